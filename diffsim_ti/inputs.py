@@ -1,0 +1,208 @@
+"""From what a user names (E, nu, density, rest shape ...) to what kernels read, with the chain rule both ways, in float64."""
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from diffsim_ti.terms import ExternalForce
+
+
+@dataclass
+class Derived:
+    """What kernels read; also used for tangents and adjoints of the same numbers. None: the scene has no such thing."""
+
+    displacement: np.ndarray  # (num_vertices, 3) [m]
+    velocity: np.ndarray  # (num_vertices, 3) [m/s]
+    coefficients: np.ndarray  # (K,) or (num_tetrahedra, K)
+    mass: np.ndarray  # (num_vertices,) [kg]
+    parameters: np.ndarray  # the numbers of all terms, one after the other
+    rest: np.ndarray  # (num_vertices, 3) [m]
+    gradients: np.ndarray  # (num_tetrahedra, 3, 3), rows grad N_1..3 [1/m]
+    volumes: np.ndarray  # (num_tetrahedra,) [m^3]
+    forces: np.ndarray | None = None  # (1 or steps, k, 3) [N]
+    motion: np.ndarray | None = None  # (steps + 1, num_fixed, 3) [m]
+
+    def zeros(self) -> "Derived":
+        """The same shapes, all zero."""
+        parts = {f.name: getattr(self, f.name) for f in fields(self)}
+        return Derived(**{k: None if v is None else np.zeros_like(v) for k, v in parts.items()})
+
+
+def rest_shape(X: np.ndarray, tetrahedra: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows grad N_1..3 (num_tetrahedra, 3, 3) and volumes of linear tetrahedra at X: B = D^-1, V = det D / 6."""
+    D = np.moveaxis(X[tetrahedra[:, 1:]] - X[tetrahedra[:, :1]], 1, 2)
+    volumes = np.linalg.det(D) / 6
+    if not np.all(volumes > 0):
+        worst = int(np.argmin(volumes))
+        raise ValueError(
+            f"rest_positions turn tetrahedron {worst} inside out (volume {volumes[worst]:.3g} m^3, "
+            f"{(~(volumes > 0)).sum()} in all); take a smaller step in the rest shape"
+        )
+    return np.linalg.inv(D), volumes
+
+
+class Inputs:
+    """The numbers of a scene that a gradient can be asked for: names, values, what kernels make of them.
+
+    `values`: dict of float64 arrays. Names: initial_positions, initial_velocities, the material's own inputs, density,
+    rest_positions, and those of the terms. prescribed_motion joins per run, sampled at its steps.
+    """
+
+    def __init__(self, scene, density, initial_positions, initial_velocities):
+        self.scene, self.mesh = scene, scene.mesh
+        n = self.mesh.num_vertices
+        velocities = np.zeros(3) if initial_velocities is None else initial_velocities
+        values = {
+            "initial_positions": self.mesh.vertices if initial_positions is None else initial_positions,
+            "initial_velocities": np.broadcast_to(np.asarray(velocities, np.float64), (n, 3)),
+            **scene.material.values(self.mesh),
+            "density": density,
+        }
+        self._term_inputs, at = [], 0  # (term, {its own name: name here}, first parameter)
+        for term in scene.terms:
+            names = {name: self._free_name(name, values) for name in term.values}
+            values |= {names[name]: value for name, value in term.values.items()}
+            self._term_inputs.append((term, names, at))
+            if not isinstance(term, ExternalForce):
+                at += sum(value.size for value in term.values.values())
+        self.num_parameters = at
+        values["rest_positions"] = self.mesh.vertices
+        self.values = self.check(values)
+
+    @staticmethod
+    def _free_name(name: str, taken: dict) -> str:
+        number = 2
+        candidate = name
+        while candidate in taken:
+            candidate, number = f"{name}_{number}", number + 1
+        return candidate
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(self.values)
+
+    def first_parameter(self, term) -> int:
+        """Where a term's numbers start in the parameter array."""
+        return next(at for t, _, at in self._term_inputs if t is term)
+
+    def check(self, values: dict) -> dict:
+        """Float64 arrays of the right shapes, or ValueError naming expected and got."""
+        n, m = self.mesh.num_vertices, self.mesh.num_tetrahedra
+        out = {}
+        for name, value in values.items():
+            value = np.asarray(value, np.float64)
+            if not np.all(np.isfinite(value)):
+                raise ValueError(f"{name} must be finite: {(~np.isfinite(value)).sum()} of {value.size} values are not")
+            if name in ("initial_positions", "initial_velocities", "rest_positions") and value.shape != (n, 3):
+                raise ValueError(f"{name}: expected shape ({n}, 3), got {value.shape}")
+            if name == "density":
+                if value.shape not in ((), (m,)):
+                    raise ValueError(f"density: expected one number or shape ({m},), got {value.shape}")
+                if not np.all(value > 0):
+                    raise ValueError(f"density must be > 0 [kg/m^3], got {value.min()}")
+            known = getattr(self, "values", {}).get(name)
+            if known is not None and name != "prescribed_motion" and known.shape != value.shape:
+                same_kind = name == "external_forces" and value.ndim in (2, 3) and value.shape[-2:] == known.shape[-2:]
+                uniform = name not in ("density", *self.scene.material.inputs) or value.shape not in ((), (m,))
+                if uniform and not same_kind:
+                    raise ValueError(f"{name}: expected shape {known.shape}, got {value.shape}")
+            out[name] = value
+        return out
+
+    def derive(self, values: dict) -> Derived:
+        """What kernels read."""
+        X = values["rest_positions"]
+        tets = self.mesh.tetrahedra
+        if X is self.mesh.vertices or np.array_equal(X, self.mesh.vertices):
+            gradients, volumes = self._rest_of_mesh()
+        else:
+            gradients, volumes = rest_shape(X, tets)
+        displacement = values["initial_positions"] - X
+        velocity = np.array(values["initial_velocities"])
+        velocity[self.scene.fixed] = 0
+        parameters, forces = np.zeros(max(self.num_parameters, 1)), None
+        for term, names, at in self._term_inputs:
+            if isinstance(term, ExternalForce):
+                forces = values[names["external_forces"]]
+                forces = forces[None] if forces.ndim == 2 else forces
+            else:
+                numbers = np.concatenate([values[name].ravel() for name in names.values()])
+                parameters[at : at + numbers.size] = numbers
+        material_values = {name: values[name] for name in self.scene.material.inputs}
+        return Derived(
+            displacement, velocity, self.scene.material.coefficients(material_values),
+            self._to_vertices(values["density"] * volumes / 4), parameters, X, gradients, volumes, forces,
+            values.get("prescribed_motion"),
+        )  # fmt: skip
+
+    def _rest_of_mesh(self):
+        if not hasattr(self, "_rest"):
+            self._rest = rest_shape(self.mesh.vertices, self.mesh.tetrahedra)
+        return self._rest
+
+    def _to_vertices(self, per_tetrahedron: np.ndarray) -> np.ndarray:
+        tets = self.mesh.tetrahedra
+        return np.bincount(tets.ravel(), np.repeat(per_tetrahedron, 4), self.mesh.num_vertices)
+
+    def derive_jvp(self, values: dict, dots: dict) -> Derived:
+        """Change of what kernels read for changes `dots` of some inputs."""
+        base = self.derive(values)
+        out, B, V, tets = base.zeros(), base.gradients, base.volumes, self.mesh.tetrahedra
+        dX = dots.get("rest_positions", 0.0)
+        out.displacement += dots.get("initial_positions", 0.0) - dX
+        out.velocity += dots.get("initial_velocities", 0.0)
+        out.velocity[self.scene.fixed] = 0
+        out.rest += dX
+        if "rest_positions" in dots:
+            dD = np.moveaxis(dX[tets[:, 1:]] - dX[tets[:, :1]], 1, 2)
+            out.gradients = -B @ dD @ B
+            out.volumes = V * np.einsum("eij,eji->e", B, dD)
+        out.mass = self._to_vertices((dots.get("density", 0.0) * V + values["density"] * out.volumes) / 4)
+        for term, names, at in self._term_inputs:
+            if isinstance(term, ExternalForce):
+                out.forces = out.forces + np.reshape(dots.get(names["external_forces"], 0.0), (-1,) + out.forces.shape[1:]) \
+                    if names["external_forces"] in dots else out.forces  # fmt: skip
+            else:
+                numbers = [np.ravel(dots.get(name, np.zeros_like(values[name]))) for name in names.values()]
+                out.parameters[at : at + sum(map(len, numbers))] = np.concatenate(numbers)
+        material = self.scene.material
+        out.coefficients = material.coefficients_jvp(
+            {name: values[name] for name in material.inputs},
+            {name: np.broadcast_to(dots.get(name, 0.0), values[name].shape) for name in material.inputs},
+        )
+        if out.motion is not None and "prescribed_motion" in dots:
+            out.motion = np.array(dots["prescribed_motion"])
+        return out
+
+    def derive_vjp(self, values: dict, adj: Derived) -> dict:
+        """Adjoints of the inputs for adjoints of what kernels read; coefficients come per tetrahedron."""
+        base = self.derive(values)
+        B, V, tets, material = base.gradients, base.volumes, self.mesh.tetrahedra, self.scene.material
+        out = {"initial_positions": adj.displacement}
+        velocity = np.array(adj.velocity)
+        velocity[self.scene.fixed] = 0
+        out["initial_velocities"] = velocity
+        out |= material.coefficients_vjp({name: values[name] for name in material.inputs}, adj.coefficients)
+        mass = adj.mass[tets].sum(1) / 4
+        out["density"] = V * mass if values["density"].ndim else np.asarray((V * mass).sum())
+        for term, names, at in self._term_inputs:
+            for name in names.values():
+                if isinstance(term, ExternalForce):
+                    out[name] = adj.forces[0] if values[name].ndim == 2 else adj.forces
+                else:
+                    size = values[name].size
+                    out[name] = adj.parameters[at : at + size].reshape(values[name].shape)
+                    at += size
+        if base.motion is not None:
+            out["prescribed_motion"] = adj.motion
+        volumes = adj.volumes + values["density"] * mass
+        Bt = np.swapaxes(B, 1, 2)
+        D_adj = -Bt @ adj.gradients @ Bt + (V * volumes)[:, None, None] * Bt
+        corners = np.swapaxes(D_adj, 1, 2)  # one row per edge, the derivative by X_a - X_0
+        X_adj = adj.rest - adj.displacement
+        np.add.at(X_adj, tets[:, 1:].ravel(), corners.reshape(-1, 3))
+        np.add.at(X_adj, tets[:, 0], -corners.sum(1))
+        out["rest_positions"] = X_adj
+        return {name: out[name] for name in self.values if name in out} | {
+            name: value for name, value in out.items() if name not in self.values
+        }

@@ -1,0 +1,101 @@
+"""Tensor calculus of isotropic laws in invariants, written once."""
+
+from dataclasses import dataclass
+
+import taichi as ti
+
+from diffsim_ti.materials.law import Law
+from diffsim_ti.materials.tensor import add_to_diagonal, cofactor_differential, inner, invariants
+
+
+@dataclass(frozen=True)
+class InvariantLaw(Law):
+    """psi(j, s, q), a function of the invariants in a form that is first or second order in the strain:
+
+        j = J - 1,    s = I_C - 3 - 2 j,    q = II_C - 3 - 2 (I_C - 3),    so that I_C - 3 = s + 2 j
+
+    with C = F^T F, I_C = tr C, II_C = |cof F|^2, J = det F. Their gradients cof F, 2 (F - cof F), 2 N with
+    N = I_C F - F C - 2 F, leave rest free of stress exactly if psi_j = 0 there, and s, q, F - cof F, N are computed from
+    H without cancellation, so that float32 keeps its digits near rest. In small strains e
+    s = 2 |e|^2 - tr(e)^2 and q = 2 tr(e)^2 - 2 |e|^2: mu = 2 (psi_s - psi_q), lam = psi_jj - 2 psi_s + 4 psi_q.
+
+    A law writes three scalar functions: `psi`, `slopes` (psi_j, psi_s, psi_q) and `curvatures` (psi_jj, psi_js, psi_ss).
+    Contract: linear in the coefficients p, and psi_q depends on nothing but p.
+    `uses_q = False`: no II_C; `couples_s = False`: psi_s depends on p only. What is not used is not computed.
+
+    Bonet, Wood, Nonlinear Continuum Mechanics for Finite Element Analysis, 2nd ed. 2008, ch. 6.
+    """
+
+    uses_q = False
+    couples_s = True
+
+    @ti.func
+    def psi(self, j, s, q, p):
+        """psi [J/m^3]"""
+
+    @ti.func
+    def slopes(self, j, s, q, p):
+        """psi_j, psi_s, psi_q"""
+
+    @ti.func
+    def curvatures(self, j, s, q, p):
+        """psi_jj, psi_js, psi_ss"""
+
+    @ti.func
+    def second_invariant(self, H, i1):
+        """(q, G, N) with C = I + G, i1 = tr G: q = (i1^2 - |G|^2) / 2, N = i1 F - F G; zeros if the law has no II_C."""
+        q, G, N = 0 * i1, H, H
+        if ti.static(self.uses_q):
+            G = H + H.transpose() + H.transpose() @ H
+            q = self.real(0.5) * (i1 * i1 - inner(G, G))
+            N = add_to_diagonal(i1 * H - G - H @ G, i1)
+        return q, G, N
+
+    @ti.func
+    def energy_density(self, H, p):
+        _, j, s = invariants(H)
+        q, _, _ = self.second_invariant(H, s + 2 * j)
+        return self.psi(j, s, q, p)
+
+    @ti.func
+    def stress(self, H, p):
+        K, j, s = invariants(H)
+        q, _, N = self.second_invariant(H, s + 2 * j)
+        psi_j, psi_s, psi_q = self.slopes(j, s, q, p)
+        P = add_to_diagonal(2 * psi_s * H + (psi_j - 2 * psi_s) * K, psi_j)
+        if ti.static(self.uses_q):
+            P += 2 * psi_q * N
+        return P
+
+    @ti.func
+    def stress_differential_and_products(self, H, dH, p):
+        K, j, s = invariants(H)
+        i1 = s + 2 * j
+        q, G, N = self.second_invariant(H, i1)
+        psi_j, psi_s, psi_q = self.slopes(j, s, q, p)
+        psi_jj, psi_js, psi_ss = self.curvatures(j, s, q, p)
+        F, KdH = add_to_diagonal(H, 1), inner(K, dH)
+        dj = dH.trace() + KdH
+        ds = 2 * (inner(H, dH) - KdH)
+        dq = 0 * dj
+
+        a = 2 * psi_s
+        dP = a * dH + (psi_j - a) * cofactor_differential(F, dH)
+        if ti.static(self.couples_s):
+            da = 2 * (psi_js * dj + psi_ss * ds)
+            dpsi_j = psi_jj * dj + psi_js * ds
+            dP += add_to_diagonal(da * H + (dpsi_j - da) * K, dpsi_j)
+        else:
+            dP += psi_jj * dj * add_to_diagonal(K, 1)
+        if ti.static(self.uses_q):
+            dq = 2 * inner(N, dH)
+            dG = F.transpose() @ dH
+            dP += 2 * psi_q * ((ds + 2 * dj) * F + i1 * dH - dH @ G - F @ (dG + dG.transpose()))
+
+        products = self.unit(0)
+        for k in ti.static(range(len(self.coefficient_names))):
+            psi_j_k, psi_s_k, psi_q_k = self.slopes(j, s, q, self.unit(k))
+            products[k] = psi_j_k * dj + psi_s_k * ds
+            if ti.static(self.uses_q):
+                products[k] += psi_q_k * dq
+        return dP, products

@@ -1,0 +1,63 @@
+"""What a law offers to kernels."""
+
+from dataclasses import dataclass
+
+import taichi as ti
+
+_FLOATS = {"f32": ti.f32, "f64": ti.f64}
+
+
+@dataclass(frozen=True)
+class Law:
+    """A constitutive formula: Taichi functions of one displacement gradient H = grad u (F = I + H), shape 3x3.
+
+    `p` is a Taichi vector of the K coefficients [Pa] named by `coefficient_names`. Every law's energy is LINEAR in p, so
+    that stress(H, e_k) is the derivative of the stress by coefficient k, and stress(H, dp) its change for a change dp.
+    The differential is exact and symmetric, and indefinite where the energy is not convex.
+
+    A law is compile-time data: constants only, equal laws share compiled kernels. precision: "f32" or "f64".
+    In its functions constants are integers, or `self.real(0.5)`, and no integer is divided or divides: Taichi computes a bare
+    0.5, x / 2 and 1 / x in f64, which makes f32 kernels slow.
+    """
+
+    precision: str
+
+    coefficient_names = ()
+
+    @property
+    def fp(self):
+        return _FLOATS[self.precision]
+
+    @ti.func
+    def real(self, x: ti.template()):
+        """A constant in the law's precision."""
+        return ti.cast(x, self.fp)
+
+    @ti.func
+    def energy_density(self, H, p):
+        """psi [J/m^3], zero at rest."""
+
+    @ti.func
+    def stress(self, H, p):
+        """First Piola-Kirchhoff stress P = dpsi/dF [Pa], 3x3."""
+
+    @ti.func
+    def stress_differential_and_products(self, H, dH, p):
+        """(dP, products): dP = d2psi/dF2 : dH, 3x3, and dH : dP/dp_k, a vector of K, from the same scalars."""
+
+    @ti.func
+    def stress_differential(self, H, dH, p):
+        """dP = d2psi/dF2 : dH [Pa], 3x3."""
+        dP, _ = self.stress_differential_and_products(H, dH, p)
+        return dP
+
+    @ti.func
+    def coefficient_products(self, H, dH):
+        """dH : dP/dp_k, a vector of K; they do not depend on p."""
+        _, products = self.stress_differential_and_products(H, dH, self.unit(0))
+        return products
+
+    @ti.func
+    def unit(self, k: ti.template()):
+        """Coefficients that are 1 at k and 0 elsewhere."""
+        return ti.Vector([self.real(int(i == k)) for i in range(len(self.coefficient_names))])

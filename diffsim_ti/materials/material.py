@@ -1,0 +1,241 @@
+"""A material: a law with its numbers."""
+
+import warnings
+from abc import ABC, abstractmethod
+
+import numpy as np
+
+from diffsim_ti.materials import moduli
+
+_ALIASES = {"E": "youngs_modulus", "nu": "poissons_ratio"}
+LOCKING_RATIO = 0.45
+
+
+class Material(ABC):
+    """A law and its numbers, in one of these spellings, never two at once:
+
+    (E, nu) or youngs_modulus= or E= [Pa], > 0, and poissons_ratio= or nu= [-], in (-1, 0.5): those of small strains,
+    mu= > 0 and lam= > -2/3 mu [Pa], the Lame parameters,
+    or what `spellings` of a material lists beyond.
+
+    Each number is one number, an array with one per tetrahedron, or a dict {tetrahedron set: number}, where the key
+    "default" serves the tetrahedra in none of the sets named.
+
+    A subclass gives `law` and constant matrices `from_lame` (K x 2) from (mu, lam) to the law's K coefficients and
+    `to_lame` (2 x K) back.
+
+    Raises ValueError with rule, value and remedy. Warns above Poisson's ratio 0.45, where linear tetrahedra lock.
+    """
+
+    spellings = (("youngs_modulus", "poissons_ratio"), ("mu", "lam"))
+    from_lame = np.eye(2)
+    to_lame = np.eye(2)
+
+    def __init__(self, *numbers, J_floor: float | None = None, **named):
+        if J_floor is not None and not 0 < J_floor < 1:
+            raise ValueError(f"J_floor must lie in (0, 1), got {J_floor}: 0.01 continues the energy below 1 % of the volume")
+        self.J_floor = None if J_floor is None else float(J_floor)
+        self._numbers = self._spell(numbers, named)
+        self._extra = ""
+        self.check({name: _all_values(name, number) for name, number in self._numbers.items()})
+        self._warn_if_locking()
+
+    def _spell(self, numbers: tuple, named: dict) -> dict:
+        """{input name: number} in the order of the one spelling that fits."""
+        usage = " or ".join(f"({', '.join(names)})" for names in self.spellings)
+        if len(numbers) > 2:
+            raise ValueError(f"{self.name}: at most two numbers go without a name (E, nu), got {len(numbers)}; use {usage}")
+        given = dict(zip(self.spellings[0], numbers))
+        for key, number in named.items():
+            name = _ALIASES.get(key, key)
+            if not any(name in names for names in self.spellings):
+                raise ValueError(f"{self.name}: no parameter is called {key!r}; use {usage}")
+            if name in given:
+                raise ValueError(f"{self.name}: {name} is given twice; keep one")
+            given[name] = number
+        for names in self.spellings:
+            if set(given) == set(names):
+                return {name: given[name] for name in names}
+        raise ValueError(f"{self.name}: needs exactly one of {usage}, got ({', '.join(given) or 'nothing'})")
+
+    def _warn_if_locking(self) -> None:
+        values = {name: _all_values(name, number) for name, number in self._numbers.items()}
+        if len({v.size for v in values.values()} - {1}) > 1:  # sets that only a mesh can pair up
+            return
+        nu = np.max(values["poissons_ratio"] if "poissons_ratio" in values else moduli.youngs_poisson(*self.lame(values))[1])
+        if nu > LOCKING_RATIO + 1e-12:
+            warnings.warn(
+                f"{self.name}: Poisson's ratio {nu:.6g} is above {LOCKING_RATIO}, where linear tetrahedra lock (bend too "
+                'little); cut cells with pattern="five", refine the mesh, or lower the ratio',
+                stacklevel=_levels_to_caller(),
+            )
+
+    @property
+    def name(self) -> str:
+        """The class name."""
+        return type(self).__name__
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of the numbers, as the user gave them: what a gradient can be asked for."""
+        return tuple(self._numbers)
+
+    @abstractmethod
+    def law(self, precision: str):
+        """The compile-time law, "f32" or "f64"; equal laws share compiled kernels."""
+
+    def values(self, mesh) -> dict[str, np.ndarray]:
+        """The numbers in float64: shape () where uniform, else (mesh.num_tetrahedra,).
+
+        Raises ValueError for a wrong length, an unknown or overlapping set, or tetrahedra left out.
+        """
+        values = {name: _on_mesh(name, number, mesh) for name, number in self._numbers.items()}
+        self.check(values)
+        return values
+
+    def check(self, values: dict) -> None:
+        """Raise ValueError, naming range, value and remedy, for numbers that no material can have."""
+        for name, value in values.items():
+            if not np.all(np.isfinite(value)):
+                bad = value[~np.isfinite(value)] if np.ndim(value) else value
+                raise ValueError(f"{name} must be finite, got {np.ravel(bad)[0]} ({np.size(bad)} of {np.size(value)} values)")
+        if "youngs_modulus" in values:
+            check_range("youngs_modulus", values["youngs_modulus"], 0, np.inf, False, "a stiffness [Pa]")
+            remedy = "0.5 is incompressible; take 0.45, or up to 0.49 with a fine mesh"
+            check_range("poissons_ratio", values["poissons_ratio"], -1, 0.5, False, remedy)
+        if "mu" in values:
+            check_range("mu", values["mu"], 0, np.inf, False, "a stiffness [Pa]")
+            if values["mu"].shape == values["lam"].shape or 1 in (values["mu"].size, values["lam"].size):
+                bulk = moduli.bulk_modulus(values["mu"], values["lam"])
+                check_range("bulk modulus lam + 2/3 mu", bulk, 0, np.inf, False, "raise lam")
+
+    def lame(self, values: dict) -> tuple[np.ndarray, np.ndarray]:
+        """Small-strain (mu, lam) [Pa], each shape () or (num_tetrahedra,)."""
+        p = self.coefficients(values) @ self.to_lame.T
+        return p[..., 0], p[..., 1]
+
+    def coefficients(self, values: dict) -> np.ndarray:
+        """The law's coefficients [Pa]: shape (K,) if all values are uniform, else (num_tetrahedra, K)."""
+        self.check(values)
+        return self._linear(values, values)
+
+    def coefficients_jvp(self, values: dict, tangents: dict) -> np.ndarray:
+        """Change of the coefficients for changes of the values; names left out do not change."""
+        return self._linear(values, {n: np.broadcast_to(tangents.get(n, 0.0), np.shape(v)) for n, v in values.items()}, True)
+
+    def coefficients_vjp(self, values: dict, coefficients_adj: np.ndarray) -> dict[str, np.ndarray]:
+        """Adjoint of each value, of its shape, from the adjoint of the coefficients, shape (num_tetrahedra, K) or (K,).
+
+        A uniform value takes the sum over all tetrahedra.
+        """
+        adj = np.asarray(coefficients_adj, np.float64)
+        v = [np.asarray(values[name], np.float64) for name in self.inputs]
+        if self.inputs in Material.spellings:
+            parts = np.moveaxis(adj @ self.from_lame, -1, 0)
+            if self.inputs == Material.spellings[0]:
+                parts = moduli.lame_vjp(*v, *parts)
+        else:
+            parts = np.moveaxis(adj @ self.from_own, -1, 0)
+        return {n: np.sum(part) if x.ndim == 0 else part for n, x, part in zip(self.inputs, v, parts)}
+
+    def _linear(self, values: dict, arguments: dict, derivative: bool = False) -> np.ndarray:
+        """Coefficients of `arguments`, or their change for changes `arguments` at `values`."""
+        v, a = ([np.asarray(d[name], np.float64) for name in self.inputs] for d in (values, arguments))
+        matrix = self.from_lame if self.inputs in Material.spellings else self.from_own
+        if self.inputs == Material.spellings[0]:
+            a = moduli.lame_jvp(*v, *a) if derivative else moduli.lame(*a)
+        return np.stack(np.broadcast_arrays(*a), -1) @ matrix.T
+
+    def __repr__(self) -> str:
+        numbers = ", ".join(f"{name}={_short(number)}" for name, number in self._numbers.items())
+        return f"{self.name}({numbers}{self._extra})"
+
+
+def check_range(name: str, value, low: float, high: float, low_included: bool, remedy: str) -> None:
+    """Raise ValueError unless low < value < high (low <= value if low_included) everywhere; NaN is outside."""
+    value = np.asarray(value)
+    bad = ~(((value >= low) if low_included else (value > low)) & (value < high))
+    if np.any(bad):
+        first = int(np.argmax(np.ravel(bad)))
+        where = f" in tetrahedron {first} ({bad.sum()} in all)" if value.ndim else ""
+        rule = f"lie in ({low:g}, {high:g})" if np.isfinite(high) else f"be {'>=' if low_included else '>'} {low:g}"
+        raise ValueError(f"{name} must {rule}, got {np.ravel(value)[first]:g}{where}: {remedy}")
+
+
+def _number(name: str, number) -> np.ndarray:
+    try:
+        value = np.asarray(number)
+        if value.dtype.kind not in "iuf":
+            raise TypeError
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} must be a number, an array of numbers or a dict of numbers, got {number!r}") from None
+    if value.ndim > 1:
+        raise ValueError(f"{name} must be one number or one per tetrahedron, got an array of shape {value.shape}")
+    return value.astype(np.float64)
+
+
+def _all_values(name: str, number) -> np.ndarray:
+    """Every number given, for checks that need no mesh; a dict as an array of its numbers."""
+    if not isinstance(number, dict):
+        return _number(name, number)
+    for key, value in number.items():
+        if _number(f"{name}[{key!r}]", value).ndim:
+            raise ValueError(f"{name}[{key!r}] must be one number, got shape {np.shape(value)}")
+    if not number:
+        raise ValueError(f'{name}: the dict is empty; name tetrahedron sets, or give a number for "default"')
+    return np.array([float(value) for value in number.values()])
+
+
+def _on_mesh(name: str, number, mesh) -> np.ndarray:
+    if isinstance(number, dict):
+        return _from_sets(name, number, mesh)
+    value = _number(name, number)
+    if value.ndim and value.shape != (mesh.num_tetrahedra,):
+        raise ValueError(
+            f"{name}: expected one number or one per tetrahedron, shape ({mesh.num_tetrahedra},), got shape {value.shape}"
+        )
+    return value
+
+
+def _from_sets(name: str, numbers: dict, mesh) -> np.ndarray:
+    value = np.full(mesh.num_tetrahedra, float(numbers.get("default", np.nan)))
+    owner = np.zeros(mesh.num_tetrahedra, np.int64)  # 1 + number of the set that a tetrahedron took its value from
+    names = [key for key in numbers if key != "default"]
+    for rank, key in enumerate(names, 1):
+        if key not in mesh.tetrahedron_sets:
+            known = ", ".join(map(repr, mesh.tetrahedron_sets)) or "none"
+            raise ValueError(f"{name}: the mesh has no tetrahedron set {key!r} (it has: {known})")
+        members = np.asarray(mesh.tetrahedron_sets[key])
+        if np.any(owner[members]):
+            first = int(members[np.argmax(owner[members] > 0)])
+            other = names[owner[first] - 1]
+            raise ValueError(f"{name}: tetrahedron {first} is in both {other!r} and {key!r}; make the sets disjoint")
+        owner[members] = rank
+        value[members] = float(numbers[key])
+    if "default" not in numbers and not owner.all():
+        left_out = np.flatnonzero(owner == 0)
+        raise ValueError(
+            f"{name}: {left_out.size} tetrahedra are in none of the sets {names} (first: {left_out[0]}); "
+            'add a number for "default"'
+        )
+    return value
+
+
+def _levels_to_caller() -> int:
+    """Stack level of the code that constructs a material, for a warning that points there."""
+    import sys
+
+    level, frame = 1, sys._getframe(1)
+    while frame and "self" in frame.f_locals and isinstance(frame.f_locals["self"], Material):
+        level, frame = level + 1, frame.f_back
+    return level
+
+
+def _short(number) -> str:
+    if isinstance(number, dict):
+        return "{" + ", ".join(f"{key!r}: {_short(value)}" for key, value in number.items()) + "}"
+    value = np.asarray(number, np.float64)
+    if value.ndim:
+        return f"array({value.size} values, {_short(value.min())} to {_short(value.max())})"
+    digits, exponent = f"{value:.11e}".split("e")
+    return min(f"{value:.12g}", f"{digits.rstrip('0').rstrip('.')}e{int(exponent)}", key=len)

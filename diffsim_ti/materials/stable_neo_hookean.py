@@ -1,0 +1,54 @@
+"""Neo-Hookean material that stays finite when inverted."""
+
+from dataclasses import dataclass
+
+import taichi as ti
+
+from diffsim_ti.materials import logarithm
+from diffsim_ti.materials.invariants import InvariantLaw
+from diffsim_ti.materials.material import Material
+
+
+@dataclass(frozen=True)
+class StableNeoHookeanLaw(InvariantLaw):
+    """psi = mu/2 (I_C - 3) - mu log J + lam/2 (J - 1)^2 = mu/2 s + mu (j - log(1 + j)) + lam/2 j^2."""
+
+    J_floor: float = 0.01
+
+    coefficient_names = ("mu", "lam")
+    couples_s = False
+
+    @ti.func
+    def psi(self, j, s, q, p):
+        return p[0] * (self.real(0.5) * s + logarithm.value(j, self.floor(), self.fp)) + self.real(0.5) * p[1] * j * j
+
+    @ti.func
+    def slopes(self, j, s, q, p):
+        return p[0] * logarithm.slope(j, self.floor(), self.fp) + p[1] * j, self.real(0.5) * p[0], 0
+
+    @ti.func
+    def curvatures(self, j, s, q, p):
+        return p[0] * logarithm.curvature(j, self.floor(), self.fp) + p[1], 0, 0
+
+    @ti.func
+    def floor(self):
+        return self.real(self.J_floor - 1)
+
+
+class StableNeoHookean(Material):
+    """psi = mu/2 (I_C - 3) - mu log J + lam/2 (J - 1)^2 [J/m^3]; P = mu (F - F^-T) + lam (J - 1) J F^-T [Pa].
+
+    Below `J_floor` -log J is continued by its second-order Taylor polynomial about J_floor. The promise: for every F, also
+    inverted, energy, stress and differential are finite, the energy is C2, and its derivative by J is negative wherever
+    J < J_floor, so that the stress pushes outwards. Above the floor the formula is exact. The limit: that is not full
+    recovery. Near F = 0 no law of this form leads every inverted state back; `SmithNeoHookean` recovers from more of them.
+
+    Arguments: see `Material`; J_floor in (0, 1), one number, part of the law (a change compiles kernels anew).
+    Bonet, Wood, Nonlinear Continuum Mechanics for Finite Element Analysis, 2nd ed. 2008, sec. 6.4.3.
+    """
+
+    def __init__(self, *numbers, J_floor: float = 0.01, **named):
+        super().__init__(*numbers, J_floor=J_floor, **named)
+
+    def law(self, precision: str) -> StableNeoHookeanLaw:
+        return StableNeoHookeanLaw(precision, self.J_floor)

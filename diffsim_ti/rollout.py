@@ -1,0 +1,324 @@
+"""Rollout: n steps of a solver as one differentiable operation."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import taichi as ti
+
+from diffsim_ti import runtime
+from diffsim_ti.checkpoints import choose_schedule
+from diffsim_ti.divergence import Guard
+from diffsim_ti.solvers.arrays import History
+from diffsim_ti.solvers.explicit_adjoint import ExplicitAdjoint, ExplicitTangent
+
+
+@dataclass(eq=False)
+class Frames:
+    """Saved states of one run: positions [m] and velocities [m/s], shape (frames, num_vertices, 3), times [s].
+
+    `inputs` are the values that the run started from, so that its gradient can be taken whenever it is wanted.
+    """
+
+    positions: np.ndarray
+    velocities: np.ndarray
+    times: np.ndarray
+    inputs: dict = field(repr=False)
+
+
+class Rollout:
+    """n steps of a solver from given inputs, with saved frames and gradients of everything that went in.
+
+    solver: an explicit solver; its scene names the inputs (`rollout.inputs`): initial_positions, initial_velocities,
+        the material's numbers, density, the terms' numbers, prescribed_motion, rest_positions.
+    steps: number of steps of solver.dt.
+    save_every: a frame every so many steps, besides the start; must divide `steps`. Default: only the end.
+    checkpoint_every: keep a state every so many steps and compute the rest again in the reverse sweep.
+    memory: or a budget [MB] from which a schedule is chosen (default 1000). The gradient is bitwise the same.
+    gradients: names of inputs whose gradient is wanted; default all but rest_positions, which costs extra.
+    clip: largest norm of the running adjoint; it is scaled back when it exceeds that (the gradient is then no gradient).
+    truncate: differentiate only the last so many steps.
+    health: keep a report of the adjoint's norm per step (`rollout.health`).
+
+    Two ways to use it. With arrays: `frames = rollout.forward(youngs_modulus=...)`, then `rollout.vjp(frames, ...)`.
+    In Taichi: `rollout.run()` under `ti.ad.Tape`, with fields `rollout.positions`, `rollout.velocities` (frames x
+    vertices) and, for the inputs, `rollout.field(name)`; after the tape `rollout.gradients[name]` or the fields' .grad.
+
+    Raises ValueError for inputs that do not fit, FloatingPointError if the run diverges or the adjoint is not finite.
+    Griewank, Walther, Evaluating Derivatives, ch. 3 and 12, doi:10.1137/1.9780898717761.
+    """
+
+    def __init__(self, solver, steps: int, save_every: int | None = None, checkpoint_every: int | None = None,
+                 memory: float | None = None, gradients=None, clip: float | None = None, truncate: int | None = None,
+                 health: bool = False):  # fmt: skip
+        self.solver, self.scene, self.steps = solver, solver.scene, int(steps)
+        if self.steps != steps or steps < 0:
+            raise ValueError(f"steps must be a whole number >= 0, got {steps}")
+        self.save_every = max(self.steps, 1) if save_every is None else int(save_every)
+        if self.save_every < 1 or self.steps % self.save_every:
+            raise ValueError(f"save_every = {save_every} must be >= 1 and divide steps = {steps}")
+        self.num_frames = self.steps // self.save_every + 1
+        values = dict(self.scene.inputs.values)
+        if self.scene.motion is not None:
+            values["prescribed_motion"] = self.scene.motion_rows(np.arange(self.steps + 1) * solver.dt)
+        self.values = values
+        self.inputs = tuple(values)
+        self.wanted = self._check_names(gradients)
+        self.num_passes = solver.num_passes(self.steps)
+        every = None if checkpoint_every is None else max(1, int(checkpoint_every)) * solver.substeps
+        self.state_bytes = 3 * self.scene.mesh.num_vertices * runtime.NUMPY[self.scene.precision]().itemsize
+        self.schedule = choose_schedule(self.num_passes, self.state_bytes, every, memory)
+        self.clip, self.truncate, self.wants_health = clip, truncate, health
+        self.health: list[dict] = []
+        self.gradients: dict[str, np.ndarray] = {}
+        self._workspace, self._current, self._fields, self._tape, self._adjoint = None, None, {}, None, None
+
+    def _check_names(self, names) -> tuple[str, ...]:
+        if names is None:
+            return tuple(name for name in self.inputs if name != "rest_positions")
+        names = self.inputs if names == "all" else tuple([names] if isinstance(names, str) else names)
+        unknown = [name for name in names if name not in self.inputs]
+        if unknown:
+            raise ValueError(f"gradients: no input named {unknown[0]!r}; this rollout has {', '.join(self.inputs)}")
+        return names
+
+    @property
+    def times(self) -> np.ndarray:
+        """Times of the frames [s]."""
+        return np.arange(self.num_frames) * self.save_every * self.solver.dt
+
+    @property
+    def memory(self) -> float:
+        """What the reverse sweep keeps [MB]: snapshots, recorded states."""
+        return self.schedule.states() * self.state_bytes / 1e6
+
+    # ---- with arrays ------------------------------------------------------------------------------------------------
+
+    def forward(self, **values) -> Frames:
+        """Run from the scene's inputs, with some of them replaced, and return the saved frames."""
+        run = self._start(values)
+        self._sweep_forward()
+        u, v = (runtime.fetch(x) for x in self._workspace.frames)
+        rest = run["rest_positions"]
+        frames = Frames((rest + u).astype(u.dtype), v, self.times, run)
+        self._current = run
+        return frames
+
+    def vjp(self, frames: Frames, positions=None, velocities=None) -> dict[str, np.ndarray]:
+        """Gradients of a loss by every wanted input, from its gradients by the frames' positions and velocities.
+
+        Float64 arrays of the inputs' shapes; None for a part that the loss does not name.
+        """
+        if self._current is not frames.inputs:  # another run came between: bring this one back
+            self._start(frames.inputs)
+            self._sweep_forward()
+            self._current = frames.inputs
+        shape = (self.num_frames, self.scene.mesh.num_vertices, 3)
+        adjoints = []
+        for name, adjoint in (("positions", positions), ("velocities", velocities)):
+            adjoint = np.zeros(shape) if adjoint is None else np.asarray(adjoint)
+            if adjoint.shape != shape:
+                raise ValueError(f"gradient by the frames' {name}: expected shape {shape}, got {adjoint.shape}")
+            if not np.all(np.isfinite(adjoint)):
+                frame = int(np.argwhere(~np.isfinite(adjoint))[0][0])
+                raise FloatingPointError(
+                    f"the loss's gradient by {name} is not finite at step {frame * self.save_every} "
+                    f"(frame {frame}): look at the loss; parameters are unchanged"
+                )
+            adjoints.append(adjoint)
+        self.gradients = self._sweep_reverse(*adjoints, self.wants_health or self.clip is not None)
+        return self.gradients
+
+    def jvp(self, frames: Frames, **tangents) -> tuple[np.ndarray, np.ndarray]:
+        """Changes (positions, velocities) of the frames for changes of inputs, to first order, float64."""
+        unknown = [name for name in tangents if name not in self.inputs]
+        if unknown:
+            raise ValueError(f"jvp: no input named {unknown[0]!r}; this rollout has {', '.join(self.inputs)}")
+        values = frames.inputs
+        ws = self._start(values) and self._workspace
+        dots = {k: np.broadcast_to(np.asarray(x, np.float64), values[k].shape) for k, x in tangents.items()}
+        tangent = ExplicitTangent(ws, self.scene.inputs.derive_jvp(values, dots))
+        ws.make_record(self.schedule.segment + 1)
+        save = self.save_every * self.solver.substeps
+        for k in range(self.schedule.num_segments):
+            first, last = self.schedule.bounds(k)
+            self._record(first, last)
+            tangent.advance(first, last, self.num_passes, save)
+            ws.advance(first, last, self.num_passes)
+        if self.solver.last_frame_is_state:
+            tangent.save_frame(self.num_frames - 1)
+        self._current = None
+        return tangent.collect()
+
+    # ---- under ti.ad.Tape -------------------------------------------------------------------------------------------
+
+    def field(self, name: str):
+        """The Taichi field of an input (with .grad), or of the frames' "positions" or "velocities".
+
+        Input fields hold the scene's values until a kernel or `from_numpy` writes others; `run` reads them.
+        """
+        if name not in self._fields:
+            fp = runtime.PRECISIONS[self.scene.precision]
+            if name in ("positions", "velocities"):
+                shape, components = (self.num_frames, self.scene.mesh.num_vertices), 3
+                self._fields[name] = runtime.fields.take(self, fp, shape, components)
+            elif name in self.inputs:
+                value = self.values[name]
+                components = 3 if value.shape[-1:] == (3,) else 0
+                shape = value.shape[:-1] if components else value.shape
+                self._fields[name] = runtime.fields.take(self, fp, shape, components)
+                self._fields[name].from_numpy(value.astype(runtime.NUMPY[self.scene.precision]))
+            else:
+                raise ValueError(f"no input named {name!r}; this rollout has {', '.join(self.inputs)}")
+        return self._fields[name]
+
+    @property
+    def positions(self):
+        """Taichi field of the frames' positions [m], shape (frames, num_vertices) of 3-vectors, with .grad."""
+        return self.field("positions")
+
+    @property
+    def velocities(self):
+        """Taichi field of the frames' velocities [m/s], shape (frames, num_vertices) of 3-vectors, with .grad."""
+        return self.field("velocities")
+
+    @ti.ad.grad_replaced
+    def run(self):
+        """Run from the input fields and fill the frames; inside a `ti.ad.Tape`, the tape will call `run_vjp`."""
+        tape = runtime.current_tape()
+        if tape is not None and tape is self._tape:
+            raise RuntimeError("this rollout already ran in this tape, and would overwrite its frames: make a second Rollout")
+        self._tape = tape
+        frames = self.forward(**self._field_values())
+        self._taped = frames
+        for name in ("positions", "velocities"):
+            self.field(name).from_numpy(getattr(frames, name))
+
+    @ti.ad.grad_for(run)
+    def run_vjp(self):
+        """Mirror of `run`: adds to the .grad of the input fields and sets `gradients`."""
+        gradients = self.vjp(self._taped, *(self.field(name).grad.to_numpy() for name in ("positions", "velocities")))
+        for name in self.inputs:
+            if name in self._fields and name in gradients:
+                grad = self._fields[name].grad
+                grad.from_numpy((grad.to_numpy() + gradients[name]).astype(runtime.NUMPY[self.scene.precision]))
+
+    def _field_values(self) -> dict:
+        exact = {}
+        for name, taichi_field in self._fields.items():
+            if name in self.inputs:
+                value = taichi_field.to_numpy()
+                known = self.values[name].astype(value.dtype)
+                exact[name] = self.values[name] if np.array_equal(value, known) else value.astype(np.float64)
+        return exact
+
+    # ---- sweeps -----------------------------------------------------------------------------------------------------
+
+    def _start(self, values: dict) -> dict:
+        unknown = [name for name in values if name not in self.inputs]
+        if unknown:
+            raise ValueError(f"no input named {unknown[0]!r}; this rollout has {', '.join(self.inputs)}")
+        run = self.values | self.scene.inputs.check(values)
+        self._check_lengths(run)
+        derived = self.scene.inputs.derive(run)
+        if self._workspace is None:
+            self._workspace = self.solver.workspace(derived)
+            self._workspace.make_frames(self.num_frames)
+            self._snapshots = History(self._workspace.arrays, self.schedule.snapshots, record=False)
+            self._guard = Guard(self._workspace)
+        else:
+            self._workspace.load(derived)
+        return run
+
+    def _check_lengths(self, run: dict) -> None:
+        forces = run.get("external_forces")
+        if forces is not None and forces.ndim == 3 and len(forces) < self.steps:
+            raise ValueError(f"external_forces: {self.steps} steps need as many rows, got {len(forces)}")
+        motion = run.get("prescribed_motion")
+        if motion is not None and motion.shape != self.values["prescribed_motion"].shape:
+            expected = self.values["prescribed_motion"].shape
+            raise ValueError(f"prescribed_motion: expected shape {expected}, got {motion.shape}")
+
+    def _sweep_forward(self) -> None:
+        """All passes; keeps the first snapshots of the schedule on the way."""
+        ws, schedule = self._workspace, self.schedule
+        path = [0, *schedule.path(0, schedule.num_segments, schedule.snapshots - 1)]
+        save = self.save_every * self.solver.substeps
+        for k, segment in enumerate(path):
+            ws.save(self._snapshots, k)
+            first = schedule.bounds(segment)[0]
+            last = schedule.bounds(path[k + 1])[0] if k + 1 < len(path) else self.num_passes
+            self._guard.advance(first, last, self.num_passes, save)
+        if self.solver.last_frame_is_state:
+            ws.save_frame(self.num_frames - 1)
+        self._kept = path
+
+    def _record(self, first: int, last: int) -> None:
+        """Passes first .. last - 1 from the current state, recorded."""
+        ws = self._workspace
+        ws.make_record(self.schedule.segment + 1)
+        ws.restore_to_record()
+        ws.advance(first, last, self.num_passes, recording=True)
+
+    def _sweep_reverse(self, positions_adj, velocities_adj, careful: bool) -> dict[str, np.ndarray]:
+        ws, schedule = self._workspace, self.schedule
+        if self._adjoint is None or self._adjoint.features.uniform != ws.arrays.features().uniform \
+                or self._adjoint.frames[0].shape != ws.frames[0].shape:  # fmt: skip
+            self._adjoint = ExplicitAdjoint(ws, "density" in self.wanted, "rest_positions" in self.wanted)
+        adjoint = self._adjoint
+        adjoint.start(positions_adj, velocities_adj, self.solver.last_frame_is_state)
+        self.health = []
+        stop = 0 if self.truncate is None else max(0, self.num_passes - self.truncate * self.solver.substeps)
+        kept, end = list(self._kept), schedule.num_segments
+        while end > 0 and schedule.bounds(end - 1)[1] > stop:
+            begin = kept[-1]
+            ws.restore(self._snapshots, len(kept) - 1)
+            for segment in schedule.path(begin, end, schedule.snapshots - len(kept)):
+                ws.advance(schedule.bounds(begin)[0], schedule.bounds(segment)[0], self.num_passes)
+                kept.append(segment)
+                ws.save(self._snapshots, len(kept) - 1)
+                begin = segment
+            first, last = schedule.bounds(end - 1)
+            if begin < end - 1:  # no snapshot is left: come here anew
+                ws.advance(schedule.bounds(begin)[0], first, self.num_passes)
+            self._record(first, last)
+            self._reverse_segment(first, last, max(first, stop), careful)
+            end -= 1
+            if kept[-1] == end:
+                kept.pop()
+        adjoint.finish()
+        self._kept = self._kept[:1]
+        derived = adjoint.collect()
+        if not np.isfinite(derived.displacement.sum() + derived.velocity.sum() + derived.coefficients.sum()):
+            if careful:
+                raise FloatingPointError("the adjoint is not finite at the start of the run")
+            return self._sweep_reverse(positions_adj, velocities_adj, careful=True)
+        gradients = self.scene.inputs.derive_vjp(self._current or self.values, derived)
+        return {name: gradients[name] for name in self.wanted if name in gradients}
+
+    def _reverse_segment(self, first: int, last: int, stop: int, careful: bool) -> None:
+        save, adjoint = self.save_every * self.solver.substeps, self._adjoint
+        if not careful:
+            adjoint.reverse(first, last, self.num_passes, save, stop)
+            return
+        substeps = self.solver.substeps
+        while last > stop:
+            begin = max(stop, (last - 1) // substeps * substeps)
+            adjoint.reverse(first, last, self.num_passes, save, begin)
+            by_position, by_velocity = adjoint.norm()
+            step = begin // substeps
+            if not np.isfinite(by_position + by_velocity):
+                raise FloatingPointError(
+                    f"the adjoint became not finite in step {step} (t = {step * self.solver.dt:g} s): "
+                    "look at the loss and at how long the rollout stays smooth; parameters are unchanged"
+                )
+            scaled = 1.0
+            norm = float(np.hypot(by_position, by_velocity))
+            if self.clip is not None and norm > self.clip:
+                scaled = self.clip / norm
+                adjoint.scale(scaled)
+            self.health.append({"step": step, "norm_position": by_position, "norm_velocity": by_velocity, "scaled": scaled})
+            last = begin
+
+
+for _method, _name in ((Rollout.run, "run"), (Rollout.run_vjp, "run_vjp")):
+    _method.__name__ = _name

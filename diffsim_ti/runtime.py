@@ -1,0 +1,267 @@
+"""The one door to Taichi's runtime: start-up, precision, arrays that are freed, fields that are lent and returned.
+
+Nothing else in the package touches `taichi.lang.impl` or `taichi._lib`.
+"""
+
+import contextlib
+import io
+import os
+import warnings
+import weakref
+from collections import defaultdict
+from types import SimpleNamespace
+
+os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # read when taichi is imported
+os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")  # no network traffic from a simulator
+
+import numpy as np  # noqa: E402
+import taichi as ti  # noqa: E402
+from taichi._lib import core as _core  # noqa: E402
+from taichi.lang import impl  # noqa: E402
+from taichi.types import primitive_types  # noqa: E402
+
+PRECISIONS = {"f32": ti.f32, "f64": ti.f64}
+NUMPY = {"f32": np.float32, "f64": np.float64}
+_ARCHS = {"cpu": ti.cpu, "cuda": ti.cuda, "vulkan": ti.vulkan}
+_settings = {"precision": "f32", "bytes": 0}
+
+
+def available_archs() -> list[str]:
+    """Names of the backends this machine and this Taichi build can run, always with "cpu"."""
+    ti.set_logging_level(ti.ERROR)  # a missing driver is an answer here, not a warning
+    return [name for name in _ARCHS if _has_arch(name)]
+
+
+def _has_arch(name: str) -> bool:
+    return {"cpu": lambda: True, "cuda": _core.with_cuda, "vulkan": _core.with_vulkan}[name]()
+
+
+def init(arch: str = "cpu", precision: str = "f32", threads: int | None = None, **options) -> None:
+    """Start Taichi for this process: a thin front of `ti.init`, and the only place that calls it.
+
+    arch: "cpu", "cuda" or "vulkan"; a backend that is not there is an error, never a fall-back.
+    precision: "f32" or "f64", what a Scene uses unless it says otherwise.
+    threads: CPU threads, default all.
+    options: handed to `ti.init`. `fast_math` stays False because it erases NaNs before anyone can see them, and
+    `default_fp` stays f64 so that both precisions can live in one process.
+
+    Used before `init`, the library calls `init()` itself: CPU, f32. A `ti.init` of the host program is respected.
+    Calling it again drops every array of earlier scenes; they say so when used.
+    Raises ValueError for an unknown name, RuntimeError for a backend that is not available.
+    """
+    if arch not in _ARCHS:
+        raise ValueError(f"arch must be one of {', '.join(_ARCHS)}, got {arch!r}")
+    set_precision(precision)
+    ti.set_logging_level(ti.ERROR)
+    if not _has_arch(arch):
+        raise RuntimeError(
+            f"the {arch} backend is not available here (available: {', '.join(available_archs())}); "
+            f"pass one of those to diffsim_ti.init, or install the driver that {arch} needs"
+        )
+    for name in ("default_fp", "fast_math"):
+        if name in options:
+            raise ValueError(f"{name} cannot be chosen: diffsim_ti needs default_fp=f64 and fast_math=False")
+    options.setdefault("log_level", ti.ERROR)
+    if not _can_write_cache(options.get("offline_cache_file_path") or os.environ.get("TI_OFFLINE_CACHE_FILE_PATH")):
+        options["offline_cache"] = False  # Taichi would crash at exit
+    if threads is not None:
+        options["cpu_max_num_threads"] = int(threads)
+    with contextlib.redirect_stdout(io.StringIO()):
+        ti.init(arch=_ARCHS[arch], default_fp=ti.f64, fast_math=False, enable_fallback=False, **options)
+
+
+def _can_write_cache(path: str | None) -> bool:
+    folder = os.path.abspath(os.path.expanduser(path or "~/.cache/taichi/ticache"))
+    while not os.path.isdir(folder):
+        folder = os.path.dirname(folder)
+    return os.access(folder, os.W_OK)
+
+
+def set_precision(precision: str) -> None:
+    """Set the precision, "f32" or "f64", of scenes that do not name one."""
+    _settings["precision"] = check_precision(precision)
+
+
+def check_precision(precision: str | None) -> str:
+    """Return a valid precision name; None means the process-wide default."""
+    if precision is None:
+        return _settings["precision"]
+    if precision not in PRECISIONS:
+        raise ValueError(f"precision must be 'f32' or 'f64', got {precision!r}")
+    return precision
+
+
+def program():
+    """The live Taichi program; starts the stated default (CPU, f32) if nothing did."""
+    if impl.get_runtime().prog is None:
+        init()
+    return impl.get_runtime().prog
+
+
+def check_host_init() -> None:
+    """Warn once about a host program's `ti.init` that weakens the library's promises."""
+    program()
+    config = impl.current_cfg()
+    if config.fast_math and not _settings.get("warned"):
+        _settings["warned"] = True
+        warnings.warn(
+            "ti.init was called with fast_math=True, which can erase NaNs before they are seen; "
+            "use diffsim_ti.init(), or ti.init(fast_math=False, default_fp=ti.f64)",
+            stacklevel=3,
+        )
+
+
+def check_alive(owner) -> None:
+    """Raise if `ti.init` was called after `owner` took its arrays."""
+    if impl.get_runtime().prog is not owner:
+        raise RuntimeError("ti.init was called again, which destroys all Taichi data: build the scene and solver anew")
+
+
+def arch_name() -> str:
+    """Name of the running backend."""
+    program()
+    arch = impl.current_cfg().arch
+    return next((name for name, value in _ARCHS.items() if value == arch), "cpu")
+
+
+def runs_on_cpu() -> bool:
+    return arch_name() == "cpu"
+
+
+def allocated_megabytes() -> float:
+    """Memory that this package's arrays hold now [MB]."""
+    return _settings["bytes"] / 1e6
+
+
+def _free(owner, handle, size) -> None:
+    _settings["bytes"] -= size
+    if handle is not None and impl.get_runtime().prog is owner:
+        owner.delete_ndarray(handle)
+
+
+def array(dtype, *shape: int):
+    """A Taichi ndarray whose memory goes back when the last reference goes (plain vector ndarrays never free it)."""
+    owner = program()
+    shape = tuple(max(int(s), 1) for s in shape)  # Taichi has no empty arrays
+    out = ti.ndarray(dtype, shape)
+    size = int(np.prod(full_shape(out))) * np.dtype(to_numpy_dtype(out.dtype)).itemsize
+    _settings["bytes"] += size
+    # scalar arrays free themselves
+    weakref.finalize(out, _free, owner, None if isinstance(out, ti.ScalarNdarray) else out.arr, size)
+    return out
+
+
+def upload(data: np.ndarray, dtype) -> "ti.Ndarray":
+    """A new Taichi array of element type `dtype` (scalar, vector or matrix) holding `data`."""
+    element = getattr(dtype, "get_shape", tuple)() if not isinstance(dtype, type(ti.f32)) else ()
+    data = np.asarray(data)
+    shape = data.shape[: data.ndim - len(element)]
+    out = array(dtype, *shape)
+    if data.size:
+        fill(out, data)
+    return out
+
+
+def full_shape(target) -> tuple:
+    """Shape of a Taichi array with its element's shape, as NumPy sees it."""
+    return tuple(target.shape) + tuple(getattr(target, "element_shape", ()) or ())
+
+
+def view(target) -> "np.ndarray | None":
+    """A NumPy array over the memory of a Taichi array, no copy; None where that memory is not the host's."""
+    host = getattr(target, "host_view", None)
+    if host is None and runs_on_cpu():
+        dtype, shape = to_numpy_dtype(target.dtype), full_shape(target)
+        kind = np.ctypeslib.as_ctypes_type(dtype) * int(np.prod(shape))
+        address = impl.get_runtime().prog.get_ndarray_data_ptr_as_int(target.arr)
+        host = target.host_view = np.ctypeslib.as_array(kind.from_address(address)).reshape(shape)
+    return host
+
+
+def fill(target, data) -> None:
+    """Copy numbers into a Taichi array; `data` broadcasts to its shape, and anything else is a ValueError."""
+    host = view(target)
+    if host is not None:
+        host[...] = data
+    else:
+        dtype = to_numpy_dtype(target.dtype)
+        target.from_numpy(np.ascontiguousarray(np.broadcast_to(np.asarray(data, dtype), full_shape(target))))
+
+
+def fetch(source) -> np.ndarray:
+    """A NumPy copy of a Taichi array."""
+    host = view(source)
+    return source.to_numpy() if host is None else host.copy()
+
+
+class Launch:
+    """A kernel with its arrays bound once, launched many times with other numbers.
+
+    A plain call looks at every argument anew: 5 us for each array, 100 us for the kernels of a step.
+    """
+
+    def __init__(self, kernel, *arrays):
+        self._kernel, self._arrays, self._context = kernel._primal, arrays, None
+        self._is_float = [id(a.annotation) in primitive_types.real_type_ids for a in self._kernel.arguments]
+
+    def __call__(self, *numbers) -> None:
+        prog = impl.get_runtime().prog
+        if self._context is None:
+            key = self._kernel.ensure_compiled(*self._arrays, *numbers)
+            compiled = self._kernel.compiled_kernels[key]
+            self._code = prog.compile_kernel(prog.config(), prog.get_device_caps(), compiled)
+            self._context = compiled.make_launch_context()
+        for k, array in enumerate(self._arrays):  # anew each time: on the CPU a launch replaces them by raw pointers
+            self._context.set_arg_ndarray((k,), array.arr)
+        for k, number in enumerate(numbers, start=len(self._arrays)):
+            if self._is_float[k]:
+                self._context.set_arg_float((k,), number)
+            else:
+                self._context.set_arg_int((k,), number)
+        prog.launch_kernel(self._code, self._context)
+
+
+def to_numpy_dtype(dtype):
+    """NumPy's type for a Taichi scalar type."""
+    return {ti.f32: np.float32, ti.f64: np.float64, ti.i32: np.int32}[dtype]
+
+
+class FieldPool:
+    """Taichi fields with gradients, lent and returned: plain fields are never freed and 512 field trees end a process."""
+
+    def __init__(self):
+        self._free = defaultdict(list)
+
+    def take(self, owner, dtype, shape: tuple, components: int = 0):
+        """A field of that kind, zeroed; it comes back to the pool when `owner` is collected."""
+        key = (id(program()), dtype, tuple(shape), components)
+        field = self._free[key].pop() if self._free[key] else self._make(dtype, tuple(shape), components)
+        weakref.finalize(owner, self._free[key].append, field)
+        for part in (field, field.grad):
+            part.from_numpy(np.zeros(tuple(shape) + ((components,) if components else ()), to_numpy_dtype(dtype)))
+        return field
+
+    @staticmethod
+    def _make(dtype, shape, components):
+        if components:
+            return ti.Vector.field(components, dtype, shape=shape, needs_grad=True)
+        return ti.field(dtype, shape=shape, needs_grad=True)
+
+
+fields = FieldPool()
+
+
+def current_tape():
+    """The `ti.ad.Tape` that is open now, or None."""
+    program()
+    return impl.get_runtime().target_tape
+
+
+@ti.data_oriented
+class Bundle:
+    """Arrays and numbers of a kernel under one name, to hand to Taichi functions; exists only while compiling."""
+
+    _is_taichi_function, func = True, SimpleNamespace(has_print=False)  # so that Taichi calls it inside a kernel
+
+    def __init__(self, **parts):
+        self.__dict__.update(parts)

@@ -1,0 +1,85 @@
+"""Scene: what is simulated, and nothing about how."""
+
+import numpy as np
+
+from diffsim_ti import runtime
+from diffsim_ti.inputs import Inputs
+from diffsim_ti.terms import Drag, ExternalForce, Gravity, Term
+
+
+class Scene:
+    """A body, its material and what acts on it. Frozen: build another scene instead of changing one.
+
+    mesh: TetrahedralMesh, the rest shape.
+    material: a law with its numbers (materials/).
+    density [kg/m^3]: one number or one per tetrahedron; vertices carry the lumped mass sum rho V / 4.
+    terms: loads, contacts, damping (terms/), each at most once except contacts. What is not listed costs nothing.
+    fixed: vertices that do not move freely: a vertex set's name, indices, a Boolean mask or a list of set names.
+    motion: displacement of the fixed vertices from where they start: a function of time [s] that returns 3 numbers or
+        shape (num_fixed, 3) [m], or keyframes (times, displacements) between which it is linear. Default: held still.
+    initial_positions [m], initial_velocities [m/s]: shape (num_vertices, 3) or 3 numbers (velocities); default at rest.
+    precision: "f32", "f64" or None for the default that `diffsim_ti.init` set.
+
+    Raises ValueError with rule, value and remedy for anything that does not fit, before any kernel runs.
+    """
+
+    def __init__(self, mesh, material, density=1000.0, terms=(), fixed=None, motion=None, initial_positions=None,
+                 initial_velocities=None, precision: str | None = None):  # fmt: skip
+        self.mesh, self.material = mesh, material
+        self.precision = runtime.check_precision(precision)
+        self.terms = tuple([terms] if isinstance(terms, Term) else terms)
+        self.fixed = np.zeros(0, np.int64) if fixed is None else mesh.vertex_indices(fixed)
+        self.motion = motion
+        self._check_terms()
+        self.inputs = Inputs(self, density, initial_positions, initial_velocities)
+        self._check_start()
+
+    def _check_terms(self) -> None:
+        for term in self.terms:
+            if not isinstance(term, Term):
+                raise ValueError(f"terms must be diffsim_ti terms such as Gravity(), got {term!r}")
+            term.check(self.mesh)
+        for kind in (Gravity, Drag, ExternalForce):
+            if sum(isinstance(t, kind) for t in self.terms) > 1:
+                raise ValueError(f"a scene takes one {kind.__name__}, got several; add their numbers instead")
+        if self.motion is not None and len(self.fixed) == 0:
+            raise ValueError("motion moves the fixed vertices, but none is fixed; pass fixed=...")
+        if self.motion is not None:
+            self.motion_rows([0.0])
+
+    def _check_start(self) -> None:
+        surface = self.mesh.surface_vertices
+        for term in self.terms:
+            term.check_start(self.inputs.values["initial_positions"], surface)
+
+    def term(self, kind: type) -> Term | None:
+        """The scene's first term of a kind, or None."""
+        return next((t for t in self.terms if isinstance(t, kind)), None)
+
+    def motion_rows(self, times) -> np.ndarray:
+        """Displacement of the fixed vertices from their start at each time [s], shape (len(times), num_fixed, 3) [m]."""
+        k = len(self.fixed)
+        if callable(self.motion):
+            rows = [np.broadcast_to(np.asarray(self.motion(float(t)), np.float64), (k, 3)) for t in times]
+            out = np.array(rows)
+        else:
+            at, to = (np.asarray(part, np.float64) for part in self.motion)
+            to = np.broadcast_to(to[:, None, :] if to.ndim == 2 else to, (len(at), k, 3))
+            if np.any(np.diff(at) <= 0):
+                raise ValueError("motion: keyframe times must increase")
+            out = np.stack([np.interp(times, at, column) for column in to.reshape(len(at), -1).T], -1).reshape(-1, k, 3)
+        if not np.all(np.isfinite(out)):
+            raise ValueError("motion: displacements must be finite")
+        return out
+
+    def describe(self) -> str:
+        """What is simulated, in a few lines."""
+        mass = self.inputs.derive(self.inputs.values).mass.sum()
+        terms = ", ".join(map(repr, self.terms)) or "none"
+        return "\n".join([
+            f"{self.mesh!r}", f"{self.material!r}", f"mass {mass:.6g} kg, precision {self.precision}",
+            f"terms: {terms}", f"fixed vertices: {len(self.fixed)}" + (", moving" if self.motion is not None else ""),
+        ])  # fmt: skip
+
+    def __repr__(self) -> str:
+        return f"Scene({self.mesh!r}, {self.material!r}, terms=[{', '.join(map(repr, self.terms))}])"

@@ -1,0 +1,120 @@
+"""Simulator: the step-by-step face of a solver."""
+
+import weakref
+
+import numpy as np
+
+from diffsim_ti import observe, runtime
+from diffsim_ti.divergence import Guard
+from diffsim_ti.observe import Energy, TetrahedronFields
+
+
+class Simulator:
+    """Advances a scene step by step and shows its state.
+
+    `Simulator(solver)`, or, for a solver made without a scene, `Simulator(mesh, material, solver)`.
+
+    positions, displacements [m] and velocities [m/s] are NumPy copies of shape (num_vertices, 3) in the scene's
+    precision; time [s] and step_count say where it is. A run that goes wrong raises Divergence (a FloatingPointError)
+    and leaves the last good state.
+    """
+
+    def __init__(self, *arguments):
+        solver = arguments[-1]
+        if len(arguments) == 3:
+            solver.bind(arguments[0], arguments[1])
+        elif len(arguments) != 1:
+            raise TypeError("Simulator takes a solver, or a mesh, a material and a solver")
+        if solver.scene is None:
+            raise ValueError("the solver has no scene: use Simulator(mesh, material, solver), or a solver made from a Scene")
+        self.solver, self.scene = solver, solver.scene
+        solver.simulator = weakref.ref(self)
+        self._start = solver.start_values()
+        self.workspace = solver.workspace(self._start)
+        self._guard = Guard(self.workspace)
+        self._passes = solver.num_passes(1)
+        self.reset()
+
+    def reset(self) -> None:
+        """Back to the start of the scene."""
+        self.step_count = 0
+        self.workspace.load(self._start)
+
+    @property
+    def time(self) -> float:
+        """Simulated time [s]."""
+        return self.step_count * self.solver.dt
+
+    def step(self) -> None:
+        """Advance by solver.dt."""
+        self._load_step()
+        self._guard.offset = self.step_count * self.solver.substeps
+        self._guard.advance(0, self._passes, self._passes)
+        self.step_count += 1
+
+    def run(self, steps: int) -> None:
+        """Advance by so many steps."""
+        for _ in range(steps):
+            self.step()
+
+    def _load_step(self) -> None:
+        """Bring what depends on the step to the device: motion of fixed vertices, forces per step."""
+        arrays, values = self.workspace.arrays, self._start
+        if values.motion is not None:
+            runtime.fill(arrays.motion, self.scene.motion_rows([self.time, self.time + self.solver.dt]))
+        if values.forces is not None and len(self._forces_rows()) > 1:
+            rows = self._forces_rows()
+            if self.step_count >= len(rows):
+                raise ValueError(f"external_forces are given for {len(rows)} steps, this is step {self.step_count}")
+            runtime.fill(arrays.forces, rows[self.step_count][None])
+
+    def _forces_rows(self) -> np.ndarray:
+        rows = self.scene.inputs.values["external_forces"]
+        return rows if rows.ndim == 3 else rows[None]
+
+    @property
+    def displacements(self) -> np.ndarray:
+        """Displacement from the rest shape [m]."""
+        return runtime.fetch(self.workspace.state.u)[0]
+
+    @property
+    def positions(self) -> np.ndarray:
+        """Positions [m]."""
+        u = self.displacements
+        return (self._start.rest + u).astype(u.dtype)
+
+    @property
+    def velocities(self) -> np.ndarray:
+        """Velocities [m/s]."""
+        return runtime.fetch(self.workspace.state.v)[0]
+
+    def set_state(self, positions=None, velocities=None) -> None:
+        """Put the body elsewhere: positions [m], velocities [m/s], shape (num_vertices, 3); None leaves a part as it is."""
+        state, shape = self.workspace.state, (self.scene.mesh.num_vertices, 3)
+        for name, value, target, origin in (
+            ("positions", positions, state.u, self._start.rest), ("velocities", velocities, state.v, 0.0),
+        ):  # fmt: skip
+            if value is not None:
+                value = np.asarray(value, np.float64)
+                if value.shape != shape:
+                    raise ValueError(f"{name}: expected shape {shape}, got {value.shape}")
+                runtime.fill(target, (value - origin)[None])
+
+    def compute_energy(self) -> Energy:
+        """Total energy [J], a float with `.parts`: kinetic, elastic, gravity, contact."""
+        return observe.energy(self.workspace)
+
+    def tetrahedron_fields(self) -> TetrahedronFields:
+        """Energy density [J/m^3], von Mises stress [Pa] and volume ratio J of each tetrahedron."""
+        return observe.tetrahedron_fields(self.workspace)
+
+    def describe(self) -> str:
+        """What is simulated, how, and what was built for it."""
+        a = self.workspace.arrays
+        built = [type(t).__name__ for t in self.scene.terms] + (["prescribed motion"] if a.values.motion is not None else [])
+        moduli = "one set of moduli" if a.features().uniform else "moduli per tetrahedron"
+        return "\n".join([
+            self.scene.describe(), self.solver.describe(),
+            f"built: {type(a.law).__name__} ({self.scene.precision}, {runtime.arch_name()}), {moduli}, "
+            f"terms {', '.join(built) or 'none'}; {runtime.allocated_megabytes():.1f} MB on the device",
+        ])  # fmt: skip

@@ -1,0 +1,156 @@
+"""The reverse sweep and the tangent of a chain of kick-drift passes, along recorded states."""
+
+import numpy as np
+
+from diffsim_ti import runtime
+from diffsim_ti.inputs import Derived
+from diffsim_ti.solvers.arrays import copy_slot
+from diffsim_ti.solvers.kick_drift import kick_drift_kernels
+
+
+class ExplicitAdjoint:
+    """Adjoint arrays of one run and the sweep that fills them.
+
+    density, shape: also the adjoints by vertex masses and by the rest shape, which cost extra.
+    """
+
+    def __init__(self, workspace, density: bool, shape: bool):
+        self.ws = workspace
+        a = workspace.arrays
+        self.features = a.features(density, shape)
+        self.kernels = kick_drift_kernels(a.law, self.features, workspace.parallel)
+        n, m = a.num_vertices, a.num_tetrahedra
+        self.u, self.v, self.w = (runtime.array(a.vec3, 1, n) for _ in range(3))
+        self.corner = runtime.array(a.vec3, 4 * m)
+        self.coefficients = runtime.array(a.coefficient, m)
+        self.sums = runtime.array(a.fp, self.features.sums()["total"], n)
+        self.forces, self.motion = (runtime.array(a.vec3, *x.shape) for x in (a.forces, a.motion))
+        self.anchor = runtime.array(a.vec3, *a.anchor.shape)
+        self.gradients = runtime.array(a.mat3, m if shape else 1)
+        self.volumes = runtime.array(a.fp, m if shape else 1)
+        self.frames = tuple(runtime.array(a.vec3, *f.shape) for f in workspace.frames)
+        self._launch = None
+
+    def _sums(self) -> tuple:
+        return (self.coefficients, self.sums, self.forces, self.motion, self.anchor, self.gradients, self.volumes)
+
+    def start(self, positions_adj: np.ndarray, velocities_adj: np.ndarray, last_frame_is_input: bool) -> None:
+        """Set the adjoints of the frames, shape (frames, n, 3), and clear the rest.
+
+        last_frame_is_input: the last frame is the state after the last pass (else the last pass shows it itself).
+        """
+        for target in (*self._sums(), self.u, self.v, self.w):
+            runtime.fill(target, 0)
+        runtime.fill(self.frames[0], positions_adj)
+        runtime.fill(self.frames[1], velocities_adj)
+        if last_frame_is_input:
+            runtime.fill(self.u, positions_adj[-1:])
+            runtime.fill(self.v, velocities_adj[-1:])
+
+    def reverse(self, base: int, last: int, num_passes: int, save_every: int, stop: int) -> None:
+        """Mirror passes last - 1 .. stop; slot 0 of the record holds the state before pass `base`."""
+        ws, a = self.ws, self.ws.arrays
+        history = ws.record
+        launch = ws._launch(
+            "vjp", self.kernels.step_vjp, *a.topology(), a.force_slot, a.motion_slot, self.corner,
+            history.u, history.v, history.f, self.u, self.v, self.w, *self._sums(), *self.frames,
+        )  # fmt: skip
+        substeps, inverse_dt = ws.solver.substeps, 1 / ws.solver.dt
+        chunk = 1 if ws.parallel else max(1, ws.work_per_launch // (2 * a.num_tetrahedra))
+        for start, count, w in reversed(ws.solver.groups(stop, last, num_passes, ws.rate)):
+            end = start + count
+            while end > start:
+                begin = max(start, end - chunk)
+                launch(begin, end - begin, base, num_passes, substeps, save_every, w.lag0, w.lag1, w.pre, w.post,
+                       w.alpha, w.decay, inverse_dt, w.alpha_by_rate, w.decay_by_rate)  # fmt: skip
+                end = begin
+
+    def finish(self) -> None:
+        """Complete the adjoint of the start."""
+        a = self.ws.arrays
+        self.ws._launch("finish", self.kernels.finish_vjp, a.start, a.corner_of, self.corner, self.u)()
+
+    def norm(self) -> tuple[float, float]:
+        """Euclidean norms of the adjoints of displacement and velocity where the sweep stands."""
+        return tuple(float(np.linalg.norm(runtime.fetch(x).astype(np.float64))) for x in (self.u, self.v))
+
+    def scale(self, factor: float) -> None:
+        """Multiply the running adjoint (clipping; the pending gather is scaled with it)."""
+        for x in (self.u, self.v, self.corner):
+            runtime.fill(x, runtime.fetch(x) * factor)
+
+    def collect(self) -> Derived:
+        """Adjoints of what kernels read, in float64, at the start of the run."""
+        a, values = self.ws.arrays, self.ws.arrays.values
+        rows = self.features.sums()
+        sums = runtime.fetch(self.sums).astype(np.float64)
+        out = values.zeros()
+        out.coefficients = runtime.fetch(self.coefficients).astype(np.float64)
+        out.displacement = runtime.fetch(self.u)[0].astype(np.float64)
+        out.velocity = runtime.fetch(self.v)[0].astype(np.float64)
+        if self.features.density:
+            out.mass = sums[rows["mass"]]
+        if self.features.gravity >= 0:
+            out.parameters[self.features.gravity :][:3] = sums[rows["gravity"] :][:3].sum(1)
+        if self.features.drag >= 0:
+            out.parameters[self.features.drag] = sums[rows["drag"]].sum()
+        for contact in self.features.contacts:
+            at = rows["contacts"] + contact.first - self.features.contacts[0].first
+            out.parameters[contact.first :][: contact.size] = sums[at : at + contact.size].sum(1)
+        out.rest = runtime.fetch(self.frames[0]).astype(np.float64).sum(0)
+        if self.features.shape:
+            out.rest += sums[rows["rest"] :][:3].T
+            out.gradients = runtime.fetch(self.gradients).astype(np.float64)
+            out.volumes = runtime.fetch(self.volumes).astype(np.float64)
+        if out.forces is not None:
+            out.forces = runtime.fetch(self.forces).astype(np.float64)
+        if out.motion is not None:
+            out.motion = runtime.fetch(self.motion).astype(np.float64)
+            out.displacement[a.fixed] += runtime.fetch(self.anchor)
+        return out
+
+
+class ExplicitTangent:
+    """The tangent of a run: changes of the state for changes of everything that kernels read."""
+
+    def __init__(self, workspace, dots: Derived):
+        self.ws = workspace
+        a = workspace.arrays
+        self.features = a.features(density=True, shape=True)
+        self.kernels = kick_drift_kernels(a.law, self.features, workspace.parallel)
+        self.u = runtime.upload(dots.displacement[None], a.vec3)
+        self.v = runtime.upload(dots.velocity[None], a.vec3)
+        self.frames = tuple(runtime.array(a.vec3, *f.shape) for f in workspace.frames)
+        motion = np.zeros((1, 1, 3)) if dots.motion is None else dots.motion
+        anchor = np.zeros((1, 3)) if dots.motion is None else dots.displacement[a.fixed]
+        self._dots = (
+            runtime.upload(np.atleast_2d(dots.coefficients), a.coefficient), runtime.upload(dots.mass, a.fp),
+            runtime.upload(dots.parameters, a.fp), runtime.upload(dots.rest, a.vec3),
+            runtime.upload(np.zeros((1, 1, 3)) if dots.forces is None else dots.forces, a.vec3),
+            runtime.upload(motion, a.vec3), runtime.upload(anchor, a.vec3), runtime.upload(dots.gradients, a.mat3),
+            runtime.upload(dots.volumes, a.fp),
+        )  # fmt: skip
+        self._rate_dot = float(dots.parameters[self.features.drag]) if self.features.drag >= 0 else 0.0
+        self._rest_dot = dots.rest
+
+    def advance(self, first: int, last: int, num_passes: int, save_every: int) -> None:
+        """Tangent of passes first .. last - 1, recorded from slot 0."""
+        ws, a, history = self.ws, self.ws.arrays, self.ws.record
+        launch = runtime.Launch(
+            self.kernels.step_jvp, *a.topology(), a.force_slot, a.motion_slot, a.corner, history.u, history.v,
+            history.f, self.u, self.v, *self._dots, *self.frames,
+        )  # fmt: skip
+        for start, count, w in ws.solver.groups(first, last, num_passes, ws.rate):
+            for j in range(start, start + count):
+                launch(j, first, ws.solver.substeps, save_every, w.lag0, w.lag1, w.pre, w.post, w.alpha, w.decay,
+                       1 / ws.solver.dt, w.alpha_by_rate * self._rate_dot, w.decay_by_rate * self._rate_dot)  # fmt: skip
+
+    def save_frame(self, frame: int) -> None:
+        """Copy the current tangent to a frame."""
+        copy_slot(self.u, 0, self.frames[0], frame)
+        copy_slot(self.v, 0, self.frames[1], frame)
+
+    def collect(self) -> tuple[np.ndarray, np.ndarray]:
+        """Changes of the frames' positions and velocities, float64."""
+        du, dv = (runtime.fetch(x).astype(np.float64) for x in self.frames)
+        return du + self._rest_dot, dv

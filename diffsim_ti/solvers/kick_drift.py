@@ -1,0 +1,354 @@
+"""Kernels of the explicit solvers. Every one of them is a chain of the same pass, a kick and a drift:
+
+    a      = f(u) / m + g                       forces at displacement u
+    v_mid  = v + pre a                          the velocity at this time (what frames show)
+    v+     = v_mid + post a
+    u'     = u + alpha v+
+    v'     = decay v+                           damping, a stage of its own after the forces
+
+Symplectic Euler: pre = 0, post = h, alpha = h decay. Velocity Verlet: pre = post = h / 2 (the two half kicks that meet at a
+time share one force evaluation), alpha = h (1 + decay) / 2. Below each pass stand its tangent and its mirror.
+
+A run's slot j holds the state before pass j. With stride 0 everything happens in slot 0 (forward only); with stride 1
+each pass writes the next slot, which is what the mirror reads.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from types import SimpleNamespace
+
+import taichi as ti
+
+from diffsim_ti.runtime import Bundle
+from diffsim_ti.tetrahedron import A, element_functions
+
+
+@dataclass(frozen=True)
+class Features:
+    """What the scene contains, known when kernels compile: an absent feature leaves no code."""
+
+    contacts: tuple = ()  # compile-time twins of the terms that act on surface vertices
+    gravity: int = -1  # where it starts in the parameter array, -1: none
+    drag: int = -1
+    forces: bool = False
+    forces_per_step: bool = False
+    motion: bool = False
+    uniform: bool = True  # one set of coefficients for all tetrahedra
+    density: bool = False  # the last two: adjoints that cost extra, only if asked for
+    shape: bool = False
+
+    def sums(self) -> dict[str, int]:
+        """Rows of the per-vertex adjoint sums and where each group starts."""
+        rows, at = {}, 0
+        for name, size in (
+            ("mass", int(self.density)),
+            ("gravity", 3 * (self.gravity >= 0)),
+            ("drag", int(self.drag >= 0)),
+            ("contacts", sum(c.size for c in self.contacts)),
+            ("rest", 3 * self.shape),
+        ):
+            rows[name] = at
+            at += size
+        return rows | {"total": at}
+
+
+@lru_cache(maxsize=None)
+def kick_drift_kernels(law, features: Features, parallel: bool) -> SimpleNamespace:
+    """Compiled passes for a law and a scene's features; `parallel`: one launch per pass, else one for many passes."""
+    el = element_functions(law, features.uniform)
+    t = el.types
+    fp, vec3 = t.fp, t.vec3
+    contacts, has_contacts = features.contacts, len(features.contacts) > 0
+    row = features.sums()
+
+    @ti.func
+    def force_at(i, j, scene: A, forces: A, plan: A):
+        """External force on vertex i in pass j: of the present step, or half of each of the two that share a kick."""
+        f = vec3(0)
+        k = scene.force_slot[i]
+        if k >= 0:
+            f = forces[0, k]
+            if ti.static(features.forces_per_step):
+                f = (forces[(j - plan.lag0) // plan.substeps, k] + forces[(j - plan.lag1) // plan.substeps, k]) / 2
+        return f
+
+    @ti.func
+    def gravity(parameters: A):
+        g = ti.static(features.gravity)
+        return vec3(parameters[g], parameters[g + 1], parameters[g + 2])
+
+    @ti.func
+    def moved(i, scene: A):
+        """Place of vertex i among those whose motion is prescribed, or -1."""
+        k = -1
+        if ti.static(features.motion):
+            k = scene.motion_slot[i]
+        return k
+
+    @ti.func
+    def fraction(j, plan: A):
+        """Share of the step that has gone at the end of pass j."""
+        return ti.cast(j % plan.substeps + 1, fp) / ti.cast(plan.substeps, fp)
+
+    @ti.func
+    def is_saved(j, plan: A):
+        saved = False
+        if plan.save_every > 0:
+            saved = j % plan.save_every == 0
+        return saved
+
+    # ---- one pass ---------------------------------------------------------------------------------------------------
+
+    @ti.func
+    def vertex(i, j, scene: A, state: A, plan: A):
+        s, t = (j - plan.base) * plan.stride, (j - plan.base + 1) * plan.stride
+        u, v = state.u[s, i], state.v[s, i]
+        # forces
+        f = el.gather(i, scene, scene.corner)
+        if ti.static(has_contacts):
+            if scene.surface[i] > 0:
+                for k in ti.static(range(len(contacts))):
+                    f += contacts[k].force(scene.parameters, scene.rest[i], u, v)
+        if ti.static(features.forces):
+            f += force_at(i, j, scene, scene.forces, plan)
+        a = scene.inverse_mass[i] * f
+        if ti.static(features.gravity >= 0):
+            if scene.inverse_mass[i] > 0:
+                a += gravity(scene.parameters)
+        # kick, frame, kick
+        v_mid = v + plan.pre * a
+        if is_saved(j, plan):
+            state.frames_u[j // plan.save_every, i] = u
+            state.frames_v[j // plan.save_every, i] = v_mid
+        v_plus = v_mid + plan.post * a
+        # drift and damping
+        u_next, v_next = u + plan.alpha * v_plus, plan.decay * v_plus
+        # prescribed motion
+        if ti.static(features.motion):
+            k = moved(i, scene)
+            if k >= 0:
+                u_next, v_next = u, v
+                if plan.alpha > 0:
+                    r = j // plan.substeps
+                    change = scene.motion[r + 1, k] - scene.motion[r, k]
+                    u_next = scene.anchor[k] + scene.motion[r, k] + fraction(j, plan) * change
+                    v_next = plan.inverse_dt * change
+        if plan.stride > 0:
+            state.f[s, i] = f
+        state.u[t, i] = u_next
+        state.v[t, i] = v_next
+
+    @ti.kernel
+    def step(tets: t.tets, gradients: t.matrices, volumes: t.scalars, coefficients: t.coefficients, start: t.ints,
+             corner_of: t.ints, inverse_mass: t.scalars, parameters: t.scalars, rest: t.vectors, surface: t.ints,
+             force_slot: t.ints, motion_slot: t.ints, forces: t.vectors2, motion: t.vectors2, anchor: t.vectors,
+             corner: t.vectors, u: t.vectors2, v: t.vectors2, f: t.vectors2, frames_u: t.vectors2, frames_v: t.vectors2,
+             first: ti.i32, count: ti.i32, base: ti.i32, stride: ti.i32, substeps: ti.i32, save_every: ti.i32,
+             lag0: ti.i32, lag1: ti.i32, pre: fp, post: fp, alpha: fp, decay: fp, inverse_dt: fp):  # fmt: skip
+        """`count` passes. Slot 0 holds the state before pass `base`; with stride 1 forces are recorded too."""
+        scene = Bundle(tets=tets, gradients=gradients, volumes=volumes, coefficients=coefficients, start=start,
+                       corner_of=corner_of, inverse_mass=inverse_mass, parameters=parameters, rest=rest,
+                       surface=surface, force_slot=force_slot, motion_slot=motion_slot, forces=forces, motion=motion,
+                       anchor=anchor, corner=corner)  # fmt: skip
+        state = Bundle(u=u, v=v, f=f, frames_u=frames_u, frames_v=frames_v)
+        plan = Bundle(base=base, stride=stride, substeps=substeps, save_every=save_every, lag0=lag0, lag1=lag1, pre=pre,
+                      post=post, alpha=alpha, decay=decay, inverse_dt=inverse_dt)  # fmt: skip
+        if ti.static(parallel):
+            for e in range(tets.shape[0]):
+                el.forces(e, scene, u, (first - base) * stride, corner)
+            for i in range(inverse_mass.shape[0]):
+                vertex(i, first, scene, state, plan)
+        else:
+            ti.loop_config(serialize=True)
+            for j in range(first, first + count):
+                for e in range(tets.shape[0]):
+                    el.forces(e, scene, u, (j - base) * stride, corner)
+                for i in range(inverse_mass.shape[0]):
+                    vertex(i, j, scene, state, plan)
+
+    # ---- its tangent ------------------------------------------------------------------------------------------------
+
+    @ti.func
+    def vertex_jvp(i, j, scene: A, state: A, dots: A, plan: A):
+        s, t = j - plan.base, j - plan.base + 1
+        u, v, du, dv = state.u[s, i], state.v[s, i], dots.u[0, i], dots.v[0, i]
+        df = el.gather(i, scene, scene.corner)
+        if ti.static(has_contacts):
+            if scene.surface[i] > 0:
+                for k in ti.static(range(len(contacts))):
+                    X = scene.rest[i]
+                    df += contacts[k].force_jvp(scene.parameters, X, u, v, du + dots.rest[i], dv)
+                    J = contacts[k].parameter_jacobian(scene.parameters, X, u, v)
+                    for m in ti.static(range(contacts[k].size)):
+                        df += J[:, m] * dots.parameters[contacts[k].first + m]
+        if ti.static(features.forces):
+            df += force_at(i, j, scene, dots.forces, plan)
+        inverse = scene.inverse_mass[i]
+        da = inverse * (df - inverse * dots.mass[i] * state.f[s, i])
+        if ti.static(features.gravity >= 0):
+            if inverse > 0:
+                da += gravity(dots.parameters)
+        dv_mid = dv + plan.pre * da
+        if is_saved(j, plan):
+            dots.frames_u[j // plan.save_every, i] = du
+            dots.frames_v[j // plan.save_every, i] = dv_mid
+        dv_plus, v_plus = dv_mid + plan.post * da, state.v[t, i] / plan.decay
+        du_next = du + plan.alpha * dv_plus + dots.alpha * v_plus
+        dv_next = plan.decay * dv_plus + dots.decay * v_plus
+        if ti.static(features.motion):
+            k = moved(i, scene)
+            if k >= 0:
+                du_next, dv_next = du, dv
+                if plan.alpha > 0:
+                    r = j // plan.substeps
+                    change = dots.motion[r + 1, k] - dots.motion[r, k]
+                    du_next = dots.anchor[k] + dots.motion[r, k] + fraction(j, plan) * change
+                    dv_next = plan.inverse_dt * change
+        dots.u[0, i] = du_next
+        dots.v[0, i] = dv_next
+
+    @ti.kernel
+    def step_jvp(tets: t.tets, gradients: t.matrices, volumes: t.scalars, coefficients: t.coefficients, start: t.ints,
+                 corner_of: t.ints, inverse_mass: t.scalars, parameters: t.scalars, rest: t.vectors, surface: t.ints,
+                 force_slot: t.ints, motion_slot: t.ints, corner: t.vectors, u: t.vectors2, v: t.vectors2,
+                 f: t.vectors2, du: t.vectors2, dv: t.vectors2, coefficients_dot: t.coefficients, mass_dot: t.scalars,
+                 parameters_dot: t.scalars, rest_dot: t.vectors, forces_dot: t.vectors2, motion_dot: t.vectors2,
+                 anchor_dot: t.vectors, gradients_dot: t.matrices, volumes_dot: t.scalars, frames_du: t.vectors2,
+                 frames_dv: t.vectors2, j: ti.i32, base: ti.i32, substeps: ti.i32, save_every: ti.i32, lag0: ti.i32,
+                 lag1: ti.i32, pre: fp, post: fp, alpha: fp, decay: fp, inverse_dt: fp, alpha_dot: fp,
+                 decay_dot: fp):  # fmt: skip
+        """The tangent of pass j along recorded slots; du, dv are advanced in place."""
+        scene = Bundle(tets=tets, gradients=gradients, volumes=volumes, coefficients=coefficients, start=start,
+                       corner_of=corner_of, inverse_mass=inverse_mass, parameters=parameters, rest=rest,
+                       surface=surface, force_slot=force_slot, motion_slot=motion_slot, corner=corner)  # fmt: skip
+        state = Bundle(u=u, v=v, f=f)
+        dots = Bundle(u=du, v=dv, coefficients=coefficients_dot, mass=mass_dot, parameters=parameters_dot, rest=rest_dot,
+                      forces=forces_dot, motion=motion_dot, anchor=anchor_dot, gradients=gradients_dot,
+                      volumes=volumes_dot, frames_u=frames_du, frames_v=frames_dv, alpha=alpha_dot,
+                      decay=decay_dot)  # fmt: skip
+        plan = Bundle(base=base, substeps=substeps, save_every=save_every, lag0=lag0, lag1=lag1, pre=pre, post=post,
+                      alpha=alpha, decay=decay, inverse_dt=inverse_dt)  # fmt: skip
+        ti.loop_config(serialize=not parallel)
+        for e in range(tets.shape[0]):
+            el.forces_jvp(e, scene, u, j - base, du, corner, dots)
+        ti.loop_config(serialize=not parallel)
+        for i in range(inverse_mass.shape[0]):
+            vertex_jvp(i, j, scene, state, dots, plan)
+
+    # ---- its mirror -------------------------------------------------------------------------------------------------
+
+    @ti.func
+    def vertex_vjp(i, j, scene: A, state: A, adjoint: A, plan: A):
+        """Complete the adjoint of the displacement after pass j, then hand back through the vertex part of pass j."""
+        s, t = j - plan.base, j - plan.base + 1
+        u, v = state.u[s, i], state.v[s, i]
+        p, q = adjoint.u[0, i], adjoint.v[0, i]
+        if j < plan.end - 1:
+            p += el.gather(i, scene, adjoint.corner)
+        # prescribed motion: the state after the pass comes from the motion alone
+        k = moved(i, scene)
+        if ti.static(features.motion):
+            if k >= 0 and plan.alpha > 0:
+                r = j // plan.substeps
+                adjoint.motion[r, k] += (1 - fraction(j, plan)) * p - plan.inverse_dt * q
+                adjoint.motion[r + 1, k] += fraction(j, plan) * p + plan.inverse_dt * q
+                adjoint.anchor[k] += p
+                p, q = vec3(0), vec3(0)
+        # drift and damping
+        v_plus_adj = plan.alpha * p + plan.decay * q
+        if k >= 0:
+            v_plus_adj = q
+        if ti.static(features.drag >= 0):
+            v_plus = state.v[t, i] / plan.decay
+            adjoint.sums[row["drag"], i] += plan.alpha_by_rate * p.dot(v_plus) + plan.decay_by_rate * q.dot(v_plus)
+        # kick, frame, kick
+        v_mid_adj = v_plus_adj
+        if is_saved(j, plan):
+            p += adjoint.frames_u[j // plan.save_every, i]
+            v_mid_adj += adjoint.frames_v[j // plan.save_every, i]
+        a_adj = plan.post * v_plus_adj + plan.pre * v_mid_adj
+        # forces
+        inverse = scene.inverse_mass[i]
+        f_adj, q = inverse * a_adj, v_mid_adj
+        if ti.static(features.density):
+            adjoint.sums[row["mass"], i] -= inverse * f_adj.dot(state.f[s, i])
+        if ti.static(features.gravity >= 0):
+            if inverse > 0:
+                for d in ti.static(range(3)):
+                    adjoint.sums[row["gravity"] + d, i] += a_adj[d]
+        if ti.static(features.forces):
+            slot = scene.force_slot[i]
+            if slot >= 0:
+                if ti.static(features.forces_per_step):
+                    adjoint.forces[(j - plan.lag0) // plan.substeps, slot] += f_adj / 2
+                    adjoint.forces[(j - plan.lag1) // plan.substeps, slot] += f_adj / 2
+                else:
+                    adjoint.forces[0, slot] += f_adj
+        if ti.static(has_contacts):
+            if scene.surface[i] > 0:
+                for c in ti.static(range(len(contacts))):
+                    by_u, by_v = contacts[c].force_vjp(scene.parameters, scene.rest[i], u, v, f_adj)
+                    p += by_u
+                    q += by_v
+                    J = contacts[c].parameter_jacobian(scene.parameters, scene.rest[i], u, v)
+                    for m in ti.static(range(contacts[c].size)):
+                        adjoint.sums[row["contacts"] + contacts[c].first - contacts[0].first + m, i] += J[:, m].dot(f_adj)
+                    if ti.static(features.shape):
+                        for d in ti.static(range(3)):
+                            adjoint.sums[row["rest"] + d, i] += by_u[d]
+        adjoint.u[0, i] = p
+        adjoint.v[0, i] = q
+        adjoint.w[0, i] = f_adj
+
+    @ti.func
+    def tetrahedron_vjp(e, j, scene: A, state: A, adjoint: A, plan: A):
+        el.forces_vjp(e, scene, state.u, j - plan.base, adjoint.w, adjoint.corner, adjoint)
+        if ti.static(features.shape):
+            el.shape_vjp(e, scene, state.u, j - plan.base, adjoint.w, adjoint)
+
+    @ti.kernel
+    def step_vjp(tets: t.tets, gradients: t.matrices, volumes: t.scalars, coefficients: t.coefficients, start: t.ints,
+                 corner_of: t.ints, inverse_mass: t.scalars, parameters: t.scalars, rest: t.vectors, surface: t.ints,
+                 force_slot: t.ints, motion_slot: t.ints, corner: t.vectors, u: t.vectors2, v: t.vectors2,
+                 f: t.vectors2, u_adj: t.vectors2, v_adj: t.vectors2, w: t.vectors2, coefficients_adj: t.coefficients,
+                 sums: t.scalars2, forces_adj: t.vectors2, motion_adj: t.vectors2, anchor_adj: t.vectors,
+                 gradients_adj: t.matrices, volumes_adj: t.scalars, frames_u_adj: t.vectors2, frames_v_adj: t.vectors2,
+                 first: ti.i32, count: ti.i32, base: ti.i32, end: ti.i32, substeps: ti.i32, save_every: ti.i32,
+                 lag0: ti.i32, lag1: ti.i32, pre: fp, post: fp, alpha: fp, decay: fp, inverse_dt: fp,
+                 alpha_by_rate: fp, decay_by_rate: fp):  # fmt: skip
+        """The mirror of passes first + count - 1 .. first; `end` is the run's number of passes.
+
+        The gather of K w is left to the next call (or to `finish_vjp`), so that each pass has two loops, as `step` has.
+        """
+        scene = Bundle(tets=tets, gradients=gradients, volumes=volumes, coefficients=coefficients, start=start,
+                       corner_of=corner_of, inverse_mass=inverse_mass, parameters=parameters, rest=rest,
+                       surface=surface, force_slot=force_slot, motion_slot=motion_slot)  # fmt: skip
+        state = Bundle(u=u, v=v, f=f)
+        adjoint = Bundle(u=u_adj, v=v_adj, w=w, corner=corner, coefficients=coefficients_adj, sums=sums,
+                         forces=forces_adj, motion=motion_adj, anchor=anchor_adj, gradients=gradients_adj,
+                         volumes=volumes_adj, frames_u=frames_u_adj, frames_v=frames_v_adj)  # fmt: skip
+        plan = Bundle(base=base, end=end, substeps=substeps, save_every=save_every, lag0=lag0, lag1=lag1, pre=pre,
+                      post=post, alpha=alpha, decay=decay, inverse_dt=inverse_dt, alpha_by_rate=alpha_by_rate,
+                      decay_by_rate=decay_by_rate)  # fmt: skip
+        if ti.static(parallel):
+            for i in range(inverse_mass.shape[0]):
+                vertex_vjp(i, first, scene, state, adjoint, plan)
+            for e in range(tets.shape[0]):
+                tetrahedron_vjp(e, first, scene, state, adjoint, plan)
+        else:
+            ti.loop_config(serialize=True)
+            for k in range(count):
+                for i in range(inverse_mass.shape[0]):
+                    vertex_vjp(i, first + count - 1 - k, scene, state, adjoint, plan)
+                for e in range(tets.shape[0]):
+                    tetrahedron_vjp(e, first + count - 1 - k, scene, state, adjoint, plan)
+
+    @ti.kernel
+    def finish_vjp(start: t.ints, corner_of: t.ints, corner: t.vectors, u_adj: t.vectors2):
+        """Add the gather that the first pass of the run has left."""
+        scene = Bundle(start=start, corner_of=corner_of)
+        ti.loop_config(serialize=not parallel)
+        for i in range(start.shape[0] - 1):
+            u_adj[0, i] += el.gather(i, scene, corner)
+
+    return SimpleNamespace(step=step, step_jvp=step_jvp, step_vjp=step_vjp, finish_vjp=finish_vjp)

@@ -1,0 +1,88 @@
+"""What every solver is: a scene, a step, and how the step is divided."""
+
+import math
+import warnings
+from abc import ABC
+
+from diffsim_ti import runtime, stability
+
+
+class Solver(ABC):
+    """Advances a scene by steps of dt [s], each divided into `substeps` equal substeps.
+
+    parallel: one launch per substep on all threads, or one serial launch for many substeps; None chooses by size.
+    allow_unstable: take a step beyond the stable one all the same.
+    Raises ValueError for dt <= 0, substeps < 1, or a step beyond the stable one.
+    """
+
+    explicit = False
+    order = 0
+
+    def __init__(self, scene, dt: float, substeps: int = 1, parallel: bool | None = None, allow_unstable: bool = False):
+        if not (math.isfinite(dt) and dt > 0):
+            raise ValueError(f"dt must be > 0 [s], got {dt}")
+        if int(substeps) != substeps or substeps < 1:
+            raise ValueError(f"substeps must be a whole number >= 1, got {substeps}")
+        self.scene, self.dt, self.substeps = scene, float(dt), int(substeps)
+        self.parallel, self.allow_unstable = parallel, allow_unstable
+        runtime.check_host_init()
+        self._tight: stability.StepLimit | None = None
+        if self.explicit and not allow_unstable:
+            self._refuse_unstable()
+
+    @property
+    def substep(self) -> float:
+        """Length h of a substep [s]."""
+        return self.dt / self.substeps
+
+    def runs_parallel(self) -> bool:
+        """Whether passes are launched one by one on all threads."""
+        if self.parallel is not None:
+            return self.parallel or not runtime.runs_on_cpu()
+        return not runtime.runs_on_cpu() or self.scene.mesh.num_tetrahedra > self.serial_limit
+
+    def stable_dt(self, tight: bool = False) -> stability.StepLimit:
+        """Largest stable substep at the start: the safe element bound or, `tight`, the Lanczos value."""
+        if not tight:
+            return stability.element_limit(self.scene)
+        if self._tight is None:
+            self._tight = stability.lanczos_limit(self.workspace(self.start_values()))
+        return self._tight
+
+    def start_values(self):
+        """What kernels read at the start; a step of motion rows if fixed vertices move."""
+        inputs, values = self.scene.inputs, dict(self.scene.inputs.values)
+        if self.scene.motion is not None:
+            values["prescribed_motion"] = self.scene.motion_rows([0.0, self.dt])
+        return inputs.derive(values)
+
+    def _refuse_unstable(self) -> None:
+        bound = self.stable_dt()
+        if self.substep <= bound.dt:
+            return
+        tight = self.stable_dt(tight=True)
+        if self.substep > tight.dt:
+            enough = math.ceil(self.dt / tight.dt / 0.95)
+            raise ValueError(
+                f"the substep dt / substeps = {self.substep:.4g} s exceeds the stable step {tight}: reduce dt, "
+                f"pass substeps={enough}, use an implicit solver, or pass allow_unstable=True"
+            )
+
+    def choose_substeps(self, share: float = 0.7) -> None:
+        """Raise `substeps` to what stability asks for, with a margin, and say so once if that is more than given."""
+        needed = math.ceil(self.dt / (share * self.stable_dt(tight=True).dt))
+        if needed > self.substeps:
+            warnings.warn(
+                f"dt = {self.dt:g} s is divided into {needed} substeps (asked for at least {self.substeps}): "
+                f"the stable step is {self.stable_dt(tight=True)}",
+                stacklevel=3,
+            )
+            self.substeps = needed
+
+    def describe(self) -> str:
+        """How the scene advances, in a line."""
+        how = "parallel, one launch per substep" if self.runs_parallel() else "serial, many substeps per launch"
+        return f"{type(self).__name__}: dt {self.dt:g} s, {self.substeps} substeps of {self.substep:.4g} s; {how}"
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}(dt={self.dt:g}, substeps={self.substeps})"
