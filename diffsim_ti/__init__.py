@@ -1,0 +1,33 @@
+"""diffsim_ti: a soft-body simulator on tetrahedra whose gradients can be trusted. Public names, in reading order."""
+
+import os
+
+os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # read when taichi is imported
+os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")  # no network traffic from a simulator
+
+from diffsim_ti.divergence import Divergence
+from diffsim_ti.materials import (
+    Corotated,
+    LinearElastic,
+    MooneyRivlin,
+    SmithNeoHookean,
+    StableNeoHookean,
+    StVenantKirchhoff,
+)
+from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.rollout import Frames, Rollout
+from diffsim_ti.runtime import init
+from diffsim_ti.scene import Scene
+from diffsim_ti.simulator import Simulator
+from diffsim_ti.solvers import SemiImplicitSolver, VelocityVerletSolver
+from diffsim_ti.terms import Drag, ExternalForce, Gravity, Ground
+from diffsim_ti.verify import check_gradients, dot_product_test, taylor_test
+
+__version__ = "0.1.0"
+__all__ = [
+    "init", "TetrahedralMesh",
+    "StableNeoHookean", "SmithNeoHookean", "LinearElastic", "Corotated", "StVenantKirchhoff", "MooneyRivlin",
+    "Gravity", "Drag", "Ground", "ExternalForce",
+    "Scene", "SemiImplicitSolver", "VelocityVerletSolver", "Simulator", "Divergence",
+    "Rollout", "Frames", "taylor_test", "dot_product_test", "check_gradients",
+]  # fmt: skip

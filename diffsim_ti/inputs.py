@@ -1,4 +1,4 @@
-"""From what a user names (E, nu, density, rest shape ...) to what kernels read, with the chain rule both ways, in float64."""
+"""From what a user names (E, nu, density, rest shape ...) to what kernels read, with the chain rule both ways."""
 
 from dataclasses import dataclass, fields
 
@@ -203,6 +203,5 @@ class Inputs:
         np.add.at(X_adj, tets[:, 1:].ravel(), corners.reshape(-1, 3))
         np.add.at(X_adj, tets[:, 0], -corners.sum(1))
         out["rest_positions"] = X_adj
-        return {name: out[name] for name in self.values if name in out} | {
-            name: value for name, value in out.items() if name not in self.values
-        }
+        order = [*self.values, *(name for name in out if name not in self.values)]
+        return {name: np.asarray(out[name]) for name in order}

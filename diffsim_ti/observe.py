@@ -30,7 +30,7 @@ def observer_kernels(law, features):
             J[e] = det
             a, b, c = S[0, 0] - S[1, 1], S[1, 1] - S[2, 2], S[2, 2] - S[0, 0]
             shear = S[0, 1] * S[0, 1] + S[1, 2] * S[1, 2] + S[2, 0] * S[2, 0]
-            von_mises[e] = ti.sqrt((a * a + b * b + c * c) / 2 + 3 * shear)
+            von_mises[e] = ti.sqrt(ti.cast(0.5, t.fp) * (a * a + b * b + c * c) + 3 * shear)
 
     @ti.kernel
     def contact_energy(rest: t.vectors, surface: t.ints, parameters: t.scalars, u: t.vectors2, energy: t.scalars):

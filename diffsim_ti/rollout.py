@@ -67,6 +67,8 @@ class Rollout:
         every = None if checkpoint_every is None else max(1, int(checkpoint_every)) * solver.substeps
         self.state_bytes = 3 * self.scene.mesh.num_vertices * runtime.NUMPY[self.scene.precision]().itemsize
         self.schedule = choose_schedule(self.num_passes, self.state_bytes, every, memory)
+        self._options = dict(save_every=self.save_every, checkpoint_every=checkpoint_every, memory=memory,
+                             gradients=self.wanted, clip=clip, truncate=truncate, health=health)  # fmt: skip
         self.clip, self.truncate, self.wants_health = clip, truncate, health
         self.health: list[dict] = []
         self.gradients: dict[str, np.ndarray] = {}
@@ -90,6 +92,10 @@ class Rollout:
     def memory(self) -> float:
         """What the reverse sweep keeps [MB]: snapshots, recorded states."""
         return self.schedule.states() * self.state_bytes / 1e6
+
+    def twin(self, **changes) -> "Rollout":
+        """The same rollout of a scene with some arguments replaced, such as precision="f64"."""
+        return Rollout(self.solver.twin(self.scene.replace(**changes)), self.steps, **self._options)
 
     # ---- with arrays ------------------------------------------------------------------------------------------------
 
@@ -166,7 +172,7 @@ class Rollout:
                 components = 3 if value.shape[-1:] == (3,) else 0
                 shape = value.shape[:-1] if components else value.shape
                 self._fields[name] = runtime.fields.take(self, fp, shape, components)
-                self._fields[name].from_numpy(value.astype(runtime.NUMPY[self.scene.precision]))
+                self._fields[name].from_numpy(np.asarray(value, runtime.NUMPY[self.scene.precision]))
             else:
                 raise ValueError(f"no input named {name!r}; this rollout has {', '.join(self.inputs)}")
         return self._fields[name]
@@ -186,7 +192,7 @@ class Rollout:
         """Run from the input fields and fill the frames; inside a `ti.ad.Tape`, the tape will call `run_vjp`."""
         tape = runtime.current_tape()
         if tape is not None and tape is self._tape:
-            raise RuntimeError("this rollout already ran in this tape, and would overwrite its frames: make a second Rollout")
+            raise RuntimeError("this rollout already ran in this tape and would overwrite its frames: make a second Rollout")
         self._tape = tape
         frames = self.forward(**self._field_values())
         self._taped = frames
@@ -200,7 +206,7 @@ class Rollout:
         for name in self.inputs:
             if name in self._fields and name in gradients:
                 grad = self._fields[name].grad
-                grad.from_numpy((grad.to_numpy() + gradients[name]).astype(runtime.NUMPY[self.scene.precision]))
+                grad.from_numpy(np.asarray(grad.to_numpy() + gradients[name], runtime.NUMPY[self.scene.precision]))
 
     def _field_values(self) -> dict:
         exact = {}

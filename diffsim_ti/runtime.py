@@ -11,14 +11,11 @@ import weakref
 from collections import defaultdict
 from types import SimpleNamespace
 
-os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # read when taichi is imported
-os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")  # no network traffic from a simulator
-
-import numpy as np  # noqa: E402
-import taichi as ti  # noqa: E402
-from taichi._lib import core as _core  # noqa: E402
-from taichi.lang import impl  # noqa: E402
-from taichi.types import primitive_types  # noqa: E402
+import numpy as np
+import taichi as ti
+from taichi._lib import core as _core
+from taichi.lang import impl
+from taichi.types import primitive_types
 
 PRECISIONS = {"f32": ti.f32, "f64": ti.f64}
 NUMPY = {"f32": np.float32, "f64": np.float64}

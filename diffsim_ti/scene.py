@@ -25,6 +25,10 @@ class Scene:
 
     def __init__(self, mesh, material, density=1000.0, terms=(), fixed=None, motion=None, initial_positions=None,
                  initial_velocities=None, precision: str | None = None):  # fmt: skip
+        self._arguments = dict(
+            mesh=mesh, material=material, density=density, terms=terms, fixed=fixed, motion=motion,
+            initial_positions=initial_positions, initial_velocities=initial_velocities, precision=precision,
+        )  # fmt: skip
         self.mesh, self.material = mesh, material
         self.precision = runtime.check_precision(precision)
         self.terms = tuple([terms] if isinstance(terms, Term) else terms)
@@ -33,6 +37,10 @@ class Scene:
         self._check_terms()
         self.inputs = Inputs(self, density, initial_positions, initial_velocities)
         self._check_start()
+
+    def replace(self, **changes) -> "Scene":
+        """A scene with some arguments replaced."""
+        return Scene(**self._arguments | changes)
 
     def _check_terms(self) -> None:
         for term in self.terms:

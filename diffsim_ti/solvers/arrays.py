@@ -38,7 +38,7 @@ class SceneArrays:
         self.tets = runtime.upload(mesh.tetrahedra, ti.types.vector(4, ti.i32))
         start, corner_of = vertex_corners(mesh.tetrahedra, mesh.num_vertices)
         self.start, self.corner_of = runtime.upload(start, ti.i32), runtime.upload(corner_of, ti.i32)
-        none = runtime.array(ti.i32)
+        none = runtime.array(ti.i32, 1)
         self.surface = none
         if self.contacts:
             surface = np.zeros(mesh.num_vertices, np.int32)

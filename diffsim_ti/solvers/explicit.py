@@ -10,7 +10,6 @@ from diffsim_ti.solvers.kick_drift import kick_drift_kernels
 from diffsim_ti.solvers.solver import Solver
 
 
-
 @dataclass(frozen=True)
 class Weights:
     """Numbers of a pass (kick_drift.py) and their derivatives by the drag rate."""

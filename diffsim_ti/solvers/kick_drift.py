@@ -62,6 +62,10 @@ def kick_drift_kernels(law, features: Features, parallel: bool) -> SimpleNamespa
     row = features.sums()
 
     @ti.func
+    def half():
+        return ti.cast(0.5, fp)  # dividing by 2 would compute in f64
+
+    @ti.func
     def force_at(i, j, scene: A, forces: A, plan: A):
         """External force on vertex i in pass j: of the present step, or half of each of the two that share a kick."""
         f = vec3(0)
@@ -69,7 +73,7 @@ def kick_drift_kernels(law, features: Features, parallel: bool) -> SimpleNamespa
         if k >= 0:
             f = forces[0, k]
             if ti.static(features.forces_per_step):
-                f = (forces[(j - plan.lag0) // plan.substeps, k] + forces[(j - plan.lag1) // plan.substeps, k]) / 2
+                f = half() * (forces[(j - plan.lag0) // plan.substeps, k] + forces[(j - plan.lag1) // plan.substeps, k])
         return f
 
     @ti.func
@@ -280,8 +284,8 @@ def kick_drift_kernels(law, features: Features, parallel: bool) -> SimpleNamespa
             slot = scene.force_slot[i]
             if slot >= 0:
                 if ti.static(features.forces_per_step):
-                    adjoint.forces[(j - plan.lag0) // plan.substeps, slot] += f_adj / 2
-                    adjoint.forces[(j - plan.lag1) // plan.substeps, slot] += f_adj / 2
+                    adjoint.forces[(j - plan.lag0) // plan.substeps, slot] += half() * f_adj
+                    adjoint.forces[(j - plan.lag1) // plan.substeps, slot] += half() * f_adj
                 else:
                     adjoint.forces[0, slot] += f_adj
         if ti.static(has_contacts):

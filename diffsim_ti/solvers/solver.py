@@ -18,7 +18,8 @@ class Solver(ABC):
     explicit = False
     order = 0
 
-    def __init__(self, scene, dt: float, substeps: int = 1, parallel: bool | None = None, allow_unstable: bool = False):
+    def __init__(self, scene, dt: float = 0.01, substeps: int = 1, parallel: bool | None = None,
+                 allow_unstable: bool = False):  # fmt: skip
         if not (math.isfinite(dt) and dt > 0):
             raise ValueError(f"dt must be > 0 [s], got {dt}")
         if int(substeps) != substeps or substeps < 1:
@@ -29,6 +30,10 @@ class Solver(ABC):
         self._tight: stability.StepLimit | None = None
         if self.explicit and not allow_unstable:
             self._refuse_unstable()
+
+    def twin(self, scene) -> "Solver":
+        """The same solver for another scene."""
+        return type(self)(scene, self.dt, substeps=self.substeps, parallel=self.parallel, allow_unstable=self.allow_unstable)
 
     @property
     def substep(self) -> float:

@@ -1,0 +1,60 @@
+"""Geometry of linear tetrahedra, vectorised, in float64."""
+
+import math
+
+import numpy as np
+
+# Corner a's opposite face, seen from outside of a tetrahedron of positive volume.
+FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
+EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
+
+
+def determinants(vertices: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
+    """det [x1 - x0, x2 - x0, x3 - x0] = 6 V per tetrahedron, signed, [m^3]."""
+    (ax, ay, az), (bx, by, bz), (cx, cy, cz) = (
+        (vertices[tetrahedra[:, a]] - vertices[tetrahedra[:, 0]]).T for a in (1, 2, 3)
+    )
+    return ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx)
+
+
+def squared_edges(vertices: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
+    """Squared edge lengths, shape (num_tetrahedra, 6) [m^2], edges in the order of EDGES."""
+    out = np.empty((len(tetrahedra), 6))
+    for column, (a, b) in enumerate(EDGES):
+        d = vertices[tetrahedra[:, a]] - vertices[tetrahedra[:, b]]
+        out[:, column] = np.einsum("ij,ij->i", d, d)
+    return out
+
+
+def shape_gradients(vertices: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
+    """grad N_a [1/m], shape (num_tetrahedra, 4, 3); rows 1..3 invert the edge matrix, row 0 is their negative sum."""
+    x0, x1, x2, x3 = (vertices[tetrahedra[:, a]] for a in range(4))
+    e1, e2, e3 = x1 - x0, x2 - x0, x3 - x0
+    rows = np.stack([np.cross(e2, e3), np.cross(e3, e1), np.cross(e1, e2)], 1)
+    rows /= np.einsum("ij,ij->i", e1, rows[:, 0])[:, None, None]
+    return np.concatenate([-rows.sum(1, keepdims=True), rows], 1)
+
+
+def rotation_matrix(rotation, angle: float | None) -> np.ndarray:
+    """The matrix of a turn about the axis `rotation` by angle [rad], or `rotation` itself; ValueError if it is none.
+
+    R = I + sin(angle) K + (1 - cos(angle)) K^2, K the cross product with the unit axis (Rodrigues).
+    """
+    R = np.asarray(rotation, np.float64)
+    if angle is not None:
+        axis = three("axis", rotation)
+        if not np.linalg.norm(axis) > 0:
+            raise ValueError(f"a rotation needs an axis of positive length, got {rotation!r}")
+        K = np.cross(np.eye(3), -axis / np.linalg.norm(axis))
+        R = np.eye(3) + math.sin(angle) * K + (1 - math.cos(angle)) * K @ K
+    if R.shape != (3, 3) or not np.allclose(R @ R.T, np.eye(3), rtol=0, atol=1e-9) or np.linalg.det(R) < 0:
+        raise ValueError(f"a rotation is a matrix (3, 3) with det +1, or an axis and an angle; got {rotation!r}")
+    return R
+
+
+def three(name: str, given, one_will_do: bool = False) -> np.ndarray:
+    """Three finite numbers, or one for all three where `one_will_do`; otherwise ValueError."""
+    values = np.asarray(given, np.float64)
+    if not np.all(np.isfinite(values)) or values.shape != (3,) and not (one_will_do and values.shape == ()):
+        raise ValueError(f"{name} must be {'one or ' if one_will_do else ''}three finite numbers, got {given!r}")
+    return np.broadcast_to(values, (3,))

@@ -1,0 +1,48 @@
+"""Named sets of vertices and of tetrahedra, and the ways in which a user may choose some."""
+
+import numpy as np
+
+
+def checked_sets(sets: dict | None, count: int, what: str) -> dict[str, np.ndarray]:
+    """name -> sorted read-only indices; ValueError for a name that is no name and for indices that do not fit."""
+    out = {}
+    for name, rows in (sets or {}).items():
+        if not isinstance(name, str) or not name or '"' in name or "\n" in name:
+            raise ValueError(f"a {what} set needs a name without quotes and line breaks, got {name!r}")
+        out[name] = indices_of(rows, count, f"{what} set {name!r}")
+        out[name].flags.writeable = False
+    return out
+
+
+def chosen_indices(chosen, sets: dict, count: int, what: str) -> np.ndarray:
+    """Sorted indices from a set's name, several names, indices, or a Boolean mask; ValueError for an unknown name."""
+    names = [chosen] if isinstance(chosen, str) else chosen
+    if isinstance(names, (list, tuple)) and names and all(isinstance(name, str) for name in names):
+        for name in names:
+            if name not in sets:
+                raise ValueError(f"no {what} set is called {name!r}; there are: {', '.join(sets) or 'none'}")
+        return np.unique(np.concatenate([sets[name] for name in names]))
+    return indices_of(chosen, count, what)
+
+
+def indices_of(chosen, count: int, what: str) -> np.ndarray:
+    """Sorted unique int64 indices from indices or a Boolean mask of length count; ValueError if they do not fit."""
+    chosen = np.asarray(chosen)
+    if chosen.dtype.kind == "b":
+        if chosen.shape != (count,):
+            raise ValueError(f"{what}: a mask must have shape ({count},), got {chosen.shape}")
+        return np.nonzero(chosen)[0]
+    if chosen.size == 0:
+        return np.zeros(0, np.int64)
+    if chosen.dtype.kind not in "iu":
+        raise ValueError(f"{what}: indices must be integers, got dtype {chosen.dtype}; convert with .astype(np.int64)")
+    chosen = np.unique(chosen).astype(np.int64)
+    if chosen[0] < 0 or chosen[-1] >= count:
+        bad = chosen[0] if chosen[0] < 0 else chosen[-1]
+        raise ValueError(f"{what}: indices must lie in 0..{count - 1}, got {bad}; indices count from 0")
+    return chosen
+
+
+def sizes(sets: dict) -> str:
+    """Names with the number of members."""
+    return ", ".join(f"{name} ({len(rows)})" for name, rows in sets.items()) or "none"

@@ -1,0 +1,239 @@
+"""Proofs that a user can run: Taylor test, dot-product test, a table of every gradient, its health, Hessian products."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from diffsim_ti.rollout import Frames, Rollout
+
+Loss = Callable[[Frames], tuple]
+
+
+@dataclass
+class TaylorResult:
+    """Remainders |f(x + eps d) - f(x) - eps g.d| for eps halved again and again, and their orders between halvings."""
+
+    epsilons: np.ndarray
+    remainders: np.ndarray
+    floor: float = 0.0
+
+    @property
+    def rates(self) -> np.ndarray:
+        """log2 of successive remainders: 2 where the gradient is right, 1 where it is wrong."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.log2(self.remainders[:-1] / self.remainders[1:])
+
+    @property
+    def rate(self) -> float:
+        """The worst of the middle three halvings; infinite where the remainder is round-off (f is linear along d)."""
+        if np.all(self.remainders <= self.floor):
+            return float("inf")
+        usable = self.rates[self.remainders[1:] > self.floor]
+        middle = usable[len(usable) // 2 - 1 : len(usable) // 2 + 2] if len(usable) > 3 else usable
+        return float(np.min(middle)) if len(middle) else float("inf")
+
+
+def taylor_test(f: Callable[[np.ndarray], float], x, gradient, direction=None, epsilon: float = 1e-2, halvings: int = 6,
+                seed: int = 0) -> TaylorResult:  # fmt: skip
+    """Second-order remainders of f along a direction: they fall as eps^2 if and only if `gradient` is f's gradient at x.
+
+    direction: default random, of the size of x. Griewank, Walther 2008; Farrell et al. 2013, doi:10.1137/120873558.
+    """
+    x, gradient = np.asarray(x, np.float64), np.asarray(gradient, np.float64)
+    if direction is None:
+        direction = np.random.default_rng(seed).standard_normal(x.shape) * (np.abs(x).max() or 1.0)
+    f0, slope = float(f(x)), float(np.sum(gradient * direction))
+    epsilons = epsilon / 2.0 ** np.arange(halvings)
+    values = [float(f(x + eps * direction)) for eps in epsilons]
+    remainders = np.array([abs(value - f0 - eps * slope) for value, eps in zip(values, epsilons)])
+    floor = 50 * np.finfo(np.float64).eps * max(abs(f0), *map(abs, values), 1e-300)
+    return TaylorResult(epsilons, remainders, floor)
+
+
+def central_difference(f: Callable[[float], float], scale: float = 1.0) -> tuple[float, float]:
+    """(f'(0), error estimate): central differences extrapolated once, at the step where two neighbours agree best."""
+    steps = scale * 10.0 ** -np.arange(2.0, 6.5, 0.5)
+    raw = np.array([(f(s) - f(-s)) / (2 * s) for s in np.append(steps, steps[-1] / np.sqrt(10))])
+    better = (10 * raw[1:] - raw[:-1]) / 9  # steps fall by sqrt(10): the error of second order by 10
+    change = np.abs(np.diff(better))
+    best = int(np.argmin(change))
+    return float(better[best + 1]), float(change[best])
+
+
+def input_scale(rollout: Rollout, name: str) -> float:
+    """A size of change that matters for an input: its own, or for lengths and velocities that of a tetrahedron's edge."""
+    mesh = rollout.scene.mesh
+    edge = float(np.cbrt(np.mean(mesh.volumes)))
+    if name in ("initial_positions", "rest_positions", "prescribed_motion"):
+        return 0.1 * edge
+    if name == "initial_velocities":
+        return 0.1 * edge / max(rollout.steps * rollout.solver.dt, rollout.solver.dt)
+    size = float(np.abs(rollout.values[name]).max())
+    return 0.1 * size if size > 0 else 0.1
+
+
+def _random_direction(rollout: Rollout, name: str, rng) -> np.ndarray:
+    direction = rng.standard_normal(rollout.values[name].shape) * input_scale(rollout, name)
+    if name == "initial_velocities":
+        direction[rollout.scene.fixed] = 0
+    return direction
+
+
+def linear_loss(rollout: Rollout, seed: int = 0) -> Loss:
+    """A loss that no symmetry hides from: w . positions + z . velocities + |positions|^2 / 2 with random w, z."""
+    rng = np.random.default_rng(seed)
+    shape = (rollout.num_frames, rollout.scene.mesh.num_vertices, 3)
+    w, z = rng.standard_normal(shape), rng.standard_normal(shape)
+
+    def loss(frames: Frames):
+        x, v = frames.positions.astype(np.float64), frames.velocities.astype(np.float64)
+        return float((w * x).sum() + (z * v).sum() + 0.5 * (x**2).sum()), w + x, z
+
+    return loss
+
+
+def dot_product_test(rollout: Rollout, inputs=None, seed: int = 0, **values) -> float:
+    """Relative difference of <w, J v> and <J^T w, v> for random v in all inputs and random w in all frames.
+
+    Round-off alone (1e-13 in f64, 1e-5 in f32) if `run_vjp` is the transpose of the tangent.
+    """
+    rng = np.random.default_rng(seed)
+    frames = rollout.forward(**values)
+    names = rollout.wanted if inputs is None else tuple(inputs)
+    directions = {name: _random_direction(rollout, name, rng) for name in names}
+    w, z = (rng.standard_normal(frames.positions.shape) for _ in range(2))
+    dx, dv = rollout.jvp(frames, **directions)
+    gradients = rollout.vjp(frames, w, z)
+    forward = float((w * dx).sum() + (z * dv).sum())
+    terms = [float((gradients[name] * directions[name]).sum()) for name in names]
+    scale = max(np.abs(w * dx).sum() + np.abs(z * dv).sum(), 1e-300) / np.sqrt(w.size)
+    return abs(forward - sum(terms)) / max(abs(forward), scale)
+
+
+@dataclass
+class GradientCheck:
+    """One row of `check_gradients`: directional derivatives along a random direction, and the Taylor rate."""
+
+    input: str
+    analytic: float
+    differences: float
+    relative_error: float
+    taylor_rate: float
+    passed: bool
+
+
+@dataclass
+class GradientReport:
+    """The rows of `check_gradients`; `passed` if all did; `str()` is the table."""
+
+    rows: list[GradientCheck] = field(default_factory=list)
+
+    @property
+    def passed(self) -> bool:
+        return all(row.passed for row in self.rows)
+
+    def __str__(self) -> str:
+        lines = [f"{'input':22s} {'analytic':>16s} {'differences':>16s} {'rel. error':>11s} {'Taylor rate':>12s}  verdict"]
+        for r in self.rows:
+            rate = "linear" if np.isinf(r.taylor_rate) else f"{r.taylor_rate:.3f}"
+            lines.append(f"{r.input:22s} {r.analytic: 16.8e} {r.differences: 16.8e} {r.relative_error:11.1e} {rate:>12s}  "
+                         f"{'right' if r.passed else 'WRONG'}")  # fmt: skip
+        return "\n".join(lines)
+
+
+def check_gradients(rollout: Rollout, loss: Loss | None = None, inputs=None, seed: int = 0, verbose: bool = True,
+                    tolerance: float | None = None) -> GradientReport:  # fmt: skip
+    """Check the gradient by every input against extrapolated central differences and by its Taylor rate; print the table.
+
+    loss(frames) -> (value, gradient by positions, gradient by velocities or None); default `linear_loss`.
+    Differences and Taylor rates are taken in float64 (on a float64 twin of an f32 scene: differences in f32 see nothing).
+    tolerance: largest relative error, default 1e-6 in f64 (what differences resolve on a long run), 1e-3 in f32.
+    A row passes if its error is within the tolerance and its Taylor rate is at least 1.9.
+    """
+    single = rollout.scene.precision == "f32"
+    twin = rollout.twin(precision="f64") if single else rollout
+    loss = loss or linear_loss(rollout, seed)
+    tolerance = tolerance or (1e-3 if single else 1e-6)
+    rng = np.random.default_rng(seed + 1)
+    frames = rollout.forward()
+    _, *adjoints = loss(frames)
+    gradients = rollout.vjp(frames, *adjoints)
+    report = GradientReport()
+    for name in rollout.wanted if inputs is None else inputs:
+        direction, x = _random_direction(rollout, name, rng), rollout.values[name]
+
+        def along(t, name=name, x=x, direction=direction):
+            return loss(twin.forward(**{name: x + t * direction}))[0]
+
+        analytic = float((gradients[name] * direction).sum())
+        exact = analytic
+        if single:
+            exact_frames = twin.forward()
+            exact = float((twin.vjp(exact_frames, *loss(exact_frames)[1:])[name] * direction).sum())
+        differences, uncertainty = central_difference(along)
+        taylor = taylor_test(along, 0.0, exact, 1.0, epsilon=0.1)
+        scale = max(abs(differences), abs(analytic))
+        error = abs(analytic - differences) / scale if scale > 0 else 0.0
+        resolved = abs(analytic - differences) <= 10 * uncertainty + tolerance * scale
+        report.rows.append(GradientCheck(name, analytic, differences, error, taylor.rate, resolved and taylor.rate >= 1.9))
+    if verbose:
+        print(report)
+    return report
+
+
+@dataclass
+class GradientHealth:
+    """How an adjoint grows through a reverse sweep: norms per step (last step first), growth rate [1/s] and horizon."""
+
+    steps: np.ndarray
+    norms: np.ndarray
+    growth_rate: float
+    exceeded_at: int | None
+
+    def __str__(self) -> str:
+        where = "never" if self.exceeded_at is None else f"going back past step {self.exceeded_at}"
+        norms = f"{self.norms[0]:.3g} to {self.norms[-1]:.3g}"
+        return f"adjoint norm {norms}, growth {self.growth_rate:.3g} 1/s, limit exceeded {where}"
+
+
+def gradient_health(rollout: Rollout, limit: float = 1e10) -> GradientHealth:
+    """Health of the last reverse sweep of a Rollout made with health=True: is the gradient still of use?
+
+    Norms are those of the adjoint of the state, |(dt p, q)|; the growth rate is the least-squares slope of their logarithm
+    backwards in time; `exceeded_at` is the latest step at which they exceed `limit` times the first.
+    """
+    if not rollout.health:
+        raise ValueError("no health report: make the Rollout with health=True and run its reverse sweep first")
+    dt = rollout.solver.dt
+    steps = np.array([h["step"] for h in rollout.health])
+    norms = np.array([np.hypot(dt * h["norm_position"], h["norm_velocity"]) for h in rollout.health])
+    good = norms > 0
+    slope = np.polyfit(-steps[good] * dt, np.log(norms[good]), 1)[0] if good.sum() > 2 else 0.0
+    over = np.nonzero(norms > limit * norms[good][0])[0] if good.any() else []
+    return GradientHealth(steps, norms, float(slope), int(steps[over[0]]) if len(over) else None)
+
+
+def hessian_product(rollout: Rollout, loss: Loss, direction: dict, epsilon: float = 1e-5, **values) -> dict:
+    """Hessian of the loss times a direction over some inputs, by central differences of exact gradients.
+
+    direction: input name -> change of that input. Error O(epsilon^2) of the direction as given; use f64.
+    """
+    base = rollout.values | rollout.scene.inputs.check(values)
+    out = {}
+    for sign in (1, -1):
+        frames = rollout.forward(**values | {n: base[n] + sign * epsilon * np.asarray(d) for n, d in direction.items()})
+        gradients = rollout.vjp(frames, *loss(frames)[1:])
+        for name in direction:
+            out[name] = out.get(name, 0.0) + sign * gradients[name] / (2 * epsilon)
+    return out
+
+
+def gauss_newton_product(rollout: Rollout, frames: Frames, direction: dict, weight=1.0) -> dict:
+    """J^T (weight J d): the Gauss-Newton Hessian of 1/2 |sqrt(weight) (positions - target)|^2 times a direction; exact.
+
+    One tangent run and one reverse sweep; positive semi-definite, so CG works on it.
+    """
+    dx, _ = rollout.jvp(frames, **direction)
+    gradients = rollout.vjp(frames, weight * dx)
+    return {name: gradients[name] for name in direction}
