@@ -276,7 +276,7 @@ class TetrahedralMesh:
             "size: " + " x ".join(f"{d:.6g}" for d in high - low) + f" m, from ({_numbers(low)}) to ({_numbers(high)})",
             f"volume: {self.volume:.6g} m^3",
             f"edges: {lengths.min():.4g} to {lengths.max():.4g} m, mean {lengths.mean():.4g} m",
-            f"quality: worst {self.quality[worst]:.3g} in tetrahedron {worst}, mean {self.quality.mean():.3g}; regular is 1",
+            f"worst quality: {self.quality[worst]:.3g} in tetrahedron {worst}; mean {self.quality.mean():.3g} of 1",
             f"smallest altitude: {self.altitudes[thin].min():.4g} m in tetrahedron {thin}",
             f"vertex sets: {sizes(self._vertex_sets)}",
             f"tetrahedron sets: {sizes(self._tetrahedron_sets)}",

@@ -45,7 +45,7 @@ def rotation_matrix(rotation, angle: float | None) -> np.ndarray:
         axis = three("axis", rotation)
         if not np.linalg.norm(axis) > 0:
             raise ValueError(f"a rotation needs an axis of positive length, got {rotation!r}")
-        K = np.cross(np.eye(3), -axis / np.linalg.norm(axis))
+        K = np.cross(np.eye(3), axis / np.linalg.norm(axis))
         R = np.eye(3) + math.sin(angle) * K + (1 - math.cos(angle)) * K @ K
     if R.shape != (3, 3) or not np.allclose(R @ R.T, np.eye(3), rtol=0, atol=1e-9) or np.linalg.det(R) < 0:
         raise ValueError(f"a rotation is a matrix (3, 3) with det +1, or an axis and an angle; got {rotation!r}")

@@ -14,18 +14,18 @@ from diffsim_ti.tetrahedron import element_functions
 @lru_cache(maxsize=None)
 def observer_kernels(law, features):
     """Kernels (fields of the tetrahedra, contact energy of the vertices) at a displacement."""
-    el = element_functions(law, features.uniform)
+    el = element_functions(law, features.uniform, False)
     t, contacts = el.types, features.contacts
 
     @ti.kernel
-    def tetrahedron_fields(tets: t.tets, gradients: t.matrices, coefficients: t.coefficients, u: t.vectors2,
-                           energy: t.scalars, von_mises: t.scalars, J: t.scalars):  # fmt: skip
+    def tetrahedron_fields(tets: t.ints, gradients: t.blocks, coefficients: t.blocks, u: t.vectors2,
+                           energy: t.scalars, von_mises: t.scalars, J: t.scalars, num_tetrahedra: ti.i32):  # fmt: skip
         scene = Bundle(tets=tets)
-        for e in range(tets.shape[0]):
-            H, p = el.edges(e, scene, u, 0) @ gradients[e], el.coefficients_of(e, coefficients)
-            F = H + ti.Matrix.identity(t.fp, 3)
+        for e in range(num_tetrahedra):
+            H, p = el.edges(e, scene, u, 0).dot(el.gradients_of(e, gradients)), el.coefficients_of(e, coefficients)
+            F = H.matrix() + ti.Matrix.identity(t.fp, 3)
             det = F.determinant()
-            S = law.stress(H, p) @ F.transpose() / det  # Cauchy
+            S = law.stress(H, p).matrix() @ F.transpose() / det  # Cauchy
             energy[e] = law.energy_density(H, p)
             J[e] = det
             a, b, c = S[0, 0] - S[1, 1], S[1, 1] - S[2, 2], S[2, 2] - S[0, 0]
@@ -69,7 +69,7 @@ def tetrahedron_fields(workspace) -> TetrahedronFields:
     a = workspace.arrays
     out = [runtime.array(a.fp, a.num_tetrahedra) for _ in range(3)]
     kernel = observer_kernels(a.law, a.features())[0]
-    kernel(a.tets, a.gradients, a.coefficients, workspace.state.u, *out)
+    kernel(a.tets, a.gradients, a.coefficients, workspace.state.u, *out, a.num_tetrahedra)
     return TetrahedronFields(*(runtime.fetch(x).astype(np.float64) for x in out))
 
 

@@ -133,6 +133,8 @@ def allocated_megabytes() -> float:
 def _free(owner, handle, size) -> None:
     _settings["bytes"] -= size
     if handle is not None and impl.get_runtime().prog is owner:
+        if not runs_on_cpu():
+            ti.sync()  # an array that a kernel still uses would not be freed, in silence
         owner.delete_ndarray(handle)
 
 
@@ -149,11 +151,11 @@ def array(dtype, *shape: int):
 
 
 def upload(data: np.ndarray, dtype) -> "ti.Ndarray":
-    """A new Taichi array of element type `dtype` (scalar, vector or matrix) holding `data`."""
-    element = getattr(dtype, "get_shape", tuple)() if not isinstance(dtype, type(ti.f32)) else ()
+    """A new Taichi array of element type `dtype` (scalar or vector) holding `data`; three components fit into four."""
     data = np.asarray(data)
-    shape = data.shape[: data.ndim - len(element)]
+    shape = data.shape if isinstance(dtype, type(ti.f32)) else data.shape[:-1]
     out = array(dtype, *shape)
+    fill(out, 0)
     if data.size:
         fill(out, data)
     return out
@@ -176,51 +178,89 @@ def view(target) -> "np.ndarray | None":
 
 
 def fill(target, data) -> None:
-    """Copy numbers into a Taichi array; `data` broadcasts to its shape, and anything else is a ValueError."""
+    """Copy numbers into a Taichi array; `data` broadcasts to its shape, and three components fit into four."""
+    data, shape = np.asarray(data), full_shape(target)
+    three = shape[-1] == 4 and data.ndim and data.shape[-1] == 3
     host = view(target)
     if host is not None:
-        host[...] = data
-    else:
-        dtype = to_numpy_dtype(target.dtype)
-        target.from_numpy(np.ascontiguousarray(np.broadcast_to(np.asarray(data, dtype), full_shape(target))))
+        (host[..., :3] if three else host)[...] = data
+        return
+    whole = np.zeros(shape, to_numpy_dtype(target.dtype))
+    (whole[..., :3] if three else whole)[...] = data
+    target.from_numpy(whole)
 
 
 def fetch(source) -> np.ndarray:
-    """A NumPy copy of a Taichi array."""
+    """A NumPy copy of a Taichi array; of four components the first three."""
     host = view(source)
-    return source.to_numpy() if host is None else host.copy()
-
-
-class Launch:
-    """A kernel with its arrays bound once, launched many times with other numbers.
-
-    A plain call looks at every argument anew: 5 us for each array, 100 us for the kernels of a step.
-    """
-
-    def __init__(self, kernel, *arrays):
-        self._kernel, self._arrays, self._context = kernel._primal, arrays, None
-        self._is_float = [id(a.annotation) in primitive_types.real_type_ids for a in self._kernel.arguments]
-
-    def __call__(self, *numbers) -> None:
-        prog = impl.get_runtime().prog
-        if self._context is None:
-            key = self._kernel.ensure_compiled(*self._arrays, *numbers)
-            compiled = self._kernel.compiled_kernels[key]
-            self._code = prog.compile_kernel(prog.config(), prog.get_device_caps(), compiled)
-            self._context = compiled.make_launch_context()
-        for k, array in enumerate(self._arrays):  # anew each time: on the CPU a launch replaces them by raw pointers
-            self._context.set_arg_ndarray((k,), array.arr)
-        for k, number in enumerate(numbers, start=len(self._arrays)):
-            if self._is_float[k]:
-                self._context.set_arg_float((k,), number)
-            else:
-                self._context.set_arg_int((k,), number)
-        prog.launch_kernel(self._code, self._context)
+    host = source.to_numpy() if host is None else host
+    is_vector = len(getattr(source, "element_shape", ()) or ()) == 1 and host.shape[-1] == 4
+    return host[..., :3].copy() if is_vector else host.copy()
 
 
 def to_numpy_dtype(dtype):
     """NumPy's type for a Taichi scalar type."""
     return {ti.f32: np.float32, ti.f64: np.float64, ti.i32: np.int32}[dtype]
+
+
+class Launch:
+    """A kernel with its arrays bound once, launched many times with other numbers.
+
+    A plain call looks at every argument anew: 5 us for each array, 130 us for the kernels of a step; this takes 12 us.
+    vectorized: compile vectors as they are, to vector instructions, instead of number by number (CPU only).
+    """
+
+    def __init__(self, kernel, *arrays, vectorized: bool = False):
+        self._kernel, self._arrays, self._vectorized = kernel._primal, arrays, vectorized
+        self._setters = None
+
+    def _prepare(self, numbers: tuple) -> None:
+        prog = impl.get_runtime().prog
+        config, kernel = prog.config(), self._kernel
+        scalarize, config.real_matrix_scalarize = config.real_matrix_scalarize, not self._vectorized
+        try:
+            kernel.runtime.materialize()
+            compiled = kernel.compiled_kernels[kernel.ensure_compiled(*self._arrays, *numbers)]
+            self._code = prog.compile_kernel(config, prog.get_device_caps(), compiled)
+        finally:
+            config.real_matrix_scalarize = scalarize
+        self._context, on_cpu = compiled.make_launch_context(), runs_on_cpu()
+        for k, array in enumerate(self._arrays):
+            if on_cpu:  # a launch replaces an array by its raw pointer, so that a context could not be used twice
+                pointer, size = prog.get_ndarray_data_ptr_as_int(array.arr), int(np.prod(full_shape(array))) * 8
+                self._context.set_arg_external_array_with_shape((k,), pointer, size, tuple(array.shape), 0)
+            else:
+                self._context.set_arg_ndarray((k,), array.arr)
+        kinds = kernel.arguments[len(self._arrays) :]
+        floats = [id(argument.annotation) in primitive_types.real_type_ids for argument in kinds]
+        self._setters = [
+            ((self._context.set_arg_float if is_float else self._context.set_arg_int), (k,))
+            for k, is_float in enumerate(floats, start=len(self._arrays))
+        ]
+        self._launch = prog.launch_kernel
+
+    def __call__(self, *numbers) -> None:
+        if self._setters is None:
+            self._prepare(numbers)
+        for (setter, index), number in zip(self._setters, numbers):
+            setter(index, number)
+        self._launch(self._code, self._context)
+
+
+def traced(function):
+    """Mark a plain Python function that kernels may call: it runs while the kernel is compiled and builds its code."""
+    function._is_taichi_function, function.func = True, SimpleNamespace(has_print=False)
+    return function
+
+
+def let(value):
+    """A local variable of the kernel that is being compiled, set to `value`."""
+    return impl.expr_init(value)
+
+
+def at(array, *index):
+    """array[index] in a traced function."""
+    return impl.subscript(None, array, *index)
 
 
 class FieldPool:
@@ -254,11 +294,11 @@ def current_tape():
     return impl.get_runtime().target_tape
 
 
-@ti.data_oriented
+@traced
 class Bundle:
     """Arrays and numbers of a kernel under one name, to hand to Taichi functions; exists only while compiling."""
 
-    _is_taichi_function, func = True, SimpleNamespace(has_print=False)  # so that Taichi calls it inside a kernel
+    _data_oriented = True  # Taichi hands it on as it is
 
     def __init__(self, **parts):
         self.__dict__.update(parts)

@@ -32,7 +32,6 @@ class Simulator:
         self._start = solver.start_values()
         self.workspace = solver.workspace(self._start)
         self._guard = Guard(self.workspace)
-        self._passes = solver.num_passes(1)
         self.reset()
 
     def reset(self) -> None:
@@ -49,13 +48,20 @@ class Simulator:
         """Advance by solver.dt."""
         self._load_step()
         self._guard.offset = self.step_count * self.solver.substeps
-        self._guard.advance(0, self._passes, self._passes)
+        passes = self.solver.num_passes(1)
+        self._guard.advance(0, passes, passes)
         self.step_count += 1
 
     def run(self, steps: int) -> None:
         """Advance by so many steps."""
         for _ in range(steps):
             self.step()
+
+    def set_substeps(self, substeps: int) -> None:
+        """Divide the steps to come into so many substeps; a step that is too long then raises Divergence."""
+        if int(substeps) != substeps or substeps < 1:
+            raise ValueError(f"substeps must be a whole number >= 1, got {substeps}")
+        self.solver.substeps = int(substeps)
 
     def _load_step(self) -> None:
         """Bring what depends on the step to the device: motion of fixed vertices, forces per step."""

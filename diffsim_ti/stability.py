@@ -44,29 +44,30 @@ def element_limit(scene) -> StepLimit:
 
 
 @lru_cache(maxsize=None)
-def stiffness_kernel(law, features, parallel: bool):
+def stiffness_kernel(law, features, parallel: bool, lanes: bool):
     """y = df/du . w at displacement u: elastic and contact forces."""
-    el = element_functions(law, features.uniform)
+    el = element_functions(law, features.uniform, lanes)
     t, contacts = el.types, features.contacts
 
     @ti.kernel
     def stiffness_product(
-        tets: t.tets, gradients: t.matrices, volumes: t.scalars, coefficients: t.coefficients, start: t.ints,
+        tets: t.ints, gradients: t.blocks, volumes: t.blocks, coefficients: t.blocks, start: t.ints,
         corner_of: t.ints, inverse_mass: t.scalars, parameters: t.scalars, rest: t.vectors, surface: t.ints,
         corner: t.vectors, u: t.vectors2, v: t.vectors2, w: t.vectors2, y: t.vectors2,
+        num_items: ti.i32, num_vertices: ti.i32,
     ):  # fmt: skip
         scene = Bundle(tets=tets, gradients=gradients, volumes=volumes, coefficients=coefficients, start=start,
                        corner_of=corner_of)  # fmt: skip
         ti.loop_config(serialize=not parallel)
-        for e in range(tets.shape[0]):
+        for e in range(num_items):
             el.stiffness(e, scene, u, 0, w, corner)
         ti.loop_config(serialize=not parallel)
-        for i in range(inverse_mass.shape[0]):
+        for i in range(num_vertices):
             f = el.gather(i, scene, corner)
             if ti.static(len(contacts) > 0):
                 if surface[i] > 0:
                     for k in ti.static(range(len(contacts))):
-                        f += contacts[k].force_jvp(parameters, rest[i], u[0, i], v[0, i], w[0, i], t.vec3(0))
+                        f += contacts[k].force_jvp(parameters, rest[i], u[0, i], v[0, i], w[0, i], t.vector(0))
             y[0, i] = f
 
     return stiffness_product
@@ -78,10 +79,10 @@ class Stiffness:
     def __init__(self, workspace):
         self.ws = workspace
         a = workspace.arrays
-        self.w, self.y = runtime.array(a.vec3, 1, a.num_vertices), runtime.array(a.vec3, 1, a.num_vertices)
-        kernel = stiffness_kernel(a.law, a.features(), workspace.parallel)
+        self.w, self.y = runtime.array(a.vector, 1, a.num_vertices), runtime.array(a.vector, 1, a.num_vertices)
+        kernel = stiffness_kernel(a.law, a.features(), workspace.parallel, a.in_lanes)
         state = workspace.state
-        self._multiply = runtime.Launch(kernel, *a.topology(), a.corner, state.u, state.v, self.w, self.y)
+        self._multiply = runtime.Launch(kernel, *a.topology(), a.corner, state.u, state.v, self.w, self.y, vectorized=a.in_lanes)
         self.root = np.sqrt(runtime.fetch(a.inverse_mass).astype(np.float64))[:, None]
         self.vector = None
 
@@ -89,7 +90,7 @@ class Stiffness:
         """The product with x, shape (num_vertices, 3), float64."""
         scale = np.abs(self.root * x).max() or 1.0  # f32 keeps its digits whatever the masses
         runtime.fill(self.w, (self.root * x / scale)[None])
-        self._multiply()
+        self._multiply(self.ws.arrays.num_items, self.ws.arrays.num_vertices)
         return -self.root * runtime.fetch(self.y)[0].astype(np.float64) * scale
 
     def largest(self, tolerance: float = 1e-3) -> tuple[float, float]:

@@ -1,8 +1,13 @@
 """The linear tetrahedron: what each one adds to forces, to their differential and to the adjoint.
 
-H = sum_a (u_a - u_0) (x) grad N_a, a = 1..3, is the displacement gradient; `gradients[e]` holds grad N_1..3 as rows.
-Corner forces f_a = -V P grad N_a go to `corner[4 e + a]`; vertices gather them, so no atomics and the same bits every run.
-`scene` is a Bundle of tets, gradients, volumes, coefficients, start, corner_of.
+H = sum_a (u_a - u_0) (x) grad N_a, a = 1..3, is the displacement gradient; corner forces f_a = -V P grad N_a go to
+`corner[4 e + a]`, and vertices gather them, so that there are no atomics and every run gives the same bits.
+
+Data of tetrahedra lie in blocks of eight. On the CPU a block is worked on at once, each number of the formula being a
+vector of eight lanes that becomes vector instructions; elsewhere, and for laws that need a loop, tetrahedra go one by one
+over the same data. The last block is filled up with copies of tetrahedron 0, whose corners no vertex gathers.
+`scene` is a Bundle of tets, gradients, volumes, coefficients, start, corner_of. Vectors of vertices have four components
+(the last is zero), since whole loads and stores of four are what vector units do well.
 """
 
 from functools import lru_cache
@@ -10,105 +15,167 @@ from types import SimpleNamespace
 
 import taichi as ti
 
-from diffsim_ti.runtime import PRECISIONS
+from diffsim_ti.materials.tensor import Tensor, inner, sum_of
+from diffsim_ti.runtime import PRECISIONS, at, let, traced
 
+LANES = 8
 A = ti.template()  # an array or Bundle handed to a Taichi function
 
 
+class _Block:
+    """Eight tetrahedra at once: item b is block b."""
+
+    def __init__(self, fp):
+        self.vector, self.lanes = ti.types.vector(4, fp), ti.types.vector(LANES, fp)
+
+    def numbers(self, array, first: int, count: int, rows: int, item):
+        """`count` numbers from `first` on, of the `rows` that each block has."""
+        return [let(at(array, rows * item + first + k)) for k in range(count)]
+
+    def corners(self, vectors, slot, tets, item):
+        """[a][d]: component d of the vector at corner a."""
+        out = []
+        for a in range(4):
+            whole = [let(at(vectors, slot, at(tets, 4 * LANES * item + LANES * a + lane))) for lane in range(LANES)]
+            out.append([let(self.lanes(*(at(w, d) for w in whole))) for d in range(3)])
+        return out
+
+    def store(self, corner, item, forces, zero):
+        for a in range(4):
+            for lane in range(LANES):
+                force = self.vector(*(at(forces[a][d], lane) for d in range(3)), zero)
+                at(corner, 4 * LANES * item + 4 * lane + a)._assign(force)
+
+    def add(self, array, rows: int, item, numbers):
+        for k, number in enumerate(numbers):
+            target = at(array, rows * item + k)
+            target._assign(target + number)
+
+
+class _Single:
+    """One tetrahedron: item e is tetrahedron e, a lane of its block."""
+
+    def __init__(self, fp):
+        self.vector = ti.types.vector(4, fp)
+
+    def numbers(self, array, first: int, count: int, rows: int, item):
+        return [let(at(at(array, rows * (item // LANES) + first + k), item % LANES)) for k in range(count)]
+
+    def corners(self, vectors, slot, tets, item):
+        block, lane = item // LANES, item % LANES
+        whole = [let(at(vectors, slot, at(tets, 4 * LANES * block + LANES * a + lane))) for a in range(4)]
+        return [[let(at(w, d)) for d in range(3)] for w in whole]
+
+    def store(self, corner, item, forces, zero):
+        for a in range(4):
+            at(corner, 4 * item + a)._assign(self.vector(*forces[a], zero))
+
+    def add(self, array, rows: int, item, numbers):
+        for k, number in enumerate(numbers):
+            target = at(at(array, rows * (item // LANES) + k), item % LANES)
+            target._assign(target + number)
+
+
 @lru_cache(maxsize=None)
-def element_functions(law, uniform: bool) -> SimpleNamespace:
-    """Taichi functions of one tetrahedron for a law; `uniform`: one set of coefficients serves all tetrahedra."""
+def element_functions(law, uniform: bool, lanes: bool) -> SimpleNamespace:
+    """Functions of one item (a block or a tetrahedron) for a law; `uniform`: one set of coefficients serves all."""
     fp = PRECISIONS[law.precision]
-    vec3, mat3 = ti.types.vector(3, fp), ti.types.matrix(3, 3, fp)
-    coefficient = ti.types.vector(len(law.coefficient_names), fp)
+    kind, K = (_Block if lanes else _Single)(fp), len(law.coefficient_names)
+    vector = kind.vector
 
-    @ti.func
-    def edges(e, scene: A, u: A, s):
+    @traced
+    def edges(item, scene, u, s) -> Tensor:
         """Columns u_a - u_0 of slot s."""
-        tet = scene.tets[e]
-        u0 = u[s, tet[0]]
-        return ti.Matrix.cols([u[s, tet[1]] - u0, u[s, tet[2]] - u0, u[s, tet[3]] - u0])
+        x = kind.corners(u, s, scene.tets, item)
+        return Tensor(x[a][d] - x[0][d] for d in range(3) for a in (1, 2, 3))
 
-    @ti.func
-    def coefficients_of(e, coefficients: A):
-        p = coefficients[0]
-        if ti.static(not uniform):
-            p = coefficients[e]
-        return p
+    @traced
+    def gradients_of(item, array) -> Tensor:
+        """Rows grad N_1..3."""
+        return Tensor(kind.numbers(array, 0, 9, 9, item))
 
-    @ti.func
-    def store(e, corner: A, Q):
-        """Columns of Q are the forces of corners 1..3; corner 0 balances them."""
-        f1, f2, f3 = vec3(Q[0, 0], Q[1, 0], Q[2, 0]), vec3(Q[0, 1], Q[1, 1], Q[2, 1]), vec3(Q[0, 2], Q[1, 2], Q[2, 2])
-        corner[4 * e] = -(f1 + f2 + f3)
-        corner[4 * e + 1] = f1
-        corner[4 * e + 2] = f2
-        corner[4 * e + 3] = f3
+    @traced
+    def coefficients_of(item, array) -> list:
+        """The law's coefficients (the first block holds them for all if they are uniform)."""
+        return kind.numbers(array, 0, K, K, 0 if uniform else item)
+
+    @traced
+    def volume_of(item, array):
+        return kind.numbers(array, 0, 1, 1, item)[0]
+
+    @traced
+    def store(item, corner, Q) -> None:
+        """Columns of Q are minus the forces of corners 1..3; corner 0 balances them."""
+        minus, zero = ti.cast(-1, fp), ti.cast(0, fp)
+        forces = [[let(minus * Q[d, a]) for d in range(3)] for a in range(3)]
+        balance = [let(sum_of(Q[d, a] for a in range(3))) for d in range(3)]
+        kind.store(corner, item, [balance, *forces], zero)
 
     @ti.func
     def gather(i, scene: A, corner: A):
         """Sum of the corners that meet at vertex i, in a fixed order."""
-        f = vec3(0)
+        f = vector(0)
         for c in range(scene.start[i], scene.start[i + 1]):
-            f += corner[scene.corner_of[c]]
+            f = f + corner[scene.corner_of[c]]
         return f
 
-    @ti.func
-    def forces(e, scene: A, u: A, s, corner: A):
+    @traced
+    def forces(item, scene, u, s, corner) -> None:
         """Elastic corner forces at slot s."""
-        B = scene.gradients[e]
-        P = law.stress(edges(e, scene, u, s) @ B, coefficients_of(e, scene.coefficients))
-        store(e, corner, -scene.volumes[e] * (P @ B.transpose()))
+        B = gradients_of(item, scene.gradients)
+        P = law.stress(edges(item, scene, u, s) @ B, coefficients_of(item, scene.coefficients))
+        store(item, corner, (P * volume_of(item, scene.volumes)) @ B.transpose())
 
-    @ti.func
-    def stiffness(e, scene: A, u: A, s, w: A, corner: A):
+    @traced
+    def stiffness(item, scene, u, s, w, corner) -> None:
         """Corner products of the derivative of the elastic force with w (negative semi-definite at rest)."""
-        B = scene.gradients[e]
-        H, dH = edges(e, scene, u, s) @ B, edges(e, scene, w, 0) @ B
-        dP = law.stress_differential(H, dH, coefficients_of(e, scene.coefficients))
-        store(e, corner, -scene.volumes[e] * (dP @ B.transpose()))
+        B = gradients_of(item, scene.gradients)
+        H, dH = edges(item, scene, u, s) @ B, edges(item, scene, w, 0) @ B
+        dP = law.stress_differential(H, dH, coefficients_of(item, scene.coefficients))
+        store(item, corner, (dP * volume_of(item, scene.volumes)) @ B.transpose())
 
-    @ti.func
-    def forces_jvp(e, scene: A, u: A, s, du: A, corner: A, dots: A):
+    @traced
+    def forces_jvp(item, scene, u, s, du, corner, dots) -> None:
         """Change of the corner forces for changes of displacements, coefficients and rest shape."""
-        B, p, volume = scene.gradients[e], coefficients_of(e, scene.coefficients), scene.volumes[e]
-        D, B_dot = edges(e, scene, u, s), dots.gradients[e]
-        H, dH = D @ B, edges(e, scene, du, 0) @ B + D @ B_dot
-        P = law.stress(H, p)
+        B, B_dot = gradients_of(item, scene.gradients), gradients_of(item, dots.gradients)
+        volume, p = volume_of(item, scene.volumes), coefficients_of(item, scene.coefficients)
+        D = edges(item, scene, u, s)
+        H, dH = D @ B, edges(item, scene, du, 0) @ B + D @ B_dot
         # energies are linear in their coefficients, so the stress of the change is the change of the stress
-        dP = law.stress_differential(H, dH, p) + law.stress(H, coefficients_of(e, dots.coefficients))
-        Q = volume * (dP @ B.transpose()) + P @ (dots.volumes[e] * B + volume * B_dot).transpose()
-        store(e, corner, -Q)
+        dP = law.stress_differential(H, dH, p) + law.stress(H, coefficients_of(item, dots.coefficients))
+        change = B * volume_of(item, dots.volumes) + B_dot * volume
+        store(item, corner, (dP * volume) @ B.transpose() + law.stress(H, p) @ change.transpose())
 
-    @ti.func
-    def forces_vjp(e, scene: A, u: A, s, w: A, corner: A, adjoint: A):
+    @traced
+    def forces_vjp(item, scene, u, s, w, corner, adjoint) -> None:
         """Corner products K w of the symmetric stiffness; adds the adjoint of the coefficients.
 
         The work of the forces on w is -V P(H) : dH, with dH the displacement gradient of w.
         """
-        B, volume = scene.gradients[e], scene.volumes[e]
-        H, dH = edges(e, scene, u, s) @ B, edges(e, scene, w, 0) @ B
-        dP, products = law.stress_differential_and_products(H, dH, coefficients_of(e, scene.coefficients))
-        store(e, corner, -volume * (dP @ B.transpose()))
-        adjoint.coefficients[e] -= volume * products
+        B, volume = gradients_of(item, scene.gradients), volume_of(item, scene.volumes)
+        H, dH = edges(item, scene, u, s) @ B, edges(item, scene, w, 0) @ B
+        dP, products = law.stress_differential_and_products(H, dH, coefficients_of(item, scene.coefficients))
+        store(item, corner, (dP * volume) @ B.transpose())
+        minus = let(ti.cast(-1, fp) * volume)
+        kind.add(adjoint.coefficients, K, item, [minus * product for product in products])
 
-    @ti.func
-    def shape_vjp(e, scene: A, u: A, s, w: A, adjoint: A):
+    @traced
+    def shape_vjp(item, scene, u, s, w, adjoint) -> None:
         """Adds the adjoints of grad N and V: the work is -V P(D B) : (W B)."""
-        B, p = scene.gradients[e], coefficients_of(e, scene.coefficients)
-        D, W = edges(e, scene, u, s), edges(e, scene, w, 0)
+        B, volume = gradients_of(item, scene.gradients), volume_of(item, scene.volumes)
+        p = coefficients_of(item, scene.coefficients)
+        D, W = edges(item, scene, u, s), edges(item, scene, w, 0)
         H, dH = D @ B, W @ B
-        P, dP = law.stress(H, p), law.stress_differential(H, dH, p)
-        adjoint.gradients[e] -= scene.volumes[e] * (D.transpose() @ dP + W.transpose() @ P)
-        adjoint.volumes[e] -= (P * dH).sum()
+        P, dP, minus = law.stress(H, p), law.stress_differential(H, dH, p), ti.cast(-1, fp)
+        kind.add(adjoint.gradients, 9, item, ((D.transpose() @ dP + W.transpose() @ P) * let(minus * volume)).numbers)
+        kind.add(adjoint.volumes, 1, item, [minus * inner(P, dH)])
 
+    block = ti.types.ndarray(ti.types.vector(LANES, fp), 1)
     types = SimpleNamespace(
-        fp=fp, vec3=vec3, scalars=ti.types.ndarray(fp, 1), scalars2=ti.types.ndarray(fp, 2),
-        vectors=ti.types.ndarray(vec3, 1), vectors2=ti.types.ndarray(vec3, 2), matrices=ti.types.ndarray(mat3, 1),
-        coefficients=ti.types.ndarray(coefficient, 1), ints=ti.types.ndarray(ti.i32, 1),
-        tets=ti.types.ndarray(ti.types.vector(4, ti.i32), 1),
+        fp=fp, vector=vector, blocks=block, scalars=ti.types.ndarray(fp, 1), scalars2=ti.types.ndarray(fp, 2),
+        vectors=ti.types.ndarray(vector, 1), vectors2=ti.types.ndarray(vector, 2), ints=ti.types.ndarray(ti.i32, 1),
     )  # fmt: skip
     return SimpleNamespace(
-        types=types, edges=edges, coefficients_of=coefficients_of, gather=gather, forces=forces, stiffness=stiffness,
-        forces_jvp=forces_jvp, forces_vjp=forces_vjp, shape_vjp=shape_vjp,
+        types=types, edges=edges, gradients_of=gradients_of, coefficients_of=coefficients_of, gather=gather,
+        forces=forces, stiffness=stiffness, forces_jvp=forces_jvp, forces_vjp=forces_vjp, shape_vjp=shape_vjp,
     )  # fmt: skip

@@ -6,6 +6,7 @@ import taichi as ti
 
 from diffsim_ti.materials.law import Law
 from diffsim_ti.materials.tensor import add_to_diagonal, cofactor_differential, inner, invariants
+from diffsim_ti.runtime import let, traced
 
 
 @dataclass(frozen=True)
@@ -41,61 +42,58 @@ class InvariantLaw(Law):
     def curvatures(self, j, s, q, p):
         """psi_jj, psi_js, psi_ss"""
 
-    @ti.func
+    @traced
     def second_invariant(self, H, i1):
-        """(q, G, N) with C = I + G, i1 = tr G: q = (i1^2 - |G|^2) / 2, N = i1 F - F G; zeros if the law has no II_C."""
-        q, G, N = 0 * i1, H, H
-        if ti.static(self.uses_q):
-            G = H + H.transpose() + H.transpose() @ H
-            q = self.real(0.5) * (i1 * i1 - inner(G, G))
-            N = add_to_diagonal(i1 * H - G - H @ G, i1)
-        return q, G, N
+        """(q, G, N) with C = I + G, i1 = tr G: q = (i1^2 - |G|^2) / 2, N = i1 F - F G; no II_C: zero, None."""
+        if not self.uses_q:
+            return let(0 * i1), None, None
+        G = H + H.transpose() + H.transpose() @ H
+        return let(self.real(0.5) * (i1 * i1 - inner(G, G))), G, add_to_diagonal(H * i1 - G - H @ G, i1)
 
-    @ti.func
+    @traced
     def energy_density(self, H, p):
         _, j, s = invariants(H)
-        q, _, _ = self.second_invariant(H, s + 2 * j)
+        q, _, _ = self.second_invariant(H, let(s + 2 * j))
         return self.psi(j, s, q, p)
 
-    @ti.func
+    @traced
     def stress(self, H, p):
         K, j, s = invariants(H)
-        q, _, N = self.second_invariant(H, s + 2 * j)
-        psi_j, psi_s, psi_q = self.slopes(j, s, q, p)
-        P = add_to_diagonal(2 * psi_s * H + (psi_j - 2 * psi_s) * K, psi_j)
-        if ti.static(self.uses_q):
-            P += 2 * psi_q * N
-        return P
+        q, _, N = self.second_invariant(H, let(s + 2 * j))
+        psi_j, psi_s, psi_q = map(let, self.slopes(j, s, q, p))
+        a = let(2 * psi_s)
+        P = add_to_diagonal(H * a + K * let(psi_j - a), psi_j)
+        return P + N * let(2 * psi_q) if self.uses_q else P
 
-    @ti.func
+    @traced
     def stress_differential_and_products(self, H, dH, p):
         K, j, s = invariants(H)
-        i1 = s + 2 * j
+        i1 = let(s + 2 * j)
         q, G, N = self.second_invariant(H, i1)
-        psi_j, psi_s, psi_q = self.slopes(j, s, q, p)
-        psi_jj, psi_js, psi_ss = self.curvatures(j, s, q, p)
+        psi_j, psi_s, psi_q = map(let, self.slopes(j, s, q, p))
+        psi_jj, psi_js, psi_ss = map(let, self.curvatures(j, s, q, p))
         F, KdH = add_to_diagonal(H, 1), inner(K, dH)
-        dj = dH.trace() + KdH
-        ds = 2 * (inner(H, dH) - KdH)
-        dq = 0 * dj
+        dj = let(dH.trace() + KdH)
+        ds = let(2 * (inner(H, dH) - KdH))
 
-        a = 2 * psi_s
-        dP = a * dH + (psi_j - a) * cofactor_differential(F, dH)
-        if ti.static(self.couples_s):
-            da = 2 * (psi_js * dj + psi_ss * ds)
-            dpsi_j = psi_jj * dj + psi_js * ds
-            dP += add_to_diagonal(da * H + (dpsi_j - da) * K, dpsi_j)
+        a = let(2 * psi_s)
+        dP = dH * a + cofactor_differential(F, dH) * let(psi_j - a)
+        if self.couples_s:
+            da = let(2 * (psi_js * dj + psi_ss * ds))
+            dpsi_j = let(psi_jj * dj + psi_js * ds)
+            dP = dP + add_to_diagonal(H * da + K * let(dpsi_j - da), dpsi_j)
         else:
-            dP += psi_jj * dj * add_to_diagonal(K, 1)
-        if ti.static(self.uses_q):
-            dq = 2 * inner(N, dH)
+            dP = dP + add_to_diagonal(K, 1) * let(psi_jj * dj)
+        dq = None
+        if self.uses_q:
+            dq = let(2 * inner(N, dH))
             dG = F.transpose() @ dH
-            dP += 2 * psi_q * ((ds + 2 * dj) * F + i1 * dH - dH @ G - F @ (dG + dG.transpose()))
+            change = F * let(ds + 2 * dj) + dH * i1 - dH @ G - F @ (dG + dG.transpose())
+            dP = dP + change * let(2 * psi_q)
 
-        products = self.unit(0)
-        for k in ti.static(range(len(self.coefficient_names))):
-            psi_j_k, psi_s_k, psi_q_k = self.slopes(j, s, q, self.unit(k))
-            products[k] = psi_j_k * dj + psi_s_k * ds
-            if ti.static(self.uses_q):
-                products[k] += psi_q_k * dq
+        products = []
+        for k in range(len(self.coefficient_names)):  # linear in p: the work of the stress for p = e_k
+            psi_j, psi_s, psi_q = self.slopes(j, s, q, self.unit(k))
+            work = psi_j * dj + psi_s * ds
+            products.append(let(work + psi_q * dq if self.uses_q else work))
         return dP, products

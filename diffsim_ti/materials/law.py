@@ -4,29 +4,30 @@ from dataclasses import dataclass
 
 import taichi as ti
 
-_FLOATS = {"f32": ti.f32, "f64": ti.f64}
+from diffsim_ti.runtime import PRECISIONS, traced
 
 
 @dataclass(frozen=True)
 class Law:
-    """A constitutive formula: Taichi functions of one displacement gradient H = grad u (F = I + H), shape 3x3.
+    """A constitutive formula: Taichi functions of one displacement gradient H = grad u (F = I + H), a `Tensor`.
 
-    `p` is a Taichi vector of the K coefficients [Pa] named by `coefficient_names`. Every law's energy is LINEAR in p, so
+    `p` is a list of the K coefficients [Pa] named by `coefficient_names`. Every law's energy is LINEAR in p, so
     that stress(H, e_k) is the derivative of the stress by coefficient k, and stress(H, dp) its change for a change dp.
     The differential is exact and symmetric, and indefinite where the energy is not convex.
 
     A law is compile-time data: constants only, equal laws share compiled kernels. precision: "f32" or "f64".
-    In its functions constants are integers, or `self.real(0.5)`, and no integer is divided or divides: Taichi computes a bare
-    0.5, x / 2 and 1 / x in f64, which makes f32 kernels slow.
+    In its functions constants are integers, or `self.real(0.5)`, and no integer is divided or divides: Taichi computes a
+    bare 0.5, x / 2 and 1 / x in f64, which makes f32 kernels slow. No unary minus on numbers: lanes have none.
     """
 
     precision: str
 
     coefficient_names = ()
+    lanes = True  # written with + - * / and max alone, so that a number may be a vector of lanes
 
     @property
     def fp(self):
-        return _FLOATS[self.precision]
+        return PRECISIONS[self.precision]
 
     @ti.func
     def real(self, x: ti.template()):
@@ -39,25 +40,25 @@ class Law:
 
     @ti.func
     def stress(self, H, p):
-        """First Piola-Kirchhoff stress P = dpsi/dF [Pa], 3x3."""
+        """First Piola-Kirchhoff stress P = dpsi/dF [Pa], a Tensor."""
 
     @ti.func
     def stress_differential_and_products(self, H, dH, p):
-        """(dP, products): dP = d2psi/dF2 : dH, 3x3, and dH : dP/dp_k, a vector of K, from the same scalars."""
+        """(dP, products): dP = d2psi/dF2 : dH, a Tensor, and dH : dP/dp_k, a list of K, from the same scalars."""
 
-    @ti.func
+    @traced
     def stress_differential(self, H, dH, p):
-        """dP = d2psi/dF2 : dH [Pa], 3x3."""
+        """dP = d2psi/dF2 : dH [Pa], a Tensor."""
         dP, _ = self.stress_differential_and_products(H, dH, p)
         return dP
 
-    @ti.func
+    @traced
     def coefficient_products(self, H, dH):
-        """dH : dP/dp_k, a vector of K; they do not depend on p."""
+        """dH : dP/dp_k, a list of K; they do not depend on p."""
         _, products = self.stress_differential_and_products(H, dH, self.unit(0))
         return products
 
-    @ti.func
-    def unit(self, k: ti.template()):
+    @traced
+    def unit(self, k: int) -> list:
         """Coefficients that are 1 at k and 0 elsewhere."""
-        return ti.Vector([self.real(int(i == k)) for i in range(len(self.coefficient_names))])
+        return [ti.cast(int(i == k), self.fp) for i in range(len(self.coefficient_names))]

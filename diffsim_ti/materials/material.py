@@ -98,7 +98,7 @@ class Material(ABC):
         for name, value in values.items():
             if not np.all(np.isfinite(value)):
                 bad = value[~np.isfinite(value)] if np.ndim(value) else value
-                raise ValueError(f"{name} must be finite, got {np.ravel(bad)[0]} ({np.size(bad)} of {np.size(value)} values)")
+                raise ValueError(f"{name} must be finite, got {np.ravel(bad)[0]} ({np.size(bad)} of {np.size(value)})")
         if "youngs_modulus" in values:
             check_range("youngs_modulus", values["youngs_modulus"], 0, np.inf, False, "a stiffness [Pa]")
             remedy = "0.5 is incompressible; take 0.45, or up to 0.49 with a fine mesh"

@@ -7,7 +7,7 @@ import numpy as np
 
 
 def lame(E, nu):
-    """(mu, lam) [Pa] from Young's modulus E [Pa] and Poisson's ratio nu [-]: E / (2 (1 + nu)), E nu / ((1 + nu)(1 - 2 nu))."""
+    """(mu, lam) [Pa] of Young's modulus E [Pa] and Poisson's ratio nu: E / (2 (1 + nu)), E nu / ((1 + nu)(1 - 2 nu))."""
     return E / (2 * (1 + nu)), E * nu / ((1 + nu) * (1 - 2 * nu))
 
 

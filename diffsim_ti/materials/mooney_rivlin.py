@@ -22,7 +22,8 @@ class MooneyRivlinLaw(InvariantLaw):
 
     @ti.func
     def psi(self, j, s, q, p):
-        return p[0] * (s + 2 * logarithm.value(j, self.floor(), self.fp)) + p[1] * (q + 2 * s) + self.real(0.5) * p[2] * j * j
+        log_part = logarithm.value(j, self.floor(), self.fp)
+        return p[0] * (s + 2 * log_part) + p[1] * (q + 2 * s) + self.real(0.5) * p[2] * j * j
 
     @ti.func
     def slopes(self, j, s, q, p):
@@ -53,13 +54,13 @@ class MooneyRivlin(Material):
     to_lame = np.array([[2.0, 2, 0], [0, 0, 1]])
 
     def __init__(self, *numbers, c01_share: float | None = None, J_floor: float = 0.01, **named):
+        self.c01_share = 0.2 if c01_share is None else float(c01_share)
+        if not 0 <= self.c01_share < 1:
+            raise ValueError(f"c01_share must lie in [0, 1), got {c01_share}: 0 is neo-Hookean, rubber has 0.1 to 0.3")
         super().__init__(*numbers, J_floor=J_floor, **named)
         own = self.inputs == self.spellings[-1]
         if own and c01_share is not None:
             raise ValueError("c01_share goes with E and nu or mu and lam; c10 and c01 already say it: leave it out")
-        self.c01_share = 0.2 if c01_share is None else float(c01_share)
-        if not 0 <= self.c01_share < 1:
-            raise ValueError(f"c01_share must lie in [0, 1), got {c01_share}: 0 is neo-Hookean, rubber has 0.1 to 0.3")
         self._extra = "" if own else f", c01_share={self.c01_share:g}"
 
     @property

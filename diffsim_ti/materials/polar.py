@@ -2,7 +2,7 @@
 
 import taichi as ti
 
-from diffsim_ti.materials.tensor import add_to_diagonal, cofactor, inner, invariants
+from diffsim_ti.materials.tensor import add_to_diagonal, cofactor, inner, invariants, tensor
 
 
 @ti.func
@@ -11,14 +11,14 @@ def polar(H, fp: ti.template()):
 
     f = tr S is the largest root of (f^2 - I_C)^2 = 4 II_C + 8 J f, and R = df/dF. Newton from above finds it, here in
     t = f - 3 so that nothing cancels near rest. For det F < 0 the sign sits on the smallest stretch.
-    Where two stretches nearly sum to zero (rank one, or mirrored) R is hardly determined; there a slower method takes over,
-    and R is one of those that fit.
-    Lin, Chen, Kim 2022, Isotropic ARAP energy using Cauchy-Green invariants, doi:10.1145/3550454.3555507.
+    Where the smaller two stretches nearly sum to zero (strongly drawn out, crushed, or mirrored) that loses digits and a slower
+    method takes over; where they do sum to zero, R is one of those that fit.
+    Lin, Chitalu, Komura 2022, Isotropic ARAP energy using Cauchy-Green invariants, doi:10.1145/3550454.3555507.
     """
     half = ti.cast(0.5, fp)
     K, j, s = invariants(H)
     i1 = s + 2 * j
-    G = H + H.transpose() + H.transpose() @ H
+    G = H + H.transpose() + H.transpose().dot(H)
     i2 = 2 * i1 + half * (i1 * i1 - inner(G, G))
     t = 3 * i1 / (3 + ti.sqrt(9 + 3 * i1))
     step, rounds = 3 + t, 0
@@ -29,35 +29,22 @@ def polar(H, fp: ti.template()):
         rounds += 1
     f, y = 3 + t, half * (t * (6 + t) - i1)
     D = (3 + y) * f - 1 - j  # (s1 + s2) (s2 + s3) (s3 + s1)
-    Q = add_to_diagonal((5 + y + i1) * H - G - H @ G + f * K, i1 + j - 2 * y - 2 * t - y * t) * (ti.cast(1, fp) / D)
-    if not D * 10 > f * f * f:  # also where D is NaN because the root is double
-        if not D * 1000 > f * f * f:
-            Q = dominant_rotation(H, fp)
-        Q = polished(H, Q, fp)
-    return add_to_diagonal(Q, 1), strain(H, Q, fp)
-
-
-@ti.func
-def strain(H, Q, fp: ti.template()):
-    """sym(R^T F) - I with R = I + Q."""
-    E = H + Q.transpose() + Q.transpose() @ H
-    return ti.cast(0.5, fp) * (E + E.transpose())
-
-
-@ti.func
-def polished(H, Q, fp: ti.template()):
-    """Q after one Newton step towards R^T R = I and R^T F symmetric."""
-    defect = Q + Q.transpose() + Q.transpose() @ Q
-    A = Q - ti.cast(0.5, fp) * (defect + Q @ defect)
-    W = spin(strain(H, A, fp), H + A.transpose() + A.transpose() @ H, fp)
-    return A + W + A @ W
+    direct = add_to_diagonal(H * (5 + y + i1) - G - H.dot(G) + K * f, i1 + j - 2 * y - 2 * t - y * t) * (ti.cast(1, fp) / D)
+    chosen = direct.matrix()
+    # rounding errors of R grow as (f^3 / D)^2, and as 1 / D because H = F - I; D is NaN where the root is double
+    if not D * 8 > f * f * f + 2:
+        chosen = dominant_rotation(H, fp)
+    Q = tensor(chosen)
+    E = H + Q.transpose() + Q.transpose().dot(H)
+    return add_to_diagonal(Q, 1), (E + E.transpose()) * half
 
 
 @ti.func
 def dominant_rotation(H, fp: ti.template()):
     """R - I for the rotation that maximises R : F: the dominant eigenvector of Davenport's 4x4 matrix is its quaternion.
 
-    Found by squaring the matrix, which copes with double eigenvalues (it then takes one of the eigenvectors).
+    Found by squaring the matrix, which copes with double eigenvalues (any of their vectors will do); 40 times
+    tell apart what differs by 1e-11.
     Horn 1987, Closed-form solution of absolute orientation using unit quaternions, doi:10.1364/JOSAA.4.000629.
     """
     F = add_to_diagonal(H, 1)
@@ -73,9 +60,13 @@ def dominant_rotation(H, fp: ti.template()):
         ]
     )
     A *= ti.cast(1, fp) / A.trace()
-    for _ in range(40):  # a gap of 1e-11 between the eigenvalues still tells them apart
+    rest, rounds = ti.cast(1, fp), 0  # rest: twice the share of the other eigenvalues
+    while rounds < 40 and rest > ti.cast(1e-9 if fp == ti.f64 else 1e-4, fp):
         A = A @ A
-        A *= ti.cast(1, fp) / A.trace()
+        trace = A.trace()
+        A *= ti.cast(1, fp) / trace
+        rest = 1 - trace
+        rounds += 1
     q, largest = ti.Vector([A[0, 0], A[1, 0], A[2, 0], A[3, 0]]), A[0, 0]
     for k in ti.static(range(1, 4)):
         if A[k, k] > largest:
@@ -98,13 +89,21 @@ def spin(eps, B, fp: ti.template()):
     No 1 / (difference of stretches) occurs. Where two stretches sum to zero (inverted or rank-one F only) R jumps and has
     no derivative; the matrix is shifted there, so that W is finite, though large.
     """
-    M = add_to_diagonal(-eps, 2 + eps.trace())
-    C = cofactor(M)
-    d = M[0, 0] * C[0, 0] + M[0, 1] * C[0, 1] + M[0, 2] * C[0, 2]
     shift = ti.cast(1e-12 if fp == ti.f64 else 1e-6, fp)
+    M = add_to_diagonal(eps * ti.cast(-1, fp), 2 + eps.trace())
+    d, extra = determinant(M, cofactor(M)), 0 * shift
     if d < shift:
-        M = add_to_diagonal(M, shift)
-        C = cofactor(M)
-        d = ti.max(M[0, 0] * C[0, 0] + M[0, 1] * C[0, 1] + M[0, 2] * C[0, 2], shift * shift * shift)
-    w = C @ ti.Vector([B[2, 1] - B[1, 2], B[0, 2] - B[2, 0], B[1, 0] - B[0, 1]]) * (ti.cast(1, fp) / d)
-    return ti.Matrix([[0 * d, -w[2], w[1]], [w[2], 0 * d, -w[0]], [-w[1], w[0], 0 * d]])
+        extra = shift
+    shifted = add_to_diagonal(M, extra)
+    C = cofactor(shifted)
+    d = determinant(shifted, C)
+    if extra > 0:
+        d = ti.max(d, shift * shift * shift)
+    w = C.matrix() @ ti.Vector([B[2, 1] - B[1, 2], B[0, 2] - B[2, 0], B[1, 0] - B[0, 1]]) * (ti.cast(1, fp) / d)
+    return tensor(ti.Matrix([[0 * d, -w[2], w[1]], [w[2], 0 * d, -w[0]], [-w[1], w[0], 0 * d]]))
+
+
+@ti.func
+def determinant(M, C):
+    """det M from its cofactors."""
+    return M[0, 0] * C[0, 0] + M[0, 1] * C[0, 1] + M[0, 2] * C[0, 2]

@@ -7,6 +7,7 @@ import taichi as ti
 from diffsim_ti.materials.law import Law
 from diffsim_ti.materials.polar import polar, spin
 from diffsim_ti.materials.tensor import add_to_diagonal, inner
+from diffsim_ti.runtime import let, traced
 
 
 @dataclass(frozen=True)
@@ -34,45 +35,45 @@ class StrainLaw(Law):
     def curvature(self, t, q, p):
         """psi_tt"""
 
-    @ti.func
-    def rotation_and_strain(self, H):
-        """(R, eps); without rotation R is H and not used."""
-        R, eps = H, self.real(0.5) * (H + H.transpose())
-        if ti.static(self.rotates):
-            R, eps = polar(H, self.fp)
-        return R, eps
+    @property
+    def lanes(self) -> bool:
+        return not self.rotates  # the polar rotation is found by a loop
 
-    @ti.func
+    @traced
+    def rotation_and_strain(self, H):
+        """(R, eps); R is None without rotation."""
+        if self.rotates:
+            return polar(H, self.fp)
+        return None, (H + H.transpose()) * self.real(0.5)
+
+    @traced
     def energy_density(self, H, p):
         _, eps = self.rotation_and_strain(H)
         return self.psi(eps.trace(), inner(eps, eps), p)
 
-    @ti.func
+    @traced
     def stress(self, H, p):
         R, eps = self.rotation_and_strain(H)
-        psi_t, psi_q = self.slopes(eps.trace(), inner(eps, eps), p)
-        P = add_to_diagonal(2 * psi_q * eps, psi_t)
-        if ti.static(self.rotates):
-            P = R @ P
-        return P
+        psi_t, psi_q = map(let, self.slopes(eps.trace(), inner(eps, eps), p))
+        P = add_to_diagonal(eps * let(2 * psi_q), psi_t)
+        return R @ P if self.rotates else P
 
-    @ti.func
+    @traced
     def stress_differential_and_products(self, H, dH, p):
         R, eps = self.rotation_and_strain(H)
         t, q = eps.trace(), inner(eps, eps)
-        psi_t, psi_q = self.slopes(t, q, p)
-        B = dH
-        if ti.static(self.rotates):
-            B = R.transpose() @ dH
-        dt, dq = B.trace(), 2 * inner(eps, B)
-        dpsi_t = self.curvature(t, q, p) * dt
-        dP = H
-        if ti.static(self.rotates):
-            dP = 2 * psi_q * dH + R @ add_to_diagonal((psi_t - 2 * psi_q) * spin(eps, B, self.fp), dpsi_t)
+        psi_t, psi_q = map(let, self.slopes(t, q, p))
+        B = R.transpose() @ dH if self.rotates else dH
+        dt, dq = B.trace(), let(2 * inner(eps, B))
+        dpsi_t = let(self.curvature(t, q, p) * dt)
+        if self.rotates:
+            W = spin(eps, B, self.fp)
+            dP = dH * let(2 * psi_q) + R @ add_to_diagonal(W * let(psi_t - 2 * psi_q), dpsi_t)
         else:
-            dP = add_to_diagonal(psi_q * (dH + dH.transpose()), dpsi_t)
-        products = self.unit(0)
-        for k in ti.static(range(len(self.coefficient_names))):
-            psi_t_k, psi_q_k = self.slopes(t, q, self.unit(k))
-            products[k] = psi_t_k * dt + psi_q_k * dq
+            dP = add_to_diagonal((dH + dH.transpose()) * psi_q, dpsi_t)
+
+        products = []
+        for k in range(len(self.coefficient_names)):  # linear in p: the work of the stress for p = e_k
+            psi_t, psi_q = self.slopes(t, q, self.unit(k))
+            products.append(let(psi_t * dt + psi_q * dq))
         return dP, products

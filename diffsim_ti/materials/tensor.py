@@ -1,47 +1,105 @@
-"""3x3 tensor algebra that the laws share. Cyclic indices spare every sign."""
+"""3x3 tensors of numbers, where a number is a Taichi scalar or a vector of lanes, and the algebra that the laws share.
+
+A kernel works on one tetrahedron with scalars, or on eight at a time with lanes; laws are written once for both.
+"""
 
 import taichi as ti
 
+from diffsim_ti.runtime import at, let, traced
 
-@ti.func
+
+@traced
+class Tensor:
+    """Nine numbers of the kernel that is being compiled; operators give new ones. Numbers multiply from the right."""
+
+    _data_oriented = True  # Taichi hands it on as it is
+
+    def __init__(self, numbers):
+        self.numbers = [let(x) for x in numbers]
+
+    def __getitem__(self, index):
+        return self.numbers[3 * index[0] + index[1]]
+
+    def __add__(self, other):
+        return Tensor(a + b for a, b in zip(self.numbers, other.numbers))
+
+    def __sub__(self, other):
+        return Tensor(a - b for a, b in zip(self.numbers, other.numbers))
+
+    def __mul__(self, number):
+        return Tensor(a * number for a in self.numbers)
+
+    def __matmul__(self, other):
+        return Tensor(sum_of(self[i, k] * other[k, j] for k in range(3)) for i in range(3) for j in range(3))
+
+    @traced
+    def dot(self, other):
+        """self @ other, for Taichi functions, where @ takes Taichi matrices only."""
+        return self @ other
+
+    @traced
+    def transpose(self):
+        return Tensor(self[j, i] for i in range(3) for j in range(3))
+
+    @traced
+    def trace(self):
+        return let(self[0, 0] + self[1, 1] + self[2, 2])
+
+    @traced
+    def matrix(self):
+        """As a Taichi matrix (scalars only)."""
+        return ti.Matrix([[self[i, j] for j in range(3)] for i in range(3)])
+
+
+def sum_of(terms):
+    """Sum from left to right, without a leading zero."""
+    first, *others = terms
+    for term in others:
+        first = first + term
+    return first
+
+
+@traced
+def tensor(matrix) -> Tensor:
+    """A Taichi matrix as a Tensor."""
+    return Tensor(at(matrix, i, j) for i in range(3) for j in range(3))
+
+
+@traced
 def inner(A, B):
     """A : B"""
-    return (A * B).sum()
+    return let(sum_of(a * b for a, b in zip(A.numbers, B.numbers)))
 
 
-@ti.func
-def cofactor(A):
+def _cyclic():
+    """(k, m, n, o) of the minor that belongs to entry (i, j); cyclic indices spare every sign."""
+    return (((i + 1) % 3, (i + 2) % 3, (j + 1) % 3, (j + 2) % 3) for i in range(3) for j in range(3))
+
+
+@traced
+def cofactor(A) -> Tensor:
     """cof A, so that A (cof A)^T = det(A) I; its trace is the sum of the principal 2x2 minors."""
-    C = A
-    for i, j in ti.static(ti.ndrange(3, 3)):
-        k, m, n, o = ti.static((i + 1) % 3, (i + 2) % 3, (j + 1) % 3, (j + 2) % 3)
-        C[i, j] = A[k, n] * A[m, o] - A[k, o] * A[m, n]
-    return C
+    return Tensor(A[k, n] * A[m, o] - A[k, o] * A[m, n] for k, m, n, o in _cyclic())
 
 
-@ti.func
-def cofactor_differential(A, dA):
+@traced
+def cofactor_differential(A, dA) -> Tensor:
     """d cof A for a change dA."""
-    C = A
-    for i, j in ti.static(ti.ndrange(3, 3)):
-        k, m, n, o = ti.static((i + 1) % 3, (i + 2) % 3, (j + 1) % 3, (j + 2) % 3)
-        C[i, j] = dA[k, n] * A[m, o] + A[k, n] * dA[m, o] - dA[k, o] * A[m, n] - A[k, o] * dA[m, n]
-    return C
+    return Tensor(
+        dA[k, n] * A[m, o] + A[k, n] * dA[m, o] - dA[k, o] * A[m, n] - A[k, o] * dA[m, n] for k, m, n, o in _cyclic()
+    )
 
 
-@ti.func
-def add_to_diagonal(A, x):
+@traced
+def add_to_diagonal(A, x) -> Tensor:
     """A + x I"""
-    B = A
-    for i in ti.static(range(3)):
-        B[i, i] += x
-    return B
+    return Tensor(A[i, j] + x if i == j else A[i, j] for i in range(3) for j in range(3))
 
 
-@ti.func
+@traced
 def invariants(H):
     """(K, j, s) of F = I + H without cancellation: K = cof F - I, j = det F - 1, s = |F|^2 - 3 - 2 j."""
     C, trace = cofactor(H), H.trace()
-    minors = C.trace() + H[0, 0] * C[0, 0] + H[0, 1] * C[0, 1] + H[0, 2] * C[0, 2]
+    minors = let(C.trace() + H[0, 0] * C[0, 0] + H[0, 1] * C[0, 1] + H[0, 2] * C[0, 2])
     K = add_to_diagonal(C - H.transpose(), trace)
-    return K, trace + minors, inner(H, H) - 2 * minors
+    return K, let(trace + minors), let(inner(H, H) - 2 * minors)

@@ -7,6 +7,7 @@ from diffsim_ti import runtime
 from diffsim_ti.inputs import Derived
 from diffsim_ti.solvers.kick_drift import Features
 from diffsim_ti.terms import Drag, ExternalForce, Gravity
+from diffsim_ti.tetrahedron import LANES
 
 
 def vertex_corners(tetrahedra: np.ndarray, num_vertices: int) -> tuple[np.ndarray, np.ndarray]:
@@ -23,19 +24,34 @@ def slots(indices: np.ndarray, num_vertices: int) -> np.ndarray:
     return out
 
 
+def to_blocks(per_tetrahedron: np.ndarray, num_blocks: int) -> np.ndarray:
+    """(num_tetrahedra, rows) as (num_blocks * rows, LANES), the last block filled up with tetrahedron 0."""
+    rows = per_tetrahedron.reshape(len(per_tetrahedron), -1)
+    fill = np.broadcast_to(rows[:1], (num_blocks * LANES - len(rows), rows.shape[1]))
+    blocks = np.concatenate([rows, fill]).reshape(num_blocks, LANES, -1)
+    return np.swapaxes(blocks, 1, 2).reshape(-1, LANES)
+
+
+def from_blocks(blocks: np.ndarray, num_tetrahedra: int, rows: int) -> np.ndarray:
+    """The inverse: (num_tetrahedra, rows) in float64."""
+    return np.swapaxes(blocks.reshape(-1, rows, LANES), 1, 2).reshape(-1, rows)[:num_tetrahedra].astype(np.float64)
+
+
 class SceneArrays:
     """What the kernels read of a scene: its topology, once, and the numbers derived from its inputs, per load."""
 
     def __init__(self, scene):
         mesh, precision = scene.mesh, scene.precision
         fp = runtime.PRECISIONS[precision]
-        self.fp, self.vec3, self.mat3 = fp, ti.types.vector(3, fp), ti.types.matrix(3, 3, fp)
+        self.fp, self.vector, self.lanes = fp, ti.types.vector(4, fp), ti.types.vector(LANES, fp)
         self.law = scene.material.law(precision)
-        self.coefficient = ti.types.vector(len(self.law.coefficient_names), fp)
+        self.num_coefficients, self.num_blocks = len(self.law.coefficient_names), -(-mesh.num_tetrahedra // LANES)
+        self.in_lanes = self.law.lanes and runtime.runs_on_cpu()
+        self.num_items = self.num_blocks if self.in_lanes else mesh.num_tetrahedra
         self.num_vertices, self.num_tetrahedra = mesh.num_vertices, mesh.num_tetrahedra
         self.contacts = tuple(t for t in scene.terms if t.acts_on_surface)
         self.fixed = scene.fixed
-        self.tets = runtime.upload(mesh.tetrahedra, ti.types.vector(4, ti.i32))
+        self.tets = runtime.upload(to_blocks(mesh.tetrahedra, self.num_blocks).ravel(), ti.i32)
         start, corner_of = vertex_corners(mesh.tetrahedra, mesh.num_vertices)
         self.start, self.corner_of = runtime.upload(start, ti.i32), runtime.upload(corner_of, ti.i32)
         none = runtime.array(ti.i32, 1)
@@ -59,7 +75,7 @@ class SceneArrays:
             forces=external is not None, motion=scene.motion is not None,
         )  # fmt: skip
         self.values: Derived | None = None
-        self.corner = runtime.array(self.vec3, 4 * mesh.num_tetrahedra)
+        self.corner = runtime.array(self.vector, 4 * LANES * self.num_blocks)
 
     def features(self, density: bool = False, shape: bool = False) -> Features:
         """What kernels must contain for the values that are loaded."""
@@ -76,22 +92,27 @@ class SceneArrays:
         inverse_mass = np.divide(1.0, values.mass, out=np.zeros_like(values.mass), where=values.mass > 0)
         inverse_mass[self.fixed] = 0
         sources = {
-            "gradients": (values.gradients, self.mat3), "volumes": (values.volumes, self.fp),
-            "coefficients": (np.atleast_2d(values.coefficients), self.coefficient),
+            "gradients": (to_blocks(values.gradients, self.num_blocks), self.lanes),
+            "volumes": (to_blocks(values.volumes, self.num_blocks), self.lanes),
+            "coefficients": (self.coefficient_blocks(values.coefficients), self.lanes),
             "inverse_mass": (inverse_mass, self.fp), "parameters": (values.parameters, self.fp),
-            "rest": (values.rest if self.contacts else np.zeros((1, 3)), self.vec3),
-            "forces": (np.zeros((1, 1, 3)) if values.forces is None else values.forces, self.vec3),
-            "motion": (np.zeros((1, 1, 3)) if values.motion is None else values.motion, self.vec3),
-            "anchor": (np.zeros((1, 3)) if values.motion is None else values.displacement[self.fixed], self.vec3),
+            "rest": (values.rest if self.contacts else np.zeros((1, 3)), self.vector),
+            "forces": (np.zeros((1, 1, 3)) if values.forces is None else values.forces, self.vector),
+            "motion": (np.zeros((1, 1, 3)) if values.motion is None else values.motion, self.vector),
+            "anchor": (np.zeros((1, 3)) if values.motion is None else values.displacement[self.fixed], self.vector),
         }  # fmt: skip
         for name, (data, dtype) in sources.items():
             current = getattr(self, name, None)
-            if current is None or runtime.full_shape(current) != data.shape:
+            if current is None or tuple(current.shape) != data.shape[: len(current.shape)]:
                 setattr(self, name, runtime.upload(data, dtype))
                 moved = True
             elif old is None or getattr(old, name, None) is not getattr(values, name, data):
                 runtime.fill(current, data)
         return moved
+
+    def coefficient_blocks(self, coefficients: np.ndarray) -> np.ndarray:
+        """Blocks of coefficients, shape (K,) or (num_tetrahedra, K); a single block serves all if they are uniform."""
+        return to_blocks(np.atleast_2d(coefficients), 1 if coefficients.ndim == 1 else self.num_blocks)
 
     def topology(self) -> tuple:
         """Arguments that every pass starts with."""
@@ -105,9 +126,9 @@ class History:
     def __init__(self, arrays: SceneArrays, num_slots: int, record: bool):
         n = arrays.num_vertices
         self.num_slots = num_slots
-        self.u = runtime.array(arrays.vec3, num_slots, n)
-        self.v = runtime.array(arrays.vec3, num_slots, n)
-        self.f = runtime.array(arrays.vec3, num_slots, n) if record else runtime.array(arrays.vec3, 1, 1)
+        self.u = runtime.array(arrays.vector, num_slots, n)
+        self.v = runtime.array(arrays.vector, num_slots, n)
+        self.f = runtime.array(arrays.vector, num_slots, n) if record else runtime.array(arrays.vector, 1, 1)
 
 
 @ti.kernel

@@ -55,7 +55,7 @@ class ExplicitWorkspace:
         self.parallel = solver.runs_parallel()
         self.state = History(self.arrays, 1, record=False)
         self.record: History | None = None
-        self.frames = (runtime.array(self.arrays.vec3, 1, 1), runtime.array(self.arrays.vec3, 1, 1))
+        self.frames = (runtime.array(self.arrays.vector, 1, 1), runtime.array(self.arrays.vector, 1, 1))
         self._launches = {}
         self.load(derived)
 
@@ -79,7 +79,7 @@ class ExplicitWorkspace:
 
     def make_frames(self, count: int) -> None:
         """Room for `count` saved states."""
-        self.frames = tuple(runtime.array(self.arrays.vec3, count, self.arrays.num_vertices) for _ in range(2))
+        self.frames = tuple(runtime.array(self.arrays.vector, count, self.arrays.num_vertices) for _ in range(2))
         self._launches.clear()
 
     def make_record(self, num_slots: int) -> History:
@@ -91,14 +91,14 @@ class ExplicitWorkspace:
 
     def _launch(self, name: str, kernel, *arrays) -> runtime.Launch:
         if name not in self._launches:
-            self._launches[name] = runtime.Launch(kernel, *arrays)
+            self._launches[name] = runtime.Launch(kernel, *arrays, vectorized=self.arrays.in_lanes)
         return self._launches[name]
 
     def advance(self, first: int, last: int, num_passes: int, save_every: int = 0, recording: bool = False) -> None:
         """Passes first .. last - 1 from the current state, or, recording, from slot 0 of the record."""
         a = self.arrays
         history = self.record if recording else self.state
-        kernels = kick_drift_kernels(a.law, a.features(), self.parallel)
+        kernels = kick_drift_kernels(a.law, a.features(), self.parallel, a.in_lanes)
         launch = self._launch(
             f"step {recording}", kernels.step, *a.topology(), a.force_slot, a.motion_slot, a.forces, a.motion, a.anchor,
             a.corner, history.u, history.v, history.f, *self.frames,
@@ -107,7 +107,7 @@ class ExplicitWorkspace:
         chunk = 1 if self.parallel else max(1, self.work_per_launch // a.num_tetrahedra)
         for start, count, w in self.solver.groups(first, last, num_passes, self.rate):
             for j in range(start, start + count, chunk):
-                launch(j, min(chunk, start + count - j), first, stride, substeps, save_every,
+                launch(a.num_items, a.num_vertices, j, min(chunk, start + count - j), first, stride, substeps, save_every,
                        w.lag0, w.lag1, w.pre, w.post, w.alpha, w.decay, inverse_dt)  # fmt: skip
 
     def first_bad_vertex(self) -> int | None:

@@ -4,7 +4,7 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.inputs import Derived
-from diffsim_ti.solvers.arrays import copy_slot
+from diffsim_ti.solvers.arrays import copy_slot, from_blocks, to_blocks
 from diffsim_ti.solvers.kick_drift import kick_drift_kernels
 
 
@@ -18,17 +18,17 @@ class ExplicitAdjoint:
         self.ws = workspace
         a = workspace.arrays
         self.features = a.features(density, shape)
-        self.kernels = kick_drift_kernels(a.law, self.features, workspace.parallel)
-        n, m = a.num_vertices, a.num_tetrahedra
-        self.u, self.v, self.w = (runtime.array(a.vec3, 1, n) for _ in range(3))
-        self.corner = runtime.array(a.vec3, 4 * m)
-        self.coefficients = runtime.array(a.coefficient, m)
+        self.kernels = kick_drift_kernels(a.law, self.features, workspace.parallel, a.in_lanes)
+        n, blocks = a.num_vertices, a.num_blocks
+        self.u, self.v, self.w = (runtime.array(a.vector, 1, n) for _ in range(3))
+        self.corner = runtime.array(a.vector, *a.corner.shape)
+        self.coefficients = runtime.array(a.lanes, a.num_coefficients * blocks)
         self.sums = runtime.array(a.fp, self.features.sums()["total"], n)
-        self.forces, self.motion = (runtime.array(a.vec3, *x.shape) for x in (a.forces, a.motion))
-        self.anchor = runtime.array(a.vec3, *a.anchor.shape)
-        self.gradients = runtime.array(a.mat3, m if shape else 1)
-        self.volumes = runtime.array(a.fp, m if shape else 1)
-        self.frames = tuple(runtime.array(a.vec3, *f.shape) for f in workspace.frames)
+        self.forces, self.motion = (runtime.array(a.vector, *x.shape) for x in (a.forces, a.motion))
+        self.anchor = runtime.array(a.vector, *a.anchor.shape)
+        self.gradients = runtime.array(a.lanes, 9 * blocks if shape else 1)
+        self.volumes = runtime.array(a.lanes, blocks if shape else 1)
+        self.frames = tuple(runtime.array(a.vector, *f.shape) for f in workspace.frames)
         self._launch = None
 
     def _sums(self) -> tuple:
@@ -61,14 +61,14 @@ class ExplicitAdjoint:
             end = start + count
             while end > start:
                 begin = max(start, end - chunk)
-                launch(begin, end - begin, base, num_passes, substeps, save_every, w.lag0, w.lag1, w.pre, w.post,
+                launch(a.num_items, a.num_vertices, begin, end - begin, base, num_passes, substeps, save_every, w.lag0, w.lag1, w.pre, w.post,
                        w.alpha, w.decay, inverse_dt, w.alpha_by_rate, w.decay_by_rate)  # fmt: skip
                 end = begin
 
     def finish(self) -> None:
         """Complete the adjoint of the start."""
         a = self.ws.arrays
-        self.ws._launch("finish", self.kernels.finish_vjp, a.start, a.corner_of, self.corner, self.u)()
+        self.ws._launch("finish", self.kernels.finish_vjp, a.start, a.corner_of, self.corner, self.u)(a.num_vertices)
 
     def norm(self) -> tuple[float, float]:
         """Euclidean norms of the adjoints of displacement and velocity where the sweep stands."""
@@ -85,7 +85,7 @@ class ExplicitAdjoint:
         rows = self.features.sums()
         sums = runtime.fetch(self.sums).astype(np.float64)
         out = values.zeros()
-        out.coefficients = runtime.fetch(self.coefficients).astype(np.float64)
+        out.coefficients = from_blocks(runtime.fetch(self.coefficients), a.num_tetrahedra, a.num_coefficients)
         out.displacement = runtime.fetch(self.u)[0].astype(np.float64)
         out.velocity = runtime.fetch(self.v)[0].astype(np.float64)
         if self.features.density:
@@ -100,8 +100,8 @@ class ExplicitAdjoint:
         out.rest = runtime.fetch(self.frames[0]).astype(np.float64).sum(0)
         if self.features.shape:
             out.rest += sums[rows["rest"] :][:3].T
-            out.gradients = runtime.fetch(self.gradients).astype(np.float64)
-            out.volumes = runtime.fetch(self.volumes).astype(np.float64)
+            out.gradients = from_blocks(runtime.fetch(self.gradients), a.num_tetrahedra, 9).reshape(-1, 3, 3)
+            out.volumes = from_blocks(runtime.fetch(self.volumes), a.num_tetrahedra, 1)[:, 0]
         if out.forces is not None:
             out.forces = runtime.fetch(self.forces).astype(np.float64)
         if out.motion is not None:
@@ -117,18 +117,19 @@ class ExplicitTangent:
         self.ws = workspace
         a = workspace.arrays
         self.features = a.features(density=True, shape=True)
-        self.kernels = kick_drift_kernels(a.law, self.features, workspace.parallel)
-        self.u = runtime.upload(dots.displacement[None], a.vec3)
-        self.v = runtime.upload(dots.velocity[None], a.vec3)
-        self.frames = tuple(runtime.array(a.vec3, *f.shape) for f in workspace.frames)
+        self.kernels = kick_drift_kernels(a.law, self.features, workspace.parallel, a.in_lanes)
+        self.u = runtime.upload(dots.displacement[None], a.vector)
+        self.v = runtime.upload(dots.velocity[None], a.vector)
+        self.frames = tuple(runtime.array(a.vector, *f.shape) for f in workspace.frames)
         motion = np.zeros((1, 1, 3)) if dots.motion is None else dots.motion
         anchor = np.zeros((1, 3)) if dots.motion is None else dots.displacement[a.fixed]
         self._dots = (
-            runtime.upload(np.atleast_2d(dots.coefficients), a.coefficient), runtime.upload(dots.mass, a.fp),
-            runtime.upload(dots.parameters, a.fp), runtime.upload(dots.rest, a.vec3),
-            runtime.upload(np.zeros((1, 1, 3)) if dots.forces is None else dots.forces, a.vec3),
-            runtime.upload(motion, a.vec3), runtime.upload(anchor, a.vec3), runtime.upload(dots.gradients, a.mat3),
-            runtime.upload(dots.volumes, a.fp),
+            runtime.upload(a.coefficient_blocks(dots.coefficients), a.lanes), runtime.upload(dots.mass, a.fp),
+            runtime.upload(dots.parameters, a.fp), runtime.upload(dots.rest, a.vector),
+            runtime.upload(np.zeros((1, 1, 3)) if dots.forces is None else dots.forces, a.vector),
+            runtime.upload(motion, a.vector), runtime.upload(anchor, a.vector), 
+            runtime.upload(to_blocks(dots.gradients, a.num_blocks), a.lanes),
+            runtime.upload(to_blocks(dots.volumes, a.num_blocks), a.lanes),
         )  # fmt: skip
         self._rate_dot = float(dots.parameters[self.features.drag]) if self.features.drag >= 0 else 0.0
         self._rest_dot = dots.rest
@@ -138,11 +139,11 @@ class ExplicitTangent:
         ws, a, history = self.ws, self.ws.arrays, self.ws.record
         launch = runtime.Launch(
             self.kernels.step_jvp, *a.topology(), a.force_slot, a.motion_slot, a.corner, history.u, history.v,
-            history.f, self.u, self.v, *self._dots, *self.frames,
+            history.f, self.u, self.v, *self._dots, *self.frames, vectorized=a.in_lanes,
         )  # fmt: skip
         for start, count, w in ws.solver.groups(first, last, num_passes, ws.rate):
             for j in range(start, start + count):
-                launch(j, first, ws.solver.substeps, save_every, w.lag0, w.lag1, w.pre, w.post, w.alpha, w.decay,
+                launch(a.num_items, a.num_vertices, j, first, ws.solver.substeps, save_every, w.lag0, w.lag1, w.pre, w.post, w.alpha, w.decay,
                        1 / ws.solver.dt, w.alpha_by_rate * self._rate_dot, w.decay_by_rate * self._rate_dot)  # fmt: skip
 
     def save_frame(self, frame: int) -> None:

@@ -53,11 +53,11 @@ class Features:
 
 
 @lru_cache(maxsize=None)
-def kick_drift_kernels(law, features: Features, parallel: bool) -> SimpleNamespace:
+def kick_drift_kernels(law, features: Features, parallel: bool, lanes: bool) -> SimpleNamespace:
     """Compiled passes for a law and a scene's features; `parallel`: one launch per pass, else one for many passes."""
-    el = element_functions(law, features.uniform)
+    el = element_functions(law, features.uniform, lanes)
     t = el.types
-    fp, vec3 = t.fp, t.vec3
+    fp, vector = t.fp, t.vector
     contacts, has_contacts = features.contacts, len(features.contacts) > 0
     row = features.sums()
 
@@ -68,7 +68,7 @@ def kick_drift_kernels(law, features: Features, parallel: bool) -> SimpleNamespa
     @ti.func
     def force_at(i, j, scene: A, forces: A, plan: A):
         """External force on vertex i in pass j: of the present step, or half of each of the two that share a kick."""
-        f = vec3(0)
+        f = vector(0)
         k = scene.force_slot[i]
         if k >= 0:
             f = forces[0, k]
@@ -79,7 +79,7 @@ def kick_drift_kernels(law, features: Features, parallel: bool) -> SimpleNamespa
     @ti.func
     def gravity(parameters: A):
         g = ti.static(features.gravity)
-        return vec3(parameters[g], parameters[g + 1], parameters[g + 2])
+        return vector(parameters[g], parameters[g + 1], parameters[g + 2], ti.cast(0, fp))
 
     @ti.func
     def moved(i, scene: A):
@@ -143,11 +143,11 @@ def kick_drift_kernels(law, features: Features, parallel: bool) -> SimpleNamespa
         state.v[t, i] = v_next
 
     @ti.kernel
-    def step(tets: t.tets, gradients: t.matrices, volumes: t.scalars, coefficients: t.coefficients, start: t.ints,
+    def step(tets: t.ints, gradients: t.blocks, volumes: t.blocks, coefficients: t.blocks, start: t.ints,
              corner_of: t.ints, inverse_mass: t.scalars, parameters: t.scalars, rest: t.vectors, surface: t.ints,
              force_slot: t.ints, motion_slot: t.ints, forces: t.vectors2, motion: t.vectors2, anchor: t.vectors,
              corner: t.vectors, u: t.vectors2, v: t.vectors2, f: t.vectors2, frames_u: t.vectors2, frames_v: t.vectors2,
-             first: ti.i32, count: ti.i32, base: ti.i32, stride: ti.i32, substeps: ti.i32, save_every: ti.i32,
+             num_items: ti.i32, num_vertices: ti.i32, first: ti.i32, count: ti.i32, base: ti.i32, stride: ti.i32, substeps: ti.i32, save_every: ti.i32,
              lag0: ti.i32, lag1: ti.i32, pre: fp, post: fp, alpha: fp, decay: fp, inverse_dt: fp):  # fmt: skip
         """`count` passes. Slot 0 holds the state before pass `base`; with stride 1 forces are recorded too."""
         scene = Bundle(tets=tets, gradients=gradients, volumes=volumes, coefficients=coefficients, start=start,
@@ -158,16 +158,16 @@ def kick_drift_kernels(law, features: Features, parallel: bool) -> SimpleNamespa
         plan = Bundle(base=base, stride=stride, substeps=substeps, save_every=save_every, lag0=lag0, lag1=lag1, pre=pre,
                       post=post, alpha=alpha, decay=decay, inverse_dt=inverse_dt)  # fmt: skip
         if ti.static(parallel):
-            for e in range(tets.shape[0]):
+            for e in range(num_items):
                 el.forces(e, scene, u, (first - base) * stride, corner)
-            for i in range(inverse_mass.shape[0]):
+            for i in range(num_vertices):
                 vertex(i, first, scene, state, plan)
         else:
             ti.loop_config(serialize=True)
             for j in range(first, first + count):
-                for e in range(tets.shape[0]):
+                for e in range(num_items):
                     el.forces(e, scene, u, (j - base) * stride, corner)
-                for i in range(inverse_mass.shape[0]):
+                for i in range(num_vertices):
                     vertex(i, j, scene, state, plan)
 
     # ---- its tangent ------------------------------------------------------------------------------------------------
@@ -182,9 +182,9 @@ def kick_drift_kernels(law, features: Features, parallel: bool) -> SimpleNamespa
                 for k in ti.static(range(len(contacts))):
                     X = scene.rest[i]
                     df += contacts[k].force_jvp(scene.parameters, X, u, v, du + dots.rest[i], dv)
-                    J = contacts[k].parameter_jacobian(scene.parameters, X, u, v)
+                    by = contacts[k].parameter_derivatives(scene.parameters, X, u, v)
                     for m in ti.static(range(contacts[k].size)):
-                        df += J[:, m] * dots.parameters[contacts[k].first + m]
+                        df += by[m] * dots.parameters[contacts[k].first + m]
         if ti.static(features.forces):
             df += force_at(i, j, scene, dots.forces, plan)
         inverse = scene.inverse_mass[i]
@@ -212,13 +212,13 @@ def kick_drift_kernels(law, features: Features, parallel: bool) -> SimpleNamespa
         dots.v[0, i] = dv_next
 
     @ti.kernel
-    def step_jvp(tets: t.tets, gradients: t.matrices, volumes: t.scalars, coefficients: t.coefficients, start: t.ints,
+    def step_jvp(tets: t.ints, gradients: t.blocks, volumes: t.blocks, coefficients: t.blocks, start: t.ints,
                  corner_of: t.ints, inverse_mass: t.scalars, parameters: t.scalars, rest: t.vectors, surface: t.ints,
                  force_slot: t.ints, motion_slot: t.ints, corner: t.vectors, u: t.vectors2, v: t.vectors2,
-                 f: t.vectors2, du: t.vectors2, dv: t.vectors2, coefficients_dot: t.coefficients, mass_dot: t.scalars,
+                 f: t.vectors2, du: t.vectors2, dv: t.vectors2, coefficients_dot: t.blocks, mass_dot: t.scalars,
                  parameters_dot: t.scalars, rest_dot: t.vectors, forces_dot: t.vectors2, motion_dot: t.vectors2,
-                 anchor_dot: t.vectors, gradients_dot: t.matrices, volumes_dot: t.scalars, frames_du: t.vectors2,
-                 frames_dv: t.vectors2, j: ti.i32, base: ti.i32, substeps: ti.i32, save_every: ti.i32, lag0: ti.i32,
+                 anchor_dot: t.vectors, gradients_dot: t.blocks, volumes_dot: t.blocks, frames_du: t.vectors2,
+                 frames_dv: t.vectors2, num_items: ti.i32, num_vertices: ti.i32, j: ti.i32, base: ti.i32, substeps: ti.i32, save_every: ti.i32, lag0: ti.i32,
                  lag1: ti.i32, pre: fp, post: fp, alpha: fp, decay: fp, inverse_dt: fp, alpha_dot: fp,
                  decay_dot: fp):  # fmt: skip
         """The tangent of pass j along recorded slots; du, dv are advanced in place."""
@@ -233,10 +233,10 @@ def kick_drift_kernels(law, features: Features, parallel: bool) -> SimpleNamespa
         plan = Bundle(base=base, substeps=substeps, save_every=save_every, lag0=lag0, lag1=lag1, pre=pre, post=post,
                       alpha=alpha, decay=decay, inverse_dt=inverse_dt)  # fmt: skip
         ti.loop_config(serialize=not parallel)
-        for e in range(tets.shape[0]):
+        for e in range(num_items):
             el.forces_jvp(e, scene, u, j - base, du, corner, dots)
         ti.loop_config(serialize=not parallel)
-        for i in range(inverse_mass.shape[0]):
+        for i in range(num_vertices):
             vertex_jvp(i, j, scene, state, dots, plan)
 
     # ---- its mirror -------------------------------------------------------------------------------------------------
@@ -254,17 +254,17 @@ def kick_drift_kernels(law, features: Features, parallel: bool) -> SimpleNamespa
         if ti.static(features.motion):
             if k >= 0 and plan.alpha > 0:
                 r = j // plan.substeps
-                adjoint.motion[r, k] += (1 - fraction(j, plan)) * p - plan.inverse_dt * q
-                adjoint.motion[r + 1, k] += fraction(j, plan) * p + plan.inverse_dt * q
-                adjoint.anchor[k] += p
-                p, q = vec3(0), vec3(0)
+                adjoint.motion[r, k] = adjoint.motion[r, k] + (1 - fraction(j, plan)) * p - plan.inverse_dt * q
+                adjoint.motion[r + 1, k] = adjoint.motion[r + 1, k] + fraction(j, plan) * p + plan.inverse_dt * q
+                adjoint.anchor[k] = adjoint.anchor[k] + p
+                p, q = vector(0), vector(0)
         # drift and damping
         v_plus_adj = plan.alpha * p + plan.decay * q
         if k >= 0:
             v_plus_adj = q
         if ti.static(features.drag >= 0):
             v_plus = state.v[t, i] / plan.decay
-            adjoint.sums[row["drag"], i] += plan.alpha_by_rate * p.dot(v_plus) + plan.decay_by_rate * q.dot(v_plus)
+            adjoint.sums[row["drag"], i] = adjoint.sums[row["drag"], i] + (plan.alpha_by_rate * p.dot(v_plus) + plan.decay_by_rate * q.dot(v_plus))
         # kick, frame, kick
         v_mid_adj = v_plus_adj
         if is_saved(j, plan):
@@ -275,31 +275,33 @@ def kick_drift_kernels(law, features: Features, parallel: bool) -> SimpleNamespa
         inverse = scene.inverse_mass[i]
         f_adj, q = inverse * a_adj, v_mid_adj
         if ti.static(features.density):
-            adjoint.sums[row["mass"], i] -= inverse * f_adj.dot(state.f[s, i])
+            adjoint.sums[row["mass"], i] = adjoint.sums[row["mass"], i] - (inverse * f_adj.dot(state.f[s, i]))
         if ti.static(features.gravity >= 0):
             if inverse > 0:
                 for d in ti.static(range(3)):
-                    adjoint.sums[row["gravity"] + d, i] += a_adj[d]
+                    adjoint.sums[row["gravity"] + d, i] = adjoint.sums[row["gravity"] + d, i] + (a_adj[d])
         if ti.static(features.forces):
             slot = scene.force_slot[i]
             if slot >= 0:
                 if ti.static(features.forces_per_step):
-                    adjoint.forces[(j - plan.lag0) // plan.substeps, slot] += half() * f_adj
-                    adjoint.forces[(j - plan.lag1) // plan.substeps, slot] += half() * f_adj
+                    r0, r1 = (j - plan.lag0) // plan.substeps, (j - plan.lag1) // plan.substeps
+                    adjoint.forces[r0, slot] = adjoint.forces[r0, slot] + half() * f_adj
+                    adjoint.forces[r1, slot] = adjoint.forces[r1, slot] + half() * f_adj
                 else:
-                    adjoint.forces[0, slot] += f_adj
+                    adjoint.forces[0, slot] = adjoint.forces[0, slot] + f_adj
         if ti.static(has_contacts):
             if scene.surface[i] > 0:
                 for c in ti.static(range(len(contacts))):
                     by_u, by_v = contacts[c].force_vjp(scene.parameters, scene.rest[i], u, v, f_adj)
                     p += by_u
                     q += by_v
-                    J = contacts[c].parameter_jacobian(scene.parameters, scene.rest[i], u, v)
+                    by = contacts[c].parameter_derivatives(scene.parameters, scene.rest[i], u, v)
                     for m in ti.static(range(contacts[c].size)):
-                        adjoint.sums[row["contacts"] + contacts[c].first - contacts[0].first + m, i] += J[:, m].dot(f_adj)
+                        at = ti.static(row["contacts"] + contacts[c].first - contacts[0].first + m)
+                        adjoint.sums[at, i] = adjoint.sums[at, i] + (by[m].dot(f_adj))
                     if ti.static(features.shape):
                         for d in ti.static(range(3)):
-                            adjoint.sums[row["rest"] + d, i] += by_u[d]
+                            adjoint.sums[row["rest"] + d, i] = adjoint.sums[row["rest"] + d, i] + (by_u[d])
         adjoint.u[0, i] = p
         adjoint.v[0, i] = q
         adjoint.w[0, i] = f_adj
@@ -311,13 +313,13 @@ def kick_drift_kernels(law, features: Features, parallel: bool) -> SimpleNamespa
             el.shape_vjp(e, scene, state.u, j - plan.base, adjoint.w, adjoint)
 
     @ti.kernel
-    def step_vjp(tets: t.tets, gradients: t.matrices, volumes: t.scalars, coefficients: t.coefficients, start: t.ints,
+    def step_vjp(tets: t.ints, gradients: t.blocks, volumes: t.blocks, coefficients: t.blocks, start: t.ints,
                  corner_of: t.ints, inverse_mass: t.scalars, parameters: t.scalars, rest: t.vectors, surface: t.ints,
                  force_slot: t.ints, motion_slot: t.ints, corner: t.vectors, u: t.vectors2, v: t.vectors2,
-                 f: t.vectors2, u_adj: t.vectors2, v_adj: t.vectors2, w: t.vectors2, coefficients_adj: t.coefficients,
+                 f: t.vectors2, u_adj: t.vectors2, v_adj: t.vectors2, w: t.vectors2, coefficients_adj: t.blocks,
                  sums: t.scalars2, forces_adj: t.vectors2, motion_adj: t.vectors2, anchor_adj: t.vectors,
-                 gradients_adj: t.matrices, volumes_adj: t.scalars, frames_u_adj: t.vectors2, frames_v_adj: t.vectors2,
-                 first: ti.i32, count: ti.i32, base: ti.i32, end: ti.i32, substeps: ti.i32, save_every: ti.i32,
+                 gradients_adj: t.blocks, volumes_adj: t.blocks, frames_u_adj: t.vectors2, frames_v_adj: t.vectors2,
+                 num_items: ti.i32, num_vertices: ti.i32, first: ti.i32, count: ti.i32, base: ti.i32, end: ti.i32, substeps: ti.i32, save_every: ti.i32,
                  lag0: ti.i32, lag1: ti.i32, pre: fp, post: fp, alpha: fp, decay: fp, inverse_dt: fp,
                  alpha_by_rate: fp, decay_by_rate: fp):  # fmt: skip
         """The mirror of passes first + count - 1 .. first; `end` is the run's number of passes.
@@ -335,24 +337,24 @@ def kick_drift_kernels(law, features: Features, parallel: bool) -> SimpleNamespa
                       post=post, alpha=alpha, decay=decay, inverse_dt=inverse_dt, alpha_by_rate=alpha_by_rate,
                       decay_by_rate=decay_by_rate)  # fmt: skip
         if ti.static(parallel):
-            for i in range(inverse_mass.shape[0]):
+            for i in range(num_vertices):
                 vertex_vjp(i, first, scene, state, adjoint, plan)
-            for e in range(tets.shape[0]):
+            for e in range(num_items):
                 tetrahedron_vjp(e, first, scene, state, adjoint, plan)
         else:
             ti.loop_config(serialize=True)
             for k in range(count):
-                for i in range(inverse_mass.shape[0]):
+                for i in range(num_vertices):
                     vertex_vjp(i, first + count - 1 - k, scene, state, adjoint, plan)
-                for e in range(tets.shape[0]):
+                for e in range(num_items):
                     tetrahedron_vjp(e, first + count - 1 - k, scene, state, adjoint, plan)
 
     @ti.kernel
-    def finish_vjp(start: t.ints, corner_of: t.ints, corner: t.vectors, u_adj: t.vectors2):
+    def finish_vjp(start: t.ints, corner_of: t.ints, corner: t.vectors, u_adj: t.vectors2, num_vertices: ti.i32):
         """Add the gather that the first pass of the run has left."""
         scene = Bundle(start=start, corner_of=corner_of)
         ti.loop_config(serialize=not parallel)
-        for i in range(start.shape[0] - 1):
-            u_adj[0, i] += el.gather(i, scene, corner)
+        for i in range(num_vertices):
+            u_adj[0, i] = u_adj[0, i] + el.gather(i, scene, corner)
 
     return SimpleNamespace(step=step, step_jvp=step_jvp, step_vjp=step_vjp, finish_vjp=finish_vjp)

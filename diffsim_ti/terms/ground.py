@@ -81,11 +81,11 @@ class GroundForce(VertexForce):
         return self.force_jvp(parameters, X, u, v, w, w), 0 * w
 
     @ti.func
-    def parameter_jacobian(self, parameters: ti.template(), X, u, v):
+    def parameter_derivatives(self, parameters: ti.template(), X, u, v):
         s, stiffness, width = self.scaled(parameters, X, u)
         slope, curvature = barrier.slope(s, self.fp), barrier.curvature(s, self.fp)
-        J = 0 * u.outer_product(u)
-        J[1, 0] = stiffness * curvature
-        J[1, 1] = -width * slope
-        J[1, 2] = -stiffness * (slope - s * curvature)
-        return J
+        by_height, by_stiffness, by_width = 0 * u, 0 * u, 0 * u
+        by_height.y = stiffness * curvature
+        by_stiffness.y = -width * slope
+        by_width.y = -stiffness * (slope - s * curvature)
+        return by_height, by_stiffness, by_width

@@ -49,7 +49,7 @@ def _short(value: np.ndarray) -> str:
 class VertexForce(ABC):
     """Compile-time twin of a term: Taichi functions of one vertex, at rest position X, displacement u, velocity v.
 
-    Equal twins share compiled kernels. `size` numbers start at `first` in the parameter array.
+    Vectors have four components, the last zero. Equal twins share compiled kernels. `size` numbers start at `first` in the parameter array.
     """
 
     precision: str
@@ -77,5 +77,5 @@ class VertexForce(ABC):
         """(adjoint of u, adjoint of v) for the adjoint w of the force."""
 
     @ti.func
-    def parameter_jacobian(self, parameters: ti.template(), X, u, v):
-        """Derivative of the force by the term's own numbers, 3 x size."""
+    def parameter_derivatives(self, parameters: ti.template(), X, u, v):
+        """Derivatives of the force by the term's own numbers: a tuple of `size` vectors."""

@@ -1,0 +1,5 @@
+"""`python -m diffsim_ti` is `diffsim-ti`."""
+
+from diffsim_ti.cli import main
+
+main()

@@ -1,0 +1,233 @@
+"""A run written as a series of frames that ParaView opens: one .vtu per frame and a .pvd that lists them with their times.
+
+`ForwardRun` advances a scene frame by frame with a step that follows the state; `Series` writes.
+"""
+
+import os
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+
+from diffsim_ti.mesh import TetrahedralMesh
+
+
+class Series:
+    """Writes `folder`/`name`.pvd and `name`_0000.vtu, `name`_0001.vtu, ...; each frame is readable once it is written.
+
+    The .pvd is replaced at one stroke after each frame, so an interrupted run leaves a valid series. Frames that an
+    earlier series of that name left in the folder are removed first. Raises OSError if the folder cannot be written.
+    """
+
+    def __init__(self, folder, mesh: TetrahedralMesh, name: str = "frames"):
+        self.folder, self.mesh, self.name = Path(folder), mesh, name
+        self.path = self.folder / f"{name}.pvd"
+        self.files: list[Path] = []
+        self._times: list[float] = []
+        self.folder.mkdir(parents=True, exist_ok=True)
+        for old in frames_of(self.path) if self.path.exists() else []:
+            if old[1].parent == self.folder and old[1].stem.startswith(f"{name}_"):
+                old[1].unlink(missing_ok=True)
+        self._write_list()
+
+    def write(self, time: float, positions, displacements, velocities, fields) -> Path:
+        """Append a frame at `time` [s].
+
+        positions, displacements [m] and velocities [m/s]: shape (num_vertices, 3). fields: TetrahedronFields, written as
+        von_mises [Pa], energy_density [J/m^3] and J [-] per tetrahedron, in the precision of `displacements`.
+        """
+        import meshio
+
+        displacements = np.asarray(displacements)
+        dtype = displacements.dtype if displacements.dtype == np.float32 else np.float64
+        path = self.folder / f"{self.name}_{len(self.files):04d}.vtu"
+        frame = meshio.Mesh(
+            np.asarray(positions, np.float64),
+            [("tetra", self.mesh.tetrahedra)],
+            point_data={"displacement": displacements.astype(dtype), "velocity": np.asarray(velocities, dtype)},
+            cell_data={
+                name: [np.asarray(getattr(fields, name), dtype)] for name in ("von_mises", "energy_density", "J")
+            },
+        )
+        frame.write(path, file_format="vtu", binary=True)
+        self.files.append(path)
+        self._times.append(float(time))
+        self._write_list()
+        return path
+
+    def _write_list(self) -> None:
+        root = ElementTree.Element("VTKFile", type="Collection", version="0.1", byte_order="LittleEndian")
+        listed = ElementTree.SubElement(root, "Collection")
+        for time, path in zip(self._times, self.files):
+            ElementTree.SubElement(listed, "DataSet", timestep=f"{time:.9g}", group="", part="0", file=path.name)
+        ElementTree.indent(root)
+        draft = self.path.with_suffix(f".pvd.{os.getpid()}")
+        try:
+            ElementTree.ElementTree(root).write(draft, encoding="utf-8", xml_declaration=True)
+            os.replace(draft, self.path)
+        finally:
+            draft.unlink(missing_ok=True)
+
+
+def frames_of(path) -> list[tuple[float, Path]]:
+    """(time [s], file) of every frame that a .pvd lists. Raises ValueError if it is no such file."""
+    path = Path(path)
+    try:
+        rows = ElementTree.parse(path).getroot().iter("DataSet")
+        return [(float(row.attrib["timestep"]), path.parent / row.attrib["file"]) for row in rows]
+    except (ElementTree.ParseError, KeyError, ValueError) as error:
+        raise ValueError(f"{path} is not a ParaView series (.pvd): {error}; remove it or choose another folder") from error
+
+
+
+@dataclass
+class Seen:
+    """The extremes of a run: smallest J, smallest gap [m], most vertices below the floor at once, substeps, retries."""
+
+    J: float = np.inf
+    gap: float = np.inf
+    inverted: int = 0
+    crossed: int = 0
+    substeps: list[int] = field(default_factory=list)  # per frame
+    retries: list[str] = field(default_factory=list)
+    seconds: float = 0.0
+
+
+class ForwardRun:
+    """Frames of equal length; the substeps of each follow the stable step of the state, unless `dt` is given.
+
+    A frame that diverges, outgrows its step or gains energy is run again from its start with twice the substeps, and
+    that is counted. With dt nothing is chosen and nothing repeated: what goes wrong is an error.
+    """
+
+    share, looks, attempts = 0.8, 8, 7  # of the stable step; per frame; per frame
+
+    def __init__(self, scene, solver_class, frame_time: float, dt: float | None = None, **options):
+        from diffsim_ti.simulator import Simulator
+        from diffsim_ti.solvers.arrays import History
+        from diffsim_ti.terms import Gravity, Ground
+
+        self.scene, self.ground, self.seen, self.adapts = scene, scene.term(Ground), Seen(), dt is None
+        gravity = scene.term(Gravity)
+        self._pull = float(np.linalg.norm(gravity.values["gravity"])) if gravity else 0.0
+        if dt is None:
+            solver = solver_class(scene, dt=frame_time / self.looks, allow_unstable=True, **options)
+            solver.allow_unstable = False  # each frame's substeps come first; the guard watches all the same
+        else:
+            if not dt > 0:
+                raise ValueError(f"--dt must be > 0 [s], got {dt:g}")
+            steps = max(1, round(frame_time / dt))
+            self.looks = min(self.looks, steps)
+            steps = -(-steps // self.looks)
+            solver = solver_class(scene, dt=steps * dt, substeps=steps, **options)
+        self.simulator = Simulator(solver)
+        self.frame_time = self.looks * solver.dt
+        ws = self.simulator.workspace
+        self._start = History(ws.arrays, 1, record=False)
+        ws.save(self._start, 0)
+        ws.advance(0, 1, solver.num_passes(1))  # compiles
+        ws.restore(self._start, 0)
+        self._limit = self._stable_dt()
+        self.energies = [self.simulator.compute_energy()]
+        self.largest_energy = self._moving(self.energies[0])
+
+    def advance(self) -> None:
+        """One frame. Raises FloatingPointError if no number of substeps tried keeps it stable."""
+        sim, begin = self.simulator, time.perf_counter()
+        first, substeps = sim.step_count, self._choose_substeps() if self.adapts else sim.solver.substeps
+        sim.workspace.save(self._start, 0)
+        for attempt in range(self.attempts):
+            sim.set_substeps(substeps)
+            try:
+                notes, why = self._try_frame(), None
+            except FloatingPointError as error:
+                if not self.adapts:
+                    raise
+                why = str(error)
+            why = why or (self._complaint() if self.adapts else None)
+            if why is None:
+                break
+            self.seen.retries.append(f"t = {first * sim.solver.dt:.4g} s, {self.looks * substeps} substeps: {why}")
+            sim.workspace.restore(self._start, 0)
+            sim.step_count = first
+            substeps *= 2
+        else:
+            raise FloatingPointError(
+                f"the frame at t = {sim.time:.4g} s fails with {self.looks * substeps // 2} substeps and fewer ({why}); "
+                "lower the impact or the load, raise the stiffness, or add --drag; frames before it are written"
+            )
+        for J, inverted, gap, crossed in notes:
+            seen = self.seen
+            seen.J, seen.gap = min(seen.J, J), min(seen.gap, gap)
+            seen.inverted, seen.crossed = max(seen.inverted, inverted), max(seen.crossed, crossed)
+        self.seen.substeps.append(self.looks * substeps)
+        self.energies.append(sim.compute_energy())
+        self.largest_energy = max(self.largest_energy, self._moving(self.energies[-1]))
+        self.seen.seconds += time.perf_counter() - begin
+
+    def _try_frame(self) -> list[tuple]:
+        notes = []
+        for _ in range(self.looks):
+            self.simulator.step()
+            J, gap = self.simulator.tetrahedron_fields().J, np.full(1, np.inf)
+            if self.ground:
+                gap = self.ground.gap(self.simulator.positions[self.scene.mesh.surface_vertices])
+            notes.append((float(J.min()), int((J <= 0).sum()), float(gap.min()), int((gap < 0).sum())))
+        return notes
+
+    def _complaint(self) -> str | None:
+        """Why the frame that was just run cannot be trusted, or None; keeps the stable step for the next one."""
+        energy, h = self.simulator.compute_energy(), self.simulator.solver.substep
+        scale = max(self.largest_energy, self._moving(energy))
+        if self.scene.motion is None and energy - self.energies[-1] > 0.05 * scale:
+            return f"the energy rose by {energy - self.energies[-1]:.3g} J"
+        try:
+            self._limit = self._stable_dt()
+        except RuntimeError as error:
+            return f"no stable step was found at the end ({error})"
+        return f"the substep {h:.3g} s outgrew the stable step {self._limit:.3g} s" if h > self._limit else None
+
+    def _stable_dt(self) -> float:
+        from diffsim_ti.stability import lanczos_limit
+
+        return lanczos_limit(self.simulator.workspace, 1e-2).dt if self.adapts else np.inf
+
+    def _choose_substeps(self) -> int:
+        dt = self.simulator.solver.dt
+        fewest = dt / (self.share * self._limit)
+        if self.ground:  # a vertex shall not cross the barrier in a few substeps
+            speed = np.linalg.norm(self.simulator.velocities, axis=1).max() + self._pull * self.frame_time
+            fewest = max(fewest, 10 * speed * dt / float(self.ground.values["barrier_width"]))
+        return max(1, int(np.ceil(fewest)))
+
+    @staticmethod
+    def _moving(energy) -> float:
+        return sum(value for name, value in energy.parts.items() if name != "gravity")
+
+
+def run_and_write(run: ForwardRun, frames: int, folder: Path, name: str, keep=()) -> tuple[float, list[str], list]:
+    """Run `frames` frames into a series.
+
+    Returns seconds of writing, file names, and (time, positions, velocities, von Mises stress) of the frames in `keep`.
+    """
+    from diffsim_ti.cli import progress
+
+    sim, kept, writing = run.simulator, [], 0.0
+    series = Series(folder, run.scene.mesh, name)
+    with progress("simulating", frames) as show:
+        for k in range(frames + 1):
+            try:
+                if k:
+                    run.advance()
+                begin = time.perf_counter()
+                series.write(sim.time, sim.positions, sim.displacements, sim.velocities, sim.tetrahedron_fields())
+                writing += time.perf_counter() - begin
+            except KeyboardInterrupt:
+                said = f"interrupted at t = {sim.time:.4g} s; {len(series.files)} frames are in {series.path}"
+                raise KeyboardInterrupt(said) from None
+            if k in keep:
+                kept.append((sim.time, sim.positions, sim.velocities, sim.tetrahedron_fields().von_mises))
+            show(k, f"t = {sim.time:.3f} s")
+    return writing, [f"{series.path} and {len(series.files)} .vtu frames"], kept

@@ -1,0 +1,93 @@
+"""Speed on a common piece of work: nanoseconds per tetrahedron and substep, forward and with gradients.
+
+The unit cube in Kuhn tetrahedra (6 per cell), Smith neo-Hookean, E = 1e5 Pa, nu = 0.4, 1000 kg/m^3, start stretched by 1 %,
+gravity, drag that keeps 0.999 of the velocity per substep, symplectic Euler, 20 substeps of 2.5e-4 s, float32; the loss is
+the sum of squared final positions, the gradients are by both Lame parameters of every tetrahedron and by the start.
+
+    python examples/benchmark.py --common [--json] [--sizes 6 11 21] [--precision f32] [--repeats 20]
+    python examples/benchmark.py --growth          # cost per tetrahedron from 6 000 to 1 000 000 tetrahedra
+"""
+
+import argparse
+import json
+import math
+import time
+
+import numpy as np
+
+import diffsim_ti as ds
+
+SUBSTEPS, H = 20, 2.5e-4
+
+
+def best_seconds(function, repeats: int) -> float:
+    """Best wall time of several calls [s]."""
+    best = math.inf
+    for _ in range(repeats):
+        start = time.perf_counter()
+        function()
+        best = min(best, time.perf_counter() - start)
+    return best
+
+
+def common_rollout(resolution: int, precision: str, per_tetrahedron: bool = True) -> ds.Rollout:
+    """The common work on a cube with `resolution` vertices a side."""
+    mesh = ds.TetrahedralMesh.create_cube(resolution)
+    m = mesh.num_tetrahedra if per_tetrahedron else ()
+    E, nu = 1e5, 0.4
+    material = ds.SmithNeoHookean(mu=np.full(m, E / (2 * (1 + nu))), lam=np.full(m, E * nu / ((1 + nu) * (1 - 2 * nu))))
+    scene = ds.Scene(
+        mesh, material, density=1000.0, terms=[ds.Gravity(-9.8), ds.Drag(-math.log(0.999) / H)],
+        initial_positions=mesh.vertices * 1.01, precision=precision,
+    )  # fmt: skip
+    # the common step is within the stable one at these sizes; --growth goes beyond, where only time is looked at
+    solver = ds.SemiImplicitSolver(scene, dt=SUBSTEPS * H, substeps=SUBSTEPS, allow_unstable=resolution > 31)
+    return ds.Rollout(solver, 1, gradients=["mu", "lam", "initial_positions"])
+
+
+def measure(resolution: int, precision: str, repeats: int) -> dict:
+    """One row of the table, with the keys `who, tets, forward_ns, forward_backward_ns, compile_s`."""
+    rollout = common_rollout(resolution, precision)
+
+    def forward_backward():
+        frames = rollout.forward()
+        adjoint = np.zeros_like(frames.positions)
+        adjoint[-1] = 2 * frames.positions[-1]
+        return rollout.vjp(frames, adjoint)
+
+    start = time.perf_counter()
+    rollout.forward()
+    compile_forward = time.perf_counter() - start
+    forward_backward()
+    compile_s = time.perf_counter() - start
+    scale = 1e9 / (SUBSTEPS * rollout.scene.mesh.num_tetrahedra)
+    return {
+        "who": "diffsim_ti", "tets": rollout.scene.mesh.num_tetrahedra,
+        "forward_ns": round(best_seconds(rollout.forward, repeats) * scale, 1),
+        "forward_backward_ns": round(best_seconds(forward_backward, repeats) * scale, 1),
+        "compile_s": round(compile_s, 2), "compile_forward_s": round(compile_forward, 2), "precision": precision,
+    }  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--common", action="store_true", help="the common work (default)")
+    parser.add_argument("--growth", action="store_true", help="6 000 to 1 000 000 tetrahedra")
+    parser.add_argument("--json", action="store_true", help="one JSON line per size")
+    parser.add_argument("--sizes", type=int, nargs="+", default=[6, 11, 21], help="vertices a side")
+    parser.add_argument("--precision", default="f32", choices=["f32", "f64"])
+    parser.add_argument("--arch", default="cpu")
+    parser.add_argument("--repeats", type=int, default=20)
+    options = parser.parse_args()
+    ds.init(options.arch, options.precision)
+    sizes = [11, 21, 31, 45, 56] if options.growth else options.sizes
+    for resolution in sizes:
+        row = measure(resolution, options.precision, max(3, options.repeats if resolution <= 21 else options.repeats // 4))
+        if options.json:
+            print(json.dumps(row), flush=True)
+        else:
+            print("  ".join(f"{key} {value}" for key, value in row.items()), flush=True)
+
+
+if __name__ == "__main__":
+    main()
