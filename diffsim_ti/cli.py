@@ -63,7 +63,7 @@ def _fail(message: str, code: int = 2) -> int:
 
 @contextmanager
 def progress(title: str, total: int):
-    """Yields a function to call with what is done; shows on stderr after two seconds, in plain lines if that is no terminal."""
+    """Yields a function to tell what is done; shows it on stderr after two seconds, as lines if that is no terminal."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -122,7 +122,8 @@ def fixed_vertices(mesh, names: list[str]) -> np.ndarray | None:
     for name in names:
         if name in SIDES and name not in mesh.vertex_sets:
             (d, end), box = SIDES[name], mesh.bounding_box
-            chosen.append(np.flatnonzero(np.abs(mesh.vertices[:, d] - box[int(end == "max"), d]) <= 0.01 * np.ptp(box, 0).max()))
+            off = np.abs(mesh.vertices[:, d] - box[int(end == "max"), d])
+            chosen.append(np.flatnonzero(off <= 0.01 * np.ptp(box, 0).max()))
         else:
             chosen.append(mesh.vertex_indices(name))
     return np.unique(np.concatenate(chosen)) if chosen else None
@@ -130,7 +131,7 @@ def fixed_vertices(mesh, names: list[str]) -> np.ndarray | None:
 
 def make_ground(mesh, material, density: float, gravity: float, speed: float, stiffness: float | None = None,
                 width: float | None = None):  # fmt: skip
-    """The floor y = 0 for a body that meets it at `speed` [m/s]: width 1 % of the size, stiffness from the impact's pressure.
+    """The floor y = 0 for a body that meets it at `speed` [m/s]: width 1 % of the size, stiffness from the impact.
 
     A front that is stopped feels p = rho c v (c the speed of pressure waves), to which come rho v^2 and the weight of the
     column above, rho g H. A vertex of mean surface area A shall carry p A at half the width: k = p A / (1.19 w). A vertex
@@ -161,23 +162,30 @@ def print_summary(run, setup: float, writing: float, files: list[str]) -> None:
     sim, seen = run.simulator, run.seen
     substeps, m = sum(seen.substeps), run.scene.mesh.num_tetrahedra
     table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
+    names = iter(("mesh", "material", "", "solver"))
     for line in sim.describe().splitlines():
-        table.add_row(*line.split(": ", 1) if ": " in line[:16] else ("", line))
-    low, high = (sim.solver.dt * run.looks / n for n in (max(seen.substeps), min(seen.substeps)))
-    table.add_row("simulated", f"{sim.time:.4g} s in {len(seen.substeps)} frames, {substeps} substeps of {low:.3g} to {high:.3g} s")
-    table.add_row("retries", "; ".join(seen.retries[-3:]) if seen.retries else "none")
-    if len(seen.retries) > 3:
-        table.add_row("", f"{len(seen.retries)} in all, the last three shown")
+        table.add_row(*line.split(": ", 1) if line.startswith(("terms", "fixed", "built")) else (next(names, ""), line))
+    table.add_row("simulated", f"{sim.time:.4g} s in {len(seen.substeps)} frames")
+    counts = f"{substeps}, from {min(seen.substeps)} to {max(seen.substeps)} a frame"
+    table.add_row("substeps", f"{counts}, {seen.shortest:.3g} to {seen.longest:.3g} s each")
+    parts = f"{len(seen.retries)}, of parts of {sim.solver.dt:.3g} s, again with half the substep; the last:"
+    table.add_row("retries", parts if seen.retries else "none")
+    for retry in seen.retries[-3:]:
+        table.add_row("", retry if len(retry) < 130 else retry[:127] + "...")
     table.add_row("wall time", f"compile and setup {setup:.2f} s, stepping {seen.seconds:.2f} s, writing {writing:.2f} s")
-    table.add_row("speed", f"{substeps / seen.seconds:.0f} substeps/s, {seen.seconds / substeps / m * 1e9:.1f} ns per tetrahedron and substep")
+    each = seen.seconds / substeps
+    table.add_row("speed", f"{1 / each:.0f} substeps/s, {each / m * 1e9:.1f} ns per tetrahedron and substep")
     for name, energy in (("energy at start", run.energies[0]), ("energy at end", run.energies[-1])):
         table.add_row(name, f"{energy:.6g} J: " + ", ".join(f"{k} {v:.4g}" for k, v in energy.parts.items()))
-    drift, scale = run.energies[-1] - run.energies[0], max(run.largest_energy, 1e-300)
-    table.add_row("energy drift", f"{drift:+.3g} J, {drift / scale:+.2%} of the largest kinetic + elastic + contact energy")
-    table.add_row("smallest J", f"{seen.J:.4g}" + (f", {seen.inverted} tetrahedra inside-out at once" if seen.inverted else ""))
+    drift = run.energies[-1] - run.energies[0]
+    share = drift / max(run.largest_energy, 1e-300)
+    table.add_row("energy drift", f"{drift:+.3g} J, {share:+.2%} of the largest kinetic + elastic + contact energy")
+    inverted = f", {seen.inverted} tetrahedra inside-out at once" if seen.inverted else ""
+    table.add_row("smallest J", f"{seen.J:.4g}{inverted}")
     if run.ground:
-        crossed = f"; {seen.crossed} vertices crossed the floor, by up to {-seen.gap:.3g} m" if seen.crossed else "; none crossed"
-        table.add_row("smallest gap", f"{seen.gap:.4g} m of width {float(run.ground.values['barrier_width']):.3g} m{crossed}")
+        width = float(run.ground.values["barrier_width"])
+        crossed = f"{seen.crossed} vertices crossed, by up to {-seen.gap:.3g} m" if seen.crossed else "none crossed"
+        table.add_row("smallest gap", f"{seen.gap:.4g} m, barrier {width:.3g} m wide; {crossed}")
     for k, name in enumerate(files):
         table.add_row("" if k else "files", name)
     console = Console()
@@ -344,5 +352,6 @@ def print_gradient(scene, seconds: float = 0.05, change: float = 1e-3) -> None:
     gradient = float(rollout.vjp(frames, positions=by_positions)["youngs_modulus"])
     heights = [rollout.forward(youngs_modulus=E * (1 + s * change)).positions[-1, :, 1].mean() for s in (1, -1)]
     difference = (heights[0] - heights[1]) / (2 * change * E)
-    print(f"mean height {seconds:g} s after the middle picture: {frames.positions[-1, :, 1].mean():.6f} m ({steps} steps, f64)")
+    height = frames.positions[-1, :, 1].mean()
+    print(f"mean height {seconds:g} s after the middle picture: {height:.6f} m ({steps} steps, f64)")
     print(f"its gradient by Young's modulus: {gradient:.6e} m/Pa; central difference {difference:.6e} m/Pa")

@@ -33,12 +33,16 @@ class Guard:
         self.ws.save(self.good, 0)
         self.good_pass = now
 
-    def advance(self, first: int, last: int, num_passes: int, save_every: int = 0) -> None:
-        """Passes first .. last - 1, looked after."""
+    def advance(self, first: int, last: int, num_passes: int, save_every: int = 0, recording: bool = False) -> None:
+        """Passes first .. last - 1, looked after; recording, slot j of the record holds the state before pass j."""
         while first < last:
             stop = min(last, first + self.every)
             self.mark(first)
-            self.ws.advance(first, stop, num_passes, save_every)
+            if recording:
+                self.ws.save(self.ws.record, first)
+            self.ws.advance(first, stop, num_passes, save_every, 0 if recording else None)
+            if recording:
+                self.ws.restore(self.ws.record, stop)
             if self.ws.first_bad_vertex() is not None:
                 self._diagnose(stop, num_passes)
             self._passes += stop - first

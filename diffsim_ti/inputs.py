@@ -49,7 +49,7 @@ class Inputs:
     """
 
     def __init__(self, scene, density, initial_positions, initial_velocities):
-        self.scene, self.mesh = scene, scene.mesh
+        self.scene, self.mesh, self._rest = scene, scene.mesh, None
         n = self.mesh.num_vertices
         velocities = np.zeros(3) if initial_velocities is None else initial_velocities
         values = {
@@ -112,11 +112,7 @@ class Inputs:
     def derive(self, values: dict) -> Derived:
         """What kernels read."""
         X = values["rest_positions"]
-        tets = self.mesh.tetrahedra
-        if X is self.mesh.vertices or np.array_equal(X, self.mesh.vertices):
-            gradients, volumes = self._rest_of_mesh()
-        else:
-            gradients, volumes = rest_shape(X, tets)
+        gradients, volumes = self._rest_of(X)
         displacement = values["initial_positions"] - X
         velocity = np.array(values["initial_velocities"])
         velocity[self.scene.fixed] = 0
@@ -135,8 +131,11 @@ class Inputs:
             values.get("prescribed_motion"),
         )  # fmt: skip
 
-    def _rest_of_mesh(self):
-        if not hasattr(self, "_rest"):
+    def _rest_of(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Rows grad N_1..3 and volumes at X; those of the mesh itself are kept."""
+        if X is not self.values["rest_positions"] and not np.array_equal(X, self.mesh.vertices):
+            return rest_shape(X, self.mesh.tetrahedra)
+        if self._rest is None:
             self._rest = rest_shape(self.mesh.vertices, self.mesh.tetrahedra)
         return self._rest
 
@@ -174,17 +173,18 @@ class Inputs:
             out.motion = np.array(dots["prescribed_motion"])
         return out
 
-    def derive_vjp(self, values: dict, adj: Derived) -> dict:
-        """Adjoints of the inputs for adjoints of what kernels read; coefficients come per tetrahedron."""
-        base = self.derive(values)
-        B, V, tets, material = base.gradients, base.volumes, self.mesh.tetrahedra, self.scene.material
-        out = {"initial_positions": adj.displacement}
-        velocity = np.array(adj.velocity)
-        velocity[self.scene.fixed] = 0
-        out["initial_velocities"] = velocity
-        out |= material.coefficients_vjp({name: values[name] for name in material.inputs}, adj.coefficients)
-        mass = adj.mass[tets].sum(1) / 4
-        out["density"] = V * mass if values["density"].ndim else np.asarray((V * mass).sum())
+    def derive_vjp(self, values: dict, adj: Derived, wanted) -> dict:
+        """Adjoints of the wanted inputs for adjoints of what kernels read; coefficients come per tetrahedron."""
+        B, V = self._rest_of(values["rest_positions"])
+        tets, material, out = self.mesh.tetrahedra, self.scene.material, {"initial_positions": adj.displacement}
+        if "initial_velocities" in wanted:
+            out["initial_velocities"] = np.array(adj.velocity)
+            out["initial_velocities"][self.scene.fixed] = 0
+        if any(name in wanted for name in material.inputs):
+            out |= material.coefficients_vjp({name: values[name] for name in material.inputs}, adj.coefficients)
+        if "density" in wanted or "rest_positions" in wanted:
+            mass = adj.mass[tets].sum(1) / 4
+            out["density"] = V * mass if values["density"].ndim else (V * mass).sum()
         for term, names, at in self._term_inputs:
             for name in names.values():
                 if isinstance(term, ExternalForce):
@@ -193,15 +193,15 @@ class Inputs:
                     size = values[name].size
                     out[name] = adj.parameters[at : at + size].reshape(values[name].shape)
                     at += size
-        if base.motion is not None:
+        if adj.motion is not None:
             out["prescribed_motion"] = adj.motion
-        volumes = adj.volumes + values["density"] * mass
-        Bt = np.swapaxes(B, 1, 2)
-        D_adj = -Bt @ adj.gradients @ Bt + (V * volumes)[:, None, None] * Bt
-        corners = np.swapaxes(D_adj, 1, 2)  # one row per edge, the derivative by X_a - X_0
-        X_adj = adj.rest - adj.displacement
-        np.add.at(X_adj, tets[:, 1:].ravel(), corners.reshape(-1, 3))
-        np.add.at(X_adj, tets[:, 0], -corners.sum(1))
-        out["rest_positions"] = X_adj
-        order = [*self.values, *(name for name in out if name not in self.values)]
-        return {name: np.asarray(out[name]) for name in order}
+        if "rest_positions" in wanted:
+            Bt = np.swapaxes(B, 1, 2)
+            volumes = adj.volumes + values["density"] * mass
+            D_adj = -Bt @ adj.gradients @ Bt + (V * volumes)[:, None, None] * Bt
+            corners = np.swapaxes(D_adj, 1, 2)  # one row per edge, the derivative by X_a - X_0
+            X_adj = adj.rest - adj.displacement
+            np.add.at(X_adj, tets[:, 1:].ravel(), corners.reshape(-1, 3))
+            np.add.at(X_adj, tets[:, 0], -corners.sum(1))
+            out["rest_positions"] = X_adj
+        return {name: np.asarray(out[name]) for name in wanted}

@@ -13,6 +13,7 @@ LIGHT = np.array([-0.45, 1.0, 0.55]) / np.linalg.norm([-0.45, 1.0, 0.55])
 PLAIN = np.array([0.33, 0.55, 0.80])
 SKY, HORIZON, FLOOR, LINE = (np.array(c) for c in ([0.99] * 3, [0.93, 0.945, 0.96], [0.965] * 3, [0.80, 0.82, 0.85]))
 FIELD_OF_VIEW = np.radians(28.0)
+CENTER = 0.46  # of the width: the body stands left of the colour bar
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,7 @@ class Camera:
         axes = np.stack([right, np.cross(back, right), back])
         center = (points.min(0) + points.max(0)) / 2
         x, y, z = axes @ (points - center).T
-        half = np.tan(FIELD_OF_VIEW / 2) * np.array([size[0] / size[1], 1.0]) * 0.82
+        half = np.tan(FIELD_OF_VIEW / 2) * np.array([size[0] / size[1] * 0.76, 0.82])
         distance = max(np.max(np.abs(x) / half[0] + z), np.max(np.abs(y) / half[1] + z))
         focal = size[1] / 2 / np.tan(FIELD_OF_VIEW / 2)
         return cls(center + back * max(distance, 1e-12), axes, focal, size)
@@ -42,12 +43,13 @@ class Camera:
         """Pixel column, row and depth [m] of points, shape (n, 3)."""
         x, y, z = self.axes @ (points - self.eye).T
         depth = np.maximum(-z, 1e-12)
-        return np.stack([self.size[0] / 2 + self.focal * x / depth, self.size[1] / 2 - self.focal * y / depth, depth], 1)
+        scale = self.focal / depth
+        return np.stack([self.size[0] * CENTER + scale * x, self.size[1] / 2 - scale * y, depth], 1)
 
     def rays(self, pixel: np.ndarray) -> np.ndarray:
         """Unit direction of the ray through each pixel (counted by rows), shape (n, 3)."""
         row, column = np.divmod(pixel, self.size[0])
-        x, y = column + 0.5 - self.size[0] / 2, self.size[1] / 2 - row - 0.5
+        x, y = column + 0.5 - self.size[0] * CENTER, self.size[1] / 2 - row - 0.5
         rays = np.stack([x, y, np.full(x.shape, -self.focal)], 1) @ self.axes
         return rays / np.sqrt(np.einsum("pd,pd->p", rays, rays))[:, None]
 
@@ -239,7 +241,7 @@ def save_picture(path, mesh, positions, values=None, label: str = "", ground: fl
         bar.ax.tick_params(labelsize=11, color="#333333", labelcolor="#333333")
         bar.ax.yaxis.set_ticks_position("left")
         bar.formatter.set_powerlimits((-3, 4))
-        figure.text(0.945, 0.775, label, ha="right", **text)
+        figure.text(0.95, 0.795, label, ha="right", **text)
     if title:
         figure.text(0.025, 0.955, title, va="top", **text)
     figure.savefig(path, dpi=100)

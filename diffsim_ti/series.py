@@ -60,8 +60,8 @@ class Series:
     def _write_list(self) -> None:
         root = ElementTree.Element("VTKFile", type="Collection", version="0.1", byte_order="LittleEndian")
         listed = ElementTree.SubElement(root, "Collection")
-        for time, path in zip(self._times, self.files):
-            ElementTree.SubElement(listed, "DataSet", timestep=f"{time:.9g}", group="", part="0", file=path.name)
+        for at, path in zip(self._times, self.files):
+            ElementTree.SubElement(listed, "DataSet", timestep=f"{at:.9g}", group="", part="0", file=path.name)
         ElementTree.indent(root)
         draft = self.path.with_suffix(f".pvd.{os.getpid()}")
         try:
@@ -84,7 +84,7 @@ def frames_of(path) -> list[tuple[float, Path]]:
 
 @dataclass
 class Seen:
-    """The extremes of a run: smallest J, smallest gap [m], most vertices below the floor at once, substeps, retries."""
+    """The extremes of a run: smallest J and gap [m], most tetrahedra inside-out and vertices below the floor at once."""
 
     J: float = np.inf
     gap: float = np.inf
@@ -92,17 +92,20 @@ class Seen:
     crossed: int = 0
     substeps: list[int] = field(default_factory=list)  # per frame
     retries: list[str] = field(default_factory=list)
+    shortest: float = np.inf  # substep [s]
+    longest: float = 0.0
     seconds: float = 0.0
 
 
 class ForwardRun:
     """Frames of equal length; the substeps of each follow the stable step of the state, unless `dt` is given.
 
-    A frame that diverges, outgrows its step or gains energy is run again from its start with twice the substeps, and
-    that is counted. With dt nothing is chosen and nothing repeated: what goes wrong is an error.
+    A frame has eight parts, after each of which the state is looked at. One that diverges, outgrows its step or gains
+    energy is run again from its start with twice the substeps, and that is counted. With dt nothing is chosen and
+    nothing repeated: what goes wrong is an error.
     """
 
-    share, looks, attempts = 0.8, 8, 7  # of the stable step; per frame; per frame
+    share, parts, attempts = 0.8, 8, 8  # of the stable step; per frame; per part
 
     def __init__(self, scene, solver_class, frame_time: float, dt: float | None = None, **options):
         from diffsim_ti.simulator import Simulator
@@ -113,81 +116,89 @@ class ForwardRun:
         gravity = scene.term(Gravity)
         self._pull = float(np.linalg.norm(gravity.values["gravity"])) if gravity else 0.0
         if dt is None:
-            solver = solver_class(scene, dt=frame_time / self.looks, allow_unstable=True, **options)
+            solver = solver_class(scene, dt=frame_time / self.parts, allow_unstable=True, **options)
             solver.allow_unstable = False  # each frame's substeps come first; the guard watches all the same
         else:
             if not dt > 0:
                 raise ValueError(f"--dt must be > 0 [s], got {dt:g}")
             steps = max(1, round(frame_time / dt))
-            self.looks = min(self.looks, steps)
-            steps = -(-steps // self.looks)
+            self.parts = min(self.parts, steps)
+            steps = -(-steps // self.parts)
             solver = solver_class(scene, dt=steps * dt, substeps=steps, **options)
         self.simulator = Simulator(solver)
-        self.frame_time = self.looks * solver.dt
+        self.frame_time = self.parts * solver.dt
         ws = self.simulator.workspace
         self._start = History(ws.arrays, 1, record=False)
         ws.save(self._start, 0)
         ws.advance(0, 1, solver.num_passes(1))  # compiles
         ws.restore(self._start, 0)
         self._limit = self._stable_dt()
-        self.energies = [self.simulator.compute_energy()]
-        self.largest_energy = self._moving(self.energies[0])
+        self._energy, self._refined = self.simulator.compute_energy(), 0
+        self.energies, self.largest_energy = [self._energy], self._moving(self._energy)
 
     def advance(self) -> None:
         """One frame. Raises FloatingPointError if no number of substeps tried keeps it stable."""
-        sim, begin = self.simulator, time.perf_counter()
-        first, substeps = sim.step_count, self._choose_substeps() if self.adapts else sim.solver.substeps
+        begin = time.perf_counter()
+        self.seen.substeps.append(0)
+        for part in range(self.parts):
+            if self.adapts:
+                self._advance_part(last=part == self.parts - 1)
+            else:
+                self.simulator.step()
+            self._look()
+        self.energies.append(self._energy)
+        self.seen.seconds += time.perf_counter() - begin
+
+    def _advance_part(self, last: bool) -> None:
+        sim, first = self.simulator, self.simulator.step_count
+        substeps = max(self._choose_substeps(), self._refined // 2)
         sim.workspace.save(self._start, 0)
-        for attempt in range(self.attempts):
+        for tried in range(self.attempts):
             sim.set_substeps(substeps)
             try:
-                notes, why = self._try_frame(), None
+                sim.step()
+                why = self._complaint(last)
             except FloatingPointError as error:
-                if not self.adapts:
-                    raise
                 why = str(error)
-            why = why or (self._complaint() if self.adapts else None)
             if why is None:
-                break
-            self.seen.retries.append(f"t = {first * sim.solver.dt:.4g} s, {self.looks * substeps} substeps: {why}")
+                self._refined = substeps if tried else self._refined // 2
+                return
+            self.seen.retries.append(f"t = {first * sim.solver.dt:.4g} s, substep {sim.solver.substep:.3g} s: {why}")
             sim.workspace.restore(self._start, 0)
             sim.step_count = first
             substeps *= 2
-        else:
-            raise FloatingPointError(
-                f"the frame at t = {sim.time:.4g} s fails with {self.looks * substeps // 2} substeps and fewer ({why}); "
-                "lower the impact or the load, raise the stiffness, or add --drag; frames before it are written"
-            )
-        for J, inverted, gap, crossed in notes:
-            seen = self.seen
-            seen.J, seen.gap = min(seen.J, J), min(seen.gap, gap)
-            seen.inverted, seen.crossed = max(seen.inverted, inverted), max(seen.crossed, crossed)
-        self.seen.substeps.append(self.looks * substeps)
-        self.energies.append(sim.compute_energy())
-        self.largest_energy = max(self.largest_energy, self._moving(self.energies[-1]))
-        self.seen.seconds += time.perf_counter() - begin
+        raise FloatingPointError(
+            f"t = {sim.time:.4g} s: unstable even with a substep of {sim.solver.substep:.3g} s ({why}); lower the impact or "
+            "the load, raise the stiffness, or add --drag; the frames before are written"
+        )
 
-    def _try_frame(self) -> list[tuple]:
-        notes = []
-        for _ in range(self.looks):
-            self.simulator.step()
-            J, gap = self.simulator.tetrahedron_fields().J, np.full(1, np.inf)
-            if self.ground:
-                gap = self.ground.gap(self.simulator.positions[self.scene.mesh.surface_vertices])
-            notes.append((float(J.min()), int((J <= 0).sum()), float(gap.min()), int((gap < 0).sum())))
-        return notes
+    def _look(self) -> None:
+        """Note the extremes of the present state."""
+        sim, seen = self.simulator, self.seen
+        J = sim.tetrahedron_fields().J
+        seen.J, seen.inverted = min(seen.J, float(J.min())), max(seen.inverted, int((J <= 0).sum()))
+        if self.ground:
+            gap = self.ground.gap(sim.positions[self.scene.mesh.surface_vertices])
+            seen.gap, seen.crossed = min(seen.gap, float(gap.min())), max(seen.crossed, int((gap < 0).sum()))
+        seen.substeps[-1] += sim.solver.substeps
+        seen.shortest = min(seen.shortest, sim.solver.substep)
+        seen.longest = max(seen.longest, sim.solver.substep)
+        self._energy = sim.compute_energy()
+        self.largest_energy = max(self.largest_energy, self._moving(self._energy))
 
-    def _complaint(self) -> str | None:
-        """Why the frame that was just run cannot be trusted, or None; keeps the stable step for the next one."""
+    def _complaint(self, last: bool) -> str | None:
+        """Why the part that was just run cannot be trusted, or None; `last`: find the stable step for the next frame."""
         energy, h = self.simulator.compute_energy(), self.simulator.solver.substep
-        scale = max(self.largest_energy, self._moving(energy))
-        if self.scene.motion is None and energy - self.energies[-1] > 0.05 * scale:
-            return f"the energy rose by {energy - self.energies[-1]:.3g} J"
+        rise = energy - self._energy
+        if self.scene.motion is None and not rise <= 0.02 * max(self.largest_energy, self._moving(energy)):
+            return f"the energy rose by {rise:.3g} J"
+        if not last:
+            return None
         try:
             self._limit = self._stable_dt()
         except RuntimeError as error:
             return f"no stable step was found at the end ({error})"
-        return f"the substep {h:.3g} s outgrew the stable step {self._limit:.3g} s" if h > self._limit else None
+        return f"the stable step fell to {self._limit:.3g} s" if h > self._limit else None
 
     def _stable_dt(self) -> float:
         from diffsim_ti.stability import lanczos_limit

@@ -1,9 +1,12 @@
-"""One Taichi runtime for the whole session."""
+"""One Taichi runtime for the whole session; DIFFSIM_TI_ARCH names another backend (tests/test_vulkan.py uses it)."""
+
+import os
 
 import pytest
-import taichi as ti
+
+import diffsim_ti
 
 
 @pytest.fixture(scope="session", autouse=True)
 def taichi():
-    ti.init(arch=ti.cpu, default_fp=ti.f64, fast_math=False, offline_cache=True, log_level=ti.ERROR)
+    diffsim_ti.init(os.environ.get("DIFFSIM_TI_ARCH", "cpu"), precision="f64")

@@ -1,4 +1,4 @@
-"""Exact first and second derivatives by hyper-dual numbers x + a e1 + b e2 + c e1 e2: an oracle that shares no code with the laws.
+"""Exact first and second derivatives by hyper-dual numbers x + a e1 + b e2 + c e1 e2, an oracle of its own.
 
 Fike, Alonso 2011, doi:10.2514/6.2011-886. Extended precision (numpy longdouble), element-wise over arrays.
 """
@@ -49,6 +49,10 @@ def derivatives(energy, F, dF):
     """(psi, P, dP) of energy(F), a function of nine entries F[i][j]; F, dF of shape (n, 3, 3)."""
     F, dF = np.asarray(F, np.longdouble), np.asarray(dF, np.longdouble)
     unit = np.eye(9, dtype=np.longdouble).reshape(9, 3, 3)
-    entries = [[HyperDual(F[:, None, i, j], unit[None, :, i, j], dF[:, None, i, j], 0.0) for j in range(3)] for i in range(3)]
+
+    def entry(i, j):
+        return HyperDual(F[:, None, i, j], unit[None, :, i, j], dF[:, None, i, j], 0.0)
+
+    entries = [[entry(i, j) for j in range(3)] for i in range(3)]
     x, a, _, c = (np.broadcast_to(part, (len(F), 9)) for part in energy(entries).parts)
     return x[:, 0], a.reshape(-1, 3, 3), c.reshape(-1, 3, 3)

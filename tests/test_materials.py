@@ -76,11 +76,12 @@ def evaluate(material, H, dH=None, precision="f64", p=None, **options):
 
 def invariants(F):
     """I_C, II_C = |cof F|^2, J of nested lists."""
-    r = range(3)
-    cof = [
-        [F[(i + 1) % 3][(j + 1) % 3] * F[(i + 2) % 3][(j + 2) % 3] - F[(i + 1) % 3][(j + 2) % 3] * F[(i + 2) % 3][(j + 1) % 3]
-         for j in r] for i in r
-    ]  # fmt: skip
+    r, after = range(3), (1, 2, 0)
+
+    def minor(k, m, n, o):
+        return F[k][n] * F[m][o] - F[k][o] * F[m][n]
+
+    cof = [[minor(after[i], after[after[i]], after[j], after[after[j]]) for j in r] for i in r]
     total = [sum((A[i][j] * A[i][j] for i in r for j in r), 0.0) for A in (F, cof)]
     return total[0], total[1], sum((F[0][j] * cof[0][j] for j in r), 0.0)
 
@@ -88,7 +89,8 @@ def invariants(F):
 def log_above(J, floor=0.01):
     """log J, continued by its second-order Taylor polynomial below the floor."""
     x = (J - floor) / floor
-    inside, outside = hyperdual.log(hyperdual.HyperDual(*[*(np.maximum(J.parts[0], floor),), *J.parts[1:]])), x - x * x * 0.5
+    inside = hyperdual.log(hyperdual.HyperDual(np.maximum(J.parts[0], floor), *J.parts[1:]))
+    outside = x - x * x * 0.5
     above = J.parts[0] >= floor
     return hyperdual.HyperDual(*(np.where(above, a, b) for a, b in zip(inside.parts, (outside + np.log(floor)).parts)))
 
@@ -114,7 +116,8 @@ def linear(F, mu, lam):
 
 def corotated(F, mu, lam):
     I_C, II_C, J = invariants(F)
-    U, s, V = np.linalg.svd(np.array([[F[i][j].parts[0][:, 0] for j in range(3)] for i in range(3)], float).transpose(2, 0, 1))
+    plain = np.array([[F[i][j].parts[0][:, 0] for j in range(3)] for i in range(3)], float)
+    U, s, V = np.linalg.svd(plain.transpose(2, 0, 1))
     s[:, 2] *= np.sign(np.linalg.det(U @ V))
     f = hyperdual.HyperDual(s.sum(1)[:, None].astype(np.longdouble))
     for _ in range(4):  # tr S solves this quartic; Newton in hyper-dual numbers turns the SVD's value into derivatives
@@ -437,7 +440,8 @@ def test_laws_of_different_formula_or_floor_differ():
     assert len(set(laws)) == len(laws)
 
 
-MESH = SimpleNamespace(num_tetrahedra=4, tetrahedron_sets={"left": np.array([0, 1]), "right": np.array([2]), "all": np.arange(4)})
+SETS = {"left": np.array([0, 1]), "right": np.array([2]), "all": np.arange(4)}
+MESH = SimpleNamespace(num_tetrahedra=4, tetrahedron_sets=SETS)
 SPELLINGS = [(m, dict(youngs_modulus=E, poissons_ratio=NU)) for m in MATERIALS]
 SPELLINGS += [(m, dict(mu=3e4, lam=5e4)) for m in MATERIALS] + [(MooneyRivlin, dict(c10=2e4, c01=1e4, bulk_modulus=9e4))]
 
@@ -534,9 +538,9 @@ def test_numbers_may_be_uniform_per_tetrahedron_or_per_set():
         (lambda: MooneyRivlin(E, 0.3, c01_share=1.0), r"c01_share must lie in \[0, 1\)"),
         (lambda: MooneyRivlin(c10=1.0, c01=1.0, bulk_modulus=9.0, c01_share=0.1), r"c01_share goes with"),
         (lambda: StableNeoHookean(np.ones(3), 0.3).values(MESH), r"shape \(4,\), got shape \(3,\)"),
-        (lambda: StableNeoHookean({"up": 1.0}, 0.3).values(MESH), r"no tetrahedron set 'up' \(it has: 'left', 'right', 'all'"),
+        (lambda: StableNeoHookean({"up": 1.0}, 0.3).values(MESH), r"no tetrahedron set 'up' \(it has: 'left', "),
         (lambda: StableNeoHookean({"left": 1.0}, 0.3).values(MESH), r"2 tetrahedra are in none .* \"default\""),
-        (lambda: StableNeoHookean({"left": 1.0, "all": 2.0}, 0.3).values(MESH), r"tetrahedron 0 is in both 'left' and 'all'"),
+        (lambda: StableNeoHookean({"left": 1.0, "all": 2.0}, 0.3).values(MESH), r"0 is in both 'left' and 'all'"),
         (lambda: StableNeoHookean({}, 0.3), r"the dict is empty"),
     ],
 )
@@ -551,7 +555,10 @@ def test_coefficients_refuse_values_that_left_the_range():
         m.coefficients({"youngs_modulus": np.array(E), "poissons_ratio": np.array(0.6)})
 
 
-@pytest.mark.parametrize("numbers", [dict(E=E, nu=0.49), dict(mu=1.0, lam=100.0), dict(E=E, nu={"left": 0.3, "default": 0.46})])
+SOFT_IN_SHEAR = [dict(E=E, nu=0.49), dict(mu=1.0, lam=100.0), dict(E=E, nu={"left": 0.3, "default": 0.46})]
+
+
+@pytest.mark.parametrize("numbers", SOFT_IN_SHEAR)
 @every_law
 def test_nearly_incompressible_materials_warn_once_of_locking(material, numbers):
     with pytest.warns(UserWarning, match="linear tetrahedra lock") as record:

@@ -11,8 +11,8 @@ def polar(H, fp: ti.template()):
 
     f = tr S is the largest root of (f^2 - I_C)^2 = 4 II_C + 8 J f, and R = df/dF. Newton from above finds it, here in
     t = f - 3 so that nothing cancels near rest. For det F < 0 the sign sits on the smallest stretch.
-    Where the smaller two stretches nearly sum to zero (strongly drawn out, crushed, or mirrored) that loses digits and a slower
-    method takes over; where they do sum to zero, R is one of those that fit.
+    Where the smaller two stretches nearly sum to zero (strongly drawn out, crushed, or mirrored) that loses digits and a
+    slower method takes over; where they do sum to zero, R is one of those that fit.
     Lin, Chitalu, Komura 2022, Isotropic ARAP energy using Cauchy-Green invariants, doi:10.1145/3550454.3555507.
     """
     half = ti.cast(0.5, fp)

@@ -94,9 +94,9 @@ class ExplicitWorkspace:
             self._launches[name] = runtime.Launch(kernel, *arrays, vectorized=self.arrays.in_lanes)
         return self._launches[name]
 
-    def advance(self, first: int, last: int, num_passes: int, save_every: int = 0, recording: bool = False) -> None:
-        """Passes first .. last - 1 from the current state, or, recording, from slot 0 of the record."""
-        a = self.arrays
+    def advance(self, first: int, last: int, num_passes: int, save_every: int = 0, base: int | None = None) -> None:
+        """Passes first .. last - 1 from the current state; or recorded: slot j - base holds the state before pass j."""
+        a, recording = self.arrays, base is not None
         history = self.record if recording else self.state
         kernels = kick_drift_kernels(a.law, a.features(), self.parallel, a.in_lanes)
         launch = self._launch(
@@ -107,7 +107,7 @@ class ExplicitWorkspace:
         chunk = 1 if self.parallel else max(1, self.work_per_launch // a.num_tetrahedra)
         for start, count, w in self.solver.groups(first, last, num_passes, self.rate):
             for j in range(start, start + count, chunk):
-                launch(a.num_items, a.num_vertices, j, min(chunk, start + count - j), first, stride, substeps, save_every,
+                launch(a.num_items, a.num_vertices, j, min(chunk, start + count - j), base or 0, stride, substeps, save_every,
                        w.lag0, w.lag1, w.pre, w.post, w.alpha, w.decay, inverse_dt)  # fmt: skip
 
     def first_bad_vertex(self) -> int | None:

@@ -1,0 +1,312 @@
+"""The command line, its series and its pictures, by what they write and say."""
+
+import subprocess
+import sys
+
+import meshio
+import numpy as np
+import pytest
+
+from diffsim_ti import cli, picture, series
+from diffsim_ti.materials import StableNeoHookean
+from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.observe import TetrahedronFields
+from diffsim_ti.scene import Scene
+from diffsim_ti.solvers import SemiImplicitSolver, VelocityVerletSolver
+from diffsim_ti.terms import Gravity
+
+
+def command(*arguments):
+    """Run in a process of its own: the commands start Taichi anew."""
+    return subprocess.run([sys.executable, "-m", "diffsim_ti", *map(str, arguments)], capture_output=True, text=True)
+
+
+def fails(capsys, *arguments) -> str:
+    """The one line of an error, with exit code 2 and nothing on stdout."""
+    with pytest.raises(SystemExit) as stop:
+        cli.main([str(a) for a in arguments])
+    said = capsys.readouterr()
+    lines = [line for line in said.err.splitlines() if not line.startswith("warning:")]
+    assert stop.value.code == 2 and said.out == "" and len(lines) == 1 and lines[0].startswith("error: "), said
+    return lines[0]
+
+
+@pytest.fixture(scope="module")
+def cube():
+    return TetrahedralMesh.create_cube(3, 0.2)
+
+
+@pytest.fixture(scope="module")
+def cube_file(cube, tmp_path_factory):
+    path = tmp_path_factory.mktemp("mesh") / "cube.vtu"
+    cube.save(path)
+    return path
+
+
+def falling(mesh, height=0.02, E=2e4, solver=SemiImplicitSolver, kind=series.ForwardRun, dt=None, **options):
+    body, law = mesh.translated([0, height, 0]), StableNeoHookean(E, 0.3)
+    ground = cli.make_ground(body, law, 1000.0, -9.81, np.sqrt(2 * 9.81 * height))
+    return kind(Scene(body, law, 1000.0, [Gravity(), ground], **options), solver, 1 / 30, dt)
+
+
+# ---- series -----------------------------------------------------------------------------------------------------------
+
+
+def test_series_holds_what_the_simulator_has(cube, tmp_path):
+    run = falling(cube)
+    series.run_and_write(run, 4, tmp_path, "body")
+    frames = series.frames_of(tmp_path / "body.pvd")
+    assert [t for t, _ in frames] == pytest.approx(np.arange(5) / 30)
+    last, sim = meshio.read(frames[-1][1]), run.simulator
+    assert np.array_equal(last.points, sim.positions.astype(np.float64))
+    assert np.array_equal(last.cells_dict["tetra"], cube.tetrahedra)
+    assert np.array_equal(last.point_data["displacement"], sim.displacements)
+    assert np.array_equal(last.point_data["velocity"], sim.velocities)
+    fields = sim.tetrahedron_fields()
+    for name in ("von_mises", "energy_density", "J"):
+        assert last.cell_data[name][0] == pytest.approx(getattr(fields, name), rel=1e-6)
+
+
+def test_series_is_valid_after_each_frame_and_replaces_an_older_one(cube, tmp_path):
+    rest, J = np.zeros((cube.num_vertices, 3)), np.ones(cube.num_tetrahedra)
+    for count in (5, 2):
+        out = series.Series(tmp_path, cube, "a")
+        for k in range(count):
+            out.write(0.1 * k, cube.vertices, rest, rest, TetrahedronFields(J, J, J))
+            assert len(series.frames_of(out.path)) == k + 1
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.pvd", "a_0000.vtu", "a_0001.vtu"]
+
+
+def test_series_names_a_broken_list(cube, tmp_path):
+    (tmp_path / "a.pvd").write_text("<VTKFile><Coll")
+    with pytest.raises(ValueError, match="not a ParaView series"):
+        series.Series(tmp_path, cube, "a")
+
+
+def test_interrupted_run_says_where_and_keeps_its_frames(cube, tmp_path, monkeypatch):
+    run = falling(cube)
+    advance = run.advance
+
+    def advance_once():
+        if run.simulator.step_count:
+            raise KeyboardInterrupt
+        advance()
+
+    monkeypatch.setattr(run, "advance", advance_once)
+    with pytest.raises(KeyboardInterrupt, match=r"interrupted at t = 0\.03333 s; 2 frames are in .*body\.pvd"):
+        series.run_and_write(run, 9, tmp_path, "body")
+    assert all(path.exists() for _, path in series.frames_of(tmp_path / "body.pvd"))
+
+
+# ---- the run whose step follows the state -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("solver", [SemiImplicitSolver, VelocityVerletSolver])
+def test_fall_keeps_energy_and_stays_above_the_floor(cube, solver):
+    run = falling(cube, height=0.05, solver=solver)
+    for _ in range(12):
+        run.advance()
+    assert run.simulator.time == pytest.approx(0.4)
+    assert run.seen.crossed == 0 and 0 < run.seen.gap < 0.002 and 0 < run.seen.J < 1
+    assert abs(run.energies[-1] - run.energies[0]) < 0.03 * run.largest_energy
+    assert min(run.seen.substeps) < max(run.seen.substeps)  # contact asks for finer steps
+
+
+class Careless(series.ForwardRun):
+    def _choose_substeps(self):
+        return 1  # far beyond the stable step
+
+
+def test_an_unstable_part_is_run_again_more_finely_and_counted(cube):
+    run = falling(cube, E=1e6, kind=Careless)
+    for _ in range(6):
+        run.advance()
+    reference = falling(cube, E=1e6)
+    for _ in range(6):
+        reference.advance()
+    assert run.seen.retries and not reference.seen.retries
+    assert run.simulator.time == reference.simulator.time
+    heights = [r.simulator.positions[:, 1].mean() for r in (run, reference)]
+    assert heights[0] == pytest.approx(heights[1], abs=2e-3)
+
+
+def test_part_that_stays_unstable_is_an_error(cube):
+    run = falling(cube, E=1e6, kind=Careless)
+    run.attempts = 1
+    with pytest.raises(FloatingPointError, match="unstable even with a substep"):
+        for _ in range(6):
+            run.advance()
+
+
+def test_given_dt_is_used_as_it_is(cube):
+    run = falling(cube, dt=2e-4)
+    run.advance()
+    assert run.seen.shortest == run.seen.longest == pytest.approx(2e-4)
+    assert run.simulator.time == pytest.approx(1 / 30, abs=8 * 2e-4)
+    with pytest.raises(ValueError, match="exceeds the stable step"):
+        falling(cube, dt=1 / 30)
+
+
+# ---- commands ---------------------------------------------------------------------------------------------------------
+
+
+def test_simulate_free_fall(cube_file, tmp_path):
+    done = command("simulate", cube_file, "-o", tmp_path, "--duration", 0.2, "--fps", 20, "--height", 1,
+                   "--precision", "f64", "--velocity", 1, 0, 0, "--size", 0.5)  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    frames = series.frames_of(tmp_path / "cube.pvd")
+    assert len(frames) == 5
+    last = meshio.read(frames[-1][1])
+    fall = last.point_data["displacement"]
+    assert np.ptp(last.points[:, 0]) == pytest.approx(0.5)
+    assert fall[:, 1].mean() == pytest.approx(-0.5 * 9.81 * 0.04, rel=0.05) and fall[:, 0].mean() == pytest.approx(0.2)
+    assert (tmp_path / "cube.png").read_bytes().startswith(b"\x89PNG")
+    for said in ("f64, cpu", "0.2 s in 4 frames", "retries", "none crossed", "energy drift", "substeps/s", "ns per"):
+        assert said in done.stdout, done.stdout
+
+
+def test_simulate_refuses_an_unstable_step_in_one_line(cube_file, tmp_path):
+    done = command("simulate", cube_file, "-o", tmp_path, "--dt", 0.1)
+    assert done.returncode == 2 and "exceeds the stable step" in done.stderr and len(done.stderr.splitlines()) == 1
+    shown = command("--traceback", "simulate", cube_file, "-o", tmp_path, "--dt", 0.1)
+    assert shown.returncode != 0 and "Traceback" in shown.stderr
+
+
+def test_errors_are_one_line(cube_file, tmp_path, capsys):
+    run = ("simulate", cube_file, "-o", tmp_path)
+    assert "nothing.msh" in fails(capsys, "info", tmp_path / "nothing.msh")
+    assert "StableNeoHookean" in fails(capsys, *run, "--material", "Rubber")
+    assert "poissons_ratio" in fails(capsys, *run, "--nu", "0.5")
+    assert "cpu, cuda, vulkan" in fails(capsys, *run, "--backend", "abacus")
+    assert "precision" in fails(capsys, *run, "--precision", "f16")
+    assert "--solver" in fails(capsys, *run, "--solver", "magic")
+    assert "duration" in fails(capsys, *run, "--duration", "0")
+    assert "size" in fails(capsys, *run, "--size", "-1")
+    assert "--colour" in fails(capsys, *run, "--colour")
+    assert "conquer" in fails(capsys, "conquer")
+
+
+def test_interrupt_exits_130(cube_file, capsys, monkeypatch):
+    def stop(*_):
+        raise KeyboardInterrupt("interrupted at t = 0.1 s")
+
+    monkeypatch.setattr(cli, "load_body", stop)
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["info", str(cube_file)])
+    assert ended.value.code == 130 and "interrupted at t = 0.1 s" in capsys.readouterr().err
+
+
+def test_info(cube_file, cube, capsys):
+    steps = []
+    for size in ("0.2", "0.4"):
+        with pytest.raises(SystemExit) as ended:
+            cli.main(["info", str(cube_file), "--size", size, "-E", "2e5"])
+        said = capsys.readouterr().out
+        assert ended.value.code == 0 and f"{cube.num_tetrahedra} tetrahedra" in said and "xmin (9)" in said
+        steps.append(float(said.split("at rest:")[1].split()[0]))
+    assert steps[1] == pytest.approx(2 * steps[0], rel=1e-3)
+
+
+def test_demo(tmp_path):
+    done = command("demo", "--quick", "-o", tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert sorted(p.name for p in tmp_path.glob("*.png")) == ["column_0.png", "column_1.png", "column_2.png"]
+    gradient, difference = (float(part.split()[-2]) for part in done.stdout.strip().splitlines()[-1].split(";"))
+    assert gradient == pytest.approx(difference, rel=1e-3)
+
+
+def test_help_names_every_command():
+    done = command("--help")
+    assert done.returncode == 0 and all(name in done.stdout for name in ("simulate", "info", "demo"))
+
+
+@pytest.mark.parametrize("up, axis", [("x", 0), ("y", 1), ("z", 2), ("-x", 0), ("-y", 1), ("-z", 2)])
+def test_up_turns_the_body(tmp_path, up, axis):
+    mesh = TetrahedralMesh.create_box(2, (1.0, 2.0, 3.0))
+    mesh.save(tmp_path / "box.vtu")
+    body = cli.load_body(tmp_path / "box.vtu", up=cli.Up(up))
+    sign = -1 if up[0] == "-" else 1
+    assert body.vertices[:, 1] == pytest.approx(sign * mesh.vertices[:, axis])
+    assert body.volume == pytest.approx(6)
+
+
+def test_fixed_by_set_or_side(cube):
+    assert np.array_equal(cli.fixed_vertices(cube, ["ymin"]), cube.vertex_sets["ymin"])
+    bare = TetrahedralMesh(cube.vertices, cube.tetrahedra)
+    both = cli.fixed_vertices(bare, ["ymin", "xmax"])
+    assert np.array_equal(both, np.union1d(cube.vertex_sets["ymin"], cube.vertex_sets["xmax"]))
+    with pytest.raises(ValueError, match="middle"):
+        cli.fixed_vertices(bare, ["middle"])
+
+
+# ---- pictures ---------------------------------------------------------------------------------------------------------
+
+VIEW = dict(box=[[-0.2, -0.2, -0.2], [0.6, 0.6, 0.6]], size=(160, 120))
+
+
+def body_pixels(image):
+    """Where a picture without values shows the body, which is blue."""
+    return image[..., 2] - image[..., 0] > 0.1
+
+
+def test_body_is_where_it_should_be(cube):
+    seen = body_pixels(picture.draw(cube, cube.vertices + 0.1, azimuth=0.0, elevation=0.0, **VIEW))
+    row, column = (x.mean() for x in np.nonzero(seen))
+    assert row == pytest.approx(60, abs=3) and column == pytest.approx(160 * picture.CENTER, abs=3)
+    assert np.ptp(np.nonzero(seen)[0]) == pytest.approx(np.ptp(np.nonzero(seen)[1]), abs=2)  # a cube looks square
+    assert 0.01 < seen.mean() < 0.2 and not seen[:10].any()
+
+
+def test_moved_body_moves_in_the_picture(cube):
+    for shift, direction in (((0, 0.2, 0), (-1, 0)), ((0.2, 0, 0), (0, 1))):
+        rows = []
+        for offset in (np.zeros(3), np.array(shift)):
+            seen = body_pixels(picture.draw(cube, cube.vertices + offset, azimuth=0.0, elevation=0.0, **VIEW))
+            rows.append([x.mean() for x in np.nonzero(seen)])
+        moved = np.subtract(rows[1], rows[0])
+        assert np.dot(moved, direction) > 10 and np.linalg.norm(moved) == pytest.approx(np.dot(moved, direction), abs=1)
+
+
+def test_nearer_triangles_hide_farther_ones(cube):
+    two = TetrahedralMesh(np.vstack([cube.vertices, cube.vertices + [0, 0, -0.3]]),
+                          np.vstack([cube.tetrahedra, cube.tetrahedra + cube.num_vertices]))  # fmt: skip
+    value = np.repeat([0.0, 1.0], cube.num_vertices)
+    view = VIEW | dict(azimuth=0.0, elevation=0.0)
+    image = picture.draw(two, two.vertices, value, **view)
+    alone = picture.draw(cube, cube.vertices, np.zeros(cube.num_vertices), **view)
+    inside = body_pixels(picture.draw(cube, cube.vertices, **view))
+    assert np.abs(image - alone)[inside].mean() < 0.02
+
+
+def test_colours_span_the_limits(cube, tmp_path):
+    y = cube.vertices[:, 1] / 0.2
+    view = VIEW | dict(azimuth=0.0, elevation=0.0)
+    image = picture.draw(cube, cube.vertices, y, **view)
+    inside = body_pixels(picture.draw(cube, cube.vertices, **view))
+    rows = np.nonzero(inside.sum(1) > 10)[0]
+    top, bottom = image[rows[2]][inside[rows[2]]].mean(0), image[rows[-3]][inside[rows[-3]]].mean(0)
+    assert top[1] > top[2] + 0.3 and top[0] > 0.5 and bottom[2] > bottom[1] + 0.1  # viridis: yellow at the top, violet below
+    per_tetrahedron = picture.to_vertices(cube, np.full(cube.num_tetrahedra, 7.0))
+    assert per_tetrahedron == pytest.approx(7)
+    with pytest.raises(ValueError, match="per tetrahedron"):
+        picture.draw(cube, cube.vertices, np.zeros(3), **view)
+
+
+def test_floor_grid_and_shadow(cube):
+    view = VIEW | dict(elevation=20.0)
+    without, empty = (picture.draw(cube, cube.vertices + [0, h, 0], ground=g, **view) for h, g in ((0.1, None), (0.1, 0.0)))
+    body = body_pixels(without)
+    difference = np.abs(without - empty).max(-1)
+    assert difference[~body].max() > 0.2  # the shadow
+    assert difference[body].max() < 1e-12 or np.mean(difference[body] > 0.05) < 0.1  # the floor lies behind
+
+
+def test_saved_picture(cube, tmp_path):
+    from matplotlib.image import imread
+
+    values = np.arange(cube.num_tetrahedra)
+    picture.save_picture(tmp_path / "a.png", cube, cube.vertices, values, "stress [Pa]", 0.0, "t = 0 s", size=(320, 240))
+    image = imread(tmp_path / "a.png")
+    assert image.shape[:2] == (240, 320) and image[..., :3].std() > 0.02
+    with pytest.raises(ValueError, match="finite"):
+        picture.draw(cube, np.full(cube.vertices.shape, np.nan))
