@@ -11,6 +11,8 @@ from typing import Annotated
 import numpy as np
 import typer
 
+from diffsim_ti.series import Interrupted
+
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, help="Soft bodies on tetrahedra.")
 ClickException = typer.BadParameter.__mro__[2]  # typer carries click inside or beside it, depending on its version
 Up = Enum("Up", {name: name for name in ("x", "y", "z", "-x", "-y", "-z")}, type=str)
@@ -44,9 +46,10 @@ def main(arguments: list[str] | None = None) -> None:
         warnings.showwarning = lambda message, *_, **__: print(f"warning: {message}", file=sys.stderr)
         try:
             code = app([a for a in arguments if a != "--traceback"], standalone_mode=False, prog_name="diffsim-ti")
-        except (KeyboardInterrupt, typer.Abort) as stop:
-            said = str(stop if isinstance(stop, KeyboardInterrupt) else stop.__cause__ or "")
-            code = _fail(said or "interrupted", 130)
+        except Interrupted as stop:
+            code = _fail(str(stop), 130)
+        except (KeyboardInterrupt, typer.Abort):
+            code = _fail("interrupted", 130)
         except ClickException as error:
             code = _fail(f"{error.format_message()} (see diffsim-ti --help)")
         except (ValueError, TypeError, RuntimeError, OSError, FloatingPointError, MemoryError) as error:
@@ -215,7 +218,7 @@ def simulate(
     velocity: Annotated[tuple[float, float, float], typer.Option(help="at the start [m/s]")] = (0.0, 0.0, 0.0),
     fixed: Annotated[list[str] | None, typer.Option(help="vertex set, or xmin .. zmax, to hold; may be repeated")] = None,
     ground: Annotated[bool, typer.Option(help="a floor at y = 0, the body above it")] = True,
-    height: Annotated[float | None, typer.Option(help="of the lowest point [m]; default a quarter of the size")] = None,
+    height: Annotated[float | None, typer.Option(help="of the lowest point [m]; default a tenth of the size")] = None,
     ground_stiffness: Annotated[float | None, typer.Option(help="[N/m]; default from the impact's pressure")] = None,
     ground_width: Annotated[float | None, typer.Option(help="[m]; default 1 % of the size")] = None,
     azimuth: Annotated[float, typer.Option(help="where the picture is taken from, about y [degrees]")] = 32.0,
@@ -245,7 +248,7 @@ def simulate(
     if drag:
         terms.append(Drag(drag))
     if ground:
-        low, height = body.bounding_box[0, 1], 0.25 * np.ptp(body.bounding_box, 0).max() if height is None else height
+        low, height = body.bounding_box[0, 1], 0.1 * np.ptp(body.bounding_box, 0).max() if height is None else height
         body = body.translated([0, height - low, 0])
         speed = np.sqrt(min(velocity[1], 0) ** 2 + 2 * abs(gravity) * max(height, 0))
         terms.append(make_ground(body, law, density, gravity, speed, ground_stiffness, ground_width))

@@ -1,5 +1,6 @@
 """Rollout: n steps of a solver as one differentiable operation."""
 
+import warnings
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -65,7 +66,7 @@ class Rollout:
         self.wanted = self._check_names(gradients)
         self.num_passes = solver.num_passes(self.steps)
         every = None if checkpoint_every is None else max(1, int(checkpoint_every)) * solver.substeps
-        self.state_bytes = 3 * self.scene.mesh.num_vertices * runtime.NUMPY[self.scene.precision]().itemsize
+        self.state_bytes = 4 * self.scene.mesh.num_vertices * runtime.NUMPY[self.scene.precision]().itemsize
         self.schedule = choose_schedule(self.num_passes, self.state_bytes, every, memory)
         self._options = dict(save_every=self.save_every, checkpoint_every=checkpoint_every, memory=memory,
                              gradients=self.wanted, clip=clip, truncate=truncate, health=health)  # fmt: skip
@@ -312,7 +313,19 @@ class Rollout:
             if careful:
                 raise FloatingPointError("the adjoint is not finite at the start of the run")
             return self._sweep_reverse(positions_adj, velocities_adj, careful=True)
+        self._warn_if_exploded(positions_adj, velocities_adj, derived)
         return self.scene.inputs.derive_vjp(self._current, derived, self.wanted)
+
+    def _warn_if_exploded(self, positions_adj, velocities_adj, derived) -> None:
+        duration = max(self.steps, 1) * self.solver.dt
+        end = np.linalg.norm(derived.displacement) + np.linalg.norm(derived.velocity) / duration
+        start = np.linalg.norm(positions_adj.astype(np.float64)) + np.linalg.norm(velocities_adj.astype(np.float64)) / duration
+        if end > 1e8 * start > 0:
+            warnings.warn(
+                f"the adjoint grew by {end / start:.1g} over the run: the motion is chaotic or unstable, and this gradient is "
+                "of little use; shorten the rollout, pass truncate=, or look at it with health=True and gradient_health",
+                stacklevel=4,
+            )
 
     def _reverse_segment(self, first: int, last: int, stop: int, careful: bool) -> None:
         save, adjoint = self.save_every * self.solver.substeps, self._adjoint

@@ -125,6 +125,15 @@ def runs_on_cpu() -> bool:
     return arch_name() == "cpu"
 
 
+def check_backend(precision: str) -> None:
+    """Raise ValueError if the running backend cannot compute in this precision."""
+    if arch_name() == "vulkan" and precision == "f64":
+        raise ValueError(
+            "Vulkan has no float64 logarithm, which energies and contacts need: use precision='f32' there, "
+            "or diffsim_ti.init('cpu') or ('cuda') for float64"
+        )
+
+
 def allocated_megabytes() -> float:
     """Memory that this package's arrays hold now [MB]."""
     return _settings["bytes"] / 1e6

@@ -82,6 +82,10 @@ def frames_of(path) -> list[tuple[float, Path]]:
 
 
 
+class Interrupted(Exception):
+    """Ctrl-C ended a run; says where, and what is written."""
+
+
 @dataclass
 class Seen:
     """The extremes of a run: smallest J and gap [m], most tetrahedra inside-out and vertices below the floor at once."""
@@ -106,6 +110,7 @@ class ForwardRun:
     """
 
     share, parts, attempts = 0.8, 8, 8  # of the stable step; per frame; per part
+    largest_rise = 0.001  # of the energy in a part, as a share of the largest kinetic + elastic + contact energy
 
     def __init__(self, scene, solver_class, frame_time: float, dt: float | None = None, **options):
         from diffsim_ti.simulator import Simulator
@@ -190,7 +195,7 @@ class ForwardRun:
         """Why the part that was just run cannot be trusted, or None; `last`: find the stable step for the next frame."""
         energy, h = self.simulator.compute_energy(), self.simulator.solver.substep
         rise = energy - self._energy
-        if self.scene.motion is None and not rise <= 0.02 * max(self.largest_energy, self._moving(energy)):
+        if self.scene.motion is None and not rise <= self.largest_rise * max(self.largest_energy, self._moving(energy)):
             return f"the energy rose by {rise:.3g} J"
         if not last:
             return None
@@ -222,6 +227,7 @@ def run_and_write(run: ForwardRun, frames: int, folder: Path, name: str, keep=()
     """Run `frames` frames into a series.
 
     Returns seconds of writing, file names, and (time, positions, velocities, von Mises stress) of the frames in `keep`.
+    Raises Interrupted on Ctrl-C.
     """
     from diffsim_ti.cli import progress
 
@@ -237,7 +243,7 @@ def run_and_write(run: ForwardRun, frames: int, folder: Path, name: str, keep=()
                 writing += time.perf_counter() - begin
             except KeyboardInterrupt:
                 said = f"interrupted at t = {sim.time:.4g} s; {len(series.files)} frames are in {series.path}"
-                raise KeyboardInterrupt(said) from None
+                raise Interrupted(said) from None
             if k in keep:
                 kept.append((sim.time, sim.positions, sim.velocities, sim.tetrahedron_fields().von_mises))
             show(k, f"t = {sim.time:.3f} s")

@@ -93,7 +93,7 @@ def test_interrupted_run_says_where_and_keeps_its_frames(cube, tmp_path, monkeyp
         advance()
 
     monkeypatch.setattr(run, "advance", advance_once)
-    with pytest.raises(KeyboardInterrupt, match=r"interrupted at t = 0\.03333 s; 2 frames are in .*body\.pvd"):
+    with pytest.raises(series.Interrupted, match=r"interrupted at t = 0\.03333 s; 2 frames are in .*body\.pvd"):
         series.run_and_write(run, 9, tmp_path, "body")
     assert all(path.exists() for _, path in series.frames_of(tmp_path / "body.pvd"))
 
@@ -188,7 +188,7 @@ def test_errors_are_one_line(cube_file, tmp_path, capsys):
 
 def test_interrupt_exits_130(cube_file, capsys, monkeypatch):
     def stop(*_):
-        raise KeyboardInterrupt("interrupted at t = 0.1 s")
+        raise series.Interrupted("interrupted at t = 0.1 s")
 
     monkeypatch.setattr(cli, "load_body", stop)
     with pytest.raises(SystemExit) as ended:

@@ -27,6 +27,7 @@ class Solver(ABC):
         self.scene, self.dt, self.substeps = scene, float(dt), int(substeps)
         self.parallel, self.allow_unstable = parallel, allow_unstable
         runtime.check_host_init()
+        runtime.check_backend(scene.precision)
         self._tight: stability.StepLimit | None = None
         if self.explicit and not allow_unstable:
             self._refuse_unstable()
