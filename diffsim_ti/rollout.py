@@ -15,13 +15,15 @@ from diffsim_ti.solvers.explicit_adjoint import ExplicitAdjoint, ExplicitTangent
 
 @dataclass(eq=False)
 class Frames:
-    """Saved states of one run: positions [m] and velocities [m/s], shape (frames, num_vertices, 3), times [s].
+    """Saved states of one run: positions [m], velocities [m/s], displacements from the rest shape [m] (which
+    keep their digits in float32), each of shape (frames, num_vertices, 3), and times [s].
 
     `inputs` are the values that the run started from, so that its gradient can be taken whenever it is wanted.
     """
 
     positions: np.ndarray
     velocities: np.ndarray
+    displacements: np.ndarray
     times: np.ndarray
     inputs: dict = field(repr=False)
 
@@ -107,7 +109,7 @@ class Rollout:
         self._sweep_forward()
         u, v = (runtime.fetch(x) for x in self._workspace.frames)
         rest = run["rest_positions"]
-        frames = Frames((rest + u).astype(u.dtype), v, self.times, run)
+        frames = Frames((rest + u).astype(u.dtype), v, u, self.times, run)
         self._current = run
         return frames
 
@@ -319,11 +321,12 @@ class Rollout:
     def _warn_if_exploded(self, positions_adj, velocities_adj, derived) -> None:
         duration = max(self.steps, 1) * self.solver.dt
         end = np.linalg.norm(derived.displacement) + np.linalg.norm(derived.velocity) / duration
-        start = np.linalg.norm(positions_adj.astype(np.float64)) + np.linalg.norm(velocities_adj.astype(np.float64)) / duration
+        start = np.linalg.norm(np.asarray(positions_adj, np.float64))
+        start += np.linalg.norm(np.asarray(velocities_adj, np.float64)) / duration
         if end > 1e8 * start > 0:
             warnings.warn(
-                f"the adjoint grew by {end / start:.1g} over the run: the motion is chaotic or unstable, and this gradient is "
-                "of little use; shorten the rollout, pass truncate=, or look at it with health=True and gradient_health",
+                f"the adjoint grew by {end / start:.1g} over the run: the motion is chaotic or unstable, and this "
+                "gradient is of little use; shorten the rollout, pass truncate=, or see gradient_health",
                 stacklevel=4,
             )
 

@@ -110,7 +110,9 @@ class ForwardRun:
     """
 
     share, parts, attempts = 0.8, 8, 8  # of the stable step; per frame; per part
-    largest_rise = 0.001  # of the energy in a part, as a share of the largest kinetic + elastic + contact energy
+    # of the energy in a part, as shares of the largest kinetic + elastic + contact energy: what symplectic Euler's
+    # passing error of first order takes, and what is left once the energy is `largest_drift` above its lowest
+    largest_rise, later_rise, largest_drift = 0.01, 0.001, 0.03
 
     def __init__(self, scene, solver_class, frame_time: float, dt: float | None = None, **options):
         from diffsim_ti.simulator import Simulator
@@ -139,6 +141,7 @@ class ForwardRun:
         ws.restore(self._start, 0)
         self._limit = self._stable_dt()
         self._energy, self._refined = self.simulator.compute_energy(), 0
+        self._lowest = self._energy
         self.energies, self.largest_energy = [self._energy], self._moving(self._energy)
 
     def advance(self) -> None:
@@ -156,7 +159,7 @@ class ForwardRun:
 
     def _advance_part(self, last: bool) -> None:
         sim, first = self.simulator, self.simulator.step_count
-        substeps = max(self._choose_substeps(), self._refined // 2)
+        substeps = max(self._choose_substeps(), self._refined)
         sim.workspace.save(self._start, 0)
         for tried in range(self.attempts):
             sim.set_substeps(substeps)
@@ -166,7 +169,7 @@ class ForwardRun:
             except FloatingPointError as error:
                 why = str(error)
             if why is None:
-                self._refined = substeps if tried else self._refined // 2
+                self._refined = substeps if tried else int(0.85 * self._refined)
                 return
             self.seen.retries.append(f"t = {first * sim.solver.dt:.4g} s, substep {sim.solver.substep:.3g} s: {why}")
             sim.workspace.restore(self._start, 0)
@@ -189,13 +192,15 @@ class ForwardRun:
         seen.shortest = min(seen.shortest, sim.solver.substep)
         seen.longest = max(seen.longest, sim.solver.substep)
         self._energy = sim.compute_energy()
+        self._lowest = min(self._lowest, self._energy)
         self.largest_energy = max(self.largest_energy, self._moving(self._energy))
 
     def _complaint(self, last: bool) -> str | None:
         """Why the part that was just run cannot be trusted, or None; `last`: find the stable step for the next frame."""
         energy, h = self.simulator.compute_energy(), self.simulator.solver.substep
-        rise = energy - self._energy
-        if self.scene.motion is None and not rise <= self.largest_rise * max(self.largest_energy, self._moving(energy)):
+        rise, scale = energy - self._energy, max(self.largest_energy, self._moving(energy))
+        drifted = energy - self._lowest > self.largest_drift * scale
+        if self.scene.motion is None and not rise <= (self.later_rise if drifted else self.largest_rise) * scale:
             return f"the energy rose by {rise:.3g} J"
         if not last:
             return None

@@ -23,7 +23,7 @@ class StepLimit:
         return f"{self.dt:.4g} s ({self.method}, set by tetrahedron {self.tetrahedron})"
 
 
-def element_limit(scene) -> StepLimit:
+def element_limit(scene, values: dict | None = None) -> StepLimit:
     """A step that is safe at rest, from each tetrahedron by itself, without contact.
 
         omega^2 <= (4 / rho) [max(lam, 0) sum_a |grad N_a|^2 + 2 mu lambda_max(sum_a grad N_a (x) grad N_a)]
@@ -32,8 +32,7 @@ def element_limit(scene) -> StepLimit:
     mu, lam are the law's small-strain moduli. The eigenvalues of the assembled system never exceed the largest of its
     elements (Hughes, The Finite Element Method, 9.1); lumped vertex masses are at least those of the element.
     """
-    values = scene.inputs.values
-    material = scene.material
+    values, material = scene.inputs.values if values is None else values, scene.material
     mu, lam = material.lame({name: values[name] for name in material.inputs})
     B = scene.inputs.derive(values).gradients
     N = np.concatenate([-B.sum(1, keepdims=True), B], 1)
@@ -82,7 +81,8 @@ class Stiffness:
         self.w, self.y = runtime.array(a.vector, 1, a.num_vertices), runtime.array(a.vector, 1, a.num_vertices)
         kernel = stiffness_kernel(a.law, a.features(), workspace.parallel, a.in_lanes)
         state = workspace.state
-        self._multiply = runtime.Launch(kernel, *a.topology(), a.corner, state.u, state.v, self.w, self.y, vectorized=a.in_lanes)
+        arrays = (*a.topology(), a.corner, state.u, state.v, self.w, self.y)
+        self._multiply = runtime.Launch(kernel, *arrays, vectorized=a.in_lanes)
         self.root = np.sqrt(runtime.fetch(a.inverse_mass).astype(np.float64))[:, None]
         self.vector = None
 

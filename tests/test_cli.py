@@ -114,7 +114,7 @@ def test_fall_keeps_energy_and_stays_above_the_floor(cube, solver):
 
 class Careless(series.ForwardRun):
     def _choose_substeps(self):
-        return 1  # far beyond the stable step
+        return max(1, super()._choose_substeps() // 8)  # beyond the stable step of the contact
 
 
 def test_an_unstable_part_is_run_again_more_finely_and_counted(cube):
@@ -124,7 +124,7 @@ def test_an_unstable_part_is_run_again_more_finely_and_counted(cube):
     reference = falling(cube, E=1e6)
     for _ in range(6):
         reference.advance()
-    assert run.seen.retries and not reference.seen.retries
+    assert len(run.seen.retries) > len(reference.seen.retries)
     assert run.simulator.time == reference.simulator.time
     heights = [r.simulator.positions[:, 1].mean() for r in (run, reference)]
     assert heights[0] == pytest.approx(heights[1], abs=2e-3)

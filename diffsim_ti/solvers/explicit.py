@@ -107,7 +107,8 @@ class ExplicitWorkspace:
         chunk = 1 if self.parallel else max(1, self.work_per_launch // a.num_tetrahedra)
         for start, count, w in self.solver.groups(first, last, num_passes, self.rate):
             for j in range(start, start + count, chunk):
-                launch(a.num_items, a.num_vertices, j, min(chunk, start + count - j), base or 0, stride, substeps, save_every,
+                launch(a.num_items, a.num_vertices, j, min(chunk, start + count - j), base or 0, stride, substeps,
+                       save_every,
                        w.lag0, w.lag1, w.pre, w.post, w.alpha, w.decay, inverse_dt)  # fmt: skip
 
     def first_bad_vertex(self) -> int | None:

@@ -61,7 +61,8 @@ class ExplicitAdjoint:
             end = start + count
             while end > start:
                 begin = max(start, end - chunk)
-                launch(a.num_items, a.num_vertices, begin, end - begin, base, num_passes, substeps, save_every, w.lag0, w.lag1, w.pre, w.post,
+                launch(a.num_items, a.num_vertices, begin, end - begin, base, num_passes, substeps, save_every, w.lag0,
+                       w.lag1, w.pre, w.post,
                        w.alpha, w.decay, inverse_dt, w.alpha_by_rate, w.decay_by_rate)  # fmt: skip
                 end = begin
 
@@ -143,7 +144,8 @@ class ExplicitTangent:
         )  # fmt: skip
         for start, count, w in ws.solver.groups(first, last, num_passes, ws.rate):
             for j in range(start, start + count):
-                launch(a.num_items, a.num_vertices, j, first, ws.solver.substeps, save_every, w.lag0, w.lag1, w.pre, w.post, w.alpha, w.decay,
+                launch(a.num_items, a.num_vertices, j, first, ws.solver.substeps, save_every, w.lag0, w.lag1, w.pre,
+                       w.post, w.alpha, w.decay,
                        1 / ws.solver.dt, w.alpha_by_rate * self._rate_dot, w.decay_by_rate * self._rate_dot)  # fmt: skip
 
     def save_frame(self, frame: int) -> None:

@@ -147,7 +147,8 @@ def kick_drift_kernels(law, features: Features, parallel: bool, lanes: bool) -> 
              corner_of: t.ints, inverse_mass: t.scalars, parameters: t.scalars, rest: t.vectors, surface: t.ints,
              force_slot: t.ints, motion_slot: t.ints, forces: t.vectors2, motion: t.vectors2, anchor: t.vectors,
              corner: t.vectors, u: t.vectors2, v: t.vectors2, f: t.vectors2, frames_u: t.vectors2, frames_v: t.vectors2,
-             num_items: ti.i32, num_vertices: ti.i32, first: ti.i32, count: ti.i32, base: ti.i32, stride: ti.i32, substeps: ti.i32, save_every: ti.i32,
+             num_items: ti.i32, num_vertices: ti.i32, first: ti.i32, count: ti.i32, base: ti.i32, stride: ti.i32,
+             substeps: ti.i32, save_every: ti.i32,
              lag0: ti.i32, lag1: ti.i32, pre: fp, post: fp, alpha: fp, decay: fp, inverse_dt: fp):  # fmt: skip
         """`count` passes. Slot 0 holds the state before pass `base`; with stride 1 forces are recorded too."""
         scene = Bundle(tets=tets, gradients=gradients, volumes=volumes, coefficients=coefficients, start=start,
@@ -218,7 +219,8 @@ def kick_drift_kernels(law, features: Features, parallel: bool, lanes: bool) -> 
                  f: t.vectors2, du: t.vectors2, dv: t.vectors2, coefficients_dot: t.blocks, mass_dot: t.scalars,
                  parameters_dot: t.scalars, rest_dot: t.vectors, forces_dot: t.vectors2, motion_dot: t.vectors2,
                  anchor_dot: t.vectors, gradients_dot: t.blocks, volumes_dot: t.blocks, frames_du: t.vectors2,
-                 frames_dv: t.vectors2, num_items: ti.i32, num_vertices: ti.i32, j: ti.i32, base: ti.i32, substeps: ti.i32, save_every: ti.i32, lag0: ti.i32,
+                 frames_dv: t.vectors2, num_items: ti.i32, num_vertices: ti.i32, j: ti.i32, base: ti.i32,
+                 substeps: ti.i32, save_every: ti.i32, lag0: ti.i32,
                  lag1: ti.i32, pre: fp, post: fp, alpha: fp, decay: fp, inverse_dt: fp, alpha_dot: fp,
                  decay_dot: fp):  # fmt: skip
         """The tangent of pass j along recorded slots; du, dv are advanced in place."""
@@ -264,7 +266,8 @@ def kick_drift_kernels(law, features: Features, parallel: bool, lanes: bool) -> 
             v_plus_adj = q
         if ti.static(features.drag >= 0):
             v_plus = state.v[t, i] / plan.decay
-            adjoint.sums[row["drag"], i] = adjoint.sums[row["drag"], i] + (plan.alpha_by_rate * p.dot(v_plus) + plan.decay_by_rate * q.dot(v_plus))
+            by_rate = plan.alpha_by_rate * p.dot(v_plus) + plan.decay_by_rate * q.dot(v_plus)
+            adjoint.sums[row["drag"], i] = adjoint.sums[row["drag"], i] + by_rate
         # kick, frame, kick
         v_mid_adj = v_plus_adj
         if is_saved(j, plan):
@@ -319,7 +322,8 @@ def kick_drift_kernels(law, features: Features, parallel: bool, lanes: bool) -> 
                  f: t.vectors2, u_adj: t.vectors2, v_adj: t.vectors2, w: t.vectors2, coefficients_adj: t.blocks,
                  sums: t.scalars2, forces_adj: t.vectors2, motion_adj: t.vectors2, anchor_adj: t.vectors,
                  gradients_adj: t.blocks, volumes_adj: t.blocks, frames_u_adj: t.vectors2, frames_v_adj: t.vectors2,
-                 num_items: ti.i32, num_vertices: ti.i32, first: ti.i32, count: ti.i32, base: ti.i32, end: ti.i32, substeps: ti.i32, save_every: ti.i32,
+                 num_items: ti.i32, num_vertices: ti.i32, first: ti.i32, count: ti.i32, base: ti.i32, end: ti.i32,
+                 substeps: ti.i32, save_every: ti.i32,
                  lag0: ti.i32, lag1: ti.i32, pre: fp, post: fp, alpha: fp, decay: fp, inverse_dt: fp,
                  alpha_by_rate: fp, decay_by_rate: fp):  # fmt: skip
         """The mirror of passes first + count - 1 .. first; `end` is the run's number of passes.

@@ -22,8 +22,8 @@ class SemiImplicitSolver(ExplicitSolver):
         """`SemiImplicitSolver(scene, dt=...)` takes dt as it is and refuses an unstable one.
 
         `SemiImplicitSolver(mesh, material, dt=...)`, or `SemiImplicitSolver(dt=...)` for
-        `Simulator(mesh, material, solver)`, makes the scene itself, with density [kg/m^3] and gravity [m/s^2, along y] and nothing else, and takes
-        `substeps` as the least number: it raises it to what stability asks for and says so.
+        `Simulator(mesh, material, solver)`, makes the scene itself, with density [kg/m^3] and gravity [m/s^2, along y]
+        and nothing else, and takes `substeps` as the least number: it raises it to what stability asks for and says so.
         """
         self.simulator = lambda: None
         self._own = dict(density=density, terms=[Gravity(gravity)])

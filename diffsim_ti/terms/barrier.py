@@ -49,3 +49,9 @@ def curvature(s, fp: ti.template()):
     elif s < 1:
         b = -2 * ti.log(s) - 4 * (s - 1) / s + (s - 1) * (s - 1) / (s * s)
     return b
+
+
+def reference_curvature() -> float:
+    """beta'' at a tenth of the width: the stiffness to expect of a firm contact, in units of the barrier's stiffness."""
+    s = 0.1
+    return -2 * math.log(s) - 4 * (s - 1) / s + ((s - 1) / s) ** 2

@@ -49,7 +49,8 @@ def _short(value: np.ndarray) -> str:
 class VertexForce(ABC):
     """Compile-time twin of a term: Taichi functions of one vertex, at rest position X, displacement u, velocity v.
 
-    Vectors have four components, the last zero. Equal twins share compiled kernels. `size` numbers start at `first` in the parameter array.
+    Vectors have four components, the last zero. Equal twins share compiled kernels.
+    `size` numbers start at `first` in the parameter array.
     """
 
     precision: str

@@ -1,0 +1,352 @@
+"""PyTorch face: learnable materials, smooth contact, implicit differentiation, checkpointed rollouts."""
+
+import math
+
+import numpy as np
+import torch
+
+from diffsim_ti.materials import StableNeoHookean
+from diffsim_ti.materials.evaluate import evaluate
+from diffsim_ti.terms import Ground
+from diffsim_ti.terms.barrier import CROSSOVER
+
+
+class _EnergyDensity(torch.autograd.Function):
+    """psi(F, coefficients) of a Taichi law."""
+
+    @staticmethod
+    def forward(ctx, law, F, coefficients):
+        psi, P, by = evaluate(law, *(x.detach().cpu().double().numpy() for x in (F, coefficients)))
+        ctx.save_for_backward(*(torch.from_numpy(x).to(F) for x in (P, by)))
+        ctx.uniform = coefficients.ndim == 1
+        return torch.from_numpy(psi).to(F)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, grad):
+        P, by = ctx.saved_tensors
+        by_coefficients = grad[:, None] * by
+        return None, grad[:, None, None] * P, by_coefficients.sum(0) if ctx.uniform else by_coefficients
+
+
+class _TorchMaterial(torch.nn.Module):
+    """What learnable materials share: E and nu as tensors, and the one law that exists in Taichi.
+
+    A subclass gives `E` and `nu`, tensors [Pa], [-] of shape () or (num_tetrahedra,).
+    """
+
+    material = StableNeoHookean
+
+    @property
+    def mu(self) -> torch.Tensor:
+        """Shear modulus E / (2 (1 + nu)) [Pa], in the graph."""
+        return self.E / (2 * (1 + self.nu))
+
+    @property
+    def lam(self) -> torch.Tensor:
+        """First Lame parameter E nu / ((1 + nu)(1 - 2 nu)) [Pa], in the graph."""
+        return self.E * self.nu / ((1 + self.nu) * (1 - 2 * self.nu))
+
+    def energy_density(self, F: torch.Tensor) -> torch.Tensor:
+        """Energy density [J/m^3], shape (m,), of deformation gradients F, shape (m, 3, 3); gradients to F, E and nu.
+
+        Second derivatives are refused by torch with an error; the core has stress differentials.
+        """
+        if F.ndim != 3 or F.shape[1:] != (3, 3):
+            raise ValueError(f"F: expected shape (m, 3, 3), got {tuple(F.shape)}")
+        material = self.core(None)
+        lame = torch.stack(torch.broadcast_tensors(self.mu, self.lam), -1)
+        coefficients = lame @ torch.as_tensor(np.array(material.from_lame), dtype=lame.dtype, device=lame.device).T
+        if coefficients.ndim == 2 and len(coefficients) != len(F):
+            raise ValueError(f"F: expected {len(coefficients)} matrices, one per tetrahedron, got {len(F)}")
+        law = material.law("f64" if F.dtype == torch.float64 else "f32")
+        return _EnergyDensity.apply(law, F, coefficients.to(F.dtype))
+
+    def tensors(self, mesh) -> dict[str, torch.Tensor]:
+        """The material's inputs on a mesh, in the graph."""
+        return {"youngs_modulus": self.E, "poissons_ratio": self.nu}
+
+    def core(self, mesh):
+        """The core's material at the present values."""
+        E, nu = (x.detach().double().cpu().numpy() for x in self.tensors(mesh).values()) if mesh else (1e5, 0.3)
+        return self.material(E, nu)
+
+
+def _one_of(name: str, *given):
+    """The single value that is not None among spellings of a name."""
+    values = [value for value in given if value is not None]
+    if len(values) != 1:
+        raise ValueError(f"{name}: give exactly one of its spellings, got {len(values)}")
+    return values[0]
+
+
+class DifferentiableMaterial(_TorchMaterial):
+    """Stable neo-Hookean material with learnable Young's modulus E [Pa] and Poisson's ratio nu [-].
+
+    psi = mu/2 (I_C - 3) - mu log J + lam/2 (J - 1)^2; E and nu scalar or one per tetrahedron; both are Parameters.
+    `DifferentiableMaterial(1e5, 0.4)`, `(E=..., nu=...)` or `(youngs_modulus=..., poissons_ratio=...)`; law: another
+    core material class, such as SmithNeoHookean.
+
+    A gradient by E in pascals is tiny (a loss of 1e-4 m^2 over an E of 1e5 Pa gives 1e-9 or less), far below Adam's eps of
+    1e-8: then Adam hardly moves E. Optimise log E with a scaled loss, or use LBFGS.
+    """
+
+    def __init__(self, youngs_modulus=None, poissons_ratio=None, requires_grad: bool = True, *, E=None, nu=None,
+                 law=StableNeoHookean):  # fmt: skip
+        super().__init__()
+        self.material = law
+        E = _one_of("Young's modulus (E, youngs_modulus)", youngs_modulus, E)
+        nu = _one_of("Poisson's ratio (nu, poissons_ratio)", poissons_ratio, nu)
+        default = torch.get_default_dtype()
+        for name, value in (("E", E), ("nu", nu)):
+            value = torch.as_tensor(value)
+            value = value.detach().clone().to(value.dtype if value.is_floating_point() and value.ndim else default)
+            self.register_parameter(name, torch.nn.Parameter(value, requires_grad=requires_grad))
+        law(self.E.detach().double().cpu().numpy(), self.nu.detach().double().cpu().numpy())  # checks the numbers
+
+
+class SpatiallyVaryingMaterial(_TorchMaterial):
+    """Stiffness that varies over the body, in one of two parametrisations.
+
+    `SpatiallyVaryingMaterial(num_elements, base_youngs, base_poisson)`: Parameters log_E and nu, one per tetrahedron.
+    `SpatiallyVaryingMaterial(base_E=, base_nu=, grid_resolution=, E_range=, requires_grad=)`: one Parameter of control
+    values in Pa on a regular grid over the mesh's bounding box, trilinear at the tetrahedra's centroids and clamped to
+    E_range; nu is a buffer.
+    """
+
+    def __init__(self, num_elements: int | None = None, base_youngs: float | None = None,
+                 base_poisson: float | None = None, *, base_E: float | None = None, base_nu: float | None = None,
+                 grid_resolution=None, E_range=None, requires_grad: bool = True, law=StableNeoHookean):  # fmt: skip
+        super().__init__()
+        self.material, self._mesh = law, None
+        E = 1e5 if base_youngs is None and base_E is None else float(_one_of("base_youngs, base_E", base_youngs, base_E))
+        nu = 0.4
+        if base_poisson is not None or base_nu is not None:
+            nu = float(_one_of("base_poisson, base_nu", base_poisson, base_nu))
+        law(E, nu)
+        if (num_elements is None) == (grid_resolution is None):
+            raise ValueError("give num_elements (a value per tetrahedron) or grid_resolution (values on a grid), not both")
+        self.grid_resolution = None if grid_resolution is None else tuple(int(r) for r in grid_resolution)
+        if self.grid_resolution is None:
+            self.log_E = torch.nn.Parameter(torch.full((num_elements,), math.log(E)), requires_grad=requires_grad)
+            self.nu = torch.nn.Parameter(torch.full((num_elements,), nu), requires_grad=requires_grad)
+        else:
+            if len(self.grid_resolution) != 3 or min(self.grid_resolution) < 2:
+                raise ValueError(f"grid_resolution: 3 numbers >= 2, got {grid_resolution}")
+            low, high = (0.1 * E, 10 * E) if E_range is None else E_range
+            if not 0 < low <= E <= high:
+                raise ValueError(f"E_range must be positive and contain base_E = {E:g}, got {E_range}")
+            self.E_range = (float(low), float(high))
+            self.control = torch.nn.Parameter(torch.full(self.grid_resolution, E), requires_grad=requires_grad)
+            self.register_buffer("nu", torch.tensor(nu))
+
+    @property
+    def E(self) -> torch.Tensor:
+        """Young's modulus per tetrahedron [Pa], in the graph; on a grid once a simulator has named the mesh."""
+        if self.grid_resolution is None:
+            return torch.exp(self.log_E)
+        if self._mesh is None:
+            raise RuntimeError("the grid's values need a mesh: build a DifferentiableSimulator, or call tensors(mesh)")
+        low, high = self.E_range
+        return (self._weights(self._mesh) * self.control.reshape(-1)[self._corners]).sum(1).clamp(low, high)
+
+    def _weights(self, mesh) -> torch.Tensor:
+        """Trilinear weights (num_tetrahedra, 8) of the grid points `_corners` around each centroid."""
+        if getattr(self, "_grid_of", None) is not mesh:
+            low, high = mesh.bounding_box
+            size = np.array(self.grid_resolution)
+            at = (mesh.centroids - low) / (high - low) * (size - 1)
+            cell = np.clip(np.floor(at).astype(int), 0, size - 2)
+            part = at - cell
+            weights, corners = [], []
+            for corner in np.ndindex(2, 2, 2):
+                weights.append(np.prod(np.where(corner, part, 1 - part), 1))
+                corners.append(np.ravel_multi_index((cell + corner).T, self.grid_resolution))
+            self._grid_of, self._grid = mesh, (np.stack(weights, 1), np.stack(corners, 1))
+        self._corners = torch.from_numpy(self._grid[1]).to(self.control.device)
+        return torch.from_numpy(self._grid[0]).to(self.control)
+
+    def tensors(self, mesh) -> dict[str, torch.Tensor]:
+        self._mesh = mesh if mesh is not None else self._mesh
+        if self.grid_resolution is None and mesh is not None and len(self.log_E) != mesh.num_tetrahedra:
+            raise ValueError(f"num_elements: the mesh has {mesh.num_tetrahedra} tetrahedra, the material {len(self.log_E)}")
+        return super().tensors(mesh)
+
+
+class DifferentiableBarrierContact:
+    """Smooth ground contact by a barrier; a plain torch formula, differentiable as often as wanted.
+
+    b(d) = -kappa (d - d_hat)^2 log(d / d_hat) for d < d_hat [J], zero beyond, C2; below d_hat / 1000 its Taylor polynomial.
+    `DifferentiableBarrierContact(barrier_stiffness=1e4, barrier_width=0.01)`, or the seeds' second spelling
+    `(ground_height=..., barrier_stiffness=..., barrier_distance=...)`. Attributes kappa, d_hat, ground_height.
+    """
+
+    def __init__(self, barrier_stiffness=1e4, barrier_width=None, *, ground_height: float = 0.0, barrier_distance=None):
+        given = [w for w in (barrier_width, barrier_distance) if w is not None]
+        if len(given) > 1:
+            raise ValueError("barrier_width and barrier_distance are two spellings of one number: give one")
+        self.kappa, self.d_hat, self.ground_height = barrier_stiffness, given[0] if given else 0.01, ground_height
+        self.term()  # checks the numbers
+
+    def term(self) -> Ground:
+        """The core's term with the same numbers."""
+        return Ground(*(float(x) for x in (self.ground_height, self.kappa, self.d_hat)))
+
+    def barrier_potential(self, d: torch.Tensor) -> torch.Tensor:
+        """Energy [J] at distances d [m], elementwise."""
+        s = d / self.d_hat
+        safe = s.clamp(CROSSOVER, 1.0)
+        t = torch.minimum(s - CROSSOVER, torch.zeros_like(s))
+        log = math.log(CROSSOVER)
+        slope = -2 * (CROSSOVER - 1) * log - (CROSSOVER - 1) ** 2 / CROSSOVER
+        curvature = -2 * log - 4 * (CROSSOVER - 1) / CROSSOVER + ((CROSSOVER - 1) / CROSSOVER) ** 2
+        beta = -((safe - 1) ** 2) * torch.log(safe) + t * (slope + t * curvature / 2)
+        return self.kappa * self.d_hat**2 * beta
+
+    def ground_contact_force(self, positions: torch.Tensor, velocities: torch.Tensor | None = None) -> torch.Tensor:
+        """Forces [N], shape (n, 3): along y, minus the slope of the barrier. velocities are not used (no friction)."""
+        with torch.enable_grad():
+            d = positions[:, 1] - self.ground_height
+            d = d if d.requires_grad else d.detach().requires_grad_()
+            (slope,) = torch.autograd.grad(self.barrier_potential(d).sum(), d, create_graph=positions.requires_grad)
+        zero = torch.zeros_like(slope)
+        return torch.stack([zero, -slope, zero], 1)
+
+    compute_forces = ground_contact_force
+
+
+def conjugate_gradient(A, b: torch.Tensor, x0: torch.Tensor | None = None, max_iters: int = 100, atol: float = 1e-6):
+    """Solve A x = b for a symmetric positive definite operator given by products A(v); |b - A x| <= atol.
+
+    Warns if it did not converge or met a direction of negative curvature. Hestenes, Stiefel 1952.
+    """
+    import warnings
+
+    x = torch.zeros_like(b) if x0 is None else x0.clone()
+    r = b - A(x)
+    p, rr = r.clone(), (r * r).sum()
+    for _ in range(max_iters):
+        if rr.sqrt() <= atol:
+            return x
+        Ap = A(p)
+        curvature = (p * Ap).sum()
+        if curvature <= 0:
+            warnings.warn(f"conjugate_gradient: A is not positive definite (p.A p = {float(curvature):.3g})", stacklevel=2)
+            return x
+        alpha = rr / curvature
+        x, r = x + alpha * p, r - alpha * Ap
+        rr, old = (r * r).sum(), rr
+        p = r + (rr / old) * p
+    if rr.sqrt() > atol:
+        warnings.warn(
+            f"conjugate_gradient did not converge: |b - A x| = {float(rr.sqrt()):.3g} > atol = {atol:g} after "
+            f"{max_iters} iterations; raise max_iters or precondition",
+            stacklevel=2,
+        )
+    return x
+
+
+class _Implicit(torch.autograd.Function):
+    """x*(params) of F(x*, params) = 0: backward solves (dF/dx)^T y = grad and returns -(dF/dp)^T y."""
+
+    @staticmethod
+    def forward(ctx, forward_fn, x_star, atol, *params):
+        ctx.forward_fn, ctx.atol, ctx.x, ctx.params = forward_fn, atol, x_star.detach(), params
+        return x_star.detach().clone()
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, grad):
+        from scipy.sparse.linalg import LinearOperator, gmres
+
+        with torch.enable_grad():
+            x = ctx.x.detach().requires_grad_()
+            params = [p.detach().requires_grad_(p.requires_grad) for p in ctx.params]
+            residual = ctx.forward_fn(x, *params)
+            n = x.numel()
+
+            def transposed(v):
+                v = torch.from_numpy(np.ascontiguousarray(v)).to(residual).reshape(residual.shape)
+                return torch.autograd.grad(residual, x, v, retain_graph=True)[0].double().cpu().numpy().ravel()
+
+            rhs = grad.double().cpu().numpy().ravel()
+            operator = LinearOperator((n, n), transposed, dtype=np.float64)
+            y, failed = gmres(operator, rhs, rtol=0.0, atol=ctx.atol, restart=min(n, 200), maxiter=50)
+            if failed:
+                raise RuntimeError(
+                    f"implicit_backward: GMRES did not reach atol = {ctx.atol:g} (residual "
+                    f"{np.linalg.norm(transposed(y) - rhs):.3g}): dF/dx may be singular at x_star; raise atol"
+                )
+            y = torch.from_numpy(y).to(residual).reshape(residual.shape)
+            wanted = [p for p in params if p.requires_grad]
+            grads = iter(torch.autograd.grad(residual, wanted, -y, allow_unused=True) if wanted else ())
+        return None, None, None, *(next(grads) if p.requires_grad else None for p in params)
+
+
+class ImplicitDifferentiation:
+    """Gradients through a solution by the implicit function theorem: dx*/dp = -(dF/dx)^-1 dF/dp."""
+
+    @staticmethod
+    def implicit_backward(forward_fn, x_star: torch.Tensor, params, atol: float = 1e-6) -> torch.Tensor:
+        """x_star with its gradients to `params` attached, for any square residual forward_fn(x, *params) = 0.
+
+        Backward solves the transposed system with exact Jacobian products by GMRES to |residual| <= atol and raises
+        RuntimeError if it cannot. params: a tensor or a sequence of tensors.
+        """
+        single = isinstance(params, torch.Tensor)
+        return _Implicit.apply(forward_fn, x_star, atol, *((params,) if single else tuple(params)))
+
+
+class CheckpointedRollout:
+    """Long rollouts in little memory, in the seeds' two spellings.
+
+    `CheckpointedRollout.rollout(step_fn, state0, num_steps, checkpoint_every)`: any torch step function; returns all
+    states, so only the graph's memory falls. `CheckpointedRollout(simulator, checkpoint_every=10)(num_steps=1000)`: a
+    DifferentiableSimulator; keeps the last state and really saves; returns its positions.
+    """
+
+    def __init__(self, simulator, checkpoint_every: int = 10):
+        self.simulator, self.checkpoint_every = simulator, checkpoint_every
+
+    def __call__(self, num_steps: int) -> torch.Tensor:
+        """Positions [m] after num_steps steps, in the graph."""
+        self.simulator.rollout(num_steps, checkpoint_every=self.checkpoint_every)
+        return self.simulator.positions
+
+    @staticmethod
+    def rollout(step_fn, state0, num_steps: int, checkpoint_every: int = 10) -> list:
+        """[s_0, ..., s_T] with s_{t+1} = step_fn(s_t); a state is a tensor or a tuple of tensors."""
+        from torch.utils.checkpoint import checkpoint
+
+        single = isinstance(state0, torch.Tensor)
+
+        def segment(count, *state):
+            out = []
+            for _ in range(count):
+                state = step_fn(state[0] if single else state)
+                state = (state,) if single else tuple(state)
+                out.extend(state)
+            return tuple(out)
+
+        states, state = [state0], (state0,) if single else tuple(state0)
+        for done in range(0, num_steps, checkpoint_every):
+            count = min(checkpoint_every, num_steps - done)
+            flat = checkpoint(segment, count, *state, use_reentrant=False)
+            width = len(state)
+            groups = [flat[i : i + width] for i in range(0, len(flat), width)]
+            states += [group[0] if single else group for group in groups]
+            state = groups[-1]
+        return states
+
+
+def smooth_step(x: torch.Tensor, edge: float = 0.0, width: float = 1.0) -> torch.Tensor:
+    """Smooth step from 0 to 1 around `edge`: 3 t^2 - 2 t^3 with t = clamp((x - edge) / width + 1/2, 0, 1); C1."""
+    t = ((x - edge) / width + 0.5).clamp(0, 1)
+    return t * t * (3 - 2 * t)
+
+
+def log_barrier(x: torch.Tensor, eps: float = 1e-3) -> torch.Tensor:
+    """-log(x) for x > eps, continued below by its second-order Taylor polynomial at eps (C2)."""
+    safe = x.clamp(min=eps)
+    t = torch.minimum(x - eps, torch.zeros_like(x)) / eps
+    return -torch.log(safe) - t + t * t / 2
