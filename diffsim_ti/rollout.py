@@ -105,7 +105,7 @@ class Rollout:
 
     def forward(self, **values) -> Frames:
         """Run from the scene's inputs, with some of them replaced, and return the saved frames."""
-        run = self._start(values)
+        run = self._start({name: np.array(value, np.float64) for name, value in values.items()})  # callers reuse arrays
         self._sweep_forward()
         u, v = (runtime.fetch(x) for x in self._workspace.frames)
         rest = run["rest_positions"]
@@ -228,6 +228,7 @@ class Rollout:
         if unknown:
             raise ValueError(f"no input named {unknown[0]!r}; this rollout has {', '.join(self.inputs)}")
         run = self.values | self.scene.inputs.check(values)
+        self._current = None  # until the sweep is through
         if self._loaded is not None and all(run[name] is self._loaded[name] for name in run):
             self._workspace.restart()
             return run
@@ -284,8 +285,9 @@ class Rollout:
         adjoint = self._adjoint
         adjoint.start(positions_adj, velocities_adj, self.solver.last_frame_is_state)
         self.health = []
-        stop = 0 if self.truncate is None else max(0, self.num_passes - self.truncate * self.solver.substeps)
-        kept, end = list(self._kept), schedule.num_segments
+        stop = 0 if self.truncate is None else max(0, self.steps - self.truncate) * self.solver.substeps
+        kept, end = self._kept, schedule.num_segments
+        self._kept = kept[:1]  # the sweep overwrites the others, also if it does not get to its end
         while end > 0 and schedule.bounds(end - 1)[1] > stop:
             begin = kept[-1]
             if self._recorded:
@@ -307,7 +309,6 @@ class Rollout:
                 kept.pop()
         if self.num_passes > stop:
             adjoint.finish()
-        self._kept = self._kept[:1]
         derived = adjoint.collect()
         if stop > 0:  # the start is beyond the cut
             derived.displacement[:], derived.velocity[:] = 0, 0

@@ -43,7 +43,7 @@ def full_scene(material=ds.StableNeoHookean, precision="f64", steps=100, resolut
     start = random_start(mesh, rng)
     terms = [
         ds.Gravity(), ds.Drag(2.0), ds.Ground(-0.15, 1e3, 0.2),
-        ds.ExternalForce(rng.normal(size=(steps, mesh.num_vertices, 3))),
+        ds.ExternalForce(50 * rng.normal(size=(steps, mesh.num_vertices, 3))),
     ]  # fmt: skip
     return ds.Scene(
         mesh, material(*start.pop("moduli")), terms=terms, fixed="xmin", precision=precision,

@@ -275,7 +275,7 @@ def distorted_mesh(slivers=True):
     for eta in (1e-1, 1e-2, 1e-3, 1e-4) if slivers else ():
         e = int(rng.integers(len(tets)))
         corners = tets[e]
-        new = X[corners] @ np.array([eta, *(np.array([0.4, 0.33, 0.27]) * (1 - eta))])
+        new = np.array([eta, *(np.array([0.4, 0.33, 0.27]) * (1 - eta))]) @ X[corners]
         X = np.vstack([X, new])
         split = np.repeat(corners[None], 4, 0)
         split[np.arange(4), np.arange(4)] = len(X) - 1

@@ -34,7 +34,8 @@ class Solver(ABC):
 
     def twin(self, scene) -> "Solver":
         """The same solver for another scene."""
-        return type(self)(scene, self.dt, substeps=self.substeps, parallel=self.parallel, allow_unstable=self.allow_unstable)
+        own = dict(dt=self.dt, substeps=self.substeps, parallel=self.parallel, allow_unstable=self.allow_unstable)
+        return type(self)(scene, **own)
 
     @property
     def substep(self) -> float:
