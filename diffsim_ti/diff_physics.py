@@ -1,10 +1,11 @@
 """PyTorch face: learnable materials, smooth contact, implicit differentiation, checkpointed rollouts."""
 
 import math
+import warnings
 
 import numpy as np
-import torch
 
+from diffsim_ti.autograd import first_order_only, torch
 from diffsim_ti.materials import StableNeoHookean
 from diffsim_ti.materials.evaluate import evaluate
 from diffsim_ti.terms import Ground
@@ -18,11 +19,11 @@ class _EnergyDensity(torch.autograd.Function):
     def forward(ctx, law, F, coefficients):
         psi, P, by = evaluate(law, *(x.detach().cpu().double().numpy() for x in (F, coefficients)))
         ctx.save_for_backward(*(torch.from_numpy(x).to(F) for x in (P, by)))
-        ctx.uniform = coefficients.ndim == 1
+        ctx.uniform, ctx.tensors = coefficients.ndim == 1, (F, coefficients)
         return torch.from_numpy(psi).to(F)
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @first_order_only("the energy's stress differential lives in the core (materials)")
     def backward(ctx, grad):
         P, by = ctx.saved_tensors
         by_coefficients = grad[:, None] * by
@@ -50,7 +51,7 @@ class _TorchMaterial(torch.nn.Module):
     def energy_density(self, F: torch.Tensor) -> torch.Tensor:
         """Energy density [J/m^3], shape (m,), of deformation gradients F, shape (m, 3, 3); gradients to F, E and nu.
 
-        Second derivatives are refused by torch with an error; the core has stress differentials.
+        Second derivatives are refused with an error; the core has stress differentials.
         """
         if F.ndim != 3 or F.shape[1:] != (3, 3):
             raise ValueError(f"F: expected shape (m, 3, 3), got {tuple(F.shape)}")
@@ -95,12 +96,12 @@ class DifferentiableMaterial(_TorchMaterial):
                  law=StableNeoHookean):  # fmt: skip
         super().__init__()
         self.material = law
+        given = [x.dtype for x in (youngs_modulus, poissons_ratio, E, nu) if isinstance(x, torch.Tensor) and x.is_floating_point()]
+        dtype = max(given, key=lambda d: torch.finfo(d).bits, default=torch.get_default_dtype())
         E = _one_of("Young's modulus (E, youngs_modulus)", youngs_modulus, E)
         nu = _one_of("Poisson's ratio (nu, poissons_ratio)", poissons_ratio, nu)
-        default = torch.get_default_dtype()
         for name, value in (("E", E), ("nu", nu)):
-            value = torch.as_tensor(value)
-            value = value.detach().clone().to(value.dtype if value.is_floating_point() and value.ndim else default)
+            value = torch.as_tensor(value, dtype=dtype).detach().clone()
             self.register_parameter(name, torch.nn.Parameter(value, requires_grad=requires_grad))
         law(self.E.detach().double().cpu().numpy(), self.nu.detach().double().cpu().numpy())  # checks the numbers
 
@@ -178,7 +179,8 @@ class DifferentiableBarrierContact:
 
     b(d) = -kappa (d - d_hat)^2 log(d / d_hat) for d < d_hat [J], zero beyond, C2; below d_hat / 1000 its Taylor polynomial.
     `DifferentiableBarrierContact(barrier_stiffness=1e4, barrier_width=0.01)`, or the seeds' second spelling
-    `(ground_height=..., barrier_stiffness=..., barrier_distance=...)`. Attributes kappa, d_hat, ground_height.
+    `(ground_height=..., barrier_stiffness=..., barrier_distance=...)`. Attributes kappa, d_hat, ground_height; each may be a
+    tensor with gradient.
     """
 
     def __init__(self, barrier_stiffness=1e4, barrier_width=None, *, ground_height: float = 0.0, barrier_distance=None):
@@ -191,6 +193,11 @@ class DifferentiableBarrierContact:
     def term(self) -> Ground:
         """The core's term with the same numbers."""
         return Ground(*(float(x) for x in (self.ground_height, self.kappa, self.d_hat)))
+
+    def tensors(self, like: torch.Tensor) -> dict[str, torch.Tensor]:
+        """The term's inputs, in the graph."""
+        numbers = dict(ground_height=self.ground_height, barrier_stiffness=self.kappa, barrier_width=self.d_hat)
+        return {name: torch.as_tensor(x, dtype=like.dtype, device=like.device) for name, x in numbers.items()}
 
     def barrier_potential(self, d: torch.Tensor) -> torch.Tensor:
         """Energy [J] at distances d [m], elementwise."""
@@ -205,10 +212,13 @@ class DifferentiableBarrierContact:
 
     def ground_contact_force(self, positions: torch.Tensor, velocities: torch.Tensor | None = None) -> torch.Tensor:
         """Forces [N], shape (n, 3): along y, minus the slope of the barrier. velocities are not used (no friction)."""
+        inputs = (positions, self.ground_height, self.kappa, self.d_hat)
+        wanted = torch.is_grad_enabled() and any(isinstance(x, torch.Tensor) and x.requires_grad for x in inputs)
         with torch.enable_grad():
             d = positions[:, 1] - self.ground_height
             d = d if d.requires_grad else d.detach().requires_grad_()
-            (slope,) = torch.autograd.grad(self.barrier_potential(d).sum(), d, create_graph=positions.requires_grad)
+            (slope,) = torch.autograd.grad(self.barrier_potential(d).sum(), d, create_graph=wanted)
+        slope = slope if wanted else slope.detach()
         zero = torch.zeros_like(slope)
         return torch.stack([zero, -slope, zero], 1)
 
@@ -220,8 +230,6 @@ def conjugate_gradient(A, b: torch.Tensor, x0: torch.Tensor | None = None, max_i
 
     Warns if it did not converge or met a direction of negative curvature. Hestenes, Stiefel 1952.
     """
-    import warnings
-
     x = torch.zeros_like(b) if x0 is None else x0.clone()
     r = b - A(x)
     p, rr = r.clone(), (r * r).sum()
@@ -251,35 +259,45 @@ class _Implicit(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, forward_fn, x_star, atol, *params):
-        ctx.forward_fn, ctx.atol, ctx.x, ctx.params = forward_fn, atol, x_star.detach(), params
+        ctx.forward_fn, ctx.atol, ctx.tensors = forward_fn, atol, params
+        ctx.save_for_backward(x_star, *params)
         return x_star.detach().clone()
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @first_order_only("differentiate the residual's equation twice by hand")
     def backward(ctx, grad):
         from scipy.sparse.linalg import LinearOperator, gmres
 
+        size = float(grad.norm())
+        if size == 0:
+            return None, None, None, *(torch.zeros_like(p) if p.requires_grad else None for p in ctx.tensors)
         with torch.enable_grad():
-            x = ctx.x.detach().requires_grad_()
-            params = [p.detach().requires_grad_(p.requires_grad) for p in ctx.params]
+            x, *params = ctx.saved_tensors
+            x = x.detach().requires_grad_()
             residual = ctx.forward_fn(x, *params)
             n = x.numel()
+            if residual.numel() != n:
+                raise ValueError(f"the residual must be square: expected {n} equations for {n} unknowns, got {residual.numel()}")
 
             def transposed(v):
                 v = torch.from_numpy(np.ascontiguousarray(v)).to(residual).reshape(residual.shape)
                 return torch.autograd.grad(residual, x, v, retain_graph=True)[0].double().cpu().numpy().ravel()
 
-            rhs = grad.double().cpu().numpy().ravel()
+            rhs = grad.double().cpu().numpy().ravel() / size
             operator = LinearOperator((n, n), transposed, dtype=np.float64)
-            y, failed = gmres(operator, rhs, rtol=0.0, atol=ctx.atol, restart=min(n, 200), maxiter=50)
+            atol = max(ctx.atol, 50 * torch.finfo(residual.dtype).eps)
+            y, failed = gmres(operator, rhs, rtol=0.0, atol=atol, restart=min(n, 200), maxiter=50)
             if failed:
                 raise RuntimeError(
-                    f"implicit_backward: GMRES did not reach atol = {ctx.atol:g} (residual "
+                    f"implicit_backward: GMRES did not reach atol = {atol:g} (residual "
                     f"{np.linalg.norm(transposed(y) - rhs):.3g}): dF/dx may be singular at x_star; raise atol"
                 )
-            y = torch.from_numpy(y).to(residual).reshape(residual.shape)
+            y = torch.from_numpy(size * y).to(residual).reshape(residual.shape)
             wanted = [p for p in params if p.requires_grad]
-            grads = iter(torch.autograd.grad(residual, wanted, -y, allow_unused=True) if wanted else ())
+            grads = torch.autograd.grad(residual, wanted, -y, allow_unused=True) if wanted else ()
+            if any(g is None for g in grads):
+                raise ValueError("implicit_backward: the residual does not depend on one of params; leave that one out")
+            grads = iter(grads)
         return None, None, None, *(next(grads) if p.requires_grad else None for p in params)
 
 
@@ -290,8 +308,9 @@ class ImplicitDifferentiation:
     def implicit_backward(forward_fn, x_star: torch.Tensor, params, atol: float = 1e-6) -> torch.Tensor:
         """x_star with its gradients to `params` attached, for any square residual forward_fn(x, *params) = 0.
 
-        Backward solves the transposed system with exact Jacobian products by GMRES to |residual| <= atol and raises
-        RuntimeError if it cannot. params: a tensor or a sequence of tensors.
+        params: a tensor or a sequence of tensors. Backward solves the transposed system, of any square shape, with exact
+        Jacobian products by GMRES to atol relative to the incoming gradient (at least what the dtype resolves) and raises
+        RuntimeError if it cannot. forward_fn must be pure: it runs again in backward. Second derivatives are refused.
         """
         single = isinstance(params, torch.Tensor)
         return _Implicit.apply(forward_fn, x_star, atol, *((params,) if single else tuple(params)))
@@ -318,6 +337,8 @@ class CheckpointedRollout:
         """[s_0, ..., s_T] with s_{t+1} = step_fn(s_t); a state is a tensor or a tuple of tensors."""
         from torch.utils.checkpoint import checkpoint
 
+        if num_steps < 0 or checkpoint_every < 1:
+            raise ValueError(f"num_steps must be >= 0 and checkpoint_every >= 1, got {num_steps} and {checkpoint_every}")
         single = isinstance(state0, torch.Tensor)
 
         def segment(count, *state):

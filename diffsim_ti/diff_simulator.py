@@ -8,13 +8,14 @@ import warnings
 from typing import NamedTuple
 
 import numpy as np
-import torch
 
 from diffsim_ti import stability
+from diffsim_ti.autograd import first_order_only, torch
+from diffsim_ti.diff_physics import DifferentiableBarrierContact
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.scene import Scene
 from diffsim_ti.solvers import SemiImplicitSolver
-from diffsim_ti.terms import Drag, ExternalForce, Gravity, Ground, barrier
+from diffsim_ti.terms import Drag, ExternalForce, Gravity, barrier
 
 DTYPES = {"f32": torch.float32, "f64": torch.float64}
 
@@ -34,25 +35,25 @@ class _RolloutFunction(torch.autograd.Function):
     def forward(ctx, rollout: Rollout, names: tuple, *tensors):
         values = {}
         for name, tensor in zip(names, tensors):
-            value = tensor.detach().to("cpu", torch.float64).numpy()
+            # a copy: an optimiser changes parameters in place, and the reverse sweep needs those of this run
+            value = tensor.detach().to("cpu", torch.float64, copy=True).numpy()
             if name == "initial_displacements":
                 name, value = "initial_positions", rollout.values["rest_positions"] + value
             values[name] = value
         frames = rollout.forward(**values)
-        ctx.rollout, ctx.names, ctx.frames = rollout, names, frames
-        ctx.kinds = [(tensor.dtype, tensor.device) for tensor in tensors]
+        ctx.rollout, ctx.names, ctx.frames, ctx.tensors = rollout, names, frames, tensors
         device = tensors[0].device if tensors else "cpu"
         return tuple(torch.from_numpy(x).to(device) for x in (frames.displacements, frames.velocities))
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @first_order_only("use verify.hessian_product or verify.gauss_newton_product")
     def backward(ctx, by_displacements, by_velocities):
         adjoints = (g.detach().to("cpu", torch.float64).numpy() for g in (by_displacements, by_velocities))
         gradients = ctx.rollout.vjp(ctx.frames, *adjoints)
         out = [None, None]
-        for name, (dtype, device), needed in zip(ctx.names, ctx.kinds, ctx.needs_input_grad[2:]):
+        for name, tensor, needed in zip(ctx.names, ctx.tensors, ctx.needs_input_grad[2:]):
             name = "initial_positions" if name == "initial_displacements" else name
-            out.append(torch.from_numpy(np.array(gradients[name])).to(device, dtype) if needed else None)
+            out.append(torch.from_numpy(np.array(gradients[name])).to(tensor.device, tensor.dtype) if needed else None)
         return tuple(out)
 
 
@@ -61,7 +62,14 @@ def rollout_frames(rollout: Rollout, **tensors: torch.Tensor) -> TorchFrames:
 
     Names are those of `rollout.inputs`, or "initial_displacements" instead of "initial_positions" (which keeps its digits
     in float32). Two runs before one backward are right. Second derivatives are refused (see `verify.hessian_product`).
+    Raises ValueError for unknown names, wrong shapes and types that are not floating point.
     """
+    if "initial_positions" in tensors and "initial_displacements" in tensors:
+        raise ValueError("initial_positions and initial_displacements are two spellings of one input: give one")
+    for name, value in tensors.items():
+        tensors[name] = value if isinstance(value, torch.Tensor) else torch.as_tensor(value, dtype=torch.float64)
+        if not tensors[name].is_floating_point():
+            raise ValueError(f"{name}: expected a floating point tensor, got {tensors[name].dtype}")
     displacements, velocities = _RolloutFunction.apply(rollout, tuple(tensors), *tensors.values())
     rest = torch.from_numpy(np.array(rollout.values["rest_positions"])).to(displacements)
     return TorchFrames(rest + displacements, velocities, displacements)
@@ -98,30 +106,39 @@ class DifferentiableSimulator:
 
     material: DifferentiableMaterial or SpatiallyVaryingMaterial (diff_physics); density [kg/m^3]: a number or a tensor,
     scalar or per tetrahedron; fixed_vertices: set name, indices or mask; contact: None for the seeds' ground, False for
-    none, or a DifferentiableBarrierContact; terms: further core terms.
+    none, or a DifferentiableBarrierContact, whose numbers may be tensors with gradient; terms: further core terms.
 
     The seeds' ground is a barrier (stiffness 1e4, width 0.01) at y = 0 where the body starts at least one width above it,
     otherwise one width below its lowest vertex; it is fixed at the start. `describe()` says which.
-    The precision follows the material's dtype. Raises Divergence if the run outgrows its substeps.
+    The precision follows the material's dtype. Raises Divergence if the run outgrows its substeps; the state is then as
+    it was before that step.
     """
+
+    kept_rollouts = 8  # one for each length and way of saving that is in use
 
     def __init__(self, mesh, material, solver: DifferentiableSolver, density=1000.0, fixed_vertices=None, contact=None,
                  terms=None, device="cpu"):  # fmt: skip
         self.mesh, self.material, self.solver, self.device = mesh, material, solver, torch.device(device)
         self.density, self.fixed_vertices = density, fixed_vertices
         self._terms = list(terms or [])
-        self._ground = self._choose_ground(contact)
+        self._contact = self._choose_contact(contact)
         self._substeps, self._rollouts, self._scenes = solver.substeps, {}, {}
         self._ratio: float | None = None
+        self._rest: torch.Tensor | None = None
         self.reset()
 
-    def _choose_ground(self, contact) -> Ground | None:
-        if contact is False:
-            return None
-        if contact is not None:
-            return contact.term()
-        lowest, width = float(self.mesh.vertices[:, 1].min()), 0.01
-        return Ground(0.0 if lowest >= width else lowest - width, 1e4, width)
+    def _choose_contact(self, contact) -> DifferentiableBarrierContact | None:
+        if contact is None:
+            lowest, width = float(self.mesh.vertices[:, 1].min()), 0.01
+            return DifferentiableBarrierContact(1e4, width, ground_height=0.0 if lowest >= width else lowest - width)
+        if contact is not False and not isinstance(contact, DifferentiableBarrierContact):
+            raise ValueError(f"contact must be None, False or a DifferentiableBarrierContact, got {contact!r}")
+        return contact or None
+
+    def __getstate__(self) -> dict:
+        """For pickle and copy.deepcopy: the state leaves its graph; what Taichi holds is built anew."""
+        state = self.__dict__ | dict(_rollouts={}, _scenes={})
+        return state | dict(_displacements=self._displacements.detach(), _velocities=self._velocities.detach())
 
     @property
     def dtype(self) -> torch.dtype:
@@ -139,61 +156,86 @@ class DifferentiableSimulator:
 
     def reset(self, positions: torch.Tensor | None = None, velocities: torch.Tensor | None = None) -> None:
         """Back to the start, or to given positions [m] and velocities [m/s], tensors of shape (num_vertices, 3)."""
-        precision = {v: k for k, v in DTYPES.items()}.get(self.dtype)
-        if precision is None:
-            raise ValueError(f"the material's parameters must be float32 or float64, got {self.dtype}")
-        if getattr(self, "_precision", None) != precision:
-            self._precision, self._rollouts, self._scenes = precision, {}, {}
-        kind = dict(dtype=self.dtype, device=self.device)
-        self._rest = torch.tensor(np.array(self.mesh.vertices), **kind)
-        shape = tuple(self._rest.shape)
-        for name, value in (("positions", positions), ("velocities", velocities)):
-            if value is not None and tuple(value.shape) != shape:
-                raise ValueError(f"{name}: expected shape {shape}, got {tuple(value.shape)}")
-        self._displacements = torch.zeros_like(self._rest) if positions is None else positions.to(**kind) - self._rest
-        self._velocities = torch.zeros_like(self._rest) if velocities is None else velocities.to(**kind)
+        self._follow_dtype()
+        self._displacements, self._velocities = torch.zeros_like(self._rest), torch.zeros_like(self._rest)
+        if positions is not None:
+            self._displacements = self._checked("positions", positions, self._rest.shape) - self._rest
+        if velocities is not None:
+            self._velocities = self._checked("velocities", velocities, self._rest.shape)
         self._choose_substeps()
+
+    def detach(self) -> None:
+        """Cut the graph here and keep the motion: gradients of later losses stop at the present state (truncated
+        backpropagation through time)."""
+        self._displacements, self._velocities = self._displacements.detach(), self._velocities.detach()
 
     def step(self, external_forces: torch.Tensor | None = None) -> None:
         """Advance by dt; external_forces [N], shape (num_vertices, 3), with gradient."""
         self._advance(1, external_forces)
 
-    def rollout(self, num_steps: int, checkpoint_every: int | None = None, save_every: int | None = None) -> TorchFrames:
-        """num_steps steps as one autograd node; the frames (the start, then every save_every-th step, default the last)."""
-        return self._advance(num_steps, None, checkpoint_every, save_every)
+    def rollout(self, num_steps: int, checkpoint_every: int | None = None, save_every: int | None = None,
+                external_forces: torch.Tensor | None = None) -> TorchFrames:  # fmt: skip
+        """num_steps steps as one autograd node; the frames (the start, then every save_every-th step, default the last).
+
+        checkpoint_every: keep a state every so many steps and compute the rest again in the reverse sweep.
+        external_forces [N]: (num_vertices, 3) for all steps, or (num_steps, num_vertices, 3), with gradient.
+        """
+        return self._advance(num_steps, external_forces, checkpoint_every, save_every)
 
     def describe(self) -> str:
         """What is simulated, and how."""
         return self._rollout(1, False, None, None).solver.describe() + "\n" + self._scene(False).describe()
 
+    def _checked(self, name: str, value, *shapes) -> torch.Tensor:
+        """A floating point tensor of one of these shapes, brought to this simulator's dtype and device in the graph."""
+        value = value if isinstance(value, torch.Tensor) else torch.as_tensor(value)
+        if tuple(value.shape) not in [tuple(shape) for shape in shapes]:
+            expected = " or ".join(str(tuple(shape)) for shape in shapes)
+            raise ValueError(f"{name}: expected shape {expected}, got {tuple(value.shape)}")
+        if not value.is_floating_point():
+            raise ValueError(f"{name}: expected a floating point tensor such as {self.dtype}, got {value.dtype}")
+        return value.to(dtype=self.dtype, device=self.device)
+
+    def _follow_dtype(self) -> None:
+        """Take on the precision of the material, which may have been moved since."""
+        if self.dtype not in DTYPES.values():
+            raise ValueError(f"the material's parameters must be float32 or float64, got {self.dtype}")
+        if self._rest is not None and self._rest.dtype == self.dtype:
+            return
+        self._rollouts, self._scenes = {}, {}
+        self._rest = torch.tensor(np.array(self.mesh.vertices), dtype=self.dtype, device=self.device)
+        if hasattr(self, "_displacements"):
+            self._displacements, self._velocities = (x.to(self._rest) for x in (self._displacements, self._velocities))
+
+    def _inputs(self) -> dict[str, torch.Tensor]:
+        """What a run takes besides state and forces."""
+        inputs = self.material.tensors(self.mesh) | {"gravity": self.solver.gravity_vector(self._rest)}
+        inputs["density"] = torch.as_tensor(self.density, dtype=self.dtype, device=self.device)
+        return inputs | (self._contact.tensors(self._rest) if self._contact else {})
+
     def _advance(self, steps, external_forces, checkpoint_every=None, save_every=None) -> TorchFrames:
-        rollout = self._rollout(steps, external_forces is not None, checkpoint_every, save_every)
+        self._follow_dtype()
         tensors = {"initial_displacements": self._displacements, "initial_velocities": self._velocities}
-        tensors |= self.material.tensors(self.mesh)
-        tensors["density"] = torch.as_tensor(self.density, dtype=self.dtype)
-        tensors["gravity"] = self.solver.gravity_vector(self._rest)
+        tensors |= self._inputs()
         if external_forces is not None:
-            if tuple(external_forces.shape) != tuple(self._rest.shape):
-                expected = tuple(self._rest.shape)
-                raise ValueError(f"external_forces: expected shape {expected}, got {tuple(external_forces.shape)}")
-            tensors["external_forces"] = external_forces
+            shape = tuple(self._rest.shape)
+            tensors["external_forces"] = self._checked("external_forces", external_forces, shape, (steps, *shape))
+        rollout = self._rollout(steps, external_forces is not None, checkpoint_every, save_every)
         frames = rollout_frames(rollout, **tensors)
         self._displacements, self._velocities = frames.displacements[-1], frames.velocities[-1]
         return frames
 
     def _scene(self, with_forces: bool) -> Scene:
         if with_forces not in self._scenes:
-            terms = [Gravity(self.solver.gravity_vector(self._rest).detach().double().cpu().numpy()), *self._terms]
+            numbers = {name: x.detach().double().cpu().numpy() for name, x in self._inputs().items()}
+            terms = [Gravity(numbers["gravity"]), *([self._contact.term()] if self._contact else []), *self._terms]
             if self.solver.damping < 1:
                 terms.append(Drag(-math.log(self.solver.damping) / self.solver.dt))
-            if self._ground is not None:
-                terms.append(self._ground)
             if with_forces:
                 terms.append(ExternalForce(np.zeros((self.mesh.num_vertices, 3))))
-            self._scenes[with_forces] = Scene(
-                self.mesh, self.material.core(self.mesh), torch.as_tensor(self.density).detach().double().cpu().numpy(),
-                terms, self.fixed_vertices, precision=self._precision,
-            )  # fmt: skip
+            precision = next(name for name, dtype in DTYPES.items() if dtype == self.dtype)
+            self._scenes[with_forces] = Scene(self.mesh, self.material.core(self.mesh), numbers["density"], terms,
+                                              self.fixed_vertices, precision=precision)  # fmt: skip
         return self._scenes[with_forces]
 
     def _rollout(self, steps: int, with_forces: bool, checkpoint_every, save_every) -> Rollout:
@@ -201,25 +243,25 @@ class DifferentiableSimulator:
         if key not in self._rollouts:
             solver = SemiImplicitSolver(self._scene(with_forces), dt=self.solver.dt, substeps=self._substeps,
                                         allow_unstable=True)  # fmt: skip
-            solver.allow_unstable = False  # the count was chosen below; outgrowing it raises
+            solver.allow_unstable = False  # the count was chosen at reset; outgrowing it raises
+            if len(self._rollouts) >= self.kept_rollouts:
+                self._rollouts.pop(next(iter(self._rollouts)))
             self._rollouts[key] = Rollout(solver, steps, save_every, checkpoint_every)
         return self._rollouts[key]
 
     def _choose_substeps(self) -> None:
-        """What stability and contact ask for at the present moduli; the count only grows, so that losses stay smooth."""
+        """What stability and contact ask for at the present numbers; the count only grows, so that losses stay smooth."""
         scene = self._scene(False)
-        numbers = {k: v.detach().double().cpu().numpy() for k, v in self.material.tensors(self.mesh).items()}
-        density = torch.as_tensor(self.density).detach().double().cpu().numpy()
-        values = scene.inputs.check(scene.inputs.values | numbers | {"density": density})
+        numbers = {name: x.detach().double().cpu().numpy() for name, x in self._inputs().items()}
+        values = scene.inputs.values | scene.inputs.check(numbers)
         bound = stability.element_limit(scene, values).dt
         if self._ratio is None:
             solver = SemiImplicitSolver(scene, dt=self.solver.dt, allow_unstable=True)
             self._ratio = solver.stable_dt(tight=True).dt / stability.element_limit(scene).dt
         omega2 = (2 / (self._ratio * bound)) ** 2
-        if self._ground is not None:
-            stiffness = float(self._ground.values["barrier_stiffness"])
+        if self._contact:
             mass = scene.inputs.derive(values).mass
-            omega2 += stiffness * barrier.reference_curvature() / mass[mass > 0].min()
+            omega2 += float(values["barrier_stiffness"]) * barrier.reference_curvature() / mass[mass > 0].min()
         needed = math.ceil(self.solver.dt * math.sqrt(omega2) / 2 / 0.8)
         if needed > self._substeps:
             warnings.warn(

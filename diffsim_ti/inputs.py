@@ -67,7 +67,7 @@ class Inputs:
                 at += sum(value.size for value in term.values.values())
         self.num_parameters = at
         values["rest_positions"] = self.mesh.vertices
-        self.values = self.check(values)
+        self.values = {name: value.copy() for name, value in self.check(values).items()}  # the caller's may change
 
     @staticmethod
     def _free_name(name: str, taken: dict) -> str:

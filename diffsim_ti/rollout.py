@@ -105,7 +105,8 @@ class Rollout:
 
     def forward(self, **values) -> Frames:
         """Run from the scene's inputs, with some of them replaced, and return the saved frames."""
-        run = self._start({name: np.array(value, np.float64) for name, value in values.items()})  # callers reuse arrays
+        own = self.values  # callers may change their arrays later: keep copies
+        run = self._start({name: x if x is own.get(name) else np.array(x, np.float64) for name, x in values.items()})
         self._sweep_forward()
         u, v = (runtime.fetch(x) for x in self._workspace.frames)
         rest = run["rest_positions"]

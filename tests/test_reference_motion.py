@@ -99,18 +99,18 @@ def test_large_amplitude_over_ten_thousand_steps(solver):
 
 @solvers
 def test_frequency_and_energy_of_a_coarse_step(solver):
-    """omega dt = 1: the frequency rises by (2 / omega dt) asin(omega dt / 2), the energy stays in its band."""
+    """omega dt = 0.9: the frequency rises by (2 / omega dt) asin(omega dt / 2), the energy stays in its band."""
     omega = 2 * np.sqrt(MU / RHO) / 0.5
-    dt, amplitude = 1 / omega, 0.1
+    dt, amplitude = 0.9 / omega, 0.1
     scene = oscillator(0.0, amplitude)
     frames = run(scene, solver, dt, 400)
     u, v = apex(frames)[:, 0], frames.velocities[:, 3, 0]
     ratio = np.arccos(((u[2:] + u[:-2]) * u[1:-1]).sum() / (2 * (u[1:-1] ** 2).sum())) / (omega * dt)
-    assert ratio == pytest.approx(2 * np.arcsin(0.5), rel=1e-10)
+    assert ratio == pytest.approx(2 / 0.9 * np.arcsin(0.45), rel=1e-10)
     energy = (v**2 + omega**2 * u**2) / (omega * amplitude) ** 2
-    low, high = (1 / 1.5, 1 / 0.5) if solver.order == 1 else (1 - 0.25, 1.0)  # SE: 1 / (1 +- w dt / 2), Verlet: 1 - (w dt / 2)^2
+    low, high = (1 / 1.45, 1 / 0.55) if solver.order == 1 else (1 - 0.45**2, 1.0)  # SE: 1 / (1 +- w dt / 2), Verlet: 1 - (w dt / 2)^2
     assert low - 1e-10 <= energy.min() and energy.max() <= high + 1e-10
-    assert energy.max() - energy.min() > 0.9 * (1 - low)  # the band is reached, so that the bound means something
+    assert energy.max() - energy.min() > 0.9 * (high - low)  # the band is reached, so that the bound means something
 
 
 # ---- free bodies --------------------------------------------------------------------------------------------------------
@@ -132,7 +132,7 @@ def test_free_fall_is_exact(solver, precision):
     expected = -G * 1e-6 * gravity_steps(solver, steps)
     if solver.order == 1 and steps == 1000:
         assert expected == pytest.approx(-4.909905, abs=1e-12)
-    assert fall[:, 1] == pytest.approx(np.full(8, expected), abs=within(precision, 3e-14, 1e-6))  # additions round, no more
+    assert fall[:, 1] == pytest.approx(np.full(8, expected), abs=within(precision, 4e-14, 1e-6))  # 1000 roundings of half an ulp of 5
     assert np.abs(fall - fall[0]).max() <= within(precision, 1e-13, 1e-6)  # rigid
     assert solution.velocities[-1, :, 1] == pytest.approx(np.full(8, -G * steps * 1e-3), rel=within(precision, 1e-12, 1e-5))
 

@@ -1,0 +1,44 @@
+"""What the modules of the PyTorch face share: torch itself, or what to install; and a clear no to second derivatives."""
+
+try:
+    import torch
+except ImportError as error:
+    raise ImportError(
+        "the PyTorch face of diffsim_ti (diff_physics, diff_simulator) needs torch, which could not be imported "
+        f"({error}): pip install 'torch>=2.2,<2.14' (CPU only: add --index-url https://download.pytorch.org/whl/cpu); "
+        "the rest of diffsim_ti works without it"
+    ) from error
+
+
+class _Refusal(torch.autograd.Function):
+    """The identity on a gradient; differentiating it once more raises."""
+
+    @staticmethod
+    def forward(ctx, remedy: str, gradient, *causes):
+        ctx.remedy = remedy
+        return gradient.clone()
+
+    @staticmethod
+    def backward(ctx, *_):
+        raise RuntimeError(f"second derivatives are not available here: {ctx.remedy}")
+
+
+def first_order_only(remedy: str):
+    """Decorate the `backward` of an autograd.Function that keeps its inputs in `ctx.tensors`.
+
+    Differentiating its result raises RuntimeError with the remedy, also where torch's `once_differentiable` would return
+    zero in silence (a loss that is linear in the outputs).
+    """
+
+    def decorate(backward):
+        def wrapped(ctx, *adjoints):
+            with torch.no_grad():
+                gradients = backward(ctx, *adjoints)
+            causes = [x for x in (*ctx.tensors, *adjoints) if isinstance(x, torch.Tensor) and x.requires_grad]
+            if not torch.is_grad_enabled() or not causes:
+                return gradients
+            return tuple(None if g is None else _Refusal.apply(remedy, g, *causes) for g in gradients)
+
+        return wrapped
+
+    return decorate
