@@ -46,7 +46,8 @@ def _split(begin: int, end: int, free: int) -> int:
     repeats = 1
     while math.comb(free + 1 + repeats, repeats) < length:
         repeats += 1
-    return begin + min(max(1, -(-length * repeats // (free + 1 + repeats))), length - 1)
+    # both parts then need no more repeats than they must: the least work there is
+    return begin + min(math.comb(free + repeats, free + 1), length - math.comb(free + repeats - 1, free))
 
 
 def choose_schedule(num_passes: int, state_bytes: int, every: int | None, memory: float | None) -> Schedule:

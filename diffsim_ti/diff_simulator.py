@@ -35,8 +35,7 @@ class _RolloutFunction(torch.autograd.Function):
     def forward(ctx, rollout: Rollout, names: tuple, *tensors):
         values = {}
         for name, tensor in zip(names, tensors):
-            # a copy: an optimiser changes parameters in place, and the reverse sweep needs those of this run
-            value = tensor.detach().to("cpu", torch.float64, copy=True).numpy()
+            value = tensor.detach().to("cpu", torch.float64).numpy()  # the rollout keeps a copy of its own
             if name == "initial_displacements":
                 name, value = "initial_positions", rollout.values["rest_positions"] + value
             values[name] = value
@@ -66,13 +65,18 @@ def rollout_frames(rollout: Rollout, **tensors: torch.Tensor) -> TorchFrames:
     """
     if "initial_positions" in tensors and "initial_displacements" in tensors:
         raise ValueError("initial_positions and initial_displacements are two spellings of one input: give one")
+    if "rest_positions" in tensors and "initial_displacements" in tensors:
+        raise ValueError("with rest_positions, give initial_positions: initial_displacements are those from the mesh")
     for name, value in tensors.items():
         tensors[name] = value if isinstance(value, torch.Tensor) else torch.as_tensor(value, dtype=torch.float64)
         if not tensors[name].is_floating_point():
             raise ValueError(f"{name}: expected a floating point tensor, got {tensors[name].dtype}")
     displacements, velocities = _RolloutFunction.apply(rollout, tuple(tensors), *tensors.values())
-    rest = torch.from_numpy(np.array(rollout.values["rest_positions"])).to(displacements)
-    return TorchFrames(rest + displacements, velocities, displacements)
+    if "rest_positions" not in tensors:
+        rest = torch.from_numpy(np.array(rollout.values["rest_positions"])).to(displacements)
+        return TorchFrames(rest + displacements, velocities, displacements)
+    rest = tensors["rest_positions"].to(displacements)  # the reverse sweep gives the gradient of positions = rest + u
+    return TorchFrames(rest.detach() + displacements, velocities, displacements + (rest.detach() - rest))
 
 
 class DifferentiableSolver:
@@ -104,9 +108,10 @@ class DifferentiableSolver:
 class DifferentiableSimulator:
     """Steps a soft body through torch's graph: positions and velocities are tensors with gradients to all that went in.
 
-    material: DifferentiableMaterial or SpatiallyVaryingMaterial (diff_physics); density [kg/m^3]: a number or a tensor,
-    scalar or per tetrahedron; fixed_vertices: set name, indices or mask; contact: None for the seeds' ground, False for
-    none, or a DifferentiableBarrierContact, whose numbers may be tensors with gradient; terms: further core terms.
+    material: DifferentiableMaterial, SpatiallyVaryingMaterial or another TorchMaterial (diff_physics); density [kg/m^3]:
+    a number or a tensor, scalar or per tetrahedron; fixed_vertices: set name, indices or mask; contact: None for the seeds'
+    ground, False for none, or a DifferentiableBarrierContact, whose numbers may be tensors with gradient; terms: further
+    core terms.
 
     The seeds' ground is a barrier (stiffness 1e4, width 0.01) at y = 0 where the body starts at least one width above it,
     otherwise one width below its lowest vertex; it is fixed at the start. `describe()` says which.

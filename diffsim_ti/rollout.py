@@ -280,8 +280,7 @@ class Rollout:
 
     def _sweep_reverse(self, positions_adj, velocities_adj, careful: bool) -> dict[str, np.ndarray]:
         ws, schedule = self._workspace, self.schedule
-        if self._adjoint is None or self._adjoint.features.uniform != ws.arrays.features().uniform \
-                or self._adjoint.frames[0].shape != ws.frames[0].shape:  # fmt: skip
+        if self._adjoint is None or not self._adjoint.fits(ws):
             self._adjoint = ExplicitAdjoint(ws, "density" in self.wanted, "rest_positions" in self.wanted)
         adjoint = self._adjoint
         adjoint.start(positions_adj, velocities_adj, self.solver.last_frame_is_state)

@@ -88,8 +88,25 @@ def check_precision(precision: str | None) -> str:
     return precision
 
 
+def _after_fork() -> None:
+    _settings["forked"] = impl.get_runtime().prog is not None
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)
+
+
+def _refuse_fork() -> None:
+    if _settings.get("forked"):
+        raise RuntimeError(
+            "this process was forked after Taichi had started, and Taichi's threads do not survive a fork: start workers "
+            "with multiprocessing.get_context('spawn'), or DataLoader(..., multiprocessing_context='spawn')"
+        )
+
+
 def program():
     """The live Taichi program; starts the stated default (CPU, f32) if nothing did."""
+    _refuse_fork()
     if impl.get_runtime().prog is None:
         init()
     return impl.get_runtime().prog
@@ -109,7 +126,8 @@ def check_host_init() -> None:
 
 
 def check_alive(owner) -> None:
-    """Raise if `ti.init` was called after `owner` took its arrays."""
+    """Raise if `ti.init` was called after `owner` took its arrays, or if this process was forked since."""
+    _refuse_fork()
     if impl.get_runtime().prog is not owner:
         raise RuntimeError("ti.init was called again, which destroys all Taichi data: build the scene and solver anew")
 

@@ -104,12 +104,13 @@ class Seen:
 class ForwardRun:
     """Frames of equal length; the substeps of each follow the stable step of the state, unless `dt` is given.
 
-    A frame has eight parts, after each of which the state is looked at. One that diverges, outgrows its step or gains
+    A frame has 16 parts, after each of which the state is looked at. One that diverges, outgrows its step or gains
     energy is run again from its start with twice the substeps, and that is counted. With dt nothing is chosen and
     nothing repeated: what goes wrong is an error.
     """
 
-    share, parts, attempts = 0.8, 8, 8  # of the stable step; per frame; per part
+    share, parts, attempts = 0.8, 16, 8  # of the stable step; per frame; per part
+    squeezed = 0.1  # J below which the stable step is looked up in each part
     # of the energy in a part, as shares of the largest kinetic + elastic + contact energy: what symplectic Euler's
     # passing error of first order takes, and what is left once the energy is `largest_drift` above its lowest
     largest_rise, later_rise, largest_drift = 0.01, 0.001, 0.03
@@ -141,7 +142,7 @@ class ForwardRun:
         ws.restore(self._start, 0)
         self._limit = self._stable_dt()
         self._energy, self._refined = self.simulator.compute_energy(), 0
-        self._lowest = self._energy
+        self._lowest, self._squeezed = self._energy, False
         self.energies, self.largest_energy = [self._energy], self._moving(self._energy)
 
     def advance(self) -> None:
@@ -165,11 +166,11 @@ class ForwardRun:
             sim.set_substeps(substeps)
             try:
                 sim.step()
-                why = self._complaint(last)
+                why = self._complaint(last or self._squeezed)
             except FloatingPointError as error:
                 why = str(error)
             if why is None:
-                self._refined = substeps if tried else int(0.85 * self._refined)
+                self._refined = substeps if tried else self._refined // 2
                 return
             self.seen.retries.append(f"t = {first * sim.solver.dt:.4g} s, substep {sim.solver.substep:.3g} s: {why}")
             sim.workspace.restore(self._start, 0)
@@ -184,6 +185,7 @@ class ForwardRun:
         """Note the extremes of the present state."""
         sim, seen = self.simulator, self.seen
         J = sim.tetrahedron_fields().J
+        self._squeezed = J.min() < self.squeezed
         seen.J, seen.inverted = min(seen.J, float(J.min())), max(seen.inverted, int((J <= 0).sum()))
         if self.ground:
             gap = self.ground.gap(sim.positions[self.scene.mesh.surface_vertices])
@@ -195,14 +197,14 @@ class ForwardRun:
         self._lowest = min(self._lowest, self._energy)
         self.largest_energy = max(self.largest_energy, self._moving(self._energy))
 
-    def _complaint(self, last: bool) -> str | None:
-        """Why the part that was just run cannot be trusted, or None; `last`: find the stable step for the next frame."""
+    def _complaint(self, look_up: bool) -> str | None:
+        """Why the part that was just run cannot be trusted, or None; `look_up`: find the stable step at its end."""
         energy, h = self.simulator.compute_energy(), self.simulator.solver.substep
         rise, scale = energy - self._energy, max(self.largest_energy, self._moving(energy))
         drifted = energy - self._lowest > self.largest_drift * scale
         if self.scene.motion is None and not rise <= (self.later_rise if drifted else self.largest_rise) * scale:
             return f"the energy rose by {rise:.3g} J"
-        if not last:
+        if not look_up:
             return None
         try:
             self._limit = self._stable_dt()

@@ -84,7 +84,7 @@ class Stiffness:
         arrays = (*a.topology(), a.corner, state.u, state.v, self.w, self.y)
         self._multiply = runtime.Launch(kernel, *arrays, vectorized=a.in_lanes)
         self.root = np.sqrt(runtime.fetch(a.inverse_mass).astype(np.float64))[:, None]
-        self.vector = None
+        self.vector, self._random = None, np.random.default_rng(1)
 
     def product(self, x: np.ndarray) -> np.ndarray:
         """The product with x, shape (num_vertices, 3), float64."""
@@ -104,25 +104,42 @@ class Stiffness:
         start = np.random.default_rng(0).standard_normal((n, 3)) * (self.root > 0)
         if not start.any():
             return 0.0, 0.0
+        with np.errstate(over="ignore", invalid="ignore"):
+            if not np.isfinite(np.linalg.norm(self.product(start))):
+                raise FloatingPointError("the stiffness of this state is not finite")
         operator = LinearOperator((3 * n, 3 * n), lambda x: self.product(x.reshape(-1, 3)).ravel(), dtype=np.float64)
         value, vector = eigsh(operator, 1, which="LA", v0=start.ravel(), tol=tolerance, ncv=min(3 * n - 1, 24))
         self.vector = vector[:, 0].reshape(-1, 3)
         residual = np.linalg.norm(self.product(self.vector) - value[0] * self.vector)
         return float(value[0]), float(residual)
 
-    def watch(self, products: int = 2) -> float:
-        """A lower bound of omega^2 at the present state: Rayleigh quotients from the last look's vector onwards."""
+    def watch(self, products: int = 4) -> float:
+        """A lower bound of omega^2 at the present state: a few Lanczos steps from the last look's vector.
+
+        Something random is mixed in: a vector that has settled on one mode would not see another mode overtake it.
+        """
         if self.vector is None:
             self.largest(1e-2)
-        best = 0.0
-        for _ in range(products):
-            x = self.vector / np.linalg.norm(self.vector)
-            y = self.product(x)
-            best = max(best, float((x * y).sum()))
-            if not np.isfinite(best) or not np.linalg.norm(y) > 0:
+        if self.vector is None:  # nothing is free to move
+            return 0.0
+        x = self._random.standard_normal(self.vector.shape) * (self.root > 0)
+        x = self.vector / np.linalg.norm(self.vector) + 0.3 * x / np.linalg.norm(x)
+        basis, ritz = [], np.zeros((products, products))
+        for k in range(products):
+            size = np.linalg.norm(x)
+            for q in basis:
+                x = x - (q * x).sum() * q
+            if np.linalg.norm(x) < 1e-4 * size:  # few vertices are free: all of their motions are in the basis
                 break
-            self.vector = y
-        return best
+            basis.append(x / np.linalg.norm(x))
+            x = self.product(basis[-1])
+            if not np.isfinite(np.linalg.norm(x)):
+                return np.inf
+            ritz[k, : k + 1] = [(q * x).sum() for q in basis]
+        count = len(basis)
+        values, vectors = np.linalg.eigh(ritz[:count, :count])  # reads the lower half
+        self.vector = sum(c * q for c, q in zip(vectors[:, -1], basis))
+        return float(values[-1])
 
     def worst_tetrahedron(self) -> int:
         """The tetrahedron where the watched vector moves most relative to its size."""

@@ -1,6 +1,6 @@
 """The common work of benchmark.py on whatever of torch-diffsim, NVIDIA Warp and JAX is installed, next to ours, in one run.
 
-    python examples/compare_peers.py [--peer-python PATH] [--rounds 3] [--markdown]
+    python examples/compare_peers.py [--peer-python PATH] [--rounds 3]
 
 Each system runs in its own process, one after the other, for several rounds; the best of each counts. --peer-python names
 an interpreter whose environment holds the peers (they need not share ours). Prints ns per tetrahedron and substep.
@@ -49,7 +49,8 @@ def best(function, repeats):
 
 def report(who, M, forward, both):
     scale = 1e9 / (SUBSTEPS * M)
-    print(json.dumps({"who": who, "tets": M, "forward_ns": forward * scale, "forward_backward_ns": both * scale}), flush=True)
+    row = {"who": who, "tets": M, "forward_ns": forward * scale, "forward_backward_ns": both * scale}
+    print(json.dumps(row), flush=True)
 """
 
 TORCH_DIFFSIM = """
@@ -242,7 +243,8 @@ def compare(peer_python: str, sizes: list[int], rounds: int) -> dict:
 def table(best: dict) -> str:
     """Markdown: forward and forward + backward by size, and how many times longer than ours."""
     sizes = sorted({tets for _, tets in best})
-    lines = ["| | " + " | ".join(f"forward, {s:,} | + gradient" for s in sizes) + " |", "| --- |" + " --- | --- |" * len(sizes)]
+    head = " | ".join(f"forward, {s:,} | + gradient" for s in sizes)
+    lines = [f"| | {head} |", "| --- |" + " --- | --- |" * len(sizes)]
     for who in dict.fromkeys(w for w, _ in best):
         cells = []
         for s in sizes:

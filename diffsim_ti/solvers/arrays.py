@@ -86,9 +86,10 @@ class SceneArrays:
         )  # fmt: skip
 
     def load(self, values: Derived) -> bool:
-        """Bring values to the device; True if array shapes changed, so that launches must be bound anew."""
-        old, self.values = self.values, values
-        moved = False
+        """Bring values to the device; True if array shapes or kernels changed, so that launches must be bound anew."""
+        old, before = self.values, None if self.values is None else self.features()
+        self.values = values
+        moved = before != self.features()
         inverse_mass = np.divide(1.0, values.mass, out=np.zeros_like(values.mass), where=values.mass > 0)
         inverse_mass[self.fixed] = 0
         sources = {

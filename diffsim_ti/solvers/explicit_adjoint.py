@@ -31,6 +31,12 @@ class ExplicitAdjoint:
         self.frames = tuple(runtime.array(a.vector, *f.shape) for f in workspace.frames)
         self._launch = None
 
+    def fits(self, workspace) -> bool:
+        """Whether kernels and shapes are still those of the run."""
+        a, kept = workspace.arrays, (self.forces, *self.frames)
+        same = self.features == a.features(self.features.density, self.features.shape)
+        return same and all(x.shape == y.shape for x, y in zip(kept, (a.forces, *workspace.frames)))
+
     def _sums(self) -> tuple:
         return (self.coefficients, self.sums, self.forces, self.motion, self.anchor, self.gradients, self.volumes)
 

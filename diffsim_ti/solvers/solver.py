@@ -82,7 +82,7 @@ class Solver(ABC):
             warnings.warn(
                 f"dt = {self.dt:g} s is divided into {needed} substeps (asked for at least {self.substeps}): "
                 f"the stable step is {self.stable_dt(tight=True)}",
-                stacklevel=3,
+                stacklevel=4,  # through bind and a constructor to the user's line
             )
             self.substeps = needed
 

@@ -28,5 +28,7 @@ class VelocityVerletSolver(ExplicitSolver):
             (1, num_passes - 1, Weights(1, 0, h / 2, h / 2, *drift)),
             (num_passes - 1, num_passes, Weights(1, 1, h / 2, 0.0, 0.0, 1.0)),
         ]
+        if num_passes == 1:  # no step: the pass only shows the start
+            runs = [(0, 1, Weights(0, 0, 0.0, 0.0, 0.0, 1.0))]
         cut = ((max(first, a), min(last, b), w) for a, b, w in runs)
         return [(a, b - a, w) for a, b, w in cut if b > a]

@@ -1,0 +1,296 @@
+"""What the library takes from its host: import, start-up, memory, kernels, files (TORTURE 70, 71; design 3.7, 3.12, 3.13)."""
+
+import gc
+import os
+import re
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import diffsim_ti as ds
+from diffsim_ti import runtime
+from diffsim_ti.solvers import SOLVERS
+from diffsim_ti.terms.ground import GroundForce
+
+ROOT = Path(__file__).parents[1]
+
+
+def python(code, **environment):
+    """Run code in a fresh interpreter; its output, and an error if it fails."""
+    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+    env = os.environ | {"PYTHONPATH": path} | environment
+    done = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True, env=env, timeout=300)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def small(mesh=None, **options):
+    mesh = ds.TetrahedralMesh.create_box(3) if mesh is None else mesh
+    return ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3), **options)
+
+
+STEP = """
+    mesh = ds.TetrahedralMesh.create_box(2)
+    scene = ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3), terms=[ds.Gravity()])
+    simulator = ds.Simulator(ds.SemiImplicitSolver(scene, dt=1e-3))
+    simulator.run(10)
+"""
+
+
+# ---- import and start ---------------------------------------------------------------------------------------------------
+
+
+def test_import_is_light_and_quiet():
+    """The goal is 1 s; a busy machine may take three."""
+    out = python("""
+        import sys, time
+        start = time.perf_counter()
+        import diffsim_ti
+        took = time.perf_counter() - start
+        import taichi.lang.impl as impl
+        heavy = [name for name in ("torch", "matplotlib", "scipy", "meshio", "rich", "typer") if name in sys.modules]
+        print(took, heavy, impl.get_runtime().prog is None)
+    """)
+    took, rest = out.split(" ", 1)
+    assert rest.strip() == "[] True"  # nothing heavy, nothing printed, no runtime started
+    assert float(took) < 3
+
+
+def test_use_before_init_starts_the_stated_default():
+    out = python("import diffsim_ti as ds\n" + textwrap.dedent(STEP) + "print(scene.precision, ds.runtime.arch_name(), simulator.positions.dtype)")
+    assert out.split() == ["f32", "cpu", "float32"]  # and nothing else on the terminal
+
+
+def test_init_refuses_what_is_not_there():
+    out = python("""
+        import diffsim_ti as ds
+        for call in (lambda: ds.init("metal"), lambda: ds.init("cpu", precision="half"), lambda: ds.init("cpu", default_fp=1)):
+            try:
+                call()
+            except ValueError as error:
+                print(error)
+        try:
+            ds.init("cuda")
+            print("the cuda backend is not available here (available: cpu")  # a machine that has one
+        except RuntimeError as error:
+            print(error)
+    """)
+    lines = out.splitlines()
+    assert lines[0] == "arch must be one of cpu, cuda, vulkan, got 'metal'"
+    assert lines[1] == "precision must be 'f32' or 'f64', got 'half'"
+    assert lines[2].startswith("default_fp cannot be chosen: diffsim_ti needs default_fp=f64")
+    assert lines[3].startswith("the cuda backend is not available here (available: cpu")
+
+
+def test_cuda_is_named_as_missing():
+    if "cuda" in runtime.available_archs():
+        pytest.skip("this machine has CUDA")
+    names = ", ".join(runtime.available_archs())
+    with pytest.raises(RuntimeError, match=rf"the cuda backend is not available here \(available: {names}\); pass one of those"):
+        ds.init("cuda")
+    ds.Simulator(ds.SemiImplicitSolver(small(), dt=1e-3)).run(2)  # the running program is as it was
+
+
+def test_host_s_init_is_respected():
+    """The host's fields live on, its settings stay, and a warning names what they cost."""
+    out = python("""
+        import warnings
+        import taichi as ti
+        ti.init(arch=ti.cpu, default_fp=ti.f32, log_level=ti.ERROR, random_seed=5)
+        field = ti.field(ti.f32, 3)
+        field[1] = 7
+        import diffsim_ti as ds
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+    """ + textwrap.indent(STEP, "        ") + """
+            ds.SemiImplicitSolver(scene, dt=1e-3)
+        print(field[1], ti.cfg.random_seed, len(caught), caught[0].message)
+    """)  # fmt: skip
+    assert re.search(r"^7.0 5 1 ti.init was called with fast_math=True, .* use diffsim_ti.init\(\)", out, re.M), out
+
+
+def test_second_init_is_noticed():
+    """Objects of the first program say so; new ones work."""
+    out = python("import diffsim_ti as ds\nds.init('cpu')\n" + textwrap.dedent(STEP) + textwrap.dedent("""
+        rollout = ds.Rollout(simulator.solver, 5)
+        frames = rollout.forward()
+        ds.init("cpu", precision="f64")
+        for use in (simulator.step, simulator.reset, lambda: simulator.positions, lambda: simulator.compute_energy(),
+                    lambda: simulator.set_state(velocities=mesh.vertices), rollout.forward, lambda: rollout.vjp(frames)):
+            try:
+                use()
+                print("used")
+            except RuntimeError as error:
+                print(error)
+        again = ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3))
+        ds.Simulator(ds.SemiImplicitSolver(again, dt=1e-3)).run(3)
+        del simulator, rollout
+        print(again.precision, "done")
+    """))  # fmt: skip
+    lines = out.splitlines()
+    assert lines[-1] == "f64 done"
+    assert lines[:-1] == ["ti.init was called again, which destroys all Taichi data: build the scene and solver anew"] * 7
+
+
+@pytest.mark.parametrize("home", ["/nonexistent", "/proc"])
+def test_home_that_cannot_be_written(home):
+    """Without a place for the kernel cache everything works, exit included."""
+    if os.access(home if os.path.isdir(home) else "/", os.W_OK):
+        pytest.skip(f"{home} can be written here (root may create it)")
+    out = python("import diffsim_ti as ds\nds.init()\n" + textwrap.dedent(STEP) + "print('done')", HOME=home)
+    assert out.splitlines()[-1] == "done"
+
+
+def test_cache_folder_that_cannot_be_made(tmp_path):
+    """The same for root, who may write anywhere: a file stands where the folder should be."""
+    (tmp_path / "file").write_text("in the way")
+    cache = str(tmp_path / "file" / "ticache")
+    out = python("import diffsim_ti as ds\nds.init()\n" + textwrap.dedent(STEP) + "print('done')", TI_OFFLINE_CACHE_FILE_PATH=cache)
+    assert out.splitlines()[-1] == "done"
+
+
+# ---- memory and kernels -------------------------------------------------------------------------------------------------
+
+
+def build_and_drop(solver=ds.SemiImplicitSolver, size=3):
+    of = small(ds.TetrahedralMesh.create_box(size), terms=[ds.Gravity()])
+    simulator = ds.Simulator(solver(of, dt=1e-3))
+    simulator.run(2)
+    rollout = ds.Rollout(solver(of, dt=1e-3), 4)
+    frames = rollout.forward()
+    rollout.vjp(frames, positions=frames.positions)
+    rollout.positions.grad.fill(0)  # a pooled field
+
+
+def resident_megabytes():
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="reads /proc")
+def test_dropped_scenes_leave_nothing(monkeypatch):
+    """200 scenes: memory goes back, and no kernel compiles after the first few."""
+    compiled = []
+    original = runtime.Launch._prepare
+    program = runtime.program()
+    monkeypatch.setattr(runtime.Launch, "_prepare", lambda self, numbers: (compiled.append(len(self._kernel.compiled_kernels)), original(self, numbers)))
+    build_and_drop()
+    gc.collect()
+    start = runtime.allocated_megabytes()
+    kernels = None
+    for k in range(200):
+        build_and_drop()
+        if k == 20:
+            gc.collect()
+            resident, kernels = resident_megabytes(), program.get_total_compilation_time() if hasattr(program, "get_total_compilation_time") else 0
+    gc.collect()
+    assert runtime.allocated_megabytes() == pytest.approx(start, abs=1e-9)
+    assert resident_megabytes() - resident < 20
+    assert kernels == (program.get_total_compilation_time() if hasattr(program, "get_total_compilation_time") else 0)
+
+
+def specializations():
+    """Compiled kernels of every factory: how many versions of each Taichi kernel exist."""
+    import taichi as ti
+
+    kernels = [k for k in gc.get_objects() if isinstance(k, ti.lang.kernel_impl.Kernel)]
+    return len(kernels), sum(len(k.compiled_kernels) for k in kernels)
+
+
+def test_equal_scenes_share_their_kernels():
+    """Another mesh, other numbers, another capacity: nothing compiles anew."""
+    build_and_drop()
+    before = specializations()
+    for size in (2, 4, 5):
+        build_and_drop(size=size)
+    assert specializations() == before
+    solver = ds.VelocityVerletSolver  # another solver runs the same pass with other weights
+    build_and_drop(solver)
+    assert specializations() == before
+    build_and_drop(size=3)
+    ds.Simulator(ds.SemiImplicitSolver(small(terms=[ds.Gravity(), ds.Drag(0.123)]), dt=1e-3)).run(1)
+    assert specializations() >= before  # a new feature may compile
+
+
+def test_memory_is_what_the_arrays_need():
+    """Forward only: no adjoint, no record. Twelve numbers per vertex and corner forces come first."""
+    gc.collect()
+    before = runtime.allocated_megabytes()
+    mesh = ds.TetrahedralMesh.create_box(9)
+    of = small(mesh, precision="f32")
+    rollout = ds.Rollout(ds.SemiImplicitSolver(of, dt=1e-4), 10)
+    rollout.forward()
+    forward = (runtime.allocated_megabytes() - before) * 1e6
+    # tets, corner list: 2 x 16 bytes a tetrahedron; gradients, volume: 40; corner forces: 64
+    assert forward < 1.3 * mesh.num_tetrahedra * (32 + 40 + 64) + 400 * mesh.num_vertices
+    frames = rollout.forward()
+    rollout.vjp(frames, positions=frames.positions)
+    assert (runtime.allocated_megabytes() - before) * 1e6 > 1.3 * forward
+    del rollout, frames
+    gc.collect()
+    assert runtime.allocated_megabytes() == pytest.approx(before, abs=1e-9)
+
+
+# ---- pay for use --------------------------------------------------------------------------------------------------------
+
+
+def workspace(of, solver=ds.SemiImplicitSolver):
+    return ds.Simulator(solver(of, dt=1e-4)).workspace
+
+
+def test_absent_features_take_no_memory():
+    bare = workspace(small()).arrays
+    for name in ("surface", "force_slot", "motion_slot", "forces", "motion", "anchor", "rest"):
+        assert np.prod(getattr(bare, name).shape) == 1, name
+    features = bare.features()
+    assert features.contacts == () and features.gravity == -1 and features.drag == -1
+    assert not (features.forces or features.motion) and features.uniform
+    assert np.prod(bare.coefficients.shape) == len(bare.law.coefficient_names)  # one block for all tetrahedra
+    full = workspace(small(terms=[ds.Ground(-1), ds.ExternalForce([0, 0, 0])], fixed="xmin", motion=lambda t: [0, 0, 0])).arrays
+    n = full.num_vertices
+    assert full.surface.shape == full.rest.shape == full.force_slot.shape == full.motion_slot.shape == (n,)
+    assert len(full.features().contacts) == 1 and full.features().forces and full.features().motion
+
+
+def step_text(of, solver=ds.SemiImplicitSolver):
+    """What the step's kernel is made of: names of the Taichi functions that are called while it compiles."""
+    called = []
+    barrier = sys.modules["diffsim_ti.terms.barrier"]
+    originals = {name: getattr(barrier, name).func for name in ("value", "slope", "curvature")}
+    force = GroundForce.force
+    return called, originals, force
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_absent_contact_leaves_no_code(solver, monkeypatch):
+    """The ground's force is looked up while a step compiles if, and only if, the scene has a ground."""
+    looked_up = []
+
+    class Spy:
+        def __get__(self, instance, owner):
+            if instance is not None:
+                looked_up.append(instance)
+            return original.__get__(instance, owner)
+
+    original = GroundForce.__dict__["force"]
+    monkeypatch.setattr(GroundForce, "force", Spy())
+    # c01_share and J_floor are compile-time numbers of the law: a new J_floor means that everything compiles here
+    material = ds.StableNeoHookean(1e5, 0.3, J_floor=0.0123 if solver is SOLVERS[0] else 0.0124)
+    mesh = ds.TetrahedralMesh.create_box(2)
+    ds.Simulator(solver(ds.Scene(mesh, material, terms=[ds.Gravity()]), dt=1e-3)).run(2)
+    assert looked_up == []
+    ds.Simulator(solver(ds.Scene(mesh, material, terms=[ds.Ground(-1.0)]), dt=1e-3)).run(2)
+    assert len(looked_up) == 1
+
+
+def test_torch_is_not_needed():
+    """The core runs where torch cannot be imported."""
+    out = python("import sys\nsys.modules['torch'] = None\nimport diffsim_ti as ds\nds.init()\n" + textwrap.dedent(STEP) + textwrap.dedent("""
+        rollout = ds.Rollout(simulator.solver, 5)
+        frames = rollout.forward()
+        print(sorted(rollout.vjp(frames, positions=frames.positions)))
+    """))  # fmt: skip
+    assert "youngs_modulus" in out

@@ -1,0 +1,316 @@
+"""Rollouts inside `ti.ad.Tape`, between kernels of the user's."""
+
+import numpy as np
+import pytest
+import taichi as ti
+from test_gradients import by_solver, full_scene, rollout_of
+
+import diffsim_ti as ds
+from diffsim_ti import runtime, verify
+
+STEPS = 12
+
+
+def scalar_field(value=0.0):
+    field = ti.field(ti.f64, (), needs_grad=True)
+    field[None] = value
+    return field
+
+
+@ti.kernel
+def spread(positions: ti.template(), velocities: ti.template(), total: ti.template()):
+    """Some loss over all frames."""
+    for f, i in positions:
+        weight = 0.1 + f + ti.sin(1.0 * i)
+        total[None] += weight * positions[f, i].norm_sqr() + positions[f, i].y + velocities[f, i].dot(positions[f, i])
+
+
+def spread_adjoint(frames):
+    """The same loss's gradients in NumPy."""
+    x, v = frames.positions.astype(float), frames.velocities.astype(float)
+    f, i = np.indices(x.shape[:2])
+    return 2 * (0.1 + f + np.sin(i))[..., None] * x + [0, 1, 0] + v, x
+
+
+def small(solver=ds.SemiImplicitSolver, precision="f64", **options):
+    return rollout_of(full_scene(precision=precision, steps=STEPS), solver, STEPS, save_every=4, **options)
+
+
+def taped(rollout, total, **options):
+    with ti.ad.Tape(total, **options):
+        rollout.run()
+        spread(rollout.positions, rollout.velocities, total)
+
+
+@pytest.mark.backends
+@by_solver
+def test_a_tape_gives_the_bits_of_vjp(solver):
+    """In f64: the tape's adjoint of the frames is the same kernel's as ours by hand."""
+    rollout, total = small(solver), scalar_field()
+    fields = {name: rollout.field(name) for name in rollout.inputs}
+    taped(rollout, total)
+    by_hand = small(solver)
+    frames = by_hand.forward()
+    adjoints = [rollout.field(name).grad.to_numpy() for name in ("positions", "velocities")]
+    expected = by_hand.vjp(frames, *adjoints)
+    assert np.array_equal(rollout.positions.to_numpy(), frames.positions)
+    assert np.array_equal(rollout.velocities.to_numpy(), frames.velocities)
+    for got, want in zip(adjoints, spread_adjoint(frames)):
+        np.testing.assert_allclose(got, want, rtol=1e-14, atol=1e-14)
+    for name, value in expected.items():
+        assert rollout.gradients[name].tobytes() == value.tobytes(), name
+        grad = fields[name].grad
+        assert np.array_equal(grad.to_numpy(), value), name
+
+
+def test_the_loss_is_differentiated_and_not_only_handed_on():
+    rollout, total = small(), scalar_field()
+    E = rollout.field("youngs_modulus")
+    base = E.to_numpy()
+    direction = np.random.default_rng(0).normal(size=base.shape) * 1e4
+
+    def loss(t):
+        E.from_numpy(base + t * direction)
+        taped(rollout, total)
+        return total[None]
+
+    loss(0.0)
+    slope = float((E.grad.to_numpy() * direction).sum())
+    assert slope == pytest.approx(verify.central_difference(loss)[0], rel=1e-7)
+
+
+def test_two_tapes_give_the_same():
+    """A tape clears gradients; without clearing they add up."""
+    rollout, total = small(), scalar_field()
+    E, v = rollout.field("youngs_modulus"), rollout.field("initial_velocities")
+    taped(rollout, total)
+    one = E.grad.to_numpy(), v.grad.to_numpy()
+    taped(rollout, total)
+    two = E.grad.to_numpy(), v.grad.to_numpy()
+    assert all(np.array_equal(a, b) for a, b in zip(one, two)) and one[0].any()
+    assert np.array_equal(rollout.gradients["youngs_modulus"], one[0])
+
+
+def test_gradients_add_up_where_a_tape_does_not_clear():
+    rollout, total = small(), scalar_field()
+    E = rollout.field("youngs_modulus")
+    taped(rollout, total)
+    one, by_run = E.grad.to_numpy(), rollout.gradients["youngs_modulus"].copy()
+    rollout.positions.grad.fill(0)
+    rollout.velocities.grad.fill(0)
+    total[None] = 0
+    taped(rollout, total, clear_gradients=False)
+    np.testing.assert_allclose(E.grad.to_numpy(), 2 * one, rtol=1e-14)
+    assert np.array_equal(rollout.gradients["youngs_modulus"], by_run)  # this is of the last run alone
+
+
+@by_solver
+def test_two_rollouts_in_one_tape(solver):
+    """Side by side, with one parameter; and the sum of what each gives alone."""
+    a, b, total = small(solver), small(solver, checkpoint_every=3), scalar_field()
+    b.field("gravity").from_numpy(np.array([1.0, -5.0, 2.0]))
+    E_a, E_b = a.field("youngs_modulus"), b.field("youngs_modulus")
+    with ti.ad.Tape(total):
+        a.run()
+        b.run()
+        spread(b.positions, b.velocities, total)
+        spread(a.positions, a.velocities, total)
+    both = E_a.grad.to_numpy(), E_b.grad.to_numpy(), total[None]
+    taped(a, total)
+    alone_a = total[None]
+    assert np.array_equal(E_a.grad.to_numpy(), both[0])
+    taped(b, total)
+    assert np.array_equal(E_b.grad.to_numpy(), both[1])
+    assert both[2] == pytest.approx(alone_a + total[None], rel=1e-14)
+    assert not np.array_equal(both[0], both[1])
+
+
+def test_one_rollout_after_another():
+    """The second starts where the first ends."""
+    scene = full_scene(steps=STEPS)
+    first, second, total = rollout_of(scene, steps=5), rollout_of(scene, steps=5), scalar_field()
+    x, v = second.field("initial_positions"), second.field("initial_velocities")
+
+    @ti.kernel
+    def hand_over(x0: ti.template(), v0: ti.template(), x1: ti.template(), v1: ti.template()):
+        for i in x1:
+            x1[i] = x0[1, i]
+            v1[i] = v0[1, i]
+
+    E = first.field("youngs_modulus")
+    base = E.to_numpy()
+
+    def loss(t):
+        E.from_numpy(base * (1 + t))
+        with ti.ad.Tape(total):
+            first.run()
+            hand_over(first.positions, first.velocities, x, v)
+            second.run()
+            spread(second.positions, second.velocities, total)
+        return total[None]
+
+    loss(0.0)
+    slope = float((E.grad.to_numpy() * base).sum())
+    assert slope == pytest.approx(verify.central_difference(loss)[0], rel=1e-7)
+
+
+@pytest.mark.backends
+@by_solver
+def test_kernels_before_and_after(solver):
+    """A parameter of the user's own: log E by a wave over the tetrahedra, drag and start besides."""
+    rollout, total, parameter = small(solver), scalar_field(), scalar_field(0.2)
+    E, drag, v0 = (rollout.field(n) for n in ("youngs_modulus", "drag_rate", "initial_velocities"))
+
+    @ti.kernel
+    def write():
+        for e in E:
+            E[e] = 1e5 * ti.exp(parameter[None] * ti.cos(1.0 * e))
+        for i in v0:
+            v0[i] = ti.Vector([parameter[None], 0.3, parameter[None] ** 2 * i])
+        drag[None] = 1.0 + parameter[None]
+
+    def loss(p):
+        parameter[None] = float(p)
+        with ti.ad.Tape(total):
+            write()
+            rollout.run()
+            spread(rollout.positions, rollout.velocities, total)
+        return total[None]
+
+    loss(0.2)
+    slope = parameter.grad[None]
+    assert slope != 0
+    differences, _ = verify.central_difference(lambda t: loss(0.2 + t), 0.1)
+    assert slope == pytest.approx(differences, rel=1e-7)
+    assert ds.taylor_test(loss, 0.2, slope, 1.0, epsilon=1e-2).rate >= 1.95
+
+
+def test_kinds_of_input_fields():
+    """A number, a number per tetrahedron, a 3-vector, vectors per vertex, per step and vertex."""
+    rollout = small()
+    shapes = {name: tuple(rollout.field(name).shape) for name in rollout.inputs}
+    assert shapes["drag_rate"] == () and shapes["youngs_modulus"] == (48,) and shapes["gravity"] == (3,) or shapes["gravity"] == ()
+    assert shapes["initial_positions"] == (27,) and shapes["external_forces"] == (STEPS, 27)
+    for name in rollout.inputs:
+        assert np.array_equal(rollout.field(name).to_numpy(), rollout.values[name]), name
+        assert rollout.field(name) is rollout.field(name)
+    with pytest.raises(ValueError, match="no input named 'colour'.*youngs_modulus"):
+        rollout.field("colour")
+
+
+def test_uniform_moduli_take_one_number():
+    mesh = ds.TetrahedralMesh.create_cube(2)
+    scene = ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3), terms=ds.Gravity(), fixed="ymax", precision="f64")
+    rollout, total = rollout_of(scene, steps=STEPS), scalar_field()
+    E = rollout.field("youngs_modulus")
+    assert E.shape == ()
+    taped(rollout, total)
+    slope = E.grad[None]
+
+    def loss(t):
+        E[None] = 1e5 * (1 + t)
+        taped(rollout, total)
+        return total[None]
+
+    assert 1e5 * slope == pytest.approx(verify.central_difference(loss)[0], rel=1e-7)
+    assert slope == float(rollout.gradients["youngs_modulus"]) or E[None] != 1e5
+
+
+def test_only_wanted_gradients_reach_fields():
+    rollout, total = small(gradients=["gravity"]), scalar_field()
+    g, E = rollout.field("gravity"), rollout.field("youngs_modulus")
+    taped(rollout, total)
+    assert g.grad.to_numpy().any() and not E.grad.to_numpy().any() and list(rollout.gradients) == ["gravity"]
+
+
+@pytest.mark.backends
+def test_f32():
+    single, double, total = small(precision="f32"), small(), scalar_field()
+    gradients = []
+    for rollout in (single, double):
+        E = rollout.field("youngs_modulus")
+        taped(rollout, total)
+        gradients.append(E.grad.to_numpy())
+    assert gradients[0].dtype == np.float32
+    assert np.linalg.norm(gradients[0] - gradients[1]) <= 1e-4 * np.linalg.norm(gradients[1])
+
+
+# ---- misuse -----------------------------------------------------------------------------------------------------------
+
+
+def test_the_same_rollout_twice_in_one_tape():
+    rollout, total = small(), scalar_field()
+    with pytest.raises(RuntimeError, match="already ran in this tape.*make a second Rollout"):
+        with ti.ad.Tape(total):
+            rollout.run()
+            spread(rollout.positions, rollout.velocities, total)
+            rollout.run()
+    taped(rollout, total)  # and a new tape is a new chance
+    assert rollout.gradients["youngs_modulus"].any()
+
+
+def test_outside_a_tape():
+    rollout, total = small(), scalar_field()
+    rollout.run()
+    rollout.run()
+    plain = rollout.positions.to_numpy()
+    assert np.array_equal(plain, small().forward().positions) and not rollout.gradients
+    taped(rollout, total)
+    assert np.array_equal(rollout.positions.to_numpy(), plain)
+
+
+def test_bad_values_in_a_field():
+    rollout, total = small(), scalar_field()
+    rollout.field("drag_rate")[None] = float("nan")
+    with pytest.raises(ValueError, match="drag_rate must be finite"):
+        with ti.ad.Tape(total):
+            rollout.run()
+
+
+def test_a_loss_gradient_that_is_nan():
+    rollout, total = small(), scalar_field()
+
+    @ti.kernel
+    def root(x: ti.template()):
+        total[None] += ti.sqrt(x[1, 3].x - x[1, 3].x)
+
+    with pytest.raises(FloatingPointError, match="gradient by positions is not finite at step 4"):
+        with ti.ad.Tape(total):
+            rollout.run()
+            root(rollout.positions)
+
+
+# ---- storage ----------------------------------------------------------------------------------------------------------
+
+
+def test_fields_come_back(monkeypatch):
+    """512 field trees end a process: dropped rollouts lend theirs to the next."""
+    made, make = [], runtime.FieldPool._make
+    monkeypatch.setattr(runtime.FieldPool, "_make", staticmethod(lambda *a: made.append(a) or make(*a)))
+    total = scalar_field()
+    scene = full_scene(steps=STEPS)
+
+    def use():
+        rollout = rollout_of(scene, steps=STEPS, save_every=4)
+        E = rollout.field("youngs_modulus")
+        assert not E.grad.to_numpy().any() and np.array_equal(E.to_numpy(), rollout.values["youngs_modulus"])
+        taped(rollout, total)
+        return E.grad.to_numpy()
+
+    first = use()
+    made.clear()
+    for _ in range(50):
+        assert np.array_equal(use(), first)
+    assert not made
+
+
+def test_device_memory_comes_back():
+    def use():
+        rollout = small()
+        rollout.vjp(rollout.forward(), np.ones((4, 27, 3)))
+
+    use()
+    before = runtime.allocated_megabytes()
+    for _ in range(10):
+        use()
+    assert runtime.allocated_megabytes() <= before * 1.01 + 1e-3
