@@ -62,7 +62,8 @@ class _Implicit(torch.autograd.Function):
                 raise ValueError(f"the residual must be square: {n} unknowns, but {residual.numel()} equations")
 
             def transposed(v):
-                v = torch.from_numpy(np.ascontiguousarray(v)).to(residual).reshape(residual.shape)
+                # a copy: autograd may hand v itself back, and GMRES goes on writing into it
+                v = torch.tensor(v, dtype=residual.dtype, device=residual.device).reshape(residual.shape)
                 return torch.autograd.grad(residual, x, v, retain_graph=True)[0].double().cpu().numpy().ravel()
 
             rhs = grad.double().cpu().numpy().ravel() / size

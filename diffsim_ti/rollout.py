@@ -1,6 +1,7 @@
 """Rollout: n steps of a solver as one differentiable operation."""
 
 import warnings
+import weakref
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -76,7 +77,7 @@ class Rollout:
         self.health: list[dict] = []
         self.gradients: dict[str, np.ndarray] = {}
         self._workspace, self._current, self._loaded = None, None, None
-        self._fields, self._tape, self._adjoint = {}, None, None
+        self._fields, self._tape, self._taped, self._adjoint = {}, None, None, None
 
     def _check_names(self, names) -> tuple[str, ...]:
         if names is None:
@@ -196,17 +197,19 @@ class Rollout:
     def run(self):
         """Run from the input fields and fill the frames; inside a `ti.ad.Tape`, the tape will call `run_vjp`."""
         tape = runtime.current_tape()
-        if tape is not None and tape is self._tape:
+        if tape is not None and self._tape is not None and tape is self._tape():
             raise RuntimeError("this rollout already ran in this tape and would overwrite its frames: make a second Rollout")
-        self._tape = tape
-        frames = self.forward(**self._field_values())
-        self._taped = frames
+        self._tape = None if tape is None else weakref.ref(tape)  # a tape holds its rollouts: no circle
+        self._taped = None
+        self._taped = frames = self.forward(**self._field_values())
         for name in ("positions", "velocities"):
             self.field(name).from_numpy(getattr(frames, name))
 
     @ti.ad.grad_for(run)
     def run_vjp(self):
         """Mirror of `run`: adds to the .grad of the input fields and sets `gradients`."""
+        if self._taped is None:  # the run failed, and its error is on its way
+            return
         gradients = self.vjp(self._taped, *(self.field(name).grad.to_numpy() for name in ("positions", "velocities")))
         for name in self.inputs:
             if name in self._fields and name in gradients:

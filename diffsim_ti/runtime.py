@@ -6,6 +6,7 @@ Nothing else in the package touches `taichi.lang.impl` or `taichi._lib`.
 import contextlib
 import io
 import os
+import tempfile
 import warnings
 import weakref
 from collections import defaultdict
@@ -48,7 +49,7 @@ def init(arch: str = "cpu", precision: str = "f32", threads: int | None = None, 
     """
     if arch not in _ARCHS:
         raise ValueError(f"arch must be one of {', '.join(_ARCHS)}, got {arch!r}")
-    set_precision(precision)
+    check_precision(precision)
     ti.set_logging_level(ti.ERROR)
     if not _has_arch(arch):
         raise RuntimeError(
@@ -60,17 +61,22 @@ def init(arch: str = "cpu", precision: str = "f32", threads: int | None = None, 
             raise ValueError(f"{name} cannot be chosen: diffsim_ti needs default_fp=f64 and fast_math=False")
     options.setdefault("log_level", ti.ERROR)
     if not _can_write_cache(options.get("offline_cache_file_path") or os.environ.get("TI_OFFLINE_CACHE_FILE_PATH")):
-        options["offline_cache"] = False  # Taichi would crash at exit
+        # Taichi makes the folder even then, and crashes at exit if it cannot
+        options |= dict(offline_cache=False, offline_cache_file_path=tempfile.mkdtemp(prefix="ticache-"))
+        os.environ.pop("TI_OFFLINE_CACHE_FILE_PATH", None)
     if threads is not None:
         options["cpu_max_num_threads"] = int(threads)
+    set_precision(precision)
     with contextlib.redirect_stdout(io.StringIO()):
         ti.init(arch=_ARCHS[arch], default_fp=ti.f64, fast_math=False, enable_fallback=False, **options)
 
 
 def _can_write_cache(path: str | None) -> bool:
-    folder = os.path.abspath(os.path.expanduser(path or "~/.cache/taichi/ticache"))
-    while not os.path.isdir(folder):
-        folder = os.path.dirname(folder)
+    folder = os.path.expanduser(path or "~/.cache/taichi/ticache")
+    try:
+        os.makedirs(folder, exist_ok=True)
+    except OSError:
+        return False
     return os.access(folder, os.W_OK)
 
 
@@ -172,6 +178,7 @@ def array(dtype, *shape: int):
     out = ti.ndarray(dtype, shape)
     size = int(np.prod(full_shape(out))) * np.dtype(to_numpy_dtype(out.dtype)).itemsize
     _settings["bytes"] += size
+    out.owner = owner
     # scalar arrays free themselves
     weakref.finalize(out, _free, owner, None if isinstance(out, ti.ScalarNdarray) else out.arr, size)
     return out
@@ -195,6 +202,7 @@ def full_shape(target) -> tuple:
 
 def view(target) -> "np.ndarray | None":
     """A NumPy array over the memory of a Taichi array, no copy; None where that memory is not the host's."""
+    check_alive(getattr(target, "owner", impl.get_runtime().prog))  # the memory of a dead program is gone
     host = getattr(target, "host_view", None)
     if host is None and runs_on_cpu():
         dtype, shape = to_numpy_dtype(target.dtype), full_shape(target)
@@ -239,7 +247,7 @@ class Launch:
 
     def __init__(self, kernel, *arrays, vectorized: bool = False):
         self._kernel, self._arrays, self._vectorized = kernel._primal, arrays, vectorized
-        self._setters = None
+        self._setters, self._owner = None, program()
 
     def _prepare(self, numbers: tuple) -> None:
         prog = impl.get_runtime().prog
@@ -267,6 +275,7 @@ class Launch:
         self._launch = prog.launch_kernel
 
     def __call__(self, *numbers) -> None:
+        check_alive(self._owner)
         if self._setters is None:
             self._prepare(numbers)
         for (setter, index), number in zip(self._setters, numbers):

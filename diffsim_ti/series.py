@@ -130,8 +130,8 @@ class ForwardRun:
             if not dt > 0:
                 raise ValueError(f"--dt must be > 0 [s], got {dt:g}")
             steps = max(1, round(frame_time / dt))
-            self.parts = min(self.parts, steps)
-            steps = -(-steps // self.parts)
+            self.parts = max(p for p in range(1, self.parts + 1) if steps % p == 0)  # dt and the time both stay as asked
+            steps //= self.parts
             solver = solver_class(scene, dt=steps * dt, substeps=steps, **options)
         self.simulator = Simulator(solver)
         self.frame_time = self.parts * solver.dt

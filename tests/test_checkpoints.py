@@ -96,7 +96,9 @@ def allocated(**options) -> tuple[float, float]:
     return sizes[1] - sizes[0], r.memory
 
 
-@pytest.mark.parametrize("options", [{}, {"checkpoint_every": 1}, {"checkpoint_every": 25}, {"memory": 0.5}, {"memory": 0.05}])
+@pytest.mark.parametrize(
+    "options", [{}, {"checkpoint_every": 1}, {"checkpoint_every": 25}, {"memory": 0.5}, {"memory": 0.05}]
+)
 def test_what_is_kept_is_what_the_schedule_says(options):
     kept, said = allocated(**options)
     # frames, prescribed motion and their adjoints grow with the run too, whatever the schedule

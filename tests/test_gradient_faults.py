@@ -1,4 +1,4 @@
-"""What must be noticed: wrong adjoints, losses and adjoints that are not finite, chaos, and Taichi code that overwrites state."""
+"""What must be noticed: wrong adjoints, numbers that are not finite, chaos, Taichi code that overwrites its state."""
 
 from dataclasses import dataclass, replace
 

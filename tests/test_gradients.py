@@ -1,4 +1,4 @@
-"""Gates for gradients: dot products, Taylor tests, differences, exact identities, a closed form. Other tests import the scenes."""
+"""Gates for gradients: dot products, Taylor tests, differences, exact identities, a closed form; scenes for other tests."""
 
 from functools import cache
 
@@ -399,30 +399,44 @@ def test_arrays_that_the_caller_changes_later():
     assert np.array_equal(rollout.vjp(frames, w)["youngs_modulus"], before["youngs_modulus"])
 
 
-# ---- also on the backend that DIFFSIM_TI_ARCH names ---------------------------------------------------------------------
+# ---- also on the backend that DIFFSIM_TI_ARCH names (Vulkan has f32 only) ------------------------------------------------
 
 
 @pytest.mark.backends
 @by_solver
-@pytest.mark.parametrize("precision, gate", [("f64", 1e-12), ("f32", 1e-5)])
-def test_backend_transpose(solver, precision, gate):
-    rollout = rollout_of(full_scene(precision=precision, resolution=2), solver, 3, save_every=1)
-    assert verify.dot_product_test(rollout) <= gate
+def test_backend_transpose(solver):
+    rollout = rollout_of(full_scene(precision="f32", resolution=2), solver, 3, save_every=1)
+    assert verify.dot_product_test(rollout) <= 1e-5
 
 
 @pytest.mark.backends
-@by_solver
-@pytest.mark.parametrize("precision", ["f64", "f32"])
-def test_backend_gradients_against_differences(solver, precision):
-    rollout = rollout_of(full_scene(precision=precision, resolution=2), solver, 3)
-    report = ds.check_gradients(rollout, inputs=["youngs_modulus", "ground_height", "prescribed_motion"], verbose=False)
-    assert report.passed, str(report)
-
-
-@pytest.mark.backends
-@pytest.mark.parametrize("precision, gate", [("f64", 1e-12), ("f32", 1e-4)])
-def test_backend_identities(precision, gate):
+def test_backend_identities():
     n, w = 5, weights(size=(8, 3))
-    g = final_loss_gradient(rollout_of(free_scene(precision=precision, resolution=2), steps=n, substeps=1), w)
-    assert_zero_sum(g["initial_positions"], -w, gate=gate)
-    assert_zero_sum(g["gravity"][None], -(DT**2) * n * (n + 1) / 2 * w, gate=gate)
+    g = final_loss_gradient(rollout_of(free_scene(precision="f32", resolution=2), steps=n, substeps=1), w)
+    assert_zero_sum(g["initial_positions"], -w, gate=1e-4)
+    assert_zero_sum(g["gravity"][None], -(DT**2) * n * (n + 1) / 2 * w, gate=1e-4)
+
+
+@pytest.mark.backends
+@pytest.mark.parametrize("checkpoint_every", [None, 7])
+def test_backend_oscillator(checkpoint_every):
+    """The closed form again, derivatives by complex steps: gradients here have the right size, not only symmetry."""
+    n, dt, u0, h, E, rho, nu = 60, 2e-3, 0.4, 0.5, 1e5, 1000.0, 0.3
+
+    def u(E, rho, nu):
+        theta = 2 * np.arcsin(np.sqrt(E / (2 * (1 + nu)) / rho) / h * dt)
+        return u0 * np.cos((n + 0.5) * theta) / np.cos(theta / 2)
+
+    mesh = ds.TetrahedralMesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.2, 0.3, h]], [[0, 1, 2, 3]])
+    start = mesh.vertices + [[0, 0, 0], [0, 0, 0], [0, 0, 0], [u0, 0, 0]]
+    scene = ds.Scene(mesh, ds.StableNeoHookean([E], [nu]), density=[rho], terms=ds.Gravity(0.0), fixed=[0, 1, 2],
+                     initial_positions=start, precision="f32")  # fmt: skip
+    rollout = rollout_of(scene, steps=n, dt=dt, substeps=1, checkpoint_every=checkpoint_every)
+    w = np.zeros((4, 3))
+    w[3, 0] = 1
+    g = final_loss_gradient(rollout, w)
+    tiny = 1e-20j
+    assert rollout.forward().positions[-1, 3, 0] - 0.2 == pytest.approx(u(E, rho, nu), abs=1e-4 * u0)
+    assert g["youngs_modulus"] == pytest.approx(u(E + tiny, rho, nu).imag / 1e-20, rel=1e-3)
+    assert g["density"] == pytest.approx(u(E, rho + tiny, nu).imag / 1e-20, rel=1e-3)
+    assert g["poissons_ratio"] == pytest.approx(u(E, rho, nu + tiny).imag / 1e-20, rel=1e-3)

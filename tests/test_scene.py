@@ -1,5 +1,7 @@
 """Scenes: what is refused and how it is said, scaling, heterogeneity, fixed vertices, determinism (TORTURE 7-10, 13, 62)."""
 
+# ruff: noqa: E501 - a table reads best with a case a line
+
 import hashlib
 import os
 import subprocess
@@ -224,6 +226,7 @@ def test_user_s_arrays_are_not_kept():
 @pytest.mark.parametrize("size", [1e-3, 1e3])
 def test_scaling(solver, size):
     """TORTURE 7: lengths by `size`, times kept: E, g and the ground go along, x / L stays."""
+
     def final(L):
         of = ds.Scene(
             MESH.scaled(L), ds.StableNeoHookean(E * L**2, 0.3), RHO, fixed="ymax", initial_velocities=np.array([0.5, 0, 0.2]) * L,
@@ -271,7 +274,11 @@ def test_series_bar_of_moduli_over_six_decades(material):
 @pytest.mark.parametrize("precision", ["f32", "f64"])
 def test_two_runs_give_the_same_bits(solver, precision):
     def run(parallel):
-        of = scene(terms=[ds.Gravity(), ds.Ground(-0.1, stiffness=1e6, width=0.1)], precision=precision, initial_velocities=[0.3, -1.0, 0.1])
+        of = scene(
+            terms=[ds.Gravity(), ds.Ground(-0.1, stiffness=1e6, width=0.1)],
+            precision=precision,
+            initial_velocities=[0.3, -1.0, 0.1],
+        )
         return ds.Rollout(solver(of, dt=1e-3, parallel=parallel), 200, save_every=50).forward()
 
     serial, again, parallel = run(False), run(False), run(True)
@@ -305,7 +312,9 @@ def test_threads_do_not_change_a_bit():
     path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     digests = set()
     for threads in ("1", "2", "2"):
-        done = subprocess.run([sys.executable, "-c", THREADS, threads], capture_output=True, text=True, env=os.environ | {"PYTHONPATH": path})
+        done = subprocess.run(
+            [sys.executable, "-c", THREADS, threads], capture_output=True, text=True, env=os.environ | {"PYTHONPATH": path}
+        )
         assert done.returncode == 0, done.stderr
         digests.add(done.stdout.strip().splitlines()[-1])
     assert len(digests) == 1 and len(digests.pop()) == len(hashlib.sha256().hexdigest())

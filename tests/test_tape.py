@@ -1,5 +1,7 @@
 """Rollouts inside `ti.ad.Tape`, between kernels of the user's."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 import taichi as ti
@@ -11,10 +13,10 @@ from diffsim_ti import runtime, verify
 STEPS = 12
 
 
-def scalar_field(value=0.0):
-    field = ti.field(ti.f64, (), needs_grad=True)
-    field[None] = value
-    return field
+@cache
+def scalar_field(name="total"):
+    """One field for all tests: kernels compile anew for each."""
+    return ti.field(ti.f64, (), needs_grad=True)
 
 
 @ti.kernel
@@ -42,7 +44,6 @@ def taped(rollout, total, **options):
         spread(rollout.positions, rollout.velocities, total)
 
 
-@pytest.mark.backends
 @by_solver
 def test_a_tape_gives_the_bits_of_vjp(solver):
     """In f64: the tape's adjoint of the frames is the same kernel's as ours by hand."""
@@ -98,7 +99,6 @@ def test_gradients_add_up_where_a_tape_does_not_clear():
     one, by_run = E.grad.to_numpy(), rollout.gradients["youngs_modulus"].copy()
     rollout.positions.grad.fill(0)
     rollout.velocities.grad.fill(0)
-    total[None] = 0
     taped(rollout, total, clear_gradients=False)
     np.testing.assert_allclose(E.grad.to_numpy(), 2 * one, rtol=1e-14)
     assert np.array_equal(rollout.gradients["youngs_modulus"], by_run)  # this is of the last run alone
@@ -154,11 +154,10 @@ def test_one_rollout_after_another():
     assert slope == pytest.approx(verify.central_difference(loss)[0], rel=1e-7)
 
 
-@pytest.mark.backends
 @by_solver
 def test_kernels_before_and_after(solver):
     """A parameter of the user's own: log E by a wave over the tetrahedra, drag and start besides."""
-    rollout, total, parameter = small(solver), scalar_field(), scalar_field(0.2)
+    rollout, total, parameter = small(solver), scalar_field(), scalar_field("parameter")
     E, drag, v0 = (rollout.field(n) for n in ("youngs_modulus", "drag_rate", "initial_velocities"))
 
     @ti.kernel
@@ -167,7 +166,8 @@ def test_kernels_before_and_after(solver):
             E[e] = 1e5 * ti.exp(parameter[None] * ti.cos(1.0 * e))
         for i in v0:
             v0[i] = ti.Vector([parameter[None], 0.3, parameter[None] ** 2 * i])
-        drag[None] = 1.0 + parameter[None]
+        for _ in range(1):
+            drag[None] = 1.0 + parameter[None]
 
     def loss(p):
         parameter[None] = float(p)
@@ -189,8 +189,9 @@ def test_kinds_of_input_fields():
     """A number, a number per tetrahedron, a 3-vector, vectors per vertex, per step and vertex."""
     rollout = small()
     shapes = {name: tuple(rollout.field(name).shape) for name in rollout.inputs}
-    assert shapes["drag_rate"] == () and shapes["youngs_modulus"] == (48,) and shapes["gravity"] == (3,) or shapes["gravity"] == ()
-    assert shapes["initial_positions"] == (27,) and shapes["external_forces"] == (STEPS, 27)
+    assert shapes["drag_rate"] == shapes["gravity"] == () and rollout.field("gravity").n == 3
+    assert shapes["youngs_modulus"] == (48,) and shapes["initial_positions"] == (27,)
+    assert shapes["external_forces"] == (STEPS, 27) and shapes["prescribed_motion"] == (STEPS + 1, 9)
     for name in rollout.inputs:
         assert np.array_equal(rollout.field(name).to_numpy(), rollout.values[name]), name
         assert rollout.field(name) is rollout.field(name)
@@ -206,6 +207,7 @@ def test_uniform_moduli_take_one_number():
     assert E.shape == ()
     taped(rollout, total)
     slope = E.grad[None]
+    assert slope == float(rollout.gradients["youngs_modulus"])
 
     def loss(t):
         E[None] = 1e5 * (1 + t)
@@ -213,7 +215,6 @@ def test_uniform_moduli_take_one_number():
         return total[None]
 
     assert 1e5 * slope == pytest.approx(verify.central_difference(loss)[0], rel=1e-7)
-    assert slope == float(rollout.gradients["youngs_modulus"]) or E[None] != 1e5
 
 
 def test_only_wanted_gradients_reach_fields():
@@ -223,7 +224,6 @@ def test_only_wanted_gradients_reach_fields():
     assert g.grad.to_numpy().any() and not E.grad.to_numpy().any() and list(rollout.gradients) == ["gravity"]
 
 
-@pytest.mark.backends
 def test_f32():
     single, double, total = small(precision="f32"), small(), scalar_field()
     gradients = []
@@ -233,6 +233,32 @@ def test_f32():
         gradients.append(E.grad.to_numpy())
     assert gradients[0].dtype == np.float32
     assert np.linalg.norm(gradients[0] - gradients[1]) <= 1e-4 * np.linalg.norm(gradients[1])
+
+
+@ti.kernel
+def squares(positions: ti.template(), velocities: ti.template(), total: ti.template()):
+    for f, i in positions:
+        total[None] += positions[f, i].norm_sqr() + velocities[f, i].norm_sqr()
+
+
+@pytest.mark.backends
+@by_solver
+def test_backend_tape(solver):
+    """In f32 all the way, as Vulkan needs it."""
+    scene = full_scene(precision="f32", resolution=2, steps=4)
+    rollout, by_hand = (rollout_of(scene, solver, 4, save_every=2) for _ in range(2))
+    total = ti.field(ti.f32, (), needs_grad=True)
+    fields = {name: rollout.field(name) for name in rollout.inputs}
+    with ti.ad.Tape(total):
+        rollout.run()
+        squares(rollout.positions, rollout.velocities, total)
+    frames = by_hand.forward()
+    expected = by_hand.vjp(frames, 2 * frames.positions, 2 * frames.velocities)
+    assert np.array_equal(rollout.positions.to_numpy(), frames.positions)
+    loss = float((frames.positions.astype(float) ** 2).sum() + (frames.velocities.astype(float) ** 2).sum())
+    assert total[None] == pytest.approx(loss, rel=1e-5)
+    for name, field in fields.items():
+        np.testing.assert_allclose(field.grad.to_numpy(), expected[name], rtol=1e-5, atol=1e-5 * np.abs(expected[name]).max())
 
 
 # ---- misuse -----------------------------------------------------------------------------------------------------------
@@ -287,8 +313,7 @@ def test_fields_come_back(monkeypatch):
     """512 field trees end a process: dropped rollouts lend theirs to the next."""
     made, make = [], runtime.FieldPool._make
     monkeypatch.setattr(runtime.FieldPool, "_make", staticmethod(lambda *a: made.append(a) or make(*a)))
-    total = scalar_field()
-    scene = full_scene(steps=STEPS)
+    scene, total = full_scene(steps=STEPS), scalar_field()
 
     def use():
         rollout = rollout_of(scene, steps=STEPS, save_every=4)

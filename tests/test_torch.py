@@ -460,7 +460,7 @@ def identification(make_optimizer, iterations):
 
     for _ in range(iterations):
         optimizer.step(closure)
-    return float(log_E.exp())
+    return float(log_E.detach().exp())
 
 
 @pytest.mark.parametrize("make, iterations, gate", [

@@ -1,0 +1,143 @@
+"""Optimisations that survive: state files that are whole or not there, resumed runs that equal uninterrupted ones."""
+
+import copy
+import hashlib
+import io
+import math
+import os
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+from diffsim_ti.autograd import torch
+
+MAGIC = b"diffsim_ti optimisation state, version 1\n"
+
+
+def save_state(path, mesh, state: dict) -> None:
+    """Write tensors, numbers and state_dicts to `path`, at once or not at all; the file before it stays as `.previous`.
+
+    The file carries its version, the mesh's content hash and a checksum. If writing fails (disk full, read-only), the old
+    files are as they were, the temporary one is removed, and the exception goes on.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    payload = io.BytesIO()
+    torch.save(state, payload)
+    body = mesh.content_hash.encode() + b"\n" + payload.getvalue()
+    temporary = path.with_name(path.name + ".tmp")
+    try:
+        with open(temporary, "wb") as file:
+            file.write(MAGIC + hashlib.sha256(body).hexdigest().encode() + b"\n" + body)
+            file.flush()
+            os.fsync(file.fileno())
+        if path.exists():
+            os.replace(path, _previous(path))
+        os.replace(temporary, path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def load_state(path, mesh) -> dict | None:
+    """The state at `path`; where that file is refused, the one before it, with a warning; None if there is neither.
+
+    Raises ValueError with the reasons if there are files but none is good: truncated, foreign, of another version or mesh.
+    """
+    path, reasons = Path(path), []
+    for candidate in (path, _previous(path)):
+        if candidate.exists():
+            try:
+                state = _read(candidate, mesh)
+            except ValueError as error:
+                reasons.append(f"{candidate}: {error}")
+                continue
+            if reasons:
+                warnings.warn(f"{reasons[0]}; using {candidate}", stacklevel=2)
+            return state
+    if reasons:
+        raise ValueError("no usable state: " + "; ".join(reasons) + "; delete the file to start anew")
+    return None
+
+
+def _previous(path: Path) -> Path:
+    return path.with_name(path.name + ".previous")
+
+
+def _read(path: Path, mesh) -> dict:
+    data = path.read_bytes()
+    if not data.startswith(MAGIC):
+        first = data.split(b"\n", 1)[0][:60]
+        kind = "written by another version" if first.startswith(MAGIC[:20]) else "not a state of ours"
+        raise ValueError(f"{kind}: it begins with {first!r}, expected {MAGIC.strip()!r}")
+    digest, _, body = data[len(MAGIC) :].partition(b"\n")
+    if hashlib.sha256(body).hexdigest().encode() != digest:
+        raise ValueError("truncated or damaged: its checksum does not fit")
+    known, _, payload = body.partition(b"\n")
+    if known != mesh.content_hash.encode():
+        raise ValueError(f"made for another mesh: {known.decode()[:12]}, this one is {mesh.content_hash[:12]}")
+    return torch.load(io.BytesIO(payload), weights_only=True)
+
+
+class Optimization:
+    """A loop around a torch optimiser that saves, resumes, and keeps the best.
+
+    module: holds the parameters; path: state file, resumed from if it is there; None keeps nothing. A resumed run is
+    bitwise the uninterrupted one (parameters, optimiser, random numbers). `losses` has the loss before each iteration,
+    `best_loss` the lowest, whose parameters `restore_best()` brings back; `seconds` counts all parts of the run.
+    """
+
+    def __init__(self, module: torch.nn.Module, optimizer: torch.optim.Optimizer, mesh, path=None, save_every: int = 1):
+        self.module, self.optimizer, self.mesh, self.path, self.save_every = module, optimizer, mesh, path, save_every
+        self.iteration, self.losses, self.seconds = 0, [], 0.0
+        self.best_loss, self._best = math.inf, copy.deepcopy(module.state_dict())
+        state = None if path is None else load_state(path, mesh)
+        if state is not None:
+            self.iteration, self.losses, self.seconds = state["iteration"], state["losses"], state["seconds"]
+            self.best_loss, self._best = state["best_loss"], state["best"]
+            module.load_state_dict(state["module"])
+            optimizer.load_state_dict(state["optimizer"])
+            torch.set_rng_state(state["random"])
+
+    def run(self, loss: Callable[[], torch.Tensor], iterations: int) -> "Optimization":
+        """Go on until `iterations` iterations are done in all; loss() makes the graph anew each time.
+
+        Raises FloatingPointError if the loss is not finite, and lets the simulator's errors through; the parameters are
+        then the best ones so far.
+        """
+
+        def closure():
+            self.optimizer.zero_grad()
+            value = loss()
+            if not torch.isfinite(value):
+                raise FloatingPointError(f"iteration {self.iteration}: the loss is {value.item()}; take smaller steps")
+            value.backward()
+            return value
+
+        while self.iteration < iterations:
+            start, before = time.perf_counter(), copy.deepcopy(self.module.state_dict())
+            try:
+                value = self.optimizer.step(closure).item()
+            except (ValueError, FloatingPointError):
+                self.restore_best()
+                raise
+            self.losses.append(value)
+            if value < self.best_loss:
+                self.best_loss, self._best = value, before
+            self.iteration += 1
+            self.seconds += time.perf_counter() - start
+            if self.path is not None and (self.iteration % self.save_every == 0 or self.iteration == iterations):
+                self.save()
+        return self
+
+    def save(self) -> None:
+        """Write the state file."""
+        save_state(self.path, self.mesh, dict(
+            iteration=self.iteration, losses=self.losses, seconds=self.seconds, best_loss=self.best_loss, best=self._best,
+            module=self.module.state_dict(), optimizer=self.optimizer.state_dict(), random=torch.get_rng_state(),
+        ))  # fmt: skip
+
+    def restore_best(self) -> None:
+        """Bring back the parameters of the lowest loss."""
+        self.module.load_state_dict(self._best)

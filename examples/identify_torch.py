@@ -1,0 +1,92 @@
+"""Identify Young's modulus (and Poisson's ratio) of a body from its motion, through PyTorch.
+
+Three scenes, from hard to easy: (a) the seeds' falling cube, in log E, with a scaled loss over all frames, Adam; (b) a cube
+held at one face that sags, L-BFGS; (c) the same for E and nu together. As the seeds write (a), with Adam on E in pascals and
+the last frame only, it cannot work: the gradient is 4e-11, Adam adds 1e-8 to what it divides by, and the loss of the last
+frame alone rises before it falls on the way from 2e5 to 8e4.
+
+    python examples/identify_torch.py
+"""
+
+from pathlib import Path
+
+import torch
+
+from diffsim_ti import TetrahedralMesh
+from diffsim_ti.diff_physics import TorchMaterial
+from diffsim_ti.diff_simulator import DifferentiableSimulator, DifferentiableSolver
+from diffsim_ti.optimization import Optimization
+from diffsim_ti.picture import save_picture
+
+TRUE_E, TRUE_NU = 8e4, 0.4
+
+
+class LogMaterial(TorchMaterial):
+    """E = exp(log_E) and nu = 0.49 sigmoid(raw_nu) stay in range whatever an optimiser does."""
+
+    def __init__(self, E: float, nu: float, learn_nu: bool = False):
+        super().__init__()
+        self.log_E = torch.nn.Parameter(torch.tensor(E, dtype=torch.float64).log())
+        self.raw_nu = torch.nn.Parameter(torch.logit(torch.tensor(nu / 0.49, dtype=torch.float64)), requires_grad=learn_nu)
+
+    @property
+    def E(self):
+        return self.log_E.exp()
+
+    @property
+    def nu(self):
+        return 0.49 * torch.sigmoid(self.raw_nu)
+
+
+def identify(name, held, learn_nu, make_optimizer, iterations, folder, start=(2e5, TRUE_NU)) -> dict:
+    """Recover the material from the motion of a cube that carries the true one."""
+    mesh = TetrahedralMesh.create_cube(resolution=4, size=0.5)
+
+    def simulator(material):
+        solver = DifferentiableSolver(dt=0.01, gravity=-9.8, damping=0.98, substeps=12)
+        options = dict(fixed_vertices="xmin", contact=False) if held else {}
+        return DifferentiableSimulator(mesh, material, solver, **options)
+
+    with torch.no_grad():
+        target = simulator(LogMaterial(TRUE_E, TRUE_NU)).rollout(20, save_every=1)
+    material = LogMaterial(*start, learn_nu=learn_nu)
+    moving, size = simulator(material), (target.displacements - target.displacements.mean(1, keepdim=True)).square().mean()
+
+    def loss():
+        moving.reset()
+        return (moving.rollout(20, save_every=1).displacements - target.displacements).square().mean() / size
+
+    optimization = Optimization(material, make_optimizer([p for p in material.parameters() if p.requires_grad]), mesh,
+                                folder and Path(folder) / f"identify_{name}.state")  # fmt: skip
+    optimization.run(loss, iterations)
+    optimization.restore_best()
+    result = dict(E=material.E.item(), E_error=abs(material.E.item() / TRUE_E - 1), loss=optimization.best_loss,
+                  iterations=iterations, seconds=optimization.seconds)  # fmt: skip
+    if learn_nu:
+        result |= dict(nu=material.nu.item(), nu_error=abs(material.nu.item() / TRUE_NU - 1))
+    print(f"{name}: " + ", ".join(f"{key} {value:.5g}" for key, value in result.items()))
+    if folder:
+        moving.reset()
+        u = moving.rollout(20).displacements[-1].detach()
+        save_picture(Path(folder) / f"identify_{name}.png", mesh, mesh.vertices + u.numpy(), u.norm(dim=1).numpy(),
+                     "displacement [m]", title=f"{name}: E = {result['E']:.4g} Pa")  # fmt: skip
+    return result
+
+
+def lbfgs(parameters):
+    tolerances = dict(tolerance_grad=1e-14, tolerance_change=1e-16)
+    return torch.optim.LBFGS(parameters, max_iter=4, line_search_fn="strong_wolfe", **tolerances)
+
+
+def main(folder="output", adam_iterations: int = 60) -> dict:
+    if folder:
+        Path(folder).mkdir(exist_ok=True)
+    return {
+        "falling": identify("falling", False, False, lambda p: torch.optim.Adam(p, lr=0.08), adam_iterations, folder),
+        "sagging": identify("sagging", True, False, lbfgs, 4, folder),
+        "both": identify("both", True, True, lbfgs, 8, folder, start=(2e5, 0.25)),
+    }
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,97 @@
+"""A small neural controller that makes a soft arm reach: trained through the simulator, step by step.
+
+The arm stands on its base; four tendons run up its edges and pull (internal forces, which add up to zero). Every 0.02 s a
+network of 180 weights sees the tip's place and velocity and the target, and sets the four tensions. The loss is the distance
+of the tip from the target over the second half of half a second, and the effort. It is trained on four targets and judged on
+three others.
+
+    python examples/train_controller.py
+"""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from diffsim_ti import TetrahedralMesh
+from diffsim_ti.diff_physics import DifferentiableMaterial
+from diffsim_ti.diff_simulator import DifferentiableSimulator, DifferentiableSolver
+from diffsim_ti.optimization import Optimization
+from diffsim_ti.picture import save_picture
+
+STEPS, STRONGEST, HEIGHT, WIDTH = 25, 40.0, 0.5, 0.1
+SEEN = [(0.12, 0.0), (-0.12, 0.0), (0.0, 0.12), (0.0, -0.12)]
+UNSEEN = [(0.08, 0.08), (-0.1, 0.05), (0.06, -0.09)]
+
+
+class Arm:
+    """A block that stands on its fixed base, with a tendon along each upright edge."""
+
+    def __init__(self):
+        self.mesh = TetrahedralMesh.create_box([2, 7, 2], [WIDTH, HEIGHT, WIDTH], origin=(-WIDTH / 2, 0.0, -WIDTH / 2))
+        x = self.mesh.vertices
+        edges = [(sx * WIDTH / 2, sz * WIDTH / 2) for sx in (1, -1) for sz in (1, -1)]
+        along = [np.nonzero(np.all(np.abs(x[:, ::2] - edge) < 1e-9, axis=1))[0] for edge in edges]
+        self.tendons = torch.from_numpy(np.stack([line[np.argsort(x[line, 1])] for line in along]))
+        self.tip = torch.from_numpy(np.nonzero(x[:, 1] > HEIGHT - 1e-9)[0])
+        material = DifferentiableMaterial(1e5, 0.3, requires_grad=False)
+        solver = DifferentiableSolver(dt=0.02, gravity=-9.8, damping=0.85, substeps=20)
+        options = dict(density=500.0, fixed_vertices="ymin", contact=False)
+        self.simulator = DifferentiableSimulator(self.mesh, material, solver, **options)
+
+    def forces(self, tensions: torch.Tensor) -> torch.Tensor:
+        """Pulls of the tendons on their vertices [N]: each piece draws its two ends together."""
+        x = self.simulator.positions
+        line = x[self.tendons]
+        pull = tensions[:, None, None] * torch.nn.functional.normalize(line[:, 1:] - line[:, :-1], dim=2)
+        out = torch.zeros_like(x)
+        out = out.index_add(0, self.tendons[:, :-1].reshape(-1), pull.reshape(-1, 3))
+        return out.index_add(0, self.tendons[:, 1:].reshape(-1), -pull.reshape(-1, 3))
+
+    def reach(self, controller, target) -> tuple[torch.Tensor, torch.Tensor]:
+        """Distance of the tip from the target in the last half of the time, and the mean squared activation."""
+        self.simulator.reset()
+        target, distances, effort = torch.tensor(target), [], 0.0
+        for step in range(STEPS):
+            place = self.simulator.positions[self.tip].mean(0)[::2]
+            speed = self.simulator.velocities[self.tip].mean(0)[::2]
+            activation = torch.sigmoid(controller(torch.cat([target / 0.1, place / 0.1, speed])))
+            self.simulator.step(self.forces(STRONGEST * activation))
+            effort = effort + activation.square().mean() / STEPS
+            if step >= STEPS // 2:
+                distances.append((self.simulator.positions[self.tip].mean(0)[::2] - target).norm())
+        return torch.stack(distances).mean(), effort
+
+
+def main(folder="output", iterations: int = 60, seed: int = 0) -> dict:
+    torch.manual_seed(seed)
+    arm = Arm()
+    controller = torch.nn.Sequential(torch.nn.Linear(6, 16), torch.nn.Tanh(), torch.nn.Linear(16, 4))
+
+    def miss(targets) -> float:
+        with torch.no_grad():
+            return float(np.mean([arm.reach(controller, target)[0].item() for target in targets]))
+
+    before = miss(UNSEEN)
+    optimizer = torch.optim.Adam(controller.parameters(), lr=0.03)
+    state = folder and Path(folder) / "train_controller.state"
+    optimization = Optimization(controller, optimizer, arm.mesh, state, save_every=5)
+
+    def loss():
+        distance, effort = arm.reach(controller, SEEN[optimization.iteration % len(SEEN)])
+        return 10 * distance + 0.01 * effort
+
+    optimization.run(loss, iterations)
+    result = dict(miss_seen=miss(SEEN), miss_unseen=miss(UNSEEN), miss_before=before, iterations=iterations,
+                  seconds=optimization.seconds)  # fmt: skip
+    print("controller, distances of the tip [m]: " + ", ".join(f"{key} {value:.4g}" for key, value in result.items()))
+    if folder:
+        Path(folder).mkdir(exist_ok=True)
+        miss(SEEN[:1])
+        save_picture(Path(folder) / "train_controller.png", arm.mesh, arm.simulator.positions.numpy(), ground=0.0,
+                     title=f"reaching for x = {SEEN[0][0]} m")  # fmt: skip
+    return result
+
+
+if __name__ == "__main__":
+    main()
