@@ -5,7 +5,6 @@ import os
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # read when taichi is imported
 os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")  # no network traffic from a simulator
 
-from diffsim_ti import runtime
 from diffsim_ti.divergence import Divergence
 from diffsim_ti.materials import (
     Corotated,

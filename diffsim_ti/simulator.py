@@ -5,8 +5,9 @@ import weakref
 import numpy as np
 
 from diffsim_ti import observe, runtime
-from diffsim_ti.divergence import Guard
+from diffsim_ti.divergence import Divergence, Guard
 from diffsim_ti.observe import Energy, TetrahedronFields
+from diffsim_ti.solvers.arrays import History
 
 
 class Simulator:
@@ -16,7 +17,7 @@ class Simulator:
 
     positions, displacements [m] and velocities [m/s] are NumPy copies of shape (num_vertices, 3) in the scene's
     precision; time [s] and step_count say where it is. A run that goes wrong raises Divergence (a FloatingPointError)
-    and leaves the last good state.
+    and leaves the state before the step that failed.
     """
 
     def __init__(self, *arguments):
@@ -32,6 +33,7 @@ class Simulator:
         self._start = solver.start_values()
         self.workspace = solver.workspace(self._start)
         self._guard = Guard(self.workspace)
+        self._before = History(self.workspace.arrays, 1, record=False)
         self.reset()
 
     def reset(self) -> None:
@@ -49,7 +51,12 @@ class Simulator:
         self._load_step()
         self._guard.offset = self.step_count * self.solver.substeps
         passes = self.solver.num_passes(1)
-        self._guard.advance(0, passes, passes)
+        self.workspace.save(self._before, 0)
+        try:
+            self._guard.advance(0, passes, passes)
+        except Divergence:
+            self.workspace.restore(self._before, 0)
+            raise
         self.step_count += 1
 
     def run(self, steps: int) -> None:

@@ -83,15 +83,21 @@ class Stiffness:
         state = workspace.state
         arrays = (*a.topology(), a.corner, state.u, state.v, self.w, self.y)
         self._multiply = runtime.Launch(kernel, *arrays, vectorized=a.in_lanes)
-        self.root = np.sqrt(runtime.fetch(a.inverse_mass).astype(np.float64))[:, None]
         self.vector, self._random = None, np.random.default_rng(1)
+
+    @property
+    def root(self) -> np.ndarray:
+        """Roots of the inverse masses as they are now, shape (num_vertices, 1)."""
+        return np.sqrt(runtime.fetch(self.ws.arrays.inverse_mass).astype(np.float64))[:, None]
 
     def product(self, x: np.ndarray) -> np.ndarray:
         """The product with x, shape (num_vertices, 3), float64."""
-        scale = np.abs(self.root * x).max() or 1.0  # f32 keeps its digits whatever the masses
-        runtime.fill(self.w, (self.root * x / scale)[None])
+        root = self.root
+        w = root * x
+        scale = np.abs(w).max() or 1.0  # f32 keeps its digits whatever the masses
+        runtime.fill(self.w, (w / scale)[None])
         self._multiply(self.ws.arrays.num_items, self.ws.arrays.num_vertices)
-        return -self.root * runtime.fetch(self.y)[0].astype(np.float64) * scale
+        return -root * runtime.fetch(self.y)[0].astype(np.float64) * scale
 
     def largest(self, tolerance: float = 1e-3) -> tuple[float, float]:
         """(largest eigenvalue omega^2 [1/s^2], residual bound) by Lanczos; keeps the vector for `watch`.

@@ -1,5 +1,6 @@
 """What is kept for the reverse sweep changes memory and time, never a bit of the gradient."""
 
+import gc
 import math
 from functools import cache
 
@@ -88,6 +89,7 @@ def allocated(**options) -> tuple[float, float]:
     """(megabytes that a gradient keeps beyond a forward run of no steps, megabytes that the schedule says)."""
     scene = full_scene(steps=1000)
     idle = rollout_of(scene, steps=0)
+    gc.collect()  # failed runs of other tests, held by their tracebacks
     sizes = []
     for r in (idle, rollout_of(scene, steps=1000, **options)):
         before = runtime.allocated_megabytes()

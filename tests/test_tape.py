@@ -258,7 +258,8 @@ def test_backend_tape(solver):
     loss = float((frames.positions.astype(float) ** 2).sum() + (frames.velocities.astype(float) ** 2).sum())
     assert total[None] == pytest.approx(loss, rel=1e-5)
     for name, field in fields.items():
-        np.testing.assert_allclose(field.grad.to_numpy(), expected[name], rtol=1e-5, atol=1e-5 * np.abs(expected[name]).max())
+        size = np.abs(expected[name]).max()
+        np.testing.assert_allclose(field.grad.to_numpy(), expected[name], rtol=1e-5, atol=1e-5 * size)
 
 
 # ---- misuse -----------------------------------------------------------------------------------------------------------

@@ -28,7 +28,7 @@ class SemiImplicitSolver(ExplicitSolver):
         self.simulator = lambda: None
         self._own = dict(density=density, terms=[Gravity(gravity)])
         if isinstance(material, (int, float)):
-            raise TypeError("dt must be named: SemiImplicitSolver(scene, dt=...)")
+            material, dt = None, float(material)  # SemiImplicitSolver(scene, 1e-3)
         if scene is None:
             self._waiting = dict(dt=dt, substeps=substeps) | options
             self.scene, self.dt, self.substeps = None, dt, substeps

@@ -1,0 +1,158 @@
+"""State files that are whole or refused, and resumed optimisations that equal uninterrupted ones, also after kill -9."""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+import torch
+
+from diffsim_ti import TetrahedralMesh
+from diffsim_ti.optimization import Optimization, load_state, save_state
+
+MESH, OTHER = TetrahedralMesh.create_cube(2), TetrahedralMesh.create_cube(3)
+
+
+def state(k: float) -> dict:
+    return {"x": torch.full((50,), k), "k": k, "nested": {"list": [1, 2.5, None]}}
+
+
+def same(a, b) -> bool:
+    return torch.equal(a["x"], b["x"]) and a["k"] == b["k"] and a["nested"] == b["nested"]
+
+
+def test_round_trip_and_previous(tmp_path):
+    path = tmp_path / "new folder" / "run.state"
+    assert load_state(path, MESH) is None
+    for k in (1.0, 2.0, 3.0):
+        save_state(path, MESH, state(k))
+        assert same(load_state(path, MESH), state(k))
+    assert sorted(p.name for p in path.parent.iterdir()) == ["run.state", "run.state.previous"]
+    path.unlink()  # as if killed between the two renames
+    assert same(load_state(path, MESH), state(2.0))
+
+
+@pytest.mark.parametrize("damage, reason", [
+    (lambda data: data[: len(data) // 2], "truncated or damaged"),
+    (lambda data: data[:30], "another version|not a state of ours"),
+    (lambda data: b"", "not a state of ours"),
+    (lambda data: data[:-5] + b"xxxxx", "truncated or damaged"),
+    (lambda data: data.replace(b"version 1", b"version 9", 1), "written by another version"),
+    (lambda data: b"PK\x03\x04" + data, "not a state of ours"),
+], ids=["half", "head", "empty", "bits", "version", "foreign"])  # fmt: skip
+def test_damaged_files_are_refused_and_the_previous_one_used(tmp_path, damage, reason):
+    path = tmp_path / "run.state"
+    save_state(path, MESH, state(1.0))
+    save_state(path, MESH, state(2.0))
+    path.write_bytes(damage(path.read_bytes()))
+    with pytest.warns(UserWarning, match=f"({reason}).*using .*previous"):
+        assert same(load_state(path, MESH), state(1.0))
+    (tmp_path / "run.state.previous").unlink()
+    with pytest.raises(ValueError, match=reason):
+        load_state(path, MESH)
+
+
+def test_another_mesh_is_refused(tmp_path):
+    save_state(tmp_path / "run.state", OTHER, state(1.0))
+    with pytest.raises(ValueError, match="made for another mesh.*delete the file to start anew"):
+        load_state(tmp_path / "run.state", MESH)
+
+
+@pytest.mark.parametrize("at", ["fsync", "replace"])
+def test_a_full_disk_leaves_the_old_file(tmp_path, monkeypatch, at):
+    path = tmp_path / "run.state"
+    save_state(path, MESH, state(1.0))
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, at, full)
+        with pytest.raises(OSError, match="No space left"):
+            save_state(path, MESH, state(2.0))
+    assert [p.name for p in tmp_path.iterdir()] == ["run.state"]
+    assert same(load_state(path, MESH), state(1.0))
+
+
+def problem(path=None, lr=0.1, save_every=1):
+    torch.manual_seed(0)
+    module = torch.nn.Linear(3, 1)
+    run = Optimization(module, torch.optim.Adam(module.parameters(), lr=lr), MESH, path, save_every)
+    return run, lambda: (module(torch.randn(4, 3)) - 1).square().mean()  # random numbers must resume too
+
+
+def test_resumed_equals_uninterrupted(tmp_path):
+    whole, loss = problem()
+    whole.run(loss, 9)
+    for stop in (4, 9):
+        part, loss = problem(tmp_path / "run.state")
+        part.run(loss, stop)
+    assert part.losses == whole.losses and part.best_loss == whole.best_loss
+    assert all(torch.equal(a, b) for a, b in zip(part.module.parameters(), whole.module.parameters()))
+
+
+def test_resumed_lbfgs_equals_uninterrupted(tmp_path):
+    def run(path, iterations):
+        module = torch.nn.Linear(3, 2).double()
+        torch.nn.init.constant_(module.weight, 0.5)
+        torch.nn.init.constant_(module.bias, 0.1)
+        x = torch.linspace(-1, 1, 12).double().reshape(4, 3)
+        optimizer = torch.optim.LBFGS(module.parameters(), max_iter=3, line_search_fn="strong_wolfe")
+        return Optimization(module, optimizer, MESH, path).run(lambda: (module(x).cosh() - 2).square().mean(), iterations)
+
+    whole = run(None, 6)
+    run(tmp_path / "run.state", 3)
+    resumed = run(tmp_path / "run.state", 6)
+    assert resumed.losses == whole.losses
+    assert all(torch.equal(a, b) for a, b in zip(resumed.module.parameters(), whole.module.parameters()))
+
+
+def test_a_loss_that_is_not_finite_keeps_the_best():
+    module = torch.nn.Linear(1, 1)
+    run = Optimization(module, torch.optim.SGD(module.parameters(), lr=0.1), MESH)
+    values = iter([2.0, 1.0, 3.0, float("nan")])
+    seen = []
+
+    def loss():
+        seen.append(module.weight.item())
+        return next(values) + 0 * module.weight.sum() + 1e-3 * module.bias.sum() + 0.1 * (module.weight - module.weight.detach()).sum()
+
+    with pytest.raises(FloatingPointError, match="iteration 3: the loss is nan"):
+        run.run(loss, 10)
+    assert module.weight.item() == seen[1] and run.best_loss == run.losses[1] and run.iteration == 3
+
+
+SCRIPT = """
+import sys, torch
+from diffsim_ti import TetrahedralMesh
+from diffsim_ti.optimization import Optimization
+torch.manual_seed(0)
+module = torch.nn.Linear(3, 1)
+run = Optimization(module, torch.optim.Adam(module.parameters(), lr=0.1), TetrahedralMesh.create_cube(2), sys.argv[1] or None)
+print("ready", flush=True)
+run.run(lambda: (module(torch.randn(4, 3)) - 1).square().mean(), 400)
+print(run.losses[-1], *(p.sum().item() for p in module.parameters()))
+"""
+
+
+def start(path) -> subprocess.Popen:
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    return subprocess.Popen([sys.executable, "-W", "error", "-c", SCRIPT, str(path)], stdout=subprocess.PIPE, text=True,
+                            env=environment)  # fmt: skip
+
+
+def test_kill_at_random_moments(tmp_path):
+    """Whatever the moment, the next run finds a whole file (warnings are errors there) and ends as if nothing had been."""
+    moments = random.Random(0)
+    for _ in range(4):
+        process = start(tmp_path / "run.state")
+        assert process.stdout.readline() == "ready\n"
+        time.sleep(moments.uniform(0.0, 0.25))
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    results = [start(path) for path in (tmp_path / "run.state", "")]
+    outputs = [process.communicate(timeout=120)[0] for process in results]
+    assert outputs[0] == outputs[1] and len(outputs[0].split()) == 4

@@ -1,0 +1,81 @@
+"""The torch examples recover what they should; each writes a picture, and goes on where it was stopped."""
+
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+FOLDER = Path(__file__).parents[1] / "examples"
+
+
+def example(name: str):
+    spec = importlib.util.spec_from_file_location(name, FOLDER / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def check_files(folder, *names):
+    for name in names:
+        assert (folder / f"{name}.png").stat().st_size > 5000 and (folder / f"{name}.state").exists()
+
+
+def test_identify(tmp_path, capsys):
+    result = example("identify_torch").main(tmp_path)
+    assert result["falling"]["E_error"] < 0.01
+    assert result["sagging"]["E_error"] < 1e-3 and result["sagging"]["iterations"] <= 10
+    assert result["both"]["E_error"] < 0.01 and result["both"]["nu_error"] < 0.01
+    check_files(tmp_path, "identify_falling", "identify_sagging", "identify_both")
+    assert all(word in capsys.readouterr().out for word in ("E_error", "nu_error", "iterations", "seconds"))
+
+
+def test_stiffness_field(tmp_path):
+    result = example("stiffness_field").main(tmp_path, iterations=15)
+    assert result["median_error"] < 0.02 and result["worst_tenth"] < 0.1 and result["classified"] > 0.98
+    assert result["start_error"] > 0.6
+    check_files(tmp_path, "stiffness_field")
+
+
+def test_learned_material(tmp_path):
+    result = example("learned_material").main(tmp_path, iterations=12)
+    assert result["median_error"] < 0.1
+    assert result["unseen_motion_error"] < 0.02 < 0.2 < result["unseen_motion_error_before"]
+    check_files(tmp_path, "learned_material")
+
+
+def test_controller(tmp_path):
+    result = example("train_controller").main(tmp_path, iterations=60)
+    assert result["miss_seen"] < 0.025 and result["miss_unseen"] < 0.04 and result["miss_before"] > 0.1
+    check_files(tmp_path, "train_controller")
+
+
+def test_resumed_controller_is_the_uninterrupted_one(tmp_path):
+    module, states = example("train_controller"), []
+    for folder, stops in (("whole", [6]), ("parts", [3, 6])):
+        for stop in stops:
+            result = module.main(tmp_path / folder, iterations=stop)
+        states.append({key: value for key, value in result.items() if key != "seconds"})
+    assert states[0].pop("miss_before") != states[1].pop("miss_before")  # the resumed one starts trained
+    assert states[0] == states[1]
+
+
+def test_distributed():
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(FOLDER.parent), *sys.path]), "OMP_NUM_THREADS": "1"}
+    out = subprocess.run([*command, str(FOLDER / "train_distributed.py")], capture_output=True, text=True, timeout=300,
+                         env=environment)  # fmt: skip
+    assert out.returncode == 0, out.stderr
+    result = json.loads(next(line for line in out.stdout.splitlines() if line.startswith("{")))
+    assert result["processes"] == 2 and result["ranks_agree"]
+    assert result["difference_from_serial"] < 1e-12
+    assert result["E_error"] < 0.02 and result["nu_error"] < 0.03
+
+
+@pytest.fixture(autouse=True)
+def default_dtype():
+    torch.set_default_dtype(torch.float32)
