@@ -7,7 +7,7 @@ import meshio
 import numpy as np
 import pytest
 
-from diffsim_ti import cli, picture, series
+from diffsim_ti import cli, forward, picture, series
 from diffsim_ti.materials import StableNeoHookean
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.observe import TetrahedronFields
@@ -43,7 +43,7 @@ def cube_file(cube, tmp_path_factory):
     return path
 
 
-def falling(mesh, height=0.02, E=2e4, solver=SemiImplicitSolver, kind=series.ForwardRun, dt=None, **options):
+def falling(mesh, height=0.02, E=2e4, solver=SemiImplicitSolver, kind=forward.ForwardRun, dt=None, **options):
     body, law = mesh.translated([0, height, 0]), StableNeoHookean(E, 0.3)
     ground = cli.make_ground(body, law, 1000.0, -9.81, np.sqrt(2 * 9.81 * height))
     return kind(Scene(body, law, 1000.0, [Gravity(), ground], **options), solver, 1 / 30, dt)
@@ -54,7 +54,7 @@ def falling(mesh, height=0.02, E=2e4, solver=SemiImplicitSolver, kind=series.For
 
 def test_series_holds_what_the_simulator_has(cube, tmp_path):
     run = falling(cube)
-    series.run_and_write(run, 4, tmp_path, "body")
+    forward.run_and_write(run, 4, tmp_path, "body")
     frames = series.frames_of(tmp_path / "body.pvd")
     assert [t for t, _ in frames] == pytest.approx(np.arange(5) / 30)
     last, sim = meshio.read(frames[-1][1]), run.simulator
@@ -93,8 +93,8 @@ def test_interrupted_run_says_where_and_keeps_its_frames(cube, tmp_path, monkeyp
         advance()
 
     monkeypatch.setattr(run, "advance", advance_once)
-    with pytest.raises(series.Interrupted, match=r"interrupted at t = 0\.03333 s; 2 frames are in .*body\.pvd"):
-        series.run_and_write(run, 9, tmp_path, "body")
+    with pytest.raises(forward.Interrupted, match=r"interrupted at t = 0\.03333 s; 2 frames are in .*body\.pvd"):
+        forward.run_and_write(run, 9, tmp_path, "body")
     assert all(path.exists() for _, path in series.frames_of(tmp_path / "body.pvd"))
 
 
@@ -112,7 +112,7 @@ def test_fall_keeps_energy_and_stays_above_the_floor(cube, solver):
     assert min(run.seen.substeps) < max(run.seen.substeps)  # contact asks for finer steps
 
 
-class Careless(series.ForwardRun):
+class Careless(forward.ForwardRun):
     def _choose_substeps(self):
         return max(1, super()._choose_substeps() // 8)  # beyond the stable step of the contact
 
@@ -188,7 +188,7 @@ def test_errors_are_one_line(cube_file, tmp_path, capsys):
 
 def test_interrupt_exits_130(cube_file, capsys, monkeypatch):
     def stop(*_):
-        raise series.Interrupted("interrupted at t = 0.1 s")
+        raise forward.Interrupted("interrupted at t = 0.1 s")
 
     monkeypatch.setattr(cli, "load_body", stop)
     with pytest.raises(SystemExit) as ended:
@@ -310,3 +310,9 @@ def test_saved_picture(cube, tmp_path):
     assert image.shape[:2] == (240, 320) and image[..., :3].std() > 0.02
     with pytest.raises(ValueError, match="finite"):
         picture.draw(cube, np.full(cube.vertices.shape, np.nan))
+
+
+def test_check_gradients_prints_the_table_for_a_mesh(cube_file, capsys):
+    code, out, _ = run(capsys, "check-gradients", cube_file, "--steps", 5)
+    rows = [line for line in out.splitlines() if line.endswith("right")]
+    assert code == 0 and len(rows) == 11 and "WRONG" not in out
