@@ -312,7 +312,7 @@ def test_saved_picture(cube, tmp_path):
         picture.draw(cube, np.full(cube.vertices.shape, np.nan))
 
 
-def test_check_gradients_prints_the_table_for_a_mesh(cube_file, capsys):
-    code, out, _ = run(capsys, "check-gradients", cube_file, "--steps", 5)
-    rows = [line for line in out.splitlines() if line.endswith("right")]
-    assert code == 0 and len(rows) == 11 and "WRONG" not in out
+def test_check_gradients_prints_the_table_for_a_mesh(cube_file):
+    done = command("check-gradients", cube_file, "--steps", 5)
+    rows = [line for line in done.stdout.splitlines() if line.endswith("right")]
+    assert done.returncode == 0 and len(rows) == 11 and "WRONG" not in done.stdout, done

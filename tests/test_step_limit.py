@@ -378,8 +378,11 @@ def test_seeds_spelling_with_the_scene_in_the_simulator():
         ds.Simulator(mesh, material, solver)
     with pytest.raises(ValueError, match="has no scene"):
         ds.Simulator(ds.SemiImplicitSolver(dt=0.01))
-    with pytest.raises(TypeError, match="dt must be named"):
-        ds.SemiImplicitSolver(block(), 0.01)
+
+
+@solvers
+def test_dt_may_go_without_its_name(solver):
+    assert solver(block(), 1e-3).dt == 1e-3
 
 
 # ---- arguments ----------------------------------------------------------------------------------------------------------
