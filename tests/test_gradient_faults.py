@@ -192,6 +192,7 @@ def test_an_adjoint_that_becomes_nan_names_its_step(monkeypatch, solver, options
     assert all(np.array_equal(again[name], right[name]) for name in right)
 
 
+@pytest.mark.filterwarnings("ignore:overflow encountered:RuntimeWarning")
 def test_an_adjoint_that_overflows():
     rollout = rollout_of(full_scene(), steps=6)
     frames = rollout.forward()
