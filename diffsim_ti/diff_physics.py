@@ -94,8 +94,9 @@ class DifferentiableMaterial(TorchMaterial):
     `DifferentiableMaterial(1e5, 0.4)`, `(E=..., nu=...)` or `(youngs_modulus=..., poissons_ratio=...)`; law: another
     core material class, such as SmithNeoHookean.
 
-    A gradient by E in pascals is tiny (a loss of 1e-4 m^2 over an E of 1e5 Pa gives 1e-9 or less), far below Adam's eps of
-    1e-8: then Adam hardly moves E. Optimise log E with a scaled loss, or use LBFGS.
+    A gradient by E in pascals is tiny: 4e-11 in the seeds' identification block, far below Adam's eps of 1e-8, so that
+    Adam's lr of 5e3 moves E by 20 Pa a step. Optimise log E with a scaled loss over all frames, or use LBFGS
+    (examples/identify_torch.py).
     """
 
     def __init__(self, youngs_modulus=None, poissons_ratio=None, requires_grad: bool = True, *, E=None, nu=None,

@@ -27,7 +27,8 @@ def simulators(resolution: int) -> dict:
     mesh = diffsim_ti.TetrahedralMesh.create_cube(resolution).translated((0.0, LIFT, 0.0))
     start = torch.tensor(mesh.vertices * (1.05, 1.0, 1.0), dtype=torch.float32)
     theirs = diffsim.DifferentiableSimulator(
-        diffsim.TetrahedralMesh(mesh.vertices.copy(), mesh.tetrahedra.copy()), diffsim.DifferentiableMaterial(1e5, 0.4),
+        diffsim.TetrahedralMesh(mesh.vertices.copy(), mesh.tetrahedra.copy()),
+        diffsim.DifferentiableMaterial(1e5, 0.4),
         diffsim.DifferentiableSolver(dt=DT, gravity=-9.8, damping=1.0, substeps=SUBSTEPS),
     )  # fmt: skip
     ours = diff_simulator.DifferentiableSimulator(
@@ -43,7 +44,7 @@ def simulators(resolution: int) -> dict:
 
 
 def measure(simulator, reset, repeats: int = 3) -> dict:
-    """Best times per step and per step's backward [ms]; where the body is in the end, and the gradient by E of its spread."""
+    """Best times per step and per step's backward [ms]; where the body ends, and the gradient by E of its spread."""
     forward, backward = [], []
     for _ in range(repeats + 1):
         reset()

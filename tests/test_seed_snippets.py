@@ -74,8 +74,8 @@ def test_material_parameter_optimization(names, capsys):
     lines = capsys.readouterr().out.splitlines()
     assert [line.split(":")[0] for line in lines] == [f"Iter {i}" for i in range(0, 50, 10)]
     assert abs(names["material"].E.grad) > 0
-    # Adam's eps swallows the gradient: fifty steps of "5e3" move E by less than 1 % towards its 8e4 (see below)
-    assert names["material"].E.item() == pytest.approx(2e5, rel=0.01)
+    # Adam's eps swallows the gradient: fifty steps of "5e3" move E by half a per cent, and away from its 8e4 (see below)
+    assert 2e5 < names["material"].E.item() < 2.02e5
 
 
 def test_spatially_varying_materials(names):
