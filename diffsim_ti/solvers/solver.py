@@ -46,7 +46,9 @@ class Solver(ABC):
         """Whether passes are launched one by one on all threads."""
         if self.parallel is not None:
             return self.parallel or not runtime.runs_on_cpu()
-        return not runtime.runs_on_cpu() or self.scene.mesh.num_tetrahedra > self.serial_limit
+        in_lanes = self.scene.material.law(self.scene.precision).lanes
+        limit = self.serial_limit_in_lanes if in_lanes else self.serial_limit
+        return not runtime.runs_on_cpu() or self.scene.mesh.num_tetrahedra > limit
 
     def stable_dt(self, tight: bool = False) -> stability.StepLimit:
         """Largest stable substep at the start: the safe element bound or, `tight`, the Lanczos value."""
