@@ -231,6 +231,8 @@ class Rollout:
         unknown = [name for name in values if name not in self.inputs]
         if unknown:
             raise ValueError(f"no input named {unknown[0]!r}; this rollout has {', '.join(self.inputs)}")
+        if self.solver.num_passes(self.steps) != self.num_passes:
+            raise RuntimeError("the solver's substeps changed since this Rollout was made: make a new one")
         run = self.values | self.scene.inputs.check(values)
         self._current = None  # until the sweep is through
         if self._loaded is not None and all(run[name] is self._loaded[name] for name in run):

@@ -286,3 +286,12 @@ def test_no_steps_at_all(solver):
     np.testing.assert_allclose(g["initial_positions"], w[0], rtol=1e-15)
     np.testing.assert_allclose(g["initial_velocities"][free], z[0][free], rtol=1e-15)
     assert not g["youngs_modulus"].any()
+
+
+def test_a_solver_whose_substeps_changed_is_refused():
+    scene = ds.Scene(ds.TetrahedralMesh.create_cube(2), ds.StableNeoHookean(1e4, 0.3), precision="f64")
+    solver = ds.SemiImplicitSolver(scene, dt=1e-3)
+    rollout = ds.Rollout(solver, 2)
+    ds.Simulator(solver).set_substeps(2)
+    with pytest.raises(RuntimeError, match="substeps changed"):
+        rollout.forward()
