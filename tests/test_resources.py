@@ -289,3 +289,10 @@ def test_torch_is_not_needed():
         print(sorted(rollout.vjp(frames, positions=frames.positions)))
     """))  # fmt: skip
     assert "youngs_modulus" in out
+
+
+def test_vulkan_refuses_float64_with_a_remedy(monkeypatch):
+    monkeypatch.setattr(runtime, "arch_name", lambda: "vulkan")
+    runtime.check_backend("f32")
+    with pytest.raises(ValueError, match="no float64 logarithm.*precision='f32'"):
+        runtime.check_backend("f64")

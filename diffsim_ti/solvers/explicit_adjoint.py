@@ -29,7 +29,6 @@ class ExplicitAdjoint:
         self.gradients = runtime.array(a.lanes, 9 * blocks if shape else 1)
         self.volumes = runtime.array(a.lanes, blocks if shape else 1)
         self.frames = tuple(runtime.array(a.vector, *f.shape) for f in workspace.frames)
-        self._launch = None
 
     def fits(self, workspace) -> bool:
         """Whether kernels and shapes are still those of the run."""
