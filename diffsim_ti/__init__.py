@@ -19,7 +19,15 @@ from diffsim_ti.rollout import Frames, Rollout
 from diffsim_ti.runtime import init
 from diffsim_ti.scene import Scene
 from diffsim_ti.simulator import Simulator
-from diffsim_ti.solvers import SemiImplicitSolver, VelocityVerletSolver
+from diffsim_ti.solvers import (
+    BDF2Solver,
+    ImplicitEulerSolver,
+    ImplicitMidpointSolver,
+    NotConverged,
+    SemiImplicitSolver,
+    StaticSolver,
+    VelocityVerletSolver,
+)
 from diffsim_ti.terms import Drag, ExternalForce, Gravity, Ground
 from diffsim_ti.verify import check_gradients, dot_product_test, taylor_test
 
@@ -28,6 +36,7 @@ __all__ = [
     "init", "TetrahedralMesh",
     "StableNeoHookean", "SmithNeoHookean", "LinearElastic", "Corotated", "StVenantKirchhoff", "MooneyRivlin",
     "Gravity", "Drag", "Ground", "ExternalForce",
-    "Scene", "SemiImplicitSolver", "VelocityVerletSolver", "Simulator", "Divergence",
+    "Scene", "SemiImplicitSolver", "VelocityVerletSolver",
+    "ImplicitEulerSolver", "ImplicitMidpointSolver", "BDF2Solver", "StaticSolver", "Simulator", "Divergence", "NotConverged",
     "Rollout", "Frames", "taylor_test", "dot_product_test", "check_gradients",
 ]  # fmt: skip

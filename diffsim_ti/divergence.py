@@ -3,7 +3,6 @@
 import numpy as np
 
 from diffsim_ti import observe, stability
-from diffsim_ti.solvers.arrays import History
 
 
 class Divergence(FloatingPointError):
@@ -25,7 +24,7 @@ class Guard:
 
     def __init__(self, workspace):
         self.ws = workspace
-        self.good = History(workspace.arrays, 1, record=False)
+        self.good = workspace.history(1)
         self.good_pass, self._passes, self.offset = 0, 0, 0  # offset: passes before this run, for reports
         self.every, self._stiffness = self.usual, None
 
@@ -59,7 +58,7 @@ class Guard:
 
     def _look_at_step(self, now: int, num_passes: int) -> None:
         solver = self.ws.solver
-        if solver.allow_unstable:
+        if solver.allow_unstable or not solver.explicit:
             return
         if self._stiffness is None:
             self._stiffness = stability.Stiffness(self.ws)

@@ -44,7 +44,6 @@ class ForwardRun:
 
     def __init__(self, scene, solver_class, frame_time: float, dt: float | None = None, **options):
         from diffsim_ti.simulator import Simulator
-        from diffsim_ti.solvers.arrays import History
         from diffsim_ti.terms import Gravity, Ground
 
         self.scene, self.ground, self.seen, self.adapts = scene, scene.term(Ground), Seen(), dt is None
@@ -63,7 +62,7 @@ class ForwardRun:
         self.simulator = Simulator(solver)
         self.frame_time = self.parts * solver.dt
         ws = self.simulator.workspace
-        self._start = History(ws.arrays, 1, record=False)
+        self._start = ws.history(1)
         ws.save(self._start, 0)
         ws.advance(0, 1, solver.num_passes(1))  # compiles
         ws.restore(self._start, 0)

@@ -10,8 +10,6 @@ import taichi as ti
 from diffsim_ti import runtime
 from diffsim_ti.checkpoints import choose_schedule
 from diffsim_ti.divergence import Guard
-from diffsim_ti.solvers.arrays import History
-from diffsim_ti.solvers.explicit_adjoint import ExplicitAdjoint, ExplicitTangent
 
 
 @dataclass(eq=False)
@@ -148,7 +146,7 @@ class Rollout:
         values = frames.inputs
         ws = self._start(values) and self._workspace
         dots = {k: np.broadcast_to(np.asarray(x, np.float64), values[k].shape) for k, x in tangents.items()}
-        tangent = ExplicitTangent(ws, self.scene.inputs.derive_jvp(values, dots))
+        tangent = self.solver.tangent(ws, self.scene.inputs.derive_jvp(values, dots))
         ws.make_record(self.schedule.segment + 1)
         save = self.save_every * self.solver.substeps
         for k in range(self.schedule.num_segments):
@@ -243,7 +241,7 @@ class Rollout:
         if self._workspace is None:
             self._workspace = self.solver.workspace(derived)
             self._workspace.make_frames(self.num_frames)
-            self._snapshots = History(self._workspace.arrays, self.schedule.snapshots, record=False)
+            self._snapshots = self._workspace.history(self.schedule.snapshots)
             self._guard = Guard(self._workspace)
         else:
             self._workspace.load(derived)
@@ -286,7 +284,7 @@ class Rollout:
     def _sweep_reverse(self, positions_adj, velocities_adj, careful: bool) -> dict[str, np.ndarray]:
         ws, schedule = self._workspace, self.schedule
         if self._adjoint is None or not self._adjoint.fits(ws):
-            self._adjoint = ExplicitAdjoint(ws, "density" in self.wanted, "rest_positions" in self.wanted)
+            self._adjoint = self.solver.adjoint(ws, "density" in self.wanted, "rest_positions" in self.wanted)
         adjoint = self._adjoint
         adjoint.start(positions_adj, velocities_adj, self.solver.last_frame_is_state)
         self.health = []

@@ -5,9 +5,8 @@ import weakref
 import numpy as np
 
 from diffsim_ti import observe, runtime
-from diffsim_ti.divergence import Divergence, Guard
+from diffsim_ti.divergence import Guard
 from diffsim_ti.observe import Energy, TetrahedronFields
-from diffsim_ti.solvers.arrays import History
 
 
 class Simulator:
@@ -33,7 +32,7 @@ class Simulator:
         self._start = solver.start_values()
         self.workspace = solver.workspace(self._start)
         self._guard = Guard(self.workspace)
-        self._before = History(self.workspace.arrays, 1, record=False)
+        self._before = self.workspace.history(1)
         self.reset()
 
     def reset(self) -> None:
@@ -54,7 +53,7 @@ class Simulator:
         self.workspace.save(self._before, 0)
         try:
             self._guard.advance(0, passes, passes)
-        except Divergence:
+        except FloatingPointError:
             self.workspace.restore(self._before, 0)
             raise
         self.step_count += 1
@@ -112,6 +111,7 @@ class Simulator:
                 if value.shape != shape:
                     raise ValueError(f"{name}: expected shape {shape}, got {value.shape}")
                 runtime.fill(target, (value - origin)[None])
+        self.workspace.forget()
 
     def compute_energy(self) -> Energy:
         """Total energy [J], a float with `.parts`: kinetic, elastic, gravity, contact."""

@@ -28,6 +28,9 @@ class _Block:
     def __init__(self, fp):
         self.vector, self.lanes = ti.types.vector(4, fp), ti.types.vector(LANES, fp)
 
+    def broadcast(self, number):
+        return let(self.lanes(*[number] * LANES))
+
     def numbers(self, array, first: int, count: int, rows: int, item):
         """`count` numbers from `first` on, of the `rows` that each block has."""
         return [let(at(array, rows * item + first + k)) for k in range(count)]
@@ -46,6 +49,10 @@ class _Block:
                 force = self.vector(*(at(forces[a][d], lane) for d in range(3)), zero)
                 at(corner, 4 * LANES * item + 4 * lane + a)._assign(force)
 
+    def put(self, array, rows: int, item, first, numbers):
+        for k, number in enumerate(numbers):
+            at(array, rows * item + first + k)._assign(number)
+
     def add(self, array, rows: int, item, numbers):
         for k, number in enumerate(numbers):
             target = at(array, rows * item + k)
@@ -58,6 +65,9 @@ class _Single:
     def __init__(self, fp):
         self.vector = ti.types.vector(4, fp)
 
+    def broadcast(self, number):
+        return number
+
     def numbers(self, array, first: int, count: int, rows: int, item):
         return [let(at(at(array, rows * (item // LANES) + first + k), item % LANES)) for k in range(count)]
 
@@ -69,6 +79,10 @@ class _Single:
     def store(self, corner, item, forces, zero):
         for a in range(4):
             at(corner, 4 * item + a)._assign(self.vector(*forces[a], zero))
+
+    def put(self, array, rows: int, item, first, numbers):
+        for k, number in enumerate(numbers):
+            at(at(array, rows * (item // LANES) + first + k), item % LANES)._assign(number)
 
     def add(self, array, rows: int, item, numbers):
         for k, number in enumerate(numbers):
@@ -176,6 +190,7 @@ def element_functions(law, uniform: bool, lanes: bool) -> SimpleNamespace:
         vectors=ti.types.ndarray(vector, 1), vectors2=ti.types.ndarray(vector, 2), ints=ti.types.ndarray(ti.i32, 1),
     )  # fmt: skip
     return SimpleNamespace(
-        types=types, edges=edges, gradients_of=gradients_of, coefficients_of=coefficients_of, gather=gather,
+        types=types, numbers=kind.numbers, put=kind.put, store_corners=kind.store, broadcast=kind.broadcast,
+        edges=edges, gradients_of=gradients_of, coefficients_of=coefficients_of, volume_of=volume_of, gather=gather,
         forces=forces, stiffness=stiffness, forces_jvp=forces_jvp, forces_vjp=forces_vjp, shape_vjp=shape_vjp,
     )  # fmt: skip

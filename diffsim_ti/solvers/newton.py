@@ -1,0 +1,118 @@
+"""Newton's method on the incremental potential, of which an implicit step is a minimum.
+
+    Phi(u) = c/2 sum_i m_i |u_i - a_i|^2 + E(u) - sum_i b_i . u_i,    R = -dPhi/du
+
+a: where inertia alone would lead [m]; b: dead loads [N]; c = 1 / gamma^2 [1/s^2], zero for statics. Directions come from
+conjugate gradients on the exact Hessian. Where that is met to be indefinite, each tetrahedron's d2psi/dF2 is made
+positive definite and the direction computed anew.
+Kane, Marsden, Ortiz, West 2000, doi:10.1002/1097-0207(20001210)49:10<1295::AID-NME993>3.0.CO;2-W.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from diffsim_ti.solvers.linear import BlockJacobi, NotConverged, Operator, conjugate_gradients
+from diffsim_ti.solvers.projection import Projection
+
+
+@dataclass
+class NewtonReport:
+    """What a solve took: relative residual before each round, products of the Hessian, projected rounds."""
+
+    residuals: list = field(default_factory=list)
+    products: int = 0
+    projected: int = 0
+    trials: int = 0
+
+
+class Newton:
+    """Minimises Phi from a start; every iterate keeps J > 0 where it was and gaps > 0 where they were.
+
+    tolerance: |R| over the size of the forces that meet at the vertices (corner by corner, so that it does not vanish
+    at equilibrium), loads and inertia. Beyond it goes only what rounding allows.
+    """
+
+    shortest = 2.0**-40  # fraction of a direction below which a line search gives up
+
+    def __init__(self, potential, free: np.ndarray, gaps, tolerance: float, max_iterations: int, eps: float):
+        self.potential, self.free, self.gaps = potential, free, gaps
+        self.tolerance, self.max_iterations, self.eps = tolerance, max_iterations, eps
+        self.report = NewtonReport()
+
+    def solve(self, start: np.ndarray, mass: np.ndarray, inertial: np.ndarray, loads: np.ndarray) -> np.ndarray:
+        """The minimiser; mass = c m, shape (num_vertices, 1). The potential stays placed there.
+
+        Raises NotConverged.
+        """
+        self.report = report = NewtonReport()
+        self.mass, self.inertial, self.loads = mass, inertial, loads
+        u = self.potential.place(start)
+        self.preconditioner = BlockJacobi(blocks := self.potential.blocks(), mass, self.free)
+        stiffness = np.abs(blocks).sum((1, 2))[:, None] + mass
+        E = self._evaluate(u)
+        for _ in range(self.max_iterations):
+            R, size = self._residual(u)
+            floor = 4 * self.eps * np.linalg.norm(stiffness * np.abs(u).max(1, keepdims=True) * self.free)
+            norm = np.linalg.norm(R)
+            report.residuals.append(norm / size if size > 0 else 0.0)
+            if norm <= self.tolerance * size + floor:
+                return u
+            if not np.isfinite(norm):
+                break
+            forcing = min(0.1, np.sqrt(norm / size), max(1e-3, 0.5 * self.tolerance * size / norm))
+            direction = self._direction(R, max(forcing, 10 * self.eps))
+            moved = self._search(u, direction, R, E)
+            if moved is None:
+                break
+            u, E = moved
+        if norm <= 100 * floor:  # rounding has the last word
+            return u
+        history = ", ".join(f"{r:.2g}" for r in report.residuals[-8:])
+        raise NotConverged(
+            f"Newton's method stopped after {len(report.residuals)} rounds at a relative residual of "
+            f"{report.residuals[-1]:.2g} (asked for {self.tolerance:g}; the last ones: {history}): take smaller steps, more "
+            "load steps, or a looser tolerance", report.residuals,
+        )  # fmt: skip
+
+    def operator(self) -> Operator:
+        """The Hessian of Phi where the potential stands."""
+        return Operator(self.potential, self.mass, self.free)
+
+    def _residual(self, u):
+        f, sizes = self.potential.forces()
+        inertia = self.mass * (u - self.inertial)
+        size = np.sqrt((sizes**2).sum() + (self.loads**2).sum() + (inertia**2 * self.free).sum())
+        return (f + self.loads - inertia) * self.free, size
+
+    def _direction(self, R, forcing):
+        A = self.operator()
+        limit = 10 * len(R)
+        d, _, _, negative = conjugate_gradients(A, R, self.preconditioner, forcing, limit, self.eps)
+        if negative:
+            self.report.projected += 1
+            A.correction = Projection(self.potential)
+            d, *_ = conjugate_gradients(A, R, self.preconditioner, forcing, limit, self.eps)
+        self.report.products += A.products
+        return d
+
+    def _evaluate(self, u):
+        E, parts, J = self.potential.energy()
+        self.report.trials += 1
+        return E, parts, J, self.gaps(u)
+
+    def _search(self, u, d, R, before):
+        """The first of u + d, u + d/2, ... that is admissible and lower; None if there is none."""
+        slope, fraction = float((R * d).sum()), 1.0
+        E, parts, J, gaps = before
+        while fraction > self.shortest:
+            trial = self.potential.place(u + fraction * d)
+            after = self._evaluate(trial)
+            step = trial - u
+            change = after[0] - E + float((step * (self.mass * (u + 0.5 * step - self.inertial) - self.loads)).sum())
+            crossed = np.any((J > 0) & ~(after[2] > 0)) or np.any((gaps > 0) & ~(after[3] > 0))
+            noise = 10 * self.eps * (parts + after[1])
+            if not crossed and (change <= -1e-4 * fraction * slope or abs(slope) * fraction <= noise >= change):
+                return trial, after
+            fraction *= 0.5
+        return None

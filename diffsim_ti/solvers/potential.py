@@ -1,0 +1,68 @@
+"""The potential energy of a displacement on the device, with its derivatives, as arrays of float64."""
+
+import numpy as np
+
+from diffsim_ti import runtime
+from diffsim_ti.solvers.potential_kernels import potential_kernels
+
+
+class Potential:
+    """Elastic and contact energy E(u) of a scene; displacements and results are NumPy arrays, shape (num_vertices, 3).
+
+    Everything after `place(u)` is at that displacement, which has the precision of the scene.
+    """
+
+    def __init__(self, arrays, tetrahedra: np.ndarray, parallel: bool):
+        self.arrays, self.tetrahedra = arrays, tetrahedra
+        a = arrays
+        self.kernels = potential_kernels(a.law, a.features(), parallel, a.in_lanes)
+        n, m = a.num_vertices, a.num_tetrahedra
+        self.u, self.w, self.y = (runtime.array(a.vector, 1, n) for _ in range(3))
+        self._size, self._contact = runtime.array(a.fp, n), runtime.array(a.fp, n)
+        self._elastic, self._J = runtime.array(a.fp, m), runtime.array(a.fp, m)
+        self._tangent = None
+        sizes, common = (a.num_items, a.num_vertices), a.topology()
+        bind = lambda kernel, *more: self._bind(kernel, common, more, sizes)  # noqa: E731
+        self._forces = bind(self.kernels.forces, a.corner, self.u, self.y, self._size)
+        self._product = bind(self.kernels.product, a.corner, self.u, self.w, self.y)
+        energy = (a.tets, a.gradients, a.volumes, a.coefficients, a.parameters, a.rest, a.surface, self.u)
+        self._energy = self._bind(self.kernels.energy, energy, (self._elastic, self._J, self._contact), (m, n), False)
+
+    def _bind(self, kernel, arrays, more, sizes, lanes=True):
+        launch = runtime.Launch(kernel, *arrays, *more, vectorized=lanes and self.arrays.in_lanes)
+        return lambda: launch(*sizes)
+
+    def place(self, u: np.ndarray) -> np.ndarray:
+        """Go to displacement u [m]; returns it as the device holds it."""
+        runtime.fill(self.u, u[None])
+        return runtime.fetch(self.u)[0].astype(np.float64)
+
+    def energy(self) -> tuple[float, float, float]:
+        """(energy [J], the sum of the absolute parts, the smallest J)."""
+        self._energy()
+        elastic, contact, J = (runtime.fetch(x).astype(np.float64) for x in (self._elastic, self._contact, self._J))
+        return elastic.sum() + contact.sum(), np.abs(elastic).sum() + np.abs(contact).sum(), J
+
+    def forces(self) -> tuple[np.ndarray, np.ndarray]:
+        """(forces -dE/du [N], sum of the sizes of the forces that meet at each vertex)."""
+        self._forces()
+        return runtime.fetch(self.y)[0].astype(np.float64), runtime.fetch(self._size).astype(np.float64)
+
+    def product(self, w: np.ndarray) -> np.ndarray:
+        """d2E/du2 w [N]"""
+        scale = np.abs(w).max() or 1.0  # f32 keeps its digits whatever the units
+        runtime.fill(self.w, (w / scale)[None])
+        self._product()
+        return runtime.fetch(self.y)[0].astype(np.float64) * -scale
+
+    def blocks(self) -> np.ndarray:
+        """3x3 diagonal blocks of d2E/du2 [N/m], shape (num_vertices, 3, 3)."""
+        a = self.arrays
+        if self._tangent is None:
+            self._tangent = runtime.array(a.lanes, 81 * a.num_blocks)
+            self._columns = tuple(runtime.array(a.vector, *a.corner.shape) for _ in range(2))
+            self._out = runtime.array(a.vector, 3, a.num_vertices)
+            more = (a.corner, *self._columns, self._tangent, self.u, self._out)
+            self._blocks = self._bind(self.kernels.blocks, a.topology(), more, (a.num_items, a.num_vertices))
+        self._blocks()
+        return np.swapaxes(runtime.fetch(self._out).astype(np.float64), 0, 1)
