@@ -19,6 +19,7 @@ from diffsim_ti.solvers.arrays import History, copy_slot
 from diffsim_ti.solvers.linear import NotConverged
 from diffsim_ti.solvers.newton import Newton
 from diffsim_ti.solvers.potential import Potential
+from diffsim_ti.solvers.preconditioners import BlockJacobi, Multigrid
 from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.solvers.workspace import Workspace
 
@@ -56,7 +57,10 @@ class ImplicitSolver(Solver):
     multistep = False
 
     def __init__(self, scene, dt: float = 0.01, substeps: int = 1, tolerance: float = 1e-6, max_iterations: int = 50,
-                 parallel: bool | None = None):  # fmt: skip
+                 parallel: bool | None = None, preconditioner: str = "auto"):  # fmt: skip
+        if preconditioner not in ("auto", "block_jacobi", "multigrid"):
+            raise ValueError(f"preconditioner must be auto, block_jacobi or multigrid, got {preconditioner!r}")
+        self.preconditioner = preconditioner
         if not 0 < tolerance < 1:
             raise ValueError(f"tolerance must lie between 0 and 1, got {tolerance}")
         if int(max_iterations) != max_iterations or max_iterations < 1:
@@ -65,7 +69,8 @@ class ImplicitSolver(Solver):
         super().__init__(scene, dt, substeps, parallel)
 
     def twin(self, scene) -> "ImplicitSolver":
-        return type(self)(scene, self.dt, self.substeps, self.tolerance, self.max_iterations, self.parallel)
+        own = (self.dt, self.substeps, self.tolerance, self.max_iterations, self.parallel, self.preconditioner)
+        return type(self)(scene, *own)
 
     def num_passes(self, steps: int) -> int:
         return steps * self.substeps
@@ -122,7 +127,8 @@ class ImplicitWorkspace(Workspace):
         self.free = (runtime.fetch(a.inverse_mass)[:, None] > 0).astype(np.float64)
         eps = np.finfo(runtime.NUMPY[self.scene.precision]).eps
         tolerance, rounds = self.solver.tolerance, self.solver.max_iterations
-        self.newton = Newton(self.potential, self.free, self._gaps, tolerance, rounds, eps)
+        self.newton = Newton(self.potential, self.free, self._gaps, self.preconditioner, tolerance, rounds, eps)
+        self._preconditioners = {}
 
     def restart(self) -> None:
         super().restart()
@@ -183,6 +189,26 @@ class ImplicitWorkspace(Workspace):
                 copy_slot(self.state.v, 0, self.record.v, j + 1 - base)
                 if self.solver.multistep:
                     self.record.fresh[j + 1 - base] = False
+
+    def preconditioner(self, mass: np.ndarray) -> tuple:
+        """(preconditioner for c M + K with mass = c m, size of the diagonal of that at rest [N/m])."""
+        key = float(mass.sum())
+        if key not in self._preconditioners:
+            held = self.potential.held_at
+            self.potential.place(np.zeros_like(held))
+            size = np.abs(self.potential.blocks()).sum((1, 2))[:, None]
+            self.potential.place(held)
+            kind = Multigrid if self._wants_multigrid(size, mass) else BlockJacobi
+            if len(self._preconditioners) > 2:
+                self._preconditioners.pop(next(iter(self._preconditioners)))
+            self._preconditioners[key] = kind(self.potential, mass, self.free), size + mass
+        return self._preconditioners[key]
+
+    def _wants_multigrid(self, size: np.ndarray, mass: np.ndarray) -> bool:
+        if self.solver.preconditioner != "auto":
+            return self.solver.preconditioner == "multigrid"
+        ratio = np.max(size[mass > 0] / mass[mass > 0], initial=0.0) if mass.any() else np.inf
+        return len(size) > 1000 and ratio > 1000
 
     def read(self, history, slot: int) -> tuple:
         """(u, v, (u-, v-) or None) of a slot, in float64."""

@@ -9,7 +9,7 @@ import numpy as np
 from diffsim_ti import runtime
 from diffsim_ti.inputs import Derived
 from diffsim_ti.solvers.arrays import from_blocks, to_blocks
-from diffsim_ti.solvers.linear import BlockJacobi, Operator, solve_symmetric
+from diffsim_ti.solvers.linear import Operator, solve_symmetric
 from diffsim_ti.solvers.potential_kernels import potential_kernels
 
 
@@ -40,7 +40,8 @@ class _Passes:
         if not b.any():
             return b
         if self._preconditioner is None:
-            self._preconditioner = BlockJacobi(self.ws.potential.blocks(), self.mass, self.ws.free)
+            self._preconditioner, _ = self.ws.preconditioner(self.mass)
+            self._preconditioner.update(self.u_star)
         return solve_symmetric(self.operator, b, self._preconditioner, self.tolerance, self.eps, 20 * len(b))
 
     def weight(self, share: float) -> np.ndarray:

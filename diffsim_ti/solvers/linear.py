@@ -29,24 +29,6 @@ class Operator:
         return y * self.free
 
 
-class BlockJacobi:
-    """The inverse 3x3 diagonal blocks of c M + d2E/du2; blocks that are not positive definite take |eigenvalues|."""
-
-    def __init__(self, blocks: np.ndarray, mass: np.ndarray, free: np.ndarray):
-        values, vectors = _symmetric_eigen(blocks + mass[:, :, None] * np.eye(3))
-        values = np.abs(values)
-        values = np.maximum(values, 1e-12 * values.max(1, keepdims=True))
-        inverse = np.divide(free, values, out=np.zeros_like(values), where=values > 0)
-        self.inverse = np.einsum("nij,nj,nkj->nik", vectors, inverse, vectors, optimize=True)
-
-    def __call__(self, r: np.ndarray) -> np.ndarray:
-        return np.matmul(self.inverse, r[:, :, None])[:, :, 0]
-
-
-def _symmetric_eigen(A: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return np.linalg.eigh(0.5 * (A + np.swapaxes(A, 1, 2)))
-
-
 def conjugate_gradients(operator, b, preconditioner, tolerance: float, max_iterations: int, eps: float):
     """(x, relative residual, iterations, negative curvature met): |b - A x| <= tolerance |b| unless stopped before.
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from diffsim_ti.solvers.linear import BlockJacobi, NotConverged, Operator, conjugate_gradients
+from diffsim_ti.solvers.linear import NotConverged, Operator, conjugate_gradients
 from diffsim_ti.solvers.projection import Projection
 
 
@@ -35,8 +35,9 @@ class Newton:
 
     shortest = 2.0**-40  # fraction of a direction below which a line search gives up
 
-    def __init__(self, potential, free: np.ndarray, gaps, tolerance: float, max_iterations: int, eps: float):
-        self.potential, self.free, self.gaps = potential, free, gaps
+    def __init__(self, potential, free: np.ndarray, gaps, preconditioners, tolerance: float, max_iterations: int,
+                 eps: float):  # fmt: skip
+        self.potential, self.free, self.gaps, self.preconditioners = potential, free, gaps, preconditioners
         self.tolerance, self.max_iterations, self.eps = tolerance, max_iterations, eps
         self.report = NewtonReport()
 
@@ -48,8 +49,7 @@ class Newton:
         self.report = report = NewtonReport()
         self.mass, self.inertial, self.loads = mass, inertial, loads
         u = self.potential.place(start)
-        self.preconditioner = BlockJacobi(blocks := self.potential.blocks(), mass, self.free)
-        stiffness = np.abs(blocks).sum((1, 2))[:, None] + mass
+        self.preconditioner, stiffness = self.preconditioners(mass)
         E = self._evaluate(u)
         for _ in range(self.max_iterations):
             R, size = self._residual(u)
@@ -61,6 +61,7 @@ class Newton:
             if not np.isfinite(norm):
                 break
             forcing = min(0.1, np.sqrt(norm / size), max(1e-3, 0.5 * self.tolerance * size / norm))
+            self.preconditioner.update(u)
             direction = self._direction(R, max(forcing, 10 * self.eps))
             moved = self._search(u, direction, R, E)
             if moved is None:

@@ -3,6 +3,7 @@
 import numpy as np
 
 from diffsim_ti import runtime
+from diffsim_ti.solvers.arrays import from_blocks
 from diffsim_ti.solvers.potential_kernels import potential_kernels
 
 
@@ -20,7 +21,8 @@ class Potential:
         self.u, self.w, self.y = (runtime.array(a.vector, 1, n) for _ in range(3))
         self._size, self._contact = runtime.array(a.fp, n), runtime.array(a.fp, n)
         self._elastic, self._J = runtime.array(a.fp, m), runtime.array(a.fp, m)
-        self._tangent = None
+        self._tangent, self._out, self._contact_blocks = None, None, None
+        self.held_at = np.zeros((n, 3))
         sizes, common = (a.num_items, a.num_vertices), a.topology()
         bind = lambda kernel, *more: self._bind(kernel, common, more, sizes)  # noqa: E731
         self._forces = bind(self.kernels.forces, a.corner, self.u, self.y, self._size)
@@ -35,7 +37,8 @@ class Potential:
     def place(self, u: np.ndarray) -> np.ndarray:
         """Go to displacement u [m]; returns it as the device holds it."""
         runtime.fill(self.u, u[None])
-        return runtime.fetch(self.u)[0].astype(np.float64)
+        self.held_at = runtime.fetch(self.u)[0].astype(np.float64)
+        return self.held_at
 
     def energy(self) -> tuple[float, float, float]:
         """(energy [J], the sum of the absolute parts, the smallest J)."""
@@ -61,8 +64,24 @@ class Potential:
         if self._tangent is None:
             self._tangent = runtime.array(a.lanes, 81 * a.num_blocks)
             self._columns = tuple(runtime.array(a.vector, *a.corner.shape) for _ in range(2))
-            self._out = runtime.array(a.vector, 3, a.num_vertices)
+            self._out = runtime.array(a.vector, 3, a.num_vertices) if self._out is None else self._out
             more = (a.corner, *self._columns, self._tangent, self.u, self._out)
             self._blocks = self._bind(self.kernels.blocks, a.topology(), more, (a.num_items, a.num_vertices))
         self._blocks()
+        return np.swapaxes(runtime.fetch(self._out).astype(np.float64), 0, 1)
+
+    def tangents(self) -> np.ndarray:
+        """d2psi/dF2 [Pa] of each tetrahedron where `blocks` was last called, shape (num_tetrahedra, 9, 9)."""
+        return from_blocks(runtime.fetch(self._tangent), self.arrays.num_tetrahedra, 81).reshape(-1, 9, 9)
+
+    def contact_blocks(self) -> np.ndarray | None:
+        """The part of contact in `blocks`; None without contacts."""
+        if not self.arrays.contacts:
+            return None
+        if self._contact_blocks is None:
+            a = self.arrays
+            self._out = runtime.array(a.vector, 3, a.num_vertices) if self._out is None else self._out
+            arrays = (a.parameters, a.rest, a.surface, self.u, self._out)
+            self._contact_blocks = self._bind(self.kernels.contact_blocks, arrays, (), (a.num_vertices,), False)
+        self._contact_blocks()
         return np.swapaxes(runtime.fetch(self._out).astype(np.float64), 0, 1)

@@ -15,7 +15,7 @@ def potential_kernels(law, features, parallel: bool, lanes: bool) -> SimpleNames
     """Kernels for a law and a scene's features: energy, forces, products of their derivatives, block diagonal."""
     el, single = element_functions(law, features.uniform, lanes), element_functions(law, features.uniform, False)
     t, contacts = el.types, features.contacts
-    fp, vector, K = t.fp, t.vector, len(law.coefficient_names)
+    fp, vector = t.fp, t.vector
 
     @ti.kernel
     def energy(tets: t.ints, gradients: t.blocks, volumes: t.blocks, coefficients: t.blocks, parameters: t.scalars,
@@ -141,6 +141,17 @@ def potential_kernels(law, features, parallel: bool, lanes: bool) -> SimpleNames
             out[1, i] = el.gather(i, scene, corner1) - contact_product(i, scene, u[0, i], vector(0, 1, 0, 0))
             out[2, i] = el.gather(i, scene, corner2) - contact_product(i, scene, u[0, i], vector(0, 0, 1, 0))
 
+    @ti.kernel
+    def contact_blocks(parameters: t.scalars, rest: t.vectors, surface: t.ints, u: t.vectors2, out: t.vectors2,
+                       num_vertices: ti.i32):  # fmt: skip
+        """The part of contact in `blocks`."""
+        scene = Bundle(parameters=parameters, rest=rest, surface=surface)
+        ti.loop_config(serialize=not parallel)
+        for i in range(num_vertices):
+            out[0, i] = 0 - contact_product(i, scene, u[0, i], vector(1, 0, 0, 0))
+            out[1, i] = 0 - contact_product(i, scene, u[0, i], vector(0, 1, 0, 0))
+            out[2, i] = 0 - contact_product(i, scene, u[0, i], vector(0, 0, 1, 0))
+
     # ---- derivatives by everything else -----------------------------------------------------------------------------
 
     row = features.sums()
@@ -202,4 +213,5 @@ def potential_kernels(law, features, parallel: bool, lanes: bool) -> SimpleNames
                             f += by[m] * parameters_dot[contacts[k].first + m]
             df[0, i] = f
 
-    return SimpleNamespace(energy=energy, forces=forces, product=product, blocks=blocks, vjp=vjp, jvp=jvp)
+    return SimpleNamespace(energy=energy, forces=forces, product=product, blocks=blocks, vjp=vjp, jvp=jvp,
+                           contact_blocks=contact_blocks)  # fmt: skip

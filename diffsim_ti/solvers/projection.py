@@ -2,9 +2,6 @@
 
 import numpy as np
 
-from diffsim_ti import runtime
-from diffsim_ti.solvers.arrays import from_blocks
-
 
 class Projection:
     """w -> sum over tetrahedra of V B^T (C+ - C) B w, with C = d2psi/dF2 and C+ the same with |eigenvalues|.
@@ -15,7 +12,7 @@ class Projection:
     def __init__(self, potential, absolute: bool = True):
         a = potential.arrays
         potential.blocks()
-        C = from_blocks(runtime.fetch(potential._tangent), a.num_tetrahedra, 81).reshape(-1, 9, 9)
+        C = potential.tangents()
         values, vectors = np.linalg.eigh(0.5 * (C + np.swapaxes(C, 1, 2)))
         some = np.nonzero(values[:, 0] < 0)[0]
         values, vectors = values[some], vectors[some]

@@ -17,12 +17,13 @@ class StaticSolver(ImplicitSolver):
     order = 0
 
     def __init__(self, scene, load_steps: int = 1, tolerance: float = 1e-8, max_iterations: int = 100, dt: float = 1.0,
-                 parallel: bool | None = None):  # fmt: skip
-        super().__init__(scene, dt, load_steps, tolerance, max_iterations, parallel)
+                 parallel: bool | None = None, preconditioner: str = "auto"):  # fmt: skip
+        super().__init__(scene, dt, load_steps, tolerance, max_iterations, parallel, preconditioner)
         self._refuse_rigid_modes()
 
     def twin(self, scene) -> "StaticSolver":
-        return StaticSolver(scene, self.substeps, self.tolerance, self.max_iterations, self.dt, self.parallel)
+        own = (self.substeps, self.tolerance, self.max_iterations, self.dt, self.parallel, self.preconditioner)
+        return StaticSolver(scene, *own)
 
     def stage(self, rate, fresh):
         return Stage(self.substep, b0=0.0, e0=0.0, static=True)
