@@ -201,7 +201,7 @@ class ImplicitWorkspace(Workspace):
             kind = Multigrid if self._wants_multigrid(size, mass) else BlockJacobi
             if len(self._preconditioners) > 2:
                 self._preconditioners.pop(next(iter(self._preconditioners)))
-            self._preconditioners[key] = kind(self.potential, mass, self.free), size + mass
+            self._preconditioners[key] = kind(self.potential, mass, self.free, size), size + mass
         return self._preconditioners[key]
 
     def _wants_multigrid(self, size: np.ndarray, mass: np.ndarray) -> bool:
@@ -239,7 +239,9 @@ class ImplicitWorkspace(Workspace):
             start = start.copy()
             start[fixed] = middle
         mass = stage.inertia * self.mass
-        u_star = self.newton.solve(self._admissible(start, u), mass, x + stage.gamma * y, self.loads(j, stage))
+        u_star = self.newton.solve(
+            self._admissible(start, u), mass, x + stage.gamma * y, self.loads(j, stage), leave_saddles=stage.static
+        )
         v_star = (u_star - x) / stage.gamma
         u_next = stage.c0 * u_star + (1 - stage.c0) * u
         v_next = np.zeros_like(v) if stage.static else stage.e0 * v_star + stage.e1 * y

@@ -30,15 +30,15 @@ class Operator:
 
 
 def conjugate_gradients(operator, b, preconditioner, tolerance: float, max_iterations: int, eps: float):
-    """(x, relative residual, iterations, negative curvature met): |b - A x| <= tolerance |b| unless stopped before.
+    """(x, relative residual, iterations, p): |b - A x| <= tolerance |b| unless stopped before.
 
-    Stops at a direction of negative curvature with the x before it (or, if it is the first direction, with the
-    preconditioned b), which is a direction of descent. Nocedal, Wright, Numerical Optimization, alg. 7.1.
+    Stops at a direction p of negative curvature (else None) with the x before it or, if it is the first direction, with
+    the preconditioned b: a direction of descent. Nocedal, Wright, Numerical Optimization, alg. 7.1.
     """
     x, r = np.zeros_like(b), b.copy()
     size = np.linalg.norm(b)
     if size == 0:
-        return x, 0.0, 0, False
+        return x, 0.0, 0, None
     z = preconditioner(r)
     p, rz = z, float((r * z).sum())
     for k in range(1, max_iterations + 1):
@@ -47,16 +47,16 @@ def conjugate_gradients(operator, b, preconditioner, tolerance: float, max_itera
         if not curvature > 10 * eps * np.linalg.norm(p) * np.linalg.norm(Ap):
             if not np.isfinite(curvature):
                 raise FloatingPointError("the stiffness of this state is not finite")
-            return (x if k > 1 else z), np.linalg.norm(r) / size, k, True
+            return (x if k > 1 else z), np.linalg.norm(r) / size, k, p
         alpha = rz / curvature
         x += alpha * p
         r -= alpha * Ap
         if np.linalg.norm(r) <= tolerance * size:
-            return x, np.linalg.norm(r) / size, k, False
+            return x, np.linalg.norm(r) / size, k, None
         z = preconditioner(r)
         rz, old = float((r * z).sum()), rz
         p = z + (rz / old) * p
-    return x, np.linalg.norm(r) / size, max_iterations, False
+    return x, np.linalg.norm(r) / size, max_iterations, None
 
 
 def solve_symmetric(operator, b, preconditioner, tolerance: float, eps: float, max_iterations: int) -> np.ndarray:
@@ -65,7 +65,7 @@ def solve_symmetric(operator, b, preconditioner, tolerance: float, eps: float, m
     Raises NotConverged.
     """
     x, residual, count, negative = conjugate_gradients(operator, b, preconditioner, tolerance, max_iterations, eps)
-    if negative:
+    if negative is not None:
         from scipy.sparse.linalg import LinearOperator, minres
 
         n = b.size

@@ -3,8 +3,9 @@
     Phi(u) = c/2 sum_i m_i |u_i - a_i|^2 + E(u) - sum_i b_i . u_i,    R = -dPhi/du
 
 a: where inertia alone would lead [m]; b: dead loads [N]; c = 1 / gamma^2 [1/s^2], zero for statics. Directions come from
-conjugate gradients on the exact Hessian. Where that is met to be indefinite, each tetrahedron's d2psi/dF2 is made
-positive definite and the direction computed anew.
+conjugate gradients on the exact Hessian. Where that is met to be indefinite they stop with what they have (buckling needs
+that), or, if that is early, each tetrahedron's d2psi/dF2 is made positive definite and the direction computed anew (crushed
+starts need that).
 Kane, Marsden, Ortiz, West 2000, doi:10.1002/1097-0207(20001210)49:10<1295::AID-NME993>3.0.CO;2-W.
 """
 
@@ -18,31 +19,41 @@ from diffsim_ti.solvers.projection import Projection
 
 @dataclass
 class NewtonReport:
-    """What a solve took: relative residual before each round, products of the Hessian, projected rounds."""
+    """What a solve took: relative residual before each round, products of the Hessian, rounds with an indefinite
+    Hessian, saddles that were left, evaluations of the energy."""
 
     residuals: list = field(default_factory=list)
     products: int = 0
-    projected: int = 0
+    indefinite: int = 0
+    saddles: int = 0
     trials: int = 0
 
 
 class Newton:
-    """Minimises Phi from a start; every iterate keeps J > 0 where it was and gaps > 0 where they were.
+    """Minimises Phi from a start. Iterates keep gaps > 0 where they were, and J > 0 as far as a moderate share of a
+    direction (`insist`) lowers Phi all the same.
 
     tolerance: |R| over the size of the forces that meet at the vertices (corner by corner, so that it does not vanish
-    at equilibrium), loads and inertia. Beyond it goes only what rounding allows.
+    at equilibrium), loads and inertia, the largest of the rounds. Beyond it goes only what rounding allows.
     """
 
+    insist = 2.0**-6
+    trusted = 10  # iterations after which the direction before an indefinite one is good enough
     shortest = 2.0**-40  # fraction of a direction below which a line search gives up
 
     def __init__(self, potential, free: np.ndarray, gaps, preconditioners, tolerance: float, max_iterations: int,
                  eps: float):  # fmt: skip
         self.potential, self.free, self.gaps, self.preconditioners = potential, free, gaps, preconditioners
         self.tolerance, self.max_iterations, self.eps = tolerance, max_iterations, eps
+        self.reach = 0.01 * float(np.ptp(potential.arrays.values.rest, 0).max())  # of the first step away from a saddle
         self.report = NewtonReport()
 
-    def solve(self, start: np.ndarray, mass: np.ndarray, inertial: np.ndarray, loads: np.ndarray) -> np.ndarray:
+    def solve(self, start: np.ndarray, mass: np.ndarray, inertial: np.ndarray, loads: np.ndarray,
+              leave_saddles: bool = False) -> np.ndarray:  # fmt: skip
         """The minimiser; mass = c m, shape (num_vertices, 1). The potential stays placed there.
+
+        leave_saddles: where Phi is stationary but falls in some direction (a column beyond its buckling load), go on
+        that way; `report.saddles` counts it.
 
         Raises NotConverged.
         """
@@ -50,14 +61,23 @@ class Newton:
         self.mass, self.inertial, self.loads = mass, inertial, loads
         u = self.potential.place(start)
         self.preconditioner, stiffness = self.preconditioners(mass)
-        E = self._evaluate(u)
+        E, size = self._evaluate(u), 0.0
         for _ in range(self.max_iterations):
-            R, size = self._residual(u)
+            R, now = self._residual(u)
+            size = max(size, now)
             floor = 4 * self.eps * np.linalg.norm(stiffness * np.abs(u).max(1, keepdims=True) * self.free)
             norm = np.linalg.norm(R)
             report.residuals.append(norm / size if size > 0 else 0.0)
             if norm <= self.tolerance * size + floor:
-                return u
+                downhill = self._downhill() if leave_saddles else None
+                if downhill is None:
+                    return u
+                report.saddles += 1
+                moved = self._search(u, *downhill, E)
+                if moved is None:
+                    return u
+                u, E = moved
+                continue
             if not np.isfinite(norm):
                 break
             forcing = min(0.1, np.sqrt(norm / size), max(1e-3, 0.5 * self.tolerance * size / norm))
@@ -89,13 +109,26 @@ class Newton:
     def _direction(self, R, forcing):
         A = self.operator()
         limit = 10 * len(R)
-        d, _, _, negative = conjugate_gradients(A, R, self.preconditioner, forcing, limit, self.eps)
-        if negative:
-            self.report.projected += 1
-            A.correction = Projection(self.potential)
-            d, *_ = conjugate_gradients(A, R, self.preconditioner, forcing, limit, self.eps)
+        d, _, count, negative = conjugate_gradients(A, R, self.preconditioner, forcing, limit, self.eps)
+        if negative is not None:
+            self.report.indefinite += 1
+            if count <= self.trusted:
+                A.correction = Projection(self.potential)
+                d, *_ = conjugate_gradients(A, R, self.preconditioner, forcing, limit, self.eps)
         self.report.products += A.products
         return d
+
+    def _downhill(self):
+        """A direction of negative curvature, found by solving for something random, and a slope for its search."""
+        probe = np.random.default_rng(0).standard_normal(self.free.shape[:1] + (3,)) * self.free
+        A = self.operator()
+        self.preconditioner.update(self.potential.held_at)
+        _, _, _, p = conjugate_gradients(A, probe, self.preconditioner, 1e-3, 10 * len(probe), self.eps)
+        self.report.products += A.products
+        if p is None:
+            return None
+        p = p * (self.reach / np.abs(p).max())
+        return p, -p * float((p * A(p)).sum()) / float((p * p).sum())
 
     def _evaluate(self, u):
         E, parts, J = self.potential.energy()
@@ -111,7 +144,10 @@ class Newton:
             after = self._evaluate(trial)
             step = trial - u
             change = after[0] - E + float((step * (self.mass * (u + 0.5 * step - self.inertial) - self.loads)).sum())
-            crossed = np.any((J > 0) & ~(after[2] > 0)) or np.any((gaps > 0) & ~(after[3] > 0))
+            # a law that is finite at J <= 0 may have no shorter way down than through it
+            crossed = np.any((gaps > 0) & ~(after[3] > 0)) or (
+                fraction > self.insist and np.any((J > 0) & ~(after[2] > 0))
+            )
             noise = 10 * self.eps * (parts + after[1])
             if not crossed and (change <= -1e-4 * fraction * slope or abs(slope) * fraction <= noise >= change):
                 return trial, after

@@ -7,17 +7,19 @@ import numpy as np
 
 
 class BlockJacobi:
-    """The inverse 3x3 diagonal blocks; blocks that are not positive definite take |eigenvalues|."""
+    """The inverse 3x3 diagonal blocks; blocks that are not positive definite take |eigenvalues|.
 
-    def __init__(self, potential, mass: np.ndarray, free: np.ndarray):
-        self.potential, self.mass, self.free = potential, mass, free
+    size: of the diagonal at rest [N/m], to which what is all but zero is raised.
+    """
+
+    def __init__(self, potential, mass: np.ndarray, free: np.ndarray, size: np.ndarray):
+        self.potential, self.mass, self.free, self.least = potential, mass, free, 1e-6 * (size + mass)
 
     def update(self, u: np.ndarray) -> None:
         """Adapt to the displacement at which the potential is placed."""
         D = self.potential.blocks() + self.mass[:, :, None] * np.eye(3)
         values, vectors = np.linalg.eigh(0.5 * (D + np.swapaxes(D, 1, 2)))
-        values = np.abs(values)
-        values = np.maximum(values, 1e-12 * values.max(1, keepdims=True))
+        values = np.maximum(np.abs(values), self.least)
         inverse = np.divide(self.free, values, out=np.zeros_like(values), where=values > 0)
         self._inverse = np.einsum("nij,nj,nkj->nik", vectors, inverse, vectors, optimize=True)
 
@@ -33,7 +35,7 @@ class Multigrid:
     Vanek, Mandel, Brezina 1996, doi:10.1007/BF02238511; Bell, Olson, Schroder, PyAMG, doi:10.21105/joss.04142.
     """
 
-    def __init__(self, potential, mass: np.ndarray, free: np.ndarray):
+    def __init__(self, potential, mass: np.ndarray, free: np.ndarray, size: np.ndarray):
         import pyamg
 
         self.potential, self.free = potential, free
