@@ -233,15 +233,18 @@ class ImplicitWorkspace(Workspace):
         x, y = self.inertial(stage, u, v, before)
         place, speed = self.prescribed(j)
         fixed = self.arrays.fixed
-        start = u if stage.static else u + self.free * (x + stage.gamma * y - u)
+        mass, loads = stage.inertia * self.mass, self.loads(j, stage)
+        inertial = x + stage.gamma * y
+        if not stage.static:  # dead loads act like a shift of where inertia leads: free flight is then exact
+            inertial = inertial + np.divide(loads, mass, out=np.zeros_like(loads), where=mass > 0)
+            loads = np.zeros_like(loads)
+        start = u if stage.static else u + self.free * (inertial - u)
         if len(fixed) and place is not None:
             middle = u[fixed] + (place - u[fixed]) / stage.c0
             start = start.copy()
             start[fixed] = middle
-        mass = stage.inertia * self.mass
-        u_star = self.newton.solve(
-            self._admissible(start, u), mass, x + stage.gamma * y, self.loads(j, stage), leave_saddles=stage.static
-        )
+        start = self._admissible(start, u)
+        u_star = self.newton.solve(start, mass, inertial, loads, leave_saddles=stage.static)
         v_star = (u_star - x) / stage.gamma
         u_next = stage.c0 * u_star + (1 - stage.c0) * u
         v_next = np.zeros_like(v) if stage.static else stage.e0 * v_star + stage.e1 * y

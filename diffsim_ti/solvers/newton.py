@@ -30,14 +30,15 @@ class NewtonReport:
 
 
 class Newton:
-    """Minimises Phi from a start. Iterates keep gaps > 0 where they were, and J > 0 as far as a moderate share of a
-    direction (`insist`) lowers Phi all the same.
+    """Minimises Phi from a start. Every iterate keeps gaps > 0 where they were. If the start has no J <= 0, J falls by a
+    factor of ten at most, so that the energy's own resistance is felt in time; only where no share of a direction down to
+    `insist` lowers Phi so (a law that is finite at J = 0, pressed beyond it) may it fall further.
 
     tolerance: |R| over the size of the forces that meet at the vertices (corner by corner, so that it does not vanish
     at equilibrium), loads and inertia, the largest of the rounds. Beyond it goes only what rounding allows.
     """
 
-    insist = 2.0**-6
+    insist = 2.0**-10
     trusted = 10  # iterations after which the direction before an indefinite one is good enough
     shortest = 2.0**-40  # fraction of a direction below which a line search gives up
 
@@ -60,12 +61,13 @@ class Newton:
         self.report = report = NewtonReport()
         self.mass, self.inertial, self.loads = mass, inertial, loads
         u = self.potential.place(start)
-        self.preconditioner, stiffness = self.preconditioners(mass)
+        self.preconditioner, self.stiffness = self.preconditioners(mass)
         E, size = self._evaluate(u), 0.0
+        self.upright = bool(np.all(E[2] > 0))
         for _ in range(self.max_iterations):
             R, now = self._residual(u)
             size = max(size, now)
-            floor = 4 * self.eps * np.linalg.norm(stiffness * np.abs(u).max(1, keepdims=True) * self.free)
+            floor = 4 * self.eps * np.linalg.norm(self.stiffness * np.abs(u).max(1, keepdims=True) * self.free)
             norm = np.linalg.norm(R)
             report.residuals.append(norm / size if size > 0 else 0.0)
             if norm <= self.tolerance * size + floor:
@@ -110,6 +112,7 @@ class Newton:
         A = self.operator()
         limit = 10 * len(R)
         d, _, count, negative = conjugate_gradients(A, R, self.preconditioner, forcing, limit, self.eps)
+        self._indefinite = negative is not None
         if negative is not None:
             self.report.indefinite += 1
             if count <= self.trusted:
@@ -127,7 +130,7 @@ class Newton:
         self.report.products += A.products
         if p is None:
             return None
-        p = p * (self.reach / np.abs(p).max())
+        p, self._indefinite = p * (self.reach / np.abs(p).max()), True
         return p, -p * float((p * A(p)).sum()) / float((p * p).sum())
 
     def _evaluate(self, u):
@@ -136,20 +139,31 @@ class Newton:
         return E, parts, J, self.gaps(u)
 
     def _search(self, u, d, R, before):
-        """The first of u + d, u + d/2, ... that is admissible and lower; None if there is none."""
-        slope, fraction = float((R * d).sum()), 1.0
-        E, parts, J, gaps = before
+        """(u + t d, what was evaluated there) for the first t of 1, 1/2, ... that is admissible and lower; None if there is
+        none. Along an indefinite direction t = 2, 4, ... are tried while they are lower still: its length says little."""
+        slope, fraction, best = float((R * d).sum()), 1.0, None
         while fraction > self.shortest:
-            trial = self.potential.place(u + fraction * d)
-            after = self._evaluate(trial)
-            step = trial - u
-            change = after[0] - E + float((step * (self.mass * (u + 0.5 * step - self.inertial) - self.loads)).sum())
-            # a law that is finite at J <= 0 may have no shorter way down than through it
-            crossed = np.any((gaps > 0) & ~(after[3] > 0)) or (
-                fraction > self.insist and np.any((J > 0) & ~(after[2] > 0))
-            )
-            noise = 10 * self.eps * (parts + after[1])
-            if not crossed and (change <= -1e-4 * fraction * slope or abs(slope) * fraction <= noise >= change):
-                return trial, after
+            trial, after, change, noise = self._try(u, fraction * d, before, self.upright and fraction > self.insist)
+            if change <= -1e-4 * fraction * slope or abs(slope) * fraction <= noise >= change:
+                best = trial, after, change
+                break
             fraction *= 0.5
-        return None
+        while best is not None and self._indefinite and fraction in (1.0, 2.0, 4.0, 8.0, 16.0, 32.0):
+            fraction *= 2
+            trial, after, change, _ = self._try(u, fraction * d, before, self.upright)
+            if not change < best[2]:
+                self.potential.place(best[0])
+                break
+            best = trial, after, change
+        return None if best is None else best[:2]
+
+    def _try(self, u, step, before, upright):
+        """(displacement, what is there, change of Phi, rounding of that change); infinite change if not admissible."""
+        trial = self.potential.place(u + step)
+        E, parts, J, gaps = before
+        after, step = self._evaluate(trial), trial - u
+        change = after[0] - E + float((step * (self.mass * (u + 0.5 * step - self.inertial) - self.loads)).sum())
+        if np.any((gaps > 0) & ~(after[3] > 0)) or (upright and np.any(~(after[2] > 0.1 * J))):
+            change = np.inf
+        rounding = parts + after[1] + float((self.stiffness * trial**2).sum())  # of strains that come from large u
+        return trial, after, change, 10 * self.eps * rounding
