@@ -247,10 +247,10 @@ class ImplicitWorkspace(Workspace):
         u_star = self.newton.solve(start, mass, inertial, loads, leave_saddles=stage.static)
         v_star = (u_star - x) / stage.gamma
         u_next = stage.c0 * u_star + (1 - stage.c0) * u
-        v_next = np.zeros_like(v) if stage.static else stage.e0 * v_star + stage.e1 * y
+        v_next = stage.e0 * v_star + stage.e1 * y
         if len(fixed):
             u_next[fixed], v_next[fixed] = (u[fixed], v[fixed]) if place is None else (place, speed)
-        return u_next, v_next
+        return u_next, np.zeros_like(v) if stage.static else v_next
 
     def _admissible(self, start, u):
         """The start of Newton's method: where inertia leads, or less far where that would turn something inside out."""

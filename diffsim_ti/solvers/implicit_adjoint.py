@@ -234,9 +234,9 @@ class ImplicitTangent(_Passes):
         before = self.du, self.dv
         self.du = s.c0 * d_star + (1 - s.c0) * self.du
         self.dv = s.e0 * (d_star - dx) / s.gamma + s.e1 * dy + de0 * self.v_star + de1 * self.y
+        self.du[a.fixed], self.dv[a.fixed] = (x[a.fixed] for x in before) if place is None else (place, speed)
         if s.static:
             self.dv = np.zeros_like(self.dv)
-        self.du[a.fixed], self.dv[a.fixed] = (x[a.fixed] for x in before) if place is None else (place, speed)
         self.before_dots = before
 
     def _prescribed(self, j: int):
