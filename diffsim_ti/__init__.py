@@ -28,14 +28,15 @@ from diffsim_ti.solvers import (
     StaticSolver,
     VelocityVerletSolver,
 )
-from diffsim_ti.terms import Drag, ExternalForce, Gravity, Ground
+from diffsim_ti.terms import Box, Capsule, Cylinder, Drag, ExternalForce, Gravity, Ground, HalfSpace, Sphere
 from diffsim_ti.verify import check_gradients, dot_product_test, taylor_test
 
 __version__ = "0.1.0"
 __all__ = [
     "init", "TetrahedralMesh",
     "StableNeoHookean", "SmithNeoHookean", "LinearElastic", "Corotated", "StVenantKirchhoff", "MooneyRivlin",
-    "Gravity", "Drag", "Ground", "ExternalForce",
+    "Gravity", "Drag", "ExternalForce",
+    "Ground", "HalfSpace", "Sphere", "Box", "Capsule", "Cylinder",
     "Scene", "SemiImplicitSolver", "VelocityVerletSolver",
     "ImplicitEulerSolver", "ImplicitMidpointSolver", "BDF2Solver", "StaticSolver", "Simulator", "Divergence", "NotConverged",
     "Rollout", "Frames", "taylor_test", "dot_product_test", "check_gradients",

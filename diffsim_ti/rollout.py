@@ -62,6 +62,7 @@ class Rollout:
         values = dict(self.scene.inputs.values)
         if self.scene.motion is not None:
             values["prescribed_motion"] = self.scene.motion_rows(np.arange(self.steps + 1) * solver.dt)
+        values |= self.scene.path_rows(np.arange(self.steps + 1) * solver.dt)
         self.values = values
         self.inputs = tuple(values)
         self.wanted = self._check_names(gradients)
@@ -252,10 +253,9 @@ class Rollout:
         forces = run.get("external_forces")
         if forces is not None and forces.ndim == 3 and len(forces) < self.steps:
             raise ValueError(f"external_forces: {self.steps} steps need as many rows, got {len(forces)}")
-        motion = run.get("prescribed_motion")
-        if motion is not None and motion.shape != self.values["prescribed_motion"].shape:
-            expected = self.values["prescribed_motion"].shape
-            raise ValueError(f"prescribed_motion: expected shape {expected}, got {motion.shape}")
+        for name in ("prescribed_motion", *self.scene.inputs.paths):
+            if name in run and run[name].shape != self.values[name].shape:
+                raise ValueError(f"{name}: expected shape {self.values[name].shape}, got {run[name].shape}")
 
     def _sweep_forward(self) -> None:
         """All passes; keeps the first snapshots of the schedule on the way."""

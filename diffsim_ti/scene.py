@@ -34,6 +34,7 @@ class Scene:
         self.terms = tuple([terms] if isinstance(terms, Term) else terms)
         self.fixed = np.zeros(0, np.int64) if fixed is None else mesh.vertex_indices(fixed)
         self.motion = motion
+        self.moving = tuple(t for t in self.terms if t.path is not None)
         self._check_terms()
         self.inputs = Inputs(self, density, initial_positions, initial_velocities)
         self._check_start()
@@ -56,9 +57,10 @@ class Scene:
             self.motion_rows([0.0])
 
     def _check_start(self) -> None:
-        surface = self.mesh.surface_vertices
+        surface, positions = self.mesh.surface_vertices, self.inputs.values["initial_positions"]
+        places = dict(zip(self.moving, self.path_rows([0.0]).values()))
         for term in self.terms:
-            term.check_start(self.inputs.values["initial_positions"], surface)
+            term.check_start(positions, surface, *places.get(term, ()))
 
     def term(self, kind: type) -> Term | None:
         """The scene's first term of a kind, or None."""
@@ -66,19 +68,12 @@ class Scene:
 
     def motion_rows(self, times) -> np.ndarray:
         """Displacement of the fixed vertices from their start at each time [s], shape (len(times), num_fixed, 3) [m]."""
-        k = len(self.fixed)
-        if callable(self.motion):
-            rows = [np.broadcast_to(np.asarray(self.motion(float(t)), np.float64), (k, 3)) for t in times]
-            out = np.array(rows)
-        else:
-            at, to = (np.asarray(part, np.float64) for part in self.motion)
-            to = np.broadcast_to(to[:, None, :] if to.ndim == 2 else to, (len(at), k, 3))
-            if np.any(np.diff(at) <= 0):
-                raise ValueError("motion: keyframe times must increase")
-            out = np.stack([np.interp(times, at, column) for column in to.reshape(len(at), -1).T], -1).reshape(-1, k, 3)
-        if not np.all(np.isfinite(out)):
-            raise ValueError("motion: displacements must be finite")
-        return out
+        return sampled("motion", self.motion, times, len(self.fixed))
+
+    def path_rows(self, times) -> dict[str, np.ndarray]:
+        """Displacement of each moving obstacle at each time [s], by input name, shape (len(times), 3) [m]."""
+        names = self.inputs.paths
+        return {name: sampled(name, t.path, times, 1)[:, 0] for name, t in zip(names, self.moving)}
 
     def describe(self) -> str:
         """What is simulated, in a few lines."""
@@ -91,3 +86,21 @@ class Scene:
 
     def __repr__(self) -> str:
         return f"Scene({self.mesh!r}, {self.material!r}, terms=[{', '.join(map(repr, self.terms))}])"
+
+
+def sampled(name: str, motion, times, k: int) -> np.ndarray:
+    """A motion of k points at each time [s], shape (len(times), k, 3) [m].
+
+    motion: a function of time that returns 3 numbers or shape (k, 3), or keyframes (times, displacements).
+    """
+    if callable(motion):
+        out = np.array([np.broadcast_to(np.asarray(motion(float(t)), np.float64), (k, 3)) for t in times])
+    else:
+        at, to = (np.asarray(part, np.float64) for part in motion)
+        to = np.broadcast_to(to[:, None, :] if to.ndim == 2 else to, (len(at), k, 3))
+        if np.any(np.diff(at) <= 0):
+            raise ValueError(f"{name}: keyframe times must increase")
+        out = np.stack([np.interp(times, at, column) for column in to.reshape(len(at), -1).T], -1).reshape(-1, k, 3)
+    if not np.all(np.isfinite(out)):
+        raise ValueError(f"{name}: displacements must be finite")
+    return out

@@ -74,6 +74,9 @@ class Simulator:
         arrays, values = self.workspace.arrays, self._start
         if values.motion is not None:
             runtime.fill(arrays.motion, self.scene.motion_rows([self.time, self.time + self.solver.dt]))
+        if values.path is not None:
+            rows = self.scene.path_rows([self.time, self.time + self.solver.dt])
+            runtime.fill(arrays.path, np.stack(list(rows.values()), 1))
         if values.forces is not None and len(self._forces_rows()) > 1:
             rows = self._forces_rows()
             if self.step_count >= len(rows):

@@ -63,6 +63,7 @@ class Solver(ABC):
         inputs, values = self.scene.inputs, dict(self.scene.inputs.values)
         if self.scene.motion is not None:
             values["prescribed_motion"] = self.scene.motion_rows([0.0, self.dt])
+        values |= self.scene.path_rows([0.0, self.dt])
         return inputs.derive(values)
 
     def _refuse_unstable(self) -> None:

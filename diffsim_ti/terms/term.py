@@ -18,6 +18,8 @@ class Term(ABC):
     """
 
     acts_on_surface = False
+    path = None  # displacement over time, of an obstacle that moves
+    table = np.zeros(0)  # numbers without gradient, laid behind the parameters on the device
 
     def __init__(self, **values):
         self.values = {name: np.array(value, dtype=np.float64) for name, value in values.items()}
@@ -56,6 +58,8 @@ class VertexForce(ABC):
     precision: str
     first: int
     size = 0
+    # of obstacles only (terms/obstacle.py): is there friction, the column of the path, are nearness and crossing noted?
+    friction, path, watched = False, -1, False
 
     @property
     def fp(self):
