@@ -5,7 +5,7 @@ import os
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # read when taichi is imported
 os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")  # no network traffic from a simulator
 
-from diffsim_ti.divergence import Divergence
+from diffsim_ti.divergence import Crossing, Divergence
 from diffsim_ti.materials import (
     Corotated,
     LinearElastic,
@@ -38,6 +38,6 @@ __all__ = [
     "Gravity", "Drag", "ExternalForce",
     "Ground", "HalfSpace", "Sphere", "Box", "Capsule", "Cylinder",
     "Scene", "SemiImplicitSolver", "VelocityVerletSolver",
-    "ImplicitEulerSolver", "ImplicitMidpointSolver", "BDF2Solver", "StaticSolver", "Simulator", "Divergence", "NotConverged",
+    "ImplicitEulerSolver", "ImplicitMidpointSolver", "BDF2Solver", "StaticSolver", "Simulator", "Divergence", "Crossing", "NotConverged",
     "Rollout", "Frames", "taylor_test", "dot_product_test", "check_gradients",
 ]  # fmt: skip

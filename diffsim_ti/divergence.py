@@ -8,13 +8,21 @@ from diffsim_ti import observe, stability
 class Divergence(FloatingPointError):
     """The state is not finite, or the step has become unstable. Carries step, vertex, tetrahedron and stable_dt [s]."""
 
-    def __init__(self, message: str, step: int, vertex: int | None, tetrahedron: int, stable_dt: float):
+    def __init__(self, message: str, step: int, vertex: int | None, tetrahedron: int | None, stable_dt: float):
         super().__init__(message)
         self.step, self.vertex, self.tetrahedron, self.stable_dt = step, vertex, tetrahedron, stable_dt
 
 
+class Crossing(Divergence):
+    """A vertex got onto or behind an obstacle. Carries also depth [m] and speed [m/s]."""
+
+    def __init__(self, message: str, step: int, vertex: int, stable_dt: float, depth: float, speed: float):
+        super().__init__(message, step, vertex, None, stable_dt)
+        self.depth, self.speed = depth, speed
+
+
 class Guard:
-    """Looks at a run every so many passes: is the state finite, is the step still stable at this state?
+    """Looks at a run every so many passes: is the state finite, did a vertex cross an obstacle, is the step still stable?
 
     Keeps the last good state, from which `diagnose` finds the exact step. Looking costs 2 to 7 %; where the step is
     within a tenth of the stable one it looks more often, for beyond it a motion soon grows e-fold in ten passes.
@@ -32,6 +40,7 @@ class Guard:
         """The current state, before pass `now`, is good: keep it."""
         self.ws.save(self.good, 0)
         self.good_pass = now
+        self._seen = self.ws.watch.rows() if self.ws.watch.contacts else None
 
     def advance(self, first: int, last: int, num_passes: int, save_every: int = 0, recording: bool = False) -> None:
         """Passes first .. last - 1, looked after; recording, slot j of the record holds the state before pass j."""
@@ -43,6 +52,8 @@ class Guard:
             self.ws.advance(first, stop, num_passes, save_every, 0 if recording else None)
             if recording:
                 self.ws.restore(self.ws.record, stop)
+            if self.ws.watch.crossing() is not None and self.ws.solver.explicit:
+                self._diagnose_crossing(stop, num_passes)
             if self.ws.first_bad_vertex() is not None:
                 self._diagnose(stop, num_passes)
             self._passes += stop - first
@@ -60,6 +71,7 @@ class Guard:
         solver = self.ws.solver
         if solver.allow_unstable or not solver.explicit:
             return
+        self.ws.place_obstacles(now)
         if self._stiffness is None:
             self._stiffness = stability.Stiffness(self.ws)
         omega2 = self._stiffness.watch()
@@ -74,6 +86,30 @@ class Guard:
             f"step {limit:.4g} s of the present state (tetrahedron {tet}; elements are squeezed, or vertices press "
             "into a contact): reduce dt, raise substeps, or pass allow_unstable=True",
             step, None, tet, float(limit),
+        )  # fmt: skip
+
+    def _diagnose_crossing(self, bad_by: int, num_passes: int) -> None:
+        """Run again to the first pass that crosses, and raise; the state before it is restored."""
+        ws, solver = self.ws, self.ws.solver
+        ws.watch.put(self._seen)
+        ws.restore(self.good, 0)
+        for j in range(self.good_pass, bad_by):
+            self.mark(j)
+            ws.advance(j, j + 1, num_passes)
+            crossing = ws.watch.crossing()
+            if crossing is not None:
+                break
+        ws.restore(self.good, 0)
+        ws.watch.put(self._seen)
+        k, vertex, depth = crossing
+        term, step = ws.watch.contacts[k], self._step_of(j, num_passes)
+        speed = float(np.linalg.norm(ws.velocity_of(vertex)))
+        enough = min(0.1 * float(term.values["barrier_width"]) / max(speed, 1e-300), 0.5 * solver.substep)
+        raise Crossing(
+            f"step {step}, t = {step * solver.dt:.6g} s: vertex {vertex} gets {depth:.3g} m behind {term!r} within a substep "
+            f"of {solver.substep:.4g} s, at {speed:.4g} m/s: reduce the substep to {enough:.3g} s (a tenth of the barrier's "
+            "width), or raise its stiffness or width; the state before is kept",
+            step, vertex, enough, depth, speed,
         )  # fmt: skip
 
     def _diagnose(self, bad_by: int, num_passes: int) -> None:

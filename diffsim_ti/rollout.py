@@ -10,12 +10,15 @@ import taichi as ti
 from diffsim_ti import runtime
 from diffsim_ti.checkpoints import choose_schedule
 from diffsim_ti.divergence import Guard
+from diffsim_ti.solvers.watch import ContactResolution
 
 
 @dataclass(eq=False)
 class Frames:
     """Saved states of one run: positions [m], velocities [m/s], displacements from the rest shape [m] (which
     keep their digits in float32), each of shape (frames, num_vertices, 3), and times [s].
+
+    `contact_resolution` says how near the body came to obstacles and how finely the steps resolve that (solvers/watch.py).
 
     `inputs` are the values that the run started from, so that its gradient can be taken whenever it is wanted.
     """
@@ -25,6 +28,7 @@ class Frames:
     displacements: np.ndarray
     times: np.ndarray
     inputs: dict = field(repr=False)
+    contact_resolution: ContactResolution | None = None
 
 
 class Rollout:
@@ -110,7 +114,7 @@ class Rollout:
         self._sweep_forward()
         u, v = (runtime.fetch(x) for x in self._workspace.frames)
         rest = run["rest_positions"]
-        frames = Frames((rest + u).astype(u.dtype), v, u, self.times, run)
+        frames = Frames((rest + u).astype(u.dtype), v, u, self.times, run, self._workspace.watch.resolution())
         self._current = run
         return frames
 
@@ -136,8 +140,18 @@ class Rollout:
                     f"(frame {frame}): look at the loss; parameters are unchanged"
                 )
             adjoints.append(adjoint)
+        self._warn_if_coarse(frames.contact_resolution)
         self.gradients = self._sweep_reverse(*adjoints, self.wants_health or self.clip is not None)
         return self.gradients
+
+    @staticmethod
+    def _warn_if_coarse(seen: ContactResolution) -> None:
+        if not seen.resolved:
+            warnings.warn(
+                f"gradients through contacts may be off by more than 10 %: {seen}; take substeps of at most "
+                f"{seen.advised_substep:.3g} s instead of {seen.substep:.3g} s, or a softer or wider barrier",
+                stacklevel=3,
+            )
 
     def jvp(self, frames: Frames, **tangents) -> tuple[np.ndarray, np.ndarray]:
         """Changes (positions, velocities) of the frames for changes of inputs, to first order, float64."""

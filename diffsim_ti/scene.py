@@ -34,7 +34,6 @@ class Scene:
         self.terms = tuple([terms] if isinstance(terms, Term) else terms)
         self.fixed = np.zeros(0, np.int64) if fixed is None else mesh.vertex_indices(fixed)
         self.motion = motion
-        self.moving = tuple(t for t in self.terms if t.path is not None)
         self._check_terms()
         self.inputs = Inputs(self, density, initial_positions, initial_velocities)
         self._check_start()
@@ -48,6 +47,7 @@ class Scene:
             if not isinstance(term, Term):
                 raise ValueError(f"terms must be diffsim_ti terms such as Gravity(), got {term!r}")
             term.check(self.mesh)
+        self.moving = tuple(t for t in self.terms if t.path is not None)
         for kind in (Gravity, Drag, ExternalForce):
             if sum(isinstance(t, kind) for t in self.terms) > 1:
                 raise ValueError(f"a scene takes one {kind.__name__}, got several; add their numbers instead")
