@@ -5,6 +5,7 @@ import numpy as np
 from diffsim_ti import runtime
 from diffsim_ti.inputs import Inputs
 from diffsim_ti.terms import Drag, ExternalForce, Gravity, Term
+from diffsim_ti.terms.motion import sampled
 
 
 class Scene:
@@ -35,6 +36,8 @@ class Scene:
         self.fixed = np.zeros(0, np.int64) if fixed is None else mesh.vertex_indices(fixed)
         self.motion = motion
         self._check_terms()
+        self.terms = tuple(t.settled(self, density, initial_positions, initial_velocities) for t in self.terms)
+        self.moving = tuple(t for t in self.terms if t.path is not None)
         self.inputs = Inputs(self, density, initial_positions, initial_velocities)
         self._check_start()
 
@@ -47,7 +50,6 @@ class Scene:
             if not isinstance(term, Term):
                 raise ValueError(f"terms must be diffsim_ti terms such as Gravity(), got {term!r}")
             term.check(self.mesh)
-        self.moving = tuple(t for t in self.terms if t.path is not None)
         for kind in (Gravity, Drag, ExternalForce):
             if sum(isinstance(t, kind) for t in self.terms) > 1:
                 raise ValueError(f"a scene takes one {kind.__name__}, got several; add their numbers instead")
@@ -58,9 +60,9 @@ class Scene:
 
     def _check_start(self) -> None:
         surface, positions = self.mesh.surface_vertices, self.inputs.values["initial_positions"]
-        places = dict(zip(self.moving, self.path_rows([0.0]).values()))
+        places = self.places(0.0)
         for term in self.terms:
-            term.check_start(positions, surface, *places.get(term, ()))
+            term.check_start(positions, surface, *([places[term]] if term in places else []))
 
     def term(self, kind: type) -> Term | None:
         """The scene's first term of a kind, or None."""
@@ -75,32 +77,21 @@ class Scene:
         names = self.inputs.paths
         return {name: sampled(name, t.path, times, 1)[:, 0] for name, t in zip(names, self.moving)}
 
+    def places(self, time: float) -> dict[Term, np.ndarray]:
+        """Displacement of each moving obstacle at a time [s], shape (3,) [m]."""
+        return {term: rows[0] for term, rows in zip(self.moving, self.path_rows([time]).values())}
+
     def describe(self) -> str:
         """What is simulated, in a few lines."""
         mass = self.inputs.derive(self.inputs.values).mass.sum()
         terms = ", ".join(map(repr, self.terms)) or "none"
+        chosen = [f"chosen: stiffness of {type(t).__name__} {float(t.values['barrier_stiffness']):.4g} N/m, from weight and speed"
+                  for t in self.terms if getattr(t, "chooses_stiffness", False)]  # fmt: skip
         return "\n".join([
             f"{self.mesh!r}", f"{self.material!r}", f"mass {mass:.6g} kg, precision {self.precision}",
             f"terms: {terms}", f"fixed vertices: {len(self.fixed)}" + (", moving" if self.motion is not None else ""),
+            *chosen,
         ])  # fmt: skip
 
     def __repr__(self) -> str:
         return f"Scene({self.mesh!r}, {self.material!r}, terms=[{', '.join(map(repr, self.terms))}])"
-
-
-def sampled(name: str, motion, times, k: int) -> np.ndarray:
-    """A motion of k points at each time [s], shape (len(times), k, 3) [m].
-
-    motion: a function of time that returns 3 numbers or shape (k, 3), or keyframes (times, displacements).
-    """
-    if callable(motion):
-        out = np.array([np.broadcast_to(np.asarray(motion(float(t)), np.float64), (k, 3)) for t in times])
-    else:
-        at, to = (np.asarray(part, np.float64) for part in motion)
-        to = np.broadcast_to(to[:, None, :] if to.ndim == 2 else to, (len(at), k, 3))
-        if np.any(np.diff(at) <= 0):
-            raise ValueError(f"{name}: keyframe times must increase")
-        out = np.stack([np.interp(times, at, column) for column in to.reshape(len(at), -1).T], -1).reshape(-1, k, 3)
-    if not np.all(np.isfinite(out)):
-        raise ValueError(f"{name}: displacements must be finite")
-    return out

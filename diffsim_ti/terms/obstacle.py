@@ -1,5 +1,6 @@
 """What all obstacles share: a barrier of the distance, friction, a path, and every derivative of these."""
 
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,9 @@ from diffsim_ti.materials.tensor import sum_of
 from diffsim_ti.runtime import at, let, traced
 from diffsim_ti.terms import barrier, friction
 from diffsim_ti.terms.graph import Graph
+from diffsim_ti.terms.gravity import Gravity
+from diffsim_ti.terms.motion import sampled
+from diffsim_ti.terms.stiffness import barrier_stiffness
 from diffsim_ti.terms.term import Term, VertexForce
 
 
@@ -59,6 +63,27 @@ class Obstacle(Term):
     @property
     def has_friction(self) -> bool:
         return "friction" in self.values
+
+    def settled(self, scene, density, initial_positions, initial_velocities) -> "Obstacle":
+        """With the stiffness that the fall from the start, or the start's velocity, asks for."""
+        if not self.chooses_stiffness:
+            return self
+        gravity = scene.term(Gravity)
+        g = float(np.linalg.norm(gravity.values["gravity"])) if gravity else 0.0
+        positions = scene.mesh.vertices if initial_positions is None else np.asarray(initial_positions, np.float64)
+        place = np.zeros(3) if self.path is None else sampled(self.path_name, self.path, [0.0], 1)[0, 0]
+        fall = max(float(self.gap(positions, place).min()), 0.0)
+        start = 0.0 if initial_velocities is None else np.linalg.norm(np.atleast_2d(initial_velocities), axis=1).max()
+        speed, width = float(np.sqrt(start**2 + 2 * g * fall)), float(self.values["barrier_width"])
+        stiffness = barrier_stiffness(scene.mesh, scene.material, float(np.mean(density)), g, speed, width)
+        if not stiffness > 0:
+            raise ValueError(
+                f"{type(self).__name__}: without gravity and velocity nothing says how stiff the barrier must be; pass "
+                "stiffness [N/m]"
+            )
+        out = copy(self)
+        out.values = self.values | {"barrier_stiffness": np.array(stiffness)}
+        return out
 
     def distance(self, positions: np.ndarray) -> np.ndarray:
         """Distance [m] of each position, shape (k, 3), to the obstacle as it was made; negative inside."""

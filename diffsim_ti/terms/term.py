@@ -31,6 +31,10 @@ class Term(ABC):
     def check(self, mesh) -> None:
         """Raise ValueError if the term does not fit the mesh."""
 
+    def settled(self, scene, density, initial_positions, initial_velocities) -> "Term":
+        """The term with what it leaves to the scene to choose."""
+        return self
+
     def check_start(self, positions: np.ndarray, surface: np.ndarray) -> None:
         """Raise ValueError if the body may not start at `positions` [m], shape (num_vertices, 3)."""
 
