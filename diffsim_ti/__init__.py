@@ -38,6 +38,7 @@ __all__ = [
     "Gravity", "Drag", "ExternalForce",
     "Ground", "HalfSpace", "Sphere", "Box", "Capsule", "Cylinder",
     "Scene", "SemiImplicitSolver", "VelocityVerletSolver",
-    "ImplicitEulerSolver", "ImplicitMidpointSolver", "BDF2Solver", "StaticSolver", "Simulator", "Divergence", "Crossing", "NotConverged",
+    "ImplicitEulerSolver", "ImplicitMidpointSolver", "BDF2Solver", "StaticSolver", "Simulator", "Divergence",
+    "Crossing", "NotConverged",
     "Rollout", "Frames", "taylor_test", "dot_product_test", "check_gradients",
 ]  # fmt: skip

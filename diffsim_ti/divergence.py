@@ -106,9 +106,9 @@ class Guard:
         speed = float(np.linalg.norm(ws.velocity_of(vertex)))
         enough = min(0.1 * float(term.values["barrier_width"]) / max(speed, 1e-300), 0.5 * solver.substep)
         raise Crossing(
-            f"step {step}, t = {step * solver.dt:.6g} s: vertex {vertex} gets {depth:.3g} m behind {term!r} within a substep "
-            f"of {solver.substep:.4g} s, at {speed:.4g} m/s: reduce the substep to {enough:.3g} s (a tenth of the barrier's "
-            "width), or raise its stiffness or width; the state before is kept",
+            f"step {step}, t = {step * solver.dt:.6g} s: vertex {vertex} gets {depth:.3g} m behind {term!r} within a "
+            f"substep of {solver.substep:.4g} s, at {speed:.4g} m/s: reduce the substep to {enough:.3g} s "
+            "(a tenth of the barrier's width), or raise its stiffness or width; the state before is kept",
             step, vertex, enough, depth, speed,
         )  # fmt: skip
 

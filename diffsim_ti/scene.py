@@ -4,7 +4,7 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.inputs import Inputs
-from diffsim_ti.terms import Drag, ExternalForce, Gravity, Term
+from diffsim_ti.terms import Drag, ExternalForce, Gravity, Obstacle, Term
 from diffsim_ti.terms.motion import sampled
 
 
@@ -85,8 +85,10 @@ class Scene:
         """What is simulated, in a few lines."""
         mass = self.inputs.derive(self.inputs.values).mass.sum()
         terms = ", ".join(map(repr, self.terms)) or "none"
-        chosen = [f"chosen: stiffness of {type(t).__name__} {float(t.values['barrier_stiffness']):.4g} N/m, from weight and speed"
-                  for t in self.terms if getattr(t, "chooses_stiffness", False)]  # fmt: skip
+        chosen = [
+            f"chosen from weight and speed: stiffness {float(t.values['barrier_stiffness']):.4g} N/m of {type(t).__name__}"
+            for t in self.terms if isinstance(t, Obstacle) and t.chooses_stiffness
+        ]  # fmt: skip
         return "\n".join([
             f"{self.mesh!r}", f"{self.material!r}", f"mass {mass:.6g} kg, precision {self.precision}",
             f"terms: {terms}", f"fixed vertices: {len(self.fixed)}" + (", moving" if self.motion is not None else ""),

@@ -69,10 +69,9 @@ class SceneArrays:
             self.motion_slot = runtime.upload(slots(scene.fixed, mesh.num_vertices), ti.i32)
         first = scene.inputs.first_parameter
         gravity, drag = scene.term(Gravity), scene.term(Drag)
-        moving = list(scene.moving)
+        columns = {term: (k,) for k, term in enumerate(scene.moving)}
         self._features = dict(
-            contacts=tuple(t.kernel(precision, first(t), *([moving.index(t)] if t in moving else [])) for t in self.contacts),
-            moving=len(moving),
+            contacts=tuple(t.kernel(precision, first(t), *columns.get(t, ())) for t in self.contacts), moving=len(columns),
             gravity=first(gravity) if gravity else -1, drag=first(drag) if drag else -1,
             forces=external is not None, motion=scene.motion is not None,
         )  # fmt: skip
@@ -100,7 +99,8 @@ class SceneArrays:
             "gradients": (to_blocks(values.gradients, self.num_blocks), self.lanes),
             "volumes": (to_blocks(values.volumes, self.num_blocks), self.lanes),
             "coefficients": (self.coefficient_blocks(values.coefficients), self.lanes),
-            "inverse_mass": (inverse_mass, self.fp), "parameters": (np.concatenate([values.parameters, self.tables]), self.fp),
+            "inverse_mass": (inverse_mass, self.fp),
+            "parameters": (np.concatenate([values.parameters, self.tables]), self.fp),
             "rest": (values.rest if self.contacts else np.zeros((1, 3)), self.vector),
             "forces": (np.zeros((1, 1, 3)) if values.forces is None else values.forces, self.vector),
             "motion": (np.zeros((1, 1, 3)) if values.motion is None else values.motion, self.vector),

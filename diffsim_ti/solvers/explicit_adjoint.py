@@ -156,8 +156,8 @@ class ExplicitTangent:
         for start, count, w in ws.solver.groups(first, last, num_passes, ws.rate):
             for j in range(start, start + count):
                 launch(a.num_items, a.num_vertices, j, first, ws.solver.substeps, save_every, w.lag0, w.lag1, w.pre,
-                       w.post, w.alpha, w.decay,
-                       1 / ws.solver.dt, ws.solver.substep, w.alpha_by_rate * self._rate_dot, w.decay_by_rate * self._rate_dot)  # fmt: skip
+                       w.post, w.alpha, w.decay, 1 / ws.solver.dt, ws.solver.substep, w.alpha_by_rate * self._rate_dot,
+                       w.decay_by_rate * self._rate_dot)  # fmt: skip
 
     def save_frame(self, frame: int) -> None:
         """Copy the current tangent to a frame."""

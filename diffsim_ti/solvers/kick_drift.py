@@ -22,6 +22,7 @@ from types import SimpleNamespace
 import taichi as ti
 
 from diffsim_ti.runtime import Bundle
+from diffsim_ti.solvers.contact_stages import contact_functions
 from diffsim_ti.tetrahedron import A, element_functions
 
 
@@ -62,8 +63,8 @@ def kick_drift_kernels(law, features: Features, parallel: bool, lanes: bool) -> 
     t = el.types
     fp, vector = t.fp, t.vector
     contacts, has_contacts = features.contacts, len(features.contacts) > 0
-    rough = tuple(k for k, contact in enumerate(contacts) if contact.friction)
-    num_rough = max(len(rough), 1)
+    touching = contact_functions(features, fp)
+    rough, place_of, gravity = touching.rough, touching.place_of, touching.gravity
     row = features.sums()
 
     @ti.func
@@ -80,11 +81,6 @@ def kick_drift_kernels(law, features: Features, parallel: bool, lanes: bool) -> 
             if ti.static(features.forces_per_step):
                 f = half() * (forces[(j - plan.lag0) // plan.substeps, k] + forces[(j - plan.lag1) // plan.substeps, k])
         return f
-
-    @ti.func
-    def gravity(parameters: A):
-        g = ti.static(features.gravity)
-        return vector(parameters[g], parameters[g + 1], parameters[g + 2], ti.cast(0, fp))
 
     @ti.func
     def moved(i, scene: A):
@@ -106,46 +102,7 @@ def kick_drift_kernels(law, features: Features, parallel: bool, lanes: bool) -> 
             saved = j % plan.save_every == 0
         return saved
 
-    @ti.func
-    def row_of(j, path: A, plan: A):
-        """The step that pass j begins in; the last row of a path has no step."""
-        return ti.min(j // plan.substeps, path.shape[0] - 1)
-
-    @ti.func
-    def place_of(k: A, j, path: A, plan: A):
-        """Displacement of obstacle k when pass j begins."""
-        place = vector(0)
-        if ti.static(contacts[k].path >= 0):
-            c, r = ti.static(contacts[k].path), row_of(j, path, plan)
-            change = path[ti.min(r + 1, path.shape[0] - 1), c] - path[r, c]
-            place = path[r, c] + ti.cast(j % plan.substeps, fp) / ti.cast(plan.substeps, fp) * change
-        return place
-
-    @ti.func
-    def speed_of(k: A, j, path: A, plan: A):
-        """Velocity of obstacle k in pass j."""
-        speed = vector(0)
-        if ti.static(contacts[k].path >= 0):
-            c, r = ti.static(contacts[k].path), row_of(j, path, plan)
-            speed = plan.inverse_dt * (path[ti.min(r + 1, path.shape[0] - 1), c] - path[r, c])
-        return speed
-
     # ---- one pass ---------------------------------------------------------------------------------------------------
-
-    @ti.func
-    def look(k: A, i, j, u, u_next, scene: A, state: A, plan: A):
-        """Note how near vertex i comes to obstacle k in pass j, and how well the pass resolves it (solvers/watch.py)."""
-        place = place_of(k, j, scene.path, plan)
-        X, move = scene.rest[i] - place, u_next - u - (place_of(k, j + 1, scene.path, plan) - place)
-        d, width = contacts[k].gap(scene.parameters, X, u), contacts[k].width(scene.parameters)
-        if d < width or move.dot(move) >= d * d:
-            approach = contacts[k].approach(scene.parameters, X, u, move)
-            reached = ti.min(d, d + approach)
-            if reached < width:
-                omega2 = scene.inverse_mass[i] * contacts[k].rigidity(scene.parameters, X, u)
-                state.watch[3 * k, i] = ti.min(state.watch[3 * k, i], reached)
-                state.watch[3 * k + 1, i] = ti.max(state.watch[3 * k + 1, i], plan.h * plan.h * omega2)
-                state.watch[3 * k + 2, i] = ti.max(state.watch[3 * k + 2, i], ti.abs(approach) / width)
 
     @ti.func
     def vertex(i, j, scene: A, state: A, plan: A):
@@ -171,11 +128,7 @@ def kick_drift_kernels(law, features: Features, parallel: bool, lanes: bool) -> 
         v_plus = v_mid + plan.post * a
         if ti.static(len(rough) > 0):
             if plan.alpha > 0 and scene.surface[i] > 0:
-                for k in ti.static(rough):
-                    X = scene.rest[i] - place_of(k, j, scene.path, plan)
-                    if contacts[k].touches(scene.parameters, X, u):
-                        wall, h_over_m = speed_of(k, j, scene.path, plan), plan.h * scene.inverse_mass[i]
-                        v_plus = contacts[k].slide(scene.parameters, X, u, v_plus, wall, h_over_m)
+                v_plus = touching.slow(i, j, u, v_plus, scene, plan)
         # drift and damping
         u_next, v_next = u + plan.alpha * v_plus, plan.decay * v_plus
         # prescribed motion
@@ -190,9 +143,7 @@ def kick_drift_kernels(law, features: Features, parallel: bool, lanes: bool) -> 
                     v_next = plan.inverse_dt * change
         if ti.static(has_contacts):
             if scene.surface[i] > 0:
-                for k in ti.static(range(len(contacts))):
-                    if ti.static(contacts[k].watched):
-                        look(k, i, j, u, u_next, scene, state, plan)
+                touching.look(i, j, u, u_next, scene, state, plan)
         if plan.stride > 0:
             state.f[s, i] = f
         state.u[t, i] = u_next
@@ -203,7 +154,8 @@ def kick_drift_kernels(law, features: Features, parallel: bool, lanes: bool) -> 
              corner_of: t.ints, inverse_mass: t.scalars, parameters: t.scalars, rest: t.vectors, surface: t.ints,
              force_slot: t.ints, motion_slot: t.ints, forces: t.vectors2, motion: t.vectors2, anchor: t.vectors,
              path: t.vectors2, corner: t.vectors, u: t.vectors2, v: t.vectors2, f: t.vectors2, frames_u: t.vectors2,
-             frames_v: t.vectors2, watch: t.scalars2, num_items: ti.i32, num_vertices: ti.i32, first: ti.i32, count: ti.i32, base: ti.i32, stride: ti.i32,
+             frames_v: t.vectors2, watch: t.scalars2,
+             num_items: ti.i32, num_vertices: ti.i32, first: ti.i32, count: ti.i32, base: ti.i32, stride: ti.i32,
              substeps: ti.i32, save_every: ti.i32,
              lag0: ti.i32, lag1: ti.i32, pre: fp, post: fp, alpha: fp, decay: fp, inverse_dt: fp, h: fp):  # fmt: skip
         """`count` passes. Slot 0 holds the state before pass `base`; with stride 1 forces are recorded too."""
@@ -228,15 +180,6 @@ def kick_drift_kernels(law, features: Features, parallel: bool, lanes: bool) -> 
                     vertex(i, j, scene, state, plan)
 
     # ---- its tangent ------------------------------------------------------------------------------------------------
-
-    @ti.func
-    def kicked(i, u, v, s, scene: A, state: A, plan: A):
-        """v+ again, before friction."""
-        a = scene.inverse_mass[i] * state.f[s, i]
-        if ti.static(features.gravity >= 0):
-            if scene.inverse_mass[i] > 0:
-                a += gravity(scene.parameters)
-        return v + plan.pre * a + plan.post * a
 
     @ti.func
     def vertex_jvp(i, j, scene: A, state: A, dots: A, plan: A):
@@ -266,16 +209,7 @@ def kick_drift_kernels(law, features: Features, parallel: bool, lanes: bool) -> 
         dv_plus, v_plus = dv_mid + plan.post * da, state.v[t, i] / plan.decay
         if ti.static(len(rough) > 0):
             if plan.alpha > 0 and scene.surface[i] > 0:
-                before = kicked(i, u, v, s, scene, state, plan)
-                h_over_m = plan.h * inverse
-                for k in ti.static(rough):
-                    X = scene.rest[i] - place_of(k, j, scene.path, plan)
-                    if contacts[k].touches(scene.parameters, X, u):
-                        dX = dots.rest[i] - place_of(k, j, dots.path, plan)
-                        wall, dwall = speed_of(k, j, scene.path, plan), speed_of(k, j, dots.path, plan)
-                        dv_plus = contacts[k].slide_jvp(scene.parameters, X, u, before, wall, h_over_m, dots.parameters,
-                                                        du + dX, dv_plus, dwall, -h_over_m * inverse * dots.mass[i])  # fmt: skip
-                        before = contacts[k].slide(scene.parameters, X, u, before, wall, h_over_m)
+                dv_plus = touching.slow_jvp(i, j, u, v, du, dv_plus, scene, state, dots, plan)
         du_next = du + plan.alpha * dv_plus + dots.alpha * v_plus
         dv_next = plan.decay * dv_plus + dots.decay * v_plus
         if ti.static(features.motion):
@@ -294,9 +228,11 @@ def kick_drift_kernels(law, features: Features, parallel: bool, lanes: bool) -> 
     def step_jvp(tets: t.ints, gradients: t.blocks, volumes: t.blocks, coefficients: t.blocks, start: t.ints,
                  corner_of: t.ints, inverse_mass: t.scalars, parameters: t.scalars, rest: t.vectors, surface: t.ints,
                  force_slot: t.ints, motion_slot: t.ints, path: t.vectors2, corner: t.vectors, u: t.vectors2,
-                 v: t.vectors2, f: t.vectors2, du: t.vectors2, dv: t.vectors2, coefficients_dot: t.blocks, mass_dot: t.scalars,
+                 v: t.vectors2, f: t.vectors2, du: t.vectors2, dv: t.vectors2,
+                 coefficients_dot: t.blocks, mass_dot: t.scalars,
                  parameters_dot: t.scalars, rest_dot: t.vectors, forces_dot: t.vectors2, motion_dot: t.vectors2,
-                 anchor_dot: t.vectors, path_dot: t.vectors2, gradients_dot: t.blocks, volumes_dot: t.blocks, frames_du: t.vectors2,
+                 anchor_dot: t.vectors, path_dot: t.vectors2,
+                 gradients_dot: t.blocks, volumes_dot: t.blocks, frames_du: t.vectors2,
                  frames_dv: t.vectors2, num_items: ti.i32, num_vertices: ti.i32, j: ti.i32, base: ti.i32,
                  substeps: ti.i32, save_every: ti.i32, lag0: ti.i32,
                  lag1: ti.i32, pre: fp, post: fp, alpha: fp, decay: fp, inverse_dt: fp, h: fp,
@@ -321,66 +257,6 @@ def kick_drift_kernels(law, features: Features, parallel: bool, lanes: bool) -> 
             vertex_jvp(i, j, scene, state, dots, plan)
 
     # ---- its mirror -------------------------------------------------------------------------------------------------
-
-    @ti.func
-    def hand_to_path(k: A, i, j, by_X, by_wall, adjoint: A, plan: A):
-        """Adjoints of the rows of the path that vertex i felt; `fold_path` sums them over the vertices."""
-        if ti.static(contacts[k].path >= 0):
-            c, share = ti.static(2 * contacts[k].path), ti.cast(j % plan.substeps, fp) / ti.cast(plan.substeps, fp)
-            to_now, to_next = (1 - share) * by_X + plan.inverse_dt * by_wall, share * by_X - plan.inverse_dt * by_wall
-            adjoint.felt[c, i] = adjoint.felt[c, i] - to_now
-            adjoint.felt[c + 1, i] = adjoint.felt[c + 1, i] - to_next
-
-    @ti.func
-    def fold_path(c, j, num_vertices, adjoint: A, plan: A):
-        """At the first pass of a step, the last to be mirrored: sum what all vertices felt in it, in a fixed order."""
-        if j % plan.substeps == 0:
-            now, following = vector(0), vector(0)
-            for i in range(num_vertices):
-                now += adjoint.felt[2 * c, i]
-                following += adjoint.felt[2 * c + 1, i]
-                adjoint.felt[2 * c, i] = vector(0)
-                adjoint.felt[2 * c + 1, i] = vector(0)
-            r = row_of(j, adjoint.path, plan)
-            after = ti.min(r + 1, adjoint.path.shape[0] - 1)
-            adjoint.path[r, c] = adjoint.path[r, c] + now
-            adjoint.path[after, c] = adjoint.path[after, c] + following
-
-    @ti.func
-    def friction_vjp(i, j, u, v, w, scene: A, state: A, adjoint: A, plan: A):
-        """Adjoints of u and of v+ before friction, for the adjoint w of v+ after it; adds those of all else."""
-        inverse, by_u_sum = scene.inverse_mass[i], vector(0)
-        h_over_m = plan.h * inverse
-        before = ti.Matrix.zero(fp, num_rough, 4)  # velocity before each obstacle's friction
-        now = kicked(i, u, v, j - plan.base, scene, state, plan)
-        for m in ti.static(range(len(rough))):
-            for d in ti.static(range(4)):
-                before[m, d] = now[d]
-            X = scene.rest[i] - place_of(rough[m], j, scene.path, plan)
-            if contacts[rough[m]].touches(scene.parameters, X, u):
-                wall = speed_of(rough[m], j, scene.path, plan)
-                now = contacts[rough[m]].slide(scene.parameters, X, u, now, wall, h_over_m)
-        for back in ti.static(range(len(rough))):
-            m = ti.static(len(rough) - 1 - back)
-            k = ti.static(rough[m])
-            X = scene.rest[i] - place_of(k, j, scene.path, plan)
-            if contacts[k].touches(scene.parameters, X, u):
-                start, wall = vector(0), speed_of(k, j, scene.path, plan)
-                for d in ti.static(range(4)):
-                    start[d] = before[m, d]
-                by_u, by_v, by_wall, by_ratio, by = contacts[k].slide_vjp(scene.parameters, X, u, start, wall, h_over_m, w)
-                w = by_v
-                by_u_sum += by_u
-                for q in ti.static(range(contacts[k].size)):
-                    at = ti.static(row["contacts"] + contacts[k].first - contacts[0].first + q)
-                    adjoint.sums[at, i] = adjoint.sums[at, i] + by[q]
-                if ti.static(features.density):
-                    adjoint.sums[row["mass"], i] = adjoint.sums[row["mass"], i] - h_over_m * inverse * by_ratio
-                if ti.static(features.shape):
-                    for d in ti.static(range(3)):
-                        adjoint.sums[row["rest"] + d, i] = adjoint.sums[row["rest"] + d, i] + by_u[d]
-                hand_to_path(k, i, j, by_u, by_wall, adjoint, plan)
-        return by_u_sum, w
 
     @ti.func
     def vertex_vjp(i, j, scene: A, state: A, adjoint: A, plan: A):
@@ -409,7 +285,7 @@ def kick_drift_kernels(law, features: Features, parallel: bool, lanes: bool) -> 
             adjoint.sums[row["drag"], i] = adjoint.sums[row["drag"], i] + by_rate
         if ti.static(len(rough) > 0):
             if plan.alpha > 0 and scene.surface[i] > 0:
-                by_u, v_plus_adj = friction_vjp(i, j, u, v, v_plus_adj, scene, state, adjoint, plan)
+                by_u, v_plus_adj = touching.slow_vjp(i, j, u, v, v_plus_adj, scene, state, adjoint, plan)
                 p += by_u
         # kick, frame, kick
         v_mid_adj = v_plus_adj
@@ -442,7 +318,7 @@ def kick_drift_kernels(law, features: Features, parallel: bool, lanes: bool) -> 
                     by_u, by_v = contacts[c].force_vjp(scene.parameters, X, u, v, f_adj)
                     p += by_u
                     q += by_v
-                    hand_to_path(c, i, j, by_u, vector(0), adjoint, plan)
+                    touching.hand_to_path(c, i, j, by_u, vector(0), adjoint, plan)
                     by = contacts[c].parameter_derivatives(scene.parameters, X, u, v)
                     for m in ti.static(range(contacts[c].size)):
                         at = ti.static(row["contacts"] + contacts[c].first - contacts[0].first + m)
@@ -464,9 +340,11 @@ def kick_drift_kernels(law, features: Features, parallel: bool, lanes: bool) -> 
     def step_vjp(tets: t.ints, gradients: t.blocks, volumes: t.blocks, coefficients: t.blocks, start: t.ints,
                  corner_of: t.ints, inverse_mass: t.scalars, parameters: t.scalars, rest: t.vectors, surface: t.ints,
                  force_slot: t.ints, motion_slot: t.ints, path: t.vectors2, corner: t.vectors, u: t.vectors2,
-                 v: t.vectors2, f: t.vectors2, u_adj: t.vectors2, v_adj: t.vectors2, w: t.vectors2, coefficients_adj: t.blocks,
+                 v: t.vectors2, f: t.vectors2, u_adj: t.vectors2, v_adj: t.vectors2, w: t.vectors2,
+                 coefficients_adj: t.blocks,
                  sums: t.scalars2, forces_adj: t.vectors2, motion_adj: t.vectors2, anchor_adj: t.vectors,
-                 path_adj: t.vectors2, felt: t.vectors2, gradients_adj: t.blocks, volumes_adj: t.blocks, frames_u_adj: t.vectors2, frames_v_adj: t.vectors2,
+                 path_adj: t.vectors2, felt: t.vectors2,
+                 gradients_adj: t.blocks, volumes_adj: t.blocks, frames_u_adj: t.vectors2, frames_v_adj: t.vectors2,
                  num_items: ti.i32, num_vertices: ti.i32, first: ti.i32, count: ti.i32, base: ti.i32, end: ti.i32,
                  substeps: ti.i32, save_every: ti.i32,
                  lag0: ti.i32, lag1: ti.i32, pre: fp, post: fp, alpha: fp, decay: fp, inverse_dt: fp, h: fp,
@@ -481,7 +359,8 @@ def kick_drift_kernels(law, features: Features, parallel: bool, lanes: bool) -> 
         state = Bundle(u=u, v=v, f=f)
         adjoint = Bundle(u=u_adj, v=v_adj, w=w, corner=corner, coefficients=coefficients_adj, sums=sums,
                          forces=forces_adj, motion=motion_adj, anchor=anchor_adj, path=path_adj, felt=felt,
-                         gradients=gradients_adj, volumes=volumes_adj, frames_u=frames_u_adj, frames_v=frames_v_adj)  # fmt: skip
+                         gradients=gradients_adj, volumes=volumes_adj, frames_u=frames_u_adj,
+                         frames_v=frames_v_adj)  # fmt: skip
         plan = Bundle(base=base, end=end, substeps=substeps, save_every=save_every, lag0=lag0, lag1=lag1, pre=pre,
                       post=post, alpha=alpha, decay=decay, inverse_dt=inverse_dt, h=h, alpha_by_rate=alpha_by_rate,
                       decay_by_rate=decay_by_rate)  # fmt: skip
@@ -491,7 +370,7 @@ def kick_drift_kernels(law, features: Features, parallel: bool, lanes: bool) -> 
             for e in range(num_items):
                 tetrahedron_vjp(e, first, scene, state, adjoint, plan)
             for c in range(features.moving):
-                fold_path(c, first, num_vertices, adjoint, plan)
+                touching.fold_path(c, first, num_vertices, adjoint, plan)
         else:
             ti.loop_config(serialize=True)
             for k in range(count):
@@ -500,7 +379,7 @@ def kick_drift_kernels(law, features: Features, parallel: bool, lanes: bool) -> 
                 for e in range(num_items):
                     tetrahedron_vjp(e, first + count - 1 - k, scene, state, adjoint, plan)
                 for c in range(features.moving):
-                    fold_path(c, first + count - 1 - k, num_vertices, adjoint, plan)
+                    touching.fold_path(c, first + count - 1 - k, num_vertices, adjoint, plan)
 
     @ti.kernel
     def finish_vjp(start: t.ints, corner_of: t.ints, corner: t.vectors, u_adj: t.vectors2, num_vertices: ti.i32):
