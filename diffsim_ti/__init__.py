@@ -28,7 +28,7 @@ from diffsim_ti.solvers import (
     StaticSolver,
     VelocityVerletSolver,
 )
-from diffsim_ti.terms import Box, Capsule, Cylinder, Drag, ExternalForce, Gravity, Ground, HalfSpace, Sphere
+from diffsim_ti.terms import Box, Capsule, Cylinder, Drag, ExternalForce, Gravity, Ground, HalfSpace, MeshObstacle, Sphere
 from diffsim_ti.verify import check_gradients, dot_product_test, taylor_test
 
 __version__ = "0.1.0"
@@ -36,7 +36,7 @@ __all__ = [
     "init", "TetrahedralMesh",
     "StableNeoHookean", "SmithNeoHookean", "LinearElastic", "Corotated", "StVenantKirchhoff", "MooneyRivlin",
     "Gravity", "Drag", "ExternalForce",
-    "Ground", "HalfSpace", "Sphere", "Box", "Capsule", "Cylinder",
+    "Ground", "HalfSpace", "Sphere", "Box", "Capsule", "Cylinder", "MeshObstacle",
     "Scene", "SemiImplicitSolver", "VelocityVerletSolver",
     "ImplicitEulerSolver", "ImplicitMidpointSolver", "BDF2Solver", "StaticSolver", "Simulator", "Divergence",
     "Crossing", "NotConverged",

@@ -69,16 +69,25 @@ class SceneArrays:
             self.motion_slot = runtime.upload(slots(scene.fixed, mesh.num_vertices), ti.i32)
         first = scene.inputs.first_parameter
         gravity, drag = scene.term(Gravity), scene.term(Drag)
-        columns = {term: (k,) for k, term in enumerate(scene.moving)}
         self._features = dict(
-            contacts=tuple(t.kernel(precision, first(t), *columns.get(t, ())) for t in self.contacts), moving=len(columns),
+            contacts=self._twins(scene), moving=len(scene.moving),
             gravity=first(gravity) if gravity else -1, drag=first(drag) if drag else -1,
             forces=external is not None, motion=scene.motion is not None,
         )  # fmt: skip
-        self.tables = np.concatenate([np.zeros(0), *(t.table for t in self.contacts)])
         self.offsets = runtime.array(self.vector, len(self.contacts))  # where obstacles are when one looks between passes
         self.values: Derived | None = None
         self.corner = runtime.array(self.vector, 4 * LANES * self.num_blocks)
+
+    def _twins(self, scene) -> tuple:
+        """Compile-time twins of the contacts; their tables stand behind the parameters, one after the other."""
+        columns, twins, at = {term: k for k, term in enumerate(scene.moving)}, [], max(scene.inputs.num_parameters, 1)
+        self.tables = np.concatenate([np.zeros(0), *(t.table for t in self.contacts)])
+        for term in self.contacts:
+            own = dict(path=columns[term]) if term in columns else {}
+            twins.append(term.kernel(scene.precision, scene.inputs.first_parameter(term),
+                                     **own | (dict(table=at) if term.table.size else {})))  # fmt: skip
+            at += term.table.size
+        return tuple(twins)
 
     def features(self, density: bool = False, shape: bool = False) -> Features:
         """What kernels must contain for the values that are loaded."""

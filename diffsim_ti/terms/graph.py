@@ -47,10 +47,10 @@ class Number:
 
 
 class Graph:
-    """Numbers in the order in which they were made; `fp` is the scene's float."""
+    """Numbers in the order in which they were made; `fp` is the scene's float, `parameters` its parameter array."""
 
-    def __init__(self, fp):
-        self.fp, self.numbers = fp, []
+    def __init__(self, fp, parameters=None):
+        self.fp, self.parameters, self.numbers = fp, parameters, []
 
     def constant(self, value):
         return ti.cast(value, self.fp)

@@ -138,7 +138,7 @@ class ObstacleForce(VertexForce):
     @traced
     def _record(self, parameters, X, u):
         """(graph, all numbers, components of u, d, n) at a point."""
-        g = Graph(self.fp)
+        g = Graph(self.fp, parameters)
         p = [g.leaf(at(parameters, self.first + k)) for k in range(self.size)]
         rest, moved = ([g.leaf(at(vector, d)) for d in range(3)] for vector in (X, u))
         d, n = self.distance_and_normal(g, p[: self.count], rest, moved)

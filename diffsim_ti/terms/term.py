@@ -39,7 +39,10 @@ class Term(ABC):
         """Raise ValueError if the body may not start at `positions` [m], shape (num_vertices, 3)."""
 
     def kernel(self, precision: str, first: int) -> "VertexForce | None":
-        """Compile-time twin; `first` is where its numbers start in the scene's parameter array."""
+        """Compile-time twin; `first` is where its numbers start in the scene's parameter array.
+
+        A term with a path or a table is also given `path`, its column among those that move, and `table`, where it starts.
+        """
         return None
 
     def __repr__(self) -> str:
