@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from diffsim_ti import observe, stability
+from diffsim_ti import observe, runtime, stability
 
 
 class Divergence(FloatingPointError):
@@ -14,11 +14,16 @@ class Divergence(FloatingPointError):
 
 
 class Crossing(Divergence):
-    """A vertex got onto or behind an obstacle. Carries also depth [m] and speed [m/s]."""
+    """A vertex got onto or behind an obstacle. Carries also depth [m], speed [m/s], and stiffness [N/m].
 
-    def __init__(self, message: str, step: int, vertex: int, stable_dt: float, depth: float, speed: float):
+    stable_dt [s] is a substep that resolves the barrier at this speed; stiffness is what stops the vertex, or None where
+    the barrier's own would do.
+    """
+
+    def __init__(self, message: str, step: int, vertex: int, stable_dt: float, depth: float, speed: float,
+                 stiffness: float | None):  # fmt: skip
         super().__init__(message, step, vertex, None, stable_dt)
-        self.depth, self.speed = depth, speed
+        self.depth, self.speed, self.stiffness = depth, speed, stiffness
 
 
 class Guard:
@@ -105,12 +110,32 @@ class Guard:
         term, step = ws.watch.contacts[k], self._step_of(j, num_passes)
         speed = float(np.linalg.norm(ws.velocity_of(vertex)))
         enough = min(0.1 * float(term.values["barrier_width"]) / max(speed, 1e-300), 0.5 * solver.substep)
+        stiffness = self._stiffness_needed(k, vertex, speed)
+        remedy = (
+            f"reduce the substep to {enough:.3g} s (a tenth of the barrier's width)" if stiffness is None
+            else f"the barrier cannot stop it at any step: raise its stiffness to {stiffness:.3g} N/m, or its width"
+        )  # fmt: skip
         raise Crossing(
             f"step {step}, t = {step * solver.dt:.6g} s: vertex {vertex} gets {depth:.3g} m behind {term!r} within a "
-            f"substep of {solver.substep:.4g} s, at {speed:.4g} m/s: reduce the substep to {enough:.3g} s "
-            "(a tenth of the barrier's width), or raise its stiffness or width; the state before is kept",
-            step, vertex, enough, depth, speed,
+            f"substep of {solver.substep:.4g} s, at {speed:.4g} m/s: {remedy}; the state before is kept",
+            step, vertex, enough, depth, speed, stiffness,
         )  # fmt: skip
+
+    def _stiffness_needed(self, k: int, vertex: int, speed: float) -> float | None:
+        """Stiffness [N/m] whose barrier, alone, stops the vertex at a fiftieth of the width; None if the present one can.
+
+        The present state counts: kinetic energy and what the barrier already holds, against k w^2 beta(1 / 1000).
+        """
+        arrays, twin = self.ws.arrays, self.ws.arrays.features().contacts[k]
+        stiffness, width = (float(arrays.values.parameters[twin.first + twin.count + m]) for m in (0, 1))
+        self.ws.place_obstacles(self.good_pass)
+        place = runtime.fetch(arrays.offsets)[k].astype(np.float64)
+        position = arrays.values.rest[vertex] + runtime.fetch(self.ws.state.u)[0, vertex]
+        gap = float(self.ws.watch.contacts[k].gap(position[None], place)[0])
+        s = np.clip(gap / width, 1e-3, 1)
+        beta = lambda s: -((s - 1) ** 2) * np.log(s)  # noqa: E731
+        energy = 0.5 * arrays.values.mass[vertex] * speed**2 + stiffness * width**2 * beta(s)
+        return energy / (width**2 * beta(0.02)) if energy > stiffness * width**2 * beta(1e-3) else None
 
     def _diagnose(self, bad_by: int, num_passes: int) -> None:
         """Run again from the last good state, pass by pass, and raise at the first bad one; that state is restored."""

@@ -95,6 +95,8 @@ class ForwardRun:
                 sim.step()
                 why = self._complaint(last or self._squeezed)
             except FloatingPointError as error:
+                if getattr(error, "stiffness", None) is not None:  # no step helps
+                    raise
                 why = str(error)
             if why is None:
                 self._refined = substeps if tried else self._refined // 2
@@ -136,7 +138,8 @@ class ForwardRun:
         energy, h = self.simulator.compute_energy(), self.simulator.solver.substep
         rise, scale = energy - self._energy, max(self.largest_energy, self._moving(energy))
         drifted = energy - self._lowest > self.largest_drift * scale
-        if self.scene.motion is None and not rise <= (self.later_rise if drifted else self.largest_rise) * scale:
+        driven = self.scene.motion is not None or self.scene.moving
+        if not driven and not rise <= (self.later_rise if drifted else self.largest_rise) * scale:
             return f"the energy rose by {rise:.3g} J"
         if not look_up:
             return None

@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 import taichi as ti
-from contact_scenes import BASE, G, SHAPES, points, resting_gap, tetrahedron
+from contact_scenes import BASE, SHAPES, G, points, resting_gap, tetrahedron
 
 import diffsim_ti as ds
 from diffsim_ti import runtime
 from diffsim_ti.terms import barrier
 
 RNG = np.random.default_rng(3)
+BASE_MESH = tetrahedron()
 POINTS = np.vstack([RNG.uniform([-0.4, -0.3, -0.4], [0.9, 0.4, 0.7], (60, 3)), BASE + [0, 0.15, 0]])
 
 
@@ -55,7 +56,7 @@ def test_distance_and_force(name):
 
 def test_sphere_pushes_out_and_bowl_in():
     """Also a vertex that got past is pushed back where it came from."""
-    ball, bowl = ds.Sphere(radius=1.0, stiffness=1e3, width=0.1), ds.Sphere(radius=1.0, inside=True, stiffness=1e3, width=0.1)
+    ball, bowl = (ds.Sphere(radius=1.0, inside=inside, stiffness=1e3, width=0.1) for inside in (False, True))
     at = np.array([[1.05, 0, 0], [0.95, 0, 0], [0.3, 0, 0]])
     assert np.all(evaluate(ball, at)[2][:, 0] > 0)
     inward = evaluate(bowl, np.array([[0.95, 0, 0], [1.05, 0, 0]]))[2]
@@ -79,7 +80,8 @@ def test_barrier_near_its_ends(precision, tolerance):
     c = np.maximum(s, barrier.CROSSOVER)
     curvature = -2 * np.log(c) - 4 * (c - 1) / c + ((c - 1) / c) ** 2
     slope0 = -(c - 1) * (2 * np.log(c) + (c - 1) / c)
-    expected = [-((c - 1) ** 2) * np.log(c) + (s - c) * (slope0 + (s - c) / 2 * curvature), slope0 + (s - c) * curvature, curvature]
+    value = -((c - 1) ** 2) * np.log(c) + (s - c) * (slope0 + (s - c) / 2 * curvature)
+    expected = [value, slope0 + (s - c) * curvature, curvature]
     np.testing.assert_allclose(runtime.fetch(out), expected, rtol=tolerance, atol=1e-6 if precision == "f32" else 1e-15)
     assert np.all(runtime.fetch(out)[:, 0] == 0) and np.all(runtime.fetch(out)[1, 1:] < 0)
 
@@ -108,7 +110,7 @@ ERRORS = {
     "box": (lambda: ds.Box(size=[1, -1, 1]), "box_size must be > 0"),
     "rotation": (lambda: ds.Box(rotation=[0, 1]), "rotation must be 3 finite numbers"),
     "open mesh": (lambda: ds.MeshObstacle(BASE, [[0, 1, 2]]), "must be closed and consistently oriented; 3 edges"),
-    "inside out": (lambda: ds.MeshObstacle(tetrahedron().vertices, tetrahedron().surface_triangles[:, ::-1]), "face inwards"),
+    "inwards": (lambda: ds.MeshObstacle(BASE_MESH.vertices, BASE_MESH.surface_triangles[:, ::-1]), "face inwards"),
     "width": (lambda: ds.Sphere(width=-1.0), r"Sphere: width \[m\] must be > 0"),
 }  # fmt: skip
 
