@@ -2,19 +2,32 @@
 
 import numpy as np
 
-from diffsim_ti import observe, stability
+from diffsim_ti import observe, runtime, stability
 
 
 class Divergence(FloatingPointError):
     """The state is not finite, or the step has become unstable. Carries step, vertex, tetrahedron and stable_dt [s]."""
 
-    def __init__(self, message: str, step: int, vertex: int | None, tetrahedron: int, stable_dt: float):
+    def __init__(self, message: str, step: int, vertex: int | None, tetrahedron: int | None, stable_dt: float):
         super().__init__(message)
         self.step, self.vertex, self.tetrahedron, self.stable_dt = step, vertex, tetrahedron, stable_dt
 
 
+class Crossing(Divergence):
+    """A vertex got onto or behind an obstacle. Carries also depth [m], speed [m/s], and stiffness [N/m].
+
+    stable_dt [s] is a substep that resolves the barrier at this speed; stiffness is what stops the vertex, or None where
+    the barrier's own would do.
+    """
+
+    def __init__(self, message: str, step: int, vertex: int, stable_dt: float, depth: float, speed: float,
+                 stiffness: float | None):  # fmt: skip
+        super().__init__(message, step, vertex, None, stable_dt)
+        self.depth, self.speed, self.stiffness = depth, speed, stiffness
+
+
 class Guard:
-    """Looks at a run every so many passes: is the state finite, is the step still stable at this state?
+    """Looks at a run every so many passes: is the state finite, did a vertex cross an obstacle, is the step still stable?
 
     Keeps the last good state, from which `diagnose` finds the exact step. Looking costs 2 to 7 %; where the step is
     within a tenth of the stable one it looks more often, for beyond it a motion soon grows e-fold in ten passes.
@@ -32,6 +45,7 @@ class Guard:
         """The current state, before pass `now`, is good: keep it."""
         self.ws.save(self.good, 0)
         self.good_pass = now
+        self._seen = self.ws.watch.rows() if self.ws.watch.contacts else None
 
     def advance(self, first: int, last: int, num_passes: int, save_every: int = 0, recording: bool = False) -> None:
         """Passes first .. last - 1, looked after; recording, slot j of the record holds the state before pass j."""
@@ -43,6 +57,8 @@ class Guard:
             self.ws.advance(first, stop, num_passes, save_every, 0 if recording else None)
             if recording:
                 self.ws.restore(self.ws.record, stop)
+            if self.ws.watch.crossing() is not None and self.ws.solver.explicit:
+                self._diagnose_crossing(stop, num_passes)
             if self.ws.first_bad_vertex() is not None:
                 self._diagnose(stop, num_passes)
             self._passes += stop - first
@@ -60,6 +76,7 @@ class Guard:
         solver = self.ws.solver
         if solver.allow_unstable or not solver.explicit:
             return
+        self.ws.place_obstacles(now)
         if self._stiffness is None:
             self._stiffness = stability.Stiffness(self.ws)
         omega2 = self._stiffness.watch()
@@ -75,6 +92,50 @@ class Guard:
             "into a contact): reduce dt, raise substeps, or pass allow_unstable=True",
             step, None, tet, float(limit),
         )  # fmt: skip
+
+    def _diagnose_crossing(self, bad_by: int, num_passes: int) -> None:
+        """Run again to the first pass that crosses, and raise; the state before it is restored."""
+        ws, solver = self.ws, self.ws.solver
+        ws.watch.put(self._seen)
+        ws.restore(self.good, 0)
+        for j in range(self.good_pass, bad_by):
+            self.mark(j)
+            ws.advance(j, j + 1, num_passes)
+            crossing = ws.watch.crossing()
+            if crossing is not None:
+                break
+        ws.restore(self.good, 0)
+        ws.watch.put(self._seen)
+        k, vertex, depth = crossing
+        term, step = ws.watch.contacts[k], self._step_of(j, num_passes)
+        speed = float(np.linalg.norm(ws.velocity_of(vertex)))
+        enough = min(0.1 * float(term.values["barrier_width"]) / max(speed, 1e-300), 0.5 * solver.substep)
+        stiffness = self._stiffness_needed(k, vertex, speed)
+        remedy = (
+            f"reduce the substep to {enough:.3g} s (a tenth of the barrier's width)" if stiffness is None
+            else f"the barrier cannot stop it at any step: raise its stiffness to {stiffness:.3g} N/m, or its width"
+        )  # fmt: skip
+        raise Crossing(
+            f"step {step}, t = {step * solver.dt:.6g} s: vertex {vertex} gets {depth:.3g} m behind {term!r} within a "
+            f"substep of {solver.substep:.4g} s, at {speed:.4g} m/s: {remedy}; the state before is kept",
+            step, vertex, enough, depth, speed, stiffness,
+        )  # fmt: skip
+
+    def _stiffness_needed(self, k: int, vertex: int, speed: float) -> float | None:
+        """Stiffness [N/m] whose barrier, alone, stops the vertex at a fiftieth of the width; None if the present one can.
+
+        The present state counts: kinetic energy and what the barrier already holds, against k w^2 beta(1 / 1000).
+        """
+        arrays, twin = self.ws.arrays, self.ws.arrays.features().contacts[k]
+        stiffness, width = (float(arrays.values.parameters[twin.first + twin.count + m]) for m in (0, 1))
+        self.ws.place_obstacles(self.good_pass)
+        place = runtime.fetch(arrays.offsets)[k].astype(np.float64)
+        position = arrays.values.rest[vertex] + runtime.fetch(self.ws.state.u)[0, vertex]
+        gap = float(self.ws.watch.contacts[k].gap(position[None], place)[0])
+        s = np.clip(gap / width, 1e-3, 1)
+        beta = lambda s: -((s - 1) ** 2) * np.log(s)  # noqa: E731
+        energy = 0.5 * arrays.values.mass[vertex] * speed**2 + stiffness * width**2 * beta(s)
+        return energy / (width**2 * beta(0.02)) if energy > stiffness * width**2 * beta(1e-3) else None
 
     def _diagnose(self, bad_by: int, num_passes: int) -> None:
         """Run again from the last good state, pass by pass, and raise at the first bad one; that state is restored."""

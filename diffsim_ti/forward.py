@@ -15,7 +15,7 @@ class Interrupted(Exception):
 
 @dataclass
 class Seen:
-    """The extremes of a run: smallest J and gap [m], most tetrahedra inside-out and vertices below the floor at once."""
+    """The extremes of a run: smallest J and gap [m], most tetrahedra inside-out and vertices in an obstacle at once."""
 
     J: float = np.inf
     gap: float = np.inf
@@ -44,9 +44,10 @@ class ForwardRun:
 
     def __init__(self, scene, solver_class, frame_time: float, dt: float | None = None, **options):
         from diffsim_ti.simulator import Simulator
-        from diffsim_ti.terms import Gravity, Ground
+        from diffsim_ti.terms import Gravity, Obstacle
 
-        self.scene, self.ground, self.seen, self.adapts = scene, scene.term(Ground), Seen(), dt is None
+        self.scene, self.seen, self.adapts = scene, Seen(), dt is None
+        self.obstacles = tuple(t for t in scene.terms if isinstance(t, Obstacle))
         gravity = scene.term(Gravity)
         self._pull = float(np.linalg.norm(gravity.values["gravity"])) if gravity else 0.0
         if dt is None:
@@ -94,6 +95,8 @@ class ForwardRun:
                 sim.step()
                 why = self._complaint(last or self._squeezed)
             except FloatingPointError as error:
+                if getattr(error, "stiffness", None) is not None:  # no step helps
+                    raise
                 why = str(error)
             if why is None:
                 self._refined = substeps if tried else self._refined // 2
@@ -113,9 +116,7 @@ class ForwardRun:
         J = sim.tetrahedron_fields().J
         self._squeezed = J.min() < self.squeezed
         seen.J, seen.inverted = min(seen.J, float(J.min())), max(seen.inverted, int((J <= 0).sum()))
-        if self.ground:
-            gap = self.ground.gap(sim.positions[self.scene.mesh.surface_vertices])
-            seen.gap, seen.crossed = min(seen.gap, float(gap.min())), max(seen.crossed, int((gap < 0).sum()))
+        self._look_at_gaps()
         seen.substeps[-1] += sim.solver.substeps
         seen.shortest = min(seen.shortest, sim.solver.substep)
         seen.longest = max(seen.longest, sim.solver.substep)
@@ -123,12 +124,22 @@ class ForwardRun:
         self._lowest = min(self._lowest, self._energy)
         self.largest_energy = max(self.largest_energy, self._moving(self._energy))
 
+    def _look_at_gaps(self) -> None:
+        sim, seen, places = self.simulator, self.seen, self.scene.places(self.simulator.time)
+        positions, crossed = sim.positions[self.scene.mesh.surface_vertices], 0
+        for term in self.obstacles:
+            gap = term.gap(positions, places.get(term, np.zeros(3)))
+            seen.gap, crossed = min(seen.gap, float(gap.min())), crossed + int((gap < 0).sum())
+        seen.crossed = max(seen.crossed, crossed)
+        seen.gap = min(seen.gap, sim.contact_resolution.smallest_gap)  # of all substeps
+
     def _complaint(self, look_up: bool) -> str | None:
         """Why the part that was just run cannot be trusted, or None; `look_up`: find the stable step at its end."""
         energy, h = self.simulator.compute_energy(), self.simulator.solver.substep
         rise, scale = energy - self._energy, max(self.largest_energy, self._moving(energy))
         drifted = energy - self._lowest > self.largest_drift * scale
-        if self.scene.motion is None and not rise <= (self.later_rise if drifted else self.largest_rise) * scale:
+        driven = self.scene.motion is not None or self.scene.moving
+        if not driven and not rise <= (self.later_rise if drifted else self.largest_rise) * scale:
             return f"the energy rose by {rise:.3g} J"
         if not look_up:
             return None
@@ -146,9 +157,11 @@ class ForwardRun:
     def _choose_substeps(self) -> int:
         dt = self.simulator.solver.dt
         fewest = dt / (self.share * self._limit)
-        if self.ground:  # a vertex shall not cross the barrier in a few substeps
+        if self.obstacles:  # a vertex shall not cross the barrier in a few substeps
             speed = np.linalg.norm(self.simulator.velocities, axis=1).max() + self._pull * self.frame_time
-            fewest = max(fewest, 10 * speed * dt / float(self.ground.values["barrier_width"]))
+            now, then = (self.scene.places(self.simulator.time + step) for step in (0.0, dt))
+            speed += max((np.linalg.norm(then[t] - now[t]) / dt for t in now), default=0.0)
+            fewest = max(fewest, 10 * speed * dt / min(float(t.values["barrier_width"]) for t in self.obstacles))
         return max(1, int(np.ceil(fewest)))
 
     @staticmethod

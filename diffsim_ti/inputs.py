@@ -21,6 +21,7 @@ class Derived:
     volumes: np.ndarray  # (num_tetrahedra,) [m^3]
     forces: np.ndarray | None = None  # (1 or steps, k, 3) [N]
     motion: np.ndarray | None = None  # (steps + 1, num_fixed, 3) [m]
+    path: np.ndarray | None = None  # displacements of obstacles, (steps + 1, num_moving, 3) [m]
 
     def zeros(self) -> "Derived":
         """The same shapes, all zero."""
@@ -45,7 +46,7 @@ class Inputs:
     """The numbers of a scene that a gradient can be asked for: names, values, what kernels make of them.
 
     `values`: dict of float64 arrays. Names: initial_positions, initial_velocities, the material's own inputs, density,
-    rest_positions, and those of the terms. prescribed_motion joins per run, sampled at its steps.
+    rest_positions, and those of the terms. prescribed_motion and paths of obstacles join per run, sampled at its steps.
     """
 
     def __init__(self, scene, density, initial_positions, initial_velocities):
@@ -66,6 +67,9 @@ class Inputs:
             if not isinstance(term, ExternalForce):
                 at += sum(value.size for value in term.values.values())
         self.num_parameters = at
+        self.paths = []  # names of the moving obstacles' paths, which join per run
+        for term in scene.moving:
+            self.paths.append(self._free_name(term.path_name, dict.fromkeys(self.paths)))
         values["rest_positions"] = self.mesh.vertices
         self.values = {name: value.copy() for name, value in self.check(values).items()}  # the caller's may change
 
@@ -129,6 +133,7 @@ class Inputs:
             displacement, velocity, self.scene.material.coefficients(material_values),
             self._to_vertices(values["density"] * volumes / 4), parameters, X, gradients, volumes, forces,
             values.get("prescribed_motion"),
+            np.stack([values[name] for name in self.paths], 1) if self.paths and self.paths[0] in values else None,
         )  # fmt: skip
 
     def _rest_of(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -171,6 +176,8 @@ class Inputs:
         )
         if out.motion is not None and "prescribed_motion" in dots:
             out.motion = np.array(dots["prescribed_motion"])
+        if out.path is not None:
+            out.path = np.stack([np.broadcast_to(dots.get(name, 0.0), values[name].shape) for name in self.paths], 1)
         return out
 
     def derive_vjp(self, values: dict, adj: Derived, wanted) -> dict:
@@ -195,6 +202,8 @@ class Inputs:
                     at += size
         if adj.motion is not None:
             out["prescribed_motion"] = adj.motion
+        if adj.path is not None:
+            out |= {name: adj.path[:, k] for k, name in enumerate(self.paths)}
         if "rest_positions" in wanted:
             Bt = np.swapaxes(B, 1, 2)
             volumes = adj.volumes + values["density"] * mass

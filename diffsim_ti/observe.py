@@ -33,13 +33,14 @@ def observer_kernels(law, features):
             von_mises[e] = ti.sqrt(ti.cast(0.5, t.fp) * (a * a + b * b + c * c) + 3 * shear)
 
     @ti.kernel
-    def contact_energy(rest: t.vectors, surface: t.ints, parameters: t.scalars, u: t.vectors2, energy: t.scalars):
+    def contact_energy(rest: t.vectors, offsets: t.vectors, surface: t.ints, parameters: t.scalars, u: t.vectors2,
+                       energy: t.scalars):  # fmt: skip
         for i in range(u.shape[1]):
             energy[i] = 0
             if ti.static(len(contacts) > 0):
                 if surface[i] > 0:
                     for k in ti.static(range(len(contacts))):
-                        energy[i] += contacts[k].energy(parameters, rest[i], u[0, i])
+                        energy[i] += contacts[k].energy(parameters, rest[i] - offsets[k], u[0, i])
 
     return tetrahedron_fields, contact_energy
 
@@ -85,6 +86,6 @@ def energy(workspace) -> Energy:
         parts["gravity"] = float(-(values.mass * ((values.rest + u) @ g)).sum())
     if features.contacts:
         per_vertex = runtime.array(a.fp, a.num_vertices)
-        observer_kernels(a.law, features)[1](a.rest, a.surface, a.parameters, workspace.state.u, per_vertex)
+        observer_kernels(a.law, features)[1](a.rest, a.offsets, a.surface, a.parameters, workspace.state.u, per_vertex)
         parts["contact"] = float(runtime.fetch(per_vertex).astype(np.float64).sum())
     return Energy(parts)

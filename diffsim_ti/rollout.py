@@ -10,12 +10,15 @@ import taichi as ti
 from diffsim_ti import runtime
 from diffsim_ti.checkpoints import choose_schedule
 from diffsim_ti.divergence import Guard
+from diffsim_ti.solvers.watch import ContactResolution
 
 
 @dataclass(eq=False)
 class Frames:
     """Saved states of one run: positions [m], velocities [m/s], displacements from the rest shape [m] (which
     keep their digits in float32), each of shape (frames, num_vertices, 3), and times [s].
+
+    `contact_resolution` says how near the body came to obstacles and how finely the steps resolve that (solvers/watch.py).
 
     `inputs` are the values that the run started from, so that its gradient can be taken whenever it is wanted.
     """
@@ -25,6 +28,7 @@ class Frames:
     displacements: np.ndarray
     times: np.ndarray
     inputs: dict = field(repr=False)
+    contact_resolution: ContactResolution | None = None
 
 
 class Rollout:
@@ -62,6 +66,7 @@ class Rollout:
         values = dict(self.scene.inputs.values)
         if self.scene.motion is not None:
             values["prescribed_motion"] = self.scene.motion_rows(np.arange(self.steps + 1) * solver.dt)
+        values |= self.scene.path_rows(np.arange(self.steps + 1) * solver.dt)
         self.values = values
         self.inputs = tuple(values)
         self.wanted = self._check_names(gradients)
@@ -109,7 +114,7 @@ class Rollout:
         self._sweep_forward()
         u, v = (runtime.fetch(x) for x in self._workspace.frames)
         rest = run["rest_positions"]
-        frames = Frames((rest + u).astype(u.dtype), v, u, self.times, run)
+        frames = Frames((rest + u).astype(u.dtype), v, u, self.times, run, self._workspace.watch.resolution())
         self._current = run
         return frames
 
@@ -135,8 +140,18 @@ class Rollout:
                     f"(frame {frame}): look at the loss; parameters are unchanged"
                 )
             adjoints.append(adjoint)
+        self._warn_if_coarse(frames.contact_resolution)
         self.gradients = self._sweep_reverse(*adjoints, self.wants_health or self.clip is not None)
         return self.gradients
+
+    @staticmethod
+    def _warn_if_coarse(seen: ContactResolution) -> None:
+        if not seen.resolved:
+            warnings.warn(
+                f"gradients through contacts may be off by more than 10 %: {seen}; take substeps of at most "
+                f"{seen.advised_substep:.3g} s instead of {seen.substep:.3g} s, or a softer or wider barrier",
+                stacklevel=3,
+            )
 
     def jvp(self, frames: Frames, **tangents) -> tuple[np.ndarray, np.ndarray]:
         """Changes (positions, velocities) of the frames for changes of inputs, to first order, float64."""
@@ -252,10 +267,9 @@ class Rollout:
         forces = run.get("external_forces")
         if forces is not None and forces.ndim == 3 and len(forces) < self.steps:
             raise ValueError(f"external_forces: {self.steps} steps need as many rows, got {len(forces)}")
-        motion = run.get("prescribed_motion")
-        if motion is not None and motion.shape != self.values["prescribed_motion"].shape:
-            expected = self.values["prescribed_motion"].shape
-            raise ValueError(f"prescribed_motion: expected shape {expected}, got {motion.shape}")
+        for name in ("prescribed_motion", *self.scene.inputs.paths):
+            if name in run and run[name].shape != self.values[name].shape:
+                raise ValueError(f"{name}: expected shape {self.values[name].shape}, got {run[name].shape}")
 
     def _sweep_forward(self) -> None:
         """All passes; keeps the first snapshots of the schedule on the way."""

@@ -4,7 +4,8 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.inputs import Inputs
-from diffsim_ti.terms import Drag, ExternalForce, Gravity, Term
+from diffsim_ti.terms import Drag, ExternalForce, Gravity, Obstacle, Term
+from diffsim_ti.terms.motion import sampled
 
 
 class Scene:
@@ -35,6 +36,8 @@ class Scene:
         self.fixed = np.zeros(0, np.int64) if fixed is None else mesh.vertex_indices(fixed)
         self.motion = motion
         self._check_terms()
+        self.terms = tuple(t.settled(self, density, initial_positions, initial_velocities) for t in self.terms)
+        self.moving = tuple(t for t in self.terms if t.path is not None)
         self.inputs = Inputs(self, density, initial_positions, initial_velocities)
         self._check_start()
 
@@ -56,9 +59,10 @@ class Scene:
             self.motion_rows([0.0])
 
     def _check_start(self) -> None:
-        surface = self.mesh.surface_vertices
+        surface, positions = self.mesh.surface_vertices, self.inputs.values["initial_positions"]
+        places = self.places(0.0)
         for term in self.terms:
-            term.check_start(self.inputs.values["initial_positions"], surface)
+            term.check_start(positions, surface, *([places[term]] if term in places else []))
 
     def term(self, kind: type) -> Term | None:
         """The scene's first term of a kind, or None."""
@@ -66,27 +70,29 @@ class Scene:
 
     def motion_rows(self, times) -> np.ndarray:
         """Displacement of the fixed vertices from their start at each time [s], shape (len(times), num_fixed, 3) [m]."""
-        k = len(self.fixed)
-        if callable(self.motion):
-            rows = [np.broadcast_to(np.asarray(self.motion(float(t)), np.float64), (k, 3)) for t in times]
-            out = np.array(rows)
-        else:
-            at, to = (np.asarray(part, np.float64) for part in self.motion)
-            to = np.broadcast_to(to[:, None, :] if to.ndim == 2 else to, (len(at), k, 3))
-            if np.any(np.diff(at) <= 0):
-                raise ValueError("motion: keyframe times must increase")
-            out = np.stack([np.interp(times, at, column) for column in to.reshape(len(at), -1).T], -1).reshape(-1, k, 3)
-        if not np.all(np.isfinite(out)):
-            raise ValueError("motion: displacements must be finite")
-        return out
+        return sampled("motion", self.motion, times, len(self.fixed))
+
+    def path_rows(self, times) -> dict[str, np.ndarray]:
+        """Displacement of each moving obstacle at each time [s], by input name, shape (len(times), 3) [m]."""
+        names = self.inputs.paths
+        return {name: sampled(name, t.path, times, 1)[:, 0] for name, t in zip(names, self.moving)}
+
+    def places(self, time: float) -> dict[Term, np.ndarray]:
+        """Displacement of each moving obstacle at a time [s], shape (3,) [m]."""
+        return {term: rows[0] for term, rows in zip(self.moving, self.path_rows([time]).values())}
 
     def describe(self) -> str:
         """What is simulated, in a few lines."""
         mass = self.inputs.derive(self.inputs.values).mass.sum()
         terms = ", ".join(map(repr, self.terms)) or "none"
+        chosen = [
+            f"chosen from weight and speed: stiffness {float(t.values['barrier_stiffness']):.4g} N/m of {type(t).__name__}"
+            for t in self.terms if isinstance(t, Obstacle) and t.chooses_stiffness
+        ]  # fmt: skip
         return "\n".join([
             f"{self.mesh!r}", f"{self.material!r}", f"mass {mass:.6g} kg, precision {self.precision}",
             f"terms: {terms}", f"fixed vertices: {len(self.fixed)}" + (", moving" if self.motion is not None else ""),
+            *chosen,
         ])  # fmt: skip
 
     def __repr__(self) -> str:

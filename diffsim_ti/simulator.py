@@ -7,6 +7,7 @@ import numpy as np
 from diffsim_ti import observe, runtime
 from diffsim_ti.divergence import Guard
 from diffsim_ti.observe import Energy, TetrahedronFields
+from diffsim_ti.solvers.watch import ContactResolution
 
 
 class Simulator:
@@ -57,6 +58,7 @@ class Simulator:
             self.workspace.restore(self._before, 0)
             raise
         self.step_count += 1
+        self.workspace.place_obstacles(self.solver.substeps)
 
     def run(self, steps: int) -> None:
         """Advance by so many steps."""
@@ -74,6 +76,9 @@ class Simulator:
         arrays, values = self.workspace.arrays, self._start
         if values.motion is not None:
             runtime.fill(arrays.motion, self.scene.motion_rows([self.time, self.time + self.solver.dt]))
+        if values.path is not None:
+            rows = self.scene.path_rows([self.time, self.time + self.solver.dt])
+            runtime.fill(arrays.path, np.stack(list(rows.values()), 1))
         if values.forces is not None and len(self._forces_rows()) > 1:
             rows = self._forces_rows()
             if self.step_count >= len(rows):
@@ -112,6 +117,11 @@ class Simulator:
                     raise ValueError(f"{name}: expected shape {shape}, got {value.shape}")
                 runtime.fill(target, (value - origin)[None])
         self.workspace.forget()
+
+    @property
+    def contact_resolution(self) -> ContactResolution:
+        """Smallest gap [m] since the start and how finely the substeps resolve contacts; obstacles only."""
+        return self.workspace.watch.resolution()
 
     def compute_energy(self) -> Energy:
         """Total energy [J], a float with `.parts`: kinetic, elastic, gravity, contact."""

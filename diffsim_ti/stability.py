@@ -52,7 +52,7 @@ def stiffness_kernel(law, features, parallel: bool, lanes: bool):
     def stiffness_product(
         tets: t.ints, gradients: t.blocks, volumes: t.blocks, coefficients: t.blocks, start: t.ints,
         corner_of: t.ints, inverse_mass: t.scalars, parameters: t.scalars, rest: t.vectors, surface: t.ints,
-        corner: t.vectors, u: t.vectors2, v: t.vectors2, w: t.vectors2, y: t.vectors2,
+        offsets: t.vectors, corner: t.vectors, u: t.vectors2, v: t.vectors2, w: t.vectors2, y: t.vectors2,
         num_items: ti.i32, num_vertices: ti.i32,
     ):  # fmt: skip
         scene = Bundle(tets=tets, gradients=gradients, volumes=volumes, coefficients=coefficients, start=start,
@@ -66,7 +66,8 @@ def stiffness_kernel(law, features, parallel: bool, lanes: bool):
             if ti.static(len(contacts) > 0):
                 if surface[i] > 0:
                     for k in ti.static(range(len(contacts))):
-                        f += contacts[k].force_jvp(parameters, rest[i], u[0, i], v[0, i], w[0, i], t.vector(0))
+                        X = rest[i] - offsets[k]
+                        f += contacts[k].force_jvp(parameters, X, u[0, i], v[0, i], w[0, i], t.vector(0))
             y[0, i] = f
 
     return stiffness_product
@@ -81,7 +82,7 @@ class Stiffness:
         self.w, self.y = runtime.array(a.vector, 1, a.num_vertices), runtime.array(a.vector, 1, a.num_vertices)
         kernel = stiffness_kernel(a.law, a.features(), workspace.parallel, a.in_lanes)
         state = workspace.state
-        arrays = (*a.topology(), a.corner, state.u, state.v, self.w, self.y)
+        arrays = (*a.topology(), a.offsets, a.corner, state.u, state.v, self.w, self.y)
         self._multiply = runtime.Launch(kernel, *arrays, vectorized=a.in_lanes)
         self.vector, self._random = None, np.random.default_rng(1)
 

@@ -65,7 +65,10 @@ def input_scale(rollout: Rollout, name: str) -> float:
     """A size of change that matters for an input: its own, or for lengths and velocities that of a tetrahedron's edge."""
     mesh = rollout.scene.mesh
     edge = float(np.cbrt(np.mean(mesh.volumes)))
-    if name in ("initial_positions", "rest_positions", "prescribed_motion"):
+    if name.rstrip("_0123456789").endswith("_path"):
+        return 0.1 * edge / max(rollout.steps, 1)  # rows of their own: larger changes would be jumps
+    places = ("_positions", "_motion", "_center", "_point", "_start", "_end", "_position")
+    if name.rstrip("_0123456789").endswith(places):
         return 0.1 * edge
     if name == "initial_velocities":
         return 0.1 * edge / max(rollout.steps * rollout.solver.dt, rollout.solver.dt)

@@ -70,12 +70,24 @@ class SceneArrays:
         first = scene.inputs.first_parameter
         gravity, drag = scene.term(Gravity), scene.term(Drag)
         self._features = dict(
-            contacts=tuple(t.kernel(precision, first(t)) for t in self.contacts),
+            contacts=self._twins(scene), moving=len(scene.moving),
             gravity=first(gravity) if gravity else -1, drag=first(drag) if drag else -1,
             forces=external is not None, motion=scene.motion is not None,
         )  # fmt: skip
+        self.offsets = runtime.array(self.vector, len(self.contacts))  # where obstacles are when one looks between passes
         self.values: Derived | None = None
         self.corner = runtime.array(self.vector, 4 * LANES * self.num_blocks)
+
+    def _twins(self, scene) -> tuple:
+        """Compile-time twins of the contacts; their tables stand behind the parameters, one after the other."""
+        columns, twins, at = {term: k for k, term in enumerate(scene.moving)}, [], max(scene.inputs.num_parameters, 1)
+        self.tables = np.concatenate([np.zeros(0), *(t.table for t in self.contacts)])
+        for term in self.contacts:
+            own = dict(path=columns[term]) if term in columns else {}
+            twins.append(term.kernel(scene.precision, scene.inputs.first_parameter(term),
+                                     **own | (dict(table=at) if term.table.size else {})))  # fmt: skip
+            at += term.table.size
+        return tuple(twins)
 
     def features(self, density: bool = False, shape: bool = False) -> Features:
         """What kernels must contain for the values that are loaded."""
@@ -96,10 +108,12 @@ class SceneArrays:
             "gradients": (to_blocks(values.gradients, self.num_blocks), self.lanes),
             "volumes": (to_blocks(values.volumes, self.num_blocks), self.lanes),
             "coefficients": (self.coefficient_blocks(values.coefficients), self.lanes),
-            "inverse_mass": (inverse_mass, self.fp), "parameters": (values.parameters, self.fp),
+            "inverse_mass": (inverse_mass, self.fp),
+            "parameters": (np.concatenate([values.parameters, self.tables]), self.fp),
             "rest": (values.rest if self.contacts else np.zeros((1, 3)), self.vector),
             "forces": (np.zeros((1, 1, 3)) if values.forces is None else values.forces, self.vector),
             "motion": (np.zeros((1, 1, 3)) if values.motion is None else values.motion, self.vector),
+            "path": (np.zeros((1, 1, 3)) if values.path is None else values.path, self.vector),
             "anchor": (np.zeros((1, 3)) if values.motion is None else values.displacement[self.fixed], self.vector),
         }  # fmt: skip
         for name, (data, dtype) in sources.items():
@@ -110,6 +124,17 @@ class SceneArrays:
             elif old is None or getattr(old, name, None) is not getattr(values, name, data):
                 runtime.fill(current, data)
         return moved
+
+    def place_obstacles(self, row: int, share: float = 0.0) -> None:
+        """Put what looks at a state between passes where the obstacles are: `share` of a step beyond row `row` of paths."""
+        features = self.features()
+        if features.moving:
+            rows, places = runtime.fetch(self.path).astype(np.float64), np.zeros((len(features.contacts), 3))
+            row, after = min(row, len(rows) - 1), min(row + 1, len(rows) - 1)
+            for k, contact in enumerate(features.contacts):
+                if contact.path >= 0:
+                    places[k] = (1 - share) * rows[row, contact.path] + share * rows[after, contact.path]
+            runtime.fill(self.offsets, places)
 
     def coefficient_blocks(self, coefficients: np.ndarray) -> np.ndarray:
         """Blocks of coefficients, shape (K,) or (num_tetrahedra, K); a single block serves all if they are uniform."""

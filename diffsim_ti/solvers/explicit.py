@@ -75,7 +75,7 @@ class ExplicitWorkspace(Workspace):
         kernels = kick_drift_kernels(a.law, a.features(), self.parallel, a.in_lanes)
         launch = self._launch(
             f"step {recording}", kernels.step, *a.topology(), a.force_slot, a.motion_slot, a.forces, a.motion, a.anchor,
-            a.corner, history.u, history.v, history.f, *self.frames,
+            a.path, a.corner, history.u, history.v, history.f, *self.frames, self.watch.array,
         )  # fmt: skip
         stride, substeps, inverse_dt = int(recording), self.solver.substeps, 1 / self.solver.dt
         chunk = 1 if self.parallel else max(1, self.work_per_launch // a.num_tetrahedra)
@@ -83,4 +83,4 @@ class ExplicitWorkspace(Workspace):
             for j in range(start, start + count, chunk):
                 launch(a.num_items, a.num_vertices, j, min(chunk, start + count - j), base or 0, stride, substeps,
                        save_every,
-                       w.lag0, w.lag1, w.pre, w.post, w.alpha, w.decay, inverse_dt)  # fmt: skip
+                       w.lag0, w.lag1, w.pre, w.post, w.alpha, w.decay, inverse_dt, self.solver.substep)  # fmt: skip

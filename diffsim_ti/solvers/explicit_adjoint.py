@@ -26,18 +26,21 @@ class ExplicitAdjoint:
         self.sums = runtime.array(a.fp, self.features.sums()["total"], n)
         self.forces, self.motion = (runtime.array(a.vector, *x.shape) for x in (a.forces, a.motion))
         self.anchor = runtime.array(a.vector, *a.anchor.shape)
+        self.path = runtime.array(a.vector, *a.path.shape)
+        self.felt = runtime.array(a.vector, 2 * self.features.moving, n if self.features.moving else 1)
         self.gradients = runtime.array(a.lanes, 9 * blocks if shape else 1)
         self.volumes = runtime.array(a.lanes, blocks if shape else 1)
         self.frames = tuple(runtime.array(a.vector, *f.shape) for f in workspace.frames)
 
     def fits(self, workspace) -> bool:
         """Whether kernels and shapes are still those of the run."""
-        a, kept = workspace.arrays, (self.forces, *self.frames)
+        a, kept = workspace.arrays, (self.forces, self.path, *self.frames)
         same = self.features == a.features(self.features.density, self.features.shape)
-        return same and all(x.shape == y.shape for x, y in zip(kept, (a.forces, *workspace.frames)))
+        return same and all(x.shape == y.shape for x, y in zip(kept, (a.forces, a.path, *workspace.frames)))
 
     def _sums(self) -> tuple:
-        return (self.coefficients, self.sums, self.forces, self.motion, self.anchor, self.gradients, self.volumes)
+        return (self.coefficients, self.sums, self.forces, self.motion, self.anchor, self.path, self.felt, self.gradients,
+                self.volumes)  # fmt: skip
 
     def start(self, positions_adj: np.ndarray, velocities_adj: np.ndarray, last_frame_is_input: bool) -> None:
         """Set the adjoints of the frames, shape (frames, n, 3), and clear the rest.
@@ -57,7 +60,7 @@ class ExplicitAdjoint:
         ws, a = self.ws, self.ws.arrays
         history = ws.record
         launch = ws._launch(
-            "vjp", self.kernels.step_vjp, *a.topology(), a.force_slot, a.motion_slot, self.corner,
+            "vjp", self.kernels.step_vjp, *a.topology(), a.force_slot, a.motion_slot, a.path, self.corner,
             history.u, history.v, history.f, self.u, self.v, self.w, *self._sums(), *self.frames,
         )  # fmt: skip
         substeps, inverse_dt = ws.solver.substeps, 1 / ws.solver.dt
@@ -68,7 +71,7 @@ class ExplicitAdjoint:
                 begin = max(start, end - chunk)
                 launch(a.num_items, a.num_vertices, begin, end - begin, base, num_passes, substeps, save_every, w.lag0,
                        w.lag1, w.pre, w.post,
-                       w.alpha, w.decay, inverse_dt, w.alpha_by_rate, w.decay_by_rate)  # fmt: skip
+                       w.alpha, w.decay, inverse_dt, ws.solver.substep, w.alpha_by_rate, w.decay_by_rate)  # fmt: skip
                 end = begin
 
     def finish(self) -> None:
@@ -113,6 +116,8 @@ class ExplicitAdjoint:
         if out.motion is not None:
             out.motion = runtime.fetch(self.motion).astype(np.float64)
             out.displacement[a.fixed] += runtime.fetch(self.anchor)
+        if out.path is not None:
+            out.path = runtime.fetch(self.path).astype(np.float64)
         return out
 
 
@@ -133,7 +138,8 @@ class ExplicitTangent:
             runtime.upload(a.coefficient_blocks(dots.coefficients), a.lanes), runtime.upload(dots.mass, a.fp),
             runtime.upload(dots.parameters, a.fp), runtime.upload(dots.rest, a.vector),
             runtime.upload(np.zeros((1, 1, 3)) if dots.forces is None else dots.forces, a.vector),
-            runtime.upload(motion, a.vector), runtime.upload(anchor, a.vector), 
+            runtime.upload(motion, a.vector), runtime.upload(anchor, a.vector),
+            runtime.upload(np.zeros((1, 1, 3)) if dots.path is None else dots.path, a.vector),
             runtime.upload(to_blocks(dots.gradients, a.num_blocks), a.lanes),
             runtime.upload(to_blocks(dots.volumes, a.num_blocks), a.lanes),
         )  # fmt: skip
@@ -144,14 +150,14 @@ class ExplicitTangent:
         """Tangent of passes first .. last - 1, recorded from slot 0."""
         ws, a, history = self.ws, self.ws.arrays, self.ws.record
         launch = runtime.Launch(
-            self.kernels.step_jvp, *a.topology(), a.force_slot, a.motion_slot, a.corner, history.u, history.v,
+            self.kernels.step_jvp, *a.topology(), a.force_slot, a.motion_slot, a.path, a.corner, history.u, history.v,
             history.f, self.u, self.v, *self._dots, *self.frames, vectorized=a.in_lanes,
         )  # fmt: skip
         for start, count, w in ws.solver.groups(first, last, num_passes, ws.rate):
             for j in range(start, start + count):
                 launch(a.num_items, a.num_vertices, j, first, ws.solver.substeps, save_every, w.lag0, w.lag1, w.pre,
-                       w.post, w.alpha, w.decay,
-                       1 / ws.solver.dt, w.alpha_by_rate * self._rate_dot, w.decay_by_rate * self._rate_dot)  # fmt: skip
+                       w.post, w.alpha, w.decay, 1 / ws.solver.dt, ws.solver.substep, w.alpha_by_rate * self._rate_dot,
+                       w.decay_by_rate * self._rate_dot)  # fmt: skip
 
     def save_frame(self, frame: int) -> None:
         """Copy the current tangent to a frame."""

@@ -3,11 +3,13 @@
     a      = f(u) / m + g                       forces at displacement u
     v_mid  = v + pre a                          the velocity at this time (what frames show)
     v+     = v_mid + post a
-    u'     = u + alpha v+
-    v'     = decay v+                           damping, a stage of its own after the forces
+    vs     = friction of the obstacles on v+    implicit, in closed form (terms/friction.py), over the time h
+    u'     = u + alpha vs
+    v'     = decay vs                           damping, a stage of its own after the forces
 
 Symplectic Euler: pre = 0, post = h, alpha = h decay. Velocity Verlet: pre = post = h / 2 (the two half kicks that meet at a
-time share one force evaluation), alpha = h (1 + decay) / 2. Below each pass stand its tangent and its mirror.
+time share one force evaluation), alpha = h (1 + decay) / 2. Friction acts where there is a drift, so that
+it acts for the whole time of a run. Below each pass stand its tangent and its mirror.
 
 A run's slot j holds the state before pass j. With stride 0 everything happens in slot 0 (forward only); with stride 1
 each pass writes the next slot, which is what the mirror reads.
@@ -20,6 +22,7 @@ from types import SimpleNamespace
 import taichi as ti
 
 from diffsim_ti.runtime import Bundle
+from diffsim_ti.solvers.contact_stages import contact_functions
 from diffsim_ti.tetrahedron import A, element_functions
 
 
@@ -33,6 +36,7 @@ class Features:
     forces: bool = False
     forces_per_step: bool = False
     motion: bool = False
+    moving: int = 0  # obstacles that follow a path
     uniform: bool = True  # one set of coefficients for all tetrahedra
     density: bool = False  # the last two: adjoints that cost extra, only if asked for
     shape: bool = False
@@ -59,6 +63,8 @@ def kick_drift_kernels(law, features: Features, parallel: bool, lanes: bool) -> 
     t = el.types
     fp, vector = t.fp, t.vector
     contacts, has_contacts = features.contacts, len(features.contacts) > 0
+    touching = contact_functions(features, fp)
+    rough, place_of, gravity = touching.rough, touching.place_of, touching.gravity
     row = features.sums()
 
     @ti.func
@@ -75,11 +81,6 @@ def kick_drift_kernels(law, features: Features, parallel: bool, lanes: bool) -> 
             if ti.static(features.forces_per_step):
                 f = half() * (forces[(j - plan.lag0) // plan.substeps, k] + forces[(j - plan.lag1) // plan.substeps, k])
         return f
-
-    @ti.func
-    def gravity(parameters: A):
-        g = ti.static(features.gravity)
-        return vector(parameters[g], parameters[g + 1], parameters[g + 2], ti.cast(0, fp))
 
     @ti.func
     def moved(i, scene: A):
@@ -112,7 +113,7 @@ def kick_drift_kernels(law, features: Features, parallel: bool, lanes: bool) -> 
         if ti.static(has_contacts):
             if scene.surface[i] > 0:
                 for k in ti.static(range(len(contacts))):
-                    f += contacts[k].force(scene.parameters, scene.rest[i], u, v)
+                    f += contacts[k].force(scene.parameters, scene.rest[i] - place_of(k, j, scene.path, plan), u, v)
         if ti.static(features.forces):
             f += force_at(i, j, scene, scene.forces, plan)
         a = scene.inverse_mass[i] * f
@@ -125,6 +126,9 @@ def kick_drift_kernels(law, features: Features, parallel: bool, lanes: bool) -> 
             state.frames_u[j // plan.save_every, i] = u
             state.frames_v[j // plan.save_every, i] = v_mid
         v_plus = v_mid + plan.post * a
+        if ti.static(len(rough) > 0):
+            if plan.alpha > 0 and scene.surface[i] > 0:
+                v_plus = touching.slow(i, j, u, v_plus, scene, plan)
         # drift and damping
         u_next, v_next = u + plan.alpha * v_plus, plan.decay * v_plus
         # prescribed motion
@@ -137,6 +141,9 @@ def kick_drift_kernels(law, features: Features, parallel: bool, lanes: bool) -> 
                     change = scene.motion[r + 1, k] - scene.motion[r, k]
                     u_next = scene.anchor[k] + scene.motion[r, k] + fraction(j, plan) * change
                     v_next = plan.inverse_dt * change
+        if ti.static(has_contacts):
+            if scene.surface[i] > 0:
+                touching.look(i, j, u, u_next, scene, state, plan)
         if plan.stride > 0:
             state.f[s, i] = f
         state.u[t, i] = u_next
@@ -146,18 +153,19 @@ def kick_drift_kernels(law, features: Features, parallel: bool, lanes: bool) -> 
     def step(tets: t.ints, gradients: t.blocks, volumes: t.blocks, coefficients: t.blocks, start: t.ints,
              corner_of: t.ints, inverse_mass: t.scalars, parameters: t.scalars, rest: t.vectors, surface: t.ints,
              force_slot: t.ints, motion_slot: t.ints, forces: t.vectors2, motion: t.vectors2, anchor: t.vectors,
-             corner: t.vectors, u: t.vectors2, v: t.vectors2, f: t.vectors2, frames_u: t.vectors2, frames_v: t.vectors2,
+             path: t.vectors2, corner: t.vectors, u: t.vectors2, v: t.vectors2, f: t.vectors2, frames_u: t.vectors2,
+             frames_v: t.vectors2, watch: t.scalars2,
              num_items: ti.i32, num_vertices: ti.i32, first: ti.i32, count: ti.i32, base: ti.i32, stride: ti.i32,
              substeps: ti.i32, save_every: ti.i32,
-             lag0: ti.i32, lag1: ti.i32, pre: fp, post: fp, alpha: fp, decay: fp, inverse_dt: fp):  # fmt: skip
+             lag0: ti.i32, lag1: ti.i32, pre: fp, post: fp, alpha: fp, decay: fp, inverse_dt: fp, h: fp):  # fmt: skip
         """`count` passes. Slot 0 holds the state before pass `base`; with stride 1 forces are recorded too."""
         scene = Bundle(tets=tets, gradients=gradients, volumes=volumes, coefficients=coefficients, start=start,
                        corner_of=corner_of, inverse_mass=inverse_mass, parameters=parameters, rest=rest,
                        surface=surface, force_slot=force_slot, motion_slot=motion_slot, forces=forces, motion=motion,
-                       anchor=anchor, corner=corner)  # fmt: skip
-        state = Bundle(u=u, v=v, f=f, frames_u=frames_u, frames_v=frames_v)
+                       anchor=anchor, path=path, corner=corner)  # fmt: skip
+        state = Bundle(u=u, v=v, f=f, frames_u=frames_u, frames_v=frames_v, watch=watch)
         plan = Bundle(base=base, stride=stride, substeps=substeps, save_every=save_every, lag0=lag0, lag1=lag1, pre=pre,
-                      post=post, alpha=alpha, decay=decay, inverse_dt=inverse_dt)  # fmt: skip
+                      post=post, alpha=alpha, decay=decay, inverse_dt=inverse_dt, h=h)  # fmt: skip
         if ti.static(parallel):
             for e in range(num_items):
                 el.forces(e, scene, u, (first - base) * stride, corner)
@@ -181,8 +189,9 @@ def kick_drift_kernels(law, features: Features, parallel: bool, lanes: bool) -> 
         if ti.static(has_contacts):
             if scene.surface[i] > 0:
                 for k in ti.static(range(len(contacts))):
-                    X = scene.rest[i]
-                    df += contacts[k].force_jvp(scene.parameters, X, u, v, du + dots.rest[i], dv)
+                    X = scene.rest[i] - place_of(k, j, scene.path, plan)
+                    dX = dots.rest[i] - place_of(k, j, dots.path, plan)
+                    df += contacts[k].force_jvp(scene.parameters, X, u, v, du + dX, dv)
                     by = contacts[k].parameter_derivatives(scene.parameters, X, u, v)
                     for m in ti.static(range(contacts[k].size)):
                         df += by[m] * dots.parameters[contacts[k].first + m]
@@ -198,6 +207,9 @@ def kick_drift_kernels(law, features: Features, parallel: bool, lanes: bool) -> 
             dots.frames_u[j // plan.save_every, i] = du
             dots.frames_v[j // plan.save_every, i] = dv_mid
         dv_plus, v_plus = dv_mid + plan.post * da, state.v[t, i] / plan.decay
+        if ti.static(len(rough) > 0):
+            if plan.alpha > 0 and scene.surface[i] > 0:
+                dv_plus = touching.slow_jvp(i, j, u, v, du, dv_plus, scene, state, dots, plan)
         du_next = du + plan.alpha * dv_plus + dots.alpha * v_plus
         dv_next = plan.decay * dv_plus + dots.decay * v_plus
         if ti.static(features.motion):
@@ -215,25 +227,28 @@ def kick_drift_kernels(law, features: Features, parallel: bool, lanes: bool) -> 
     @ti.kernel
     def step_jvp(tets: t.ints, gradients: t.blocks, volumes: t.blocks, coefficients: t.blocks, start: t.ints,
                  corner_of: t.ints, inverse_mass: t.scalars, parameters: t.scalars, rest: t.vectors, surface: t.ints,
-                 force_slot: t.ints, motion_slot: t.ints, corner: t.vectors, u: t.vectors2, v: t.vectors2,
-                 f: t.vectors2, du: t.vectors2, dv: t.vectors2, coefficients_dot: t.blocks, mass_dot: t.scalars,
+                 force_slot: t.ints, motion_slot: t.ints, path: t.vectors2, corner: t.vectors, u: t.vectors2,
+                 v: t.vectors2, f: t.vectors2, du: t.vectors2, dv: t.vectors2,
+                 coefficients_dot: t.blocks, mass_dot: t.scalars,
                  parameters_dot: t.scalars, rest_dot: t.vectors, forces_dot: t.vectors2, motion_dot: t.vectors2,
-                 anchor_dot: t.vectors, gradients_dot: t.blocks, volumes_dot: t.blocks, frames_du: t.vectors2,
+                 anchor_dot: t.vectors, path_dot: t.vectors2,
+                 gradients_dot: t.blocks, volumes_dot: t.blocks, frames_du: t.vectors2,
                  frames_dv: t.vectors2, num_items: ti.i32, num_vertices: ti.i32, j: ti.i32, base: ti.i32,
                  substeps: ti.i32, save_every: ti.i32, lag0: ti.i32,
-                 lag1: ti.i32, pre: fp, post: fp, alpha: fp, decay: fp, inverse_dt: fp, alpha_dot: fp,
-                 decay_dot: fp):  # fmt: skip
+                 lag1: ti.i32, pre: fp, post: fp, alpha: fp, decay: fp, inverse_dt: fp, h: fp,
+                 alpha_dot: fp, decay_dot: fp):  # fmt: skip
         """The tangent of pass j along recorded slots; du, dv are advanced in place."""
         scene = Bundle(tets=tets, gradients=gradients, volumes=volumes, coefficients=coefficients, start=start,
                        corner_of=corner_of, inverse_mass=inverse_mass, parameters=parameters, rest=rest,
-                       surface=surface, force_slot=force_slot, motion_slot=motion_slot, corner=corner)  # fmt: skip
+                       surface=surface, force_slot=force_slot, motion_slot=motion_slot, path=path,
+                       corner=corner)  # fmt: skip
         state = Bundle(u=u, v=v, f=f)
         dots = Bundle(u=du, v=dv, coefficients=coefficients_dot, mass=mass_dot, parameters=parameters_dot, rest=rest_dot,
-                      forces=forces_dot, motion=motion_dot, anchor=anchor_dot, gradients=gradients_dot,
-                      volumes=volumes_dot, frames_u=frames_du, frames_v=frames_dv, alpha=alpha_dot,
+                      forces=forces_dot, motion=motion_dot, anchor=anchor_dot, path=path_dot,
+                      gradients=gradients_dot, volumes=volumes_dot, frames_u=frames_du, frames_v=frames_dv, alpha=alpha_dot,
                       decay=decay_dot)  # fmt: skip
         plan = Bundle(base=base, substeps=substeps, save_every=save_every, lag0=lag0, lag1=lag1, pre=pre, post=post,
-                      alpha=alpha, decay=decay, inverse_dt=inverse_dt)  # fmt: skip
+                      alpha=alpha, decay=decay, inverse_dt=inverse_dt, h=h)  # fmt: skip
         ti.loop_config(serialize=not parallel)
         for e in range(num_items):
             el.forces_jvp(e, scene, u, j - base, du, corner, dots)
@@ -268,6 +283,10 @@ def kick_drift_kernels(law, features: Features, parallel: bool, lanes: bool) -> 
             v_plus = state.v[t, i] / plan.decay
             by_rate = plan.alpha_by_rate * p.dot(v_plus) + plan.decay_by_rate * q.dot(v_plus)
             adjoint.sums[row["drag"], i] = adjoint.sums[row["drag"], i] + by_rate
+        if ti.static(len(rough) > 0):
+            if plan.alpha > 0 and scene.surface[i] > 0:
+                by_u, v_plus_adj = touching.slow_vjp(i, j, u, v, v_plus_adj, scene, state, adjoint, plan)
+                p += by_u
         # kick, frame, kick
         v_mid_adj = v_plus_adj
         if is_saved(j, plan):
@@ -295,10 +314,12 @@ def kick_drift_kernels(law, features: Features, parallel: bool, lanes: bool) -> 
         if ti.static(has_contacts):
             if scene.surface[i] > 0:
                 for c in ti.static(range(len(contacts))):
-                    by_u, by_v = contacts[c].force_vjp(scene.parameters, scene.rest[i], u, v, f_adj)
+                    X = scene.rest[i] - place_of(c, j, scene.path, plan)
+                    by_u, by_v = contacts[c].force_vjp(scene.parameters, X, u, v, f_adj)
                     p += by_u
                     q += by_v
-                    by = contacts[c].parameter_derivatives(scene.parameters, scene.rest[i], u, v)
+                    touching.hand_to_path(c, i, j, by_u, vector(0), adjoint, plan)
+                    by = contacts[c].parameter_derivatives(scene.parameters, X, u, v)
                     for m in ti.static(range(contacts[c].size)):
                         at = ti.static(row["contacts"] + contacts[c].first - contacts[0].first + m)
                         adjoint.sums[at, i] = adjoint.sums[at, i] + (by[m].dot(f_adj))
@@ -318,13 +339,15 @@ def kick_drift_kernels(law, features: Features, parallel: bool, lanes: bool) -> 
     @ti.kernel
     def step_vjp(tets: t.ints, gradients: t.blocks, volumes: t.blocks, coefficients: t.blocks, start: t.ints,
                  corner_of: t.ints, inverse_mass: t.scalars, parameters: t.scalars, rest: t.vectors, surface: t.ints,
-                 force_slot: t.ints, motion_slot: t.ints, corner: t.vectors, u: t.vectors2, v: t.vectors2,
-                 f: t.vectors2, u_adj: t.vectors2, v_adj: t.vectors2, w: t.vectors2, coefficients_adj: t.blocks,
+                 force_slot: t.ints, motion_slot: t.ints, path: t.vectors2, corner: t.vectors, u: t.vectors2,
+                 v: t.vectors2, f: t.vectors2, u_adj: t.vectors2, v_adj: t.vectors2, w: t.vectors2,
+                 coefficients_adj: t.blocks,
                  sums: t.scalars2, forces_adj: t.vectors2, motion_adj: t.vectors2, anchor_adj: t.vectors,
+                 path_adj: t.vectors2, felt: t.vectors2,
                  gradients_adj: t.blocks, volumes_adj: t.blocks, frames_u_adj: t.vectors2, frames_v_adj: t.vectors2,
                  num_items: ti.i32, num_vertices: ti.i32, first: ti.i32, count: ti.i32, base: ti.i32, end: ti.i32,
                  substeps: ti.i32, save_every: ti.i32,
-                 lag0: ti.i32, lag1: ti.i32, pre: fp, post: fp, alpha: fp, decay: fp, inverse_dt: fp,
+                 lag0: ti.i32, lag1: ti.i32, pre: fp, post: fp, alpha: fp, decay: fp, inverse_dt: fp, h: fp,
                  alpha_by_rate: fp, decay_by_rate: fp):  # fmt: skip
         """The mirror of passes first + count - 1 .. first; `end` is the run's number of passes.
 
@@ -332,19 +355,22 @@ def kick_drift_kernels(law, features: Features, parallel: bool, lanes: bool) -> 
         """
         scene = Bundle(tets=tets, gradients=gradients, volumes=volumes, coefficients=coefficients, start=start,
                        corner_of=corner_of, inverse_mass=inverse_mass, parameters=parameters, rest=rest,
-                       surface=surface, force_slot=force_slot, motion_slot=motion_slot)  # fmt: skip
+                       surface=surface, force_slot=force_slot, motion_slot=motion_slot, path=path)  # fmt: skip
         state = Bundle(u=u, v=v, f=f)
         adjoint = Bundle(u=u_adj, v=v_adj, w=w, corner=corner, coefficients=coefficients_adj, sums=sums,
-                         forces=forces_adj, motion=motion_adj, anchor=anchor_adj, gradients=gradients_adj,
-                         volumes=volumes_adj, frames_u=frames_u_adj, frames_v=frames_v_adj)  # fmt: skip
+                         forces=forces_adj, motion=motion_adj, anchor=anchor_adj, path=path_adj, felt=felt,
+                         gradients=gradients_adj, volumes=volumes_adj, frames_u=frames_u_adj,
+                         frames_v=frames_v_adj)  # fmt: skip
         plan = Bundle(base=base, end=end, substeps=substeps, save_every=save_every, lag0=lag0, lag1=lag1, pre=pre,
-                      post=post, alpha=alpha, decay=decay, inverse_dt=inverse_dt, alpha_by_rate=alpha_by_rate,
+                      post=post, alpha=alpha, decay=decay, inverse_dt=inverse_dt, h=h, alpha_by_rate=alpha_by_rate,
                       decay_by_rate=decay_by_rate)  # fmt: skip
         if ti.static(parallel):
             for i in range(num_vertices):
                 vertex_vjp(i, first, scene, state, adjoint, plan)
             for e in range(num_items):
                 tetrahedron_vjp(e, first, scene, state, adjoint, plan)
+            for c in range(features.moving):
+                touching.fold_path(c, first, num_vertices, adjoint, plan)
         else:
             ti.loop_config(serialize=True)
             for k in range(count):
@@ -352,6 +378,8 @@ def kick_drift_kernels(law, features: Features, parallel: bool, lanes: bool) -> 
                     vertex_vjp(i, first + count - 1 - k, scene, state, adjoint, plan)
                 for e in range(num_items):
                     tetrahedron_vjp(e, first + count - 1 - k, scene, state, adjoint, plan)
+                for c in range(features.moving):
+                    touching.fold_path(c, first + count - 1 - k, num_vertices, adjoint, plan)
 
     @ti.kernel
     def finish_vjp(start: t.ints, corner_of: t.ints, corner: t.vectors, u_adj: t.vectors2, num_vertices: ti.i32):

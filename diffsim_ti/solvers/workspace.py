@@ -3,6 +3,7 @@
 from diffsim_ti import runtime
 from diffsim_ti.inputs import Derived
 from diffsim_ti.solvers.arrays import History, SceneArrays, copy_slot, first_bad_vertex
+from diffsim_ti.solvers.watch import ContactWatch
 
 
 class Workspace:
@@ -16,6 +17,7 @@ class Workspace:
         self.state = self.history(1)
         self.record: History | None = None
         self.frames = (runtime.array(self.arrays.vector, 1, 1), runtime.array(self.arrays.vector, 1, 1))
+        self.watch = ContactWatch(self)
         self._launches = {}
         self.load(derived)
 
@@ -34,6 +36,13 @@ class Workspace:
         """Set the state to the start."""
         runtime.fill(self.state.u, self.arrays.values.displacement[None])
         runtime.fill(self.state.v, self.arrays.values.velocity[None])
+        self.arrays.place_obstacles(0)
+        self.watch.clear()
+
+    def place_obstacles(self, now: int) -> None:
+        """Put obstacles where they are before pass `now`, for what looks at the state there."""
+        row, part = divmod(now, self.solver.substeps)
+        self.arrays.place_obstacles(row, part / self.solver.substeps)
 
     def forget(self) -> None:
         """The state was set from outside: forget what came before it."""

@@ -1,10 +1,19 @@
 """Loads, contacts and damping: one per file."""
 
+from diffsim_ti.terms.ball import Capsule, Sphere
+from diffsim_ti.terms.box import Box, Cylinder
 from diffsim_ti.terms.drag import Drag
 from diffsim_ti.terms.external_force import ExternalForce
 from diffsim_ti.terms.gravity import Gravity
 from diffsim_ti.terms.ground import Ground
+from diffsim_ti.terms.half_space import HalfSpace
+from diffsim_ti.terms.mesh_obstacle import MeshObstacle
+from diffsim_ti.terms.obstacle import Obstacle
 from diffsim_ti.terms.term import Term, VertexForce
 
-TERMS = (Gravity, Drag, Ground, ExternalForce)
-__all__ = ["Drag", "ExternalForce", "Gravity", "Ground", "Term", "TERMS", "VertexForce"]
+OBSTACLES = (Ground, HalfSpace, Sphere, Box, Capsule, Cylinder, MeshObstacle)
+TERMS = (Gravity, Drag, ExternalForce, *OBSTACLES)
+__all__ = [
+    "Box", "Capsule", "Cylinder", "Drag", "ExternalForce", "Gravity", "Ground", "HalfSpace", "MeshObstacle", "OBSTACLES",
+    "Obstacle", "Sphere", "Term", "TERMS", "VertexForce",
+]  # fmt: skip

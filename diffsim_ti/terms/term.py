@@ -18,6 +18,8 @@ class Term(ABC):
     """
 
     acts_on_surface = False
+    path = None  # displacement over time, of an obstacle that moves
+    table = np.zeros(0)  # numbers without gradient, laid behind the parameters on the device
 
     def __init__(self, **values):
         self.values = {name: np.array(value, dtype=np.float64) for name, value in values.items()}
@@ -29,11 +31,18 @@ class Term(ABC):
     def check(self, mesh) -> None:
         """Raise ValueError if the term does not fit the mesh."""
 
+    def settled(self, scene, density, initial_positions, initial_velocities) -> "Term":
+        """The term with what it leaves to the scene to choose."""
+        return self
+
     def check_start(self, positions: np.ndarray, surface: np.ndarray) -> None:
         """Raise ValueError if the body may not start at `positions` [m], shape (num_vertices, 3)."""
 
     def kernel(self, precision: str, first: int) -> "VertexForce | None":
-        """Compile-time twin; `first` is where its numbers start in the scene's parameter array."""
+        """Compile-time twin; `first` is where its numbers start in the scene's parameter array.
+
+        A term with a path or a table is also given `path`, its column among those that move, and `table`, where it starts.
+        """
         return None
 
     def __repr__(self) -> str:
@@ -56,6 +65,8 @@ class VertexForce(ABC):
     precision: str
     first: int
     size = 0
+    # of obstacles only (terms/obstacle.py): is there friction, the column of the path, are nearness and crossing noted?
+    friction, path, watched = False, -1, False
 
     @property
     def fp(self):

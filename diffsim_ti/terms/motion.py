@@ -1,0 +1,21 @@
+"""A motion that is given over time, read at some times."""
+
+import numpy as np
+
+
+def sampled(name: str, motion, times, k: int) -> np.ndarray:
+    """A motion of k points at each time [s], shape (len(times), k, 3) [m].
+
+    motion: a function of time that returns 3 numbers or shape (k, 3), or keyframes (times, displacements).
+    """
+    if callable(motion):
+        out = np.array([np.broadcast_to(np.asarray(motion(float(t)), np.float64), (k, 3)) for t in times])
+    else:
+        at, to = (np.asarray(part, np.float64) for part in motion)
+        to = np.broadcast_to(to[:, None, :] if to.ndim == 2 else to, (len(at), k, 3))
+        if np.any(np.diff(at) <= 0):
+            raise ValueError(f"{name}: keyframe times must increase")
+        out = np.stack([np.interp(times, at, column) for column in to.reshape(len(at), -1).T], -1).reshape(-1, k, 3)
+    if not np.all(np.isfinite(out)):
+        raise ValueError(f"{name}: displacements must be finite")
+    return out
