@@ -196,7 +196,8 @@ class ImplicitWorkspace(Workspace):
         if key not in self._preconditioners:
             held = self.potential.held_at
             self.potential.place(np.zeros_like(held))
-            size = np.abs(self.potential.blocks()).sum((1, 2))[:, None]
+            blocks, contact = self.potential.blocks(), self.potential.contact_blocks()
+            size = np.abs(blocks if contact is None else blocks - contact).sum((1, 2))[:, None]
             self.potential.place(held)
             kind = Multigrid if self._wants_multigrid(size, mass) else BlockJacobi
             if len(self._preconditioners) > 2:
@@ -243,6 +244,7 @@ class ImplicitWorkspace(Workspace):
             middle = u[fixed] + (place - u[fixed]) / stage.c0
             start = start.copy()
             start[fixed] = middle
+        self.begin(j, stage, u, x)
         start = self._admissible(start, u)
         u_star = self.newton.solve(start, mass, inertial, loads, leave_saddles=stage.static)
         v_star = (u_star - x) / stage.gamma
@@ -275,7 +277,39 @@ class ImplicitWorkspace(Workspace):
             return np.zeros(0)
         surface = self.scene.mesh.surface_vertices
         at = a.values.rest[surface] + u[surface]
-        return np.concatenate([term.gap(at) for term in a.contacts])
+        return np.concatenate([term.gap(at, self._walls[3 * k]) for k, term in enumerate(a.contacts)])
+
+    def begin(self, j: int, stage: Stage, u: np.ndarray, x: np.ndarray) -> None:
+        """Tell the potential where obstacles are in pass j and where friction is measured from."""
+        self._walls = self.walls(self.arrays.values.path, j, stage)
+        self.potential.begin(u, x, 1 / stage.gamma, self._walls)
+
+    def walls(self, path: np.ndarray | None, j: int, stage: Stage) -> np.ndarray:
+        """Three rows for each obstacle: displacement where forces are taken, displacement before, velocity."""
+        twins = self.arrays.features().contacts
+        out = np.zeros((3 * len(twins), 3))
+        if path is not None:
+            path = runtime.fetch(self.arrays.path).astype(np.float64) if path is self.arrays.values.path else path
+            r, s = divmod(j, self.solver.substeps)
+            change = path[r + 1] - path[r]
+            before = path[r] + s / self.solver.substeps * change
+            for k, c in enumerate(twins):
+                if c.path >= 0:
+                    to_stage = 1 / (self.solver.substeps * stage.c0)
+                    at_stage, speed = before + to_stage * change, change / self.solver.dt
+                    out[3 * k : 3 * k + 3] = at_stage[c.path], before[c.path], speed[c.path]
+        return out
+
+    def walls_vjp(self, walls_adj: np.ndarray, j: int, stage: Stage, path_adj: np.ndarray) -> None:
+        """Add the adjoints of the rows of paths for those of `walls`."""
+        r, s = divmod(j, self.solver.substeps)
+        share = s / self.solver.substeps
+        at_stage = share + 1 / (self.solver.substeps * stage.c0)
+        for k, c in enumerate(self.arrays.features().contacts):
+            if c.path >= 0:
+                by_stage, by_before, by_speed = walls_adj[3 * k : 3 * k + 3]
+                path_adj[r, c.path] += (1 - at_stage) * by_stage + (1 - share) * by_before - by_speed / self.solver.dt
+                path_adj[r + 1, c.path] += at_stage * by_stage + share * by_before + by_speed / self.solver.dt
 
     def prescribed(self, j: int) -> tuple:
         """(displacement [m], velocity [m/s]) of the fixed vertices after pass j; None where they are held."""

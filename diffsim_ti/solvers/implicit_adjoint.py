@@ -30,6 +30,7 @@ class _Passes:
         self.x, self.y = ws.inertial(stage, self.u, self.v, self.before)
         self.u_star = (self.u_next - (1 - stage.c0) * self.u) / stage.c0
         self.mass = stage.inertia * ws.mass
+        ws.begin(j, stage, self.u, self.x)
         ws.potential.place(self.u_star)
         self.operator = Operator(ws.potential, self.mass, ws.free)
         self._preconditioner = None
@@ -74,8 +75,11 @@ class ImplicitAdjoint(_Passes):
         self.gradients = runtime.array(a.lanes, 9 * blocks if shape else 1)
         self.volumes = runtime.array(a.lanes, blocks if shape else 1)
         p = self.potential = workspace.potential
-        self._vjp = runtime.Launch(kernel, *a.topology(), a.corner, p.u, p.w, p.y, self.coefficients, self.gradients,
-                                   self.volumes, self.sums, vectorized=a.in_lanes)  # fmt: skip
+        contacts = len(a.features().contacts)
+        self.lag = runtime.array(a.vector, 2, n if p.rubs else 1)
+        self.walls = runtime.array(a.vector, 3 * contacts, n if contacts else 1)
+        self._vjp = runtime.Launch(kernel, *p.common(), a.corner, p.u, p.w, p.y, self.coefficients, self.gradients,
+                                   self.volumes, self.sums, self.lag, self.walls, vectorized=a.in_lanes)  # fmt: skip
 
     def fits(self, workspace) -> bool:
         """Whether kernels and arrays are still those of the run."""
@@ -93,6 +97,7 @@ class ImplicitAdjoint(_Passes):
         self.mass_adj, self.gravity, self.rate = np.zeros(len(self.p)), np.zeros(3), 0.0
         self.forces = None if a.values.forces is None else np.zeros_like(a.values.forces)
         self.motion = None if a.values.motion is None else np.zeros_like(a.values.motion)
+        self.path = None if a.values.path is None else np.zeros_like(a.values.path)
         self.anchor = np.zeros((len(a.fixed), 3))
 
     def reverse(self, base: int, last: int, num_passes: int, save_every: int, stop: int) -> None:
@@ -112,7 +117,9 @@ class ImplicitAdjoint(_Passes):
         # the equation
         by_star = self.solve(s.c0 * p_free + s.e0 / s.gamma * q_free)
         runtime.fill(ws.potential.w, by_star[None])
-        self._vjp(ws.arrays.num_items, ws.arrays.num_vertices)
+        for target in (self.lag, self.walls):
+            runtime.fill(target, 0)
+        self._vjp(ws.arrays.num_items, ws.arrays.num_vertices, ws.potential.per_gamma)
         reaction = runtime.fetch(ws.potential.y)[0].astype(np.float64)
         share = ws.load_share(j, s)
         self.gravity += share * (ws.mass * by_star).sum(0)
@@ -123,12 +130,18 @@ class ImplicitAdjoint(_Passes):
         # where inertia starts from
         inertial = self.mass * by_star
         x_adj = inertial - s.e0 / s.gamma * q_free
+        by_lag = np.zeros_like(p)
+        if ws.potential.rubs:
+            by_lag, by_x = runtime.fetch(self.lag).astype(np.float64)
+            x_adj = x_adj + by_x
+        if self.path is not None:
+            ws.walls_vjp(runtime.fetch(self.walls).astype(np.float64).sum(1), j, s, self.path)
         y_adj = s.gamma * inertial + s.e1 * q_free
         db0, db1, de0, de1 = s.by_rate
         self.rate += db0 * (y_adj * self.v).sum() + de0 * (q_free * self.v_star).sum() + de1 * (q_free * self.y).sum()
         if self.before is not None:
             self.rate += db1 * (y_adj * self.before[1]).sum()
-        u_adj = s.a0 * x_adj + (1 - s.c0) * p_free if not s.static else np.zeros_like(p)
+        u_adj = s.a0 * x_adj + (1 - s.c0) * p_free + by_lag
         v_adj = s.b0 * y_adj
         # prescribed places
         if len(fixed):
@@ -179,7 +192,7 @@ class ImplicitAdjoint(_Passes):
             out.rest = out.rest + sums[rows["rest"] :][:3].T
             out.gradients = from_blocks(runtime.fetch(self.gradients), a.num_tetrahedra, 9).reshape(-1, 3, 3)
             out.volumes = from_blocks(runtime.fetch(self.volumes), a.num_tetrahedra, 1)[:, 0]
-        out.forces, out.motion = self.forces, self.motion
+        out.forces, out.motion, out.path = self.forces, self.motion, self.path
         if self.motion is not None:
             out.displacement[a.fixed] += self.anchor
         return out
@@ -198,9 +211,10 @@ class ImplicitTangent(_Passes):
         self._arrays = (
             runtime.upload(a.coefficient_blocks(dots.coefficients), a.lanes), runtime.upload(dots.parameters, a.fp),
             runtime.upload(dots.rest, a.vector), runtime.upload(to_blocks(dots.gradients, blocks), a.lanes),
-            runtime.upload(to_blocks(dots.volumes, blocks), a.lanes),
+            runtime.upload(to_blocks(dots.volumes, blocks), a.lanes), runtime.array(a.vector, *p.lag.shape),
+            runtime.array(a.vector, *p.walls.shape),
         )  # fmt: skip
-        self._jvp = runtime.Launch(kernel, *a.topology(), a.corner, p.u, p.w, p.y, *self._arrays, vectorized=a.in_lanes)
+        self._jvp = runtime.Launch(kernel, *p.common(), a.corner, p.u, p.w, p.y, *self._arrays, vectorized=a.in_lanes)
         self.rate_dot = float(dots.parameters[a.features().drag]) if a.features().drag >= 0 else 0.0
         self.frames = [], []
 
@@ -223,7 +237,11 @@ class ImplicitTangent(_Passes):
         held = np.zeros_like(self.du)
         held[a.fixed] = self.du[a.fixed] if place is None else self.du[a.fixed] + (place - self.du[a.fixed]) / s.c0
         runtime.fill(ws.potential.w, held[None])
-        self._jvp(a.num_items, a.num_vertices)
+        if ws.potential.rubs:
+            runtime.fill(self._arrays[-2], np.stack([self.du, dx]))
+        if dots.path is not None:
+            runtime.fill(self._arrays[-1], ws.walls(dots.path, j, s))
+        self._jvp(a.num_items, a.num_vertices, ws.potential.per_gamma)
         share = ws.load_share(j, s)
         dR = runtime.fetch(ws.potential.y)[0].astype(np.float64) + dots.mass[:, None] * self.weight(share)
         if a.features().gravity >= 0:

@@ -19,20 +19,38 @@ class Potential:
         self.kernels = potential_kernels(a.law, a.features(), parallel, a.in_lanes)
         n, m = a.num_vertices, a.num_tetrahedra
         self.u, self.w, self.y = (runtime.array(a.vector, 1, n) for _ in range(3))
+        twins = a.features().contacts
+        self.rubs = any(c.friction for c in twins)
+        self.lag = runtime.array(a.vector, 2, n if self.rubs else 1)
+        self.walls = runtime.array(a.vector, 3 * len(twins))
+        self.per_gamma = 1.0
         self._size, self._contact = runtime.array(a.fp, n), runtime.array(a.fp, n)
         self._elastic, self._J = runtime.array(a.fp, m), runtime.array(a.fp, m)
         self._tangent, self._out, self._contact_blocks = None, None, None
         self.held_at = np.zeros((n, 3))
-        sizes, common = (a.num_items, a.num_vertices), a.topology()
+        sizes, common = (a.num_items, a.num_vertices), self.common()
         bind = lambda kernel, *more: self._bind(kernel, common, more, sizes)  # noqa: E731
         self._forces = bind(self.kernels.forces, a.corner, self.u, self.y, self._size)
         self._product = bind(self.kernels.product, a.corner, self.u, self.w, self.y)
-        energy = (a.tets, a.gradients, a.volumes, a.coefficients, a.parameters, a.rest, a.surface, self.u)
-        self._energy = self._bind(self.kernels.energy, energy, (self._elastic, self._J, self._contact), (m, n), False)
+        numbers = (a.tets, a.gradients, a.volumes, a.coefficients, a.parameters, a.rest, a.surface)
+        more = (self.walls, self.lag, self.u, self._elastic, self._J, self._contact)
+        self._energy = self._bind(self.kernels.energy, numbers, more, (m, n), False)
 
     def _bind(self, kernel, arrays, more, sizes, lanes=True):
         launch = runtime.Launch(kernel, *arrays, *more, vectorized=lanes and self.arrays.in_lanes)
-        return lambda: launch(*sizes)
+        return lambda: launch(*sizes, self.per_gamma)
+
+    def common(self) -> tuple:
+        """Arguments that every kernel of tetrahedra and contact starts with."""
+        return (*self.arrays.topology(), self.walls, self.lag)
+
+    def begin(self, u: np.ndarray, x: np.ndarray, per_gamma: float, walls: np.ndarray) -> None:
+        """What contact sees of a pass: its first displacement, x and 1 / gamma, and the obstacles (potential_kernels.py)."""
+        self.per_gamma = per_gamma
+        if self.rubs:
+            runtime.fill(self.lag, np.stack([u, x]))
+        if len(walls):
+            runtime.fill(self.walls, walls)
 
     def place(self, u: np.ndarray) -> np.ndarray:
         """Go to displacement u [m]; returns it as the device holds it."""
@@ -66,7 +84,7 @@ class Potential:
             self._columns = tuple(runtime.array(a.vector, *a.corner.shape) for _ in range(2))
             self._out = runtime.array(a.vector, 3, a.num_vertices) if self._out is None else self._out
             more = (a.corner, *self._columns, self._tangent, self.u, self._out)
-            self._blocks = self._bind(self.kernels.blocks, a.topology(), more, (a.num_items, a.num_vertices))
+            self._blocks = self._bind(self.kernels.blocks, self.common(), more, (a.num_items, a.num_vertices))
         self._blocks()
         return np.swapaxes(runtime.fetch(self._out).astype(np.float64), 0, 1)
 
@@ -81,7 +99,7 @@ class Potential:
         if self._contact_blocks is None:
             a = self.arrays
             self._out = runtime.array(a.vector, 3, a.num_vertices) if self._out is None else self._out
-            arrays = (a.parameters, a.rest, a.surface, self.u, self._out)
+            arrays = (a.parameters, a.rest, a.surface, self.walls, self.lag, self.u, self._out)
             self._contact_blocks = self._bind(self.kernels.contact_blocks, arrays, (), (a.num_vertices,), False)
         self._contact_blocks()
         return np.swapaxes(runtime.fetch(self._out).astype(np.float64), 0, 1)

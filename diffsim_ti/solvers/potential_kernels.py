@@ -1,4 +1,9 @@
-"""Kernels of the potential energy of a displacement: elasticity of all tetrahedra and contact of surface vertices."""
+"""Kernels of the potential energy of a displacement: elasticity of all tetrahedra and contact of surface vertices.
+
+Contact is looked at where obstacles are in the pass: `walls` holds three vectors for each, its displacement where the pass
+takes its forces, its displacement where the pass begins, and its velocity. `lag` holds two rows, the displacement of the
+body where the pass begins, from which friction takes its normal force, and x, so that (u - x) per_gamma is the velocity.
+"""
 
 from functools import lru_cache
 from types import SimpleNamespace
@@ -19,10 +24,11 @@ def potential_kernels(law, features, parallel: bool, lanes: bool) -> SimpleNames
 
     @ti.kernel
     def energy(tets: t.ints, gradients: t.blocks, volumes: t.blocks, coefficients: t.blocks, parameters: t.scalars,
-               rest: t.vectors, surface: t.ints, u: t.vectors2, elastic: t.scalars, J: t.scalars, contact: t.scalars,
-               num_tetrahedra: ti.i32, num_vertices: ti.i32):  # fmt: skip
-        """Energy [J] and volume ratio of each tetrahedron, contact energy [J] of each vertex."""
-        scene = Bundle(tets=tets)
+               rest: t.vectors, surface: t.ints, walls: t.vectors, lag: t.vectors2, u: t.vectors2, elastic: t.scalars,
+               J: t.scalars, contact: t.scalars, num_tetrahedra: ti.i32, num_vertices: ti.i32,
+               per_gamma: fp):  # fmt: skip
+        """Energy [J] and volume ratio of each tetrahedron, energy of contact and friction [J] of each vertex."""
+        scene = Bundle(tets=tets, parameters=parameters, rest=rest, walls=walls, lag=lag, per_gamma=per_gamma)
         ti.loop_config(serialize=not parallel)
         for e in range(num_tetrahedra):
             H = single.edges(e, scene, u, 0).dot(single.gradients_of(e, gradients))
@@ -35,12 +41,33 @@ def potential_kernels(law, features, parallel: bool, lanes: bool) -> SimpleNames
             if ti.static(len(contacts) > 0):
                 if surface[i] > 0:
                     for k in ti.static(range(len(contacts))):
-                        value += contacts[k].energy(parameters, rest[i], u[0, i])
+                        value += contacts[k].energy(parameters, rest[i] - walls[3 * k], u[0, i])
+                        if ti.static(contacts[k].friction):
+                            if rubs(k, i, scene):
+                                v = velocity(i, scene, u[0, i])
+                                lost = contacts[k].dissipation(parameters, X_of(k, i, scene), lag[0, i], v, walls[3 * k + 2])
+                                value += lost / per_gamma
             contact[i] = value
 
     @ti.func
     def volume_ratio(H):
         return (H.matrix() + ti.Matrix.identity(fp, 3)).determinant()
+
+    # ---- contact of a vertex ----------------------------------------------------------------------------------------
+
+    @ti.func
+    def velocity(i, scene: A, u):
+        return scene.per_gamma * (u - scene.lag[1, i])
+
+    @ti.func
+    def X_of(k: A, i, scene: A):
+        """Rest position relative to obstacle k where the pass begins."""
+        return scene.rest[i] - scene.walls[3 * k + 1]
+
+    @ti.func
+    def rubs(k: A, i, scene: A):
+        """Whether friction of obstacle k is felt."""
+        return contacts[k].touches(scene.parameters, X_of(k, i, scene), scene.lag[0, i])
 
     @ti.func
     def contact_force(i, scene: A, u):
@@ -48,26 +75,38 @@ def potential_kernels(law, features, parallel: bool, lanes: bool) -> SimpleNames
         if ti.static(len(contacts) > 0):
             if scene.surface[i] > 0:
                 for k in ti.static(range(len(contacts))):
-                    f += contacts[k].force(scene.parameters, scene.rest[i], u, vector(0))
+                    f += contacts[k].force(scene.parameters, scene.rest[i] - scene.walls[3 * k], u, vector(0))
+                    if ti.static(contacts[k].friction):
+                        if rubs(k, i, scene):
+                            v, wall = velocity(i, scene, u), scene.walls[3 * k + 2]
+                            f += contacts[k].rub(scene.parameters, X_of(k, i, scene), scene.lag[0, i], v, wall)
         return f
 
     @ti.func
     def contact_product(i, scene: A, u, w):
+        """Change of the contact force for a change w of the displacement."""
         f = vector(0)
         if ti.static(len(contacts) > 0):
             if scene.surface[i] > 0:
                 for k in ti.static(range(len(contacts))):
-                    f += contacts[k].force_jvp(scene.parameters, scene.rest[i], u, vector(0), w, vector(0))
+                    X = scene.rest[i] - scene.walls[3 * k]
+                    f += contacts[k].force_jvp(scene.parameters, X, u, vector(0), w, vector(0))
+                    if ti.static(contacts[k].friction):
+                        if rubs(k, i, scene):
+                            v, wall = velocity(i, scene, u), scene.walls[3 * k + 2]
+                            f += contacts[k].rub_product(scene.parameters, X_of(k, i, scene), scene.lag[0, i], v, wall,
+                                                         scene.per_gamma * w)  # fmt: skip
         return f
 
     @ti.kernel
     def forces(tets: t.ints, gradients: t.blocks, volumes: t.blocks, coefficients: t.blocks, start: t.ints,
                corner_of: t.ints, inverse_mass: t.scalars, parameters: t.scalars, rest: t.vectors, surface: t.ints,
-               corner: t.vectors, u: t.vectors2, f: t.vectors2, size: t.scalars, num_items: ti.i32,
-               num_vertices: ti.i32):  # fmt: skip
+               walls: t.vectors, lag: t.vectors2, corner: t.vectors, u: t.vectors2, f: t.vectors2, size: t.scalars,
+               num_items: ti.i32, num_vertices: ti.i32, per_gamma: fp):  # fmt: skip
         """Forces, and the sum of the sizes of what meets at a vertex, against which a rest is measured."""
         scene = Bundle(tets=tets, gradients=gradients, volumes=volumes, coefficients=coefficients, start=start,
-                       corner_of=corner_of, parameters=parameters, rest=rest, surface=surface)  # fmt: skip
+                       corner_of=corner_of, parameters=parameters, rest=rest, surface=surface, walls=walls, lag=lag,
+                       per_gamma=per_gamma)  # fmt: skip
         ti.loop_config(serialize=not parallel)
         for e in range(num_items):
             el.forces(e, scene, u, 0, corner)
@@ -85,11 +124,12 @@ def potential_kernels(law, features, parallel: bool, lanes: bool) -> SimpleNames
     @ti.kernel
     def product(tets: t.ints, gradients: t.blocks, volumes: t.blocks, coefficients: t.blocks, start: t.ints,
                 corner_of: t.ints, inverse_mass: t.scalars, parameters: t.scalars, rest: t.vectors, surface: t.ints,
-                corner: t.vectors, u: t.vectors2, w: t.vectors2, y: t.vectors2, num_items: ti.i32,
-                num_vertices: ti.i32):  # fmt: skip
+                walls: t.vectors, lag: t.vectors2, corner: t.vectors, u: t.vectors2, w: t.vectors2, y: t.vectors2,
+                num_items: ti.i32, num_vertices: ti.i32, per_gamma: fp):  # fmt: skip
         """y = df/du w"""
         scene = Bundle(tets=tets, gradients=gradients, volumes=volumes, coefficients=coefficients, start=start,
-                       corner_of=corner_of, parameters=parameters, rest=rest, surface=surface)  # fmt: skip
+                       corner_of=corner_of, parameters=parameters, rest=rest, surface=surface, walls=walls, lag=lag,
+                       per_gamma=per_gamma)  # fmt: skip
         ti.loop_config(serialize=not parallel)
         for e in range(num_items):
             el.stiffness(e, scene, u, 0, w, corner)
@@ -125,11 +165,13 @@ def potential_kernels(law, features, parallel: bool, lanes: bool) -> SimpleNames
     @ti.kernel
     def blocks(tets: t.ints, gradients: t.blocks, volumes: t.blocks, coefficients: t.blocks, start: t.ints,
                corner_of: t.ints, inverse_mass: t.scalars, parameters: t.scalars, rest: t.vectors, surface: t.ints,
-               corner0: t.vectors, corner1: t.vectors, corner2: t.vectors, tangent: t.blocks, u: t.vectors2,
-               out: t.vectors2, num_items: ti.i32, num_vertices: ti.i32):  # fmt: skip
+               walls: t.vectors, lag: t.vectors2, corner0: t.vectors, corner1: t.vectors, corner2: t.vectors,
+               tangent: t.blocks, u: t.vectors2, out: t.vectors2, num_items: ti.i32, num_vertices: ti.i32,
+               per_gamma: fp):  # fmt: skip
         """d2psi/dF2 of each tetrahedron, and the 3x3 diagonal blocks of -df/du, rows 0..2 of `out`."""
         scene = Bundle(tets=tets, gradients=gradients, volumes=volumes, coefficients=coefficients, start=start,
-                       corner_of=corner_of, parameters=parameters, rest=rest, surface=surface)  # fmt: skip
+                       corner_of=corner_of, parameters=parameters, rest=rest, surface=surface, walls=walls, lag=lag,
+                       per_gamma=per_gamma)  # fmt: skip
         ti.loop_config(serialize=not parallel)
         for e in range(num_items):
             for c in range(9):
@@ -142,10 +184,10 @@ def potential_kernels(law, features, parallel: bool, lanes: bool) -> SimpleNames
             out[2, i] = el.gather(i, scene, corner2) - contact_product(i, scene, u[0, i], vector(0, 0, 1, 0))
 
     @ti.kernel
-    def contact_blocks(parameters: t.scalars, rest: t.vectors, surface: t.ints, u: t.vectors2, out: t.vectors2,
-                       num_vertices: ti.i32):  # fmt: skip
+    def contact_blocks(parameters: t.scalars, rest: t.vectors, surface: t.ints, walls: t.vectors, lag: t.vectors2,
+                       u: t.vectors2, out: t.vectors2, num_vertices: ti.i32, per_gamma: fp):  # fmt: skip
         """The part of contact in `blocks`."""
-        scene = Bundle(parameters=parameters, rest=rest, surface=surface)
+        scene = Bundle(parameters=parameters, rest=rest, surface=surface, walls=walls, lag=lag, per_gamma=per_gamma)
         ti.loop_config(serialize=not parallel)
         for i in range(num_vertices):
             out[0, i] = 0 - contact_product(i, scene, u[0, i], vector(1, 0, 0, 0))
@@ -159,13 +201,16 @@ def potential_kernels(law, features, parallel: bool, lanes: bool) -> SimpleNames
     @ti.kernel
     def vjp(tets: t.ints, gradients: t.blocks, volumes: t.blocks, coefficients: t.blocks, start: t.ints,
             corner_of: t.ints, inverse_mass: t.scalars, parameters: t.scalars, rest: t.vectors, surface: t.ints,
-            corner: t.vectors, u: t.vectors2, w: t.vectors2, y: t.vectors2, coefficients_adj: t.blocks,
-            gradients_adj: t.blocks, volumes_adj: t.blocks, sums: t.scalars2, num_items: ti.i32,
-            num_vertices: ti.i32):  # fmt: skip
-        """y = df/du w (it is symmetric), and adds the adjoints of all that the forces depend on."""
+            walls: t.vectors, lag: t.vectors2, corner: t.vectors, u: t.vectors2, w: t.vectors2, y: t.vectors2,
+            coefficients_adj: t.blocks, gradients_adj: t.blocks, volumes_adj: t.blocks, sums: t.scalars2,
+            lag_adj: t.vectors2, walls_adj: t.vectors2, num_items: ti.i32, num_vertices: ti.i32,
+            per_gamma: fp):  # fmt: skip
+        """y = df/du w (it is symmetric), lag_adj, walls_adj; adds the adjoints of all else that the forces depend on."""
         scene = Bundle(tets=tets, gradients=gradients, volumes=volumes, coefficients=coefficients, start=start,
-                       corner_of=corner_of, parameters=parameters, rest=rest, surface=surface)  # fmt: skip
-        adjoint = Bundle(coefficients=coefficients_adj, gradients=gradients_adj, volumes=volumes_adj)
+                       corner_of=corner_of, parameters=parameters, rest=rest, surface=surface, walls=walls, lag=lag,
+                       per_gamma=per_gamma)  # fmt: skip
+        adjoint = Bundle(coefficients=coefficients_adj, gradients=gradients_adj, volumes=volumes_adj, sums=sums, lag=lag_adj,
+                         walls=walls_adj)  # fmt: skip
         ti.loop_config(serialize=not parallel)
         for e in range(num_items):
             el.forces_vjp(e, scene, u, 0, w, corner, adjoint)
@@ -177,41 +222,89 @@ def potential_kernels(law, features, parallel: bool, lanes: bool) -> SimpleNames
             if ti.static(len(contacts) > 0):
                 if surface[i] > 0:
                     for k in ti.static(range(len(contacts))):
-                        X, x, zero = rest[i], u[0, i], vector(0)
-                        by_u, _ = contacts[k].force_vjp(parameters, X, x, zero, w[0, i])
-                        f += by_u
-                        by = contacts[k].parameter_derivatives(parameters, X, x, zero)
-                        for m in ti.static(range(contacts[k].size)):
-                            to = ti.static(row["contacts"] + contacts[k].first - contacts[0].first + m)
-                            sums[to, i] = sums[to, i] + by[m].dot(w[0, i])
-                        if ti.static(features.shape):
-                            for d in ti.static(range(3)):
-                                sums[row["rest"] + d, i] = sums[row["rest"] + d, i] + by_u[d]
+                        f += contact_vjp(k, i, scene, u[0, i], w[0, i], adjoint)
             y[0, i] = f
+
+    @ti.func
+    def add_to_sums(k: A, i, by, adjoint: A):
+        """Adjoints of the numbers of obstacle k, a tuple."""
+        for m in ti.static(range(contacts[k].size)):
+            to = ti.static(row["contacts"] + contacts[k].first - contacts[0].first + m)
+            adjoint.sums[to, i] = adjoint.sums[to, i] + by[m]
+
+    @ti.func
+    def add_to_rest(i, by_X, adjoint: A):
+        if ti.static(features.shape):
+            for d in ti.static(range(3)):
+                adjoint.sums[row["rest"] + d, i] = adjoint.sums[row["rest"] + d, i] + by_X[d]
+
+    @ti.func
+    def contact_vjp(k: A, i, scene: A, u, w, adjoint: A):
+        X, zero = scene.rest[i] - scene.walls[3 * k], vector(0)
+        by_u, _ = contacts[k].force_vjp(scene.parameters, X, u, zero, w)
+        by = contacts[k].parameter_derivatives(scene.parameters, X, u, zero)
+        for m in ti.static(range(contacts[k].size)):
+            to = ti.static(row["contacts"] + contacts[k].first - contacts[0].first + m)
+            adjoint.sums[to, i] = adjoint.sums[to, i] + by[m].dot(w)
+        add_to_rest(i, by_u, adjoint)
+        adjoint.walls[3 * k, i] = zero - by_u
+        adjoint.walls[3 * k + 1, i] = zero
+        adjoint.walls[3 * k + 2, i] = zero
+        if ti.static(contacts[k].friction):
+            if rubs(k, i, scene):
+                v, wall = velocity(i, scene, u), scene.walls[3 * k + 2]
+                by_lag, by_v, by_wall, by_numbers = contacts[k].rub_vjp(
+                    scene.parameters, X_of(k, i, scene), scene.lag[0, i], v, wall, w
+                )
+                add_to_sums(k, i, by_numbers, adjoint)
+                add_to_rest(i, by_lag, adjoint)
+                by_u += scene.per_gamma * by_v
+                adjoint.lag[0, i] = adjoint.lag[0, i] + by_lag
+                adjoint.lag[1, i] = adjoint.lag[1, i] - scene.per_gamma * by_v
+                adjoint.walls[3 * k + 1, i] = zero - by_lag
+                adjoint.walls[3 * k + 2, i] = by_wall
+        return by_u
 
     @ti.kernel
     def jvp(tets: t.ints, gradients: t.blocks, volumes: t.blocks, coefficients: t.blocks, start: t.ints,
             corner_of: t.ints, inverse_mass: t.scalars, parameters: t.scalars, rest: t.vectors, surface: t.ints,
-            corner: t.vectors, u: t.vectors2, du: t.vectors2, df: t.vectors2, coefficients_dot: t.blocks,
-            parameters_dot: t.scalars, rest_dot: t.vectors, gradients_dot: t.blocks, volumes_dot: t.blocks,
-            num_items: ti.i32, num_vertices: ti.i32):  # fmt: skip
+            walls: t.vectors, lag: t.vectors2, corner: t.vectors, u: t.vectors2, du: t.vectors2, df: t.vectors2,
+            coefficients_dot: t.blocks, parameters_dot: t.scalars, rest_dot: t.vectors, gradients_dot: t.blocks,
+            volumes_dot: t.blocks, lag_dot: t.vectors2, walls_dot: t.vectors, num_items: ti.i32,
+            num_vertices: ti.i32, per_gamma: fp):  # fmt: skip
         """Change of the forces for changes of everything that they depend on."""
         scene = Bundle(tets=tets, gradients=gradients, volumes=volumes, coefficients=coefficients, start=start,
-                       corner_of=corner_of, parameters=parameters, rest=rest, surface=surface)  # fmt: skip
-        dots = Bundle(coefficients=coefficients_dot, gradients=gradients_dot, volumes=volumes_dot)
+                       corner_of=corner_of, parameters=parameters, rest=rest, surface=surface, walls=walls, lag=lag,
+                       per_gamma=per_gamma)  # fmt: skip
+        dots = Bundle(coefficients=coefficients_dot, gradients=gradients_dot, volumes=volumes_dot,
+                      parameters=parameters_dot, rest=rest_dot, lag=lag_dot, walls=walls_dot)  # fmt: skip
         ti.loop_config(serialize=not parallel)
         for e in range(num_items):
             el.forces_jvp(e, scene, u, 0, du, corner, dots)
         ti.loop_config(serialize=not parallel)
         for i in range(num_vertices):
-            f = el.gather(i, scene, corner) + contact_product(i, scene, u[0, i], du[0, i] + rest_dot[i])
+            f = el.gather(i, scene, corner)
             if ti.static(len(contacts) > 0):
                 if surface[i] > 0:
                     for k in ti.static(range(len(contacts))):
-                        by = contacts[k].parameter_derivatives(parameters, rest[i], u[0, i], vector(0))
-                        for m in ti.static(range(contacts[k].size)):
-                            f += by[m] * parameters_dot[contacts[k].first + m]
+                        f += contact_jvp(k, i, scene, u[0, i], du[0, i], dots)
             df[0, i] = f
+
+    @ti.func
+    def contact_jvp(k: A, i, scene: A, u, du, dots: A):
+        X, zero = scene.rest[i] - scene.walls[3 * k], vector(0)
+        moved = du + dots.rest[i] - dots.walls[3 * k]
+        f = contacts[k].force_jvp(scene.parameters, X, u, zero, moved, zero)
+        by = contacts[k].parameter_derivatives(scene.parameters, X, u, zero)
+        for m in ti.static(range(contacts[k].size)):
+            f += by[m] * dots.parameters[contacts[k].first + m]
+        if ti.static(contacts[k].friction):
+            if rubs(k, i, scene):
+                v, wall = velocity(i, scene, u), scene.walls[3 * k + 2]
+                before = dots.lag[0, i] + dots.rest[i] - dots.walls[3 * k + 1]
+                f += contacts[k].rub_jvp(scene.parameters, X_of(k, i, scene), scene.lag[0, i], v, wall, dots.parameters,
+                                         before, scene.per_gamma * (du - dots.lag[1, i]), dots.walls[3 * k + 2])  # fmt: skip
+        return f
 
     return SimpleNamespace(energy=energy, forces=forces, product=product, blocks=blocks, vjp=vjp, jvp=jvp,
                            contact_blocks=contact_blocks)  # fmt: skip

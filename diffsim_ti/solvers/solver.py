@@ -28,8 +28,6 @@ class Solver(ABC):
         self.parallel, self.allow_unstable = parallel, allow_unstable
         runtime.check_host_init()
         runtime.check_backend(scene.precision)
-        if not self.explicit:
-            self._refuse_obstacles()
         self._tight: stability.StepLimit | None = None
         if self.explicit and not allow_unstable:
             self._refuse_unstable()
@@ -67,15 +65,6 @@ class Solver(ABC):
             values["prescribed_motion"] = self.scene.motion_rows([0.0, self.dt])
         values |= self.scene.path_rows([0.0, self.dt])
         return inputs.derive(values)
-
-    def _refuse_obstacles(self) -> None:
-        for term in self.scene.terms:
-            asked = "a path" if term.path is not None else "friction" if "friction" in term.values else None
-            if asked:
-                raise ValueError(
-                    f"{type(self).__name__} takes obstacles without friction that stand still, got {asked} in {term!r}: use "
-                    "SemiImplicitSolver or VelocityVerletSolver, or leave it out"
-                )
 
     def _refuse_unstable(self) -> None:
         bound = self.stable_dt()

@@ -1,4 +1,6 @@
-"""Coulomb friction, smoothed, as a stage of its own: velocities are slowed in closed form, so that no step is too large.
+"""Coulomb friction, smoothed.
+
+In explicit solvers it is a stage of its own: velocities are slowed in closed form, so that no step is too large.
 
 A vertex of mass m that a barrier pushes with N slides along the obstacle with speed s*. In a time h friction mu N leaves
 
@@ -26,9 +28,36 @@ def slide(g, n, push, v, wall, mu, h_over_m, eps):
 
     Everything is a number of the graph `g`, or a list of three.
     """
+    t, speed = tangential(g, n, v, wall)
+    lost = g.number(1) - keeps(g, speed, h_over_m * mu * push, eps)
+    return [a - lost * x for a, x in zip(v, t)]
+
+
+# In implicit solvers friction is a force of the pass, -mu N f(|t| / eps) t / |t|, t the tangential velocity, with N
+# and the normal as they are at its beginning. It then has a potential in the displacement, as Newton's method likes it.
+
+
+def tangential(g, n, v, wall):
+    """(t, |t|): the part of the velocity relative to the obstacle that lies in its surface."""
     relative = [a - b for a, b in zip(v, wall)]
     towards = g.dot(relative, n)
-    tangential = [r - towards * k for r, k in zip(relative, n)]
-    c = h_over_m * mu * push
-    lost = g.number(1) - keeps(g, g.sqrt(g.dot(tangential, tangential)), c, eps)
-    return [a - lost * t for a, t in zip(v, tangential)]
+    t = [r - towards * k for r, k in zip(relative, n)]
+    return t, g.sqrt(g.dot(t, t))
+
+
+def rub(g, n, push, v, wall, mu, eps):
+    """The force of friction on a vertex."""
+    t, speed = tangential(g, n, v, wall)
+    slow = (eps * 2 - g.minimum(speed, eps)) / (eps * eps)
+    share = g.select(speed.value < eps.value, slow, g.number(1) / g.maximum(speed, eps))
+    factor = g.number(0) - mu * push * share
+    return [factor * x for x in t]
+
+
+def dissipation(g, n, push, v, wall, mu, eps):
+    """Its potential by the velocity, mu N eps (y^2 - y^3 / 3) for y = |t| / eps < 1, mu N (|t| - eps / 3) beyond."""
+    _, speed = tangential(g, n, v, wall)
+    third = g.number(1 / 3)
+    low = g.minimum(speed, eps)
+    inside = low * low / eps * (g.number(1) - third * low / eps)
+    return mu * push * g.select(speed.value < eps.value, inside, speed - third * eps)

@@ -244,7 +244,7 @@ class ObstacleForce(VertexForce):
         for m, target in enumerate(by):
             target._assign(self._vector([row[m] for row in rows]))
 
-    # ---- friction ---------------------------------------------------------------------------------------------------
+    # ---- friction as a stage of explicit passes ----------------------------------------------------------------------
 
     @traced
     def _record_slide(self, parameters, X, u, v, wall, h_over_m):
@@ -275,3 +275,49 @@ class ObstacleForce(VertexForce):
         adjoints = g.reverse([(k, let(at(w, d))) for d, k in enumerate(after)], [*moved, *before, *walls, ratio, *p])
         vectors = [self._vector(adjoints[k : k + 3]) for k in (0, 3, 6)]
         return (*vectors, adjoints[9], tuple(adjoints[10:]))
+
+    # ---- friction as a force of implicit passes, at the velocity v, with N and n at the displacement u ----------------
+
+    @traced
+    def _record_rub(self, parameters, X, u, v, wall):
+        g, p, moved, d, n = self._record(parameters, X, u)
+        speed, wall = ([g.leaf(at(vector, d)) for d in range(3)] for vector in (v, wall))
+        return g, p, moved, speed, wall, n, self._push(g, p, d)
+
+    @traced
+    def dissipation(self, parameters, X, u, v, wall):
+        """Potential of friction by the velocity [W]."""
+        g, p, _, speed, wall, n, push = self._record_rub(parameters, X, u, v, wall)
+        return friction.dissipation(g, n, push, speed, wall, p[self.count + 2], p[self.count + 3]).value
+
+    @traced
+    def _rubbed(self, parameters, X, u, v, wall):
+        g, p, moved, speed, wall, n, push = self._record_rub(parameters, X, u, v, wall)
+        return g, p, moved, speed, wall, friction.rub(g, n, push, speed, wall, p[self.count + 2], p[self.count + 3])
+
+    @traced
+    def rub(self, parameters, X, u, v, wall):
+        """Force of friction [N]; `wall`: the obstacle's velocity."""
+        return self._vector([k.value for k in self._rubbed(parameters, X, u, v, wall)[-1]])
+
+    @traced
+    def rub_product(self, parameters, X, u, v, wall, dv):
+        """Its change for a change of the velocity alone."""
+        g, _, _, speed, _, f = self._rubbed(parameters, X, u, v, wall)
+        return self._vector(g.forward([(x, at(dv, d)) for d, x in enumerate(speed)], f))
+
+    @traced
+    def rub_jvp(self, parameters, X, u, v, wall, parameters_dot, du, dv, dwall):
+        """Its change for changes of everything."""
+        g, p, moved, speed, walls, f = self._rubbed(parameters, X, u, v, wall)
+        dots = [(q, at(parameters_dot, self.first + k)) for k, q in enumerate(p)]
+        for leaves, change in ((moved, du), (speed, dv), (walls, dwall)):
+            dots += [(leaf, at(change, d)) for d, leaf in enumerate(leaves)]
+        return self._vector(g.forward(dots, f))
+
+    @traced
+    def rub_vjp(self, parameters, X, u, v, wall, w):
+        """(adjoints of u, v, wall as vectors, and of the obstacle's numbers, a tuple) for the adjoint w of the force."""
+        g, p, moved, speed, walls, f = self._rubbed(parameters, X, u, v, wall)
+        adjoints = g.reverse([(k, let(at(w, d))) for d, k in enumerate(f)], [*moved, *speed, *walls, *p])
+        return (*(self._vector(adjoints[k : k + 3]) for k in (0, 3, 6)), tuple(adjoints[9:]))

@@ -1,0 +1,109 @@
+"""Contact, friction and moving obstacles in implicit steps."""
+
+import numpy as np
+import pytest
+from contact_scenes import SHAPES, G, points, resting_gap, tetrahedron
+
+import diffsim_ti as ds
+
+SOLVERS = (ds.ImplicitEulerSolver, ds.BDF2Solver)
+solvers = pytest.mark.parametrize("solver", SOLVERS, ids=lambda s: s.__name__)
+every = pytest.mark.parametrize(
+    "solver", [*SOLVERS, ds.ImplicitMidpointSolver, ds.StaticSolver], ids=lambda s: s.__name__
+)
+
+
+@solvers
+@pytest.mark.parametrize("mass", [1e-2, 1.0, 10.0])
+def test_weight_rests_at_the_gap_where_the_barrier_carries_it(solver, mass):
+    """R22, settling from a start in the barrier that is not its equilibrium, in steps of 0.01 s."""
+    scene = points(tetrahedron(0.004), ds.Ground(), mass, terms=[ds.Gravity(-G), ds.Drag(5.0)], precision="f64")
+    x = ds.Rollout(solver(scene, dt=1e-2, tolerance=1e-10), 500).forward().positions[-1]
+    np.testing.assert_allclose(x[:3, 1], resting_gap(mass * G), atol=1e-6)
+
+
+@solvers
+def test_incline(solver):
+    """R21: friction .50 sticks, but for a creep slower than friction_speed; .49 slides .274198 m in 2.5 s."""
+    from test_contact_friction import on_incline
+
+    for friction, slides in ((0.50, False), (0.49, True)):
+        scene, down = on_incline(friction, 1e-4, precision="f64")
+        frames = ds.Rollout(solver(scene, dt=1e-2), 250).forward()
+        way = (frames.positions[-1] - frames.positions[0])[:3] @ down
+        if slides:
+            assert way == pytest.approx(np.full(3, 0.274198), rel=1e-2)
+        else:
+            assert np.all(way > 0) and np.all(way <= 1.02 * 1e-4 * 2.5)
+
+
+@solvers
+@pytest.mark.parametrize("friction, distance", [(0.2, 1.019368), (0.4, 0.509684)])
+@pytest.mark.parametrize("precision", ["f32", "f64"])
+def test_stopping_distance(solver, friction, distance, precision):
+    scene = points(tetrahedron(resting_gap(G)), ds.Ground(friction=friction), terms=[ds.Gravity(-G)],
+                   initial_velocities=[2, 0, 0], precision=precision)  # fmt: skip
+    frames = ds.Rollout(solver(scene, dt=5e-3), 240, save_every=10).forward()
+    assert (frames.positions[-1] - frames.positions[0])[:3, 0] == pytest.approx(np.full(3, distance), rel=1e-2)
+    assert np.abs(frames.velocities[-1, :3]).max() < 1e-4
+
+
+@solvers
+def test_a_moving_floor_drags(solver):
+    floor = ds.Ground(friction=0.3, friction_speed=1e-3, path=lambda t: [1.5 * t, 0, 0])
+    scene = points(tetrahedron(resting_gap(G)), floor, terms=[ds.Gravity(-G)], precision="f64")
+    frames = ds.Rollout(solver(scene, dt=5e-3), 200, save_every=10).forward()
+    np.testing.assert_allclose(frames.velocities[:, 0, 0], np.minimum(0.3 * G * frames.times, 1.5), atol=2e-2)
+
+
+def test_a_rising_floor_lifts():
+    floor = ds.Ground(path=lambda t: [0, 0.1 * t, 0])
+    scene = points(tetrahedron(resting_gap(G)), floor, terms=[ds.Gravity(-G), ds.Drag(1.0)], precision="f64")
+    frames = ds.Rollout(ds.ImplicitEulerSolver(scene, dt=1e-2), 100).forward()
+    assert (frames.positions[-1] - frames.positions[0])[0, 1] == pytest.approx(0.1, abs=2e-3)
+
+
+@pytest.mark.parametrize("speed", [1.0, 8.0, 65.0])
+def test_no_step_is_too_large_for_the_barrier(speed):
+    """Row 41: whatever the speed, iterates stay in front of the floor."""
+    mesh = ds.TetrahedralMesh.create_cube(resolution=2, size=0.2).translated([0, 0.05, 0])
+    scene = ds.Scene(mesh, ds.StableNeoHookean(1e6, 0.3), terms=[ds.Ground(stiffness=1e6)],
+                     initial_velocities=[0, -speed, 0], precision="f64")  # fmt: skip
+    frames = ds.Rollout(ds.ImplicitEulerSolver(scene, dt=1e-2), 20, save_every=1).forward()
+    assert frames.positions[:, :, 1].min() > 0 and frames.velocities[-1, :, 1].mean() > -0.1 * speed
+
+
+def rubbing(solver, shape="ground", **options) -> ds.Rollout:
+    """A body pressed on a moving, rough obstacle, sliding and sticking."""
+    mesh, rng = tetrahedron(0.006), np.random.default_rng(0)
+    obstacle = SHAPES[shape](stiffness=2e3, width=0.05, friction=0.4, friction_speed=0.05,
+                             path=lambda t: [0.3 * t, 0.1 * t, -0.2 * t])  # fmt: skip
+    static = solver is ds.StaticSolver
+    scene = ds.Scene(mesh, ds.StableNeoHookean(1e4, 0.3), 100.0, terms=[ds.Gravity(-G), obstacle],
+                     fixed=[1, 2, 3] if static else None, precision="f64",
+                     initial_velocities=0.2 * rng.standard_normal((4, 3)) - [0, 0.1, 0])  # fmt: skip
+    made = solver(scene, dt=1e-2, tolerance=1e-12)
+    return ds.Rollout(made, 3, save_every=1, gradients="all", **options)
+
+
+@every
+def test_gradients_through_friction_on_a_moving_obstacle(solver):
+    report = ds.check_gradients(rubbing(solver), verbose=False)
+    assert report.passed, str(report)
+    assert {"ground_path", "friction", "friction_speed"} <= {row.input for row in report.rows}
+
+
+@pytest.mark.parametrize("shape", sorted(set(SHAPES) - {"ground", "mesh"}))
+def test_reverse_sweep_against_tangent_on_every_shape(shape):
+    assert ds.dot_product_test(rubbing(ds.ImplicitEulerSolver, shape)) < 1e-9
+
+
+@solvers
+def test_checkpoints_give_the_same_bits(solver):
+    results = []
+    for every_so_many in (None, 1):
+        rollout = rubbing(solver, checkpoint_every=every_so_many)
+        frames = rollout.forward()
+        results.append(rollout.vjp(frames, np.ones(frames.positions.shape)))
+    for name, gradient in results[0].items():
+        np.testing.assert_array_equal(gradient, results[1][name])
