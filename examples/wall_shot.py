@@ -62,8 +62,8 @@ def main(picture_folder: str | None = None) -> dict:
     seen = frames.contact_resolution
     if picture_folder:
         save_picture(Path(picture_folder) / "wall_shot.png", mesh, frames.positions[-1])
-    print(f"throw with {v.round(4)} m/s: off by {miss:.1e} m after {iteration} iterations, {seconds:.1f} s; it comes back at "
-          f"{back:.3g} m/s; {seen}")  # fmt: skip
+    print(f"throw with {v.round(4)} m/s: off by {miss:.1e} m after {iteration} iterations, {seconds:.1f} s; it comes back "
+          f"at {back:.3g} m/s; {seen}")  # fmt: skip
     return {"miss": miss, "velocity": v, "back": back, "resolved": seen.resolved, "gap": seen.smallest_gap,
             "iterations": iteration, "seconds": seconds}  # fmt: skip
 
