@@ -79,6 +79,7 @@ class Rollout:
         self.clip, self.truncate, self.wants_health = clip, truncate, health
         self.health: list[dict] = []
         self.gradients: dict[str, np.ndarray] = {}
+        self._warned = False
         self._workspace, self._current, self._loaded = None, None, None
         self._fields, self._tape, self._taped, self._adjoint = {}, None, None, None
 
@@ -144,9 +145,10 @@ class Rollout:
         self.gradients = self._sweep_reverse(*adjoints, self.wants_health or self.clip is not None)
         return self.gradients
 
-    @staticmethod
-    def _warn_if_coarse(seen: ContactResolution) -> None:
-        if not seen.resolved:
+    def _warn_if_coarse(self, seen: ContactResolution) -> None:
+        """Once per rollout."""
+        if not seen.resolved and not self._warned:
+            self._warned = True
             warnings.warn(
                 f"gradients through contacts may be off by more than 10 %: {seen}; take substeps of at most "
                 f"{seen.advised_substep:.3g} s instead of {seen.substep:.3g} s, or a softer or wider barrier",

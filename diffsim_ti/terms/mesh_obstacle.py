@@ -18,7 +18,8 @@ class MeshObstacle(Obstacle):
     rounded within a cell. Beyond 2 cells and a width from the mesh nothing is felt.
 
     Inputs with gradient: "mesh_position", shape (3,), and those of every `Obstacle`, whose other arguments it takes.
-    Raises ValueError for a mesh that is not closed or oriented, RuntimeError without libigl (`pip install libigl`).
+    Raises ValueError for a mesh that is not closed or oriented, RuntimeError without libigl (`pip install
+    'diffsim-ti[mesh-obstacles]'`).
     Baerentzen, Aanaes 2005, Signed distance computation using the angle weighted pseudonormal, doi:10.1109/TVCG.2005.49.
     """
 

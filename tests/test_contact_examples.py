@@ -1,0 +1,41 @@
+"""The examples of contact run and find what they look for."""
+
+import importlib.util
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+
+
+def run(name: str, *arguments) -> dict:
+    """The numbers that an example's `main` returns."""
+    spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.main(*arguments)
+
+
+def test_incline(capsys):
+    """A whole body, not a point: R21 to 1 %."""
+    numbers = run("incline")
+    assert numbers["exact"] == pytest.approx(0.274198, rel=1e-5)
+    assert numbers["slides"] == pytest.approx(numbers["exact"], rel=1e-2) and 0 < numbers["holds"] < 1e-3
+    assert "Coulomb's law" in capsys.readouterr().out
+
+
+@pytest.mark.filterwarnings("error:gradients through contacts")
+def test_wall_shot(capsys):
+    numbers = run("wall_shot")
+    assert numbers["miss"] <= 1e-6 and numbers["iterations"] <= 6  # Newton's method converges: the gradient is exact
+    assert numbers["back"] < -1 and numbers["velocity"][0] > 2 and 0 < numbers["gap"] < 0.06 and numbers["resolved"]
+    assert "throw with" in capsys.readouterr().out
+
+
+@pytest.mark.filterwarnings("error:gradients through contacts")
+def test_gripper(capsys, tmp_path):
+    numbers = run("gripper", tmp_path)
+    assert numbers["before"] > 0.02 and numbers["after"] < 5e-4 and numbers["evaluations"] <= 15
+    assert numbers["squeezes"].shape == (2, 5) and numbers["squeezes"].max() > 2e-3 and numbers["resolved"]
+    assert (tmp_path / "gripper.png").stat().st_size > 10_000
+    assert "slips by" in capsys.readouterr().out
