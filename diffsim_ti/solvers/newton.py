@@ -67,7 +67,7 @@ class Newton:
         for _ in range(self.max_iterations):
             R, now = self._residual(u)
             size = max(size, now)
-            floor = 4 * self.eps * np.linalg.norm(self.stiffness * np.abs(u).max(1, keepdims=True) * self.free)
+            floor = 4 * self.eps * np.linalg.norm(self._rigidity() * np.abs(u).max(1, keepdims=True) * self.free)
             norm = np.linalg.norm(R)
             report.residuals.append(norm / size if size > 0 else 0.0)
             if norm <= self.tolerance * size + floor:
@@ -97,6 +97,11 @@ class Newton:
             f"{report.residuals[-1]:.2g} (asked for {self.tolerance:g}; the last ones: {history}): take smaller steps, more "
             "load steps, or a looser tolerance", report.residuals,
         )  # fmt: skip
+
+    def _rigidity(self) -> np.ndarray:
+        """How much force a small displacement makes at each vertex [N/m], contact and friction included."""
+        contact = self.potential.contact_blocks()
+        return self.stiffness if contact is None else self.stiffness + np.abs(contact).sum((1, 2))[:, None]
 
     def operator(self) -> Operator:
         """The Hessian of Phi where the potential stands."""
@@ -144,7 +149,7 @@ class Newton:
         slope, fraction, best = float((R * d).sum()), 1.0, None
         while fraction > self.shortest:
             trial, after, change, noise = self._try(u, fraction * d, before, self.upright and fraction > self.insist)
-            if change <= -1e-4 * fraction * slope or abs(slope) * fraction <= noise >= change:
+            if change <= -1e-4 * fraction * slope or (abs(slope) * fraction <= noise >= change and self._falls(trial, d, slope)):
                 best = trial, after, change
                 break
             fraction *= 0.5
@@ -156,6 +161,12 @@ class Newton:
                 break
             best = trial, after, change
         return None if best is None else best[:2]
+
+    def _falls(self, u, d, slope) -> bool:
+        """Whether Phi does not rise again at u as steeply as it fell before: what is left to ask where its change drowns in
+        rounding. Hager, Zhang 2005, A New Conjugate Gradient Method with Guaranteed Descent, doi:10.1137/030601880."""
+        R, _ = self._residual(u)
+        return float((R * d).sum()) >= -0.8 * slope
 
     def _try(self, u, step, before, upright):
         """(displacement, what is there, change of Phi, rounding of that change); infinite change if not admissible."""

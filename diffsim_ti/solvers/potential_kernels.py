@@ -50,6 +50,10 @@ def potential_kernels(law, features, parallel: bool, lanes: bool) -> SimpleNames
             contact[i] = value
 
     @ti.func
+    def length(v):
+        return ti.sqrt(v.norm_sqr())  # `norm` adds a float64 zero
+
+    @ti.func
     def volume_ratio(H):
         return (H.matrix() + ti.Matrix.identity(fp, 3)).determinant()
 
@@ -113,11 +117,11 @@ def potential_kernels(law, features, parallel: bool, lanes: bool) -> SimpleNames
         ti.loop_config(serialize=not parallel)
         for i in range(num_vertices):
             pushed, total = contact_force(i, scene, u[0, i]), vector(0)
-            norm = pushed.norm()
+            norm = length(pushed)
             for c in range(start[i], start[i + 1]):
                 part = corner[corner_of[c]]
                 total += part
-                norm += part.norm()
+                norm += length(part)
             f[0, i] = total + pushed
             size[i] = norm
 
