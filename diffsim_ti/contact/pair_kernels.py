@@ -72,10 +72,32 @@ def pair_kernels(precision: str, first: int, parallel: bool) -> SimpleNamespace:
         return total
 
     @ti.func
+    def apart(kind: ti.template(), y1, y2, y3):
+        """An axis n that parts the boxes of the two primitives, and their distance d along it, which may be negative.
+
+        The distance of the primitives is at least d, which spares most pairs of the list the search for nearest points.
+        """
+        lo, hi = ti.min(ti.min(y1, y2), y3), ti.max(ti.max(y1, y2), y3)  # from the vertex, at the origin, to the triangle
+        if ti.static(kind == EDGE_EDGE):
+            lo, hi = ti.min(y2, y3) - ti.max(y1, vec3(0)), ti.max(y2, y3) - ti.min(y1, vec3(0))
+        n, d = vec3(0), ti.cast(-1, fp)
+        for k in ti.static(range(3)):
+            if lo[k] > d:
+                n, d = vec3(0), lo[k]
+                n[k] = ti.cast(-1, fp)
+            if 0 - hi[k] > d:
+                n, d = vec3(0), 0 - hi[k]
+                n[k] = ti.cast(1, fp)
+        return n, d
+
+    @ti.func
     def force(kind: ti.template(), p, scale, scene: A, slot):
         stiffness, width = scene.parameters[first], scene.parameters[first + 1]
         y1, y2, y3 = corners(p, scene, slot)
-        energy, n, d, g1, g2, g3 = f.gradient(kind, y1, y2, y3, scale, stiffness, width)
+        n, d = apart(kind, y1, y2, y3)
+        energy, g1, g2, g3 = ti.cast(0, fp), vec3(0), vec3(0), vec3(0)
+        if d < width or scene.exact > 0:
+            energy, n, d, g1, g2, g3 = f.gradient(kind, y1, y2, y3, scale, stiffness, width)
         scene.plane[p] = vec4(n[0], n[1], n[2], d)
         scene.energy[p] = energy
         store(p, scene.corner, g1, g2, g3)
@@ -83,9 +105,13 @@ def pair_kernels(precision: str, first: int, parallel: bool) -> SimpleNamespace:
     @ti.kernel
     def forces(pairs: ints, scales: scalars, surface: ints, row: ints, corner_of: ints, rest: vectors, parameters: scalars,
                u: vectors2, corner: vectors, plane: vectors, energy: scalars, before: vectors, out: vectors, slot: ti.i32,
-               num_vt: ti.i32, num_ee: ti.i32, num_surface: ti.i32, first_out: ti.i32):  # fmt: skip
-        """Forces at u[slot]; keeps the plane (n, d) that parts each pair, and where the surface was."""
-        scene = Bundle(pairs=pairs, rest=rest, parameters=parameters, u=u, corner=corner, plane=plane, energy=energy)
+               num_vt: ti.i32, num_ee: ti.i32, num_surface: ti.i32, first_out: ti.i32, exact: ti.i32):  # fmt: skip
+        """Forces at u[slot]; keeps a plane (n, d) that parts each pair, and where the surface was.
+
+        d is the distance of a pair that is nearer than the width or if `exact`, else a lower bound of it.
+        """
+        scene = Bundle(pairs=pairs, rest=rest, parameters=parameters, u=u, corner=corner, plane=plane, energy=energy,
+                       exact=exact)  # fmt: skip
         ti.loop_config(serialize=not parallel)
         for p in range(num_vt):
             force(VERTEX_TRIANGLE, p, ti.cast(0, fp), scene, slot)
@@ -163,7 +189,7 @@ def pair_kernels(precision: str, first: int, parallel: bool) -> SimpleNamespace:
             flags[k] = 0
         ti.loop_config(serialize=not parallel)
         for s in range(num_surface):
-            moved = (u[slot, surface[s]] - built[s]).norm()
+            moved = ti.sqrt((u[slot, surface[s]] - built[s]).norm_sqr())
             if not moved <= stale:
                 flags[0] = 1
             if not moved <= lost:

@@ -154,7 +154,7 @@ def pair_functions(precision: str) -> SimpleNamespace:
         n = r / d. scale: 1 / sqrt(threshold of |a x b|^2), not used for vertex and triangle.
         """
         w, r, g = nearest(kind, y1, y2, y3)
-        d = r.norm()
+        d = ti.sqrt(r.norm_sqr())
         n = r / ti.max(d, ti.cast(tiny, fp))
         energy, g1, g2, g3 = ti.cast(0, fp), vec3(0), vec3(0), vec3(0)
         if d < width:
@@ -177,7 +177,7 @@ def pair_functions(precision: str) -> SimpleNamespace:
         """(h1, h2, h3, by_stiffness, by_width): change of the gradient of corners 1 to 3 (0 balances them) for changes of
         corners, stiffness and width; and the products of dy with the gradient's derivatives by stiffness and width."""
         w, r, g = nearest(kind, y1, y2, y3)
-        d = r.norm()
+        d = ti.sqrt(r.norm_sqr())
         h1, h2, h3, by_stiffness, by_width = vec3(0), vec3(0), vec3(0), ti.cast(0, fp), ti.cast(0, fp)
         if d < width:
             inverse = ti.cast(1, fp) / ti.max(d, ti.cast(tiny, fp))

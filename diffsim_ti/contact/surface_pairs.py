@@ -20,8 +20,9 @@ class SurfacePairs:
     Forces go to the last corners of an array of corners, one for each surface vertex (solvers/arrays.py).
     """
 
-    passes = 20  # that a list should last; its skin follows the motion, within these shares of the width
-    least_skin, largest_skin = 0.1, 2.0
+    passes = 20  # that a list should last: its skin follows the motion, but
+    least_skin = 0.2  # is at least this share of the width, and
+    largest_reach = 0.6  # width + skin is at most this share of an edge, beyond which neighbours of neighbours fill the list
 
     def __init__(self, arrays, parallel: bool):
         self.a, mesh, term = arrays, arrays.mesh, arrays.self_contact
@@ -95,7 +96,8 @@ class SurfacePairs:
             return
         moved = np.sqrt(((x - runtime.fetch(self.built)) ** 2).sum(1).max()) if self.fresh and self.age else 0.0
         wanted = 2 * self.passes * moved / max(self.age, 1)
-        self.skin = float(np.clip(wanted, self.least_skin * self.width, self.largest_skin * self.width))
+        least = self.least_skin * self.width
+        self.skin = float(np.clip(wanted, least, max(least, self.largest_reach * self.list.typical - self.width)))
         self.list.build(self.a.rest, u, slot, self.width + self.skin)
         self.kernels.keep_place(self.list.surface, u, self.built, slot, self.list.num_surface)
         count, take = self.list.count, self.list.buffers.take
@@ -173,12 +175,12 @@ class SurfacePairs:
 
     # ---- forces -----------------------------------------------------------------------------------------------------
 
-    def forces(self, u, slot: int, out) -> None:
+    def forces(self, u, slot: int, out, exact: bool = False) -> None:
         """Contact forces at u[slot], to the last corners of `out`."""
         k = self.list
         self._launch("forces", self.kernels.forces, k.pairs, k.scale, k.surface, k.row, k.corner, self.a.rest,
                      self.a.parameters, u, self.corner, self.plane, self.energy, self.before,
-                     out)(slot, k.num_vt, k.num_ee, k.num_surface, self.a.first_contact_corner)  # fmt: skip
+                     out)(slot, k.num_vt, k.num_ee, k.num_surface, self.a.first_contact_corner, int(exact))  # fmt: skip
 
     def product(self, u, slot: int, w, out, rest_dot=None, parameters_dot=(0.0, 0.0)) -> None:
         """Change of the contact forces for changes w[0] of the positions (and of rest shape, stiffness, width)."""
@@ -212,7 +214,7 @@ class SurfacePairs:
         """Distances [m] and corners of all pairs of the list at u[0]."""
         if self._scratch is None:
             self._scratch = runtime.array(self.kernels.vector, self.a.first_contact_corner + self.list.num_surface)
-        self.forces(u, 0, self._scratch)
+        self.forces(u, 0, self._scratch, exact=True)
         pairs = runtime.fetch(self.list.pairs)[: 4 * self.list.count].reshape(-1, 4)
         return _all_four(self.plane)[: self.list.count, 3].astype(np.float64), pairs
 
