@@ -69,18 +69,20 @@ class SurfacePairs:
             )
 
     def check_apart(self, u) -> None:
-        """Raise ValueError if surfaces touch or pass through each other at u[0]; the list was made there."""
+        """Raise ValueError if surfaces touch or pass through each other at u[0]."""
+        if not self.fresh or self.age:
+            self._build(u, 0)
         found = self.list.first_piercing(self.a.rest, u, 0)
         if found:
             edge, triangle = self.edges[found[0]], self.mesh.surface_triangles[found[1]]
             raise ValueError(
-                f"surfaces pass through each other at the start: edge {_numbers(edge)} and triangle {_numbers(triangle)}; "
+                f"surfaces pass through each other: edge {_numbers(edge)} and triangle {_numbers(triangle)}; "
                 "move the bodies apart"
             )
         gaps, pairs = self._distances(u)
         if gaps.size and not gaps.min() > 0:
             worst = int(gaps.argmin())
-            raise ValueError(f"surfaces touch at the start: {self._name(worst, pairs)}; move the bodies apart")
+            raise ValueError(f"surfaces touch: {self._name(worst, pairs)}; move the bodies apart")
 
     def forget(self, u) -> None:
         """The state was set from outside."""
