@@ -178,7 +178,8 @@ def pair_kernels(precision: str, first: int, parallel: bool) -> SimpleNamespace:
 
     @ti.kernel
     def check(pairs: ints, surface: ints, place: ints, u: vectors2, before: vectors, built: vectors, plane: vectors,
-              flags: ints, slot: ti.i32, num_vt: ti.i32, num_ee: ti.i32, num_surface: ti.i32, stale: fp, lost: fp):  # fmt: skip
+              flags: ints, slot: ti.i32, num_vt: ti.i32, num_ee: ti.i32, num_surface: ti.i32, stale: fp,
+              lost: fp):  # fmt: skip
         """flags: a vertex is farther than `stale` or `lost` from where the list was made; a pair may have crossed.
 
         Two convex sets that a plane parts cannot meet while their corners move in straight lines and stay parted.

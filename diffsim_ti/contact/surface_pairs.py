@@ -153,8 +153,8 @@ class SurfacePairs:
             i = surface[np.linalg.norm(moved[surface], axis=1).argmax()]
             speed = np.linalg.norm(moved[i]) / h
             raise Tunnelling(
-                f"vertex {i} moves at {speed:.3g} m/s, {np.linalg.norm(moved[i]):.3g} m in one substep of {h:.3g} s: too far "
-                f"for a contact of width {self.width:.3g} m to see what it passes; {remedy}"
+                f"vertex {i} moves at {speed:.3g} m/s, {np.linalg.norm(moved[i]):.3g} m in one substep of {h:.3g} s: "
+                f"too far for a contact of width {self.width:.3g} m to see what it passes; {remedy}"
             )
         pairs = runtime.fetch(self.list.pairs)[: 4 * self.list.count].reshape(-1, 4)
         plane = _all_four(self.plane)[: self.list.count].astype(np.float64)
