@@ -111,8 +111,8 @@ def broad_phase_kernels(precision: str) -> SimpleNamespace:
     @ti.kernel
     def find_vertex_triangle(rest: vectors, u: vectors2, surface: ints, triangles: ints, start: ints, entries: ints,
                              keys: ints, row: ints, partner: ints, slot: ti.i32, count: ti.i32, mask: ti.i32, reach: fp,
-                             inverse_size: fp, counting: ti.i32):  # fmt: skip
-        """Triangles within reach of each surface vertex: their number, or themselves, in order."""
+                             inverse_size: fp, room: ti.i32):  # fmt: skip
+        """Triangles within reach of each surface vertex, in order, at most `room`, and their number."""
         scene = Bundle(rest=rest, u=u)
         for s in range(count):
             i = surface[s]
@@ -128,18 +128,16 @@ def broad_phase_kernels(precision: str) -> SimpleNamespace:
                     if gap.norm_sqr() < reach * reach:
                         w, r, g = f.nearest(VERTEX_TRIANGLE, y1, y2, y3)
                         if r.norm_sqr() < reach * reach:
-                            if counting == 0:
-                                partner[row[s] + found] = p
+                            if found < room:
+                                partner[room * s + found] = p
                             found += 1
-            if counting == 1:
-                row[s] = found
-            else:
-                sort(partner, row[s], row[s] + found)
+            row[s] = found
+            sort(partner, room * s, room * s + ti.min(found, room))
 
     @ti.kernel
     def find_edge_edge(rest: vectors, u: vectors2, edges: ints, box: ints, start: ints, entries: ints, keys: ints, row: ints,
-                       partner: ints, slot: ti.i32, count: ti.i32, mask: ti.i32, reach: fp, counting: ti.i32):  # fmt: skip
-        """Edges of larger number within reach of each edge: their number, or themselves, in order."""
+                       partner: ints, slot: ti.i32, count: ti.i32, mask: ti.i32, reach: fp, room: ti.i32):  # fmt: skip
+        """Edges of larger number within reach of each edge, in order, at most `room`, and their number."""
         scene = Bundle(rest=rest, u=u)
         for e in range(count):
             i, j, found = edges[2 * e], edges[2 * e + 1], 0
@@ -165,31 +163,29 @@ def broad_phase_kernels(precision: str) -> SimpleNamespace:
                                     if gap.norm_sqr() < reach * reach:
                                         w, r, g = f.nearest(EDGE_EDGE, y1, y2, y3)
                                         if r.norm_sqr() < reach * reach:
-                                            if counting == 0:
-                                                partner[row[e] + found] = p
+                                            if found < room:
+                                                partner[room * e + found] = p
                                             found += 1
-            if counting == 1:
-                row[e] = found
-            else:
-                sort(partner, row[e], row[e] + found)
+            row[e] = found
+            sort(partner, room * e, room * e + ti.min(found, room))
 
     @ti.kernel
     def write_pairs(surface: ints, triangles: ints, edges: ints, row_t: ints, row_e: ints, partner_t: ints, partner_e: ints,
                     lengths: scalars, pairs: ints, scale: scalars, num_surface: ti.i32, num_edges: ti.i32, num_vt: ti.i32,
-                    factor: fp):  # fmt: skip
+                    room_t: ti.i32, room_e: ti.i32, factor: fp):  # fmt: skip
         """Corners of each pair, four indices of vertices; and, of edges, 1 / sqrt(threshold of |a x b|^2)."""
         for s in range(num_surface):
             for p in range(row_t[s], row_t[s + 1]):
                 pairs[4 * p] = surface[s]
                 for k in ti.static(range(3)):
-                    pairs[4 * p + 1 + k] = triangles[3 * partner_t[p] + k]
+                    pairs[4 * p + 1 + k] = triangles[3 * partner_t[room_t * s + p - row_t[s]] + k]
         for e in range(num_edges):
             for q in range(row_e[e], row_e[e + 1]):
-                p = num_vt + q
+                p, other = num_vt + q, partner_e[room_e * e + q - row_e[e]]
                 for k in ti.static(range(2)):
                     pairs[4 * p + k] = edges[2 * e + k]
-                    pairs[4 * p + 2 + k] = edges[2 * partner_e[q] + k]
-                scale[q] = factor / (lengths[e] * lengths[partner_e[q]])
+                    pairs[4 * p + 2 + k] = edges[2 * other + k]
+                scale[q] = factor / (lengths[e] * lengths[other])
 
     @ti.kernel
     def fill_rows(pairs: ints, place_of: ints, row: ints, cursor: ints, corner: ints, count: ti.i32, counting: ti.i32):
@@ -307,7 +303,7 @@ class Cells:
         self.corners = runtime.upload(corners.ravel(), ti.i32)
         self.kernels, self.buffers, self.name = broad_phase_kernels(precision), buffers, name
         self.box = runtime.array(ti.i32, 6 * self.count)
-        self.num_buckets = 1 << max(4, int(2 * self.count).bit_length())
+        self.num_buckets = 1 << max(4, self.count.bit_length())
         self.start, self.cursor = (runtime.array(ti.i32, self.num_buckets + 1) for _ in range(2))
 
     def fill(self, rest, u, slot: int, margin: float, cell: float) -> None:
@@ -344,6 +340,7 @@ class CandidatePairs:
         self.row, self.cursor = (runtime.array(ti.i32, len(surface) + 1) for _ in range(2))
         self.extent = runtime.array(self.kernels.fp, self.triangles.count)
         self.num_vt = self.num_ee = 0
+        self.room = {"vt": 16, "ee": 32}  # partners kept of each vertex and edge; grows
         self._take()
 
     def _take(self) -> None:
@@ -354,6 +351,16 @@ class CandidatePairs:
     @property
     def count(self) -> int:
         return self.num_vt + self.num_ee
+
+    def _find(self, name: str, kernel, arrays: tuple, row, slot: int, count: int, *numbers):
+        """Partners of each of `count` primitives, `room` places for each, and their numbers in `row`."""
+        while True:
+            partner = self.buffers.take(name, ti.i32, self.room[name] * count)
+            kernel(*arrays, partner, slot, count, *numbers, self.room[name])
+            most = int(runtime.fetch(row)[:count].max(initial=0))
+            if most <= self.room[name]:
+                return partner
+            self.room[name] = most + most // 2
 
     def build(self, rest, u, slot: int, reach: float) -> None:
         """Find all pairs nearer than `reach` [m] at rest + u[slot]."""
@@ -366,16 +373,12 @@ class CandidatePairs:
         e.fill(rest, u, slot, 0.505 * reach, cell)
         vt = (rest, u, self.surface, t.corners, t.start, t.entries, t.keys, self.row_t)
         ee = (rest, u, e.corners, e.box, e.start, e.entries, e.keys, self.row_e)
-        to_vt, to_ee = (slot, ns, t.num_buckets - 1, reach, 1 / cell), (slot, ne, e.num_buckets - 1, reach)
-        k.find_vertex_triangle(*vt, t.start, *to_vt, 1)
-        k.find_edge_edge(*ee, e.start, *to_ee, 1)
+        partner_t = self._find("vt", k.find_vertex_triangle, vt, self.row_t, slot, ns, t.num_buckets - 1, reach, 1 / cell)
+        partner_e = self._find("ee", k.find_edge_edge, ee, self.row_e, slot, ne, e.num_buckets - 1, reach)
         self.num_vt, self.num_ee = b.scan(self.row_t, ns), b.scan(self.row_e, ne)
-        partner_t, partner_e = b.take("vt", ti.i32, self.num_vt), b.take("ee", ti.i32, self.num_ee)
-        k.find_vertex_triangle(*vt, partner_t, *to_vt, 0)
-        k.find_edge_edge(*ee, partner_e, *to_ee, 0)
         self._take()
         k.write_pairs(self.surface, t.corners, e.corners, self.row_t, self.row_e, partner_t, partner_e, self.lengths,
-                      self.pairs, self.scale, ns, ne, self.num_vt, 1000**0.5)  # fmt: skip
+                      self.pairs, self.scale, ns, ne, self.num_vt, self.room["vt"], self.room["ee"], 1000**0.5)  # fmt: skip
         _clear(self.row, ns + 1)
         k.fill_rows(self.pairs, self.place, self.cursor, self.row, self.corner, 4 * self.count, 1)
         b.scan(self.row, ns)

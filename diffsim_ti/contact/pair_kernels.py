@@ -180,21 +180,27 @@ def pair_kernels(precision: str, first: int, parallel: bool) -> SimpleNamespace:
     def check(pairs: ints, surface: ints, place: ints, u: vectors2, before: vectors, built: vectors, plane: vectors,
               flags: ints, slot: ti.i32, num_vt: ti.i32, num_ee: ti.i32, num_surface: ti.i32, stale: fp,
               lost: fp):  # fmt: skip
-        """flags: a vertex is farther than `stale` or `lost` from where the list was made; a pair may have crossed.
+        """flags: a vertex is farther than `stale` (0) or `lost` (1) from where the list was made, the same of its motion
+        relative to the first vertex's (3, 4), since bodies may fly together; a pair may have crossed (2).
 
         Two convex sets that a plane parts cannot meet while their corners move in straight lines and stay parted.
         """
         scene = Bundle(pairs=pairs, place=place, u=u, before=before, plane=plane, slot=slot)
         ti.loop_config(serialize=True)
-        for k in range(3):
+        for k in range(5):
             flags[k] = 0
         ti.loop_config(serialize=not parallel)
         for s in range(num_surface):
-            moved = ti.sqrt((u[slot, surface[s]] - built[s]).norm_sqr())
-            if not moved <= stale:
+            move, first_move = u[slot, surface[s]] - built[s], u[slot, surface[0]] - built[0]
+            moved, relative = move.norm_sqr(), (move - first_move).norm_sqr()
+            if not moved <= stale * stale:
                 flags[0] = 1
-            if not moved <= lost:
+            if not moved <= lost * lost:
                 flags[1] = 1
+            if not relative <= stale * stale:
+                flags[3] = 1
+            if not relative <= lost * lost:
+                flags[4] = 1
         ti.loop_config(serialize=not parallel)
         for p in range(num_vt):
             if not closing(VERTEX_TRIANGLE, p, scene) <= ti.cast(SAFE, fp) * plane[p][3]:

@@ -15,7 +15,8 @@ class Tunnelling(FloatingPointError):
 class SurfacePairs:
     """Pairs of surface primitives of a scene with a SelfContact term (terms/self_contact.py).
 
-    The list holds all pairs within width + skin of where it was made, and holds good until a vertex has moved by skin / 2.
+    The list holds all pairs within width + skin of where it was made, and holds good until a vertex has moved by skin / 2
+    (or, where bodies fly together, has moved so far relative to the first vertex).
     Pairs beyond the width add exact zeros, in a fixed order, so that forces have the same bits whatever the list's age.
     Forces go to the last corners of an array of corners, one for each surface vertex (solvers/arrays.py).
     """
@@ -36,7 +37,7 @@ class SurfacePairs:
         n = len(mesh.surface_vertices)
         vector = self.kernels.vector
         self.before, self.built, self.sums, self.rest_adj = (runtime.array(vector, n) for _ in range(4))
-        self.none, self.flags = runtime.array(vector, 1), runtime.array(ti.i32, 3)
+        self.none, self.flags = runtime.array(vector, 1), runtime.array(ti.i32, 5)
         self.skin, self.fresh, self.age, self.builds = 0.0, False, 0, 0
         self._launches, self._version, self._checked_rest, self._scratch = {}, -1, None, None
 
@@ -96,8 +97,11 @@ class SurfacePairs:
         x = runtime.fetch(u)[slot][surface]
         if not np.all(np.isfinite(x)):  # the guard of the run will say so
             return
-        moved = np.sqrt(((x - runtime.fetch(self.built)) ** 2).sum(1).max()) if self.fresh and self.age else 0.0
-        wanted = 2 * self.passes * moved / max(self.age, 1)
+        wanted = 0.0
+        if self.fresh and self.age:
+            move = x - runtime.fetch(self.built)
+            moved = min(np.linalg.norm(y, axis=1).max() for y in (move, move - move[0]))
+            wanted = 2 * self.passes * moved / self.age
         least = self.least_skin * self.width
         self.skin = float(np.clip(wanted, least, max(least, self.largest_reach * self.list.typical - self.width)))
         self.list.build(self.a.rest, u, slot, self.width + self.skin)
@@ -121,13 +125,15 @@ class SurfacePairs:
             self._launches[key] = runtime.Launch(kernel, *arrays)
         return self._launches[key]
 
-    def _check(self, u, slot: int, num_vt: int, num_ee: int) -> np.ndarray:
+    def _check(self, u, slot: int, num_vt: int, num_ee: int) -> tuple[bool, bool, bool]:
+        """Whether the list is stale, whether pairs beyond it may have crossed, and whether pairs of it may have."""
         k = self.list
         self._launch("check", self.kernels.check, k.pairs, k.surface, k.place, u, self.before, self.built, self.plane,
                      self.flags)(slot, num_vt, num_ee, k.num_surface, 0.5 * self.skin,
                                  0.5 * (self.width + self.skin))  # fmt: skip
         flags = runtime.view(self.flags)
-        return runtime.fetch(self.flags) if flags is None else flags
+        far, lost, crossed, far_apart, lost_apart = runtime.fetch(self.flags) if flags is None else flags
+        return bool(far and far_apart), bool(lost and lost_apart), bool(crossed)
 
     def ensure(self, u, slot: int) -> None:
         """Make the list anew if it does not hold at u[slot]."""
@@ -137,10 +143,10 @@ class SurfacePairs:
     def check_pass(self, u, slot: int, h: float) -> None:
         """After a pass of length h [s] to u[slot]: raise Tunnelling if a pair may have crossed."""
         self.age += 1
-        flags = self._check(u, slot, self.list.num_vt, self.list.num_ee)
-        if (flags[1] or flags[2]) and np.all(np.isfinite(runtime.fetch(u)[slot])):
-            self._refuse(runtime.fetch(u)[slot].astype(np.float64), h, bool(flags[2]))
-        if flags[0]:
+        stale, lost, crossed = self._check(u, slot, self.list.num_vt, self.list.num_ee)
+        if (lost or crossed) and np.all(np.isfinite(runtime.fetch(u)[slot])):
+            self._refuse(runtime.fetch(u)[slot].astype(np.float64), h, crossed)
+        if stale:
             self._build(u, slot)
 
     def _refuse(self, u: np.ndarray, h: float, crossed: bool) -> None:
