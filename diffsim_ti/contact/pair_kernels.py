@@ -13,6 +13,7 @@ from diffsim_ti.contact.proximity import EDGE_EDGE, VERTEX_TRIANGLE, pair_functi
 from diffsim_ti.runtime import Bundle
 
 A = ti.template()
+MARGIN = 1.001
 SAFE = 0.9  # share of its gap by which a pair may close in one pass
 # which corners belong to different primitives
 OPPOSITE = (((0, 1), (0, 2), (0, 3)), ((0, 2), (0, 3), (1, 2), (1, 3)))
@@ -72,31 +73,22 @@ def pair_kernels(precision: str, first: int, parallel: bool) -> SimpleNamespace:
         return total
 
     @ti.func
-    def apart(kind: ti.template(), y1, y2, y3):
-        """An axis n that parts the boxes of the two primitives, and their distance d along it, which may be negative.
-
-        The distance of the primitives is at least d, which spares most pairs of the list the search for nearest points.
-        """
-        lo, hi = ti.min(ti.min(y1, y2), y3), ti.max(ti.max(y1, y2), y3)  # from the vertex, at the origin, to the triangle
-        if ti.static(kind == EDGE_EDGE):
-            lo, hi = ti.min(y2, y3) - ti.max(y1, vec3(0)), ti.max(y2, y3) - ti.min(y1, vec3(0))
-        n, d = vec3(0), ti.cast(-1, fp)
-        for k in ti.static(range(3)):
-            if lo[k] > d:
-                n, d = vec3(0), lo[k]
-                n[k] = ti.cast(-1, fp)
-            if 0 - hi[k] > d:
-                n, d = vec3(0), 0 - hi[k]
-                n[k] = ti.cast(1, fp)
-        return n, d
+    def apart(kind: ti.template(), n, y1, y2, y3):
+        """How far apart along n all corners of the two primitives are: their distance is at least that, whatever n."""
+        y, d = (0 * y1, y1, y2, y3), ti.cast(1e30, fp)
+        for a, b in ti.static(OPPOSITE[kind]):
+            d = ti.min(d, n.dot(y[a] - y[b]))
+        return d
 
     @ti.func
     def force(kind: ti.template(), p, scale, scene: A, slot):
         stiffness, width = scene.parameters[first], scene.parameters[first + 1]
         y1, y2, y3 = corners(p, scene, slot)
-        n, d = apart(kind, y1, y2, y3)
-        energy, g1, g2, g3 = ti.cast(0, fp), vec3(0), vec3(0), vec3(0)
-        if d < width or scene.exact > 0:
+        last = scene.plane[p]
+        n, energy, g1, g2, g3 = vec3(last[0], last[1], last[2]), ti.cast(0, fp), vec3(0), vec3(0), vec3(0)
+        d = apart(kind, n, y1, y2, y3)
+        # the plane of the pass before spares most pairs the search; the margin is for rounding
+        if not d > ti.cast(MARGIN, fp) * width or scene.exact > 0:
             energy, n, d, g1, g2, g3 = f.gradient(kind, y1, y2, y3, scale, stiffness, width)
         scene.plane[p] = vec4(n[0], n[1], n[2], d)
         scene.energy[p] = energy
@@ -211,9 +203,13 @@ def pair_kernels(precision: str, first: int, parallel: bool) -> SimpleNamespace:
                 flags[2] = 1
 
     @ti.kernel
-    def keep_place(surface: ints, u: vectors2, built: vectors, slot: ti.i32, num_surface: ti.i32):
+    def begin(surface: ints, u: vectors2, built: vectors, plane: vectors, slot: ti.i32, num_surface: ti.i32,
+              count: ti.i32):  # fmt: skip
+        """A new list: where the surface is, and no planes yet."""
+        for p in range(count):
+            plane[p] = vec4(0)
         for s in range(num_surface):
             built[s] = u[slot, surface[s]]
 
-    return SimpleNamespace(forces=forces, products=products, add_sums=add_sums, check=check, keep_place=keep_place, fp=fp,
+    return SimpleNamespace(forces=forces, products=products, add_sums=add_sums, check=check, begin=begin, fp=fp,
                            vector=vec4)  # fmt: skip

@@ -105,10 +105,10 @@ class SurfacePairs:
         least = self.least_skin * self.width
         self.skin = float(np.clip(wanted, least, max(least, self.largest_reach * self.list.typical - self.width)))
         self.list.build(self.a.rest, u, slot, self.width + self.skin)
-        self.kernels.keep_place(self.list.surface, u, self.built, slot, self.list.num_surface)
         count, take = self.list.count, self.list.buffers.take
         self.corner, self.plane = take("forces", self.kernels.vector, 4 * count), take("planes", self.kernels.vector, count)
         self.energy, self.numbers = take("energies", self.kernels.fp, count), take("numbers", self.kernels.vector, count)
+        self.kernels.begin(self.list.surface, u, self.built, self.plane, slot, self.list.num_surface, count)
         if self._version != self.list.buffers.version:
             self._launches.clear()
             self._version = self.list.buffers.version
