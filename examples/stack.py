@@ -12,7 +12,7 @@ DT, SECONDS = 1e-3, 1.2  # [s]
 
 
 def main(count: int = COUNT, seconds: float = SECONDS) -> dict:
-    """Returns speeds [m/s], the drift sideways [m], the smallest gap [m] and the gaps' mean between blocks [m] at the end."""
+    """Returns height, drift sideways, smallest gap and the gaps between blocks [m], and speed [m/s], at the end."""
     block = ds.TetrahedralMesh.create_box(4, SIDE, pattern="five").translated([-SIDE / 2, GAP, -SIDE / 2])
     turned = [block.rotated([0, 1, 0], 0.15 * k).translated([0, k * (SIDE + GAP), 0]) for k in range(count)]
     mesh = ds.TetrahedralMesh.joined(turned)
@@ -29,8 +29,8 @@ def main(count: int = COUNT, seconds: float = SECONDS) -> dict:
     between = [x[upper, 1].min() - x[lower, 1].max() for lower, upper in zip(bodies, bodies[1:])]
     drift = max(np.hypot(*(x[body] - mesh.vertices[body]).mean(0)[[0, 2]]) for body in bodies)
     speed, gap = float(np.abs(v).max()), simulator.smallest_gap()
-    print(f"{count} blocks, {x[:, 1].max():.3f} m high after {seconds:g} s: speed {speed:.1e} m/s, drift {1e3 * drift:.3f} mm, "
-          f"smallest gap {1e3 * gap:.2f} mm")  # fmt: skip
+    print(f"{count} blocks, {x[:, 1].max():.3f} m high after {seconds:g} s: speed {speed:.1e} m/s, "
+          f"drift {1e3 * drift:.3f} mm, smallest gap {1e3 * gap:.2f} mm")  # fmt: skip
     return {"height": float(x[:, 1].max()), "speed": speed, "drift": float(drift), "gap": gap, "between": between}
 
 
