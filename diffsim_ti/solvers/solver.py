@@ -30,7 +30,7 @@ class Solver(ABC):
         runtime.check_host_init()
         runtime.check_backend(scene.precision)
         if not self.explicit and scene.term(SelfContact):
-            raise ValueError(f"{type(self).__name__} has no self-contact yet: use an explicit solver, or leave SelfContact out")
+            raise ValueError(f"{type(self).__name__} has no self-contact yet: use an explicit solver, or leave it out")
         self._tight: stability.StepLimit | None = None
         if self.explicit and not allow_unstable:
             self._refuse_unstable()
