@@ -5,6 +5,7 @@ import os
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # read when taichi is imported
 os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")  # no network traffic from a simulator
 
+from diffsim_ti.contact.surface_pairs import Tunnelling
 from diffsim_ti.divergence import Crossing, Divergence
 from diffsim_ti.materials import (
     Corotated,
@@ -28,7 +29,19 @@ from diffsim_ti.solvers import (
     StaticSolver,
     VelocityVerletSolver,
 )
-from diffsim_ti.terms import Box, Capsule, Cylinder, Drag, ExternalForce, Gravity, Ground, HalfSpace, MeshObstacle, Sphere
+from diffsim_ti.terms import (
+    Box,
+    Capsule,
+    Cylinder,
+    Drag,
+    ExternalForce,
+    Gravity,
+    Ground,
+    HalfSpace,
+    MeshObstacle,
+    SelfContact,
+    Sphere,
+)
 from diffsim_ti.verify import check_gradients, dot_product_test, taylor_test
 
 __version__ = "0.1.0"
@@ -36,9 +49,9 @@ __all__ = [
     "init", "TetrahedralMesh",
     "StableNeoHookean", "SmithNeoHookean", "LinearElastic", "Corotated", "StVenantKirchhoff", "MooneyRivlin",
     "Gravity", "Drag", "ExternalForce",
-    "Ground", "HalfSpace", "Sphere", "Box", "Capsule", "Cylinder", "MeshObstacle",
+    "Ground", "HalfSpace", "Sphere", "Box", "Capsule", "Cylinder", "MeshObstacle", "SelfContact",
     "Scene", "SemiImplicitSolver", "VelocityVerletSolver",
     "ImplicitEulerSolver", "ImplicitMidpointSolver", "BDF2Solver", "StaticSolver", "Simulator", "Divergence",
-    "Crossing", "NotConverged",
+    "Crossing", "Tunnelling", "NotConverged",
     "Rollout", "Frames", "taylor_test", "dot_product_test", "check_gradients",
 ]  # fmt: skip

@@ -14,7 +14,7 @@ from diffsim_ti import mesh_checks as checks
 from diffsim_ti import mesh_geometry as geometry
 from diffsim_ti.mesh_grid import box
 from diffsim_ti.mesh_io import KEEPS_SETS, read_mesh, write_mesh
-from diffsim_ti.mesh_sets import checked_sets, chosen_indices, sizes
+from diffsim_ti.mesh_sets import checked_sets, chosen_indices, join_sets, sizes
 
 
 class TetrahedralMesh:
@@ -110,6 +110,26 @@ class TetrahedralMesh:
         if lost:
             kept = ", ".join(KEEPS_SETS)
             warnings.warn(f"{path} cannot keep the sets {', '.join(lost)}; these formats can: {kept}", stacklevel=2)
+
+    @classmethod
+    def joined(cls, meshes) -> "TetrahedralMesh":
+        """Several bodies as one mesh of several pieces, one after the other.
+
+        Sets of the same name become one; each body's vertices and tetrahedra also become sets "body_0", "body_1", ...
+        ValueError for an empty list, and for meshes that have a set of such a name already.
+        """
+        meshes = list(meshes)
+        if not meshes:
+            raise ValueError("joined needs at least one mesh, got none")
+        firsts = np.cumsum([0, *(mesh.num_vertices for mesh in meshes)])
+        first_tets = np.cumsum([0, *(mesh.num_tetrahedra for mesh in meshes)])
+        vertex_sets = join_sets([mesh.vertex_sets for mesh in meshes], firsts)
+        tetrahedron_sets = join_sets([mesh.tetrahedron_sets for mesh in meshes], first_tets)
+        return cls(
+            np.concatenate([mesh.vertices for mesh in meshes]),
+            np.concatenate([mesh.tetrahedra + first for mesh, first in zip(meshes, firsts)]),
+            vertex_sets=vertex_sets, tetrahedron_sets=tetrahedron_sets,
+        )  # fmt: skip
 
     # What it consists of
 

@@ -43,6 +43,19 @@ def indices_of(chosen, count: int, what: str) -> np.ndarray:
     return chosen
 
 
+def join_sets(parts: list[dict], firsts: np.ndarray) -> dict[str, np.ndarray]:
+    """Sets of several bodies as sets of all, and each body's members as "body_<k>"; those of body k begin at firsts[k]."""
+    out = {}
+    for k in range(len(parts)):
+        name = f"body_{k}"
+        if any(name in other for other in parts):
+            raise ValueError(f"joined names the bodies body_0, body_1, ..., but a mesh has a set {name!r}: rename it")
+        out[name] = np.arange(firsts[k], firsts[k + 1])
+    for name in dict.fromkeys(name for sets in parts for name in sets):
+        out[name] = np.concatenate([sets[name] + first for sets, first in zip(parts, firsts) if name in sets])
+    return out
+
+
 def sizes(sets: dict) -> str:
     """Names with the number of members."""
     return ", ".join(f"{name} ({len(rows)})" for name, rows in sets.items()) or "none"

@@ -88,4 +88,6 @@ def energy(workspace) -> Energy:
         per_vertex = runtime.array(a.fp, a.num_vertices)
         observer_kernels(a.law, features)[1](a.rest, a.offsets, a.surface, a.parameters, workspace.state.u, per_vertex)
         parts["contact"] = float(runtime.fetch(per_vertex).astype(np.float64).sum())
+    if workspace.pairs:
+        parts["contact"] = parts.get("contact", 0.0) + workspace.pairs.look(workspace.state.u)[0]
     return Energy(parts)

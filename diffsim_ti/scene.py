@@ -4,7 +4,7 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.inputs import Inputs
-from diffsim_ti.terms import Drag, ExternalForce, Gravity, Obstacle, Term
+from diffsim_ti.terms import Drag, ExternalForce, Gravity, Obstacle, SelfContact, Term
 from diffsim_ti.terms.motion import sampled
 
 
@@ -50,7 +50,7 @@ class Scene:
             if not isinstance(term, Term):
                 raise ValueError(f"terms must be diffsim_ti terms such as Gravity(), got {term!r}")
             term.check(self.mesh)
-        for kind in (Gravity, Drag, ExternalForce):
+        for kind in (Gravity, Drag, ExternalForce, SelfContact):
             if sum(isinstance(t, kind) for t in self.terms) > 1:
                 raise ValueError(f"a scene takes one {kind.__name__}, got several; add their numbers instead")
         if self.motion is not None and len(self.fixed) == 0:

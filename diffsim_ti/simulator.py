@@ -127,6 +127,17 @@ class Simulator:
         """Total energy [J], a float with `.parts`: kinetic, elastic, gravity, contact."""
         return observe.energy(self.workspace)
 
+    def smallest_gap(self) -> float:
+        """Smallest distance [m] of surface primitives that share no vertex; infinite beyond the reach of SelfContact."""
+        if self.workspace.pairs is None:
+            raise ValueError("this scene has no SelfContact: add it to the scene's terms to know gaps between surfaces")
+        return self.workspace.pairs.look(self.workspace.state.u)[1]
+
+    def check_surfaces(self) -> None:
+        """Raise ValueError, naming primitives, if surfaces touch or pass through each other (scenes with SelfContact)."""
+        self.smallest_gap()
+        self.workspace.pairs.check_apart(self.workspace.state.u)
+
     def tetrahedron_fields(self) -> TetrahedronFields:
         """Energy density [J/m^3], von Mises stress [Pa] and volume ratio J of each tetrahedron."""
         return observe.tetrahedron_fields(self.workspace)

@@ -97,6 +97,9 @@ class Stiffness:
         w = root * x
         scale = np.abs(w).max() or 1.0  # f32 keeps its digits whatever the masses
         runtime.fill(self.w, (w / scale)[None])
+        if self.ws.pairs:
+            self.ws.pairs.ensure(self.ws.state.u, 0)
+            self.ws.pairs.product(self.ws.state.u, 0, self.w, self.ws.arrays.corner)
         self._multiply(self.ws.arrays.num_items, self.ws.arrays.num_vertices)
         return -root * runtime.fetch(self.y)[0].astype(np.float64) * scale
 

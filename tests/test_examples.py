@@ -13,12 +13,12 @@ import pytest
 ROOT = Path(__file__).parent.parent
 
 
-def run(name: str) -> dict:
+def run(name: str, *arguments) -> dict:
     """The numbers that an example's `main` returns."""
     spec = importlib.util.spec_from_file_location(name, ROOT / "examples" / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    return module.main()
+    return module.main(*arguments)
 
 
 def test_throw_at_target(capsys):
@@ -44,6 +44,18 @@ def test_inverse_rest_shape(capsys):
     assert numbers["ratio"] >= 100 and numbers["iterations"] <= 6
     assert numbers["lift"] > numbers["before"] > 0.05  # cast upwards, by more than the mean sag
     assert "sag" in capsys.readouterr().out
+
+
+def test_stack(capsys):
+    numbers = run("stack", 3, 0.3)
+    assert 0.29 < numbers["height"] < 0.31 and numbers["drift"] < 1e-5 and numbers["gap"] > 1e-3
+    assert min(numbers["between"]) > 0 and "high after" in capsys.readouterr().out
+
+
+def test_bowl(capsys):
+    numbers = run("bowl", 4, 2, 22)
+    assert 0 < numbers["gap"] < 0.25 * 0.1 / 2 and numbers["radius"] < 0.5
+    assert "no surface passed through another" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("precision", ["f32", "f64"])

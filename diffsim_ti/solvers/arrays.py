@@ -6,7 +6,7 @@ import taichi as ti
 from diffsim_ti import runtime
 from diffsim_ti.inputs import Derived
 from diffsim_ti.solvers.kick_drift import Features
-from diffsim_ti.terms import Drag, ExternalForce, Gravity
+from diffsim_ti.terms import Drag, ExternalForce, Gravity, SelfContact
 from diffsim_ti.tetrahedron import LANES
 
 
@@ -15,6 +15,12 @@ def vertex_corners(tetrahedra: np.ndarray, num_vertices: int) -> tuple[np.ndarra
     corner_of = np.argsort(tetrahedra.ravel(), kind="stable")
     counts = np.bincount(tetrahedra.ravel(), minlength=num_vertices)
     return np.concatenate([[0], np.cumsum(counts)]), corner_of
+
+
+def with_own_corner(start: np.ndarray, corner_of: np.ndarray, vertices: np.ndarray, first: int) -> tuple:
+    """The same rows with one corner more, first + k, at the end of that of vertices[k]."""
+    longer = np.insert(corner_of, start[vertices + 1], first + np.arange(len(vertices)))
+    return start + np.searchsorted(vertices, np.arange(len(start))), longer
 
 
 def slots(indices: np.ndarray, num_vertices: int) -> np.ndarray:
@@ -52,7 +58,13 @@ class SceneArrays:
         self.contacts = tuple(t for t in scene.terms if t.acts_on_surface)
         self.fixed = scene.fixed
         self.tets = runtime.upload(to_blocks(mesh.tetrahedra, self.num_blocks).ravel(), ti.i32)
+        self.mesh, self.precision, self.self_contact = mesh, precision, scene.term(SelfContact)
+        self.first_contact_corner, num_corners = 4 * LANES * self.num_blocks, 4 * LANES * self.num_blocks
         start, corner_of = vertex_corners(mesh.tetrahedra, mesh.num_vertices)
+        if self.self_contact:  # each surface vertex gathers one corner more, after those of its tetrahedra
+            self.first_of_self_contact = scene.inputs.first_parameter(self.self_contact)
+            start, corner_of = with_own_corner(start, corner_of, mesh.surface_vertices, num_corners)
+            num_corners += len(mesh.surface_vertices)
         self.start, self.corner_of = runtime.upload(start, ti.i32), runtime.upload(corner_of, ti.i32)
         none = runtime.array(ti.i32, 1)
         self.surface = none
@@ -76,7 +88,7 @@ class SceneArrays:
         )  # fmt: skip
         self.offsets = runtime.array(self.vector, len(self.contacts))  # where obstacles are when one looks between passes
         self.values: Derived | None = None
-        self.corner = runtime.array(self.vector, 4 * LANES * self.num_blocks)
+        self.corner = runtime.array(self.vector, num_corners)
 
     def _twins(self, scene) -> tuple:
         """Compile-time twins of the contacts; their tables stand behind the parameters, one after the other."""
@@ -110,7 +122,7 @@ class SceneArrays:
             "coefficients": (self.coefficient_blocks(values.coefficients), self.lanes),
             "inverse_mass": (inverse_mass, self.fp),
             "parameters": (np.concatenate([values.parameters, self.tables]), self.fp),
-            "rest": (values.rest if self.contacts else np.zeros((1, 3)), self.vector),
+            "rest": (values.rest if self.contacts or self.self_contact else np.zeros((1, 3)), self.vector),
             "forces": (np.zeros((1, 1, 3)) if values.forces is None else values.forces, self.vector),
             "motion": (np.zeros((1, 1, 3)) if values.motion is None else values.motion, self.vector),
             "path": (np.zeros((1, 1, 3)) if values.path is None else values.path, self.vector),

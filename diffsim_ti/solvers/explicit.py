@@ -78,9 +78,16 @@ class ExplicitWorkspace(Workspace):
             a.path, a.corner, history.u, history.v, history.f, *self.frames, self.watch.array,
         )  # fmt: skip
         stride, substeps, inverse_dt = int(recording), self.solver.substeps, 1 / self.solver.dt
-        chunk = 1 if self.parallel else max(1, self.work_per_launch // a.num_tetrahedra)
+        pairs, base = self.pairs, base or 0
+        if pairs:
+            pairs.ensure(history.u, (first - base) * stride)
+        chunk = 1 if self.parallel or pairs else max(1, self.work_per_launch // a.num_tetrahedra)
         for start, count, w in self.solver.groups(first, last, num_passes, self.rate):
             for j in range(start, start + count, chunk):
-                launch(a.num_items, a.num_vertices, j, min(chunk, start + count - j), base or 0, stride, substeps,
+                if pairs:
+                    pairs.forces(history.u, (j - base) * stride, a.corner)
+                launch(a.num_items, a.num_vertices, j, min(chunk, start + count - j), base, stride, substeps,
                        save_every,
                        w.lag0, w.lag1, w.pre, w.post, w.alpha, w.decay, inverse_dt, self.solver.substep)  # fmt: skip
+                if pairs:
+                    pairs.check_pass(history.u, (j + 1 - base) * stride, self.solver.substep)

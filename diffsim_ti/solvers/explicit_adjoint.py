@@ -49,6 +49,8 @@ class ExplicitAdjoint:
         """
         for target in (*self._sums(), self.u, self.v, self.w):
             runtime.fill(target, 0)
+        if self.ws.pairs:
+            self.ws.pairs.clear_sums()
         runtime.fill(self.frames[0], positions_adj)
         runtime.fill(self.frames[1], velocities_adj)
         if last_frame_is_input:
@@ -64,7 +66,7 @@ class ExplicitAdjoint:
             history.u, history.v, history.f, self.u, self.v, self.w, *self._sums(), *self.frames,
         )  # fmt: skip
         substeps, inverse_dt = ws.solver.substeps, 1 / ws.solver.dt
-        chunk = 1 if ws.parallel else max(1, ws.work_per_launch // (2 * a.num_tetrahedra))
+        chunk = 1 if ws.parallel or ws.pairs else max(1, ws.work_per_launch // (2 * a.num_tetrahedra))
         for start, count, w in reversed(ws.solver.groups(stop, last, num_passes, ws.rate)):
             end = start + count
             while end > start:
@@ -72,6 +74,9 @@ class ExplicitAdjoint:
                 launch(a.num_items, a.num_vertices, begin, end - begin, base, num_passes, substeps, save_every, w.lag0,
                        w.lag1, w.pre, w.post,
                        w.alpha, w.decay, inverse_dt, ws.solver.substep, w.alpha_by_rate, w.decay_by_rate)  # fmt: skip
+                if ws.pairs:
+                    ws.pairs.ensure(history.u, begin - base)
+                    ws.pairs.vjp(history.u, begin - base, self.w, self.corner)
                 end = begin
 
     def finish(self) -> None:
@@ -107,6 +112,10 @@ class ExplicitAdjoint:
             at = rows["contacts"] + contact.first - self.features.contacts[0].first
             out.parameters[contact.first :][: contact.size] = sums[at : at + contact.size].sum(1)
         out.rest = runtime.fetch(self.frames[0]).astype(np.float64).sum(0)
+        if self.ws.pairs:
+            numbers, rest = self.ws.pairs.collect()
+            out.parameters[a.first_of_self_contact :][:2] = numbers
+            out.rest += rest
         if self.features.shape:
             out.rest += sums[rows["rest"] :][:3].T
             out.gradients = from_blocks(runtime.fetch(self.gradients), a.num_tetrahedra, 9).reshape(-1, 3, 3)
@@ -144,7 +153,7 @@ class ExplicitTangent:
             runtime.upload(to_blocks(dots.volumes, a.num_blocks), a.lanes),
         )  # fmt: skip
         self._rate_dot = float(dots.parameters[self.features.drag]) if self.features.drag >= 0 else 0.0
-        self._rest_dot = dots.rest
+        self._rest_dot, self._parameters_dot = dots.rest, dots.parameters
 
     def advance(self, first: int, last: int, num_passes: int, save_every: int) -> None:
         """Tangent of passes first .. last - 1, recorded from slot 0."""
@@ -155,6 +164,10 @@ class ExplicitTangent:
         )  # fmt: skip
         for start, count, w in ws.solver.groups(first, last, num_passes, ws.rate):
             for j in range(start, start + count):
+                if ws.pairs:
+                    ws.pairs.ensure(history.u, j - first)
+                    ws.pairs.product(history.u, j - first, self.u, a.corner, self._dots[3],
+                                     self._parameters_dot[a.first_of_self_contact :][:2])  # fmt: skip
                 launch(a.num_items, a.num_vertices, j, first, ws.solver.substeps, save_every, w.lag0, w.lag1, w.pre,
                        w.post, w.alpha, w.decay, 1 / ws.solver.dt, ws.solver.substep, w.alpha_by_rate * self._rate_dot,
                        w.decay_by_rate * self._rate_dot)  # fmt: skip

@@ -1,6 +1,7 @@
 """Device data of one run: the scene's numbers, the current state, recorded states and saved frames as needed."""
 
 from diffsim_ti import runtime
+from diffsim_ti.contact.surface_pairs import SurfacePairs
 from diffsim_ti.inputs import Derived
 from diffsim_ti.solvers.arrays import History, SceneArrays, copy_slot, first_bad_vertex
 from diffsim_ti.solvers.watch import ContactWatch
@@ -14,6 +15,7 @@ class Workspace:
         self.owner = runtime.program()
         self.arrays = SceneArrays(self.scene)
         self.parallel = solver.runs_parallel()
+        self.pairs = SurfacePairs(self.arrays, self.parallel) if self.arrays.self_contact else None
         self.state = self.history(1)
         self.record: History | None = None
         self.frames = (runtime.array(self.arrays.vector, 1, 1), runtime.array(self.arrays.vector, 1, 1))
@@ -31,6 +33,8 @@ class Workspace:
         if self.arrays.load(derived):
             self._launches.clear()
         self.restart()
+        if self.pairs:
+            self.pairs.load(self.state.u)
 
     def restart(self) -> None:
         """Set the state to the start."""
@@ -46,6 +50,8 @@ class Workspace:
 
     def forget(self) -> None:
         """The state was set from outside: forget what came before it."""
+        if self.pairs:
+            self.pairs.forget(self.state.u)
 
     @property
     def rate(self) -> float:
@@ -63,6 +69,8 @@ class Workspace:
         if self.record is None or self.record.num_slots < num_slots:
             self.record = self.history(num_slots, record=True)
             self._launches.clear()
+            if self.pairs:
+                self.pairs.unbind()
         return self.record
 
     def first_bad_vertex(self) -> int | None:

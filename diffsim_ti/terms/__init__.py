@@ -9,11 +9,12 @@ from diffsim_ti.terms.ground import Ground
 from diffsim_ti.terms.half_space import HalfSpace
 from diffsim_ti.terms.mesh_obstacle import MeshObstacle
 from diffsim_ti.terms.obstacle import Obstacle
+from diffsim_ti.terms.self_contact import SelfContact
 from diffsim_ti.terms.term import Term, VertexForce
 
 OBSTACLES = (Ground, HalfSpace, Sphere, Box, Capsule, Cylinder, MeshObstacle)
-TERMS = (Gravity, Drag, ExternalForce, *OBSTACLES)
+TERMS = (Gravity, Drag, ExternalForce, *OBSTACLES, SelfContact)
 __all__ = [
     "Box", "Capsule", "Cylinder", "Drag", "ExternalForce", "Gravity", "Ground", "HalfSpace", "MeshObstacle", "OBSTACLES",
-    "Obstacle", "Sphere", "Term", "TERMS", "VertexForce",
+    "Obstacle", "SelfContact", "Sphere", "Term", "TERMS", "VertexForce",
 ]  # fmt: skip

@@ -1,0 +1,1 @@
+"""Contact of surfaces with themselves and with each other: distances, candidates, forces."""

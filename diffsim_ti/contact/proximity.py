@@ -1,0 +1,282 @@
+"""Distance of a vertex to a triangle and of two edges, the barrier energy of such a pair, and their derivatives.
+
+A pair has four corners x_0..x_3: (vertex, triangle) or (first edge, second edge). Its nearest points lie at parameters
+t = (t_1, t_2), and r = sum_i w_i(t) x_i joins them, w affine in t. A constraint at the border of the triangle or of an edge
+leaves 2, 1 or 0 of the parameters free, and that is all that differs between face, edge and vertex:
+
+    grad_i d^2 = 2 r w_i                                    by the envelope theorem
+    dt = -G (E^T dr_t + dE^T r),   E_k = dr / dt_k          G = (E^T E)^-1 on the free parameters, zero elsewhere
+
+with dr_t the change of r at fixed t; then dr = dr_t + E dt and dw_i = (dw_i / dt) dt. Energy of a pair:
+
+    m(q) stiffness width^2 beta(d / width)                  beta: terms/barrier.py
+
+where m = q (2 - q) for q < 1, else 1, fades out edges that become parallel, whose nearest points jump:
+q = |a x b|^2 / (10^-3 A^2 B^2), with A, B the lengths at rest. Vertex and triangle: m = 1.
+Li et al. 2020, Incremental Potential Contact, doi:10.1145/3386569.3392425. Vectors are relative to corner 0.
+"""
+
+from functools import lru_cache
+from types import SimpleNamespace
+
+import numpy as np
+import taichi as ti
+
+from diffsim_ti import runtime
+from diffsim_ti.terms import barrier
+
+VERTEX_TRIANGLE, EDGE_EDGE = 0, 1
+PARALLEL = 1e-3  # threshold of q, in squared lengths at rest
+# how the weights of the corners change with the two parameters
+BY_FIRST = ((0, 1, -1, 0), (-1, 1, 0, 0))
+BY_SECOND = ((0, 1, 0, -1), (0, 0, 1, -1))
+
+
+@lru_cache(maxsize=None)
+def pair_functions(precision: str) -> SimpleNamespace:
+    """Taichi functions of one pair; `kind` is VERTEX_TRIANGLE or EDGE_EDGE, known when kernels compile."""
+    fp = runtime.PRECISIONS[precision]
+    vec3, vec4 = ti.types.vector(3, fp), ti.types.vector(4, fp)
+    # sin^2 of an angle below which edges, and triangles, count as degenerate: their inner solution is lost to rounding
+    flat, tiny = (1e-6, 1e-30) if precision == "f32" else (1e-14, 1e-200)
+
+    @ti.func
+    def along(q, e):
+        """Nearest parameter in [0, 1] of the line t e to the point q, and 1 / |e|^2 if it is free, else 0."""
+        zero, one = ti.cast(0, fp), ti.cast(1, fp)
+        square = ti.max(e.norm_sqr(), ti.cast(tiny, fp))
+        t, free = q.dot(e) / square, one / square
+        if t <= zero:
+            t, free = zero, zero
+        if t >= one:
+            t, free = one, zero
+        return t, free
+
+    @ti.func
+    def nearest_on_triangle(y1, y2, y3):
+        """(t_1, t_2, G_11, G_12, G_22) of the origin and the triangle y1 + t_1 (y2 - y1) + t_2 (y3 - y1)."""
+        zero, one = ti.cast(0, fp), ti.cast(1, fp)
+        e1, e2, q = y2 - y1, y3 - y1, 0 * y1 - y1
+        a11, a12, a22, normal = e1.norm_sqr(), e1.dot(e2), e2.norm_sqr(), e1.cross(e2)
+        det = normal.norm_sqr()
+        inverse = one / ti.max(det, ti.cast(tiny, fp))
+        # cross products lose fewer digits than b_1 a_22 - b_2 a_12
+        s, t = q.cross(e2).dot(normal) * inverse, e1.cross(q).dot(normal) * inverse
+        g = vec3(a22, 0 - a12, a11) * inverse
+        if not (det > ti.cast(flat, fp) * a11 * a22 and s > zero and t > zero and s + t < one):
+            s1, free1 = along(q, e1)
+            t2, free2 = along(q, e2)
+            t3, free3 = along(q - e1, e2 - e1)
+            d1, d2, d3 = (q - s1 * e1).norm_sqr(), (q - t2 * e2).norm_sqr(), (q - e1 - t3 * (e2 - e1)).norm_sqr()
+            s, t, g = s1, zero, vec3(free1, zero, zero)
+            if d2 < d1:
+                s, t, g, d1 = zero, t2, vec3(zero, zero, free2), d2
+            if d3 < d1:
+                s, t, g = one - t3, t3, vec3(free3, 0 - free3, free3)
+        return s, t, g[0], g[1], g[2]
+
+    @ti.func
+    def nearest_of_edges(y1, y2, y3):
+        """(t_1, t_2, G_11, G_12, G_22) of the edges t_1 y1 and y2 + t_2 (y3 - y2)."""
+        zero, one = ti.cast(0, fp), ti.cast(1, fp)
+        a, b = y1, y3 - y2
+        aa, ab, bb, normal = a.norm_sqr(), a.dot(b), b.norm_sqr(), a.cross(b)
+        det = normal.norm_sqr()
+        inverse = one / ti.max(det, ti.cast(tiny, fp))
+        s, t = y2.cross(b).dot(normal) * inverse, y2.cross(a).dot(normal) * inverse
+        g = vec3(bb, ab, aa) * inverse
+        if not (det > ti.cast(flat, fp) * aa * bb and s > zero and s < one and t > zero and t < one):
+            t0, free0 = along(0 * y2 - y2, b)
+            t1, free1 = along(a - y2, b)
+            s0, free2 = along(y2, a)
+            s1, free3 = along(y3, a)
+            s, t, g = zero, t0, vec3(zero, zero, free0)
+            best = (y2 + t0 * b).norm_sqr()
+            d = (a - y2 - t1 * b).norm_sqr()
+            if d < best:
+                s, t, g, best = one, t1, vec3(zero, zero, free1), d
+            d = (s0 * a - y2).norm_sqr()
+            if d < best:
+                s, t, g, best = s0, zero, vec3(free2, zero, zero), d
+            d = (s1 * a - y3).norm_sqr()
+            if d < best:
+                s, t, g = s1, one, vec3(free3, zero, zero)
+        return s, t, g[0], g[1], g[2]
+
+    @ti.func
+    def nearest(kind: ti.template(), y1, y2, y3):
+        """Weights w of the corners, r, and G, as (w, r, (G_11, G_12, G_22))."""
+        one, w = ti.cast(1, fp), vec4(0)
+        s, t, g11, g12, g22 = ti.cast(0, fp), ti.cast(0, fp), ti.cast(0, fp), ti.cast(0, fp), ti.cast(0, fp)
+        if ti.static(kind == VERTEX_TRIANGLE):
+            s, t, g11, g12, g22 = nearest_on_triangle(y1, y2, y3)
+            w = vec4(one, s + t - one, 0 - s, 0 - t)
+        else:
+            s, t, g11, g12, g22 = nearest_of_edges(y1, y2, y3)
+            w = vec4(one - s, s, t - one, 0 - t)
+        return w, w[1] * y1 + w[2] * y2 + w[3] * y3, vec3(g11, g12, g22)
+
+    @ti.func
+    def combine(weights: ti.template(), y1, y2, y3):
+        """sum_i weights_i y_i with constant weights of -1, 0, 1."""
+        out = vec3(0)
+        for k in ti.static(range(3)):
+            if ti.static(weights[k + 1] != 0):
+                out += ti.cast(weights[k + 1], fp) * (y1, y2, y3)[k]
+        return out
+
+    @ti.func
+    def nearest_jvp(kind: ti.template(), y1, y2, y3, dy1, dy2, dy3, w, r, g):
+        """Changes (dw, dr) for changes of the corners relative to corner 0, and dr at fixed parameters."""
+        first, second = ti.static(BY_FIRST[kind], BY_SECOND[kind])
+        dr = w[1] * dy1 + w[2] * dy2 + w[3] * dy3
+        e1, e2 = combine(first, y1, y2, y3), combine(second, y1, y2, y3)
+        b1 = e1.dot(dr) + combine(first, dy1, dy2, dy3).dot(r)
+        b2 = e2.dot(dr) + combine(second, dy1, dy2, dy3).dot(r)
+        ds, dt = 0 - (g[0] * b1 + g[1] * b2), 0 - (g[1] * b1 + g[2] * b2)
+        dw = vec4(0)
+        for k in ti.static(range(4)):
+            dw[k] = ti.cast(first[k], fp) * ds + ti.cast(second[k], fp) * dt
+        return dw, dr + ds * e1 + dt * e2, dr
+
+    @ti.func
+    def mollifier(q):
+        """m(q), m', m''"""
+        one, m, slope, curvature = ti.cast(1, fp), ti.cast(1, fp), ti.cast(0, fp), ti.cast(0, fp)
+        if q < one:
+            m, slope, curvature = q * (2 - q), 2 * (one - q), ti.cast(-2, fp)
+        return m, slope, curvature
+
+    @ti.func
+    def gradient(kind: ti.template(), y1, y2, y3, scale, stiffness, width):
+        """(energy, n, d, g1, g2, g3): gradient of the energy by corners 1 to 3; corner 0 balances them.
+
+        n = r / d. scale: 1 / sqrt(threshold of |a x b|^2), not used for vertex and triangle.
+        """
+        w, r, g = nearest(kind, y1, y2, y3)
+        d = ti.sqrt(r.norm_sqr())
+        n = r / ti.max(d, ti.cast(tiny, fp))
+        energy, g1, g2, g3 = ti.cast(0, fp), vec3(0), vec3(0), vec3(0)
+        if d < width:
+            s = d / width
+            phi, slope = stiffness * width * width * barrier.value(s, fp), stiffness * width * barrier.slope(s, fp)
+            m = ti.cast(1, fp)
+            if ti.static(kind == EDGE_EDGE):
+                a, b = y1, y3 - y2
+                x = scale * a.cross(b)
+                m, by_q, _ = mollifier(x.norm_sqr())
+                by_b = (2 * phi * by_q * scale) * x.cross(a)
+                g1, g2, g3 = (2 * phi * by_q * scale) * b.cross(x), 0 - by_b, by_b
+            energy = m * phi
+            force = (m * slope) * n
+            g1, g2, g3 = g1 + w[1] * force, g2 + w[2] * force, g3 + w[3] * force
+        return energy, n, d, g1, g2, g3
+
+    @ti.func
+    def gradient_jvp(kind: ti.template(), y1, y2, y3, dy1, dy2, dy3, scale, stiffness, width, d_stiffness, d_width):
+        """(h1, h2, h3, by_stiffness, by_width): change of the gradient of corners 1 to 3 (0 balances them) for changes of
+        corners, stiffness and width; and the products of dy with the gradient's derivatives by stiffness and width."""
+        w, r, g = nearest(kind, y1, y2, y3)
+        d = ti.sqrt(r.norm_sqr())
+        h1, h2, h3, by_stiffness, by_width = vec3(0), vec3(0), vec3(0), ti.cast(0, fp), ti.cast(0, fp)
+        if d < width:
+            inverse = ti.cast(1, fp) / ti.max(d, ti.cast(tiny, fp))
+            n, s = inverse * r, d / width
+            dw, dr, fixed = nearest_jvp(kind, y1, y2, y3, dy1, dy2, dy3, w, r, g)
+            dd = n.dot(fixed)
+            dn = inverse * (dr - n.dot(dr) * n)
+            # phi = stiffness width^2 beta, its derivatives by d, and by width
+            beta, beta1, beta2 = barrier.value(s, fp), barrier.slope(s, fp), barrier.curvature(s, fp)
+            phi, slope, curvature = stiffness * width * width * beta, stiffness * width * beta1, stiffness * beta2
+            phi_by_width, slope_by_width = stiffness * width * (2 * beta - s * beta1), stiffness * (beta1 - s * beta2)
+            relative = d_stiffness / stiffness
+            d_phi = slope * dd + relative * phi + d_width * phi_by_width
+            d_slope = curvature * dd + relative * slope + d_width * slope_by_width
+            m, dm = ti.cast(1, fp), ti.cast(0, fp)
+            if ti.static(kind == EDGE_EDGE):
+                a, b, da, db = y1, y3 - y2, dy1, dy3 - dy2
+                x, dx = scale * a.cross(b), scale * (da.cross(b) + a.cross(db))
+                dq = 2 * x.dot(dx)
+                q_a, q_b = (2 * scale) * b.cross(x), (2 * scale) * x.cross(a)
+                dq_a, dq_b = (2 * scale) * (db.cross(x) + b.cross(dx)), (2 * scale) * (dx.cross(a) + x.cross(da))
+                value, by_q, by_qq = mollifier(x.norm_sqr())
+                m, dm = value, by_q * dq
+                change, factor = d_phi * by_q + phi * by_qq * dq, phi * by_q
+                by_b = change * q_b + factor * dq_b
+                h1, h2, h3 = change * q_a + factor * dq_a, 0 - by_b, by_b
+                by_stiffness += factor * dq / stiffness
+                by_width += phi_by_width * by_q * dq
+            by_stiffness += m * slope * dd / stiffness
+            by_width += m * slope_by_width * dd
+            along_n, turned = (m * d_slope + dm * slope) * n, (m * slope) * dn
+            shifted = (m * slope) * n
+            h1 += w[1] * (along_n + turned) + dw[1] * shifted
+            h2 += w[2] * (along_n + turned) + dw[2] * shifted
+            h3 += w[3] * (along_n + turned) + dw[3] * shifted
+        return h1, h2, h3, by_stiffness, by_width
+
+    return SimpleNamespace(fp=fp, vec3=vec3, vec4=vec4, nearest=nearest, nearest_jvp=nearest_jvp, gradient=gradient,
+                           gradient_jvp=gradient_jvp)  # fmt: skip
+
+
+@lru_cache(maxsize=None)
+def _evaluate_kernel(precision: str, kind: int):
+    f = pair_functions(precision)
+    array1, array2, array3 = (ti.types.ndarray(f.fp, k) for k in (1, 2, 3))
+
+    @ti.func
+    def row(a: ti.template(), p, k):
+        return f.vec3(a[p, k, 0] - a[p, 0, 0], a[p, k, 1] - a[p, 0, 1], a[p, k, 2] - a[p, 0, 2])
+
+    @ti.func
+    def write(out: ti.template(), p, h1, h2, h3):
+        h0 = f.vec3(0) - (h1 + h2 + h3)
+        for d in ti.static(range(3)):
+            out[p, 0, d], out[p, 1, d], out[p, 2, d], out[p, 3, d] = h0[d], h1[d], h2[d], h3[d]
+
+    @ti.kernel
+    def evaluate(x: array3, dx: array3, scale: array1, numbers: array2, square_gradient: array3, square_product: array3,
+                 gradient: array3, product: array3, stiffness: f.fp, width: f.fp):  # fmt: skip
+        for p in range(x.shape[0]):
+            y1, y2, y3, dy1, dy2, dy3 = row(x, p, 1), row(x, p, 2), row(x, p, 3), row(dx, p, 1), row(dx, p, 2), row(dx, p, 3)
+            w, r, g = f.nearest(kind, y1, y2, y3)
+            dw, dr, _ = f.nearest_jvp(kind, y1, y2, y3, dy1, dy2, dy3, w, r, g)
+            for k in ti.static(range(4)):
+                for d in ti.static(range(3)):
+                    square_gradient[p, k, d] = 2 * w[k] * r[d]
+                    square_product[p, k, d] = 2 * (w[k] * dr[d] + dw[k] * r[d])
+            energy, n, d, g1, g2, g3 = f.gradient(kind, y1, y2, y3, scale[p], stiffness, width)
+            h1, h2, h3, by_stiffness, by_width = f.gradient_jvp(kind, y1, y2, y3, dy1, dy2, dy3, scale[p], stiffness, width,
+                                                                ti.cast(0, f.fp), ti.cast(0, f.fp))  # fmt: skip
+            numbers[p, 0], numbers[p, 1], numbers[p, 2], numbers[p, 3] = d, energy, by_stiffness, by_width
+            write(gradient, p, g1, g2, g3)
+            write(product, p, h1, h2, h3)
+
+    return evaluate
+
+
+def evaluate_pairs(kind: int, points, direction=None, stiffness: float = 1.0, width: float = 1.0, threshold=None,
+                   precision: str = "f64") -> SimpleNamespace:  # fmt: skip
+    """Distances and barrier energies of pairs of given corners, with derivatives; arrays in, arrays out.
+
+    kind: VERTEX_TRIANGLE or EDGE_EDGE. points, direction: shape (k, 4, 3) [m]; direction defaults to zero.
+    threshold: of |a x b|^2 [m^4], below which edges are faded out, one number or shape (k,); default 10^-3 |a|^2 |b|^2.
+    Returns distance (k,) [m], energy (k,) [J], gradient (k, 4, 3) [N], product: the energy's Hessian times direction,
+    square_gradient and square_product: the same of the squared distance, by_stiffness and by_width: direction times
+    the derivatives of the gradient.
+    """
+    x = np.ascontiguousarray(points, runtime.NUMPY[precision])
+    if x.ndim != 3 or x.shape[1:] != (4, 3):
+        raise ValueError(f"points must have shape (k, 4, 3), four corners for each pair, got {x.shape}")
+    dx = np.zeros_like(x) if direction is None else np.ascontiguousarray(np.broadcast_to(direction, x.shape), x.dtype)
+    if threshold is None:
+        threshold = PARALLEL * ((x[:, 1] - x[:, 0]) ** 2).sum(1) * ((x[:, 3] - x[:, 2]) ** 2).sum(1)
+    scale = np.ascontiguousarray(np.broadcast_to(1 / np.sqrt(threshold), len(x)), x.dtype)
+    runtime.program()
+    numbers = np.zeros((len(x), 4), x.dtype)
+    square_gradient, square_product, gradient, product = (np.zeros_like(x) for _ in range(4))
+    _evaluate_kernel(precision, kind)(x, dx, scale, numbers, square_gradient, square_product, gradient, product,
+                                      float(stiffness), float(width))  # fmt: skip
+    return SimpleNamespace(distance=numbers[:, 0], energy=numbers[:, 1], by_stiffness=numbers[:, 2],
+                           by_width=numbers[:, 3], square_gradient=square_gradient, square_product=square_product,
+                           gradient=gradient, product=product)  # fmt: skip

@@ -1,0 +1,258 @@
+"""Contact within a run: the list of near pairs, kept while it holds, and the forces of its pairs."""
+
+import numpy as np
+import taichi as ti
+
+from diffsim_ti import runtime
+from diffsim_ti.contact.broad_phase import CandidatePairs
+from diffsim_ti.contact.pair_kernels import OPPOSITE, pair_kernels
+
+
+class Tunnelling(FloatingPointError):
+    """In one pass, surfaces moved so far that they may have gone through each other."""
+
+
+class SurfacePairs:
+    """Pairs of surface primitives of a scene with a SelfContact term (terms/self_contact.py).
+
+    The list holds all pairs within width + skin of where it was made, and holds good until a vertex has moved by skin / 2
+    (or, where bodies fly together, has moved so far relative to the first vertex).
+    Pairs beyond the width add exact zeros, in a fixed order, so that forces have the same bits whatever the list's age.
+    Forces go to the last corners of an array of corners, one for each surface vertex (solvers/arrays.py).
+    """
+
+    passes = 20  # that a list should last: its skin follows the motion, but
+    least_skin = 0.2  # is at least this share of the width, and
+    largest_reach = 0.6  # width + skin is at most this share of an edge, beyond which neighbours of neighbours fill the list
+
+    def __init__(self, arrays, parallel: bool):
+        self.a, mesh, term = arrays, arrays.mesh, arrays.self_contact
+        self.mesh, self.first, self.parallel = mesh, arrays.first_of_self_contact, parallel
+        self.kernels = pair_kernels(arrays.precision, self.first, parallel)
+        edges = surface_edges(mesh)
+        lengths = np.linalg.norm(mesh.vertices[edges[:, 1]] - mesh.vertices[edges[:, 0]], axis=1)
+        self.edges, self.term = edges, term
+        self.list = CandidatePairs(mesh.num_vertices, mesh.surface_vertices, mesh.surface_triangles, edges, lengths,
+                                   arrays.precision)  # fmt: skip
+        n = len(mesh.surface_vertices)
+        vector = self.kernels.vector
+        self.before, self.built, self.sums, self.rest_adj = (runtime.array(vector, n) for _ in range(4))
+        self.none, self.flags = runtime.array(vector, 1), runtime.array(ti.i32, 5)
+        self.skin, self.fresh, self.age, self.builds = 0.0, False, 0, 0
+        self._launches, self._version, self._checked_rest, self._scratch = {}, -1, None, None
+
+    @property
+    def width(self) -> float:
+        return float(self.a.values.parameters[self.first + 1])
+
+    def load(self, u) -> None:
+        """New values, the start at u: raise ValueError if the surface passes through itself, or the width does not fit."""
+        self.fresh = False
+        checked = (self.a.values.rest, self.width)
+        if self._checked_rest is None or self._checked_rest[0] is not checked[0] or self._checked_rest[1] != checked[1]:
+            rest_state = runtime.array(self.kernels.vector, 1, self.a.num_vertices)
+            runtime.fill(rest_state, 0)
+            self._check_rest(rest_state)
+            self._checked_rest = checked
+        self._build(u, 0)
+        self.check_apart(u)
+
+    def _check_rest(self, u) -> None:
+        self._build(u, 0)
+        gaps, pairs = self._distances(u)
+        body = pieces(self.mesh)
+        near = np.nonzero((gaps < self.width) & (body[pairs[:, 0]] == body[pairs[:, 2]]))[0]
+        if near.size:
+            worst = near[gaps[near].argmin()]
+            raise ValueError(
+                f"self-contact of width {self.width:.3g} m: {self._name(worst, pairs)} of one body are only "
+                f"{gaps[worst]:.3g} m apart at rest and would press on each other; take a width below that"
+            )
+
+    def check_apart(self, u) -> None:
+        """Raise ValueError if surfaces touch or pass through each other at u[0]."""
+        if not self.fresh or self.age:
+            self._build(u, 0)
+        found = self.list.first_piercing(self.a.rest, u, 0)
+        if found:
+            edge, triangle = self.edges[found[0]], self.mesh.surface_triangles[found[1]]
+            raise ValueError(
+                f"surfaces pass through each other: edge {_numbers(edge)} and triangle {_numbers(triangle)}; "
+                "move the bodies apart"
+            )
+        gaps, pairs = self._distances(u)
+        if gaps.size and not gaps.min() > 0:
+            worst = int(gaps.argmin())
+            raise ValueError(f"surfaces touch: {self._name(worst, pairs)}; move the bodies apart")
+
+    def forget(self, u) -> None:
+        """The state was set from outside."""
+        self._build(u, 0)
+        self.check_apart(u)
+
+    # ---- the list ---------------------------------------------------------------------------------------------------
+
+    def _build(self, u, slot: int) -> None:
+        surface = self.mesh.surface_vertices
+        x = runtime.fetch(u)[slot][surface]
+        if not np.all(np.isfinite(x)):  # the guard of the run will say so
+            return
+        wanted = 0.0
+        if self.fresh and self.age:
+            move = x - runtime.fetch(self.built)
+            moved = min(np.linalg.norm(y, axis=1).max() for y in (move, move - move[0]))
+            wanted = 2 * self.passes * moved / self.age
+        least = self.least_skin * self.width
+        self.skin = float(np.clip(wanted, least, max(least, self.largest_reach * self.list.typical - self.width)))
+        self.list.build(self.a.rest, u, slot, self.width + self.skin)
+        count, take = self.list.count, self.list.buffers.take
+        self.corner, self.plane = take("forces", self.kernels.vector, 4 * count), take("planes", self.kernels.vector, count)
+        self.energy, self.numbers = take("energies", self.kernels.fp, count), take("numbers", self.kernels.vector, count)
+        self.kernels.begin(self.list.surface, u, self.built, self.plane, slot, self.list.num_surface, count)
+        if self._version != self.list.buffers.version:
+            self._launches.clear()
+            self._version = self.list.buffers.version
+        self.fresh, self.age = True, 0
+        self.builds += 1
+
+    def unbind(self) -> None:
+        """Let go of the arrays that forces were computed from."""
+        self._launches.clear()
+
+    def _launch(self, name: str, kernel, *arrays) -> runtime.Launch:
+        key = (name, *map(id, arrays))
+        if key not in self._launches:
+            self._launches[key] = runtime.Launch(kernel, *arrays)
+        return self._launches[key]
+
+    def _check(self, u, slot: int, num_vt: int, num_ee: int) -> tuple[bool, bool, bool]:
+        """Whether the list is stale, whether pairs beyond it may have crossed, and whether pairs of it may have."""
+        k = self.list
+        self._launch("check", self.kernels.check, k.pairs, k.surface, k.place, u, self.before, self.built, self.plane,
+                     self.flags)(slot, num_vt, num_ee, k.num_surface, 0.5 * self.skin,
+                                 0.5 * (self.width + self.skin))  # fmt: skip
+        flags = runtime.view(self.flags)
+        far, lost, crossed, far_apart, lost_apart = runtime.fetch(self.flags) if flags is None else flags
+        return bool(far and far_apart), bool(lost and lost_apart), bool(crossed)
+
+    def ensure(self, u, slot: int) -> None:
+        """Make the list anew if it does not hold at u[slot]."""
+        if not self.fresh or self._check(u, slot, 0, 0)[0]:
+            self._build(u, slot)
+
+    def check_pass(self, u, slot: int, h: float) -> None:
+        """After a pass of length h [s] to u[slot]: raise Tunnelling if a pair may have crossed."""
+        self.age += 1
+        stale, lost, crossed = self._check(u, slot, self.list.num_vt, self.list.num_ee)
+        if (lost or crossed) and np.all(np.isfinite(runtime.fetch(u)[slot])):
+            self._refuse(runtime.fetch(u)[slot].astype(np.float64), h, crossed)
+        if stale:
+            self._build(u, slot)
+
+    def _refuse(self, u: np.ndarray, h: float, crossed: bool) -> None:
+        surface = self.mesh.surface_vertices
+        moved = np.zeros((self.mesh.num_vertices, 3))
+        moved[surface] = u[surface] - runtime.fetch(self.before)
+        self.fresh = False
+        remedy = "take a shorter step, raise the contact's stiffness or width, or lower the speed"
+        if not crossed:
+            i = surface[np.linalg.norm(moved[surface], axis=1).argmax()]
+            speed = np.linalg.norm(moved[i]) / h
+            raise Tunnelling(
+                f"vertex {i} moves at {speed:.3g} m/s, {np.linalg.norm(moved[i]):.3g} m in one substep of {h:.3g} s: "
+                f"too far for a contact of width {self.width:.3g} m to see what it passes; {remedy}"
+            )
+        pairs = runtime.fetch(self.list.pairs)[: 4 * self.list.count].reshape(-1, 4)
+        plane = _all_four(self.plane)[: self.list.count].astype(np.float64)
+        closing = np.full(len(pairs), -np.inf)
+        for kind, part in enumerate((slice(0, self.list.num_vt), slice(self.list.num_vt, None))):
+            for a, b in OPPOSITE[kind]:
+                change = ((moved[pairs[part, b]] - moved[pairs[part, a]]) * plane[part, :3]).sum(1)
+                closing[part] = np.maximum(closing[part], change)
+        worst = int((closing - plane[:, 3]).argmax())
+        raise Tunnelling(
+            f"{self._name(worst, pairs)} may have gone through each other: their gap was {plane[worst, 3]:.3g} m, and they "
+            f"closed by {closing[worst]:.3g} m ({closing[worst] / h:.3g} m/s) in one substep of {h:.3g} s; {remedy}"
+        )
+
+    def _name(self, pair: int, pairs: np.ndarray) -> str:
+        c = pairs[pair]
+        if pair < self.list.num_vt:
+            return f"vertex {c[0]} and triangle {_numbers(c[1:])}"
+        return f"edges {_numbers(c[:2])} and {_numbers(c[2:])}"
+
+    # ---- forces -----------------------------------------------------------------------------------------------------
+
+    def forces(self, u, slot: int, out, exact: bool = False) -> None:
+        """Contact forces at u[slot], to the last corners of `out`."""
+        k = self.list
+        self._launch("forces", self.kernels.forces, k.pairs, k.scale, k.surface, k.row, k.corner, self.a.rest,
+                     self.a.parameters, u, self.corner, self.plane, self.energy, self.before,
+                     out)(slot, k.num_vt, k.num_ee, k.num_surface, self.a.first_contact_corner, int(exact))  # fmt: skip
+
+    def product(self, u, slot: int, w, out, rest_dot=None, parameters_dot=(0.0, 0.0)) -> None:
+        """Change of the contact forces for changes w[0] of the positions (and of rest shape, stiffness, width)."""
+        k = self.list
+        self._launch("products", self.kernels.products, k.pairs, k.scale, k.row, k.corner, self.a.rest, self.a.parameters, u,
+                     w, self.none if rest_dot is None else rest_dot, self.corner, self.numbers,
+                     out)(slot, k.num_vt, k.num_ee, k.num_surface, self.a.first_contact_corner, int(rest_dot is not None),
+                          *parameters_dot)  # fmt: skip
+
+    def clear_sums(self) -> None:
+        """Begin a reverse sweep."""
+        runtime.fill(self.sums, 0)
+        runtime.fill(self.rest_adj, 0)
+
+    def vjp(self, u, slot: int, w, out) -> None:
+        """The product with the adjoint w[0] of the forces; adds the adjoints of stiffness, width and rest shape."""
+        self.product(u, slot, w, out)
+        k = self.list
+        self._launch("sums", self.kernels.add_sums, k.row, k.corner, self.numbers, out, self.sums,
+                     self.rest_adj)(k.num_surface, self.a.first_contact_corner)  # fmt: skip
+
+    def collect(self) -> tuple[np.ndarray, np.ndarray]:
+        """Adjoints of (stiffness, width) and of the rest shape, (num_vertices, 3), by the forces alone; float64."""
+        rest = np.zeros((self.mesh.num_vertices, 3))
+        rest[self.mesh.surface_vertices] = runtime.fetch(self.rest_adj)
+        return _all_four(self.sums).astype(np.float64).sum(0)[:2], rest
+
+    # ---- to look at -------------------------------------------------------------------------------------------------
+
+    def _distances(self, u) -> tuple[np.ndarray, np.ndarray]:
+        """Distances [m] and corners of all pairs of the list at u[0]."""
+        if self._scratch is None:
+            self._scratch = runtime.array(self.kernels.vector, self.a.first_contact_corner + self.list.num_surface)
+        self.forces(u, 0, self._scratch, exact=True)
+        pairs = runtime.fetch(self.list.pairs)[: 4 * self.list.count].reshape(-1, 4)
+        return _all_four(self.plane)[: self.list.count, 3].astype(np.float64), pairs
+
+    def look(self, u) -> tuple[float, float]:
+        """Contact energy [J] and smallest gap [m] (infinite beyond the list's reach) at u[0]."""
+        self.ensure(u, 0)
+        gaps, _ = self._distances(u)
+        energies = runtime.fetch(self.energy)[: self.list.count].astype(np.float64)
+        return float(energies.sum()), float(gaps.min(initial=np.inf))
+
+
+def surface_edges(mesh) -> np.ndarray:
+    """Each edge of the surface once, the smaller index first, sorted; shape (k, 2)."""
+    return np.unique(np.sort(mesh.surface_triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1), axis=0)
+
+
+def pieces(mesh) -> np.ndarray:
+    """Number of the piece that each vertex belongs to; pieces share no vertex."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    i, k = mesh.tetrahedra[:, [0, 1, 0, 2, 0, 3]].reshape(-1, 2).T
+    graph = coo_matrix((np.ones(len(i), bool), (i, k)), (mesh.num_vertices, mesh.num_vertices))
+    return connected_components(graph, directed=False)[1]
+
+
+def _all_four(vectors) -> np.ndarray:
+    host = runtime.view(vectors)
+    return vectors.to_numpy() if host is None else host
+
+
+def _numbers(indices) -> str:
+    return "(" + ", ".join(str(int(i)) for i in indices) + ")"

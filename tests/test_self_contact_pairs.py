@@ -1,0 +1,168 @@
+"""Distances, energies and candidates of pairs of surface primitives, against IPC Toolkit, differences and brute force."""
+
+import numpy as np
+import pytest
+import taichi as ti
+
+import diffsim_ti as ds
+from diffsim_ti import runtime
+from diffsim_ti.contact.broad_phase import CandidatePairs
+from diffsim_ti.contact.proximity import EDGE_EDGE, VERTEX_TRIANGLE, evaluate_pairs
+from diffsim_ti.contact.surface_pairs import surface_edges
+
+by_kind = pytest.mark.parametrize("kind", [VERTEX_TRIANGLE, EDGE_EDGE])
+STIFFNESS, WIDTH = 2.0, 3.0
+
+
+def random_pairs(kind, count=400, seed=0):
+    rng = np.random.default_rng(seed)
+    return rng.normal(size=(count, 4, 3)), rng.normal(size=(count, 4, 3))
+
+
+def away_from_borders(kind, x, direction, width=WIDTH, step=1e-4):
+    """Pairs whose second derivatives do not jump within `step`: the distance's product changes little."""
+    a, b = (evaluate_pairs(kind, x + s * direction, direction, STIFFNESS, width).square_product for s in (-step, step))
+    size = np.abs(a).max((1, 2))
+    return np.abs(a - b).max((1, 2)) < 0.02 * size
+
+
+@by_kind
+def test_distances_agree_with_ipc_toolkit(kind):
+    ipctk = pytest.importorskip("ipctk")
+    name = ("point_triangle", "edge_edge")[kind]
+    distance, gradient, hessian = (getattr(ipctk, f"{name}_distance{part}") for part in ("", "_gradient", "_hessian"))
+    x, direction = random_pairs(kind)
+    ours = evaluate_pairs(kind, x, direction)
+    theirs = np.array([distance(*p) for p in x])
+    np.testing.assert_allclose(ours.distance**2, theirs, rtol=1e-10)
+    g = np.array([gradient(*p) for p in x]).reshape(x.shape)
+    h = np.array([hessian(*p) @ d.ravel() for p, d in zip(x, direction)]).reshape(x.shape)
+    scale = np.abs(h).max((1, 2), keepdims=True)
+    assert np.abs(ours.square_gradient - g).max() <= 1e-10 * np.abs(g).max()
+    assert (np.abs(ours.square_product - h) / scale).max() <= 1e-10
+
+
+@by_kind
+def test_energy_and_gradient_agree_with_ipc_toolkit(kind):
+    """Their barrier -(d - w)^2 log(d / w) of the distance itself, times their mollifier."""
+    ipctk = pytest.importorskip("ipctk")
+    x, _ = random_pairs(kind, seed=1)
+    x[:50, 3] = x[:50, 2] + (x[:50, 1] - x[:50, 0]) + 0.02 * x[:50, 3]  # nearly parallel edges
+    ours = evaluate_pairs(kind, x, None, STIFFNESS, WIDTH)
+    name = ("point_triangle", "edge_edge")[kind]
+    barrier, faded = ipctk.ClampedLogBarrier(), 0
+    for k, p in enumerate(x):
+        square, by_x = getattr(ipctk, f"{name}_distance")(*p), getattr(ipctk, f"{name}_distance_gradient")(*p)
+        d = np.sqrt(square)
+        if d <= 2e-3 * WIDTH:
+            continue
+        value, slope = barrier(d, WIDTH), barrier.first_derivative(d, WIDTH)
+        m, by_m = 1.0, np.zeros(12)
+        if kind == EDGE_EDGE:
+            threshold = ipctk.edge_edge_mollifier_threshold(*p)
+            m = ipctk.edge_edge_mollifier(*p, threshold)
+            by_m = ipctk.edge_edge_mollifier_gradient(*p, threshold)
+            faded += m < 1
+        gradient = STIFFNESS * (m * slope * by_x / (2 * d) + value * by_m)
+        assert ours.energy[k] == pytest.approx(STIFFNESS * m * value, rel=1e-9, abs=1e-14)
+        # an edge's own length squared is what a nearly parallel pair's distance loses of its digits
+        np.testing.assert_allclose(ours.gradient[k].ravel(), gradient, rtol=1e-7, atol=1e-8 * np.abs(gradient).max() + 1e-14)
+    assert kind == VERTEX_TRIANGLE or faded >= 20
+
+
+@by_kind
+@pytest.mark.parametrize("threshold", [1e-6, 30.0], ids=["plain", "faded"])
+def test_derivatives_agree_with_differences(kind, threshold):
+    x, direction = random_pairs(kind, seed=2)
+    keep = away_from_borders(kind, x, direction) & (evaluate_pairs(kind, x).distance > 0.1)
+    x, direction, eps = x[keep], direction[keep], 1e-6
+    assert len(x) > 100
+
+    def at(shift=0.0, stiffness=STIFFNESS, width=WIDTH):
+        return evaluate_pairs(kind, x + shift * direction, direction, stiffness, width, threshold=threshold)
+
+    here, plus, minus = at(), at(eps), at(-eps)
+    slope = (here.gradient * direction).sum((1, 2))
+    np.testing.assert_allclose((plus.energy - minus.energy) / (2 * eps), slope, rtol=1e-5, atol=1e-6 * np.abs(slope).max())
+    product = (plus.gradient - minus.gradient) / (2 * eps)
+    scale = np.abs(product).max((1, 2), keepdims=True) + 1e-6 * np.abs(product).max()
+    assert (np.abs(product - here.product) / scale).max() <= 1e-4
+    for name in ("stiffness", "width"):
+        value = dict(stiffness=STIFFNESS, width=WIDTH)[name]
+        plus, minus = at(**{name: value + eps}), at(**{name: value - eps})
+        by = ((plus.gradient - minus.gradient) * direction).sum((1, 2)) / (2 * eps)
+        np.testing.assert_allclose(getattr(here, f"by_{name}"), by, rtol=1e-5, atol=1e-6 * np.abs(by).max())
+
+
+@by_kind
+def test_product_is_symmetric(kind):
+    x, a = random_pairs(kind, seed=3)
+    b = np.random.default_rng(4).normal(size=x.shape)
+    ka, kb = (evaluate_pairs(kind, x, d, STIFFNESS, WIDTH).product for d in (a, b))
+    left, right = (b * ka).sum((1, 2)), (a * kb).sum((1, 2))
+    size = np.linalg.norm(ka.reshape(len(x), -1), axis=1) * np.linalg.norm(b.reshape(len(x), -1), axis=1)
+    assert np.all(np.abs(left - right) <= 1e-9 * size + 1e-12)
+
+
+def test_single_precision_follows_double():
+    kind = EDGE_EDGE
+    x, direction = random_pairs(kind, seed=5)
+    double = evaluate_pairs(kind, x, direction, STIFFNESS, WIDTH)
+    keep = (double.distance > 0.05) & away_from_borders(kind, x, direction)
+    single = evaluate_pairs(kind, x, direction, STIFFNESS, WIDTH, precision="f32")
+    assert np.abs(single.distance - double.distance)[keep].max() <= 1e-5
+    assert np.abs(single.gradient - double.gradient)[keep].max() <= 1e-4 * np.abs(double.gradient[keep]).max()
+
+
+def test_parallel_edges_exert_no_force():
+    """Exactly parallel: the nearest points are not unique, and the energy is faded out with its slope."""
+    x = np.array([[[0, 0, 0], [1, 0, 0], [0.2, 0.1, 0], [1.1, 0.1, 0]]])
+    out = evaluate_pairs(EDGE_EDGE, x, np.random.default_rng(0).normal(size=x.shape), STIFFNESS, 1.0)
+    assert out.distance[0] == pytest.approx(0.1, rel=1e-14) and out.energy[0] == 0 and np.all(out.gradient == 0)
+    assert np.all(np.isfinite(out.product))
+
+
+@by_kind
+def test_beyond_the_width_exactly_nothing(kind):
+    x, direction = random_pairs(kind)
+    x[:, 2:] += 10.0
+    x[:, 1] += 10.0 * (kind == VERTEX_TRIANGLE)
+    out = evaluate_pairs(kind, x, direction, STIFFNESS, 1.0)
+    assert out.distance.min() > 1
+    for part in (out.energy, out.gradient, out.product, out.by_stiffness, out.by_width):
+        assert np.all(part == 0)
+
+
+@pytest.mark.parametrize("precision", ["f64", "f32"])
+def test_broad_phase_finds_what_brute_force_finds(precision):
+    box = ds.TetrahedralMesh.create_box(4, 1.0)
+    shaken = np.random.default_rng(0).normal(size=box.vertices.shape) * 0.03
+    rough = ds.TetrahedralMesh(box.vertices + shaken, box.tetrahedra)
+    mesh = ds.TetrahedralMesh.joined([rough, box.translated([0.3, 1.1, 0.2]), rough.translated([-900.0, 0, 0])])
+    triangles, edges = mesh.surface_triangles, surface_edges(mesh)
+    lengths = np.linalg.norm(mesh.vertices[edges[:, 0]] - mesh.vertices[edges[:, 1]], axis=1)
+    found = CandidatePairs(mesh.num_vertices, mesh.surface_vertices, triangles, edges, lengths, precision)
+    vector = ti.types.vector(4, runtime.PRECISIONS[precision])
+    rest, u = runtime.upload(mesh.vertices, vector), runtime.upload(np.zeros((1, mesh.num_vertices, 3)), vector)
+    reach = 0.21
+    found.build(rest, u, 0, reach)
+    first_two = np.arange(mesh.num_vertices) < 2 * box.num_vertices
+    i, t = np.nonzero(first_two[mesh.surface_vertices][:, None] & first_two[triangles].all(1)[None])
+    vt = np.column_stack([mesh.surface_vertices[i], triangles[t]])
+    vt = vt[(vt[:, :1] != vt[:, 1:]).all(1)]
+    a, b = np.triu_indices(int(first_two[edges].all(1).sum()), 1)
+    ee = np.column_stack([edges[a], edges[b]])
+    ee = ee[(ee[:, :2, None] != ee[:, None, 2:]).all((1, 2))]
+    near = [p[evaluate_pairs(kind, mesh.vertices[p]).distance < reach] for kind, p in enumerate((vt, ee))]
+    pairs = runtime.fetch(found.pairs)[: 4 * found.count].reshape(-1, 4)
+    ours = [pairs[: found.num_vt], pairs[found.num_vt :]]
+    for mine, brute in zip(ours, near):
+        np.testing.assert_array_equal(mine[first_two[mine].all(1)], brute)
+        assert len(mine) > len(brute) > 50  # the body far away has its own
+    assert found.first_piercing(rest, u, 0) is None
+    lowered = np.zeros((1, mesh.num_vertices, 3))
+    lowered[0, box.num_vertices : 2 * box.num_vertices, 1] = -0.3
+    runtime.fill(u, lowered)
+    found.build(rest, u, 0, reach)
+    edge, triangle = found.first_piercing(rest, u, 0)
+    assert (edges[edge][0] < box.num_vertices) != (triangles[triangle][0] < box.num_vertices)
