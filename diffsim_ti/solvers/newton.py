@@ -149,7 +149,8 @@ class Newton:
         slope, fraction, best = float((R * d).sum()), 1.0, None
         while fraction > self.shortest:
             trial, after, change, noise = self._try(u, fraction * d, before, self.upright and fraction > self.insist)
-            if change <= -1e-4 * fraction * slope or (abs(slope) * fraction <= noise >= change and self._falls(trial, d, slope)):
+            drowned = abs(slope) * fraction <= noise >= change
+            if change <= -1e-4 * fraction * slope or (drowned and self._falls(trial, d, slope)):
                 best = trial, after, change
                 break
             fraction *= 0.5
