@@ -1,0 +1,28 @@
+"""The command that turns a saved series into a film: `diffsim-ti render`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def register(app: typer.Typer) -> None:
+    """Add this module's commands to the command line."""
+    app.command()(render)
+
+
+def render(
+    series: Annotated[Path, typer.Argument(help="the .pvd of a run", exists=True, dir_okay=False)],
+    output: Annotated[Path, typer.Option("--output", "-o", help=".mp4, .gif, or .png of the end")] = Path("output/film.mp4"),
+    colour: Annotated[str, typer.Option(help="displacement, speed, von_mises, energy_density or J")] = "von_mises",
+    fps: Annotated[float, typer.Option(help="frames per second of the film")] = 30.0,
+    size: Annotated[tuple[int, int], typer.Option(help="width and height [pixels]")] = (640, 480),
+    ground: Annotated[float | None, typer.Option(help="height of a floor to draw [m]")] = None,
+    azimuth: Annotated[float, typer.Option(help="of the eye, about y [degrees]")] = 32.0,
+    elevation: Annotated[float, typer.Option(help="of the eye, above the floor [degrees]")] = 14.0,
+):
+    """Draw a saved series as a film, coloured by a field, without a display."""
+    from diffsim_ti.film import render_series
+
+    count = render_series(series, output, colour, fps, size, ground, azimuth, elevation)
+    print(f"{count} frame{'s' * (count != 1)} drawn in software: {output}")

@@ -1,0 +1,54 @@
+"""What a picture's colours mean: the fields of a saved frame, their units, colour maps and limits.
+
+The maps are even in lightness and safe for the colour-blind: viridis for what starts at zero, PuOr about the middle value
+for what goes both ways.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Field:
+    """A quantity to colour by: `middle` is the neutral value of a two-sided field, None for one that starts at zero."""
+
+    label: str
+    colours: str = "viridis"
+    middle: float | None = None
+
+    def limits(self, low: float, high: float) -> tuple[float, float]:
+        """What the colours span for values from `low` to `high`: never empty, symmetric about `middle` if there is one."""
+        if self.middle is None:
+            low = min(0.0, low)
+            return (low, high) if high > low else (low, low + 1.0)
+        reach = max(abs(low - self.middle), abs(high - self.middle)) or 1.0
+        return self.middle - reach, self.middle + reach
+
+
+FIELDS = {
+    "displacement": Field("displacement [m]"),
+    "speed": Field("speed [m/s]"),
+    "von_mises": Field("von Mises stress [Pa]"),
+    "energy_density": Field("energy density [J/m^3]"),
+    "J": Field("volume ratio J [-]", "PuOr", 1.0),
+}
+
+
+def field_named(name: str) -> Field:
+    """The field of that name. Raises ValueError for an unknown one."""
+    if name not in FIELDS:
+        raise ValueError(f"colour: must be one of {', '.join(FIELDS)}, got {name!r}; choose one of these")
+    return FIELDS[name]
+
+
+def values_of(frame, name: str) -> np.ndarray:
+    """The field in a frame read by meshio: per vertex (displacement, speed) or per tetrahedron (the others)."""
+    field_named(name)
+    source = {"displacement": "displacement", "speed": "velocity"}.get(name)
+    try:
+        if source is None:
+            return np.asarray(frame.cell_data[name][0], np.float64)
+        return np.linalg.norm(np.asarray(frame.point_data[source], np.float64), axis=1)
+    except KeyError as error:
+        raise ValueError(f"colour: the frame must hold {error}, it does not; choose another colour") from error
