@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from diffsim_ti.colours import Field, field_named, values_of
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.picture import draw, to_vertices
 from diffsim_ti.series import frames_of
+from diffsim_ti.series_fields import Field, field_named, values_of
 
 KINDS = (".mp4", ".gif", ".png")
 
@@ -19,7 +19,7 @@ def render_series(series, output, colour: str = "von_mises", fps: float = 30.0, 
                   ground: float | None = None, azimuth: float = 32.0, elevation: float = 14.0) -> int:  # fmt: skip
     """Draw every frame of a .pvd series into `output` (.mp4, .gif), or the last one (.png); the number drawn.
 
-    colour: a name in colours.FIELDS; fps: frames per second of the film (a GIF keeps time in steps of 10 ms); size:
+    colour: a name in series_fields.FIELDS; fps: frames per second of the film (a GIF keeps time in steps of 10 ms); size:
     pixels, even for .mp4; ground: height of a floor to draw [m]; azimuth, elevation of the eye [degrees].
     Raises ValueError for bad arguments or an empty series, RuntimeError if MP4's encoder is not installed.
     """

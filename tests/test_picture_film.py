@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from matplotlib import colormaps
 
-from diffsim_ti import cli, colours, film
+from diffsim_ti import cli, film, series_fields
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.series import Series
 
@@ -60,7 +60,7 @@ def test_picture_of_the_end_has_a_legend(series, tmp_path):
 
 @pytest.mark.parametrize("low, high, expected", [(0.9, 1.3, (0.7, 1.3)), (1.0, 1.0, (0.0, 2.0))])
 def test_two_sided_limits_are_symmetric(low, high, expected):
-    assert colours.FIELDS["J"].limits(low, high) == pytest.approx(expected)
+    assert series_fields.FIELDS["J"].limits(low, high) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("change, text", [
