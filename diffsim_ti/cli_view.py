@@ -20,9 +20,12 @@ def render(
     ground: Annotated[float | None, typer.Option(help="height of a floor to draw [m]")] = None,
     azimuth: Annotated[float, typer.Option(help="of the eye, about y [degrees]")] = 32.0,
     elevation: Annotated[float, typer.Option(help="of the eye, above the floor [degrees]")] = 14.0,
+    wireframe: Annotated[bool, typer.Option("--wireframe", help="draw the edges of the triangles")] = False,
+    backend: Annotated[str, typer.Option(help="vulkan, software, or auto: Vulkan where there is a driver")] = "auto",
 ):
     """Draw a saved series as a film, coloured by a field, without a display."""
     from diffsim_ti.film import render_series
 
-    count = render_series(series, output, colour, fps, size, ground, azimuth, elevation)
-    print(f"{count} frame{'s' * (count != 1)} drawn in software: {output}")
+    count = render_series(series, output, colour, fps, size, ground, azimuth, elevation, backend, print,
+                          wireframe=wireframe)  # fmt: skip
+    print(f"{count} frame{'s' * (count != 1)}: {output}")

@@ -32,6 +32,8 @@ FIELDS = {
     "von_mises": Field("von Mises stress [Pa]"),
     "energy_density": Field("energy density [J/m^3]"),
     "J": Field("volume ratio J [-]", "PuOr", 1.0),
+    "stiffness": Field("Young's modulus [Pa]"),
+    "gradient": Field("size of the gradient"),
 }
 
 

@@ -1,0 +1,82 @@
+"""Camera: a pinhole, the same for every way of drawing."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+FIELD_OF_VIEW = 28.0  # [degrees]
+NEAREST = 1e-9  # [m], the least depth a point is projected with
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole at `position` [m] that looks at `look_at` [m]; field_of_view [degrees] is that of the picture's height."""
+
+    position: np.ndarray
+    look_at: np.ndarray
+    up: tuple[float, float, float] = (0.0, 1.0, 0.0)
+    field_of_view: float = FIELD_OF_VIEW
+
+    @classmethod
+    def framing(cls, points, size=(4, 3), azimuth: float = 32.0, elevation: float = 14.0) -> "Camera":
+        """A camera that sees all points [m], shape (k, 3), in a picture of this size (only its ratio counts).
+
+        azimuth about y (0: from +z, 90: from +x) and elevation above the floor, below 90, in degrees.
+        """
+        points = np.asarray(points, np.float64)
+        if points.ndim != 2 or points.shape[1] != 3 or not len(points) or not np.all(np.isfinite(points)):
+            raise ValueError(f"camera: points to frame must be finite, of shape (k, 3), got shape {points.shape}")
+        if not abs(elevation) < 90:
+            raise ValueError(f"elevation must lie between -90 and 90 degrees, got {elevation:g}; use 89 to look down")
+        a, e = np.radians([azimuth, elevation])
+        back = np.array([np.sin(a) * np.cos(e), np.sin(e), np.cos(a) * np.cos(e)])
+        center = (points.min(0) + points.max(0)) / 2
+        camera = cls(center + back, center)
+        x, y, z = camera.axes @ (points - center).T
+        half = np.tan(np.radians(FIELD_OF_VIEW) / 2) * np.array([size[0] / size[1] * 0.72, 0.82])
+        distance = max(np.max(np.abs(x) / half[0] + z), np.max(np.abs(y) / half[1] + z), 1e-6)
+        return cls(center + back * distance, center)
+
+    @property
+    def axes(self) -> np.ndarray:
+        """Rows: right, up, backwards; unit vectors."""
+        back = self.position - self.look_at
+        back = back / np.linalg.norm(back)
+        right = np.cross(self.up, back)
+        right /= np.linalg.norm(right)
+        return np.stack([right, np.cross(back, right), back])
+
+    def focal(self, size) -> float:
+        """Focal length in pixels of a picture of `size` (width, height)."""
+        return size[1] / 2 / np.tan(np.radians(self.field_of_view) / 2)
+
+    def project(self, points: np.ndarray, size) -> np.ndarray:
+        """Pixel column, row and depth [m] of points, shape (..., 3)."""
+        x, y, z = np.moveaxis((points - self.position) @ self.axes.T, -1, 0)
+        depth = np.maximum(-z, NEAREST)
+        scale = self.focal(size) / depth
+        return np.stack([size[0] / 2 + scale * x, size[1] / 2 - scale * y, depth], -1)
+
+    def rays(self, column, row, size) -> np.ndarray:
+        """Unit direction of the ray through picture points (in pixels), shape (n, 3)."""
+        x, y = np.asarray(column) - size[0] / 2, size[1] / 2 - np.asarray(row)
+        rays = np.stack([x, y, np.full(x.shape, -self.focal(size))], -1) @ self.axes
+        return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+
+    def orbited(self, azimuth: float, elevation: float) -> "Camera":
+        """Turned about what it looks at by these angles [degrees]; stops short of straight up and down."""
+        offset = self.position - self.look_at
+        distance = np.linalg.norm(offset)
+        a = np.arctan2(offset[0], offset[2]) + np.radians(azimuth)
+        e = np.clip(np.arcsin(offset[1] / distance) + np.radians(elevation), *np.radians([-85, 85]))
+        back = np.array([np.sin(a) * np.cos(e), np.sin(e), np.cos(a) * np.cos(e)])
+        return replace(self, position=self.look_at + distance * back)
+
+    def zoomed(self, factor: float) -> "Camera":
+        """So many times nearer to what it looks at."""
+        return replace(self, position=self.look_at + (self.position - self.look_at) / factor)
+
+    def shifted(self, right: float, up: float) -> "Camera":
+        """Moved in its picture plane [m]."""
+        move = right * self.axes[0] + up * self.axes[1]
+        return replace(self, position=self.position + move, look_at=self.look_at + move)
