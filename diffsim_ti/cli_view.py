@@ -1,4 +1,4 @@
-"""The command that turns a saved series into a film: `diffsim-ti render`."""
+"""The commands that show a saved series: `diffsim-ti render` writes a film, `diffsim-ti view` opens a window."""
 
 from pathlib import Path
 from typing import Annotated
@@ -9,6 +9,7 @@ import typer
 def register(app: typer.Typer) -> None:
     """Add this module's commands to the command line."""
     app.command()(render)
+    app.command()(view)
 
 
 def render(
@@ -29,3 +30,21 @@ def render(
     count = render_series(series, output, colour, fps, size, ground, azimuth, elevation, backend, print,
                           wireframe=wireframe)  # fmt: skip
     print(f"{count} frame{'s' * (count != 1)}: {output}")
+
+
+def view(
+    series: Annotated[Path, typer.Argument(help="the .pvd of a run", exists=True, dir_okay=False)],
+    colour: Annotated[str, typer.Option(help="displacement, speed, von_mises, energy_density or J")] = "von_mises",
+    ground: Annotated[float | None, typer.Option(help="height of a floor to draw [m]")] = None,
+):
+    """Look at a saved series in a window: play, step, scrub, turn, colour by a field."""
+    from diffsim_ti.film import extent, rest_of
+    from diffsim_ti.series import frames_of
+    from diffsim_ti.series_fields import field_named
+    from diffsim_ti.viewer import SavedFrames, Viewer
+
+    source = SavedFrames(series)
+    frames = frames_of(series)
+    mesh = rest_of(frames[0][1])
+    box, _ = extent(mesh, frames, colour, field_named(colour))
+    Viewer(mesh, source, colour, box=box, ground=ground).run()

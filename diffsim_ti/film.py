@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from diffsim_ti.colouring import Colouring, to_vertices
-from diffsim_ti.series_fields import Field, field_named, values_of
 from diffsim_ti.drawing import Drawing
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.series import frames_of
+from diffsim_ti.series_fields import Field, field_named, values_of
 
 KINDS = (".mp4", ".gif", ".png")
 

@@ -11,14 +11,18 @@ CREASE = np.cos(np.radians(50.0))  # triangles that meet at more than this in th
 
 @dataclass
 class Soup:
-    """Triangles without shared corners: picture coordinates (column, row, depth) and RGB, both of shape (n, 3, 3)."""
+    """Triangles without shared corners: picture coordinates (column, row, depth) and RGB, both of shape (n, 3, 3).
+
+    distance [m], shape (n,): by which to paint them where there is no depth buffer, the farthest first.
+    """
 
     corners: np.ndarray
     colours: np.ndarray
+    distance: np.ndarray
 
     @staticmethod
     def joined(soups) -> "Soup":
-        return Soup(np.concatenate([s.corners for s in soups]), np.concatenate([s.colours for s in soups]))
+        return Soup(*(np.concatenate([getattr(s, part) for s in soups]) for part in ("corners", "colours", "distance")))
 
 
 class Surface:
@@ -50,7 +54,7 @@ class Surface:
         (ax, ay), (bx, by) = ((screen[:, k, :2] - screen[:, 0, :2]).T for k in (1, 2))
         seen = (ax * by - ay * bx < 0) & (screen[..., 2].min(1) > 1e-6)
         colour = np.broadcast_to(colour, (len(points), 3))[self.triangles[seen]]
-        return Soup(screen[seen], shaded(colour, self.normals(points)[seen]))
+        return Soup(screen[seen], shaded(colour, self.normals(points)[seen]), screen[seen, :, 2].mean(1))
 
 
 def shaded(colour: np.ndarray, normal: np.ndarray) -> np.ndarray:
@@ -72,7 +76,8 @@ def with_edges(soup: Soup, width: float) -> Soup:
     inner = np.concatenate([weights @ xy, 1 / (weights @ inverse[..., None])], 2)
     frame = soup.corners * [1, 1, 1 + 1e-6]
     dark = 0.35 * soup.colours + 0.65 * EDGE
-    return Soup(np.stack([frame, inner], 1).reshape(-1, 3, 3), np.stack([dark, weights @ soup.colours], 1).reshape(-1, 3, 3))
+    corners, colours = np.stack([frame, inner], 1), np.stack([dark, weights @ soup.colours], 1)
+    return Soup(corners.reshape(-1, 3, 3), colours.reshape(-1, 3, 3), np.repeat(soup.distance, 2))
 
 
 def marks(points, camera, size, radius: float, nearer: float) -> Soup:
@@ -84,7 +89,8 @@ def marks(points, camera, size, radius: float, nearer: float) -> Soup:
     corners[:, :, 1, :2] += rim[:-1]
     corners[:, :, 2, :2] += rim[1:]
     corners[..., 2] = np.maximum(corners[..., 2] - nearer, 1e-6)
-    return Soup(corners.reshape(-1, 3, 3), np.broadcast_to(MARK, corners.reshape(-1, 3, 3).shape))
+    corners = corners.reshape(-1, 3, 3)
+    return Soup(corners, np.broadcast_to(MARK, corners.shape), corners[:, :, 2].mean(1))
 
 
 def _normalized(v: np.ndarray) -> np.ndarray:
