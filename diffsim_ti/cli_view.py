@@ -38,13 +38,7 @@ def view(
     ground: Annotated[float | None, typer.Option(help="height of a floor to draw [m]")] = None,
 ):
     """Look at a saved series in a window: play, step, scrub, turn, colour by a field."""
-    from diffsim_ti.film import extent, rest_of
-    from diffsim_ti.series import frames_of
-    from diffsim_ti.series_fields import field_named
     from diffsim_ti.viewer import SavedFrames, Viewer
 
     source = SavedFrames(series)
-    frames = frames_of(series)
-    mesh = rest_of(frames[0][1])
-    box, _ = extent(mesh, frames, colour, field_named(colour))
-    Viewer(mesh, source, colour, box=box, ground=ground).run()
+    Viewer(source.mesh, source, colour, box=source.box(), ground=ground).run()

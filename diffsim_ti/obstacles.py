@@ -58,7 +58,7 @@ def _offset(term, time: float) -> np.ndarray:
 
 
 def revolved(center, axis, along: np.ndarray, radius: np.ndarray):
-    """A surface of revolution: rings at distances `along` the axis from `center`, of these radii, closed if they end in 0."""
+    """A surface of revolution: rings `along` the axis from `center`, closed where the radius ends in 0."""
     axis = _unit(axis)
     first = _unit(np.cross(axis, [0.0, 0.0, 1.0] if abs(axis[2]) < 0.9 else [1.0, 0.0, 0.0]))
     angle = np.arange(ROUND) * 2 * np.pi / ROUND

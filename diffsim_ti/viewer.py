@@ -11,7 +11,8 @@ import numpy as np
 from diffsim_ti import runtime
 from diffsim_ti.colouring import Colouring
 from diffsim_ti.drawing import Drawing
-from diffsim_ti.series_fields import field_named
+from diffsim_ti.film import extent, read_frame, rest_of
+from diffsim_ti.series_fields import field_named, values_of
 
 STRIDE = 2  # the backdrop is drawn this much smaller and stretched
 
@@ -20,7 +21,7 @@ class Viewer:
     """Shows frames in a Taichi window; RuntimeError where there is none to be had.
 
     source: what gives frames: `len(source)`, `source.frame(k)` -> (time [s], positions [m], {field: values}, notes), where
-    notes are lines of text. look: what `Drawing` takes (ground, obstacles, fixed, box, wireframe ...).
+    notes are lines of text, and `source.colouring(field)`, the same for all frames. look: what `Drawing` takes (ground, obstacles, fixed, box, wireframe ...).
     """
 
     def __init__(self, mesh, source, colour: str = "von_mises", title: str = "diffsim_ti", size=(1024, 768), **look):
@@ -51,7 +52,7 @@ class Viewer:
         values = fields.get(self.colour)
         if values is not None:
             if self.colour not in self._colourings:
-                self._colourings[self.colour] = Colouring.of_field(self.colour, values)
+                self._colourings[self.colour] = self.source.colouring(self.colour)
             drawing.colouring = self._colourings[self.colour]
         soup, shapes = drawing.soup(positions, values)
         self._small.camera = drawing.camera
@@ -141,18 +142,30 @@ class SavedFrames:
     def __init__(self, series):
         from diffsim_ti.series import frames_of
 
-        self._frames, self._last = frames_of(series), (-1, None)
+        self._frames, self._last, self._mesh = frames_of(series), (-1, None), None
         if not self._frames:
             raise ValueError(f"{series}: must list at least one frame, lists none; run the simulation first")
 
     def __len__(self) -> int:
         return len(self._frames)
 
+    @property
+    def mesh(self):
+        """The body at rest."""
+        self._mesh = self._mesh or rest_of(self._frames[0][1])
+        return self._mesh
+
+    def box(self) -> np.ndarray:
+        """What all frames lie in, shape (2, 3) [m]."""
+        return extent(self.mesh, self._frames, "displacement", field_named("displacement"))[0]
+
+    def colouring(self, name: str) -> Colouring:
+        """Colours whose limits span all frames."""
+        field = field_named(name)
+        return Colouring(field.label, extent(self.mesh, self._frames, name, field)[1], field.colours)
+
     def frame(self, k: int):
         if self._last[0] != k:
-            from diffsim_ti.film import read_frame
-            from diffsim_ti.series_fields import values_of
-
             when, path = self._frames[k]
             frame = read_frame(path)
             names = ("displacement", "speed", "von_mises", "energy_density", "J")
