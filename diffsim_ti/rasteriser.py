@@ -1,7 +1,6 @@
 """Drawing triangles without any graphics driver: NumPy with a depth buffer.
 
-Against the libraries (a film of the 19 379-tetrahedra bunny): VTK draws as well but weighs half a gigabyte on disk, and
-matplotlib's Poly3DCollection has no depth buffer and no smooth shading; so this stays.
+Rather than a library: VTK's modules weigh half a gigabyte on disk, matplotlib's Poly3DCollection has no depth buffer.
 """
 
 import numpy as np

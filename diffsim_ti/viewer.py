@@ -21,7 +21,8 @@ class Viewer:
     """Shows frames in a Taichi window; RuntimeError where there is none to be had.
 
     source: what gives frames: `len(source)`, `source.frame(k)` -> (time [s], positions [m], {field: values}, notes), where
-    notes are lines of text, and `source.colouring(field)`, the same for all frames. look: what `Drawing` takes (ground, obstacles, fixed, box, wireframe ...).
+    notes are lines of text, and `source.colouring(field)`, the same for all frames.
+    look: what `Drawing` takes (ground, obstacles, fixed, box, wireframe ...).
     """
 
     def __init__(self, mesh, source, colour: str = "von_mises", title: str = "diffsim_ti", size=(1024, 768), **look):
