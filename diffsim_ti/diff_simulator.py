@@ -14,7 +14,7 @@ from diffsim_ti.autograd import first_order_only, torch
 from diffsim_ti.diff_physics import DifferentiableBarrierContact
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.scene import Scene
-from diffsim_ti.solvers import SemiImplicitSolver
+from diffsim_ti.solvers import SemiImplicitSolver, Solver, StaticSolver
 from diffsim_ti.terms import Drag, ExternalForce, Gravity, barrier
 
 DTYPES = {"f32": torch.float32, "f64": torch.float64}
@@ -80,18 +80,30 @@ def rollout_frames(rollout: Rollout, **tensors: torch.Tensor) -> TorchFrames:
 
 
 class DifferentiableSolver:
-    """How a DifferentiableSimulator steps: symplectic Euler with the seeds' numbers.
+    """How a DifferentiableSimulator steps: any solver with inertia, symplectic Euler unless said otherwise.
 
     dt [s]; gravity [m/s^2]: a number along y, 3 numbers, or a tensor of either (with gradient); damping: the share of
-    velocity kept over one dt, whatever the substeps, default 1 (none); substeps: the least number. The simulator raises
-    it to what stability and contact ask for, says so once, and keeps the count.
+    velocity kept over one dt, whatever the substeps, default 1 (none).
+    method: a solver class of the core: SemiImplicitSolver, VelocityVerletSolver, ImplicitEulerSolver,
+    ImplicitMidpointSolver or BDF2Solver; options: further arguments of that class, such as tolerance=1e-9.
+    substeps: for explicit methods the least number: the simulator raises it to what stability and contact ask for, says so
+    once, and keeps the count. Implicit methods take it as it is; their gradients are as exact as `tolerance`.
+
+    BDF2Solver looks back two steps, but each `step()` and each `rollout()` starts afresh: `step()` refuses it, and
+    `rollout(n)` takes its first step by backward Euler. Equilibria (StaticSolver) have no steps: use `rollout_frames`.
     """
 
-    def __init__(self, dt: float = 0.01, gravity=-9.8, damping: float = 1.0, substeps: int = 1):
+    def __init__(self, dt: float = 0.01, gravity=-9.8, damping: float = 1.0, substeps: int = 1,
+                 method: type[Solver] = SemiImplicitSolver, **options):  # fmt: skip
         if not (math.isfinite(dt) and dt > 0):
             raise ValueError(f"dt must be > 0 [s], got {dt}")
         if not 0 < damping <= 1:
             raise ValueError(f"damping is the share of velocity kept over one dt and must lie in (0, 1], got {damping}")
+        if not (isinstance(method, type) and issubclass(method, Solver)):
+            raise ValueError(f"method must be a solver class such as ImplicitEulerSolver, got {method!r}")
+        if issubclass(method, StaticSolver):
+            raise ValueError("method: StaticSolver has no steps; use rollout_frames(Rollout(StaticSolver(scene), 1), ...)")
+        self.method, self.options = method, options
         self.dt, self.gravity, self.damping, self.substeps = float(dt), gravity, float(damping), int(substeps)
 
     def gravity_vector(self, like: torch.Tensor) -> torch.Tensor:
@@ -176,6 +188,11 @@ class DifferentiableSimulator:
 
     def step(self, external_forces: torch.Tensor | None = None) -> None:
         """Advance by dt; external_forces [N], shape (num_vertices, 3), with gradient."""
+        if getattr(self.solver.method, "multistep", False):
+            raise ValueError(
+                f"step() starts afresh each time, which makes {self.solver.method.__name__}, a two-step method, backward "
+                "Euler: use rollout(n), or method=ImplicitEulerSolver"
+            )
         self._advance(1, external_forces)
 
     def rollout(self, num_steps: int, checkpoint_every: int | None = None, save_every: int | None = None,
@@ -246,22 +263,30 @@ class DifferentiableSimulator:
     def _rollout(self, steps: int, with_forces: bool, checkpoint_every, save_every) -> Rollout:
         key = (steps, with_forces, checkpoint_every, save_every)
         if key not in self._rollouts:
-            solver = SemiImplicitSolver(self._scene(with_forces), dt=self.solver.dt, substeps=self._substeps,
-                                        allow_unstable=True)  # fmt: skip
-            solver.allow_unstable = False  # the count was chosen at reset; outgrowing it raises
+            solver = self._core_solver(self._scene(with_forces), self._substeps)
             if len(self._rollouts) >= self.kept_rollouts:
                 self._rollouts.pop(next(iter(self._rollouts)))
             self._rollouts[key] = Rollout(solver, steps, save_every, checkpoint_every)
         return self._rollouts[key]
 
+    def _core_solver(self, scene: Scene, substeps: int) -> Solver:
+        options = dict(dt=self.solver.dt, substeps=substeps) | self.solver.options
+        if not self.solver.method.explicit:
+            return self.solver.method(scene, **options)
+        solver = self.solver.method(scene, allow_unstable=True, **options)
+        solver.allow_unstable = False  # the count is chosen at reset; outgrowing it raises
+        return solver
+
     def _choose_substeps(self) -> None:
         """What stability and contact ask for at the present numbers; the count only grows, so that losses stay smooth."""
+        if not self.solver.method.explicit:
+            return
         scene = self._scene(False)
         numbers = {name: x.detach().double().cpu().numpy() for name, x in self._inputs().items()}
         values = scene.inputs.values | scene.inputs.check(numbers)
         bound = stability.element_limit(scene, values).dt
         if self._ratio is None:
-            solver = SemiImplicitSolver(scene, dt=self.solver.dt, allow_unstable=True)
+            solver = self._core_solver(scene, 1)
             self._ratio = solver.stable_dt(tight=True).dt / stability.element_limit(scene).dt
         omega2 = (2 / (self._ratio * bound)) ** 2
         if self._contact:
