@@ -15,9 +15,8 @@ from diffsim_ti.diff_physics import DifferentiableBarrierContact
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.scene import Scene
 from diffsim_ti.solvers import SemiImplicitSolver, Solver, StaticSolver
+from diffsim_ti.tensors import DTYPES, TensorRollout, is_direct
 from diffsim_ti.terms import Drag, ExternalForce, Gravity, barrier
-
-DTYPES = {"f32": torch.float32, "f64": torch.float64}
 
 
 class TorchFrames(NamedTuple):
@@ -28,8 +27,28 @@ class TorchFrames(NamedTuple):
     displacements: torch.Tensor
 
 
+class _DirectRolloutFunction(torch.autograd.Function):
+    """Inputs of a rollout -> displacements and velocities of its frames, copied on the device."""
+
+    @staticmethod
+    def forward(ctx, rollout: Rollout, names: tuple, *tensors):
+        ctx.run, *frames = rollout.face.forward(dict(zip(names, tensors)))
+        ctx.rollout, ctx.names, ctx.tensors = rollout, names, tensors
+        return tuple(x.to(tensors[0].device) if tensors else x for x in frames)
+
+    @staticmethod
+    @first_order_only("use verify.hessian_product or verify.gauss_newton_product")
+    def backward(ctx, *adjoints):
+        wanted = [name for name, needed in zip(ctx.names, ctx.needs_input_grad[2:]) if needed]
+        gradients = ctx.rollout.face.vjp(ctx.run, *adjoints, wanted)
+        out = [None, None]
+        for name, tensor, needed in zip(ctx.names, ctx.tensors, ctx.needs_input_grad[2:]):
+            out.append(torch.as_tensor(gradients[name]).to(tensor.device, tensor.dtype) if needed else None)
+        return tuple(out)
+
+
 class _RolloutFunction(torch.autograd.Function):
-    """Inputs of a rollout -> displacements and velocities of its frames."""
+    """The same by way of the host, for what cannot be copied directly (`is_direct`)."""
 
     @staticmethod
     def forward(ctx, rollout: Rollout, names: tuple, *tensors):
@@ -61,6 +80,10 @@ def rollout_frames(rollout: Rollout, **tensors: torch.Tensor) -> TorchFrames:
 
     Names are those of `rollout.inputs`, or "initial_displacements" instead of "initial_positions" (which keeps its digits
     in float32). Two runs before one backward are right. Second derivatives are refused (see `verify.hessian_product`).
+
+    Explicit solvers copy initial displacements and velocities, frames, and the gradients by them between tensors and the
+    device by one kernel each way (tensors.py); all other inputs are small and go through the host, as does everything with
+    implicit solvers, prescribed motion, rest_positions, and on Vulkan, whose memory torch cannot see.
     Raises ValueError for unknown names, wrong shapes and types that are not floating point.
     """
     if "initial_positions" in tensors and "initial_displacements" in tensors:
@@ -71,7 +94,12 @@ def rollout_frames(rollout: Rollout, **tensors: torch.Tensor) -> TorchFrames:
         tensors[name] = value if isinstance(value, torch.Tensor) else torch.as_tensor(value, dtype=torch.float64)
         if not tensors[name].is_floating_point():
             raise ValueError(f"{name}: expected a floating point tensor, got {tensors[name].dtype}")
-    displacements, velocities = _RolloutFunction.apply(rollout, tuple(tensors), *tensors.values())
+    if is_direct(rollout, tensors):
+        if rollout.face is None:
+            rollout.face = TensorRollout(rollout)
+        displacements, velocities = _DirectRolloutFunction.apply(rollout, tuple(tensors), *tensors.values())
+    else:
+        displacements, velocities = _RolloutFunction.apply(rollout, tuple(tensors), *tensors.values())
     if "rest_positions" not in tensors:
         rest = torch.from_numpy(np.array(rollout.values["rest_positions"])).to(displacements)
         return TorchFrames(rest + displacements, velocities, displacements)
