@@ -169,6 +169,7 @@ class DifferentiableSimulator:
         self._contact = self._choose_contact(contact)
         self._substeps, self._rollouts, self._scenes = solver.substeps, {}, {}
         self._ratio: float | None = None
+        self._last: Rollout | None = None
         self._rest: torch.Tensor | None = None
         self.reset()
 
@@ -182,7 +183,7 @@ class DifferentiableSimulator:
 
     def __getstate__(self) -> dict:
         """For pickle and copy.deepcopy: the state leaves its graph; what Taichi holds is built anew."""
-        state = self.__dict__ | dict(_rollouts={}, _scenes={})
+        state = self.__dict__ | dict(_rollouts={}, _scenes={}, _last=None)
         return state | dict(_displacements=self._displacements.detach(), _velocities=self._velocities.detach())
 
     @property
@@ -232,6 +233,13 @@ class DifferentiableSimulator:
         """
         return self._advance(num_steps, external_forces, checkpoint_every, save_every)
 
+    @property
+    def last_rollout(self) -> Rollout:
+        """The core's Rollout that ran last, for `verify`: its scene has the numbers that the simulator was made with."""
+        if self._last is None:
+            raise RuntimeError("nothing ran yet: call step() or rollout() first")
+        return self._last
+
     def describe(self) -> str:
         """What is simulated, and how."""
         return self._rollout(1, False, None, None).solver.describe() + "\n" + self._scene(False).describe()
@@ -271,7 +279,7 @@ class DifferentiableSimulator:
             shape = tuple(self._rest.shape)
             tensors["external_forces"] = self._checked("external_forces", external_forces, shape, (steps, *shape))
         rollout = self._rollout(steps, external_forces is not None, checkpoint_every, save_every)
-        frames = rollout_frames(rollout, **tensors)
+        frames, self._last = rollout_frames(rollout, **tensors), rollout
         self._displacements, self._velocities = frames.displacements[-1], frames.velocities[-1]
         return frames
 
