@@ -100,7 +100,8 @@ def main(folder="output", iterations: int = 80) -> dict:
     dist.all_gather(every, torch.stack([p.detach() for p in parameters]))
     result = dict(
         processes=world, difference_from_serial=difference, ranks_agree=all(torch.equal(every[0], x) for x in every),
-        E=material.E.item(), nu=material.nu.item(), E_error=abs(material.E.item() / TRUE_E - 1), nu_error=abs(material.nu.item() / TRUE_NU - 1),
+        E=material.E.item(), nu=material.nu.item(), E_error=abs(material.E.item() / TRUE_E - 1),
+        nu_error=abs(material.nu.item() / TRUE_NU - 1),
         iterations=iterations, seconds=seconds + time.perf_counter() - start,
     )  # fmt: skip
     dist.destroy_process_group()
