@@ -14,10 +14,9 @@ from diffsim_ti.autograd import first_order_only, torch
 from diffsim_ti.diff_physics import DifferentiableBarrierContact
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.scene import Scene
-from diffsim_ti.solvers import SemiImplicitSolver
+from diffsim_ti.solvers import SemiImplicitSolver, Solver, StaticSolver
+from diffsim_ti.tensors import DTYPES, TensorRollout, is_direct
 from diffsim_ti.terms import Drag, ExternalForce, Gravity, barrier
-
-DTYPES = {"f32": torch.float32, "f64": torch.float64}
 
 
 class TorchFrames(NamedTuple):
@@ -28,8 +27,28 @@ class TorchFrames(NamedTuple):
     displacements: torch.Tensor
 
 
+class _DirectRolloutFunction(torch.autograd.Function):
+    """Inputs of a rollout -> displacements and velocities of its frames, copied on the device."""
+
+    @staticmethod
+    def forward(ctx, rollout: Rollout, names: tuple, *tensors):
+        ctx.run, *frames = rollout.face.forward(dict(zip(names, tensors)))
+        ctx.rollout, ctx.names, ctx.tensors = rollout, names, tensors
+        return tuple(x.to(tensors[0].device) if tensors else x for x in frames)
+
+    @staticmethod
+    @first_order_only("use verify.hessian_product or verify.gauss_newton_product")
+    def backward(ctx, *adjoints):
+        wanted = [name for name, needed in zip(ctx.names, ctx.needs_input_grad[2:]) if needed]
+        gradients = ctx.rollout.face.vjp(ctx.run, *adjoints, wanted)
+        out = [None, None]
+        for name, tensor, needed in zip(ctx.names, ctx.tensors, ctx.needs_input_grad[2:]):
+            out.append(torch.as_tensor(gradients[name]).to(tensor.device, tensor.dtype) if needed else None)
+        return tuple(out)
+
+
 class _RolloutFunction(torch.autograd.Function):
-    """Inputs of a rollout -> displacements and velocities of its frames."""
+    """The same by way of the host, for what cannot be copied directly (`is_direct`)."""
 
     @staticmethod
     def forward(ctx, rollout: Rollout, names: tuple, *tensors):
@@ -61,6 +80,10 @@ def rollout_frames(rollout: Rollout, **tensors: torch.Tensor) -> TorchFrames:
 
     Names are those of `rollout.inputs`, or "initial_displacements" instead of "initial_positions" (which keeps its digits
     in float32). Two runs before one backward are right. Second derivatives are refused (see `verify.hessian_product`).
+
+    Explicit solvers copy initial displacements and velocities, frames, and the gradients by them between tensors and the
+    device by one kernel each way (tensors.py); all other inputs are small and go through the host, as does everything with
+    implicit solvers, prescribed motion, rest_positions, and on Vulkan, whose memory torch cannot see.
     Raises ValueError for unknown names, wrong shapes and types that are not floating point.
     """
     if "initial_positions" in tensors and "initial_displacements" in tensors:
@@ -71,7 +94,12 @@ def rollout_frames(rollout: Rollout, **tensors: torch.Tensor) -> TorchFrames:
         tensors[name] = value if isinstance(value, torch.Tensor) else torch.as_tensor(value, dtype=torch.float64)
         if not tensors[name].is_floating_point():
             raise ValueError(f"{name}: expected a floating point tensor, got {tensors[name].dtype}")
-    displacements, velocities = _RolloutFunction.apply(rollout, tuple(tensors), *tensors.values())
+    if is_direct(rollout, tensors):
+        if rollout.face is None:
+            rollout.face = TensorRollout(rollout)
+        displacements, velocities = _DirectRolloutFunction.apply(rollout, tuple(tensors), *tensors.values())
+    else:
+        displacements, velocities = _RolloutFunction.apply(rollout, tuple(tensors), *tensors.values())
     if "rest_positions" not in tensors:
         rest = torch.from_numpy(np.array(rollout.values["rest_positions"])).to(displacements)
         return TorchFrames(rest + displacements, velocities, displacements)
@@ -80,18 +108,30 @@ def rollout_frames(rollout: Rollout, **tensors: torch.Tensor) -> TorchFrames:
 
 
 class DifferentiableSolver:
-    """How a DifferentiableSimulator steps: symplectic Euler with the seeds' numbers.
+    """How a DifferentiableSimulator steps: any solver with inertia, symplectic Euler unless said otherwise.
 
     dt [s]; gravity [m/s^2]: a number along y, 3 numbers, or a tensor of either (with gradient); damping: the share of
-    velocity kept over one dt, whatever the substeps, default 1 (none); substeps: the least number. The simulator raises
-    it to what stability and contact ask for, says so once, and keeps the count.
+    velocity kept over one dt, whatever the substeps, default 1 (none).
+    method: a solver class of the core: SemiImplicitSolver, VelocityVerletSolver, ImplicitEulerSolver,
+    ImplicitMidpointSolver or BDF2Solver; options: further arguments of that class, such as tolerance=1e-9.
+    substeps: for explicit methods the least number: the simulator raises it to what stability and contact ask for, says so
+    once, and keeps the count. Implicit methods take it as it is; their gradients are as exact as `tolerance`.
+
+    BDF2Solver looks back two steps, but each `step()` and each `rollout()` starts afresh: `step()` refuses it, and
+    `rollout(n)` takes its first step by backward Euler. Equilibria (StaticSolver) have no steps: use `rollout_frames`.
     """
 
-    def __init__(self, dt: float = 0.01, gravity=-9.8, damping: float = 1.0, substeps: int = 1):
+    def __init__(self, dt: float = 0.01, gravity=-9.8, damping: float = 1.0, substeps: int = 1,
+                 method: type[Solver] = SemiImplicitSolver, **options):  # fmt: skip
         if not (math.isfinite(dt) and dt > 0):
             raise ValueError(f"dt must be > 0 [s], got {dt}")
         if not 0 < damping <= 1:
             raise ValueError(f"damping is the share of velocity kept over one dt and must lie in (0, 1], got {damping}")
+        if not (isinstance(method, type) and issubclass(method, Solver)):
+            raise ValueError(f"method must be a solver class such as ImplicitEulerSolver, got {method!r}")
+        if issubclass(method, StaticSolver):
+            raise ValueError("method: StaticSolver has no steps; use rollout_frames(Rollout(StaticSolver(scene), 1), ...)")
+        self.method, self.options = method, options
         self.dt, self.gravity, self.damping, self.substeps = float(dt), gravity, float(damping), int(substeps)
 
     def gravity_vector(self, like: torch.Tensor) -> torch.Tensor:
@@ -129,6 +169,7 @@ class DifferentiableSimulator:
         self._contact = self._choose_contact(contact)
         self._substeps, self._rollouts, self._scenes = solver.substeps, {}, {}
         self._ratio: float | None = None
+        self._last: Rollout | None = None
         self._rest: torch.Tensor | None = None
         self.reset()
 
@@ -142,7 +183,7 @@ class DifferentiableSimulator:
 
     def __getstate__(self) -> dict:
         """For pickle and copy.deepcopy: the state leaves its graph; what Taichi holds is built anew."""
-        state = self.__dict__ | dict(_rollouts={}, _scenes={})
+        state = self.__dict__ | dict(_rollouts={}, _scenes={}, _last=None)
         return state | dict(_displacements=self._displacements.detach(), _velocities=self._velocities.detach())
 
     @property
@@ -176,6 +217,11 @@ class DifferentiableSimulator:
 
     def step(self, external_forces: torch.Tensor | None = None) -> None:
         """Advance by dt; external_forces [N], shape (num_vertices, 3), with gradient."""
+        if getattr(self.solver.method, "multistep", False):
+            raise ValueError(
+                f"step() starts afresh each time, which makes {self.solver.method.__name__}, a two-step method, backward "
+                "Euler: use rollout(n), or method=ImplicitEulerSolver"
+            )
         self._advance(1, external_forces)
 
     def rollout(self, num_steps: int, checkpoint_every: int | None = None, save_every: int | None = None,
@@ -186,6 +232,13 @@ class DifferentiableSimulator:
         external_forces [N]: (num_vertices, 3) for all steps, or (num_steps, num_vertices, 3), with gradient.
         """
         return self._advance(num_steps, external_forces, checkpoint_every, save_every)
+
+    @property
+    def last_rollout(self) -> Rollout:
+        """The core's Rollout that ran last, for `verify`: its scene has the numbers that the simulator was made with."""
+        if self._last is None:
+            raise RuntimeError("nothing ran yet: call step() or rollout() first")
+        return self._last
 
     def describe(self) -> str:
         """What is simulated, and how."""
@@ -226,7 +279,7 @@ class DifferentiableSimulator:
             shape = tuple(self._rest.shape)
             tensors["external_forces"] = self._checked("external_forces", external_forces, shape, (steps, *shape))
         rollout = self._rollout(steps, external_forces is not None, checkpoint_every, save_every)
-        frames = rollout_frames(rollout, **tensors)
+        frames, self._last = rollout_frames(rollout, **tensors), rollout
         self._displacements, self._velocities = frames.displacements[-1], frames.velocities[-1]
         return frames
 
@@ -246,22 +299,30 @@ class DifferentiableSimulator:
     def _rollout(self, steps: int, with_forces: bool, checkpoint_every, save_every) -> Rollout:
         key = (steps, with_forces, checkpoint_every, save_every)
         if key not in self._rollouts:
-            solver = SemiImplicitSolver(self._scene(with_forces), dt=self.solver.dt, substeps=self._substeps,
-                                        allow_unstable=True)  # fmt: skip
-            solver.allow_unstable = False  # the count was chosen at reset; outgrowing it raises
+            solver = self._core_solver(self._scene(with_forces), self._substeps)
             if len(self._rollouts) >= self.kept_rollouts:
                 self._rollouts.pop(next(iter(self._rollouts)))
             self._rollouts[key] = Rollout(solver, steps, save_every, checkpoint_every)
         return self._rollouts[key]
 
+    def _core_solver(self, scene: Scene, substeps: int) -> Solver:
+        options = dict(dt=self.solver.dt, substeps=substeps) | self.solver.options
+        if not self.solver.method.explicit:
+            return self.solver.method(scene, **options)
+        solver = self.solver.method(scene, allow_unstable=True, **options)
+        solver.allow_unstable = False  # the count is chosen at reset; outgrowing it raises
+        return solver
+
     def _choose_substeps(self) -> None:
         """What stability and contact ask for at the present numbers; the count only grows, so that losses stay smooth."""
+        if not self.solver.method.explicit:
+            return
         scene = self._scene(False)
         numbers = {name: x.detach().double().cpu().numpy() for name, x in self._inputs().items()}
         values = scene.inputs.values | scene.inputs.check(numbers)
         bound = stability.element_limit(scene, values).dt
         if self._ratio is None:
-            solver = SemiImplicitSolver(scene, dt=self.solver.dt, allow_unstable=True)
+            solver = self._core_solver(scene, 1)
             self._ratio = solver.stable_dt(tight=True).dt / stability.element_limit(scene).dt
         omega2 = (2 / (self._ratio * bound)) ** 2
         if self._contact:

@@ -82,6 +82,7 @@ class Rollout:
         self._warned = False
         self._workspace, self._current, self._loaded = None, None, None
         self._fields, self._tape, self._taped, self._adjoint = {}, None, None, None
+        self.face = None  # of torch (tensors.py)
 
     def _check_names(self, names) -> tuple[str, ...]:
         if names is None:
@@ -134,12 +135,7 @@ class Rollout:
             adjoint = np.zeros(shape) if adjoint is None else np.asarray(adjoint)
             if adjoint.shape != shape:
                 raise ValueError(f"gradient by the frames' {name}: expected shape {shape}, got {adjoint.shape}")
-            if not np.all(np.isfinite(adjoint)):
-                frame = int(np.argwhere(~np.isfinite(adjoint))[0][0])
-                raise FloatingPointError(
-                    f"the loss's gradient by {name} is not finite at step {frame * self.save_every} "
-                    f"(frame {frame}): look at the loss; parameters are unchanged"
-                )
+            self.check_adjoint(name, adjoint)
             adjoints.append(adjoint)
         self._warn_if_coarse(frames.contact_resolution)
         self.gradients = self._sweep_reverse(*adjoints, self.wants_health or self.clip is not None)
@@ -153,6 +149,15 @@ class Rollout:
                 f"gradients through contacts may be off by more than 10 %: {seen}; take substeps of at most "
                 f"{seen.advised_substep:.3g} s instead of {seen.substep:.3g} s, or a softer or wider barrier",
                 stacklevel=3,
+            )
+
+    def check_adjoint(self, name: str, adjoint: np.ndarray) -> None:
+        """Raise FloatingPointError naming the step at which a loss's gradient by the frames is not finite."""
+        if not np.all(np.isfinite(adjoint)):
+            frame = int(np.argwhere(~np.isfinite(adjoint))[0][0])
+            raise FloatingPointError(
+                f"the loss's gradient by {name} is not finite at step {frame * self.save_every} "
+                f"(frame {frame}): look at the loss; parameters are unchanged"
             )
 
     def jvp(self, frames: Frames, **tangents) -> tuple[np.ndarray, np.ndarray]:
@@ -297,30 +302,36 @@ class Rollout:
         ws.restore_to_record()
         ws.advance(first, last, self.num_passes, base=first)
 
-    def _sweep_reverse(self, positions_adj, velocities_adj, careful: bool) -> dict[str, np.ndarray]:
+    @property
+    def truncates(self) -> bool:
+        """Whether the reverse sweep stops before it comes to the start."""
+        return self.truncate is not None and self.truncate < self.steps
+
+    def _mirror(self, begin, careful: bool):
+        """The reverse sweep; begin(adjoint) sets the adjoints of the frames. Returns the adjoint at the start."""
         ws, schedule = self._workspace, self.schedule
         if self._adjoint is None or not self._adjoint.fits(ws):
             self._adjoint = self.solver.adjoint(ws, "density" in self.wanted, "rest_positions" in self.wanted)
         adjoint = self._adjoint
-        adjoint.start(positions_adj, velocities_adj, self.solver.last_frame_is_state)
+        begin(adjoint)
         self.health = []
         stop = 0 if self.truncate is None else max(0, self.steps - self.truncate) * self.solver.substeps
         kept, end = self._kept, schedule.num_segments
         self._kept = kept[:1]  # the sweep overwrites the others, also if it does not get to its end
         while end > 0 and schedule.bounds(end - 1)[1] > stop:
-            begin = kept[-1]
+            at = kept[-1]
             if self._recorded:
                 self._reverse_segment(0, self.num_passes, stop, careful)
                 break
             ws.restore(self._snapshots, len(kept) - 1)
-            for segment in schedule.path(begin, end, schedule.snapshots - len(kept)):
-                ws.advance(schedule.bounds(begin)[0], schedule.bounds(segment)[0], self.num_passes)
+            for segment in schedule.path(at, end, schedule.snapshots - len(kept)):
+                ws.advance(schedule.bounds(at)[0], schedule.bounds(segment)[0], self.num_passes)
                 kept.append(segment)
                 ws.save(self._snapshots, len(kept) - 1)
-                begin = segment
+                at = segment
             first, last = schedule.bounds(end - 1)
-            if begin < end - 1:  # no snapshot is left: come here anew
-                ws.advance(schedule.bounds(begin)[0], first, self.num_passes)
+            if at < end - 1:  # no snapshot is left: come here anew
+                ws.advance(schedule.bounds(at)[0], first, self.num_passes)
             self._record(first, last)
             self._reverse_segment(first, last, max(first, stop), careful)
             end -= 1
@@ -328,21 +339,25 @@ class Rollout:
                 kept.pop()
         if self.num_passes > stop:
             adjoint.finish()
-        derived = adjoint.collect()
-        if stop > 0:  # the start is beyond the cut
+        return adjoint
+
+    def _sweep_reverse(self, positions_adj, velocities_adj, careful: bool) -> dict[str, np.ndarray]:
+        last = self.solver.last_frame_is_state
+        derived = self._mirror(lambda adjoint: adjoint.start(positions_adj, velocities_adj, last), careful).collect()
+        if self.truncates:
             derived.displacement[:], derived.velocity[:] = 0, 0
         if not np.isfinite(derived.displacement.sum() + derived.velocity.sum() + derived.coefficients.sum()):
             if careful:
                 raise FloatingPointError("the adjoint is not finite at the start of the run")
             return self._sweep_reverse(positions_adj, velocities_adj, careful=True)
-        self._warn_if_exploded(positions_adj, velocities_adj, derived)
+        norms = [np.linalg.norm(np.asarray(x, np.float64)) for x in (positions_adj, velocities_adj)]
+        self._warn_if_exploded(norms, [np.linalg.norm(x) for x in (derived.displacement, derived.velocity)])
         return self.scene.inputs.derive_vjp(self._current, derived, self.wanted)
 
-    def _warn_if_exploded(self, positions_adj, velocities_adj, derived) -> None:
+    def _warn_if_exploded(self, of_frames, of_start) -> None:
+        """Norms of the adjoints of displacements and velocities, where the sweep began and where it ended."""
         duration = max(self.steps, 1) * self.solver.dt
-        end = np.linalg.norm(derived.displacement) + np.linalg.norm(derived.velocity) / duration
-        start = np.linalg.norm(np.asarray(positions_adj, np.float64))
-        start += np.linalg.norm(np.asarray(velocities_adj, np.float64)) / duration
+        start, end = (by_u + by_v / duration for by_u, by_v in (of_frames, of_start))
         if end > 1e8 * start > 0:
             warnings.warn(
                 f"the adjoint grew by {end / start:.1g} over the run: the motion is chaotic or unstable, and this "

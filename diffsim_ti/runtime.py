@@ -261,6 +261,8 @@ class Launch:
             config.real_matrix_scalarize = scalarize
         self._context, on_cpu = compiled.make_launch_context(), runs_on_cpu()
         for k, array in enumerate(self._arrays):
+            if not isinstance(array, ti.Ndarray):  # a torch tensor, set at each launch
+                continue
             if on_cpu:  # a launch replaces an array by its raw pointer, so that a context could not be used twice
                 pointer, size = prog.get_ndarray_data_ptr_as_int(array.arr), int(np.prod(full_shape(array))) * 8
                 self._context.set_arg_external_array_with_shape((k,), pointer, size, tuple(array.shape), 0)
@@ -280,6 +282,22 @@ class Launch:
             self._prepare(numbers)
         for (setter, index), number in zip(self._setters, numbers):
             setter(index, number)
+        self._launch(self._code, self._context)
+
+
+class TensorLaunch(Launch):
+    """A kernel whose first arguments are torch tensors, other ones at each launch; its arrays are bound once."""
+
+    def __call__(self, *tensors) -> None:
+        check_alive(self._owner)
+        if self._setters is None:
+            arrays = self._arrays
+            self._arrays = (*tensors, *arrays)
+            self._prepare(())
+            self._arrays = arrays  # keeps no tensor alive
+        for k, tensor in enumerate(tensors):
+            size = tensor.numel() * tensor.element_size()
+            self._context.set_arg_external_array_with_shape((k,), tensor.data_ptr(), size, tuple(tensor.shape), 0)
         self._launch(self._code, self._context)
 
 

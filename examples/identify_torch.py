@@ -12,7 +12,7 @@ from pathlib import Path
 
 import torch
 
-from diffsim_ti import TetrahedralMesh
+from diffsim_ti import TetrahedralMesh, verify
 from diffsim_ti.diff_physics import TorchMaterial
 from diffsim_ti.diff_simulator import DifferentiableSimulator, DifferentiableSolver
 from diffsim_ti.optimization import Optimization
@@ -65,6 +65,9 @@ def identify(name, held, learn_nu, make_optimizer, iterations, folder, start=(2e
     if learn_nu:
         result |= dict(nu=material.nu.item(), nu_error=abs(material.nu.item() / TRUE_NU - 1))
     print(f"{name}: " + ", ".join(f"{key} {value:.5g}" for key, value in result.items()))
+    told = verify.identifiability(moving.last_rollout, ["youngs_modulus", "density"])
+    print(f"{name}: with E and density both free, directions not seen: {told.num_singular} of 2\n{told}")
+    result["unseen"] = told.num_singular
     if folder:
         moving.reset()
         u = moving.rollout(20).displacements[-1].detach()

@@ -134,7 +134,7 @@ module = torch.nn.Linear(3, 1)
 optimizer = torch.optim.Adam(module.parameters(), lr=0.1)
 run = Optimization(module, optimizer, TetrahedralMesh.create_cube(2), sys.argv[1] or None)
 print("ready", flush=True)
-run.run(lambda: (module(torch.randn(4, 3)) - 1).square().mean(), 150)
+run.run(lambda: (module(torch.randn(4, 3)) - 1).square().mean(), 40)
 print(run.losses[-1], *(p.sum().item() for p in module.parameters()))
 """
 
@@ -157,3 +157,70 @@ def test_kill_at_random_moments(tmp_path):
     results = [start(path) for path in (tmp_path / "run.state", "")]
     outputs = [process.communicate(timeout=120)[0] for process in results]
     assert outputs[0] == outputs[1] and len(outputs[0].split()) == 4
+
+
+FIFTY = """
+import os, random, signal, sys, time, warnings
+warnings.simplefilter("error", UserWarning)  # a file that is refused is a warning
+import torch
+from diffsim_ti import TetrahedralMesh
+from diffsim_ti.optimization import Optimization
+torch.set_num_threads(1)
+mesh, path, iterations = TetrahedralMesh.create_cube(2), sys.argv[1], 110
+
+def optimise(path, progress):
+    torch.manual_seed(0)
+    module = torch.nn.Linear(3, 1)
+    run = Optimization(module, torch.optim.Adam(module.parameters(), lr=0.1), mesh, path)
+    begun = run.iteration
+
+    def loss():
+        os.write(progress, b"i")
+        return (module(torch.randn(4, 3)) - 1).square().mean()
+
+    run.run(loss, iterations)
+    return begun, run.losses, [p.tolist() for p in module.parameters()]
+
+def child(path, report=None, progress=os.open(os.devnull, os.O_WRONLY)):
+    pid = os.fork()
+    if pid == 0:
+        try:
+            result = optimise(path, progress)
+            if report:
+                open(report, "w").write(repr(result))
+            os._exit(0)
+        except BaseException as error:
+            print("failed:", repr(error), file=sys.stderr, flush=True)
+            os._exit(1)
+    return pid
+
+moments, kills = random.Random(1), 0
+while kills < 50:
+    reading, writing = os.pipe()
+    pid = child(path, progress=writing)
+    os.close(writing)
+    for _ in range(moments.randrange(4)):  # after so many iterations have begun, however fast the disk is,
+        assert os.read(reading, 1), "it ended by itself"
+    time.sleep(moments.uniform(0.0, 0.005))  # in the midst of one, of its saving, or of the start
+    os.kill(pid, signal.SIGKILL)
+    status = os.waitpid(pid, 0)[1]
+    assert os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGKILL, "it had ended, or failed, before the kill"
+    os.close(reading)
+    kills += 1
+for name in (path, ""):
+    assert os.waitpid(child(name or None, path + ("A" if name else "B")), 0)[1] == 0
+killed, whole = (eval(open(path + end).read()) for end in "AB")
+assert killed[1:] == whole[1:], "not the uninterrupted run"
+print(kills, killed[0], len(killed[1]))
+"""
+
+
+def test_fifty_kills(tmp_path):
+    """Children of one light process, killed 50 times: no file is refused, and the last run ends bitwise as if alone."""
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    out = subprocess.run([sys.executable, "-c", FIFTY, str(tmp_path / "run.state")], capture_output=True, text=True,
+                         timeout=120, env=environment)  # fmt: skip
+    assert out.returncode == 0, out.stderr
+    kills, begun, iterations = map(int, out.stdout.split())
+    assert kills == 50 and iterations == 110
+    assert 20 < begun < 110  # the kills fell into the optimisation, and it went on from there

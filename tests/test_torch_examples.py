@@ -33,6 +33,7 @@ def test_identify(tmp_path, capsys):
     check_files(tmp_path, "identify_falling", "identify_sagging", "identify_both")
     out = capsys.readouterr().out
     assert all(word in out for word in ("E_error", "nu_error", "iterations", "seconds"))
+    assert result["sagging"]["unseen"] == 1 and "NOT SEEN" in out  # E and density together, under gravity alone
 
 
 def test_stiffness_field(tmp_path):
@@ -65,16 +66,25 @@ def test_resumed_controller_is_the_uninterrupted_one(tmp_path, monkeypatch):
     assert states[0] == states[1]
 
 
-def test_distributed():
+def distributed(folder, iterations: int) -> dict:
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(FOLDER.parent), *sys.path]), "OMP_NUM_THREADS": "1"}
-    out = subprocess.run([*command, str(FOLDER / "train_distributed.py")], capture_output=True, text=True, timeout=300,
-                         env=environment)  # fmt: skip
+    script = [str(FOLDER / "train_distributed.py"), "--folder", str(folder), "--iterations", str(iterations)]
+    out = subprocess.run([*command, *script], capture_output=True, text=True, timeout=300, env=environment)
     assert out.returncode == 0, out.stderr
-    result = json.loads(next(line for line in out.stdout.splitlines() if line.startswith("{")))
+    return json.loads(next(line for line in out.stdout.splitlines() if line.startswith("{")))
+
+
+def test_distributed(tmp_path):
+    """In one go, and stopped after 30 iterations and gone on with."""
+    result = distributed(tmp_path / "whole", 80)
     assert result["processes"] == 2 and result["ranks_agree"]
     assert result["difference_from_serial"] < 1e-12
     assert result["E_error"] < 0.02 and result["nu_error"] < 0.03
+    check_files(tmp_path / "whole", "train_distributed")
+    distributed(tmp_path / "parts", 30)
+    resumed = distributed(tmp_path / "parts", 80)
+    assert (resumed["E"], resumed["nu"]) == (result["E"], result["nu"])
 
 
 @pytest.fixture(autouse=True)

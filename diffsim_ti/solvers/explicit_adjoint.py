@@ -47,15 +47,19 @@ class ExplicitAdjoint:
 
         last_frame_is_input: the last frame is the state after the last pass (else the last pass shows it itself).
         """
-        for target in (*self._sums(), self.u, self.v, self.w):
-            runtime.fill(target, 0)
-        if self.ws.pairs:
-            self.ws.pairs.clear_sums()
+        self.clear()
         runtime.fill(self.frames[0], positions_adj)
         runtime.fill(self.frames[1], velocities_adj)
         if last_frame_is_input:
             runtime.fill(self.u, positions_adj[-1:])
             runtime.fill(self.v, velocities_adj[-1:])
+
+    def clear(self) -> None:
+        """All adjoints zero, but those of the frames."""
+        for target in (*self._sums(), self.u, self.v, self.w):
+            runtime.fill(target, 0)
+        if self.ws.pairs:
+            self.ws.pairs.clear_sums()
 
     def reverse(self, base: int, last: int, num_passes: int, save_every: int, stop: int) -> None:
         """Mirror passes last - 1 .. stop; slot 0 of the record holds the state before pass `base`."""
@@ -93,15 +97,16 @@ class ExplicitAdjoint:
         for x in (self.u, self.v, self.corner):
             runtime.fill(x, runtime.fetch(x) * factor)
 
-    def collect(self) -> Derived:
-        """Adjoints of what kernels read, in float64, at the start of the run."""
+    def collect(self, state: bool = True) -> Derived:
+        """Adjoints of what kernels read, in float64, at the start of the run; state=False leaves out those of the state."""
         a, values = self.ws.arrays, self.ws.arrays.values
         rows = self.features.sums()
         sums = runtime.fetch(self.sums).astype(np.float64)
         out = values.zeros()
         out.coefficients = from_blocks(runtime.fetch(self.coefficients), a.num_tetrahedra, a.num_coefficients)
-        out.displacement = runtime.fetch(self.u)[0].astype(np.float64)
-        out.velocity = runtime.fetch(self.v)[0].astype(np.float64)
+        if state:
+            out.displacement = runtime.fetch(self.u)[0].astype(np.float64)
+            out.velocity = runtime.fetch(self.v)[0].astype(np.float64)
         if self.features.density:
             out.mass = sums[rows["mass"]]
         if self.features.gravity >= 0:
@@ -111,12 +116,11 @@ class ExplicitAdjoint:
         for contact in self.features.contacts:
             at = rows["contacts"] + contact.first - self.features.contacts[0].first
             out.parameters[contact.first :][: contact.size] = sums[at : at + contact.size].sum(1)
-        out.rest = runtime.fetch(self.frames[0]).astype(np.float64).sum(0)
         if self.ws.pairs:
-            numbers, rest = self.ws.pairs.collect()
+            numbers, out.rest = self.ws.pairs.collect()
             out.parameters[a.first_of_self_contact :][:2] = numbers
-            out.rest += rest
         if self.features.shape:
+            out.rest = out.rest + runtime.fetch(self.frames[0]).astype(np.float64).sum(0)
             out.rest += sums[rows["rest"] :][:3].T
             out.gradients = from_blocks(runtime.fetch(self.gradients), a.num_tetrahedra, 9).reshape(-1, 3, 3)
             out.volumes = from_blocks(runtime.fetch(self.volumes), a.num_tetrahedra, 1)[:, 0]
