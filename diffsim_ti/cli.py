@@ -30,10 +30,12 @@ from diffsim_ti.cli_options import (
     print_summary,
     solver_class,
 )  # fmt: skip
+from diffsim_ti.cli_study import register as register_study
 from diffsim_ti.cli_view import register
 from diffsim_ti.forward import Interrupted
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, help="Soft bodies on tetrahedra.")
+register_study(app)  # chart, stability, recommend
 ClickException = typer.BadParameter.__mro__[2]  # typer carries click inside or beside it, depending on its version
 register(app)
 

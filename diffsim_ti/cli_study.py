@@ -1,0 +1,84 @@
+"""Commands that measure: chart, stability, recommend."""
+
+import runpy
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from diffsim_ti.cli_options import Backend, Density, MaterialName, Poisson, Youngs, fixed_vertices, load_body, make_material
+
+Folder = Annotated[Path, typer.Option("--output", "-o", help="folder for the picture, the CSV and the JSON")]
+Quick = Annotated[bool, typer.Option("--quick", help="small meshes, few steps: seconds instead of minutes")]
+Fixed = Annotated[list[str] | None, typer.Option(help="vertex set, or xmin .. zmax, to hold; may be repeated")]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands."""
+    app.command()(chart)
+
+
+def own_scene(path: Path, material: str, youngs_modulus: float, poissons_ratio: float, density: float, fixed):
+    """A scene from a Python file that defines `scene` or `scene()`, or from a mesh under its own weight."""
+    from diffsim_ti.scene import Scene
+    from diffsim_ti.terms import Gravity
+
+    if not path.exists():
+        raise ValueError(f"{path}: no such file; give a mesh, or a Python file that defines scene()")
+    if path.suffix == ".py":
+        made = runpy.run_path(str(path)).get("scene")
+        made = made() if callable(made) else made
+        if not isinstance(made, Scene):
+            raise ValueError(f"{path} must define `scene`, a diffsim_ti.Scene or a function that returns one")
+        return made
+    body = load_body(path)
+    law = make_material(material, youngs_modulus, poissons_ratio)
+    return Scene(body, law, density, Gravity(), fixed_vertices(body, fixed or []))
+
+
+def chart(
+    problem: Annotated[str, typer.Argument(help="oscillator, lame, beam, sag, bounce, bounce-gradient, identify; a mesh; "
+                                                "or a Python file that defines scene")],  # fmt: skip
+    output: Folder = Path("output/chart"),
+    quick: Quick = False,
+    duration: Annotated[float, typer.Option(help="of a scene of one's own [s]")] = 0.2,
+    material: MaterialName = "StableNeoHookean",
+    youngs_modulus: Youngs = 1e5,
+    poissons_ratio: Poisson = 0.4,
+    density: Density = 1000.0,
+    fixed: Fixed = None,
+    limit: Annotated[float, typer.Option(help="leave out runs expected to take longer than this [s]")] = 5.0,
+    repeats: Annotated[int, typer.Option(help="timed rounds, of which the best counts")] = 3,
+    backend: Backend = "cpu",
+):
+    """Measure time against error for every solver, step, precision and mesh; draw the work-precision diagram."""
+    from diffsim_ti import runtime
+    from diffsim_ti.study import PROBLEMS, Problem, charts
+    from diffsim_ti.study import chart as measure
+    from diffsim_ti.study import problem as built_in
+
+    if problem in PROBLEMS:
+        runtime.init(backend)
+        asked = built_in(problem)
+    elif Path(problem).suffix:
+        runtime.init(backend)
+        scene = own_scene(Path(problem), material, youngs_modulus, poissons_ratio, density, fixed)
+        asked = Problem.of_scene(scene, duration, Path(problem).stem)
+    else:
+        raise ValueError(f"no problem is called {problem!r}; there are {', '.join(PROBLEMS)}, or give a file")
+    result = measure(asked, repeats=repeats, limit=limit, quick=quick, say=print)
+    unit = "s" if asked.static else "s per simulated s"
+    for p in result.front:
+        print(f"  {p.seconds:9.3g} {unit}   error {p.error:.2e}   {p.label}")
+    for error in (1e-2, 1e-3):
+        best = result.time_to(error)
+        print(f"error {error:g}: " + (f"{best.seconds:.3g} {unit} with {best.label}" if best else "not reached"))
+    if result.reference_error:
+        print(f"the reference's own error: {result.reference_error:.1e}")
+    refused = sum(bool(p.said) for p in result.points)
+    print(f"{len(result.points)} runs, {refused} refused, {len(result.left_out)} left out as too long")
+    if not any(np.isfinite(p.error) for p in result.points):
+        raise FloatingPointError("no run gave a number; the reasons are in the JSON file")
+    for name in charts.write_chart(result, output):
+        print(name)

@@ -1,0 +1,103 @@
+"""Pictures and files of charts, maps and growth. Colours are Okabe and Ito's, which colour-blind readers tell apart."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+
+COLORS = {"SemiImplicit": "#E69F00", "VelocityVerlet": "#0072B2", "ImplicitEuler": "#D55E00", "ImplicitMidpoint": "#009E73",
+          "BDF2": "#CC79A7", "Static": "#56B4E9"}  # fmt: skip
+PEER_COLORS = {"torch-diffsim": "#555555", "warp (CPU)": "#999999", "jax": "#BBBBBB"}
+MARKERS = {"SemiImplicit": "o", "VelocityVerlet": "s", "ImplicitEuler": "^", "ImplicitMidpoint": "D", "BDF2": "v",
+           "Static": "P"}  # fmt: skip
+
+
+def new_figure(width: float = 8.4, height: float = 5.4):
+    """(figure, axes) in the style of all pictures, without a display."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), dpi=130, layout="constrained")
+    axes = figure.add_subplot()
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    return figure, axes
+
+
+def draw_chart(chart, path, peers: dict | None = None) -> None:
+    """The work-precision diagram: time against error, a mark per run, the Pareto front as a line with its labels.
+
+    peers: other systems' runs of the same problem, name -> [(seconds per simulated second, error), ...].
+    """
+    figure, axes = new_figure()
+    names = dict.fromkeys(p.solver for p in chart.points)
+    for solver in names:
+        name = solver.removesuffix("Solver")
+        for precision, filled in (("f32", True), ("f64", False)):
+            rows = [p for p in chart.points if p.solver == solver and p.precision == precision and np.isfinite(p.error)]
+            if rows:
+                color = COLORS.get(name, "#000000")
+                axes.scatter([p.seconds for p in rows], [p.error for p in rows], s=22, marker=MARKERS.get(name, "x"),
+                             facecolors=color if filled else "none", edgecolors=color, linewidths=1.0, alpha=0.75,
+                             label=f"{name}, {precision}", zorder=2)  # fmt: skip
+    front = chart.front
+    axes.plot([p.seconds for p in front], [p.error for p in front], "k-", lw=1.3, zorder=1, label="Pareto front")
+    for who, rows in (peers or {}).items():
+        rows = sorted(rows)
+        color = PEER_COLORS.get(who, "#777777")
+        axes.plot(*zip(*rows), "*", ms=9, color=color, zorder=3, label=who)
+    axes.set(xscale="log", yscale="log", ylabel=f"{chart.problem.error}, relative",
+             xlabel="wall time per equilibrium [s]" if chart.problem.static else "wall time per simulated second [s]")  # fmt: skip
+    axes.set_title(chart.problem.title, loc="left", fontsize=11)
+    axes.grid(which="major", color="0.9", zorder=0)
+    if chart.reference_error > 0:
+        axes.axhspan(axes.get_ylim()[0], chart.reference_error, color="0.9", zorder=0)
+        axes.text(0.99, chart.reference_error, "the reference's own error", transform=axes.get_yaxis_transform(), ha="right",
+                  va="bottom", fontsize=8, color="0.35")  # fmt: skip
+    label_front(axes, front)
+    axes.legend(fontsize=8, frameon=False, ncols=1, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    save(figure, path)
+
+
+def label_front(axes, front, most: int = 6) -> None:
+    """Name some of the front's runs beside them, no closer than a twelfth of a decade of the whole range."""
+    if not front:
+        return
+    span = np.log10(front[0].error / front[-1].error) or 1.0
+    last = np.inf
+    for p in front:
+        if np.log10(last / p.error) >= span / most or last == np.inf or p is front[-1]:
+            last = p.error
+            axes.annotate(p.label, (p.seconds, p.error), textcoords="offset points", xytext=(-5, -4), ha="right", va="top",
+                          fontsize=7, color="0.15", zorder=4)  # fmt: skip
+
+
+def save(figure, path) -> None:
+    """Write a figure, making its folder."""
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path)
+
+
+def write_json(record: dict, path) -> None:
+    """Numbers and words as JSON, NaN as null."""
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    Path(path).write_text(json.dumps(record, indent=1, default=str) + "\n")
+
+
+def write_csv(rows: list[dict], path) -> None:
+    """Rows with the same keys as CSV."""
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    with open(path, "w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0].keys())
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def write_chart(chart, folder, peers: dict | None = None) -> list[str]:
+    """chart_<problem>.png, .csv, .json in a folder; returns their names."""
+    stem = Path(folder) / f"chart_{chart.problem.name.replace('-', '_')}"
+    record = chart.record()
+    draw_chart(chart, stem.with_suffix(".png"), peers)
+    write_csv(record["points"], stem.with_suffix(".csv"))
+    write_json(record | ({"peers": peers} if peers else {}), stem.with_suffix(".json"))
+    return [str(stem.with_suffix(s)) for s in (".png", ".csv", ".json")]

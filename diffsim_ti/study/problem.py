@@ -1,0 +1,82 @@
+"""Problem: a scene with a number to get right, to be run by many solvers, steps and meshes."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+ELEMENTS = {"linear": {}}  # kinds of element: name -> arguments of Scene
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What is computed, over how long, and against what it is measured.
+
+    scene(cells, pattern, precision, **element) -> Scene, on a mesh of so many cells across.
+    duration [s], frames: how long it moves, and at how many equal times it is looked at.
+    quantity(frames, gradients) -> the numbers to get right; frames are a Rollout's, gradients those of `adjoint`.
+    exact: the closed form's numbers, or None: a converged reference is computed, with its own error.
+    scale: what errors are divided by; default the largest of the exact numbers.
+    adjoint(frames) -> the loss's gradient by the frames' positions; `inputs`: the gradients asked for.
+    cells, patterns: the meshes of the chart. reference_cells: those that the reference is extrapolated from (it then
+        includes the mesh's error); None: the reference is of each mesh by itself (the error of steps and precision).
+    largest_step [s]: steps to start from, where the stable one does not say (contact to come).
+    static: an equilibrium; only StaticSolver takes part.
+    levels: steps per solver, each half the last.
+    """
+
+    name: str
+    title: str
+    error: str
+    scene: Callable
+    duration: float
+    quantity: Callable
+    frames: int = 16
+    exact: np.ndarray | None = None
+    scale: float | None = None
+    adjoint: Callable | None = None
+    inputs: tuple = ()
+    cells: tuple = (2, 4, 8)
+    patterns: tuple = ("five", "kuhn")
+    reference_cells: tuple | None = None
+    largest_step: float = np.inf
+    static: bool = False
+    levels: int = 3
+
+    @property
+    def differentiates(self) -> bool:
+        """Whether the number is a gradient."""
+        return self.adjoint is not None
+
+    def quick(self) -> "Problem":
+        """The same with its smallest meshes."""
+        return replace(self, cells=self.cells[:2], patterns=self.patterns[:1],
+                       reference_cells=self.reference_cells and (4, 6, 8))  # fmt: skip
+
+    @classmethod
+    def of_scene(cls, scene, duration: float, name: str = "scene", frames: int = 10) -> "Problem":
+        """The motion of a scene of one's own, against its converged motion on the same mesh.
+
+        The error is the largest distance of any vertex at any frame, over the largest displacement from the start.
+        """
+        if not duration > 0:
+            raise ValueError(f"duration must be > 0 [s], got {duration:g}")
+
+        def build(cells, pattern, precision, **element):
+            return scene.replace(precision=precision, **element)
+
+        def moved(frames, gradients):
+            return frames.displacements.astype(np.float64) - frames.displacements[0]
+
+        return cls(name, f"{name}: {scene.mesh.num_tetrahedra} tetrahedra, {duration:g} s", "error of motion",
+                   build, duration, moved, frames, cells=(0,), patterns=("own mesh",))  # fmt: skip
+
+
+def distance(problem: Problem, quantity, exact) -> float:
+    """Error of a problem's numbers: the largest difference over the scale; rows of 3 count by their length."""
+    quantity, exact = np.asarray(quantity, np.float64), np.asarray(exact, np.float64)
+    apart = np.abs(quantity - exact)
+    if apart.ndim > 1 and apart.shape[-1] == 3:
+        apart = np.linalg.norm(apart, axis=-1)
+    largest = np.abs(exact) if exact.ndim < 2 else np.linalg.norm(exact, axis=-1)
+    return float(apart.max() / (problem.scale or largest.max()))

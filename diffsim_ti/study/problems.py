@@ -1,0 +1,187 @@
+"""The built-in problems: closed forms where there are some, else converged references."""
+
+import numpy as np
+
+from diffsim_ti.materials import LinearElastic, SmithNeoHookean, StableNeoHookean
+from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.scene import Scene
+from diffsim_ti.study.problem import Problem
+from diffsim_ti.terms import Gravity, Ground
+
+
+def oscillator() -> Problem:
+    """A tetrahedron sheared at its apex: u'' = -omega^2 u at any amplitude, omega = 2 sqrt(mu / rho) / h."""
+    E, density, height, reach, time = 1e5, 1000.0, 0.5, 0.2, 0.5
+    omega = 2 * np.sqrt(E / 2 / density) / height
+
+    def scene(cells, pattern, precision, **element):
+        mesh = TetrahedralMesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, height]], [[0, 1, 2, 3]])
+        start = mesh.vertices + reach * np.eye(4, 3, -3)
+        return Scene(mesh, StableNeoHookean(E, 0.0), density, fixed=[0, 1, 2], initial_positions=start,
+                     precision=precision, **element)  # fmt: skip
+
+    times = np.linspace(0, time, 17)
+    return Problem("oscillator", "One tetrahedron in shear, closed form", "error of motion", scene, time,
+                   lambda frames, _: frames.displacements[:, 3, 0], exact=reach * np.cos(omega * times), scale=reach,
+                   cells=(1,), patterns=("one tetrahedron",), levels=9)  # fmt: skip
+
+
+def lame(nu: float = 0.3) -> Problem:
+    """Lame mode of a free cube, exact for any nu: u = (cos px sin py, -sin px cos py, 0), p = pi / a,
+    omega = p sqrt(2 mu / rho). Free of divergence, so what the mesh adds to its frequency is locking.
+
+    The number is the mode's frequency with its decay, fitted to the projection of the motion on the mode over a period.
+    """
+    E, density, a, reach = 1e5, 1000.0, 1.0, 1e-4
+    omega = np.pi * np.sqrt(E / (1 + nu) / density) / a
+
+    def mode(X):
+        p = np.pi / a
+        x, y, z = X.T
+        return np.stack([np.cos(p * x) * np.sin(p * y), -np.sin(p * x) * np.cos(p * y), 0 * z], 1)
+
+    def scene(cells, pattern, precision, **element):
+        mesh = TetrahedralMesh.create_cube(cells + 1, a, pattern)
+        return Scene(mesh, StableNeoHookean(E, nu), density, initial_positions=mesh.vertices + reach * mode(mesh.vertices),
+                     precision=precision, **element)  # fmt: skip
+
+    def frequency(frames, _):
+        X = frames.inputs["rest_positions"]
+        inner = (mode(X) ** 2).sum(1)
+        q = (frames.displacements * mode(X)).sum((1, 2)) / inner.sum() / reach
+        return fit_oscillation(frames.times, q, omega)
+
+    return Problem("lame", f"Lamé mode of a free cube, nu = {nu:g}, closed form", "error of frequency and decay", scene,
+                   2 * np.pi / omega, frequency, exact=np.array([omega, 0.0]), cells=(4, 8, 16, 24, 32))  # fmt: skip
+
+
+def fit_oscillation(times, q, guess: float) -> np.ndarray:
+    """(omega, sigma) [1/s] of q = exp(-sigma t) (A cos omega t + B sin omega t), by least squares from omega = guess."""
+    from scipy.optimize import least_squares
+
+    def remainder(p):
+        wave = np.exp(-p[1] * times)[:, None] * np.stack([np.cos(p[0] * times), np.sin(p[0] * times)], 1)
+        return wave @ np.linalg.lstsq(wave, q, rcond=None)[0] - q
+
+    start = min(([guess * s, guess * d] for s in (0.7, 0.85, 1.0, 1.2, 1.5) for d in (0.0, 0.2)),
+                key=lambda p: (remainder(p) ** 2).sum())  # fmt: skip
+    return least_squares(remainder, start, x_scale=guess, xtol=1e-12, ftol=1e-12, gtol=1e-12).x
+
+
+def beam_scene(law, cells, pattern, precision, nu=0.3, **element) -> Scene:
+    """A beam 1 m long and 0.2 m thick, held at x = 0, under its own weight; E = 1e6 Pa, 1000 kg/m^3."""
+    mesh = TetrahedralMesh.create_box((5 * cells + 1, cells + 1, cells + 1), (1.0, 0.2, 0.2), pattern)
+    return Scene(mesh, law(1e6, nu), 1000.0, Gravity(), fixed="xmin", precision=precision, **element)
+
+
+def corners(rest) -> np.ndarray:
+    """The four corners of the beam's end, which every mesh has."""
+    return np.flatnonzero((rest[:, 0] == 1) & np.isin(rest[:, 1], (0, 0.2)) & np.isin(rest[:, 2], (0, 0.2)))
+
+
+def tip(frames, _=None) -> np.ndarray:
+    """Mean displacement of the beam's end, shape (frames, 3) [m]."""
+    return frames.displacements[:, corners(frames.inputs["rest_positions"])].astype(np.float64).mean(1)
+
+
+def beam() -> Problem:
+    """Large motion of the clamped beam that is let go straight: the path of its end over half a swing."""
+    return Problem("beam", "Clamped beam let go under its own weight, nu = 0.3", "error of motion, over its reach",
+                   lambda *args, **more: beam_scene(SmithNeoHookean, *args, **more), 0.5, tip, frames=10,
+                   cells=(1, 2, 3, 4, 6, 8), reference_cells=(6, 9, 12))  # fmt: skip
+
+
+def sag(nu: float = 0.3) -> Problem:
+    """Equilibrium of the clamped beam for small strains: Timoshenko's drop of the end,
+
+        q L^4 / (8 E I) + q L^2 / (2 k G A), k = 10 (1 + nu) / (12 + 11 nu)  (Cowper 1966, doi:10.1115/1.3625046)
+    """
+    E, load, L, H = 1e6, 1000 * 9.81 * 0.04, 1.0, 0.2
+    shear = 10 * (1 + nu) / (12 + 11 * nu) * E / (2 * (1 + nu)) * H**2
+    drop = load * L**4 / (8 * E * H**4 / 12) + load * L**2 / (2 * shear)
+    return Problem("sag", f"Clamped beam at rest, small strains, nu = {nu:g}, beam theory", "error of the end's drop",
+                   lambda *args, **more: beam_scene(LinearElastic, *args, nu=nu, **more), 1.0,
+                   lambda frames, _: tip(frames)[-1:, 1], frames=1, exact=np.array([-drop]), cells=(1, 2, 4, 6, 8),
+                   static=True)  # fmt: skip
+
+
+def bounce_scene(precision, speed: float, **element) -> Scene:
+    """A mass of 1 kg that meets a floor at `speed` [m/s] from 5 mm above the barrier: stiffness 1e4 N/m, width 0.01 m.
+
+    It is the apex of a tetrahedron too soft to be felt (1e-6 Pa), hanging from three fixed vertices.
+    """
+    mesh = TetrahedralMesh([[0, 1, 0], [1, 1, 0], [0, 1, 1], [0, 0.015, 0]], [[0, 1, 2, 3]], fix_orientation=True)
+    velocities = -speed * np.eye(4, 3, -3)[:, [1, 0, 2]]
+    return Scene(mesh, StableNeoHookean(1e-6, 0.0), 4 / mesh.volume, Ground(0.0, 1e4, 0.01), fixed=[0, 1, 2],
+                 initial_velocities=velocities, precision=precision, **element)  # fmt: skip
+
+
+def time_in_contact(speed: float, stiffness: float = 1e4, width: float = 0.01) -> float:
+    """Time [s] that a mass of 1 kg spends in the barrier: 2 int dd / sqrt(v^2 - 2 b(d)) from the deepest point."""
+    from scipy.integrate import quad
+    from scipy.optimize import brentq
+
+    def energy(d):
+        return -stiffness * (d - width) ** 2 * np.log(d / width)
+
+    deepest = brentq(lambda d: 2 * energy(d) - speed**2, 1e-3 * width, width * (1 - 1e-12), xtol=1e-18)
+    # d = deepest + s^2 takes the root of the denominator away
+    rate = lambda s: 2 * s / np.sqrt(max(speed**2 - 2 * energy(deepest + s * s), 1e-300))  # noqa: E731
+    return 2 * quad(rate, 0, np.sqrt(width - deepest), epsabs=1e-12, limit=400)[0]
+
+
+def bounce(speed: float = 2.0) -> Problem:
+    """Bounce on the barrier, by energy: the height after it, in widths of the barrier."""
+    time = 0.03
+    height = 0.01 + speed * (time - 0.005 / speed - time_in_contact(speed))
+    return Problem("bounce", f"A mass meets a floor at {speed:g} m/s, by energy", "error of height, in barrier widths",
+                   lambda cells, pattern, precision, **more: bounce_scene(precision, speed, **more), time,
+                   lambda frames, _: frames.inputs["rest_positions"][3, 1] + frames.displacements[-1:, 3, 1].astype(float),
+                   frames=1, exact=np.array([height]), scale=0.01, cells=(1,), patterns=("one mass",),
+                   largest_step=2e-3, levels=9)  # fmt: skip
+
+
+def bounce_gradient(speed: float = 2.0) -> Problem:
+    """How the height after the bounce depends on that before: d x / d x0 = -1 exactly."""
+    def last_height(frames):
+        out = np.zeros(frames.positions.shape)
+        out[-1, 3, 1] = 1.0
+        return out
+
+    time = 0.03
+    return Problem("bounce-gradient", f"Gradient through a bounce at {speed:g} m/s, by energy", "error of d height / d start",
+                   lambda cells, pattern, precision, **more: bounce_scene(precision, speed, **more), time,
+                   lambda _, gradients: gradients["initial_positions"][3, 1:2], frames=1, exact=np.array([-1.0]),
+                   adjoint=last_height, inputs=("initial_positions",), cells=(1,), patterns=("one mass",),
+                   largest_step=2e-3, levels=9)  # fmt: skip
+
+
+def identify() -> Problem:
+    """The gradient by E that identification follows: a clamped beam that sags, its end watched at 10 times for 0.25 s.
+
+    Loss: mean square of the end's distance [m] from where E = 0.9e6 Pa would about have brought it.
+    """
+    times = np.linspace(0, 0.25, 11)
+    target = np.stack([0 * times, -4.3 * times**2, 0 * times], 1)  # [m]
+
+    def pull(frames):
+        at = corners(frames.inputs["rest_positions"])
+        out = np.zeros(frames.positions.shape)
+        out[:, at] = (2 * (tip(frames) - target) / len(at) / len(times))[:, None]
+        return out
+
+    return Problem("identify", "Gradient by E of a beam's watched motion, per mesh", "error of d loss / d E",
+                   lambda *args, **more: beam_scene(SmithNeoHookean, *args, **more), 0.25,
+                   lambda _, gradients: np.atleast_1d(gradients["youngs_modulus"]), frames=10, adjoint=pull,
+                   inputs=("youngs_modulus",), cells=(2, 4), patterns=("five",))  # fmt: skip
+
+
+PROBLEMS = {"oscillator": oscillator, "lame": lame, "beam": beam, "sag": sag, "bounce": bounce,
+            "bounce-gradient": bounce_gradient, "identify": identify}  # fmt: skip
+
+
+def problem(name: str) -> Problem:
+    """A built-in problem by its name."""
+    if name not in PROBLEMS:
+        raise ValueError(f"no problem is called {name!r}; there are {', '.join(PROBLEMS)}")
+    return PROBLEMS[name]()
