@@ -17,6 +17,7 @@ Fixed = Annotated[list[str] | None, typer.Option(help="vertex set, or xmin .. zm
 def register(app: typer.Typer) -> None:
     """Add the commands."""
     app.command()(chart)
+    app.command()(recommend)
 
 
 def own_scene(path: Path, material: str, youngs_modulus: float, poissons_ratio: float, density: float, fixed):
@@ -48,7 +49,7 @@ def chart(
     poissons_ratio: Poisson = 0.4,
     density: Density = 1000.0,
     fixed: Fixed = None,
-    limit: Annotated[float, typer.Option(help="leave out runs expected to take longer than this [s]")] = 5.0,
+    limit: Annotated[float, typer.Option(help="leave out runs expected to take longer than this [s]")] = 1.0,
     repeats: Annotated[int, typer.Option(help="timed rounds, of which the best counts")] = 3,
     backend: Backend = "cpu",
 ):
@@ -82,3 +83,27 @@ def chart(
         raise FloatingPointError("no run gave a number; the reasons are in the JSON file")
     for name in charts.write_chart(result, output):
         print(name)
+
+
+def recommend(
+    scene: Annotated[Path, typer.Argument(help="a mesh, or a Python file that defines scene")],
+    duration: Annotated[float, typer.Option(help="simulated time [s]")] = 0.2,
+    tolerance: Annotated[float, typer.Option(help="of the motion, over the largest displacement")] = 1e-2,
+    memory: Annotated[float | None, typer.Option(help="most that gradients may keep [MB]")] = None,
+    gradients: Annotated[bool, typer.Option(help="whether the run will be differentiated")] = True,
+    budget: Annotated[float, typer.Option(help="wall time for trial runs [s]")] = 20.0,
+    quick: Annotated[bool, typer.Option("--quick", help="the same as --budget 4")] = False,
+    material: MaterialName = "StableNeoHookean",
+    youngs_modulus: Youngs = 1e5,
+    poissons_ratio: Poisson = 0.4,
+    density: Density = 1000.0,
+    fixed: Fixed = None,
+    backend: Backend = "cpu",
+):
+    """Name the cheapest solver, step, precision and checkpoints for a tolerance, from short trial runs."""
+    from diffsim_ti import runtime
+    from diffsim_ti.study import recommend as advise
+
+    runtime.init(backend)
+    body = own_scene(scene, material, youngs_modulus, poissons_ratio, density, fixed)
+    print(advise(body, duration, tolerance, memory, gradients, 4.0 if quick else budget))

@@ -13,7 +13,7 @@ MARKERS = {"SemiImplicit": "o", "VelocityVerlet": "s", "ImplicitEuler": "^", "Im
            "Static": "P"}  # fmt: skip
 
 
-def new_figure(width: float = 8.4, height: float = 5.4):
+def new_figure(width: float = 9.2, height: float = 5.4):
     """(figure, axes) in the style of all pictures, without a display."""
     from matplotlib.figure import Figure
 
@@ -29,7 +29,7 @@ def draw_chart(chart, path, peers: dict | None = None) -> None:
 
     peers: other systems' runs of the same problem, name -> [(seconds per simulated second, error), ...].
     """
-    figure, axes = new_figure()
+    figure, axes = new_figure(10.5)
     names = dict.fromkeys(p.solver for p in chart.points)
     for solver in names:
         name = solver.removesuffix("Solver")
@@ -46,8 +46,8 @@ def draw_chart(chart, path, peers: dict | None = None) -> None:
         rows = sorted(rows)
         color = PEER_COLORS.get(who, "#777777")
         axes.plot(*zip(*rows), "*", ms=9, color=color, zorder=3, label=who)
-    axes.set(xscale="log", yscale="log", ylabel=f"{chart.problem.error}, relative",
-             xlabel="wall time per equilibrium [s]" if chart.problem.static else "wall time per simulated second [s]")  # fmt: skip
+    per = "equilibrium" if chart.problem.static else "simulated second"
+    axes.set(xscale="log", yscale="log", ylabel=chart.problem.error, xlabel=f"wall time per {per} [s]")
     axes.set_title(chart.problem.title, loc="left", fontsize=11)
     axes.grid(which="major", color="0.9", zorder=0)
     if chart.reference_error > 0:
@@ -59,17 +59,14 @@ def draw_chart(chart, path, peers: dict | None = None) -> None:
     save(figure, path)
 
 
-def label_front(axes, front, most: int = 6) -> None:
-    """Name some of the front's runs beside them, no closer than a twelfth of a decade of the whole range."""
-    if not front:
-        return
-    span = np.log10(front[0].error / front[-1].error) or 1.0
-    last = np.inf
-    for p in front:
-        if np.log10(last / p.error) >= span / most or last == np.inf or p is front[-1]:
-            last = p.error
-            axes.annotate(p.label, (p.seconds, p.error), textcoords="offset points", xytext=(-5, -4), ha="right", va="top",
-                          fontsize=7, color="0.15", zorder=4)  # fmt: skip
+def label_front(axes, front, most: int = 9) -> None:
+    """Number some of the front's runs and say beside the diagram what they are."""
+    few = [front[round(k)] for k in np.linspace(0, len(front) - 1, min(most, len(front)))]
+    for k, p in enumerate(few):
+        axes.annotate(str(k + 1), (p.seconds, p.error), textcoords="offset points", xytext=(-3, -3), ha="right", va="top",
+                      fontsize=8, fontweight="bold", zorder=4)  # fmt: skip
+    lines = ["the front:", *(f"{k + 1}  {p.label}" for k, p in enumerate(few))]
+    axes.text(1.02, 0.0, "\n".join(lines), transform=axes.transAxes, fontsize=7.5, va="bottom", linespacing=1.5)
 
 
 def save(figure, path) -> None:

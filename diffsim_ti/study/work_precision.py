@@ -36,8 +36,9 @@ class Point:
 
     @property
     def label(self) -> str:
-        mesh = f"{self.cells} {self.pattern}" if self.cells else self.pattern
-        return f"{self.solver.removesuffix('Solver')}, {mesh}, {1e3 * self.substep:.3g} ms, {self.precision}"
+        mesh = f"{self.cells} cells {self.pattern}" if self.cells > 1 else self.pattern
+        step = "" if self.solver == "StaticSolver" else f", {1e3 * self.substep:.3g} ms"
+        return f"{self.solver.removesuffix('Solver')}, {mesh}{step}, {self.precision}"
 
 
 @dataclass
@@ -110,7 +111,7 @@ def run(problem: Problem, rollout: Rollout) -> tuple[float, np.ndarray]:
 # ---- references -------------------------------------------------------------------------------------------------------
 
 
-def reference(problem: Problem, cells: int | None = None, pattern: str = "five", substeps: int = 4) -> tuple[np.ndarray, float]:
+def reference(problem: Problem, cells: int | None = None, pattern: str = "five", substeps: int = 4) -> tuple:
     """(the right numbers, their own relative error): the closed form, or extrapolated from converging runs in float64.
 
     By steps on a mesh of so many cells: from h and h / 2 of velocity Verlet, whose error falls as h^2; the error is the
@@ -219,11 +220,12 @@ class Runs:
         return points
 
 
-def chart(problem: Problem, solvers=None, precisions=("f32", "f64"), levels: int | None = None, repeats: int = 3, limit: float = 5.0,
-          quick: bool = False, say: Callable = lambda line: None) -> Chart:  # fmt: skip
+def chart(problem: Problem, solvers=None, precisions=("f32", "f64"), levels: int | None = None, repeats: int = 3,
+          limit: float = 1.0, quick: bool = False, say: Callable = lambda line: None) -> Chart:  # fmt: skip
     """Run a problem by every solver, step, precision and mesh, and measure time and error.
 
-    solvers: classes; default all. levels: steps per solver, each half the last; default the problem's. repeats: timed rounds, the best counts.
+    solvers: classes; default all. levels: steps per solver, each half the last; default the problem's.
+    repeats: timed rounds, the best counts.
     limit [s]: runs expected to take longer are left out, and named. quick: small meshes, float32.
     say: called with what the chart will do and how long that takes. Raises ValueError for a problem no solver can do.
     """

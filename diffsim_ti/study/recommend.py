@@ -1,0 +1,290 @@
+"""Advice: the cheapest solver, step, precision and checkpoints that meet a tolerance, from trial runs and the theory."""
+
+import time
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from diffsim_ti.rollout import Rollout
+from diffsim_ti.solvers import SOLVERS, VelocityVerletSolver
+from diffsim_ti.study.problem import Problem, distance
+from diffsim_ti.terms import Drag, ExternalForce
+
+SAFETY = 0.7  # of the tolerance: what a trial run must keep, for the error of the whole run is predicted
+SHARE = 0.8  # of the stable step at the start, which may fall on the way
+LOCKING_ABOVE = 0.45  # Poisson's ratio
+
+
+@dataclass
+class Option:
+    """A way to run a scene, with what a trial run says of it."""
+
+    solver: type
+    precision: str
+    substep: float  # [s]
+    steps: int  # of the whole duration
+    error: float = np.nan  # over the whole duration, relative to the largest displacement
+    seconds: float = np.nan  # wall time of the whole duration, with its gradient if asked for
+    substeps: int = 0  # per frame of the trial
+
+    @property
+    def label(self) -> str:
+        return f"{self.solver.__name__}, {self.substep:.3g} s, {self.precision}"
+
+
+@dataclass
+class Recommendation:
+    """What to use: `solver`, `dt` [s], `steps`, `precision`, `memory` [MB] for the checkpoints, `element`; what to expect
+    of it: `seconds` of wall time, `megabytes` kept for gradients, `error` relative to the largest displacement.
+
+    `reasons`: three lines; `left_out`: what the scene does without, and why. `rollout(scene)` makes it.
+    """
+
+    option: Option
+    duration: float
+    gradients: bool
+    memory: float | None
+    megabytes: float
+    error: float
+    element: str
+    reasons: list[str]
+    left_out: list[str]
+    tried: list[Option] = field(repr=False, default_factory=list)
+
+    solver = property(lambda self: self.option.solver)
+    precision = property(lambda self: self.option.precision)
+    dt = property(lambda self: self.option.substep)
+    steps = property(lambda self: self.option.steps)
+    seconds = property(lambda self: self.option.seconds)
+
+    def rollout(self, scene, frames: int = 1, **options) -> Rollout:
+        """The recommended run of the scene, `frames` times saved; options are Rollout's."""
+        substeps = -(-self.steps // frames)
+        solver = self.solver(scene.replace(precision=self.precision), dt=self.duration / frames, substeps=substeps)
+        return Rollout(solver, frames, save_every=1, memory=self.memory, **options)
+
+    def __str__(self) -> str:
+        kept = f"{self.megabytes:.3g} MB" if self.gradients else "no states"
+        return "\n".join([
+            f"{self.solver.__name__}(scene, dt={self.dt:.4g}), {self.steps} steps, precision {self.precision}, "
+            f"element {self.element}" + (f", Rollout(..., memory={self.memory:g})" if self.memory else ""),
+            f"expect: {self.seconds:.3g} s of wall time, {kept} kept, error {self.error:.2g} of the largest displacement",
+            *(f"- {line}" for line in self.reasons), "left out: " + "; ".join(self.left_out),
+        ])  # fmt: skip
+
+
+def recommend(scene, duration: float, tolerance: float = 1e-2, memory: float | None = None, gradients: bool = True,
+              budget: float = 20.0, frames: int = 8) -> Recommendation:  # fmt: skip
+    """The cheapest way to run `scene` for `duration` [s] with a relative error of motion below `tolerance`.
+
+    The error meant is that of steps and precision on the scene's own mesh: the largest distance of any vertex at any of
+    `frames` times over the largest displacement from the start. memory [MB]: most that gradients may keep.
+    gradients: whether runs will be differentiated, which is then timed as well.
+    budget [s]: wall time of the trials, compiling apart; if the reference of the whole duration would take more, trials
+    cover a first part and errors grow with time from there.
+
+    Raises ValueError for a duration or tolerance that is no such thing, FloatingPointError if nothing meets the tolerance.
+    """
+    if not (duration > 0 and np.isfinite(duration)):
+        raise ValueError(f"duration must be > 0 [s], got {duration:g}")
+    if not 0 < tolerance < 1:
+        raise ValueError(f"tolerance must lie between 0 and 1, got {tolerance:g}")
+    if memory is not None and not memory > 0:
+        raise ValueError(f"memory must be > 0 [MB], got {memory:g}")
+    trials = Trials(scene, duration, tolerance, memory, gradients, budget, frames)
+    trials.run()
+    return trials.advice()
+
+
+class Trials:
+    """Trial runs of a scene: a reference, then each solver at the steps that its order of convergence suggests."""
+
+    def __init__(self, scene, duration, tolerance, memory, gradients, budget, frames):
+        self.scene, self.duration, self.tolerance, self.frames = scene, duration, tolerance, frames
+        self.memory, self.gradients, self.budget = memory, gradients, budget
+        self.stable = VelocityVerletSolver(scene, dt=duration, allow_unstable=True).stable_dt(tight=True).dt
+        self.tried: list[Option] = []
+        self.notes: list[str] = []
+        self._find_reference()
+        self.spent = 0.0  # [s] of the trials, compile time apart
+
+    def _find_reference(self) -> None:
+        """Converged motion in float64 by velocity Verlet over `self.span`, all of the duration if the budget allows.
+
+        From the first step of halves that agree to a tenth of the tolerance, extrapolated; its error is the last change.
+        """
+        k = int(np.ceil(self.duration / self.frames / (SHARE * self.stable)))
+        seconds = self._seconds_per_substep() * k * self.frames
+        self.span = self.duration * min(1.0, 0.1 * self.budget / max(3 * seconds, 1e-9))
+        self.problem = replace(Problem.of_scene(self.scene, self.span), frames=self.frames)
+        k = max(1, int(np.ceil(k * self.span / self.duration)))
+        coarse, self.own_error = None, np.nan
+        for _ in range(8):
+            try:
+                fine = self._motion(VelocityVerletSolver, "f64", k)[0]
+            except FloatingPointError:  # the stable step falls on the way
+                fine = None
+            if coarse is not None and fine is not None:
+                self.reference = fine + (fine - coarse) / 3
+                self.own_error = distance(self.problem, fine, self.reference)
+                if self.own_error < 0.1 * self.tolerance:
+                    return
+            coarse, k = fine, 2 * k
+        raise FloatingPointError(
+            f"the motion does not converge: with {k} steps in {self.span:.3g} s the last halving still changed it by "
+            f"{self.own_error:.1g} of the largest displacement; shorten the duration"
+        )
+
+    def _seconds_per_substep(self) -> float:
+        rollout = self._rollout(VelocityVerletSolver, "f64", 40, frames=1, span=4 * self.stable)
+        rollout.forward()
+        begin = time.perf_counter()
+        rollout.forward()
+        return (time.perf_counter() - begin) / 40
+
+    def _rollout(self, kind, precision, substeps, frames=None, span=None) -> Rollout:
+        frames, span = frames or self.frames, span or self.span
+        solver = kind(self.scene.replace(precision=precision), dt=span / frames, substeps=substeps)
+        return Rollout(solver, frames, save_every=1, memory=self.memory)
+
+    def _motion(self, kind, precision, substeps, timed: bool = False):
+        """(displacements from the start at the frames, wall time [s], `timed`, with the gradient if one is wanted)."""
+        rollout = self._rollout(kind, precision, substeps)
+        frames = rollout.forward()
+        moved = frames.displacements.astype(np.float64) - frames.displacements[0]
+        if not timed:
+            return moved, np.nan
+        self._time(rollout, moved)  # compiles
+        seconds = self._time(rollout, moved)
+        self.spent += 3 * seconds
+        return moved, seconds
+
+    def _time(self, rollout, adjoint) -> float:
+        """Wall time of a run [s], with its gradient if one is wanted."""
+        start = time.perf_counter()
+        frames = rollout.forward()
+        if self.gradients:
+            rollout.vjp(frames, adjoint)
+        return time.perf_counter() - start
+
+    def _compare(self, rounds: int = 5) -> None:
+        """Time the good options that are near the best once more, back to back, for the machine may have been busy."""
+        best = self._best()
+        good = [o for o in self.tried if o.error <= SAFETY * self.tolerance]
+        near = [o for o in good if o.seconds < max(12 * best.seconds, 1e-3 * self.budget)]
+        rollouts = [self._rollout(o.solver, o.precision, o.substeps) for o in near]
+        times, longer = [[] for _ in near], self.duration / self.span
+        for _ in range(rounds):
+            for k, (option, rollout) in enumerate(zip(near, rollouts)):
+                if not times[k] or option.seconds / longer < 0.02 * self.budget:
+                    times[k].append(self._time(rollout, self.reference))
+        for option, seconds in zip(near, times):
+            option.seconds = longer * min(seconds[1:] or seconds)
+
+    def _try(self, kind, precision, substeps) -> Option:
+        """Run an option over the span; its error and time are carried on to the whole duration."""
+        longer = self.duration / self.span
+        total = int(np.ceil(substeps * self.frames * longer))
+        option = Option(kind, precision, self.duration / total, total, substeps=substeps)
+        try:
+            moved, seconds = self._motion(kind, precision, substeps, timed=True)
+            option.error = distance(self.problem, moved, self.reference) * longer
+            option.seconds = seconds * longer
+        except FloatingPointError as error:
+            self.notes.append(f"{option.label}: {type(error).__name__}")
+        self.tried.append(option)
+        return option
+
+    def run(self) -> None:
+        """Every solver in float32 from its largest step to one that meets the tolerance, then float64 at the same step."""
+        first = max(1, int(np.ceil(self.span / self.frames / (SHARE * self.stable))))
+        for kind in sorted(SOLVERS, key=lambda kind: not kind.explicit):
+            substeps = first if kind.explicit else 1
+            for _ in range(5):
+                if self._too_dear(kind, substeps):
+                    break
+                option = self._try(kind, "f32", substeps)
+                if option.error <= SAFETY * self.tolerance:
+                    break
+                finer = (option.error / (0.5 * self.tolerance)) ** (1 / kind.order) if np.isfinite(option.error) else 4
+                substeps = int(np.ceil(substeps * np.clip(finer, 1.3, 16)))
+        for kind in [kind for kind in SOLVERS if kind.explicit]:  # float64 costs little more on small meshes
+            known = [o for o in self.tried if o.solver is kind and np.isfinite(o.error)]
+            if known and not self._too_dear(kind, known[-1].substeps):
+                self._try(kind, "f64", min(known, key=lambda o: o.error).substeps)
+        self._compare()
+
+    def _too_dear(self, kind, substeps) -> bool:
+        """Whether a trial would take longer than twelve times the best so far, or than the budget's rest."""
+        best, known = self._best(), [o for o in self.tried if o.solver is kind and np.isfinite(o.seconds)]
+        if not known:
+            return not kind.explicit and self.spent > self.budget
+        seconds = min(o.seconds / o.substeps for o in known) * substeps
+        trial = 3 * seconds * self.span / self.duration
+        if best is not None and seconds > 12 * best.seconds or self.spent + trial > self.budget:
+            self.notes.append(f"{kind.__name__} with a finer step than {known[-1].substep:.3g} s was not tried: too dear")
+            return True
+        return False
+
+    def _best(self) -> Option | None:
+        good = [o for o in self.tried if o.error <= SAFETY * self.tolerance]
+        return min(good, key=lambda o: o.seconds, default=None)
+
+    # ---- what follows from it -------------------------------------------------------------------------------------------
+
+    def advice(self) -> Recommendation:
+        """The cheapest option that met the tolerance, in words as well."""
+        best = self._best()
+        if best is None:
+            closest = min(self.tried, key=lambda o: np.nan_to_num(o.error, nan=np.inf))
+            raise FloatingPointError(
+                f"nothing tried meets a tolerance of {self.tolerance:g}: the closest is {closest.label} with an error of "
+                f"{closest.error:.2g}; loosen the tolerance, raise budget= ({self.budget:g} s), or shorten the duration"
+            )
+        plan = Rollout(best.solver(self.scene.replace(precision=best.precision), dt=self.duration / self.frames,
+                                   substeps=-(-best.steps // self.frames)), self.frames, memory=self.memory)  # fmt: skip
+        return Recommendation(
+            best, self.duration, self.gradients, self.memory, plan.memory if self.gradients else 0.0,
+            max(best.error, self.own_error), "linear", self._reasons(best, plan), self._left_out(best), self.tried,
+        )  # fmt: skip
+
+    def _reasons(self, best, plan) -> list[str]:
+        others = {}
+        for o in self.tried:
+            if o.solver is not best.solver and o.error <= SAFETY * self.tolerance:
+                others[o.solver.__name__] = min(others.get(o.solver.__name__, np.inf), o.seconds / best.seconds)
+        beaten = ", ".join(f"{name} {times:.1f} times as long" for name, times in sorted(others.items(), key=lambda x: x[1]))
+        share = best.substep / self.stable
+        limit = (f"its step is {share:.2g} of the stable step {self.stable:.3g} s" if best.solver.explicit
+                 else f"its step is {share:.2g} times the explicit limit {self.stable:.3g} s")  # fmt: skip
+        schedule = plan.schedule
+        again = "each step runs once more in the reverse sweep" if schedule.num_segments > 1 else "all steps are kept"
+        return [
+            f"accuracy: error {best.error:.2g} against a converged run (itself good to {self.own_error:.1g}), order "
+            f"{best.solver.order}; {limit}",
+            f"time: {beaten or 'no other solver met the tolerance'}",
+            f"memory: {plan.memory:.3g} MB in {schedule.num_segments} segments, {again}" if self.gradients
+            else "memory: without gradients no state is kept",
+        ]  # fmt: skip
+
+    def _left_out(self, best) -> list[str]:
+        out = []
+        if best.precision == "f32":
+            out.append("float64: float32's rounding stays below the tolerance")
+        implicit = [o for o in self.tried if not o.solver.explicit and np.isfinite(o.error)]
+        if best.solver.explicit and implicit:
+            close = min(implicit, key=lambda o: o.error)
+            times = close.seconds / best.seconds
+            out.append(f"implicit solvers: {close.solver.__name__} takes {times:.2g} times as long, error {close.error:.2g}")
+        if self.scene.term(Drag) is None:
+            out.append("damping: none in the scene")
+        if not any(getattr(t, "acts_on_surface", False) for t in self.scene.terms):
+            out.append("contact: none in the scene")
+        if self.scene.term(ExternalForce) is None and self.scene.motion is None:
+            out.append("forces and motion per step")
+        nu = float(np.max(self.scene.inputs.values.get("poissons_ratio", 0.0)))
+        if nu > LOCKING_ABOVE:
+            out.append(f"nothing against locking, though nu = {nu:g}: a mesh of pattern five, or a finer one, is advised")
+        else:
+            out.append(f"elements against locking: nu = {nu:g} is at most {LOCKING_ABOVE}")
+        return out + self.notes

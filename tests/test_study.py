@@ -1,0 +1,229 @@
+"""Charts and advice: what they measure is right, what they promise is kept."""
+
+import itertools
+import json
+import time
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+import diffsim_ti as ds
+from diffsim_ti.solvers import SOLVERS
+from diffsim_ti.study import PROBLEMS, Problem, chart, charts, pareto_front, problem, problems, recommend
+from diffsim_ti.study.work_precision import Point, choose_substeps, make_rollout, reference, run
+
+EXPLICIT = [kind for kind in SOLVERS if kind.explicit]
+
+
+@lru_cache
+def quick_chart(name: str):
+    asked = problem(name)
+    asked = replace(asked, cells=asked.cells[:1], patterns=asked.patterns[:1], levels=4)
+    return chart(asked, precisions=("f64",), repeats=1)
+
+
+# ---- problems ---------------------------------------------------------------------------------------------------------
+
+
+def test_closed_forms_are_those_of_the_references():
+    omega, decay = problems.lame(0.3).exact
+    assert omega / (2 * np.pi) == pytest.approx(4.385290, rel=1e-6) and decay == 0
+    assert problems.lame(0.0).exact[0] / (2 * np.pi) == pytest.approx(5.0, rel=1e-12)
+    for nu, drop in ((0.0, 0.37965), (0.3, 0.38288), (0.45, 0.38450), (0.49, 0.38493)):
+        assert -problems.sag(nu).exact[0] == pytest.approx(drop, rel=2e-5)
+
+
+@pytest.mark.parametrize("speed, deepest", [(1.0, 3.292e-3), (2.0, 8.956e-4)])
+def test_time_in_contact_is_that_of_the_equation_of_motion(speed, deepest):
+    """The energy integral against the equation of motion itself, integrated by another method."""
+    from scipy.integrate import solve_ivp
+
+    def fall(t, y):
+        d = max(y[0], 1e-12)
+        return [y[1], 1e4 * (2 * (d - 0.01) * np.log(d / 0.01) + (d - 0.01) ** 2 / d)] if d < 0.01 else [y[1], 0.0]
+
+    leaves = lambda t, y: y[0] - 0.01 if t > 1e-5 else -1.0  # noqa: E731
+    leaves.terminal = True
+    way = solve_ivp(fall, (0, 0.1), [0.01, -speed], rtol=1e-10, atol=1e-13, events=leaves)
+    assert problems.time_in_contact(speed) == pytest.approx(way.t[-1], rel=1e-4)
+    assert way.y[0].min() == pytest.approx(deepest, rel=2e-2)
+
+
+def test_fit_finds_frequency_and_decay():
+    t = np.linspace(0, 1, 17)
+    omega, sigma = problems.fit_oscillation(t, np.exp(-0.7 * t) * np.cos(6.9 * t + 0.3), 6.3)
+    assert (omega, sigma) == pytest.approx((6.9, 0.7), rel=1e-6)
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_every_problem_runs_quickly_and_gets_better_with_smaller_steps(name):
+    if name == "sag":
+        result = chart(replace(problem(name), cells=(1, 2), patterns=("five",)), precisions=("f64",), repeats=1)
+        assert result.points[1].error < 0.7 * result.points[0].error
+        # the drop itself: 6 cells across give .928 of beam theory's (an independent code's value), 4 give .871
+        for cells, share in ((4, 0.871),):
+            scene = problem(name).scene(cells, "five", "f64")
+            drop = run(problem(name), make_rollout(problem(name), scene, ds.StaticSolver, 1))[1]
+            assert drop[0] / problem(name).exact[0] == pytest.approx(share, abs=2e-3)
+        return
+    asked = problem(name)
+    cells, pattern = asked.cells[0], asked.patterns[0]
+    asked = replace(asked, reference_cells=None)  # of this mesh: steps alone
+    if name == "lame":  # the exact frequency is of the finest mesh; on one mesh steps converge to that mesh's own
+        asked = replace(asked, exact=None)
+    right, own_error = reference(asked, cells, pattern)
+    assert own_error < 1e-2
+    scene = asked.scene(cells, pattern, "f64")
+    k = 4 * choose_substeps(asked, scene, ds.VelocityVerletSolver, 1)[0]
+    errors = []
+    for substeps in (k, 2 * k):
+        numbers = run(asked, make_rollout(asked, scene, ds.VelocityVerletSolver, substeps))[1]
+        errors.append(np.abs(numbers - right).max() / np.abs(right).max())
+    assert errors[1] < 0.5 * errors[0] < 0.05 or errors[1] < 1e-9
+
+
+# ---- charts -----------------------------------------------------------------------------------------------------------
+
+
+def test_front_holds_what_nothing_beats():
+    rng = np.random.default_rng(3)
+    points = [Point("S", 1, "p", "linear", "f32", 1, 1.0, 1, seconds=s, error=e) for s, e in rng.uniform(size=(60, 2))]
+    points.append(Point("S", 1, "p", "linear", "f32", 1, 1.0, 1, said="refused"))
+    front = pareto_front(points)
+    for p in points[:-1]:
+        beaten = any(q.seconds <= p.seconds and q.error <= p.error and q is not p for q in points)
+        assert (p in front) == (not beaten)
+
+
+def test_chart_of_the_oscillator_shows_each_solvers_order():
+    """Halving the step divides the error by 2 to the order, in the closed form's own problem."""
+    result = quick_chart("oscillator")
+    for kind in SOLVERS:
+        errors = [p.error for p in result.points if p.solver == kind.__name__]
+        fine = kind in EXPLICIT or kind.order == 2
+        assert len(errors) >= 4 and all(np.isfinite(errors))
+        if fine:  # backward Euler's first steps are too coarse to show it
+            assert np.log2(errors[-2] / errors[-1]) == pytest.approx(kind.order, abs=0.35)
+    assert result.front and result.time_to(1e-1) is not None and result.time_to(1e-9) is None
+
+
+def test_chart_writes_picture_table_and_record(tmp_path):
+    result = quick_chart("oscillator")
+    names = charts.write_chart(result, tmp_path, peers={"another": [(0.1, 0.1)]})
+    assert [name.rsplit(".")[-1] for name in names] == ["png", "csv", "json"]
+    record = json.loads((tmp_path / "chart_oscillator.json").read_text())
+    assert len(record["points"]) == len(result.points) and record["peers"]["another"] == [[0.1, 0.1]]
+    assert sum(p["on_front"] for p in record["points"]) == len(result.front)
+    lines = (tmp_path / "chart_oscillator.csv").read_text().splitlines()
+    assert len(lines) == 1 + len(result.points) and lines[0].startswith("solver,cells,pattern")
+    assert (tmp_path / "chart_oscillator.png").stat().st_size > 10_000
+
+
+def test_runs_that_raise_are_shown_as_refused_and_long_ones_are_named():
+    asked = replace(problem("lame"), cells=(2,), patterns=("five",))
+    unstable = replace(asked, scene=lambda *a, **k: asked.scene(*a, **k).replace(density=1e3))
+    result = chart(unstable, solvers=(ds.VelocityVerletSolver,), precisions=("f32",), levels=2, repeats=1, limit=1e-9)
+    assert not result.points and len(result.left_out) == 2 and "would take" in result.left_out[0]
+    with pytest.raises(ValueError, match="is a motion"):
+        chart(asked, solvers=(ds.StaticSolver,))
+    with pytest.raises(ValueError, match="no problem is called 'x'"):
+        problem("x")
+
+
+# ---- advice -----------------------------------------------------------------------------------------------------------
+
+
+def held_back(name: str) -> tuple:
+    """(scene, duration, tolerance) that the advice was not made with."""
+    if name == "twist":
+        mesh = ds.TetrahedralMesh.create_box((3, 3, 5), (0.1, 0.1, 0.3), "five")
+        turn = np.cross(mesh.vertices - [0.05, 0.05, 0], [0, 0, 1.0]) * mesh.vertices[:, 2:] * 20
+        return ds.Scene(mesh, ds.StVenantKirchhoff(5e4, 0.25), 900.0, fixed="zmin", initial_velocities=turn), 0.15, 1e-2
+    mesh = ds.TetrahedralMesh.create_cube(3, 0.2).translated((0, 0.012, 0))
+    floor = ds.Ground(width=0.01, stiffness=500.0)
+    return ds.Scene(mesh, ds.Corotated(3e4, 0.3), 800.0, [ds.Gravity(), ds.Drag(2.0), floor]), 0.1, 2e-2
+
+
+@lru_cache
+def advised(name: str, gradients: bool = False):
+    scene, duration, tolerance = held_back(name)
+    return recommend(scene, duration, tolerance, gradients=gradients, budget=3.0)
+
+
+def moved(scene, kind, precision, duration, substeps) -> np.ndarray:
+    """Displacements from the start at eight times, shape (9, num_vertices, 3) [m]."""
+    rollout = ds.Rollout(kind(scene.replace(precision=precision), dt=duration / 8, substeps=substeps), 8, save_every=1)
+    return from_start(rollout)
+
+
+def from_start(rollout) -> np.ndarray:
+    u = rollout.forward().displacements.astype(np.float64)
+    return u - u[0]
+
+
+def relative(motion, right) -> float:
+    return np.linalg.norm(motion - right, axis=-1).max() / np.linalg.norm(right, axis=-1).max()
+
+
+@pytest.mark.parametrize("name", ["twist", "drop"])
+def test_advice_keeps_its_promise(name):
+    """Error below the tolerance against an independent converged run: another solver, sixteen times finer."""
+    (scene, duration, tolerance), advice = held_back(name), advised(name)
+    fine = 16 * -(-advice.steps // 8)
+    coarse, fine = (moved(scene, ds.SemiImplicitSolver, "f64", duration, k) for k in (fine, 2 * fine))
+    assert relative(from_start(advice.rollout(scene, 8)), 2 * fine - coarse) <= tolerance
+    assert advice.error <= tolerance and len(advice.reasons) == 3 and advice.left_out
+    assert all(word in str(advice) for word in (advice.solver.__name__, "expect:", "left out:"))
+
+
+@pytest.mark.parametrize("name", ["twist"])
+def test_advice_overlooks_nothing_twice_as_cheap(name):
+    """Every explicit solver, precision and step of a ladder: none that meets the tolerance takes half the time."""
+    (scene, duration, tolerance), advice = held_back(name), advised(name)
+    own = -(-advice.steps // 8)
+    right = moved(scene, ds.VelocityVerletSolver, "f64", duration, 16 * own)
+    rollouts = {"advised": advice.rollout(scene, 8)}
+    for kind, precision, k in itertools.product(SOLVERS, ("f32", "f64"), (own // 4, own // 2, own, 2 * own)):
+        if k and (kind.explicit or (precision, k) == ("f64", own // 4)):  # finer implicit steps only take longer
+            try:
+                rollout = ds.Rollout(kind(scene.replace(precision=precision), dt=duration / 8, substeps=k), 8, 1)
+                error = relative(from_start(rollout), right)
+            except (ValueError, FloatingPointError):
+                continue
+            if error <= tolerance:
+                rollouts[kind.__name__, precision, k] = rollout
+    best = dict.fromkeys(rollouts, np.inf)
+    for _ in range(5):
+        for key, rollout in rollouts.items():
+            begin = time.perf_counter()
+            rollout.forward()
+            best[key] = min(best[key], time.perf_counter() - begin)
+    assert best["advised"] <= 2 * min(best.values()), best
+
+
+def test_advice_states_memory_and_keeps_to_it():
+    scene, duration, tolerance = held_back("drop")
+    advice = recommend(scene, duration, tolerance, memory=0.05, budget=2.0)
+    rollout = advice.rollout(scene, 4)
+    assert 0 < advice.megabytes <= 0.05 and rollout.memory <= 0.05
+    frames = rollout.forward()
+    assert np.isfinite(rollout.vjp(frames, frames.positions)["youngs_modulus"])
+    assert "contact: none" not in str(advice) and "damping: none" not in str(advice)
+
+
+@pytest.mark.parametrize("wrong, says", [(dict(duration=0.0), "duration"), (dict(tolerance=2.0), "tolerance"),
+                                         (dict(memory=-1.0), "memory")])  # fmt: skip
+def test_advice_refuses_what_is_no_question(wrong, says):
+    scene, duration, tolerance = held_back("drop")
+    with pytest.raises(ValueError, match=says):
+        recommend(scene, **dict(duration=duration, tolerance=tolerance) | wrong)
+
+
+def test_own_scene_is_charted_against_its_own_converged_motion():
+    scene, duration, _ = held_back("twist")
+    result = chart(Problem.of_scene(scene, duration, frames=4), solvers=EXPLICIT, precisions=("f32",), levels=2, repeats=1)
+    assert result.reference_error < 1e-3 and all(np.isfinite(p.error) for p in result.points)
+    verlet = [p.error for p in result.points if p.solver == "VelocityVerletSolver"]
+    assert verlet[1] < 0.4 * verlet[0]
