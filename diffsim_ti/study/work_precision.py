@@ -13,6 +13,7 @@ from diffsim_ti.study.problem import ELEMENTS, Problem, distance
 
 # wall time per tetrahedron and substep, before anything was measured [s]; with gradients three times as much
 GUESS = {True: 6e-8, False: 1e-5}
+HOPELESS = 30  # times as long as the front at the same error: a solver that takes that on a mesh skips the larger ones
 SHARE = 0.8  # of the stable step at the start, with which explicit solvers begin: elements get squeezed on the way
 
 
@@ -156,6 +157,7 @@ class Runs:
         self.levels, self.repeats, self.limit = levels, repeats, limit
         self.rate: dict = {}  # (solver, precision) -> [s] per tetrahedron and substep
         self.left_out: list[str] = []
+        self._done: list[Point] = []
 
     def meshes(self):
         """(cells, pattern, element) of each mesh, the small ones first."""
@@ -217,7 +219,20 @@ class Runs:
             known = self.rate.get((point.solver, point.precision))
             rate = best / max(point.tetrahedra, 200) / point.substeps
             self.rate[point.solver, point.precision] = rate if known is None else 0.5 * (known + rate)
+        self._drop_hopeless(points)
         return points
+
+    def _drop_hopeless(self, points: list[Point]) -> None:
+        """Leave out of the larger meshes what is far behind the front on this one."""
+        self._done += points
+        front = pareto_front(self._done)
+        for kind in self.solvers:
+            own = [p for p in points if p.solver == kind.__name__ and np.isfinite(p.seconds)]
+            behind = [p.seconds / min(q.seconds for q in front if q.error <= p.error) for p in own]
+            if behind and min(behind) > HOPELESS:
+                self.solvers = tuple(k for k in self.solvers if k is not kind)
+                self.left_out.append(f"{kind.__name__} beyond {own[0].cells} cells {own[0].pattern}: "
+                                     f"{min(behind):.0f} times as long as the front at the same error")  # fmt: skip
 
 
 def chart(problem: Problem, solvers=None, precisions=("f32", "f64"), levels: int | None = None, repeats: int = 3,
