@@ -17,6 +17,7 @@ Fixed = Annotated[list[str] | None, typer.Option(help="vertex set, or xmin .. zm
 def register(app: typer.Typer) -> None:
     """Add the commands."""
     app.command()(chart)
+    app.command()(stability)
     app.command()(recommend)
 
 
@@ -83,6 +84,51 @@ def chart(
         raise FloatingPointError("no run gave a number; the reasons are in the JSON file")
     for name in charts.write_chart(result, output):
         print(name)
+
+
+def stability(
+    axis: Annotated[str, typer.Argument(help="stiffness, nu, impact, quality, compression, or all")] = "all",
+    solver: Annotated[list[str] | None, typer.Option(help="class name; may be repeated; default all")] = None,
+    output: Folder = Path("output/stability"),
+    quick: Quick = False,
+    backend: Backend = "cpu",
+):
+    """Map where each solver is accurate, bounded, loses energy, raises, or is wrong silently. Exit code 1 if one is."""
+    from dataclasses import replace
+
+    from diffsim_ti import runtime
+    from diffsim_ti.cli_options import progress
+    from diffsim_ti.solvers import SOLVERS
+    from diffsim_ti.study import map_picture
+    from diffsim_ti.study.stability_map import AXES, stability_map
+
+    names = {kind.__name__: kind for kind in SOLVERS}
+    for asked, known in (([axis], ["all", *AXES]), (solver or [], names)):
+        for name in asked:
+            if name not in known:
+                raise ValueError(f"{name!r} is none of {', '.join(known)}")
+    runtime.init(backend, "f64")
+    axes = {name: AXES[name] for name in (AXES if axis == "all" else [axis])}
+    if quick:
+        axes = {name: replace(a, values=a.values[:: max(1, len(a.values) - 1)]) for name, a in axes.items()}
+    kinds = [names[name] for name in solver or (list(names)[:2] if quick else names)]
+    silent, done = [], 0
+    with progress("stability", len(axes) * len(kinds)) as show:
+        for name, quantity in axes.items():
+            for kind in kinds:
+                result = stability_map(kind, quantity, steps=60 if quick else None, find_bounds=not quick,
+                                       show=lambda note: show(done, note))  # fmt: skip
+                done += 1
+                silent += result.silent
+                gap = np.nanmax(np.abs(result.bounds / result.limits - 1), initial=0.0)
+                counts = ", ".join(f"{(result.outcomes == k).sum()} {word}" for k, word in enumerate(map_picture.OUTCOMES))
+                print(f"{name}, {kind.__name__}: {counts}" + (f"; boundary within {gap:.1%} of the limit" if gap else ""))
+                for file in map_picture.write_map(result, output, name):
+                    print(f"  {file}")
+    for line in silent:
+        print(f"wrong silently: {line}")
+    if silent:
+        raise typer.Exit(1)
 
 
 def recommend(

@@ -1,8 +1,13 @@
 """Speed against accuracy, stability, growth of gradients, and advice: what a scene needs and what that costs."""
 
+from diffsim_ti.study.growth import Growth, growth
 from diffsim_ti.study.problem import Problem
 from diffsim_ti.study.problems import PROBLEMS, problem
 from diffsim_ti.study.recommend import Recommendation, recommend
+from diffsim_ti.study.stability_map import StabilityMap, boundary, power_limit, stability_map
 from diffsim_ti.study.work_precision import Chart, Point, chart, pareto_front
 
-__all__ = ["Chart", "PROBLEMS", "Point", "Problem", "Recommendation", "chart", "pareto_front", "problem", "recommend"]
+__all__ = [
+    "Chart", "Growth", "PROBLEMS", "Point", "Problem", "Recommendation", "StabilityMap", "boundary", "chart", "growth",
+    "pareto_front", "power_limit", "problem", "recommend", "stability_map",
+]  # fmt: skip

@@ -1,4 +1,4 @@
-"""Pictures and files of charts, maps and growth. Colours are Okabe and Ito's, which colour-blind readers tell apart."""
+"""Pictures and files of charts. Colours are Okabe and Ito's, which colour-blind readers tell apart."""
 
 import csv
 import json

@@ -1,0 +1,214 @@
+"""Where a solver is accurate, stays bounded, loses energy, is refused, or goes wrong without saying so."""
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from diffsim_ti.materials import SmithNeoHookean
+from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.scene import Scene
+from diffsim_ti.simulator import Simulator
+from diffsim_ti.stability import Stiffness
+from diffsim_ti.terms import Ground
+
+OUTCOMES = ("accurate", "bounded", "loses energy", "raises", "wrong silently")
+ACCURATE = 0.01  # change of the total energy, over the energy that moves
+LOSES = 0.10
+GAINS = 0.10
+
+
+@dataclass(frozen=True)
+class Axis:
+    """A quantity that a map runs over: its values and the scene that each makes."""
+
+    name: str
+    unit: str
+    values: tuple
+    scene: Callable  # value -> Scene
+
+    def __iter__(self):
+        return iter(self.values)
+
+
+def body(cells: int = 2, squeeze: float = 1.0, flat: float = 1.0, E: float = 1e5, nu: float = 0.3, terms=(), lift=0.0,
+         speed: float = 0.0) -> Scene:  # fmt: skip
+    """A cube of 0.2 m, its elements flattened to `flat` of their height, the body squeezed to `squeeze` along y, and
+    shaken by random velocities of 0.1 % of the speed of sound so that every mode takes part."""
+    mesh = TetrahedralMesh.create_box(cells + 1, (0.2, 0.2 * flat, 0.2), "five").translated((0, lift, 0))
+    shake = 1e-3 * np.sqrt(E / 1000.0) * np.random.default_rng(0).standard_normal(mesh.vertices.shape)
+    start = mesh.vertices * [1, squeeze, 1]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # nu near 1/2 and slivers are what is looked at
+        return Scene(mesh, SmithNeoHookean(E, nu), 1000.0, terms, initial_positions=start,
+                     initial_velocities=shake - [0, speed, 0], precision="f64")  # fmt: skip
+
+
+def impact(speed: float) -> Scene:
+    """The cube 2 mm above a barrier 5 mm wide, moving down."""
+    return body(lift=0.007, speed=speed, terms=[Ground(0.0, 2e3, 0.005)])
+
+
+AXES = {
+    "stiffness": Axis("Young's modulus", "Pa", tuple(10.0 ** np.arange(3, 8.1, 1.0)), lambda E: body(E=E)),
+    "nu": Axis("Poisson's ratio", "-", (0.0, 0.1, 0.2, 0.3, 0.4, 0.45, 0.48, 0.49, 0.495, 0.499), lambda nu: body(nu=nu)),
+    "impact": Axis("speed of impact", "m/s", (0.1, 0.2, 0.5, 1.0, 2.0, 3.0, 5.0, 8.0), impact),
+    "quality": Axis("height of the elements over their width", "-", (1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01),
+                    lambda flat: body(flat=flat)),
+    "compression": Axis("stretch at the start", "-", (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3), lambda s: body(squeeze=s)),
+}  # fmt: skip
+
+
+def power_limit(scene, rounds: int = 3000, tolerance: float = 1e-7) -> float:
+    """The explicit limit 2 / omega_max [s] at the scene's start, by plain power iteration on the assembled stiffness.
+
+    Independent of the Lanczos iteration by which solvers look at their steps; converges from above.
+    """
+    from diffsim_ti.solvers import VelocityVerletSolver
+
+    solver = VelocityVerletSolver(scene, dt=1.0, allow_unstable=True)
+    stiffness = Stiffness(solver.workspace(solver.start_values()))
+    x = np.random.default_rng(5).standard_normal((scene.mesh.num_vertices, 3)) * (stiffness.root > 0)
+    value = 0.0
+    for k in range(rounds):
+        x /= np.linalg.norm(x)
+        y = stiffness.product(x)
+        before, value = value, float((x * y).sum())
+        if abs(value - before) < tolerance * abs(value) and k > 20:
+            break
+        x = y + 0.05 * abs(value) * x  # negative eigenvalues of a squeezed body do not compete
+    return 2 / np.sqrt(value)
+
+
+@dataclass
+class Run:
+    """What became of a run: one of OUTCOMES, the largest and the last change of energy (relative), what was said."""
+
+    outcome: str
+    rise: float = 0.0
+    change: float = 0.0
+    said: str = ""
+
+
+def judge(scene, kind, dt: float, steps: int = 200, overridden: bool = False) -> Run:
+    """Run `steps` steps and judge them by the energy, relative to the energy that can move: kinetic, elastic, contact.
+
+    An explicit step swaps energy to and fro within its stable range, but keeps a neighbouring one (`kept_energy`): that
+    one's rise tells growth from swapping. overridden: with allow_unstable=True, as a user may ask; then nothing but the
+    state's being finite is looked at.
+    """
+    options = dict(allow_unstable=True) if overridden and kind.explicit else {}
+    try:
+        simulator = Simulator(kind(scene, dt=dt, **options))
+        first, moving, kept = measure(simulator)
+        rise, change = 0.0, 0.0
+        for _ in range(20):
+            simulator.run(max(1, steps // 20))
+            total, now, still_kept = measure(simulator)
+            scale = max(moving, min(now, 100 * moving))
+            change, rise = max(change, abs(total - first) / scale), max(rise, (still_kept - kept) / scale)
+            if not np.isfinite(change + rise) or rise > 1e3:
+                return Run("wrong silently", rise, change, "the energy grew without bound")
+    except (ValueError, FloatingPointError) as error:
+        return Run("raises", said=f"{type(error).__name__}: {error}")
+    if rise > GAINS:
+        return Run("wrong silently", rise, change, "the energy rose")
+    if (still_kept - kept) / scale < -LOSES:
+        return Run("loses energy", rise, change)
+    return Run("accurate" if change < ACCURATE else "bounded", rise, change)
+
+
+def measure(simulator) -> tuple[float, float, float]:
+    """(total energy, its parts that move, the energy that the solver keeps) [J] at the present state; takes a step."""
+    solver, mass = simulator.solver, simulator.scene.inputs.derive(simulator.scene.inputs.values).mass[:, None]
+    u, v = simulator.displacements.astype(float), simulator.velocities.astype(float)
+    with np.errstate(over="ignore", invalid="ignore"):
+        energy = simulator.compute_energy()
+        simulator.step()
+        kept = float(energy)
+        if solver.explicit:
+            kept += kept_energy(solver, mass, u, v, simulator.displacements - u, simulator.velocities - v)
+        return float(energy), float(sum(part for name, part in energy.parts.items() if name != "gravity")), kept
+
+
+def kept_energy(solver, mass, u, v, du, dv) -> float:
+    """What an explicit solver keeps besides the energy H, exactly for linear forces f:
+
+    symplectic Euler H + (h / 2) v . f, velocity Verlet H - (h^2 / 8) f . f / m. Forces are those that made the step.
+    Hairer, Lubich, Wanner, Geometric Numerical Integration, IX.3.
+    """
+    h = solver.dt
+    if solver.order == 1:
+        return float((0.5 * mass * v * dv).sum())
+    f = 2 * mass * (du - h * v) / h**2
+    return float(-(h**2 / 8 * f * f / mass).sum())
+
+
+def boundary(scene, kind, steps: int = 2000, accuracy: float = 0.005) -> float:
+    """Largest dt [s] at which the solver, its refusal overridden, stays bounded: by bisection around the limit."""
+    low, high = 0.8 * power_limit(scene), 1.3 * power_limit(scene)
+    while high / low > 1 + accuracy:
+        middle = np.sqrt(low * high)
+        run = judge(scene, kind, middle, steps, overridden=True)
+        low, high = (low, middle) if run.outcome in ("wrong silently", "raises") else (middle, high)
+    return float(np.sqrt(low * high))
+
+
+@dataclass
+class StabilityMap:
+    """Runs over dt (rows, as shares of the explicit limit) x an axis (columns), with the limits [s] of the columns.
+
+    bounds: the steps [s] up to which the solver, overridden, stayed bounded; NaN where that was not looked for.
+    """
+
+    solver: str
+    axis: Axis
+    shares: np.ndarray
+    limits: np.ndarray
+    runs: list[list[Run]]
+    bounds: np.ndarray
+
+    @property
+    def outcomes(self) -> np.ndarray:
+        """Indices into OUTCOMES, shape (len(shares), len(axis.values))."""
+        return np.array([[OUTCOMES.index(run.outcome) for run in row] for row in self.runs])
+
+    @property
+    def silent(self) -> list[str]:
+        """Runs that went wrong without a word."""
+        return [f"{self.solver}, {self.axis.name} {value:g} {self.axis.unit}, dt {share * limit:.3g} s ({share:.2g} of the "
+                f"limit): {run.said}, by {run.rise:.2g} of what moves"
+                for share, row in zip(self.shares, self.runs)
+                for value, limit, run in zip(self.axis.values, self.limits, row)
+                if run.outcome == "wrong silently"]  # fmt: skip
+
+    def rows(self) -> list[dict]:
+        """One row per run, for a table."""
+        return [dict(solver=self.solver, axis=self.axis.name, value=value, dt=share * limit, share=share, limit=limit,
+                     outcome=run.outcome, rise=run.rise, change=run.change, said=run.said)
+                for share, row in zip(self.shares, self.runs)
+                for value, limit, run in zip(self.axis.values, self.limits, row)]  # fmt: skip
+
+
+SHARES = {True: (0.1, 0.2, 0.4, 0.6, 0.8, 0.9, 0.95, 0.99, 1.01, 1.05, 1.2, 2.0), False: (0.3, 1.0, 3.0, 10.0, 30.0)}
+
+
+def stability_map(kind, axis: Axis, shares=None, steps: int | None = None, find_bounds: bool = False,
+                  show: Callable = lambda note: None) -> StabilityMap:  # fmt: skip
+    """Judge a solver at every share of the explicit limit and every value of the axis.
+
+    shares: of the explicit limit at the start of each scene; default SHARES. steps: per run, default 200, implicit 40.
+    find_bounds: of explicit solvers also look by bisection where they stop being bounded.
+    """
+    shares = np.array(SHARES[kind.explicit] if shares is None else shares)
+    steps = (200 if kind.explicit else 40) if steps is None else steps
+    limits, bounds, columns = [], [], []
+    for value in axis:
+        show(f"{kind.__name__}, {axis.name} {value:g}")
+        scene = axis.scene(value)
+        limits.append(power_limit(scene))
+        columns.append([judge(scene, kind, share * limits[-1], steps) for share in shares])
+        bounds.append(boundary(scene, kind) if find_bounds and kind.explicit else np.nan)
+    return StabilityMap(kind.__name__, axis, shares, np.array(limits), [list(row) for row in zip(*columns)],
+                        np.array(bounds))  # fmt: skip

@@ -1,0 +1,72 @@
+"""Stability maps: the boundary is where theory puts it, and outcomes are called by their names."""
+
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import diffsim_ti as ds
+from diffsim_ti.solvers import SOLVERS
+from diffsim_ti.study import boundary, growth, map_picture, power_limit, stability_map
+from diffsim_ti.study.stability_map import AXES, OUTCOMES, body, judge
+
+EXPLICIT = [kind for kind in SOLVERS if kind.explicit]
+
+
+def test_power_iteration_agrees_with_the_eigenvalues_of_the_assembled_matrix():
+    """Against a dense matrix of differences of forces at rest, column by column."""
+    scene = body(1)
+    solver = ds.VelocityVerletSolver(scene, dt=1.0, allow_unstable=True)
+    from diffsim_ti.stability import Stiffness
+
+    stiffness, n = Stiffness(solver.workspace(solver.start_values())), scene.mesh.num_vertices
+    dense = np.stack([stiffness.product(e.reshape(n, 3)).ravel() for e in np.eye(3 * n)], 1)
+    assert power_limit(scene) == pytest.approx(2 / np.sqrt(np.linalg.eigvalsh(dense)[-1]), rel=1e-4)
+
+
+@pytest.mark.parametrize("kind", EXPLICIT)
+def test_boundary_is_the_theoretical_limit(kind):
+    """Within 3 %: symplectic Euler and velocity Verlet are bounded up to 2 / omega_max and no further."""
+    scene = body()
+    assert boundary(scene, kind) == pytest.approx(power_limit(scene), rel=0.03)
+
+
+@pytest.mark.parametrize("kind", EXPLICIT)
+@pytest.mark.parametrize("axis", ["stiffness", "nu", "quality"])
+def test_no_explicit_solver_is_wrong_silently(kind, axis):
+    short = replace(AXES[axis], values=AXES[axis].values[:: len(AXES[axis].values) - 1])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        result = stability_map(kind, short, shares=(0.3, 0.95, 1.05), steps=100)
+    assert not result.silent, result.silent
+    outcomes = np.array(OUTCOMES)[result.outcomes]
+    assert set(outcomes[0]) <= {"accurate", "bounded"} and set(outcomes[-1]) == {"raises"}
+
+
+def test_outcomes_have_their_names():
+    scene, limit = body(), power_limit(body())
+    assert judge(scene, ds.VelocityVerletSolver, 0.05 * limit, 40).outcome == "accurate"
+    assert judge(scene, ds.SemiImplicitSolver, 0.9 * limit, 40).outcome == "bounded"
+    assert judge(scene, ds.ImplicitEulerSolver, limit, 20).outcome == "loses energy"
+    assert judge(scene, ds.SemiImplicitSolver, 1.05 * limit, 40).outcome == "raises"
+    assert judge(scene, ds.SemiImplicitSolver, 1.05 * limit, 200, overridden=True).outcome == "wrong silently"
+
+
+def test_map_writes_picture_and_tables(tmp_path):
+    short = replace(AXES["nu"], values=(0.0, 0.3))
+    result = stability_map(ds.VelocityVerletSolver, short, shares=(0.5, 1.05), steps=20)
+    files = map_picture.write_map(result, tmp_path, "nu")
+    assert [name.rsplit(".")[-1] for name in files] == ["png", "csv", "json"]
+    assert len((tmp_path / "stability_nu_velocityverlet.csv").read_text().splitlines()) == 5
+
+
+def test_growth_of_an_oscillator_is_none_and_of_an_inverted_one_is_its_rate():
+    """A rigid free body's tangent stays; a body at stretch 0.3 in an unstable step grows and has a horizon in f32."""
+    calm = growth(ds.VelocityVerletSolver(body().replace(precision="f64"), dt=0.3 * power_limit(body())), 200)
+    assert calm.horizon is None and abs(calm.rate) < 5 and calm.sizes[:, 0] == pytest.approx(1.0)
+    scene = body().replace(precision="f32")
+    wild = growth(ds.VelocityVerletSolver(scene, dt=1.05 * power_limit(body()), allow_unstable=True), 100)
+    # beyond the limit the fastest mode multiplies by exp(2 arccosh(s)) each step, s = dt / limit
+    assert wild.rate == pytest.approx(2 * np.arccosh(1.05) / (1.05 * power_limit(body())), rel=0.05)
+    assert wild.horizon is not None and "until" in str(wild)
