@@ -50,7 +50,7 @@ def test_outcomes_have_their_names():
     assert judge(scene, ds.SemiImplicitSolver, 0.9 * limit, 40).outcome == "bounded"
     assert judge(scene, ds.ImplicitEulerSolver, limit, 20).outcome == "loses energy"
     assert judge(scene, ds.SemiImplicitSolver, 1.05 * limit, 40).outcome == "raises"
-    assert judge(scene, ds.SemiImplicitSolver, 1.05 * limit, 200, overridden=True).outcome == "wrong silently"
+    assert judge(scene, ds.SemiImplicitSolver, 1.01 * limit, 60, overridden=True).outcome == "wrong silently"
 
 
 def test_map_writes_picture_and_tables(tmp_path):
@@ -61,11 +61,11 @@ def test_map_writes_picture_and_tables(tmp_path):
     assert len((tmp_path / "stability_nu_velocityverlet.csv").read_text().splitlines()) == 5
 
 
-def test_growth_of_an_oscillator_is_none_and_of_an_inverted_one_is_its_rate():
-    """A rigid free body's tangent stays; a body at stretch 0.3 in an unstable step grows and has a horizon in f32."""
-    calm = growth(ds.VelocityVerletSolver(body().replace(precision="f64"), dt=0.3 * power_limit(body())), 200)
-    assert calm.horizon is None and abs(calm.rate) < 5 and calm.sizes[:, 0] == pytest.approx(1.0)
-    scene = body().replace(precision="f32")
+def test_growth_beyond_the_limit_is_the_fastest_modes_and_has_a_horizon():
+    """Within the limit tangents hardly grow; beyond it, at rest, they grow as theory says, until float32 drowns in it."""
+    calm = growth(ds.VelocityVerletSolver(body(), dt=0.3 * power_limit(body())), 200)
+    assert calm.horizon is None and abs(calm.rate) < 10 and calm.sizes[:, 0] == pytest.approx(1.0)
+    scene = body().replace(precision="f32", initial_velocities=None)
     wild = growth(ds.VelocityVerletSolver(scene, dt=1.05 * power_limit(body()), allow_unstable=True), 100)
     # beyond the limit the fastest mode multiplies by exp(2 arccosh(s)) each step, s = dt / limit
     assert wild.rate == pytest.approx(2 * np.arccosh(1.05) / (1.05 * power_limit(body())), rel=0.05)
