@@ -51,7 +51,8 @@ def draw_chart(chart, path, peers: dict | None = None) -> None:
     axes.set_title(chart.problem.title, loc="left", fontsize=11)
     axes.grid(which="major", color="0.9", zorder=0)
     if chart.reference_error > 0:
-        axes.axhspan(axes.get_ylim()[0], chart.reference_error, color="0.9", zorder=0)
+        axes.axhspan(chart.reference_error / 2, chart.reference_error, color="0.9", zorder=0)
+        axes.set_ylim(bottom=min(chart.reference_error / 2, axes.get_ylim()[0]))
         axes.text(0.99, chart.reference_error, "the reference's own error", transform=axes.get_yaxis_transform(), ha="right",
                   va="bottom", fontsize=8, color="0.35")  # fmt: skip
     label_front(axes, front)
