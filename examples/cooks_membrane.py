@@ -25,9 +25,9 @@ LARGE = dict(material=ds.StableNeoHookean(2 * 0.4225 * 1.3, 0.3), traction=1 / 1
 
 def panel(cells: int, thickness: float) -> ds.TetrahedralMesh:
     """48 mm long, 44 mm high on the left, 16 mm on the right, one cell thick; sets as those of a box."""
-    box = ds.TetrahedralMesh.create_box((cells + 1, cells + 1, 2), pattern="five")
+    box = ds.TetrahedralMesh.create_box((cells + 1, cells + 1, 2), (1, 1, 1 / cells), pattern="five")
     s, r, q = box.vertices.T
-    vertices = np.stack([48 * s, 44 * s + r * (44 - 28 * s), thickness * q], 1)
+    vertices = np.stack([48 * s, 44 * s + r * (44 - 28 * s), thickness * cells * q], 1)
     return ds.TetrahedralMesh(vertices, box.tetrahedra, vertex_sets=box.vertex_sets)
 
 
