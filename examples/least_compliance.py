@@ -80,7 +80,8 @@ def main(folder="output", quick: bool = False) -> dict:
            "clear": clear, "volume": float(volumes @ x), "history": history, "seconds": seconds}  # fmt: skip
     print(f"compliance {1e3 * c:.4g} mJ after {iterations} steps, {out['by_even']:.3g} times less than with x = {SHARE} "
           f"everywhere and {out['by_thinner']:.3g} times less than of an even panel of that share of the thickness; volume "
-          f"{out['volume']:.3f}, {100 * clear:.0f} % all or nothing; {mesh.num_tetrahedra} tetrahedra, {seconds:.1f} s")  # fmt: skip
+          f"{out['volume']:.3f}, {100 * clear:.0f} % all or nothing; "
+          f"{mesh.num_tetrahedra} tetrahedra, {seconds:.1f} s")  # fmt: skip
     if folder:
         Path(folder).mkdir(exist_ok=True)
         save_picture(Path(folder) / "least_compliance.png", mesh, mesh.vertices, x, "density", limits=(0.0, 1.0),

@@ -84,7 +84,8 @@ def main(folder="output", quick: bool = False) -> dict:
     after, seconds = canopy.rms(off), time.perf_counter() - start
     lift = float((rest - canopy.wanted)[canopy.mesh.vertex_sets["xmax"], 1].mean())
     print(f"{3 * len(canopy.free)} unknowns: {1e3 * before:.3g} mm off when cast flat, {1e3 * after:.2g} mm "
-          f"with the edge cast {1e3 * lift:.3g} mm higher ({before / after:.0f} times less); {iterations} iterations, {seconds:.1f} s")  # fmt: skip
+          f"with the edge cast {1e3 * lift:.3g} mm higher ({before / after:.0f} times less); "
+          f"{iterations} iterations, {seconds:.1f} s")  # fmt: skip
     if folder:
         Path(folder).mkdir(exist_ok=True)
         save_picture(Path(folder) / "sag_into_shape.png", canopy.mesh, rest, rest[:, 1] - canopy.wanted[:, 1],
