@@ -44,13 +44,13 @@ def optimality_step(x: np.ndarray, by_x: np.ndarray, volumes: np.ndarray) -> np.
 class Panel:
     """The compliance of a panel as a function of the stiffness of its tetrahedra."""
 
-    def __init__(self, cells):
+    def __init__(self, cells, tolerance: float = 1e-6):
         self.mesh = mesh = ds.TetrahedralMesh.create_box([n + 1 for n in cells], SIZE, pattern="five")
         loaded = mesh.vertices_where(lambda X: (X[:, 0] > SIZE[0] - 1e-9) & (np.abs(X[:, 1] - SIZE[1] / 2) < 0.06))
         self.load = np.zeros((2, mesh.num_vertices, 3))
         self.load[1, loaded, 1] = -FORCE / len(loaded)
         scene = ds.Scene(mesh, ds.LinearElastic(E0, 0.3), 1.0, [ds.ExternalForce(self.load[1])], "xmin", precision="f64")
-        self.rollout = ds.Rollout(ds.StaticSolver(scene, tolerance=1e-6), 1, gradients=["youngs_modulus"])
+        self.rollout = ds.Rollout(ds.StaticSolver(scene, tolerance=tolerance), 1, gradients=["youngs_modulus"])
 
     def compliance(self, E: np.ndarray) -> tuple[float, np.ndarray]:
         """(f . u [J], its derivatives by E)"""

@@ -23,9 +23,9 @@ FALL = 3000  # stop when the error has fallen so many times
 class Canopy:
     """A plate held along one edge, and its equilibria as a function of its rest shape."""
 
-    def __init__(self, resolution):
+    def __init__(self, resolution, E: float):
         self.mesh = ds.TetrahedralMesh.create_box(resolution, (1.0, 0.1, 0.6), pattern="five")
-        scene = ds.Scene(self.mesh, ds.StableNeoHookean(2e6, 0.3), 1000.0, [ds.Gravity()], "xmin", precision="f64")
+        scene = ds.Scene(self.mesh, ds.StableNeoHookean(E, 0.3), 1000.0, [ds.Gravity()], "xmin", precision="f64")
         self.rollout = ds.Rollout(ds.StaticSolver(scene, tolerance=1e-10), 1, gradients=["rest_positions"])
         self.wanted = self.mesh.vertices
         self.free = np.setdiff1d(np.arange(self.mesh.num_vertices), scene.fixed)
@@ -73,7 +73,7 @@ class Canopy:
 
 def main(folder="output", quick: bool = False) -> dict:
     """Returns rms distances before and after [m], their ratio, how much higher the edge is cast [m], iterations, seconds."""
-    canopy = Canopy((7, 2, 4) if quick else (13, 3, 9))
+    canopy = Canopy((7, 2, 4), 2e6) if quick else Canopy((11, 3, 7), 4e6)
     start, iterations, rest = time.perf_counter(), 0, canopy.wanted.copy()
     frames, off = canopy.hang(rest, rest)
     before = canopy.rms(off)
