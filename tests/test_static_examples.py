@@ -1,0 +1,95 @@
+"""The examples of equilibria and implicit steps find what they look for, on small meshes."""
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+
+
+def example(name: str):
+    """An example as a module."""
+    spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_cantilever(capsys):
+    """Small strains as another code finds them (its numbers have three digits); large rotations as the elastica."""
+    numbers = example("cantilever").main(quick=True)
+    for share, known in numbers["shares"].values():
+        assert share == pytest.approx(known, abs=6e-3)
+    (fine, extrapolated), = numbers["elastica"].values()
+    assert -0.06 < fine[0] < -0.04  # locked
+    assert np.abs(extrapolated).max() < 0.018  # and how much of it extrapolation from 2 and 3 cells takes away
+    assert "elastica" in capsys.readouterr().out
+
+
+def test_cooks_membrane(capsys):
+    """Plane strain is met, the corner rises towards the reference from below, as linear tetrahedra do."""
+    numbers = example("cooks_membrane").main(quick=True)
+    for name in ("linear", "large"):
+        case = numbers[name]
+        rise, exact = np.array(case["corner"]), case["exact"][0]
+        assert np.all(np.diff(rise) > 0) and case["left"] < 1e-6
+        assert 0.85 * exact < rise[-1] < exact
+    assert 0.9 * 14.499 < numbers["large"]["middle"][-1] < 14.499
+    assert "corner rises" in capsys.readouterr().out
+
+
+def test_sag_into_shape(tmp_path, capsys):
+    numbers = example("sag_into_shape").main(tmp_path, quick=True)
+    assert numbers["ratio"] >= 1000 and numbers["iterations"] <= 7
+    assert numbers["before"] > 0.1 and numbers["lift"] > numbers["before"]  # cast higher, by more than the mean sag
+    assert (tmp_path / "sag_into_shape.png").stat().st_size > 10_000
+    assert "times less" in capsys.readouterr().out
+
+
+def test_stiffness_from_picture(capsys):
+    """Within 2 %, and within three times the spread that the noise of the picture leaves."""
+    numbers = example("stiffness_from_picture").main(quick=True)
+    truth = {"upper": 2e6, "elbow": 2.5e5, "lower": 8e5}
+    for part, E in numbers["E"].items():
+        assert E == pytest.approx(truth[part], rel=0.02)
+    assert numbers["error"] < 3 * numbers["spread"] and numbers["evaluations"] <= 60
+    assert 0.09 <= numbers["residual_mm"] <= 0.11  # nothing is left but the noise of 0.1 mm
+    assert "E = " in capsys.readouterr().out
+
+
+def test_least_compliance(tmp_path, capsys):
+    numbers = example("least_compliance").main(tmp_path, quick=True)
+    assert numbers["by_even"] >= 4.5 and numbers["volume"] == pytest.approx(0.4, abs=1e-6)
+    assert np.all(np.diff(numbers["history"]) < 0)
+    assert (tmp_path / "least_compliance.png").stat().st_size > 10_000
+    assert "times less" in capsys.readouterr().out
+
+
+def test_derivatives_of_the_compliance():
+    """By E they are -f . u shares: E dc/dE adds up to -c; and they equal differences."""
+    module = example("least_compliance")
+    panel = module.Panel((4, 2, 1), tolerance=1e-12)
+    E = module.E0 * (1 + np.random.default_rng(0).random(panel.mesh.num_tetrahedra))
+    c, by_E = panel.compliance(E)
+    assert (E * by_E).sum() == pytest.approx(-c, rel=1e-9) and by_E.max() <= 0
+    change = 1e-3 * E * np.random.default_rng(1).standard_normal(len(E))
+    difference = (panel.compliance(E + change)[0] - panel.compliance(E - change)[0]) / 2
+    assert by_E @ change == pytest.approx(difference, rel=1e-4)
+
+
+def test_benchmark_of_implicit_steps(capsys):
+    """Every part runs; the direct solver takes the same steps."""
+    benchmark = example("benchmark_implicit")
+    (tetrahedra, ours, theirs, ratio, differ), = benchmark.direct([160], 2)
+    assert tetrahedra == 168 and ratio == pytest.approx(theirs / ours) and differ < 1e-6
+    rows, exponent = benchmark.growth([60, 400], 1)
+    assert np.isfinite(exponent) and rows[-1][2] > 10
+    (_, iterations, *_, cost), = benchmark.backward([160], 1)
+    assert iterations >= 1 and cost > 0
+    rows = benchmark.crossing(benchmark.beam(24), [1e6], 20)
+    assert {row[:3] for row in rows} >= {("carried", 1e6, "BDF2Solver"), ("falls", 1e6, "ImplicitEulerSolver")}
+    assert all(row[4] <= 0.01 and row[5] > 0 for row in rows)
+    assert benchmark._where_one([1.0, 100.0], [100.0, 10.0]) == "E = 1e+04 Pa"
+    assert "| tetrahedra |" in capsys.readouterr().out
