@@ -1,5 +1,7 @@
 """Noticing that a run goes wrong, and saying where, when and why."""
 
+import warnings
+
 import numpy as np
 
 from diffsim_ti import observe, runtime, stability
@@ -33,13 +35,19 @@ class Guard:
     within a tenth of the stable one it looks more often, for beyond it a motion soon grows e-fold in ten passes.
     """
 
-    usual, close = 400, 50  # passes between two looks
+    usual, close, first = 400, 50, 10  # passes between two looks; the first one of a deformed start
 
     def __init__(self, workspace):
         self.ws = workspace
         self.good = workspace.history(1)
-        self.good_pass, self._passes, self.offset = 0, 0, 0  # offset: passes before this run, for reports
-        self.every, self._stiffness = self.usual, None
+        self.good_pass, self.offset = 0, 0  # offset: passes before this run, for reports
+        self._stiffness, self._warned = None, False
+        self.restart()
+
+    def restart(self) -> None:
+        """A new run: looks come at the same passes whatever ran before, and sooner where it starts deformed."""
+        solver = self.ws.solver
+        self._passes, self.every = 0, self.first if solver.explicit and solver.starts_deformed() else self.usual
 
     def mark(self, now: int) -> None:
         """The current state, before pass `now`, is good: keep it."""
@@ -61,11 +69,26 @@ class Guard:
                 self._diagnose_crossing(stop, num_passes)
             if self.ws.first_bad_vertex() is not None:
                 self._diagnose(stop, num_passes)
+            self._warn_of_stiff_contact()
             self._passes += stop - first
             if self._passes >= self.every:
                 self._passes = 0
                 self._look_at_step(stop, num_passes)
             first = stop
+
+    def _warn_of_stiff_contact(self) -> None:
+        """Once, where a barrier was stiffer than a step can follow: energy may then come from nowhere."""
+        if self._warned or not self.ws.solver.explicit or not self.ws.watch.contacts:
+            return
+        omega_dt = self.ws.watch.largest_omega_dt()
+        if omega_dt > 2:
+            self._warned = True
+            h = self.ws.solver.substep
+            warnings.warn(
+                f"a contact was stiffer than the substep {h:.3g} s can follow (omega dt = {omega_dt:.3g} > 2), so that "
+                f"energy may be gained in it: take substeps of {1.8 * h / omega_dt:.3g} s, or a softer or wider barrier",
+                stacklevel=5,
+            )
 
     def _step_of(self, j: int, num_passes: int) -> int:
         """The step that pass j belongs to; velocity Verlet's closing half kick belongs to the last one."""
@@ -81,7 +104,8 @@ class Guard:
             self._stiffness = stability.Stiffness(self.ws)
         omega2 = self._stiffness.watch()
         if np.isfinite(omega2) and omega2 * solver.substep**2 <= 4:
-            self.every = self.close if omega2 * solver.substep**2 > 0.9**2 * 4 else self.usual
+            near = omega2 * solver.substep**2 > 0.9**2 * 4
+            self.every = min(2 * self.every, self.close if near else self.usual)
             return
         step, limit = self._step_of(now - 1, num_passes), 2 / np.sqrt(omega2)
         tet = self._stiffness.worst_tetrahedron()

@@ -136,6 +136,11 @@ class Inputs:
             np.stack([values[name] for name in self.paths], 1) if self.paths and self.paths[0] in values else None,
         )  # fmt: skip
 
+    @property
+    def rest_gradients(self) -> np.ndarray:
+        """grad N_1..3 of each tetrahedron of the mesh [1/m], shape (num_tetrahedra, 3, 3)."""
+        return self._rest_of(self.values["rest_positions"])[0]
+
     def _rest_of(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rows grad N_1..3 and volumes at X; those of the mesh itself are kept."""
         if X is not self.values["rest_positions"] and not np.array_equal(X, self.mesh.vertices):

@@ -281,6 +281,7 @@ class Rollout:
     def _sweep_forward(self) -> None:
         """All passes; keeps the first snapshots of the schedule on the way."""
         ws, schedule = self._workspace, self.schedule
+        self._guard.restart()
         self._recorded = schedule.num_segments == 1 and self._adjoint is not None  # a gradient was asked for before
         if self._recorded:
             ws.make_record(schedule.segment + 1)

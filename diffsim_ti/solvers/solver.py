@@ -4,6 +4,8 @@ import math
 import warnings
 from abc import ABC
 
+import numpy as np
+
 from diffsim_ti import runtime, stability
 from diffsim_ti.terms import SelfContact
 
@@ -32,6 +34,7 @@ class Solver(ABC):
         if not self.explicit and scene.term(SelfContact):
             raise ValueError(f"{type(self).__name__} has no self-contact yet: use an explicit solver, or leave it out")
         self._tight: stability.StepLimit | None = None
+        self._deformed: bool | None = None
         if self.explicit and not allow_unstable:
             self._refuse_unstable()
 
@@ -69,9 +72,17 @@ class Solver(ABC):
         values |= self.scene.path_rows([0.0, self.dt])
         return inputs.derive(values)
 
+    def starts_deformed(self, strain: float = 0.05) -> bool:
+        """Whether the start is strained so much that the bound at rest may not hold."""
+        if self._deformed is None:
+            inputs, tets = self.scene.inputs, self.scene.mesh.tetrahedra
+            u = inputs.values["initial_positions"] - inputs.values["rest_positions"]
+            D = np.swapaxes(u[tets[:, 1:]] - u[tets[:, :1]], 1, 2)
+            self._deformed = bool(u.any() and np.abs(np.matmul(D, inputs.rest_gradients)).max() > strain)
+        return self._deformed
+
     def _refuse_unstable(self) -> None:
-        bound = self.stable_dt()
-        if self.substep <= bound.dt:
+        if self.substep <= self.stable_dt().dt and not self.starts_deformed():
             return
         tight = self.stable_dt(tight=True)
         if self.substep > tight.dt:

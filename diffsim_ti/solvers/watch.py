@@ -88,6 +88,12 @@ class ContactWatch:
         k, i = np.unravel_index(np.argmin(gaps), gaps.shape)
         return (int(k), int(i), -float(gaps[k, i])) if gaps[k, i] <= 0 else None
 
+    def largest_omega_dt(self) -> float:
+        """Largest h sqrt(b''(d) / m) since the run's start."""
+        host = runtime.view(self.array)
+        rows = runtime.fetch(self.array) if host is None else host
+        return float(np.sqrt(rows[1::3].max()))
+
     def resolution(self) -> ContactResolution:
         """What was seen since the run's start."""
         h = self.ws.solver.substep

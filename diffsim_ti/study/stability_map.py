@@ -13,10 +13,10 @@ from diffsim_ti.simulator import Simulator
 from diffsim_ti.stability import Stiffness
 from diffsim_ti.terms import Ground
 
-OUTCOMES = ("accurate", "bounded", "loses energy", "raises", "wrong silently")
+OUTCOMES = ("accurate", "bounded", "loses energy", "raises", "wrong silently")  # "raises": or warns
 ACCURATE = 0.01  # change of the total energy, over the energy that moves
 LOSES = 0.10
-GAINS = 0.10
+GAINS = 0.20  # less may be the error of a nonlinear swap of energy, which comes and goes
 
 
 @dataclass(frozen=True)
@@ -103,17 +103,20 @@ def judge(scene, kind, dt: float, steps: int = 200, overridden: bool = False) ->
         simulator = Simulator(kind(scene, dt=dt, **options))
         first, moving, kept = measure(simulator)
         rise, change = 0.0, 0.0
-        for _ in range(20):
-            simulator.run(max(1, steps // 20))
-            total, now, still_kept = measure(simulator)
-            scale = max(moving, min(now, 100 * moving))
-            change, rise = max(change, abs(total - first) / scale), max(rise, (still_kept - kept) / scale)
-            if not np.isfinite(change + rise) or rise > 1e3:
-                return Run("wrong silently", rise, change, "the energy grew without bound")
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            for _ in range(20):
+                simulator.run(max(1, steps // 20))
+                total, now, still_kept = measure(simulator)
+                scale = max(moving, min(now, 100 * moving))
+                change, rise = max(change, abs(total - first) / scale), max(rise, (still_kept - kept) / scale)
+                if not np.isfinite(change + rise) or rise > 1e3:
+                    break
     except (ValueError, FloatingPointError) as error:
         return Run("raises", said=f"{type(error).__name__}: {error}")
-    if rise > GAINS:
-        return Run("wrong silently", rise, change, "the energy rose")
+    warned = [str(w.message) for w in said if "stiffer than the substep" in str(w.message)]
+    if not rise <= GAINS:
+        return Run("raises", rise, change, warned[0]) if warned else Run("wrong silently", rise, change, "the energy rose")
     if (still_kept - kept) / scale < -LOSES:
         return Run("loses energy", rise, change)
     return Run("accurate" if change < ACCURATE else "bounded", rise, change)
