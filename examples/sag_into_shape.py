@@ -89,7 +89,7 @@ def main(folder="output", quick: bool = False) -> dict:
     if folder:
         Path(folder).mkdir(exist_ok=True)
         save_picture(Path(folder) / "sag_into_shape.png", canopy.mesh, rest, rest[:, 1] - canopy.wanted[:, 1],
-                     "cast higher by [m]", title="the shape to cast, which sags flat", azimuth=60)  # fmt: skip
+                     "cast higher by [m]", title="the shape to cast, which sags flat", azimuth=15)  # fmt: skip
     return {"before": before, "after": after, "ratio": before / after, "lift": lift, "iterations": iterations,
             "rest": rest, "seconds": seconds}  # fmt: skip
 
