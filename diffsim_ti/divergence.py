@@ -103,19 +103,31 @@ class Guard:
         if self._stiffness is None:
             self._stiffness = stability.Stiffness(self.ws)
         omega2 = self._stiffness.watch()
-        if np.isfinite(omega2) and omega2 * solver.substep**2 <= 4:
+        apart = self._flies_apart()
+        if np.isfinite(omega2) and omega2 * solver.substep**2 <= 4 and not apart:
             near = omega2 * solver.substep**2 > 0.9**2 * 4
             self.every = min(2 * self.every, self.close if near else self.usual)
             return
         step, limit = self._step_of(now - 1, num_passes), 2 / np.sqrt(omega2)
         tet = self._stiffness.worst_tetrahedron()
         self.ws.restore(self.good, 0)
+        why = (
+            "is too long: vertices cross the body within it"
+            if apart
+            else f"has outgrown the stable step {limit:.4g} s of the present state (tetrahedron {tet}; elements are "
+            "squeezed, or vertices press into a contact)"
+        )
         raise Divergence(
-            f"step {step}, t = {step * solver.dt:.6g} s: the substep {solver.substep:.4g} s has outgrown the stable "
-            f"step {limit:.4g} s of the present state (tetrahedron {tet}; elements are squeezed, or vertices press "
-            "into a contact): reduce dt, raise substeps, or pass allow_unstable=True",
+            f"step {step}, t = {step * solver.dt:.6g} s: the substep {solver.substep:.4g} s {why}: reduce dt, raise "
+            "substeps, or pass allow_unstable=True",
             step, None, tet, float(limit),
         )  # fmt: skip
+
+    def _flies_apart(self) -> bool:
+        """Whether vertices cross the body within a substep: no state that a stable step leads to."""
+        v = runtime.fetch(self.ws.state.v)[0].astype(np.float64)
+        spread = np.abs(v - v.mean(0)).max() * self.ws.solver.substep
+        return bool(spread > np.ptp(self.ws.arrays.values.rest, 0).max())
 
     def _diagnose_crossing(self, bad_by: int, num_passes: int) -> None:
         """Run again to the first pass that crosses, and raise; the state before it is restored."""

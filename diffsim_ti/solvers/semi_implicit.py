@@ -28,7 +28,8 @@ class SemiImplicitSolver(ExplicitSolver):
         self.simulator = lambda: None
         self._own = dict(density=density, terms=[Gravity(gravity)])
         if isinstance(material, (int, float)):
-            material, dt = None, float(material)  # SemiImplicitSolver(scene, 1e-3)
+            substeps = substeps if dt == 0.01 else dt  # SemiImplicitSolver(scene, 1e-3, 4)
+            material, dt = None, float(material)
         if scene is None:
             self._waiting = dict(dt=dt, substeps=substeps) | options
             self.scene, self.dt, self.substeps = None, dt, substeps
