@@ -51,6 +51,7 @@ class Multigrid:
             self._levels = pyamg.smoothed_aggregation_solver(
                 self._matrix, B=_rigid_motions(potential.arrays.values.rest) * np.repeat(free, 3, 0),
                 strength=("symmetric", {"theta": 0.08}), presmoother=sweep, postsmoother=sweep, max_coarse=300,
+                coarse_solver="splu",
             )  # fmt: skip
         finally:
             np.random.set_state(state)
