@@ -82,11 +82,13 @@ def make_material(name: str, youngs_modulus: float, poissons_ratio: float):
     raise ValueError(f"--material: no law is called {name!r}; there are {', '.join(k.__name__ for k in MATERIALS)}")
 
 
-def solver_class(name: str):
+def solver_class(name: str, implicit: bool = True):
     """A solver's class by the name that --solver takes."""
-    from diffsim_ti.solvers import SemiImplicitSolver, VelocityVerletSolver
+    from diffsim_ti.solvers import BDF2Solver, ImplicitEulerSolver, SemiImplicitSolver, VelocityVerletSolver
 
     solvers = {"semi-implicit": SemiImplicitSolver, "verlet": VelocityVerletSolver}
+    if implicit:
+        solvers |= {"implicit-euler": ImplicitEulerSolver, "bdf2": BDF2Solver}
     if name not in solvers:
         raise ValueError(f"--solver must be one of {', '.join(solvers)}, got {name!r}")
     return solvers[name]

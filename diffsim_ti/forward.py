@@ -32,8 +32,9 @@ class ForwardRun:
     """Frames of equal length; the substeps of each follow the stable step of the state, unless `dt` is given.
 
     A frame has 16 parts, after each of which the state is looked at. One that diverges, outgrows its step or gains
-    energy is run again from its start with twice the substeps, and that is counted. With dt nothing is chosen and
-    nothing repeated: what goes wrong is an error.
+    energy is run again from its start with twice the substeps, and that is counted. With an implicit solver a frame has 4
+    parts, whose steps are halved only where one does not converge or gains energy. With dt nothing is chosen and nothing
+    repeated: what goes wrong is an error.
     """
 
     share, parts, attempts = 0.8, 16, 8  # of the stable step; per frame; per part
@@ -50,7 +51,11 @@ class ForwardRun:
         self.obstacles = tuple(t for t in scene.terms if isinstance(t, Obstacle))
         gravity = scene.term(Gravity)
         self._pull = float(np.linalg.norm(gravity.values["gravity"])) if gravity else 0.0
-        if dt is None:
+        self.implicit = not solver_class.explicit
+        if dt is None and self.implicit:
+            self.parts = 4
+            solver = solver_class(scene, dt=frame_time / self.parts, **options)
+        elif dt is None:
             solver = solver_class(scene, dt=frame_time / self.parts, allow_unstable=True, **options)
             solver.allow_unstable = False  # each frame's substeps come first; the guard watches all the same
         else:
@@ -152,12 +157,12 @@ class ForwardRun:
     def _stable_dt(self) -> float:
         from diffsim_ti.stability import lanczos_limit
 
-        return lanczos_limit(self.simulator.workspace, 1e-2).dt if self.adapts else np.inf
+        return lanczos_limit(self.simulator.workspace, 1e-2).dt if self.adapts and not self.implicit else np.inf
 
     def _choose_substeps(self) -> int:
         dt = self.simulator.solver.dt
         fewest = dt / (self.share * self._limit)
-        if self.obstacles:  # a vertex shall not cross the barrier in a few substeps
+        if self.obstacles and not self.implicit:  # a vertex shall not cross the barrier in a few substeps
             speed = np.linalg.norm(self.simulator.velocities, axis=1).max() + self._pull * self.frame_time
             now, then = (self.scene.places(self.simulator.time + step) for step in (0.0, dt))
             speed += max((np.linalg.norm(then[t] - now[t]) / dt for t in now), default=0.0)

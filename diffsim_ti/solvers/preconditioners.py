@@ -72,6 +72,9 @@ class Multigrid:
         finest = self._levels.levels[0].A
         finest.data[self._diagonal] += contact - (0 if self._contact is None else self._contact)
         self._contact = contact
+        for kept in ("block_D", "block_D_inv"):  # pyamg keeps the diagonal that it found first
+            if hasattr(finest, kept):
+                delattr(finest, kept)
         sweep = ("block_gauss_seidel", {"sweep": "symmetric", "iterations": 1})
         change_smoothers(self._levels, sweep, sweep)
 
