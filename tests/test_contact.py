@@ -143,10 +143,9 @@ def test_touching_exactly_is_refused_and_a_path_counts():
     points(tetrahedron(0.35), rising)
 
 
-def test_implicit_solvers_refuse_friction_and_paths():
-    for options, what in ((dict(friction=0.5), "friction"), (dict(path=lambda t: [0, 0, 0]), "a path")):
-        with pytest.raises(ValueError, match=f"without friction that stand still, got {what}"):
-            ds.ImplicitEulerSolver(points(tetrahedron(0.5), ds.Ground(**options)), dt=1e-3)
+def test_implicit_solvers_refuse_self_contact():
+    with pytest.raises(ValueError, match="use an explicit solver"):
+        ds.ImplicitEulerSolver(points(tetrahedron(0.5), ds.SelfContact(1e3, 1e-3)), dt=1e-3)
 
 
 def test_stiffness_is_chosen_and_said():

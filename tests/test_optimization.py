@@ -155,7 +155,7 @@ def test_kill_at_random_moments(tmp_path):
         process.send_signal(signal.SIGKILL)
         process.wait()
     results = [start(path) for path in (tmp_path / "run.state", "")]
-    outputs = [process.communicate(timeout=120)[0] for process in results]
+    outputs = [process.communicate(timeout=600)[0] for process in results]
     assert outputs[0] == outputs[1] and len(outputs[0].split()) == 4
 
 
@@ -219,7 +219,7 @@ def test_fifty_kills(tmp_path):
     """Children of one light process, killed 50 times: no file is refused, and the last run ends bitwise as if alone."""
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     out = subprocess.run([sys.executable, "-c", FIFTY, str(tmp_path / "run.state")], capture_output=True, text=True,
-                         timeout=120, env=environment)  # fmt: skip
+                         timeout=600, env=environment)  # fmt: skip
     assert out.returncode == 0, out.stderr
     kills, begun, iterations = map(int, out.stdout.split())
     assert kills == 50 and iterations == 110
