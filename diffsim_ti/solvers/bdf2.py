@@ -10,7 +10,7 @@ class BDF2Solver(ImplicitSolver):
     backward Euler.
 
     Second order, L-stable: what is too fast for the step is damped away, what is slow is hardly touched (relative loss of
-    amplitude per step (omega h)^4 / 4). Two steps before and after a change of the step: the change restarts it.
+    amplitude per step (omega h)^4 / 4). A change of the step, or a state that is set from outside, starts it anew.
     Hairer, Wanner, Solving Ordinary Differential Equations II, V.1, doi:10.1007/978-3-642-05221-7.
     """
 

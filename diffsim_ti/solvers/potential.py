@@ -58,8 +58,8 @@ class Potential:
         self.held_at = runtime.fetch(self.u)[0].astype(np.float64)
         return self.held_at
 
-    def energy(self) -> tuple[float, float, float]:
-        """(energy [J], the sum of the absolute parts, the smallest J)."""
+    def energy(self) -> tuple[float, float, np.ndarray]:
+        """(energy [J], the sum of its absolute parts, J of each tetrahedron)."""
         self._energy()
         elastic, contact, J = (runtime.fetch(x).astype(np.float64) for x in (self._elastic, self._contact, self._J))
         return elastic.sum() + contact.sum(), np.abs(elastic).sum() + np.abs(contact).sum(), J
