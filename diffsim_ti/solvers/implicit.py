@@ -9,6 +9,7 @@ far beyond the middle as the start was before it. BDF2: x and y extrapolate from
 velocities by exp(-c h) in a stage of its own. Statics: no inertia, u* is where forces vanish.
 """
 
+import weakref
 from abc import abstractmethod
 from dataclasses import dataclass
 
@@ -127,7 +128,9 @@ class ImplicitWorkspace(Workspace):
         self.free = (runtime.fetch(a.inverse_mass)[:, None] > 0).astype(np.float64)
         eps = np.finfo(runtime.NUMPY[self.scene.precision]).eps
         tolerance, rounds = self.solver.tolerance, self.solver.max_iterations
-        self.newton = Newton(self.potential, self.free, self._gaps, self.preconditioner, tolerance, rounds, eps)
+        me = weakref.proxy(self)  # no circle: a dropped run gives its memory back at once
+        gaps, preconditioner = (lambda u: me._gaps(u)), (lambda mass: me.preconditioner(mass))
+        self.newton = Newton(self.potential, self.free, gaps, preconditioner, tolerance, rounds, eps)
         self._preconditioners = {}
 
     def restart(self) -> None:

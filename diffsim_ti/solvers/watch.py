@@ -1,5 +1,6 @@
 """What contacts did during a run, noted by the passes: smallest gaps, and how finely the steps resolve them."""
 
+import weakref
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,7 +60,7 @@ class ContactWatch:
     """Three rows for each contact term (gap, (omega dt)^2, travel), which each vertex keeps for itself in the passes."""
 
     def __init__(self, workspace):
-        self.ws, arrays = workspace, workspace.arrays
+        self.ws, arrays = weakref.proxy(workspace), workspace.arrays  # which holds this: no circle
         self.contacts = arrays.contacts
         n = arrays.num_vertices if self.contacts else 1
         self.array = runtime.array(arrays.fp, 3 * len(self.contacts), n)
