@@ -248,11 +248,6 @@ def test_tunnelling_is_an_error_that_names_the_pair_and_keeps_the_state():
     weak.check_surfaces()
 
 
-def test_implicit_solvers_refuse():
-    with pytest.raises(ValueError, match="no self-contact"):
-        ds.ImplicitEulerSolver(two_blocks().scene, dt=1e-3)
-
-
 def test_one_per_scene_and_gap_needs_it():
     scene = two_blocks().scene
     with pytest.raises(ValueError, match="one SelfContact"):

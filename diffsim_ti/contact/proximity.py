@@ -215,8 +215,12 @@ def pair_functions(precision: str) -> SimpleNamespace:
             h3 += w[3] * (along_n + turned) + dw[3] * shifted
         return h1, h2, h3, by_stiffness, by_width
 
+    @ti.func
+    def curvature(s):
+        return barrier.curvature(s, fp)
+
     return SimpleNamespace(fp=fp, vec3=vec3, vec4=vec4, nearest=nearest, nearest_jvp=nearest_jvp, gradient=gradient,
-                           gradient_jvp=gradient_jvp)  # fmt: skip
+                           gradient_jvp=gradient_jvp, mollifier=mollifier, curvature=curvature)  # fmt: skip
 
 
 @lru_cache(maxsize=None)

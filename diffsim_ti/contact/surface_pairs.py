@@ -92,12 +92,11 @@ class SurfacePairs:
 
     # ---- the list ---------------------------------------------------------------------------------------------------
 
-    def _build(self, u, slot: int) -> None:
+    def _build(self, u, slot: int, wanted: float = 0.0) -> None:
         surface = self.mesh.surface_vertices
         x = runtime.fetch(u)[slot][surface]
         if not np.all(np.isfinite(x)):  # the guard of the run will say so
             return
-        wanted = 0.0
         if self.fresh and self.age:
             move = x - runtime.fetch(self.built)
             moved = min(np.linalg.norm(y, axis=1).max() for y in (move, move - move[0]))

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from diffsim_ti import runtime
+from diffsim_ti.contact.implicit_pairs import ImplicitPairs
 from diffsim_ti.solvers.arrays import History, copy_slot
 from diffsim_ti.solvers.linear import NotConverged
 from diffsim_ti.solvers.newton import Newton
@@ -109,6 +110,8 @@ class PairHistory(History):
 class ImplicitWorkspace(Workspace):
     """A run of an implicit solver. Vectors of vertices are worked on in float64 on the host, tetrahedra on the device."""
 
+    pairs_kind = ImplicitPairs
+
     def __init__(self, solver, derived):
         self.potential, self._length = None, solver.substep
         super().__init__(solver, derived)
@@ -121,7 +124,7 @@ class ImplicitWorkspace(Workspace):
         self._launches.clear()
         super().load(derived)
         if not self._launches.get("potential"):
-            self.potential = Potential(self.arrays, self.scene.mesh.tetrahedra, self.parallel)
+            self.potential = Potential(self.arrays, self.scene.mesh.tetrahedra, self.parallel, self.pairs)
             self._launches["potential"] = True
         a = self.arrays
         self.mass = derived.mass[:, None]
@@ -135,10 +138,14 @@ class ImplicitWorkspace(Workspace):
 
     def restart(self) -> None:
         super().restart()
-        self.forget()
+        self._begin_anew()
 
     def forget(self) -> None:
         """The state was set from outside: there is none before it."""
+        super().forget()
+        self._begin_anew()
+
+    def _begin_anew(self) -> None:
         if self.solver.multistep:
             self.state.fresh[0] = True
 
@@ -171,7 +178,7 @@ class ImplicitWorkspace(Workspace):
             self.restore(self.record, first - base)
         if self.solver.substep != self._length:
             self._length = self.solver.substep
-            self.forget()
+            self._begin_anew()
         for j in range(first, last):
             if save_every and j % save_every == 0:
                 self.save_frame(j // save_every)
@@ -252,6 +259,8 @@ class ImplicitWorkspace(Workspace):
         u_star = self.newton.solve(start, mass, inertial, loads, leave_saddles=stage.static)
         v_star = (u_star - x) / stage.gamma
         u_next = stage.c0 * u_star + (1 - stage.c0) * u
+        if self.pairs and stage.c0 != 1:
+            self.pairs.check_end(u_star, u_next)
         v_next = stage.e0 * v_star + stage.e1 * y
         if len(fixed):
             u_next[fixed], v_next[fixed] = (u[fixed], v[fixed]) if place is None else (place, speed)
@@ -260,14 +269,23 @@ class ImplicitWorkspace(Workspace):
     def _admissible(self, start, u):
         """The start of Newton's method: where inertia leads, or less far where that would turn something inside out."""
         held = start * (1 - self.free) + u * self.free
+        longest = self._safe_share(u, held, start)
         _, _, J0 = self._looked_at(held)
         gaps0 = self._gaps(held)
-        for fraction in (1.0, 0.5, 0.25, 0.0):
+        for fraction in (longest, 0.5 * longest, 0.25 * longest):
             at = held + fraction * (start - held)
             _, _, J = self._looked_at(at)
             if not (np.any((J0 > 0) & ~(J > 0)) or np.any((gaps0 > 0) & ~(self._gaps(at) > 0))):
                 return at
         return held
+
+    def _safe_share(self, u, held, start) -> float:
+        """How far from `held` towards `start` no surfaces meet; prescribed vertices have to get where they are held."""
+        if not self.pairs:
+            return 1.0
+        if not self.pairs.way_is_free(u, held - u):
+            raise NotConverged("prescribed motion drives surfaces through each other: take smaller steps", [])
+        return self.pairs.safe_share(held, start - held)
 
     def _looked_at(self, u):
         self.potential.place(u)

@@ -90,6 +90,8 @@ class ImplicitAdjoint(_Passes):
         """Set the adjoints of the frames, shape (frames, n, 3), and clear the rest."""
         for target in (self.coefficients, self.sums, self.gradients, self.volumes):
             runtime.fill(target, 0)
+        if self.ws.pairs:
+            self.ws.pairs.clear_sums()
         a = self.ws.arrays
         self.frames = tuple(np.asarray(x, np.float64) for x in (positions_adj, velocities_adj))
         self.p, self.q = self.frames[0][-1].copy(), self.frames[1][-1].copy()
@@ -119,6 +121,8 @@ class ImplicitAdjoint(_Passes):
         runtime.fill(ws.potential.w, by_star[None])
         for target in (self.lag, self.walls):
             runtime.fill(target, 0)
+        if ws.pairs:
+            ws.pairs.vjp(ws.potential.u, 0, ws.potential.w, ws.arrays.corner)
         self._vjp(ws.arrays.num_items, ws.arrays.num_vertices, ws.potential.per_gamma)
         reaction = runtime.fetch(ws.potential.y)[0].astype(np.float64)
         share = ws.load_share(j, s)
@@ -188,6 +192,10 @@ class ImplicitAdjoint(_Passes):
             at = rows["contacts"] + contact.first - self.features.contacts[0].first
             out.parameters[contact.first :][: contact.size] = sums[at : at + contact.size].sum(1)
         out.rest = self.frames[0].sum(0)
+        if self.ws.pairs:
+            numbers, by_pairs = self.ws.pairs.collect()
+            out.parameters[a.first_of_self_contact :][:2] = numbers
+            out.rest = out.rest + by_pairs
         if self.features.shape:
             out.rest = out.rest + sums[rows["rest"] :][:3].T
             out.gradients = from_blocks(runtime.fetch(self.gradients), a.num_tetrahedra, 9).reshape(-1, 3, 3)
@@ -241,6 +249,9 @@ class ImplicitTangent(_Passes):
             runtime.fill(self._arrays[-2], np.stack([self.du, dx]))
         if dots.path is not None:
             runtime.fill(self._arrays[-1], ws.walls(dots.path, j, s))
+        if ws.pairs:
+            ws.pairs.product(ws.potential.u, 0, ws.potential.w, a.corner, self._arrays[2],
+                             dots.parameters[a.first_of_self_contact :][:2])  # fmt: skip
         self._jvp(a.num_items, a.num_vertices, ws.potential.per_gamma)
         share = ws.load_share(j, s)
         dR = runtime.fetch(ws.potential.y)[0].astype(np.float64) + dots.mass[:, None] * self.weight(share)

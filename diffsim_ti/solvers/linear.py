@@ -23,7 +23,7 @@ class Operator:
 
     def __call__(self, w: np.ndarray) -> np.ndarray:
         self.products += 1
-        y = self.mass * w + self.potential.product(w)
+        y = self.mass * w + self.potential.product(w, convex=self.correction is not None)
         if self.correction is not None:
             y += self.correction(w)
         return y * self.free

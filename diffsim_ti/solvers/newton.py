@@ -16,6 +16,8 @@ import numpy as np
 from diffsim_ti.solvers.linear import NotConverged, Operator, conjugate_gradients
 from diffsim_ti.solvers.projection import Projection
 
+LONGER = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # steps along an indefinite direction that are doubled while Phi falls
+
 
 @dataclass
 class NewtonReport:
@@ -30,7 +32,8 @@ class NewtonReport:
 
 
 class Newton:
-    """Minimises Phi from a start. Every iterate keeps gaps > 0 where they were. If the start has no J <= 0, J falls by a
+    """Minimises Phi from a start. Every iterate keeps gaps > 0 where they were, and surfaces never pass through each other
+    on the way. If the start has no J <= 0, J falls by a
     factor of ten at most, so that the energy's own resistance is felt in time; only where no share of a direction down to
     `insist` lowers Phi so (a law that is finite at J = 0, pressed beyond it) may it fall further.
 
@@ -146,7 +149,9 @@ class Newton:
     def _search(self, u, d, R, before):
         """(u + t d, what was evaluated there) for the first t of 1, 1/2, ... that is admissible and lower; None if there is
         none. Along an indefinite direction t = 2, 4, ... are tried while they are lower still: its length says little."""
-        slope, fraction, best = float((R * d).sum()), 1.0, None
+        slope, best = float((R * d).sum()), None
+        longest = self._safe_share(u, d)
+        fraction = min(1.0, longest)
         while fraction > self.shortest:
             trial, after, change, noise = self._try(u, fraction * d, before, self.upright and fraction > self.insist)
             drowned = abs(slope) * fraction <= noise >= change
@@ -154,7 +159,7 @@ class Newton:
                 best = trial, after, change
                 break
             fraction *= 0.5
-        while best is not None and self._indefinite and fraction in (1.0, 2.0, 4.0, 8.0, 16.0, 32.0):
+        while best is not None and self._indefinite and fraction in LONGER and 2 * fraction <= longest:
             fraction *= 2
             trial, after, change, _ = self._try(u, fraction * d, before, self.upright)
             if not change < best[2]:
@@ -162,6 +167,11 @@ class Newton:
                 break
             best = trial, after, change
         return None if best is None else best[:2]
+
+    def _safe_share(self, u, d) -> float:
+        """The longest step along d in which surfaces stay apart."""
+        pairs, most = self.potential.pairs, 2 * LONGER[-1] if self._indefinite else 1.0
+        return pairs.safe_share(u, d, most) if pairs else most
 
     def _falls(self, u, d, slope) -> bool:
         """Whether Phi does not rise again at u as steeply as it fell before: what is left to ask where its change drowns in

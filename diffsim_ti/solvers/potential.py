@@ -13,8 +13,8 @@ class Potential:
     Everything after `place(u)` is at that displacement, which has the precision of the scene.
     """
 
-    def __init__(self, arrays, tetrahedra: np.ndarray, parallel: bool):
-        self.arrays, self.tetrahedra = arrays, tetrahedra
+    def __init__(self, arrays, tetrahedra: np.ndarray, parallel: bool, pairs=None):
+        self.arrays, self.tetrahedra, self.pairs = arrays, tetrahedra, pairs
         a = arrays
         self.kernels = potential_kernels(a.law, a.features(), parallel, a.in_lanes)
         n, m = a.num_vertices, a.num_tetrahedra
@@ -51,28 +51,38 @@ class Potential:
             runtime.fill(self.lag, np.stack([u, x]))
         if len(walls):
             runtime.fill(self.walls, walls)
+        if self.pairs:
+            self.pairs.begin(u)
 
     def place(self, u: np.ndarray) -> np.ndarray:
         """Go to displacement u [m]; returns it as the device holds it."""
         runtime.fill(self.u, u[None])
         self.held_at = runtime.fetch(self.u)[0].astype(np.float64)
+        if self.pairs:
+            self.pairs.place(self.u)
         return self.held_at
 
     def energy(self) -> tuple[float, float, np.ndarray]:
         """(energy [J], the sum of its absolute parts, J of each tetrahedron)."""
         self._energy()
         elastic, contact, J = (runtime.fetch(x).astype(np.float64) for x in (self._elastic, self._contact, self._J))
+        if self.pairs:
+            contact = np.concatenate([contact, self.pairs.energies()])
         return elastic.sum() + contact.sum(), np.abs(elastic).sum() + np.abs(contact).sum(), J
 
     def forces(self) -> tuple[np.ndarray, np.ndarray]:
         """(forces -dE/du [N], sum of the sizes of the forces that meet at each vertex)."""
+        if self.pairs:
+            self.pairs.forces(self.u, 0, self.arrays.corner)
         self._forces()
         return runtime.fetch(self.y)[0].astype(np.float64), runtime.fetch(self._size).astype(np.float64)
 
-    def product(self, w: np.ndarray) -> np.ndarray:
-        """d2E/du2 w [N]"""
+    def product(self, w: np.ndarray, convex: bool = False) -> np.ndarray:
+        """d2E/du2 w [N]; `convex`: of contact between surfaces, only its convex part."""
         scale = np.abs(w).max() or 1.0  # f32 keeps its digits whatever the units
         runtime.fill(self.w, (w / scale)[None])
+        if self.pairs:
+            self.pairs.hessian_product(self.u, self.w, convex)
         self._product()
         return runtime.fetch(self.y)[0].astype(np.float64) * -scale
 
@@ -81,11 +91,13 @@ class Potential:
         a = self.arrays
         if self._tangent is None:
             self._tangent = runtime.array(a.lanes, 81 * a.num_blocks)
-            self._columns = tuple(runtime.array(a.vector, *a.corner.shape) for _ in range(2))
+            self._columns = tuple(runtime.array(a.vector, *a.corner.shape) for _ in range(3))
             self._out = runtime.array(a.vector, 3, a.num_vertices) if self._out is None else self._out
-            more = (a.corner, *self._columns, self._tangent, self.u, self._out)
+            more = (*self._columns, self._tangent, self.u, self._out)
             self._blocks = self._bind(self.kernels.blocks, self.common(), more, (a.num_items, a.num_vertices))
         self._blocks()
+        if self.pairs:
+            self.pairs.add_blocks(self.u, self._out)
         return np.swapaxes(runtime.fetch(self._out).astype(np.float64), 0, 1)
 
     def tangents(self) -> np.ndarray:
@@ -94,7 +106,7 @@ class Potential:
 
     def contact_blocks(self) -> np.ndarray | None:
         """The part of contact in `blocks`; None without contacts."""
-        if not self.arrays.contacts:
+        if not (self.arrays.contacts or self.pairs):
             return None
         if self._contact_blocks is None:
             a = self.arrays
@@ -102,4 +114,6 @@ class Potential:
             arrays = (a.parameters, a.rest, a.surface, self.walls, self.lag, self.u, self._out)
             self._contact_blocks = self._bind(self.kernels.contact_blocks, arrays, (), (a.num_vertices,), False)
         self._contact_blocks()
+        if self.pairs:
+            self.pairs.add_blocks(self.u, self._out)
         return np.swapaxes(runtime.fetch(self._out).astype(np.float64), 0, 1)

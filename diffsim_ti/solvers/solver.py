@@ -7,7 +7,6 @@ from abc import ABC
 import numpy as np
 
 from diffsim_ti import runtime, stability
-from diffsim_ti.terms import SelfContact
 
 
 class Solver(ABC):
@@ -31,8 +30,6 @@ class Solver(ABC):
         self.parallel, self.allow_unstable = parallel, allow_unstable
         runtime.check_host_init()
         runtime.check_backend(scene.precision)
-        if not self.explicit and scene.term(SelfContact):
-            raise ValueError(f"{type(self).__name__} has no self-contact yet: use an explicit solver, or leave it out")
         self._tight: stability.StepLimit | None = None
         self._deformed: bool | None = None
         if self.explicit and not allow_unstable:

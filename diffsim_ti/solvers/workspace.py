@@ -10,12 +10,14 @@ from diffsim_ti.solvers.watch import ContactWatch
 class Workspace:
     """What every solver's run needs; `advance` is the solver's own."""
 
+    pairs_kind = SurfacePairs
+
     def __init__(self, solver, derived: Derived):
         self.solver, self.scene = solver, solver.scene
         self.owner = runtime.program()
         self.arrays = SceneArrays(self.scene)
         self.parallel = solver.runs_parallel()
-        self.pairs = SurfacePairs(self.arrays, self.parallel) if self.arrays.self_contact else None
+        self.pairs = self.pairs_kind(self.arrays, self.parallel) if self.arrays.self_contact else None
         self.state = self.history(1)
         self.record: History | None = None
         self.frames = (runtime.array(self.arrays.vector, 1, 1), runtime.array(self.arrays.vector, 1, 1))

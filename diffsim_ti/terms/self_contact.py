@@ -12,7 +12,8 @@ class SelfContact(Term):
 
     The width must be smaller than the rest distance of all primitives of one body that share no vertex, so that a body at
     rest does not press on itself; different bodies (pieces of the mesh, see `TetrahedralMesh.joined`) may start nearer.
-    Inputs with gradient: "self_contact_stiffness", "self_contact_width". One per scene; explicit solvers only.
+    Inputs with gradient: "self_contact_stiffness", "self_contact_width". One per scene. Implicit solvers keep surfaces apart
+    on the whole way of every step; ImplicitMidpointSolver raises Tunnelling where the end of a step lies beyond a contact.
 
     Raises ValueError for stiffness <= 0 or width <= 0 and, when a run starts, for a width that is too large, and for
     surfaces that touch or pass through each other. A substep in which two primitives may have passed through each other

@@ -1,0 +1,97 @@
+"""Contact of a surface with itself in implicit solvers: Hessian, and how far a step may go."""
+
+import numpy as np
+
+from diffsim_ti import runtime
+from diffsim_ti.contact.hessian_kernels import hessian_kernels
+from diffsim_ti.contact.pair_kernels import SAFE
+from diffsim_ti.contact.surface_pairs import SurfacePairs, Tunnelling
+
+
+class ImplicitPairs(SurfacePairs):
+    """Pairs of a scene in Newton's method, where displacements come in tries, not in passes.
+
+    After `place`, the list, the planes, the energies and the last corners of `arrays.corner` are those of that place.
+    """
+
+    longest_march = 200  # lists made along one step
+
+    def __init__(self, arrays, parallel: bool):
+        super().__init__(arrays, parallel)
+        self.hessian = hessian_kernels(arrays.precision, self.first, parallel)
+        self.step = runtime.array(self.kernels.vector, 1, arrays.num_vertices)
+        self.next = runtime.array(self.kernels.vector, 1, arrays.num_vertices)
+
+    def begin(self, u: np.ndarray) -> None:
+        """A new pass from u: from here on all is a function of u, whatever came before."""
+        self.fresh = False
+        runtime.fill(self.next, u[None])
+        self._build(self.next, 0)
+
+    def place(self, u) -> None:
+        """Go to the displacements u[0]."""
+        self.ensure(u, 0)
+        self.forces(u, 0, self.a.corner)
+
+    def energies(self) -> np.ndarray:
+        """Energy of each pair [J]."""
+        return runtime.fetch(self.energy)[: self.list.count].astype(np.float64)
+
+    def hessian_product(self, u, w, convex: bool) -> None:
+        """Change of the contact forces for changes w[0] of the positions, to the last corners of `arrays.corner`."""
+        k = self.list
+        self._launch("hessian", self.hessian.products, k.pairs, k.scale, k.row, k.corner, self.a.rest, self.a.parameters, u,
+                     w, self.corner, self.plane, self.a.corner)(k.num_vt, k.num_ee, k.num_surface,
+                                                                self.a.first_contact_corner, int(convex))  # fmt: skip
+
+    def add_blocks(self, u, out) -> None:
+        """Add the diagonal blocks of the Hessian's convex part to rows 0..2 of `out` (potential_kernels.py)."""
+        k = self.list
+        self._launch("blocks", self.hessian.blocks, k.pairs, k.scale, k.row, k.corner, k.surface, self.a.rest,
+                     self.a.parameters, u, self.corner, self.plane, out)(k.num_vt, k.num_ee, k.num_surface)  # fmt: skip
+
+    def safe_share(self, u: np.ndarray, step: np.ndarray, most: float = 1.0) -> float:
+        """A share of the step, at most `most`, up to which no two primitives meet on the way; close to the largest such
+        share only where they are about to meet. Marches along the step, with a new list at each halt."""
+        surface = self.mesh.surface_vertices
+        d = step[surface]
+        relative = 2 * min(np.linalg.norm(y, axis=1).max() for y in (d, d - d[0]))
+        if relative == 0:
+            return most
+        runtime.fill(self.step, step[None])
+        share = 0.0
+        for _ in range(self.longest_march):
+            runtime.fill(self.next, (u + share * step)[None])
+            self._build(self.next, 0, wanted=(most - share) * relative)
+            self.forces(self.next, 0, self.a.corner, exact=True)
+            unlisted = SAFE * (self.width + self.skin) / relative
+            listed = self._shares().min(initial=np.inf)
+            share += min(listed, unlisted)
+            if share >= most:
+                return most
+            if listed < unlisted:
+                return share
+        return share
+
+    def _shares(self) -> np.ndarray:
+        out, k = self.list.buffers.take("shares", self.kernels.fp, self.list.count), self.list
+        self.hessian.shares(k.pairs, self.step, self.plane, out, k.num_vt, k.num_ee, SAFE)
+        return runtime.fetch(out)[: k.count].astype(np.float64)
+
+    def way_is_free(self, u: np.ndarray, step: np.ndarray) -> bool:
+        """Whether no two primitives meet on the way from u to u + step; narrow gaps may pass for closed."""
+        for _ in range(self.longest_march):
+            share = self.safe_share(u, step)
+            if share == 1 or share < 1e-3:
+                return share == 1
+            u, step = u + share * step, (1 - share) * step
+        return False
+
+    def check_end(self, u: np.ndarray, u_next: np.ndarray) -> None:
+        """Raise Tunnelling unless the way from u to u_next is free."""
+        if not self.way_is_free(u, u_next - u):
+            self.fresh = False
+            raise Tunnelling(
+                "beyond the middle of a step, where its forces were taken, surfaces may have gone through each other: take "
+                "a shorter step, or a solver whose steps end where forces are taken, ImplicitEulerSolver or BDF2Solver"
+            )
