@@ -222,13 +222,13 @@ def sufficient(solver_class, scene, reference: np.ndarray, most: int) -> tuple[s
         steps *= 2
 
 
-def crossing(mesh: ds.TetrahedralMesh, moduli, most: int) -> list:
+def crossing(mesh: ds.TetrahedralMesh, moduli, most: int, motions=("falls", "carried")) -> list:
     """Rows (motion, E, solver, steps, error, seconds, over explicit); prints where implicit and explicit cost the same.
 
     falls: let go without sag, so that the answer is its vibration; carried: from equilibrium, the held end moved slowly.
     """
     rows, solvers = [], (ds.ImplicitEulerSolver, ds.ImplicitMidpointSolver, ds.BDF2Solver)
-    for name in ("falls", "carried"):
+    for name in motions:
         for E in moduli:
             scene = scene_of(mesh, E)
             if name == "carried":
@@ -241,7 +241,7 @@ def crossing(mesh: ds.TetrahedralMesh, moduli, most: int) -> list:
                 rows.append((name, E, solver.__name__, steps, error, seconds, seconds / explicit))
     print_table(["motion", "E [Pa]", "solver", "steps", "error", "seconds", "over explicit"], rows)
     print()
-    for name in ("falls", "carried"):
+    for name in motions:
         for solver in solvers:
             ratios = [row[6] for row in rows if row[0] == name and row[2] == solver.__name__]
             print(f"{name}, {solver.__name__}: costs as much as explicit at {_where_one(moduli, ratios)}")
@@ -265,6 +265,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=5, help="steps, or repetitions, that are measured")
     parser.add_argument("--moduli", type=float, nargs="+", default=[1e7, 4e7], help="E [Pa] of --part crossing")
     parser.add_argument("--most-steps", type=int, default=640, help="of --part crossing: beyond that, extrapolate")
+    parser.add_argument("--motions", nargs="+", choices=["falls", "carried"], default=["falls", "carried"])
     options = parser.parse_args()
     ds.init(precision="f64")
     sizes = options.sizes
@@ -276,7 +277,7 @@ def main() -> None:
         backward(sizes or [1_000, 20_000], options.steps)
     else:
         mesh = ds.TetrahedralMesh.from_file(options.mesh) if options.mesh else beam((sizes or [1_000])[0])
-        crossing(mesh, options.moduli, options.most_steps)
+        crossing(mesh, options.moduli, options.most_steps, options.motions)
 
 
 if __name__ == "__main__":
