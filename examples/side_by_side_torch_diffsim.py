@@ -5,6 +5,7 @@ Its law is Smith's stable neo-Hookean; its ground (barrier of width 0.02 at y = 
 lifted above it; damping is off.
 
     python examples/side_by_side_torch_diffsim.py [--sizes 4 6 8]
+    python examples/side_by_side_torch_diffsim.py --implicit [--sizes 2 3 4 5]    # its dense IPC step, which needs ipctk
 """
 
 import argparse
@@ -60,6 +61,43 @@ def measure(simulator, reset, repeats: int = 3) -> dict:
                 step_ms=min(forward[1:]), backward_ms=min(backward[1:]))  # fmt: skip
 
 
+def implicit(sizes=(2, 3, 4, 5), steps: int = 2) -> list[tuple]:
+    """Rows (vertices, tetrahedra, seconds per step of torch-diffsim's IPC solver, of ours, ratio, difference [m]).
+
+    A beam, held at one end, begins to fall: backward Euler in float64 to the same tolerance, with contact of the surface
+    with itself watched by both.
+    """
+    import diffsim
+    from diffsim.ipc import IPCImplicitEulerSolver
+
+    rows = []
+    for n in sizes:
+        mesh = diffsim_ti.TetrahedralMesh.create_box((3 * n - 2, n, n), (0.6, 0.2, 0.2))
+        held, E, nu, dt, tolerance = mesh.vertex_indices("xmin"), 1e5, 0.4, 1e-2, 1e-8
+        terms = [diffsim_ti.Gravity(-9.8), diffsim_ti.SelfContact(1e3, 1e-3)]
+        scene = diffsim_ti.Scene(mesh, diffsim_ti.SmithNeoHookean(E, nu), 1000.0, terms, fixed=held, precision="f64")
+        ours = diffsim_ti.Simulator(diffsim_ti.ImplicitEulerSolver(scene, dt=dt, tolerance=tolerance))
+        body = diffsim.TetrahedralMesh(mesh.vertices.copy(), mesh.tetrahedra.copy())
+        for name, value in vars(body).items():
+            if torch.is_tensor(value) and value.is_floating_point():
+                setattr(body, name, value.double())
+        solver = IPCImplicitEulerSolver(dt=dt, dhat=1e-3, newton_tolerance=tolerance)
+        law, masses = diffsim.DifferentiableMaterial(E, nu), torch.as_tensor(scene.inputs.derive(scene.inputs.values).mass)
+        state = torch.as_tensor(mesh.vertices.copy()), torch.zeros(mesh.vertices.shape, dtype=torch.float64)
+        seconds = []
+        for _ in range(steps + 1):  # the first one compiles and sets up
+            begin = time.perf_counter()
+            state = [x.detach() for x in solver.step(body, law, *state, masses, fixed_vertices=torch.as_tensor(held))]
+            middle = time.perf_counter()
+            ours.step()
+            seconds.append((middle - begin, time.perf_counter() - middle))
+        theirs, mine = (sum(x) / steps for x in zip(*seconds[1:]))
+        off = float(abs(state[0].numpy() - ours.positions).max())
+        rows.append((mesh.num_vertices, mesh.num_tetrahedra, theirs, mine, theirs / mine, off))
+        print("| " + " | ".join(f"{x:.3g}" for x in rows[-1]) + " |", flush=True)
+    return rows
+
+
 def main(sizes=(4, 6, 8)) -> list[dict]:
     rows = []
     for resolution in sizes:
@@ -91,6 +129,13 @@ def table(rows: list[dict]) -> str:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--sizes", type=int, nargs="+", default=[4, 6, 8], help="vertices a side")
+    parser.add_argument("--sizes", type=int, nargs="+", help="vertices a side")
+    parser.add_argument("--implicit", action="store_true", help="the implicit steps of both")
+    options = parser.parse_args()
     warnings.simplefilter("ignore", DeprecationWarning)
-    main(parser.parse_args().sizes)
+    if options.implicit:
+        diffsim_ti.init(precision="f64")
+        print("| vertices | tetrahedra | torch-diffsim [s] | diffsim_ti [s] | ratio | differ by [m] |\n" + "|---:" * 6 + "|")
+        implicit(options.sizes or (2, 3, 4, 5))
+    else:
+        main(options.sizes or (4, 6, 8))
