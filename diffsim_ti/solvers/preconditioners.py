@@ -21,7 +21,7 @@ class BlockJacobi:
         values, vectors = np.linalg.eigh(0.5 * (D + np.swapaxes(D, 1, 2)))
         values = np.maximum(np.abs(values), self.least)
         inverse = np.divide(self.free, values, out=np.zeros_like(values), where=values > 0)
-        self._inverse = np.einsum("nij,nj,nkj->nik", vectors, inverse, vectors, optimize=True)
+        self._inverse = np.matmul(vectors * inverse[:, None, :], np.swapaxes(vectors, 1, 2))
 
     def __call__(self, r: np.ndarray) -> np.ndarray:
         return np.matmul(self._inverse, r[:, :, None])[:, :, 0]
