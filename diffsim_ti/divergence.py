@@ -41,7 +41,7 @@ class Guard:
         self.ws = workspace
         self.good = workspace.history(1)
         self.good_pass, self.offset = 0, 0  # offset: passes before this run, for reports
-        self._stiffness, self._warned = None, False
+        self._stiffness, self._warned, self._warned_of_gain = None, False, False
         self.restart()
 
     def restart(self) -> None:
@@ -70,6 +70,7 @@ class Guard:
             if self.ws.first_bad_vertex() is not None:
                 self._diagnose(stop, num_passes)
             self._warn_of_stiff_contact()
+            self._warn_of_gained_energy()
             self._passes += stop - first
             if self._passes >= self.every:
                 self._passes = 0
@@ -89,6 +90,19 @@ class Guard:
                 f"energy may be gained in it: take substeps of {1.8 * h / omega_dt:.3g} s, or a softer or wider barrier",
                 stacklevel=5,
             )
+
+    def _warn_of_gained_energy(self) -> None:
+        """Once, where an implicit method's steps have added a tenth of the energy that moves."""
+        watch, h = self.ws.energy_watch, self.ws.solver.substep
+        if self._warned_of_gain or watch is None or watch.share <= 0.1:
+            return
+        self._warned_of_gain = True
+        warnings.warn(
+            f"{type(self.ws.solver).__name__} has gained {watch.gained:.3g} J, {watch.share:.0%} of the energy that moves, "
+            f"from nonlinear motion or contact within its substeps of {h:.3g} s: take substeps of {h / 4:.3g} s, or "
+            "BDF2Solver or ImplicitEulerSolver, which damp",
+            stacklevel=5,
+        )
 
     def _step_of(self, j: int, num_passes: int) -> int:
         """The step that pass j belongs to; velocity Verlet's closing half kick belongs to the last one."""

@@ -18,6 +18,7 @@ import numpy as np
 from diffsim_ti import runtime
 from diffsim_ti.contact.implicit_pairs import ImplicitPairs
 from diffsim_ti.solvers.arrays import History, copy_slot
+from diffsim_ti.solvers.energy_watch import EnergyWatch
 from diffsim_ti.solvers.linear import NotConverged
 from diffsim_ti.solvers.newton import Newton
 from diffsim_ti.solvers.potential import Potential
@@ -57,6 +58,7 @@ class ImplicitSolver(Solver):
     serial_limit, serial_limit_in_lanes = 3_000, 10_000  # as for the explicit solvers
     last_frame_is_state = True
     multistep = False
+    may_gain_energy = False  # whether long steps can add energy, so that it must be watched
 
     def __init__(self, scene, dt: float = 0.01, substeps: int = 1, tolerance: float = 1e-6, max_iterations: int = 50,
                  parallel: bool | None = None, preconditioner: str = "auto"):  # fmt: skip
@@ -114,6 +116,7 @@ class ImplicitWorkspace(Workspace):
 
     def __init__(self, solver, derived):
         self.potential, self._length = None, solver.substep
+        self.energy_watch = EnergyWatch(self) if solver.may_gain_energy else None
         super().__init__(solver, derived)
 
     def history(self, num_slots, record=False):
@@ -139,6 +142,8 @@ class ImplicitWorkspace(Workspace):
     def restart(self) -> None:
         super().restart()
         self._begin_anew()
+        if self.energy_watch:
+            self.energy_watch.clear()
 
     def forget(self) -> None:
         """The state was set from outside: there is none before it."""
@@ -264,6 +269,8 @@ class ImplicitWorkspace(Workspace):
         v_next = stage.e0 * v_star + stage.e1 * y
         if len(fixed):
             u_next[fixed], v_next[fixed] = (u[fixed], v[fixed]) if place is None else (place, speed)
+        if self.energy_watch:
+            self.energy_watch.note(u, u_star, u_next, v_next)
         return u_next, np.zeros_like(v) if stage.static else v_next
 
     def _admissible(self, start, u):

@@ -11,6 +11,7 @@ class Workspace:
     """What every solver's run needs; `advance` is the solver's own."""
 
     pairs_kind = SurfacePairs
+    energy_watch = None  # counts energy that long steps add, for solvers that neither damp nor limit it
 
     def __init__(self, solver, derived: Derived):
         self.solver, self.scene = solver, solver.scene

@@ -100,11 +100,11 @@ def judge(scene, kind, dt: float, steps: int = 200, overridden: bool = False) ->
     """
     options = dict(allow_unstable=True) if overridden and kind.explicit else {}
     try:
-        simulator = Simulator(kind(scene, dt=dt, **options))
-        first, moving, kept = measure(simulator)
-        rise, change = 0.0, 0.0
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
+            simulator = Simulator(kind(scene, dt=dt, **options))
+            first, moving, kept = measure(simulator)
+            rise, change = 0.0, 0.0
             for _ in range(20):
                 simulator.run(max(1, steps // 20))
                 total, now, still_kept = measure(simulator)
@@ -114,7 +114,7 @@ def judge(scene, kind, dt: float, steps: int = 200, overridden: bool = False) ->
                     break
     except (ValueError, FloatingPointError) as error:
         return Run("raises", said=f"{type(error).__name__}: {error}")
-    warned = [str(w.message) for w in said if "stiffer than the substep" in str(w.message)]
+    warned = [str(w.message) for w in said if "energy may be gained" in str(w.message) or "has gained" in str(w.message)]
     if not rise <= GAINS:
         return Run("raises", rise, change, warned[0]) if warned else Run("wrong silently", rise, change, "the energy rose")
     if (still_kept - kept) / scale < -LOSES:
