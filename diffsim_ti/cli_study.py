@@ -1,4 +1,4 @@
-"""Commands that measure: chart, stability, recommend."""
+"""Commands that measure: chart, stability, growth, recommend."""
 
 import runpy
 from pathlib import Path
@@ -7,7 +7,17 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from diffsim_ti.cli_options import Backend, Density, MaterialName, Poisson, Youngs, fixed_vertices, load_body, make_material
+from diffsim_ti.cli_options import (
+    Backend,
+    Density,
+    MaterialName,
+    Poisson,
+    Precision,
+    Youngs,
+    fixed_vertices,
+    load_body,
+    make_material,
+)
 
 Folder = Annotated[Path, typer.Option("--output", "-o", help="folder for the picture, the CSV and the JSON")]
 Quick = Annotated[bool, typer.Option("--quick", help="small meshes, few steps: seconds instead of minutes")]
@@ -18,6 +28,7 @@ def register(app: typer.Typer) -> None:
     """Add the commands."""
     app.command()(chart)
     app.command()(stability)
+    app.command()(growth)
     app.command()(recommend)
 
 
@@ -115,20 +126,54 @@ def stability(
     silent, done = [], 0
     with progress("stability", len(axes) * len(kinds)) as show:
         for name, quantity in axes.items():
+            results = []
             for kind in kinds:
                 result = stability_map(kind, quantity, steps=60 if quick else None, find_bounds=not quick,
                                        show=lambda note: show(done, note))  # fmt: skip
                 done += 1
+                results.append(result)
                 silent += result.silent
                 gap = np.nanmax(np.abs(result.bounds / result.limits - 1), initial=0.0)
                 counts = ", ".join(f"{(result.outcomes == k).sum()} {word}" for k, word in enumerate(map_picture.OUTCOMES))
                 print(f"{name}, {kind.__name__}: {counts}" + (f"; boundary within {gap:.1%} of the limit" if gap else ""))
-                for file in map_picture.write_map(result, output, name):
-                    print(f"  {file}")
+            for file in map_picture.write_maps(results, output, name):
+                print(f"  {file}")
     for line in silent:
         print(f"wrong silently: {line}")
     if silent:
         raise typer.Exit(1)
+
+
+def growth(
+    scene: Annotated[str, typer.Argument(help="all built-in scenes, a mesh, or a Python file that defines scene")] = "all",
+    duration: Annotated[float, typer.Option(help="simulated time [s]")] = 3.0,
+    output: Folder = Path("output/growth"),
+    quick: Quick = False,
+    precision: Precision = "f32",
+    material: MaterialName = "StableNeoHookean",
+    youngs_modulus: Youngs = 1e5,
+    poissons_ratio: Poisson = 0.4,
+    density: Density = 1000.0,
+    fixed: Fixed = None,
+    backend: Backend = "cpu",
+):
+    """How fast gradients grow with the length of a run (a Lyapunov-like rate), and until when they are of use."""
+    from diffsim_ti import runtime
+    from diffsim_ti.study.growth import GROWTH_SCENES, study_growth, write_growth
+
+    if not duration > 0:
+        raise ValueError(f"--duration must be > 0 [s], got {duration:g}")
+    runtime.init(backend, precision)
+    if scene == "all":
+        scenes = {name: make(precision) for name, make in GROWTH_SCENES.items()}
+    else:
+        made = own_scene(Path(scene), material, youngs_modulus, poissons_ratio, density, fixed)
+        scenes = {Path(scene).stem: made.replace(precision=precision)}
+    results = study_growth(scenes, 0.1 * duration if quick else duration)
+    for name, result in results.items():
+        print(f"{name}: {result}")
+    for file in write_growth(results, output, float(np.finfo(runtime.NUMPY[precision]).eps)):
+        print(file)
 
 
 def recommend(

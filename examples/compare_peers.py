@@ -1,267 +1,210 @@
-"""The common work of benchmark.py on whatever of torch-diffsim, NVIDIA Warp and JAX is installed, next to ours, in one run.
+"""Common work on whatever of torch-diffsim, NVIDIA Warp and JAX is installed, next to ours, in one run.
 
-    python examples/compare_peers.py [--peer-python PATH] [--rounds 3]
+    python examples/compare_peers.py [--peer-python PATH] [--part common|accuracy|charts|all] [--quick]
 
-Each system runs in its own process, one after the other, for several rounds; the best of each counts. --peer-python names
-an interpreter whose environment holds the peers (they need not share ours). Prints ns per tetrahedron and substep.
+common: the work of benchmark.py, equal steps; prints ns per tetrahedron and substep.
+accuracy: time to a given error, with and without gradients, of a Lamé mode against its closed form and of a bunny that falls
+    on a floor against its own converged motion; draws peers.png and prints the times to 1e-2 and 1e-3.
+charts: the work-precision diagrams of `diffsim-ti chart` with torch-diffsim's runs in them.
+
+Each peer runs in a process of its own (examples/peers/), one after the other. --peer-python names an interpreter whose
+environment holds the peers (they need not share ours). Pictures and records go to --output.
 """
 
 import argparse
-import json
-import subprocess
 import sys
-import tempfile
+from dataclasses import replace
 from pathlib import Path
 
-CUBE = """
-import json, time
 import numpy as np
-SUBSTEPS, H = 20, 2.5e-4
+from benchmark import SUBSTEPS, H, common_rollout, measure
+from peers import work
+
+import diffsim_ti as ds
+from diffsim_ti.study import chart, charts, pareto_front, problem, problems
+from diffsim_ti.study.problem import Problem, Watch
+from diffsim_ti.study.work_precision import reference
+
+ROOT = Path(__file__).parent.parent
+EXPLICIT = (ds.SemiImplicitSolver, ds.VelocityVerletSolver)
+ERRORS = (1e-2, 1e-3)
 
 
-def cube(n):
-    x = np.linspace(0, 1, n)
-    V = np.stack(np.meshgrid(x, x, x, indexing="ij"), -1).reshape(-1, 3)
-    i, j, k = (a.ravel() for a in np.meshgrid(*[np.arange(n - 1)] * 3, indexing="ij"))
-    T = []
-    for order in [(0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0)]:
-        c = [0, 0, 0]
-        corners = [(i * n + j) * n + k]
-        for axis in order:
-            c[axis] = 1
-            corners.append(((i + c[0]) * n + j + c[1]) * n + k + c[2])
-        T.append(np.stack(corners, -1))
-    T = np.stack(T, 1).reshape(-1, 4)
-    D = V[T[:, 1:]] - V[T[:, :1]]
-    flip = np.linalg.det(D) < 0
-    T[flip] = T[flip][:, [0, 2, 1, 3]]
-    return V, T
+# ---- equal steps --------------------------------------------------------------------------------------------------------
 
 
-def best(function, repeats):
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        function()
-        times.append(time.perf_counter() - start)
-    return min(times)
-
-
-def report(who, M, forward, both):
-    scale = 1e9 / (SUBSTEPS * M)
-    row = {"who": who, "tets": M, "forward_ns": forward * scale, "forward_backward_ns": both * scale}
-    print(json.dumps(row), flush=True)
-"""
-
-TORCH_DIFFSIM = """
-import torch
-from diffsim import (DifferentiableMaterial, DifferentiableSimulator, DifferentiableSolver, SemiImplicitSolver, Simulator,
-                     StableNeoHookean, TetrahedralMesh)
-for n in SIZES:
-    V, T = cube(n)
-    lift = torch.tensor([0.0, 5.0, 0.0])  # its ground plane cannot be switched off
-    rest = TetrahedralMesh(V + lift.numpy(), T)
-    stretched = torch.as_tensor(V, dtype=torch.float32) * 1.01 + lift
-    plain = Simulator(rest, StableNeoHookean(1e5, 0.4), SemiImplicitSolver(dt=1e-3, damping=0.999, substeps=4))
-    plain.positions = stretched.clone()
-    plain.step()
-    simulator = DifferentiableSimulator(rest, DifferentiableMaterial(1e5, 0.4),
-                                        DifferentiableSolver(dt=1e-3, damping=0.999, substeps=4))
-
-    def both():
-        simulator.reset()
-        simulator.positions = stretched.clone().requires_grad_(True)
-        for _ in range(5):
-            simulator.step()
-        (simulator.positions ** 2).sum().backward()
-
-    report("torch-diffsim", len(T), best(lambda: [plain.step() for _ in range(5)], 5), best(both, 4))
-"""
-
-WARP = """
-import warp as wp
-wp.config.quiet = True
-wp.init()
-
-
-@wp.func
-def cofactor(F: wp.mat33):
-    a = wp.vec3(F[0, 0], F[1, 0], F[2, 0])
-    b = wp.vec3(F[0, 1], F[1, 1], F[2, 1])
-    c = wp.vec3(F[0, 2], F[1, 2], F[2, 2])
-    return wp.matrix_from_cols(wp.cross(b, c), wp.cross(c, a), wp.cross(a, b))
-
-
-@wp.kernel
-def forces(x: wp.array(dtype=wp.vec3), tet: wp.array2d(dtype=int), B: wp.array(dtype=wp.mat33), W: wp.array(dtype=float),
-           mu: wp.array(dtype=float), lam: wp.array(dtype=float), f: wp.array(dtype=wp.vec3)):
-    e = wp.tid()
-    x0 = x[tet[e, 0]]
-    F = wp.matrix_from_cols(x[tet[e, 1]] - x0, x[tet[e, 2]] - x0, x[tet[e, 3]] - x0) * B[e]
-    m = 4.0 * mu[e] / 3.0
-    l = lam[e] + 5.0 * mu[e] / 6.0
-    P = m * (1.0 - 1.0 / (wp.ddot(F, F) + 1.0)) * F + (l * (wp.determinant(F) - 1.0) - 0.75 * m) * cofactor(F)
-    Q = (P * wp.transpose(B[e])) * (-W[e])
-    h1, h2, h3 = wp.vec3(Q[0, 0], Q[1, 0], Q[2, 0]), wp.vec3(Q[0, 1], Q[1, 1], Q[2, 1]), wp.vec3(Q[0, 2], Q[1, 2], Q[2, 2])
-    wp.atomic_add(f, tet[e, 1], h1)
-    wp.atomic_add(f, tet[e, 2], h2)
-    wp.atomic_add(f, tet[e, 3], h3)
-    wp.atomic_add(f, tet[e, 0], -(h1 + h2 + h3))
-
-
-@wp.kernel
-def advance(x: wp.array(dtype=wp.vec3), v: wp.array(dtype=wp.vec3), f: wp.array(dtype=wp.vec3), m: wp.array(dtype=float),
-            h: float, x1: wp.array(dtype=wp.vec3), v1: wp.array(dtype=wp.vec3)):
-    i = wp.tid()
-    w = 0.999 * (v[i] + h * (f[i] / m[i] + wp.vec3(0.0, -9.8, 0.0)))
-    v1[i] = w
-    x1[i] = x[i] + h * w
-
-
-@wp.kernel
-def squares(x: wp.array(dtype=wp.vec3), loss: wp.array(dtype=float)):
-    i = wp.tid()
-    wp.atomic_add(loss, 0, wp.dot(x[i], x[i]))
-
-
-for n in SIZES:
-    V, T = cube(n)
-    N, M = len(V), len(T)
-    D = np.moveaxis(V[T[:, 1:]] - V[T[:, :1]], 1, 2)
-    volume = np.linalg.det(D) / 6
-    mass = np.bincount(T.ravel(), np.repeat(250 * volume, 4))
-
-    def array(a, dtype, **k):
-        return wp.array(a, dtype=dtype, device="cpu", **k)
-
-    def states(k):
-        return [wp.zeros(N, dtype=wp.vec3, device="cpu", requires_grad=True) for _ in range(k)]
-
-    tet, B = array(T.astype(np.int32), int), array(np.linalg.inv(D).astype(np.float32), wp.mat33)
-    W, m = array(volume.astype(np.float32), float), array(mass.astype(np.float32), float)
-    mu = array(np.full(M, 1e5 / 2.8, np.float32), float, requires_grad=True)
-    lam = array(np.full(M, 1e5 * 0.4 / (1.4 * 0.2), np.float32), float, requires_grad=True)
-    xs, vs, fs = states(SUBSTEPS + 1), states(SUBSTEPS + 1), states(SUBSTEPS)
-    xs[0].assign((V * 1.01).astype(np.float32))
-    loss = wp.zeros(1, dtype=float, device="cpu", requires_grad=True)
-
-    def rollout():
-        for f in fs:
-            f.zero_()
-        for s in range(SUBSTEPS):
-            wp.launch(forces, M, inputs=[xs[s], tet, B, W, mu, lam], outputs=[fs[s]], device="cpu")
-            wp.launch(advance, N, inputs=[xs[s], vs[s], fs[s], m, H], outputs=[xs[s + 1], vs[s + 1]], device="cpu")
-        wp.launch(squares, N, inputs=[xs[SUBSTEPS]], outputs=[loss], device="cpu")
-
-    def both():
-        tape = wp.Tape()
-        with tape:
-            rollout()
-        tape.backward(loss)
-        tape.zero()
-
-    rollout()
-    both()
-    report("warp (CPU)", M, best(rollout, 5), best(both, 4))
-"""
-
-JAX = """
-import jax
-import jax.numpy as jnp
-
-
-def cofactor(F):
-    a, b, c = F[..., 0], F[..., 1], F[..., 2]
-    return jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], -1)
-
-
-for n in SIZES:
-    V, T = cube(n)
-    M = len(T)
-    D = np.moveaxis(V[T[:, 1:]] - V[T[:, :1]], 1, 2)
-    volume = np.linalg.det(D) / 6
-    mass = np.bincount(T.ravel(), np.repeat(250 * volume, 4))
-    B, W, tet = jnp.asarray(np.linalg.inv(D), jnp.float32), jnp.asarray(volume, jnp.float32), jnp.asarray(T)
-    m, gravity = jnp.asarray(mass, jnp.float32)[:, None], jnp.array([0, -9.8, 0.0])
-
-    def force(x, mu, lam):
-        X = x[tet]
-        F = jnp.moveaxis(X[:, 1:] - X[:, :1], 1, 2) @ B
-        C = cofactor(F)
-        J, Ic = (F[..., 0] * C[..., 0]).sum(-1), (F * F).sum((1, 2))
-        a, b = 4 * mu / 3 * (1 - 1 / (Ic + 1)), (lam + 5 * mu / 6) * (J - 1) - mu
-        P = a[:, None, None] * F + b[:, None, None] * C
-        h = jnp.moveaxis(-W[:, None, None] * (P @ jnp.swapaxes(B, 1, 2)), 2, 1)
-        h = jnp.concatenate([-h.sum(1, keepdims=True), h], 1)
-        return jnp.zeros_like(x).at[tet.ravel()].add(h.reshape(-1, 3))
-
-    def loss(x, mu, lam):
-        def step(state, _):
-            x, v = state
-            v = 0.999 * (v + H * (force(x, mu, lam) / m + gravity))
-            return (x + H * v, v), None
-
-        (x, _), _ = jax.lax.scan(step, (x, jnp.zeros_like(x)), None, length=SUBSTEPS)
-        return (x ** 2).sum()
-
-    arguments = (jnp.asarray(V * 1.01, jnp.float32), jnp.full(M, 1e5 / 2.8), jnp.full(M, 1e5 * 0.4 / (1.4 * 0.2)))
-    plain, both = jax.jit(loss), jax.jit(jax.value_and_grad(loss, (0, 1, 2)))
-    for f in (plain, both):
-        jax.block_until_ready(f(*arguments))
-    report("jax", M, *(best(lambda: jax.block_until_ready(f(*arguments)), 4) for f in (plain, both)))
-"""
-
-PEERS = {"torch-diffsim": TORCH_DIFFSIM, "warp": WARP, "jax": JAX}
-
-
-def run_peer(python: str, code: str, sizes: list[int]) -> list[dict]:
-    """Rows of one peer in a process of its own; none if it is not installed there."""
-    with tempfile.TemporaryDirectory() as folder:
-        script = Path(folder) / "peer.py"  # a file: Warp reads its kernels' source
-        script.write_text(CUBE + f"SIZES = {sizes}\n" + code)
-        done = subprocess.run([python, str(script)], capture_output=True, text=True)
-    return [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
-
-
-def run_ours(sizes: list[int]) -> list[dict]:
-    command = [sys.executable, str(Path(__file__).with_name("benchmark.py")), "--json", "--sizes", *map(str, sizes)]
-    return [json.loads(line) for line in subprocess.run(command, capture_output=True, text=True).stdout.splitlines()]
-
-
-def compare(peer_python: str, sizes: list[int], rounds: int) -> dict:
-    """{(who, tets): [best forward_ns, best forward_backward_ns]} over several rounds."""
+def common(python: str, sizes, rounds: int) -> dict:
+    """{(who, tetrahedra): [forward, forward and gradient]} in ns per tetrahedron and substep, the best of the rounds."""
     best: dict = {}
+
+    def note(who, tets, k, ns):
+        row = best.setdefault((who, tets), [np.inf, np.inf])
+        row[k] = min(row[k], ns)
+
     for _ in range(rounds):
-        for rows in (run_ours(sizes), *(run_peer(peer_python, code, sizes) for code in PEERS.values())):
-            for row in rows:
-                now = [row["forward_ns"], row["forward_backward_ns"]]
-                known = best.setdefault((row["who"], row["tets"]), now)
-                best[row["who"], row["tets"]] = [min(a, b) for a, b in zip(known, now)]
+        for n in sizes:
+            row = measure(n, "f32", 10)
+            note("diffsim_ti", row["tets"], 0, row["forward_ns"])
+            note("diffsim_ti", row["tets"], 1, row["forward_backward_ns"])
+        for who in work.installed(python):
+            for n in sizes:
+                scene = common_rollout(n, "f32", per_tetrahedron=False).scene
+                rest, tets = scene.mesh.vertices, scene.mesh.num_tetrahedra
+                end = np.array([0.0, 1.0])
+                job = work.scene_numbers(scene, H) | dict(E=1e5, nu=0.4, frames=1, substeps=SUBSTEPS, repeats=5)
+                both = job | dict(weights=2 * rest, linear=end, square=0 * end, target=0 * end)
+                for k, answer in enumerate(work.ask(who, python, [job, both])):
+                    if answer is not None:
+                        note(who, tets, k, float(answer["seconds"]) / SUBSTEPS / tets * 1e9)
     return best
 
 
-def table(best: dict) -> str:
-    """Markdown: forward and forward + backward by size, and how many times longer than ours."""
+def common_table(best: dict) -> str:
+    """Markdown: forward and forward + gradient by size, and how many times as long as ours."""
     sizes = sorted({tets for _, tets in best})
     head = " | ".join(f"forward, {s:,} | + gradient" for s in sizes)
     lines = [f"| | {head} |", "| --- |" + " --- | --- |" * len(sizes)]
     for who in dict.fromkeys(w for w, _ in best):
         cells = []
         for s in sizes:
-            ours = best["diffsim_ti", s]
-            for value, own in zip(best.get((who, s), [float("nan")] * 2), ours):
+            for value, own in zip(best.get((who, s), [np.nan] * 2), best["diffsim_ti", s]):
                 cells.append(f"{value:.0f}" + ("" if who == "diffsim_ti" else f" ({value / own:.1f}x)"))
         lines.append(f"| {who} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
 
+# ---- equal accuracy -----------------------------------------------------------------------------------------------------
+
+
+def drop(gradient: bool = False) -> Problem:
+    """A bunny of E = 1e5 Pa that meets a floor at 1 m/s, for 50 ms: its motion, or d (mean height at the end) / dE."""
+    mesh = ds.TetrahedralMesh.from_file(ROOT / "assets" / "tetmesh" / "bunny0.msh").translated((0, 0.006, 0))
+    scene = ds.Scene(mesh, ds.SmithNeoHookean(1e5, 0.4), 1000.0, [ds.Gravity(), ds.Ground(0.0, None, 0.005)],
+                     initial_velocities=(0, -1.0, 0), precision="f32")  # fmt: skip
+    out = replace(Problem.of_scene(scene, 0.05, "drop", frames=5), patterns=("five",),
+                  title="A bunny of 7 637 tetrahedra meets a floor at 1 m/s")  # fmt: skip
+    if not gradient:
+        return out
+    mean = Watch.end(lambda rest: np.eye(3)[1] * np.ones((len(rest), 1)) / len(rest), 5)
+    return replace(out, name="drop-gradient", title="Gradient by E of where that bunny is then",
+                   quantity=lambda _, g: np.atleast_1d(g["youngs_modulus"]), adjoint=mean, inputs=("youngs_modulus",),
+                   error="error of the derivative")  # fmt: skip
+
+
+def accuracy(python: str, quick: bool) -> dict:
+    """{problem: {who: [(seconds per simulated second, error), ...]}}"""
+    few, many = ((4, 8), (4, 8)) if quick else ((4, 8, 12, 16, 24), (4, 8, 12, 16))
+    out = {}
+    for asked, cells, levels in ((problem("lame"), few, 1), (problem("lame-gradient"), many, 1), (drop(), (0,), 3),
+                                 (drop(True), (0,), 3)):  # fmt: skip
+        ours = replace(asked, cells=few if len(cells) > 1 else cells, patterns=("five",))
+        result = chart(ours, EXPLICIT, ("f32",), levels=2 if levels == 1 else 3, limit=60.0, repeats=3, say=print)
+        out[asked.title] = {"diffsim_ti": [(p.seconds, p.error) for p in result.points if np.isfinite(p.error)]}
+        for who in work.installed(python):
+            out[asked.title][who] = work.peer_points(asked, who, python, cells, 1 if quick else levels)
+    return out
+
+
+def time_to(points, error: float) -> float:
+    """The least time of a run whose error is at most this; infinite if there is none."""
+    return min((seconds for seconds, e in points if e <= error), default=np.inf)
+
+
+def accuracy_table(found: dict) -> str:
+    """Markdown: wall time per simulated second to an error, and how many times as long as ours."""
+    lines = ["| | error | " + " | ".join(next(iter(found.values()))) + " |"]
+    lines.append("| --- | --- |" + " --- |" * len(next(iter(found.values()))))
+    for title, rows in found.items():
+        for error in ERRORS:
+            times = {who: time_to(points, error) for who, points in rows.items()}
+            cells = [f"{t:.3g} s ({t / times['diffsim_ti']:.3g}x)" if np.isfinite(t) else "not reached" for t in times.values()]
+            lines.append(f"| {title} | {error:g} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+STYLES = {"diffsim_ti": ("#0072B2", "o"), "torch-diffsim": ("#D55E00", "s"), "Warp (CPU)": ("#009E73", "^"),
+          "JAX": ("#CC79A7", "D")}  # fmt: skip
+
+
+def draw(found: dict, path) -> None:
+    """Time against error, a panel per problem, the front of each system."""
+    from types import SimpleNamespace
+
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 8.6), dpi=120, layout="constrained")
+    for axes, (title, rows) in zip(figure.subplots(2, 2).flat, found.items()):
+        for who, points in rows.items():
+            color, marker = STYLES[who]
+            front = pareto_front([SimpleNamespace(seconds=s, error=e) for s, e in points])
+            axes.scatter(*zip(*points), s=18, color=color, marker=marker, alpha=0.35) if points else None
+            axes.plot([p.seconds for p in front], [p.error for p in front], color=color, marker=marker, ms=6, label=who)
+        for error in ERRORS:
+            axes.axhline(error, color="0.75", lw=0.8, ls="--", zorder=0)
+        axes.set(xscale="log", yscale="log", xlabel="wall time per simulated second [s]", ylabel="error [-]")
+        axes.set_title(title, loc="left", fontsize=10)
+        for side in ("top", "right"):
+            axes.spines[side].set_visible(False)
+    figure.axes[0].legend(frameon=False, fontsize=9)
+    charts.save(figure, path)
+
+
+# ---- the charts with a peer in them -------------------------------------------------------------------------------------
+
+
+def as_deep(d, stiffness: float = 1e4, width: float = 0.01):
+    """torch-diffsim's cubic floor, as run_torch_diffsim.py makes it of a barrier [J]."""
+    return problems.barrier_energy(0.1 * width, stiffness, width) * ((width - d) / (0.9 * width)) ** 3
+
+
+def peers_of(name: str, who: str, python: str, quick: bool) -> list[tuple[float, float]]:
+    """A peer's runs of a built-in problem, against the same right numbers; for a floor, of its own floor."""
+    asked, right, levels = problem(name), None, 2
+    cells = {"lame": (4, 8, 12, 16, 24), "beam": (1, 2, 3, 4, 6), "identify": (2, 4)}.get(name, (1,))
+    if name == "beam":
+        known = reference(asked)[0]
+        right, levels = lambda n: known, 1
+    elif name == "identify":
+        right = lambda n: reference(asked, n, "five")[0]  # noqa: E731
+    elif name.startswith("bounce"):
+        levels = 7
+        if name == "bounce":
+            asked = replace(asked, exact=np.array([problems.bounce_height(2.0, as_deep)]))
+    return work.peer_points(asked, who, python, cells[:2] if quick else cells, 1 if quick else levels, right)
+
+
+def charted(python: str, quick: bool, folder) -> str:
+    """Write the charts with torch-diffsim's runs; Markdown of the times to an error."""
+    found = {}
+    for name in ("lame", "beam", "bounce", "bounce-gradient", "identify"):
+        result = chart(problem(name), quick=quick, limit=4.0, say=print)
+        peers = {who: peers_of(name, who, python, quick) for who in work.installed(python) if who == "torch-diffsim"}
+        charts.write_chart(result, folder, peers)
+        ours = [(p.seconds, p.error) for p in result.points if np.isfinite(p.error)]
+        found[result.problem.title] = {"diffsim_ti": ours, **peers}
+    return accuracy_table(found)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--peer-python", default=sys.executable, help="interpreter with the peers")
-    parser.add_argument("--sizes", type=int, nargs="+", default=[6, 11, 21], help="vertices a side")
-    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--part", default="all", choices=["common", "accuracy", "charts", "all"])
+    parser.add_argument("--sizes", type=int, nargs="+", default=[6, 11, 21], help="vertices a side of the common work")
+    parser.add_argument("--rounds", type=int, default=3, help="of the common work")
+    parser.add_argument("--quick", action="store_true", help="small meshes, few steps")
+    parser.add_argument("--output", type=Path, default=Path("output/peers"), help="folder for pictures and records")
     options = parser.parse_args()
-    print(table(compare(options.peer_python, options.sizes, options.rounds)))
+    ds.init(precision="f32")
+    print("peers:", ", ".join(work.installed(options.peer_python)) or "none is installed; see --peer-python")
+    if options.part in ("common", "all"):
+        print(common_table(common(options.peer_python, options.sizes, options.rounds)))
+    if options.part in ("accuracy", "all"):
+        found = accuracy(options.peer_python, options.quick)
+        draw(found, options.output / "peers.png")
+        charts.write_json(found, options.output / "peers.json")
+        print(accuracy_table(found))
+    if options.part in ("charts", "all"):
+        print(charted(options.peer_python, options.quick, options.output))
 
 
 if __name__ == "__main__":

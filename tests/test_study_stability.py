@@ -53,12 +53,13 @@ def test_outcomes_have_their_names():
     assert judge(scene, ds.SemiImplicitSolver, 1.01 * limit, 60, overridden=True).outcome == "wrong silently"
 
 
-def test_map_writes_picture_and_tables(tmp_path):
+def test_maps_of_an_axis_share_a_picture_and_tables(tmp_path):
     short = replace(AXES["nu"], values=(0.0, 0.3))
-    result = stability_map(ds.VelocityVerletSolver, short, shares=(0.5, 1.05), steps=20)
-    files = map_picture.write_map(result, tmp_path, "nu")
+    results = [stability_map(kind, short, shares=(0.5, 1.05), steps=20) for kind in EXPLICIT]
+    files = map_picture.write_maps(results, tmp_path, "nu")
     assert [name.rsplit(".")[-1] for name in files] == ["png", "csv", "json"]
-    assert len((tmp_path / "stability_nu_velocityverlet.csv").read_text().splitlines()) == 5
+    assert len((tmp_path / "stability_nu.csv").read_text().splitlines()) == 9
+    assert (tmp_path / "stability_nu.png").stat().st_size > 10_000
 
 
 def test_growth_beyond_the_limit_is_the_fastest_modes_and_has_a_horizon():

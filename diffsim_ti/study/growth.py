@@ -1,10 +1,19 @@
 """How gradients grow in long rollouts, and up to where they are of use."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from pathlib import Path
 
 import numpy as np
 
+from diffsim_ti.materials import SmithNeoHookean
+from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.rollout import Rollout
+from diffsim_ti.scene import Scene
+from diffsim_ti.solvers import VelocityVerletSolver
+from diffsim_ti.study.charts import COLORS, new_figure, save, write_csv, write_json
+from diffsim_ti.study.problems import beam_scene, lame_scene
+from diffsim_ti.terms import Gravity, Ground
+from diffsim_ti.terms.stiffness import barrier_stiffness
 
 
 @dataclass
@@ -48,3 +57,64 @@ def growth(solver, steps: int, frames: int = 50, directions: int = 2, useful: fl
     rounding = float(np.finfo(start.positions.dtype).eps)
     beyond = np.flatnonzero(largest * rounding > useful)
     return Growth(times, sizes, rate, float(times[beyond[0]]) if len(beyond) else None)
+
+
+def bouncing_block(precision: str) -> Scene:
+    """A cube of 0.2 m that falls 5 cm on its edge and goes on bouncing: every contact parts neighbouring motions."""
+    mesh = TetrahedralMesh.create_cube(4, 0.2, "five").rotated((0.3, 0.2, 1.0), 0.6)
+    mesh = mesh.translated((0, 0.05 - mesh.vertices[:, 1].min(), 0))
+    law = SmithNeoHookean(1e5, 0.3)
+    floor = Ground(0.0, barrier_stiffness(mesh, law, 1000.0, 9.81, 1.0, 0.01), 0.01)
+    return Scene(mesh, law, 1000.0, [Gravity(), floor], precision=precision)
+
+
+GROWTH_SCENES = {
+    "swinging cube (Lame mode)": lambda precision: lame_scene(0.3, 4, "five", precision),
+    "clamped beam let go": lambda precision: beam_scene(SmithNeoHookean, 2, "five", precision),
+    "bouncing block": bouncing_block,
+}
+
+
+def study_growth(scenes: dict, duration: float, share: float = 0.1, frames: int = 100) -> dict[str, Growth]:
+    """Growth in each scene over `duration` [s], by velocity Verlet at `share` of the stable step of the start, so that
+    contacts are resolved too."""
+    out = {}
+    for name, scene in scenes.items():
+        dt = share * VelocityVerletSolver(scene, dt=duration, allow_unstable=True).stable_dt(tight=True).dt
+        steps = int(np.ceil(duration / dt))
+        out[name] = growth(VelocityVerletSolver(scene, dt=duration / steps), steps, min(frames, steps))
+    return out
+
+
+def draw_growth(results: dict[str, Growth], path, rounding: float) -> None:
+    """Size of the tangent against time, a line per run, with the size at which rounding has grown to 1 % of the state."""
+    figure, axes = new_figure()
+    styles = ("-", "--", "-.", ":")
+    for k, ((name, result), color) in enumerate(zip(results.items(), COLORS.values())):
+        largest = result.sizes.max(0)
+        until = "to the end" if result.horizon is None else f"until {result.horizon:.2g} s"
+        axes.plot(result.times, largest, styles[k % 4], color=color, lw=1.8,
+                  label=f"{name}: {result.rate:.2g} 1/s, of use {until}")  # fmt: skip
+        if result.horizon is not None:
+            axes.plot(result.horizon, np.interp(result.horizon, result.times, largest), "o", color=color, ms=8)
+    axes.set(yscale="log", xlabel="time [s]", ylabel="largest d positions / d start [-]")
+    top = max(np.nanmax(result.sizes) for result in results.values())
+    if top * rounding > 1e-4:
+        axes.axhline(1e-2 / rounding, color="0.4", lw=1)
+        axes.text(0.01, 1e-2 / rounding, "rounding grown to 1 % of the state", transform=axes.get_yaxis_transform(),
+                  va="bottom", fontsize=9, color="0.35")  # fmt: skip
+    axes.grid(which="major", color="0.9")
+    axes.set_title("Growth of gradients with the length of a run", loc="left", fontsize=11)
+    axes.legend(frameon=False, fontsize=9, loc="upper left", bbox_to_anchor=(0, -0.12))
+    save(figure, path)
+
+
+def write_growth(results: dict[str, Growth], folder, rounding: float) -> list[str]:
+    """growth.png, .csv, .json in a folder; returns their names."""
+    stem = Path(folder) / "growth"
+    draw_growth(results, stem.with_suffix(".png"), rounding)
+    write_csv([dict(scene=name, time=t, size=s) for name, result in results.items()
+               for t, s in zip(result.times, result.sizes.max(0))], stem.with_suffix(".csv"))  # fmt: skip
+    write_json({name: asdict(r) | dict(times=r.times.tolist(), sizes=r.sizes.tolist()) for name, r in results.items()},
+               stem.with_suffix(".json"))  # fmt: skip
+    return [str(stem.with_suffix(s)) for s in (".png", ".csv", ".json")]

@@ -1,82 +1,80 @@
-"""Pictures and files of stability maps and of growth."""
+"""Pictures and files of stability maps."""
 
 from pathlib import Path
 
 import numpy as np
 
-from diffsim_ti.study.charts import new_figure, save, write_csv, write_json
+from diffsim_ti.study.charts import save, write_csv, write_json
 from diffsim_ti.study.stability_map import OUTCOMES
 
 OUTCOME_COLORS = ("#009E73", "#8FD0EC", "#F0E442", "#BBBBBB", "#D55E00")  # in the order of OUTCOMES
+LETTERS = "ABLR!"  # the same in letters, for eyes and printers that see no colours
+LEGEND = ("accurate: energy keeps to 1 %", "bounded", "loses more than a tenth of the energy",
+          "raises, refuses or warns", "wrong silently")  # fmt: skip
 
 
-def draw_map(result, path) -> None:
-    """A coloured cell per run, dt against the map's quantity, with the theoretical limit and where boundedness ends."""
+def draw_maps(results: list, path) -> None:
+    """A panel per solver: a cell per run, dt against the maps' quantity, with the theoretical limit and where
+    boundedness ends; three panels a row, the legend in the last place."""
+    from matplotlib.figure import Figure
+
+    columns = min(3, len(results) + 1)
+    rows = -(-(len(results) + 1) // columns)
+    figure = Figure(figsize=(4.9 * columns, 4.6 * rows), dpi=110, layout="constrained")
+    grid = figure.subplots(rows, columns, squeeze=False)
+    places = [axes for row in grid for axes in row]
+    explicit = [r for r in results if r.explicit]
+    if len(explicit) == 2 and len(results) > 2 and columns == 3:  # explicit solvers above, implicit ones below
+        places = [places[0], places[1], *places[3:], places[2]]
+    for result, axes in zip(results, places):
+        draw_panel(result, axes)
+    draw_legend(results, places[len(results)])
+    for axes in places[len(results) + 1 :]:
+        axes.axis("off")
+    silent, total = sum(len(r.silent) for r in results), sum(r.outcomes.size for r in results)
+    figure.suptitle(f"{results[0].axis.name}: {silent} of {total} runs went wrong without a word", fontsize=12)
+    save(figure, path)
+
+
+def draw_panel(result, axes) -> None:
+    """One solver's map. Rows are as high as each other, whatever lies between their steps."""
     from matplotlib.colors import ListedColormap
+
+    outcomes = result.outcomes
+    axes.pcolormesh(outcomes, cmap=ListedColormap(OUTCOME_COLORS), vmin=-0.5, vmax=len(OUTCOMES) - 0.5, edgecolors="white",
+                    linewidth=0.8)  # fmt: skip
+    for (row, column), outcome in np.ndenumerate(outcomes):
+        axes.text(column + 0.5, row + 0.5, LETTERS[outcome], ha="center", va="center", fontsize=7, color="0.15")
+    height = lambda share: np.interp(np.log(share), np.log(result.shares), np.arange(len(result.shares)) + 0.5)  # noqa: E731
+    axes.axhline(height(1.0), color="black", lw=1.8)
+    axes.plot(np.arange(len(result.limits)) + 0.5, height(result.bounds / result.limits), "kx", ms=8, mew=1.6)
+    axes.set_xticks(np.arange(len(result.limits)) + 0.5, [f"{value:g}" for value in result.axis.values], fontsize=8)
+    axes.set_yticks(np.arange(len(result.shares)) + 0.5, [f"{share:g}" for share in result.shares], fontsize=8)
+    axes.set_xlabel(f"{result.axis.name} [{result.axis.unit}]", fontsize=9)
+    axes.set_ylabel("dt over the explicit limit [-]", fontsize=9)
+    axes.set_title(result.solver.removesuffix("Solver"), loc="left", fontsize=10)
+
+
+def draw_legend(results, axes) -> None:
+    """What colours, letters, line and crosses mean."""
+    from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    figure, axes = new_figure(9.0)
-    columns, outcomes = np.arange(len(result.axis.values)), result.outcomes
-    edges = share_edges(result.shares)
-    axes.pcolormesh(np.arange(len(columns) + 1) - 0.5, edges, outcomes, cmap=ListedColormap(OUTCOME_COLORS), vmin=-0.5,
-                    vmax=len(OUTCOMES) - 0.5, edgecolors="white", linewidth=0.6)  # fmt: skip
-    axes.axhline(1.0, color="black", lw=1.4)
-    axes.text(len(columns) - 0.45, 1.0, "2 / omega max,\nby power iteration", va="center", fontsize=8)
-    if np.isfinite(result.bounds).any():
-        axes.plot(columns, result.bounds / result.limits, "kx", ms=7)
-        axes.text(len(columns) - 0.45, 0.86, "x: bounded up to\nhere, if overridden", va="top", fontsize=8)
-    axes.set(yscale="log", xlabel=f"{result.axis.name} [{result.axis.unit}]",
-             ylabel="dt over the explicit limit at the start [-]")  # fmt: skip
-    axes.set_xticks(columns, [f"{value:g}" for value in result.axis.values])
-    labelled = zip(result.shares, apart(result.shares))
-    axes.set_yticks(result.shares, [f"{share:g}" if keep else "" for share, keep in labelled])
-    axes.minorticks_off()
-    title = f"{result.solver}: {len(result.silent)} of {outcomes.size} runs wrong without a word"
-    axes.set_title(title, loc="left", fontsize=11)
-    handles = [Patch(color=color, label=name) for color, name in zip(OUTCOME_COLORS, OUTCOMES)]
-    axes.legend(handles=handles, loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False, fontsize=9)
-    save(figure, path)
+    handles = [Patch(color=color, label=f"{letter}  {words}") for color, letter, words
+               in zip(OUTCOME_COLORS, LETTERS, LEGEND)]  # fmt: skip
+    handles.append(Line2D([], [], color="black", lw=1.8, label="2 / omega max of the start, by power iteration"))
+    if any(np.isfinite(r.bounds).any() for r in results):
+        handles.append(Line2D([], [], color="black", marker="x", ms=8, lw=0, label="up to here bounded, refusal overridden"))
+    axes.axis("off")
+    axes.legend(handles=handles, loc="center left", frameon=False, fontsize=9, handlelength=1.6, labelspacing=0.9)
 
 
-def share_edges(shares) -> np.ndarray:
-    """Edges of cells around the shares; one edge is exactly 1, the limit, where shares lie on both sides."""
-    middles = np.sqrt(shares[1:] * shares[:-1])
-    middles[(shares[1:] > 1) & (shares[:-1] < 1)] = 1.0
-    return np.concatenate([[shares[0] ** 2 / middles[0]], middles, [shares[-1] ** 2 / middles[-1]]])
-
-
-def apart(shares, least: float = 1.08) -> list[bool]:
-    """Which shares have room for a label: each at least 8 % above the last one labelled."""
-    keep, last = [], 0.0
-    for share in shares:
-        keep.append(share >= least * last)
-        last = share if keep[-1] else last
-    return keep
-
-
-def write_map(result, folder, name: str) -> list[str]:
-    """stability_<axis>_<solver>.png, .csv, .json in a folder; returns their names."""
-    stem = Path(folder) / f"stability_{name}_{result.solver.removesuffix('Solver').lower()}"
-    draw_map(result, stem.with_suffix(".png"))
-    write_csv(result.rows(), stem.with_suffix(".csv"))
-    record = dict(solver=result.solver, axis=result.axis.name, values=list(result.axis.values), limits_s=list(result.limits),
-                  bounded_up_to_s=[None if np.isnan(b) else b for b in result.bounds], runs=result.rows())  # fmt: skip
-    write_json(record, stem.with_suffix(".json"))
+def write_maps(results: list, folder, name: str) -> list[str]:
+    """stability_<name>.png, .csv, .json of all solvers on one axis in a folder; returns their names."""
+    stem = Path(folder) / f"stability_{name}"
+    draw_maps(results, stem.with_suffix(".png"))
+    write_csv([row for result in results for row in result.rows()], stem.with_suffix(".csv"))
+    write_json({r.solver: dict(axis=r.axis.name, values=list(r.axis.values), limits_s=list(r.limits), runs=r.rows(),
+                               bounded_up_to_s=[None if np.isnan(b) else b for b in r.bounds]) for r in results},
+               stem.with_suffix(".json"))  # fmt: skip
     return [str(stem.with_suffix(s)) for s in (".png", ".csv", ".json")]
-
-
-def draw_growth(results: dict, path) -> None:
-    """Size of the tangent against time, a line per run, with the horizon marked where one is reached."""
-    from diffsim_ti.study.charts import COLORS
-
-    figure, axes = new_figure()
-    for (name, result), color in zip(results.items(), COLORS.values()):
-        largest = result.sizes.max(0)
-        axes.plot(result.times, largest, color=color, lw=1.6)
-        axes.annotate(f"{name}, {result.rate:.2g} 1/s", (result.times[-1], largest[-1]), xytext=(5, 0),
-                      textcoords="offset points", va="center", fontsize=8, color=color, annotation_clip=False)  # fmt: skip
-        if result.horizon is not None:
-            axes.plot(result.horizon, np.interp(result.horizon, result.times, largest), "o", color=color)
-    axes.set(yscale="log", xlabel="time [s]", ylabel="size of d positions / d start [-]")
-    axes.set_title("Growth of gradients", loc="left", fontsize=11)
-    save(figure, path)

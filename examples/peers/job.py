@@ -11,9 +11,9 @@ import numpy as np
 
 
 class Job:
-    """vertices (n, 3) [m], tetrahedra (m, 4); start, velocities (n, 3); fixed: indices; E [Pa], nu, density, gravity [m/s^2];
-    h [s], substeps per frame, frames; keep: what is left of the velocity after a substep; ground: (stiffness [N/m],
-    width [m]) of the barrier of y = 0, or nothing; repeats: timed runs.
+    """vertices (n, 3) [m], tetrahedra (m, 4); start, velocities (n, 3); fixed: indices; E [Pa], nu, density,
+    gravity [m/s^2]; h [s], substeps per frame, frames; keep: what is left of the velocity after a substep;
+    ground: (stiffness [N/m], width [m]) of the barrier of y = 0, or nothing; repeats: timed runs.
 
     With `weights` (n, 3) a gradient is wanted, of the loss sum_f [linear_f q_f + square_f (q_f - target_f)^2 / 2],
     q_f = sum(weights * displacements_f); the three are of length frames + 1.
@@ -49,12 +49,11 @@ class Job:
         return (by_mu * self.mu + by_lam * self.lam) / self.E
 
 
-def timed(function, repeats: int, enough: float = 8.0):
-    """(best wall time [s], the result); a first call compiles, unless it took so long that compiling is nothing of it."""
-    begin = time.perf_counter()
-    result = function()
-    times = [time.perf_counter() - begin]
-    while len(times) <= repeats and sum(times) < enough:
+def timed(function, repeats: int, compiles: bool = True, enough: float = 6.0):
+    """(best wall time [s], the result) of up to `repeats` calls, until `enough` seconds are spent; where a first call
+    `compiles` it is not counted."""
+    result, times = function() if compiles else None, []
+    while not times or (len(times) < repeats and sum(times) < enough):
         begin = time.perf_counter()
         result = function()
         times.append(time.perf_counter() - begin)

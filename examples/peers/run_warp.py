@@ -55,7 +55,8 @@ def work(job):
     free[job.fixed] = 0
 
     def array(a, dtype, **options):
-        return wp.array(np.ascontiguousarray(a, np.int32 if dtype is int else np.float32), dtype=dtype, device="cpu", **options)
+        host = np.ascontiguousarray(a, np.int32 if dtype is int else np.float32)
+        return wp.array(host, dtype=dtype, device="cpu", **options)
 
     def states(count):
         return [wp.zeros(n, dtype=wp.vec3, device="cpu", requires_grad=job.differentiates) for _ in range(count)]
@@ -93,7 +94,8 @@ def work(job):
         seeds = {xs[j * job.substeps]: wp.array(adjoints[j], dtype=wp.vec3, device="cpu") for j in range(1, job.frames + 1)}
         tape.backward(grads=seeds)
         by_mu, by_lam = (float(a.grad.numpy().astype(float).sum()) for a in (mu, lam))
-        gradients = dict(youngs_modulus=job.by_youngs_modulus(by_mu, by_lam), initial_positions=xs[0].grad.numpy().astype(float))
+        gradients = dict(youngs_modulus=job.by_youngs_modulus(by_mu, by_lam),
+                         initial_positions=xs[0].grad.numpy().astype(float))  # fmt: skip
         tape.zero()
         return positions, gradients
 
