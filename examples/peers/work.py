@@ -32,7 +32,8 @@ def scene_numbers(scene, h: float) -> dict:
     return dict(
         vertices=scene.mesh.vertices, tetrahedra=scene.mesh.tetrahedra, start=values["initial_positions"],
         velocities=values["initial_velocities"], fixed=np.asarray(scene.fixed, int),
-        density=float(np.mean(values["density"])), E=float(np.mean(values.get("youngs_modulus", 0))), nu=float(np.mean(values.get("poissons_ratio", 0))), h=h,
+        density=float(np.mean(values["density"])),
+        E=float(np.mean(values.get("youngs_modulus", 0))), nu=float(np.mean(values.get("poissons_ratio", 0))), h=h,
         gravity=0.0 if gravity is None else float(values["gravity"][1]),
         keep=1.0 if drag is None else float(np.exp(-values["drag_rate"] * h)),
         ground=np.array([values[n] for n in ("barrier_stiffness", "barrier_width")], float) if ground else np.zeros(0),
