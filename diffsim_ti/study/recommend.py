@@ -6,9 +6,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from diffsim_ti.rollout import Rollout
-from diffsim_ti.solvers import SOLVERS, VelocityVerletSolver
+from diffsim_ti.solvers import SOLVERS, BDF2Solver, VelocityVerletSolver
 from diffsim_ti.study.problem import Problem, distance
-from diffsim_ti.terms import Drag, ExternalForce
+from diffsim_ti.terms import Drag, ExternalForce, SelfContact
 
 SAFETY = 0.7  # of the tolerance: what a trial run must keep, for the error of the whole run is predicted
 SHARE = 0.8  # of the stable step at the start, which may fall on the way
@@ -105,42 +105,61 @@ class Trials:
         self.stable = VelocityVerletSolver(scene, dt=duration, allow_unstable=True).stable_dt(tight=True).dt
         self.tried: list[Option] = []
         self.notes: list[str] = []
-        self._find_reference()
         self.spent = 0.0  # [s] of the trials, compile time apart
+        self._find_reference()
 
     def _find_reference(self) -> None:
-        """Converged motion in float64 by velocity Verlet over `self.span`, all of the duration if the budget allows.
-
-        From the first step of halves that agree to a tenth of the tolerance, extrapolated; its error is the last change.
+        """Converged motion in float64 over `self.span`: by velocity Verlet, over all of the duration if a tenth of the
+        budget allows; else by implicit steps over all of it; else, where these do not converge, by velocity Verlet over
+        the first part.
         """
         k = int(np.ceil(self.duration / self.frames / (SHARE * self.stable)))
-        seconds = self._seconds_per_substep() * k * self.frames
-        self.span = self.duration * min(1.0, 0.1 * self.budget / max(3 * seconds, 1e-9))
+        self.explicit_cost = self._seconds_per_substep()
+        seconds = self.explicit_cost * k * self.frames
+        self.span, part = self.duration, min(1.0, 0.1 * self.budget / max(3 * seconds, 1e-9))
         self.problem = replace(Problem.of_scene(self.scene, self.span), frames=self.frames)
-        k = max(1, int(np.ceil(k * self.span / self.duration)))
-        coarse, self.own_error = None, np.nan
+        if part < 1 and not self.scene.term(SelfContact) and self._converge(BDF2Solver, 1, 0.5 * self.budget):
+            self.reference_by = BDF2Solver
+            return
+        self.span, self.reference_by = part * self.duration, VelocityVerletSolver
+        self.problem = replace(Problem.of_scene(self.scene, self.span), frames=self.frames)
+        if not self._converge(VelocityVerletSolver, max(1, int(np.ceil(k * part)))):
+            raise FloatingPointError(
+                f"the motion does not converge: with ever more steps in {self.span:.3g} s the last halving still changed it "
+                f"by {self.own_error:.1g} of the largest displacement; shorten the duration"
+            )
+
+    def _converge(self, kind, k: int, limit: float = np.inf) -> bool:
+        """Halve the steps of a second-order solver, from k per frame, until two agree to a tenth of the tolerance; the
+        reference is extrapolated from them, its error is their distance from it. False if that takes more than `limit` [s].
+        """
+        coarse, self.own_error, begin = None, np.nan, None
         for _ in range(8):
             try:
-                fine = self._motion(VelocityVerletSolver, "f64", k)[0]
-            except FloatingPointError:  # the stable step falls on the way
+                fine = self._motion(kind, "f64", k)[0]
+            except FloatingPointError:  # the stable step falls on the way, or Newton's method does not converge
                 fine = None
             if coarse is not None and fine is not None:
                 self.reference = fine + (fine - coarse) / 3
                 self.own_error = distance(self.problem, fine, self.reference)
                 if self.own_error < 0.1 * self.tolerance:
-                    return
+                    return True
+            begin = begin or time.perf_counter()  # the first run compiles
+            if time.perf_counter() - begin > limit:
+                return False
             coarse, k = fine, 2 * k
-        raise FloatingPointError(
-            f"the motion does not converge: with {k} steps in {self.span:.3g} s the last halving still changed it by "
-            f"{self.own_error:.1g} of the largest displacement; shorten the duration"
-        )
+        return False
 
     def _seconds_per_substep(self) -> float:
-        rollout = self._rollout(VelocityVerletSolver, "f64", 40, frames=1, span=4 * self.stable)
-        rollout.forward()
-        begin = time.perf_counter()
-        rollout.forward()
-        return (time.perf_counter() - begin) / 40
+        """Wall time of a substep of velocity Verlet [s], the cost of starting a run taken off."""
+        times = []
+        for substeps in (40, 400):
+            rollout = self._rollout(VelocityVerletSolver, "f64", substeps, frames=1, span=0.1 * substeps * self.stable)
+            rollout.forward()
+            begin = time.perf_counter()
+            rollout.forward()
+            times.append(time.perf_counter() - begin)
+        return max((times[1] - times[0]) / 360, 0.1 * times[1] / 400)
 
     def _rollout(self, kind, precision, substeps, frames=None, span=None) -> Rollout:
         frames, span = frames or self.frames, span or self.span
@@ -196,33 +215,58 @@ class Trials:
         return option
 
     def run(self) -> None:
-        """Every solver in float32 from its largest step to one that meets the tolerance, then float64 at the same step."""
-        first = max(1, int(np.ceil(self.span / self.frames / (SHARE * self.stable))))
-        for kind in sorted(SOLVERS, key=lambda kind: not kind.explicit):
-            substeps = first if kind.explicit else 1
-            for _ in range(5):
-                if self._too_dear(kind, substeps):
-                    break
-                option = self._try(kind, "f32", substeps)
-                if option.error <= SAFETY * self.tolerance:
-                    break
-                finer = (option.error / (0.5 * self.tolerance)) ** (1 / kind.order) if np.isfinite(option.error) else 4
-                substeps = int(np.ceil(substeps * np.clip(finer, 1.3, 16)))
-        for kind in [kind for kind in SOLVERS if kind.explicit]:  # float64 costs little more on small meshes
-            known = [o for o in self.tried if o.solver is kind and np.isfinite(o.error)]
-            if known and not self._too_dear(kind, known[-1].substeps):
-                self._try(kind, "f64", min(known, key=lambda o: o.error).substeps)
-        self._compare()
+        """Every solver from its largest step to one that meets the tolerance; first the kind that made the reference.
 
-    def _too_dear(self, kind, substeps) -> bool:
+        Explicit ones in float32, then in float64 at the same step, which costs little more on small meshes; implicit ones
+        in float32, and in float64 if that is not good enough.
+        """
+        first = max(1, int(np.ceil(self.span / self.frames / (SHARE * self.stable))))
+        other = lambda kind: (kind.explicit != self.reference_by.explicit, kind is not BDF2Solver)  # noqa: E731
+        for kind in sorted(SOLVERS, key=other):
+            if not kind.explicit and self.scene.term(SelfContact):
+                continue
+            good = self._refine(kind, "f32", first if kind.explicit else 1)
+            if not kind.explicit and not good:
+                self._refine(kind, "f64", 1)
+        for kind in [kind for kind in SOLVERS if kind.explicit]:
+            known = [o for o in self.tried if o.solver is kind and np.isfinite(o.error)]
+            if known and not self._too_dear(kind, "f64", known[-1].substeps):
+                self._try(kind, "f64", min(known, key=lambda o: o.error).substeps)
+        if self._best() is not None:
+            self._compare()
+
+    def _refine(self, kind, precision: str, substeps: int) -> bool:
+        """Try ever more substeps a frame, as many as the order of convergence suggests; whether the tolerance is met.
+
+        Where a finer step is no better (rounding, or a tolerance of the solver), it ends.
+        """
+        before = np.inf
+        for _ in range(5):
+            if self._too_dear(kind, precision, substeps):
+                return False
+            option = self._try(kind, precision, substeps)
+            if option.error <= SAFETY * self.tolerance:
+                return True
+            if option.error > 0.9 * before:
+                return False
+            before = np.fmin(option.error, before)
+            finer = (option.error / (0.5 * self.tolerance)) ** (1 / kind.order) if np.isfinite(option.error) else 4
+            substeps = int(np.ceil(substeps * np.clip(finer, 1.3, 16)))
+        return False
+
+    def _too_dear(self, kind, precision: str, substeps: int) -> bool:
         """Whether a trial would take longer than twelve times the best so far, or than the budget's rest."""
-        best, known = self._best(), [o for o in self.tried if o.solver is kind and np.isfinite(o.seconds)]
-        if not known:
-            return not kind.explicit and self.spent > self.budget
-        seconds = min(o.seconds / o.substeps for o in known) * substeps
-        trial = 3 * seconds * self.span / self.duration
-        if best is not None and seconds > 12 * best.seconds or self.spent + trial > self.budget:
-            self.notes.append(f"{kind.__name__} with a finer step than {known[-1].substep:.3g} s was not tried: too dear")
+        best = self._best()
+        known = [o for o in self.tried if o.solver is kind and np.isfinite(o.seconds)]
+        if not known and not kind.explicit:
+            return self.spent > self.budget
+        longer = self.duration / self.span
+        seconds = (min(o.seconds / o.substeps for o in known) * substeps if known
+                   else self.explicit_cost * substeps * self.frames * longer * (3 if self.gradients else 1))  # fmt: skip
+        trial, dearer = 3 * seconds / longer, best is not None and seconds > 12 * best.seconds
+        if dearer or (self.spent + trial > self.budget and (known or best is not None)):
+            step = self.span / self.frames / substeps
+            self.notes.append(f"{kind.__name__} with a step of {step:.3g} s, {precision}, was not tried: too dear")
             return True
         return False
 
