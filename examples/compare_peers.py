@@ -86,7 +86,7 @@ def drop(gradient: bool = False, duration: float = 0.05) -> Problem:
                   title="A bunny of 7 637 tetrahedra meets a floor at 1 m/s")  # fmt: skip
     if not gradient:
         return out
-    mean = Watch.end(lambda rest: np.eye(3)[1] * np.ones((len(rest), 1)) / len(rest), 5)
+    mean = Watch.end(lambda mesh: np.eye(3)[1] * np.ones((mesh.num_vertices, 1)) / mesh.num_vertices, 5)
     return replace(out, name="drop-gradient", title="Gradient by E of where that bunny is then",
                    quantity=lambda _, g: np.atleast_1d(g["youngs_modulus"]), adjoint=mean, inputs=("youngs_modulus",),
                    error="error of the derivative")  # fmt: skip

@@ -12,8 +12,8 @@ ELEMENTS = {"linear": {}}  # kinds of element: name -> arguments of Scene
 class Watch:
     """A loss of one number per frame, q_f = sum_i w_i . u_f,i: sum_f [linear_f q_f + square_f (q_f - target_f)^2 / 2].
 
-    weights(rest) -> w, shape (num_vertices, 3); the others have a number for each frame. Called with frames, it gives the
-    loss's gradient by their positions.
+    weights(mesh) -> w, shape (num_vertices, 3); the others have a number for each frame. Called with frames and their mesh,
+    it gives the loss's gradient by their positions.
     """
 
     weights: Callable
@@ -27,8 +27,8 @@ class Watch:
         none = np.zeros(frames + 1)
         return cls(weights, np.append(none[1:], 1.0), none, none)
 
-    def __call__(self, frames) -> np.ndarray:
-        weights = self.weights(frames.inputs["rest_positions"])
+    def __call__(self, frames, mesh) -> np.ndarray:
+        weights = self.weights(mesh)
         q = np.tensordot(frames.displacements.astype(np.float64), weights, 2)
         return (self.linear + self.square * (q - self.target))[:, None, None] * weights
 
@@ -42,7 +42,7 @@ class Problem:
     quantity(frames, gradients) -> the numbers to get right; frames are a Rollout's, gradients those of `adjoint`.
     exact: the closed form's numbers, or None: a converged reference is computed, with its own error.
     scale: what errors are divided by; default the largest of the exact numbers.
-    adjoint(frames) -> the loss's gradient by the frames' positions, such as a Watch; `inputs`: the gradients asked for.
+    adjoint(frames, mesh) -> the loss's gradient by the frames' positions, such as a Watch; `inputs`: the gradients asked for.
     cells, patterns: the meshes of the chart. reference_cells: those that the reference is extrapolated from (it then
         includes the mesh's error); None: the reference is of each mesh by itself (the error of steps and precision).
     largest_step [s]: steps to start from, where the stable one does not say (contact to come).

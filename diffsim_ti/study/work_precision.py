@@ -104,7 +104,7 @@ def run(problem: Problem, rollout: Rollout) -> tuple[float, np.ndarray]:
     """(wall time [s] of the run with its gradient if the problem asks for one, its numbers)."""
     begin = time.perf_counter()
     frames = rollout.forward()
-    gradients = rollout.vjp(frames, problem.adjoint(frames)) if problem.differentiates else {}
+    gradients = rollout.vjp(frames, problem.adjoint(frames, rollout.scene.mesh)) if problem.differentiates else {}
     seconds = time.perf_counter() - begin
     return seconds, problem.quantity(frames, gradients)
 

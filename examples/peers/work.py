@@ -46,7 +46,7 @@ def problem_job(problem: Problem, scene, substeps: int, repeats: int = 3) -> dic
     job |= dict(frames=problem.frames, substeps=substeps, repeats=repeats)
     if problem.differentiates:
         watch = problem.adjoint
-        job |= dict(weights=watch.weights(scene.mesh.vertices), linear=watch.linear, square=watch.square,
+        job |= dict(weights=watch.weights(scene.mesh), linear=watch.linear, square=watch.square,
                     target=watch.target)  # fmt: skip
     return job
 
