@@ -42,7 +42,7 @@ class Problem:
     quantity(frames, gradients) -> the numbers to get right; frames are a Rollout's, gradients those of `adjoint`.
     exact: the closed form's numbers, or None: a converged reference is computed, with its own error.
     scale: what errors are divided by; default the largest of the exact numbers.
-    adjoint(frames, mesh) -> the loss's gradient by the frames' positions, such as a Watch; `inputs`: the gradients asked for.
+    adjoint(frames, mesh) -> the loss's gradient by the frames' positions, such as a Watch; `inputs`: those asked for.
     cells, patterns: the meshes of the chart. reference_cells: those that the reference is extrapolated from (it then
         includes the mesh's error); None: the reference is of each mesh by itself (the error of steps and precision).
     largest_step [s]: steps to start from, where the stable one does not say (contact to come).

@@ -39,7 +39,7 @@ def lame_share(X) -> np.ndarray:
 
 
 def lame_share_by_mass(mesh) -> np.ndarray:
-    """Weights that give the mode's share [m], weighed by the vertices' masses: what the mesh mixes in counts squared only."""
+    """Weights that give the mode's share [m], weighed by mass: what the mesh mixes in counts squared only."""
     mass = np.bincount(mesh.tetrahedra.ravel(), np.repeat(mesh.volumes / 4, 4), mesh.num_vertices)[:, None]
     mode = lame_mode(mesh.vertices)
     return mass * mode / (mass * mode**2).sum()
