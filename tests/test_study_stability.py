@@ -44,6 +44,27 @@ def test_no_explicit_solver_is_wrong_silently(kind, axis):
     assert set(outcomes[0]) <= {"accurate", "bounded"} and set(outcomes[-1]) == {"raises"}
 
 
+@pytest.mark.parametrize("kind", SOLVERS)
+@pytest.mark.parametrize("axis, values", [("impact", (2.0,)), ("compression", (0.7,))])
+def test_no_solver_is_wrong_silently_where_steps_meet_their_end(kind, axis, values):
+    """Impacts and squeezed starts, within and beyond the steps that follow them: bounded, damped, or said."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        result = stability_map(kind, replace(AXES[axis], values=values), shares=(0.3, 0.9, 3.0), steps=40)
+    assert not result.silent, result.silent
+    assert kind.explicit or kind is ds.ImplicitMidpointSolver or "raises" not in np.array(OUTCOMES)[result.outcomes]
+
+
+def test_a_map_would_show_what_is_wrong_silently():
+    """With its word taken away, the midpoint rule at an impact is found out."""
+    scene = AXES["impact"].scene(5.0)
+    limit = power_limit(scene)
+    assert judge(scene, ds.ImplicitMidpointSolver, 3 * limit, 40).outcome == "raises"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ds.ImplicitMidpointSolver, "may_gain_energy", False)
+        assert judge(scene, ds.ImplicitMidpointSolver, 3 * limit, 40).outcome == "wrong silently"
+
+
 def test_outcomes_have_their_names():
     scene, limit = body(), power_limit(body())
     assert judge(scene, ds.VelocityVerletSolver, 0.05 * limit, 40).outcome == "accurate"
@@ -71,3 +92,18 @@ def test_growth_beyond_the_limit_is_the_fastest_modes_and_has_a_horizon():
     # beyond the limit the fastest mode multiplies by exp(2 arccosh(s)) each step, s = dt / limit
     assert wild.rate == pytest.approx(2 * np.arccosh(1.05) / (1.05 * power_limit(body())), rel=0.05)
     assert wild.horizon is not None and "until" in str(wild)
+
+
+def test_growth_of_ones_own_scene_by_the_command(tmp_path):
+    from typer.testing import CliRunner
+
+    from diffsim_ti.cli import app
+
+    (tmp_path / "hang.py").write_text("from diffsim_ti.study.growth import GROWTH_SCENES\n"
+                                      "scene = GROWTH_SCENES['clamped beam let go']('f64')\n")  # fmt: skip
+    command = ["growth", str(tmp_path / "hang.py"), "--duration", "0.1", "--precision", "f64", "-o", str(tmp_path)]
+    done = CliRunner().invoke(app, command)
+    assert done.exit_code == 0, done.output
+    assert "hang: gradients grow to" in done.output
+    assert (tmp_path / "growth.png").stat().st_size > 10_000
+    assert len((tmp_path / "growth.csv").read_text().splitlines()) > 10

@@ -45,8 +45,9 @@ ROWS = {
             "implicit:series_of_bars_with_stiffnesses_over_six_decades scene:series_bar_of_moduli_over_six_decades",
     },
     "Explicit steps": {
-        "bounded just below the limit, refused just above":
+        "bounded just below the limit, refused just above, and divergence beyond it is named in time":
             "step_limit:bounded_below_the_limit step_limit:refused_above_the_limit "
+            "step_limit:divergence_above_the_limit_is_named "
             "study_stability:boundary_is_the_theoretical_limit",
         "ten times the limit is refused with the substeps it takes": "step_limit:ten_times_the_limit_says_how_many_substeps",
         "squeezing is noticed before anything is NaN": "step_limit:compression_outgrows_the_step_before_any_nan",
@@ -59,7 +60,8 @@ ROWS = {
         "the worst tetrahedron sets the limit and is named": "step_limit:worst_tetrahedron_is_named",
         "damping decays by its rate whatever the step": "reference_motion:drag_is_a_rate",
         "no step, stiffness, Poisson's ratio or element is wrong without a word":
-            "study_stability:no_explicit_solver_is_wrong_silently",
+            "study_stability:no_explicit_solver_is_wrong_silently "
+            "study_stability:no_solver_is_wrong_silently_where_steps_meet_their_end",
     },
     "Implicit steps": {
         "where a body hangs at last does not depend on the step":
@@ -68,7 +70,9 @@ ROWS = {
         "too few rounds raise, with their history, and leave the state":
             "implicit:not_converged_carries_its_history_and_leaves_the_state",
         "a fast spin is lost at the rate of the formula": "implicit:backward_euler_loses_spin_by_its_formula",
-        "very stiff steps": "implicit:stiff_steps_stay_finite_where_the_explicit_step_is_far_exceeded",
+        "very stiff steps stay finite; where the midpoint rule gains energy it says so":
+            "implicit:stiff_steps_stay_finite_where_the_explicit_step_is_far_exceeded "
+            "torture:midpoint_says_where_it_gains_energy",
         "an indefinite Hessian is reported": "implicit:an_indefinite_hessian_is_reported",
         "errors fall with the tolerance": "implicit_gradients:errors_fall_with_the_tolerance",
         "a column bends beyond its buckling load": "implicit:a_column_beyond_its_buckling_load_bends",
@@ -79,14 +83,16 @@ ROWS = {
         "weights rest where the barrier carries them":
             "reference_motion:weight_at_rest_on_the_ground "
             "implicit_contact:weight_rests_at_the_gap_where_the_barrier_carries_it",
-        "fast impacts are never below the floor in silence": "contact_crossing:speed_table",
+        "fast impacts are never below the floor in silence":
+            "contact_crossing:speed_table implicit_contact:no_step_is_too_large_for_the_barrier",
         "bounces keep energy and their gradient": "reference_motion:barrier_bounce contact_gradients:bounce_sweep",
         "inclines hold and let slide": "contact_friction:incline implicit_contact:incline",
         "stopping distances": "contact_friction:stopping_distance implicit_contact:stopping_distance",
         "friction never adds energy": "contact_friction:friction_never_adds_energy",
         "two bodies collide head-on": "",
         "slow impact of a sphere as by Hertz": "",
-        "symmetric contact stays symmetric": "contact:symmetric_contact_stays_symmetric",
+        "symmetric contact stays symmetric; a face exactly where the barrier begins feels nothing":
+            "contact:symmetric_contact_stays_symmetric torture:a_face_exactly_at_the_width_feels_nothing",
     },
     "Gradients": {
         "Taylor's test of every input": "gradients:every_input_by_itself gradients:a_smooth_thousand_steps",
@@ -101,7 +107,10 @@ ROWS = {
             "checkpoints:backward_after_an_exception",
         "checkpoints give the same bits, and memory falls as theory says":
             "checkpoints:budgets_give_the_same_bits checkpoints:memory_falls_as_the_theory_says",
-        "implicit gradients agree with differences": "implicit_gradients:every_input_agrees_with_differences",
+        "implicit gradients agree with differences, and with the hanging bar's closed form":
+            "implicit_gradients:every_input_agrees_with_differences torture:tip_of_a_hanging_bar_by_its_modulus",
+        "moduli per region are recovered; what cannot be told apart is named":
+            "identification:recovery_per_region identification:stiffness_and_density_together_are_not_seen",
         "chaotic runs are finite, their growth reported":
             "gradient_faults:health_of_a_bouncing_block gradient_faults:an_adjoint_that_explodes_says_so "
             "study_stability:growth_beyond_the_limit_is_the_fastest_modes_and_has_a_horizon",

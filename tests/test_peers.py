@@ -1,0 +1,99 @@
+"""What the peers are told is the problem as it is, and what is made of their answers is right; none needs be installed."""
+
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import diffsim_ti as ds
+from diffsim_ti.study import problem
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "examples"))
+sys.path.insert(0, str(Path(__file__).parent.parent / "examples" / "peers"))
+
+import compare_peers  # noqa: E402
+from job import Job  # noqa: E402
+from peers import work  # noqa: E402
+
+# a peer of our own hand: symplectic Euler in NumPy, no gradients
+NUMPY_PEER = """
+import numpy as np
+from job import answer_all, timed
+
+def work(job):
+    B, W = np.linalg.inv(job.rest_edges), job.volumes
+    def run():
+        x, v, seen = job.start.copy(), job.velocities.copy(), [job.start]
+        for s in range(job.frames * job.substeps):
+            F = np.moveaxis(job.edges(x), 1, 2) @ B
+            J, C = np.linalg.det(F), np.linalg.det(F)[:, None, None] * np.linalg.inv(F).swapaxes(1, 2)
+            m, k = 4 * job.mu / 3, job.lam + 5 * job.mu / 6
+            P = (m * (1 - 1 / ((F * F).sum((1, 2)) + 1)))[:, None, None] * F + (k * (J - 1) - 0.75 * m)[:, None, None] * C
+            h = np.swapaxes(-W[:, None, None] * (P @ B.swapaxes(1, 2)), 1, 2)
+            f = np.zeros_like(x)
+            np.add.at(f, job.tetrahedra, np.concatenate([-h.sum(1, keepdims=True), h], 1))
+            f[:, 1] += job.gravity * job.masses
+            v = job.keep * (v + job.h * f / job.masses[:, None])
+            v[job.fixed] = 0
+            x = x + job.h * v
+            if (s + 1) % job.substeps == 0:
+                seen.append(x)
+        return np.stack(seen)
+    seconds, x = timed(run, job.repeats)
+    return seconds, x, {}
+
+answer_all(work)
+"""
+
+
+@pytest.mark.parametrize("name", ["lame-gradient", "identify", "bounce-gradient"])
+def test_a_job_is_the_problem(name, tmp_path):
+    """Masses, moduli and the loss's gradient by the frames, from the file alone, are ours."""
+    asked = problem(name)
+    scene = asked.scene(asked.cells[0], asked.patterns[0], "f64")
+    np.savez(tmp_path / "a.job.npz", **work.problem_job(asked, scene, 3))
+    job = Job(str(tmp_path / "a.job.npz"))
+    derived = scene.inputs.derive(scene.inputs.values)
+    np.testing.assert_allclose(job.masses, derived.mass, rtol=1e-12)
+    assert job.h * job.substeps * job.frames == pytest.approx(asked.duration) and job.differentiates
+    u = np.random.default_rng(0).standard_normal((job.frames + 1, *job.vertices.shape))
+    frames = SimpleNamespace(displacements=u, inputs=dict(rest_positions=scene.mesh.vertices))
+    np.testing.assert_allclose(job.adjoints(job.vertices + u), asked.adjoint(frames, scene.mesh), rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["lame", "beam"])
+def test_another_code_finds_our_error(name, tmp_path, monkeypatch):
+    """The same steps in NumPy, through files and a process: the error of our own run, to rounding of float32 starts."""
+    (tmp_path / "run_numpy.py").write_text(NUMPY_PEER)
+    monkeypatch.setattr(work, "HERE", tmp_path)
+    monkeypatch.setitem(work.PEERS, "NumPy", ("run_numpy.py", "numpy"))
+    monkeypatch.setenv("PYTHONPATH", str(Path(work.__file__).parent))
+    asked = problem(name)
+    right = asked.exact if asked.exact is not None else np.zeros((asked.frames + 1, 3)) + 0.4
+    [(seconds, error)] = work.peer_points(asked, "NumPy", sys.executable, (2,), right=lambda n: right)
+    scene = asked.scene(2, asked.patterns[0], "f64")
+    substeps = work.first_substeps(asked, scene)
+    solver = ds.SemiImplicitSolver(scene, dt=asked.duration / asked.frames, substeps=substeps)
+    ours = asked.quantity(ds.Rollout(solver, asked.frames, save_every=1).forward(), {})
+    assert seconds > 0
+    assert error == pytest.approx(work.distance(asked, ours, right), rel=1e-4)
+
+
+def test_a_peer_that_fails_is_told_and_left_out(tmp_path, monkeypatch, capsys):
+    (tmp_path / "run_broken.py").write_text("raise SystemExit('no such device')")
+    monkeypatch.setattr(work, "HERE", tmp_path)
+    monkeypatch.setitem(work.PEERS, "Broken", ("run_broken.py", "numpy"))
+    assert work.peer_points(problem("lame"), "Broken", sys.executable, (2,)) == []
+    assert "no such device" in capsys.readouterr().err
+    monkeypatch.setitem(work.PEERS, "Absent", ("run_broken.py", "no_such_module"))
+    assert "Absent" not in work.installed(sys.executable) and "Broken" in work.installed(sys.executable)
+
+
+def test_table_and_picture_of_equal_accuracy(tmp_path):
+    found = {f"problem {k}": {"diffsim_ti": [(0.1, 1e-1), (1.0, 5e-4)], "JAX": [(4.0, 5e-3)]} for k in range(4)}
+    table = compare_peers.accuracy_table(found)
+    assert "| problem 0 | 0.01 | 1 s (1x) | 4 s (4x) |" in table and "| 0.001 | 1 s (1x) | not reached |" in table
+    compare_peers.draw(found, tmp_path / "peers.png")
+    assert (tmp_path / "peers.png").stat().st_size > 10_000
