@@ -8,7 +8,7 @@ import numpy as np
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.solvers import SOLVERS, BDF2Solver, VelocityVerletSolver
 from diffsim_ti.study.problem import Problem, distance
-from diffsim_ti.terms import Drag, ExternalForce, SelfContact
+from diffsim_ti.terms import Drag, ExternalForce
 
 SAFETY = 0.7  # of the tolerance: what a trial run must keep, for the error of the whole run is predicted
 SHARE = 0.8  # of the stable step at the start, which may fall on the way
@@ -118,7 +118,7 @@ class Trials:
         seconds = self.explicit_cost * k * self.frames
         self.span, part = self.duration, min(1.0, 0.1 * self.budget / max(3 * seconds, 1e-9))
         self.problem = replace(Problem.of_scene(self.scene, self.span), frames=self.frames)
-        if part < 1 and not self.scene.term(SelfContact) and self._converge(BDF2Solver, 1, 0.5 * self.budget):
+        if part < 1 and self._converge(BDF2Solver, 1, 0.5 * self.budget):
             self.reference_by = BDF2Solver
             return
         self.span, self.reference_by = part * self.duration, VelocityVerletSolver
@@ -223,8 +223,6 @@ class Trials:
         first = max(1, int(np.ceil(self.span / self.frames / (SHARE * self.stable))))
         other = lambda kind: (kind.explicit != self.reference_by.explicit, kind is not BDF2Solver)  # noqa: E731
         for kind in sorted(SOLVERS, key=other):
-            if not kind.explicit and self.scene.term(SelfContact):
-                continue
             good = self._refine(kind, "f32", first if kind.explicit else 1)
             if not kind.explicit and not good:
                 self._refine(kind, "f64", 1)
