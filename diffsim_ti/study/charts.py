@@ -8,7 +8,7 @@ import numpy as np
 
 COLORS = {"SemiImplicit": "#E69F00", "VelocityVerlet": "#0072B2", "ImplicitEuler": "#D55E00", "ImplicitMidpoint": "#009E73",
           "BDF2": "#CC79A7", "Static": "#56B4E9"}  # fmt: skip
-PEER_COLORS = {"torch-diffsim": "#555555", "warp (CPU)": "#999999", "jax": "#BBBBBB"}
+PEER_COLORS = {"torch-diffsim": "#555555", "Warp (CPU)": "#999999", "JAX": "#BBBBBB"}
 MARKERS = {"SemiImplicit": "o", "VelocityVerlet": "s", "ImplicitEuler": "^", "ImplicitMidpoint": "D", "BDF2": "v",
            "Static": "P"}  # fmt: skip
 
@@ -44,8 +44,11 @@ def draw_chart(chart, path, peers: dict | None = None) -> None:
     axes.plot([p.seconds for p in front], [p.error for p in front], "k-", lw=1.3, zorder=1, label="Pareto front")
     for who, rows in (peers or {}).items():
         rows = sorted(rows)
-        color = PEER_COLORS.get(who, "#777777")
-        axes.plot(*zip(*rows), "*", ms=9, color=color, zorder=3, label=who)
+        best = [min(e for _, e in rows[: k + 1]) for k in range(len(rows))]
+        own = [row for k, row in enumerate(rows) if row[1] == best[k] and (k == 0 or row[1] < best[k - 1])]
+        if rows:
+            axes.plot(*zip(*rows), "*", ms=8, color=PEER_COLORS.get(who, "#777777"), zorder=3, label=who)
+            axes.plot(*zip(*own), "--", lw=1.2, color=PEER_COLORS.get(who, "#777777"), zorder=1, label=f"{who}'s front")
     per = "equilibrium" if chart.problem.static else "simulated second"
     axes.set(xscale="log", yscale="log", ylabel=chart.problem.error, xlabel=f"wall time per {per} [s]")
     axes.set_title(chart.problem.title, loc="left", fontsize=11)
@@ -62,7 +65,11 @@ def draw_chart(chart, path, peers: dict | None = None) -> None:
 
 def label_front(axes, front, most: int = 9) -> None:
     """Number some of the front's runs and say beside the diagram what they are."""
-    few = [front[round(k)] for k in np.linspace(0, len(front) - 1, min(most, len(front)))]
+    apart = front[:1]
+    for p in front[1:]:  # of runs that lie close together the first one is named
+        if abs(np.log(p.seconds / apart[-1].seconds)) + abs(np.log(p.error / apart[-1].error)) > 0.35:
+            apart.append(p)
+    few = [apart[round(k)] for k in np.linspace(0, len(apart) - 1, min(most, len(apart)))]
     for k, p in enumerate(few):
         axes.annotate(str(k + 1), (p.seconds, p.error), textcoords="offset points", xytext=(-3, -3), ha="right", va="top",
                       fontsize=8, fontweight="bold", zorder=4)  # fmt: skip
