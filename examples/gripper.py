@@ -13,6 +13,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 import diffsim_ti as ds
+from diffsim_ti.obstacles import box
 from diffsim_ti.picture import save_picture
 
 SIZE, WIDTH, DURATION, DT = 0.1, 0.01, 0.5, 2.5e-4  # [m], [m], [s], [s]
@@ -71,7 +72,11 @@ def main(picture_folder: str | None = None) -> dict:
     seconds = time.perf_counter() - start
     best = min(seen, key=lambda run: run["slip"])
     if picture_folder:
-        save_picture(Path(picture_folder) / "gripper.png", scene.mesh, best["frames"].positions[-1], ground=0.0)
+        pads = [box((s * (SIZE / 2 + 1.5 * WIDTH - q), SIZE / 2 + LIFT, 0), (WIDTH, SIZE, SIZE), (1, 0, 0, 0))
+                for s, q in zip((-1, 1), best["q"][:, -1])]  # fmt: skip
+        save_picture(Path(picture_folder) / "gripper.png", scene.mesh, best["frames"].positions[-1], ground=0.0,
+                     obstacles=pads, box=[[-0.1, 0, -0.05], [0.1, 0.17, 0.05]], wireframe=True,
+                     title="lifted by friction alone")  # fmt: skip
     print(f"slips by {100 * seen[0]['slip']:.3g} cm at first, {1000 * best['slip']:.2g} mm at last; squeezes [mm] "
           f"{(1000 * best['q']).round(1).tolist()}; {len(seen)} evaluations, {seconds:.1f} s; "
           f"{best['frames'].contact_resolution}")  # fmt: skip

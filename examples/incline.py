@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 import diffsim_ti as ds
+from diffsim_ti.obstacles import obstacle_surfaces
 from diffsim_ti.picture import save_picture
 
 SLOPE, G, DURATION = 0.5, 9.81, 2.5  # [-], [m/s^2], [s]
@@ -44,7 +45,9 @@ def main(picture_folder: str | None = None) -> dict:
         moved[friction] = float((frames.positions[-1] - frames.positions[0]).mean(0) @ down)
         print(f"friction {friction:.2f}: {moved[friction]:.5f} m in {DURATION} s; {frames.contact_resolution}")
     if picture_folder:
-        save_picture(Path(picture_folder) / "incline.png", scene.mesh, frames.positions[-1], ground=None)
+        save_picture(Path(picture_folder) / "incline.png", scene.mesh, frames.positions[-1], wireframe=True,
+                     obstacles=obstacle_surfaces(scene), box=[[-0.5, -0.3, -0.4], [0.5, 0.4, 0.4]],
+                     title="friction 0.50 holds on tan = 1/2")  # fmt: skip
     seconds = time.perf_counter() - start
     off = moved[0.49] / exact - 1
     print(f"Coulomb's law: {exact:.5f} m ({off:+.2%}) and 0 ({moved[0.50]:.1e} m of creep); {seconds:.1f} s")

@@ -3,15 +3,18 @@
     python examples/stack.py
 """
 
+from pathlib import Path
+
 import numpy as np
 
 import diffsim_ti as ds
+from diffsim_ti.picture import save_picture
 
 SIDE, GAP, COUNT = 0.1, 2e-3, 4  # [m]
 DT, SECONDS = 1e-3, 1.2  # [s]
 
 
-def main(count: int = COUNT, seconds: float = SECONDS) -> dict:
+def main(count: int = COUNT, seconds: float = SECONDS, picture_folder: str | None = None) -> dict:
     """Returns height, drift sideways, smallest gap and the gaps between blocks [m], and speed [m/s], at the end."""
     block = ds.TetrahedralMesh.create_box(4, SIDE, pattern="five").translated([-SIDE / 2, GAP, -SIDE / 2])
     turned = [block.rotated([0, 1, 0], 0.15 * k).translated([0, k * (SIDE + GAP), 0]) for k in range(count)]
@@ -31,6 +34,9 @@ def main(count: int = COUNT, seconds: float = SECONDS) -> dict:
     speed, gap = float(np.abs(v).max()), simulator.smallest_gap()
     print(f"{count} blocks, {x[:, 1].max():.3f} m high after {seconds:g} s: speed {speed:.1e} m/s, "
           f"drift {1e3 * drift:.3f} mm, smallest gap {1e3 * gap:.2f} mm")  # fmt: skip
+    if picture_folder:
+        save_picture(Path(picture_folder) / "stack.png", mesh, x, ground=0.0, wireframe=True,
+                     title=f"{count} soft blocks after {seconds:g} s")  # fmt: skip
     return {"height": float(x[:, 1].max()), "speed": speed, "drift": float(drift), "gap": gap, "between": between}
 
 
