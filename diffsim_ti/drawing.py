@@ -77,6 +77,10 @@ class Drawing:
         shapes = [(points, self.mesh.surface_triangles), *((p, s.triangles) for s, p in zip(self._around, placed))]
         return Soup.joined(soups), shapes
 
+    def backdrop(self, shapes) -> np.ndarray:
+        """What lies behind, with the shadows of `shapes` from `soup`: RGB in [0, 1], float32 (height, width, 3)."""
+        return self._backdrop.image(self.camera, shapes)
+
     def image(self, positions, values=None, title: str = "", obstacles=None) -> np.ndarray:
         """A picture, RGB uint8 (height, width, 3), of the body at `positions` [m], shape (num_vertices, 3).
 
@@ -85,7 +89,7 @@ class Drawing:
         Raises ValueError for shapes that do not fit and for numbers that are not finite.
         """
         soup, shapes = self.soup(positions, values, None, obstacles)
-        image = self._painter.paint(soup, self._backdrop.image(self.camera, shapes))
+        image = self._painter.paint(soup, self.backdrop(shapes))
         image = np.ascontiguousarray(np.clip(255 * image + 0.5, 0, 255).astype(np.uint8))
         if values is not None and self.colouring.label:
             if self._legend is None:

@@ -1,28 +1,85 @@
-"""A picture of an optimisation: how the loss fell, where the parameters went, and the body found over its target."""
+"""A picture of an optimisation: how the loss fell, where the parameters went, and the body found over its target.
+
+`OptimizationPicture` collects evaluations and writes at the end or while they are made; `optimization_figure` draws arrays.
+"""
+
+import os
+import time
+from pathlib import Path
 
 import numpy as np
 
-CURVE, START, FOUND, TARGET = "#1f5fa8", "#b8b8b8", "#6fa8dc", "#d1495b"
+CURVES = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00")  # Okabe and Ito's, told apart by all eyes
+START, FOUND, TARGET = "#b8b8b8", "#6fa8dc", "#d55e00"
+LEAST = 1e-300  # a loss of nothing is drawn below the axis
+
+
+class OptimizationPicture:
+    """Evaluations of an optimisation, as they come, and their picture.
+
+    mesh, target, truth, loss_label, plane, size: as in `optimization_figure`; path: where the picture goes.
+    every [s]: with a path, `add` writes the picture when the last was written so long ago (0: each time; None: only
+    `save` does). A picture takes some 0.3 s; it is replaced at one stroke, so a viewer that follows the file sees it whole.
+    """
+
+    def __init__(self, mesh, target, path=None, every: float | None = None, **look):
+        if every is not None and (path is None or not every >= 0):
+            raise ValueError(f"every: must be >= 0 [s] and go with a path, got {every} and path {path}; leave it out")
+        self.mesh, self.target, self.path, self.every, self.look = mesh, target, path and Path(path), every, look
+        self.losses, self.parameters, self.start, self.found = [], {}, None, None
+        self._written = time.perf_counter()
+
+    def add(self, loss: float, parameters: dict, positions) -> None:
+        """An evaluation: its loss, {name with unit: number or numbers}, and the body's positions [m], (num_vertices, 3)."""
+        if self.losses and set(parameters) != set(self.parameters):
+            raise ValueError(f"parameters: must be {sorted(self.parameters)} each time, got {sorted(parameters)}")
+        self.losses.append(float(loss))
+        for name, value in parameters.items():
+            self.parameters.setdefault(name, []).append(np.array(value, np.float64))
+        self.found = np.array(positions, np.float64)
+        self.start = self.found if self.start is None else self.start
+        if self.every is not None and time.perf_counter() - self._written >= self.every:
+            self.save()
+
+    def save(self, path=None) -> None:
+        """Write the picture to `path` or the one given at first."""
+        if path is None and self.path is None:
+            raise ValueError("path: must be given here or to OptimizationPicture, got none; pass where the picture goes")
+        path = Path(path or self.path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        draft = path.with_name(f".{os.getpid()}_{path.name}")
+        try:
+            save_optimization(draft, self.losses, self.parameters, self.mesh, self.found, self.target, self.start,
+                              **self.look)  # fmt: skip
+            os.replace(draft, path)
+        finally:
+            draft.unlink(missing_ok=True)
+        self._written = time.perf_counter()
+
+
+def save_optimization(path, *arguments, **options) -> None:
+    """Write `optimization_figure` of the arguments in the format of the suffix (PNG, SVG, PDF ...)."""
+    optimization_figure(*arguments, **options).savefig(path)
 
 
 def optimization_figure(losses, parameters: dict, mesh, found, target, start=None, truth: dict | None = None,
-                        loss_label: str = "loss", plane: str = "xy", size=(1200, 400)):  # fmt: skip
-    """A matplotlib figure of three panels; `size` in pixels.
+                        loss_label: str = "loss", plane: str = "xy", size=(960, 320)):  # fmt: skip
+    """A matplotlib figure: a panel for the loss, one for each parameter, one for the body; `size` in pixels.
 
-    losses: shape (n,), one per evaluation, drawn on a logarithmic axis.
-    parameters: {name with unit: values}, shapes (n,) or (n, k); each name gets a panel. truth: {name: the value to find}.
+    losses: shape (n,), one per evaluation, drawn on a logarithmic axis; a loss of nothing falls out of it below.
+    parameters: {name with unit: values}, shapes (n,) or (n, k). truth: {name: the value to find}, drawn dashed.
     mesh, found: the body and its positions at the end [m], shape (num_vertices, 3), seen along the axis that `plane` lacks;
         start: its positions at the first evaluation.
     target: the positions wanted [m]: of all vertices, drawn as edges, or some points, shape (m, 3), drawn as crosses.
-    Raises ValueError for shapes that do not fit and for numbers that are not finite, or losses not above zero.
+    Raises ValueError for shapes that do not fit, for numbers that are not finite, and for losses below zero.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     losses = _finite("losses", losses)
-    if losses.ndim != 1 or not losses.size or losses.min() <= 0:
-        raise ValueError(f"losses: must be a row of numbers > 0 for a logarithmic axis, got shape {losses.shape} with "
-                         f"least {losses.min(initial=np.inf):g}; leave out what is exact")  # fmt: skip
+    if losses.ndim != 1 or not losses.size or losses.min() < 0:
+        raise ValueError(f"losses: must be a row of numbers >= 0, got shape {losses.shape} with "
+                         f"least {losses.min(initial=np.inf):g}; add a constant to a loss that can be negative")  # fmt: skip
     if len(plane) != 2 or len(set(plane) & set("xyz")) != 2:
         raise ValueError(f"plane: must be two of x, y, z, got {plane!r}; 'xy' is the view from the front")
     unknown = set(truth or {}) - set(parameters)
@@ -35,8 +92,10 @@ def optimization_figure(losses, parameters: dict, mesh, found, target, start=Non
     FigureCanvasAgg(figure)
     panels = figure.subplots(1, count, width_ratios=[1] * (count - 1) + [1.3])
     evaluations = np.arange(1, len(losses) + 1)
-    panels[0].semilogy(evaluations, losses, "o-", color=CURVE, markersize=4)
-    panels[0].set(xlabel="evaluation", ylabel=loss_label)
+    panels[0].plot(evaluations, np.maximum(losses, LEAST), "o-", color=CURVES[0], markersize=4)
+    panels[0].set(xlabel="evaluation", ylabel=loss_label, yscale="log")
+    if losses.max() > 0:
+        panels[0].set_ylim(0.3 * losses[losses > 0].min(), 3 * losses.max())
     for panel, (name, values) in zip(panels[1:], parameters.items()):
         values = _finite(name, values)
         if values.ndim not in (1, 2) or len(values) != len(losses):
@@ -49,11 +108,6 @@ def optimization_figure(losses, parameters: dict, mesh, found, target, start=Non
     return figure
 
 
-def save_optimization(path, *arguments, **options) -> None:
-    """Write `optimization_figure` of the arguments in the format of the suffix (PNG, SVG, PDF ...)."""
-    optimization_figure(*arguments, **options).savefig(path)
-
-
 def _finite(name: str, values) -> np.ndarray:
     values = np.asarray(values, np.float64)
     if not np.all(np.isfinite(values)):
@@ -64,13 +118,13 @@ def _finite(name: str, values) -> np.ndarray:
 def _curves(panel, evaluations, values, name: str, truth) -> None:
     """Each column of the values over the evaluations, and dashed what they should become."""
     columns = values.reshape(len(values), -1)
-    styles = ("o-", "s-", "^-", "d-")
+    names = [f"component {k + 1}" for k in range(columns.shape[1])] if columns.shape[1] > 1 else ["found"]
+    goals = None if truth is None else np.broadcast_to(np.ravel(truth), columns.shape[1])
     for k, column in enumerate(columns.T):
-        label = f"component {k + 1}" if columns.shape[1] > 1 else "found"
-        panel.plot(evaluations, column, styles[k % len(styles)], color=CURVE, markersize=4, label=label)
-    if truth is not None:
-        for k, value in enumerate(np.ravel(truth)):
-            panel.axhline(value, color=TARGET, linestyle="--", label=None if k else "truth")
+        colour = CURVES[k % len(CURVES)]
+        panel.plot(evaluations, column, "o-", color=colour, markersize=4, label=names[k] if k < 6 else None)
+        if goals is not None:
+            panel.axhline(goals[k], color=colour, linestyle="--", label=None if k else "truth")
     if truth is not None or columns.shape[1] > 1:
         panel.legend(frameon=False, fontsize="small")
     panel.set(xlabel="evaluation", ylabel=name)
@@ -94,7 +148,9 @@ def _overlay(panel, mesh, shown, target, plane: str) -> None:
         edges = target[np.unique(np.sort(pairs, 1), axis=0)][..., axes]
         panel.add_collection(LineCollection(edges, color=TARGET, linewidth=0.7, label="target"))
     else:
-        panel.plot(*target[:, axes].T, "x", color=TARGET, markersize=6, label="target")
+        large = len(target) <= 30
+        panel.plot(*target[:, axes].T, "x" if large else ".", color=TARGET, markersize=8 if large else 2, markeredgewidth=2,
+                   label="target")  # fmt: skip
     panel.set(xlabel=f"{plane[0]} [m]", ylabel=f"{plane[1]} [m]")
     panel.autoscale_view()
     panel.margins(0.08)

@@ -1,53 +1,92 @@
-"""One picture of each example that can save one, as assets/pictures/gallery_<example>.png: those of the README.
+"""The pictures and films of the examples, as assets/pictures/gallery_<example>.png or .gif: those of the README.
 
-Examples run in their small form where the full one takes long, each in its own process, as Taichi's settings are global.
+Each example runs by the command that its table shows, in a process and a folder of its own; pictures are then made small
+enough for a repository. `--list` prints the commands.
 
-    python examples/gallery.py [--only NAME] [--folder assets/pictures]
+    python examples/gallery.py [--only NAME] [--folder assets/pictures] [--list]
 """
 
 import argparse
+import os
 import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
 
-from PIL import Image
+from PIL import Image, ImageSequence
 
 HERE = Path(__file__).resolve().parent
 PICTURES = HERE.parent / "assets" / "pictures"
-WIDTH = 720  # [pixels], at most
-# {example: arguments of its main, as Python; `folder` is where its picture goes}
+WIDTH, FILM_WIDTH, COLOURS = 600, 400, 96  # [pixels], at most; of a film's palette
+# {example: (its arguments, the file it writes)}
 EXAMPLES = {
-    "identify_beam": "folder",
-    "throw_at_target": "folder",
-    "inverse_rest_shape": "folder",
-    "sag_into_shape": "folder, quick=True",
-    "least_compliance": "folder, quick=True",
-    "cantilever": "quick=True, picture_folder=folder",
-    "stack": "picture_folder=folder",
-    "incline": "folder",
-    "gripper": "folder",
-    "wall_shot": "folder",
+    "bowl": ("--cells 4 --frames 60 --film output/bowl.gif", "bowl.gif"),
+    "gripper": ("output", "gripper.gif"),
+    "train_controller": ("", "train_controller.gif"),
+    "wall_shot": ("output", "wall_shot.png"),
+    "incline": ("output", "incline.png"),
+    "stack": ("output", "stack.png"),
+    "least_compliance": ("output", "least_compliance.png"),
+    "sag_into_shape": ("output", "sag_into_shape.png"),
+    "inverse_rest_shape": ("output", "inverse_rest_shape.png"),
+    "stiffness_field": ("", "stiffness_field.png"),
+    "learned_material": ("", "learned_material.png"),
+    "cantilever": ("--quick output", "cantilever.png"),
+    "cooks_membrane": ("--quick output", "cooks_membrane.png"),
+    "throw_at_target": ("output", "throw_at_target.png"),
+    "identify_beam": ("output", "identify_beam.png"),
+    "identify_torch": ("", "identify_both.png"),
+    "stiffness_from_picture": ("output", "stiffness_from_picture.png"),
 }
-RUN = "import diffsim_ti as ds, {name} as example; folder = {folder!r}; ds.init(precision='f64'); example.main({arguments})"
+
+
+def command(name: str) -> str:
+    """What makes an example's picture, in the folder output."""
+    return f"python examples/{name}.py {EXAMPLES[name][0]}".strip()
 
 
 def make(name: str, folder: Path) -> Path:
-    """Run an example and keep its picture, no wider than WIDTH, in 256 colours; RuntimeError if there is none."""
+    """Run an example and keep its picture, made small; RuntimeError with what it said if there is none."""
+    arguments, made = EXAMPLES[name]
     with tempfile.TemporaryDirectory() as temporary:
-        code = RUN.format(name=name, folder=temporary, arguments=EXAMPLES[name])
-        search = f"import sys; sys.path[:0] = [{str(HERE)!r}, {str(HERE.parent)!r}]; "
-        done = subprocess.run([sys.executable, "-c", search + code], capture_output=True, text=True)
-        made = Path(temporary) / f"{name}.png"
+        (Path(temporary) / "output").mkdir()
+        paths = os.pathsep.join([str(HERE.parent), os.environ.get("PYTHONPATH", "")])
+        done = subprocess.run([sys.executable, HERE / f"{name}.py", *arguments.split()], cwd=temporary, capture_output=True,
+                              text=True, env=os.environ | {"PYTHONPATH": paths})  # fmt: skip
+        made = Path(temporary) / "output" / made
         if done.returncode or not made.exists():
             raise RuntimeError(f"{name}: saved no picture (exit status {done.returncode})\n{done.stderr[-2000:]}")
-        image = Image.open(made).convert("RGB")
-        if image.width > WIDTH:
-            image = image.resize((WIDTH, round(image.height * WIDTH / image.width)), Image.Resampling.LANCZOS)
-        out = folder / f"gallery_{name}.png"
-        image.quantize(256, dither=Image.Dither.NONE).save(out, optimize=True)
+        out = folder / f"gallery_{name}{made.suffix}"
+        (shrink_film if made.suffix == ".gif" else shrink_picture)(made, out)
     return out
+
+
+def shrunk(image: Image.Image, width: int) -> Image.Image:
+    """No wider than `width`."""
+    if image.width <= width:
+        return image
+    return image.resize((width, round(image.height * width / image.width)), Image.Resampling.LANCZOS)
+
+
+def shrink_picture(source: Path, target: Path) -> None:
+    """A PNG in 256 colours."""
+    image = shrunk(Image.open(source).convert("RGB"), WIDTH)
+    image.quantize(256, dither=Image.Dither.NONE).save(target, optimize=True)
+
+
+def shrink_film(source: Path, target: Path) -> None:
+    """A GIF whose frames share their colours, not dithered, so that what stands still costs nothing."""
+    with Image.open(source) as film:
+        duration = film.info["duration"]
+        frames = [shrunk(frame.convert("RGB"), FILM_WIDTH) for frame in ImageSequence.Iterator(film)]
+    shown = [frames[k * (len(frames) - 1) // 3] for k in range(4)]
+    sheet = Image.new("RGB", (shown[0].width, 4 * shown[0].height))
+    for k, frame in enumerate(shown):
+        sheet.paste(frame, (0, k * frame.height))
+    palette = sheet.quantize(COLOURS, method=Image.Quantize.MAXCOVERAGE)
+    first, *rest = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
+    first.save(target, save_all=True, append_images=rest, duration=duration, loop=0, optimize=True)
 
 
 def main(only: str | None = None, folder=PICTURES) -> dict:
@@ -68,5 +107,9 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--only", metavar="NAME", help="make this one: " + ", ".join(EXAMPLES))
     parser.add_argument("--folder", default=PICTURES, help="where pictures go")
+    parser.add_argument("--list", action="store_true", help="print the commands that make them")
     options = parser.parse_args()
-    main(options.only, options.folder)
+    if options.list:
+        print("\n".join(map(command, EXAMPLES)))
+    else:
+        main(options.only, options.folder)

@@ -3,7 +3,7 @@
 The parameter is log E, which keeps E positive and makes a factor of ten as far up as down; L-BFGS takes the exact gradient.
 Density must be known: motion under gravity alone tells E / rho and nothing more.
 
-    python examples/identify_beam.py [folder for a picture]
+    python examples/identify_beam.py [folder for a picture, which is written while the optimisation runs]
 """
 
 import sys
@@ -14,11 +14,12 @@ import numpy as np
 from scipy.optimize import minimize
 
 import diffsim_ti as ds
-from diffsim_ti.optimization_picture import save_optimization
+from diffsim_ti.optimization_picture import OptimizationPicture
 
 TRUE_E, GUESS = 1.0e6, 3.0e5  # [Pa]
 RANGE = 1.0e5, 2.5e6  # [Pa]; the step is stable up to there
 NOISE = 1e-4  # [m]
+NAME = "Young's modulus [Pa]"
 
 
 def observed_motion(rollout: ds.Rollout, watched: np.ndarray) -> np.ndarray:
@@ -38,7 +39,10 @@ def main(picture_folder: str | None = None) -> dict:
     rollout = ds.Rollout(ds.VelocityVerletSolver(scene, dt=1e-3), 300, save_every=10, gradients=["youngs_modulus"])
     tip = mesh.vertex_sets["xmax"]
     observed = observed_motion(rollout, tip)
-    seen = []
+    picture = OptimizationPicture(
+        mesh, observed[-1], picture_folder and Path(picture_folder) / "identify_beam.png", 0.0 if picture_folder else None,
+        truth={NAME: TRUE_E}, loss_label="loss [mm²]",
+    )  # fmt: skip
 
     def loss_and_gradient(log_E):
         E = float(np.exp(log_E[0]))
@@ -46,8 +50,8 @@ def main(picture_folder: str | None = None) -> dict:
         residual = 1e3 * (frames.positions[:, tip] - observed)  # [mm]
         adjoint = np.zeros(frames.positions.shape)
         adjoint[:, tip] = 2e3 * residual / residual.size
-        seen.append(((residual**2).mean(), E, frames.positions[-1]))
-        return seen[-1][0], np.array([E * rollout.vjp(frames, adjoint)["youngs_modulus"]])
+        picture.add((residual**2).mean(), {NAME: E}, frames.positions[-1])
+        return picture.losses[-1], np.array([E * rollout.vjp(frames, adjoint)["youngs_modulus"]])
 
     start = time.perf_counter()
     found = minimize(
@@ -59,11 +63,6 @@ def main(picture_folder: str | None = None) -> dict:
     residual = float(np.sqrt(found.fun))
     print(f"E = {E:.6g} Pa, {100 * error:.2g} % off, from {GUESS:.3g} Pa in {found.nit} iterations "
           f"({found.nfev} gradients), {seconds:.1f} s; residual {residual:.3g} mm")  # fmt: skip
-    if picture_folder:
-        losses, moduli, places = zip(*seen)
-        name = "Young's modulus [Pa]"
-        save_optimization(Path(picture_folder) / "identify_beam.png", losses, {name: moduli}, mesh, places[-1],
-                          observed[-1], start=places[0], truth={name: TRUE_E}, loss_label="loss [mm²]")  # fmt: skip
     return {"youngs_modulus": E, "error": error, "evaluations": found.nfev, "residual_mm": residual, "seconds": seconds}
 
 

@@ -1,8 +1,9 @@
 """A stack of soft blocks that stands: each rests on the barrier of the one below.
 
-    python examples/stack.py
+    python examples/stack.py [folder for a picture]
 """
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -35,11 +36,12 @@ def main(count: int = COUNT, seconds: float = SECONDS, picture_folder: str | Non
     print(f"{count} blocks, {x[:, 1].max():.3f} m high after {seconds:g} s: speed {speed:.1e} m/s, "
           f"drift {1e3 * drift:.3f} mm, smallest gap {1e3 * gap:.2f} mm")  # fmt: skip
     if picture_folder:
-        save_picture(Path(picture_folder) / "stack.png", mesh, x, ground=0.0, wireframe=True,
+        body = np.repeat(np.arange(count), mesh.num_vertices // count)
+        save_picture(Path(picture_folder) / "stack.png", mesh, x, body, ground=0.0, wireframe=True, azimuth=40, elevation=22,
                      title=f"{count} soft blocks after {seconds:g} s")  # fmt: skip
     return {"height": float(x[:, 1].max()), "speed": speed, "drift": float(drift), "gap": gap, "between": between}
 
 
 if __name__ == "__main__":
     ds.init(precision="f64")
-    main()
+    main(picture_folder=sys.argv[1] if len(sys.argv) > 1 else None)

@@ -14,7 +14,7 @@ import numpy as np
 import taichi as ti
 
 import diffsim_ti as ds
-from diffsim_ti.optimization_picture import save_optimization
+from diffsim_ti.optimization_picture import OptimizationPicture
 
 DURATION, DT = 0.6, 2e-3  # [s]
 TARGET = (2.0, 1.2, -0.5)  # [m]
@@ -53,7 +53,8 @@ def main(picture_folder: str | None = None) -> dict:
     velocity[None] = [1.0, 1.0, 0.0]
 
     start = time.perf_counter()
-    v, last, seen = velocity.to_numpy(), None, []
+    v, last = velocity.to_numpy(), None
+    picture = OptimizationPicture(mesh, np.array([TARGET]), loss_label="loss [m²]")
     for iteration in range(1, 31):
         centre[None] = [0.0, 0.0, 0.0]
         with ti.ad.Tape(loss):
@@ -62,7 +63,7 @@ def main(picture_folder: str | None = None) -> dict:
             find_centre(rollout.positions, 1, centre)
             measure(centre, target, loss)
         miss = loss[None] ** 0.5
-        seen.append((loss[None], v, rollout.positions.to_numpy()[1]))
+        picture.add(loss[None], {"velocity [m/s]": v}, rollout.positions.to_numpy()[1])
         print(f"iteration {iteration}: misses by {miss:.3g} m")
         if miss < TOLERANCE:
             break
@@ -75,9 +76,7 @@ def main(picture_folder: str | None = None) -> dict:
     seconds = time.perf_counter() - start
 
     if picture_folder:
-        losses, velocities, places = zip(*seen)
-        save_optimization(Path(picture_folder) / "throw_at_target.png", losses, {"velocity [m/s]": velocities}, mesh,
-                          places[-1], np.array([TARGET]), start=places[0], loss_label="loss [m²]")  # fmt: skip
+        picture.save(Path(picture_folder) / "throw_at_target.png")
     print(f"throw with {v.round(4)} m/s: off by {miss:.1e} m after {iteration} iterations, {seconds:.1f} s")
     return {"miss": miss, "velocity": v, "iterations": iteration, "seconds": seconds}
 
