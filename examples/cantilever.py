@@ -79,7 +79,8 @@ def save_bent(path, numbers=(0.0, 1.0, 2.0, 5.0), cells: int = 3) -> None:
         places.append(frames.positions[-1])
         drops.append(-frames.displacements[-1][:, 1])
     bars = ds.TetrahedralMesh.joined([scene.mesh] * len(numbers))
-    save_picture(path, bars, np.concatenate(places), np.concatenate(drops), "deflection [m]", azimuth=20, elevation=8, box=[[0, -0.75, 0], [1.2, 0.1, 0.1]],
+    save_picture(path, bars, np.concatenate(places), np.concatenate(drops), "deflection [m]",
+                 azimuth=20, elevation=8, box=[[0, -0.75, 0], [1.2, 0.1, 0.1]],
                  title="loads P L²/(E I) = " + ", ".join(f"{number:g}" for number in numbers))  # fmt: skip
 
 
