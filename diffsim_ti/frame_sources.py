@@ -100,7 +100,7 @@ class LiveFrames:
         return self._frames[k]
 
     def colouring(self, name: str) -> Colouring:
-        """Colours whose limits span all frames so far."""
+        """Colours whose limits span all frames so far, with some room."""
         kind = field_named(name)
         return Colouring(kind.label, kind.limits(*self._limits[name]), kind.colours)
 
@@ -141,7 +141,10 @@ class LiveFrames:
             shown = to_vertices(self.mesh, values)[self.mesh.surface_vertices]
             low, high = np.percentile(shown, [0.5, 99.5])
             least, most = self._limits.get(name, (low, high))
-            self._limits[name] = min(low, least), max(high, most)
+            if low < least or high > most:  # seldom, so that colours do not flicker
+                room = 0.3 * (max(high, most) - min(low, least))
+                least, most = (low - room if low < least else least), (high + room if high > most else most)
+            self._limits[name] = least, most
         notes = [f"energy {energy:.4g} J", *(f"  {name} {part:.4g} J" for name, part in energy.parts.items())]
         notes.append(f"smallest J {measured.J.min():.3g}")
         if np.isfinite(seen.gap):

@@ -59,10 +59,17 @@ class Viewer:
         if self.held is not None:
             ends = np.stack([frame.positions[self.held], self._under_cursor()])
             soup = Soup.joined([soup, marks(ends, drawing.camera, self.size, 0.008 * self.size[1], 0.5 * self._depth)])
-        self._small.camera = drawing.camera
-        self._canvas.draw(soup, self._small.backdrop(shapes), self.size)
+        self._canvas.draw(soup, self._behind(shapes, values is not None), self.size)
         self._panel(frame)
         self.window.show()
+
+    def _behind(self, shapes, coloured: bool) -> np.ndarray:
+        """The floor with its shadows, and the legend."""
+        self._small.camera, self._small.colouring = self.drawing.camera, self.drawing.colouring
+        image = np.array(self._small.backdrop(shapes))
+        if coloured:
+            self._small.add_legend(image)
+        return image
 
     # ---- input ------------------------------------------------------------------------------------------------------
 
