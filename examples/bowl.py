@@ -79,8 +79,8 @@ def main(count: int = 20, cells: int = 10, frames: int = 40, film: str | None = 
     simulator.check_surfaces()
     if film:
         colours = np.tile(np.repeat(np.arange(count), mesh.num_vertices // count), (len(places), 1))
-        save_film(film, mesh, places, colours, 12.5, obstacles=[[bowl(np.zeros(3), RADIUS)]] * len(places), elevation=35,
-                  box=[[-0.4, -0.45, -0.4], [0.4, 0.0, 0.4]],
+        save_film(film, mesh, places, colours, 12.5, (400, 300), elevation=35,
+                  obstacles=[[bowl(np.zeros(3), RADIUS)]] * len(places), box=[[-0.4, -0.45, -0.4], [0.4, 0.0, 0.4]],
                   title=lambda k: f"{count} soft blocks, t = {2 * FRAME * k:.2f} s")  # fmt: skip
     costs, late = np.sum(costs, 0), np.sum(costs[3 * frames // 4 :], 0)
     out = {"gap": gap, "radius": float(np.linalg.norm(simulator.positions, axis=1).max()),

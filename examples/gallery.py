@@ -18,7 +18,7 @@ from PIL import Image, ImageSequence
 
 HERE = Path(__file__).resolve().parent
 PICTURES = HERE.parent / "assets" / "pictures"
-WIDTH, FILM_WIDTH, COLOURS = 600, 400, 96  # [pixels], at most; of a film's palette
+WIDTH, FILM_WIDTH, COLOURS = 600, 400, 128  # [pixels], at most; of a film's palette
 # {example: (its arguments, the file it writes)}
 EXAMPLES = {
     "bowl": ("--cells 4 --frames 60 --film output/bowl.gif", "bowl.gif"),
@@ -84,7 +84,10 @@ def shrink_film(source: Path, target: Path) -> None:
     sheet = Image.new("RGB", (shown[0].width, 4 * shown[0].height))
     for k, frame in enumerate(shown):
         sheet.paste(frame, (0, k * frame.height))
-    palette = sheet.quantize(COLOURS, method=Image.Quantize.MAXCOVERAGE)
+    # half for what covers most of the picture, half for what differs most
+    halves = [sheet.quantize(COLOURS // 2, method=m) for m in (Image.Quantize.MEDIANCUT, Image.Quantize.MAXCOVERAGE)]
+    palette = Image.new("P", (1, 1))
+    palette.putpalette(sum((half.getpalette()[: 3 * (COLOURS // 2)] for half in halves), []))
     first, *rest = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     first.save(target, save_all=True, append_images=rest, duration=duration, loop=0, optimize=True)
 

@@ -40,8 +40,8 @@ def save_lift(path, scene: ds.Scene, paths: dict, times) -> None:
     frames = ds.Rollout(ds.SemiImplicitSolver(scene, dt=DT), len(times) - 1, every, gradients=[]).forward(**paths)
     places = [(side * (SIZE / 2 + 1.5 * WIDTH), SIZE / 2, 0) + path[::every] for side, path in zip((-1, 1), paths.values())]
     pads = [[box(place, (WIDTH, SIZE, SIZE), (1, 0, 0, 0)) for place in pair] for pair in zip(*places)]
-    save_film(path, scene.mesh, frames.positions, fps=8.0, obstacles=pads, ground=0.0, wireframe=True, elevation=18,
-              box=[[-0.1, 0, -0.05], [0.1, 0.16, 0.05]],
+    save_film(path, scene.mesh, frames.positions, fps=8.0, size=(400, 300), obstacles=pads, ground=0.0, wireframe=True,
+              elevation=18, box=[[-0.1, 0, -0.05], [0.1, 0.16, 0.05]],
               title=lambda k: f"lifted by friction alone, t = {shown[k]:.2f} s")  # fmt: skip
 
 

@@ -73,15 +73,15 @@ def save_reaches(path, arm: Arm, controller, targets) -> None:
     for target in targets:
         with torch.no_grad():
             arm.reach(controller, target)
-        for positions, activation in arm.seen:
+        for positions, activation in arm.seen[::2]:
             places.append(positions)
             pull = np.zeros(arm.mesh.num_vertices)
             pull[arm.tendons.numpy()] = STRONGEST * activation[:, None]
             pulls.append(pull)
             marks.append([ball((target[0], 1.06 * HEIGHT, target[1]), 0.012)])
-    save_film(path, arm.mesh, places, pulls, 12.5, obstacles=marks, ground=0.0, label="tension [N]",
+    save_film(path, arm.mesh, places, pulls, 8.0, (400, 300), obstacles=marks, ground=0.0, label="tension [N]",
               box=[[-0.13, 0.0, -0.13], [0.13, 0.56, 0.13]], elevation=25, wireframe=True, fixed="ymin",
-              title=lambda k: f"targets it was not trained on, t = {0.02 * (k % STEPS + 1):.2f} s")  # fmt: skip
+              title=lambda k: f"targets it was not trained on, t = {0.04 * (k % (STEPS // 2 + 1)):.2f} s")  # fmt: skip
 
 
 def main(folder="output", iterations: int = 60, seed: int = 0) -> dict:
