@@ -23,6 +23,7 @@ from diffsim_ti.cli_options import (
     Up,
     UpAxis,
     Youngs,
+    fall_scene,
     fixed_vertices,
     load_body,
     make_ground,
@@ -107,8 +108,6 @@ def simulate(
     from diffsim_ti import runtime
     from diffsim_ti.forward import ForwardRun, run_and_write
     from diffsim_ti.picture import save_picture
-    from diffsim_ti.scene import Scene
-    from diffsim_ti.terms import Drag, Gravity
 
     begin = time.perf_counter()
     for name, value in (("duration", duration), ("fps", fps), ("density", density)):
@@ -118,15 +117,8 @@ def simulate(
     law = make_material(material, youngs_modulus, poissons_ratio)
     body = load_body(mesh, size, up, fix_orientation)
     runtime.init(backend, precision, threads)
-    terms = [Gravity(gravity)] if gravity else []
-    if drag:
-        terms.append(Drag(drag))
-    if ground:
-        low, height = body.bounding_box[0, 1], 0.1 * np.ptp(body.bounding_box, 0).max() if height is None else height
-        body = body.translated([0, height - low, 0])
-        speed = np.sqrt(min(velocity[1], 0) ** 2 + 2 * abs(gravity) * max(height, 0))
-        terms.append(make_ground(body, law, density, gravity, speed, ground_stiffness, ground_width))
-    scene = Scene(body, law, density, terms, fixed_vertices(body, fixed or []), initial_velocities=velocity)
+    scene, body = fall_scene(body, law, density, gravity, drag, velocity, fixed, ground, height, ground_stiffness,
+                             ground_width)  # fmt: skip
     frames = max(1, round(duration * fps))
     run = ForwardRun(scene, kind, duration / frames, dt)
     setup = time.perf_counter() - begin

@@ -119,6 +119,26 @@ def make_ground(mesh, material, density: float, gravity: float, speed: float, st
     return Ground(0.0, stiffness, width)
 
 
+def fall_scene(body, law, density: float, gravity: float = -9.81, drag: float = 0.0, velocity=(0.0, 0.0, 0.0), fixed=(),
+               floor: bool = True, height: float | None = None, stiffness: float | None = None, width: float | None = None,
+               extra=()):  # fmt: skip
+    """(scene, body): a body let go above the floor y = 0, its lowest point at `height` [m], default a tenth of its size.
+
+    fixed: as `fixed_vertices` takes them; stiffness, width: the floor's barrier, see `make_ground`; extra: more terms.
+    """
+    from diffsim_ti.scene import Scene
+    from diffsim_ti.terms import Drag, Gravity
+
+    terms = ([Gravity(gravity)] if gravity else []) + ([Drag(drag)] if drag else [])
+    if floor:
+        low, height = body.bounding_box[0, 1], 0.1 * np.ptp(body.bounding_box, 0).max() if height is None else height
+        body = body.translated([0, height - low, 0])
+        speed = np.sqrt(min(velocity[1], 0) ** 2 + 2 * abs(gravity) * max(height, 0))
+        terms.append(make_ground(body, law, density, gravity, speed, stiffness, width))
+    fixed = fixed_vertices(body, list(fixed or []))
+    return Scene(body, law, density, terms + list(extra), fixed, initial_velocities=velocity), body
+
+
 # ---- what is said at the end ------------------------------------------------------------------------------------------
 
 

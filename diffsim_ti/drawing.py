@@ -47,7 +47,7 @@ class Drawing:
         self.obstacles, self._around = tuple(obstacles), [Surface(*shape) for shape in obstacles]
         self._surface = Surface(mesh.vertices, mesh.surface_triangles)
         self._backdrop = Backdrop(self.size, ground, self.box)
-        self._painter, self._legend, self._asked = painter(backend, self.size), None, backend
+        self._painter, self._legend, self._asked = painter(backend, self.size), (None, None), backend
 
     def describe(self) -> str:
         """Which back end draws, in a line."""
@@ -77,6 +77,10 @@ class Drawing:
         shapes = [(points, self.mesh.surface_triangles), *((p, s.triangles) for s, p in zip(self._around, placed))]
         return Soup.joined(soups), shapes
 
+    def backdrop(self, shapes) -> np.ndarray:
+        """What lies behind, with the shadows of `shapes` from `soup`: RGB in [0, 1], float32 (height, width, 3)."""
+        return self._backdrop.image(self.camera, shapes)
+
     def image(self, positions, values=None, title: str = "", obstacles=None) -> np.ndarray:
         """A picture, RGB uint8 (height, width, 3), of the body at `positions` [m], shape (num_vertices, 3).
 
@@ -85,14 +89,21 @@ class Drawing:
         Raises ValueError for shapes that do not fit and for numbers that are not finite.
         """
         soup, shapes = self.soup(positions, values, None, obstacles)
-        image = self._painter.paint(soup, self._backdrop.image(self.camera, shapes))
+        image = self._painter.paint(soup, self.backdrop(shapes))
         image = np.ascontiguousarray(np.clip(255 * image + 0.5, 0, 255).astype(np.uint8))
-        if values is not None and self.colouring.label:
-            if self._legend is None:
-                self._legend = legend(self.colouring, self.size)
-            (rows, columns), colour, cover = self._legend
-            image[rows, columns] = colour + image[rows, columns] * (1 - cover)
+        if values is not None:
+            self.add_legend(image)
         return write_text(image, title) if title else image
+
+    def add_legend(self, image: np.ndarray) -> None:
+        """Draw the colouring's bar into a picture, uint8 or in [0, 1]; nothing if it has no label."""
+        if not self.colouring.label:
+            return
+        if self._legend[0] != self.colouring:
+            self._legend = self.colouring, legend(self.colouring, self.size)
+        (rows, columns), colour, cover = self._legend[1]
+        full = 1 if image.dtype == np.uint8 else 255
+        image[rows, columns] = colour / full + image[rows, columns] * (1 - cover)
 
     def close(self) -> None:
         """Give back the back end's window."""

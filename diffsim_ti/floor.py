@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from diffsim_ti.rasteriser import covered_pixels
+from diffsim_ti.rasteriser import covered
 from diffsim_ti.surface import LIGHT
 
 SKY, HORIZON, FLOOR, LINE = (np.array(c) for c in ([0.99] * 3, [0.93, 0.945, 0.96], [0.965] * 3, [0.80, 0.82, 0.85]))
@@ -31,9 +31,14 @@ class Backdrop:
         hit, at, fade = self._below
         dark = np.zeros(hit.shape, np.float32)
         dark[hit] = fade * self._shadow(shapes, at)
-        height, width = self._image.shape[:2]
-        dark = zoom(dark, COARSE, order=1, grid_mode=True, mode="nearest")[:height, :width]
-        return self._image * (1 - dark[..., None])
+        image, (rows, columns) = self._image.copy(), np.nonzero(dark > 1e-3)
+        if len(rows):  # the rest is not touched
+            top, left = max(rows.min() - 1, 0), max(columns.min() - 1, 0)
+            bottom, right = rows.max() + 2, columns.max() + 2
+            part = image[COARSE * top : COARSE * bottom, COARSE * left : COARSE * right]
+            fine = zoom(dark[top:bottom, left:right], COARSE, order=1, grid_mode=True, mode="nearest")
+            part *= 1 - fine[: part.shape[0], : part.shape[1], None]
+        return image
 
     def _floor_points(self, camera, stride: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Which picture points (every stride-th) see the floor, where (k, 2) [m], and how clearly (k,)."""
@@ -73,11 +78,9 @@ class Backdrop:
             return np.zeros(len(at))
         flat = corners[..., [0, 2]] - (corners[..., 1:2] - self.ground) * LIGHT[[0, 2]] / LIGHT[1]
         low, high = flat.min((0, 1)), flat.max((0, 1))
-        margin, cells = 0.12 * (high - low).max(), 384
+        margin, cells = 0.12 * (high - low).max(), 256
         scale = cells / ((high - low).max() + 2 * margin)
-        mask = np.zeros(cells * cells, np.float32)
-        mask[covered_pixels((flat - low + margin) * scale, (cells, cells))[1]] = 1
-        soft = gaussian_filter(mask.reshape(cells, cells), 4.5)
+        soft = gaussian_filter(covered((flat - low + margin) * scale, (cells, cells)).astype(np.float32), 3.0)
         column, row = ((at - low + margin) * scale).T - 0.5
         return 0.38 * map_coordinates(soft, [row, column], order=1, cval=0.0)
 

@@ -35,6 +35,9 @@ class ForwardRun:
     energy is run again from its start with twice the substeps, and that is counted. With an implicit solver a frame has 4
     parts, whose steps are halved only where one does not converge or gains energy. With dt nothing is chosen and nothing
     repeated: what goes wrong is an error.
+
+    driven: whether something outside may add energy, which is then no sign of a bad step. before_part: called before each
+    part, for instance to change forces.
     """
 
     share, parts, attempts = 0.8, 16, 8  # of the stable step; per frame; per part
@@ -48,6 +51,7 @@ class ForwardRun:
         from diffsim_ti.terms import Gravity, Obstacle
 
         self.scene, self.seen, self.adapts = scene, Seen(), dt is None
+        self.driven, self.before_part = scene.motion is not None or bool(scene.moving), None
         self.obstacles = tuple(t for t in scene.terms if isinstance(t, Obstacle))
         gravity = scene.term(Gravity)
         self._pull = float(np.linalg.norm(gravity.values["gravity"])) if gravity else 0.0
@@ -77,11 +81,18 @@ class ForwardRun:
         self._lowest, self._squeezed = self._energy, False
         self.energies, self.largest_energy = [self._energy], self._moving(self._energy)
 
+    def balance_anew(self) -> None:
+        """Measure the rise and drift of energy from the present state on, which something outside has changed."""
+        self._energy = self._lowest = self.simulator.compute_energy()
+        self.largest_energy = max(self.largest_energy, self._moving(self._energy))
+
     def advance(self) -> None:
         """One frame. Raises FloatingPointError if no number of substeps tried keeps it stable."""
         begin = time.perf_counter()
         self.seen.substeps.append(0)
         for part in range(self.parts):
+            if self.before_part is not None:
+                self.before_part()
             if self.adapts:
                 self._advance_part(last=part == self.parts - 1)
             else:
@@ -143,8 +154,7 @@ class ForwardRun:
         energy, h = self.simulator.compute_energy(), self.simulator.solver.substep
         rise, scale = energy - self._energy, max(self.largest_energy, self._moving(energy))
         drifted = energy - self._lowest > self.largest_drift * scale
-        driven = self.scene.motion is not None or self.scene.moving
-        if not driven and not rise <= (self.later_rise if drifted else self.largest_rise) * scale:
+        if not self.driven and not rise <= (self.later_rise if drifted else self.largest_rise) * scale:
             return f"the energy rose by {rise:.3g} J"
         if not look_up:
             return None
@@ -183,7 +193,7 @@ def run_and_write(run: ForwardRun, frames: int, folder: Path, name: str, keep=()
     from diffsim_ti.cli_options import progress
 
     sim, kept, writing = run.simulator, [], 0.0
-    series = Series(folder, run.scene.mesh, name)
+    series = Series(folder, run.scene.mesh, name, run.scene)
     with progress("simulating", frames) as show:
         for k in range(frames + 1):
             try:

@@ -21,12 +21,12 @@ def legend(colouring, size) -> tuple:
     bar = figure.colorbar(ScalarMappable(Normalize(*colouring.limits), colouring.map),
                           cax=figure.add_axes((0.925, 0.25, 0.02, 0.5)))  # fmt: skip
     bar.outline.set_visible(False)
-    small = max(11 * scale, 7)
+    small = max(16 * scale, 7)
     bar.ax.tick_params(labelsize=small, color=INK, labelcolor=INK, length=4 * scale)
     bar.ax.yaxis.set_ticks_position("left")
     bar.ax.yaxis.get_offset_text().set_fontsize(small)
     bar.formatter.set_powerlimits((-3, 4))
-    figure.text(0.965, 0.795, colouring.label, ha="right", color=INK, fontsize=max(13 * scale, 8))
+    figure.text(0.965, 0.795, colouring.label, ha="right", color=INK, fontsize=max(18 * scale, 8))
     canvas.draw()
     rgba = np.asarray(canvas.buffer_rgba()).astype(np.float64)
     rows, columns = np.nonzero(rgba[..., 3])
@@ -49,5 +49,5 @@ def write_text(image: np.ndarray, text: str) -> np.ndarray:
 
     out = Image.fromarray(image)
     margin = 0.025 * image.shape[1]
-    ImageDraw.Draw(out).text((margin, margin), text, INK, _font(max(11, round(0.02 * image.shape[0]))))
+    ImageDraw.Draw(out).text((margin, margin), text, INK, _font(max(11, round(0.03 * image.shape[0]))))
     return np.array(out)

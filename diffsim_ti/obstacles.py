@@ -19,8 +19,8 @@ def floor_of(scene) -> float | None:
 def obstacle_surfaces(scene, time: float = 0.0) -> list[tuple[np.ndarray, np.ndarray]]:
     """(points [m], shape (k, 3), triangles) of each obstacle of a scene at `time` [s], floors left out.
 
-    Balls, boxes, capsules, cylinders, triangle meshes, and slanted planes as large squares; a hollow ball is not drawn,
-    since it would hide what is in it.
+    Balls, boxes, capsules, cylinders, triangle meshes, slanted planes as large squares, and a hollow ball as the bowl that
+    its lower half is, seen from within.
     """
     out = []
     for term in scene.terms:
@@ -32,8 +32,8 @@ def obstacle_surfaces(scene, time: float = 0.0) -> list[tuple[np.ndarray, np.nda
 
 def _surface(term, scene):
     values = getattr(term, "values", {})
-    if "sphere_radius" in values and not term.inside:
-        return ball(values["sphere_center"], float(values["sphere_radius"]))
+    if "sphere_radius" in values:
+        return (bowl if term.inside else ball)(values["sphere_center"], float(values["sphere_radius"]))
     if "box_size" in values:
         return box(values["box_center"], values["box_size"], values["box_rotation"])
     for kind in ("capsule", "cylinder"):
@@ -73,6 +73,13 @@ def revolved(center, axis, along: np.ndarray, radius: np.ndarray):
 def ball(center, radius: float):
     angle = np.linspace(-np.pi / 2, np.pi / 2, ROUND // 2 + 1)
     return revolved(center, (0.0, 1.0, 0.0), radius * np.sin(angle), radius * np.cos(angle))
+
+
+def bowl(center, radius: float):
+    """The lower half of a hollow ball: it faces inwards, so that the side near the eye is not drawn."""
+    angle = np.linspace(-np.pi / 2, 0, ROUND // 2 + 1)
+    points, triangles = revolved(center, (0.0, 1.0, 0.0), radius * np.sin(angle), radius * np.cos(angle))
+    return points, triangles[:, ::-1]
 
 
 def tube(start, end, radius: float, rounded: bool):

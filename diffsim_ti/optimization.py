@@ -100,8 +100,10 @@ class Optimization:
             optimizer.load_state_dict(state["optimizer"])
             torch.set_rng_state(state["random"])
 
-    def run(self, loss: Callable[[], torch.Tensor], iterations: int) -> "Optimization":
+    def run(self, loss: Callable[[], torch.Tensor], iterations: int, after: Callable | None = None) -> "Optimization":
         """Go on until `iterations` iterations are done in all; loss() makes the graph anew each time.
+
+        after(value): called after each iteration with the loss before it, for instance to draw.
 
         Raises FloatingPointError if the loss is not finite, and lets the simulator's errors through; the parameters are
         then the best ones so far.
@@ -127,6 +129,8 @@ class Optimization:
                 self.best_loss, self._best = value, before
             self.iteration += 1
             self.seconds += time.perf_counter() - start
+            if after is not None:
+                after(value)
             if self.path is not None and (self.iteration % self.save_every == 0 or self.iteration == iterations):
                 self.save()
         return self

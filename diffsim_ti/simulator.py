@@ -40,6 +40,8 @@ class Simulator:
         """Back to the start of the scene."""
         self.step_count = 0
         self.workspace.load(self._start)
+        if self._start.forces is not None and len(self._start.forces) == 1:
+            runtime.fill(self.workspace.arrays.forces, self._start.forces)  # set_forces may have changed them
 
     @property
     def time(self) -> float:
@@ -117,6 +119,15 @@ class Simulator:
                     raise ValueError(f"{name}: expected shape {shape}, got {value.shape}")
                 runtime.fill(target, (value - origin)[None])
         self.workspace.forget()
+
+    def set_forces(self, forces) -> None:
+        """Other external forces [N] from now on, in the shape of the scene's constant ExternalForce, until a reset."""
+        given, forces = self.scene.inputs.values.get("external_forces"), np.asarray(forces, np.float64)
+        if given is None or given.ndim == 3:
+            raise ValueError("set_forces needs a scene with a constant ExternalForce, of shape (k, 3); add one of zeros")
+        if forces.shape != given.shape or not np.all(np.isfinite(forces)):
+            raise ValueError(f"forces: expected finite numbers of shape {given.shape}, got shape {forces.shape}")
+        runtime.fill(self.workspace.arrays.forces, forces[None])
 
     @property
     def contact_resolution(self) -> ContactResolution:

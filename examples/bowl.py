@@ -4,7 +4,7 @@ The same fall is run with and without self-contact (without it the blocks fall t
 time of a substep is compared. A frame that is refused, because surfaces might cross or the step is unstable, is run again
 with half the substep.
 
-    python examples/bowl.py [--quick] [--cells 10] [--frames 40]
+    python examples/bowl.py [--quick] [--cells 10] [--frames 40] [--film output/bowl.gif]
 """
 
 import argparse
@@ -13,6 +13,8 @@ import time
 import numpy as np
 
 import diffsim_ti as ds
+from diffsim_ti.film import save_film
+from diffsim_ti.obstacles import bowl
 
 SIDE, RADIUS, FRAME, SUBSTEPS = 0.1, 0.5, 0.01, 100  # of a block and of the bowl [m]; of a frame [s]
 PLACES = [(x, y, z) for y in (-0.26, -0.075, 0.11) for x in (-0.18, 0.0, 0.18) for z in (-0.18, 0.0, 0.18)]
@@ -59,20 +61,27 @@ def advance(simulator: ds.Simulator) -> float:
             print(f"again with {substeps} substeps: {error}")
 
 
-def main(count: int = 20, cells: int = 10, frames: int = 40) -> dict:
+def main(count: int = 20, cells: int = 10, frames: int = 40, film: str | None = None) -> dict:
     """Returns the smallest gap and the largest distance from the bowl's centre [m], and what a substep costs with contact
     relative to one without, in the whole fall (`ratio`) and in its last quarter (`late_ratio`)."""
     mesh = make_blocks(count, cells)
     print(f"{count} blocks, {mesh.num_tetrahedra} tetrahedra, {len(mesh.surface_triangles)} surface triangles")
     simulator, free = (make_fall(mesh, cells, contact) for contact in (True, False))
-    costs, gap = [], np.inf
+    costs, gap, places = [], np.inf, [simulator.positions]
     for frame in range(frames):
         costs.append((advance(simulator), advance(free)))
         gap = min(gap, simulator.smallest_gap())
+        if film and frame % 2:
+            places.append(simulator.positions)
         touching, alone = (1e3 * cost for cost in costs[-1])
         print(f"frame {frame + 1}: a substep takes {touching:.2f} ms, without contact {alone:.2f} ms; smallest gap so far "
               f"{1e3 * gap:.3g} mm", flush=True)  # fmt: skip
     simulator.check_surfaces()
+    if film:
+        colours = np.tile(np.repeat(np.arange(count), mesh.num_vertices // count), (len(places), 1))
+        save_film(film, mesh, places, colours, 12.5, (400, 300), elevation=35,
+                  obstacles=[[bowl(np.zeros(3), RADIUS)]] * len(places), box=[[-0.4, -0.45, -0.4], [0.4, 0.0, 0.4]],
+                  title=lambda k: f"{count} soft blocks, t = {2 * FRAME * k:.2f} s")  # fmt: skip
     costs, late = np.sum(costs, 0), np.sum(costs[3 * frames // 4 :], 0)
     out = {"gap": gap, "radius": float(np.linalg.norm(simulator.positions, axis=1).max()),
            "ratio": costs[0] / costs[1], "late_ratio": late[0] / late[1]}  # fmt: skip
@@ -87,6 +96,7 @@ if __name__ == "__main__":
     parser.add_argument("--cells", type=int, default=10, help="cells along an edge of a block")
     parser.add_argument("--frames", type=int, default=40, help="frames of 0.01 s")
     parser.add_argument("--arch", default="cpu")
+    parser.add_argument("--film", help="where a film of the fall goes, four times slower than it is: .gif or .mp4")
     options = parser.parse_args()
     ds.init(options.arch)
-    main(4, 3, 24) if options.quick else main(20, options.cells, options.frames)
+    main(4, 3, 24, options.film) if options.quick else main(20, options.cells, options.frames, options.film)

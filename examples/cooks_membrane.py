@@ -8,16 +8,19 @@ Two problems, in N, mm and MPa: small strains, whose corner rises 32.18 mm, and 
 14.499 mm in the middle of the edge. Linear tetrahedra approach both from below (locking), with an error of order h^2 or a
 little less, for the corner on the left is singular: so three meshes also give the limit, by Aitken's formula.
 
-    python examples/cooks_membrane.py
+    python examples/cooks_membrane.py [--quick] [folder for a picture]
 """
 
+import sys
 import time
+from pathlib import Path
 
 import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.linalg import LinearOperator, cg
 
 import diffsim_ti as ds
+from diffsim_ti.picture import save_picture
 
 THICKNESS = 12.0  # [mm]: a thin panel would buckle sideways before it is held
 LINEAR = dict(material=ds.LinearElastic(70.0, 1 / 3), traction=6.25, exact=(32.18, None))
@@ -80,7 +83,8 @@ def membrane(cells: int, material, traction: float, exact: tuple) -> dict:
     u, edge = frames.displacements[-1], mesh.vertex_sets["xmax"]
     rise, y = (x[edge, 1].reshape(-1, 2).mean(1) for x in (u, mesh.vertices))  # front and back
     corner, middle = np.interp([60, 52], y, rise)
-    return {"corner": corner, "middle": middle, "left": np.abs(u[:, 2]).max(), "steps": steps, "products": products}
+    return {"corner": corner, "middle": middle, "left": np.abs(u[:, 2]).max(), "steps": steps, "products": products,
+            "mesh": mesh, "positions": frames.positions[-1]}  # fmt: skip
 
 
 def limit(a: float, b: float, c: float) -> float:
@@ -88,7 +92,7 @@ def limit(a: float, b: float, c: float) -> float:
     return c + (c - b) ** 2 / ((b - a) - (c - b))
 
 
-def main(quick: bool = False) -> dict:
+def main(quick: bool = False, picture_folder: str | None = None) -> dict:
     """{"linear", "large": {"cells", "corner", "middle" (lists), "limit" (corner, middle), "exact", "left"}}, mm."""
     out, start = {}, time.perf_counter()
     for name, problem in (("linear", LINEAR), ("large", LARGE)):
@@ -102,6 +106,10 @@ def main(quick: bool = False) -> dict:
               + f"; limit {limits[0]:.3f}, exact {problem['exact'][0]}")  # fmt: skip
         if problem["exact"][1]:
             print(f"  middle of the edge {middle[-1]:.3f} mm, limit {limits[1]:.3f}, exact {problem['exact'][1]}")
+        if picture_folder and name == "large":
+            mesh, bent = rows[-1]["mesh"], rows[-1]["positions"]
+            save_picture(Path(picture_folder) / "cooks_membrane.png", mesh, bent, (bent - mesh.vertices)[:, 1], "rise [mm]",
+                         title="Cook's membrane, large strains", fixed="xmin", wireframe=True, azimuth=12)  # fmt: skip
         print(f"  |u_z| <= {out[name]['left']:.1g} mm after {rows[-1]['steps']} Newton steps, "
               f"{rows[-1]['products']} products")  # fmt: skip
     out["seconds"] = time.perf_counter() - start
@@ -111,4 +119,4 @@ def main(quick: bool = False) -> dict:
 
 if __name__ == "__main__":
     ds.init(precision="f64")
-    main()
+    main("--quick" in sys.argv, *[folder for folder in sys.argv[1:] if folder != "--quick"])

@@ -2,7 +2,7 @@
 
 Pads are planes that follow paths; the gradient by the paths goes through friction, which is all that holds the cube.
 
-    python examples/gripper.py
+    python examples/gripper.py [folder for a film]
 """
 
 import sys
@@ -13,7 +13,8 @@ import numpy as np
 from scipy.optimize import minimize
 
 import diffsim_ti as ds
-from diffsim_ti.picture import save_picture
+from diffsim_ti.film import save_film
+from diffsim_ti.obstacles import box
 
 SIZE, WIDTH, DURATION, DT = 0.1, 0.01, 0.5, 2.5e-4  # [m], [m], [s], [s]
 LIFT, KNOTS = 0.05, np.array([0.1, 0.2, 0.3, 0.4, 0.5])  # [m]; when squeezes are chosen [s], at first there is none
@@ -32,6 +33,18 @@ def gripper_scene() -> ds.Scene:
     return ds.Scene(cube, ds.StableNeoHookean(1e5, 0.3), 300.0, terms, precision="f64")
 
 
+def save_lift(path, scene: ds.Scene, paths: dict, times) -> None:
+    """A film of the lift, ten times slower than it is."""
+    every = len(times) // 40
+    shown = times[::every]
+    frames = ds.Rollout(ds.SemiImplicitSolver(scene, dt=DT), len(times) - 1, every, gradients=[]).forward(**paths)
+    places = [(side * (SIZE / 2 + 1.5 * WIDTH), SIZE / 2, 0) + path[::every] for side, path in zip((-1, 1), paths.values())]
+    pads = [[box(place, (WIDTH, SIZE, SIZE), (1, 0, 0, 0)) for place in pair] for pair in zip(*places)]
+    save_film(path, scene.mesh, frames.positions, fps=8.0, size=(400, 300), obstacles=pads, ground=0.0, wireframe=True,
+              elevation=18, box=[[-0.1, 0, -0.05], [0.1, 0.16, 0.05]],
+              title=lambda k: f"lifted by friction alone, t = {shown[k]:.2f} s")  # fmt: skip
+
+
 def main(picture_folder: str | None = None) -> dict:
     """Returns how far the cube slips at first and at last [m], the squeezes [m], evaluations and seconds."""
     scene = gripper_scene()
@@ -44,13 +57,15 @@ def main(picture_folder: str | None = None) -> dict:
     hats = np.stack([np.interp(times, [0, *KNOTS], row) for row in np.eye(6)[1:]], 1)  # (steps + 1, knots)
     start, seen = time.perf_counter(), []
 
+    def paths(q):
+        """How the pads move, from squeezes [m] of left and right pad at the knots."""
+        rows = (("half_space_path", 1, q[0]), ("half_space_path_2", -1, q[1]))
+        return {name: np.stack([sign * hats @ row, lift, 0 * lift], 1) for name, sign, row in rows}
+
     def evaluate(squeezes):
-        """Loss and its gradient by the squeezes [cm] of left and right pad at the knots."""
+        """Loss and its gradient by the squeezes [cm]."""
         q = 0.01 * squeezes.reshape(2, -1)
-        paths = {}
-        for name, sign, row in (("half_space_path", 1, q[0]), ("half_space_path_2", -1, q[1])):
-            paths[name] = np.stack([sign * hats @ row, lift, 0 * lift], 1)
-        frames = rollout.forward(**paths)
+        frames = rollout.forward(**paths(q))
         # against the pads, from when they have closed on it
         slip = frames.positions[GRIPPED:].mean(1) - frames.positions[GRIPPED].mean(0)
         slip[:, 1] -= (lift[:: steps // 10] - lift[GRIPPED * steps // 10])[GRIPPED:]
@@ -71,7 +86,7 @@ def main(picture_folder: str | None = None) -> dict:
     seconds = time.perf_counter() - start
     best = min(seen, key=lambda run: run["slip"])
     if picture_folder:
-        save_picture(Path(picture_folder) / "gripper.png", scene.mesh, best["frames"].positions[-1], ground=0.0)
+        save_lift(Path(picture_folder) / "gripper.gif", scene, paths(best["q"]), times)
     print(f"slips by {100 * seen[0]['slip']:.3g} cm at first, {1000 * best['slip']:.2g} mm at last; squeezes [mm] "
           f"{(1000 * best['q']).round(1).tolist()}; {len(seen)} evaluations, {seconds:.1f} s; "
           f"{best['frames'].contact_resolution}")  # fmt: skip

@@ -3,19 +3,23 @@
 The parameter is log E, which keeps E positive and makes a factor of ten as far up as down; L-BFGS takes the exact gradient.
 Density must be known: motion under gravity alone tells E / rho and nothing more.
 
-    python examples/identify_beam.py
+    python examples/identify_beam.py [folder for a picture, which is written while the optimisation runs]
 """
 
+import sys
 import time
+from pathlib import Path
 
 import numpy as np
 from scipy.optimize import minimize
 
 import diffsim_ti as ds
+from diffsim_ti.optimization_picture import OptimizationPicture
 
 TRUE_E, GUESS = 1.0e6, 3.0e5  # [Pa]
 RANGE = 1.0e5, 2.5e6  # [Pa]; the step is stable up to there
 NOISE = 1e-4  # [m]
+NAME = "Young's modulus [Pa]"
 
 
 def observed_motion(rollout: ds.Rollout, watched: np.ndarray) -> np.ndarray:
@@ -25,7 +29,7 @@ def observed_motion(rollout: ds.Rollout, watched: np.ndarray) -> np.ndarray:
     return seen + NOISE * np.random.default_rng(0).standard_normal(seen.shape)
 
 
-def main() -> dict:
+def main(picture_folder: str | None = None) -> dict:
     """Returns the modulus found [Pa], its relative error, evaluations of loss and gradient, and seconds."""
     mesh = ds.TetrahedralMesh.create_box((9, 3, 3), size=(1.0, 0.2, 0.2), pattern="five")
     scene = ds.Scene(
@@ -35,6 +39,10 @@ def main() -> dict:
     rollout = ds.Rollout(ds.VelocityVerletSolver(scene, dt=1e-3), 300, save_every=10, gradients=["youngs_modulus"])
     tip = mesh.vertex_sets["xmax"]
     observed = observed_motion(rollout, tip)
+    picture = OptimizationPicture(
+        mesh, observed[-1], picture_folder and Path(picture_folder) / "identify_beam.png", 0.0 if picture_folder else None,
+        truth={NAME: TRUE_E}, loss_label="loss [mm²]",
+    )  # fmt: skip
 
     def loss_and_gradient(log_E):
         E = float(np.exp(log_E[0]))
@@ -42,7 +50,8 @@ def main() -> dict:
         residual = 1e3 * (frames.positions[:, tip] - observed)  # [mm]
         adjoint = np.zeros(frames.positions.shape)
         adjoint[:, tip] = 2e3 * residual / residual.size
-        return (residual**2).mean(), np.array([E * rollout.vjp(frames, adjoint)["youngs_modulus"]])
+        picture.add((residual**2).mean(), {NAME: E}, frames.positions[-1])
+        return picture.losses[-1], np.array([E * rollout.vjp(frames, adjoint)["youngs_modulus"]])
 
     start = time.perf_counter()
     found = minimize(
@@ -59,4 +68,4 @@ def main() -> dict:
 
 if __name__ == "__main__":
     ds.init(precision="f64")
-    main()
+    main(*sys.argv[1:])

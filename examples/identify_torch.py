@@ -6,6 +6,8 @@ the last frame only, it cannot work: the gradient is 4e-11, Adam adds 1e-8 to wh
 frame alone rises before it falls on the way from 2e5 to 8e4.
 
     python examples/identify_torch.py
+
+Pictures of all three go to output/, written while they run.
 """
 
 from pathlib import Path
@@ -16,7 +18,7 @@ from diffsim_ti import TetrahedralMesh, verify
 from diffsim_ti.diff_physics import TorchMaterial
 from diffsim_ti.diff_simulator import DifferentiableSimulator, DifferentiableSolver
 from diffsim_ti.optimization import Optimization
-from diffsim_ti.picture import save_picture
+from diffsim_ti.optimization_picture import OptimizationPicture
 
 TRUE_E, TRUE_NU = 8e4, 0.4
 
@@ -52,13 +54,23 @@ def identify(name, held, learn_nu, make_optimizer, iterations, folder, start=(2e
     material = LogMaterial(*start, learn_nu=learn_nu)
     moving, size = simulator(material), (target.displacements - target.displacements.mean(1, keepdim=True)).square().mean()
 
+    end = mesh.vertices + target.displacements[-1].numpy()
+    picture = OptimizationPicture(mesh, end, folder and Path(folder) / f"identify_{name}.png", 1.0 if folder else None,
+                                  truth={"E [Pa]": TRUE_E} | ({"nu": TRUE_NU} if learn_nu else {}))  # fmt: skip
+    seen = {}
+
     def loss():
         moving.reset()
-        return (moving.rollout(20, save_every=1).displacements - target.displacements).square().mean() / size
+        u = moving.rollout(20, save_every=1).displacements
+        seen.update(E=material.E.item(), nu=float(material.nu), u=u[-1].detach().numpy())
+        return (u - target.displacements).square().mean() / size
+
+    def note(value):
+        picture.add(value, {"E [Pa]": seen["E"]} | ({"nu": seen["nu"]} if learn_nu else {}), mesh.vertices + seen["u"])
 
     optimization = Optimization(material, make_optimizer([p for p in material.parameters() if p.requires_grad]), mesh,
                                 folder and Path(folder) / f"identify_{name}.state")  # fmt: skip
-    optimization.run(loss, iterations)
+    optimization.run(loss, iterations, note)
     optimization.restore_best()
     result = dict(E=material.E.item(), E_error=abs(material.E.item() / TRUE_E - 1), loss=optimization.best_loss,
                   iterations=iterations, seconds=optimization.seconds)  # fmt: skip
@@ -69,10 +81,7 @@ def identify(name, held, learn_nu, make_optimizer, iterations, folder, start=(2e
     print(f"{name}: with E and density both free, directions not seen: {told.num_singular} of 2\n{told}")
     result["unseen"] = told.num_singular
     if folder:
-        moving.reset()
-        u = moving.rollout(20).displacements[-1].detach()
-        save_picture(Path(folder) / f"identify_{name}.png", mesh, mesh.vertices + u.numpy(), u.norm(dim=1).numpy(),
-                     "displacement [m]", title=f"{name}: E = {result['E']:.4g} Pa")  # fmt: skip
+        picture.save()
     return result
 
 

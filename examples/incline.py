@@ -3,7 +3,7 @@
 The slab first settles on the incline, in drag, at the friction that just holds it; then it is let go. A soft body on a stiff
 barrier would not do: Coulomb friction makes such a body vibrate (as brakes squeal), and then it slides further.
 
-    python examples/incline.py
+    python examples/incline.py [folder for a picture]
 """
 
 import sys
@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 import diffsim_ti as ds
+from diffsim_ti.obstacles import square
 from diffsim_ti.picture import save_picture
 
 SLOPE, G, DURATION = 0.5, 9.81, 2.5  # [-], [m/s^2], [s]
@@ -37,14 +38,21 @@ def main(picture_folder: str | None = None) -> dict:
     scene, down = slab_scene(SLOPE, drag=30.0)
     settled = ds.Rollout(ds.SemiImplicitSolver(scene, dt=DT), round(2.5 / DT)).forward().positions[-1]
     exact = 0.5 * G * (SLOPE - 0.49) / np.sqrt(1 + SLOPE**2) * DURATION**2
-    moved = {}
+    moved, ends = {}, []
     for friction in (0.49, 0.50):
         scene, _ = slab_scene(friction, settled)
         frames = ds.Rollout(ds.SemiImplicitSolver(scene, dt=DT), round(DURATION / DT)).forward()
         moved[friction] = float((frames.positions[-1] - frames.positions[0]).mean(0) @ down)
+        ends.append(frames.positions[-1] - frames.positions[0])
         print(f"friction {friction:.2f}: {moved[friction]:.5f} m in {DURATION} s; {frames.contact_resolution}")
     if picture_folder:
-        save_picture(Path(picture_folder) / "incline.png", scene.mesh, frames.positions[-1], ground=None)
+        apart = np.array([0, 0, 0.25])
+        places = np.concatenate([settled + ends[0] + apart, settled + ends[1] - apart])
+        slid = np.linalg.norm(np.concatenate(ends), axis=1)
+        slope = square(settled.mean(0) - [0, 0.058, 0], (-SLOPE, 1, 0), 0.22)
+        save_picture(Path(picture_folder) / "incline.png", ds.TetrahedralMesh.joined([scene.mesh] * 2), places, slid,
+                     "slid by [m]", obstacles=[slope], wireframe=True, azimuth=-12, elevation=22,
+                     title="friction 0.49 slides, 0.50 holds, on tan = 1/2")  # fmt: skip
     seconds = time.perf_counter() - start
     off = moved[0.49] / exact - 1
     print(f"Coulomb's law: {exact:.5f} m ({off:+.2%}) and 0 ({moved[0.50]:.1e} m of creep); {seconds:.1f} s")

@@ -4,15 +4,18 @@ The unknowns are the rest positions of all free vertices. The bar is let go in t
 hangs still; the residual is how far it then is from the wanted shape. Gauss-Newton: the step solves J^T J d = -J^T r by
 conjugate gradients, where J^T r is the gradient by the rest shape and J^T J d one tangent and one reverse run.
 
-    python examples/inverse_rest_shape.py
+    python examples/inverse_rest_shape.py [folder for a picture]
 """
 
+import sys
 import time
+from pathlib import Path
 
 import numpy as np
 from scipy.sparse.linalg import LinearOperator, cg
 
 import diffsim_ti as ds
+from diffsim_ti.picture import save_picture
 from diffsim_ti.verify import gauss_newton_product
 
 STEPS, DT = 800, 2e-3
@@ -20,7 +23,7 @@ DAMPING = 3e-3  # of Levenberg and Marquardt: directions that hardly move the ba
 TOLERANCE = 1e-5  # [m]
 
 
-def main() -> dict:
+def main(picture_folder: str | None = None) -> dict:
     """Returns the residual before and after [m], their ratio, how far the tip is cast upwards [m], iterations, seconds."""
     bar = ds.TetrahedralMesh.create_box((7, 3, 3), size=(0.6, 0.2, 0.2), pattern="five")
     scene = ds.Scene(
@@ -61,9 +64,15 @@ def main() -> dict:
     lift = float((rest - bar.vertices)[bar.vertex_sets["xmax"], 1].mean())
     print(f"sag {1e3 * before:.3g} mm; with the new rest shape {1e3 * after:.2g} mm ({ratio:.0f} times less), whose tip "
           f"is cast {1e3 * lift:.3g} mm higher; {iteration} iterations, {seconds:.1f} s")  # fmt: skip
+    if picture_folder:
+        higher, hangs = 1e3 * (rest - bar.vertices)[:, 1], frames.positions[-1] - [0, 0, 0.35]
+        both = ds.TetrahedralMesh.joined([bar, bar])
+        save_picture(Path(picture_folder) / "inverse_rest_shape.png", both, np.concatenate([rest, hangs]),
+                     np.concatenate([higher, 0 * higher]), "cast higher [mm]", wireframe=True, azimuth=-35, elevation=18,
+                     title="cast like the one in front, it sags straight", fixed=both.vertices[:, 0] < 1e-9)  # fmt: skip
     return {"before": before, "after": after, "ratio": ratio, "lift": lift, "iterations": iteration, "seconds": seconds}
 
 
 if __name__ == "__main__":
     ds.init(precision="f64")
-    main()
+    main(*sys.argv[1:])

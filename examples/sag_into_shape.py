@@ -5,9 +5,10 @@ step minimises |r + J d|^2 + damping |d|^2, r = x(X) - wanted, by LSMR, to which
 a direction of the rest shape and J^T r its gradient by the rest shape: one linear solve each with the Hessian of the
 equilibrium, whatever the number of unknowns. A step is halved while it makes things worse or turns a tetrahedron over.
 
-    python examples/sag_into_shape.py
+    python examples/sag_into_shape.py [folder for a picture, default output]
 """
 
+import sys
 import time
 from pathlib import Path
 
@@ -88,12 +89,15 @@ def main(folder="output", quick: bool = False) -> dict:
           f"{iterations} iterations, {seconds:.1f} s")  # fmt: skip
     if folder:
         Path(folder).mkdir(exist_ok=True)
-        save_picture(Path(folder) / "sag_into_shape.png", canopy.mesh, rest, rest[:, 1] - canopy.wanted[:, 1],
-                     "cast higher by [m]", title="the shape to cast, which sags flat", azimuth=15)  # fmt: skip
+        higher, below = rest[:, 1] - canopy.wanted[:, 1], frames.positions[-1] - [0, 0.35, 0]
+        both = ds.TetrahedralMesh.joined([canopy.mesh, canopy.mesh])
+        save_picture(Path(folder) / "sag_into_shape.png", both, np.concatenate([rest, below]),
+                     np.concatenate([higher, 0 * higher]), "cast higher by [m]", azimuth=-25, elevation=18, wireframe=True,
+                     title="cast as above, it sags flat as below", fixed=both.vertices[:, 0] < 1e-9)  # fmt: skip
     return {"before": before, "after": after, "ratio": before / after, "lift": lift, "iterations": iterations,
             "rest": rest, "seconds": seconds}  # fmt: skip
 
 
 if __name__ == "__main__":
     ds.init(precision="f64")
-    main()
+    main(*sys.argv[1:])

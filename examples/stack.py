@@ -1,17 +1,21 @@
 """A stack of soft blocks that stands: each rests on the barrier of the one below.
 
-    python examples/stack.py
+    python examples/stack.py [folder for a picture]
 """
+
+import sys
+from pathlib import Path
 
 import numpy as np
 
 import diffsim_ti as ds
+from diffsim_ti.picture import save_picture
 
 SIDE, GAP, COUNT = 0.1, 2e-3, 4  # [m]
 DT, SECONDS = 1e-3, 1.2  # [s]
 
 
-def main(count: int = COUNT, seconds: float = SECONDS) -> dict:
+def main(count: int = COUNT, seconds: float = SECONDS, picture_folder: str | None = None) -> dict:
     """Returns height, drift sideways, smallest gap and the gaps between blocks [m], and speed [m/s], at the end."""
     block = ds.TetrahedralMesh.create_box(4, SIDE, pattern="five").translated([-SIDE / 2, GAP, -SIDE / 2])
     turned = [block.rotated([0, 1, 0], 0.15 * k).translated([0, k * (SIDE + GAP), 0]) for k in range(count)]
@@ -31,9 +35,13 @@ def main(count: int = COUNT, seconds: float = SECONDS) -> dict:
     speed, gap = float(np.abs(v).max()), simulator.smallest_gap()
     print(f"{count} blocks, {x[:, 1].max():.3f} m high after {seconds:g} s: speed {speed:.1e} m/s, "
           f"drift {1e3 * drift:.3f} mm, smallest gap {1e3 * gap:.2f} mm")  # fmt: skip
+    if picture_folder:
+        body = np.repeat(np.arange(count), mesh.num_vertices // count)
+        save_picture(Path(picture_folder) / "stack.png", mesh, x, body, ground=0.0, wireframe=True, azimuth=40, elevation=22,
+                     title=f"{count} soft blocks after {seconds:g} s")  # fmt: skip
     return {"height": float(x[:, 1].max()), "speed": speed, "drift": float(drift), "gap": gap, "between": between}
 
 
 if __name__ == "__main__":
     ds.init(precision="f64")
-    main()
+    main(picture_folder=sys.argv[1] if len(sys.argv) > 1 else None)

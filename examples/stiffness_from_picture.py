@@ -5,18 +5,22 @@ part; the gradient is that of the equilibrium, one linear solve. The places are 
 spread of the answer that follows from that is stated with it: sqrt(noise^2 (S^T S)^-1), S the sensitivities of the places
 to log E.
 
-    python examples/stiffness_from_picture.py
+    python examples/stiffness_from_picture.py [folder for a picture]
 """
 
+import sys
 import time
+from pathlib import Path
 
 import numpy as np
 from scipy.optimize import minimize
 
 import diffsim_ti as ds
+from diffsim_ti.optimization_picture import OptimizationPicture
 
 PARTS = {"upper": 2e6, "elbow": 2.5e5, "lower": 8e5}  # true E [Pa]
 GUESS, NU, DENSITY, NOISE = 6e5, 0.4, 1000.0, 1e-4
+NAME = "Young's moduli [Pa]"
 
 
 def arm(cells: int) -> ds.TetrahedralMesh:
@@ -28,7 +32,7 @@ def arm(cells: int) -> ds.TetrahedralMesh:
     return mesh
 
 
-def main(quick: bool = False) -> dict:
+def main(quick: bool = False, picture_folder: str | None = None) -> dict:
     """Returns {part: E found [Pa]}, the largest relative error and its expected spread, evaluations, seconds."""
     mesh = arm(2 if quick else 4)
     scene = ds.Scene(mesh, ds.StableNeoHookean(GUESS, NU), DENSITY, [ds.Gravity()], "xmin", precision="f64")
@@ -40,6 +44,7 @@ def main(quick: bool = False) -> dict:
 
     truth = rollout.forward(youngs_modulus=np.array(list(PARTS.values()))[part]).positions[-1][seen]
     picture = truth + NOISE * np.random.default_rng(0).standard_normal(truth.shape)
+    chart = OptimizationPicture(mesh, picture, truth={NAME: list(PARTS.values())}, loss_label="loss [mm²]")
     place, adjoint = mesh.vertices.copy(), np.zeros((2, mesh.num_vertices, 3))
 
     def loss_and_gradient(log_E):
@@ -47,13 +52,16 @@ def main(quick: bool = False) -> dict:
         place[:] = frames.positions[-1]  # each equilibrium starts from the one before
         off = 1e3 * (place[seen] - picture)  # [mm]
         adjoint[1, seen] = 2e3 * off / off.size
+        chart.add((off**2).mean(), {NAME: np.exp(log_E)}, place)
         by_E = rollout.vjp(frames, adjoint)["youngs_modulus"] * np.exp(log_E)[part]
-        return (off**2).mean(), np.bincount(part, by_E)
+        return chart.losses[-1], np.bincount(part, by_E)
 
     start = time.perf_counter()
     found = minimize(loss_and_gradient, np.log([GUESS] * 3), jac=True, method="L-BFGS-B", options=dict(ftol=1e-10))
     seconds = time.perf_counter() - start
 
+    if picture_folder:
+        chart.save(Path(picture_folder) / "stiffness_from_picture.png")
     E = np.exp(found.x)
     frames = rollout.forward(youngs_modulus=E[part], initial_positions=place)
     S = [rollout.jvp(frames, youngs_modulus=E[k] * (part == k))[0][-1][seen].ravel() for k in range(3)]
@@ -69,4 +77,4 @@ def main(quick: bool = False) -> dict:
 
 if __name__ == "__main__":
     ds.init(precision="f64")
-    main()
+    main(False, *sys.argv[1:])

@@ -3,14 +3,18 @@
 Gradient descent: the first step is the one that would hit without air, where the centre moves as a stone does; the next take
 their length from how the gradient changed (Barzilai, Borwein 1988, doi:10.1093/imanum/8.1.141).
 
-    python examples/throw_at_target.py
+    python examples/throw_at_target.py [folder for a picture]
 """
 
+import sys
 import time
+from pathlib import Path
 
+import numpy as np
 import taichi as ti
 
 import diffsim_ti as ds
+from diffsim_ti.optimization_picture import OptimizationPicture
 
 DURATION, DT = 0.6, 2e-3  # [s]
 TARGET = (2.0, 1.2, -0.5)  # [m]
@@ -35,7 +39,7 @@ def measure(centre: ti.template(), target: ti.types.vector(3, ti.f64), loss: ti.
     loss[None] = (centre[None] - target).norm_sqr()
 
 
-def main() -> dict:
+def main(picture_folder: str | None = None) -> dict:
     """Returns the miss [m], the velocity [m/s], how often the run was differentiated, and the seconds it took."""
     mesh = ds.TetrahedralMesh.create_box(4, size=0.3, origin=(-0.15, -0.15, -0.15))
     scene = ds.Scene(mesh, ds.SmithNeoHookean(2e4, 0.4), density=200.0, terms=[ds.Gravity(), ds.Drag(0.6)], precision="f64")
@@ -50,6 +54,7 @@ def main() -> dict:
 
     start = time.perf_counter()
     v, last = velocity.to_numpy(), None
+    picture = OptimizationPicture(mesh, np.array([TARGET]), loss_label="loss [m²]")
     for iteration in range(1, 31):
         centre[None] = [0.0, 0.0, 0.0]
         with ti.ad.Tape(loss):
@@ -58,6 +63,7 @@ def main() -> dict:
             find_centre(rollout.positions, 1, centre)
             measure(centre, target, loss)
         miss = loss[None] ** 0.5
+        picture.add(loss[None], {"velocity [m/s]": v}, rollout.positions.to_numpy()[1])
         print(f"iteration {iteration}: misses by {miss:.3g} m")
         if miss < TOLERANCE:
             break
@@ -69,10 +75,12 @@ def main() -> dict:
         velocity.from_numpy(v)
     seconds = time.perf_counter() - start
 
+    if picture_folder:
+        picture.save(Path(picture_folder) / "throw_at_target.png")
     print(f"throw with {v.round(4)} m/s: off by {miss:.1e} m after {iteration} iterations, {seconds:.1f} s")
     return {"miss": miss, "velocity": v, "iterations": iteration, "seconds": seconds}
 
 
 if __name__ == "__main__":
     ds.init(precision="f64")
-    main()
+    main(*sys.argv[1:])

@@ -6,6 +6,8 @@ of the tip from the target over the second half of half a second, and the effort
 three others.
 
     python examples/train_controller.py
+
+A film of what it learnt goes to output/.
 """
 
 from pathlib import Path
@@ -16,8 +18,9 @@ import torch
 from diffsim_ti import TetrahedralMesh
 from diffsim_ti.diff_physics import DifferentiableMaterial
 from diffsim_ti.diff_simulator import DifferentiableSimulator, DifferentiableSolver
+from diffsim_ti.film import save_film
+from diffsim_ti.obstacles import ball
 from diffsim_ti.optimization import Optimization
-from diffsim_ti.picture import save_picture
 
 STEPS, STRONGEST, HEIGHT, WIDTH = 25, 40.0, 0.5, 0.1
 SEEN = [(0.12, 0.0), (-0.12, 0.0), (0.0, 0.12), (0.0, -0.12)]
@@ -51,16 +54,34 @@ class Arm:
     def reach(self, controller, target) -> tuple[torch.Tensor, torch.Tensor]:
         """Distance of the tip from the target in the last half of the time, and the mean squared activation."""
         self.simulator.reset()
-        target, distances, effort = torch.tensor(target), [], 0.0
+        target, distances, effort, self.seen = torch.tensor(target), [], 0.0, []
         for step in range(STEPS):
             place = self.simulator.positions[self.tip].mean(0)[::2]
             speed = self.simulator.velocities[self.tip].mean(0)[::2]
             activation = torch.sigmoid(controller(torch.cat([target / 0.1, place / 0.1, speed])))
             self.simulator.step(self.forces(STRONGEST * activation))
+            self.seen.append((self.simulator.positions.detach().numpy(), activation.detach().numpy()))
             effort = effort + activation.square().mean() / STEPS
             if step >= STEPS // 2:
                 distances.append((self.simulator.positions[self.tip].mean(0)[::2] - target).norm())
         return torch.stack(distances).mean(), effort
+
+
+def save_reaches(path, arm: Arm, controller, targets) -> None:
+    """A film of the arm reaching for one target after the other; colour is what its tendons pull."""
+    places, pulls, marks = [], [], []
+    for target in targets:
+        with torch.no_grad():
+            arm.reach(controller, target)
+        for positions, activation in arm.seen[::2]:
+            places.append(positions)
+            pull = np.zeros(arm.mesh.num_vertices)
+            pull[arm.tendons.numpy()] = STRONGEST * activation[:, None]
+            pulls.append(pull)
+            marks.append([ball((target[0], 1.06 * HEIGHT, target[1]), 0.012)])
+    save_film(path, arm.mesh, places, pulls, 8.0, (400, 300), obstacles=marks, ground=0.0, label="tension [N]",
+              box=[[-0.13, 0.0, -0.13], [0.13, 0.56, 0.13]], elevation=25, wireframe=True, fixed="ymin",
+              title=lambda k: f"targets it was not trained on, t = {0.04 * (k % (STEPS // 2 + 1)):.2f} s")  # fmt: skip
 
 
 def main(folder="output", iterations: int = 60, seed: int = 0) -> dict:
@@ -87,9 +108,7 @@ def main(folder="output", iterations: int = 60, seed: int = 0) -> dict:
     print("controller, distances of the tip [m]: " + ", ".join(f"{key} {value:.4g}" for key, value in result.items()))
     if folder:
         Path(folder).mkdir(exist_ok=True)
-        miss(SEEN[:1])
-        save_picture(Path(folder) / "train_controller.png", arm.mesh, arm.simulator.positions.numpy(), ground=0.0,
-                     title=f"reaching for x = {SEEN[0][0]} m")  # fmt: skip
+        save_reaches(Path(folder) / "train_controller.gif", arm, controller, UNSEEN)
     return result
 
 

@@ -3,7 +3,7 @@
 The wall is rough and the ball soft, so that it leaves with other speed and spin than it came with. Three reverse sweeps, one
 for each coordinate of the ball's centre, give the Jacobian that Newton's method needs.
 
-    python examples/wall_shot.py
+    python examples/wall_shot.py [folder for a picture]
 """
 
 import sys
@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 import diffsim_ti as ds
+from diffsim_ti.obstacles import box
 from diffsim_ti.picture import save_picture
 
 DURATION, DT = 0.6, 2e-4  # [s]
@@ -61,7 +62,13 @@ def main(picture_folder: str | None = None) -> dict:
     back = float(share @ frames.velocities[-1, :, 0])
     seen = frames.contact_resolution
     if picture_folder:
-        save_picture(Path(picture_folder) / "wall_shot.png", mesh, frames.positions[-1])
+        way = ds.Rollout(ds.VelocityVerletSolver(scene, dt=DT), round(DURATION / DT), save_every=300).forward(
+            initial_velocities=np.tile(v, (mesh.num_vertices, 1))).positions  # fmt: skip
+        many = ds.TetrahedralMesh.joined([mesh] * len(way))
+        slab = box((WALL + 0.01, 0.5, 0.15), (0.02, 1.2, 0.8), (1, 0, 0, 0))
+        times = np.repeat(np.arange(len(way)) * DURATION / (len(way) - 1), mesh.num_vertices)
+        save_picture(Path(picture_folder) / "wall_shot.png", many, way.reshape(-1, 3), times, "time [s]",
+                     obstacles=[slab], azimuth=-30, title="thrown off a rough wall at a target")  # fmt: skip
     print(f"throw with {v.round(4)} m/s: off by {miss:.1e} m after {iteration} iterations, {seconds:.1f} s; it comes back "
           f"at {back:.3g} m/s; {seen}")  # fmt: skip
     return {"miss": miss, "velocity": v, "back": back, "resolved": seen.resolved, "gap": seen.smallest_gap,

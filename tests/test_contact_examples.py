@@ -37,5 +37,5 @@ def test_gripper(capsys, tmp_path):
     numbers = run("gripper", tmp_path)
     assert numbers["before"] > 0.02 and numbers["after"] < 5e-4 and numbers["evaluations"] <= 15
     assert numbers["squeezes"].shape == (2, 5) and numbers["squeezes"].max() > 2e-3 and numbers["resolved"]
-    assert (tmp_path / "gripper.png").stat().st_size > 10_000
+    assert (tmp_path / "gripper.gif").stat().st_size > 10_000
     assert "slips by" in capsys.readouterr().out

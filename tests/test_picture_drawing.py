@@ -9,11 +9,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from diffsim_ti import obstacles
+from diffsim_ti import obstacles, rasteriser
 from diffsim_ti.camera import Camera
 from diffsim_ti.colouring import Colouring
 from diffsim_ti.drawing import Drawing
 from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.surface import Soup
 from diffsim_ti.vulkan_painter import has_vulkan
 
 ROOT = Path(__file__).parents[1]
@@ -141,6 +142,42 @@ def test_obstacles_are_closed_and_face_outwards(shape, volume):
     assert enclosed == pytest.approx(volume, rel=0.02)  # 32 sides
 
 
+def test_a_hollow_ball_is_a_bowl_seen_from_within():
+    points, triangles = obstacles.bowl(np.array([1.0, 2, 3]), 0.5)
+    normals = np.cross(points[triangles[:, 1]] - points[triangles[:, 0]], points[triangles[:, 2]] - points[triangles[:, 0]])
+    inwards = np.einsum("nd,nd->n", normals, [1.0, 2, 3] - points[triangles].mean(1))
+    assert (inwards >= -1e-12).all() and points[:, 1].max() == pytest.approx(2.0)
+    assert np.linalg.norm(normals, axis=1).sum() / 2 == pytest.approx(2 * np.pi * 0.25, rel=0.02)
+
+
+@pytest.mark.parametrize("size", [(40, 30), (7, 5)])
+def test_spans_cover_the_pixels_inside(size):
+    """Against the half-plane test of every pixel centre, also for triangles that stick out of the picture."""
+    corners = np.random.default_rng(0).uniform(-10, 45, (30, 3, 2))
+    x, y = np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5)
+    inside = np.zeros((30, size[1], size[0]), bool)
+    for k, (a, b, c) in enumerate(corners):
+        sides = [(q[0] - p[0]) * (y - p[1]) - (q[1] - p[1]) * (x - p[0]) for p, q in ((a, b), (b, c), (c, a))]
+        inside[k] = np.all(np.array(sides) > 0, 0) | np.all(np.array(sides) < 0, 0)
+    found = np.zeros_like(inside)
+    for k, row, first, end in zip(*rasteriser.spans(corners, size)):
+        found[k, row, first:end] = True
+    assert inside.any() and np.array_equal(found, inside)
+    assert np.array_equal(rasteriser.covered(corners, size), inside.any(0))
+
+
+def test_the_nearer_triangle_is_seen_and_colours_are_linear_in_space():
+    """A blue triangle that pierces a red one: in perspective they meet where their depths are equal."""
+    corners = np.array([[[0, 0, 1.0], [40, 0, 1.0], [0, 40, 2.0]], [[0, 0, 2.0], [40, 0, 2.0], [0, 40, 1.0]]])
+    colours = np.zeros((2, 3, 3))
+    colours[0, :, 0], colours[1, :, 2] = 1, [0.5, 0.5, 1.0]
+    soup = Soup(corners, colours, corners[..., 2].mean(1))
+    image = rasteriser.SoftwarePainter((40, 40)).paint(soup, np.ones((40, 40, 3), np.float32))
+    assert image[18, 5] == pytest.approx([1, 0, 0]) and image[22, 5, 0] == 0 and image[35, 35] == pytest.approx([1, 1, 1])
+    y = 30.5  # 1 / depth is linear in the picture: 1/2 + y / 80; so is colour / depth
+    assert image[30, 2, 2] == pytest.approx((0.25 + y / 40 * 0.75) / (0.5 + y / 80), abs=0.02)
+
+
 def test_obstacles_of_a_scene_by_type():
     term = SimpleNamespace(values={"sphere_center": np.zeros(3), "sphere_radius": np.array(0.5)}, inside=False, path=None)
     floor = SimpleNamespace(values={"ground_height": np.array(-0.25)})
@@ -170,6 +207,7 @@ CODE = """
 import resource, numpy as np, sys
 from diffsim_ti.drawing import Drawing
 from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.surface import Soup
 cube = TetrahedralMesh.create_cube(3, 0.2)
 pages = lambda: int(open("/proc/self/statm").read().split()[1]) * resource.getpagesize() / 2**20
 with Drawing(cube, (160, 120), ground=0.0, backend=sys.argv[1]) as drawing:

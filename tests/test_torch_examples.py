@@ -20,9 +20,9 @@ def example(name: str):
     return module
 
 
-def check_files(folder, *names):
+def check_files(folder, *names, kind="png"):
     for name in names:
-        assert (folder / f"{name}.png").stat().st_size > 5000 and (folder / f"{name}.state").exists()
+        assert (folder / f"{name}.{kind}").stat().st_size > 5000 and (folder / f"{name}.state").exists()
 
 
 def test_identify(tmp_path, capsys):
@@ -53,7 +53,7 @@ def test_learned_material(tmp_path):
 def test_controller(tmp_path):
     result = example("train_controller").main(tmp_path, iterations=60)
     assert result["miss_seen"] < 0.025 and result["miss_unseen"] < 0.04 and result["miss_before"] > 0.1
-    check_files(tmp_path, "train_controller")
+    check_files(tmp_path, "train_controller", kind="gif")
 
 
 def test_resumed_controller_is_the_uninterrupted_one(tmp_path, monkeypatch):

@@ -1,0 +1,118 @@
+"""The pictures and films of the examples, as assets/pictures/gallery_<example>.png or .gif: those of the README.
+
+Each example runs by the command that its table shows, in a process and a folder of its own; pictures are then made small
+enough for a repository. `--list` prints the commands.
+
+    python examples/gallery.py [--only NAME] [--folder assets/pictures] [--list]
+"""
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from PIL import Image, ImageSequence
+
+HERE = Path(__file__).resolve().parent
+PICTURES = HERE.parent / "assets" / "pictures"
+WIDTH, FILM_WIDTH, COLOURS = 600, 400, 128  # [pixels], at most; of a film's palette
+# {example: (its arguments, the file it writes)}
+EXAMPLES = {
+    "bowl": ("--cells 4 --frames 60 --film output/bowl.gif", "bowl.gif"),
+    "gripper": ("output", "gripper.gif"),
+    "train_controller": ("", "train_controller.gif"),
+    "wall_shot": ("output", "wall_shot.png"),
+    "incline": ("output", "incline.png"),
+    "stack": ("output", "stack.png"),
+    "least_compliance": ("output", "least_compliance.png"),
+    "sag_into_shape": ("output", "sag_into_shape.png"),
+    "inverse_rest_shape": ("output", "inverse_rest_shape.png"),
+    "stiffness_field": ("", "stiffness_field.png"),
+    "learned_material": ("", "learned_material.png"),
+    "cantilever": ("--quick output", "cantilever.png"),
+    "cooks_membrane": ("--quick output", "cooks_membrane.png"),
+    "throw_at_target": ("output", "throw_at_target.png"),
+    "identify_beam": ("output", "identify_beam.png"),
+    "identify_torch": ("", "identify_both.png"),
+    "stiffness_from_picture": ("output", "stiffness_from_picture.png"),
+}
+
+
+def command(name: str) -> str:
+    """What makes an example's picture, in the folder output."""
+    return f"python examples/{name}.py {EXAMPLES[name][0]}".strip()
+
+
+def make(name: str, folder: Path) -> Path:
+    """Run an example and keep its picture, made small; RuntimeError with what it said if there is none."""
+    arguments, made = EXAMPLES[name]
+    with tempfile.TemporaryDirectory() as temporary:
+        (Path(temporary) / "output").mkdir()
+        paths = os.pathsep.join([str(HERE.parent), os.environ.get("PYTHONPATH", "")])
+        done = subprocess.run([sys.executable, HERE / f"{name}.py", *arguments.split()], cwd=temporary, capture_output=True,
+                              text=True, env=os.environ | {"PYTHONPATH": paths})  # fmt: skip
+        made = Path(temporary) / "output" / made
+        if done.returncode or not made.exists():
+            raise RuntimeError(f"{name}: saved no picture (exit status {done.returncode})\n{done.stderr[-2000:]}")
+        out = folder / f"gallery_{name}{made.suffix}"
+        (shrink_film if made.suffix == ".gif" else shrink_picture)(made, out)
+    return out
+
+
+def shrunk(image: Image.Image, width: int) -> Image.Image:
+    """No wider than `width`."""
+    if image.width <= width:
+        return image
+    return image.resize((width, round(image.height * width / image.width)), Image.Resampling.LANCZOS)
+
+
+def shrink_picture(source: Path, target: Path) -> None:
+    """A PNG in 256 colours."""
+    image = shrunk(Image.open(source).convert("RGB"), WIDTH)
+    image.quantize(256, dither=Image.Dither.NONE).save(target, optimize=True)
+
+
+def shrink_film(source: Path, target: Path) -> None:
+    """A GIF whose frames share their colours, not dithered, so that what stands still costs nothing."""
+    with Image.open(source) as film:
+        duration = film.info["duration"]
+        frames = [shrunk(frame.convert("RGB"), FILM_WIDTH) for frame in ImageSequence.Iterator(film)]
+    shown = [frames[k * (len(frames) - 1) // 3] for k in range(4)]
+    sheet = Image.new("RGB", (shown[0].width, 4 * shown[0].height))
+    for k, frame in enumerate(shown):
+        sheet.paste(frame, (0, k * frame.height))
+    # half for what covers most of the picture, half for what differs most
+    halves = [sheet.quantize(COLOURS // 2, method=m) for m in (Image.Quantize.MEDIANCUT, Image.Quantize.MAXCOVERAGE)]
+    palette = Image.new("P", (1, 1))
+    palette.putpalette(sum((half.getpalette()[: 3 * (COLOURS // 2)] for half in halves), []))
+    first, *rest = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
+    first.save(target, save_all=True, append_images=rest, duration=duration, loop=0, optimize=True)
+
+
+def main(only: str | None = None, folder=PICTURES) -> dict:
+    """{example: its picture's path}; ValueError for an example that saves no picture."""
+    if only is not None and only not in EXAMPLES:
+        raise ValueError(f"--only: must be one of {', '.join(EXAMPLES)}, got {only!r}")
+    folder, out = Path(folder), {}
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in [only] if only else EXAMPLES:
+        start = time.perf_counter()
+        out[name] = make(name, folder)
+        size = out[name].stat().st_size
+        print(f"{out[name].name}: {size / 1000:.0f} kB, {time.perf_counter() - start:.0f} s", flush=True)
+    return out
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--only", metavar="NAME", help="make this one: " + ", ".join(EXAMPLES))
+    parser.add_argument("--folder", default=PICTURES, help="where pictures go")
+    parser.add_argument("--list", action="store_true", help="print the commands that make them")
+    options = parser.parse_args()
+    if options.list:
+        print("\n".join(map(command, EXAMPLES)))
+    else:
+        main(options.only, options.folder)
