@@ -4,6 +4,7 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.inputs import Inputs
+from diffsim_ti.materials.patch_law import PatchLaw
 from diffsim_ti.terms import Drag, ExternalForce, Gravity, Obstacle, SelfContact, Term
 from diffsim_ti.terms.motion import sampled
 
@@ -20,18 +21,24 @@ class Scene:
         shape (num_fixed, 3) [m], or keyframes (times, displacements) between which it is linear. Default: held still.
     initial_positions [m], initial_velocities [m/s]: shape (num_vertices, 3) or 3 numbers (velocities); default at rest.
     precision: "f32", "f64" or None for the default that `diffsim_ti.init` set.
+    volume: where a change of volume is resisted: in each of the "tetrahedra", which lock as Poisson's ratio nears 0.5, or
+        on average over "patches" of up to eight, which lock much less (patched_tetrahedron.py).
 
     Raises ValueError with rule, value and remedy for anything that does not fit, before any kernel runs.
     """
 
     def __init__(self, mesh, material, density=1000.0, terms=(), fixed=None, motion=None, initial_positions=None,
-                 initial_velocities=None, precision: str | None = None):  # fmt: skip
+                 initial_velocities=None, precision: str | None = None, volume: str = "tetrahedra"):  # fmt: skip
         self._arguments = dict(
             mesh=mesh, material=material, density=density, terms=terms, fixed=fixed, motion=motion,
             initial_positions=initial_positions, initial_velocities=initial_velocities, precision=precision,
+            volume=volume,
         )  # fmt: skip
         self.mesh, self.material = mesh, material
         self.precision = runtime.check_precision(precision)
+        if volume not in ("tetrahedra", "patches"):
+            raise ValueError(f'volume must be "tetrahedra" or, against locking, "patches", got {volume!r}')
+        self.volume = volume
         self.terms = tuple([terms] if isinstance(terms, Term) else terms)
         self.fixed = np.zeros(0, np.int64) if fixed is None else mesh.vertex_indices(fixed)
         self.motion = motion
@@ -40,6 +47,12 @@ class Scene:
         self.moving = tuple(t for t in self.terms if t.path is not None)
         self.inputs = Inputs(self, density, initial_positions, initial_velocities)
         self._check_start()
+
+    @property
+    def law(self):
+        """The law that kernels are compiled for."""
+        law = self.material.law(self.precision)
+        return PatchLaw(self.precision, law) if self.volume == "patches" else law
 
     def replace(self, **changes) -> "Scene":
         """A scene with some arguments replaced."""

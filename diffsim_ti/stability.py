@@ -7,8 +7,8 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
+from diffsim_ti.patched_tetrahedron import functions_of
 from diffsim_ti.runtime import Bundle
-from diffsim_ti.tetrahedron import element_functions
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ def element_limit(scene, values: dict | None = None) -> StepLimit:
 @lru_cache(maxsize=None)
 def stiffness_kernel(law, features, parallel: bool, lanes: bool):
     """y = df/du . w at displacement u: elastic and contact forces."""
-    el = element_functions(law, features.uniform, lanes)
+    el = functions_of(law, features.uniform, lanes)
     t, contacts = el.types, features.contacts
 
     @ti.kernel

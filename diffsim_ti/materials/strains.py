@@ -47,6 +47,24 @@ class StrainLaw(Law):
         return None, (H + H.transpose()) * self.real(0.5)
 
     @traced
+    def dilatation(self, H):
+        """tr eps"""
+        return self.rotation_and_strain(H)[1].trace()
+
+    @traced
+    def dilatation_gradient(self, H):
+        """R"""
+        R = self.rotation_and_strain(H)[0] if self.rotates else H * 0
+        return R if self.rotates else add_to_diagonal(R, 1)
+
+    @traced
+    def dilatation_gradient_differential(self, H, dH):
+        if not self.rotates:
+            return H * 0
+        R, eps = self.rotation_and_strain(H)
+        return R @ spin(eps, R.transpose() @ dH, self.fp)
+
+    @traced
     def energy_density(self, H, p):
         _, eps = self.rotation_and_strain(H)
         return self.psi(eps.trace(), inner(eps, eps), p)

@@ -17,7 +17,7 @@ class Potential:
         self.arrays, self.tetrahedra, self.pairs = arrays, tetrahedra, pairs
         a = arrays
         self.kernels = potential_kernels(a.law, a.features(), parallel, a.in_lanes)
-        n, m = a.num_vertices, a.num_tetrahedra
+        n, m = a.num_vertices, a.num_places
         self.u, self.w, self.y = (runtime.array(a.vector, 1, n) for _ in range(3))
         twins = a.features().contacts
         self.rubs = any(c.friction for c in twins)
@@ -102,7 +102,7 @@ class Potential:
 
     def tangents(self) -> np.ndarray:
         """d2psi/dF2 [Pa] of each tetrahedron where `blocks` was last called, shape (num_tetrahedra, 9, 9)."""
-        return from_blocks(runtime.fetch(self._tangent), self.arrays.num_tetrahedra, 81).reshape(-1, 9, 9)
+        return from_blocks(runtime.fetch(self._tangent), self.arrays.place, 81).reshape(-1, 9, 9)
 
     def contact_blocks(self) -> np.ndarray | None:
         """The part of contact in `blocks`; None without contacts."""
