@@ -41,9 +41,11 @@ class StrainLaw(Law):
 
     @traced
     def rotation_and_strain(self, H):
-        """(R, eps); R is None without rotation."""
+        """(R, eps), found once for each Tensor; R is None without rotation."""
         if self.rotates:
-            return polar(H, self.fp)
+            if H.polar is None:
+                H.polar = polar(H, self.fp)
+            return H.polar
         return None, (H + H.transpose()) * self.real(0.5)
 
     @traced

@@ -190,6 +190,15 @@ def potential_kernels(law, features, parallel: bool, lanes: bool) -> SimpleNames
             out[2, i] = el.gather(i, scene, corner2) - contact_product(i, scene, u[0, i], vector(0, 0, 1, 0))
 
     @ti.kernel
+    def pressure_forces(tets: t.ints, gradients: t.blocks, volumes: t.blocks, coefficients: t.blocks, u: t.vectors2,
+                        corner: t.vectors, num_items: ti.i32, per_gamma: fp):  # fmt: skip
+        """Corner forces of a unit pressure in every patch."""
+        scene = Bundle(tets=tets, gradients=gradients, volumes=volumes, coefficients=coefficients)
+        ti.loop_config(serialize=not parallel)
+        for e in range(num_items):
+            el.pressure_forces(e, scene, u, 0, corner)
+
+    @ti.kernel
     def contact_blocks(parameters: t.scalars, rest: t.vectors, surface: t.ints, walls: t.vectors, lag: t.vectors2,
                        u: t.vectors2, out: t.vectors2, num_vertices: ti.i32, per_gamma: fp):  # fmt: skip
         """The part of contact in `blocks`."""
@@ -313,4 +322,4 @@ def potential_kernels(law, features, parallel: bool, lanes: bool) -> SimpleNames
         return f
 
     return SimpleNamespace(energy=energy, forces=forces, product=product, blocks=blocks, vjp=vjp, jvp=jvp,
-                           contact_blocks=contact_blocks)  # fmt: skip
+                           contact_blocks=contact_blocks, pressure_forces=pressure_forces)  # fmt: skip
