@@ -1,12 +1,17 @@
 """Scene: what is simulated, and nothing about how."""
 
+import warnings
+
 import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.inputs import Inputs
+from diffsim_ti.materials.moduli import youngs_poisson
 from diffsim_ti.materials.patch_law import PatchLaw
 from diffsim_ti.terms import Drag, ExternalForce, Gravity, Obstacle, SelfContact, Term
 from diffsim_ti.terms.motion import sampled
+
+LOCKING_RATIO = 0.45
 
 
 class Scene:
@@ -24,7 +29,8 @@ class Scene:
     volume: where a change of volume is resisted: in each of the "tetrahedra", which lock as Poisson's ratio nears 0.5, or
         on average over "patches" of up to eight, which lock much less (patched_tetrahedron.py).
 
-    Raises ValueError with rule, value and remedy for anything that does not fit, before any kernel runs.
+    Raises ValueError with rule, value and remedy for anything that does not fit, before any kernel runs. Warns where
+    tetrahedra lock, above Poisson's ratio 0.45.
     """
 
     def __init__(self, mesh, material, density=1000.0, terms=(), fixed=None, motion=None, initial_positions=None,
@@ -47,6 +53,8 @@ class Scene:
         self.moving = tuple(t for t in self.terms if t.path is not None)
         self.inputs = Inputs(self, density, initial_positions, initial_velocities)
         self._check_start()
+        if volume == "tetrahedra":
+            self._warn_if_locking()
 
     @property
     def law(self):
@@ -76,6 +84,18 @@ class Scene:
         places = self.places(0.0)
         for term in self.terms:
             term.check_start(positions, surface, *([places[term]] if term in places else []))
+
+    def _warn_if_locking(self) -> None:
+        values = self.inputs.values
+        mu, lam = self.material.lame({name: values[name] for name in self.material.inputs})
+        nu = float(np.max(youngs_poisson(mu, lam)[1]))
+        if nu > LOCKING_RATIO + 1e-12:
+            warnings.warn(
+                f"{self.material.name}: Poisson's ratio {nu:.6g} is above {LOCKING_RATIO}, where linear tetrahedra lock "
+                '(bend too little): pass volume="patches" to the Scene, cut cells with pattern="five", refine the mesh, or '
+                "lower the ratio",
+                stacklevel=3,
+            )
 
     def term(self, kind: type) -> Term | None:
         """The scene's first term of a kind, or None."""

@@ -30,8 +30,9 @@ def element_limit(scene, values: dict | None = None) -> StepLimit:
         omega^2 <= (4 / rho) [max(lam, 0) sum_a |grad N_a|^2 + 2 mu lambda_max(sum_a grad N_a (x) grad N_a)]
         dt = 2 / omega
 
-    mu, lam are the law's small-strain moduli; with volume="patches" lam is the patch's mean. The eigenvalues of the assembled system never exceed the largest of its
-    elements (Hughes, The Finite Element Method, 9.1); lumped vertex masses are at least those of the element.
+    mu, lam are the law's small-strain moduli; with volume="patches" lam is the patch's mean. The eigenvalues of the
+    assembled system never exceed the largest of its elements (Hughes, The Finite Element Method, 9.1); lumped vertex masses
+    are at least those of the element.
     """
     values, material = scene.inputs.values if values is None else values, scene.material
     mu, lam = material.lame({name: values[name] for name in material.inputs})

@@ -215,7 +215,6 @@ class ImplicitTangent(_Passes):
         p = workspace.potential
         self.du, self.dv, self.before_dots = dots.displacement.copy(), dots.velocity.copy(), None
         kernel = potential_kernels(a.law, a.features(), workspace.parallel, a.in_lanes).jvp
-        blocks = a.num_blocks
         self._arrays = (
             runtime.upload(a.coefficient_blocks(dots.coefficients), a.lanes), runtime.upload(dots.parameters, a.fp),
             runtime.upload(dots.rest, a.vector), runtime.upload(to_blocks(dots.gradients, a.order), a.lanes),

@@ -114,7 +114,9 @@ def _rigid_motions(X: np.ndarray) -> np.ndarray:
 
 
 def element_matrices(potential) -> np.ndarray:
-    """12x12 stiffness of each tetrahedron, its patch's pressure held, where `potential.blocks` was last called, as (m, 4, 4, 3, 3) blocks [N/m]."""
+    """12x12 stiffness of each tetrahedron where `potential.blocks` was last called, as (m, 4, 4, 3, 3) blocks [N/m]; a
+    patch's pressure is held.
+    """
     a = potential.arrays
     m, B = a.num_tetrahedra, a.values.gradients
     N = np.concatenate([-B.sum(1, keepdims=True), B], 1)
