@@ -236,5 +236,5 @@ def test_membrane_locks_several_times_less():
 
 
 def test_beam_of_kuhn_cells_bends():
-    """A cantilever of 4 cells across, nu = 0.4999: 6 % of its drop with tetrahedra, 83 % with patches."""
-    assert benchmark_locking.product_drop(4, "kuhn", 0.4999, "patches") == pytest.approx(0.827, abs=1e-3)
+    """A cantilever of 4 cells across, nu = 0.4999: 6 % of its drop with tetrahedra, 82 % with patches."""
+    assert benchmark_locking.product_drop(4, "kuhn", 0.4999, "patches") == pytest.approx(0.822, abs=1e-3)
