@@ -7,22 +7,22 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
+from diffsim_ti.patched_tetrahedron import functions_of
 from diffsim_ti.runtime import Bundle
-from diffsim_ti.tetrahedron import element_functions
 
 
 @lru_cache(maxsize=None)
 def observer_kernels(law, features):
     """Kernels (fields of the tetrahedra, contact energy of the vertices) at a displacement."""
-    el = element_functions(law, features.uniform, False)
+    el = functions_of(law, features.uniform, False)
     t, contacts = el.types, features.contacts
 
     @ti.kernel
-    def tetrahedron_fields(tets: t.ints, gradients: t.blocks, coefficients: t.blocks, u: t.vectors2,
-                           energy: t.scalars, von_mises: t.scalars, J: t.scalars, num_tetrahedra: ti.i32):  # fmt: skip
-        scene = Bundle(tets=tets)
-        for e in range(num_tetrahedra):
-            H, p = el.edges(e, scene, u, 0).dot(el.gradients_of(e, gradients)), el.coefficients_of(e, coefficients)
+    def tetrahedron_fields(tets: t.ints, gradients: t.blocks, volumes: t.blocks, coefficients: t.blocks, u: t.vectors2,
+                           energy: t.scalars, von_mises: t.scalars, J: t.scalars, num_places: ti.i32):  # fmt: skip
+        scene = Bundle(tets=tets, gradients=gradients, volumes=volumes, coefficients=coefficients)
+        for e in range(num_places):
+            H, p = el.edges(e, scene, u, 0).dot(el.gradients_of(e, gradients)), el.coefficients_at(e, scene, u, 0)
             F = H.matrix() + ti.Matrix.identity(t.fp, 3)
             det = F.determinant()
             S = law.stress(H, p).matrix() @ F.transpose() / det  # Cauchy
@@ -68,10 +68,10 @@ class TetrahedronFields:
 def tetrahedron_fields(workspace) -> TetrahedronFields:
     """Fields of the current state. von Mises is sqrt(3/2 dev S : dev S) of the Cauchy stress S = P F^T / J."""
     a = workspace.arrays
-    out = [runtime.array(a.fp, a.num_tetrahedra) for _ in range(3)]
+    out = [runtime.array(a.fp, a.num_places) for _ in range(3)]
     kernel = observer_kernels(a.law, a.features())[0]
-    kernel(a.tets, a.gradients, a.coefficients, workspace.state.u, *out, a.num_tetrahedra)
-    return TetrahedronFields(*(runtime.fetch(x).astype(np.float64) for x in out))
+    kernel(a.tets, a.gradients, a.volumes, a.coefficients, workspace.state.u, *out, a.num_places)
+    return TetrahedronFields(*(runtime.fetch(x)[a.place].astype(np.float64) for x in out))
 
 
 def energy(workspace) -> Energy:

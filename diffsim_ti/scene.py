@@ -1,11 +1,17 @@
 """Scene: what is simulated, and nothing about how."""
 
+import warnings
+
 import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.inputs import Inputs
+from diffsim_ti.materials.moduli import youngs_poisson
+from diffsim_ti.materials.patch_law import PatchLaw
 from diffsim_ti.terms import Drag, ExternalForce, Gravity, Obstacle, SelfContact, Term
 from diffsim_ti.terms.motion import sampled
+
+LOCKING_RATIO = 0.45
 
 
 class Scene:
@@ -20,18 +26,25 @@ class Scene:
         shape (num_fixed, 3) [m], or keyframes (times, displacements) between which it is linear. Default: held still.
     initial_positions [m], initial_velocities [m/s]: shape (num_vertices, 3) or 3 numbers (velocities); default at rest.
     precision: "f32", "f64" or None for the default that `diffsim_ti.init` set.
+    volume: where a change of volume is resisted: in each of the "tetrahedra", which lock as Poisson's ratio nears 0.5, or
+        on average over "patches" of up to eight, which lock much less (patched_tetrahedron.py).
 
-    Raises ValueError with rule, value and remedy for anything that does not fit, before any kernel runs.
+    Raises ValueError with rule, value and remedy for anything that does not fit, before any kernel runs. Warns where
+    tetrahedra lock, above Poisson's ratio 0.45.
     """
 
     def __init__(self, mesh, material, density=1000.0, terms=(), fixed=None, motion=None, initial_positions=None,
-                 initial_velocities=None, precision: str | None = None):  # fmt: skip
+                 initial_velocities=None, precision: str | None = None, volume: str = "tetrahedra"):  # fmt: skip
         self._arguments = dict(
             mesh=mesh, material=material, density=density, terms=terms, fixed=fixed, motion=motion,
             initial_positions=initial_positions, initial_velocities=initial_velocities, precision=precision,
+            volume=volume,
         )  # fmt: skip
         self.mesh, self.material = mesh, material
         self.precision = runtime.check_precision(precision)
+        if volume not in ("tetrahedra", "patches"):
+            raise ValueError(f'volume must be "tetrahedra" or, against locking, "patches", got {volume!r}')
+        self.volume = volume
         self.terms = tuple([terms] if isinstance(terms, Term) else terms)
         self.fixed = np.zeros(0, np.int64) if fixed is None else mesh.vertex_indices(fixed)
         self.motion = motion
@@ -40,6 +53,14 @@ class Scene:
         self.moving = tuple(t for t in self.terms if t.path is not None)
         self.inputs = Inputs(self, density, initial_positions, initial_velocities)
         self._check_start()
+        if volume == "tetrahedra":
+            self._warn_if_locking()
+
+    @property
+    def law(self):
+        """The law that kernels are compiled for."""
+        law = self.material.law(self.precision)
+        return PatchLaw(self.precision, law) if self.volume == "patches" else law
 
     def replace(self, **changes) -> "Scene":
         """A scene with some arguments replaced."""
@@ -63,6 +84,18 @@ class Scene:
         places = self.places(0.0)
         for term in self.terms:
             term.check_start(positions, surface, *([places[term]] if term in places else []))
+
+    def _warn_if_locking(self) -> None:
+        values = self.inputs.values
+        mu, lam = self.material.lame({name: values[name] for name in self.material.inputs})
+        nu = float(np.max(youngs_poisson(mu, lam)[1]))
+        if nu > LOCKING_RATIO + 1e-12:
+            warnings.warn(
+                f"{self.material.name}: Poisson's ratio {nu:.6g} is above {LOCKING_RATIO}, where linear tetrahedra lock "
+                '(bend too little): pass volume="patches" to the Scene, cut cells with pattern="five", refine the mesh, or '
+                "lower the ratio",
+                stacklevel=3,
+            )
 
     def term(self, kind: type) -> Term | None:
         """The scene's first term of a kind, or None."""

@@ -7,8 +7,9 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
+from diffsim_ti.mesh_patches import volume_patches
+from diffsim_ti.patched_tetrahedron import functions_of
 from diffsim_ti.runtime import Bundle
-from diffsim_ti.tetrahedron import element_functions
 
 
 @dataclass(frozen=True)
@@ -29,12 +30,18 @@ def element_limit(scene, values: dict | None = None) -> StepLimit:
         omega^2 <= (4 / rho) [max(lam, 0) sum_a |grad N_a|^2 + 2 mu lambda_max(sum_a grad N_a (x) grad N_a)]
         dt = 2 / omega
 
-    mu, lam are the law's small-strain moduli. The eigenvalues of the assembled system never exceed the largest of its
-    elements (Hughes, The Finite Element Method, 9.1); lumped vertex masses are at least those of the element.
+    mu, lam are the law's small-strain moduli; with volume="patches" lam is the patch's mean. The eigenvalues of the
+    assembled system never exceed the largest of its elements (Hughes, The Finite Element Method, 9.1); lumped vertex masses
+    are at least those of the element.
     """
     values, material = scene.inputs.values if values is None else values, scene.material
     mu, lam = material.lame({name: values[name] for name in material.inputs})
-    B = scene.inputs.derive(values).gradients
+    derived = scene.inputs.derive(values)
+    B = derived.gradients
+    if scene.volume == "patches" and np.ndim(lam):
+        patches = volume_patches(scene.mesh)
+        means = np.bincount(patches, lam * derived.volumes) / np.bincount(patches, derived.volumes)
+        lam = means[patches]
     N = np.concatenate([-B.sum(1, keepdims=True), B], 1)
     largest = np.linalg.eigvalsh(np.einsum("eai,eaj->eij", N, N))[:, -1]
     omega2 = 4 / values["density"] * (np.maximum(lam, 0) * (N**2).sum((1, 2)) + 2 * mu * largest)
@@ -45,7 +52,7 @@ def element_limit(scene, values: dict | None = None) -> StepLimit:
 @lru_cache(maxsize=None)
 def stiffness_kernel(law, features, parallel: bool, lanes: bool):
     """y = df/du . w at displacement u: elastic and contact forces."""
-    el = element_functions(law, features.uniform, lanes)
+    el = functions_of(law, features.uniform, lanes)
     t, contacts = el.types, features.contacts
 
     @ti.kernel

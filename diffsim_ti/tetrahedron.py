@@ -114,6 +114,11 @@ def element_functions(law, uniform: bool, lanes: bool) -> SimpleNamespace:
         return kind.numbers(array, 0, K, K, 0 if uniform else item)
 
     @traced
+    def coefficients_at(item, scene, u, s) -> list:
+        """What the law takes at slot s of the displacement."""
+        return coefficients_of(item, scene.coefficients)
+
+    @traced
     def volume_of(item, array):
         return kind.numbers(array, 0, 1, 1, item)[0]
 
@@ -190,7 +195,8 @@ def element_functions(law, uniform: bool, lanes: bool) -> SimpleNamespace:
         vectors=ti.types.ndarray(vector, 1), vectors2=ti.types.ndarray(vector, 2), ints=ti.types.ndarray(ti.i32, 1),
     )  # fmt: skip
     return SimpleNamespace(
-        types=types, numbers=kind.numbers, put=kind.put, store_corners=kind.store, broadcast=kind.broadcast,
-        edges=edges, gradients_of=gradients_of, coefficients_of=coefficients_of, volume_of=volume_of, gather=gather,
+        types=types, numbers=kind.numbers, put=kind.put, add=kind.add, store_corners=kind.store, store=store,
+        broadcast=kind.broadcast, edges=edges, gradients_of=gradients_of, coefficients_of=coefficients_of,
+        coefficients_at=coefficients_at, volume_of=volume_of, gather=gather,
         forces=forces, stiffness=stiffness, forces_jvp=forces_jvp, forces_vjp=forces_vjp, shape_vjp=shape_vjp,
     )  # fmt: skip

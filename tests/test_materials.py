@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import taichi as ti
 
+from diffsim_ti import Scene, TetrahedralMesh
 from diffsim_ti.materials import (
     MATERIALS,
     Corotated,
@@ -561,9 +562,14 @@ SOFT_IN_SHEAR = [dict(E=E, nu=0.49), dict(mu=1.0, lam=100.0), dict(E=E, nu={"lef
 @pytest.mark.parametrize("numbers", SOFT_IN_SHEAR)
 @every_law
 def test_nearly_incompressible_materials_warn_once_of_locking(material, numbers):
-    with pytest.warns(UserWarning, match="linear tetrahedra lock") as record:
-        material(**numbers)
+    box = TetrahedralMesh.create_box(2)
+    mesh = TetrahedralMesh(box.vertices, box.tetrahedra, tetrahedron_sets={"left": [0, 1]})
+    with pytest.warns(UserWarning, match='linear tetrahedra lock.*volume="patches"') as record:
+        Scene(mesh, material(**numbers))
     assert len(record) == 1 and record[0].filename == __file__
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Scene(mesh, material(**numbers), volume="patches")
 
 
 def test_ordinary_materials_do_not_warn():
@@ -571,5 +577,5 @@ def test_ordinary_materials_do_not_warn():
         warnings.simplefilter("error")
         for nu in (-0.5, 0.0, 0.45):
             for m in (StableNeoHookean, StVenantKirchhoff, Corotated):
-                m(E, nu)
-                m(mu=moduli.lame(E, nu)[0], lam=moduli.lame(E, nu)[1])
+                Scene(TetrahedralMesh.create_box(2), m(E, nu))
+                Scene(TetrahedralMesh.create_box(2), m(mu=moduli.lame(E, nu)[0], lam=moduli.lame(E, nu)[1]))

@@ -51,6 +51,19 @@ class InvariantLaw(Law):
         return let(self.real(0.5) * (i1 * i1 - inner(G, G))), G, add_to_diagonal(H * i1 - G - H @ G, i1)
 
     @traced
+    def dilatation(self, H):
+        """J - 1"""
+        return invariants(H)[1]
+
+    @traced
+    def dilatation_gradient(self, H):
+        return add_to_diagonal(invariants(H)[0], 1)
+
+    @traced
+    def dilatation_gradient_differential(self, H, dH):
+        return cofactor_differential(add_to_diagonal(H, 1), dH)
+
+    @traced
     def energy_density(self, H, p):
         _, j, s = invariants(H)
         q, _, _ = self.second_invariant(H, let(s + 2 * j))

@@ -23,6 +23,7 @@ class Law:
     precision: str
 
     coefficient_names = ()
+    last_without_lam = ()  # factors f: with lam = 0 the last coefficient is sum_k f_k p_k; empty: zero
     lanes = True  # written with + - * / and max alone, so that a number may be a vector of lanes
 
     @property
@@ -45,6 +46,18 @@ class Law:
     @ti.func
     def stress_differential_and_products(self, H, dH, p):
         """(dP, products): dP = d2psi/dF2 : dH, a Tensor, and dH : dP/dp_k, a list of K, from the same scalars."""
+
+    @traced
+    def dilatation(self, H):
+        """theta, the change of volume of which lam resists lam/2 theta^2 [-]; tr(e) for small strains e."""
+
+    @traced
+    def dilatation_gradient(self, H):
+        """dtheta/dF, a Tensor."""
+
+    @traced
+    def dilatation_gradient_differential(self, H, dH):
+        """Its change for a change dH, a Tensor."""
 
     @traced
     def stress_differential(self, H, dH, p):

@@ -1,6 +1,5 @@
 """A material: a law with its numbers."""
 
-import warnings
 from abc import ABC, abstractmethod
 
 import numpy as np
@@ -8,7 +7,6 @@ import numpy as np
 from diffsim_ti.materials import moduli
 
 _ALIASES = {"E": "youngs_modulus", "nu": "poissons_ratio"}
-LOCKING_RATIO = 0.45
 
 
 class Material(ABC):
@@ -24,7 +22,7 @@ class Material(ABC):
     A subclass gives `law` and constant matrices `from_lame` (K x 2) from (mu, lam) to the law's K coefficients and
     `to_lame` (2 x K) back.
 
-    Raises ValueError with rule, value and remedy. Warns above Poisson's ratio 0.45, where linear tetrahedra lock.
+    Raises ValueError with rule, value and remedy.
     """
 
     spellings = (("youngs_modulus", "poissons_ratio"), ("mu", "lam"))
@@ -38,7 +36,6 @@ class Material(ABC):
         self._numbers = self._spell(numbers, named)
         self._extra = ""
         self.check({name: _all_values(name, number) for name, number in self._numbers.items()})
-        self._warn_if_locking()
 
     def _spell(self, numbers: tuple, named: dict) -> dict:
         """{input name: number} in the order of the one spelling that fits."""
@@ -57,18 +54,6 @@ class Material(ABC):
             if set(given) == set(names):
                 return {name: given[name] for name in names}
         raise ValueError(f"{self.name}: needs exactly one of {usage}, got ({', '.join(given) or 'nothing'})")
-
-    def _warn_if_locking(self) -> None:
-        values = {name: _all_values(name, number) for name, number in self._numbers.items()}
-        if len({v.size for v in values.values()} - {1}) > 1:  # sets that only a mesh can pair up
-            return
-        nu = np.max(values["poissons_ratio"] if "poissons_ratio" in values else moduli.youngs_poisson(*self.lame(values))[1])
-        if nu > LOCKING_RATIO + 1e-12:
-            warnings.warn(
-                f"{self.name}: Poisson's ratio {nu:.6g} is above {LOCKING_RATIO}, where linear tetrahedra lock (bend too "
-                'little); cut cells with pattern="five", refine the mesh, or lower the ratio',
-                stacklevel=_levels_to_caller(),
-            )
 
     @property
     def name(self) -> str:
@@ -101,7 +86,7 @@ class Material(ABC):
                 raise ValueError(f"{name} must be finite, got {np.ravel(bad)[0]} ({np.size(bad)} of {np.size(value)})")
         if "youngs_modulus" in values:
             check_range("youngs_modulus", values["youngs_modulus"], 0, np.inf, False, "a stiffness [Pa]")
-            remedy = "0.5 is incompressible; take 0.45, or up to 0.49 with a fine mesh"
+            remedy = '0.5 is incompressible; take 0.45, or up to 0.4999 with volume="patches" of the Scene'
             check_range("poissons_ratio", values["poissons_ratio"], -1, 0.5, False, remedy)
         if "mu" in values:
             check_range("mu", values["mu"], 0, np.inf, False, "a stiffness [Pa]")
@@ -219,16 +204,6 @@ def _from_sets(name: str, numbers: dict, mesh) -> np.ndarray:
             'add a number for "default"'
         )
     return value
-
-
-def _levels_to_caller() -> int:
-    """Stack level of the code that constructs a material, for a warning that points there."""
-    import sys
-
-    level, frame = 1, sys._getframe(1)
-    while frame and "self" in frame.f_locals and isinstance(frame.f_locals["self"], Material):
-        level, frame = level + 1, frame.f_back
-    return level
 
 
 def _short(number) -> str:

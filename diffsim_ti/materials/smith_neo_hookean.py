@@ -15,6 +15,7 @@ class SmithNeoHookeanLaw(InvariantLaw):
     """psi = m/2 (3/4 s + x - log(1 + x)) + l/2 j^2 with x = (I_C - 3) / 4 = (s + 2 j) / 4."""
 
     coefficient_names = ("m", "l")
+    last_without_lam = (5 / 8,)
 
     @ti.func
     def psi(self, j, s, q, p):

@@ -6,6 +6,8 @@ import taichi as ti
 
 from diffsim_ti.materials.invariants import InvariantLaw
 from diffsim_ti.materials.material import Material
+from diffsim_ti.materials.tensor import add_to_diagonal, inner
+from diffsim_ti.runtime import let, traced
 
 
 @dataclass(frozen=True)
@@ -14,6 +16,19 @@ class StVenantKirchhoffLaw(InvariantLaw):
 
     coefficient_names = ("mu", "lam")
     uses_q = True
+
+    @traced
+    def dilatation(self, H):
+        """tr E"""
+        return let(H.trace() + inner(H, H) * self.real(0.5))
+
+    @traced
+    def dilatation_gradient(self, H):
+        return add_to_diagonal(H, 1)
+
+    @traced
+    def dilatation_gradient_differential(self, H, dH):
+        return dH
 
     @ti.func
     def psi(self, j, s, q, p):

@@ -41,10 +41,30 @@ class StrainLaw(Law):
 
     @traced
     def rotation_and_strain(self, H):
-        """(R, eps); R is None without rotation."""
+        """(R, eps), found once for each Tensor; R is None without rotation."""
         if self.rotates:
-            return polar(H, self.fp)
+            if H.polar is None:
+                H.polar = polar(H, self.fp)
+            return H.polar
         return None, (H + H.transpose()) * self.real(0.5)
+
+    @traced
+    def dilatation(self, H):
+        """tr eps"""
+        return self.rotation_and_strain(H)[1].trace()
+
+    @traced
+    def dilatation_gradient(self, H):
+        """R"""
+        R = self.rotation_and_strain(H)[0] if self.rotates else H * 0
+        return R if self.rotates else add_to_diagonal(R, 1)
+
+    @traced
+    def dilatation_gradient_differential(self, H, dH):
+        if not self.rotates:
+            return H * 0
+        R, eps = self.rotation_and_strain(H)
+        return R @ spin(eps, R.transpose() @ dH, self.fp)
 
     @traced
     def energy_density(self, H, p):

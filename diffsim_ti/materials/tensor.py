@@ -16,6 +16,7 @@ class Tensor:
 
     def __init__(self, numbers):
         self.numbers = [let(x) for x in numbers]
+        self.polar = None  # its polar decomposition, once some law has asked for it
 
     def __getitem__(self, index):
         return self.numbers[3 * index[0] + index[1]]

@@ -5,6 +5,7 @@ import taichi as ti
 
 from diffsim_ti import runtime
 from diffsim_ti.inputs import Derived
+from diffsim_ti.mesh_patches import in_eights, volume_patches
 from diffsim_ti.solvers.kick_drift import Features
 from diffsim_ti.terms import Drag, ExternalForce, Gravity, SelfContact
 from diffsim_ti.tetrahedron import LANES
@@ -30,17 +31,15 @@ def slots(indices: np.ndarray, num_vertices: int) -> np.ndarray:
     return out
 
 
-def to_blocks(per_tetrahedron: np.ndarray, num_blocks: int) -> np.ndarray:
-    """(num_tetrahedra, rows) as (num_blocks * rows, LANES), the last block filled up with tetrahedron 0."""
-    rows = per_tetrahedron.reshape(len(per_tetrahedron), -1)
-    fill = np.broadcast_to(rows[:1], (num_blocks * LANES - len(rows), rows.shape[1]))
-    blocks = np.concatenate([rows, fill]).reshape(num_blocks, LANES, -1)
-    return np.swapaxes(blocks, 1, 2).reshape(-1, LANES)
+def to_blocks(per_tetrahedron: np.ndarray, order: np.ndarray) -> np.ndarray:
+    """(num_tetrahedra, rows) as (num_blocks * rows, LANES); order: the tetrahedron in each lane."""
+    rows = per_tetrahedron.reshape(len(per_tetrahedron), -1)[order]
+    return np.swapaxes(rows.reshape(len(order) // LANES, LANES, -1), 1, 2).reshape(-1, LANES)
 
 
-def from_blocks(blocks: np.ndarray, num_tetrahedra: int, rows: int) -> np.ndarray:
-    """The inverse: (num_tetrahedra, rows) in float64."""
-    return np.swapaxes(blocks.reshape(-1, rows, LANES), 1, 2).reshape(-1, rows)[:num_tetrahedra].astype(np.float64)
+def from_blocks(blocks: np.ndarray, place, rows: int) -> np.ndarray:
+    """The inverse: (num_tetrahedra, rows) in float64; place: where each tetrahedron stands, among all lanes."""
+    return np.swapaxes(blocks.reshape(-1, rows, LANES), 1, 2).reshape(-1, rows)[place].astype(np.float64)
 
 
 class SceneArrays:
@@ -50,17 +49,20 @@ class SceneArrays:
         mesh, precision = scene.mesh, scene.precision
         fp = runtime.PRECISIONS[precision]
         self.fp, self.vector, self.lanes = fp, ti.types.vector(4, fp), ti.types.vector(LANES, fp)
-        self.law = scene.material.law(precision)
-        self.num_coefficients, self.num_blocks = len(self.law.coefficient_names), -(-mesh.num_tetrahedra // LANES)
+        self.law = scene.law
+        self._place_tetrahedra(scene)
+        self.num_coefficients, self.num_blocks = len(self.law.coefficient_names), len(self.order) // LANES
         self.in_lanes = self.law.lanes and runtime.runs_on_cpu()
-        self.num_items = self.num_blocks if self.in_lanes else mesh.num_tetrahedra
+        self.num_items = self.num_blocks if self.in_lanes else self.num_places
         self.num_vertices, self.num_tetrahedra = mesh.num_vertices, mesh.num_tetrahedra
         self.contacts = tuple(t for t in scene.terms if t.acts_on_surface)
         self.fixed = scene.fixed
-        self.tets = runtime.upload(to_blocks(mesh.tetrahedra, self.num_blocks).ravel(), ti.i32)
+        self.tets = runtime.upload(to_blocks(mesh.tetrahedra, self.order).ravel(), ti.i32)
         self.mesh, self.precision, self.self_contact = mesh, precision, scene.term(SelfContact)
         self.first_contact_corner, num_corners = 4 * LANES * self.num_blocks, 4 * LANES * self.num_blocks
         start, corner_of = vertex_corners(mesh.tetrahedra, mesh.num_vertices)
+        if self.patches is not None:
+            corner_of = 4 * self.place[corner_of // 4] + corner_of % 4
         if self.self_contact:  # each surface vertex gathers one corner more, after those of its tetrahedra
             self.first_of_self_contact = scene.inputs.first_parameter(self.self_contact)
             start, corner_of = with_own_corner(start, corner_of, mesh.surface_vertices, num_corners)
@@ -90,6 +92,20 @@ class SceneArrays:
         self.values: Derived | None = None
         self.corner = runtime.array(self.vector, num_corners)
 
+    def _place_tetrahedra(self, scene) -> None:
+        """`order`: the tetrahedron in each lane; `place`: the lane of each; `num_places`: lanes to go through."""
+        m = scene.mesh.num_tetrahedra
+        self.patches = volume_patches(scene.mesh) if scene.volume == "patches" else None
+        if self.patches is not None:
+            self.order, self.place = in_eights(self.patches)
+            self.num_places = len(self.order)
+            self._alone = np.zeros(self.num_places)  # 1 where a lane is no repetition
+            self._alone[self.place] = 1
+            return
+        self.order = np.zeros(-(-m // LANES) * LANES, np.int64)  # the last block is filled up with tetrahedron 0
+        self.order[:m] = np.arange(m)
+        self.place, self.num_places = slice(m), m
+
     def _twins(self, scene) -> tuple:
         """Compile-time twins of the contacts; their tables stand behind the parameters, one after the other."""
         columns, twins, at = {term: k for k, term in enumerate(scene.moving)}, [], max(scene.inputs.num_parameters, 1)
@@ -117,8 +133,8 @@ class SceneArrays:
         inverse_mass = np.divide(1.0, values.mass, out=np.zeros_like(values.mass), where=values.mass > 0)
         inverse_mass[self.fixed] = 0
         sources = {
-            "gradients": (to_blocks(values.gradients, self.num_blocks), self.lanes),
-            "volumes": (to_blocks(values.volumes, self.num_blocks), self.lanes),
+            "gradients": (to_blocks(values.gradients, self.order), self.lanes),
+            "volumes": (self.volume_blocks(values.volumes), self.lanes),
             "coefficients": (self.coefficient_blocks(values.coefficients), self.lanes),
             "inverse_mass": (inverse_mass, self.fp),
             "parameters": (np.concatenate([values.parameters, self.tables]), self.fp),
@@ -150,7 +166,12 @@ class SceneArrays:
 
     def coefficient_blocks(self, coefficients: np.ndarray) -> np.ndarray:
         """Blocks of coefficients, shape (K,) or (num_tetrahedra, K); a single block serves all if they are uniform."""
-        return to_blocks(np.atleast_2d(coefficients), 1 if coefficients.ndim == 1 else self.num_blocks)
+        return to_blocks(np.atleast_2d(coefficients), np.zeros(LANES, int) if coefficients.ndim == 1 else self.order)
+
+    def volume_blocks(self, volumes: np.ndarray) -> np.ndarray:
+        """Blocks of volumes; repetitions in a patch have none."""
+        blocks = to_blocks(volumes, self.order)
+        return blocks if self.patches is None else blocks * self._alone.reshape(-1, LANES)
 
     def topology(self) -> tuple:
         """Arguments that every pass starts with."""

@@ -103,7 +103,7 @@ class ExplicitAdjoint:
         rows = self.features.sums()
         sums = runtime.fetch(self.sums).astype(np.float64)
         out = values.zeros()
-        out.coefficients = from_blocks(runtime.fetch(self.coefficients), a.num_tetrahedra, a.num_coefficients)
+        out.coefficients = from_blocks(runtime.fetch(self.coefficients), a.place, a.num_coefficients)
         if state:
             out.displacement = runtime.fetch(self.u)[0].astype(np.float64)
             out.velocity = runtime.fetch(self.v)[0].astype(np.float64)
@@ -122,8 +122,8 @@ class ExplicitAdjoint:
         if self.features.shape:
             out.rest = out.rest + runtime.fetch(self.frames[0]).astype(np.float64).sum(0)
             out.rest += sums[rows["rest"] :][:3].T
-            out.gradients = from_blocks(runtime.fetch(self.gradients), a.num_tetrahedra, 9).reshape(-1, 3, 3)
-            out.volumes = from_blocks(runtime.fetch(self.volumes), a.num_tetrahedra, 1)[:, 0]
+            out.gradients = from_blocks(runtime.fetch(self.gradients), a.place, 9).reshape(-1, 3, 3)
+            out.volumes = from_blocks(runtime.fetch(self.volumes), a.place, 1)[:, 0]
         if out.forces is not None:
             out.forces = runtime.fetch(self.forces).astype(np.float64)
         if out.motion is not None:
@@ -153,8 +153,8 @@ class ExplicitTangent:
             runtime.upload(np.zeros((1, 1, 3)) if dots.forces is None else dots.forces, a.vector),
             runtime.upload(motion, a.vector), runtime.upload(anchor, a.vector),
             runtime.upload(np.zeros((1, 1, 3)) if dots.path is None else dots.path, a.vector),
-            runtime.upload(to_blocks(dots.gradients, a.num_blocks), a.lanes),
-            runtime.upload(to_blocks(dots.volumes, a.num_blocks), a.lanes),
+            runtime.upload(to_blocks(dots.gradients, a.order), a.lanes),
+            runtime.upload(a.volume_blocks(dots.volumes), a.lanes),
         )  # fmt: skip
         self._rate_dot = float(dots.parameters[self.features.drag]) if self.features.drag >= 0 else 0.0
         self._rest_dot, self._parameters_dot = dots.rest, dots.parameters

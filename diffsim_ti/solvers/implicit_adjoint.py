@@ -182,7 +182,7 @@ class ImplicitAdjoint(_Passes):
         """Adjoints of what kernels read, in float64, at the start of the run."""
         a, rows = self.ws.arrays, self.features.sums()
         sums, out = runtime.fetch(self.sums).astype(np.float64), a.values.zeros()
-        out.coefficients = from_blocks(runtime.fetch(self.coefficients), a.num_tetrahedra, a.num_coefficients)
+        out.coefficients = from_blocks(runtime.fetch(self.coefficients), a.place, a.num_coefficients)
         out.displacement, out.velocity, out.mass = self.p, self.q, self.mass_adj
         if self.features.gravity >= 0:
             out.parameters[self.features.gravity :][:3] = self.gravity
@@ -198,8 +198,8 @@ class ImplicitAdjoint(_Passes):
             out.rest = out.rest + by_pairs
         if self.features.shape:
             out.rest = out.rest + sums[rows["rest"] :][:3].T
-            out.gradients = from_blocks(runtime.fetch(self.gradients), a.num_tetrahedra, 9).reshape(-1, 3, 3)
-            out.volumes = from_blocks(runtime.fetch(self.volumes), a.num_tetrahedra, 1)[:, 0]
+            out.gradients = from_blocks(runtime.fetch(self.gradients), a.place, 9).reshape(-1, 3, 3)
+            out.volumes = from_blocks(runtime.fetch(self.volumes), a.place, 1)[:, 0]
         out.forces, out.motion, out.path = self.forces, self.motion, self.path
         if self.motion is not None:
             out.displacement[a.fixed] += self.anchor
@@ -215,11 +215,10 @@ class ImplicitTangent(_Passes):
         p = workspace.potential
         self.du, self.dv, self.before_dots = dots.displacement.copy(), dots.velocity.copy(), None
         kernel = potential_kernels(a.law, a.features(), workspace.parallel, a.in_lanes).jvp
-        blocks = a.num_blocks
         self._arrays = (
             runtime.upload(a.coefficient_blocks(dots.coefficients), a.lanes), runtime.upload(dots.parameters, a.fp),
-            runtime.upload(dots.rest, a.vector), runtime.upload(to_blocks(dots.gradients, blocks), a.lanes),
-            runtime.upload(to_blocks(dots.volumes, blocks), a.lanes), runtime.array(a.vector, *p.lag.shape),
+            runtime.upload(dots.rest, a.vector), runtime.upload(to_blocks(dots.gradients, a.order), a.lanes),
+            runtime.upload(a.volume_blocks(dots.volumes), a.lanes), runtime.array(a.vector, *p.lag.shape),
             runtime.array(a.vector, *p.walls.shape),
         )  # fmt: skip
         self._jvp = runtime.Launch(kernel, *p.common(), a.corner, p.u, p.w, p.y, *self._arrays, vectorized=a.in_lanes)

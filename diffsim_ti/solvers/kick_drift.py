@@ -21,9 +21,10 @@ from types import SimpleNamespace
 
 import taichi as ti
 
+from diffsim_ti.patched_tetrahedron import functions_of
 from diffsim_ti.runtime import Bundle
 from diffsim_ti.solvers.contact_stages import contact_functions
-from diffsim_ti.tetrahedron import A, element_functions
+from diffsim_ti.tetrahedron import A
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,7 @@ class Features:
 @lru_cache(maxsize=None)
 def kick_drift_kernels(law, features: Features, parallel: bool, lanes: bool) -> SimpleNamespace:
     """Compiled passes for a law and a scene's features; `parallel`: one launch per pass, else one for many passes."""
-    el = element_functions(law, features.uniform, lanes)
+    el = functions_of(law, features.uniform, lanes)
     t = el.types
     fp, vector = t.fp, t.vector
     contacts, has_contacts = features.contacts, len(features.contacts) > 0

@@ -4,6 +4,7 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.solvers.arrays import from_blocks
+from diffsim_ti.solvers.patch_coupling import PatchCoupling
 from diffsim_ti.solvers.potential_kernels import potential_kernels
 
 
@@ -17,7 +18,7 @@ class Potential:
         self.arrays, self.tetrahedra, self.pairs = arrays, tetrahedra, pairs
         a = arrays
         self.kernels = potential_kernels(a.law, a.features(), parallel, a.in_lanes)
-        n, m = a.num_vertices, a.num_tetrahedra
+        n, m = a.num_vertices, a.num_places
         self.u, self.w, self.y = (runtime.array(a.vector, 1, n) for _ in range(3))
         twins = a.features().contacts
         self.rubs = any(c.friction for c in twins)
@@ -26,7 +27,7 @@ class Potential:
         self.per_gamma = 1.0
         self._size, self._contact = runtime.array(a.fp, n), runtime.array(a.fp, n)
         self._elastic, self._J = runtime.array(a.fp, m), runtime.array(a.fp, m)
-        self._tangent, self._out, self._contact_blocks = None, None, None
+        self._tangent, self._out, self._contact_blocks, self._pressure, self._coupling = None, None, None, None, None
         self.held_at = np.zeros((n, 3))
         sizes, common = (a.num_items, a.num_vertices), self.common()
         bind = lambda kernel, *more: self._bind(kernel, common, more, sizes)  # noqa: E731
@@ -98,11 +99,29 @@ class Potential:
         self._blocks()
         if self.pairs:
             self.pairs.add_blocks(self.u, self._out)
-        return np.swapaxes(runtime.fetch(self._out).astype(np.float64), 0, 1)
+        blocks = np.swapaxes(runtime.fetch(self._out).astype(np.float64), 0, 1)
+        return blocks if a.patches is None else blocks + self.coupling.diagonal(self.patch_gradients())
+
+    @property
+    def coupling(self) -> PatchCoupling:
+        """What patches add to d2E/du2, by the numbers that are loaded."""
+        if self._coupling is None or self._coupling[0] is not self.arrays.values:
+            self._coupling = self.arrays.values, PatchCoupling(self.arrays, self.tetrahedra)
+        return self._coupling[1]
+
+    def patch_gradients(self) -> np.ndarray:
+        """g of `coupling` at the present displacement."""
+        a = self.arrays
+        if self._pressure is None:
+            self._pressure = self._bind(self.kernels.pressure_forces, (a.tets, a.gradients, a.volumes, a.coefficients),
+                                        (self.u, a.corner), (a.num_items,))  # fmt: skip
+        self._pressure()
+        return self.coupling.rows(runtime.fetch(a.corner)[: a.first_contact_corner].astype(np.float64))
 
     def tangents(self) -> np.ndarray:
-        """d2psi/dF2 [Pa] of each tetrahedron where `blocks` was last called, shape (num_tetrahedra, 9, 9)."""
-        return from_blocks(runtime.fetch(self._tangent), self.arrays.num_tetrahedra, 81).reshape(-1, 9, 9)
+        """d2psi/dF2 [Pa] of each tetrahedron, its patch's pressure held, where `blocks` was last called, shape
+        (num_tetrahedra, 9, 9)."""
+        return from_blocks(runtime.fetch(self._tangent), self.arrays.place, 81).reshape(-1, 9, 9)
 
     def contact_blocks(self) -> np.ndarray | None:
         """The part of contact in `blocks`; None without contacts."""

@@ -11,14 +11,15 @@ from types import SimpleNamespace
 import taichi as ti
 
 from diffsim_ti.materials.tensor import Tensor, sum_of
+from diffsim_ti.patched_tetrahedron import functions_of
 from diffsim_ti.runtime import Bundle, let, traced
-from diffsim_ti.tetrahedron import A, element_functions
+from diffsim_ti.tetrahedron import A
 
 
 @lru_cache(maxsize=None)
 def potential_kernels(law, features, parallel: bool, lanes: bool) -> SimpleNamespace:
     """Kernels for a law and a scene's features: energy, forces, products of their derivatives, block diagonal."""
-    el, single = element_functions(law, features.uniform, lanes), element_functions(law, features.uniform, False)
+    el, single = functions_of(law, features.uniform, lanes), functions_of(law, features.uniform, False)
     t, contacts = el.types, features.contacts
     fp, vector = t.fp, t.vector
 
@@ -28,11 +29,12 @@ def potential_kernels(law, features, parallel: bool, lanes: bool) -> SimpleNames
                J: t.scalars, contact: t.scalars, num_tetrahedra: ti.i32, num_vertices: ti.i32,
                per_gamma: fp):  # fmt: skip
         """Energy [J] and volume ratio of each tetrahedron, energy of contact and friction [J] of each vertex."""
-        scene = Bundle(tets=tets, parameters=parameters, rest=rest, walls=walls, lag=lag, per_gamma=per_gamma)
+        scene = Bundle(tets=tets, gradients=gradients, volumes=volumes, coefficients=coefficients, parameters=parameters,
+                       rest=rest, walls=walls, lag=lag, per_gamma=per_gamma)  # fmt: skip
         ti.loop_config(serialize=not parallel)
         for e in range(num_tetrahedra):
             H = single.edges(e, scene, u, 0).dot(single.gradients_of(e, gradients))
-            psi = law.energy_density(H, single.coefficients_of(e, coefficients))
+            psi = law.energy_density(H, single.coefficients_at(e, scene, u, 0))
             elastic[e] = psi * single.volume_of(e, volumes)
             J[e] = volume_ratio(H)
         ti.loop_config(serialize=not parallel)
@@ -148,7 +150,7 @@ def potential_kernels(law, features, parallel: bool, lanes: bool) -> SimpleNames
         """Column c of d2psi/dF2, nine numbers, to rows 9 c .. 9 c + 8 of its block."""
         H = el.edges(e, scene, u, 0) @ el.gradients_of(e, scene.gradients)
         dH = Tensor(el.broadcast(ti.cast(c == k, fp)) for k in range(9))
-        dP = law.stress_differential(H, dH, el.coefficients_of(e, scene.coefficients))
+        dP = law.stress_differential(H, dH, el.coefficients_at(e, scene, u, 0))
         el.put(tangent, 81, e, 9 * c, dP.numbers)
 
     @traced
@@ -186,6 +188,15 @@ def potential_kernels(law, features, parallel: bool, lanes: bool) -> SimpleNames
             out[0, i] = el.gather(i, scene, corner0) - contact_product(i, scene, u[0, i], vector(1, 0, 0, 0))
             out[1, i] = el.gather(i, scene, corner1) - contact_product(i, scene, u[0, i], vector(0, 1, 0, 0))
             out[2, i] = el.gather(i, scene, corner2) - contact_product(i, scene, u[0, i], vector(0, 0, 1, 0))
+
+    @ti.kernel
+    def pressure_forces(tets: t.ints, gradients: t.blocks, volumes: t.blocks, coefficients: t.blocks, u: t.vectors2,
+                        corner: t.vectors, num_items: ti.i32, per_gamma: fp):  # fmt: skip
+        """Corner forces of a unit pressure in every patch."""
+        scene = Bundle(tets=tets, gradients=gradients, volumes=volumes, coefficients=coefficients)
+        ti.loop_config(serialize=not parallel)
+        for e in range(num_items):
+            el.pressure_forces(e, scene, u, 0, corner)
 
     @ti.kernel
     def contact_blocks(parameters: t.scalars, rest: t.vectors, surface: t.ints, walls: t.vectors, lag: t.vectors2,
@@ -311,4 +322,4 @@ def potential_kernels(law, features, parallel: bool, lanes: bool) -> SimpleNames
         return f
 
     return SimpleNamespace(energy=energy, forces=forces, product=product, blocks=blocks, vjp=vjp, jvp=jvp,
-                           contact_blocks=contact_blocks)  # fmt: skip
+                           contact_blocks=contact_blocks, pressure_forces=pressure_forces)  # fmt: skip

@@ -114,7 +114,9 @@ def _rigid_motions(X: np.ndarray) -> np.ndarray:
 
 
 def element_matrices(potential) -> np.ndarray:
-    """12x12 stiffness of each tetrahedron where `potential.blocks` was last called, as (m, 4, 4, 3, 3) blocks [N/m]."""
+    """12x12 stiffness of each tetrahedron where `potential.blocks` was last called, as (m, 4, 4, 3, 3) blocks [N/m]; a
+    patch's pressure is held.
+    """
     a = potential.arrays
     m, B = a.num_tetrahedra, a.values.gradients
     N = np.concatenate([-B.sum(1, keepdims=True), B], 1)
@@ -128,8 +130,12 @@ def _assemble(potential, mass, free):
     from scipy.sparse import bsr_matrix
 
     n, tets = potential.arrays.num_vertices, potential.tetrahedra.astype(np.int64)
-    places, inverse = np.unique((tets[:, :, None] * n + tets[:, None, :]).ravel(), return_inverse=True)
+    places = (tets[:, :, None] * n + tets[:, None, :]).ravel()
     entries = element_matrices(potential).reshape(-1, 9)
+    if potential.arrays.patches is not None:
+        rows, columns, blocks = potential.coupling.entries(potential.patch_gradients())
+        places, entries = np.concatenate([places, rows * n + columns]), np.concatenate([entries, blocks.reshape(-1, 9)])
+    places, inverse = np.unique(places, return_inverse=True)
     data = np.stack([np.bincount(inverse, entries[:, k], len(places)) for k in range(9)], 1).reshape(-1, 3, 3)
     rows, columns = places // n, places % n
     is_free = free[:, 0] > 0

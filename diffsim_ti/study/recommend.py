@@ -326,7 +326,8 @@ class Trials:
             out.append("forces and motion per step")
         nu = float(np.max(self.scene.inputs.values.get("poissons_ratio", 0.0)))
         if nu > LOCKING_ABOVE:
-            out.append(f"nothing against locking, though nu = {nu:g}: a mesh of pattern five, or a finer one, is advised")
+            if self.scene.volume == "tetrahedra":
+                out.append(f'nothing against locking, though nu = {nu:g}: volume="patches" of a Scene is advised')
         else:
             out.append(f"elements against locking: nu = {nu:g} is at most {LOCKING_ABOVE}")
         return out + self.notes

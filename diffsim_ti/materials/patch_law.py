@@ -1,0 +1,57 @@
+"""A law whose resistance to a change of volume is averaged over patches of tetrahedra."""
+
+from dataclasses import dataclass
+
+from diffsim_ti.materials.law import Law
+from diffsim_ti.materials.tensor import sum_of
+from diffsim_ti.runtime import let, traced
+
+
+@dataclass(frozen=True)
+class PatchLaw(Law):
+    """psi(H; p) = psi(H; p') + lam/2 theta^2, where theta(H) is the law's own measure of the change of volume and p' its
+    coefficients p with lam = 0, split: psi(H; p') stays in each tetrahedron, the patch's mean of theta takes the rest.
+
+    So a tetrahedron of a patch with pressure pi = lam theta_patch (positive in tension) [Pa] has the coefficients
+    q = [*p', pi], the stress P(H; p') + pi dtheta/dF and, as its share of the patch's energy, pi theta / 2.
+    """
+
+    base: Law
+
+    @property
+    def coefficient_names(self) -> tuple:
+        return self.base.coefficient_names
+
+    @property
+    def lanes(self) -> bool:
+        return self.base.lanes
+
+    @traced
+    def split(self, p) -> tuple:
+        """(p', lam): lam is the last coefficient less what the others make of it at lam = 0."""
+        parts = [p[k] * self.real(factor) for k, factor in enumerate(self.base.last_without_lam) if factor]
+        last = let(sum_of(parts)) if parts else let(p[-1] * 0)
+        return [*p[:-1], last], let(p[-1] - last)
+
+    @traced
+    def split_vjp(self, by_rest: list, by_lam) -> list:
+        """Adjoint of p for adjoints of p' and lam."""
+        out = [*by_rest[:-1], by_lam]
+        for k, factor in enumerate(self.base.last_without_lam):
+            if factor:
+                out[k] = let(out[k] + (by_rest[-1] - by_lam) * self.real(factor))
+        return out
+
+    @traced
+    def energy_density(self, H, q):
+        return self.base.energy_density(H, q[:-1]) + q[-1] * self.base.dilatation(H) * self.real(0.5)
+
+    @traced
+    def stress(self, H, q):
+        return self.base.stress(H, q[:-1]) + self.base.dilatation_gradient(H) * q[-1]
+
+    @traced
+    def stress_differential_and_products(self, H, dH, q):
+        """At a fixed pressure; the products are those of p'."""
+        dP, products = self.base.stress_differential_and_products(H, dH, q[:-1])
+        return dP + self.base.dilatation_gradient_differential(H, dH) * q[-1], products
