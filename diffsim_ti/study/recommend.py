@@ -1,6 +1,7 @@
 """Advice: the cheapest solver, step, precision and checkpoints that meet a tolerance, from trial runs and the theory."""
 
 import time
+import warnings
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -91,8 +92,10 @@ def recommend(scene, duration: float, tolerance: float = 1e-2, memory: float | N
         raise ValueError(f"tolerance must lie between 0 and 1, got {tolerance:g}")
     if memory is not None and not memory > 0:
         raise ValueError(f"memory must be > 0 [MB], got {memory:g}")
-    trials = Trials(scene, duration, tolerance, memory, gradients, budget, frames)
-    trials.run()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of trials with coarse steps, whose errors are measured
+        trials = Trials(scene, duration, tolerance, memory, gradients, budget, frames)
+        trials.run()
     return trials.advice()
 
 
