@@ -39,6 +39,7 @@ class Point:
     @property
     def label(self) -> str:
         mesh = f"{self.cells} cells {self.pattern}" if self.cells > 1 else self.pattern
+        mesh += "" if self.element == "linear" else f" {self.element}"
         step = "" if self.solver == "StaticSolver" else f", {1e3 * self.substep:.3g} ms"
         return f"{self.solver.removesuffix('Solver')}, {mesh}{step}, {self.precision}"
 
