@@ -153,7 +153,7 @@ def held_back(name: str) -> tuple:
 @lru_cache
 def advised(name: str, gradients: bool = False):
     scene, duration, tolerance = held_back(name)
-    return recommend(scene, duration, tolerance, gradients=gradients, budget=8.0 if name == "pull" else 3.0)
+    return recommend(scene, duration, tolerance, gradients=gradients, budget=5.0 if name == "pull" else 3.0)
 
 
 def moved(scene, kind, precision, duration, substeps) -> np.ndarray:
