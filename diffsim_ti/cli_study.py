@@ -51,11 +51,12 @@ def own_scene(path: Path, material: str, youngs_modulus: float, poissons_ratio: 
 
 
 def chart(
-    problem: Annotated[str, typer.Argument(help="oscillator, lame, beam, sag, bounce, bounce-gradient, identify; a mesh; "
-                                                "or a Python file that defines scene")],  # fmt: skip
+    problem: Annotated[str, typer.Argument(help="oscillator, lame, lame-gradient, beam, sag, bounce, bounce-gradient, "
+                                                "identify; a mesh; or a Python file that defines scene")],  # fmt: skip
     output: Folder = Path("output/chart"),
     quick: Quick = False,
     duration: Annotated[float, typer.Option(help="of a scene of one's own [s]")] = 0.2,
+    gradient: Annotated[str | None, typer.Option(help="of a scene of one's own: chart the gradient by this input")] = None,
     material: MaterialName = "StableNeoHookean",
     youngs_modulus: Youngs = 1e5,
     poissons_ratio: Poisson = 0.4,
@@ -77,7 +78,7 @@ def chart(
     elif Path(problem).suffix:
         runtime.init(backend)
         scene = own_scene(Path(problem), material, youngs_modulus, poissons_ratio, density, fixed)
-        asked = Problem.of_scene(scene, duration, Path(problem).stem)
+        asked = Problem.of_scene(scene, duration, Path(problem).stem, gradient=gradient)
     else:
         raise ValueError(f"no problem is called {problem!r}; there are {', '.join(PROBLEMS)}, or give a file")
     result = measure(asked, repeats=repeats, limit=limit, quick=quick, say=print)

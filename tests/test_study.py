@@ -153,7 +153,7 @@ def held_back(name: str) -> tuple:
 @lru_cache
 def advised(name: str, gradients: bool = False):
     scene, duration, tolerance = held_back(name)
-    return recommend(scene, duration, tolerance, gradients=gradients, budget=8.0 if name == "pull" else 3.0)
+    return recommend(scene, duration, tolerance, gradients=gradients, budget=5.0 if name == "pull" else 3.0)
 
 
 def moved(scene, kind, precision, duration, substeps) -> np.ndarray:
@@ -246,3 +246,13 @@ def test_own_scene_is_charted_against_its_own_converged_motion():
     assert result.reference_error < 1e-3 and all(np.isfinite(p.error) for p in result.points)
     verlet = [p.error for p in result.points if p.solver == "VelocityVerletSolver"]
     assert verlet[1] < 0.4 * verlet[0]
+
+
+def test_gradients_of_an_own_scene_are_charted_too():
+    scene, duration, _ = held_back("twist")
+    asked = Problem.of_scene(scene, duration, "twist", frames=4, gradient="youngs_modulus")
+    result = chart(asked, solvers=(ds.VelocityVerletSolver,), precisions=("f64",), levels=3, repeats=1)
+    errors = [p.error for p in result.points]
+    assert result.reference_error < 1e-2 and errors[2] < 0.5 * errors[0] < 0.5
+    with pytest.raises(ValueError, match="no input named 'youngs'"):
+        Problem.of_scene(scene, duration, gradient="youngs")

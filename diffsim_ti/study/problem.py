@@ -79,22 +79,35 @@ class Problem:
                        reference_cells=self.reference_cells and (4, 6, 8))  # fmt: skip
 
     @classmethod
-    def of_scene(cls, scene, duration: float, name: str = "scene", frames: int = 10) -> "Problem":
-        """The motion of a scene of one's own, against its converged motion on the same mesh.
+    def of_scene(cls, scene, duration: float, name: str = "scene", frames: int = 10,
+                 gradient: str | None = None) -> "Problem":  # fmt: skip
+        """The motion of a scene of one's own, against its converged motion on the same mesh; or a gradient through it.
 
         The error is the largest distance of any vertex at any frame, over the largest displacement from the start.
+        gradient: an input's name; then the number is the gradient by it of the mean square displacement [m^2] at the end.
         """
         if not duration > 0:
             raise ValueError(f"duration must be > 0 [s], got {duration:g}")
+        if gradient is not None and gradient not in scene.inputs.values:
+            raise ValueError(f"no input named {gradient!r}; this scene has {', '.join(scene.inputs.values)}")
 
         def build(cells, pattern, precision, **element):
             return scene.replace(precision=precision, **element)
 
-        def moved(frames, gradients):
+        def moved(frames, gradients=None):
             return frames.displacements.astype(np.float64) - frames.displacements[0]
 
-        return cls(name, f"{name}: {scene.mesh.num_tetrahedra} tetrahedra, {duration:g} s", "error of motion",
-                   build, duration, moved, frames, cells=(0,), patterns=("own mesh",))  # fmt: skip
+        def adjoint(frames, mesh):
+            out = np.zeros(frames.positions.shape)
+            out[-1] = 2 * moved(frames)[-1] / mesh.num_vertices
+            return out
+
+        title = f"{name}: {scene.mesh.num_tetrahedra} tetrahedra, {duration:g} s"
+        if gradient is None:
+            return cls(name, title, "error of motion", build, duration, moved, frames, cells=(0,), patterns=("own mesh",))
+        return cls(f"{name}-{gradient}", title, f"error of the gradient by {gradient}", build, duration,
+                   lambda _, gradients: np.atleast_1d(gradients[gradient]), frames, adjoint=adjoint, inputs=(gradient,),
+                   cells=(0,), patterns=("own mesh",))  # fmt: skip
 
 
 def distance(problem: Problem, quantity, exact) -> float:

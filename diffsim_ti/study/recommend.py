@@ -1,6 +1,7 @@
 """Advice: the cheapest solver, step, precision and checkpoints that meet a tolerance, from trial runs and the theory."""
 
 import time
+import warnings
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -91,8 +92,10 @@ def recommend(scene, duration: float, tolerance: float = 1e-2, memory: float | N
         raise ValueError(f"tolerance must lie between 0 and 1, got {tolerance:g}")
     if memory is not None and not memory > 0:
         raise ValueError(f"memory must be > 0 [MB], got {memory:g}")
-    trials = Trials(scene, duration, tolerance, memory, gradients, budget, frames)
-    trials.run()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of trials with coarse steps, whose errors are measured
+        trials = Trials(scene, duration, tolerance, memory, gradients, budget, frames)
+        trials.run()
     return trials.advice()
 
 
@@ -218,13 +221,13 @@ class Trials:
         """Every solver from its largest step to one that meets the tolerance; first the kind that made the reference.
 
         Explicit ones in float32, then in float64 at the same step, which costs little more on small meshes; implicit ones
-        in float32, and in float64 if that is not good enough.
+        in float32, and in float64 where finer steps do not help.
         """
         first = max(1, int(np.ceil(self.span / self.frames / (SHARE * self.stable))))
         other = lambda kind: (kind.explicit != self.reference_by.explicit, kind is not BDF2Solver)  # noqa: E731
         for kind in sorted(SOLVERS, key=other):
-            good = self._refine(kind, "f32", first if kind.explicit else 1)
-            if not kind.explicit and not good:
+            stuck = self._refine(kind, "f32", first if kind.explicit else 1)
+            if not kind.explicit and stuck:
                 self._refine(kind, "f64", 1)
         for kind in [kind for kind in SOLVERS if kind.explicit]:
             known = [o for o in self.tried if o.solver is kind and np.isfinite(o.error)]
@@ -234,23 +237,21 @@ class Trials:
             self._compare()
 
     def _refine(self, kind, precision: str, substeps: int) -> bool:
-        """Try ever more substeps a frame, as many as the order of convergence suggests; whether the tolerance is met.
-
-        Where a finer step is no better (rounding, or a tolerance of the solver), it ends.
-        """
+        """Try ever more substeps a frame, as many as the order of convergence suggests, until the tolerance is met or
+        that is too dear; whether it got stuck, a finer step being no better (rounding, or the solver's tolerance)."""
         before = np.inf
         for _ in range(5):
             if self._too_dear(kind, precision, substeps):
                 return False
             option = self._try(kind, precision, substeps)
             if option.error <= SAFETY * self.tolerance:
-                return True
-            if option.error > 0.9 * before:
                 return False
+            if option.error > 0.9 * before:
+                return True
             before = np.fmin(option.error, before)
             finer = (option.error / (0.5 * self.tolerance)) ** (1 / kind.order) if np.isfinite(option.error) else 4
             substeps = int(np.ceil(substeps * np.clip(finer, 1.3, 16)))
-        return False
+        return True
 
     def _too_dear(self, kind, precision: str, substeps: int) -> bool:
         """Whether a trial would take longer than twelve times the best so far, or than the budget's rest."""
