@@ -71,8 +71,10 @@ def view(
     from diffsim_ti.forward import ForwardRun
     from diffsim_ti.frame_sources import LiveFrames, SavedFrames
     from diffsim_ti.terms import ExternalForce
-    from diffsim_ti.viewer import Viewer
+    from diffsim_ti.viewer import NO_DISPLAY, Viewer, has_display
 
+    if not has_display():
+        raise RuntimeError(NO_DISPLAY)
     if source.suffix == ".pvd":
         frames = SavedFrames(source)
     else:

@@ -16,6 +16,7 @@ from diffsim_ti.series_fields import field_named
 from diffsim_ti.surface import Soup, marks
 
 STRIDE = 2  # the backdrop is drawn this much smaller and stretched
+NO_DISPLAY = "there is no display with a Vulkan driver; use `diffsim-ti render` to draw a film instead"
 PANEL = (0.01, 0.01, 0.3)  # left, top and width of the panel, as shares of the window
 
 
@@ -30,7 +31,7 @@ class Viewer:
         field_named(colour)
         self.window = open_window(title, size)
         if self.window is None:
-            raise RuntimeError("there is no display with a Vulkan driver; use `diffsim-ti render` to draw a film instead")
+            raise RuntimeError(NO_DISPLAY)
         from diffsim_ti.vulkan_painter import Canvas
 
         self.source, self.colour, self.size = source, colour, tuple(size)
@@ -177,13 +178,18 @@ class Viewer:
                 gui.text(line)
 
 
-def open_window(title: str, size):
-    """A window, or None where none can be had."""
+def has_display() -> bool:
+    """Whether there seem to be a screen and a Vulkan driver."""
     import os
     import sys
 
-    has_display = sys.platform in ("win32", "darwin") or any(os.environ.get(n) for n in ("DISPLAY", "WAYLAND_DISPLAY"))
-    if not has_display or "vulkan" not in runtime.available_archs():
+    screen = sys.platform in ("win32", "darwin") or any(os.environ.get(n) for n in ("DISPLAY", "WAYLAND_DISPLAY"))
+    return screen and "vulkan" in runtime.available_archs()
+
+
+def open_window(title: str, size):
+    """A window, or None where none can be had."""
+    if not has_display():
         return None
     import taichi as ti
 

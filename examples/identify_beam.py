@@ -40,7 +40,7 @@ def main(picture_folder: str | None = None) -> dict:
     tip = mesh.vertex_sets["xmax"]
     observed = observed_motion(rollout, tip)
     picture = OptimizationPicture(
-        mesh, observed[-1], picture_folder and Path(picture_folder) / "identify_beam.png", 0.0 if picture_folder else None,
+        mesh, observed[-1], picture_folder and Path(picture_folder) / "identify_beam.png", 1.0 if picture_folder else None,
         truth={NAME: TRUE_E}, loss_label="loss [mm²]",
     )  # fmt: skip
 
@@ -63,6 +63,8 @@ def main(picture_folder: str | None = None) -> dict:
     residual = float(np.sqrt(found.fun))
     print(f"E = {E:.6g} Pa, {100 * error:.2g} % off, from {GUESS:.3g} Pa in {found.nit} iterations "
           f"({found.nfev} gradients), {seconds:.1f} s; residual {residual:.3g} mm")  # fmt: skip
+    if picture_folder:
+        picture.save()
     return {"youngs_modulus": E, "error": error, "evaluations": found.nfev, "residual_mm": residual, "seconds": seconds}
 
 

@@ -55,14 +55,14 @@ def identify(name, held, learn_nu, make_optimizer, iterations, folder, start=(2e
     moving, size = simulator(material), (target.displacements - target.displacements.mean(1, keepdim=True)).square().mean()
 
     end = mesh.vertices + target.displacements[-1].numpy()
-    picture = OptimizationPicture(mesh, end, folder and Path(folder) / f"identify_{name}.png", 1.0 if folder else None,
+    picture = OptimizationPicture(mesh, end, folder and Path(folder) / f"identify_{name}.png", 5.0 if folder else None,
                                   truth={"E [Pa]": TRUE_E} | ({"nu": TRUE_NU} if learn_nu else {}))  # fmt: skip
     seen = {}
 
     def loss():
         moving.reset()
         u = moving.rollout(20, save_every=1).displacements
-        seen.update(E=material.E.item(), nu=float(material.nu), u=u[-1].detach().numpy())
+        seen.update(E=material.E.item(), nu=material.nu.item(), u=u[-1].detach().numpy())
         return (u - target.displacements).square().mean() / size
 
     def note(value):

@@ -49,7 +49,7 @@ def main(picture_folder: str | None = None) -> dict:
         apart = np.array([0, 0, 0.25])
         places = np.concatenate([settled + ends[0] + apart, settled + ends[1] - apart])
         slid = np.linalg.norm(np.concatenate(ends), axis=1)
-        slope = square(settled.mean(0) - [0, 0.058, 0], (-SLOPE, 1, 0), 0.22)
+        slope = square(settled.mean(0) - [0.12, 0.118, 0], (-SLOPE, 1, 0), 0.24)
         save_picture(Path(picture_folder) / "incline.png", ds.TetrahedralMesh.joined([scene.mesh] * 2), places, slid,
                      "slid by [m]", obstacles=[slope], wireframe=True, azimuth=-12, elevation=22,
                      title="friction 0.49 slides, 0.50 holds, on tan = 1/2")  # fmt: skip

@@ -7,7 +7,7 @@ import pytest
 import taichi as ti
 
 import diffsim_ti as ds
-from diffsim_ti import cli_options, viewer
+from diffsim_ti import cli, cli_options, viewer
 from diffsim_ti.camera import Camera
 from diffsim_ti.dragging import Grip, picked_vertex
 from diffsim_ti.forward import ForwardRun
@@ -302,12 +302,39 @@ def test_forces_are_refused_where_the_scene_has_none(live):
         ds.Simulator(ds.SemiImplicitSolver(scene, dt=1e-4)).set_forces(np.zeros((2, 3)))
 
 
-def test_without_a_display_the_viewer_says_what_to_do(series, monkeypatch):
+def test_the_command_opens_a_series_or_a_live_run(series, tmp_path, monkeypatch):
+    opened = []
+
+    class Opened:
+        def __init__(self, source, colour, playing, **look):
+            opened.append((source, colour, playing, look))
+
+        def run(self):
+            pass
+
+    monkeypatch.setattr(viewer, "Viewer", Opened)
+    monkeypatch.setattr(viewer, "has_display", lambda: True)
+    monkeypatch.setattr("diffsim_ti.runtime.init", lambda: None)
+    TetrahedralMesh.create_cube(3, 0.2).save(tmp_path / "cube.vtu")
+    for arguments in ([str(series), "--ground", "-0.5"], [str(tmp_path / "cube.vtu"), "--colour", "J", "--fixed", "xmin"]):
+        with pytest.raises(SystemExit) as stop:
+            cli.main(["view", *arguments])
+        assert stop.value.code == 0
+    (saved, _, playing, look), (live, colour, plays, _) = opened
+    assert isinstance(saved, SavedFrames) and not playing and look["ground"] == -0.5
+    assert isinstance(live, LiveFrames) and plays and colour == "J" and live.can_drag and live.look["ground"] == 0.0
+    assert len(live.look["fixed"]) == 9 and live.frame(0).positions[:, 1].min() == pytest.approx(0.02, abs=1e-6)
+
+
+def test_without_a_display_the_viewer_says_what_to_do(series, monkeypatch, capsys):
     monkeypatch.setattr("sys.platform", "linux")
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     source = SavedFrames(series)
     with pytest.raises(RuntimeError, match="diffsim-ti render"):
         Viewer(source)
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["view", str(series)])
+    assert stop.value.code == 2 and "diffsim-ti render" in capsys.readouterr().err
     with pytest.raises(ValueError, match="must be one of"):
         Viewer(source, "mass")
