@@ -22,6 +22,7 @@ from diffsim_ti.cli_options import (
     Threads,
     Up,
     UpAxis,
+    Volume,
     Youngs,
     fixed_vertices,
     load_body,
@@ -83,6 +84,7 @@ def simulate(
     youngs_modulus: Youngs = 1e5,
     poissons_ratio: Poisson = 0.4,
     density: Density = 1000.0,
+    volume: Volume = "tetrahedra",
     size: Size = None,
     up: UpAxis = Up.y,
     fix_orientation: FixOrientation = False,
@@ -126,7 +128,7 @@ def simulate(
         body = body.translated([0, height - low, 0])
         speed = np.sqrt(min(velocity[1], 0) ** 2 + 2 * abs(gravity) * max(height, 0))
         terms.append(make_ground(body, law, density, gravity, speed, ground_stiffness, ground_width))
-    scene = Scene(body, law, density, terms, fixed_vertices(body, fixed or []), initial_velocities=velocity)
+    scene = Scene(body, law, density, terms, fixed_vertices(body, fixed or []), initial_velocities=velocity, volume=volume)
     frames = max(1, round(duration * fps))
     run = ForwardRun(scene, kind, duration / frames, dt)
     setup = time.perf_counter() - begin

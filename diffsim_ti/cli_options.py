@@ -21,6 +21,7 @@ MaterialName = Annotated[str, typer.Option(help="the law, by class name; capital
 Youngs = Annotated[float, typer.Option("--youngs-modulus", "-E", help="Young's modulus [Pa]")]
 Poisson = Annotated[float, typer.Option("--poissons-ratio", "--nu", help="Poisson's ratio [-]")]
 Density = Annotated[float, typer.Option(help="[kg/m^3]")]
+Volume = Annotated[str, typer.Option(help="where a change of volume is resisted: tetrahedra, or patches (near nu = 0.5)")]
 Backend = Annotated[str, typer.Option(help="cpu, cuda or vulkan")]
 Precision = Annotated[str, typer.Option(help="f32 or f64")]
 Threads = Annotated[int | None, typer.Option(help="CPU threads, default all")]
