@@ -22,6 +22,7 @@ from diffsim_ti.cli_options import (
     Threads,
     Up,
     UpAxis,
+    Volume,
     Youngs,
     fall_scene,
     fixed_vertices,
@@ -84,6 +85,7 @@ def simulate(
     youngs_modulus: Youngs = 1e5,
     poissons_ratio: Poisson = 0.4,
     density: Density = 1000.0,
+    volume: Volume = "tetrahedra",
     size: Size = None,
     up: UpAxis = Up.y,
     fix_orientation: FixOrientation = False,
@@ -118,7 +120,7 @@ def simulate(
     body = load_body(mesh, size, up, fix_orientation)
     runtime.init(backend, precision, threads)
     scene, body = fall_scene(body, law, density, gravity, drag, velocity, fixed, ground, height, ground_stiffness,
-                             ground_width)  # fmt: skip
+                             ground_width, volume=volume)  # fmt: skip
     frames = max(1, round(duration * fps))
     run = ForwardRun(scene, kind, duration / frames, dt)
     setup = time.perf_counter() - begin

@@ -21,6 +21,7 @@ MaterialName = Annotated[str, typer.Option(help="the law, by class name; capital
 Youngs = Annotated[float, typer.Option("--youngs-modulus", "-E", help="Young's modulus [Pa]")]
 Poisson = Annotated[float, typer.Option("--poissons-ratio", "--nu", help="Poisson's ratio [-]")]
 Density = Annotated[float, typer.Option(help="[kg/m^3]")]
+Volume = Annotated[str, typer.Option(help="where a change of volume is resisted: tetrahedra, or patches (near nu = 0.5)")]
 Backend = Annotated[str, typer.Option(help="cpu, cuda or vulkan")]
 Precision = Annotated[str, typer.Option(help="f32 or f64")]
 Threads = Annotated[int | None, typer.Option(help="CPU threads, default all")]
@@ -121,10 +122,11 @@ def make_ground(mesh, material, density: float, gravity: float, speed: float, st
 
 def fall_scene(body, law, density: float, gravity: float = -9.81, drag: float = 0.0, velocity=(0.0, 0.0, 0.0), fixed=(),
                floor: bool = True, height: float | None = None, stiffness: float | None = None, width: float | None = None,
-               extra=()):  # fmt: skip
+               extra=(), volume: str = "tetrahedra"):  # fmt: skip
     """(scene, body): a body let go above the floor y = 0, its lowest point at `height` [m], default a tenth of its size.
 
-    fixed: as `fixed_vertices` takes them; stiffness, width: the floor's barrier, see `make_ground`; extra: more terms.
+    fixed: as `fixed_vertices` takes them; stiffness, width: the floor's barrier, see `make_ground`; extra: more terms;
+    volume: as `Scene` takes it.
     """
     from diffsim_ti.scene import Scene
     from diffsim_ti.terms import Drag, Gravity
@@ -136,7 +138,7 @@ def fall_scene(body, law, density: float, gravity: float = -9.81, drag: float = 
         speed = np.sqrt(min(velocity[1], 0) ** 2 + 2 * abs(gravity) * max(height, 0))
         terms.append(make_ground(body, law, density, gravity, speed, stiffness, width))
     fixed = fixed_vertices(body, list(fixed or []))
-    return Scene(body, law, density, terms + list(extra), fixed, initial_velocities=velocity), body
+    return Scene(body, law, density, terms + list(extra), fixed, initial_velocities=velocity, volume=volume), body
 
 
 # ---- what is said at the end ------------------------------------------------------------------------------------------

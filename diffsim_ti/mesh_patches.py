@@ -1,18 +1,27 @@
 """Patches of at most eight neighbouring tetrahedra, over which the change of volume is averaged."""
 
+from weakref import WeakKeyDictionary
+
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 SIZE = 8
+_known = WeakKeyDictionary()  # meshes do not change
 
 
 def volume_patches(mesh) -> np.ndarray:
-    """Patch of each tetrahedron, numbered from 0, shape (num_tetrahedra,).
+    """Patch of each tetrahedron, numbered from 0, shape (num_tetrahedra,); found once for a mesh.
 
     Centroids are bisected across the longest extent until at most eight are left, so that patches are compact. A patch
     hangs together (its tetrahedra share vertices), and never mixes members of a tetrahedron set with others.
     """
+    if mesh not in _known:
+        _known[mesh] = _find_patches(mesh)
+    return _known[mesh]
+
+
+def _find_patches(mesh) -> np.ndarray:
     tets, centroids = mesh.tetrahedra, mesh.vertices[mesh.tetrahedra].mean(1)
     kinds = np.zeros((mesh.num_tetrahedra, len(mesh.tetrahedron_sets)), bool)
     for k, members in enumerate(mesh.tetrahedron_sets.values()):

@@ -123,7 +123,8 @@ class Scene:
             for t in self.terms if isinstance(t, Obstacle) and t.chooses_stiffness
         ]  # fmt: skip
         return "\n".join([
-            f"{self.mesh!r}", f"{self.material!r}", f"mass {mass:.6g} kg, precision {self.precision}",
+            f"{self.mesh!r}", f"{self.material!r}" + (", volume averaged over patches" if self.volume == "patches" else ""),
+            f"mass {mass:.6g} kg, precision {self.precision}",
             f"terms: {terms}", f"fixed vertices: {len(self.fixed)}" + (", moving" if self.motion is not None else ""),
             *chosen,
         ])  # fmt: skip

@@ -180,6 +180,7 @@ def test_errors_are_one_line(cube_file, tmp_path, capsys):
     assert "cpu, cuda, vulkan" in fails(capsys, *run, "--backend", "abacus")
     assert "precision" in fails(capsys, *run, "--precision", "f16")
     assert "--solver" in fails(capsys, *run, "--solver", "magic")
+    assert "patches" in fails(capsys, *run, "--volume", "vertices")
     assert "duration" in fails(capsys, *run, "--duration", "0")
     assert "size" in fails(capsys, *run, "--size", "-1")
     assert "--colour" in fails(capsys, *run, "--colour")

@@ -210,6 +210,7 @@ def test_observed_energy_is_the_energy_of_the_forces():
 
 def test_without_patches_nothing_is_there():
     plain = ds.Scene(mesh(), ds.StableNeoHookean(1e5, 0.3), precision="f64")
+    assert "patches" not in plain.describe() and "patches" in plain.replace(volume="patches").describe()
     assert plain.law == plain.material.law("f64") and plain.replace(volume="patches").law.base == plain.law
     solver = ds.SemiImplicitSolver(plain, 1e-5)
     assert solver.workspace(solver.start_values()).arrays.patches is None
