@@ -53,7 +53,6 @@ def make(name: str, folder: Path) -> Path:
     """Run an example and keep its picture, made small; RuntimeError with what it said if there is none."""
     arguments, made = EXAMPLES[name]
     with tempfile.TemporaryDirectory() as temporary:
-        (Path(temporary) / "output").mkdir()
         paths = os.pathsep.join([str(HERE.parent), os.environ.get("PYTHONPATH", "")])
         start = ["-m", "torch.distributed.run", "--standalone", *TORCHRUN[name].split()] if name in TORCHRUN else []
         done = subprocess.run([sys.executable, *start, HERE / f"{name}.py", *arguments.split()], cwd=temporary, text=True,
