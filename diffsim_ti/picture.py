@@ -1,5 +1,7 @@
 """A PNG of a body in one call; `drawing.Drawing` draws many."""
 
+from pathlib import Path
+
 import numpy as np
 
 from diffsim_ti.colouring import Colouring, to_vertices
@@ -31,9 +33,10 @@ def save_picture(path, mesh, positions, values=None, label: str = "", ground: fl
     the colours span, default zero (or the smallest value, if negative) to the 99.5th percentile of the surface.
     ground: height of a floor to draw [m]. view: what `Drawing` takes (box to fit, default the body's; size; azimuth,
     elevation; obstacles, fixed, wireframe, backend, by default the one that needs no Vulkan), colours, a matplotlib map.
-    Raises ValueError for shapes that do not fit.
+    The folder is made if there is none. Raises ValueError for shapes that do not fit.
     """
     from PIL import Image
 
     image = draw(mesh, positions, values, limits, ground, label=label, title=title, **view)
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray((255 * image + 0.5).astype(np.uint8)).save(path)

@@ -38,22 +38,25 @@ EXAMPLES = {
     "identify_beam": ("output", "identify_beam.png"),
     "identify_torch": ("", "identify_both.png"),
     "stiffness_from_picture": ("output", "stiffness_from_picture.png"),
+    "train_distributed": ("", "train_distributed.png"),
 }
+TORCHRUN = {"train_distributed": "--nproc_per_node=2"}  # examples of several processes
 
 
 def command(name: str) -> str:
     """What makes an example's picture, in the folder output."""
-    return f"python examples/{name}.py {EXAMPLES[name][0]}".strip()
+    start = f"torchrun {TORCHRUN[name]}" if name in TORCHRUN else "python"
+    return f"{start} examples/{name}.py {EXAMPLES[name][0]}".strip()
 
 
 def make(name: str, folder: Path) -> Path:
     """Run an example and keep its picture, made small; RuntimeError with what it said if there is none."""
     arguments, made = EXAMPLES[name]
     with tempfile.TemporaryDirectory() as temporary:
-        (Path(temporary) / "output").mkdir()
         paths = os.pathsep.join([str(HERE.parent), os.environ.get("PYTHONPATH", "")])
-        done = subprocess.run([sys.executable, HERE / f"{name}.py", *arguments.split()], cwd=temporary, capture_output=True,
-                              text=True, env=os.environ | {"PYTHONPATH": paths})  # fmt: skip
+        start = ["-m", "torch.distributed.run", "--standalone", *TORCHRUN[name].split()] if name in TORCHRUN else []
+        done = subprocess.run([sys.executable, *start, HERE / f"{name}.py", *arguments.split()], cwd=temporary, text=True,
+                              capture_output=True, env=os.environ | {"PYTHONPATH": paths})  # fmt: skip
         made = Path(temporary) / "output" / made
         if done.returncode or not made.exists():
             raise RuntimeError(f"{name}: saved no picture (exit status {done.returncode})\n{done.stderr[-2000:]}")

@@ -58,7 +58,7 @@ def test_controller(tmp_path):
 
 def test_resumed_controller_is_the_uninterrupted_one(tmp_path, monkeypatch):
     module, states = example("train_controller"), []
-    monkeypatch.setattr(module, "save_picture", lambda *_, **__: None)
+    monkeypatch.setattr(module, "save_reaches", lambda *_, **__: None)
     for folder, stops in (("whole", [6]), ("parts", [3, 6])):
         for stop in stops:
             result = module.main(tmp_path / folder, iterations=stop)
