@@ -183,7 +183,7 @@ def charted(python: str, quick: bool, folder) -> str:
     """Write the charts with torch-diffsim's runs; Markdown of the times to an error."""
     found = {}
     for name in ("lame", "beam", "bounce", "bounce-gradient", "identify"):
-        result = chart(problem(name), quick=quick, repeats=2, limit=0.5, say=print)
+        result = chart(problem(name), quick=quick, repeats=2, limit=0.35, say=print)
         peers = {who: peers_of(name, who, python, quick) for who in work.installed(python) if who == "torch-diffsim"}
         charts.write_chart(result, folder, peers)
         ours = [(p.seconds, p.error) for p in result.points if np.isfinite(p.error)]
