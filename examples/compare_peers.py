@@ -92,8 +92,8 @@ def drop(gradient: bool = False, duration: float = 0.05) -> Problem:
                    error="error of the derivative")  # fmt: skip
 
 
-def accuracy(python: str, quick: bool) -> dict:
-    """{problem: {who: [(seconds per simulated second, error), ...]}}"""
+def accuracy(python: str, quick: bool, folder) -> dict:
+    """{problem: {who: [(seconds per simulated second, error), ...]}}; peers.png and peers.json grow with each problem."""
     cubes, time = ((4, 8), 0.012) if quick else ((4, 8, 12, 16, 24), 0.05)
     out = {}
     for asked, cells, levels in ((problem("lame"), cubes, 1), (problem("lame-gradient"), cubes, 1),
@@ -105,6 +105,9 @@ def accuracy(python: str, quick: bool) -> dict:
         out[asked.title] = {"diffsim_ti": [(p.seconds, p.error) for p in result.points if np.isfinite(p.error)]}
         for who in work.installed(python):
             out[asked.title][who] = work.peer_points(asked, who, python, cells, 1 if quick else levels)
+        draw(out, folder / "peers.png")
+        charts.write_json(out, folder / "peers.json")
+        print(accuracy_table(out).splitlines()[-1], flush=True)
     return out
 
 
@@ -139,7 +142,10 @@ def draw(found: dict, path) -> None:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 8.6), dpi=120, layout="constrained")
-    for axes, (title, rows) in zip(figure.subplots(2, 2).flat, found.items()):
+    panels = figure.subplots(2, 2).flat
+    for axes in panels[len(found) :]:
+        axes.axis("off")
+    for axes, (title, rows) in zip(panels, found.items()):
         for who, points in rows.items():
             color, marker = STYLES[who]
             front = pareto_front([SimpleNamespace(seconds=s, error=e) for s, e in points])
@@ -183,11 +189,12 @@ def charted(python: str, quick: bool, folder) -> str:
     """Write the charts with torch-diffsim's runs; Markdown of the times to an error."""
     found = {}
     for name in ("lame", "beam", "bounce", "bounce-gradient", "identify"):
-        result = chart(problem(name), quick=quick, repeats=2, limit=0.5, say=print)
+        result = chart(problem(name), quick=quick, repeats=2, limit=0.35, say=print)
         peers = {who: peers_of(name, who, python, quick) for who in work.installed(python) if who == "torch-diffsim"}
         charts.write_chart(result, folder, peers)
         ours = [(p.seconds, p.error) for p in result.points if np.isfinite(p.error)]
         found[result.problem.title] = {"diffsim_ti": ours, **peers}
+        print(accuracy_table(found), flush=True)
     return accuracy_table(found)
 
 
@@ -205,10 +212,7 @@ def main() -> None:
     if options.part in ("common", "all"):
         print(common_table(common(options.peer_python, options.sizes, options.rounds)))
     if options.part in ("accuracy", "all"):
-        found = accuracy(options.peer_python, options.quick)
-        draw(found, options.output / "peers.png")
-        charts.write_json(found, options.output / "peers.json")
-        print(accuracy_table(found))
+        print(accuracy_table(accuracy(options.peer_python, options.quick, options.output)))
     if options.part in ("charts", "all"):
         print(charted(options.peer_python, options.quick, options.output))
 
