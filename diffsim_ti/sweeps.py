@@ -112,7 +112,8 @@ class Sweeps:
         """The reverse sweep; begin(adjoint) sets the adjoints of the frames. Returns the adjoint at the start."""
         ws, schedule = self._workspace, self.schedule
         if self._adjoint is None or not self._adjoint.fits(ws):
-            self._adjoint = self.solver.adjoint(ws, "density" in self.wanted, "rest_positions" in self.wanted)
+            shape = "rest_positions" in self.wanted
+            self._adjoint = self.solver.adjoint(ws, shape or "density" in self.wanted, shape)  # the rest shape makes masses
         adjoint = self._adjoint
         begin(adjoint)
         self.health = []

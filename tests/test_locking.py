@@ -150,21 +150,22 @@ def test_rigid_motions_are_free_of_force_and_no_motion_of_net_force(precision, r
 
 
 def rollout(solver, law=ds.SmithNeoHookean, precision="f64", **changes) -> ds.Rollout:
-    """Two steps with weight, drag, moduli per tetrahedron and, explicitly, self-contact (which gathers corners too)."""
+    """Two steps with weight, drag, moduli per tetrahedron and, with symplectic Euler, self-contact (with corners too)."""
     static = solver is ds.StaticSolver
     terms = [ds.Gravity(), ds.Drag(0.7)] + ([ds.SelfContact(1e3, 0.01)] if solver is ds.SemiImplicitSolver else [])
     if not static:
         changes |= dict(initial_positions=mesh().vertices + state(6, 0.01), initial_velocities=state(7, 0.3))
     s = scene(law, precision=precision, terms=terms, fixed="xmin", **changes)
     made = solver(s, 1e-4) if solver.explicit else solver(s, **({} if static else {"dt": 1e-2}), tolerance=1e-12)
-    return ds.Rollout(made, 2, 1, gradients="all")
+    names = ["youngs_modulus", "poissons_ratio", "rest_positions", "density" if static else "initial_positions"]
+    return ds.Rollout(made, 2, 1, gradients=names)
 
 
 @pytest.mark.parametrize("solver", SOLVERS, ids=lambda solver: solver.__name__)
-def test_gradients_of_every_input(solver):
+def test_gradients_of_moduli_rest_shape_and_state(solver):
     made = rollout(solver)
     report = ds.check_gradients(made, verbose=False)
-    assert report.passed and "rest_positions" in made.wanted, str(report)
+    assert report.passed, str(report)
     assert ds.dot_product_test(made) < (1e-13 if solver.explicit else 1e-10)  # the latter: to the solves' tolerance
 
 
