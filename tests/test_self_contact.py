@@ -4,6 +4,8 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
+from scipy.integrate import quad
+from scipy.optimize import brentq
 
 import diffsim_ti as ds
 from diffsim_ti import verify
@@ -104,8 +106,8 @@ def test_checkpoints_and_list_age_do_not_change_a_bit(monkeypatch):
     whole = rollout.vjp(frames, *adjoints)
     again = ds.Rollout(two_blocks(), 150, checkpoint_every=7, gradients="all")
     builds = []
-    for skin, passes in ((SurfacePairs.least_skin, SurfacePairs.passes), (0.05, 3)):
-        monkeypatch.setattr(SurfacePairs, "least_skin", skin)
+    for skin, passes in ((SurfacePairs.least_slack, SurfacePairs.passes), (0.02, 2)):
+        monkeypatch.setattr(SurfacePairs, "least_slack", skin)
         monkeypatch.setattr(SurfacePairs, "passes", passes)
         before = again._workspace.pairs.builds if again._workspace else 0
         other = again.forward()
@@ -128,32 +130,32 @@ def test_threads_do_not_change_a_bit():
     np.testing.assert_array_equal(positions[0], positions[2])
 
 
-def test_head_on_collision_exchanges_velocities():
-    """Equal stiff bodies, corner against corner on one line: velocities are exchanged, as are their derivatives."""
-    speed, gap, steps, dt = 1.0, 0.02, 1200, 5e-5
+HEAD_ON = dict(speed=1.0, gap=0.02, time=0.06, stiffness=3e3, width=8e-3)
+
+
+@lru_cache
+def head_on():
+    """A rollout of equal stiff bodies, corner against corner on one line; the left one moves."""
     body = tetrahedron().translated(-0.025 * np.ones(3))  # its centroid at the origin
-    axis = np.array([1.0, 0.0, 0.0])
     corner = body.vertices[1] / np.linalg.norm(body.vertices[1])
-    turn = np.cross(corner, axis)
-    left = body.rotated(turn / np.linalg.norm(turn), float(np.arccos(corner @ axis)))
-    reach = left.vertices[:, 0].max()
-    left = left.translated([-reach - gap / 2, 0, 0])
-    right = left.rotated([0, 1, 0], np.pi)
-    mesh = ds.TetrahedralMesh.joined([left, right])
+    turn = np.cross(corner, [1.0, 0.0, 0.0])
+    left = body.rotated(turn / np.linalg.norm(turn), float(np.arccos(corner[0])))
+    left = left.translated([-left.vertices[:, 0].max() - HEAD_ON["gap"] / 2, 0, 0])
+    mesh = ds.TetrahedralMesh.joined([left, left.rotated([0, 1, 0], np.pi)])
     velocity = np.zeros((8, 3))
-    velocity[:4, 0] = speed
-    scene = ds.Scene(mesh, ds.StableNeoHookean(1e7, 0.3), density=1000.0, terms=[ds.SelfContact(3e3, 8e-3)],
-                     initial_velocities=velocity, precision="f64")  # fmt: skip
-    rollout = ds.Rollout(ds.SemiImplicitSolver(scene, dt=dt), steps, gradients=["initial_velocities", "initial_positions"])
-    frames = rollout.forward()
-    centre = [frames.positions[-1, k : k + 4].mean(0) for k in (0, 4)]
-    before = [frames.positions[0, k : k + 4].mean(0) for k in (0, 4)]
-    T = steps * dt
-    # left runs to the right one, which takes over: distances of centres as of points that exchange velocities
-    travelled = [centre[0][0] - before[0][0], centre[1][0] - before[1][0]]
-    np.testing.assert_allclose(sum(travelled), speed * T, rtol=1e-10)
-    reached = travelled[0]
-    assert reached == pytest.approx(gap, rel=0.3)  # the width of the contact and the bodies' give
+    velocity[:4, 0] = HEAD_ON["speed"]
+    contact = ds.SelfContact(HEAD_ON["stiffness"], HEAD_ON["width"])
+    scene = ds.Scene(mesh, ds.StableNeoHookean(1e7, 0.3), density=1000.0, terms=[contact], initial_velocities=velocity,
+                     precision="f64")  # fmt: skip
+    rollout = ds.Rollout(ds.SemiImplicitSolver(scene, dt=5e-5), 1200, gradients=["initial_velocities", "initial_positions"])
+    return rollout, rollout.forward(), 1000.0 * body.volume
+
+
+def test_head_on_collision_exchanges_velocities():
+    """Velocities are exchanged, as are their derivatives."""
+    rollout, frames, _ = head_on()
+    travelled = [(frames.positions[-1, k : k + 4] - frames.positions[0, k : k + 4]).mean(0)[0] for k in (0, 4)]
+    np.testing.assert_allclose(sum(travelled), HEAD_ON["speed"] * HEAD_ON["time"], rtol=1e-10)
     seed = np.zeros(frames.positions.shape)
     seed[-1, 4:, 0] = 0.25
     gradients = rollout.vjp(frames, velocities=seed)
@@ -161,7 +163,35 @@ def test_head_on_collision_exchanges_velocities():
     by_left, by_right = (gradients["initial_velocities"][k : k + 4, 0].sum() for k in (0, 4))
     assert by_left == pytest.approx(1.0, abs=0.05) and by_right == pytest.approx(0.0, abs=0.05)
     v = [frames.velocities[-1, k : k + 4].mean(0)[0] for k in (0, 4)]
-    assert v[0] == pytest.approx(0, abs=0.05 * speed) and v[1] == pytest.approx(speed, rel=0.05)
+    assert v[0] == pytest.approx(0, abs=0.05) and v[1] == pytest.approx(HEAD_ON["speed"], rel=0.05)
+
+
+def test_head_on_collision_ends_where_rigid_bodies_would():
+    """Positions and their gradients against the exact motion of two rigid bodies that exchange their velocities.
+
+    Within the width w they spend the time t = 2 int dd / sqrt(v^2 - 2 E(d) / (m / 2)), so that the right body travels
+    v T + w - gap - v t / 2. Corner on corner: six pairs of vertex and triangle and nine of edges, all at one distance.
+    """
+    rollout, frames, mass = head_on()
+    gap, time, stiffness, w = (HEAD_ON[name] for name in ("gap", "time", "stiffness", "width"))
+
+    def travel(v):
+        energy = lambda d: -15 * stiffness * (d - w) ** 2 * np.log(d / w)  # noqa: E731
+        least = brentq(lambda d: energy(d) - mass * v * v / 4, 1e-9 * w, w * (1 - 1e-9))
+        # d = least + (w - least) x^2 takes the root at the turning point away
+        inside = 2 * quad(lambda x: 2 * (w - least) * x / np.sqrt(v * v - 4 * energy(least + (w - least) * x * x) / mass),
+                          1e-6, 1)[0]  # fmt: skip
+        return v * time + w - gap - v * inside / 2
+
+    speed = HEAD_ON["speed"]
+    travelled = (frames.positions[-1, 4:] - frames.positions[0, 4:]).mean(0)[0]
+    assert travelled == pytest.approx(travel(speed), rel=0.05)  # the bodies are not rigid
+    seed = np.zeros(frames.positions.shape)
+    seed[-1, 4:, 0] = 0.25
+    gradients = {name: g[:4, 0].sum() for name, g in rollout.vjp(frames, positions=seed).items()}
+    slope = (travel(speed + 1e-4) - travel(speed - 1e-4)) / 2e-4
+    assert gradients["initial_velocities"] == pytest.approx(slope, rel=0.05)
+    assert gradients["initial_positions"] == pytest.approx(1.0, rel=0.05)  # an earlier hit by as much is that much farther
 
 
 @lru_cache

@@ -8,7 +8,7 @@ import diffsim_ti as ds
 from diffsim_ti import runtime
 from diffsim_ti.contact.broad_phase import CandidatePairs
 from diffsim_ti.contact.proximity import EDGE_EDGE, VERTEX_TRIANGLE, evaluate_pairs
-from diffsim_ti.contact.surface_pairs import surface_edges
+from diffsim_ti.contact.surface_pairs import pieces, surface_edges
 
 by_kind = pytest.mark.parametrize("kind", [VERTEX_TRIANGLE, EDGE_EDGE])
 STIFFNESS, WIDTH = 2.0, 3.0
@@ -141,7 +141,7 @@ def test_broad_phase_finds_what_brute_force_finds(precision):
     mesh = ds.TetrahedralMesh.joined([rough, box.translated([0.3, 1.1, 0.2]), rough.translated([-900.0, 0, 0])])
     triangles, edges = mesh.surface_triangles, surface_edges(mesh)
     lengths = np.linalg.norm(mesh.vertices[edges[:, 0]] - mesh.vertices[edges[:, 1]], axis=1)
-    found = CandidatePairs(mesh.num_vertices, mesh.surface_vertices, triangles, edges, lengths, precision)
+    found = CandidatePairs(mesh.surface_vertices, triangles, edges, lengths, pieces(mesh), precision)
     vector = ti.types.vector(4, runtime.PRECISIONS[precision])
     rest, u = runtime.upload(mesh.vertices, vector), runtime.upload(np.zeros((1, mesh.num_vertices, 3)), vector)
     reach = 0.21

@@ -89,7 +89,9 @@ ROWS = {
         "inclines hold and let slide": "contact_friction:incline implicit_contact:incline",
         "stopping distances": "contact_friction:stopping_distance implicit_contact:stopping_distance",
         "friction never adds energy": "contact_friction:friction_never_adds_energy",
-        "two bodies collide head-on": "",
+        "two bodies collide head-on":
+            "self_contact:head_on_collision_exchanges_velocities "
+            "self_contact:head_on_collision_ends_where_rigid_bodies_would",
         "slow impact of a sphere as by Hertz": "",
         "symmetric contact stays symmetric; a face exactly where the barrier begins feels nothing":
             "contact:symmetric_contact_stays_symmetric torture:a_face_exactly_at_the_width_feels_nothing",

@@ -40,31 +40,30 @@ class ImplicitPairs(SurfacePairs):
     def hessian_product(self, u, w, convex: bool) -> None:
         """Change of the contact forces for changes w[0] of the positions, to the last corners of `arrays.corner`."""
         k = self.list
-        self._launch("hessian", self.hessian.products, k.pairs, k.scale, k.row, k.corner, self.a.rest, self.a.parameters, u,
+        self._launch(self.hessian.products, k.pairs, k.scale, k.row, k.corner, self.a.rest, self.a.parameters, u,
                      w, self.corner, self.plane, self.a.corner)(k.num_vt, k.num_ee, k.num_surface,
                                                                 self.a.first_contact_corner, int(convex))  # fmt: skip
 
     def add_blocks(self, u, out) -> None:
         """Add the diagonal blocks of the Hessian's convex part to rows 0..2 of `out` (potential_kernels.py)."""
         k = self.list
-        self._launch("blocks", self.hessian.blocks, k.pairs, k.scale, k.row, k.corner, k.surface, self.a.rest,
+        self._launch(self.hessian.blocks, k.pairs, k.scale, k.row, k.corner, k.surface, self.a.rest,
                      self.a.parameters, u, self.corner, self.plane, out)(k.num_vt, k.num_ee, k.num_surface)  # fmt: skip
 
     def safe_share(self, u: np.ndarray, step: np.ndarray, most: float = 1.0) -> float:
         """A share of the step, at most `most`, up to which no two primitives meet on the way; close to the largest such
         share only where they are about to meet. Marches along the step, with a new list at each halt."""
-        surface = self.mesh.surface_vertices
-        d = step[surface]
-        relative = 2 * min(np.linalg.norm(y, axis=1).max() for y in (d, d - d[0]))
-        if relative == 0:
+        travel = self._travel(step[self.mesh.surface_vertices])
+        if not travel.any():
             return most
         runtime.fill(self.step, step[None])
         share = 0.0
         for _ in range(self.longest_march):
             runtime.fill(self.next, (u + share * step)[None])
-            self._build(self.next, 0, wanted=(most - share) * relative)
+            self._build(self.next, 0, wanted=(most - share) * travel)
             self.forces(self.next, 0, self.a.corner, exact=True)
-            unlisted = SAFE * (self.width + self.skin) / relative
+            reach = runtime.fetch(self.list.slack)[:, :2].astype(np.float64) + 0.5 * SAFE * self.width
+            unlisted = np.divide(reach, travel, out=np.full_like(travel, np.inf), where=travel > 0).min()
             listed = self._shares().min(initial=np.inf)
             share += min(listed, unlisted)
             if share >= most:

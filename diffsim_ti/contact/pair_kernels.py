@@ -169,30 +169,42 @@ def pair_kernels(precision: str, first: int, parallel: bool) -> SimpleNamespace:
         return most
 
     @ti.kernel
-    def check(pairs: ints, surface: ints, place: ints, u: vectors2, before: vectors, built: vectors, plane: vectors,
-              flags: ints, slot: ti.i32, num_vt: ti.i32, num_ee: ti.i32, num_surface: ti.i32, stale: fp,
-              lost: fp):  # fmt: skip
-        """flags: a vertex is farther than `stale` (0) or `lost` (1) from where the list was made, the same of its motion
-        relative to the first vertex's (3, 4), since bodies may fly together; a pair may have crossed (2).
+    def check(pairs: ints, surface: ints, place: ints, body: ints, slack: vectors, marked: ints, u: vectors2,
+              before: vectors, built: vectors, frame: vectors, plane: vectors, flags: ints, slot: ti.i32, num_vt: ti.i32,
+              num_ee: ti.i32, num_surface: ti.i32, num_bodies: ti.i32, markers: ti.i32, lost: fp):  # fmt: skip
+        """flags: a vertex has used up its slack (0), or that and `lost` (1); a pair may have crossed (2).
 
+        frame: mean motion of each body's markers since the list was made, and their mean, which motion is relative to.
         Two convex sets that a plane parts cannot meet while their corners move in straight lines and stay parted.
         """
         scene = Bundle(pairs=pairs, place=place, u=u, before=before, plane=plane, slot=slot)
         ti.loop_config(serialize=True)
-        for k in range(5):
+        for k in range(3):
             flags[k] = 0
         ti.loop_config(serialize=not parallel)
+        for b in range(num_bodies):
+            total = vec4(0)
+            for k in range(b * markers, (b + 1) * markers):
+                total += u[slot, surface[marked[k]]] - built[marked[k]]
+            frame[b] = (ti.cast(1, fp) / ti.cast(markers, fp)) * total
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            total = vec4(0)
+            for b in range(num_bodies):
+                total += frame[b]
+            frame[num_bodies] = (ti.cast(1, fp) / ti.cast(num_bodies, fp)) * total
+        ti.loop_config(serialize=not parallel)
         for s in range(num_surface):
-            move, first_move = u[slot, surface[s]] - built[s], u[slot, surface[0]] - built[0]
-            moved, relative = move.norm_sqr(), (move - first_move).norm_sqr()
-            if not moved <= stale * stale:
-                flags[0] = 1
-            if not moved <= lost * lost:
-                flags[1] = 1
-            if not relative <= stale * stale:
-                flags[3] = 1
-            if not relative <= lost * lost:
-                flags[4] = 1
+            move = u[slot, surface[s]] - built[s]
+            for k in range(1 + ti.cast(num_bodies > 1, ti.i32)):
+                origin, limit = frame[body[s]], slack[s][0]
+                if k == 1:
+                    origin, limit = frame[num_bodies], slack[s][1]
+                square = (move - origin).norm_sqr()
+                if not square <= limit * limit:
+                    flags[0] = 1
+                if not square <= (limit + lost) * (limit + lost):
+                    flags[1] = 1
         ti.loop_config(serialize=not parallel)
         for p in range(num_vt):
             if not closing(VERTEX_TRIANGLE, p, scene) <= ti.cast(SAFE, fp) * plane[p][3]:

@@ -15,15 +15,17 @@ class Tunnelling(FloatingPointError):
 class SurfacePairs:
     """Pairs of surface primitives of a scene with a SelfContact term (terms/self_contact.py).
 
-    The list holds all pairs within width + skin of where it was made, and holds good until a vertex has moved by skin / 2
-    (or, where bodies fly together, has moved so far relative to the first vertex).
+    The list holds all pairs that were within the width and the slacks of their vertices when it was made, and holds good
+    until a vertex has used up one of its two slacks: the one towards its own body by moving relative to that body, the one
+    towards others by moving relative to the mean of all bodies. Slacks follow the motion since the list before.
     Pairs beyond the width add exact zeros, in a fixed order, so that forces have the same bits whatever the list's age.
     Forces go to the last corners of an array of corners, one for each surface vertex (solvers/arrays.py).
     """
 
-    passes = 20  # that a list should last: its skin follows the motion, but
-    least_skin = 0.2  # is at least this share of the width, and
-    largest_reach = 0.6  # width + skin is at most this share of an edge, beyond which neighbours of neighbours fill the list
+    passes = 5  # that a list should last, by its slacks, but
+    least_slack = 0.1  # they are at least this share of the width, and
+    largest_reach = 1.0, 2.0  # width + 2 slack at most this share of an edge, of one body (with many neighbours) and of two
+    markers = 16  # vertices whose mean motion is that of a body
 
     def __init__(self, arrays, parallel: bool):
         self.a, mesh, term = arrays, arrays.mesh, arrays.self_contact
@@ -32,14 +34,18 @@ class SurfacePairs:
         edges = surface_edges(mesh)
         lengths = np.linalg.norm(mesh.vertices[edges[:, 1]] - mesh.vertices[edges[:, 0]], axis=1)
         self.edges, self.term = edges, term
-        self.list = CandidatePairs(mesh.num_vertices, mesh.surface_vertices, mesh.surface_triangles, edges, lengths,
-                                   arrays.precision)  # fmt: skip
-        n = len(mesh.surface_vertices)
-        vector = self.kernels.vector
+        self.body = np.full(mesh.num_vertices, -1)
+        self.body[mesh.surface_vertices] = np.unique(pieces(mesh)[mesh.surface_vertices], return_inverse=True)[1]
+        self.list = CandidatePairs(mesh.surface_vertices, mesh.surface_triangles, edges, lengths, self.body,
+                                   arrays.precision, parallel)  # fmt: skip
+        self._launch, n, vector = self.list.launch, len(mesh.surface_vertices), self.kernels.vector
         self.before, self.built, self.sums, self.rest_adj = (runtime.array(vector, n) for _ in range(4))
-        self.none, self.flags = runtime.array(vector, 1), runtime.array(ti.i32, 5)
-        self.skin, self.fresh, self.age, self.builds = 0.0, False, 0, 0
-        self._launches, self._version, self._checked_rest, self._scratch = {}, -1, None, None
+        self.none, self.flags = runtime.array(vector, 1), runtime.array(ti.i32, 3)
+        marked = spread(self.body[mesh.surface_vertices], self.markers)
+        self.num_bodies, self.marked = len(marked), runtime.upload(marked.ravel(), ti.i32)
+        self.frame = runtime.array(vector, self.num_bodies + 1)
+        self.fresh, self.age, self.builds = False, 0, 0
+        self._checked_rest = self._scratch = None
 
     @property
     def width(self) -> float:
@@ -60,8 +66,7 @@ class SurfacePairs:
     def _check_rest(self, u) -> None:
         self._build(u, 0)
         gaps, pairs = self._distances(u)
-        body = pieces(self.mesh)
-        near = np.nonzero((gaps < self.width) & (body[pairs[:, 0]] == body[pairs[:, 2]]))[0]
+        near = np.nonzero((gaps < self.width) & (self.body[pairs[:, 0]] == self.body[pairs[:, 2]]))[0]
         if near.size:
             worst = near[gaps[near].argmin()]
             raise ValueError(
@@ -87,56 +92,66 @@ class SurfacePairs:
 
     def forget(self, u) -> None:
         """The state was set from outside."""
+        self.age = 0
         self._build(u, 0)
         self.check_apart(u)
 
     # ---- the list ---------------------------------------------------------------------------------------------------
 
-    def _build(self, u, slot: int, wanted: float = 0.0) -> None:
-        surface = self.mesh.surface_vertices
-        x = runtime.fetch(u)[slot][surface]
+    def _build(self, u, slot: int, wanted=0.0) -> None:
+        """The list at u[slot]; slacks follow the motion, or cover `wanted`, shape (n, 2) [m]."""
+        x = runtime.fetch(u)[slot][self.mesh.surface_vertices]
         if not np.all(np.isfinite(x)):  # the guard of the run will say so
             return
-        if self.fresh and self.age:
-            move = x - runtime.fetch(self.built)
-            moved = min(np.linalg.norm(y, axis=1).max() for y in (move, move - move[0]))
-            wanted = 2 * self.passes * moved / self.age
-        least = self.least_skin * self.width
-        self.skin = float(np.clip(wanted, least, max(least, self.largest_reach * self.list.typical - self.width)))
-        self.list.build(self.a.rest, u, slot, self.width + self.skin)
+        runtime.fill(self.list.slack, self._slacks(x, wanted))
+        self.list.build(self.a.rest, u, slot, self.width)
         count, take = self.list.count, self.list.buffers.take
         self.corner, self.plane = take("forces", self.kernels.vector, 4 * count), take("planes", self.kernels.vector, count)
         self.energy, self.numbers = take("energies", self.kernels.fp, count), take("numbers", self.kernels.vector, count)
-        self.kernels.begin(self.list.surface, u, self.built, self.plane, slot, self.list.num_surface, count)
-        if self._version != self.list.buffers.version:
-            self._launches.clear()
-            self._version = self.list.buffers.version
+        self._launch(self.kernels.begin, self.list.surface, u, self.built,
+                     self.plane)(slot, self.list.num_surface, count)  # fmt: skip
         self.fresh, self.age = True, 0
         self.builds += 1
 
+    def _slacks(self, x: np.ndarray, wanted) -> np.ndarray:
+        """Slacks [m] of the surface vertices towards their own body and others, shape (n, 4), for displacements x."""
+        slack, least = np.zeros((len(x), 4)), self.least_slack * self.width
+        slack[:, :2] = wanted
+        if self.fresh and self.age:
+            whole, last = self._travel(x - runtime.fetch(self.built)), self._travel(x - runtime.fetch(self.before))
+            pace = np.maximum(whole / self.age, last)
+            # the mean, for what will be hit; the slack before, for what shakes
+            slack[:, :2] = self.passes * (pace + pace.mean(0))
+            slack[:, :2] = np.maximum(slack, 0.9 * _all_four(self.list.slack))[:, :2]
+        for k, largest in enumerate(self.largest_reach):
+            slack[:, k] = slack[:, k].clip(least, max(least, 0.5 * (largest * self.list.typical - self.width)))
+        return slack
+
+    def _travel(self, move: np.ndarray) -> np.ndarray:
+        """Lengths of surface vertices' motions relative to their body's and to the mean of all, shape (n, 2)."""
+        frame = move[runtime.fetch(self.marked).reshape(self.num_bodies, -1)].mean(1)
+        origins = frame[self.body[self.mesh.surface_vertices]], frame.mean(0)
+        return np.stack([np.linalg.norm(move - origin, axis=1) for origin in origins], 1)
+
     def unbind(self) -> None:
         """Let go of the arrays that forces were computed from."""
-        self._launches.clear()
-
-    def _launch(self, name: str, kernel, *arrays) -> runtime.Launch:
-        key = (name, *map(id, arrays))
-        if key not in self._launches:
-            self._launches[key] = runtime.Launch(kernel, *arrays)
-        return self._launches[key]
+        self._launch.clear()
 
     def _check(self, u, slot: int, num_vt: int, num_ee: int) -> tuple[bool, bool, bool]:
         """Whether the list is stale, whether pairs beyond it may have crossed, and whether pairs of it may have."""
         k = self.list
-        self._launch("check", self.kernels.check, k.pairs, k.surface, k.place, u, self.before, self.built, self.plane,
-                     self.flags)(slot, num_vt, num_ee, k.num_surface, 0.5 * self.skin,
-                                 0.5 * (self.width + self.skin))  # fmt: skip
+        self._launch(self.kernels.check, k.pairs, k.surface, k.place, k.body, k.slack, self.marked, u, self.before,
+                     self.built, self.frame, self.plane,
+                     self.flags)(slot, num_vt, num_ee, k.num_surface, self.num_bodies, self.markers,
+                                 0.5 * self.width)  # fmt: skip
         flags = runtime.view(self.flags)
-        far, lost, crossed, far_apart, lost_apart = runtime.fetch(self.flags) if flags is None else flags
-        return bool(far and far_apart), bool(lost and lost_apart), bool(crossed)
+        stale, lost, crossed = runtime.fetch(self.flags) if flags is None else flags
+        return bool(stale), bool(lost), bool(crossed)
 
     def ensure(self, u, slot: int) -> None:
         """Make the list anew if it does not hold at u[slot]."""
         if not self.fresh or self._check(u, slot, 0, 0)[0]:
+            self.age = 0  # a jump says nothing of the pace
             self._build(u, slot)
 
     def check_pass(self, u, slot: int, h: float) -> None:
@@ -185,14 +200,14 @@ class SurfacePairs:
     def forces(self, u, slot: int, out, exact: bool = False) -> None:
         """Contact forces at u[slot], to the last corners of `out`."""
         k = self.list
-        self._launch("forces", self.kernels.forces, k.pairs, k.scale, k.surface, k.row, k.corner, self.a.rest,
+        self._launch(self.kernels.forces, k.pairs, k.scale, k.surface, k.row, k.corner, self.a.rest,
                      self.a.parameters, u, self.corner, self.plane, self.energy, self.before,
                      out)(slot, k.num_vt, k.num_ee, k.num_surface, self.a.first_contact_corner, int(exact))  # fmt: skip
 
     def product(self, u, slot: int, w, out, rest_dot=None, parameters_dot=(0.0, 0.0)) -> None:
         """Change of the contact forces for changes w[0] of the positions (and of rest shape, stiffness, width)."""
         k = self.list
-        self._launch("products", self.kernels.products, k.pairs, k.scale, k.row, k.corner, self.a.rest, self.a.parameters, u,
+        self._launch(self.kernels.products, k.pairs, k.scale, k.row, k.corner, self.a.rest, self.a.parameters, u,
                      w, self.none if rest_dot is None else rest_dot, self.corner, self.numbers,
                      out)(slot, k.num_vt, k.num_ee, k.num_surface, self.a.first_contact_corner, int(rest_dot is not None),
                           *parameters_dot)  # fmt: skip
@@ -206,7 +221,7 @@ class SurfacePairs:
         """The product with the adjoint w[0] of the forces; adds the adjoints of stiffness, width and rest shape."""
         self.product(u, slot, w, out)
         k = self.list
-        self._launch("sums", self.kernels.add_sums, k.row, k.corner, self.numbers, out, self.sums,
+        self._launch(self.kernels.add_sums, k.row, k.corner, self.numbers, out, self.sums,
                      self.rest_adj)(k.num_surface, self.a.first_contact_corner)  # fmt: skip
 
     def collect(self) -> tuple[np.ndarray, np.ndarray]:
@@ -246,6 +261,14 @@ def pieces(mesh) -> np.ndarray:
     i, k = mesh.tetrahedra[:, [0, 1, 0, 2, 0, 3]].reshape(-1, 2).T
     graph = coo_matrix((np.ones(len(i), bool), (i, k)), (mesh.num_vertices, mesh.num_vertices))
     return connected_components(graph, directed=False)[1]
+
+
+def spread(body: np.ndarray, count: int) -> np.ndarray:
+    """`count` members of each body, evenly spread over their numbers, repeated where there are fewer; (bodies, count)."""
+    members = np.argsort(body, kind="stable")
+    first = np.searchsorted(body[members], np.arange(body.max() + 2))
+    share = (np.arange(count) + 0.5) / count
+    return members[(first[:-1, None] + np.diff(first)[:, None] * share).astype(int)]
 
 
 def _all_four(vectors) -> np.ndarray:
