@@ -3,8 +3,6 @@
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 SIZE = 8
 _known = WeakKeyDictionary()  # meshes do not change
@@ -46,6 +44,9 @@ def _find_patches(mesh) -> np.ndarray:
 
 def _pieces(labels: np.ndarray, tets: np.ndarray) -> np.ndarray:
     """Labels anew, so that tetrahedra of one label hang together by shared vertices."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
     m = len(tets)
     corners, place = np.unique(labels[:, None] * (tets.max() + 1) + tets, return_inverse=True)
     edges = np.repeat(np.arange(m), 4), m + place.ravel()
