@@ -143,11 +143,6 @@ def test_touching_exactly_is_refused_and_a_path_counts():
     points(tetrahedron(0.35), rising)
 
 
-def test_implicit_solvers_refuse_self_contact():
-    with pytest.raises(ValueError, match="use an explicit solver"):
-        ds.ImplicitEulerSolver(points(tetrahedron(0.5), ds.SelfContact(1e3, 1e-3)), dt=1e-3)
-
-
 def test_stiffness_is_chosen_and_said():
     """From the speed of the fall: at rest on the floor the weight still leaves a gap."""
     mesh, material = tetrahedron(0.1), ds.StableNeoHookean(1e5, 0.3)

@@ -92,7 +92,7 @@ ROWS = {
         "two bodies collide head-on":
             "self_contact:head_on_collision_exchanges_velocities "
             "self_contact:head_on_collision_ends_where_rigid_bodies_would",
-        "slow impact of a sphere as by Hertz": "",
+        "slow impact of a ball as by Hertz": "hertz:slow_impact_of_a_ball_converges_to_hertz",
         "symmetric contact stays symmetric; a face exactly where the barrier begins feels nothing":
             "contact:symmetric_contact_stays_symmetric torture:a_face_exactly_at_the_width_feels_nothing",
     },
