@@ -159,6 +159,9 @@ class Rollout(Sweeps):
 
         Input fields hold the scene's values until a kernel or `from_numpy` writes others; `run` reads them.
         """
+        if not self._fields:
+            self._program = runtime.program()
+        runtime.check_alive(self._program)
         if name not in self._fields:
             fp = runtime.PRECISIONS[self.scene.precision]
             if name in ("positions", "velocities"):
@@ -208,6 +211,8 @@ class Rollout(Sweeps):
                 grad.from_numpy(np.asarray(grad.to_numpy() + gradients[name], runtime.NUMPY[self.scene.precision]))
 
     def _field_values(self) -> dict:
+        if self._fields:
+            runtime.check_alive(self._program)
         exact = {}
         for name, taichi_field in self._fields.items():
             if name in self.inputs:

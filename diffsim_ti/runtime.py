@@ -110,12 +110,20 @@ def _refuse_fork() -> None:
         )
 
 
-def program():
-    """The live Taichi program; starts the stated default (CPU, f32) if nothing did."""
+def program() -> weakref.ref:
+    """The live Taichi program; starts the stated default (CPU, f32) if nothing did.
+
+    A weak reference: a program that somebody still holds would outlive `ti.init`, and free memory of the next one at its end.
+    """
     _refuse_fork()
     if impl.get_runtime().prog is None:
         init()
-    return impl.get_runtime().prog
+    return weakref.ref(impl.get_runtime().prog)
+
+
+def is_alive(owner: weakref.ref) -> bool:
+    """Whether the program `owner` is the one that runs."""
+    return owner() is not None and owner() is impl.get_runtime().prog
 
 
 def check_host_init() -> None:
@@ -131,10 +139,10 @@ def check_host_init() -> None:
         )
 
 
-def check_alive(owner) -> None:
-    """Raise if `ti.init` was called after `owner` took its arrays, or if this process was forked since."""
+def check_alive(owner: weakref.ref) -> None:
+    """Raise if `ti.init` was called after the program `owner`, or if this process was forked since."""
     _refuse_fork()
-    if impl.get_runtime().prog is not owner:
+    if not is_alive(owner):
         raise RuntimeError("ti.init was called again, which destroys all Taichi data: build the scene and solver anew")
 
 
@@ -165,22 +173,28 @@ def allocated_megabytes() -> float:
 
 def _free(owner, handle, size) -> None:
     _settings["bytes"] -= size
-    if handle is not None and impl.get_runtime().prog is owner:
+    if is_alive(owner):
         if not runs_on_cpu():
             ti.sync()  # an array that a kernel still uses would not be freed, in silence
-        owner.delete_ndarray(handle)
+        owner().delete_ndarray(handle)
+
+
+class _Scalars(ti.ScalarNdarray):
+    """An array of numbers that is freed like one of vectors, by `_free`."""
+
+    def __del__(self):
+        pass  # Taichi's own frees whatever array of a later program has come to lie at the same address
 
 
 def array(dtype, *shape: int):
-    """A Taichi ndarray whose memory goes back when the last reference goes (plain vector ndarrays never free it)."""
+    """A Taichi ndarray whose memory goes back when the last reference goes, and only to the program that gave it."""
     owner = program()
     shape = tuple(max(int(s), 1) for s in shape)  # Taichi has no empty arrays
-    out = ti.ndarray(dtype, shape)
+    out = _Scalars(dtype, shape) if isinstance(dtype, type(ti.f32)) else ti.ndarray(dtype, shape)
     size = int(np.prod(full_shape(out))) * np.dtype(to_numpy_dtype(out.dtype)).itemsize
     _settings["bytes"] += size
     out.owner = owner
-    # scalar arrays free themselves
-    weakref.finalize(out, _free, owner, None if isinstance(out, ti.ScalarNdarray) else out.arr, size)
+    weakref.finalize(out, _free, owner, out.arr, size)
     return out
 
 
@@ -197,12 +211,19 @@ def upload(data: np.ndarray, dtype) -> "ti.Ndarray":
 
 def full_shape(target) -> tuple:
     """Shape of a Taichi array with its element's shape, as NumPy sees it."""
+    _check_owner(target)
     return tuple(target.shape) + tuple(getattr(target, "element_shape", ()) or ())
+
+
+def _check_owner(target) -> None:
+    """The memory of an array of a dead program is gone, and so is what describes it."""
+    if hasattr(target, "owner"):
+        check_alive(target.owner)
 
 
 def view(target) -> "np.ndarray | None":
     """A NumPy array over the memory of a Taichi array, no copy; None where that memory is not the host's."""
-    check_alive(getattr(target, "owner", impl.get_runtime().prog))  # the memory of a dead program is gone
+    _check_owner(target)
     host = getattr(target, "host_view", None)
     if host is None and runs_on_cpu():
         dtype, shape = to_numpy_dtype(target.dtype), full_shape(target)
@@ -274,7 +295,6 @@ class Launch:
             ((self._context.set_arg_float if is_float else self._context.set_arg_int), (k,))
             for k, is_float in enumerate(floats, start=len(self._arrays))
         ]
-        self._launch = prog.launch_kernel
 
     def __call__(self, *numbers) -> None:
         check_alive(self._owner)
@@ -282,7 +302,7 @@ class Launch:
             self._prepare(numbers)
         for (setter, index), number in zip(self._setters, numbers):
             setter(index, number)
-        self._launch(self._code, self._context)
+        self._owner().launch_kernel(self._code, self._context)
 
 
 class TensorLaunch(Launch):
@@ -298,7 +318,7 @@ class TensorLaunch(Launch):
         for k, tensor in enumerate(tensors):
             size = tensor.numel() * tensor.element_size()
             self._context.set_arg_external_array_with_shape((k,), tensor.data_ptr(), size, tuple(tensor.shape), 0)
-        self._launch(self._code, self._context)
+        self._owner().launch_kernel(self._code, self._context)
 
 
 def traced(function):
@@ -325,7 +345,7 @@ class FieldPool:
 
     def take(self, owner, dtype, shape: tuple, components: int = 0):
         """A field of that kind, zeroed; it comes back to the pool when `owner` is collected."""
-        key = (id(program()), dtype, tuple(shape), components)
+        key = (program(), dtype, tuple(shape), components)
         field = self._free[key].pop() if self._free[key] else self._make(dtype, tuple(shape), components)
         weakref.finalize(owner, self._free[key].append, field)
         for part in (field, field.grad):

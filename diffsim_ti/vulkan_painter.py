@@ -62,7 +62,8 @@ class VulkanPainter:
 
         while _open:
             _open[0].close()
-        self.size, self._program = tuple(size), runtime.program()
+        self.size = tuple(size)
+        runtime.program()
         with settings_elsewhere():
             window = ti.ui.Window("diffsim_ti", tuple(SUPERSAMPLING * n for n in size), show_window=False)
         self._window, self._canvas = window, Canvas(window)

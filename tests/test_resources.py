@@ -107,6 +107,28 @@ def test_cuda_is_named_as_missing():
     assert small().precision == before  # and so is the default
 
 
+def test_arrays_of_an_earlier_program_leave_those_of_the_next_alone():
+    """Numbers and vectors of both lie at the same addresses."""
+    out = python("""
+        import numpy as np, taichi as ti, diffsim_ti as ds
+        from diffsim_ti import runtime
+
+        def some(value):
+            return [runtime.upload(np.full((1000, 3), value), ti.types.vector(4, ti.f32)) for _ in range(50)] + [
+                runtime.upload(np.full(1000, value), ti.i32) for _ in range(50)]
+
+        ds.init()
+        before = some(1)
+        ds.init()
+        kept = some(2)
+        before.clear()
+        later = some(3)
+        print(all((runtime.fetch(array) == 2).all() for array in kept), runtime.allocated_megabytes())
+    """)
+    said, megabytes = out.split()
+    assert said == "True" and float(megabytes) == 2 * (50 * 16e-3 + 50 * 4e-3)
+
+
 def test_host_s_init_is_respected():
     """The host's fields live on, its settings stay, and a warning names what they cost."""
     out = python("""
@@ -130,9 +152,11 @@ def test_second_init_is_noticed():
     out = python("import diffsim_ti as ds\nds.init('cpu')\n" + textwrap.dedent(STEP) + textwrap.dedent("""
         rollout = ds.Rollout(simulator.solver, 5)
         frames = rollout.forward()
+        rollout.field("initial_velocities")
         ds.init("cpu", precision="f64")
         for use in (simulator.step, simulator.reset, lambda: simulator.positions, lambda: simulator.compute_energy(),
-                    lambda: simulator.set_state(velocities=mesh.vertices), rollout.forward, lambda: rollout.vjp(frames)):
+                    lambda: simulator.set_state(velocities=mesh.vertices), rollout.forward, lambda: rollout.vjp(frames),
+                    rollout.run, lambda: rollout.positions):
             try:
                 use()
                 print("used")
@@ -145,7 +169,7 @@ def test_second_init_is_noticed():
     """))  # fmt: skip
     lines = out.splitlines()
     assert lines[-1] == "f64 done"
-    assert lines[:-1] == ["ti.init was called again, which destroys all Taichi data: build the scene and solver anew"] * 7
+    assert lines[:-1] == ["ti.init was called again, which destroys all Taichi data: build the scene and solver anew"] * 9
 
 
 def test_home_that_cannot_be_written():

@@ -91,8 +91,11 @@ def broad_phase_kernels(precision: str, parallel: bool) -> SimpleNamespace:
                  their_count: ti.i32, their_leaves: ti.i32, reach: fp, room: ti.i32):  # fmt: skip
             """Partners of each primitive in the tree of `theirs`, in order, at most `room`, and their number.
 
-            Edges walk from their own leaf on, so that each two meet once; the smaller number gets the larger one.
+            Of two edges the smaller number gets the larger one. On a CPU they walk from their own leaf on, so that each two
+            meet once; elsewhere each looks at all and adds to its own row alone, as software Vulkan (Mesa 22.3) leaves a
+            loop at its second atomic.
             """
+            once = ti.static(kind == EDGE_EDGE and runtime.runs_on_cpu())
             scene = Bundle(rest=rest, u=u)
             ti.loop_config(serialize=not parallel)
             for e in range(count):
@@ -100,7 +103,7 @@ def broad_phase_kernels(precision: str, parallel: bool) -> SimpleNamespace:
             ti.loop_config(serialize=not parallel)
             for g in range(groups):
                 node = 1
-                if ti.static(kind == EDGE_EDGE):
+                if ti.static(once):
                     node = leaves + g
                 while node > 0:
                     if tree.overlap(node, boxes[2 * (leaves + g)], boxes[2 * (leaves + g) + 1], their_boxes):
@@ -110,21 +113,25 @@ def broad_phase_kernels(precision: str, parallel: bool) -> SimpleNamespace:
                         m = GROUP * (node - their_leaves)
                         for a in range(GROUP * g, ti.min(GROUP * (g + 1), count)):
                             lo, hi, first = items[2 * a], items[2 * a + 1], m
-                            if ti.static(kind == EDGE_EDGE):
+                            if ti.static(once):
                                 first = ti.max(m, a + 1)
                             if tree.overlap(node, lo, hi, their_boxes):
                                 for b in range(first, ti.min(m + GROUP, their_count)):
                                     if tree.overlap(b, lo, hi, their_items):
                                         e, p, near = order[a], their_order[b], False
-                                        if ti.static(kind == EDGE_EDGE):
+                                        if ti.static(once):
                                             e, p = ti.min(e, p), ti.max(e, p)
                                         limit = both(reach, slacks[e], their_slacks[p])
                                         if ti.static(kind == VERTEX_TRIANGLE):
                                             near = near_triangle(e, p, limit, corners, their_corners, scene, slot)
-                                        else:
+                                        elif e < p:
                                             near = near_edge(e, p, limit, corners, scene, slot)
                                         if near:
-                                            k = ti.atomic_add(row[e], 1)  # any order: rows are sorted
+                                            k = row[e]
+                                            if ti.static(once):
+                                                k = ti.atomic_add(row[e], 1)  # any order: rows are sorted
+                                            else:
+                                                row[e] = k + 1
                                             if k < room:
                                                 partner[room * e + k] = p
                     node = tree.beyond(node)
