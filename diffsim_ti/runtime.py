@@ -113,7 +113,7 @@ def _refuse_fork() -> None:
 def program() -> weakref.ref:
     """The live Taichi program; starts the stated default (CPU, f32) if nothing did.
 
-    A weak reference: a program that somebody still holds would outlive `ti.init`, and free memory of the next one at its end.
+    A weak reference: a program that is still held would outlive `ti.init`, and at its end free memory of the next one.
     """
     _refuse_fork()
     if impl.get_runtime().prog is None:
