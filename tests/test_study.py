@@ -197,7 +197,7 @@ def test_advice_keeps_its_promise(name):
     assert all(word in str(advice) for word in (advice.solver.__name__, "expect:", "left out:"))
 
 
-@pytest.mark.parametrize("name", ["twist"])
+@pytest.mark.parametrize("name", ["twist", "drop"])
 def test_advice_overlooks_nothing_twice_as_cheap(name):
     """Every explicit solver, precision and step of a ladder: none that meets the tolerance takes half the time."""
     (scene, duration, tolerance), advice = held_back(name), advised(name)
@@ -214,12 +214,14 @@ def test_advice_overlooks_nothing_twice_as_cheap(name):
             if error <= tolerance:
                 rollouts[kind.__name__, precision, k] = rollout
     best = dict.fromkeys(rollouts, np.inf)
-    for _ in range(5):
+    for repeat in range(40):
         for key, rollout in rollouts.items():
             begin = time.perf_counter()
             rollout.forward()
             best[key] = min(best[key], time.perf_counter() - begin)
-    assert best["advised"] <= 2 * min(best.values()), best
+        if repeat > 4 and best["advised"] <= 2 * min(best.values()):
+            return  # the machine may be busy at any one moment, not at all of them
+    raise AssertionError(best)
 
 
 def test_advice_states_memory_and_keeps_to_it():

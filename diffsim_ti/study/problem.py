@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-ELEMENTS = {"linear": {}}  # kinds of element: name -> arguments of Scene
+ELEMENTS = {"linear": {}, "patches": {"volume": "patches"}}  # kinds of element: name -> arguments of Scene
 
 
 @dataclass(frozen=True)
@@ -43,8 +43,9 @@ class Problem:
     exact: the closed form's numbers, or None: a converged reference is computed, with its own error.
     scale: what errors are divided by; default the largest of the exact numbers.
     adjoint(frames, mesh) -> the loss's gradient by the frames' positions, such as a Watch; `inputs`: those asked for.
-    cells, patterns: the meshes of the chart. reference_cells: those that the reference is extrapolated from (it then
-        includes the mesh's error); None: the reference is of each mesh by itself (the error of steps and precision).
+    cells, patterns, elements: the meshes of the chart, and the kinds of elements (ELEMENTS) to try on each.
+    reference_cells: those that the reference is extrapolated from (it then includes the mesh's error); None: the reference
+        is of each mesh with linear elements by itself (the error of steps and precision).
     largest_step [s]: steps to start from, where the stable one does not say (contact to come).
     static: an equilibrium; only StaticSolver takes part.
     levels: steps per solver, each half the last.
@@ -63,6 +64,7 @@ class Problem:
     inputs: tuple = ()
     cells: tuple = (2, 4, 8)
     patterns: tuple = ("five", "kuhn")
+    elements: tuple = ("linear",)
     reference_cells: tuple | None = None
     largest_step: float = np.inf
     static: bool = False

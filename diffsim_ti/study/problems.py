@@ -129,7 +129,7 @@ def beam() -> Problem:
     """Large motion of the clamped beam that is let go straight: the path of its end over half a swing."""
     return Problem("beam", "Clamped beam let go under its own weight, nu = 0.3", "error of motion, over its reach",
                    lambda *args, **more: beam_scene(SmithNeoHookean, *args, **more), 0.5, tip, frames=10,
-                   cells=(1, 2, 3, 4, 6, 8), reference_cells=(6, 9, 12))  # fmt: skip
+                   cells=(1, 2, 3, 4, 6, 8), elements=("linear", "patches"), reference_cells=(6, 9, 12))  # fmt: skip
 
 
 def sag(nu: float = 0.3) -> Problem:
@@ -143,7 +143,7 @@ def sag(nu: float = 0.3) -> Problem:
     return Problem("sag", f"Clamped beam at rest, small strains, nu = {nu:g}, beam theory", "error of the end's drop",
                    lambda *args, **more: beam_scene(LinearElastic, *args, nu=nu, **more), 1.0,
                    lambda frames, _: tip(frames)[-1:, 1], frames=1, exact=np.array([-drop]), cells=(1, 2, 4, 6, 8),
-                   static=True)  # fmt: skip
+                   elements=("linear", "patches"), static=True)  # fmt: skip
 
 
 def bounce_scene(precision, speed: float, **element) -> Scene:

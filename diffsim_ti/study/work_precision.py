@@ -4,7 +4,7 @@ import time
 import warnings
 from collections.abc import Callable
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 
@@ -57,6 +57,14 @@ class Chart:
     def front(self) -> list[Point]:
         """Runs that none beats in both time and error, the cheapest first."""
         return pareto_front(self.points)
+
+    def with_points(self, more: list[Point]) -> "Chart":
+        """The same with more runs, and with the front marked anew."""
+        out = replace(self, points=[*self.points, *more])
+        front = out.front
+        for p in out.points:
+            p.on_front = p in front
+        return out
 
     def time_to(self, error: float) -> Point | None:
         """The cheapest run whose error is at most this."""
@@ -166,7 +174,7 @@ class Runs:
 
     def meshes(self):
         """(cells, pattern, element) of each mesh, the small ones first."""
-        return [(n, p, e) for n in self.problem.cells for p in self.problem.patterns for e in ELEMENTS]
+        return [(n, p, e) for n in self.problem.cells for p in self.problem.patterns for e in self.problem.elements]
 
     def of_mesh(self, cells, pattern, element) -> list[tuple[Point, type, object]]:
         """(point, solver class, scene) of everything to run on a mesh."""
@@ -270,7 +278,4 @@ def chart(problem: Problem, solvers=None, precisions=("f32", "f64"), levels: int
                 right, error = reference(problem, mesh[0], mesh[1])
                 own_error = max(own_error, error)
             points += runs.measure(mesh, right, lambda note, k=k: show(k + 1, note))
-    out = Chart(problem, points, own_error, runs.left_out)
-    for p in out.front:
-        p.on_front = True
-    return out
+    return Chart(problem, [], own_error, runs.left_out).with_points(points)
