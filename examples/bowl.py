@@ -16,7 +16,7 @@ import diffsim_ti as ds
 from diffsim_ti.film import save_film
 from diffsim_ti.obstacles import bowl
 
-SIDE, RADIUS, FRAME, SUBSTEPS = 0.1, 0.5, 0.01, 100  # of a block and of the bowl [m]; of a frame [s]
+SIDE, RADIUS, FRAME, SUBSTEPS = 0.1, 0.5, 0.01, 180  # of a block and of the bowl [m]; of a frame [s]
 PLACES = [(x, y, z) for y in (-0.26, -0.075, 0.11) for x in (-0.18, 0.0, 0.18) for z in (-0.18, 0.0, 0.18)]
 
 
@@ -37,7 +37,7 @@ def make_fall(mesh, cells: int, contact: bool) -> ds.Simulator:
     if contact:
         terms.append(ds.SelfContact(stiffness=400.0, width=width))
     start = np.tile([0.0, -0.5, 0.0], (mesh.num_vertices, 1))
-    scene = ds.Scene(mesh, ds.StableNeoHookean(3e4, 0.3), density=1000.0, terms=terms, initial_velocities=start,
+    scene = ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3), density=1000.0, terms=terms, initial_velocities=start,
                      precision="f32")  # fmt: skip
     simulator = ds.Simulator(ds.SemiImplicitSolver(scene, dt=FRAME, substeps=SUBSTEPS))
     simulator.step()  # compiles

@@ -28,6 +28,8 @@ def tree_kernels(precision: str, parallel: bool) -> SimpleNamespace:
     fp = runtime.PRECISIONS[precision]
     vec3, vec4 = ti.types.vector(3, fp), ti.types.vector(4, fp)
     ints, vectors, vectors2 = ti.types.ndarray(ti.i32, 1), ti.types.ndarray(vec4, 1), ti.types.ndarray(vec4, 2)
+    eight = ti.types.vector(GROUP, fp)
+    eights = ti.types.ndarray(eight, 1)
     rounding = 4 * float(np.finfo(runtime.to_numpy_dtype(fp)).eps)
 
     @ti.func
@@ -67,6 +69,17 @@ def tree_kernels(precision: str, parallel: bool) -> SimpleNamespace:
         return ti.max(gap, ti.max(a[2] - hi[2], lo[2] - b[2])) <= 0
 
     @ti.func
+    def overlapping(k, lo, hi, lanes: A):
+        """Which primitives of leaf k overlap, a bit for each, by comparing all at once."""
+        x = ti.max(lanes[6 * k] - hi[0], lo[0] - lanes[6 * k + 3])
+        y = ti.max(lanes[6 * k + 1] - hi[1], lo[1] - lanes[6 * k + 4])
+        z = ti.max(lanes[6 * k + 2] - hi[2], lo[2] - lanes[6 * k + 5])
+        gap, bits = ti.max(x, ti.max(y, z)), 0
+        for j in ti.static(range(GROUP)):
+            bits |= ti.cast(gap[j] <= 0, ti.i32) << j
+        return bits
+
+    @ti.func
     def beyond(node):
         """The next node of a walk that leaves out the children of `node`; 0 at the end."""
         following = node + 1
@@ -84,8 +97,8 @@ def tree_kernels(precision: str, parallel: bool) -> SimpleNamespace:
     def refit_kernel(size: int):
         @ti.kernel
         def refit(rest: vectors, u: vectors2, corners: ints, order: ints, place: ints, body: ints, slack: vectors,
-                  slacks: vectors, items: vectors, boxes: vectors, slot: ti.i32, count: ti.i32, leaves: ti.i32,
-                  subtrees: ti.i32, reach: fp):  # fmt: skip
+                  slacks: vectors, items: vectors, lanes: eights, boxes: vectors, slot: ti.i32, count: ti.i32,
+                  leaves: ti.i32, subtrees: ti.i32, reach: fp):  # fmt: skip
             """Slacks of primitives from those of vertices, and boxes of all nodes where the vertices are now."""
             scene = Bundle(rest=rest, u=u, place=place, body=body, slack=slack)
             ti.loop_config(serialize=not parallel)
@@ -98,6 +111,8 @@ def tree_kernels(precision: str, parallel: bool) -> SimpleNamespace:
                     items[2 * m] = vec4(lo[0], lo[1], lo[2], ti.cast(0, fp))
                     items[2 * m + 1] = vec4(hi[0], hi[1], hi[2], ti.cast(0, fp))
                     low, high = ti.min(low, items[2 * m]), ti.max(high, items[2 * m + 1])
+                    for d in ti.static(range(3)):
+                        lanes[6 * k + d][m - GROUP * k], lanes[6 * k + 3 + d][m - GROUP * k] = lo[d], hi[d]
                 boxes[2 * (leaves + k)], boxes[2 * (leaves + k) + 1] = low, high
             ti.loop_config(serialize=not parallel)
             for r in range(subtrees):
@@ -112,7 +127,7 @@ def tree_kernels(precision: str, parallel: bool) -> SimpleNamespace:
 
         return refit
 
-    return SimpleNamespace(overlap=overlap, beyond=beyond, vector=vec4, fp=fp,
+    return SimpleNamespace(overlap=overlap, overlapping=overlapping, beyond=beyond, vector=vec4, eight=eight, fp=fp,
                            refit={size: refit_kernel(size) for size in (1, 2, 3)})  # fmt: skip
 
 
@@ -131,7 +146,9 @@ class BoxTree:
         # lowest and highest corners: of primitives as they follow each other, and of nodes
         self.items = runtime.array(self.kernels.vector, 2 * self.count)
         self.boxes = runtime.array(self.kernels.vector, 4 * self.leaves)
-        self.arrays = self.corners, self.order, self.slacks, self.items, self.boxes
+        # of primitives leaf by leaf: lowest x of all in it, lowest y, z, highest x, y, z; a place left over is nowhere
+        self.lanes = runtime.upload(np.tile(np.repeat([1e30, -1e30], 3)[:, None], (self.groups, GROUP)), self.kernels.eight)
+        self.arrays = self.corners, self.order, self.slacks, self.items, self.lanes, self.boxes
         self.refits = 0
 
     def refit(self, rest, u, place, body, slack, slot: int, reach: float) -> None:
@@ -142,7 +159,8 @@ class BoxTree:
             runtime.fill(self.order, curve_order(x[self._host].mean(1)))
         self.refits += 1
         self.launch(self.kernels.refit[self.size], rest, u, self.corners, self.order, place, body, slack, self.slacks,
-                    self.items, self.boxes)(slot, self.count, self.leaves, min(SUBTREES, self.leaves), reach)  # fmt: skip
+                    self.items, self.lanes, self.boxes)(slot, self.count, self.leaves, min(SUBTREES, self.leaves),
+                                                        reach)  # fmt: skip
 
 
 def curve_order(points: np.ndarray) -> np.ndarray:

@@ -19,6 +19,7 @@ from diffsim_ti.contact.proximity import EDGE_EDGE, VERTEX_TRIANGLE, pair_functi
 from diffsim_ti.runtime import Bundle
 
 A = ti.template()
+ROOM = 1e-3  # of an edge's length or of the reach, that the simpler test of a pair leaves for rounding
 
 
 @lru_cache(maxsize=None)
@@ -27,6 +28,7 @@ def broad_phase_kernels(precision: str, parallel: bool) -> SimpleNamespace:
     f, tree = pair_functions(precision), tree_kernels(precision, parallel)
     fp, vec3 = f.fp, f.vec3
     ints, vectors = ti.types.ndarray(ti.i32, 1), ti.types.ndarray(ti.types.vector(4, fp), 1)
+    eights = ti.types.ndarray(tree.eight, 1)
     vectors2, scalars = ti.types.ndarray(ti.types.vector(4, fp), 2), ti.types.ndarray(fp, 1)
 
     @ti.func
@@ -44,9 +46,42 @@ def broad_phase_kernels(precision: str, parallel: bool) -> SimpleNamespace:
         return reach + slack
 
     @ti.func
+    def clamp(t):
+        return ti.min(ti.max(t, ti.cast(0, fp)), ti.cast(1, fp))
+
+    @ti.func
+    def edges_may_be_near(y1, y2, y3, reach):
+        """False only for edges (0, y1), (y2, y3) farther apart than `reach`; no branches, some room for parallel ones."""
+        a, b, tiny = y1, y3 - y2, ti.cast(f.tiny, fp)
+        aa, ab, bb, p, q = a.norm_sqr(), a.dot(b), b.norm_sqr(), a.dot(y2), b.dot(y2)
+        s = clamp((p * bb - ab * q) / ti.max(aa * bb - ab * ab, tiny))
+        t = clamp((ab * s - q) / ti.max(bb, tiny))
+        s = clamp((ab * t + p) / ti.max(aa, tiny))
+        limit = reach + ti.cast(ROOM, fp) * ti.sqrt(aa)
+        return (y2 + t * b - s * a).norm_sqr() < limit * limit
+
+    @ti.func
+    def triangle_may_be_near(y1, y2, y3, reach):
+        """False only for a triangle farther from the origin than `reach`: by its plane, or a side and the plane."""
+        normal = (y2 - y1).cross(y3 - y1)
+        square = ti.max(normal.norm_sqr(), ti.cast(f.tiny, fp))
+        height, limit = y1.dot(normal), ti.cast(1 + ROOM, fp) * reach
+        room = limit * limit * square - height * height
+        near = room >= 0
+        for a, b in ti.static(((y1, y2), (y2, y3), (y3, y1))):
+            out = b.cross(a).dot(normal)  # beyond the side a b if > 0
+            near &= (out <= 0) | (out * out <= room * (b - a).norm_sqr())
+        return near
+
+    @ti.func
     def is_near(kind: ti.template(), gap, reach, y1, y2, y3):
-        """Whether a pair is nearer than `reach`; `gap`, between boxes, spares most pairs the search."""
+        """Whether a pair is nearer than `reach`; `gap`, between boxes, and a simpler test spare most pairs the search."""
         near, limit = gap.norm_sqr() < reach * reach, ti.cast(0, fp)
+        if near:
+            if ti.static(kind == VERTEX_TRIANGLE):
+                near = triangle_may_be_near(y1, y2, y3, reach)
+            else:
+                near = edges_may_be_near(y1, y2, y3, reach)
         if near:
             w, r, g = f.nearest(kind, y1, y2, y3)
             limit = r.norm_sqr()
@@ -83,12 +118,23 @@ def broad_phase_kernels(precision: str, parallel: bool) -> SimpleNamespace:
             near = is_near(EDGE_EDGE, ti.max(gap, zero), reach, y1, y2, y3)
         return near
 
+    @ti.func
+    def lowest(bits):
+        """Number of the lowest bit that is set."""
+        return 31 - ti.math.clz(bits & (0 - bits))
+
+    @ti.func
+    def beyond_own(first):
+        """Bits from number `first` on, of at most GROUP."""
+        return ti.cast(-1, ti.i32) << ti.min(ti.max(first, 0), GROUP)
+
     def find_kernel(kind: int):
         @ti.kernel
-        def find(rest: vectors, u: vectors2, corners: ints, order: ints, slacks: vectors, items: vectors, boxes: vectors,
-                 their_corners: ints, their_order: ints, their_slacks: vectors, their_items: vectors, their_boxes: vectors,
-                 row: ints, partner: ints, most: ints, slot: ti.i32, count: ti.i32, leaves: ti.i32, groups: ti.i32,
-                 their_count: ti.i32, their_leaves: ti.i32, reach: fp, room: ti.i32):  # fmt: skip
+        def find(rest: vectors, u: vectors2, corners: ints, order: ints, slacks: vectors, items: vectors, lanes: eights,
+                 boxes: vectors, their_corners: ints, their_order: ints, their_slacks: vectors, their_items: vectors,
+                 their_lanes: eights, their_boxes: vectors, row: ints, partner: ints, most: ints, slot: ti.i32,
+                 count: ti.i32, leaves: ti.i32, groups: ti.i32, their_leaves: ti.i32, reach: fp,
+                 room: ti.i32):  # fmt: skip
             """Partners of each primitive in the tree of `theirs`, in order, at most `room`, and their number.
 
             Of two edges the smaller number gets the larger one. On a CPU they walk from their own leaf on, so that each two
@@ -110,30 +156,33 @@ def broad_phase_kernels(precision: str, parallel: bool) -> SimpleNamespace:
                         if node < their_leaves:
                             node = 2 * node
                             continue
-                        m = GROUP * (node - their_leaves)
-                        for a in range(GROUP * g, ti.min(GROUP * (g + 1), count)):
-                            lo, hi, first = items[2 * a], items[2 * a + 1], m
+                        leaf = node - their_leaves
+                        mine = tree.overlapping(g, their_boxes[2 * node], their_boxes[2 * node + 1], lanes)
+                        while mine != 0:
+                            a = GROUP * g + lowest(mine)
+                            mine &= mine - 1
+                            theirs = tree.overlapping(leaf, items[2 * a], items[2 * a + 1], their_lanes)
                             if ti.static(once):
-                                first = ti.max(m, a + 1)
-                            if tree.overlap(node, lo, hi, their_boxes):
-                                for b in range(first, ti.min(m + GROUP, their_count)):
-                                    if tree.overlap(b, lo, hi, their_items):
-                                        e, p, near = order[a], their_order[b], False
-                                        if ti.static(once):
-                                            e, p = ti.min(e, p), ti.max(e, p)
-                                        limit = both(reach, slacks[e], their_slacks[p])
-                                        if ti.static(kind == VERTEX_TRIANGLE):
-                                            near = near_triangle(e, p, limit, corners, their_corners, scene, slot)
-                                        elif e < p:
-                                            near = near_edge(e, p, limit, corners, scene, slot)
-                                        if near:
-                                            k = row[e]
-                                            if ti.static(once):
-                                                k = ti.atomic_add(row[e], 1)  # any order: rows are sorted
-                                            else:
-                                                row[e] = k + 1
-                                            if k < room:
-                                                partner[room * e + k] = p
+                                theirs &= beyond_own(a + 1 - GROUP * leaf)
+                            while theirs != 0:
+                                b = GROUP * leaf + lowest(theirs)
+                                theirs &= theirs - 1
+                                e, p, near = order[a], their_order[b], False
+                                if ti.static(once):
+                                    e, p = ti.min(e, p), ti.max(e, p)
+                                limit = both(reach, slacks[e], their_slacks[p])
+                                if ti.static(kind == VERTEX_TRIANGLE):
+                                    near = near_triangle(e, p, limit, corners, their_corners, scene, slot)
+                                elif e < p:
+                                    near = near_edge(e, p, limit, corners, scene, slot)
+                                if near:
+                                    k = row[e]
+                                    if ti.static(once):
+                                        k = ti.atomic_add(row[e], 1)  # any order: rows are sorted
+                                    else:
+                                        row[e] = k + 1
+                                    if k < room:
+                                        partner[room * e + k] = p
                     node = tree.beyond(node)
             ti.loop_config(serialize=not parallel)
             for e in range(count):
@@ -266,9 +315,9 @@ class CandidatePairs:
         while True:
             partner = self.buffers.take(f"partners {kind}", ti.i32, self.room[kind] * of.count)
             runtime.fill(self.most, 0)
-            self.launch(self.kernels.find[kind], rest, u, *of.arrays, *among.arrays, row, partner,
-                        self.most)(slot, of.count, of.leaves, of.groups, among.count, among.leaves, reach,
-                                   self.room[kind])  # fmt: skip
+            find = self.launch(self.kernels.find[kind], rest, u, *of.arrays, *among.arrays, row, partner, self.most,
+                               vectorized=runtime.runs_on_cpu())  # fmt: skip
+            find(slot, of.count, of.leaves, of.groups, among.leaves, reach, self.room[kind])
             most = int(runtime.fetch(self.most)[0])
             if most == 0:
                 self.buffers.scan(row, of.count)

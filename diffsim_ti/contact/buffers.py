@@ -47,10 +47,10 @@ class Launches:
     def __init__(self):
         self._bound = {}
 
-    def __call__(self, kernel, *arrays) -> runtime.Launch:
+    def __call__(self, kernel, *arrays, vectorized: bool = False) -> runtime.Launch:
         key = (id(kernel), *map(id, arrays))
         if key not in self._bound:
-            self._bound[key] = runtime.Launch(kernel, *arrays)
+            self._bound[key] = runtime.Launch(kernel, *arrays, vectorized=vectorized)
         return self._bound[key]
 
     def clear(self) -> None:

@@ -1,7 +1,8 @@
 """Kernels over the pairs of a surface: forces and their derivatives, energies, and whether a pass may have gone too far.
 
 Each pair writes to its four corners, and each surface vertex sums its corners in order, so that there are no atomics; what
-vertex s gets is written to `out[first_out + s]`, one more corner for the gather of the tetrahedra's forces.
+vertex s gets is written to `out[first_out + s]`, one more corner for the gather of the tetrahedra's forces. Most pairs of a
+list are beyond the width: they write nothing but their plane, and vertices with no other pairs sum nothing.
 """
 
 from functools import lru_cache
@@ -14,6 +15,7 @@ from diffsim_ti.runtime import Bundle
 
 A = ti.template()
 MARGIN = 1.001
+BLOCK = 256  # vertices whose motion one thread compares
 SAFE = 0.9  # share of its gap by which a pair may close in one pass
 # which corners belong to different primitives
 OPPOSITE = (((0, 1), (0, 2), (0, 3)), ((0, 2), (0, 3), (1, 2), (1, 3)))
@@ -66,13 +68,6 @@ def pair_kernels(precision: str, first: int, parallel: bool) -> SimpleNamespace:
         corner[4 * p + 3] = vec4(0 - g3[0], 0 - g3[1], 0 - g3[2], zero)
 
     @ti.func
-    def gather(s, row: A, corner_of: A, corner: A):
-        total = vec4(0)
-        for k in range(row[s], row[s + 1]):
-            total += corner[corner_of[k]]
-        return total
-
-    @ti.func
     def apart(kind: ti.template(), n, y1, y2, y3):
         """How far apart along n all corners of the two primitives are: their distance is at least that, whatever n."""
         y, d = (0 * y1, y1, y2, y3), ti.cast(1e30, fp)
@@ -81,29 +76,52 @@ def pair_kernels(precision: str, first: int, parallel: bool) -> SimpleNamespace:
         return d
 
     @ti.func
+    def unit(v):
+        return v / ti.max(ti.sqrt(v.norm_sqr()), ti.cast(1e-30, fp))
+
+    @ti.func
+    def guess(kind: ti.template(), y1, y2, y3):
+        """A normal along which the two primitives are likely to be apart: across both, or from one middle to the other."""
+        across, between = y1.cross(y3 - y2), ti.cast(0.5, fp) * (y1 - y2 - y3)
+        if ti.static(kind == VERTEX_TRIANGLE):
+            across, between = (y2 - y1).cross(y3 - y1), 0 - (y1 + y2 + y3)
+        if across.dot(between) < 0:
+            across = 0 - across
+        n, other = unit(across), unit(between)
+        if apart(kind, other, y1, y2, y3) > apart(kind, n, y1, y2, y3):
+            n = other
+        return n
+
+    @ti.func
     def force(kind: ti.template(), p, scale, scene: A, slot):
         stiffness, width = scene.parameters[first], scene.parameters[first + 1]
         y1, y2, y3 = corners(p, scene, slot)
         last = scene.plane[p]
         n, energy, g1, g2, g3 = vec3(last[0], last[1], last[2]), ti.cast(0, fp), vec3(0), vec3(0), vec3(0)
+        if last[0] == 0 and last[1] == 0 and last[2] == 0:  # a new list
+            n = guess(kind, y1, y2, y3)
         d = apart(kind, n, y1, y2, y3)
         # the plane of the pass before spares most pairs the search; the margin is for rounding
         if not d > ti.cast(MARGIN, fp) * width or scene.exact > 0:
             energy, n, d, g1, g2, g3 = f.gradient(kind, y1, y2, y3, scale, stiffness, width)
         scene.plane[p] = vec4(n[0], n[1], n[2], d)
         scene.energy[p] = energy
-        store(p, scene.corner, g1, g2, g3)
+        if not d > width:
+            store(p, scene.corner, g1, g2, g3)
+            for k in ti.static(range(4)):
+                scene.touched[scene.place[scene.pairs[4 * p + k]]] = 1
 
     @ti.kernel
-    def forces(pairs: ints, scales: scalars, surface: ints, row: ints, corner_of: ints, rest: vectors, parameters: scalars,
-               u: vectors2, corner: vectors, plane: vectors, energy: scalars, before: vectors, out: vectors, slot: ti.i32,
-               num_vt: ti.i32, num_ee: ti.i32, num_surface: ti.i32, first_out: ti.i32, exact: ti.i32):  # fmt: skip
+    def forces(pairs: ints, scales: scalars, surface: ints, place: ints, row: ints, corner_of: ints, rest: vectors,
+               parameters: scalars, u: vectors2, corner: vectors, plane: vectors, energy: scalars, touched: ints,
+               before: vectors, out: vectors, slot: ti.i32, num_vt: ti.i32, num_ee: ti.i32, num_surface: ti.i32,
+               first_out: ti.i32, exact: ti.i32):  # fmt: skip
         """Forces at u[slot]; keeps a plane (n, d) that parts each pair, and where the surface was.
 
         d is the distance of a pair that is nearer than the width or if `exact`, else a lower bound of it.
         """
-        scene = Bundle(pairs=pairs, rest=rest, parameters=parameters, u=u, corner=corner, plane=plane, energy=energy,
-                       exact=exact)  # fmt: skip
+        scene = Bundle(pairs=pairs, place=place, rest=rest, parameters=parameters, u=u, corner=corner, plane=plane,
+                       energy=energy, touched=touched, exact=exact)  # fmt: skip
         ti.loop_config(serialize=not parallel)
         for p in range(num_vt):
             force(VERTEX_TRIANGLE, p, ti.cast(0, fp), scene, slot)
@@ -112,7 +130,13 @@ def pair_kernels(precision: str, first: int, parallel: bool) -> SimpleNamespace:
             force(EDGE_EDGE, num_vt + q, scales[q], scene, slot)
         ti.loop_config(serialize=not parallel)
         for s in range(num_surface):
-            out[first_out + s] = gather(s, row, corner_of, corner)
+            total = vec4(0)
+            if touched[s] > 0:
+                touched[s] = 0
+                for k in range(row[s], row[s + 1]):
+                    if not plane[corner_of[k] >> 2][3] > parameters[first + 1]:
+                        total += corner[corner_of[k]]
+            out[first_out + s] = total
             before[s] = u[slot, surface[s]]
 
     @ti.func
@@ -143,7 +167,10 @@ def pair_kernels(precision: str, first: int, parallel: bool) -> SimpleNamespace:
             product(EDGE_EDGE, num_vt + q, scales[q], scene, slot)
         ti.loop_config(serialize=not parallel)
         for s in range(num_surface):
-            out[first_out + s] = gather(s, row, corner_of, corner)
+            total = vec4(0)
+            for k in range(row[s], row[s + 1]):
+                total += corner[corner_of[k]]
+            out[first_out + s] = total
 
     @ti.kernel
     def add_sums(row: ints, corner_of: ints, numbers: vectors, out: vectors, sums: vectors, rest_adj: vectors,
@@ -170,12 +197,15 @@ def pair_kernels(precision: str, first: int, parallel: bool) -> SimpleNamespace:
 
     @ti.kernel
     def check(pairs: ints, surface: ints, place: ints, body: ints, slack: vectors, marked: ints, u: vectors2,
-              before: vectors, built: vectors, frame: vectors, plane: vectors, flags: ints, slot: ti.i32, num_vt: ti.i32,
-              num_ee: ti.i32, num_surface: ti.i32, num_bodies: ti.i32, markers: ti.i32, lost: fp):  # fmt: skip
+              before: vectors, built: vectors, frame: vectors, farthest: scalars, plane: vectors, flags: ints, slot: ti.i32,
+              num_vt: ti.i32, num_ee: ti.i32, num_surface: ti.i32, num_bodies: ti.i32, markers: ti.i32,
+              lost: fp):  # fmt: skip
         """flags: a vertex has used up its slack (0), or that and `lost` (1); a pair may have crossed (2).
 
         frame: mean motion of each body's markers since the list was made, and their mean, which motion is relative to.
-        Two convex sets that a plane parts cannot meet while their corners move in straight lines and stay parted.
+        Two convex sets that a plane parts cannot meet while their corners move in straight lines and stay parted. No pair
+        closes by more than twice the farthest that a vertex has moved relative to the mean since `forces`, which spares
+        most pairs the look at their corners. farthest: that of each BLOCK vertices, squared, then of all.
         """
         scene = Bundle(pairs=pairs, place=place, u=u, before=before, plane=plane, slot=slot)
         ti.loop_config(serialize=True)
@@ -189,10 +219,12 @@ def pair_kernels(precision: str, first: int, parallel: bool) -> SimpleNamespace:
             frame[b] = (ti.cast(1, fp) / ti.cast(markers, fp)) * total
         ti.loop_config(serialize=True)
         for _ in range(1):
-            total = vec4(0)
+            total, latest = vec4(0), vec4(0)
             for b in range(num_bodies):
                 total += frame[b]
+                latest += u[slot, surface[marked[b * markers]]] - before[marked[b * markers]]
             frame[num_bodies] = (ti.cast(1, fp) / ti.cast(num_bodies, fp)) * total
+            frame[num_bodies + 1] = (ti.cast(1, fp) / ti.cast(num_bodies, fp)) * latest
         ti.loop_config(serialize=not parallel)
         for s in range(num_surface):
             move = u[slot, surface[s]] - built[s]
@@ -205,14 +237,31 @@ def pair_kernels(precision: str, first: int, parallel: bool) -> SimpleNamespace:
                     flags[0] = 1
                 if not square <= (limit + lost) * (limit + lost):
                     flags[1] = 1
+        blocks = (num_surface + BLOCK - 1) // BLOCK
+        ti.loop_config(serialize=not parallel)
+        for b in range(blocks):
+            most = ti.cast(0, fp)
+            for s in range(b * BLOCK, ti.min((b + 1) * BLOCK, num_surface)):
+                most = ti.max(most, (u[slot, surface[s]] - before[s] - frame[num_bodies + 1]).norm_sqr())
+            farthest[b] = most
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            most = ti.cast(0, fp)
+            for b in range(blocks):
+                most = ti.max(most, farthest[b])
+            farthest[blocks] = ti.cast(2 * MARGIN, fp) * ti.sqrt(most)
         ti.loop_config(serialize=not parallel)
         for p in range(num_vt):
-            if not closing(VERTEX_TRIANGLE, p, scene) <= ti.cast(SAFE, fp) * plane[p][3]:
-                flags[2] = 1
+            room = ti.cast(SAFE, fp) * plane[p][3]
+            if not farthest[blocks] <= room:
+                if not closing(VERTEX_TRIANGLE, p, scene) <= room:
+                    flags[2] = 1
         ti.loop_config(serialize=not parallel)
         for q in range(num_ee):
-            if not closing(EDGE_EDGE, num_vt + q, scene) <= ti.cast(SAFE, fp) * plane[num_vt + q][3]:
-                flags[2] = 1
+            room = ti.cast(SAFE, fp) * plane[num_vt + q][3]
+            if not farthest[blocks] <= room:
+                if not closing(EDGE_EDGE, num_vt + q, scene) <= room:
+                    flags[2] = 1
 
     @ti.kernel
     def begin(surface: ints, u: vectors2, built: vectors, plane: vectors, slot: ti.i32, num_surface: ti.i32,

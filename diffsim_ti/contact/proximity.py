@@ -219,8 +219,9 @@ def pair_functions(precision: str) -> SimpleNamespace:
     def curvature(s):
         return barrier.curvature(s, fp)
 
-    return SimpleNamespace(fp=fp, vec3=vec3, vec4=vec4, nearest=nearest, nearest_jvp=nearest_jvp, gradient=gradient,
-                           gradient_jvp=gradient_jvp, mollifier=mollifier, curvature=curvature)  # fmt: skip
+    return SimpleNamespace(fp=fp, vec3=vec3, vec4=vec4, tiny=tiny, nearest=nearest, nearest_jvp=nearest_jvp,
+                           gradient=gradient, gradient_jvp=gradient_jvp, mollifier=mollifier,
+                           curvature=curvature)  # fmt: skip
 
 
 @lru_cache(maxsize=None)

@@ -5,7 +5,7 @@ import taichi as ti
 
 from diffsim_ti import runtime
 from diffsim_ti.contact.broad_phase import CandidatePairs
-from diffsim_ti.contact.pair_kernels import OPPOSITE, pair_kernels
+from diffsim_ti.contact.pair_kernels import BLOCK, OPPOSITE, pair_kernels
 
 
 class Tunnelling(FloatingPointError):
@@ -22,7 +22,7 @@ class SurfacePairs:
     Forces go to the last corners of an array of corners, one for each surface vertex (solvers/arrays.py).
     """
 
-    passes = 5  # that a list should last, by its slacks, but
+    passes = 8  # that a list should last, by its slacks, but
     least_slack = 0.1  # they are at least this share of the width, and
     largest_reach = 1.0, 2.0  # width + 2 slack at most this share of an edge, of one body (with many neighbours) and of two
     markers = 16  # vertices whose mean motion is that of a body
@@ -43,7 +43,8 @@ class SurfacePairs:
         self.none, self.flags = runtime.array(vector, 1), runtime.array(ti.i32, 3)
         marked = spread(self.body[mesh.surface_vertices], self.markers)
         self.num_bodies, self.marked = len(marked), runtime.upload(marked.ravel(), ti.i32)
-        self.frame = runtime.array(vector, self.num_bodies + 1)
+        self.frame = runtime.array(vector, self.num_bodies + 2)
+        self.farthest, self.touched = runtime.array(self.kernels.fp, n // BLOCK + 2), runtime.array(ti.i32, n)
         self.fresh, self.age, self.builds = False, 0, 0
         self._checked_rest = self._scratch = None
 
@@ -141,7 +142,7 @@ class SurfacePairs:
         """Whether the list is stale, whether pairs beyond it may have crossed, and whether pairs of it may have."""
         k = self.list
         self._launch(self.kernels.check, k.pairs, k.surface, k.place, k.body, k.slack, self.marked, u, self.before,
-                     self.built, self.frame, self.plane,
+                     self.built, self.frame, self.farthest, self.plane,
                      self.flags)(slot, num_vt, num_ee, k.num_surface, self.num_bodies, self.markers,
                                  0.5 * self.width)  # fmt: skip
         flags = runtime.view(self.flags)
@@ -200,8 +201,8 @@ class SurfacePairs:
     def forces(self, u, slot: int, out, exact: bool = False) -> None:
         """Contact forces at u[slot], to the last corners of `out`."""
         k = self.list
-        self._launch(self.kernels.forces, k.pairs, k.scale, k.surface, k.row, k.corner, self.a.rest,
-                     self.a.parameters, u, self.corner, self.plane, self.energy, self.before,
+        self._launch(self.kernels.forces, k.pairs, k.scale, k.surface, k.place, k.row, k.corner, self.a.rest,
+                     self.a.parameters, u, self.corner, self.plane, self.energy, self.touched, self.before,
                      out)(slot, k.num_vt, k.num_ee, k.num_surface, self.a.first_contact_corner, int(exact))  # fmt: skip
 
     def product(self, u, slot: int, w, out, rest_dot=None, parameters_dot=(0.0, 0.0)) -> None:
