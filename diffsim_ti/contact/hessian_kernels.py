@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import taichi as ti
 
-from diffsim_ti.contact.pair_kernels import OPPOSITE
+from diffsim_ti.contact.pair_kernels import OPPOSITE, pair_kernels
 from diffsim_ti.contact.proximity import EDGE_EDGE, VERTEX_TRIANGLE, pair_functions
 from diffsim_ti.runtime import Bundle
 
@@ -19,31 +19,17 @@ A = ti.template()
 @lru_cache(maxsize=None)
 def hessian_kernels(precision: str, first: int, parallel: bool) -> SimpleNamespace:
     """Kernels for the numbers (stiffness, width) at `first` in the parameter array."""
-    f = pair_functions(precision)
+    f, pair = pair_functions(precision), pair_kernels(precision, first, parallel)
     fp, vec3, vec4 = f.fp, f.vec3, ti.types.vector(4, f.fp)
     ints, scalars = ti.types.ndarray(ti.i32, 1), ti.types.ndarray(fp, 1)
     vectors, vectors2 = ti.types.ndarray(vec4, 1), ti.types.ndarray(vec4, 2)
 
     @ti.func
-    def between(x: A, i, k):
-        """x_k - x_i of the vertices' vectors."""
-        y = x[0, k] - x[0, i]
-        return vec3(y[0], y[1], y[2])
-
-    @ti.func
-    def corners(p, scene: A):
-        """Corners 1 to 3 of pair p relative to corner 0."""
-        c0, out = scene.pairs[4 * p], (vec3(0), vec3(0), vec3(0))
-        for k in ti.static(range(3)):
-            y = scene.rest[scene.pairs[4 * p + k + 1]] - scene.rest[c0]
-            out[k] += vec3(y[0], y[1], y[2]) + between(scene.u, c0, scene.pairs[4 * p + k + 1])
-        return out
-
-    @ti.func
     def changes(p, scene: A):
+        """Vectors w of corners 1 to 3 of pair p relative to corner 0's."""
         c0 = scene.pairs[4 * p]
-        return (between(scene.w, c0, scene.pairs[4 * p + 1]), between(scene.w, c0, scene.pairs[4 * p + 2]),
-                between(scene.w, c0, scene.pairs[4 * p + 3]))  # fmt: skip
+        return (pair.of(scene.w, c0, scene.pairs[4 * p + 1], 0), pair.of(scene.w, c0, scene.pairs[4 * p + 2], 0),
+                pair.of(scene.w, c0, scene.pairs[4 * p + 3], 0))  # fmt: skip
 
     @ti.func
     def stiffness_along(kind: ti.template(), y1, y2, y3, scale, scene: A):
@@ -65,9 +51,9 @@ def hessian_kernels(precision: str, first: int, parallel: bool) -> SimpleNamespa
 
     @ti.func
     def product(kind: ti.template(), p, scale, scene: A):
-        h0, h1, h2, h3 = vec3(0), vec3(0), vec3(0), vec3(0)
+        h1, h2, h3 = vec3(0), vec3(0), vec3(0)
         if is_felt(p, scene):
-            y1, y2, y3 = corners(p, scene)
+            y1, y2, y3 = pair.corners(p, scene, 0)
             dy1, dy2, dy3 = changes(p, scene)
             if scene.convex > 0:
                 w, n, k = stiffness_along(kind, y1, y2, y3, scale, scene)
@@ -77,12 +63,7 @@ def hessian_kernels(precision: str, first: int, parallel: bool) -> SimpleNamespa
                 zero = ti.cast(0, fp)
                 h1, h2, h3, _, _ = f.gradient_jvp(kind, y1, y2, y3, dy1, dy2, dy3, scale, scene.parameters[first],
                                                   scene.parameters[first + 1], zero, zero)  # fmt: skip
-            h0 = h1 + h2 + h3
-        zero = ti.cast(0, fp)
-        scene.corner[4 * p] = vec4(h0[0], h0[1], h0[2], zero)
-        scene.corner[4 * p + 1] = vec4(0 - h1[0], 0 - h1[1], 0 - h1[2], zero)
-        scene.corner[4 * p + 2] = vec4(0 - h2[0], 0 - h2[1], 0 - h2[2], zero)
-        scene.corner[4 * p + 3] = vec4(0 - h3[0], 0 - h3[1], 0 - h3[2], zero)
+        pair.store(p, scene.corner, h1, h2, h3)
 
     @ti.kernel
     def products(pairs: ints, scales: scalars, row: ints, corner_of: ints, rest: vectors, parameters: scalars, u: vectors2,
@@ -108,7 +89,7 @@ def hessian_kernels(precision: str, first: int, parallel: bool) -> SimpleNamespa
         """Of each corner, the vector c with c c^T its diagonal block of the convex part."""
         c = (vec4(0), vec4(0), vec4(0), vec4(0))
         if is_felt(p, scene):
-            y1, y2, y3 = corners(p, scene)
+            y1, y2, y3 = pair.corners(p, scene, 0)
             w, n, k = stiffness_along(kind, y1, y2, y3, scale, scene)
             for a in ti.static(range(4)):
                 v = w[a] * ti.sqrt(k) * n
@@ -144,7 +125,7 @@ def hessian_kernels(precision: str, first: int, parallel: bool) -> SimpleNamespa
         plane, closing = scene.plane[p], ti.cast(0, fp)
         n = vec3(plane[0], plane[1], plane[2])
         for a, b in ti.static(OPPOSITE[kind]):
-            closing = ti.max(closing, n.dot(between(scene.w, scene.pairs[4 * p + a], scene.pairs[4 * p + b])))
+            closing = ti.max(closing, n.dot(pair.of(scene.w, scene.pairs[4 * p + a], scene.pairs[4 * p + b], 0)))
         return most * plane[3] / ti.max(closing, ti.cast(1e-30, fp))
 
     @ti.kernel

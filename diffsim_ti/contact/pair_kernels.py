@@ -272,5 +272,5 @@ def pair_kernels(precision: str, first: int, parallel: bool) -> SimpleNamespace:
         for s in range(num_surface):
             built[s] = u[slot, surface[s]]
 
-    return SimpleNamespace(forces=forces, products=products, add_sums=add_sums, check=check, begin=begin, fp=fp,
-                           vector=vec4)  # fmt: skip
+    return SimpleNamespace(forces=forces, products=products, add_sums=add_sums, check=check, begin=begin, of=of,
+                           corners=corners, store=store, fp=fp, vector=vec4)  # fmt: skip

@@ -76,8 +76,8 @@ class Problem:
         return self.adjoint is not None
 
     def quick(self) -> "Problem":
-        """The same with its smallest meshes."""
-        return replace(self, cells=self.cells[:2], patterns=self.patterns[:1],
+        """The same with its smallest meshes, of the first pattern and kind of elements."""
+        return replace(self, cells=self.cells[:2], patterns=self.patterns[:1], elements=self.elements[:1],
                        reference_cells=self.reference_cells and (4, 6, 8))  # fmt: skip
 
     @classmethod
