@@ -61,7 +61,9 @@ def test_fit_finds_frequency_and_decay():
 def test_every_problem_runs_quickly_and_gets_better_with_smaller_steps(name):
     if name == "sag":
         result = chart(replace(problem(name), cells=(1, 2), patterns=("five",)), precisions=("f64",), repeats=1)
-        assert result.points[1].error < 0.7 * result.points[0].error
+        errors = {(p.cells, p.element): p.error for p in result.points}
+        assert all(errors[2, element] < 0.7 * errors[1, element] for element in ("linear", "patches"))
+        assert errors[2, "patches"] < 0.9 * errors[2, "linear"]
         # the drop itself: 6 cells across give .928 of beam theory's (an independent code's value), 4 give .871
         for cells, share in ((4, 0.871),):
             scene = problem(name).scene(cells, "five", "f64")
