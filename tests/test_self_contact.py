@@ -106,9 +106,10 @@ def test_checkpoints_and_list_age_do_not_change_a_bit(monkeypatch):
     whole = rollout.vjp(frames, *adjoints)
     again = ds.Rollout(two_blocks(), 150, checkpoint_every=7, gradients="all")
     builds = []
-    for skin, passes in ((SurfacePairs.least_slack, SurfacePairs.passes), (0.02, 2)):
-        monkeypatch.setattr(SurfacePairs, "least_slack", skin)
-        monkeypatch.setattr(SurfacePairs, "passes", passes)
+    names = "least_slack", "typical_slack", "fewest_passes"
+    for numbers in ([getattr(SurfacePairs, name) for name in names], (0.02, 0.05, 2)):
+        for name, number in zip(names, numbers):
+            monkeypatch.setattr(SurfacePairs, name, number)
         before = again._workspace.pairs.builds if again._workspace else 0
         other = again.forward()
         builds.append(again._workspace.pairs.builds - before)

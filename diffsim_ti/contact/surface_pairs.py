@@ -22,7 +22,8 @@ class SurfacePairs:
     Forces go to the last corners of an array of corners, one for each surface vertex (solvers/arrays.py).
     """
 
-    passes = 8  # that a list should last, by its slacks, but
+    typical_slack = 0.5  # share of the width that half of the vertices get at most, so that lists stay short
+    fewest_passes, most_passes = 3, 30  # that a list should last, by its slacks, but
     least_slack = 0.1  # they are at least this share of the width, and
     largest_reach = 1.0, 2.0  # width + 2 slack at most this share of an edge, of one body (with many neighbours) and of two
     markers = 16  # vertices whose mean motion is that of a body
@@ -121,8 +122,10 @@ class SurfacePairs:
         if self.fresh and self.age:
             whole, last = self._travel(x - runtime.fetch(self.built)), self._travel(x - runtime.fetch(self.before))
             pace = np.maximum(whole / self.age, last)
-            # the mean, for what will be hit; the slack before, for what shakes
-            slack[:, :2] = self.passes * (pace + pace.mean(0))
+            pace += pace.mean(0)  # the mean, for what will be hit
+            passes = self.typical_slack * self.width / max(float(np.median(pace.max(1))), 1e-300)
+            slack[:, :2] = np.clip(passes, self.fewest_passes, self.most_passes) * pace
+            # the slack before, for what shakes
             slack[:, :2] = np.maximum(slack, 0.9 * _all_four(self.list.slack))[:, :2]
         for k, largest in enumerate(self.largest_reach):
             slack[:, k] = slack[:, k].clip(least, max(least, 0.5 * (largest * self.list.typical - self.width)))
