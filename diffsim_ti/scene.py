@@ -11,7 +11,7 @@ from diffsim_ti.materials.patch_law import PatchLaw
 from diffsim_ti.terms import Drag, ExternalForce, Gravity, Obstacle, SelfContact, Term
 from diffsim_ti.terms.motion import sampled
 
-LOCKING_RATIO = 0.45
+LOCKING_RATIO = 0.45  # Poisson's ratio above which linear tetrahedra lock noticeably
 
 
 class Scene:
@@ -85,10 +85,14 @@ class Scene:
         for term in self.terms:
             term.check_start(positions, surface, *([places[term]] if term in places else []))
 
-    def _warn_if_locking(self) -> None:
+    def largest_poissons_ratio(self) -> float:
+        """Poisson's ratio of small strains, the largest of all tetrahedra, whatever numbers the law is given by."""
         values = self.inputs.values
         mu, lam = self.material.lame({name: values[name] for name in self.material.inputs})
-        nu = float(np.max(youngs_poisson(mu, lam)[1]))
+        return float(np.max(youngs_poisson(mu, lam)[1]))
+
+    def _warn_if_locking(self) -> None:
+        nu = self.largest_poissons_ratio()
         if nu > LOCKING_RATIO + 1e-12:
             warnings.warn(
                 f"{self.material.name}: Poisson's ratio {nu:.6g} is above {LOCKING_RATIO}, where linear tetrahedra lock "

@@ -3,6 +3,7 @@
 import itertools
 import json
 import time
+import warnings
 from dataclasses import replace
 from functools import lru_cache
 
@@ -234,6 +235,17 @@ def test_advice_states_memory_and_keeps_to_it():
     frames = rollout.forward()
     assert np.isfinite(rollout.vjp(frames, frames.positions)["youngs_modulus"])
     assert "contact: none" not in str(advice) and "damping: none" not in str(advice)
+
+
+@pytest.mark.parametrize("bulk_modulus, says", [(5e5, 'volume="patches" of a Scene is advised'), (2e4, "is at most 0.45")])
+def test_advice_names_patches_where_tetrahedra_lock(bulk_modulus, says):
+    """Whatever numbers the law is given by: mu is 10 kPa, so that nu is 0.49 or 0.29."""
+    law = ds.MooneyRivlin(c10=4e3, c01=1e3, bulk_modulus=bulk_modulus)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of locking
+        scene = ds.Scene(ds.TetrahedralMesh.create_cube(2, 0.1), law, 1000.0, [ds.Gravity()], fixed="ymin")
+    advice = recommend(scene, 0.01, 0.05, gradients=False, budget=1.0)
+    assert says in " ".join(advice.left_out)
 
 
 @pytest.mark.parametrize("wrong, says", [(dict(duration=0.0), "duration"), (dict(tolerance=2.0), "tolerance"),

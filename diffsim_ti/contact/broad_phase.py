@@ -19,7 +19,6 @@ from diffsim_ti.contact.proximity import EDGE_EDGE, VERTEX_TRIANGLE, pair_functi
 from diffsim_ti.runtime import Bundle
 
 A = ti.template()
-ROOM = 1e-3  # of an edge's length or of the reach, that the simpler test of a pair leaves for rounding
 
 
 @lru_cache(maxsize=None)
@@ -46,42 +45,11 @@ def broad_phase_kernels(precision: str, parallel: bool) -> SimpleNamespace:
         return reach + slack
 
     @ti.func
-    def clamp(t):
-        return ti.min(ti.max(t, ti.cast(0, fp)), ti.cast(1, fp))
-
-    @ti.func
-    def edges_may_be_near(y1, y2, y3, reach):
-        """False only for edges (0, y1), (y2, y3) farther apart than `reach`; no branches, some room for parallel ones."""
-        a, b, tiny = y1, y3 - y2, ti.cast(f.tiny, fp)
-        aa, ab, bb, p, q = a.norm_sqr(), a.dot(b), b.norm_sqr(), a.dot(y2), b.dot(y2)
-        s = clamp((p * bb - ab * q) / ti.max(aa * bb - ab * ab, tiny))
-        t = clamp((ab * s - q) / ti.max(bb, tiny))
-        s = clamp((ab * t + p) / ti.max(aa, tiny))
-        limit = reach + ti.cast(ROOM, fp) * ti.sqrt(aa)
-        return (y2 + t * b - s * a).norm_sqr() < limit * limit
-
-    @ti.func
-    def triangle_may_be_near(y1, y2, y3, reach):
-        """False only for a triangle farther from the origin than `reach`: by its plane, or a side and the plane."""
-        normal = (y2 - y1).cross(y3 - y1)
-        square = ti.max(normal.norm_sqr(), ti.cast(f.tiny, fp))
-        height, limit = y1.dot(normal), ti.cast(1 + ROOM, fp) * reach
-        room = limit * limit * square - height * height
-        near = room >= 0
-        for a, b in ti.static(((y1, y2), (y2, y3), (y3, y1))):
-            out = b.cross(a).dot(normal)  # beyond the side a b if > 0
-            near &= (out <= 0) | (out * out <= room * (b - a).norm_sqr())
-        return near
-
-    @ti.func
     def is_near(kind: ti.template(), gap, reach, y1, y2, y3):
         """Whether a pair is nearer than `reach`; `gap`, between boxes, and a simpler test spare most pairs the search."""
         near, limit = gap.norm_sqr() < reach * reach, ti.cast(0, fp)
         if near:
-            if ti.static(kind == VERTEX_TRIANGLE):
-                near = triangle_may_be_near(y1, y2, y3, reach)
-            else:
-                near = edges_may_be_near(y1, y2, y3, reach)
+            near = f.may_be_near(kind, y1, y2, y3, reach)
         if near:
             w, r, g = f.nearest(kind, y1, y2, y3)
             limit = r.norm_sqr()

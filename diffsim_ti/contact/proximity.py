@@ -27,6 +27,7 @@ from diffsim_ti.terms import barrier
 
 VERTEX_TRIANGLE, EDGE_EDGE = 0, 1
 PARALLEL = 1e-3  # threshold of q, in squared lengths at rest
+ROOM = 1e-3  # of an edge's length or of the reach, that the cheap test of nearness leaves for rounding
 # how the weights of the corners change with the two parameters
 BY_FIRST = ((0, 1, -1, 0), (-1, 1, 0, 0))
 BY_SECOND = ((0, 1, 0, -1), (0, 0, 1, -1))
@@ -115,6 +116,44 @@ def pair_functions(precision: str) -> SimpleNamespace:
             s, t, g11, g12, g22 = nearest_of_edges(y1, y2, y3)
             w = vec4(one - s, s, t - one, 0 - t)
         return w, w[1] * y1 + w[2] * y2 + w[3] * y3, vec3(g11, g12, g22)
+
+    @ti.func
+    def clamp(t):
+        return ti.min(ti.max(t, ti.cast(0, fp)), ti.cast(1, fp))
+
+    @ti.func
+    def edges_may_be_near(y1, y2, y3, reach):
+        """False only for edges (0, y1), (y2, y3) farther apart than `reach`; no branches, some room for parallel ones."""
+        a, b, least = y1, y3 - y2, ti.cast(tiny, fp)
+        aa, ab, bb, p, q = a.norm_sqr(), a.dot(b), b.norm_sqr(), a.dot(y2), b.dot(y2)
+        s = clamp((p * bb - ab * q) / ti.max(aa * bb - ab * ab, least))
+        t = clamp((ab * s - q) / ti.max(bb, least))
+        s = clamp((ab * t + p) / ti.max(aa, least))
+        limit = reach + ti.cast(ROOM, fp) * ti.sqrt(aa)
+        return (y2 + t * b - s * a).norm_sqr() < limit * limit
+
+    @ti.func
+    def triangle_may_be_near(y1, y2, y3, reach):
+        """False only for a triangle farther from the origin than `reach`: by its plane, or a side and the plane."""
+        normal = (y2 - y1).cross(y3 - y1)
+        square = ti.max(normal.norm_sqr(), ti.cast(tiny, fp))
+        height, limit = y1.dot(normal), ti.cast(1 + ROOM, fp) * reach
+        room = limit * limit * square - height * height
+        near = room >= 0
+        for a, b in ti.static(((y1, y2), (y2, y3), (y3, y1))):
+            out = b.cross(a).dot(normal)  # beyond the side a b if > 0
+            near &= (out <= 0) | (out * out <= room * (b - a).norm_sqr())
+        return near
+
+    @ti.func
+    def may_be_near(kind: ti.template(), y1, y2, y3, reach):
+        """False only for a pair farther apart than `reach`; much cheaper than `nearest`."""
+        near = False
+        if ti.static(kind == VERTEX_TRIANGLE):
+            near = triangle_may_be_near(y1, y2, y3, reach)
+        else:
+            near = edges_may_be_near(y1, y2, y3, reach)
+        return near
 
     @ti.func
     def combine(weights: ti.template(), y1, y2, y3):
@@ -219,7 +258,7 @@ def pair_functions(precision: str) -> SimpleNamespace:
     def curvature(s):
         return barrier.curvature(s, fp)
 
-    return SimpleNamespace(fp=fp, vec3=vec3, vec4=vec4, tiny=tiny, nearest=nearest, nearest_jvp=nearest_jvp,
+    return SimpleNamespace(fp=fp, vec3=vec3, vec4=vec4, nearest=nearest, nearest_jvp=nearest_jvp, may_be_near=may_be_near,
                            gradient=gradient, gradient_jvp=gradient_jvp, mollifier=mollifier,
                            curvature=curvature)  # fmt: skip
 

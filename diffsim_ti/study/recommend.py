@@ -7,13 +7,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from diffsim_ti.rollout import Rollout
+from diffsim_ti.scene import LOCKING_RATIO
 from diffsim_ti.solvers import SOLVERS, BDF2Solver, VelocityVerletSolver
 from diffsim_ti.study.problem import Problem, distance
 from diffsim_ti.terms import Drag, ExternalForce
 
 SAFETY = 0.7  # of the tolerance: what a trial run must keep, for the error of the whole run is predicted
 SHARE = 0.8  # of the stable step at the start, which may fall on the way
-LOCKING_ABOVE = 0.45  # Poisson's ratio
 
 
 @dataclass
@@ -325,10 +325,10 @@ class Trials:
             out.append("contact: none in the scene")
         if self.scene.term(ExternalForce) is None and self.scene.motion is None:
             out.append("forces and motion per step")
-        nu = float(np.max(self.scene.inputs.values.get("poissons_ratio", 0.0)))
-        if nu > LOCKING_ABOVE:
+        nu = self.scene.largest_poissons_ratio()
+        if nu > LOCKING_RATIO + 1e-12:
             if self.scene.volume == "tetrahedra":
-                out.append(f'nothing against locking, though nu = {nu:g}: volume="patches" of a Scene is advised')
+                out.append(f'nothing against locking, though nu = {nu:.4g}: volume="patches" of a Scene is advised')
         else:
-            out.append(f"elements against locking: nu = {nu:g} is at most {LOCKING_ABOVE}")
+            out.append(f"elements against locking: nu = {nu:.4g} is at most {LOCKING_RATIO}")
         return out + self.notes
