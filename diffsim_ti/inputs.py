@@ -4,6 +4,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
+from diffsim_ti.rows import Rows
 from diffsim_ti.terms import ExternalForce
 
 
@@ -59,14 +60,14 @@ class Inputs:
             **scene.material.values(self.mesh),
             "density": density,
         }
-        self._term_inputs, at = [], 0  # (term, {its own name: name here}, first parameter)
+        self._names = []  # {a term's own name: its name here}, for each term in the order of the scene's list
         for term in scene.terms:
-            names = {name: self._free_name(name, values) for name in term.values}
-            values |= {names[name]: value for name, value in term.values.items()}
-            self._term_inputs.append((term, names, at))
-            if not isinstance(term, ExternalForce):
-                at += sum(value.size for value in term.values.values())
-        self.num_parameters = at
+            self._names.append({name: self._free_name(name, values) for name in term.values})
+            values |= {self._names[-1][name]: value for name, value in term.values.items()}
+        named = dict(zip(scene.terms, self._names))
+        self._numbered = [(t, named[t]) for t in scene.ordered_terms if not isinstance(t, ExternalForce)]
+        self.parameters = Rows({term: sum(value.size for value in term.values.values()) for term, _ in self._numbered})
+        self._forces = next((named[t]["external_forces"] for t in scene.terms if isinstance(t, ExternalForce)), None)
         self.paths = []  # names of the moving obstacles' paths, which join per run
         for term in scene.moving:
             self.paths.append(self._free_name(term.path_name, dict.fromkeys(self.paths)))
@@ -85,9 +86,10 @@ class Inputs:
     def names(self) -> tuple[str, ...]:
         return tuple(self.values)
 
-    def first_parameter(self, term) -> int:
-        """Where a term's numbers start in the parameter array."""
-        return next(at for t, _, at in self._term_inputs if t is term)
+    def names_of(self, place: int) -> dict[str, str]:
+        """{own name: name here} of the inputs of the term at a place of the scene's list."""
+        term, paths = self.scene.terms[place], dict(zip(self.scene.moving, self.paths))
+        return self._names[place] | ({term.path_name: paths[term]} if term in paths else {})
 
     def check(self, values: dict) -> dict:
         """Float64 arrays of the right shapes, or ValueError naming expected and got."""
@@ -120,14 +122,12 @@ class Inputs:
         displacement = values["initial_positions"] - X
         velocity = np.array(values["initial_velocities"])
         velocity[self.scene.fixed] = 0
-        parameters, forces = np.zeros(max(self.num_parameters, 1)), None
-        for term, names, at in self._term_inputs:
-            if isinstance(term, ExternalForce):
-                forces = values[names["external_forces"]]
-                forces = forces[None] if forces.ndim == 2 else forces
-            else:
-                numbers = np.concatenate([values[name].ravel() for name in names.values()])
-                parameters[at : at + numbers.size] = numbers
+        parameters, forces = np.zeros(max(self.parameters.total, 1)), None
+        for term, names in self._numbered:
+            parameters[self.parameters.of(term)] = np.concatenate([values[name].ravel() for name in names.values()])
+        if self._forces is not None:
+            forces = values[self._forces]
+            forces = forces[None] if forces.ndim == 2 else forces
         material_values = {name: values[name] for name in self.scene.material.inputs}
         return Derived(
             displacement, velocity, self.scene.material.coefficients(material_values),
@@ -167,13 +167,11 @@ class Inputs:
             out.gradients = -B @ dD @ B
             out.volumes = V * np.einsum("eij,eji->e", B, dD)
         out.mass = self._to_vertices((dots.get("density", 0.0) * V + values["density"] * out.volumes) / 4)
-        for term, names, at in self._term_inputs:
-            if isinstance(term, ExternalForce):
-                out.forces = out.forces + np.reshape(dots.get(names["external_forces"], 0.0), (-1,) + out.forces.shape[1:]) \
-                    if names["external_forces"] in dots else out.forces  # fmt: skip
-            else:
-                numbers = [np.ravel(dots.get(name, np.zeros_like(values[name]))) for name in names.values()]
-                out.parameters[at : at + sum(map(len, numbers))] = np.concatenate(numbers)
+        for term, names in self._numbered:
+            numbers = [np.ravel(dots.get(name, np.zeros_like(values[name]))) for name in names.values()]
+            out.parameters[self.parameters.of(term)] = np.concatenate(numbers)
+        if self._forces in dots:
+            out.forces = out.forces + np.reshape(dots[self._forces], (-1,) + out.forces.shape[1:])
         material = self.scene.material
         out.coefficients = material.coefficients_jvp(
             {name: values[name] for name in material.inputs},
@@ -197,14 +195,13 @@ class Inputs:
         if "density" in wanted or "rest_positions" in wanted:
             mass = adj.mass[tets].sum(1) / 4
             out["density"] = V * mass if values["density"].ndim else (V * mass).sum()
-        for term, names, at in self._term_inputs:
+        for term, names in self._numbered:
+            at = self.parameters.of(term).start
             for name in names.values():
-                if isinstance(term, ExternalForce):
-                    out[name] = adj.forces[0] if values[name].ndim == 2 else adj.forces
-                else:
-                    size = values[name].size
-                    out[name] = adj.parameters[at : at + size].reshape(values[name].shape)
-                    at += size
+                out[name] = adj.parameters[at : at + values[name].size].reshape(values[name].shape)
+                at += values[name].size
+        if self._forces is not None:
+            out[self._forces] = adj.forces[0] if values[self._forces].ndim == 2 else adj.forces
         if adj.motion is not None:
             out["prescribed_motion"] = adj.motion
         if adj.path is not None:

@@ -1,6 +1,7 @@
 """Scene: what is simulated, and nothing about how."""
 
 import warnings
+from copy import copy
 
 import numpy as np
 
@@ -11,6 +12,12 @@ from diffsim_ti.materials.patch_law import PatchLaw
 from diffsim_ti.terms import Drag, ExternalForce, Gravity, Obstacle, SelfContact, Term
 from diffsim_ti.terms.motion import sampled
 
+
+def _kind(term) -> tuple:
+    """What kernels go through terms by: obstacles last, each kind's together, so that the order of a list means nothing."""
+    return term.acts_on_surface, type(term).__qualname__, type(term).__module__
+
+
 LOCKING_RATIO = 0.45  # Poisson's ratio above which linear tetrahedra lock noticeably
 
 
@@ -20,7 +27,8 @@ class Scene:
     mesh: TetrahedralMesh, the rest shape.
     material: a law with its numbers (materials/).
     density [kg/m^3]: one number or one per tetrahedron; vertices carry the lumped mass sum rho V / 4.
-    terms: loads, contacts, damping (terms/), each at most once except contacts. What is not listed costs nothing.
+    terms: loads, contacts, damping (terms/), each at most once except contacts. What is not listed costs nothing. Their
+        order means nothing but that of obstacles of one kind, whose forces and frictions act one after the other.
     fixed: vertices that do not move freely: a vertex set's name, indices, a Boolean mask or a list of set names.
     motion: displacement of the fixed vertices from where they start: a function of time [s] that returns 3 numbers or
         shape (num_fixed, 3) [m], or keyframes (times, displacements) between which it is linear. Default: held still.
@@ -49,8 +57,11 @@ class Scene:
         self.fixed = np.zeros(0, np.int64) if fixed is None else mesh.vertex_indices(fixed)
         self.motion = motion
         self._check_terms()
-        self.terms = tuple(t.settled(self, density, initial_positions, initial_velocities) for t in self.terms)
-        self.moving = tuple(t for t in self.terms if t.path is not None)
+        self._given = self.terms
+        settled = (t.settled(self, density, initial_positions, initial_velocities) for t in self.terms)
+        self.terms = tuple(copy(t) for t in settled)  # one that is listed twice is two
+        self.ordered_terms = tuple(sorted(self.terms, key=_kind))
+        self.moving = tuple(t for t in self.ordered_terms if t.path is not None)
         self.inputs = Inputs(self, density, initial_positions, initial_velocities)
         self._check_start()
         if volume == "tetrahedra":
@@ -104,6 +115,13 @@ class Scene:
     def term(self, kind: type) -> Term | None:
         """The scene's first term of a kind, or None."""
         return next((t for t in self.terms if isinstance(t, kind)), None)
+
+    def input_names(self, term: Term) -> dict[str, str]:
+        """{a term's own name of an input: its name in this scene}, where a second obstacle's end in _2, paths included."""
+        for terms in (self.terms, self._given):
+            if term in terms:
+                return self.inputs.names_of(terms.index(term))
+        raise ValueError(f"this scene does not list {term!r}; it has {', '.join(map(repr, self.terms)) or 'no terms'}")
 
     def motion_rows(self, times) -> np.ndarray:
         """Displacement of the fixed vertices from their start at each time [s], shape (len(times), num_fixed, 3) [m]."""

@@ -1,4 +1,7 @@
-"""One Taichi runtime for the whole session; DIFFSIM_TI_ARCH names another backend (tests/test_vulkan.py uses it)."""
+"""One Taichi runtime for the whole session; DIFFSIM_TI_ARCH names another backend (tests/test_vulkan.py uses it).
+
+DIFFSIM_TI_DEBUG=1: kernels check the bounds of every array; slow, in one process: `DIFFSIM_TI_DEBUG=1 python -m pytest`.
+"""
 
 import os
 
@@ -9,7 +12,8 @@ import diffsim_ti
 
 @pytest.fixture(scope="session", autouse=True)
 def taichi():
-    diffsim_ti.init(os.environ.get("DIFFSIM_TI_ARCH", "cpu"), precision="f64")
+    debug = dict(debug=True) if os.environ.get("DIFFSIM_TI_DEBUG") else {}
+    diffsim_ti.init(os.environ.get("DIFFSIM_TI_ARCH", "cpu"), precision="f64", **debug)
 
 
 @pytest.fixture(scope="module", autouse=True)

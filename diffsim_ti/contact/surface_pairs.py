@@ -30,7 +30,7 @@ class SurfacePairs:
 
     def __init__(self, arrays, parallel: bool):
         self.a, mesh, term = arrays, arrays.mesh, arrays.self_contact
-        self.mesh, self.first, self.parallel = mesh, arrays.first_of_self_contact, parallel
+        self.mesh, self.first, self.parallel = mesh, arrays.parameters_of_self_contact.start, parallel
         self.kernels = pair_kernels(arrays.precision, self.first, parallel)
         edges = surface_edges(mesh)
         lengths = np.linalg.norm(mesh.vertices[edges[:, 1]] - mesh.vertices[edges[:, 0]], axis=1)

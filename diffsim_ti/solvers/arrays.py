@@ -55,7 +55,7 @@ class SceneArrays:
         self.in_lanes = self.law.lanes and runtime.runs_on_cpu()
         self.num_items = self.num_blocks if self.in_lanes else self.num_places
         self.num_vertices, self.num_tetrahedra = mesh.num_vertices, mesh.num_tetrahedra
-        self.contacts = tuple(t for t in scene.terms if t.acts_on_surface)
+        self.contacts = tuple(t for t in scene.ordered_terms if t.acts_on_surface)
         self.fixed = scene.fixed
         self.tets = runtime.upload(to_blocks(mesh.tetrahedra, self.order).ravel(), ti.i32)
         self.mesh, self.precision, self.self_contact = mesh, precision, scene.term(SelfContact)
@@ -64,7 +64,7 @@ class SceneArrays:
         if self.patches is not None:
             corner_of = 4 * self.place[corner_of // 4] + corner_of % 4
         if self.self_contact:  # each surface vertex gathers one corner more, after those of its tetrahedra
-            self.first_of_self_contact = scene.inputs.first_parameter(self.self_contact)
+            self.parameters_of_self_contact = scene.inputs.parameters.of(self.self_contact)
             start, corner_of = with_own_corner(start, corner_of, mesh.surface_vertices, num_corners)
             num_corners += len(mesh.surface_vertices)
         self.start, self.corner_of = runtime.upload(start, ti.i32), runtime.upload(corner_of, ti.i32)
@@ -81,12 +81,11 @@ class SceneArrays:
         self.motion_slot = none
         if scene.motion is not None:
             self.motion_slot = runtime.upload(slots(scene.fixed, mesh.num_vertices), ti.i32)
-        first = scene.inputs.first_parameter
-        gravity, drag = scene.term(Gravity), scene.term(Drag)
+        rows = scene.inputs.parameters
         self._features = dict(
             contacts=self._twins(scene), moving=len(scene.moving),
-            gravity=first(gravity) if gravity else -1, drag=first(drag) if drag else -1,
-            forces=external is not None, motion=scene.motion is not None,
+            gravity=rows.first(scene.term(Gravity)), drag=rows.first(scene.term(Drag)),
+            forces=external is not None, motion=scene.motion is not None, num_parameters=rows.total,
         )  # fmt: skip
         self.offsets = runtime.array(self.vector, len(self.contacts))  # where obstacles are when one looks between passes
         self.values: Derived | None = None
@@ -108,12 +107,15 @@ class SceneArrays:
 
     def _twins(self, scene) -> tuple:
         """Compile-time twins of the contacts; their tables stand behind the parameters, one after the other."""
-        columns, twins, at = {term: k for k, term in enumerate(scene.moving)}, [], max(scene.inputs.num_parameters, 1)
+        columns, twins, at = {term: k for k, term in enumerate(scene.moving)}, [], max(scene.inputs.parameters.total, 1)
         self.tables = np.concatenate([np.zeros(0), *(t.table for t in self.contacts)])
         for term in self.contacts:
             own = dict(path=columns[term]) if term in columns else {}
-            twins.append(term.kernel(scene.precision, scene.inputs.first_parameter(term),
-                                     **own | (dict(table=at) if term.table.size else {})))  # fmt: skip
+            rows = scene.inputs.parameters.of(term)
+            twin = term.kernel(scene.precision, rows.start, **own | (dict(table=at) if term.table.size else {}))
+            if slice(twin.first, twin.first + twin.size) != rows:  # it would read, and add to, another term's rows
+                raise AssertionError(f"the kernel of {term!r} has {twin.size} numbers, its term {rows.stop - rows.start}")
+            twins.append(twin)
             at += term.table.size
         return tuple(twins)
 

@@ -15,7 +15,8 @@ from diffsim_ti.tetrahedron import A
 @lru_cache(maxsize=None)
 def contact_functions(features, fp) -> SimpleNamespace:
     """Taichi functions of one vertex for a scene's features."""
-    vector, contacts, row = ti.types.vector(4, fp), features.contacts, features.sums()
+    vector, contacts, sums = ti.types.vector(4, fp), features.contacts, features.sums()
+    mass_row, rest_row = sums.first("mass"), sums.first("rest")
     rough = tuple(k for k, contact in enumerate(contacts) if contact.friction)
     num_rough = max(len(rough), 1)
 
@@ -158,13 +159,13 @@ def contact_functions(features, fp) -> SimpleNamespace:
                 w = by_v
                 by_u_sum += by_u
                 for q in ti.static(range(contacts[k].size)):
-                    at = ti.static(row["contacts"] + contacts[k].first - contacts[0].first + q)
+                    at = ti.static(contacts[k].first + q)
                     adjoint.sums[at, i] = adjoint.sums[at, i] + by[q]
                 if ti.static(features.density):
-                    adjoint.sums[row["mass"], i] = adjoint.sums[row["mass"], i] - h_over_m * inverse * by_ratio
+                    adjoint.sums[mass_row, i] = adjoint.sums[mass_row, i] - h_over_m * inverse * by_ratio
                 if ti.static(features.shape):
                     for d in ti.static(range(3)):
-                        adjoint.sums[row["rest"] + d, i] = adjoint.sums[row["rest"] + d, i] + by_u[d]
+                        adjoint.sums[rest_row + d, i] = adjoint.sums[rest_row + d, i] + by_u[d]
                 hand_to_path(k, i, j, by_u, by_wall, adjoint, plan)
         return by_u_sum, w
 

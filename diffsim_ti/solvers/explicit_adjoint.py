@@ -23,7 +23,7 @@ class ExplicitAdjoint:
         self.u, self.v, self.w = (runtime.array(a.vector, 1, n) for _ in range(3))
         self.corner = runtime.array(a.vector, *a.corner.shape)
         self.coefficients = runtime.array(a.lanes, a.num_coefficients * blocks)
-        self.sums = runtime.array(a.fp, self.features.sums()["total"], n)
+        self.sums = runtime.array(a.fp, self.features.sums().total, n)
         self.forces, self.motion = (runtime.array(a.vector, *x.shape) for x in (a.forces, a.motion))
         self.anchor = runtime.array(a.vector, *a.anchor.shape)
         self.path = runtime.array(a.vector, *a.path.shape)
@@ -108,20 +108,13 @@ class ExplicitAdjoint:
             out.displacement = runtime.fetch(self.u)[0].astype(np.float64)
             out.velocity = runtime.fetch(self.v)[0].astype(np.float64)
         if self.features.density:
-            out.mass = sums[rows["mass"]]
-        if self.features.gravity >= 0:
-            out.parameters[self.features.gravity :][:3] = sums[rows["gravity"] :][:3].sum(1)
-        if self.features.drag >= 0:
-            out.parameters[self.features.drag] = sums[rows["drag"]].sum()
-        for contact in self.features.contacts:
-            at = rows["contacts"] + contact.first - self.features.contacts[0].first
-            out.parameters[contact.first :][: contact.size] = sums[at : at + contact.size].sum(1)
+            out.mass = sums[rows.first("mass")]
+        out.parameters[: self.features.num_parameters] = sums[rows.of("parameters")].sum(1)
         if self.ws.pairs:
-            numbers, out.rest = self.ws.pairs.collect()
-            out.parameters[a.first_of_self_contact :][:2] = numbers
+            out.parameters[a.parameters_of_self_contact], out.rest = self.ws.pairs.collect()
         if self.features.shape:
             out.rest = out.rest + runtime.fetch(self.frames[0]).astype(np.float64).sum(0)
-            out.rest += sums[rows["rest"] :][:3].T
+            out.rest += sums[rows.of("rest")].T
             out.gradients = from_blocks(runtime.fetch(self.gradients), a.place, 9).reshape(-1, 3, 3)
             out.volumes = from_blocks(runtime.fetch(self.volumes), a.place, 1)[:, 0]
         if out.forces is not None:
@@ -171,7 +164,7 @@ class ExplicitTangent:
                 if ws.pairs:
                     ws.pairs.ensure(history.u, j - first)
                     ws.pairs.product(history.u, j - first, self.u, a.corner, self._dots[3],
-                                     self._parameters_dot[a.first_of_self_contact :][:2])  # fmt: skip
+                                     self._parameters_dot[a.parameters_of_self_contact])  # fmt: skip
                 launch(a.num_items, a.num_vertices, j, first, ws.solver.substeps, save_every, w.lag0, w.lag1, w.pre,
                        w.post, w.alpha, w.decay, 1 / ws.solver.dt, ws.solver.substep, w.alpha_by_rate * self._rate_dot,
                        w.decay_by_rate * self._rate_dot)  # fmt: skip

@@ -71,7 +71,7 @@ class ImplicitAdjoint(_Passes):
         kernel = potential_kernels(a.law, self.features, workspace.parallel, a.in_lanes).vjp
         n, blocks = a.num_vertices, a.num_blocks
         self.coefficients = runtime.array(a.lanes, a.num_coefficients * blocks)
-        self.sums = runtime.array(a.fp, self.features.sums()["total"], n)
+        self.sums = runtime.array(a.fp, self.features.sums().total, n)
         self.gradients = runtime.array(a.lanes, 9 * blocks if shape else 1)
         self.volumes = runtime.array(a.lanes, blocks if shape else 1)
         p = self.potential = workspace.potential
@@ -184,20 +184,17 @@ class ImplicitAdjoint(_Passes):
         sums, out = runtime.fetch(self.sums).astype(np.float64), a.values.zeros()
         out.coefficients = from_blocks(runtime.fetch(self.coefficients), a.place, a.num_coefficients)
         out.displacement, out.velocity, out.mass = self.p, self.q, self.mass_adj
+        out.parameters[: self.features.num_parameters] = sums[rows.of("parameters")].sum(1)
         if self.features.gravity >= 0:
             out.parameters[self.features.gravity :][:3] = self.gravity
         if self.features.drag >= 0:
             out.parameters[self.features.drag] = self.rate
-        for contact in self.features.contacts:
-            at = rows["contacts"] + contact.first - self.features.contacts[0].first
-            out.parameters[contact.first :][: contact.size] = sums[at : at + contact.size].sum(1)
         out.rest = self.frames[0].sum(0)
         if self.ws.pairs:
-            numbers, by_pairs = self.ws.pairs.collect()
-            out.parameters[a.first_of_self_contact :][:2] = numbers
+            out.parameters[a.parameters_of_self_contact], by_pairs = self.ws.pairs.collect()
             out.rest = out.rest + by_pairs
         if self.features.shape:
-            out.rest = out.rest + sums[rows["rest"] :][:3].T
+            out.rest = out.rest + sums[rows.of("rest")].T
             out.gradients = from_blocks(runtime.fetch(self.gradients), a.place, 9).reshape(-1, 3, 3)
             out.volumes = from_blocks(runtime.fetch(self.volumes), a.place, 1)[:, 0]
         out.forces, out.motion, out.path = self.forces, self.motion, self.path
@@ -250,7 +247,7 @@ class ImplicitTangent(_Passes):
             runtime.fill(self._arrays[-1], ws.walls(dots.path, j, s))
         if ws.pairs:
             ws.pairs.product(ws.potential.u, 0, ws.potential.w, a.corner, self._arrays[2],
-                             dots.parameters[a.first_of_self_contact :][:2])  # fmt: skip
+                             dots.parameters[a.parameters_of_self_contact])  # fmt: skip
         self._jvp(a.num_items, a.num_vertices, ws.potential.per_gamma)
         share = ws.load_share(j, s)
         dR = runtime.fetch(ws.potential.y)[0].astype(np.float64) + dots.mass[:, None] * self.weight(share)

@@ -22,6 +22,7 @@ from types import SimpleNamespace
 import taichi as ti
 
 from diffsim_ti.patched_tetrahedron import functions_of
+from diffsim_ti.rows import Rows
 from diffsim_ti.runtime import Bundle
 from diffsim_ti.solvers.contact_stages import contact_functions
 from diffsim_ti.tetrahedron import A
@@ -38,23 +39,14 @@ class Features:
     forces_per_step: bool = False
     motion: bool = False
     moving: int = 0  # obstacles that follow a path
+    num_parameters: int = 0  # numbers of all terms
     uniform: bool = True  # one set of coefficients for all tetrahedra
     density: bool = False  # the last two: adjoints that cost extra, only if asked for
     shape: bool = False
 
-    def sums(self) -> dict[str, int]:
-        """Rows of the per-vertex adjoint sums and where each group starts."""
-        rows, at = {}, 0
-        for name, size in (
-            ("mass", int(self.density)),
-            ("gravity", 3 * (self.gravity >= 0)),
-            ("drag", int(self.drag >= 0)),
-            ("contacts", sum(c.size for c in self.contacts)),
-            ("rest", 3 * self.shape),
-        ):
-            rows[name] = at
-            at += size
-        return rows | {"total": at}
+    def sums(self) -> Rows:
+        """Rows of the per-vertex adjoint sums: those of the parameters stand as the parameters do."""
+        return Rows({"parameters": self.num_parameters, "mass": int(self.density), "rest": 3 * self.shape})
 
 
 @lru_cache(maxsize=None)
@@ -66,7 +58,8 @@ def kick_drift_kernels(law, features: Features, parallel: bool, lanes: bool) -> 
     contacts, has_contacts = features.contacts, len(features.contacts) > 0
     touching = contact_functions(features, fp)
     rough, place_of, gravity = touching.rough, touching.place_of, touching.gravity
-    row = features.sums()
+    sums = features.sums()
+    mass_row, rest_row = sums.first("mass"), sums.first("rest")
 
     @ti.func
     def half():
@@ -283,7 +276,7 @@ def kick_drift_kernels(law, features: Features, parallel: bool, lanes: bool) -> 
         if ti.static(features.drag >= 0):
             v_plus = state.v[t, i] / plan.decay
             by_rate = plan.alpha_by_rate * p.dot(v_plus) + plan.decay_by_rate * q.dot(v_plus)
-            adjoint.sums[row["drag"], i] = adjoint.sums[row["drag"], i] + by_rate
+            adjoint.sums[features.drag, i] = adjoint.sums[features.drag, i] + by_rate
         if ti.static(len(rough) > 0):
             if plan.alpha > 0 and scene.surface[i] > 0:
                 by_u, v_plus_adj = touching.slow_vjp(i, j, u, v, v_plus_adj, scene, state, adjoint, plan)
@@ -298,11 +291,11 @@ def kick_drift_kernels(law, features: Features, parallel: bool, lanes: bool) -> 
         inverse = scene.inverse_mass[i]
         f_adj, q = inverse * a_adj, v_mid_adj
         if ti.static(features.density):
-            adjoint.sums[row["mass"], i] = adjoint.sums[row["mass"], i] - (inverse * f_adj.dot(state.f[s, i]))
+            adjoint.sums[mass_row, i] = adjoint.sums[mass_row, i] - (inverse * f_adj.dot(state.f[s, i]))
         if ti.static(features.gravity >= 0):
             if inverse > 0:
                 for d in ti.static(range(3)):
-                    adjoint.sums[row["gravity"] + d, i] = adjoint.sums[row["gravity"] + d, i] + (a_adj[d])
+                    adjoint.sums[features.gravity + d, i] = adjoint.sums[features.gravity + d, i] + (a_adj[d])
         if ti.static(features.forces):
             slot = scene.force_slot[i]
             if slot >= 0:
@@ -322,11 +315,11 @@ def kick_drift_kernels(law, features: Features, parallel: bool, lanes: bool) -> 
                     touching.hand_to_path(c, i, j, by_u, vector(0), adjoint, plan)
                     by = contacts[c].parameter_derivatives(scene.parameters, X, u, v)
                     for m in ti.static(range(contacts[c].size)):
-                        at = ti.static(row["contacts"] + contacts[c].first - contacts[0].first + m)
+                        at = ti.static(contacts[c].first + m)
                         adjoint.sums[at, i] = adjoint.sums[at, i] + (by[m].dot(f_adj))
                     if ti.static(features.shape):
                         for d in ti.static(range(3)):
-                            adjoint.sums[row["rest"] + d, i] = adjoint.sums[row["rest"] + d, i] + (by_u[d])
+                            adjoint.sums[rest_row + d, i] = adjoint.sums[rest_row + d, i] + (by_u[d])
         adjoint.u[0, i] = p
         adjoint.v[0, i] = q
         adjoint.w[0, i] = f_adj

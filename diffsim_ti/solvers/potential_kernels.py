@@ -211,7 +211,7 @@ def potential_kernels(law, features, parallel: bool, lanes: bool) -> SimpleNames
 
     # ---- derivatives by everything else -----------------------------------------------------------------------------
 
-    row = features.sums()
+    rest_row = features.sums().first("rest")
 
     @ti.kernel
     def vjp(tets: t.ints, gradients: t.blocks, volumes: t.blocks, coefficients: t.blocks, start: t.ints,
@@ -244,14 +244,14 @@ def potential_kernels(law, features, parallel: bool, lanes: bool) -> SimpleNames
     def add_to_sums(k: A, i, by, adjoint: A):
         """Adjoints of the numbers of obstacle k, a tuple."""
         for m in ti.static(range(contacts[k].size)):
-            to = ti.static(row["contacts"] + contacts[k].first - contacts[0].first + m)
+            to = ti.static(contacts[k].first + m)
             adjoint.sums[to, i] = adjoint.sums[to, i] + by[m]
 
     @ti.func
     def add_to_rest(i, by_X, adjoint: A):
         if ti.static(features.shape):
             for d in ti.static(range(3)):
-                adjoint.sums[row["rest"] + d, i] = adjoint.sums[row["rest"] + d, i] + by_X[d]
+                adjoint.sums[rest_row + d, i] = adjoint.sums[rest_row + d, i] + by_X[d]
 
     @ti.func
     def contact_vjp(k: A, i, scene: A, u, w, adjoint: A):
@@ -259,7 +259,7 @@ def potential_kernels(law, features, parallel: bool, lanes: bool) -> SimpleNames
         by_u, _ = contacts[k].force_vjp(scene.parameters, X, u, zero, w)
         by = contacts[k].parameter_derivatives(scene.parameters, X, u, zero)
         for m in ti.static(range(contacts[k].size)):
-            to = ti.static(row["contacts"] + contacts[k].first - contacts[0].first + m)
+            to = ti.static(contacts[k].first + m)
             adjoint.sums[to, i] = adjoint.sums[to, i] + by[m].dot(w)
         add_to_rest(i, by_u, adjoint)
         adjoint.walls[3 * k, i] = zero - by_u
