@@ -6,7 +6,6 @@ os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # read when taichi is 
 os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")  # no network traffic from a simulator
 
 from diffsim_ti.contact.surface_pairs import Tunnelling
-from diffsim_ti.divergence import Crossing, Divergence
 from diffsim_ti.materials import (
     Corotated,
     LinearElastic,
@@ -29,6 +28,7 @@ from diffsim_ti.solvers import (
     StaticSolver,
     VelocityVerletSolver,
 )
+from diffsim_ti.state.guard import Crossing, Divergence
 from diffsim_ti.terms import (
     Box,
     Capsule,
@@ -46,12 +46,40 @@ from diffsim_ti.verify import check_gradients, dot_product_test, taylor_test
 
 __version__ = "0.1.0"
 __all__ = [
-    "init", "TetrahedralMesh",
-    "StableNeoHookean", "SmithNeoHookean", "LinearElastic", "Corotated", "StVenantKirchhoff", "MooneyRivlin",
-    "Gravity", "Drag", "ExternalForce",
-    "Ground", "HalfSpace", "Sphere", "Box", "Capsule", "Cylinder", "MeshObstacle", "SelfContact",
-    "Scene", "SemiImplicitSolver", "VelocityVerletSolver",
-    "ImplicitEulerSolver", "ImplicitMidpointSolver", "BDF2Solver", "StaticSolver", "Simulator", "Divergence",
-    "Crossing", "Tunnelling", "NotConverged",
-    "Rollout", "Frames", "taylor_test", "dot_product_test", "check_gradients",
-]  # fmt: skip
+    "init",
+    "TetrahedralMesh",
+    "StableNeoHookean",
+    "SmithNeoHookean",
+    "LinearElastic",
+    "Corotated",
+    "StVenantKirchhoff",
+    "MooneyRivlin",
+    "Gravity",
+    "Drag",
+    "ExternalForce",
+    "Ground",
+    "HalfSpace",
+    "Sphere",
+    "Box",
+    "Capsule",
+    "Cylinder",
+    "MeshObstacle",
+    "SelfContact",
+    "Scene",
+    "SemiImplicitSolver",
+    "VelocityVerletSolver",
+    "ImplicitEulerSolver",
+    "ImplicitMidpointSolver",
+    "BDF2Solver",
+    "StaticSolver",
+    "Simulator",
+    "Divergence",
+    "Crossing",
+    "Tunnelling",
+    "NotConverged",
+    "Rollout",
+    "Frames",
+    "taylor_test",
+    "dot_product_test",
+    "check_gradients",
+]

@@ -4,17 +4,24 @@ import math
 
 import numpy as np
 
-from diffsim_ti.autograd import first_order_only, torch
-from diffsim_ti.implicit_differentiation import ImplicitDifferentiation, conjugate_gradient
 from diffsim_ti.materials import StableNeoHookean
 from diffsim_ti.materials.evaluate import evaluate
 from diffsim_ti.terms import Ground
-from diffsim_ti.terms.barrier import CROSSOVER
+from diffsim_ti.terms.obstacles.barrier import CROSSOVER
+from diffsim_ti.torch_bridge.autograd import first_order_only, torch
+from diffsim_ti.torch_bridge.implicit_differentiation import ImplicitDifferentiation, conjugate_gradient
 
 __all__ = [
-    "TorchMaterial", "DifferentiableMaterial", "SpatiallyVaryingMaterial", "DifferentiableBarrierContact",
-    "ImplicitDifferentiation", "conjugate_gradient", "CheckpointedRollout", "smooth_step", "log_barrier",
-]  # fmt: skip
+    "TorchMaterial",
+    "DifferentiableMaterial",
+    "SpatiallyVaryingMaterial",
+    "DifferentiableBarrierContact",
+    "ImplicitDifferentiation",
+    "conjugate_gradient",
+    "CheckpointedRollout",
+    "smooth_step",
+    "log_barrier",
+]
 
 
 class _EnergyDensity(torch.autograd.Function):
@@ -99,8 +106,16 @@ class DifferentiableMaterial(TorchMaterial):
     (examples/identify_torch.py).
     """
 
-    def __init__(self, youngs_modulus=None, poissons_ratio=None, requires_grad: bool = True, *, E=None, nu=None,
-                 law=StableNeoHookean):  # fmt: skip
+    def __init__(
+        self,
+        youngs_modulus=None,
+        poissons_ratio=None,
+        requires_grad: bool = True,
+        *,
+        E=None,
+        nu=None,
+        law=StableNeoHookean,
+    ):
         super().__init__()
         self.material = law
         E = _one_of("Young's modulus (E, youngs_modulus)", youngs_modulus, E)
@@ -122,18 +137,34 @@ class SpatiallyVaryingMaterial(TorchMaterial):
     E_range; nu is a buffer.
     """
 
-    def __init__(self, num_elements: int | None = None, base_youngs: float | None = None,
-                 base_poisson: float | None = None, *, base_E: float | None = None, base_nu: float | None = None,
-                 grid_resolution=None, E_range=None, requires_grad: bool = True, law=StableNeoHookean):  # fmt: skip
+    def __init__(
+        self,
+        num_elements: int | None = None,
+        base_youngs: float | None = None,
+        base_poisson: float | None = None,
+        *,
+        base_E: float | None = None,
+        base_nu: float | None = None,
+        grid_resolution=None,
+        E_range=None,
+        requires_grad: bool = True,
+        law=StableNeoHookean,
+    ):
         super().__init__()
         self.material, self._mesh = law, None
-        E = 1e5 if base_youngs is None and base_E is None else float(_one_of("base_youngs, base_E", base_youngs, base_E))
+        E = (
+            1e5
+            if base_youngs is None and base_E is None
+            else float(_one_of("base_youngs, base_E", base_youngs, base_E))
+        )
         nu = 0.4
         if base_poisson is not None or base_nu is not None:
             nu = float(_one_of("base_poisson, base_nu", base_poisson, base_nu))
         law(E, nu)
         if (num_elements is None) == (grid_resolution is None):
-            raise ValueError("give num_elements (a value per tetrahedron) or grid_resolution (values on a grid), not both")
+            raise ValueError(
+                "give num_elements (a value per tetrahedron) or grid_resolution (values on a grid), not both"
+            )
         self.grid_resolution = None if grid_resolution is None else tuple(int(r) for r in grid_resolution)
         if self.grid_resolution is None:
             self.log_E = torch.nn.Parameter(torch.full((num_elements,), math.log(E)), requires_grad=requires_grad)
@@ -177,7 +208,9 @@ class SpatiallyVaryingMaterial(TorchMaterial):
     def tensors(self, mesh) -> dict[str, torch.Tensor]:
         self._mesh = mesh if mesh is not None else self._mesh
         if self.grid_resolution is None and mesh is not None and len(self.log_E) != mesh.num_tetrahedra:
-            raise ValueError(f"num_elements: the mesh has {mesh.num_tetrahedra} tetrahedra, the material {len(self.log_E)}")
+            raise ValueError(
+                f"num_elements: the mesh has {mesh.num_tetrahedra} tetrahedra, the material {len(self.log_E)}"
+            )
         return super().tensors(mesh)
 
 
@@ -254,7 +287,9 @@ class CheckpointedRollout:
         from torch.utils.checkpoint import checkpoint
 
         if num_steps < 0 or checkpoint_every < 1:
-            raise ValueError(f"num_steps must be >= 0 and checkpoint_every >= 1, got {num_steps} and {checkpoint_every}")
+            raise ValueError(
+                f"num_steps must be >= 0 and checkpoint_every >= 1, got {num_steps} and {checkpoint_every}"
+            )
         single = isinstance(state0, torch.Tensor)
 
         def segment(count, *state):

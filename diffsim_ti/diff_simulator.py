@@ -9,14 +9,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from diffsim_ti import stability
-from diffsim_ti.autograd import first_order_only, torch
 from diffsim_ti.diff_physics import DifferentiableBarrierContact
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.scene import Scene
 from diffsim_ti.solvers import SemiImplicitSolver, Solver, StaticSolver
-from diffsim_ti.tensors import DTYPES, TensorRollout, is_direct
-from diffsim_ti.terms import Drag, ExternalForce, Gravity, barrier
+from diffsim_ti.state import stability
+from diffsim_ti.terms import Drag, ExternalForce, Gravity
+from diffsim_ti.terms.obstacles import barrier
+from diffsim_ti.torch_bridge.autograd import first_order_only, torch
+from diffsim_ti.torch_bridge.tensors import DTYPES, TensorRollout, is_direct
 
 
 class TorchFrames(NamedTuple):
@@ -121,8 +122,15 @@ class DifferentiableSolver:
     `rollout(n)` takes its first step by backward Euler. Equilibria (StaticSolver) have no steps: use `rollout_frames`.
     """
 
-    def __init__(self, dt: float = 0.01, gravity=-9.8, damping: float = 1.0, substeps: int = 1,
-                 method: type[Solver] = SemiImplicitSolver, **options):  # fmt: skip
+    def __init__(
+        self,
+        dt: float = 0.01,
+        gravity=-9.8,
+        damping: float = 1.0,
+        substeps: int = 1,
+        method: type[Solver] = SemiImplicitSolver,
+        **options,
+    ):
         if not (math.isfinite(dt) and dt > 0):
             raise ValueError(f"dt must be > 0 [s], got {dt}")
         if not 0 < damping <= 1:
@@ -130,7 +138,9 @@ class DifferentiableSolver:
         if not (isinstance(method, type) and issubclass(method, Solver)):
             raise ValueError(f"method must be a solver class such as ImplicitEulerSolver, got {method!r}")
         if issubclass(method, StaticSolver):
-            raise ValueError("method: StaticSolver has no steps; use rollout_frames(Rollout(StaticSolver(scene), 1), ...)")
+            raise ValueError(
+                "method: StaticSolver has no steps; use rollout_frames(Rollout(StaticSolver(scene), 1), ...)"
+            )
         self.method, self.options = method, options
         self.dt, self.gravity, self.damping, self.substeps = float(dt), gravity, float(damping), int(substeps)
 
@@ -161,8 +171,17 @@ class DifferentiableSimulator:
 
     kept_rollouts = 8  # one for each length and way of saving that is in use
 
-    def __init__(self, mesh, material, solver: DifferentiableSolver, density=1000.0, fixed_vertices=None, contact=None,
-                 terms=None, device="cpu"):  # fmt: skip
+    def __init__(
+        self,
+        mesh,
+        material,
+        solver: DifferentiableSolver,
+        density=1000.0,
+        fixed_vertices=None,
+        contact=None,
+        terms=None,
+        device="cpu",
+    ):
         self.mesh, self.material, self.solver, self.device = mesh, material, solver, torch.device(device)
         self.density, self.fixed_vertices = density, fixed_vertices
         self._terms = list(terms or [])
@@ -224,8 +243,13 @@ class DifferentiableSimulator:
             )
         self._advance(1, external_forces)
 
-    def rollout(self, num_steps: int, checkpoint_every: int | None = None, save_every: int | None = None,
-                external_forces: torch.Tensor | None = None) -> TorchFrames:  # fmt: skip
+    def rollout(
+        self,
+        num_steps: int,
+        checkpoint_every: int | None = None,
+        save_every: int | None = None,
+        external_forces: torch.Tensor | None = None,
+    ) -> TorchFrames:
         """num_steps steps as one autograd node; the frames (the start, then every save_every-th step, default the last).
 
         checkpoint_every: keep a state every so many steps and compute the rest again in the reverse sweep.
@@ -292,8 +316,14 @@ class DifferentiableSimulator:
             if with_forces:
                 terms.append(ExternalForce(np.zeros((self.mesh.num_vertices, 3))))
             precision = next(name for name, dtype in DTYPES.items() if dtype == self.dtype)
-            self._scenes[with_forces] = Scene(self.mesh, self.material.core(self.mesh), numbers["density"], terms,
-                                              self.fixed_vertices, precision=precision)  # fmt: skip
+            self._scenes[with_forces] = Scene(
+                self.mesh,
+                self.material.core(self.mesh),
+                numbers["density"],
+                terms,
+                self.fixed_vertices,
+                precision=precision,
+            )
         return self._scenes[with_forces]
 
     def _rollout(self, steps: int, with_forces: bool, checkpoint_every, save_every) -> Rollout:

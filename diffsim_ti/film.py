@@ -7,18 +7,28 @@ from pathlib import Path
 
 import numpy as np
 
-from diffsim_ti.colouring import Colouring, to_vertices
-from diffsim_ti.drawing import Drawing
 from diffsim_ti.mesh import TetrahedralMesh
-from diffsim_ti.series import Surroundings, frames_of
-from diffsim_ti.series_fields import Field, field_named, values_of
+from diffsim_ti.visual.colouring import Colouring, to_vertices
+from diffsim_ti.visual.drawing import Drawing
+from diffsim_ti.visual.fields import Field, field_named, values_of
+from diffsim_ti.visual.series import Surroundings, frames_of
 
 KINDS = (".mp4", ".gif", ".png")
 
 
-def render_series(series, output, colour: str = "von_mises", fps: float = 30.0, size=(640, 480),
-                  ground: float | None = None, azimuth: float = 32.0, elevation: float = 14.0, backend: str = "auto",
-                  say=None, **look) -> int:  # fmt: skip
+def render_series(
+    series,
+    output,
+    colour: str = "von_mises",
+    fps: float = 30.0,
+    size=(640, 480),
+    ground: float | None = None,
+    azimuth: float = 32.0,
+    elevation: float = 14.0,
+    backend: str = "auto",
+    say=None,
+    **look,
+) -> int:
     """Draw every frame of a .pvd series into `output` (.mp4, .gif), or the last one (.png); the number drawn.
 
     colour: a name in series_fields.FIELDS; fps: frames per second of the film (a GIF keeps time in steps of 10 ms); size:
@@ -35,21 +45,45 @@ def render_series(series, output, colour: str = "von_mises", fps: float = 30.0, 
     box, limits = extent(mesh, frames, colour, field)
     colouring = Colouring(field.label, limits, field.colours)
     around, shown = Surroundings(series), range(len(frames))[-1 if output.suffix == ".png" else 0 :]
-    drawing = Drawing(mesh, size, ground=around.ground if ground is None else ground, colouring=colouring, box=box,
-                      azimuth=azimuth, elevation=elevation, backend=backend, obstacles=around.shapes(0),
-                      fixed=fixed_of(read_frame(frames[0][1])), **look)  # fmt: skip
+    drawing = Drawing(
+        mesh,
+        size,
+        ground=around.ground if ground is None else ground,
+        colouring=colouring,
+        box=box,
+        azimuth=azimuth,
+        elevation=elevation,
+        backend=backend,
+        obstacles=around.shapes(0),
+        fixed=fixed_of(read_frame(frames[0][1])),
+        **look,
+    )
     output.parent.mkdir(parents=True, exist_ok=True)
     with drawing, film_writer(output, fps) as writer:
         if say:
             say(drawing.describe())
         for k in shown:
             frame, obstacles = read_frame(frames[k][1]), [points for points, _ in around.shapes(k)]
-            writer.append_data(drawing.image(frame.points, values_of(frame, colour), f"t = {frames[k][0]:.3f} s", obstacles))
+            writer.append_data(
+                drawing.image(frame.points, values_of(frame, colour), f"t = {frames[k][0]:.3f} s", obstacles)
+            )
     return len(shown)
 
 
-def save_film(path, mesh, positions, values=None, fps: float = 25.0, size=(640, 480), title=None, obstacles=None,
-              label: str = "", limits=None, box=None, **look) -> int:  # fmt: skip
+def save_film(
+    path,
+    mesh,
+    positions,
+    values=None,
+    fps: float = 25.0,
+    size=(640, 480),
+    title=None,
+    obstacles=None,
+    label: str = "",
+    limits=None,
+    box=None,
+    **look,
+) -> int:
     """Draw states of a body into `path` (.mp4, .gif), or the last one (.png); the number drawn.
 
     positions: shape (n, num_vertices, 3) [m]; values: shape (n, m), per vertex or tetrahedron, coloured as in `save_picture`
@@ -74,8 +108,9 @@ def save_film(path, mesh, positions, values=None, fps: float = 25.0, size=(640, 
     with drawing, film_writer(path, fps) as writer:
         for k in frames:
             around = [points for points, _ in obstacles[k]] if obstacles else None
-            writer.append_data(drawing.image(positions[k], None if values is None else values[k],
-                                             title(k) if title else "", around))  # fmt: skip
+            writer.append_data(
+                drawing.image(positions[k], None if values is None else values[k], title(k) if title else "", around)
+            )
     return len(frames)
 
 
@@ -98,7 +133,11 @@ def film_writer(output: Path, fps: float):
         except ImportError as error:
             raise RuntimeError("MP4 needs imageio-ffmpeg: pip install 'diffsim-ti[film]', or write a .gif") from error
         return imageio.get_writer(output, format="FFMPEG", fps=fps, macro_block_size=2)
-    return imageio.get_writer(output, duration=1000 / fps, loop=0) if output.suffix == ".gif" else imageio.get_writer(output)
+    return (
+        imageio.get_writer(output, duration=1000 / fps, loop=0)
+        if output.suffix == ".gif"
+        else imageio.get_writer(output)
+    )
 
 
 def read_frame(path: Path):
@@ -112,7 +151,9 @@ def rest_of(path: Path) -> TetrahedralMesh:
     """The body at rest, whose volumes weight the colours."""
     frame = read_frame(path)
     if "displacement" not in frame.point_data:
-        raise ValueError(f"{path}: must hold displacements, has {sorted(frame.point_data)}; render a series of diffsim-ti")
+        raise ValueError(
+            f"{path}: must hold displacements, has {sorted(frame.point_data)}; render a series of diffsim-ti"
+        )
     return TetrahedralMesh(frame.points - frame.point_data["displacement"], frame.cells_dict["tetra"])
 
 

@@ -130,11 +130,18 @@ class Inputs:
             forces = forces[None] if forces.ndim == 2 else forces
         material_values = {name: values[name] for name in self.scene.material.inputs}
         return Derived(
-            displacement, velocity, self.scene.material.coefficients(material_values),
-            self._to_vertices(values["density"] * volumes / 4), parameters, X, gradients, volumes, forces,
+            displacement,
+            velocity,
+            self.scene.material.coefficients(material_values),
+            self._to_vertices(values["density"] * volumes / 4),
+            parameters,
+            X,
+            gradients,
+            volumes,
+            forces,
             values.get("prescribed_motion"),
             np.stack([values[name] for name in self.paths], 1) if self.paths and self.paths[0] in values else None,
-        )  # fmt: skip
+        )
 
     @property
     def rest_gradients(self) -> np.ndarray:

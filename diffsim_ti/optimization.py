@@ -10,7 +10,7 @@ import warnings
 from collections.abc import Callable
 from pathlib import Path
 
-from diffsim_ti.autograd import torch
+from diffsim_ti.torch_bridge.autograd import torch
 
 MAGIC = b"diffsim_ti optimisation state, version 1\n"
 
@@ -137,10 +137,20 @@ class Optimization:
 
     def save(self) -> None:
         """Write the state file."""
-        save_state(self.path, self.mesh, dict(
-            iteration=self.iteration, losses=self.losses, seconds=self.seconds, best_loss=self.best_loss, best=self._best,
-            module=self.module.state_dict(), optimizer=self.optimizer.state_dict(), random=torch.get_rng_state(),
-        ))  # fmt: skip
+        save_state(
+            self.path,
+            self.mesh,
+            dict(
+                iteration=self.iteration,
+                losses=self.losses,
+                seconds=self.seconds,
+                best_loss=self.best_loss,
+                best=self._best,
+                module=self.module.state_dict(),
+                optimizer=self.optimizer.state_dict(),
+                random=torch.get_rng_state(),
+            ),
+        )
 
     def restore_best(self) -> None:
         """Bring back the parameters of the lowest loss."""

@@ -44,13 +44,16 @@ class OptimizationPicture:
     def save(self, path=None) -> None:
         """Write the picture to `path` or the one given at first."""
         if path is None and self.path is None:
-            raise ValueError("path: must be given here or to OptimizationPicture, got none; pass where the picture goes")
+            raise ValueError(
+                "path: must be given here or to OptimizationPicture, got none; pass where the picture goes"
+            )
         path = Path(path or self.path)
         path.parent.mkdir(parents=True, exist_ok=True)
         draft = path.with_name(f".{os.getpid()}_{path.name}")
         try:
-            save_optimization(draft, self.losses, self.parameters, self.mesh, self.found, self.target, self.start,
-                              **self.look)  # fmt: skip
+            save_optimization(
+                draft, self.losses, self.parameters, self.mesh, self.found, self.target, self.start, **self.look
+            )
             os.replace(draft, path)
         finally:
             draft.unlink(missing_ok=True)
@@ -62,8 +65,18 @@ def save_optimization(path, *arguments, **options) -> None:
     optimization_figure(*arguments, **options).savefig(path)
 
 
-def optimization_figure(losses, parameters: dict, mesh, found, target, start=None, truth: dict | None = None,
-                        loss_label: str = "loss", plane: str = "xy", size=(960, 320)):  # fmt: skip
+def optimization_figure(
+    losses,
+    parameters: dict,
+    mesh,
+    found,
+    target,
+    start=None,
+    truth: dict | None = None,
+    loss_label: str = "loss",
+    plane: str = "xy",
+    size=(960, 320),
+):
     """A matplotlib figure: a panel for the loss, one for each parameter, one for the body; `size` in pixels.
 
     losses: shape (n,), one per evaluation, drawn on a logarithmic axis; a loss of nothing falls out of it below.
@@ -78,8 +91,10 @@ def optimization_figure(losses, parameters: dict, mesh, found, target, start=Non
 
     losses = _finite("losses", losses)
     if losses.ndim != 1 or not losses.size or losses.min() < 0:
-        raise ValueError(f"losses: must be a row of numbers >= 0, got shape {losses.shape} with "
-                         f"least {losses.min(initial=np.inf):g}; add a constant to a loss that can be negative")  # fmt: skip
+        raise ValueError(
+            f"losses: must be a row of numbers >= 0, got shape {losses.shape} with "
+            f"least {losses.min(initial=np.inf):g}; add a constant to a loss that can be negative"
+        )
     if len(plane) != 2 or len(set(plane) & set("xyz")) != 2:
         raise ValueError(f"plane: must be two of x, y, z, got {plane!r}; 'xy' is the view from the front")
     unknown = set(truth or {}) - set(parameters)
@@ -99,7 +114,9 @@ def optimization_figure(losses, parameters: dict, mesh, found, target, start=Non
     for panel, (name, values) in zip(panels[1:], parameters.items()):
         values = _finite(name, values)
         if values.ndim not in (1, 2) or len(values) != len(losses):
-            raise ValueError(f"{name}: must have one row for each of the {len(losses)} losses, got shape {values.shape}")
+            raise ValueError(
+                f"{name}: must have one row for each of the {len(losses)} losses, got shape {values.shape}"
+            )
         _curves(panel, evaluations, values, name, (truth or {}).get(name))
     _overlay(panels[-1], mesh, shown, _finite("target", target), plane)
     for panel in panels[:-1]:
@@ -149,8 +166,14 @@ def _overlay(panel, mesh, shown, target, plane: str) -> None:
         panel.add_collection(LineCollection(edges, color=TARGET, linewidth=0.7, label="target"))
     else:
         large = len(target) <= 30
-        panel.plot(*target[:, axes].T, "x" if large else ".", color=TARGET, markersize=8 if large else 2, markeredgewidth=2,
-                   label="target")  # fmt: skip
+        panel.plot(
+            *target[:, axes].T,
+            "x" if large else ".",
+            color=TARGET,
+            markersize=8 if large else 2,
+            markeredgewidth=2,
+            label="target",
+        )
     panel.set(xlabel=f"{plane[0]} [m]", ylabel=f"{plane[1]} [m]")
     panel.autoscale_view()
     panel.margins(0.08)

@@ -4,13 +4,26 @@ from pathlib import Path
 
 import numpy as np
 
-from diffsim_ti.colouring import Colouring, to_vertices
-from diffsim_ti.drawing import Drawing
+from diffsim_ti.visual.colouring import Colouring, to_vertices
+from diffsim_ti.visual.drawing import Drawing
 
 
-def draw(mesh, positions, values=None, limits=None, ground: float | None = None, box=None, size=(1200, 900),
-         azimuth: float = 32.0, elevation: float = 14.0, colours: str | None = None, label: str = "", title: str = "",
-         backend: str = "software", **view) -> np.ndarray:  # fmt: skip
+def draw(
+    mesh,
+    positions,
+    values=None,
+    limits=None,
+    ground: float | None = None,
+    box=None,
+    size=(1200, 900),
+    azimuth: float = 32.0,
+    elevation: float = 14.0,
+    colours: str | None = None,
+    label: str = "",
+    title: str = "",
+    backend: str = "software",
+    **view,
+) -> np.ndarray:
     """The picture as RGB in [0, 1], shape (height, width, 3); arguments as in `save_picture`."""
     colouring = None
     if values is not None:
@@ -20,13 +33,31 @@ def draw(mesh, positions, values=None, limits=None, ground: float | None = None,
     if box is None and shown.shape == mesh.vertices.shape and np.all(np.isfinite(shown)):
         shown = shown[mesh.surface_vertices]
         box = np.stack([shown.min(0), shown.max(0)])
-    with Drawing(mesh, size, ground=ground, colouring=colouring, box=box, azimuth=azimuth, elevation=elevation,
-                 backend=backend, **view) as drawing:  # fmt: skip
+    with Drawing(
+        mesh,
+        size,
+        ground=ground,
+        colouring=colouring,
+        box=box,
+        azimuth=azimuth,
+        elevation=elevation,
+        backend=backend,
+        **view,
+    ) as drawing:
         return drawing.image(positions, values, title) / 255
 
 
-def save_picture(path, mesh, positions, values=None, label: str = "", ground: float | None = None, title: str = "",
-                 limits=None, **view) -> None:  # fmt: skip
+def save_picture(
+    path,
+    mesh,
+    positions,
+    values=None,
+    label: str = "",
+    ground: float | None = None,
+    title: str = "",
+    limits=None,
+    **view,
+) -> None:
     """Write a picture of the body's surface at `positions` [m], y upwards, in the format of the suffix (PNG, JPEG ...).
 
     values: per tetrahedron (averaged to vertices) or per vertex, shown in colour with a bar named `label`; limits: what

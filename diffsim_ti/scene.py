@@ -41,13 +41,31 @@ class Scene:
     tetrahedra lock, above Poisson's ratio 0.45.
     """
 
-    def __init__(self, mesh, material, density=1000.0, terms=(), fixed=None, motion=None, initial_positions=None,
-                 initial_velocities=None, precision: str | None = None, volume: str = "tetrahedra"):  # fmt: skip
+    def __init__(
+        self,
+        mesh,
+        material,
+        density=1000.0,
+        terms=(),
+        fixed=None,
+        motion=None,
+        initial_positions=None,
+        initial_velocities=None,
+        precision: str | None = None,
+        volume: str = "tetrahedra",
+    ):
         self._arguments = dict(
-            mesh=mesh, material=material, density=density, terms=terms, fixed=fixed, motion=motion,
-            initial_positions=initial_positions, initial_velocities=initial_velocities, precision=precision,
+            mesh=mesh,
+            material=material,
+            density=density,
+            terms=terms,
+            fixed=fixed,
+            motion=motion,
+            initial_positions=initial_positions,
+            initial_velocities=initial_velocities,
+            precision=precision,
             volume=volume,
-        )  # fmt: skip
+        )
         self.mesh, self.material = mesh, material
         self.precision = runtime.check_precision(precision)
         if volume not in ("tetrahedra", "patches"):
@@ -142,14 +160,19 @@ class Scene:
         terms = ", ".join(map(repr, self.terms)) or "none"
         chosen = [
             f"chosen from weight and speed: stiffness {float(t.values['barrier_stiffness']):.4g} N/m of {type(t).__name__}"
-            for t in self.terms if isinstance(t, Obstacle) and t.chooses_stiffness
-        ]  # fmt: skip
-        return "\n".join([
-            f"{self.mesh!r}", f"{self.material!r}" + (", volume averaged over patches" if self.volume == "patches" else ""),
-            f"mass {mass:.6g} kg, precision {self.precision}",
-            f"terms: {terms}", f"fixed vertices: {len(self.fixed)}" + (", moving" if self.motion is not None else ""),
-            *chosen,
-        ])  # fmt: skip
+            for t in self.terms
+            if isinstance(t, Obstacle) and t.chooses_stiffness
+        ]
+        return "\n".join(
+            [
+                f"{self.mesh!r}",
+                f"{self.material!r}" + (", volume averaged over patches" if self.volume == "patches" else ""),
+                f"mass {mass:.6g} kg, precision {self.precision}",
+                f"terms: {terms}",
+                f"fixed vertices: {len(self.fixed)}" + (", moving" if self.motion is not None else ""),
+                *chosen,
+            ]
+        )
 
     def __repr__(self) -> str:
         return f"Scene({self.mesh!r}, {self.material!r}, terms=[{', '.join(map(repr, self.terms))}])"

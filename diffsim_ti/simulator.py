@@ -4,10 +4,11 @@ import weakref
 
 import numpy as np
 
-from diffsim_ti import observe, runtime
-from diffsim_ti.divergence import Guard
-from diffsim_ti.observe import Energy, TetrahedronFields
-from diffsim_ti.solvers.watch import ContactResolution
+from diffsim_ti import runtime
+from diffsim_ti.state import observe
+from diffsim_ti.state.guard import Guard
+from diffsim_ti.state.observe import Energy, TetrahedronFields
+from diffsim_ti.state.watch import ContactResolution
 
 
 class Simulator:
@@ -27,7 +28,9 @@ class Simulator:
         elif len(arguments) != 1:
             raise TypeError("Simulator takes a solver, or a mesh, a material and a solver")
         if solver.scene is None:
-            raise ValueError("the solver has no scene: use Simulator(mesh, material, solver), or a solver made from a Scene")
+            raise ValueError(
+                "the solver has no scene: use Simulator(mesh, material, solver), or a solver made from a Scene"
+            )
         self.solver, self.scene = solver, solver.scene
         solver.simulator = weakref.ref(self)
         self._start = solver.start_values()
@@ -111,8 +114,9 @@ class Simulator:
         """Put the body elsewhere: positions [m], velocities [m/s], shape (num_vertices, 3); None leaves a part as it is."""
         state, shape = self.workspace.state, (self.scene.mesh.num_vertices, 3)
         for name, value, target, origin in (
-            ("positions", positions, state.u, self._start.rest), ("velocities", velocities, state.v, 0.0),
-        ):  # fmt: skip
+            ("positions", positions, state.u, self._start.rest),
+            ("velocities", velocities, state.v, 0.0),
+        ):
             if value is not None:
                 value = np.asarray(value, np.float64)
                 if value.shape != shape:
@@ -124,7 +128,9 @@ class Simulator:
         """Other external forces [N] from now on, in the shape of the scene's constant ExternalForce, until a reset."""
         given, forces = self.scene.inputs.values.get("external_forces"), np.asarray(forces, np.float64)
         if given is None or given.ndim == 3:
-            raise ValueError("set_forces needs a scene with a constant ExternalForce, of shape (k, 3); add one of zeros")
+            raise ValueError(
+                "set_forces needs a scene with a constant ExternalForce, of shape (k, 3); add one of zeros"
+            )
         if forces.shape != given.shape or not np.all(np.isfinite(forces)):
             raise ValueError(f"forces: expected finite numbers of shape {given.shape}, got shape {forces.shape}")
         runtime.fill(self.workspace.arrays.forces, forces[None])
@@ -156,10 +162,15 @@ class Simulator:
     def describe(self) -> str:
         """What is simulated, how, and what was built for it."""
         a = self.workspace.arrays
-        built = [type(t).__name__ for t in self.scene.terms] + (["prescribed motion"] if a.values.motion is not None else [])
+        built = [type(t).__name__ for t in self.scene.terms] + (
+            ["prescribed motion"] if a.values.motion is not None else []
+        )
         moduli = "one set of moduli" if a.features().uniform else "moduli per tetrahedron"
-        return "\n".join([
-            self.scene.describe(), self.solver.describe(),
-            f"built: {type(a.law).__name__} ({self.scene.precision}, {runtime.arch_name()}), {moduli}, "
-            f"terms {', '.join(built) or 'none'}; {runtime.allocated_megabytes():.1f} MB on the device",
-        ])  # fmt: skip
+        return "\n".join(
+            [
+                self.scene.describe(),
+                self.solver.describe(),
+                f"built: {type(a.law).__name__} ({self.scene.precision}, {runtime.arch_name()}), {moduli}, "
+                f"terms {', '.join(built) or 'none'}; {runtime.allocated_megabytes():.1f} MB on the device",
+            ]
+        )

@@ -34,8 +34,15 @@ class TaylorResult:
         return float(np.min(middle)) if len(middle) else float("inf")
 
 
-def taylor_test(f: Callable[[np.ndarray], float], x, gradient, direction=None, epsilon: float = 1e-2, halvings: int = 6,
-                seed: int = 0) -> TaylorResult:  # fmt: skip
+def taylor_test(
+    f: Callable[[np.ndarray], float],
+    x,
+    gradient,
+    direction=None,
+    epsilon: float = 1e-2,
+    halvings: int = 6,
+    seed: int = 0,
+) -> TaylorResult:
     """Second-order remainders of f along a direction: they fall as eps^2 if and only if `gradient` is f's gradient at x.
 
     direction: default random, of the size of x. Griewank, Walther 2008; Farrell et al. 2013, doi:10.1137/120873558.
@@ -137,16 +144,26 @@ class GradientReport:
         return all(row.passed for row in self.rows)
 
     def __str__(self) -> str:
-        lines = [f"{'input':22s} {'analytic':>16s} {'differences':>16s} {'rel. error':>11s} {'Taylor rate':>12s}  verdict"]
+        lines = [
+            f"{'input':22s} {'analytic':>16s} {'differences':>16s} {'rel. error':>11s} {'Taylor rate':>12s}  verdict"
+        ]
         for r in self.rows:
             rate = "linear" if np.isinf(r.taylor_rate) else f"{r.taylor_rate:.3f}"
-            lines.append(f"{r.input:22s} {r.analytic: 16.8e} {r.differences: 16.8e} {r.relative_error:11.1e} {rate:>12s}  "
-                         f"{'right' if r.passed else 'WRONG'}")  # fmt: skip
+            lines.append(
+                f"{r.input:22s} {r.analytic: 16.8e} {r.differences: 16.8e} {r.relative_error:11.1e} {rate:>12s}  "
+                f"{'right' if r.passed else 'WRONG'}"
+            )
         return "\n".join(lines)
 
 
-def check_gradients(rollout: Rollout, loss: Loss | None = None, inputs=None, seed: int = 0, verbose: bool = True,
-                    tolerance: float | None = None) -> GradientReport:  # fmt: skip
+def check_gradients(
+    rollout: Rollout,
+    loss: Loss | None = None,
+    inputs=None,
+    seed: int = 0,
+    verbose: bool = True,
+    tolerance: float | None = None,
+) -> GradientReport:
     """Check the gradient by every input against extrapolated central differences and by its Taylor rate; print the table.
 
     loss(frames) -> (value, gradient by positions, gradient by velocities or None); default `linear_loss`.
@@ -182,7 +199,9 @@ def check_gradients(rollout: Rollout, loss: Loss | None = None, inputs=None, see
         scale = max(abs(differences), abs(analytic))
         error = abs(analytic - differences) / scale if scale > 0 else 0.0
         resolved = abs(analytic - differences) <= 10 * uncertainty + tolerance * scale
-        report.rows.append(GradientCheck(name, analytic, differences, error, taylor.rate, resolved and taylor.rate >= 1.9))
+        report.rows.append(
+            GradientCheck(name, analytic, differences, error, taylor.rate, resolved and taylor.rate >= 1.9)
+        )
     if verbose:
         print(report)
     return report

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from diffsim_ti.floor import Backdrop
-from diffsim_ti.viewer import open_window
+from diffsim_ti.visual.backdrop import Backdrop
+from diffsim_ti.visual.viewer import open_window
 
 
 class SimulationVisualizer:
@@ -52,8 +52,8 @@ class _Scene:
     """The window's picture, drawn as `Drawing` draws it."""
 
     def __init__(self, window, mesh, ground):
-        from diffsim_ti.drawing import Drawing
-        from diffsim_ti.vulkan_painter import Canvas
+        from diffsim_ti.visual.drawing import Drawing
+        from diffsim_ti.visual.vulkan_painter import Canvas
 
         self.window, self.size = window, (1024, 768)
         self.drawing = Drawing(mesh, self.size, ground=ground, backend="software")

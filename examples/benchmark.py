@@ -37,9 +37,13 @@ def common_rollout(resolution: int, precision: str, per_tetrahedron: bool = True
     E, nu = 1e5, 0.4
     material = ds.SmithNeoHookean(mu=np.full(m, E / (2 * (1 + nu))), lam=np.full(m, E * nu / ((1 + nu) * (1 - 2 * nu))))
     scene = ds.Scene(
-        mesh, material, density=1000.0, terms=[ds.Gravity(-9.8), ds.Drag(-math.log(0.999) / H)],
-        initial_positions=mesh.vertices * 1.01, precision=precision,
-    )  # fmt: skip
+        mesh,
+        material,
+        density=1000.0,
+        terms=[ds.Gravity(-9.8), ds.Drag(-math.log(0.999) / H)],
+        initial_positions=mesh.vertices * 1.01,
+        precision=precision,
+    )
     # the common step is within the stable one at these sizes; --growth goes beyond, where only time is looked at
     solver = ds.SemiImplicitSolver(scene, dt=SUBSTEPS * H, substeps=SUBSTEPS, allow_unstable=resolution > 31)
     return ds.Rollout(solver, 1, gradients=["mu", "lam", "initial_positions"])
@@ -62,11 +66,14 @@ def measure(resolution: int, precision: str, repeats: int) -> dict:
     compile_s = time.perf_counter() - start
     scale = 1e9 / (SUBSTEPS * rollout.scene.mesh.num_tetrahedra)
     return {
-        "who": "diffsim_ti", "tets": rollout.scene.mesh.num_tetrahedra,
+        "who": "diffsim_ti",
+        "tets": rollout.scene.mesh.num_tetrahedra,
         "forward_ns": round(best_seconds(rollout.forward, repeats) * scale, 1),
         "forward_backward_ns": round(best_seconds(forward_backward, repeats) * scale, 1),
-        "compile_s": round(compile_s, 2), "compile_forward_s": round(compile_forward, 2), "precision": precision,
-    }  # fmt: skip
+        "compile_s": round(compile_s, 2),
+        "compile_forward_s": round(compile_forward, 2),
+        "precision": precision,
+    }
 
 
 def main() -> None:
@@ -82,7 +89,9 @@ def main() -> None:
     ds.init(options.arch, options.precision)
     sizes = [11, 21, 31, 45, 56] if options.growth else options.sizes
     for resolution in sizes:
-        row = measure(resolution, options.precision, max(3, options.repeats if resolution <= 21 else options.repeats // 4))
+        row = measure(
+            resolution, options.precision, max(3, options.repeats if resolution <= 21 else options.repeats // 4)
+        )
         if options.json:
             print(json.dumps(row), flush=True)
         else:

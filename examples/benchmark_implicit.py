@@ -27,7 +27,9 @@ FRAMES, ERROR, HELD = 20, 1e-2, 0.05
 def beam(tetrahedra: int) -> ds.TetrahedralMesh:
     """About so many tetrahedra, 1 m long, in cells that are nearly cubes."""
     across = max(1, round((tetrahedra / 30) ** (1 / 3)))
-    return ds.TetrahedralMesh.create_box((round(tetrahedra / 6 / across**2) + 1, across + 1, across + 1), (1.0, 0.2, 0.2))
+    return ds.TetrahedralMesh.create_box(
+        (round(tetrahedra / 6 / across**2) + 1, across + 1, across + 1), (1.0, 0.2, 0.2)
+    )
 
 
 def scene_of(mesh: ds.TetrahedralMesh, E: float = 1e6, held: float = 1e-6, **more) -> ds.Scene:
@@ -93,7 +95,10 @@ class DirectEuler:
         _, J, T = self.deformed(u)
         g = self.N @ np.swapaxes(T, 1, 2)
         K = np.einsum("eai,ebj->eabij", g, g, optimize=True) * (self.lam * (2 * J - 1) * J)[:, None, None, None, None]
-        K += np.einsum("ebi,eaj->eabij", g, g, optimize=True) * (self.mu - self.lam * (J - 1) * J)[:, None, None, None, None]
+        K += (
+            np.einsum("ebi,eaj->eabij", g, g, optimize=True)
+            * (self.mu - self.lam * (J - 1) * J)[:, None, None, None, None]
+        )
         K += self.mu * (self.N @ np.swapaxes(self.N, 1, 2))[..., None, None] * np.eye(3)
         K = (self.V[:, None, None, None, None] * K).reshape(-1, 9)
         data = np.stack([np.bincount(self.entry, K[:, k], len(self.rows)) for k in range(9)], 1).reshape(-1, 3, 3)

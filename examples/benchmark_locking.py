@@ -21,7 +21,7 @@ from scipy.sparse import coo_matrix, diags, kron
 from scipy.sparse.linalg import eigsh, splu
 
 import diffsim_ti as ds
-from diffsim_ti.mesh_patches import volume_patches
+from diffsim_ti.mesh.patches import volume_patches
 
 ELEMENTS = ("tetrahedra", "nodal", "patches", "quadratic")
 EDGES = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
@@ -146,8 +146,9 @@ def membrane(cells, pattern, nu, element):
     traction = 6.25 / 70 * E * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) / 6
     if element == "quadratic":  # a traction goes to the middles of a triangle's edges
         middles = {tuple(x): k for k, x in enumerate(np.round(system.X, 6))}
-        faces = np.array([[middles[tuple(x)] for x in np.round((x3 + np.roll(x3, 1, 0)) / 2, 6)]
-                          for x3 in mesh.vertices[faces]])  # fmt: skip
+        faces = np.array(
+            [[middles[tuple(x)] for x in np.round((x3 + np.roll(x3, 1, 0)) / 2, 6)] for x3 in mesh.vertices[faces]]
+        )
     forces = np.zeros(system.X.shape)
     np.add.at(forces[:, 1], faces.ravel(), np.repeat(traction, 3))
     free = np.repeat(system.X[:, :1] > 1e-9, 3, 1) & [True, True, False]
@@ -179,19 +180,32 @@ def main(quick: bool = False) -> dict:
     """{(nu, pattern, element): dict of the three ratios, unknowns, evaluations, step [s]} and "agreement", "seconds"."""
     start, out = time.perf_counter(), {}
     cells, ratios = (2, 4) if quick else (4, 8), (0.4999,) if quick else tuple(DROP)
-    print("share of the drop and of the rise, frequency ratio; unknowns, evaluations of the law, stable step of the beam")
+    print(
+        "share of the drop and of the rise, frequency ratio; unknowns, evaluations of the law, stable step of the beam"
+    )
     for nu in ratios:
         for pattern in ("five", "kuhn"):
             for element in ELEMENTS:
                 n, c = (k // (2 if element == "quadratic" else 1) for k in cells)
                 drop, system = beam(n, pattern, nu, element)
-                row = dict(beam=drop, cook=membrane(c, pattern, nu, element)[0], lame=lame(n, pattern, nu, element),
-                           unknowns=system.unknowns, evaluations=system.evaluations, step=system.stable_step())  # fmt: skip
+                row = dict(
+                    beam=drop,
+                    cook=membrane(c, pattern, nu, element)[0],
+                    lame=lame(n, pattern, nu, element),
+                    unknowns=system.unknowns,
+                    evaluations=system.evaluations,
+                    step=system.stable_step(),
+                )
                 out[nu, pattern, element] = row
-                print(f"nu {nu:<6} {pattern} {element:10s} {row['beam']:.3f}  {row['cook']:.3f}  {row['lame']:.3f}; "
-                      f"{row['unknowns']:5d} {row['evaluations']:5d}  {1e3 * row['step']:.3g} ms")  # fmt: skip
-    off = [product_drop(2, p, 0.4999, v) / beam(2, p, 0.4999, v)[0] - 1
-           for p in ("five", "kuhn") for v in ("tetrahedra", "patches")]  # fmt: skip
+                print(
+                    f"nu {nu:<6} {pattern} {element:10s} {row['beam']:.3f}  {row['cook']:.3f}  {row['lame']:.3f}; "
+                    f"{row['unknowns']:5d} {row['evaluations']:5d}  {1e3 * row['step']:.3g} ms"
+                )
+    off = [
+        product_drop(2, p, 0.4999, v) / beam(2, p, 0.4999, v)[0] - 1
+        for p in ("five", "kuhn")
+        for v in ("tetrahedra", "patches")
+    ]
     out["agreement"], out["seconds"] = max(map(abs, off)), time.perf_counter() - start
     print(f"diffsim_ti differs from these matrices by {out['agreement']:.1g}; {out['seconds']:.1f} s")
     return out

@@ -37,8 +37,9 @@ def make_fall(mesh, cells: int, contact: bool) -> ds.Simulator:
     if contact:
         terms.append(ds.SelfContact(stiffness=400.0, width=width))
     start = np.tile([0.0, -0.5, 0.0], (mesh.num_vertices, 1))
-    scene = ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3), density=1000.0, terms=terms, initial_velocities=start,
-                     precision="f32")  # fmt: skip
+    scene = ds.Scene(
+        mesh, ds.StableNeoHookean(1e5, 0.3), density=1000.0, terms=terms, initial_velocities=start, precision="f32"
+    )
     simulator = ds.Simulator(ds.SemiImplicitSolver(scene, dt=FRAME, substeps=SUBSTEPS))
     simulator.step()  # compiles
     simulator.reset()
@@ -74,19 +75,37 @@ def main(count: int = 20, cells: int = 10, frames: int = 40, film: str | None = 
         if film and frame % 2:
             places.append(simulator.positions)
         touching, alone = (1e3 * cost for cost in costs[-1])
-        print(f"frame {frame + 1}: a substep takes {touching:.2f} ms, without contact {alone:.2f} ms; smallest gap so far "
-              f"{1e3 * gap:.3g} mm", flush=True)  # fmt: skip
+        print(
+            f"frame {frame + 1}: a substep takes {touching:.2f} ms, without contact {alone:.2f} ms; smallest gap so far "
+            f"{1e3 * gap:.3g} mm",
+            flush=True,
+        )
     simulator.check_surfaces()
     if film:
         colours = np.tile(np.repeat(np.arange(count), mesh.num_vertices // count), (len(places), 1))
-        save_film(film, mesh, places, colours, 12.5, (400, 300), elevation=35,
-                  obstacles=[[bowl(np.zeros(3), RADIUS)]] * len(places), box=[[-0.4, -0.45, -0.4], [0.4, 0.0, 0.4]],
-                  title=lambda k: f"{count} soft blocks, t = {2 * FRAME * k:.2f} s")  # fmt: skip
+        save_film(
+            film,
+            mesh,
+            places,
+            colours,
+            12.5,
+            (400, 300),
+            elevation=35,
+            obstacles=[[bowl(np.zeros(3), RADIUS)]] * len(places),
+            box=[[-0.4, -0.45, -0.4], [0.4, 0.0, 0.4]],
+            title=lambda k: f"{count} soft blocks, t = {2 * FRAME * k:.2f} s",
+        )
     costs, late = np.sum(costs, 0), np.sum(costs[3 * frames // 4 :], 0)
-    out = {"gap": gap, "radius": float(np.linalg.norm(simulator.positions, axis=1).max()),
-           "ratio": costs[0] / costs[1], "late_ratio": late[0] / late[1]}  # fmt: skip
-    print(f"no surface passed through another, smallest gap {1e3 * gap:.3g} mm; a substep costs {out['ratio']:.2f} times "
-          f"that without contact ({out['late_ratio']:.2f} in the last quarter)")  # fmt: skip
+    out = {
+        "gap": gap,
+        "radius": float(np.linalg.norm(simulator.positions, axis=1).max()),
+        "ratio": costs[0] / costs[1],
+        "late_ratio": late[0] / late[1],
+    }
+    print(
+        f"no surface passed through another, smallest gap {1e3 * gap:.3g} mm; a substep costs {out['ratio']:.2f} times "
+        f"that without contact ({out['late_ratio']:.2f} in the last quarter)"
+    )
     return out
 
 

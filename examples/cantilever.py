@@ -24,15 +24,20 @@ E, G = 1e6, 9.81
 BEAM = {0.3: 0.38288, 0.45: 0.38450}
 # Shares of it that linear tetrahedra reach, from an independent code: {(pattern, nu): {cells across: share}}
 KNOWN = {
-    ("kuhn", 0.3): {1: 0.241, 2: 0.509, 4: 0.780, 6: 0.877}, ("kuhn", 0.45): {1: 0.138, 2: 0.309, 4: 0.583, 6: 0.730},
-    ("five", 0.3): {2: 0.660, 4: 0.871, 6: 0.928}, ("five", 0.45): {2: 0.580, 4: 0.810, 6: 0.880},
-}  # fmt: skip
+    ("kuhn", 0.3): {1: 0.241, 2: 0.509, 4: 0.780, 6: 0.877},
+    ("kuhn", 0.45): {1: 0.138, 2: 0.309, 4: 0.583, 6: 0.730},
+    ("five", 0.3): {2: 0.660, 4: 0.871, 6: 0.928},
+    ("five", 0.45): {2: 0.580, 4: 0.810, 6: 0.880},
+}
 # The elastica, (tip drop / L, reach / L); weight: rho g A L^3 / (E I), load: P L^2 / (E I)
 ELASTICA = {
-    ("weight", 1.0): (0.123471, 0.991246), ("weight", 2.0): (0.238507, 0.966893),
+    ("weight", 1.0): (0.123471, 0.991246),
+    ("weight", 2.0): (0.238507, 0.966893),
     ("weight", 20.0): (0.829881, 0.445232),
-    ("load", 1.0): (0.301721, 0.943567), ("load", 5.0): (0.713792, 0.612372), ("load", 10.0): (0.810609, 0.445004),
-}  # fmt: skip
+    ("load", 1.0): (0.301721, 0.943567),
+    ("load", 5.0): (0.713792, 0.612372),
+    ("load", 10.0): (0.810609, 0.445004),
+}
 SLENDERNESS = 12  # length over height of the elastica's bar
 
 
@@ -79,9 +84,17 @@ def save_bent(path, numbers=(0.0, 1.0, 2.0, 5.0), cells: int = 3) -> None:
         places.append(frames.positions[-1])
         drops.append(-frames.displacements[-1][:, 1])
     bars = ds.TetrahedralMesh.joined([scene.mesh] * len(numbers))
-    save_picture(path, bars, np.concatenate(places), np.concatenate(drops), "deflection [m]",
-                 azimuth=20, elevation=8, box=[[0, -0.75, 0], [1.2, 0.1, 0.1]],
-                 title="loads P L²/(E I) = " + ", ".join(f"{number:g}" for number in numbers))  # fmt: skip
+    save_picture(
+        path,
+        bars,
+        np.concatenate(places),
+        np.concatenate(drops),
+        "deflection [m]",
+        azimuth=20,
+        elevation=8,
+        box=[[0, -0.75, 0], [1.2, 0.1, 0.1]],
+        title="loads P L²/(E I) = " + ", ".join(f"{number:g}" for number in numbers),
+    )
 
 
 def small_strains(cells: dict) -> dict:
@@ -104,8 +117,10 @@ def elasticas(cases, coarse: int, fine: int) -> dict:
         a, b = elastica_tip(*case, coarse), elastica_tip(*case, fine)
         limit = b + (b - a) / ((fine / coarse) ** 2 - 1)
         out[case] = b - ELASTICA[case], limit - ELASTICA[case]
-        print(f"  {case[0]} {case[1]:4.1f}: exact {ELASTICA[case][0]:.4f} {ELASTICA[case][1]:.4f}, "
-              f"computed {b[0]:.4f} {b[1]:.4f}, extrapolated {limit[0]:.4f} {limit[1]:.4f}")  # fmt: skip
+        print(
+            f"  {case[0]} {case[1]:4.1f}: exact {ELASTICA[case][0]:.4f} {ELASTICA[case][1]:.4f}, "
+            f"computed {b[0]:.4f} {b[1]:.4f}, extrapolated {limit[0]:.4f} {limit[1]:.4f}"
+        )
     return out
 
 

@@ -80,24 +80,43 @@ def common_table(best: dict) -> str:
 def drop(gradient: bool = False, duration: float = 0.05) -> Problem:
     """A bunny of E = 1e5 Pa that meets a floor at 1 m/s: its motion, or d (mean height at the end) / dE."""
     mesh = ds.TetrahedralMesh.from_file(ROOT / "assets" / "tetmesh" / "bunny0.msh").translated((0, 0.006, 0))
-    scene = ds.Scene(mesh, ds.SmithNeoHookean(1e5, 0.4), 1000.0, [ds.Gravity(), ds.Ground(0.0, None, 0.005)],
-                     initial_velocities=(0, -1.0, 0), precision="f32")  # fmt: skip
-    out = replace(Problem.of_scene(scene, duration, "drop", frames=5), patterns=("five",),
-                  title="A bunny of 7 637 tetrahedra meets a floor at 1 m/s")  # fmt: skip
+    scene = ds.Scene(
+        mesh,
+        ds.SmithNeoHookean(1e5, 0.4),
+        1000.0,
+        [ds.Gravity(), ds.Ground(0.0, None, 0.005)],
+        initial_velocities=(0, -1.0, 0),
+        precision="f32",
+    )
+    out = replace(
+        Problem.of_scene(scene, duration, "drop", frames=5),
+        patterns=("five",),
+        title="A bunny of 7 637 tetrahedra meets a floor at 1 m/s",
+    )
     if not gradient:
         return out
     mean = Watch.end(lambda mesh: np.eye(3)[1] * np.ones((mesh.num_vertices, 1)) / mesh.num_vertices, 5)
-    return replace(out, name="drop-gradient", title="Gradient by E of where that bunny is then",
-                   quantity=lambda _, g: np.atleast_1d(g["youngs_modulus"]), adjoint=mean, inputs=("youngs_modulus",),
-                   error="error of the derivative")  # fmt: skip
+    return replace(
+        out,
+        name="drop-gradient",
+        title="Gradient by E of where that bunny is then",
+        quantity=lambda _, g: np.atleast_1d(g["youngs_modulus"]),
+        adjoint=mean,
+        inputs=("youngs_modulus",),
+        error="error of the derivative",
+    )
 
 
 def accuracy(python: str, quick: bool, folder) -> dict:
     """{problem: {who: [(seconds per simulated second, error), ...]}}; peers.png and peers.json grow with each problem."""
     cubes, time = ((4, 8), 0.012) if quick else ((4, 8, 12, 16, 24), 0.05)
     out = {}
-    for asked, cells, levels in ((problem("lame"), cubes, 1), (problem("lame-gradient"), cubes, 1),
-                                 (drop(False, time), (0,), 2), (drop(True, time), (0,), 2)):  # fmt: skip
+    for asked, cells, levels in (
+        (problem("lame"), cubes, 1),
+        (problem("lame-gradient"), cubes, 1),
+        (drop(False, time), (0,), 2),
+        (drop(True, time), (0,), 2),
+    ):
         ours = replace(asked, cells=cells, patterns=("five",))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # coarse steps through contact are what is measured
@@ -131,8 +150,12 @@ def accuracy_table(found: dict) -> str:
     return "\n".join(lines)
 
 
-STYLES = {"diffsim_ti": ("#0072B2", "o"), "torch-diffsim": ("#D55E00", "s"), "Warp (CPU)": ("#009E73", "^"),
-          "JAX": ("#CC79A7", "D")}  # fmt: skip
+STYLES = {
+    "diffsim_ti": ("#0072B2", "o"),
+    "torch-diffsim": ("#D55E00", "s"),
+    "Warp (CPU)": ("#009E73", "^"),
+    "JAX": ("#CC79A7", "D"),
+}
 
 
 def draw(found: dict, path) -> None:
@@ -196,8 +219,15 @@ def charted(python: str, quick: bool, folder) -> str:
     for name in ("lame", "beam", "bounce", "bounce-gradient", "identify"):
         result = chart(problem(name), quick=quick, repeats=2, limit=0.35, say=print)
         if name == "beam" and not quick:  # meshes that take too long for all solvers and steps
-            fine = chart(replace(problem(name), cells=FINE_BEAMS, patterns=("five",)), (ds.VelocityVerletSolver,), ("f32",),
-                         levels=1, repeats=1, limit=60.0, say=print)  # fmt: skip
+            fine = chart(
+                replace(problem(name), cells=FINE_BEAMS, patterns=("five",)),
+                (ds.VelocityVerletSolver,),
+                ("f32",),
+                levels=1,
+                repeats=1,
+                limit=60.0,
+                say=print,
+            )
             result = result.with_points(fine.points)
         peers = {who: peers_of(name, who, python, quick) for who in work.installed(python) if who == "torch-diffsim"}
         charts.write_chart(result, folder, peers)

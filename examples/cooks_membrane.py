@@ -83,8 +83,15 @@ def membrane(cells: int, material, traction: float, exact: tuple) -> dict:
     u, edge = frames.displacements[-1], mesh.vertex_sets["xmax"]
     rise, y = (x[edge, 1].reshape(-1, 2).mean(1) for x in (u, mesh.vertices))  # front and back
     corner, middle = np.interp([60, 52], y, rise)
-    return {"corner": corner, "middle": middle, "left": np.abs(u[:, 2]).max(), "steps": steps, "products": products,
-            "mesh": mesh, "positions": frames.positions[-1]}  # fmt: skip
+    return {
+        "corner": corner,
+        "middle": middle,
+        "left": np.abs(u[:, 2]).max(),
+        "steps": steps,
+        "products": products,
+        "mesh": mesh,
+        "positions": frames.positions[-1],
+    }
 
 
 def limit(a: float, b: float, c: float) -> float:
@@ -100,18 +107,38 @@ def main(quick: bool = False, picture_folder: str | None = None) -> dict:
         rows = [membrane(n, **problem) for n in cells]
         corner, middle = ([row[key] for row in rows] for key in ("corner", "middle"))
         limits = limit(*corner), limit(*middle)
-        out[name] = dict(cells=cells, corner=corner, middle=middle, limit=limits, exact=problem["exact"],
-                         left=max(row["left"] for row in rows))  # fmt: skip
-        print(f"{name}: corner rises " + ", ".join(f"{c:.3f} mm ({n} cells)" for n, c in zip(cells, corner))
-              + f"; limit {limits[0]:.3f}, exact {problem['exact'][0]}")  # fmt: skip
+        out[name] = dict(
+            cells=cells,
+            corner=corner,
+            middle=middle,
+            limit=limits,
+            exact=problem["exact"],
+            left=max(row["left"] for row in rows),
+        )
+        print(
+            f"{name}: corner rises "
+            + ", ".join(f"{c:.3f} mm ({n} cells)" for n, c in zip(cells, corner))
+            + f"; limit {limits[0]:.3f}, exact {problem['exact'][0]}"
+        )
         if problem["exact"][1]:
             print(f"  middle of the edge {middle[-1]:.3f} mm, limit {limits[1]:.3f}, exact {problem['exact'][1]}")
         if picture_folder and name == "large":
             mesh, bent = rows[-1]["mesh"], rows[-1]["positions"]
-            save_picture(Path(picture_folder) / "cooks_membrane.png", mesh, bent, (bent - mesh.vertices)[:, 1], "rise [mm]",
-                         title="Cook's membrane, large strains", fixed="xmin", wireframe=True, azimuth=12)  # fmt: skip
-        print(f"  |u_z| <= {out[name]['left']:.1g} mm after {rows[-1]['steps']} Newton steps, "
-              f"{rows[-1]['products']} products")  # fmt: skip
+            save_picture(
+                Path(picture_folder) / "cooks_membrane.png",
+                mesh,
+                bent,
+                (bent - mesh.vertices)[:, 1],
+                "rise [mm]",
+                title="Cook's membrane, large strains",
+                fixed="xmin",
+                wireframe=True,
+                azimuth=12,
+            )
+        print(
+            f"  |u_z| <= {out[name]['left']:.1g} mm after {rows[-1]['steps']} Newton steps, "
+            f"{rows[-1]['products']} products"
+        )
     out["seconds"] = time.perf_counter() - start
     print(f"{out['seconds']:.1f} s")
     return out

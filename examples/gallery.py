@@ -55,8 +55,13 @@ def make(name: str, folder: Path) -> Path:
     with tempfile.TemporaryDirectory() as temporary:
         paths = os.pathsep.join([str(HERE.parent), os.environ.get("PYTHONPATH", "")])
         start = ["-m", "torch.distributed.run", "--standalone", *TORCHRUN[name].split()] if name in TORCHRUN else []
-        done = subprocess.run([sys.executable, *start, HERE / f"{name}.py", *arguments.split()], cwd=temporary, text=True,
-                              capture_output=True, env=os.environ | {"PYTHONPATH": paths})  # fmt: skip
+        done = subprocess.run(
+            [sys.executable, *start, HERE / f"{name}.py", *arguments.split()],
+            cwd=temporary,
+            text=True,
+            capture_output=True,
+            env=os.environ | {"PYTHONPATH": paths},
+        )
         made = Path(temporary) / "output" / made
         if done.returncode or not made.exists():
             raise RuntimeError(f"{name}: saved no picture (exit status {done.returncode})\n{done.stderr[-2000:]}")

@@ -38,19 +38,32 @@ def save_lift(path, scene: ds.Scene, paths: dict, times) -> None:
     every = len(times) // 40
     shown = times[::every]
     frames = ds.Rollout(ds.SemiImplicitSolver(scene, dt=DT), len(times) - 1, every, gradients=[]).forward(**paths)
-    places = [(side * (SIZE / 2 + 1.5 * WIDTH), SIZE / 2, 0) + path[::every] for side, path in zip((-1, 1), paths.values())]
+    places = [
+        (side * (SIZE / 2 + 1.5 * WIDTH), SIZE / 2, 0) + path[::every] for side, path in zip((-1, 1), paths.values())
+    ]
     pads = [[box(place, (WIDTH, SIZE, SIZE), (1, 0, 0, 0)) for place in pair] for pair in zip(*places)]
-    save_film(path, scene.mesh, frames.positions, fps=8.0, size=(400, 300), obstacles=pads, ground=0.0, wireframe=True,
-              elevation=18, box=[[-0.1, 0, -0.05], [0.1, 0.16, 0.05]],
-              title=lambda k: f"lifted by friction alone, t = {shown[k]:.2f} s")  # fmt: skip
+    save_film(
+        path,
+        scene.mesh,
+        frames.positions,
+        fps=8.0,
+        size=(400, 300),
+        obstacles=pads,
+        ground=0.0,
+        wireframe=True,
+        elevation=18,
+        box=[[-0.1, 0, -0.05], [0.1, 0.16, 0.05]],
+        title=lambda k: f"lifted by friction alone, t = {shown[k]:.2f} s",
+    )
 
 
 def main(picture_folder: str | None = None) -> dict:
     """Returns how far the cube slips at first and at last [m], the squeezes [m], evaluations and seconds."""
     scene = gripper_scene()
     steps = round(DURATION / DT)
-    rollout = ds.Rollout(ds.SemiImplicitSolver(scene, dt=DT), steps, steps // 10,
-                         gradients=["half_space_path", "half_space_path_2"])  # fmt: skip
+    rollout = ds.Rollout(
+        ds.SemiImplicitSolver(scene, dt=DT), steps, steps // 10, gradients=["half_space_path", "half_space_path_2"]
+    )
     times = np.arange(steps + 1) * DT
     lift = np.clip((times - 0.12) / 0.28, 0, 1)
     lift = LIFT * lift**2 * (3 - 2 * lift)
@@ -87,11 +100,19 @@ def main(picture_folder: str | None = None) -> dict:
     best = min(seen, key=lambda run: run["slip"])
     if picture_folder:
         save_lift(Path(picture_folder) / "gripper.gif", scene, paths(best["q"]), times)
-    print(f"slips by {100 * seen[0]['slip']:.3g} cm at first, {1000 * best['slip']:.2g} mm at last; squeezes [mm] "
-          f"{(1000 * best['q']).round(1).tolist()}; {len(seen)} evaluations, {seconds:.1f} s; "
-          f"{best['frames'].contact_resolution}")  # fmt: skip
-    return {"before": seen[0]["slip"], "after": best["slip"], "squeezes": best["q"], "evaluations": len(seen),
-            "resolved": best["frames"].contact_resolution.resolved, "seconds": seconds}  # fmt: skip
+    print(
+        f"slips by {100 * seen[0]['slip']:.3g} cm at first, {1000 * best['slip']:.2g} mm at last; squeezes [mm] "
+        f"{(1000 * best['q']).round(1).tolist()}; {len(seen)} evaluations, {seconds:.1f} s; "
+        f"{best['frames'].contact_resolution}"
+    )
+    return {
+        "before": seen[0]["slip"],
+        "after": best["slip"],
+        "squeezes": best["q"],
+        "evaluations": len(seen),
+        "resolved": best["frames"].contact_resolution.resolved,
+        "seconds": seconds,
+    }
 
 
 if __name__ == "__main__":

@@ -33,16 +33,24 @@ def main(picture_folder: str | None = None) -> dict:
     """Returns the modulus found [Pa], its relative error, evaluations of loss and gradient, and seconds."""
     mesh = ds.TetrahedralMesh.create_box((9, 3, 3), size=(1.0, 0.2, 0.2), pattern="five")
     scene = ds.Scene(
-        mesh, ds.StableNeoHookean(GUESS, 0.3), density=1000.0, terms=[ds.Gravity(), ds.Drag(0.5)], fixed="xmin",
+        mesh,
+        ds.StableNeoHookean(GUESS, 0.3),
+        density=1000.0,
+        terms=[ds.Gravity(), ds.Drag(0.5)],
+        fixed="xmin",
         precision="f64",
-    )  # fmt: skip
+    )
     rollout = ds.Rollout(ds.VelocityVerletSolver(scene, dt=1e-3), 300, save_every=10, gradients=["youngs_modulus"])
     tip = mesh.vertex_sets["xmax"]
     observed = observed_motion(rollout, tip)
     picture = OptimizationPicture(
-        mesh, observed[-1], picture_folder and Path(picture_folder) / "identify_beam.png", 1.0 if picture_folder else None,
-        truth={NAME: TRUE_E}, loss_label="loss [mm²]",
-    )  # fmt: skip
+        mesh,
+        observed[-1],
+        picture_folder and Path(picture_folder) / "identify_beam.png",
+        1.0 if picture_folder else None,
+        truth={NAME: TRUE_E},
+        loss_label="loss [mm²]",
+    )
 
     def loss_and_gradient(log_E):
         E = float(np.exp(log_E[0]))
@@ -55,14 +63,21 @@ def main(picture_folder: str | None = None) -> dict:
 
     start = time.perf_counter()
     found = minimize(
-        loss_and_gradient, [np.log(GUESS)], jac=True, method="L-BFGS-B", bounds=[np.log(RANGE)], options=dict(ftol=1e-14)
+        loss_and_gradient,
+        [np.log(GUESS)],
+        jac=True,
+        method="L-BFGS-B",
+        bounds=[np.log(RANGE)],
+        options=dict(ftol=1e-14),
     )
     seconds = time.perf_counter() - start
     E = float(np.exp(found.x[0]))
     error = abs(E - TRUE_E) / TRUE_E
     residual = float(np.sqrt(found.fun))
-    print(f"E = {E:.6g} Pa, {100 * error:.2g} % off, from {GUESS:.3g} Pa in {found.nit} iterations "
-          f"({found.nfev} gradients), {seconds:.1f} s; residual {residual:.3g} mm")  # fmt: skip
+    print(
+        f"E = {E:.6g} Pa, {100 * error:.2g} % off, from {GUESS:.3g} Pa in {found.nit} iterations "
+        f"({found.nfev} gradients), {seconds:.1f} s; residual {residual:.3g} mm"
+    )
     if picture_folder:
         picture.save()
     return {"youngs_modulus": E, "error": error, "evaluations": found.nfev, "residual_mm": residual, "seconds": seconds}

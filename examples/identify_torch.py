@@ -29,7 +29,9 @@ class LogMaterial(TorchMaterial):
     def __init__(self, E: float, nu: float, learn_nu: bool = False):
         super().__init__()
         self.log_E = torch.nn.Parameter(torch.tensor(E, dtype=torch.float64).log())
-        self.raw_nu = torch.nn.Parameter(torch.logit(torch.tensor(nu / 0.49, dtype=torch.float64)), requires_grad=learn_nu)
+        self.raw_nu = torch.nn.Parameter(
+            torch.logit(torch.tensor(nu / 0.49, dtype=torch.float64)), requires_grad=learn_nu
+        )
 
     @property
     def E(self):
@@ -52,11 +54,19 @@ def identify(name, held, learn_nu, make_optimizer, iterations, folder, start=(2e
     with torch.no_grad():
         target = simulator(LogMaterial(TRUE_E, TRUE_NU)).rollout(20, save_every=1)
     material = LogMaterial(*start, learn_nu=learn_nu)
-    moving, size = simulator(material), (target.displacements - target.displacements.mean(1, keepdim=True)).square().mean()
+    moving, size = (
+        simulator(material),
+        (target.displacements - target.displacements.mean(1, keepdim=True)).square().mean(),
+    )
 
     end = mesh.vertices + target.displacements[-1].numpy()
-    picture = OptimizationPicture(mesh, end, folder and Path(folder) / f"identify_{name}.png", 5.0 if folder else None,
-                                  truth={"E [Pa]": TRUE_E} | ({"nu": TRUE_NU} if learn_nu else {}))  # fmt: skip
+    picture = OptimizationPicture(
+        mesh,
+        end,
+        folder and Path(folder) / f"identify_{name}.png",
+        5.0 if folder else None,
+        truth={"E [Pa]": TRUE_E} | ({"nu": TRUE_NU} if learn_nu else {}),
+    )
     seen = {}
 
     def loss():
@@ -68,12 +78,21 @@ def identify(name, held, learn_nu, make_optimizer, iterations, folder, start=(2e
     def note(value):
         picture.add(value, {"E [Pa]": seen["E"]} | ({"nu": seen["nu"]} if learn_nu else {}), mesh.vertices + seen["u"])
 
-    optimization = Optimization(material, make_optimizer([p for p in material.parameters() if p.requires_grad]), mesh,
-                                folder and Path(folder) / f"identify_{name}.state")  # fmt: skip
+    optimization = Optimization(
+        material,
+        make_optimizer([p for p in material.parameters() if p.requires_grad]),
+        mesh,
+        folder and Path(folder) / f"identify_{name}.state",
+    )
     optimization.run(loss, iterations, note)
     optimization.restore_best()
-    result = dict(E=material.E.item(), E_error=abs(material.E.item() / TRUE_E - 1), loss=optimization.best_loss,
-                  iterations=iterations, seconds=optimization.seconds)  # fmt: skip
+    result = dict(
+        E=material.E.item(),
+        E_error=abs(material.E.item() / TRUE_E - 1),
+        loss=optimization.best_loss,
+        iterations=iterations,
+        seconds=optimization.seconds,
+    )
     if learn_nu:
         result |= dict(nu=material.nu.item(), nu_error=abs(material.nu.item() / TRUE_NU - 1))
     print(f"{name}: " + ", ".join(f"{key} {value:.5g}" for key, value in result.items()))

@@ -50,9 +50,18 @@ def main(picture_folder: str | None = None) -> dict:
         places = np.concatenate([settled + ends[0] + apart, settled + ends[1] - apart])
         slid = np.linalg.norm(np.concatenate(ends), axis=1)
         slope = square(settled.mean(0) - [0.12, 0.118, 0], (-SLOPE, 1, 0), 0.24)
-        save_picture(Path(picture_folder) / "incline.png", ds.TetrahedralMesh.joined([scene.mesh] * 2), places, slid,
-                     "slid by [m]", obstacles=[slope], wireframe=True, azimuth=-12, elevation=22,
-                     title="friction 0.49 slides, 0.50 holds, on tan = 1/2")  # fmt: skip
+        save_picture(
+            Path(picture_folder) / "incline.png",
+            ds.TetrahedralMesh.joined([scene.mesh] * 2),
+            places,
+            slid,
+            "slid by [m]",
+            obstacles=[slope],
+            wireframe=True,
+            azimuth=-12,
+            elevation=22,
+            title="friction 0.49 slides, 0.50 holds, on tan = 1/2",
+        )
     seconds = time.perf_counter() - start
     off = moved[0.49] / exact - 1
     print(f"Coulomb's law: {exact:.5f} m ({off:+.2%}) and 0 ({moved[0.50]:.1e} m of creep); {seconds:.1f} s")

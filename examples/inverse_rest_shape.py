@@ -27,9 +27,13 @@ def main(picture_folder: str | None = None) -> dict:
     """Returns the residual before and after [m], their ratio, how far the tip is cast upwards [m], iterations, seconds."""
     bar = ds.TetrahedralMesh.create_box((7, 3, 3), size=(0.6, 0.2, 0.2), pattern="five")
     scene = ds.Scene(
-        bar, ds.StableNeoHookean(3e5, 0.3), density=1000.0, terms=[ds.Gravity(), ds.Drag(20.0)], fixed="xmin",
+        bar,
+        ds.StableNeoHookean(3e5, 0.3),
+        density=1000.0,
+        terms=[ds.Gravity(), ds.Drag(20.0)],
+        fixed="xmin",
         precision="f64",
-    )  # fmt: skip
+    )
     rollout = ds.Rollout(ds.SemiImplicitSolver(scene, dt=DT), STEPS, gradients=["rest_positions"])
     free = np.setdiff1d(np.arange(bar.num_vertices), scene.fixed)
     rest = bar.vertices.copy()
@@ -62,14 +66,25 @@ def main(picture_folder: str | None = None) -> dict:
 
     before, after, ratio = history[0], history[-1], history[0] / history[-1]
     lift = float((rest - bar.vertices)[bar.vertex_sets["xmax"], 1].mean())
-    print(f"sag {1e3 * before:.3g} mm; with the new rest shape {1e3 * after:.2g} mm ({ratio:.0f} times less), whose tip "
-          f"is cast {1e3 * lift:.3g} mm higher; {iteration} iterations, {seconds:.1f} s")  # fmt: skip
+    print(
+        f"sag {1e3 * before:.3g} mm; with the new rest shape {1e3 * after:.2g} mm ({ratio:.0f} times less), whose tip "
+        f"is cast {1e3 * lift:.3g} mm higher; {iteration} iterations, {seconds:.1f} s"
+    )
     if picture_folder:
         higher, hangs = 1e3 * (rest - bar.vertices)[:, 1], frames.positions[-1] - [0, 0, 0.35]
         both = ds.TetrahedralMesh.joined([bar, bar])
-        save_picture(Path(picture_folder) / "inverse_rest_shape.png", both, np.concatenate([rest, hangs]),
-                     np.concatenate([higher, 0 * higher]), "cast higher [mm]", wireframe=True, azimuth=-35, elevation=18,
-                     title="cast like the one in front, it sags straight", fixed=both.vertices[:, 0] < 1e-9)  # fmt: skip
+        save_picture(
+            Path(picture_folder) / "inverse_rest_shape.png",
+            both,
+            np.concatenate([rest, hangs]),
+            np.concatenate([higher, 0 * higher]),
+            "cast higher [mm]",
+            wireframe=True,
+            azimuth=-35,
+            elevation=18,
+            title="cast like the one in front, it sags straight",
+            fixed=both.vertices[:, 0] < 1e-9,
+        )
     return {"before": before, "after": after, "ratio": ratio, "lift": lift, "iterations": iteration, "seconds": seconds}
 
 

@@ -27,10 +27,12 @@ class NetworkMaterial(TorchMaterial):
         low, high = mesh.bounding_box
         self.register_buffer("at", torch.from_numpy(2 * (mesh.centroids - low) / (high - low) - 1))
         self.network = torch.nn.Sequential(
-            torch.nn.Linear(3, width), torch.nn.Tanh(),
-            torch.nn.Linear(width, width), torch.nn.Tanh(),
+            torch.nn.Linear(3, width),
+            torch.nn.Tanh(),
+            torch.nn.Linear(width, width),
+            torch.nn.Tanh(),
             torch.nn.Linear(width, 1),
-        ).double()  # fmt: skip
+        ).double()
         self.nu = torch.tensor(0.3, dtype=torch.float64)
 
     @property
@@ -77,14 +79,28 @@ def main(folder="output", iterations: int = 30, seed: int = 0) -> dict:
     with torch.no_grad():
         error = (material.E.log() - truth).abs()
         after = math.sqrt(relative(motion(ours, thrown), unseen).item())
-    result = dict(median_error=error.median().item(), unseen_motion_error=after, unseen_motion_error_before=before,
-                  loss=optimization.best_loss, iterations=iterations, seconds=optimization.seconds)  # fmt: skip
-    print(f"learned material on {mesh.num_tetrahedra} tetrahedra: " + ", ".join(f"{k} {v:.4g}" for k, v in result.items()))
+    result = dict(
+        median_error=error.median().item(),
+        unseen_motion_error=after,
+        unseen_motion_error_before=before,
+        loss=optimization.best_loss,
+        iterations=iterations,
+        seconds=optimization.seconds,
+    )
+    print(
+        f"learned material on {mesh.num_tetrahedra} tetrahedra: " + ", ".join(f"{k} {v:.4g}" for k, v in result.items())
+    )
     if folder:
         Path(folder).mkdir(exist_ok=True)
         bent, E = mesh.vertices + unseen[-1].numpy(), material.E.detach().numpy()
-        save_picture(Path(folder) / "learned_material.png", mesh, bent, E, "Young's modulus [Pa]",
-                     title="stiffness from a network, in a motion it has not seen")  # fmt: skip
+        save_picture(
+            Path(folder) / "learned_material.png",
+            mesh,
+            bent,
+            E,
+            "Young's modulus [Pa]",
+            title="stiffness from a network, in a motion it has not seen",
+        )
     return result
 
 

@@ -50,7 +50,9 @@ class Panel:
         loaded = mesh.vertices_where(lambda X: (X[:, 0] > SIZE[0] - 1e-9) & (np.abs(X[:, 1] - SIZE[1] / 2) < 0.06))
         self.load = np.zeros((2, mesh.num_vertices, 3))
         self.load[1, loaded, 1] = -FORCE / len(loaded)
-        scene = ds.Scene(mesh, ds.LinearElastic(E0, 0.3), 1.0, [ds.ExternalForce(self.load[1])], "xmin", precision="f64")
+        scene = ds.Scene(
+            mesh, ds.LinearElastic(E0, 0.3), 1.0, [ds.ExternalForce(self.load[1])], "xmin", precision="f64"
+        )
         self.rollout = ds.Rollout(ds.StaticSolver(scene, tolerance=tolerance), 1, gradients=["youngs_modulus"])
 
     def compliance(self, E: np.ndarray) -> tuple[float, np.ndarray]:
@@ -77,19 +79,39 @@ def main(folder="output", quick: bool = False) -> dict:
             design = optimality_step(design, by_x, average.T @ volumes)
     seconds = time.perf_counter() - start
     clear = float(volumes[(x < 0.1) | (x > 0.9)].sum())
-    out = {"even": history[0], "thinner": thinner, "best": c, "by_even": history[0] / c, "by_thinner": thinner / c,
-           "clear": clear, "volume": float(volumes @ x), "history": history, "seconds": seconds}  # fmt: skip
-    print(f"compliance {1e3 * c:.4g} mJ after {iterations} steps, {out['by_even']:.3g} times less than with x = {SHARE} "
-          f"everywhere and {out['by_thinner']:.3g} times less than of an even panel of that share of the thickness; volume "
-          f"{out['volume']:.3f}, {100 * clear:.0f} % all or nothing; "
-          f"{mesh.num_tetrahedra} tetrahedra, {seconds:.1f} s")  # fmt: skip
+    out = {
+        "even": history[0],
+        "thinner": thinner,
+        "best": c,
+        "by_even": history[0] / c,
+        "by_thinner": thinner / c,
+        "clear": clear,
+        "volume": float(volumes @ x),
+        "history": history,
+        "seconds": seconds,
+    }
+    print(
+        f"compliance {1e3 * c:.4g} mJ after {iterations} steps, {out['by_even']:.3g} times less than with x = {SHARE} "
+        f"everywhere and {out['by_thinner']:.3g} times less than of an even panel of that share of the thickness; volume "
+        f"{out['volume']:.3f}, {100 * clear:.0f} % all or nothing; "
+        f"{mesh.num_tetrahedra} tetrahedra, {seconds:.1f} s"
+    )
     if folder:
         Path(folder).mkdir(exist_ok=True)
         corners, kept = np.unique(mesh.tetrahedra[x > 0.5], return_inverse=True)
         kept = ds.TetrahedralMesh(mesh.vertices[corners], kept.reshape(-1, 4))
-        save_picture(Path(folder) / "least_compliance.png", kept, kept.vertices, x[x > 0.5], "density", limits=(0.5, 1.0),
-                     title="the stiffest bracket, held on the left", azimuth=20, elevation=12,
-                     fixed=kept.vertices[:, 0] < 1e-9)  # fmt: skip
+        save_picture(
+            Path(folder) / "least_compliance.png",
+            kept,
+            kept.vertices,
+            x[x > 0.5],
+            "density",
+            limits=(0.5, 1.0),
+            title="the stiffest bracket, held on the left",
+            azimuth=20,
+            elevation=12,
+            fixed=kept.vertices[:, 0] < 1e-9,
+        )
     return out
 
 

@@ -44,8 +44,12 @@ def profile(resolution: int) -> dict:
     profiled = time.perf_counter() - begin
     inside = sum(t for _, t in kernels.values())
     outside = max(0.0, profiled - inside) / profiled
-    return dict(tetrahedra=rollout.scene.mesh.num_tetrahedra, seconds=seconds, outside=outside,
-                kernels={name: (calls, t / profiled) for name, (calls, t) in kernels.items()})  # fmt: skip
+    return dict(
+        tetrahedra=rollout.scene.mesh.num_tetrahedra,
+        seconds=seconds,
+        outside=outside,
+        kernels={name: (calls, t / profiled) for name, (calls, t) in kernels.items()},
+    )
 
 
 def bounds(program: str) -> dict[int, float]:
@@ -95,9 +99,11 @@ def table(rows: list[dict], programs: list[str]) -> str:
     return "\n".join(lines)
 
 
-PARTS = {"part 0 serial": "all substeps in one serial kernel",
-         "part 1 range_for": "forces of tetrahedra, a launch per substep",
-         "part 3 range_for": "gathering and moving vertices, a launch per substep"}  # fmt: skip
+PARTS = {
+    "part 0 serial": "all substeps in one serial kernel",
+    "part 1 range_for": "forces of tetrahedra, a launch per substep",
+    "part 3 range_for": "gathering and moving vertices, a launch per substep",
+}
 
 
 def main(sizes=(6, 11, 21, 44), programs=()) -> list[dict]:

@@ -84,18 +84,36 @@ def main(folder="output", quick: bool = False) -> dict:
         iterations += 1
     after, seconds = canopy.rms(off), time.perf_counter() - start
     lift = float((rest - canopy.wanted)[canopy.mesh.vertex_sets["xmax"], 1].mean())
-    print(f"{3 * len(canopy.free)} unknowns: {1e3 * before:.3g} mm off when cast flat, {1e3 * after:.2g} mm "
-          f"with the edge cast {1e3 * lift:.3g} mm higher ({before / after:.0f} times less); "
-          f"{iterations} iterations, {seconds:.1f} s")  # fmt: skip
+    print(
+        f"{3 * len(canopy.free)} unknowns: {1e3 * before:.3g} mm off when cast flat, {1e3 * after:.2g} mm "
+        f"with the edge cast {1e3 * lift:.3g} mm higher ({before / after:.0f} times less); "
+        f"{iterations} iterations, {seconds:.1f} s"
+    )
     if folder:
         Path(folder).mkdir(exist_ok=True)
         higher, below = rest[:, 1] - canopy.wanted[:, 1], frames.positions[-1] - [0, 0.35, 0]
         both = ds.TetrahedralMesh.joined([canopy.mesh, canopy.mesh])
-        save_picture(Path(folder) / "sag_into_shape.png", both, np.concatenate([rest, below]),
-                     np.concatenate([higher, 0 * higher]), "cast higher by [m]", azimuth=-25, elevation=18, wireframe=True,
-                     title="cast as above, it sags flat as below", fixed=both.vertices[:, 0] < 1e-9)  # fmt: skip
-    return {"before": before, "after": after, "ratio": before / after, "lift": lift, "iterations": iterations,
-            "rest": rest, "seconds": seconds}  # fmt: skip
+        save_picture(
+            Path(folder) / "sag_into_shape.png",
+            both,
+            np.concatenate([rest, below]),
+            np.concatenate([higher, 0 * higher]),
+            "cast higher by [m]",
+            azimuth=-25,
+            elevation=18,
+            wireframe=True,
+            title="cast as above, it sags flat as below",
+            fixed=both.vertices[:, 0] < 1e-9,
+        )
+    return {
+        "before": before,
+        "after": after,
+        "ratio": before / after,
+        "lift": lift,
+        "iterations": iterations,
+        "rest": rest,
+        "seconds": seconds,
+    }
 
 
 if __name__ == "__main__":

@@ -31,11 +31,13 @@ def simulators(resolution: int) -> dict:
         diffsim.TetrahedralMesh(mesh.vertices.copy(), mesh.tetrahedra.copy()),
         diffsim.DifferentiableMaterial(1e5, 0.4),
         diffsim.DifferentiableSolver(dt=DT, gravity=-9.8, damping=1.0, substeps=SUBSTEPS),
-    )  # fmt: skip
+    )
     ours = diff_simulator.DifferentiableSimulator(
-        mesh, diff_physics.DifferentiableMaterial(1e5, 0.4, law=diffsim_ti.SmithNeoHookean),
-        diff_simulator.DifferentiableSolver(dt=DT, gravity=-9.8, damping=1.0, substeps=SUBSTEPS), contact=False,
-    )  # fmt: skip
+        mesh,
+        diff_physics.DifferentiableMaterial(1e5, 0.4, law=diffsim_ti.SmithNeoHookean),
+        diff_simulator.DifferentiableSolver(dt=DT, gravity=-9.8, damping=1.0, substeps=SUBSTEPS),
+        contact=False,
+    )
     assert ours._substeps == SUBSTEPS, "the step must be stable as it is"
 
     def reset_theirs():
@@ -57,8 +59,12 @@ def measure(simulator, reset, repeats: int = 3) -> dict:
         (simulator.positions[:, 0] ** 2).mean().backward()
         forward.append(1e3 * (middle - begin) / STEPS)
         backward.append(1e3 * (time.perf_counter() - middle) / STEPS)
-    return dict(positions=simulator.positions.detach(), gradient=simulator.material.E.grad.item(),
-                step_ms=min(forward[1:]), backward_ms=min(backward[1:]))  # fmt: skip
+    return dict(
+        positions=simulator.positions.detach(),
+        gradient=simulator.material.E.grad.item(),
+        step_ms=min(forward[1:]),
+        backward_ms=min(backward[1:]),
+    )
 
 
 def implicit(sizes=(2, 3, 4, 5), steps: int = 2) -> list[tuple]:
@@ -82,7 +88,10 @@ def implicit(sizes=(2, 3, 4, 5), steps: int = 2) -> list[tuple]:
             if torch.is_tensor(value) and value.is_floating_point():
                 setattr(body, name, value.double())
         solver = IPCImplicitEulerSolver(dt=dt, dhat=1e-3, newton_tolerance=tolerance)
-        law, masses = diffsim.DifferentiableMaterial(E, nu), torch.as_tensor(scene.inputs.derive(scene.inputs.values).mass)
+        law, masses = (
+            diffsim.DifferentiableMaterial(E, nu),
+            torch.as_tensor(scene.inputs.derive(scene.inputs.values).mass),
+        )
         state = torch.as_tensor(mesh.vertices.copy()), torch.zeros(mesh.vertices.shape, dtype=torch.float64)
         seconds = []
         for _ in range(steps + 1):  # the first one compiles and sets up
@@ -104,10 +113,16 @@ def main(sizes=(4, 6, 8)) -> list[dict]:
         results = {who: measure(*both) for who, both in simulators(resolution).items()}
         theirs, ours = results["torch-diffsim"], results["diffsim_ti"]
         moved = (ours["positions"] - theirs["positions"]).abs().max().item()
-        row = dict(tetrahedra=6 * (resolution - 1) ** 3, largest_difference_m=moved,
-                   gradient_difference=abs(ours["gradient"] / theirs["gradient"] - 1))  # fmt: skip
+        row = dict(
+            tetrahedra=6 * (resolution - 1) ** 3,
+            largest_difference_m=moved,
+            gradient_difference=abs(ours["gradient"] / theirs["gradient"] - 1),
+        )
         for who, result in results.items():
-            row |= {f"{who} step_ms": round(result["step_ms"], 3), f"{who} backward_ms": round(result["backward_ms"], 3)}
+            row |= {
+                f"{who} step_ms": round(result["step_ms"], 3),
+                f"{who} backward_ms": round(result["backward_ms"], 3),
+            }
         print(json.dumps(row), flush=True)
         rows.append(row)
     print(table(rows))
@@ -116,8 +131,10 @@ def main(sizes=(4, 6, 8)) -> list[dict]:
 
 def table(rows: list[dict]) -> str:
     """Times of step() and of its share of backward() [ms] as Markdown, with how many times faster diffsim_ti is."""
-    lines = ["| tetrahedra | step(): torch-diffsim | diffsim_ti | ratio | backward(): torch-diffsim | diffsim_ti | ratio |",
-             "|---:|---:|---:|---:|---:|---:|---:|"]  # fmt: skip
+    lines = [
+        "| tetrahedra | step(): torch-diffsim | diffsim_ti | ratio | backward(): torch-diffsim | diffsim_ti | ratio |",
+        "|---:|---:|---:|---:|---:|---:|---:|",
+    ]
     for row in rows:
         cells = [str(row["tetrahedra"])]
         for what in ("step_ms", "backward_ms"):
@@ -135,7 +152,11 @@ if __name__ == "__main__":
     warnings.simplefilter("ignore", DeprecationWarning)
     if options.implicit:
         diffsim_ti.init(precision="f64")
-        print("| vertices | tetrahedra | torch-diffsim [s] | diffsim_ti [s] | ratio | differ by [m] |\n" + "|---:" * 6 + "|")
+        print(
+            "| vertices | tetrahedra | torch-diffsim [s] | diffsim_ti [s] | ratio | differ by [m] |\n"
+            + "|---:" * 6
+            + "|"
+        )
         implicit(options.sizes or (2, 3, 4, 5))
     else:
         main(options.sizes or (4, 6, 8))

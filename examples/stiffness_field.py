@@ -65,14 +65,28 @@ def main(folder="output", iterations: int = 25, cells=(8, 3, 3), weight: float =
     optimization.restore_best()
     error = (material.log_E.detach() - truth).abs()
     found = (material.log_E.detach() > 0.5 * np.log(SOFT * STIFF)).numpy()
-    result = dict(median_error=error.median().item(), worst_tenth=error.quantile(0.9).item(),
-                  classified=float((found == stiff).mean()), start_error=(start - truth).abs().median().item(),
-                  loss=optimization.best_loss, iterations=iterations, seconds=optimization.seconds)  # fmt: skip
-    print(f"stiffness field of {mesh.num_tetrahedra} tetrahedra: " + ", ".join(f"{k} {v:.4g}" for k, v in result.items()))
+    result = dict(
+        median_error=error.median().item(),
+        worst_tenth=error.quantile(0.9).item(),
+        classified=float((found == stiff).mean()),
+        start_error=(start - truth).abs().median().item(),
+        loss=optimization.best_loss,
+        iterations=iterations,
+        seconds=optimization.seconds,
+    )
+    print(
+        f"stiffness field of {mesh.num_tetrahedra} tetrahedra: " + ", ".join(f"{k} {v:.4g}" for k, v in result.items())
+    )
     if folder:
         Path(folder).mkdir(exist_ok=True)
-        save_picture(Path(folder) / "stiffness_field.png", mesh, mesh.vertices, material.E.detach().numpy(),
-                     "Young's modulus [Pa]", title="recovered from noisy displacements")  # fmt: skip
+        save_picture(
+            Path(folder) / "stiffness_field.png",
+            mesh,
+            mesh.vertices,
+            material.E.detach().numpy(),
+            "Young's modulus [Pa]",
+            title="recovered from noisy displacements",
+        )
     return result
 
 

@@ -69,10 +69,18 @@ def main(quick: bool = False, picture_folder: str | None = None) -> dict:
     error = np.abs(E / list(PARTS.values()) - 1)
     for k, name in enumerate(PARTS):
         print(f"{name}: E = {E[k]:.4g} Pa, {100 * error[k]:.2g} % off (expected spread {100 * spread[k]:.2g} %)")
-    print(f"from {GUESS:.3g} Pa in {found.nit} iterations ({found.nfev} gradients), {seconds:.1f} s; "
-          f"residual {np.sqrt(found.fun):.3g} mm")  # fmt: skip
-    return {"E": dict(zip(PARTS, E)), "error": error.max(), "spread": spread.max(), "evaluations": found.nfev,
-            "residual_mm": np.sqrt(found.fun), "seconds": seconds}  # fmt: skip
+    print(
+        f"from {GUESS:.3g} Pa in {found.nit} iterations ({found.nfev} gradients), {seconds:.1f} s; "
+        f"residual {np.sqrt(found.fun):.3g} mm"
+    )
+    return {
+        "E": dict(zip(PARTS, E)),
+        "error": error.max(),
+        "spread": spread.max(),
+        "evaluations": found.nfev,
+        "residual_mm": np.sqrt(found.fun),
+        "seconds": seconds,
+    }
 
 
 if __name__ == "__main__":

@@ -42,7 +42,9 @@ def measure(centre: ti.template(), target: ti.types.vector(3, ti.f64), loss: ti.
 def main(picture_folder: str | None = None) -> dict:
     """Returns the miss [m], the velocity [m/s], how often the run was differentiated, and the seconds it took."""
     mesh = ds.TetrahedralMesh.create_box(4, size=0.3, origin=(-0.15, -0.15, -0.15))
-    scene = ds.Scene(mesh, ds.SmithNeoHookean(2e4, 0.4), density=200.0, terms=[ds.Gravity(), ds.Drag(0.6)], precision="f64")
+    scene = ds.Scene(
+        mesh, ds.SmithNeoHookean(2e4, 0.4), density=200.0, terms=[ds.Gravity(), ds.Drag(0.6)], precision="f64"
+    )
     rollout = ds.Rollout(ds.SemiImplicitSolver(scene, dt=DT), round(DURATION / DT))
 
     velocity, centre = (ti.Vector.field(3, ti.f64, (), needs_grad=True) for _ in range(2))

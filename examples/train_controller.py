@@ -79,9 +79,22 @@ def save_reaches(path, arm: Arm, controller, targets) -> None:
             pull[arm.tendons.numpy()] = STRONGEST * activation[:, None]
             pulls.append(pull)
             marks.append([ball((target[0], 1.06 * HEIGHT, target[1]), 0.012)])
-    save_film(path, arm.mesh, places, pulls, 8.0, (400, 300), obstacles=marks, ground=0.0, label="tension [N]",
-              box=[[-0.13, 0.0, -0.13], [0.13, 0.56, 0.13]], elevation=25, wireframe=True, fixed="ymin",
-              title=lambda k: f"targets it was not trained on, t = {0.04 * (k % (STEPS // 2 + 1)):.2f} s")  # fmt: skip
+    save_film(
+        path,
+        arm.mesh,
+        places,
+        pulls,
+        8.0,
+        (400, 300),
+        obstacles=marks,
+        ground=0.0,
+        label="tension [N]",
+        box=[[-0.13, 0.0, -0.13], [0.13, 0.56, 0.13]],
+        elevation=25,
+        wireframe=True,
+        fixed="ymin",
+        title=lambda k: f"targets it was not trained on, t = {0.04 * (k % (STEPS // 2 + 1)):.2f} s",
+    )
 
 
 def main(folder="output", iterations: int = 60, seed: int = 0) -> dict:
@@ -103,8 +116,13 @@ def main(folder="output", iterations: int = 60, seed: int = 0) -> dict:
         return 10 * distance + 0.01 * effort
 
     optimization.run(loss, iterations)
-    result = dict(miss_seen=miss(SEEN), miss_unseen=miss(UNSEEN), miss_before=before, iterations=iterations,
-                  seconds=optimization.seconds)  # fmt: skip
+    result = dict(
+        miss_seen=miss(SEEN),
+        miss_unseen=miss(UNSEEN),
+        miss_before=before,
+        iterations=iterations,
+        seconds=optimization.seconds,
+    )
     print("controller, distances of the tip [m]: " + ", ".join(f"{key} {value:.4g}" for key, value in result.items()))
     if folder:
         Path(folder).mkdir(exist_ok=True)

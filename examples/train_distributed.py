@@ -92,27 +92,44 @@ def main(folder="output", iterations: int = 80) -> dict:
             parameter.grad = share
         optimizer.step()
         if path and rank == 0 and ((iteration + 1) % 10 == 0 or iteration + 1 == iterations):
-            save_state(path, ensemble.mesh, dict(
-                iteration=iteration + 1, seconds=seconds + time.perf_counter() - start, difference=difference,
-                module=material.state_dict(), optimizer=optimizer.state_dict(),
-            ))  # fmt: skip
+            save_state(
+                path,
+                ensemble.mesh,
+                dict(
+                    iteration=iteration + 1,
+                    seconds=seconds + time.perf_counter() - start,
+                    difference=difference,
+                    module=material.state_dict(),
+                    optimizer=optimizer.state_dict(),
+                ),
+            )
     every = [torch.zeros(2, dtype=torch.float64) for _ in range(world)]
     dist.all_gather(every, torch.stack([p.detach() for p in parameters]))
     result = dict(
-        processes=world, difference_from_serial=difference, ranks_agree=all(torch.equal(every[0], x) for x in every),
-        E=material.E.item(), nu=material.nu.item(), E_error=abs(material.E.item() / TRUE_E - 1),
+        processes=world,
+        difference_from_serial=difference,
+        ranks_agree=all(torch.equal(every[0], x) for x in every),
+        E=material.E.item(),
+        nu=material.nu.item(),
+        E_error=abs(material.E.item() / TRUE_E - 1),
         nu_error=abs(material.nu.item() / TRUE_NU - 1),
-        iterations=iterations, seconds=seconds + time.perf_counter() - start,
-    )  # fmt: skip
+        iterations=iterations,
+        seconds=seconds + time.perf_counter() - start,
+    )
     dist.destroy_process_group()
     if rank == 0:
         print(json.dumps(result))
         if folder:
             with torch.no_grad():
                 u = ensemble.motion(ensemble.ours, 0)[-1]
-            save_picture(Path(folder) / "train_distributed.png", ensemble.mesh, ensemble.mesh.vertices + u.numpy(),
-                         u.norm(dim=1).numpy(), "displacement [m]",
-                         title=f"E = {result['E']:.4g} Pa, nu = {result['nu']:.3f}")  # fmt: skip
+            save_picture(
+                Path(folder) / "train_distributed.png",
+                ensemble.mesh,
+                ensemble.mesh.vertices + u.numpy(),
+                u.norm(dim=1).numpy(),
+                "displacement [m]",
+                title=f"E = {result['E']:.4g} Pa, nu = {result['nu']:.3f}",
+            )
     return result
 
 

@@ -62,17 +62,37 @@ def main(picture_folder: str | None = None) -> dict:
     back = float(share @ frames.velocities[-1, :, 0])
     seen = frames.contact_resolution
     if picture_folder:
-        way = ds.Rollout(ds.VelocityVerletSolver(scene, dt=DT), round(DURATION / DT), save_every=300).forward(
-            initial_velocities=np.tile(v, (mesh.num_vertices, 1))).positions  # fmt: skip
+        way = (
+            ds.Rollout(ds.VelocityVerletSolver(scene, dt=DT), round(DURATION / DT), save_every=300)
+            .forward(initial_velocities=np.tile(v, (mesh.num_vertices, 1)))
+            .positions
+        )
         many = ds.TetrahedralMesh.joined([mesh] * len(way))
         slab = box((WALL + 0.01, 0.5, 0.15), (0.02, 1.2, 0.8), (1, 0, 0, 0))
         times = np.repeat(np.arange(len(way)) * DURATION / (len(way) - 1), mesh.num_vertices)
-        save_picture(Path(picture_folder) / "wall_shot.png", many, way.reshape(-1, 3), times, "time [s]",
-                     obstacles=[slab], azimuth=-30, title="thrown off a rough wall at a target")  # fmt: skip
-    print(f"throw with {v.round(4)} m/s: off by {miss:.1e} m after {iteration} iterations, {seconds:.1f} s; it comes back "
-          f"at {back:.3g} m/s; {seen}")  # fmt: skip
-    return {"miss": miss, "velocity": v, "back": back, "resolved": seen.resolved, "gap": seen.smallest_gap,
-            "iterations": iteration, "seconds": seconds}  # fmt: skip
+        save_picture(
+            Path(picture_folder) / "wall_shot.png",
+            many,
+            way.reshape(-1, 3),
+            times,
+            "time [s]",
+            obstacles=[slab],
+            azimuth=-30,
+            title="thrown off a rough wall at a target",
+        )
+    print(
+        f"throw with {v.round(4)} m/s: off by {miss:.1e} m after {iteration} iterations, {seconds:.1f} s; it comes back "
+        f"at {back:.3g} m/s; {seen}"
+    )
+    return {
+        "miss": miss,
+        "velocity": v,
+        "back": back,
+        "resolved": seen.resolved,
+        "gap": seen.smallest_gap,
+        "iterations": iteration,
+        "seconds": seconds,
+    }
 
 
 if __name__ == "__main__":

@@ -10,8 +10,8 @@ from test_gradients import by_solver, full_scene, rollout_of
 
 import diffsim_ti as ds
 from diffsim_ti import runtime
-from diffsim_ti.checkpoints import Schedule, choose_schedule
-from diffsim_ti.solvers.explicit import ExplicitWorkspace
+from diffsim_ti.rollout.checkpoints import Schedule, choose_schedule
+from diffsim_ti.solvers.explicit.solver import ExplicitWorkspace
 
 STEPS = 24
 rng = np.random.default_rng(4)
@@ -114,7 +114,9 @@ def test_memory_falls_as_the_theory_says():
     n = 2000
     whole, root = choose_schedule(n, 100, None, 1.0), choose_schedule(n, 100, None, 0.1)
     assert whole.states() == 2 + 3 * (n + 1)
-    assert root.snapshots == root.num_segments and root.states() <= 2 * math.sqrt(6 * n) + 8  # 2 n / s + 3 s at its least
+    assert (
+        root.snapshots == root.num_segments and root.states() <= 2 * math.sqrt(6 * n) + 8
+    )  # 2 n / s + 3 s at its least
     for states in (20, 50, 100):
         assert choose_schedule(n, 100, None, states * 1e-4).states() <= states
 
@@ -237,7 +239,7 @@ def test_backward_after_an_exception(options):
 @by_options
 def test_an_interrupted_sweep(monkeypatch, options):
     """Ctrl-C in the middle of a sweep leaves nothing behind."""
-    from diffsim_ti.solvers.explicit_adjoint import ExplicitAdjoint
+    from diffsim_ti.solvers.explicit.adjoint import ExplicitAdjoint
 
     r = rollout(**options)
     frames, calls, reverse = r.forward(), [], ExplicitAdjoint.reverse

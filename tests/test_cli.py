@@ -7,13 +7,15 @@ import meshio
 import numpy as np
 import pytest
 
-from diffsim_ti import cli, forward, picture, series
+from diffsim_ti import adaptive_run as forward
+from diffsim_ti import cli, picture
 from diffsim_ti.materials import StableNeoHookean
 from diffsim_ti.mesh import TetrahedralMesh
-from diffsim_ti.observe import TetrahedronFields
 from diffsim_ti.scene import Scene
 from diffsim_ti.solvers import SemiImplicitSolver, VelocityVerletSolver
+from diffsim_ti.state.observe import TetrahedronFields
 from diffsim_ti.terms import Gravity
+from diffsim_ti.visual import series
 
 
 def command(*arguments):
@@ -151,8 +153,26 @@ def test_given_dt_is_used_as_it_is(cube):
 
 
 def test_simulate_free_fall(cube_file, tmp_path):
-    done = command("simulate", cube_file, "-o", tmp_path, "--duration", 0.2, "--fps", 20, "--height", 1,
-                   "--precision", "f64", "--velocity", 1, 0, 0, "--size", 0.5)  # fmt: skip
+    done = command(
+        "simulate",
+        cube_file,
+        "-o",
+        tmp_path,
+        "--duration",
+        0.2,
+        "--fps",
+        20,
+        "--height",
+        1,
+        "--precision",
+        "f64",
+        "--velocity",
+        1,
+        0,
+        0,
+        "--size",
+        0.5,
+    )
     assert done.returncode == 0, done.stderr
     frames = series.frames_of(tmp_path / "cube.pvd")
     assert len(frames) == 5
@@ -269,8 +289,10 @@ def test_moved_body_moves_in_the_picture(cube):
 
 
 def test_nearer_triangles_hide_farther_ones(cube):
-    two = TetrahedralMesh(np.vstack([cube.vertices, cube.vertices + [0, 0, -0.3]]),
-                          np.vstack([cube.tetrahedra, cube.tetrahedra + cube.num_vertices]))  # fmt: skip
+    two = TetrahedralMesh(
+        np.vstack([cube.vertices, cube.vertices + [0, 0, -0.3]]),
+        np.vstack([cube.tetrahedra, cube.tetrahedra + cube.num_vertices]),
+    )
     value = np.repeat([0.0, 1.0], cube.num_vertices)
     view = VIEW | dict(azimuth=0.0, elevation=0.0)
     image = picture.draw(two, two.vertices, value, **view)
@@ -286,7 +308,9 @@ def test_colours_span_the_limits(cube, tmp_path):
     inside = body_pixels(picture.draw(cube, cube.vertices, **view))
     rows = np.nonzero(inside.sum(1) > 10)[0]
     top, bottom = image[rows[2]][inside[rows[2]]].mean(0), image[rows[-3]][inside[rows[-3]]].mean(0)
-    assert top[1] > top[2] + 0.3 and top[0] > 0.5 and bottom[2] > bottom[1] + 0.1  # viridis: yellow at the top, violet below
+    assert (
+        top[1] > top[2] + 0.3 and top[0] > 0.5 and bottom[2] > bottom[1] + 0.1
+    )  # viridis: yellow at the top, violet below
     per_tetrahedron = picture.to_vertices(cube, np.full(cube.num_tetrahedra, 7.0))
     assert per_tetrahedron == pytest.approx(7)
     with pytest.raises(ValueError, match="per tetrahedron"):
@@ -295,7 +319,9 @@ def test_colours_span_the_limits(cube, tmp_path):
 
 def test_floor_grid_and_shadow(cube):
     view = VIEW | dict(elevation=20.0)
-    without, empty = (picture.draw(cube, cube.vertices + [0, h, 0], ground=g, **view) for h, g in ((0.1, None), (0.1, 0.0)))
+    without, empty = (
+        picture.draw(cube, cube.vertices + [0, h, 0], ground=g, **view) for h, g in ((0.1, None), (0.1, 0.0))
+    )
     body = body_pixels(without)
     difference = np.abs(without - empty).max(-1)
     assert difference[~body].max() > 0.2  # the shadow
@@ -306,7 +332,9 @@ def test_saved_picture(cube, tmp_path):
     from matplotlib.image import imread
 
     values = np.arange(cube.num_tetrahedra)
-    picture.save_picture(tmp_path / "a.png", cube, cube.vertices, values, "stress [Pa]", 0.0, "t = 0 s", size=(320, 240))
+    picture.save_picture(
+        tmp_path / "a.png", cube, cube.vertices, values, "stress [Pa]", 0.0, "t = 0 s", size=(320, 240)
+    )
     image = imread(tmp_path / "a.png")
     assert image.shape[:2] == (240, 320) and image[..., :3].std() > 0.02
     with pytest.raises(ValueError, match="finite"):

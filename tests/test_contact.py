@@ -7,7 +7,7 @@ from contact_scenes import BASE, SHAPES, G, points, resting_gap, tetrahedron
 
 import diffsim_ti as ds
 from diffsim_ti import runtime
-from diffsim_ti.terms import barrier
+from diffsim_ti.terms.obstacles import barrier
 
 RNG = np.random.default_rng(3)
 BASE_MESH = tetrahedron()
@@ -22,8 +22,13 @@ def evaluate(term, positions, precision="f64"):
     twin = term.kernel(precision, 0, **own)
 
     @ti.kernel
-    def look(parameters: ti.types.ndarray(fp, 1), x: ti.types.ndarray(vec, 1), gap: ti.types.ndarray(fp, 1),
-             energy: ti.types.ndarray(fp, 1), force: ti.types.ndarray(vec, 1)):  # fmt: skip
+    def look(
+        parameters: ti.types.ndarray(fp, 1),
+        x: ti.types.ndarray(vec, 1),
+        gap: ti.types.ndarray(fp, 1),
+        energy: ti.types.ndarray(fp, 1),
+        force: ti.types.ndarray(vec, 1),
+    ):
         for i in range(x.shape[0]):
             zero = vec(0)
             gap[i] = twin.gap(parameters, x[i], zero)
@@ -112,7 +117,7 @@ ERRORS = {
     "open mesh": (lambda: ds.MeshObstacle(BASE, [[0, 1, 2]]), "must be closed and consistently oriented; 3 edges"),
     "inwards": (lambda: ds.MeshObstacle(BASE_MESH.vertices, BASE_MESH.surface_triangles[:, ::-1]), "face inwards"),
     "width": (lambda: ds.Sphere(width=-1.0), r"Sphere: width \[m\] must be > 0"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", ERRORS)
@@ -189,8 +194,11 @@ def test_several_obstacles_and_energy(solver):
     """A body between a floor, a ball and a wall: kinetic, elastic and contact energy add up to what it started with."""
     mesh = ds.TetrahedralMesh.create_box(2, size=0.2, origin=[0, 0.12, 0])
     options = dict(stiffness=2e3, width=0.1)
-    terms = [ds.Ground(**options), ds.Sphere([0.1, -0.7, 0.1], 0.75, **options),
-             ds.HalfSpace([0.3, 0, 0], [-1, 0, 0], **options)]  # fmt: skip
+    terms = [
+        ds.Ground(**options),
+        ds.Sphere([0.1, -0.7, 0.1], 0.75, **options),
+        ds.HalfSpace([0.3, 0, 0], [-1, 0, 0], **options),
+    ]
     scene = ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3), 500.0, terms=terms, initial_velocities=[0.7, -0.8, 0.1])
     simulator = ds.Simulator(solver(scene, dt=2e-4))
     start, drift, touched = simulator.compute_energy(), 0.0, 0.0
@@ -199,7 +207,12 @@ def test_several_obstacles_and_energy(solver):
         energy = simulator.compute_energy()
         drift, touched = max(drift, abs(energy - start)), max(touched, energy.parts["contact"])
     assert touched > 0.1 * start and drift < (0.02 if solver.order == 1 else 1e-4) * start
-    assert set(scene.inputs.names) >= {"barrier_stiffness", "barrier_stiffness_2", "barrier_stiffness_3", "sphere_radius"}
+    assert set(scene.inputs.names) >= {
+        "barrier_stiffness",
+        "barrier_stiffness_2",
+        "barrier_stiffness_3",
+        "sphere_radius",
+    }
 
 
 @pytest.mark.parametrize("solver", [ds.SemiImplicitSolver, ds.VelocityVerletSolver])
@@ -243,5 +256,3 @@ def test_momentum_balance(solver):
 def slope_of(s):
     with np.errstate(all="ignore"):
         return np.where(s < 1, -(s - 1) * (2 * np.log(np.minimum(s, 1)) + (s - 1) / s), 0)
-
-

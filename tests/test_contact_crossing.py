@@ -4,7 +4,7 @@ import pytest
 from contact_scenes import SHAPES, points, tetrahedron
 
 import diffsim_ti as ds
-from diffsim_ti.forward import ForwardRun
+from diffsim_ti.adaptive_run import ForwardRun
 
 SOLVERS = [ds.SemiImplicitSolver, ds.VelocityVerletSolver]
 solvers = pytest.mark.parametrize("solver", SOLVERS)
@@ -85,8 +85,9 @@ def test_a_fast_obstacle_does_not_run_over_a_vertex(solver):
 def test_forward_runs_divide_the_step(solver, name):
     """A run that follows the state takes finer steps until nothing crosses, and reports the smallest gap."""
     term = SHAPES[name](stiffness=1e5, width=0.03)
-    scene = ds.Scene(tetrahedron(0.15), ds.StableNeoHookean(1e5, 0.3), 300.0, [ds.Gravity(), term],
-                     initial_velocities=[0, -6, 0])  # fmt: skip
+    scene = ds.Scene(
+        tetrahedron(0.15), ds.StableNeoHookean(1e5, 0.3), 300.0, [ds.Gravity(), term], initial_velocities=[0, -6, 0]
+    )
     run = ForwardRun(scene, solver, frame_time=0.02)
     for _ in range(4):
         run.advance()

@@ -41,8 +41,13 @@ def test_incline(solver, precision):
 @pytest.mark.parametrize("precision", ["f32", "f64"])
 def test_stopping_distance(solver, friction, distance, precision):
     """R21, from 2 m/s; it also stops, and does not come back."""
-    scene = points(tetrahedron(resting_gap(G)), ds.Ground(friction=friction), terms=[ds.Gravity(-G)],
-                   initial_velocities=[2, 0, 0], precision=precision)  # fmt: skip
+    scene = points(
+        tetrahedron(resting_gap(G)),
+        ds.Ground(friction=friction),
+        terms=[ds.Gravity(-G)],
+        initial_velocities=[2, 0, 0],
+        precision=precision,
+    )
     frames = ds.Rollout(solver(scene, dt=2e-3), 600, save_every=10).forward()
     way = (frames.positions[-1] - frames.positions[0])[:3, 0]
     assert way == pytest.approx(np.full(3, distance), rel=1e-2)
@@ -66,8 +71,12 @@ def test_moving_floor_drags_and_carries(solver):
 def test_friction_never_adds_energy(solver, speed):
     """Row 46: any tangential speed, either way, only falls; no chatter about zero, whatever the step."""
     for sign in (1, -1):
-        scene = points(tetrahedron(resting_gap(G)), ds.Ground(friction=0.8, friction_speed=1e-3), terms=[ds.Gravity(-G)],
-                       initial_velocities=[sign * speed, 0, 0.3 * speed])  # fmt: skip
+        scene = points(
+            tetrahedron(resting_gap(G)),
+            ds.Ground(friction=0.8, friction_speed=1e-3),
+            terms=[ds.Gravity(-G)],
+            initial_velocities=[sign * speed, 0, 0.3 * speed],
+        )
         frames = ds.Rollout(solver(scene, dt=1e-2), 60, save_every=1).forward()
         along = frames.velocities[:, 0, [0, 2]]
         size = np.linalg.norm(along, axis=1)
@@ -79,8 +88,12 @@ def test_friction_never_adds_energy(solver, speed):
 @solvers
 def test_friction_work_is_what_the_energy_loses(solver):
     """mu N times the way that was slid, while kinetic energy falls by as much."""
-    scene = points(tetrahedron(resting_gap(G)), ds.Ground(friction=0.25, friction_speed=1e-4), terms=[ds.Gravity(-G)],
-                   initial_velocities=[1.2, 0, -0.5])  # fmt: skip
+    scene = points(
+        tetrahedron(resting_gap(G)),
+        ds.Ground(friction=0.25, friction_speed=1e-4),
+        terms=[ds.Gravity(-G)],
+        initial_velocities=[1.2, 0, -0.5],
+    )
     frames = ds.Rollout(solver(scene, dt=1e-4), 3000, save_every=100).forward()
     way = np.linalg.norm(np.diff(frames.positions[:, 0], axis=0), axis=1).cumsum()
     lost = 0.5 * (1.3**2 - (frames.velocities[1:, 0] ** 2).sum(1))
@@ -110,7 +123,11 @@ def test_static_and_sliding_are_one_continuous_law(solver):
 def test_two_rough_walls_act_one_after_the_other():
     """In a corner both frictions hold; a vertex that rests in it does not move."""
     wall = ds.HalfSpace([-resting_gap(5.0), 0, 0], [1, 0, 0], stiffness=1e4, friction=0.6)
-    scene = points(tetrahedron(resting_gap(G)), [ds.Ground(friction=0.6), wall], terms=[ds.Gravity([-5.0, -G, 2.0])],
-                   fixed=[1, 2, 3])  # fmt: skip
+    scene = points(
+        tetrahedron(resting_gap(G)),
+        [ds.Ground(friction=0.6), wall],
+        terms=[ds.Gravity([-5.0, -G, 2.0])],
+        fixed=[1, 2, 3],
+    )
     end = ds.Rollout(ds.SemiImplicitSolver(scene, dt=1e-3), 1000).forward()
     assert np.abs(end.positions[-1, 0] - BASE[0] - [0, resting_gap(G), 0]).max() < 1.1e-3  # creep of friction_speed

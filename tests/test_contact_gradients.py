@@ -23,8 +23,13 @@ def rollout_of(name, solver, rough=True, moving=True, **options):
     """A tetrahedron that falls onto a shape, slides on it, and is followed by it."""
     own = dict(friction=0.4, friction_speed=0.05) if rough else {}
     term = SHAPES[name](stiffness=300.0, width=0.2, **own, path=path if moving else None)
-    scene = ds.Scene(tetrahedron(0.15), ds.StableNeoHookean(2e4, 0.3), 100.0, [ds.Gravity(), ds.Drag(0.5), term],
-                     initial_velocities=[0.8, -1.0, 0.3])  # fmt: skip
+    scene = ds.Scene(
+        tetrahedron(0.15),
+        ds.StableNeoHookean(2e4, 0.3),
+        100.0,
+        [ds.Gravity(), ds.Drag(0.5), term],
+        initial_velocities=[0.8, -1.0, 0.3],
+    )
     return ds.Rollout(solver(scene, dt=4e-3, substeps=4), STEPS, save_every=STEPS // 4, gradients="all", **options)
 
 
@@ -60,10 +65,19 @@ def test_several_rough_and_moving_obstacles():
     """Rows of sums, columns of paths and the order of frictions: two that move, two that are rough, one that is neither."""
     options = dict(stiffness=300.0, width=0.2)
     rough = dict(friction=0.3, friction_speed=0.05)
-    terms = [SHAPES["ground"](**options, **rough), ds.HalfSpace([-0.1, 0, 0], [1, 0, 0], **options, path=path),
-             SHAPES["sphere"](**options, **rough, path=lambda t: [0.1 * t, 0, 0]), SHAPES["bowl"](**options)]  # fmt: skip
-    scene = ds.Scene(tetrahedron(0.15), ds.StableNeoHookean(2e4, 0.3), 100.0, [ds.Gravity(), *terms],
-                     initial_velocities=[-0.5, -1.0, 0.3])  # fmt: skip
+    terms = [
+        SHAPES["ground"](**options, **rough),
+        ds.HalfSpace([-0.1, 0, 0], [1, 0, 0], **options, path=path),
+        SHAPES["sphere"](**options, **rough, path=lambda t: [0.1 * t, 0, 0]),
+        SHAPES["bowl"](**options),
+    ]
+    scene = ds.Scene(
+        tetrahedron(0.15),
+        ds.StableNeoHookean(2e4, 0.3),
+        100.0,
+        [ds.Gravity(), *terms],
+        initial_velocities=[-0.5, -1.0, 0.3],
+    )
     rollout = ds.Rollout(ds.VelocityVerletSolver(scene, dt=4e-3, substeps=4), STEPS)
     assert {"half_space_path", "sphere_path", "friction", "friction_2"} <= set(rollout.inputs)
     report = ds.check_gradients(rollout, verbose=False)
@@ -157,8 +171,14 @@ def bounces(solver, speed: float):
     lift = 0.02 + np.linspace(0, 0.02, n)
     vertices = np.concatenate([one.vertices + [k, h, 0] for k, h in enumerate(lift)])
     mesh = ds.TetrahedralMesh(vertices, np.concatenate([one.tetrahedra + 4 * k for k in range(n)]))
-    scene = ds.Scene(mesh, ds.LinearElastic(1e-6, 0.0), 4 / one.volume, fixed=np.arange(3, 4 * n, 4), terms=[ds.Ground()],
-                     initial_velocities=[0, -speed, 0])  # fmt: skip
+    scene = ds.Scene(
+        mesh,
+        ds.LinearElastic(1e-6, 0.0),
+        4 / one.volume,
+        fixed=np.arange(3, 4 * n, 4),
+        terms=[ds.Ground()],
+        initial_velocities=[0, -speed, 0],
+    )
     return scene
 
 

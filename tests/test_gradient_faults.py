@@ -11,8 +11,8 @@ import diffsim_ti as ds
 from diffsim_ti import verify
 from diffsim_ti.materials.stable_neo_hookean import StableNeoHookeanLaw
 from diffsim_ti.runtime import traced
-from diffsim_ti.solvers.explicit_adjoint import ExplicitAdjoint
-from diffsim_ti.terms.ground import GroundForce
+from diffsim_ti.solvers.explicit.adjoint import ExplicitAdjoint
+from diffsim_ti.terms.obstacles.ground import GroundForce
 
 # ---- mutations: each must fail the dot-product test or the table of gradients -----------------------------------------
 
@@ -86,7 +86,9 @@ COLLECTED = {
     "shape 0.1 % off": barely_scaled("gradients"),
     "no volumes": without("volumes"),
     "velocity 0.1 % off": barely_scaled("velocity"),
-    "coefficients transposed": lambda adjoint, derived: derived.coefficients.__setitem__(..., derived.coefficients[:, ::-1]),
+    "coefficients transposed": lambda adjoint, derived: derived.coefficients.__setitem__(
+        ..., derived.coefficients[:, ::-1]
+    ),
 }
 
 
@@ -114,9 +116,10 @@ def test_mutated_results(monkeypatch, solver, name):
     assert not gates_passed(rollout)[1], f"{name}: nothing was noticed"
 
 
-@pytest.mark.parametrize("law, dot_product_sees_it", [
-    (TransposedBlock, True), (WithoutVolumetricCurvature, False), (SlightlyWrongProducts, True),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "law, dot_product_sees_it",
+    [(TransposedBlock, True), (WithoutVolumetricCurvature, False), (SlightlyWrongProducts, True)],
+)
 def test_mutated_laws(law, dot_product_sees_it):
     """The dot product compares with the tangent, which shares dP: a symmetric mistake is for differences to find."""
     symmetric, right = gates_passed(rollout_of(full_scene(with_law(law)), steps=3))
@@ -219,9 +222,11 @@ def falling(steps, solver=ds.SemiImplicitSolver, height=0.25, **options):
     mesh = random_mesh()
     m = mesh.num_tetrahedra
     scene = ds.Scene(
-        mesh, ds.StableNeoHookean(np.full(m, 1e5), 0.3), terms=[ds.Gravity(), ds.Ground(-0.05 - height, 1e5, 0.05)],
+        mesh,
+        ds.StableNeoHookean(np.full(m, 1e5), 0.3),
+        terms=[ds.Gravity(), ds.Ground(-0.05 - height, 1e5, 0.05)],
         precision="f64",
-    )  # fmt: skip
+    )
     return ds.Rollout(solver(scene, dt=1e-3), steps, **options)
 
 
@@ -260,9 +265,12 @@ def test_health_of_a_bouncing_block():
     """Five seconds of tumbling and bouncing: the report tells how fast the gradient grows and when it is of no more use."""
     mesh = ds.TetrahedralMesh.create_cube(2).rotated([0.3, 1.0, 0.2], 0.7)
     scene = ds.Scene(
-        mesh, ds.StableNeoHookean(np.full(mesh.num_tetrahedra, 2e5), 0.3), terms=[ds.Gravity(), ds.Ground(-1.0, 2e6, 0.1)],
-        initial_velocities=np.cross([1.0, 0.5, 3.0], mesh.vertices), precision="f64",
-    )  # fmt: skip
+        mesh,
+        ds.StableNeoHookean(np.full(mesh.num_tetrahedra, 2e5), 0.3),
+        terms=[ds.Gravity(), ds.Ground(-1.0, 2e6, 0.1)],
+        initial_velocities=np.cross([1.0, 0.5, 3.0], mesh.vertices),
+        precision="f64",
+    )
     rollout = ds.Rollout(ds.SemiImplicitSolver(scene, dt=1e-3, substeps=2), 5000, health=True)
     frames = rollout.forward()
     w = np.zeros(frames.positions.shape)
@@ -333,9 +341,11 @@ def last_steps(scene, solver, frames, k, steps):
         return moved(t + at * 2e-3) - moved(at * 2e-3)
 
     start = scene.replace(
-        initial_positions=frames.positions[at], initial_velocities=frames.velocities[at], motion=motion,
+        initial_positions=frames.positions[at],
+        initial_velocities=frames.velocities[at],
+        motion=motion,
         terms=[*scene.terms[:3], ds.ExternalForce(scene.inputs.values["external_forces"][at:])],
-    )  # fmt: skip
+    )
     return rollout_of(start, solver, k)
 
 
@@ -371,7 +381,9 @@ def test_truncated_gradients_approach_the_whole(solver):
     """In velocity Verlet the cut lies in the middle of a kick; with damping both forget the past."""
     scene = full_scene()
     w = np.random.default_rng(2).normal(size=(27, 3))
-    gradients = [final_loss_gradient(rollout_of(scene, solver, 100, truncate=k), w)["gravity"] for k in (None, 100, 99, 50)]
+    gradients = [
+        final_loss_gradient(rollout_of(scene, solver, 100, truncate=k), w)["gravity"] for k in (None, 100, 99, 50)
+    ]
     distance = [np.linalg.norm(g - gradients[0]) for g in gradients]
     assert distance[1] == 0 < distance[2] < distance[3]
 

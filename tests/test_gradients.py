@@ -13,9 +13,20 @@ from diffsim_ti.solvers import SOLVERS as ALL_SOLVERS
 SOLVERS = [s for s in ALL_SOLVERS if s.explicit]  # the implicit ones: test_implicit*.py
 DT = 2e-3
 INPUTS = (
-    "initial_positions", "initial_velocities", "youngs_modulus", "poissons_ratio", "density", "gravity", "drag_rate",
-    "ground_height", "barrier_stiffness", "barrier_width", "external_forces", "prescribed_motion", "rest_positions",
-)  # fmt: skip
+    "initial_positions",
+    "initial_velocities",
+    "youngs_modulus",
+    "poissons_ratio",
+    "density",
+    "gravity",
+    "drag_rate",
+    "ground_height",
+    "barrier_stiffness",
+    "barrier_width",
+    "external_forces",
+    "prescribed_motion",
+    "rest_positions",
+)
 by_solver = pytest.mark.parametrize("solver", SOLVERS)
 by_material = pytest.mark.parametrize("material", MATERIALS)
 
@@ -43,23 +54,36 @@ def full_scene(material=ds.StableNeoHookean, precision="f64", steps=100, resolut
     mesh, rng = random_mesh(resolution, seed), np.random.default_rng(seed)
     start = random_start(mesh, rng)
     terms = [
-        ds.Gravity(), ds.Drag(2.0), ds.Ground(-0.15, 1e3, 0.2),
+        ds.Gravity(),
+        ds.Drag(2.0),
+        ds.Ground(-0.15, 1e3, 0.2),
         ds.ExternalForce(50 * rng.normal(size=(steps, mesh.num_vertices, 3))),
-    ]  # fmt: skip
+    ]
     return ds.Scene(
-        mesh, material(*start.pop("moduli")), terms=terms, fixed="xmin", precision=precision,
-        motion=lambda t: np.array([0.0, 0.05 * np.sin(20 * t), 0.02 * t]), **start,
-    )  # fmt: skip
+        mesh,
+        material(*start.pop("moduli")),
+        terms=terms,
+        fixed="xmin",
+        precision=precision,
+        motion=lambda t: np.array([0.0, 0.05 * np.sin(20 * t), 0.02 * t]),
+        **start,
+    )
 
 
-def free_scene(material=ds.StableNeoHookean, gravity=(0.3, -9.81, 1.0), precision="f64", resolution=3, seed=0, **changes):
+def free_scene(
+    material=ds.StableNeoHookean, gravity=(0.3, -9.81, 1.0), precision="f64", resolution=3, seed=0, **changes
+):
     """A deformed body of random moduli in free flight."""
     mesh, rng = random_mesh(resolution, seed), np.random.default_rng(seed)
     start = random_start(mesh, rng)
-    return ds.Scene(mesh, material(*start.pop("moduli")), terms=ds.Gravity(gravity), precision=precision, **start | changes)
+    return ds.Scene(
+        mesh, material(*start.pop("moduli")), terms=ds.Gravity(gravity), precision=precision, **start | changes
+    )
 
 
-def rollout_of(scene, solver=ds.SemiImplicitSolver, steps=10, dt=DT, substeps=2, gradients="all", **options) -> ds.Rollout:
+def rollout_of(
+    scene, solver=ds.SemiImplicitSolver, steps=10, dt=DT, substeps=2, gradients="all", **options
+) -> ds.Rollout:
     return ds.Rollout(solver(scene, dt=dt, substeps=substeps), steps, gradients=gradients, **options)
 
 
@@ -258,9 +282,10 @@ def test_scaling_of_time(solver, material):
 
     by_dt, _ = verify.central_difference(loss, 0.1)
     parts = [
-        values["initial_velocities"] * g["initial_velocities"], 2 * values["gravity"] * g["gravity"],
+        values["initial_velocities"] * g["initial_velocities"],
+        2 * values["gravity"] * g["gravity"],
         2 * values["youngs_modulus"] * g["youngs_modulus"],
-    ]  # fmt: skip
+    ]
     assert_zero_sum(np.array([[by_dt]]), *(-part.reshape(-1, 1) for part in parts), gate=1e-7)
 
 
@@ -280,8 +305,15 @@ def test_shear_oscillator(nu, u, by_E, by_rho, by_nu, apex):
     """One tetrahedron on a fixed base, its apex moved sideways: a linear oscillator at any amplitude."""
     mesh = ds.TetrahedralMesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [*apex, 0.5]], [[0, 1, 2, 3]])
     start = mesh.vertices + [[0, 0, 0], [0, 0, 0], [0, 0, 0], [0.4, 0, 0]]
-    scene = ds.Scene(mesh, ds.StableNeoHookean([1e5], nu), density=[1000.0], terms=ds.Gravity(0.0), fixed=[0, 1, 2],
-                     initial_positions=start, precision="f64")  # fmt: skip
+    scene = ds.Scene(
+        mesh,
+        ds.StableNeoHookean([1e5], nu),
+        density=[1000.0],
+        terms=ds.Gravity(0.0),
+        fixed=[0, 1, 2],
+        initial_positions=start,
+        precision="f64",
+    )
     rollout = rollout_of(scene, steps=1000, dt=1e-3, substeps=1)
     frames = rollout.forward()
     w = np.zeros((4, 3))
@@ -438,8 +470,15 @@ def test_backend_oscillator(checkpoint_every):
 
     mesh = ds.TetrahedralMesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.2, 0.3, h]], [[0, 1, 2, 3]])
     start = mesh.vertices + [[0, 0, 0], [0, 0, 0], [0, 0, 0], [u0, 0, 0]]
-    scene = ds.Scene(mesh, ds.StableNeoHookean([E], [nu]), density=[rho], terms=ds.Gravity(0.0), fixed=[0, 1, 2],
-                     initial_positions=start, precision="f32")  # fmt: skip
+    scene = ds.Scene(
+        mesh,
+        ds.StableNeoHookean([E], [nu]),
+        density=[rho],
+        terms=ds.Gravity(0.0),
+        fixed=[0, 1, 2],
+        initial_positions=start,
+        precision="f32",
+    )
     rollout = rollout_of(scene, steps=n, dt=dt, substeps=1, checkpoint_every=checkpoint_every)
     w = np.zeros((4, 3))
     w[3, 0] = 1

@@ -27,11 +27,17 @@ def over_hertz(cells: int) -> np.ndarray:
     """(largest force, contact time, depth), each over what Hertz's theory says for a rigid floor."""
     mesh = ball(cells)
     volume = mesh.volumes.sum()
-    stiffness, mass, depth = 4 / 3 * E * np.sqrt(R), DENSITY * volume, DEPTH * R * (volume / (4 / 3 * np.pi * R**3)) ** 0.4
+    stiffness, mass, depth = (
+        4 / 3 * E * np.sqrt(R),
+        DENSITY * volume,
+        DEPTH * R * (volume / (4 / 3 * np.pi * R**3)) ** 0.4,
+    )
     speed = np.sqrt(0.8 * stiffness * depth**2.5 / mass)
     expected = stiffness * depth**1.5, 2.9432 * depth / speed, depth
     floor = ds.Ground(stiffness=4000.0, width=WIDTH * R)
-    scene = ds.Scene(mesh, ds.LinearElastic(E, 0.0), DENSITY, [floor], initial_velocities=[0, -speed, 0], precision="f64")
+    scene = ds.Scene(
+        mesh, ds.LinearElastic(E, 0.0), DENSITY, [floor], initial_velocities=[0, -speed, 0], precision="f64"
+    )
     dt = expected[1] / 50
     frames = ds.Rollout(ds.BDF2Solver(scene, dt=dt, tolerance=1e-6), 80, save_every=1).forward()
     weights = ds.Simulator(ds.BDF2Solver(scene, dt=dt))._start.mass[:, None] / mass

@@ -15,7 +15,9 @@ TRUE = np.array([4e4, 1e5, 2e5])
 
 def body(solver=ds.SemiImplicitSolver, E=TRUE[REGIONS], **options) -> ds.Rollout:
     """A beam held at one end that sags under its weight."""
-    scene = ds.Scene(MESH, ds.StableNeoHookean(E, 0.3), density=1000.0, terms=[ds.Gravity()], fixed="xmin", precision="f64")
+    scene = ds.Scene(
+        MESH, ds.StableNeoHookean(E, 0.3), density=1000.0, terms=[ds.Gravity()], fixed="xmin", precision="f64"
+    )
     if solver is ds.StaticSolver:
         return ds.Rollout(solver(scene, tolerance=1e-11), 1)
     return ds.Rollout(solver(scene, dt=1e-2, substeps=8), 20, save_every=5)
@@ -49,7 +51,9 @@ def test_recovery_per_region(swing, seed):
 
 def test_bounds_of_the_regions_hold(swing):
     """The errors that the Fisher matrix foretells at that noise are below the 1 % that recovery keeps."""
-    found = verify.identifiability(swing, "youngs_modulus", groups={"youngs_modulus": REGIONS}, youngs_modulus=TRUE[REGIONS])
+    found = verify.identifiability(
+        swing, "youngs_modulus", groups={"youngs_modulus": REGIONS}, youngs_modulus=TRUE[REGIONS]
+    )
     assert found.eigenvalues.shape == (3,) and found.num_singular == 0
     assert 1e-5 / np.sqrt(found.eigenvalues[0]) < 0.01
     assert found.directions[0]["youngs_modulus"].shape == (3,)
@@ -74,16 +78,19 @@ def test_the_eigenvalue_is_what_moves(swing):
     start = dict(youngs_modulus=np.array(8e4), poissons_ratio=np.array(0.3))
     found, eps = verify.identifiability(swing, list(start), **start), 1e-5
     for value, direction in zip(found.eigenvalues, found.directions):
-        ends = [swing.forward(**{n: x * (1 + s * eps * direction[n][0]) for n, x in start.items()}).displacements
-                for s in (1, -1)]  # fmt: skip
+        ends = [
+            swing.forward(**{n: x * (1 + s * eps * direction[n][0]) for n, x in start.items()}).displacements
+            for s in (1, -1)
+        ]
         moved = np.linalg.norm((ends[0] - ends[1]) / (2 * eps))
         assert moved == pytest.approx(np.sqrt(value), rel=1e-5)
 
 
 def test_refusals(swing):
     for arguments, expected in (
-        (("stiffness",), "no input named 'stiffness'"), (("initial_velocities",), "initial_velocities is zero"),
+        (("stiffness",), "no input named 'stiffness'"),
+        (("initial_velocities",), "initial_velocities is zero"),
         (("youngs_modulus", {"youngs_modulus": [1, 2]}), r"groups of youngs_modulus: expected shape \(18|groups of"),
-    ):  # fmt: skip
+    ):
         with pytest.raises(ValueError, match=expected):
             verify.identifiability(swing, *arguments)

@@ -8,9 +8,7 @@ import diffsim_ti as ds
 
 SOLVERS = (ds.ImplicitEulerSolver, ds.BDF2Solver)
 solvers = pytest.mark.parametrize("solver", SOLVERS, ids=lambda s: s.__name__)
-every = pytest.mark.parametrize(
-    "solver", [*SOLVERS, ds.StaticSolver], ids=lambda s: s.__name__
-)
+every = pytest.mark.parametrize("solver", [*SOLVERS, ds.StaticSolver], ids=lambda s: s.__name__)
 
 
 @solvers
@@ -41,8 +39,13 @@ def test_incline(solver):
 @pytest.mark.parametrize("friction, distance", [(0.2, 1.019368), (0.4, 0.509684)])
 @pytest.mark.parametrize("precision", ["f32", "f64"])
 def test_stopping_distance(solver, friction, distance, precision):
-    scene = points(tetrahedron(resting_gap(G)), ds.Ground(friction=friction), terms=[ds.Gravity(-G)],
-                   initial_velocities=[2, 0, 0], precision=precision)  # fmt: skip
+    scene = points(
+        tetrahedron(resting_gap(G)),
+        ds.Ground(friction=friction),
+        terms=[ds.Gravity(-G)],
+        initial_velocities=[2, 0, 0],
+        precision=precision,
+    )
     frames = ds.Rollout(solver(scene, dt=5e-3), 240, save_every=10).forward()
     assert (frames.positions[-1] - frames.positions[0])[:3, 0] == pytest.approx(np.full(3, distance), rel=1e-2)
     assert np.abs(frames.velocities[-1, :3]).max() < (1e-4 if precision == "f64" else 1e-3)  # friction_speed is 1e-3
@@ -67,8 +70,13 @@ def test_a_rising_floor_lifts():
 def test_no_step_is_too_large_for_the_barrier(speed):
     """Row 41: whatever the speed, iterates stay in front of the floor."""
     mesh = ds.TetrahedralMesh.create_cube(resolution=2, size=0.2).translated([0, 0.05, 0])
-    scene = ds.Scene(mesh, ds.StableNeoHookean(1e6, 0.3), terms=[ds.Ground(stiffness=1e6)],
-                     initial_velocities=[0, -speed, 0], precision="f64")  # fmt: skip
+    scene = ds.Scene(
+        mesh,
+        ds.StableNeoHookean(1e6, 0.3),
+        terms=[ds.Ground(stiffness=1e6)],
+        initial_velocities=[0, -speed, 0],
+        precision="f64",
+    )
     frames = ds.Rollout(ds.ImplicitEulerSolver(scene, dt=1e-2), 20, save_every=1).forward()
     assert frames.positions[:, :, 1].min() > 0 and frames.velocities[-1, :, 1].mean() > -0.1 * speed
 
@@ -76,12 +84,19 @@ def test_no_step_is_too_large_for_the_barrier(speed):
 def rubbing(solver, shape="ground", **options) -> ds.Rollout:
     """A body pressed on a moving, rough obstacle, sliding and sticking."""
     mesh, rng = tetrahedron(0.006), np.random.default_rng(0)
-    obstacle = SHAPES[shape](stiffness=2e3, width=0.05, friction=0.4, friction_speed=0.05,
-                             path=lambda t: [0.3 * t, 0.1 * t, -0.2 * t])  # fmt: skip
+    obstacle = SHAPES[shape](
+        stiffness=2e3, width=0.05, friction=0.4, friction_speed=0.05, path=lambda t: [0.3 * t, 0.1 * t, -0.2 * t]
+    )
     static = solver is ds.StaticSolver
-    scene = ds.Scene(mesh, ds.StableNeoHookean(1e4, 0.3), 100.0, terms=[ds.Gravity(-G), obstacle],
-                     fixed=[1, 2, 3] if static else None, precision="f64",
-                     initial_velocities=0.2 * rng.standard_normal((4, 3)) - [0, 0.1, 0])  # fmt: skip
+    scene = ds.Scene(
+        mesh,
+        ds.StableNeoHookean(1e4, 0.3),
+        100.0,
+        terms=[ds.Gravity(-G), obstacle],
+        fixed=[1, 2, 3] if static else None,
+        precision="f64",
+        initial_velocities=0.2 * rng.standard_normal((4, 3)) - [0, 0.1, 0],
+    )
     made = solver(scene, dt=1e-2, tolerance=1e-11, max_iterations=200)
     return ds.Rollout(made, 2, save_every=1, gradients="all", **options)
 
@@ -113,8 +128,13 @@ def test_checkpoints_give_the_same_bits(solver):
 def test_multigrid_follows_contact_that_comes_and_goes():
     """A firm barrier stiffens a few vertices by orders of magnitude: the preconditioner must know in every round."""
     mesh = ds.TetrahedralMesh.create_cube(resolution=7, size=0.2).translated([0, 0.01, 0])
-    scene = ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.4), terms=[ds.Gravity(), ds.Ground(stiffness=1e6, width=0.005)],
-                     initial_velocities=[0, -1.0, 0], precision="f64")  # fmt: skip
+    scene = ds.Scene(
+        mesh,
+        ds.StableNeoHookean(1e5, 0.4),
+        terms=[ds.Gravity(), ds.Ground(stiffness=1e6, width=0.005)],
+        initial_velocities=[0, -1.0, 0],
+        precision="f64",
+    )
     solver = ds.ImplicitEulerSolver(scene, dt=5e-3, preconditioner="multigrid")
     workspace, most = solver.workspace(solver.start_values()), 0
     for j in range(12):

@@ -7,7 +7,7 @@ import pytest
 import taichi as ti
 
 import diffsim_ti as ds
-from diffsim_ti.solvers import implicit_adjoint
+from diffsim_ti.solvers.implicit import adjoint as implicit_adjoint
 
 DYNAMIC = (ds.ImplicitEulerSolver, ds.ImplicitMidpointSolver, ds.BDF2Solver)
 ALL = (*DYNAMIC, ds.StaticSolver)
@@ -21,8 +21,17 @@ def mesh() -> ds.TetrahedralMesh:
     return ds.TetrahedralMesh.create_box((3, 2, 2), (0.8, 0.4, 0.4))
 
 
-def make(solver, law=ds.StableNeoHookean, steps=4, precision="f64", tolerance=1e-12, gradients="all", save_every=None,
-         checkpoint_every=None, **changes) -> ds.Rollout:  # fmt: skip
+def make(
+    solver,
+    law=ds.StableNeoHookean,
+    steps=4,
+    precision="f64",
+    tolerance=1e-12,
+    gradients="all",
+    save_every=None,
+    checkpoint_every=None,
+    **changes,
+) -> ds.Rollout:
     """Everything at once: damping, forces per step, moduli per tetrahedron, moving supports, a floor."""
     rng, m = np.random.default_rng(0), mesh()
     static = solver is ds.StaticSolver
@@ -30,11 +39,17 @@ def make(solver, law=ds.StableNeoHookean, steps=4, precision="f64", tolerance=1e
     terms = [ds.Gravity(), ds.Drag(0.7), ds.ExternalForce(20 * rng.standard_normal((steps, 2, 3)), [3, 7])]
     if not static:
         terms.append(ds.Ground(height=-0.03, stiffness=2e3, width=0.05))
-    arguments = dict(
-        density=1000 + 100 * rng.random(m.num_tetrahedra), terms=terms, fixed="xmin", precision=precision,
-        motion=lambda t: [0.03 * t, 0.05 * t * t, 0.02 * np.sin(t)],
-        initial_velocities=0.3 * rng.standard_normal(m.vertices.shape),
-    ) | changes  # fmt: skip
+    arguments = (
+        dict(
+            density=1000 + 100 * rng.random(m.num_tetrahedra),
+            terms=terms,
+            fixed="xmin",
+            precision=precision,
+            motion=lambda t: [0.03 * t, 0.05 * t * t, 0.02 * np.sin(t)],
+            initial_velocities=0.3 * rng.standard_normal(m.vertices.shape),
+        )
+        | changes
+    )
     E = 1e5 * (1 + rng.random(m.num_tetrahedra))
     numbers = {"E": E, "nu": 0.3}
     scene = ds.Scene(m, law(**numbers), **arguments)
@@ -127,8 +142,13 @@ def test_identities_of_a_free_body(solver):
 def test_statics_under_dead_loads_scale():
     """E du/dE + f du/df + g du/dg = 0."""
     m = mesh()
-    scene = ds.Scene(m, ds.StableNeoHookean(1e5, 0.3), terms=[ds.Gravity(), ds.ExternalForce([5.0, -40, 10], [3])],
-                     fixed="xmin", precision="f64")  # fmt: skip
+    scene = ds.Scene(
+        m,
+        ds.StableNeoHookean(1e5, 0.3),
+        terms=[ds.Gravity(), ds.ExternalForce([5.0, -40, 10], [3])],
+        fixed="xmin",
+        precision="f64",
+    )
     rollout = ds.Rollout(ds.StaticSolver(scene, tolerance=1e-12), 1)
     frames = rollout.forward()
     w = np.random.default_rng(0).standard_normal(frames.positions.shape)
@@ -143,8 +163,9 @@ def test_gradient_of_the_static_twin_of_the_oscillator():
     """u = f h^2 / (mu V): E du/dE = -u, f du/df = u."""
     X = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.25, 0.25, 0.5]])
     m, E, force = ds.TetrahedralMesh(X, np.array([[0, 1, 2, 3]])), 1e5, 2000.0
-    scene = ds.Scene(m, ds.StableNeoHookean(E, 0.3), terms=[ds.ExternalForce([force, 0, 0], [3])], fixed=[0, 1, 2],
-                     precision="f64")  # fmt: skip
+    scene = ds.Scene(
+        m, ds.StableNeoHookean(E, 0.3), terms=[ds.ExternalForce([force, 0, 0], [3])], fixed=[0, 1, 2], precision="f64"
+    )
     rollout = ds.Rollout(ds.StaticSolver(scene, tolerance=1e-13), 1)
     frames = rollout.forward()
     w = np.zeros((2, 4, 3))

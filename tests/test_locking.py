@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 import diffsim_ti as ds
-from diffsim_ti import observe
 from diffsim_ti.materials import MATERIALS
-from diffsim_ti.mesh_patches import SIZE, in_eights, volume_patches
-from diffsim_ti.solvers.preconditioners import _assemble
-from diffsim_ti.stability import element_limit, lanczos_limit
+from diffsim_ti.mesh.patches import SIZE, in_eights, volume_patches
+from diffsim_ti.solvers.implicit.preconditioners import _assemble
+from diffsim_ti.state import observe
+from diffsim_ti.state.stability import element_limit, lanczos_limit
 
 path = Path(__file__).parent.parent / "examples" / "benchmark_locking.py"
 spec = importlib.util.spec_from_file_location("benchmark_locking", path)
@@ -169,9 +169,10 @@ def test_gradients_of_moduli_rest_shape_and_state(solver):
     assert ds.dot_product_test(made) < (1e-13 if solver.explicit else 1e-10)  # the latter: to the solves' tolerance
 
 
-@pytest.mark.parametrize("law, precision, rounding", [
-    (ds.StableNeoHookean, "f32", 1e-5), (ds.StVenantKirchhoff, "f64", 1e-13), (ds.MooneyRivlin, "f64", 1e-13),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "law, precision, rounding",
+    [(ds.StableNeoHookean, "f32", 1e-5), (ds.StVenantKirchhoff, "f64", 1e-13), (ds.MooneyRivlin, "f64", 1e-13)],
+)
 def test_the_reverse_sweep_is_the_transpose_of_the_tangent(law, precision, rounding):
     assert ds.dot_product_test(rollout(ds.VelocityVerletSolver, law, precision)) < rounding
 
@@ -184,7 +185,9 @@ def test_preconditioners_are_made_of_the_exact_matrix():
     blocks = p.blocks()
     largest = np.abs(exact).max()
     assert np.abs(_assemble(p, np.zeros((n, 1)), np.ones((n, 1)))[0].toarray() - exact).max() < 1e-13 * largest
-    assert max(np.abs(blocks[i] - exact[3 * i : 3 * i + 3, 3 * i : 3 * i + 3]).max() for i in range(n)) < 1e-13 * largest
+    assert (
+        max(np.abs(blocks[i] - exact[3 * i : 3 * i + 3, 3 * i : 3 * i + 3]).max() for i in range(n)) < 1e-13 * largest
+    )
 
 
 def test_step_limits():

@@ -20,7 +20,7 @@ from diffsim_ti.materials import (
     StVenantKirchhoff,
     moduli,
 )
-from diffsim_ti.materials.tensor import tensor
+from diffsim_ti.materials.calculus.tensor import tensor
 
 E, NU, N = 1e5, 0.3, 200
 INDIFFERENT = [m for m in MATERIALS if m is not LinearElastic]
@@ -67,7 +67,9 @@ def evaluate(material, H, dH=None, precision="f64", p=None, **options):
     H = np.ascontiguousarray(H, dtype)
     dH = np.zeros_like(H) if dH is None else np.ascontiguousarray(dH, dtype)
     p = np.ascontiguousarray(np.broadcast_to(p, (n, k)), dtype)
-    out = SimpleNamespace(psi=np.zeros(n, dtype), P=np.zeros_like(H), dP=np.zeros_like(H), products=np.zeros((n, k), dtype))
+    out = SimpleNamespace(
+        psi=np.zeros(n, dtype), P=np.zeros_like(H), dP=np.zeros_like(H), products=np.zeros((n, k), dtype)
+    )
     kernel(law)(H, dH, p, out.psi, out.P, out.dP, out.products)
     return out
 
@@ -128,7 +130,9 @@ def corotated(F, mu, lam):
 
 
 def kirchhoff(F, mu, lam):
-    green = [[0.5 * (sum((F[k][i] * F[k][j] for k in range(3)), 0.0) - float(i == j)) for j in range(3)] for i in range(3)]
+    green = [
+        [0.5 * (sum((F[k][i] * F[k][j] for k in range(3)), 0.0) - float(i == j)) for j in range(3)] for i in range(3)
+    ]
     trace = green[0][0] + green[1][1] + green[2][2]
     return mu * sum((x * x for row in green for x in row), 0.0) + lam / 2 * trace * trace
 
@@ -220,7 +224,9 @@ def test_differential_is_symmetric(material):
     H, A, B = states("random") - np.eye(3), directions(N), directions(N, 6)
     dA, dB = evaluate(material, H, A).dP, evaluate(material, H, B).dP
     gap = np.abs((B * dA).sum((1, 2)) - (A * dB).sum((1, 2)))
-    assert np.all(gap <= 1e-14 * (norm(A) * norm(dB) + norm(B) * norm(dA)) * 3)  # 3: sums of nine products of O(1) error
+    assert np.all(
+        gap <= 1e-14 * (norm(A) * norm(dB) + norm(B) * norm(dA)) * 3
+    )  # 3: sums of nine products of O(1) error
 
 
 @both_precisions
@@ -237,13 +243,18 @@ def test_coefficient_products_are_the_derivative_of_the_stress_by_each_coefficie
 @pytest.mark.parametrize("material", [StableNeoHookean, MooneyRivlin, Corotated])
 def test_differential_and_products_taken_alone_are_those_of_the_pair(material):
     law, k = material(E, NU).law("f64"), len(material(E, NU).law("f64").coefficient_names)
-    matrices, vectors = ti.types.ndarray(ti.types.matrix(3, 3, law.fp), 1), ti.types.ndarray(ti.types.vector(k, law.fp), 1)
+    matrices, vectors = (
+        ti.types.ndarray(ti.types.matrix(3, 3, law.fp), 1),
+        ti.types.ndarray(ti.types.vector(k, law.fp), 1),
+    )
 
     @ti.kernel
     def alone(H: matrices, dH: matrices, p: vectors, dP: matrices, products: vectors):
         ti.loop_config(serialize=True)
         for i in range(H.shape[0]):
-            dP[i] = law.stress_differential(tensor(H[i]), tensor(dH[i]), [p[0][c] for c in ti.static(range(k))]).matrix()
+            dP[i] = law.stress_differential(
+                tensor(H[i]), tensor(dH[i]), [p[0][c] for c in ti.static(range(k))]
+            ).matrix()
             work = law.coefficient_products(tensor(H[i]), tensor(dH[i]))
             for c in ti.static(range(k)):
                 products[i][c] = work[c]
@@ -369,7 +380,11 @@ def test_logarithm_is_exact_above_the_floor_and_c2_finite_and_outward_below(mate
     np.testing.assert_allclose(got.dP[:, 0, 0], dP[:, 0, 0], rtol=1e-12)
     assert np.all(got.P[:, 0, 0] < 0)  # pushes outwards
     below, above = (evaluate(material, np.diag([0.01 * (1 + side) - 1, 0, 0])[None], dH[:1]) for side in (-1e-9, 1e-9))
-    for name in ("psi", "P", "dP"):  # C2: J differs by 2e-11, what is compared has slopes of at most mu / J_floor^2 = 1e4 mu
+    for name in (
+        "psi",
+        "P",
+        "dP",
+    ):  # C2: J differs by 2e-11, what is compared has slopes of at most mu / J_floor^2 = 1e4 mu
         np.testing.assert_allclose(getattr(below, name), getattr(above, name), rtol=1e-8, atol=2e-11 * 1e4 * E)
 
 
@@ -385,8 +400,15 @@ def test_the_floor_is_a_choice():
 @both_precisions
 @every_law
 def test_inverted_and_collapsed_states_give_finite_results(material, precision):
-    collapsed = [np.zeros((3, 3)), np.diag([1.0, 0, 0]), np.diag([1.0, 1, 0]), np.diag([1.0, 1, -1]), -np.eye(3),
-                 np.diag([2.0, 0.5, -0.5]), np.diag([1.0, 1e-9, -1e-9])]  # fmt: skip
+    collapsed = [
+        np.zeros((3, 3)),
+        np.diag([1.0, 0, 0]),
+        np.diag([1.0, 1, 0]),
+        np.diag([1.0, 1, -1]),
+        -np.eye(3),
+        np.diag([2.0, 0.5, -0.5]),
+        np.diag([1.0, 1e-9, -1e-9]),
+    ]
     F = np.concatenate([collapsed, rotations(20) @ with_stretches(np.random.default_rng(0).uniform(-1, 1, (20, 3)))])
     got = evaluate(material, F - np.eye(3), directions(len(F)), precision)
     for value in (got.psi, got.P, got.dP, got.products):
@@ -444,7 +466,9 @@ def test_laws_of_different_formula_or_floor_differ():
 SETS = {"left": np.array([0, 1]), "right": np.array([2]), "all": np.arange(4)}
 MESH = SimpleNamespace(num_tetrahedra=4, tetrahedron_sets=SETS)
 SPELLINGS = [(m, dict(youngs_modulus=E, poissons_ratio=NU)) for m in MATERIALS]
-SPELLINGS += [(m, dict(mu=3e4, lam=5e4)) for m in MATERIALS] + [(MooneyRivlin, dict(c10=2e4, c01=1e4, bulk_modulus=9e4))]
+SPELLINGS += [(m, dict(mu=3e4, lam=5e4)) for m in MATERIALS] + [
+    (MooneyRivlin, dict(c10=2e4, c01=1e4, bulk_modulus=9e4))
+]
 
 
 @pytest.mark.parametrize("material, numbers", SPELLINGS)
@@ -510,7 +534,9 @@ def test_numbers_may_be_uniform_per_tetrahedron_or_per_set():
     m = StableNeoHookean(np.array([1e4, 2e4, 3e4, 4e4], np.float32), 0.3)
     assert m.coefficients(m.values(MESH)).shape == (4, 2)
     assert StableNeoHookean(E, NU).coefficients(StableNeoHookean(E, NU).values(MESH)).shape == (2,)
-    assert repr(StableNeoHookean({"left": 1e4, "default": 1e6}, 0.3)).startswith("StableNeoHookean(youngs_modulus={'left'")
+    assert repr(StableNeoHookean({"left": 1e4, "default": 1e6}, 0.3)).startswith(
+        "StableNeoHookean(youngs_modulus={'left'"
+    )
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from diffsim_ti.mesh import TetrahedralMesh
-from diffsim_ti.mesh_checks import surface_of
+from diffsim_ti.mesh.checks import surface_of
 
 ASSETS = Path(__file__).parents[1] / "assets" / "tetmesh"
 CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
@@ -513,8 +513,12 @@ def test_gmsh41_with_groups_on_some_volumes_only_names_the_remedy(tmp_path):
 
 def test_medit_references_become_tag_sets(tmp_path):
     cube = TetrahedralMesh.create_cube(2)
-    path = write(tmp_path / "a.mesh", [("tetra", cube.tetrahedra)], cube.vertices,
-                 cell_data={"medit:ref": [np.array([2, 2, 5, 5, 5, 0])]})  # fmt: skip
+    path = write(
+        tmp_path / "a.mesh",
+        [("tetra", cube.tetrahedra)],
+        cube.vertices,
+        cell_data={"medit:ref": [np.array([2, 2, 5, 5, 5, 0])]},
+    )
     mesh = TetrahedralMesh.from_file(path)
     assert {k: v.tolist() for k, v in mesh.tetrahedron_sets.items()} == {"tag_2": [0, 1], "tag_5": [2, 3, 4]}
 
@@ -527,21 +531,30 @@ def test_several_blocks_with_lines_and_points_beside_them(tmp_path):
 
 
 def test_files_that_are_refused(tmp_path):
-    ten = np.concatenate([CORNERS, [(CORNERS[a] + CORNERS[b]) / 2 for a, b in
-                                    ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))]])  # fmt: skip
+    ten = np.concatenate(
+        [CORNERS, [(CORNERS[a] + CORNERS[b]) / 2 for a, b in ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))]]
+    )
     cube = TetrahedralMesh.create_cube(2)
     both = [("tetra", cube.tetrahedra), ("hexahedron", [[0, 4, 6, 2, 1, 5, 7, 3]])]
     refused = [
-        (write(tmp_path / "surface.vtu", [("triangle", [[0, 1, 2]])]),
-         r"holds no tetrahedra; cell types found: triangle \(1\); fill the surface with tetrahedra"),
-        (write(tmp_path / "ten.vtu", [("tetra10", [list(range(10))])], ten),
-         r"only 4-node tetrahedra .* cell types found: tetra10 \(1\); export linear elements"),
-        (write(tmp_path / "mixed.vtu", both, cube.vertices),
-         r"tetrahedra beside hexahedron cells .* cell types found: tetra \(6\), hexahedron \(1\); mesh the body"),
+        (
+            write(tmp_path / "surface.vtu", [("triangle", [[0, 1, 2]])]),
+            r"holds no tetrahedra; cell types found: triangle \(1\); fill the surface with tetrahedra",
+        ),
+        (
+            write(tmp_path / "ten.vtu", [("tetra10", [list(range(10))])], ten),
+            r"only 4-node tetrahedra .* cell types found: tetra10 \(1\); export linear elements",
+        ),
+        (
+            write(tmp_path / "mixed.vtu", both, cube.vertices),
+            r"tetrahedra beside hexahedron cells .* cell types found: tetra \(6\), hexahedron \(1\); mesh the body",
+        ),
         (write(tmp_path / "flat.vtu", [("tetra", TET)], CORNERS * [1, 1, 0]), r"flat\.vtu: tetrahedron 0 is flat"),
-        (write(tmp_path / "twice.msh", [("tetra", [[0, 1, 2, 3], [0, 1, 2, 3]])], file_format="gmsh22"),
-         r"twice\.msh: tetrahedra must differ: 0 and 1"),
-    ]  # fmt: skip
+        (
+            write(tmp_path / "twice.msh", [("tetra", [[0, 1, 2, 3], [0, 1, 2, 3]])], file_format="gmsh22"),
+            r"twice\.msh: tetrahedra must differ: 0 and 1",
+        ),
+    ]
     for path, message in refused:
         with pytest.raises(ValueError, match=message):
             TetrahedralMesh.from_file(path)
@@ -564,8 +577,12 @@ def test_unreadable_and_missing_files(tmp_path, capfd):
 
 def test_orphans_in_a_file_can_be_dropped(tmp_path):
     points = np.concatenate([[[9.0, 9, 9]], CORNERS, [[8.0, 8, 8]]])
-    path = write(tmp_path / "a.vtu", [("tetra", TET + 1)], points,
-                 point_data={"vertex_set:tip": np.array([1, 0, 0, 0, 1, 1], np.int32)})  # fmt: skip
+    path = write(
+        tmp_path / "a.vtu",
+        [("tetra", TET + 1)],
+        points,
+        point_data={"vertex_set:tip": np.array([1, 0, 0, 0, 1, 1], np.int32)},
+    )
     with pytest.warns(UserWarning, match=r"2 vertices in no tetrahedron, first 0"):
         assert TetrahedralMesh.from_file(path).num_vertices == 6
     with warnings.catch_warnings():

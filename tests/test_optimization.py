@@ -35,14 +35,18 @@ def test_round_trip_and_previous(tmp_path):
     assert same(load_state(path, MESH), state(2.0))
 
 
-@pytest.mark.parametrize("damage, reason", [
-    (lambda data: data[: len(data) // 2], "truncated or damaged"),
-    (lambda data: data[:30], "another version|not a state of ours"),
-    (lambda data: b"", "not a state of ours"),
-    (lambda data: data[:-5] + b"xxxxx", "truncated or damaged"),
-    (lambda data: data.replace(b"version 1", b"version 9", 1), "written by another version"),
-    (lambda data: b"PK\x03\x04" + data, "not a state of ours"),
-], ids=["half", "head", "empty", "bits", "version", "foreign"])  # fmt: skip
+@pytest.mark.parametrize(
+    "damage, reason",
+    [
+        (lambda data: data[: len(data) // 2], "truncated or damaged"),
+        (lambda data: data[:30], "another version|not a state of ours"),
+        (lambda data: b"", "not a state of ours"),
+        (lambda data: data[:-5] + b"xxxxx", "truncated or damaged"),
+        (lambda data: data.replace(b"version 1", b"version 9", 1), "written by another version"),
+        (lambda data: b"PK\x03\x04" + data, "not a state of ours"),
+    ],
+    ids=["half", "head", "empty", "bits", "version", "foreign"],
+)
 def test_damaged_files_are_refused_and_the_previous_one_used(tmp_path, damage, reason):
     path = tmp_path / "run.state"
     save_state(path, MESH, state(1.0))
@@ -101,7 +105,9 @@ def test_resumed_lbfgs_equals_uninterrupted(tmp_path):
         torch.nn.init.constant_(module.bias, 0.1)
         x = torch.linspace(-1, 1, 12).double().reshape(4, 3)
         optimizer = torch.optim.LBFGS(module.parameters(), max_iter=3, line_search_fn="strong_wolfe")
-        return Optimization(module, optimizer, MESH, path).run(lambda: (module(x).cosh() - 2).square().mean(), iterations)
+        return Optimization(module, optimizer, MESH, path).run(
+            lambda: (module(x).cosh() - 2).square().mean(), iterations
+        )
 
     whole = run(None, 6)
     run(tmp_path / "run.state", 3)
@@ -218,8 +224,13 @@ print(kills, killed[0], len(killed[1]))
 def test_fifty_kills(tmp_path):
     """Children of one light process, killed 50 times: no file is refused, and the last run ends bitwise as if alone."""
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
-    out = subprocess.run([sys.executable, "-c", FIFTY, str(tmp_path / "run.state")], capture_output=True, text=True,
-                         timeout=600, env=environment)  # fmt: skip
+    out = subprocess.run(
+        [sys.executable, "-c", FIFTY, str(tmp_path / "run.state")],
+        capture_output=True,
+        text=True,
+        timeout=600,
+        env=environment,
+    )
     assert out.returncode == 0, out.stderr
     kills, begun, iterations = map(int, out.stdout.split())
     assert kills == 50 and iterations == 110

@@ -15,15 +15,26 @@ SIZE = (480, 160)
 
 def test_panels_hold_the_curves_the_body_and_the_target():
     losses = [1.0, 1e-3, 0.0]  # met exactly
-    figure = optimization_figure(losses, {"E [Pa]": [1e5, 2e5, 3e5], "v [m/s]": np.eye(3)}, CUBE, X + 0.1, X + 0.1, X,
-                                 {"E [Pa]": 3e5}, loss_label="loss [m²]", size=SIZE)  # fmt: skip
+    figure = optimization_figure(
+        losses,
+        {"E [Pa]": [1e5, 2e5, 3e5], "v [m/s]": np.eye(3)},
+        CUBE,
+        X + 0.1,
+        X + 0.1,
+        X,
+        {"E [Pa]": 3e5},
+        loss_label="loss [m²]",
+        size=SIZE,
+    )
     loss, E, v, body = figure.axes
     assert loss.get_yscale() == "log" and loss.get_ylabel() == "loss [m²]" and loss.get_ylim()[0] == pytest.approx(3e-4)
     assert loss.lines[0].get_ydata()[:2] == pytest.approx(losses[:2])
-    assert E.lines[0].get_ydata() == pytest.approx([1e5, 2e5, 3e5]) and E.lines[1].get_ydata() == pytest.approx([3e5] * 2)
+    assert E.lines[0].get_ydata() == pytest.approx([1e5, 2e5, 3e5]) and E.lines[1].get_ydata() == pytest.approx(
+        [3e5] * 2
+    )
     assert len(v.lines) == 3 and len({line.get_color() for line in v.lines}) == 3
     start, found = [c for c in body.collections if isinstance(c, PolyCollection)]
-    edges, = [c for c in body.collections if isinstance(c, LineCollection)]
+    (edges,) = [c for c in body.collections if isinstance(c, LineCollection)]
     middles = [np.mean([p.vertices.mean(0) for p in c.get_paths()], 0) for c in (start, found, edges)]
     assert middles[0] == pytest.approx([0.1, 0.1], abs=0.01)
     assert middles[1] == pytest.approx([0.2, 0.2], abs=0.01) == middles[2]
@@ -60,11 +71,18 @@ def test_written_only_when_asked(tmp_path):
         picture.save()
 
 
-@pytest.mark.parametrize("change, text", [
-    (dict(losses=[1.0, -1.0, 0.1]), "losses"), (dict(losses=[1.0, np.nan, 0.1]), "finite"), (dict(plane="xx"), "plane"),
-    (dict(truth={"nu": 1.0}), "truth"), (dict(parameters={"E": [1.0]}), "one row for each"),
-    (dict(found=X[:3]), "must have shape"), (dict(target=np.zeros(3)), "target"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "change, text",
+    [
+        (dict(losses=[1.0, -1.0, 0.1]), "losses"),
+        (dict(losses=[1.0, np.nan, 0.1]), "finite"),
+        (dict(plane="xx"), "plane"),
+        (dict(truth={"nu": 1.0}), "truth"),
+        (dict(parameters={"E": [1.0]}), "one row for each"),
+        (dict(found=X[:3]), "must have shape"),
+        (dict(target=np.zeros(3)), "target"),
+    ],
+)
 def test_bad_arguments_are_refused(change, text):
     good = dict(losses=[1.0, 0.5, 0.1], parameters={"E": [1.0, 2.0, 3.0]}, mesh=CUBE, found=X, target=X, size=SIZE)
     with pytest.raises(ValueError, match=text):

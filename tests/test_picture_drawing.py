@@ -9,13 +9,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from diffsim_ti import obstacles, rasteriser
-from diffsim_ti.camera import Camera
-from diffsim_ti.colouring import Colouring
-from diffsim_ti.drawing import Drawing
+from diffsim_ti import obstacles
 from diffsim_ti.mesh import TetrahedralMesh
-from diffsim_ti.surface import Soup
-from diffsim_ti.vulkan_painter import has_vulkan
+from diffsim_ti.visual import rasteriser
+from diffsim_ti.visual.camera import Camera
+from diffsim_ti.visual.colouring import Colouring
+from diffsim_ti.visual.drawing import Drawing
+from diffsim_ti.visual.surface import Soup
+from diffsim_ti.visual.vulkan_painter import has_vulkan
 
 ROOT = Path(__file__).parents[1]
 SIZE = (200, 150)
@@ -129,12 +130,15 @@ def test_camera_turns_zooms_and_projects():
         Camera.framing(np.array(BOX), SIZE, 0.0, 90.0)
 
 
-@pytest.mark.parametrize("shape, volume", [
-    (obstacles.ball([1, 2, 3], 0.5), 4 / 3 * np.pi * 0.125),
-    (obstacles.box([1, 0, 0], [0.2, 0.4, 0.6], [1.0, 0.3, 0.2, 0.1]), 0.048),
-    (obstacles.tube(np.zeros(3), np.array([1.0, 1.0, 0]), 0.2, False), np.pi * 0.04 * 2**0.5),
-    (obstacles.tube(np.zeros(3), np.array([0, 0, 1.0]), 0.2, True), np.pi * 0.04 + 4 / 3 * np.pi * 0.008),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "shape, volume",
+    [
+        (obstacles.ball([1, 2, 3], 0.5), 4 / 3 * np.pi * 0.125),
+        (obstacles.box([1, 0, 0], [0.2, 0.4, 0.6], [1.0, 0.3, 0.2, 0.1]), 0.048),
+        (obstacles.tube(np.zeros(3), np.array([1.0, 1.0, 0]), 0.2, False), np.pi * 0.04 * 2**0.5),
+        (obstacles.tube(np.zeros(3), np.array([0, 0, 1.0]), 0.2, True), np.pi * 0.04 + 4 / 3 * np.pi * 0.008),
+    ],
+)
 def test_obstacles_are_closed_and_face_outwards(shape, volume):
     points, triangles = shape
     a, b, c = (points[triangles[:, k]] for k in range(3))
@@ -144,7 +148,9 @@ def test_obstacles_are_closed_and_face_outwards(shape, volume):
 
 def test_a_hollow_ball_is_a_bowl_seen_from_within():
     points, triangles = obstacles.bowl(np.array([1.0, 2, 3]), 0.5)
-    normals = np.cross(points[triangles[:, 1]] - points[triangles[:, 0]], points[triangles[:, 2]] - points[triangles[:, 0]])
+    normals = np.cross(
+        points[triangles[:, 1]] - points[triangles[:, 0]], points[triangles[:, 2]] - points[triangles[:, 0]]
+    )
     inwards = np.einsum("nd,nd->n", normals, [1.0, 2, 3] - points[triangles].mean(1))
     assert (inwards >= -1e-12).all() and points[:, 1].max() == pytest.approx(2.0)
     assert np.linalg.norm(normals, axis=1).sum() / 2 == pytest.approx(2 * np.pi * 0.25, rel=0.02)
@@ -173,29 +179,40 @@ def test_the_nearer_triangle_is_seen_and_colours_are_linear_in_space():
     colours[0, :, 0], colours[1, :, 2] = 1, [0.5, 0.5, 1.0]
     soup = Soup(corners, colours, corners[..., 2].mean(1))
     image = rasteriser.SoftwarePainter((40, 40)).paint(soup, np.ones((40, 40, 3), np.float32))
-    assert image[18, 5] == pytest.approx([1, 0, 0]) and image[22, 5, 0] == 0 and image[35, 35] == pytest.approx([1, 1, 1])
+    assert (
+        image[18, 5] == pytest.approx([1, 0, 0]) and image[22, 5, 0] == 0 and image[35, 35] == pytest.approx([1, 1, 1])
+    )
     y = 30.5  # 1 / depth is linear in the picture: 1/2 + y / 80; so is colour / depth
     assert image[30, 2, 2] == pytest.approx((0.25 + y / 40 * 0.75) / (0.5 + y / 80), abs=0.02)
 
 
 def test_obstacles_of_a_scene_by_type():
-    term = SimpleNamespace(values={"sphere_center": np.zeros(3), "sphere_radius": np.array(0.5)}, inside=False, path=None)
+    term = SimpleNamespace(
+        values={"sphere_center": np.zeros(3), "sphere_radius": np.array(0.5)}, inside=False, path=None
+    )
     floor = SimpleNamespace(values={"ground_height": np.array(-0.25)})
     scene = SimpleNamespace(terms=[floor, term], mesh=None)
     assert obstacles.floor_of(scene) == -0.25
-    (points, _), = obstacles.obstacle_surfaces(scene)
+    ((points, _),) = obstacles.obstacle_surfaces(scene)
     assert np.linalg.norm(points, axis=1) == pytest.approx(0.5)
 
 
-@pytest.mark.parametrize("arguments, text", [
-    (dict(size=(3, 3)), "size"), (dict(backend="opengl"), "backend must be one of"), (dict(elevation=91.0), "elevation"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "arguments, text",
+    [
+        (dict(size=(3, 3)), "size"),
+        (dict(backend="opengl"), "backend must be one of"),
+        (dict(elevation=91.0), "elevation"),
+    ],
+)
 def test_bad_arguments_are_refused(cube, arguments, text):
     with pytest.raises(ValueError, match=text):
         Drawing(cube, **arguments)
 
 
-@pytest.mark.parametrize("values, limits, text", [([0.0, np.nan], None, "finite"), ([0.0, 1.0], (1.0, 1.0), "lower first")])
+@pytest.mark.parametrize(
+    "values, limits, text", [([0.0, np.nan], None, "finite"), ([0.0, 1.0], (1.0, 1.0), "lower first")]
+)
 def test_bad_colours_are_refused(values, limits, text):
     with pytest.raises(ValueError, match=text):
         Colouring.of(values, limits=limits)
@@ -205,9 +222,9 @@ def test_bad_colours_are_refused(values, limits, text):
 
 CODE = """
 import resource, numpy as np, sys
-from diffsim_ti.drawing import Drawing
+from diffsim_ti.visual.drawing import Drawing
 from diffsim_ti.mesh import TetrahedralMesh
-from diffsim_ti.surface import Soup
+from diffsim_ti.visual.surface import Soup
 cube = TetrahedralMesh.create_cube(3, 0.2)
 pages = lambda: int(open("/proc/self/statm").read().split()[1]) * resource.getpagesize() / 2**20
 with Drawing(cube, (160, 120), ground=0.0, backend=sys.argv[1]) as drawing:
@@ -237,5 +254,7 @@ def test_300_frames_without_growth(backend):
 def test_without_a_vulkan_driver_the_choice_is_software():
     """An empty list of drivers is what a machine without Vulkan has."""
     code = CODE.replace("300", "41").replace("sys.argv[1]", "'auto'")
-    lines = in_process(code, VK_ICD_FILENAMES="/nonexistent.json", VK_DRIVER_FILES="/nonexistent.json", TI_ENABLE_VULKAN="0")
+    lines = in_process(
+        code, VK_ICD_FILENAMES="/nonexistent.json", VK_DRIVER_FILES="/nonexistent.json", TI_ENABLE_VULKAN="0"
+    )
     assert "drawn by NumPy (no Vulkan driver here)" in lines[0]

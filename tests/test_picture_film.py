@@ -8,9 +8,10 @@ import pytest
 from matplotlib import colormaps
 
 import diffsim_ti as ds
-from diffsim_ti import cli, film, series_fields
+from diffsim_ti import cli, film
 from diffsim_ti.mesh import TetrahedralMesh
-from diffsim_ti.series import Series
+from diffsim_ti.visual import fields as series_fields
+from diffsim_ti.visual.series import Series
 
 SIZE = (160, 120)
 LEFT = slice(0, 110)  # columns without the legend
@@ -56,8 +57,17 @@ def test_states_in_memory_become_a_film(cube, tmp_path):
 
     at = [cube.vertices - [0, 0.1 * k, 0] for k in range(3)]
     balls = [[ball((0.4, 0.2 * k - 0.1, 0.1), 0.08)] for k in range(3)]
-    count = film.save_film(tmp_path / "a.gif", cube, at, [np.full(cube.num_vertices, 5.0 * k) for k in range(3)], size=SIZE,
-                           obstacles=balls, azimuth=0.0, elevation=0.0, box=[[-0.1, -0.3, 0], [0.5, 0.4, 0.2]])  # fmt: skip
+    count = film.save_film(
+        tmp_path / "a.gif",
+        cube,
+        at,
+        [np.full(cube.num_vertices, 5.0 * k) for k in range(3)],
+        size=SIZE,
+        obstacles=balls,
+        azimuth=0.0,
+        elevation=0.0,
+        box=[[-0.1, -0.3, 0], [0.5, 0.4, 0.2]],
+    )
     images = [np.asarray(i)[..., :3].astype(float) for i in imageio.mimread(tmp_path / "a.gif")]
     assert count == len(images) == 3
     rows = [np.nonzero(body(i))[0].mean() for i in images]
@@ -86,7 +96,11 @@ def test_a_series_shows_its_floor_obstacles_and_fixed_vertices(cube, tmp_path):
     assert body(last).sum() < 0.8 * body(first).sum()
     assert ((first[..., 0] - first[..., 2] > 100)[:, LEFT]).sum() > 5  # marks
     assert [p.name for p in sorted(tmp_path.glob("*.vtu"))] == [
-        "a_0000.vtu", "a_0001.vtu", "a_obstacles_0000.vtu", "a_obstacles_0001.vtu"]  # fmt: skip
+        "a_0000.vtu",
+        "a_0001.vtu",
+        "a_obstacles_0000.vtu",
+        "a_obstacles_0001.vtu",
+    ]
     Series(tmp_path, cube, "a")  # an older series goes with its obstacles
     assert not list(tmp_path.glob("*.vtu"))
 
@@ -105,10 +119,15 @@ def test_two_sided_limits_are_symmetric(low, high, expected):
     assert series_fields.FIELDS["J"].limits(low, high) == pytest.approx(expected)
 
 
-@pytest.mark.parametrize("change, text", [
-    (dict(colour="mass"), "must be one of"), (dict(fps=0.0), "fps"), (dict(size=(161, 120)), "even"),
-    (dict(output="a.avi"), "must end in"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "change, text",
+    [
+        (dict(colour="mass"), "must be one of"),
+        (dict(fps=0.0), "fps"),
+        (dict(size=(161, 120)), "even"),
+        (dict(output="a.avi"), "must end in"),
+    ],
+)
 def test_bad_arguments_are_refused(series, tmp_path, change, text):
     output = tmp_path / change.pop("output", "a.mp4")
     with pytest.raises(ValueError, match=text):

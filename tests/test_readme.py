@@ -48,5 +48,7 @@ def test_code_block_runs_and_prints_what_is_shown(code, printed):
 
 def test_every_command_that_the_readme_names_exists():
     commands = set(re.findall(r"diffsim-ti ([a-z-]+)", README))
-    shown = subprocess.run([sys.executable, "-m", "diffsim_ti", "--help"], capture_output=True, text=True, cwd=ROOT).stdout
+    shown = subprocess.run(
+        [sys.executable, "-m", "diffsim_ti", "--help"], capture_output=True, text=True, cwd=ROOT
+    ).stdout
     assert commands and all(command in shown for command in commands), commands

@@ -7,7 +7,7 @@ import diffsim_ti as ds
 from diffsim_ti import runtime
 from diffsim_ti.materials import MATERIALS
 from diffsim_ti.solvers import SOLVERS as ALL_SOLVERS
-from diffsim_ti.stability import Stiffness
+from diffsim_ti.state.stability import Stiffness
 
 SOLVERS = [s for s in ALL_SOLVERS if s.explicit]  # the implicit ones: test_implicit*.py
 E, RHO, G = 1e5, 1000.0, 9.81
@@ -144,7 +144,9 @@ def test_free_fall_is_exact(solver, precision):
         np.full(8, expected), abs=within(precision, 4e-14, 1e-6)
     )  # 1000 roundings of half an ulp of 5
     assert np.abs(fall - fall[0]).max() <= within(precision, 1e-13, 1e-6)  # rigid
-    assert solution.velocities[-1, :, 1] == pytest.approx(np.full(8, -G * steps * 1e-3), rel=within(precision, 1e-12, 1e-5))
+    assert solution.velocities[-1, :, 1] == pytest.approx(
+        np.full(8, -G * steps * 1e-3), rel=within(precision, 1e-12, 1e-5)
+    )
 
 
 @solvers
@@ -230,11 +232,17 @@ def fields_of(F, material, precision="f64"):
 
 
 @backends
-@pytest.mark.parametrize("nu, s, t, P11, psi", [
-    (0.0, 1.5, 1, 41666.666667, 10976.744595), (0.3, 0.8, 1.063056609, -23561.988190, 2224.535063),
-    (0.3, 1.5, 0.871868464, 38201.163631, 10333.526022), (0.3, 2, 0.779503187, 65237.976567, 36439.407882),
-    (0.45, 1.5, 0.830036766, 35885.953285, 9865.483031), (0.45, 2, 0.724651756, 59911.721253, 34050.329301),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "nu, s, t, P11, psi",
+    [
+        (0.0, 1.5, 1, 41666.666667, 10976.744595),
+        (0.3, 0.8, 1.063056609, -23561.988190, 2224.535063),
+        (0.3, 1.5, 0.871868464, 38201.163631, 10333.526022),
+        (0.3, 2, 0.779503187, 65237.976567, 36439.407882),
+        (0.45, 1.5, 0.830036766, 35885.953285, 9865.483031),
+        (0.45, 2, 0.724651756, 59911.721253, 34050.329301),
+    ],
+)
 def test_uniaxial_stretch(nu, s, t, P11, psi, precision):
     """R1. The stress is uniaxial, so that von Mises is |P11| / t^2."""
     fields = fields_of(np.diag([s, t, t]), ds.StableNeoHookean(E, nu), precision)
@@ -252,7 +260,9 @@ def test_simple_shear(nu, gamma):
     F[0, 1] = gamma
     mu = E / (2 * (1 + nu))
     # F - I is known to one ulp of 1 (positions are stored), so that gamma = 1e-6 carries ten digits
-    assert fields_of(F, ds.StableNeoHookean(E, nu)).energy_density == pytest.approx(np.full(5, mu * gamma**2 / 2), rel=1e-9)
+    assert fields_of(F, ds.StableNeoHookean(E, nu)).energy_density == pytest.approx(
+        np.full(5, mu * gamma**2 / 2), rel=1e-9
+    )
 
 
 @pytest.mark.parametrize("s", [0.5, 0.9, 1.3, 2.0])
@@ -462,7 +472,12 @@ def test_drag_is_a_rate(solver, dt, precision):
     """v = v0 exp(-c t) for any dt and any number of substeps; the body is soft, so that large steps are stable."""
     mesh = one_tetrahedron()
     scene = ds.Scene(
-        mesh, ds.StableNeoHookean(1e-3, 0.3), RHO, terms=[ds.Drag(0.7)], initial_velocities=[1, 2, 3], precision=precision
+        mesh,
+        ds.StableNeoHookean(1e-3, 0.3),
+        RHO,
+        terms=[ds.Drag(0.7)],
+        initial_velocities=[1, 2, 3],
+        precision=precision,
     )
     for substeps in (1, 3):
         frames = run(scene, solver, dt, few(10, 3), substeps=substeps)
@@ -496,8 +511,15 @@ def test_prescribed_motion_is_followed(solver, how, precision):
     times = np.array([0.0, 0.021, 0.05, 0.2])
     keyframes = (times, np.array([[0, 0, 0], [0.02, -0.01, 0], [0.03, 0, 0.01], [0, 0.1, 0]]))
     motion = function if how == "function" else keyframes
-    scene = ds.Scene(mesh, ds.StableNeoHookean(E, 0.3), RHO, fixed="ymin", motion=motion,
-                     initial_positions=mesh.vertices + [0, 0.3, 0], precision=precision)  # fmt: skip
+    scene = ds.Scene(
+        mesh,
+        ds.StableNeoHookean(E, 0.3),
+        RHO,
+        fixed="ymin",
+        motion=motion,
+        initial_positions=mesh.vertices + [0, 0.3, 0],
+        precision=precision,
+    )
     frames = run(scene, solver, dt, steps, substeps=2)
     if how == "function":
         path = np.array([function(t) for t in frames.times])
@@ -553,7 +575,9 @@ def test_external_force_per_step(solver, precision):
     """The body's momentum is the sum of the impulses dt f, whatever the substeps."""
     mesh, rng = ds.TetrahedralMesh.create_box(2), np.random.default_rng(0)
     forces = rng.standard_normal((10, 2, 3))
-    scene = ds.Scene(mesh, ds.StableNeoHookean(E, 0.3), RHO, terms=[ds.ExternalForce(forces, [1, 6])], precision=precision)
+    scene = ds.Scene(
+        mesh, ds.StableNeoHookean(E, 0.3), RHO, terms=[ds.ExternalForce(forces, [1, 6])], precision=precision
+    )
     for substeps in (1, 3):
         frames = run(scene, solver, 2e-3, 10, substeps=substeps)
         momentum = (masses(scene)[:, None] * frames.velocities).sum(1)
@@ -612,7 +636,9 @@ def test_weight_at_rest_on_the_ground(solver, mass, gap):
 def test_barrier_bounce(solver, v, d_min, omega):
     """R23: vertices of 1 kg, nearly free of each other, fly into the barrier and come back as fast."""
     mesh = standing_tetrahedron(0.02)
-    scene = ds.Scene(mesh, ds.LinearElastic(1e-6, 0.0), 4 / mesh.volume, terms=[ds.Ground()], initial_velocities=[0, -v, 0])
+    scene = ds.Scene(
+        mesh, ds.LinearElastic(1e-6, 0.0), 4 / mesh.volume, terms=[ds.Ground()], initial_velocities=[0, -v, 0]
+    )
     dt = 0.05 / omega
     frames = run(scene, solver, dt, int(0.04 / v / dt))
     y = frames.positions[:, :3, 1]
@@ -642,5 +668,7 @@ def test_energy_adds_up():
     m, mu, volume = masses(scene)[3], E / 2.6, scene.mesh.volume
     assert energy.parts["kinetic"] == pytest.approx(0.5 * m * 0.25, rel=1e-14)
     assert energy.parts["elastic"] == pytest.approx(mu * (0.4 / 0.5) ** 2 / 2 * volume, rel=1e-13)
-    assert energy.parts["gravity"] == pytest.approx(m * G * scene.inputs.values["initial_positions"][:, 1].sum(), rel=1e-13)
+    assert energy.parts["gravity"] == pytest.approx(
+        m * G * scene.inputs.values["initial_positions"][:, 1].sum(), rel=1e-13
+    )
     assert energy.parts["contact"] == 0 and energy == pytest.approx(sum(energy.parts.values()))

@@ -15,7 +15,7 @@ import taichi as ti
 import diffsim_ti as ds
 from diffsim_ti import runtime
 from diffsim_ti.solvers import SOLVERS as ALL_SOLVERS
-from diffsim_ti.terms.ground import GroundForce
+from diffsim_ti.terms.obstacles.ground import GroundForce
 
 SOLVERS = [s for s in ALL_SOLVERS if s.explicit]  # the implicit ones: test_implicit*.py
 ROOT = Path(__file__).parents[1]
@@ -131,7 +131,8 @@ def test_arrays_of_an_earlier_program_leave_those_of_the_next_alone():
 
 def test_host_s_init_is_respected():
     """The host's fields live on, its settings stay, and a warning names what they cost."""
-    out = python("""
+    out = python(
+        """
         import warnings
         import taichi as ti
         ti.init(arch=ti.cpu, default_fp=ti.f32, log_level=ti.ERROR, random_seed=5)
@@ -140,16 +141,22 @@ def test_host_s_init_is_respected():
         import diffsim_ti as ds
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-    """ + textwrap.indent(STEP, "        ") + """
+    """
+        + textwrap.indent(STEP, "        ")
+        + """
             ds.SemiImplicitSolver(scene, dt=1e-3)
         print(field[1], ti.cfg.random_seed, len(caught), caught[0].message)
-    """)  # fmt: skip
+    """
+    )
     assert re.search(r"^7.0 5 1 ti.init was called with fast_math=True, .* use diffsim_ti.init\(\)", out, re.M), out
 
 
 def test_second_init_is_noticed():
     """Objects of the first program say so; new ones work."""
-    out = python("import diffsim_ti as ds\nds.init('cpu')\n" + textwrap.dedent(STEP) + textwrap.dedent("""
+    out = python(
+        "import diffsim_ti as ds\nds.init('cpu')\n"
+        + textwrap.dedent(STEP)
+        + textwrap.dedent("""
         rollout = ds.Rollout(simulator.solver, 5)
         frames = rollout.forward()
         rollout.field("initial_velocities")
@@ -166,10 +173,13 @@ def test_second_init_is_noticed():
         ds.Simulator(ds.SemiImplicitSolver(again, dt=1e-3)).run(3)
         del simulator, rollout
         print(again.precision, "done")
-    """))  # fmt: skip
+    """)
+    )
     lines = out.splitlines()
     assert lines[-1] == "f64 done"
-    assert lines[:-1] == ["ti.init was called again, which destroys all Taichi data: build the scene and solver anew"] * 9
+    assert (
+        lines[:-1] == ["ti.init was called again, which destroys all Taichi data: build the scene and solver anew"] * 9
+    )
 
 
 def test_home_that_cannot_be_written():
@@ -183,7 +193,8 @@ def test_cache_folder_that_cannot_be_made(tmp_path):
     (tmp_path / "file").write_text("in the way")
     cache = str(tmp_path / "file" / "ticache")
     out = python(
-        "import diffsim_ti as ds\nds.init()\n" + textwrap.dedent(STEP) + "print('done')", TI_OFFLINE_CACHE_FILE_PATH=cache
+        "import diffsim_ti as ds\nds.init()\n" + textwrap.dedent(STEP) + "print('done')",
+        TI_OFFLINE_CACHE_FILE_PATH=cache,
     )
     assert out.splitlines()[-1] == "done"
 
@@ -308,11 +319,15 @@ def test_absent_contact_leaves_no_code(solver, monkeypatch):
 def test_torch_is_not_needed():
     """The core runs where torch cannot be imported."""
     start = "import sys\nsys.modules['torch'] = None\nimport diffsim_ti as ds\nds.init()\n"
-    out = python(start + textwrap.dedent(STEP) + textwrap.dedent("""
+    out = python(
+        start
+        + textwrap.dedent(STEP)
+        + textwrap.dedent("""
         rollout = ds.Rollout(simulator.solver, 5)
         frames = rollout.forward()
         print(sorted(rollout.vjp(frames, positions=frames.positions)))
-    """))  # fmt: skip
+    """)
+    )
     assert "youngs_modulus" in out
 
 

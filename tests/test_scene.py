@@ -52,25 +52,49 @@ REFUSED = {
     "nu half": (lambda: ds.StableNeoHookean(E, 0.5), r"poissons_ratio must lie in \(-1, 0.5\), got 0.5: .*take 0.45"),
     "nu minus one": (lambda: ds.StableNeoHookean(E, -1.0), r"poissons_ratio must lie in \(-1, 0.5\), got -1"),
     "E nan": (lambda: ds.StableNeoHookean(np.nan, 0.3), "youngs_modulus must be finite, got nan"),
-    "E of the wrong length": (lambda: scene(material=ds.StableNeoHookean(np.full(M + 1, E), 0.3)), f"youngs_modulus.*{M}.*{M + 1}"),
-    "E in one tetrahedron": (lambda: scene(material=ds.StableNeoHookean(spoiled(M, -2.0), 0.3)), "got -2 in tetrahedron 1"),
+    "E of the wrong length": (
+        lambda: scene(material=ds.StableNeoHookean(np.full(M + 1, E), 0.3)),
+        f"youngs_modulus.*{M}.*{M + 1}",
+    ),
+    "E in one tetrahedron": (
+        lambda: scene(material=ds.StableNeoHookean(spoiled(M, -2.0), 0.3)),
+        "got -2 in tetrahedron 1",
+    ),
     # density
     "density zero": (lambda: scene(density=0.0), r"density must be > 0 \[kg/m\^3\], got 0"),
     "density negative in one": (lambda: scene(density=spoiled(M, -3.0)), r"density must be > 0 .*got -3"),
     "density nan": (lambda: scene(density=np.nan), "density must be finite: 1 of 1 values"),
-    "density of the wrong length": (lambda: scene(density=np.ones(M - 1)), rf"density: expected one number or shape \({M},\), got \({M - 1},\)"),
+    "density of the wrong length": (
+        lambda: scene(density=np.ones(M - 1)),
+        rf"density: expected one number or shape \({M},\), got \({M - 1},\)",
+    ),
     # start
-    "positions' shape": (lambda: scene(initial_positions=np.zeros((N + 1, 3))), rf"initial_positions: expected shape \({N}, 3\), got \({N + 1}, 3\)"),
-    "positions nan": (lambda: scene(initial_positions=spoiled((N, 3))), f"initial_positions must be finite: 1 of {3 * N}"),
+    "positions' shape": (
+        lambda: scene(initial_positions=np.zeros((N + 1, 3))),
+        rf"initial_positions: expected shape \({N}, 3\), got \({N + 1}, 3\)",
+    ),
+    "positions nan": (
+        lambda: scene(initial_positions=spoiled((N, 3))),
+        f"initial_positions must be finite: 1 of {3 * N}",
+    ),
     "velocities inf": (lambda: scene(initial_velocities=spoiled((N, 3), np.inf)), "initial_velocities must be finite"),
-    "velocities' shape": (lambda: scene(initial_velocities=np.zeros((2, 3))), rf"initial_velocities.*\({N}, ?3\)|broadcast"),
+    "velocities' shape": (
+        lambda: scene(initial_velocities=np.zeros((2, 3))),
+        rf"initial_velocities.*\({N}, ?3\)|broadcast",
+    ),
     "precision": (lambda: scene(precision="f16"), "precision must be 'f32' or 'f64', got 'f16'"),
     # terms
     "not a term": (lambda: scene(terms=[9.81]), r"terms must be diffsim_ti terms such as Gravity\(\), got 9.81"),
-    "two gravities": (lambda: scene(terms=[ds.Gravity(), ds.Gravity()]), "a scene takes one Gravity, got several; add their numbers"),
+    "two gravities": (
+        lambda: scene(terms=[ds.Gravity(), ds.Gravity()]),
+        "a scene takes one Gravity, got several; add their numbers",
+    ),
     "two drags": (lambda: scene(terms=[ds.Drag(1), ds.Drag(2)]), "a scene takes one Drag"),
     "two forces": (lambda: scene(terms=[ds.ExternalForce([0, 0, 1])] * 2), "a scene takes one ExternalForce"),
-    "gravity's shape": (lambda: ds.Gravity([1, 2]), r"acceleration must be a number \(along y\) or 3 numbers, got shape \(2,\)"),
+    "gravity's shape": (
+        lambda: ds.Gravity([1, 2]),
+        r"acceleration must be a number \(along y\) or 3 numbers, got shape \(2,\)",
+    ),
     "gravity nan": (lambda: ds.Gravity(np.nan), "Gravity: gravity must be finite"),
     "drag negative": (lambda: ds.Drag(-1.0), r"Drag: rate must be one number >= 0 \[1/s\], got -1"),
     "drag per vertex": (lambda: ds.Drag([1.0, 2.0]), "Drag: rate must be one number"),
@@ -78,35 +102,77 @@ REFUSED = {
     "ground kappa negative": (lambda: ds.Ground(stiffness=-1.0), r"Ground: stiffness \[N/m\] must be > 0, got -1"),
     "ground width": (lambda: ds.Ground(width=0.0), r"Ground: width \[m\] must be > 0, got 0"),
     "ground nan": (lambda: ds.Ground(height=np.nan), "Ground: ground_height must be finite"),
-    "starts below the ground": (lambda: scene(terms=[ds.Ground(height=0.25)]), r"vertex \d+ is at -0.25 m above y = 0.25 \(9 vertices\); lift the body"),
-    "starts on the ground": (lambda: scene(terms=[ds.Ground(height=0.0)]), r"starts below or on the ground: vertex \d+ is at 0 m"),
-    "moved below the ground": (lambda: scene(terms=[ds.Ground(height=-0.5)], initial_positions=MESH.vertices - [0, 1, 0]), "at -0.5 m above y = -0.5"),
-    "forces' shape": (lambda: ds.ExternalForce(np.zeros((2, 2))), r"forces must have shape \(3,\), \(k, 3\) or \(steps, k, 3\), got \(2, 2\)"),
-    "forces' count": (lambda: scene(terms=[ds.ExternalForce(np.zeros((4, 3)), [0, 1])]), r"expected forces for 2 vertices, shape \(..., 2, 3\), got \(4, 3\)"),
-    "forces' set": (lambda: scene(terms=[ds.ExternalForce([0, 0, 1], "top")]), "no vertex set is called 'top'; there are: xmin"),
+    "starts below the ground": (
+        lambda: scene(terms=[ds.Ground(height=0.25)]),
+        r"vertex \d+ is at -0.25 m above y = 0.25 \(9 vertices\); lift the body",
+    ),
+    "starts on the ground": (
+        lambda: scene(terms=[ds.Ground(height=0.0)]),
+        r"starts below or on the ground: vertex \d+ is at 0 m",
+    ),
+    "moved below the ground": (
+        lambda: scene(terms=[ds.Ground(height=-0.5)], initial_positions=MESH.vertices - [0, 1, 0]),
+        "at -0.5 m above y = -0.5",
+    ),
+    "forces' shape": (
+        lambda: ds.ExternalForce(np.zeros((2, 2))),
+        r"forces must have shape \(3,\), \(k, 3\) or \(steps, k, 3\), got \(2, 2\)",
+    ),
+    "forces' count": (
+        lambda: scene(terms=[ds.ExternalForce(np.zeros((4, 3)), [0, 1])]),
+        r"expected forces for 2 vertices, shape \(..., 2, 3\), got \(4, 3\)",
+    ),
+    "forces' set": (
+        lambda: scene(terms=[ds.ExternalForce([0, 0, 1], "top")]),
+        "no vertex set is called 'top'; there are: xmin",
+    ),
     # fixed vertices and their motion
     "fixed name": (lambda: scene(fixed="bottom"), "no vertex set is called 'bottom'; there are: xmin, xmax"),
     "fixed index": (lambda: scene(fixed=[0, N]), f"indices must lie in 0..{N - 1}, got {N}"),
     "fixed negative": (lambda: scene(fixed=[-1]), f"indices must lie in 0..{N - 1}, got -1"),
     "fixed mask": (lambda: scene(fixed=np.zeros(N - 1, bool)), rf"a mask must have shape \({N},\), got \({N - 1},\)"),
     "fixed floats": (lambda: scene(fixed=[0.0, 1.0]), "indices must be integers, got dtype float64"),
-    "motion of none": (lambda: scene(motion=lambda t: [0, 0, 0]), "motion moves the fixed vertices, but none is fixed; pass fixed="),
-    "motion nan": (lambda: scene(fixed="xmin", motion=lambda t: [np.nan, 0, 0]), "motion: displacements must be finite"),
-    "keyframes": (lambda: scene(fixed="xmin", motion=([0, 1, 1], np.zeros((3, 3)))), "motion: keyframe times must increase"),
+    "motion of none": (
+        lambda: scene(motion=lambda t: [0, 0, 0]),
+        "motion moves the fixed vertices, but none is fixed; pass fixed=",
+    ),
+    "motion nan": (
+        lambda: scene(fixed="xmin", motion=lambda t: [np.nan, 0, 0]),
+        "motion: displacements must be finite",
+    ),
+    "keyframes": (
+        lambda: scene(fixed="xmin", motion=([0, 1, 1], np.zeros((3, 3)))),
+        "motion: keyframe times must increase",
+    ),
     # rollouts
     "steps negative": (lambda: rollout(-1), "steps must be a whole number >= 0, got -1"),
     "steps broken": (lambda: rollout(1.5), "steps must be a whole number >= 0, got 1.5"),
     "save_every": (lambda: rollout(options=dict(save_every=3)), "save_every = 3 must be >= 1 and divide steps = 10"),
     "save_every zero": (lambda: rollout(options=dict(save_every=0)), "save_every = 0 must be >= 1"),
-    "gradients": (lambda: rollout(options=dict(gradients=["stiffness"])), "no input named 'stiffness'; this rollout has initial_positions, .*youngs_modulus"),
-    "memory": (lambda: rollout(options=dict(memory=1e-6)), r"memory = 1e-06 MB is too little to differentiate at all: .* MB is the least"),
+    "gradients": (
+        lambda: rollout(options=dict(gradients=["stiffness"])),
+        "no input named 'stiffness'; this rollout has initial_positions, .*youngs_modulus",
+    ),
+    "memory": (
+        lambda: rollout(options=dict(memory=1e-6)),
+        r"memory = 1e-06 MB is too little to differentiate at all: .* MB is the least",
+    ),
     "unknown value": (lambda: rollout().forward(stiffness=1.0), "no input named 'stiffness'; this rollout has"),
-    "value's shape": (lambda: rollout().forward(initial_positions=np.zeros((3, 3))), r"initial_positions: expected shape"),
+    "value's shape": (
+        lambda: rollout().forward(initial_positions=np.zeros((3, 3))),
+        r"initial_positions: expected shape",
+    ),
     "value's range": (lambda: rollout().forward(youngs_modulus=-1.0), "youngs_modulus must be > 0, got -1"),
     "value's nan": (lambda: rollout().forward(density=np.nan), "density must be finite"),
-    "inside out": (lambda: rollout().forward(rest_positions=-MESH.vertices), r"rest_positions turn tetrahedron \d+ inside out .*take a smaller step"),
-    "too few forces": (lambda: rollout(terms=[ds.ExternalForce(np.zeros((9, N, 3)))]).forward(), "external_forces: 10 steps need as many rows, got 9"),
-}  # fmt: skip
+    "inside out": (
+        lambda: rollout().forward(rest_positions=-MESH.vertices),
+        r"rest_positions turn tetrahedron \d+ inside out .*take a smaller step",
+    ),
+    "too few forces": (
+        lambda: rollout(terms=[ds.ExternalForce(np.zeros((9, N, 3)))]).forward(),
+        "external_forces: 10 steps need as many rows, got 9",
+    ),
+}
 
 
 @pytest.mark.parametrize("case", REFUSED)
@@ -116,13 +182,19 @@ def test_refused(case):
         build()
 
 
-@pytest.mark.parametrize("build", [
-    lambda: scene(initial_velocities=[1.0, 2.0, 3.0]), lambda: scene(terms=ds.Gravity()), lambda: scene(density=np.full(M, 2.0)),
-    lambda: scene(terms=[ds.Ground(height=-0.005)]),  # within the barrier's width: allowed
-    lambda: scene(terms=[ds.Ground(height=-1.0), ds.Ground(height=-2.0)]),  # contacts may be several
-    lambda: scene(fixed=[]), lambda: scene(fixed="xmin", motion=lambda t: np.zeros((9, 3))),
-    lambda: scene(material=ds.StableNeoHookean(np.linspace(1e4, 1e5, 2 * M)[::2], 0.3)),  # not contiguous
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "build",
+    [
+        lambda: scene(initial_velocities=[1.0, 2.0, 3.0]),
+        lambda: scene(terms=ds.Gravity()),
+        lambda: scene(density=np.full(M, 2.0)),
+        lambda: scene(terms=[ds.Ground(height=-0.005)]),  # within the barrier's width: allowed
+        lambda: scene(terms=[ds.Ground(height=-1.0), ds.Ground(height=-2.0)]),  # contacts may be several
+        lambda: scene(fixed=[]),
+        lambda: scene(fixed="xmin", motion=lambda t: np.zeros((9, 3))),
+        lambda: scene(material=ds.StableNeoHookean(np.linspace(1e4, 1e5, 2 * M)[::2], 0.3)),  # not contiguous
+    ],
+)
 def test_accepted(build):
     ds.Simulator(ds.SemiImplicitSolver(build(), dt=1e-4)).run(2)
 
@@ -191,13 +263,25 @@ def test_replace_changes_only_what_it_names():
 def test_describe():
     of = scene(terms=[ds.Gravity(), ds.Drag(0.5)], fixed="xmin", motion=lambda t: [0, 0, 0], precision="f64")
     text = of.describe()
-    for part in (repr(MESH), repr(SOFT), "mass 1000 kg, precision f64", "Gravity(gravity=[ 0.  , -9.81,  0.  ])", "Drag(drag_rate=0.5)",
-                 "fixed vertices: 9, moving"):  # fmt: skip
+    for part in (
+        repr(MESH),
+        repr(SOFT),
+        "mass 1000 kg, precision f64",
+        "Gravity(gravity=[ 0.  , -9.81,  0.  ])",
+        "Drag(drag_rate=0.5)",
+        "fixed vertices: 9, moving",
+    ):
         assert part in text, text
     assert "terms: none" in scene().describe() and "fixed vertices: 0" in scene().describe()
     simulator = ds.Simulator(ds.VelocityVerletSolver(of, dt=1e-3, substeps=2))
-    for part in (text, "VelocityVerletSolver: dt 0.001 s, 2 substeps of 0.0005 s", "built: StableNeoHookeanLaw (f64", "one set of moduli",
-                 "terms Gravity, Drag, prescribed motion", "MB on the device"):  # fmt: skip
+    for part in (
+        text,
+        "VelocityVerletSolver: dt 0.001 s, 2 substeps of 0.0005 s",
+        "built: StableNeoHookeanLaw (f64",
+        "one set of moduli",
+        "terms Gravity, Drag, prescribed motion",
+        "MB on the device",
+    ):
         assert part in simulator.describe(), simulator.describe()
     varied = scene(material=ds.StableNeoHookean(np.linspace(1e4, 1e5, M), 0.3))
     assert "moduli per tetrahedron" in ds.Simulator(ds.SemiImplicitSolver(varied, dt=1e-3)).describe()
@@ -205,7 +289,13 @@ def test_describe():
 
 def test_inputs_are_named_after_the_scene():
     of = scene(terms=[ds.Gravity(), ds.Ground(height=-1), ds.Ground(height=-2)])
-    assert of.inputs.names[:5] == ("initial_positions", "initial_velocities", "youngs_modulus", "poissons_ratio", "density")
+    assert of.inputs.names[:5] == (
+        "initial_positions",
+        "initial_velocities",
+        "youngs_modulus",
+        "poissons_ratio",
+        "density",
+    )
     assert {"gravity", "ground_height", "ground_height_2", "rest_positions"} <= set(of.inputs.names)
 
 
@@ -230,9 +320,13 @@ def test_scaling(solver, size):
 
     def final(L):
         of = ds.Scene(
-            MESH.scaled(L), ds.StableNeoHookean(E * L**2, 0.3), RHO, fixed="ymax", initial_velocities=np.array([0.5, 0, 0.2]) * L,
+            MESH.scaled(L),
+            ds.StableNeoHookean(E * L**2, 0.3),
+            RHO,
+            fixed="ymax",
+            initial_velocities=np.array([0.5, 0, 0.2]) * L,
             terms=[ds.Gravity(-9.81 * L), ds.Drag(0.1), ds.Ground(-0.05 * L, stiffness=1e6 * L**3, width=0.1 * L)],
-        )  # fmt: skip
+        )
         frames = ds.Rollout(solver(of, dt=1e-3), 300, save_every=100).forward()
         return frames.positions / L, frames.velocities / L
 
@@ -284,7 +378,9 @@ def test_two_runs_give_the_same_bits(solver, precision):
 
     serial, again, parallel = run(False), run(False), run(True)
     assert np.array_equal(serial.positions, again.positions) and np.array_equal(serial.velocities, again.velocities)
-    assert np.array_equal(serial.positions, parallel.positions) and np.array_equal(serial.velocities, parallel.velocities)
+    assert np.array_equal(serial.positions, parallel.positions) and np.array_equal(
+        serial.velocities, parallel.velocities
+    )
 
 
 def test_rerun_of_a_rollout_gives_the_same_bits():
@@ -314,7 +410,10 @@ def test_threads_do_not_change_a_bit():
     digests = set()
     for threads in ("1", "2", "2"):
         done = subprocess.run(
-            [sys.executable, "-c", THREADS, threads], capture_output=True, text=True, env=os.environ | {"PYTHONPATH": path}
+            [sys.executable, "-c", THREADS, threads],
+            capture_output=True,
+            text=True,
+            env=os.environ | {"PYTHONPATH": path},
         )
         assert done.returncode == 0, done.stderr
         digests.add(done.stdout.strip().splitlines()[-1])

@@ -28,8 +28,14 @@ def crossed_edges(precision="f64", speed=3.0, solver=ds.SemiImplicitSolver, **op
     mesh = ds.TetrahedralMesh.joined([lower, upper])
     velocity = np.zeros((8, 3))
     velocity[4:] = [0.1, -speed, 0.2]
-    scene = ds.Scene(mesh, MATERIAL, density=1000.0, terms=[ds.SelfContact(STIFFNESS, WIDTH)], initial_velocities=velocity,
-                     precision=precision)  # fmt: skip
+    scene = ds.Scene(
+        mesh,
+        MATERIAL,
+        density=1000.0,
+        terms=[ds.SelfContact(STIFFNESS, WIDTH)],
+        initial_velocities=velocity,
+        precision=precision,
+    )
     return solver(scene, dt=DT, **options)
 
 
@@ -41,8 +47,14 @@ def two_blocks(precision="f64", **options):
     mesh = ds.TetrahedralMesh.joined([block, upper])
     velocity = np.zeros((mesh.num_vertices, 3))
     velocity[mesh.vertex_sets["body_1"]] = [0, -2, 0]
-    scene = ds.Scene(mesh, MATERIAL, density=1000.0, terms=[ds.SelfContact(STIFFNESS, WIDTH)], initial_velocities=velocity,
-                     precision=precision)  # fmt: skip
+    scene = ds.Scene(
+        mesh,
+        MATERIAL,
+        density=1000.0,
+        terms=[ds.SelfContact(STIFFNESS, WIDTH)],
+        initial_velocities=velocity,
+        precision=precision,
+    )
     return ds.SemiImplicitSolver(scene, dt=DT, **options)
 
 
@@ -76,7 +88,9 @@ def test_energy_and_momenta_through_a_collision():
 def test_gradients_through_a_collision(kind):
     rollout = collision() if kind == "blocks" else ds.Rollout(crossed_edges(), 60, gradients="all")
     frames = rollout.forward()
-    free = (frames.displacements[-1] - frames.displacements[0]) - rollout.values["initial_velocities"] * frames.times[-1]
+    free = (frames.displacements[-1] - frames.displacements[0]) - rollout.values["initial_velocities"] * frames.times[
+        -1
+    ]
     assert np.abs(free).max() > 1e-3  # they met
     loss = verify.linear_loss(rollout)
     value, *adjoints = loss(frames)
@@ -87,8 +101,14 @@ def test_gradients_through_a_collision(kind):
         direction = rng.standard_normal(x.shape) * (np.abs(x).max() if x.ndim == 0 else 0.01)
         slope = float((gradients[name] * direction).sum())
         steps = np.array([3e-5, 1e-5])
-        central = [(loss(rollout.forward(**{name: x + s * direction}))[0]
-                    - loss(rollout.forward(**{name: x - s * direction}))[0]) / (2 * s) for s in steps]  # fmt: skip
+        central = [
+            (
+                loss(rollout.forward(**{name: x + s * direction}))[0]
+                - loss(rollout.forward(**{name: x - s * direction}))[0]
+            )
+            / (2 * s)
+            for s in steps
+        ]
         # second derivatives jump where pairs change their nearest corners: no better than that
         assert min(abs(c - slope) for c in central) <= 2e-5 * abs(slope) + 1e-9, name
 
@@ -146,9 +166,17 @@ def head_on():
     velocity = np.zeros((8, 3))
     velocity[:4, 0] = HEAD_ON["speed"]
     contact = ds.SelfContact(HEAD_ON["stiffness"], HEAD_ON["width"])
-    scene = ds.Scene(mesh, ds.StableNeoHookean(1e7, 0.3), density=1000.0, terms=[contact], initial_velocities=velocity,
-                     precision="f64")  # fmt: skip
-    rollout = ds.Rollout(ds.SemiImplicitSolver(scene, dt=5e-5), 1200, gradients=["initial_velocities", "initial_positions"])
+    scene = ds.Scene(
+        mesh,
+        ds.StableNeoHookean(1e7, 0.3),
+        density=1000.0,
+        terms=[contact],
+        initial_velocities=velocity,
+        precision="f64",
+    )
+    rollout = ds.Rollout(
+        ds.SemiImplicitSolver(scene, dt=5e-5), 1200, gradients=["initial_velocities", "initial_positions"]
+    )
     return rollout, rollout.forward(), 1000.0 * body.volume
 
 
@@ -180,8 +208,12 @@ def test_head_on_collision_ends_where_rigid_bodies_would():
         energy = lambda d: -15 * stiffness * (d - w) ** 2 * np.log(d / w)  # noqa: E731
         least = brentq(lambda d: energy(d) - mass * v * v / 4, 1e-9 * w, w * (1 - 1e-9))
         # d = least + (w - least) x^2 takes the root at the turning point away
-        inside = 2 * quad(lambda x: 2 * (w - least) * x / np.sqrt(v * v - 4 * energy(least + (w - least) * x * x) / mass),
-                          1e-6, 1)[0]  # fmt: skip
+        inside = (
+            2
+            * quad(
+                lambda x: 2 * (w - least) * x / np.sqrt(v * v - 4 * energy(least + (w - least) * x * x) / mass), 1e-6, 1
+            )[0]
+        )
         return v * time + w - gap - v * inside / 2
 
     speed = HEAD_ON["speed"]
@@ -192,7 +224,9 @@ def test_head_on_collision_ends_where_rigid_bodies_would():
     gradients = {name: g[:4, 0].sum() for name, g in rollout.vjp(frames, positions=seed).items()}
     slope = (travel(speed + 1e-4) - travel(speed - 1e-4)) / 2e-4
     assert gradients["initial_velocities"] == pytest.approx(slope, rel=0.05)
-    assert gradients["initial_positions"] == pytest.approx(1.0, rel=0.05)  # an earlier hit by as much is that much farther
+    assert gradients["initial_positions"] == pytest.approx(
+        1.0, rel=0.05
+    )  # an earlier hit by as much is that much farther
 
 
 @lru_cache
@@ -221,8 +255,10 @@ def test_no_contact_costs_no_bit():
     scene = two_blocks().scene
     apart = np.array(scene.mesh.vertices)
     apart[scene.mesh.vertex_sets["body_1"]] += [0, 1, 0]
-    runs = [ds.Simulator(ds.SemiImplicitSolver(scene.replace(terms=terms, initial_positions=apart), dt=DT))
-            for terms in ([ds.SelfContact(STIFFNESS, WIDTH)], [])]  # fmt: skip
+    runs = [
+        ds.Simulator(ds.SemiImplicitSolver(scene.replace(terms=terms, initial_positions=apart), dt=DT))
+        for terms in ([ds.SelfContact(STIFFNESS, WIDTH)], [])
+    ]
     for run in runs:
         run.run(50)
     np.testing.assert_array_equal(runs[0].positions, runs[1].positions)
@@ -244,7 +280,9 @@ def test_collision_in_single_precision():
 # ---- refusals --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("arguments, said", [((-1.0, 1e-3), "stiffness"), ((1.0, 0.0), "width"), ((np.nan, 1), "finite")])
+@pytest.mark.parametrize(
+    "arguments, said", [((-1.0, 1e-3), "stiffness"), ((1.0, 0.0), "width"), ((np.nan, 1), "finite")]
+)
 def test_bad_numbers_are_refused(arguments, said):
     with pytest.raises(ValueError, match=said):
         ds.SelfContact(*arguments)
@@ -273,7 +311,9 @@ def test_tunnelling_is_an_error_that_names_the_pair_and_keeps_the_state():
     with pytest.raises(ds.Tunnelling, match=r"substep of 0\.0001 s.*shorter step"):
         simulator.run(20)
     simulator.check_surfaces()
-    weak = ds.Simulator(ds.SemiImplicitSolver(crossed_edges().scene.replace(terms=[ds.SelfContact(1e-3, WIDTH)]), dt=DT))
+    weak = ds.Simulator(
+        ds.SemiImplicitSolver(crossed_edges().scene.replace(terms=[ds.SelfContact(1e-3, WIDTH)]), dt=DT)
+    )
     with pytest.raises(ds.Tunnelling, match=r"(edges|vertex).*may have gone through each other: their gap was .* m/s"):
         weak.run(100)
     weak.check_surfaces()

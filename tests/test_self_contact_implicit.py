@@ -61,7 +61,9 @@ def test_tangent_and_adjoint_agree(solver):
 
 def test_checkpoints_do_not_change_a_bit():
     scene = two_blocks().scene
-    whole, pieces = (ds.Rollout(ds.BDF2Solver(scene, dt=2e-3), 12, checkpoint_every=k, gradients="all") for k in (None, 5))
+    whole, pieces = (
+        ds.Rollout(ds.BDF2Solver(scene, dt=2e-3), 12, checkpoint_every=k, gradients="all") for k in (None, 5)
+    )
     adjoints = np.random.default_rng(1).normal(size=(2, 2, scene.mesh.num_vertices, 3))
     found = []
     for rollout in (whole, pieces):
@@ -110,8 +112,15 @@ def pressed(push, load_steps=1):
     y = mesh.vertices[:, 1]
     fixed = np.nonzero((y < 1e-9) | (y > 0.2))[0]
     top = (y[fixed] > 0.2)[:, None]
-    scene = ds.Scene(mesh, MATERIAL, density=1000.0, terms=[ds.SelfContact(1e4, 2e-3)], fixed=fixed, precision="f64",
-                     motion=lambda t: -push * t * top * np.array([0, 1.0, 0]))  # fmt: skip
+    scene = ds.Scene(
+        mesh,
+        MATERIAL,
+        density=1000.0,
+        terms=[ds.SelfContact(1e4, 2e-3)],
+        fixed=fixed,
+        precision="f64",
+        motion=lambda t: -push * t * top * np.array([0, 1.0, 0]),
+    )
     return ds.StaticSolver(scene, load_steps=load_steps, tolerance=1e-10)
 
 
@@ -131,7 +140,9 @@ def test_equilibrium_of_two_bodies_pressed_together():
 
 def test_motion_through_another_body_is_refused_and_nothing_is_lost():
     simulator = ds.Simulator(pressed(0.18))
-    with pytest.raises(ds.NotConverged, match="prescribed motion drives surfaces through each other: take smaller steps"):
+    with pytest.raises(
+        ds.NotConverged, match="prescribed motion drives surfaces through each other: take smaller steps"
+    ):
         simulator.step()
     np.testing.assert_array_equal(simulator.displacements, 0)
     simulator.check_surfaces()

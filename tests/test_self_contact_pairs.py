@@ -66,7 +66,9 @@ def test_energy_and_gradient_agree_with_ipc_toolkit(kind):
         gradient = STIFFNESS * (m * slope * by_x / (2 * d) + value * by_m)
         assert ours.energy[k] == pytest.approx(STIFFNESS * m * value, rel=1e-9, abs=1e-14)
         # an edge's own length squared is what a nearly parallel pair's distance loses of its digits
-        np.testing.assert_allclose(ours.gradient[k].ravel(), gradient, rtol=1e-7, atol=1e-8 * np.abs(gradient).max() + 1e-14)
+        np.testing.assert_allclose(
+            ours.gradient[k].ravel(), gradient, rtol=1e-7, atol=1e-8 * np.abs(gradient).max() + 1e-14
+        )
     assert kind == VERTEX_TRIANGLE or faded >= 20
 
 
@@ -83,7 +85,9 @@ def test_derivatives_agree_with_differences(kind, threshold):
 
     here, plus, minus = at(), at(eps), at(-eps)
     slope = (here.gradient * direction).sum((1, 2))
-    np.testing.assert_allclose((plus.energy - minus.energy) / (2 * eps), slope, rtol=1e-5, atol=1e-6 * np.abs(slope).max())
+    np.testing.assert_allclose(
+        (plus.energy - minus.energy) / (2 * eps), slope, rtol=1e-5, atol=1e-6 * np.abs(slope).max()
+    )
     product = (plus.gradient - minus.gradient) / (2 * eps)
     scale = np.abs(product).max((1, 2), keepdims=True) + 1e-6 * np.abs(product).max()
     assert (np.abs(product - here.product) / scale).max() <= 1e-4
@@ -158,7 +162,9 @@ def test_broad_phase_finds_what_brute_force_finds(precision):
     a, b = np.triu_indices(int(first_two[edges].all(1).sum()), 1)
     ee = np.column_stack([edges[a], edges[b]])
     ee = ee[(ee[:, :2, None] != ee[:, None, 2:]).all((1, 2))]
-    distances = [evaluate_pairs(kind, mesh.vertices[p], precision=precision).distance for kind, p in enumerate((vt, ee))]
+    distances = [
+        evaluate_pairs(kind, mesh.vertices[p], precision=precision).distance for kind, p in enumerate((vt, ee))
+    ]
     near = [p[distance < reach] for p, distance in zip((vt, ee), distances)]
     pairs = runtime.fetch(found.pairs)[: 4 * found.count].reshape(-1, 4)
     ours = [pairs[: found.num_vt], pairs[found.num_vt :]]

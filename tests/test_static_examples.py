@@ -22,7 +22,7 @@ def test_cantilever(capsys):
     numbers = example("cantilever").main(quick=True)
     for share, known in numbers["shares"].values():
         assert share == pytest.approx(known, abs=6e-3)
-    (fine, extrapolated), = numbers["elastica"].values()
+    ((fine, extrapolated),) = numbers["elastica"].values()
     assert -0.06 < fine[0] < -0.04  # locked
     assert np.abs(extrapolated).max() < 0.018  # and how much of it extrapolation from 2 and 3 cells takes away
     assert "elastica" in capsys.readouterr().out
@@ -83,11 +83,11 @@ def test_derivatives_of_the_compliance():
 def test_benchmark_of_implicit_steps(capsys):
     """Every part runs; the direct solver takes the same steps."""
     benchmark = example("benchmark_implicit")
-    (tetrahedra, ours, theirs, ratio, differ), = benchmark.direct([160], 2)
+    ((tetrahedra, ours, theirs, ratio, differ),) = benchmark.direct([160], 2)
     assert tetrahedra == 168 and ratio == pytest.approx(theirs / ours) and differ < 1e-6
     rows, exponent = benchmark.growth([60, 400], 1)
     assert np.isfinite(exponent) and rows[-1][2] > 10
-    (_, iterations, *_, cost), = benchmark.backward([160], 1)
+    ((_, iterations, *_, cost),) = benchmark.backward([160], 1)
     assert iterations >= 1 and cost > 0
     rows = benchmark.crossing(benchmark.beam(24), [1e6], 20)
     assert {row[:3] for row in rows} >= {("carried", 1e6, "BDF2Solver"), ("falls", 1e6, "ImplicitEulerSolver")}

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import diffsim_ti as ds
-from diffsim_ti import stability
 from diffsim_ti.materials import MATERIALS
 from diffsim_ti.solvers import SOLVERS as ALL_SOLVERS
+from diffsim_ti.state import stability
 
 SOLVERS = [s for s in ALL_SOLVERS if s.explicit]  # the implicit ones: test_implicit*.py
 E, RHO = 1e5, 1000.0
@@ -40,9 +40,12 @@ def shaken():
 
 MESHES = {
     "one": lambda: ds.TetrahedralMesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 1, 2, 3]]),
-    "regular": lambda: ds.TetrahedralMesh.create_box(4), "five": lambda: ds.TetrahedralMesh.create_box(4, pattern="five"),
-    "graded": graded, "slivers": slivers, "shaken": shaken,
-}  # fmt: skip
+    "regular": lambda: ds.TetrahedralMesh.create_box(4),
+    "five": lambda: ds.TetrahedralMesh.create_box(4, pattern="five"),
+    "graded": graded,
+    "slivers": slivers,
+    "shaken": shaken,
+}
 meshes = pytest.mark.parametrize("name", MESHES)
 
 
@@ -132,7 +135,9 @@ def test_worst_tetrahedron_is_named():
         values = values.copy()
         values[changed] *= factor
         scene = ds.Scene(
-            mesh, ds.StableNeoHookean(values if changed == stiff else young, 0.3), values if changed == light else density
+            mesh,
+            ds.StableNeoHookean(values if changed == stiff else young, 0.3),
+            values if changed == light else density,
         )
         assert stability.element_limit(scene).tetrahedron == changed
         tight = any_step(scene).stable_dt(tight=True)
@@ -178,7 +183,8 @@ def test_refused_above_the_limit(solver, share):
     scene = block()
     tight = any_step(scene, solver).stable_dt(tight=True)
     message = (
-        r"exceeds the stable step \S+ s \(Lanczos, set by tetrahedron \d+\): reduce dt, pass substeps=2, .*allow_unstable"
+        r"exceeds the stable step \S+ s \(Lanczos, set by tetrahedron \d+\): "
+        r"reduce dt, pass substeps=2, .*allow_unstable"
     )
     with pytest.raises(ValueError, match=message):
         solver(scene, dt=share * tight.dt)
@@ -216,7 +222,8 @@ def test_divergence_above_the_limit_is_named(solver, share, how):
     error = caught.value
     assert isinstance(error, FloatingPointError)
     assert re.search(
-        rf"step {error.step}, t = [\d.e+-]+ s: (velocity|displacement) of vertex {error.vertex} is not finite", str(error)
+        rf"step {error.step}, t = [\d.e+-]+ s: (velocity|displacement) of vertex {error.vertex} is not finite",
+        str(error),
     )
     assert re.search(rf"smallest J around it = [-\d.einf+]+ in tetrahedron {error.tetrahedron}", str(error))
     assert error.vertex in scene.mesh.tetrahedra[error.tetrahedron]
@@ -263,7 +270,9 @@ def test_compression_outgrows_the_step_before_any_nan(solver, how):
     run = solver(scene.replace(motion=press, terms=[ds.Drag(5.0)]), dt=dt)
     steps = int(2 * T / dt)
     simulator = ds.Simulator(run)
-    with pytest.raises(ds.Divergence, match="has outgrown the stable step .*(elements are squeezed).*reduce dt") as caught:
+    with pytest.raises(
+        ds.Divergence, match="has outgrown the stable step .*(elements are squeezed).*reduce dt"
+    ) as caught:
         ds.Rollout(run, steps).forward() if how == "rollout" else simulator.run(steps)
     error = caught.value
     assert 0 < error.step < steps and 0 <= error.tetrahedron < scene.mesh.num_tetrahedra
@@ -363,7 +372,9 @@ def test_seeds_spelling_is_quiet_where_the_step_is_stable():
         warnings.simplefilter("error")
         solver = ds.SemiImplicitSolver(ds.TetrahedralMesh.create_cube(3), ds.StableNeoHookean(1e3, 0.3), dt=0.01)
         assert solver.substeps == 1
-        many = ds.SemiImplicitSolver(ds.TetrahedralMesh.create_cube(3), ds.StableNeoHookean(1e3, 0.3), dt=0.01, substeps=7)
+        many = ds.SemiImplicitSolver(
+            ds.TetrahedralMesh.create_cube(3), ds.StableNeoHookean(1e3, 0.3), dt=0.01, substeps=7
+        )
     assert many.substeps == 7  # the least number, kept
 
 

@@ -179,7 +179,9 @@ def test_advice_is_implicit_where_explicit_steps_are_tiny():
     (scene, duration, tolerance), advice = held_back("pull"), advised("pull")
     assert not advice.solver.explicit and advice.steps < 1000
     stable = ds.VelocityVerletSolver(scene, dt=1.0, allow_unstable=True).stable_dt(tight=True).dt
-    rollout = ds.Rollout(ds.VelocityVerletSolver(scene, dt=duration / 8, substeps=int(duration / 8 / stable / 0.8)), 8, 1)
+    rollout = ds.Rollout(
+        ds.VelocityVerletSolver(scene, dt=duration / 8, substeps=int(duration / 8 / stable / 0.8)), 8, 1
+    )
     begin = time.perf_counter()
     right = from_start(rollout)
     explicit, own = time.perf_counter() - begin, advice.rollout(scene, 8)
@@ -237,7 +239,9 @@ def test_advice_states_memory_and_keeps_to_it():
     assert "contact: none" not in str(advice) and "damping: none" not in str(advice)
 
 
-@pytest.mark.parametrize("bulk_modulus, says", [(5e5, 'volume="patches" of a Scene is advised'), (2e4, "is at most 0.45")])
+@pytest.mark.parametrize(
+    "bulk_modulus, says", [(5e5, 'volume="patches" of a Scene is advised'), (2e4, "is at most 0.45")]
+)
 def test_advice_names_patches_where_tetrahedra_lock(bulk_modulus, says):
     """Whatever numbers the law is given by: mu is 10 kPa, so that nu is 0.49 or 0.29."""
     law = ds.MooneyRivlin(c10=4e3, c01=1e3, bulk_modulus=bulk_modulus)
@@ -248,8 +252,9 @@ def test_advice_names_patches_where_tetrahedra_lock(bulk_modulus, says):
     assert says in " ".join(advice.left_out)
 
 
-@pytest.mark.parametrize("wrong, says", [(dict(duration=0.0), "duration"), (dict(tolerance=2.0), "tolerance"),
-                                         (dict(memory=-1.0), "memory")])  # fmt: skip
+@pytest.mark.parametrize(
+    "wrong, says", [(dict(duration=0.0), "duration"), (dict(tolerance=2.0), "tolerance"), (dict(memory=-1.0), "memory")]
+)
 def test_advice_refuses_what_is_no_question(wrong, says):
     scene, duration, tolerance = held_back("drop")
     with pytest.raises(ValueError, match=says):
@@ -258,7 +263,9 @@ def test_advice_refuses_what_is_no_question(wrong, says):
 
 def test_own_scene_is_charted_against_its_own_converged_motion():
     scene, duration, _ = held_back("twist")
-    result = chart(Problem.of_scene(scene, duration, frames=4), solvers=EXPLICIT, precisions=("f32",), levels=2, repeats=1)
+    result = chart(
+        Problem.of_scene(scene, duration, frames=4), solvers=EXPLICIT, precisions=("f32",), levels=2, repeats=1
+    )
     assert result.reference_error < 1e-3 and all(np.isfinite(p.error) for p in result.points)
     verlet = [p.error for p in result.points if p.solver == "VelocityVerletSolver"]
     assert verlet[1] < 0.4 * verlet[0]

@@ -18,7 +18,7 @@ def test_power_iteration_agrees_with_the_eigenvalues_of_the_assembled_matrix():
     """Against a dense matrix of differences of forces at rest, column by column."""
     scene = body(1)
     solver = ds.VelocityVerletSolver(scene, dt=1.0, allow_unstable=True)
-    from diffsim_ti.stability import Stiffness
+    from diffsim_ti.state.stability import Stiffness
 
     stiffness, n = Stiffness(solver.workspace(solver.start_values())), scene.mesh.num_vertices
     dense = np.stack([stiffness.product(e.reshape(n, 3)).ravel() for e in np.eye(3 * n)], 1)
@@ -99,8 +99,9 @@ def test_growth_of_ones_own_scene_by_the_command(tmp_path):
 
     from diffsim_ti.cli import app
 
-    (tmp_path / "hang.py").write_text("from diffsim_ti.study.growth import GROWTH_SCENES\n"
-                                      "scene = GROWTH_SCENES['clamped beam let go']('f64')\n")  # fmt: skip
+    (tmp_path / "hang.py").write_text(
+        "from diffsim_ti.study.growth import GROWTH_SCENES\nscene = GROWTH_SCENES['clamped beam let go']('f64')\n"
+    )
     command = ["growth", str(tmp_path / "hang.py"), "--duration", "0.1", "--precision", "f64", "-o", str(tmp_path)]
     done = CliRunner().invoke(app, command)
     assert done.exit_code == 0, done.output

@@ -48,8 +48,9 @@ class Given(TorchMaterial):
 def simulator(mesh=MESH, E=1e5, nu=0.3, gravity=-9.8, dt=0.01, damping=0.98, substeps=2, **options):
     """In contact from the start, damped."""
     options.setdefault("contact", DifferentiableBarrierContact(1e4, 0.1, ground_height=-0.05))
-    return DifferentiableSimulator(mesh, DifferentiableMaterial(E, nu), DifferentiableSolver(dt, gravity, damping, substeps),
-                                   **options)  # fmt: skip
+    return DifferentiableSimulator(
+        mesh, DifferentiableMaterial(E, nu), DifferentiableSolver(dt, gravity, damping, substeps), **options
+    )
 
 
 def start(scale=1.0):
@@ -69,8 +70,9 @@ def variable(value) -> torch.Tensor:
 SIM = {}
 
 
-def moved(E=1.0, nu=0.3, density=1.0, gravity=-9.8, positions=None, velocities=None, forces=None, contact=None,
-          rollout=False):  # fmt: skip
+def moved(
+    E=1.0, nu=0.3, density=1.0, gravity=-9.8, positions=None, velocities=None, forces=None, contact=None, rollout=False
+):
     """Four steps of one simulator from scaled inputs of order one -> positions and velocities."""
     if "sim" not in SIM:
         SIM["sim"] = simulator()
@@ -93,8 +95,11 @@ SCALARS = dict(E=1.0, nu=0.3, density=1.0, gravity=[0.5, -9.8, 1.0])
 PER_TETRAHEDRON = dict(E=SHARES, nu=0.3 * SHARES, density=SHARES.flip(0))
 
 
-@pytest.mark.parametrize("name, value", [*SCALARS.items(), *PER_TETRAHEDRON.items(), ("gravity", -9.8)],
-                         ids=[*SCALARS, *(f"{n} per tetrahedron" for n in PER_TETRAHEDRON), "gravity along y"])  # fmt: skip
+@pytest.mark.parametrize(
+    "name, value",
+    [*SCALARS.items(), *PER_TETRAHEDRON.items(), ("gravity", -9.8)],
+    ids=[*SCALARS, *(f"{n} per tetrahedron" for n in PER_TETRAHEDRON), "gravity along y"],
+)
 def test_gradcheck_of_numbers(name, value):
     assert gradcheck(lambda x: moved(**{name: x}), variable(value), **GATE)
 
@@ -112,9 +117,11 @@ def test_gradcheck_of_contact_numbers():
     assert gradcheck(lambda *c: moved(contact=c), tuple(variable(x) for x in (1.0, 0.1, -0.05)), **GATE)
 
 
-@pytest.mark.parametrize("inputs", [
-    dict(E=1.0, nu=0.3, density=1.0, gravity=[0.5, -9.8, 1.0]), dict(velocities=NOISE[1]), dict(forces=NOISE),
-], ids=["numbers", "velocities", "forces per step"])  # fmt: skip
+@pytest.mark.parametrize(
+    "inputs",
+    [dict(E=1.0, nu=0.3, density=1.0, gravity=[0.5, -9.8, 1.0]), dict(velocities=NOISE[1]), dict(forces=NOISE)],
+    ids=["numbers", "velocities", "forces per step"],
+)
 def test_gradcheck_of_rollout_frames(inputs):
     def run(*values):
         return moved(**dict(zip(inputs, values)), rollout=True)
@@ -164,11 +171,12 @@ def gradients_of(run, sim, forces):
 def test_steps_equal_a_rollout():
     sim = simulator()
     ways = [
-        lambda f: [sim.step(row) for row in f], lambda f: sim.rollout(4, external_forces=f),
+        lambda f: [sim.step(row) for row in f],
+        lambda f: sim.rollout(4, external_forces=f),
         lambda f: sim.rollout(4, checkpoint_every=2, external_forces=f),
         lambda f: sim.rollout(4, save_every=1, external_forces=f),
         lambda f: (sim.rollout(2, external_forces=f[:2]), sim.rollout(2, external_forces=f[2:])),
-    ]  # fmt: skip
+    ]
     values, gradients = gradients_of(ways[0], sim, 100 * NOISE)
     for way in ways[1:]:
         others, same = gradients_of(way, sim, 100 * NOISE)
@@ -219,7 +227,11 @@ def test_inputs_without_gradient_get_none():
 def test_non_contiguous_inputs():
     plain, forces = start(), 100 * NOISE[3]
     results = []
-    for wrap in (lambda a: variable(a), lambda a: variable(a.T.contiguous()).T, lambda a: variable(a).expand(2, N, 3)[1]):
+    for wrap in (
+        lambda a: variable(a),
+        lambda a: variable(a.T.contiguous()).T,
+        lambda a: variable(a).expand(2, N, 3)[1],
+    ):
         sim = simulator()
         x, v, f = (wrap(a) for a in (*plain, forces))
         sim.reset(x, v)
@@ -390,10 +402,11 @@ def test_first_derivatives_with_create_graph_are_the_same():
 
 def test_state_dict_round_trip(tmp_path):
     for made in (
-        lambda E: DifferentiableMaterial(E, 0.3), lambda E: DifferentiableMaterial(torch.full((M,), E), 0.3),
+        lambda E: DifferentiableMaterial(E, 0.3),
+        lambda E: DifferentiableMaterial(torch.full((M,), E), 0.3),
         lambda E: SpatiallyVaryingMaterial(M, E, 0.3),
         lambda E: SpatiallyVaryingMaterial(base_E=E, base_nu=0.3, grid_resolution=(2, 3, 2), E_range=(1e4, 1e6)),
-    ):  # fmt: skip
+    ):
         torch.save(made(7e4).state_dict(), tmp_path / "material.pt")
         other = made(1e5)
         other.load_state_dict(torch.load(tmp_path / "material.pt"))
@@ -463,11 +476,15 @@ def identification(make_optimizer, iterations):
     return float(log_E.detach().exp())
 
 
-@pytest.mark.parametrize("make, iterations, gate", [
-    (lambda p: torch.optim.LBFGS(p, lr=1, max_iter=20, line_search_fn="strong_wolfe"), 1, 1e-5),
-    (lambda p: torch.optim.Adam(p, lr=0.1), 100, 1e-2),
-    (lambda p: torch.optim.SGD(p, lr=0.02, momentum=0.5), 50, 1e-2),
-], ids=["LBFGS", "Adam", "SGD"])  # fmt: skip
+@pytest.mark.parametrize(
+    "make, iterations, gate",
+    [
+        (lambda p: torch.optim.LBFGS(p, lr=1, max_iter=20, line_search_fn="strong_wolfe"), 1, 1e-5),
+        (lambda p: torch.optim.Adam(p, lr=0.1), 100, 1e-2),
+        (lambda p: torch.optim.SGD(p, lr=0.02, momentum=0.5), 50, 1e-2),
+    ],
+    ids=["LBFGS", "Adam", "SGD"],
+)
 def test_optimisers(make, iterations, gate):
     assert identification(make, iterations) == pytest.approx(1e5, rel=gate)
 
@@ -481,7 +498,10 @@ def test_wrong_shapes_and_types_name_expected_and_got():
         (lambda: sim.reset(torch.zeros(3, 3)), r"positions: expected shape \(8, 3\), got \(3, 3\)"),
         (lambda: sim.reset(velocities=torch.zeros(3, 8)), r"velocities: expected shape \(8, 3\), got \(3, 8\)"),
         (lambda: sim.step(torch.zeros(3)), r"external_forces: expected shape \(8, 3\).*, got \(3,\)"),
-        (lambda: sim.rollout(5, external_forces=torch.zeros(4, N, 3)), r"external_forces: .*\(5, 8, 3\), got \(4, 8, 3\)"),
+        (
+            lambda: sim.rollout(5, external_forces=torch.zeros(4, N, 3)),
+            r"external_forces: .*\(5, 8, 3\), got \(4, 8, 3\)",
+        ),
         (lambda: sim.step(torch.zeros(N, 3).int()), "external_forces: expected a floating point.*got torch.int32"),
         (lambda: sim.reset(torch.zeros(N, 3).cfloat()), "positions: expected a floating point.*got torch.complex64"),
         (lambda: simulator(density=torch.ones(5)), r"density: expected one number or shape \(6,\), got \(5,\)"),
@@ -495,10 +515,13 @@ def test_wrong_shapes_and_types_name_expected_and_got():
         (lambda: simulator(damping=1.5), "damping is the share of velocity kept"),
         (lambda: DifferentiableMaterial(1e5, 0.3, E=1e5), "exactly one of its spellings"),
         (lambda: SpatiallyVaryingMaterial(), "num_elements .* or grid_resolution"),
-        (lambda: SpatiallyVaryingMaterial(M, 1e5, 0.3).energy_density(torch.eye(3).expand(2, 3, 3)), "expected 6 matrices"),
+        (
+            lambda: SpatiallyVaryingMaterial(M, 1e5, 0.3).energy_density(torch.eye(3).expand(2, 3, 3)),
+            "expected 6 matrices",
+        ),
         (lambda: simulator().material.energy_density(torch.eye(3)), r"F: expected shape \(m, 3, 3\), got \(3, 3\)"),
         (lambda: DifferentiableBarrierContact(1e4, 0.1, barrier_distance=0.1), "two spellings"),
-    ):  # fmt: skip
+    ):
         with pytest.raises(ValueError, match=expected):
             call()
     with pytest.raises(ValueError, match="2 tetrahedra|6 tetrahedra, the material 5"):
@@ -539,8 +562,13 @@ def test_functional_face_refuses():
 
 
 def run_script(script: str, **environment) -> str:
-    result = subprocess.run([sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True, timeout=300,
-                            env=os.environ | environment)  # fmt: skip
+    result = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(script)],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        env=os.environ | environment,
+    )
     assert result.returncode == 0, result.stderr
     return result.stdout
 
@@ -583,14 +611,18 @@ class Motions(torch.utils.data.Dataset):
 
 def test_workers_by_fork_are_refused_with_a_remedy():
     simulator().step()  # Taichi runs here
-    loader = torch.utils.data.DataLoader(Motions(simulator()), num_workers=1, multiprocessing_context="fork", timeout=60)
+    loader = torch.utils.data.DataLoader(
+        Motions(simulator()), num_workers=1, multiprocessing_context="fork", timeout=60
+    )
     with pytest.raises(RuntimeError, match="forked after Taichi had started.*spawn"):
         list(loader)
 
 
 def test_workers_by_spawn():
     data = Motions(simulator())
-    loader = torch.utils.data.DataLoader(data, batch_size=None, num_workers=1, multiprocessing_context="spawn", timeout=120)
+    loader = torch.utils.data.DataLoader(
+        data, batch_size=None, num_workers=1, multiprocessing_context="spawn", timeout=120
+    )
     for got, k in zip(loader, range(2)):
         assert torch.equal(got, data[k])
 

@@ -47,9 +47,9 @@ class Given(TorchMaterial):
 
 
 @pytest.mark.parametrize("law", [None, SmithNeoHookean])
-@pytest.mark.parametrize("E, nu", [
-    (2.0, 0.3), (RNG.uniform(1, 2, 5), RNG.uniform(0.1, 0.4, 5)), (2.0, RNG.uniform(0.1, 0.4, 5)),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "E, nu", [(2.0, 0.3), (RNG.uniform(1, 2, 5), RNG.uniform(0.1, 0.4, 5)), (2.0, RNG.uniform(0.1, 0.4, 5))]
+)
 def test_gradcheck_of_energy_density(law, E, nu):
     def energy(F, E, nu):
         return Given(E, nu, law).energy_density(F)
@@ -79,15 +79,20 @@ def test_energy_density_refuses_second_derivatives():
 def test_energy_density_of_non_contiguous_and_float32():
     material = DifferentiableMaterial(2.0, 0.3)
     turned = GRADIENTS.transpose(1, 2).contiguous().transpose(1, 2)
-    assert not turned.is_contiguous() and torch.equal(material.energy_density(turned), material.energy_density(GRADIENTS))
+    assert not turned.is_contiguous() and torch.equal(
+        material.energy_density(turned), material.energy_density(GRADIENTS)
+    )
     double = material.energy_density(GRADIENTS)
     single = material.float().energy_density(GRADIENTS.float())
     assert single.dtype == torch.float32 and torch.allclose(single.double(), double, rtol=1e-4)
 
 
 def test_spellings_of_materials():
-    for m in (DifferentiableMaterial(8e4, 0.4), DifferentiableMaterial(E=8e4, nu=0.4),
-              DifferentiableMaterial(youngs_modulus=8e4, poissons_ratio=0.4)):  # fmt: skip
+    for m in (
+        DifferentiableMaterial(8e4, 0.4),
+        DifferentiableMaterial(E=8e4, nu=0.4),
+        DifferentiableMaterial(youngs_modulus=8e4, poissons_ratio=0.4),
+    ):
         assert m.E.item() == 8e4 and m.nu.item() == 0.4 and set(m.state_dict()) == {"E", "nu"}
     assert not DifferentiableMaterial(8e4, 0.4, requires_grad=False).E.requires_grad
 
@@ -102,8 +107,11 @@ def test_grid_of_control_values_is_trilinear_and_clamped():
         material.control.copy_(1e5 + corners @ slope)  # a linear field is interpolated exactly
     E = material.tensors(mesh)["youngs_modulus"]
     assert torch.allclose(E, 1e5 + torch.tensor(mesh.centroids) @ slope, rtol=1e-12)
-    assert gradcheck(lambda c: torch.func.functional_call(Moduli(material, mesh), {"material.control": 1e5 * c}, ()) / 1e5,
-                     variable(material.control.detach() / 1e5), **GATE)  # fmt: skip
+    assert gradcheck(
+        lambda c: torch.func.functional_call(Moduli(material, mesh), {"material.control": 1e5 * c}, ()) / 1e5,
+        variable(material.control.detach() / 1e5),
+        **GATE,
+    )
     with torch.no_grad():
         material.control.fill_(1e9)
     assert torch.all(material.tensors(mesh)["youngs_modulus"] == 2e5)
@@ -189,7 +197,9 @@ def test_implicit_differentiation_in_the_seeds_words():
     A = torch.tensor([[3.0, 1.0], [0.0, 2.0]])
     exact = torch.linalg.solve(A.T, torch.ones(2)) * 2 * p.detach()
     for scale in (1.0, 1e-12):
-        x = ImplicitDifferentiation.implicit_backward(lambda x, p: A @ x - p**2, torch.linalg.solve(A, p.detach() ** 2), p)
+        x = ImplicitDifferentiation.implicit_backward(
+            lambda x, p: A @ x - p**2, torch.linalg.solve(A, p.detach() ** 2), p
+        )
         (gradient,) = torch.autograd.grad(scale * x.sum(), p)
         assert torch.allclose(gradient, scale * exact, rtol=1e-6, atol=0)
     x = ImplicitDifferentiation.implicit_backward(lambda x, _: A @ x - p**2, x.detach(), p)  # p by closure
@@ -204,8 +214,11 @@ def test_implicit_differentiation_of_intermediate_and_constant_parameters():
 
 def test_implicit_differentiation_of_an_explicit_equation():
     """dF/dx = 1, so that autograd hands GMRES its own vectors back."""
-    assert gradcheck(lambda p: ImplicitDifferentiation.implicit_backward(lambda x, p: x - p**2, p.detach() ** 2, p),
-                     variable([1.0, 2.0, 3.0]), **GATE)  # fmt: skip
+    assert gradcheck(
+        lambda p: ImplicitDifferentiation.implicit_backward(lambda x, p: x - p**2, p.detach() ** 2, p),
+        variable([1.0, 2.0, 3.0]),
+        **GATE,
+    )
 
 
 def test_implicit_differentiation_refuses():

@@ -16,8 +16,11 @@ N = MESH.num_vertices
 NOISE = torch.tensor(np.random.default_rng(0).normal(size=(3, N, 3)))
 TIGHT = dict(tolerance=1e-12)  # differences see the solve's tolerance over their eps of 1e-6
 METHODS = {
-    ds.VelocityVerletSolver: {}, ds.ImplicitEulerSolver: TIGHT, ds.ImplicitMidpointSolver: TIGHT, ds.BDF2Solver: TIGHT,
-}  # fmt: skip
+    ds.VelocityVerletSolver: {},
+    ds.ImplicitEulerSolver: TIGHT,
+    ds.ImplicitMidpointSolver: TIGHT,
+    ds.BDF2Solver: TIGHT,
+}
 by_method = pytest.mark.parametrize("method", METHODS, ids=lambda m: m.__name__)
 
 
@@ -84,7 +87,9 @@ def test_gradcheck_of_an_equilibrium():
     rollout = ds.Rollout(ds.StaticSolver(scene, tolerance=1e-12), 1)
 
     def run(E, nu, density, gravity):
-        frames = rollout_frames(rollout, youngs_modulus=1e5 * E, poissons_ratio=nu, density=1e3 * density, gravity=gravity)
+        frames = rollout_frames(
+            rollout, youngs_modulus=1e5 * E, poissons_ratio=nu, density=1e3 * density, gravity=gravity
+        )
         return (NOISE * frames.displacements[-1]).sum((1, 2))
 
     inputs = tuple(torch.tensor(x).double().requires_grad_() for x in (1.0, 0.3, 1.0, [0.5, -9.8, 1.0]))

@@ -7,14 +7,16 @@ import pytest
 import taichi as ti
 
 import diffsim_ti as ds
-from diffsim_ti import cli, cli_options, viewer
-from diffsim_ti.camera import Camera
-from diffsim_ti.dragging import Grip, picked_vertex
-from diffsim_ti.forward import ForwardRun
-from diffsim_ti.frame_sources import LiveFrames, SavedFrames
+from diffsim_ti import cli
+from diffsim_ti.adaptive_run import ForwardRun
+from diffsim_ti.cli import options as cli_options
 from diffsim_ti.mesh import TetrahedralMesh
-from diffsim_ti.series import Series
-from diffsim_ti.viewer import Viewer
+from diffsim_ti.visual import viewer
+from diffsim_ti.visual.camera import Camera
+from diffsim_ti.visual.dragging import Grip, picked_vertex
+from diffsim_ti.visual.frame_sources import LiveFrames, SavedFrames
+from diffsim_ti.visual.series import Series
+from diffsim_ti.visual.viewer import Viewer
 
 SIZE = (200, 150)
 
@@ -54,7 +56,14 @@ class Window:
     """A window that shows nothing."""
 
     def __init__(self):
-        self.running, self.cursor, self.pressed, self.keys, self.clicked, self.slide = True, (0.5, 0.5), (), [], None, None
+        self.running, self.cursor, self.pressed, self.keys, self.clicked, self.slide = (
+            True,
+            (0.5, 0.5),
+            (),
+            [],
+            None,
+            None,
+        )
 
     def get_events(self, kind):
         keys, self.keys = self.keys, []
@@ -85,7 +94,7 @@ def make_viewer(monkeypatch):
         out.draw()
         return out, window
 
-    monkeypatch.setattr("diffsim_ti.vulkan_painter.Canvas", lambda window: None)
+    monkeypatch.setattr("diffsim_ti.visual.vulkan_painter.Canvas", lambda window: None)
     return make
 
 
@@ -108,8 +117,9 @@ def series(tmp_path_factory):
 def falling():
     """A small cube above a floor, in a run that can be pulled."""
     cube = TetrahedralMesh.create_cube(3, 0.2)
-    scene, _ = cli_options.fall_scene(cube, ds.StableNeoHookean(1e5, 0.3), 1000.0, height=0.01,
-                                      extra=[ds.ExternalForce([0.0, 0.0, 0.0])])  # fmt: skip
+    scene, _ = cli_options.fall_scene(
+        cube, ds.StableNeoHookean(1e5, 0.3), 1000.0, height=0.01, extra=[ds.ExternalForce([0.0, 0.0, 0.0])]
+    )
     return ForwardRun(scene, ds.SemiImplicitSolver, 1 / 60)
 
 
@@ -138,9 +148,9 @@ def test_saved_frames_know_floor_obstacles_and_what_is_fixed(series):
     look = source.look
     assert look["ground"] == pytest.approx(-0.1)
     assert source.mesh.vertices[look["fixed"], 0] == pytest.approx(0) and len(look["fixed"]) == 9
-    (points, triangles), = look["obstacles"]
+    ((points, triangles),) = look["obstacles"]
     assert np.linalg.norm(points - [0.5, 0.1, 0.1], axis=1) == pytest.approx(0.1) and triangles.max() < len(points)
-    moved, = source.frame(2).obstacles
+    (moved,) = source.frame(2).obstacles
     assert moved - points == pytest.approx(np.tile([0, 0.4, 0], (len(points), 1)), abs=1e-6)
 
 
@@ -273,7 +283,9 @@ def test_the_left_button_pulls_a_live_body(live, make_viewer):
     assert view.held is None
     velocity = live.run.simulator.velocities[:, 1].mean()
     view.go(len(live))
-    assert live.run.simulator.velocities[:, 1].mean() - velocity == pytest.approx(-9.81 / 60, rel=0.1)  # a corner touches
+    assert live.run.simulator.velocities[:, 1].mean() - velocity == pytest.approx(
+        -9.81 / 60, rel=0.1
+    )  # a corner touches
 
 
 def test_a_click_on_the_panel_or_beside_the_body_grabs_nothing(live, make_viewer):
@@ -316,7 +328,10 @@ def test_the_command_opens_a_series_or_a_live_run(series, tmp_path, monkeypatch)
     monkeypatch.setattr(viewer, "has_display", lambda: True)
     monkeypatch.setattr("diffsim_ti.runtime.init", lambda: None)
     TetrahedralMesh.create_cube(3, 0.2).save(tmp_path / "cube.vtu")
-    for arguments in ([str(series), "--ground", "-0.5"], [str(tmp_path / "cube.vtu"), "--colour", "J", "--fixed", "xmin"]):
+    for arguments in (
+        [str(series), "--ground", "-0.5"],
+        [str(tmp_path / "cube.vtu"), "--colour", "J", "--fixed", "xmin"],
+    ):
         with pytest.raises(SystemExit) as stop:
             cli.main(["view", *arguments])
         assert stop.value.code == 0

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from diffsim_ti.mesh import TetrahedralMesh
-from diffsim_ti.series import Series
-from diffsim_ti.vulkan_painter import has_vulkan
+from diffsim_ti.visual.series import Series
+from diffsim_ti.visual.vulkan_painter import has_vulkan
 
 ROOT = Path(__file__).parents[1]
 missing = [name for name in ("Xvfb", "xdotool") if shutil.which(name) is None] + ([] if has_vulkan() else ["Vulkan"])
@@ -23,8 +23,8 @@ pytestmark = pytest.mark.skipif(bool(missing), reason=f"no {', '.join(missing)} 
 
 SCRIPT = """
 import sys
-from diffsim_ti.frame_sources import SavedFrames
-from diffsim_ti.viewer import Viewer
+from diffsim_ti.visual.frame_sources import SavedFrames
+from diffsim_ti.visual.viewer import Viewer
 view, last = Viewer(SavedFrames(sys.argv[1]), "speed", size=(640, 480)), None
 while view.window.running:
     view.draw()
@@ -42,8 +42,13 @@ def series(tmp_path_factory):
     out, ones = Series(tmp_path_factory.mktemp("series"), cube, "cube"), np.ones(cube.num_tetrahedra)
     for k in range(3):
         offset = np.zeros(cube.vertices.shape) + [0, 0.1 * k, 0]
-        out.write(0.1 * k, cube.vertices + offset, offset, 0 * offset, SimpleNamespace(
-            von_mises=1e3 * k * ones, energy_density=k * ones, J=ones))  # fmt: skip
+        out.write(
+            0.1 * k,
+            cube.vertices + offset,
+            offset,
+            0 * offset,
+            SimpleNamespace(von_mises=1e3 * k * ones, energy_density=k * ones, J=ones),
+        )
     return out.path
 
 
@@ -53,20 +58,33 @@ class Screen:
     def __init__(self, folder, series):
         read, write = os.pipe()
         self.folder, self.said = folder, []
-        self.server = subprocess.Popen(["Xvfb", "-displayfd", str(write), "-screen", "0", "640x480x24", "-fbdir", folder],
-                                       pass_fds=[write], stderr=subprocess.DEVNULL)  # fmt: skip
+        self.server = subprocess.Popen(
+            ["Xvfb", "-displayfd", str(write), "-screen", "0", "640x480x24", "-fbdir", folder],
+            pass_fds=[write],
+            stderr=subprocess.DEVNULL,
+        )
         os.close(write)
         with os.fdopen(read) as told:  # to the end of the line: without a reader the server stops
             self.env = os.environ | {"DISPLAY": ":" + told.readline().strip(), "PYTHONPATH": str(ROOT)}
-        self.viewer = subprocess.Popen([sys.executable, "-c", SCRIPT, series], env=self.env, cwd=folder, text=True,
-                                       stdout=subprocess.PIPE, stderr=subprocess.PIPE)  # fmt: skip
-        threading.Thread(target=lambda: self.said.extend(line.split() for line in self.viewer.stdout), daemon=True).start()
+        self.viewer = subprocess.Popen(
+            [sys.executable, "-c", SCRIPT, series],
+            env=self.env,
+            cwd=folder,
+            text=True,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+        )
+        threading.Thread(
+            target=lambda: self.said.extend(line.split() for line in self.viewer.stdout), daemon=True
+        ).start()
         self.until(lambda state: state[:2] == ["0", "speed"], 60)
         self.window = self.xdotool("search", "--name", "diffsim_ti").split()[0]
         self.xdotool("windowmove", self.window, 0, 0)
 
     def xdotool(self, *words) -> str:
-        return subprocess.run(["xdotool", *map(str, words)], env=self.env, capture_output=True, text=True, check=True).stdout
+        return subprocess.run(
+            ["xdotool", *map(str, words)], env=self.env, capture_output=True, text=True, check=True
+        ).stdout
 
     def until(self, good, seconds: float = 15.0) -> list:
         """Wait for what the viewer says."""

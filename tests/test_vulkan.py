@@ -19,6 +19,8 @@ def test_marked_tests_pass_on_vulkan():
     if "vulkan" not in available:
         pytest.skip(f"no Vulkan driver here (available: {', '.join(available)}); mesa's lavapipe is one in software")
     command = [sys.executable, "-m", "pytest", "tests", "-m", "backends", "-q", "--tb=short", "-p", "no:cacheprovider"]
-    done = subprocess.run(command, cwd=ROOT, env=os.environ | {"DIFFSIM_TI_ARCH": "vulkan"}, capture_output=True, text=True)
+    done = subprocess.run(
+        command, cwd=ROOT, env=os.environ | {"DIFFSIM_TI_ARCH": "vulkan"}, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-2000:]
     assert int(re.search(r"(\d+) passed", done.stdout).group(1)) >= 10

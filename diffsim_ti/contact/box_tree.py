@@ -96,9 +96,24 @@ def tree_kernels(precision: str, parallel: bool) -> SimpleNamespace:
 
     def refit_kernel(size: int):
         @ti.kernel
-        def refit(rest: vectors, u: vectors2, corners: ints, order: ints, place: ints, body: ints, slack: vectors,
-                  slacks: vectors, items: vectors, lanes: eights, boxes: vectors, slot: ti.i32, count: ti.i32,
-                  leaves: ti.i32, subtrees: ti.i32, reach: fp):  # fmt: skip
+        def refit(
+            rest: vectors,
+            u: vectors2,
+            corners: ints,
+            order: ints,
+            place: ints,
+            body: ints,
+            slack: vectors,
+            slacks: vectors,
+            items: vectors,
+            lanes: eights,
+            boxes: vectors,
+            slot: ti.i32,
+            count: ti.i32,
+            leaves: ti.i32,
+            subtrees: ti.i32,
+            reach: fp,
+        ):
             """Slacks of primitives from those of vertices, and boxes of all nodes where the vertices are now."""
             scene = Bundle(rest=rest, u=u, place=place, body=body, slack=slack)
             ti.loop_config(serialize=not parallel)
@@ -127,8 +142,15 @@ def tree_kernels(precision: str, parallel: bool) -> SimpleNamespace:
 
         return refit
 
-    return SimpleNamespace(overlap=overlap, overlapping=overlapping, beyond=beyond, vector=vec4, eight=eight, fp=fp,
-                           refit={size: refit_kernel(size) for size in (1, 2, 3)})  # fmt: skip
+    return SimpleNamespace(
+        overlap=overlap,
+        overlapping=overlapping,
+        beyond=beyond,
+        vector=vec4,
+        eight=eight,
+        fp=fp,
+        refit={size: refit_kernel(size) for size in (1, 2, 3)},
+    )
 
 
 class BoxTree:
@@ -147,7 +169,9 @@ class BoxTree:
         self.items = runtime.array(self.kernels.vector, 2 * self.count)
         self.boxes = runtime.array(self.kernels.vector, 4 * self.leaves)
         # of primitives leaf by leaf: lowest x of all in it, lowest y, z, highest x, y, z; a place left over is nowhere
-        self.lanes = runtime.upload(np.tile(np.repeat([1e30, -1e30], 3)[:, None], (self.groups, GROUP)), self.kernels.eight)
+        self.lanes = runtime.upload(
+            np.tile(np.repeat([1e30, -1e30], 3)[:, None], (self.groups, GROUP)), self.kernels.eight
+        )
         self.arrays = self.corners, self.order, self.slacks, self.items, self.lanes, self.boxes
         self.refits = 0
 
@@ -158,16 +182,34 @@ class BoxTree:
             x = runtime.fetch(rest) + (runtime.fetch(u) if host is None else host)[slot, :, :3]
             runtime.fill(self.order, curve_order(x[self._host].mean(1)))
         self.refits += 1
-        self.launch(self.kernels.refit[self.size], rest, u, self.corners, self.order, place, body, slack, self.slacks,
-                    self.items, self.lanes, self.boxes)(slot, self.count, self.leaves, min(SUBTREES, self.leaves),
-                                                        reach)  # fmt: skip
+        self.launch(
+            self.kernels.refit[self.size],
+            rest,
+            u,
+            self.corners,
+            self.order,
+            place,
+            body,
+            slack,
+            self.slacks,
+            self.items,
+            self.lanes,
+            self.boxes,
+        )(slot, self.count, self.leaves, min(SUBTREES, self.leaves), reach)
 
 
 def curve_order(points: np.ndarray) -> np.ndarray:
     """Indices of points, shape (n, 3), in the order of Morton's curve through their bounding box."""
     lowest = points.min(0)
-    cells = ((points - lowest) * (2**20 / max(np.ptp(points, axis=0).max(), 1e-300))).astype(np.int64).clip(0, 2**20 - 1)
-    for shift, mask in ((32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F), (4, 0x10C30C30C30C30C3),
-                        (2, 0x1249249249249249)):  # fmt: skip
+    cells = (
+        ((points - lowest) * (2**20 / max(np.ptp(points, axis=0).max(), 1e-300))).astype(np.int64).clip(0, 2**20 - 1)
+    )
+    for shift, mask in (
+        (32, 0x1F00000000FFFF),
+        (16, 0x1F0000FF0000FF),
+        (8, 0x100F00F00F00F00F),
+        (4, 0x10C30C30C30C30C3),
+        (2, 0x1249249249249249),
+    ):
         cells = (cells | (cells << shift)) & mask
     return np.argsort(cells[:, 0] | (cells[:, 1] << 1) | (cells[:, 2] << 2), kind="stable")

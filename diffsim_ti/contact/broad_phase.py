@@ -81,7 +81,12 @@ def broad_phase_kernels(precision: str, parallel: bool) -> SimpleNamespace:
         i, j, i2, j2 = edges[2 * e], edges[2 * e + 1], edges[2 * p], edges[2 * p + 1]
         near = i2 != i and i2 != j and j2 != i and j2 != j
         if near:
-            y1, y2, y3, zero = between(i, j, scene, slot), between(i, i2, scene, slot), between(i, j2, scene, slot), vec3(0)
+            y1, y2, y3, zero = (
+                between(i, j, scene, slot),
+                between(i, i2, scene, slot),
+                between(i, j2, scene, slot),
+                vec3(0),
+            )
             gap = ti.max(ti.min(y2, y3) - ti.max(y1, zero), ti.min(y1, zero) - ti.max(y2, y3))
             near = is_near(EDGE_EDGE, ti.max(gap, zero), reach, y1, y2, y3)
         return near
@@ -98,11 +103,32 @@ def broad_phase_kernels(precision: str, parallel: bool) -> SimpleNamespace:
 
     def find_kernel(kind: int):
         @ti.kernel
-        def find(rest: vectors, u: vectors2, corners: ints, order: ints, slacks: vectors, items: vectors, lanes: eights,
-                 boxes: vectors, their_corners: ints, their_order: ints, their_slacks: vectors, their_items: vectors,
-                 their_lanes: eights, their_boxes: vectors, row: ints, partner: ints, most: ints, slot: ti.i32,
-                 count: ti.i32, leaves: ti.i32, groups: ti.i32, their_leaves: ti.i32, reach: fp,
-                 room: ti.i32):  # fmt: skip
+        def find(
+            rest: vectors,
+            u: vectors2,
+            corners: ints,
+            order: ints,
+            slacks: vectors,
+            items: vectors,
+            lanes: eights,
+            boxes: vectors,
+            their_corners: ints,
+            their_order: ints,
+            their_slacks: vectors,
+            their_items: vectors,
+            their_lanes: eights,
+            their_boxes: vectors,
+            row: ints,
+            partner: ints,
+            most: ints,
+            slot: ti.i32,
+            count: ti.i32,
+            leaves: ti.i32,
+            groups: ti.i32,
+            their_leaves: ti.i32,
+            reach: fp,
+            room: ti.i32,
+        ):
             """Partners of each primitive in the tree of `theirs`, in order, at most `room`, and their number.
 
             Of two edges the smaller number gets the larger one. On a CPU they walk from their own leaf on, so that each two
@@ -161,9 +187,24 @@ def broad_phase_kernels(precision: str, parallel: bool) -> SimpleNamespace:
         return find
 
     @ti.kernel
-    def write_pairs(surface: ints, triangles: ints, edges: ints, row_t: ints, row_e: ints, partner_t: ints, partner_e: ints,
-                    lengths: scalars, pairs: ints, scale: scalars, num_surface: ti.i32, num_edges: ti.i32, num_vt: ti.i32,
-                    room_t: ti.i32, room_e: ti.i32, factor: fp):  # fmt: skip
+    def write_pairs(
+        surface: ints,
+        triangles: ints,
+        edges: ints,
+        row_t: ints,
+        row_e: ints,
+        partner_t: ints,
+        partner_e: ints,
+        lengths: scalars,
+        pairs: ints,
+        scale: scalars,
+        num_surface: ti.i32,
+        num_edges: ti.i32,
+        num_vt: ti.i32,
+        room_t: ti.i32,
+        room_e: ti.i32,
+        factor: fp,
+    ):
         """Corners of each pair, four indices of vertices; and, of edges, 1 / sqrt(threshold of |a x b|^2)."""
         ti.loop_config(serialize=not parallel)
         for s in range(num_surface):
@@ -205,9 +246,22 @@ def broad_phase_kernels(precision: str, parallel: bool) -> SimpleNamespace:
             sort(corner, row[s], row[s + 1])
 
     @ti.kernel
-    def find_piercing(rest: vectors, u: vectors2, edges: ints, order: ints, items: vectors, triangles: ints,
-                      their_order: ints, their_items: vectors, boxes: vectors, pierced: ints, slot: ti.i32, count: ti.i32,
-                      their_count: ti.i32, leaves: ti.i32):  # fmt: skip
+    def find_piercing(
+        rest: vectors,
+        u: vectors2,
+        edges: ints,
+        order: ints,
+        items: vectors,
+        triangles: ints,
+        their_order: ints,
+        their_items: vectors,
+        boxes: vectors,
+        pierced: ints,
+        slot: ti.i32,
+        count: ti.i32,
+        their_count: ti.i32,
+        leaves: ti.i32,
+    ):
         """pierced[e]: the triangle of largest number that edge e passes through, or -1."""
         scene = Bundle(rest=rest, u=u)
         ti.loop_config(serialize=not parallel)
@@ -238,9 +292,13 @@ def broad_phase_kernels(precision: str, parallel: bool) -> SimpleNamespace:
                 node = tree.beyond(node)
 
     return SimpleNamespace(
-        find={kind: find_kernel(kind) for kind in (VERTEX_TRIANGLE, EDGE_EDGE)}, write_pairs=write_pairs,
-        count_corners=count_corners, fill_rows=fill_rows, find_piercing=find_piercing, fp=fp,
-    )  # fmt: skip
+        find={kind: find_kernel(kind) for kind in (VERTEX_TRIANGLE, EDGE_EDGE)},
+        write_pairs=write_pairs,
+        count_corners=count_corners,
+        fill_rows=fill_rows,
+        find_piercing=find_piercing,
+        fp=fp,
+    )
 
 
 class CandidatePairs:
@@ -251,8 +309,16 @@ class CandidatePairs:
     primitives' reach is larger by, towards those of the same body and of others; zero unless set. body: of each vertex.
     """
 
-    def __init__(self, surface: np.ndarray, triangles: np.ndarray, edges: np.ndarray, lengths: np.ndarray, body: np.ndarray,
-                 precision: str, parallel: bool = True):  # fmt: skip
+    def __init__(
+        self,
+        surface: np.ndarray,
+        triangles: np.ndarray,
+        edges: np.ndarray,
+        lengths: np.ndarray,
+        body: np.ndarray,
+        precision: str,
+        parallel: bool = True,
+    ):
         self.kernels, self.launch = broad_phase_kernels(precision, parallel), Launches()
         self.buffers = Buffers(self.launch, parallel)
         self.trees = tuple(BoxTree(c, precision, parallel, self.launch) for c in (surface[:, None], triangles, edges))
@@ -283,8 +349,17 @@ class CandidatePairs:
         while True:
             partner = self.buffers.take(f"partners {kind}", ti.i32, self.room[kind] * of.count)
             runtime.fill(self.most, 0)
-            find = self.launch(self.kernels.find[kind], rest, u, *of.arrays, *among.arrays, row, partner, self.most,
-                               vectorized=runtime.runs_on_cpu())  # fmt: skip
+            find = self.launch(
+                self.kernels.find[kind],
+                rest,
+                u,
+                *of.arrays,
+                *among.arrays,
+                row,
+                partner,
+                self.most,
+                vectorized=runtime.runs_on_cpu(),
+            )
             find(slot, of.count, of.leaves, of.groups, among.leaves, reach, self.room[kind])
             most = int(runtime.fetch(self.most)[0])
             if most == 0:
@@ -302,8 +377,19 @@ class CandidatePairs:
         partner_e = self._find(EDGE_EDGE, e, e, self.row_e, rest, u, slot, reach)
         self.num_vt, self.num_ee = _last(self.row_t), _last(self.row_e)
         self._take()
-        self.launch(k.write_pairs, self.surface, t.corners, e.corners, self.row_t, self.row_e, partner_t, partner_e,
-                    self.lengths, self.pairs, self.scale)(ns, ne, self.num_vt, *self.room, 1000**0.5)  # fmt: skip
+        self.launch(
+            k.write_pairs,
+            self.surface,
+            t.corners,
+            e.corners,
+            self.row_t,
+            self.row_e,
+            partner_t,
+            partner_e,
+            self.lengths,
+            self.pairs,
+            self.scale,
+        )(ns, ne, self.num_vt, *self.room, 1000**0.5)
         self.launch(k.count_corners, self.pairs, self.place, self.row)(4 * self.count, ns)
         self.buffers.scan(self.row, ns)
         self.launch(k.fill_rows, self.pairs, self.place, self.row, self.cursor, self.corner)(4 * self.count, ns)
@@ -312,8 +398,22 @@ class CandidatePairs:
         """(edge, triangle) of the surface that pass through each other, after a `build` at the same place; or None."""
         _, t, e = self.trees
         pierced = runtime.array(ti.i32, e.count)
-        self.kernels.find_piercing(rest, u, e.corners, e.order, e.items, t.corners, t.order, t.items, t.boxes, pierced, slot,
-                                   e.count, t.count, t.leaves)  # fmt: skip
+        self.kernels.find_piercing(
+            rest,
+            u,
+            e.corners,
+            e.order,
+            e.items,
+            t.corners,
+            t.order,
+            t.items,
+            t.boxes,
+            pierced,
+            slot,
+            e.count,
+            t.count,
+            t.leaves,
+        )
         found = runtime.fetch(pierced)[: e.count]
         worst = int(np.argmax(found >= 0))
         return (worst, int(found[worst])) if found[worst] >= 0 else None

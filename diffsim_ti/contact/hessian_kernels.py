@@ -28,8 +28,11 @@ def hessian_kernels(precision: str, first: int, parallel: bool) -> SimpleNamespa
     def changes(p, scene: A):
         """Vectors w of corners 1 to 3 of pair p relative to corner 0's."""
         c0 = scene.pairs[4 * p]
-        return (pair.of(scene.w, c0, scene.pairs[4 * p + 1], 0), pair.of(scene.w, c0, scene.pairs[4 * p + 2], 0),
-                pair.of(scene.w, c0, scene.pairs[4 * p + 3], 0))  # fmt: skip
+        return (
+            pair.of(scene.w, c0, scene.pairs[4 * p + 1], 0),
+            pair.of(scene.w, c0, scene.pairs[4 * p + 2], 0),
+            pair.of(scene.w, c0, scene.pairs[4 * p + 3], 0),
+        )
 
     @ti.func
     def stiffness_along(kind: ti.template(), y1, y2, y3, scale, scene: A):
@@ -61,16 +64,45 @@ def hessian_kernels(precision: str, first: int, parallel: bool) -> SimpleNamespa
                 h1, h2, h3 = w[1] * pull, w[2] * pull, w[3] * pull
             else:
                 zero = ti.cast(0, fp)
-                h1, h2, h3, _, _ = f.gradient_jvp(kind, y1, y2, y3, dy1, dy2, dy3, scale, scene.parameters[first],
-                                                  scene.parameters[first + 1], zero, zero)  # fmt: skip
+                h1, h2, h3, _, _ = f.gradient_jvp(
+                    kind,
+                    y1,
+                    y2,
+                    y3,
+                    dy1,
+                    dy2,
+                    dy3,
+                    scale,
+                    scene.parameters[first],
+                    scene.parameters[first + 1],
+                    zero,
+                    zero,
+                )
         pair.store(p, scene.corner, h1, h2, h3)
 
     @ti.kernel
-    def products(pairs: ints, scales: scalars, row: ints, corner_of: ints, rest: vectors, parameters: scalars, u: vectors2,
-                 w: vectors2, corner: vectors, plane: vectors, out: vectors, num_vt: ti.i32, num_ee: ti.i32,
-                 num_surface: ti.i32, first_out: ti.i32, convex: ti.i32):  # fmt: skip
+    def products(
+        pairs: ints,
+        scales: scalars,
+        row: ints,
+        corner_of: ints,
+        rest: vectors,
+        parameters: scalars,
+        u: vectors2,
+        w: vectors2,
+        corner: vectors,
+        plane: vectors,
+        out: vectors,
+        num_vt: ti.i32,
+        num_ee: ti.i32,
+        num_surface: ti.i32,
+        first_out: ti.i32,
+        convex: ti.i32,
+    ):
         """Change of the forces for changes w of the positions; `convex`: of the convex part of the energy alone."""
-        scene = Bundle(pairs=pairs, rest=rest, parameters=parameters, u=u, w=w, corner=corner, plane=plane, convex=convex)
+        scene = Bundle(
+            pairs=pairs, rest=rest, parameters=parameters, u=u, w=w, corner=corner, plane=plane, convex=convex
+        )
         ti.loop_config(serialize=not parallel)
         for p in range(num_vt):
             product(VERTEX_TRIANGLE, p, ti.cast(0, fp), scene)
@@ -98,9 +130,22 @@ def hessian_kernels(precision: str, first: int, parallel: bool) -> SimpleNamespa
             scene.corner[4 * p + a] = c[a]
 
     @ti.kernel
-    def blocks(pairs: ints, scales: scalars, row: ints, corner_of: ints, surface: ints, rest: vectors, parameters: scalars,
-               u: vectors2, corner: vectors, plane: vectors, out: vectors2, num_vt: ti.i32, num_ee: ti.i32,
-               num_surface: ti.i32):  # fmt: skip
+    def blocks(
+        pairs: ints,
+        scales: scalars,
+        row: ints,
+        corner_of: ints,
+        surface: ints,
+        rest: vectors,
+        parameters: scalars,
+        u: vectors2,
+        corner: vectors,
+        plane: vectors,
+        out: vectors2,
+        num_vt: ti.i32,
+        num_ee: ti.i32,
+        num_surface: ti.i32,
+    ):
         """Adds the 3x3 diagonal blocks of the convex part to rows 0..2 of `out`, one column of each vertex."""
         scene = Bundle(pairs=pairs, rest=rest, parameters=parameters, u=u, corner=corner, plane=plane)
         ti.loop_config(serialize=not parallel)

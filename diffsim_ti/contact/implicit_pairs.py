@@ -40,15 +40,38 @@ class ImplicitPairs(SurfacePairs):
     def hessian_product(self, u, w, convex: bool) -> None:
         """Change of the contact forces for changes w[0] of the positions, to the last corners of `arrays.corner`."""
         k = self.list
-        self._launch(self.hessian.products, k.pairs, k.scale, k.row, k.corner, self.a.rest, self.a.parameters, u,
-                     w, self.corner, self.plane, self.a.corner)(k.num_vt, k.num_ee, k.num_surface,
-                                                                self.a.first_contact_corner, int(convex))  # fmt: skip
+        self._launch(
+            self.hessian.products,
+            k.pairs,
+            k.scale,
+            k.row,
+            k.corner,
+            self.a.rest,
+            self.a.parameters,
+            u,
+            w,
+            self.corner,
+            self.plane,
+            self.a.corner,
+        )(k.num_vt, k.num_ee, k.num_surface, self.a.first_contact_corner, int(convex))
 
     def add_blocks(self, u, out) -> None:
         """Add the diagonal blocks of the Hessian's convex part to rows 0..2 of `out` (potential_kernels.py)."""
         k = self.list
-        self._launch(self.hessian.blocks, k.pairs, k.scale, k.row, k.corner, k.surface, self.a.rest,
-                     self.a.parameters, u, self.corner, self.plane, out)(k.num_vt, k.num_ee, k.num_surface)  # fmt: skip
+        self._launch(
+            self.hessian.blocks,
+            k.pairs,
+            k.scale,
+            k.row,
+            k.corner,
+            k.surface,
+            self.a.rest,
+            self.a.parameters,
+            u,
+            self.corner,
+            self.plane,
+            out,
+        )(k.num_vt, k.num_ee, k.num_surface)
 
     def safe_share(self, u: np.ndarray, step: np.ndarray, most: float = 1.0) -> float:
         """A share of the step, at most `most`, up to which no two primitives meet on the way; close to the largest such

@@ -44,8 +44,11 @@ def pair_kernels(precision: str, first: int, parallel: bool) -> SimpleNamespace:
     def corners(p, scene: A, slot):
         """Corners 1 to 3 of pair p relative to corner 0."""
         c0, c1, c2, c3 = scene.pairs[4 * p], scene.pairs[4 * p + 1], scene.pairs[4 * p + 2], scene.pairs[4 * p + 3]
-        return (at_rest(scene.rest, c0, c1) + of(scene.u, c0, c1, slot), at_rest(scene.rest, c0, c2)
-                + of(scene.u, c0, c2, slot), at_rest(scene.rest, c0, c3) + of(scene.u, c0, c3, slot))  # fmt: skip
+        return (
+            at_rest(scene.rest, c0, c1) + of(scene.u, c0, c1, slot),
+            at_rest(scene.rest, c0, c2) + of(scene.u, c0, c2, slot),
+            at_rest(scene.rest, c0, c3) + of(scene.u, c0, c3, slot),
+        )
 
     @ti.func
     def changes(p, scene: A):
@@ -112,16 +115,45 @@ def pair_kernels(precision: str, first: int, parallel: bool) -> SimpleNamespace:
                 scene.touched[scene.place[scene.pairs[4 * p + k]]] = 1
 
     @ti.kernel
-    def forces(pairs: ints, scales: scalars, surface: ints, place: ints, row: ints, corner_of: ints, rest: vectors,
-               parameters: scalars, u: vectors2, corner: vectors, plane: vectors, energy: scalars, touched: ints,
-               before: vectors, out: vectors, slot: ti.i32, num_vt: ti.i32, num_ee: ti.i32, num_surface: ti.i32,
-               first_out: ti.i32, exact: ti.i32):  # fmt: skip
+    def forces(
+        pairs: ints,
+        scales: scalars,
+        surface: ints,
+        place: ints,
+        row: ints,
+        corner_of: ints,
+        rest: vectors,
+        parameters: scalars,
+        u: vectors2,
+        corner: vectors,
+        plane: vectors,
+        energy: scalars,
+        touched: ints,
+        before: vectors,
+        out: vectors,
+        slot: ti.i32,
+        num_vt: ti.i32,
+        num_ee: ti.i32,
+        num_surface: ti.i32,
+        first_out: ti.i32,
+        exact: ti.i32,
+    ):
         """Forces at u[slot]; keeps a plane (n, d) that parts each pair, and where the surface was.
 
         d is the distance of a pair that is nearer than the width or if `exact`, else a lower bound of it.
         """
-        scene = Bundle(pairs=pairs, place=place, rest=rest, parameters=parameters, u=u, corner=corner, plane=plane,
-                       energy=energy, touched=touched, exact=exact)  # fmt: skip
+        scene = Bundle(
+            pairs=pairs,
+            place=place,
+            rest=rest,
+            parameters=parameters,
+            u=u,
+            corner=corner,
+            plane=plane,
+            energy=energy,
+            touched=touched,
+            exact=exact,
+        )
         ti.loop_config(serialize=not parallel)
         for p in range(num_vt):
             force(VERTEX_TRIANGLE, p, ti.cast(0, fp), scene, slot)
@@ -152,13 +184,42 @@ def pair_kernels(precision: str, first: int, parallel: bool) -> SimpleNamespace:
         scene.numbers[p] = vec4(0 - by_stiffness, 0 - by_width, ti.cast(0, fp), ti.cast(0, fp))
 
     @ti.kernel
-    def products(pairs: ints, scales: scalars, row: ints, corner_of: ints, rest: vectors, parameters: scalars, u: vectors2,
-                 w: vectors2, rest_dot: vectors, corner: vectors, numbers: vectors, out: vectors, slot: ti.i32,
-                 num_vt: ti.i32, num_ee: ti.i32, num_surface: ti.i32, first_out: ti.i32, by_rest: ti.i32, d_stiffness: fp,
-                 d_width: fp):  # fmt: skip
+    def products(
+        pairs: ints,
+        scales: scalars,
+        row: ints,
+        corner_of: ints,
+        rest: vectors,
+        parameters: scalars,
+        u: vectors2,
+        w: vectors2,
+        rest_dot: vectors,
+        corner: vectors,
+        numbers: vectors,
+        out: vectors,
+        slot: ti.i32,
+        num_vt: ti.i32,
+        num_ee: ti.i32,
+        num_surface: ti.i32,
+        first_out: ti.i32,
+        by_rest: ti.i32,
+        d_stiffness: fp,
+        d_width: fp,
+    ):
         """Change of the forces at u[slot] for changes w of the positions (and of rest shape, stiffness and width)."""
-        scene = Bundle(pairs=pairs, rest=rest, parameters=parameters, u=u, w=w, rest_dot=rest_dot, corner=corner,
-                       numbers=numbers, by_rest=by_rest, d_stiffness=d_stiffness, d_width=d_width)  # fmt: skip
+        scene = Bundle(
+            pairs=pairs,
+            rest=rest,
+            parameters=parameters,
+            u=u,
+            w=w,
+            rest_dot=rest_dot,
+            corner=corner,
+            numbers=numbers,
+            by_rest=by_rest,
+            d_stiffness=d_stiffness,
+            d_width=d_width,
+        )
         ti.loop_config(serialize=not parallel)
         for p in range(num_vt):
             product(VERTEX_TRIANGLE, p, ti.cast(0, fp), scene, slot)
@@ -173,8 +234,16 @@ def pair_kernels(precision: str, first: int, parallel: bool) -> SimpleNamespace:
             out[first_out + s] = total
 
     @ti.kernel
-    def add_sums(row: ints, corner_of: ints, numbers: vectors, out: vectors, sums: vectors, rest_adj: vectors,
-                 num_surface: ti.i32, first_out: ti.i32):  # fmt: skip
+    def add_sums(
+        row: ints,
+        corner_of: ints,
+        numbers: vectors,
+        out: vectors,
+        sums: vectors,
+        rest_adj: vectors,
+        num_surface: ti.i32,
+        first_out: ti.i32,
+    ):
         """Adjoints of stiffness and width, each pair at its corner 0, and of the rest shape, after `products`."""
         ti.loop_config(serialize=not parallel)
         for s in range(num_surface):
@@ -196,10 +265,28 @@ def pair_kernels(precision: str, first: int, parallel: bool) -> SimpleNamespace:
         return most
 
     @ti.kernel
-    def check(pairs: ints, surface: ints, place: ints, body: ints, slack: vectors, marked: ints, u: vectors2,
-              before: vectors, built: vectors, frame: vectors, farthest: scalars, plane: vectors, flags: ints, slot: ti.i32,
-              num_vt: ti.i32, num_ee: ti.i32, num_surface: ti.i32, num_bodies: ti.i32, markers: ti.i32,
-              lost: fp):  # fmt: skip
+    def check(
+        pairs: ints,
+        surface: ints,
+        place: ints,
+        body: ints,
+        slack: vectors,
+        marked: ints,
+        u: vectors2,
+        before: vectors,
+        built: vectors,
+        frame: vectors,
+        farthest: scalars,
+        plane: vectors,
+        flags: ints,
+        slot: ti.i32,
+        num_vt: ti.i32,
+        num_ee: ti.i32,
+        num_surface: ti.i32,
+        num_bodies: ti.i32,
+        markers: ti.i32,
+        lost: fp,
+    ):
         """flags: a vertex has used up its slack (0), or that and `lost` (1); a pair may have crossed (2).
 
         frame: mean motion of each body's markers since the list was made, and their mean, which motion is relative to.
@@ -264,13 +351,24 @@ def pair_kernels(precision: str, first: int, parallel: bool) -> SimpleNamespace:
                     flags[2] = 1
 
     @ti.kernel
-    def begin(surface: ints, u: vectors2, built: vectors, plane: vectors, slot: ti.i32, num_surface: ti.i32,
-              count: ti.i32):  # fmt: skip
+    def begin(
+        surface: ints, u: vectors2, built: vectors, plane: vectors, slot: ti.i32, num_surface: ti.i32, count: ti.i32
+    ):
         """A new list: where the surface is, and no planes yet."""
         for p in range(count):
             plane[p] = vec4(0)
         for s in range(num_surface):
             built[s] = u[slot, surface[s]]
 
-    return SimpleNamespace(forces=forces, products=products, add_sums=add_sums, check=check, begin=begin, of=of,
-                           corners=corners, store=store, fp=fp, vector=vec4)  # fmt: skip
+    return SimpleNamespace(
+        forces=forces,
+        products=products,
+        add_sums=add_sums,
+        check=check,
+        begin=begin,
+        of=of,
+        corners=corners,
+        store=store,
+        fp=fp,
+        vector=vec4,
+    )

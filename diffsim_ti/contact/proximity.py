@@ -9,7 +9,7 @@ leaves 2, 1 or 0 of the parameters free, and that is all that differs between fa
 
 with dr_t the change of r at fixed t; then dr = dr_t + E dt and dw_i = (dw_i / dt) dt. Energy of a pair:
 
-    m(q) stiffness width^2 beta(d / width)                  beta: terms/barrier.py
+    m(q) stiffness width^2 beta(d / width)                  beta: barrier.py
 
 where m = q (2 - q) for q < 1, else 1, fades out edges that become parallel, whose nearest points jump:
 q = |a x b|^2 / (10^-3 A^2 B^2), with A, B the lengths at rest. Vertex and triangle: m = 1.
@@ -23,7 +23,7 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
-from diffsim_ti.terms import barrier
+from diffsim_ti.terms.obstacles import barrier
 
 VERTEX_TRIANGLE, EDGE_EDGE = 0, 1
 PARALLEL = 1e-3  # threshold of q, in squared lengths at rest
@@ -258,9 +258,18 @@ def pair_functions(precision: str) -> SimpleNamespace:
     def curvature(s):
         return barrier.curvature(s, fp)
 
-    return SimpleNamespace(fp=fp, vec3=vec3, vec4=vec4, nearest=nearest, nearest_jvp=nearest_jvp, may_be_near=may_be_near,
-                           gradient=gradient, gradient_jvp=gradient_jvp, mollifier=mollifier,
-                           curvature=curvature)  # fmt: skip
+    return SimpleNamespace(
+        fp=fp,
+        vec3=vec3,
+        vec4=vec4,
+        nearest=nearest,
+        nearest_jvp=nearest_jvp,
+        may_be_near=may_be_near,
+        gradient=gradient,
+        gradient_jvp=gradient_jvp,
+        mollifier=mollifier,
+        curvature=curvature,
+    )
 
 
 @lru_cache(maxsize=None)
@@ -279,10 +288,27 @@ def _evaluate_kernel(precision: str, kind: int):
             out[p, 0, d], out[p, 1, d], out[p, 2, d], out[p, 3, d] = h0[d], h1[d], h2[d], h3[d]
 
     @ti.kernel
-    def evaluate(x: array3, dx: array3, scale: array1, numbers: array2, square_gradient: array3, square_product: array3,
-                 gradient: array3, product: array3, stiffness: f.fp, width: f.fp):  # fmt: skip
+    def evaluate(
+        x: array3,
+        dx: array3,
+        scale: array1,
+        numbers: array2,
+        square_gradient: array3,
+        square_product: array3,
+        gradient: array3,
+        product: array3,
+        stiffness: f.fp,
+        width: f.fp,
+    ):
         for p in range(x.shape[0]):
-            y1, y2, y3, dy1, dy2, dy3 = row(x, p, 1), row(x, p, 2), row(x, p, 3), row(dx, p, 1), row(dx, p, 2), row(dx, p, 3)
+            y1, y2, y3, dy1, dy2, dy3 = (
+                row(x, p, 1),
+                row(x, p, 2),
+                row(x, p, 3),
+                row(dx, p, 1),
+                row(dx, p, 2),
+                row(dx, p, 3),
+            )
             w, r, g = f.nearest(kind, y1, y2, y3)
             dw, dr, _ = f.nearest_jvp(kind, y1, y2, y3, dy1, dy2, dy3, w, r, g)
             for k in ti.static(range(4)):
@@ -290,8 +316,9 @@ def _evaluate_kernel(precision: str, kind: int):
                     square_gradient[p, k, d] = 2 * w[k] * r[d]
                     square_product[p, k, d] = 2 * (w[k] * dr[d] + dw[k] * r[d])
             energy, n, d, g1, g2, g3 = f.gradient(kind, y1, y2, y3, scale[p], stiffness, width)
-            h1, h2, h3, by_stiffness, by_width = f.gradient_jvp(kind, y1, y2, y3, dy1, dy2, dy3, scale[p], stiffness, width,
-                                                                ti.cast(0, f.fp), ti.cast(0, f.fp))  # fmt: skip
+            h1, h2, h3, by_stiffness, by_width = f.gradient_jvp(
+                kind, y1, y2, y3, dy1, dy2, dy3, scale[p], stiffness, width, ti.cast(0, f.fp), ti.cast(0, f.fp)
+            )
             numbers[p, 0], numbers[p, 1], numbers[p, 2], numbers[p, 3] = d, energy, by_stiffness, by_width
             write(gradient, p, g1, g2, g3)
             write(product, p, h1, h2, h3)
@@ -299,8 +326,15 @@ def _evaluate_kernel(precision: str, kind: int):
     return evaluate
 
 
-def evaluate_pairs(kind: int, points, direction=None, stiffness: float = 1.0, width: float = 1.0, threshold=None,
-                   precision: str = "f64") -> SimpleNamespace:  # fmt: skip
+def evaluate_pairs(
+    kind: int,
+    points,
+    direction=None,
+    stiffness: float = 1.0,
+    width: float = 1.0,
+    threshold=None,
+    precision: str = "f64",
+) -> SimpleNamespace:
     """Distances and barrier energies of pairs of given corners, with derivatives; arrays in, arrays out.
 
     kind: VERTEX_TRIANGLE or EDGE_EDGE. points, direction: shape (k, 4, 3) [m]; direction defaults to zero.
@@ -319,8 +353,16 @@ def evaluate_pairs(kind: int, points, direction=None, stiffness: float = 1.0, wi
     runtime.program()
     numbers = np.zeros((len(x), 4), x.dtype)
     square_gradient, square_product, gradient, product = (np.zeros_like(x) for _ in range(4))
-    _evaluate_kernel(precision, kind)(x, dx, scale, numbers, square_gradient, square_product, gradient, product,
-                                      float(stiffness), float(width))  # fmt: skip
-    return SimpleNamespace(distance=numbers[:, 0], energy=numbers[:, 1], by_stiffness=numbers[:, 2],
-                           by_width=numbers[:, 3], square_gradient=square_gradient, square_product=square_product,
-                           gradient=gradient, product=product)  # fmt: skip
+    _evaluate_kernel(precision, kind)(
+        x, dx, scale, numbers, square_gradient, square_product, gradient, product, float(stiffness), float(width)
+    )
+    return SimpleNamespace(
+        distance=numbers[:, 0],
+        energy=numbers[:, 1],
+        by_stiffness=numbers[:, 2],
+        by_width=numbers[:, 3],
+        square_gradient=square_gradient,
+        square_product=square_product,
+        gradient=gradient,
+        product=product,
+    )

@@ -19,13 +19,16 @@ class SurfacePairs:
     until a vertex has used up one of its two slacks: the one towards its own body by moving relative to that body, the one
     towards others by moving relative to the mean of all bodies. Slacks follow the motion since the list before.
     Pairs beyond the width add exact zeros, in a fixed order, so that forces have the same bits whatever the list's age.
-    Forces go to the last corners of an array of corners, one for each surface vertex (solvers/arrays.py).
+    Forces go to the last corners of an array of corners, one for each surface vertex (state/arrays.py).
     """
 
     typical_slack = 0.5  # share of the width that half of the vertices get at most, so that lists stay short
     fewest_passes, most_passes = 3, 30  # that a list should last, by its slacks, but
     least_slack = 0.1  # they are at least this share of the width, and
-    largest_reach = 1.0, 2.0  # width + 2 slack at most this share of an edge, of one body (with many neighbours) and of two
+    largest_reach = (
+        1.0,
+        2.0,
+    )  # width + 2 slack at most this share of an edge, of one body (with many neighbours) and of two
     markers = 16  # vertices whose mean motion is that of a body
 
     def __init__(self, arrays, parallel: bool):
@@ -37,8 +40,9 @@ class SurfacePairs:
         self.edges, self.term = edges, term
         self.body = np.full(mesh.num_vertices, -1)
         self.body[mesh.surface_vertices] = np.unique(pieces(mesh)[mesh.surface_vertices], return_inverse=True)[1]
-        self.list = CandidatePairs(mesh.surface_vertices, mesh.surface_triangles, edges, lengths, self.body,
-                                   arrays.precision, parallel)  # fmt: skip
+        self.list = CandidatePairs(
+            mesh.surface_vertices, mesh.surface_triangles, edges, lengths, self.body, arrays.precision, parallel
+        )
         self._launch, n, vector = self.list.launch, len(mesh.surface_vertices), self.kernels.vector
         self.before, self.built, self.sums, self.rest_adj = (runtime.array(vector, n) for _ in range(4))
         self.none, self.flags = runtime.array(vector, 1), runtime.array(ti.i32, 3)
@@ -108,10 +112,17 @@ class SurfacePairs:
         runtime.fill(self.list.slack, self._slacks(x, wanted))
         self.list.build(self.a.rest, u, slot, self.width)
         count, take = self.list.count, self.list.buffers.take
-        self.corner, self.plane = take("forces", self.kernels.vector, 4 * count), take("planes", self.kernels.vector, count)
-        self.energy, self.numbers = take("energies", self.kernels.fp, count), take("numbers", self.kernels.vector, count)
-        self._launch(self.kernels.begin, self.list.surface, u, self.built,
-                     self.plane)(slot, self.list.num_surface, count)  # fmt: skip
+        self.corner, self.plane = (
+            take("forces", self.kernels.vector, 4 * count),
+            take("planes", self.kernels.vector, count),
+        )
+        self.energy, self.numbers = (
+            take("energies", self.kernels.fp, count),
+            take("numbers", self.kernels.vector, count),
+        )
+        self._launch(self.kernels.begin, self.list.surface, u, self.built, self.plane)(
+            slot, self.list.num_surface, count
+        )
         self.fresh, self.age = True, 0
         self.builds += 1
 
@@ -144,10 +155,22 @@ class SurfacePairs:
     def _check(self, u, slot: int, num_vt: int, num_ee: int) -> tuple[bool, bool, bool]:
         """Whether the list is stale, whether pairs beyond it may have crossed, and whether pairs of it may have."""
         k = self.list
-        self._launch(self.kernels.check, k.pairs, k.surface, k.place, k.body, k.slack, self.marked, u, self.before,
-                     self.built, self.frame, self.farthest, self.plane,
-                     self.flags)(slot, num_vt, num_ee, k.num_surface, self.num_bodies, self.markers,
-                                 0.5 * self.width)  # fmt: skip
+        self._launch(
+            self.kernels.check,
+            k.pairs,
+            k.surface,
+            k.place,
+            k.body,
+            k.slack,
+            self.marked,
+            u,
+            self.before,
+            self.built,
+            self.frame,
+            self.farthest,
+            self.plane,
+            self.flags,
+        )(slot, num_vt, num_ee, k.num_surface, self.num_bodies, self.markers, 0.5 * self.width)
         flags = runtime.view(self.flags)
         stale, lost, crossed = runtime.fetch(self.flags) if flags is None else flags
         return bool(stale), bool(lost), bool(crossed)
@@ -204,17 +227,51 @@ class SurfacePairs:
     def forces(self, u, slot: int, out, exact: bool = False) -> None:
         """Contact forces at u[slot], to the last corners of `out`."""
         k = self.list
-        self._launch(self.kernels.forces, k.pairs, k.scale, k.surface, k.place, k.row, k.corner, self.a.rest,
-                     self.a.parameters, u, self.corner, self.plane, self.energy, self.touched, self.before,
-                     out)(slot, k.num_vt, k.num_ee, k.num_surface, self.a.first_contact_corner, int(exact))  # fmt: skip
+        self._launch(
+            self.kernels.forces,
+            k.pairs,
+            k.scale,
+            k.surface,
+            k.place,
+            k.row,
+            k.corner,
+            self.a.rest,
+            self.a.parameters,
+            u,
+            self.corner,
+            self.plane,
+            self.energy,
+            self.touched,
+            self.before,
+            out,
+        )(slot, k.num_vt, k.num_ee, k.num_surface, self.a.first_contact_corner, int(exact))
 
     def product(self, u, slot: int, w, out, rest_dot=None, parameters_dot=(0.0, 0.0)) -> None:
         """Change of the contact forces for changes w[0] of the positions (and of rest shape, stiffness, width)."""
         k = self.list
-        self._launch(self.kernels.products, k.pairs, k.scale, k.row, k.corner, self.a.rest, self.a.parameters, u,
-                     w, self.none if rest_dot is None else rest_dot, self.corner, self.numbers,
-                     out)(slot, k.num_vt, k.num_ee, k.num_surface, self.a.first_contact_corner, int(rest_dot is not None),
-                          *parameters_dot)  # fmt: skip
+        self._launch(
+            self.kernels.products,
+            k.pairs,
+            k.scale,
+            k.row,
+            k.corner,
+            self.a.rest,
+            self.a.parameters,
+            u,
+            w,
+            self.none if rest_dot is None else rest_dot,
+            self.corner,
+            self.numbers,
+            out,
+        )(
+            slot,
+            k.num_vt,
+            k.num_ee,
+            k.num_surface,
+            self.a.first_contact_corner,
+            int(rest_dot is not None),
+            *parameters_dot,
+        )
 
     def clear_sums(self) -> None:
         """Begin a reverse sweep."""
@@ -225,8 +282,9 @@ class SurfacePairs:
         """The product with the adjoint w[0] of the forces; adds the adjoints of stiffness, width and rest shape."""
         self.product(u, slot, w, out)
         k = self.list
-        self._launch(self.kernels.add_sums, k.row, k.corner, self.numbers, out, self.sums,
-                     self.rest_adj)(k.num_surface, self.a.first_contact_corner)  # fmt: skip
+        self._launch(self.kernels.add_sums, k.row, k.corner, self.numbers, out, self.sums, self.rest_adj)(
+            k.num_surface, self.a.first_contact_corner
+        )
 
     def collect(self) -> tuple[np.ndarray, np.ndarray]:
         """Adjoints of (stiffness, width) and of the rest shape, (num_vertices, 3), by the forces alone; float64."""

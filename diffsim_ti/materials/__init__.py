@@ -1,7 +1,8 @@
 """Materials, one law per file, over two bases that hold all tensor calculus: invariants and strains."""
 
+from diffsim_ti.materials.calculus.invariants import InvariantLaw
+from diffsim_ti.materials.calculus.strains import StrainLaw
 from diffsim_ti.materials.corotated import Corotated
-from diffsim_ti.materials.invariants import InvariantLaw
 from diffsim_ti.materials.law import Law
 from diffsim_ti.materials.linear_elastic import LinearElastic
 from diffsim_ti.materials.material import Material
@@ -9,11 +10,19 @@ from diffsim_ti.materials.mooney_rivlin import MooneyRivlin
 from diffsim_ti.materials.smith_neo_hookean import SmithNeoHookean
 from diffsim_ti.materials.st_venant_kirchhoff import StVenantKirchhoff
 from diffsim_ti.materials.stable_neo_hookean import StableNeoHookean
-from diffsim_ti.materials.strains import StrainLaw
 
 MATERIALS = (StableNeoHookean, SmithNeoHookean, LinearElastic, Corotated, StVenantKirchhoff, MooneyRivlin)
 
 __all__ = [
-    "MATERIALS", "Corotated", "InvariantLaw", "Law", "LinearElastic", "Material", "MooneyRivlin", "SmithNeoHookean",
-    "StVenantKirchhoff", "StableNeoHookean", "StrainLaw",
-]  # fmt: skip
+    "MATERIALS",
+    "Corotated",
+    "InvariantLaw",
+    "Law",
+    "LinearElastic",
+    "Material",
+    "MooneyRivlin",
+    "SmithNeoHookean",
+    "StVenantKirchhoff",
+    "StableNeoHookean",
+    "StrainLaw",
+]

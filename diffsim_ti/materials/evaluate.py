@@ -6,7 +6,7 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
-from diffsim_ti.materials.tensor import tensor
+from diffsim_ti.materials.calculus.tensor import tensor
 
 
 @lru_cache(maxsize=None)

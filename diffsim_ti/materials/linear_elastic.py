@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import taichi as ti
 
+from diffsim_ti.materials.calculus.strains import StrainLaw
 from diffsim_ti.materials.material import Material
-from diffsim_ti.materials.strains import StrainLaw
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,9 @@ class Material(ABC):
 
     def __init__(self, *numbers, J_floor: float | None = None, **named):
         if J_floor is not None and not 0 < J_floor < 1:
-            raise ValueError(f"J_floor must lie in (0, 1), got {J_floor}: 0.01 continues the energy below 1 % of the volume")
+            raise ValueError(
+                f"J_floor must lie in (0, 1), got {J_floor}: 0.01 continues the energy below 1 % of the volume"
+            )
         self.J_floor = None if J_floor is None else float(J_floor)
         self._numbers = self._spell(numbers, named)
         self._extra = ""
@@ -41,7 +43,9 @@ class Material(ABC):
         """{input name: number} in the order of the one spelling that fits."""
         usage = " or ".join(f"({', '.join(names)})" for names in self.spellings)
         if len(numbers) > 2:
-            raise ValueError(f"{self.name}: at most two numbers go without a name (E, nu), got {len(numbers)}; use {usage}")
+            raise ValueError(
+                f"{self.name}: at most two numbers go without a name (E, nu), got {len(numbers)}; use {usage}"
+            )
         given = dict(zip(self.spellings[0], numbers))
         for key, number in named.items():
             name = _ALIASES.get(key, key)
@@ -106,7 +110,9 @@ class Material(ABC):
 
     def coefficients_jvp(self, values: dict, tangents: dict) -> np.ndarray:
         """Change of the coefficients for changes of the values; names left out do not change."""
-        return self._linear(values, {n: np.broadcast_to(tangents.get(n, 0.0), np.shape(v)) for n, v in values.items()}, True)
+        return self._linear(
+            values, {n: np.broadcast_to(tangents.get(n, 0.0), np.shape(v)) for n, v in values.items()}, True
+        )
 
     def coefficients_vjp(self, values: dict, coefficients_adj: np.ndarray) -> dict[str, np.ndarray]:
         """Adjoint of each value, of its shape, from the adjoint of the coefficients, shape (num_tetrahedra, K) or (K,).

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 import taichi as ti
 
-from diffsim_ti.materials import logarithm
-from diffsim_ti.materials.invariants import InvariantLaw
+from diffsim_ti.materials.calculus import logarithm
+from diffsim_ti.materials.calculus.invariants import InvariantLaw
 from diffsim_ti.materials.material import Material, check_range
 
 

@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass
 
+from diffsim_ti.materials.calculus.tensor import sum_of
 from diffsim_ti.materials.law import Law
-from diffsim_ti.materials.tensor import sum_of
 from diffsim_ti.runtime import let, traced
 
 

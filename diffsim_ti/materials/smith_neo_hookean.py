@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 import taichi as ti
 
-from diffsim_ti.materials.invariants import InvariantLaw
-from diffsim_ti.materials.logarithm import x_minus_log1p
+from diffsim_ti.materials.calculus.invariants import InvariantLaw
+from diffsim_ti.materials.calculus.logarithm import x_minus_log1p
 from diffsim_ti.materials.material import Material
 
 

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import taichi as ti
 
-from diffsim_ti.materials.invariants import InvariantLaw
+from diffsim_ti.materials.calculus.invariants import InvariantLaw
+from diffsim_ti.materials.calculus.tensor import add_to_diagonal, inner
 from diffsim_ti.materials.material import Material
-from diffsim_ti.materials.tensor import add_to_diagonal, inner
 from diffsim_ti.runtime import let, traced
 
 

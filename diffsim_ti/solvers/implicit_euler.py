@@ -2,7 +2,7 @@
 
 import math
 
-from diffsim_ti.solvers.implicit import ImplicitSolver, Stage
+from diffsim_ti.solvers.implicit.solver import ImplicitSolver, Stage
 
 
 class ImplicitEulerSolver(ImplicitSolver):

@@ -3,7 +3,7 @@
 import math
 
 from diffsim_ti.scene import Scene
-from diffsim_ti.solvers.explicit import ExplicitSolver, Weights
+from diffsim_ti.solvers.explicit.solver import ExplicitSolver, Weights
 from diffsim_ti.terms import Gravity
 
 
@@ -17,8 +17,9 @@ class SemiImplicitSolver(ExplicitSolver):
     order = 1
     last_frame_is_state = True
 
-    def __init__(self, scene=None, material=None, dt: float = 0.01, substeps: int = 1, density=1000.0, gravity=-9.8,
-                 **options):  # fmt: skip
+    def __init__(
+        self, scene=None, material=None, dt: float = 0.01, substeps: int = 1, density=1000.0, gravity=-9.8, **options
+    ):
         """`SemiImplicitSolver(scene, dt=...)` takes dt as it is and refuses an unstable one.
 
         `SemiImplicitSolver(mesh, material, dt=...)`, or `SemiImplicitSolver(dt=...)` for

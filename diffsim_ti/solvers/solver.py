@@ -6,7 +6,8 @@ from abc import ABC
 
 import numpy as np
 
-from diffsim_ti import runtime, stability
+from diffsim_ti import runtime
+from diffsim_ti.state import stability
 
 
 class Solver(ABC):
@@ -20,8 +21,9 @@ class Solver(ABC):
     explicit = False
     order = 0
 
-    def __init__(self, scene, dt: float = 0.01, substeps: int = 1, parallel: bool | None = None,
-                 allow_unstable: bool = False):  # fmt: skip
+    def __init__(
+        self, scene, dt: float = 0.01, substeps: int = 1, parallel: bool | None = None, allow_unstable: bool = False
+    ):
         if not (math.isfinite(dt) and dt > 0):
             raise ValueError(f"dt must be > 0 [s], got {dt}")
         if int(substeps) != substeps or substeps < 1:

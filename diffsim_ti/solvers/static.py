@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from diffsim_ti.solvers.implicit import ImplicitSolver, Stage
+from diffsim_ti.solvers.implicit.solver import ImplicitSolver, Stage
 
 
 class StaticSolver(ImplicitSolver):
@@ -16,8 +16,16 @@ class StaticSolver(ImplicitSolver):
 
     order = 0
 
-    def __init__(self, scene, load_steps: int = 1, tolerance: float = 1e-8, max_iterations: int = 100, dt: float = 1.0,
-                 parallel: bool | None = None, preconditioner: str = "auto"):  # fmt: skip
+    def __init__(
+        self,
+        scene,
+        load_steps: int = 1,
+        tolerance: float = 1e-8,
+        max_iterations: int = 100,
+        dt: float = 1.0,
+        parallel: bool | None = None,
+        preconditioner: str = "auto",
+    ):
         super().__init__(scene, dt, load_steps, tolerance, max_iterations, parallel, preconditioner)
         self._refuse_rigid_modes()
 
@@ -42,7 +50,9 @@ class StaticSolver(ImplicitSolver):
             held = mesh.vertices[fixed & (piece == k)]
             spread = np.linalg.matrix_rank(held - held[0], tol=1e-9 * np.ptp(mesh.vertices)) if len(held) else -1
             if spread < 2:
-                free = {-1: "6 rigid modes: 3 translations, 3 rotations", 0: "3 rotations", 1: "1 rotation"}[int(spread)]
+                free = {-1: "6 rigid modes: 3 translations, 3 rotations", 0: "3 rotations", 1: "1 rotation"}[
+                    int(spread)
+                ]
                 which = f"piece {k} of {count} of the body" if count > 1 else "the body"
                 raise ValueError(
                     f"statics: {which} is free to move rigidly ({free}): fix at least three of its vertices that do not "

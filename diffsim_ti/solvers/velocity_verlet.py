@@ -2,7 +2,7 @@
 
 import math
 
-from diffsim_ti.solvers.explicit import ExplicitSolver, Weights
+from diffsim_ti.solvers.explicit.solver import ExplicitSolver, Weights
 
 
 class VelocityVerletSolver(ExplicitSolver):

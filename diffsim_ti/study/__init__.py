@@ -8,6 +8,19 @@ from diffsim_ti.study.stability_map import StabilityMap, boundary, power_limit, 
 from diffsim_ti.study.work_precision import Chart, Point, chart, pareto_front
 
 __all__ = [
-    "Chart", "Growth", "PROBLEMS", "Point", "Problem", "Recommendation", "StabilityMap", "boundary", "chart", "growth",
-    "pareto_front", "power_limit", "problem", "recommend", "stability_map",
-]  # fmt: skip
+    "Chart",
+    "Growth",
+    "PROBLEMS",
+    "Point",
+    "Problem",
+    "Recommendation",
+    "StabilityMap",
+    "boundary",
+    "chart",
+    "growth",
+    "pareto_front",
+    "power_limit",
+    "problem",
+    "recommend",
+    "stability_map",
+]

@@ -6,11 +6,23 @@ from pathlib import Path
 
 import numpy as np
 
-COLORS = {"SemiImplicit": "#E69F00", "VelocityVerlet": "#0072B2", "ImplicitEuler": "#D55E00", "ImplicitMidpoint": "#009E73",
-          "BDF2": "#CC79A7", "Static": "#56B4E9"}  # fmt: skip
+COLORS = {
+    "SemiImplicit": "#E69F00",
+    "VelocityVerlet": "#0072B2",
+    "ImplicitEuler": "#D55E00",
+    "ImplicitMidpoint": "#009E73",
+    "BDF2": "#CC79A7",
+    "Static": "#56B4E9",
+}
 PEER_COLORS = {"torch-diffsim": "#555555", "Warp (CPU)": "#999999", "JAX": "#BBBBBB"}
-MARKERS = {"SemiImplicit": "o", "VelocityVerlet": "s", "ImplicitEuler": "^", "ImplicitMidpoint": "D", "BDF2": "v",
-           "Static": "P"}  # fmt: skip
+MARKERS = {
+    "SemiImplicit": "o",
+    "VelocityVerlet": "s",
+    "ImplicitEuler": "^",
+    "ImplicitMidpoint": "D",
+    "BDF2": "v",
+    "Static": "P",
+}
 
 
 def new_figure(width: float = 9.2, height: float = 5.4):
@@ -37,9 +49,18 @@ def draw_chart(chart, path, peers: dict | None = None) -> None:
             rows = [p for p in chart.points if p.solver == solver and p.precision == precision and np.isfinite(p.error)]
             if rows:
                 color = COLORS.get(name, "#000000")
-                axes.scatter([p.seconds for p in rows], [p.error for p in rows], s=22, marker=MARKERS.get(name, "x"),
-                             facecolors=color if filled else "none", edgecolors=color, linewidths=1.0, alpha=0.75,
-                             label=f"{name}, {precision}", zorder=2)  # fmt: skip
+                axes.scatter(
+                    [p.seconds for p in rows],
+                    [p.error for p in rows],
+                    s=22,
+                    marker=MARKERS.get(name, "x"),
+                    facecolors=color if filled else "none",
+                    edgecolors=color,
+                    linewidths=1.0,
+                    alpha=0.75,
+                    label=f"{name}, {precision}",
+                    zorder=2,
+                )
     front = chart.front
     axes.plot([p.seconds for p in front], [p.error for p in front], "k-", lw=1.3, zorder=1, label="Pareto front")
     for who, rows in (peers or {}).items():
@@ -56,8 +77,16 @@ def draw_chart(chart, path, peers: dict | None = None) -> None:
     if chart.reference_error > 0:
         axes.axhspan(chart.reference_error / 2, chart.reference_error, color="0.9", zorder=0)
         axes.set_ylim(bottom=min(chart.reference_error / 2, axes.get_ylim()[0]))
-        axes.text(0.99, chart.reference_error, "the reference's own error", transform=axes.get_yaxis_transform(), ha="right",
-                  va="bottom", fontsize=8, color="0.35")  # fmt: skip
+        axes.text(
+            0.99,
+            chart.reference_error,
+            "the reference's own error",
+            transform=axes.get_yaxis_transform(),
+            ha="right",
+            va="bottom",
+            fontsize=8,
+            color="0.35",
+        )
     label_front(axes, front)
     axes.legend(fontsize=8, frameon=False, ncols=1, loc="upper left", bbox_to_anchor=(1.0, 1.0))
     save(figure, path)
@@ -71,8 +100,17 @@ def label_front(axes, front, most: int = 9) -> None:
             apart.append(p)
     few = [apart[round(k)] for k in np.linspace(0, len(apart) - 1, min(most, len(apart)))]
     for k, p in enumerate(few):
-        axes.annotate(str(k + 1), (p.seconds, p.error), textcoords="offset points", xytext=(-3, -3), ha="right", va="top",
-                      fontsize=8, fontweight="bold", zorder=4)  # fmt: skip
+        axes.annotate(
+            str(k + 1),
+            (p.seconds, p.error),
+            textcoords="offset points",
+            xytext=(-3, -3),
+            ha="right",
+            va="top",
+            fontsize=8,
+            fontweight="bold",
+            zorder=4,
+        )
     lines = ["the front:", *(f"{k + 1}  {p.label}" for k, p in enumerate(few))]
     axes.text(1.02, 0.0, "\n".join(lines), transform=axes.transAxes, fontsize=7.5, va="bottom", linespacing=1.5)
 

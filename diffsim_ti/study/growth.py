@@ -13,7 +13,7 @@ from diffsim_ti.solvers import VelocityVerletSolver
 from diffsim_ti.study.charts import COLORS, new_figure, save, write_csv, write_json
 from diffsim_ti.study.problems import beam_scene, lame_scene
 from diffsim_ti.terms import Gravity, Ground
-from diffsim_ti.terms.stiffness import barrier_stiffness
+from diffsim_ti.terms.obstacles.stiffness import barrier_stiffness
 
 
 @dataclass
@@ -93,16 +93,29 @@ def draw_growth(results: dict[str, Growth], path, rounding: float) -> None:
     for k, ((name, result), color) in enumerate(zip(results.items(), COLORS.values())):
         largest = result.sizes.max(0)
         until = "to the end" if result.horizon is None else f"until {result.horizon:.2g} s"
-        axes.plot(result.times, largest, styles[k % 4], color=color, lw=1.8,
-                  label=f"{name}: {result.rate:.2g} 1/s, of use {until}")  # fmt: skip
+        axes.plot(
+            result.times,
+            largest,
+            styles[k % 4],
+            color=color,
+            lw=1.8,
+            label=f"{name}: {result.rate:.2g} 1/s, of use {until}",
+        )
         if result.horizon is not None:
             axes.plot(result.horizon, np.interp(result.horizon, result.times, largest), "o", color=color, ms=8)
     axes.set(yscale="log", xlabel="time [s]", ylabel="largest d positions / d start [-]")
     top = max(np.nanmax(result.sizes) for result in results.values())
     if top * rounding > 1e-4:
         axes.axhline(1e-2 / rounding, color="0.4", lw=1)
-        axes.text(0.01, 1e-2 / rounding, "rounding grown to 1 % of the state", transform=axes.get_yaxis_transform(),
-                  va="bottom", fontsize=9, color="0.35")  # fmt: skip
+        axes.text(
+            0.01,
+            1e-2 / rounding,
+            "rounding grown to 1 % of the state",
+            transform=axes.get_yaxis_transform(),
+            va="bottom",
+            fontsize=9,
+            color="0.35",
+        )
     axes.grid(which="major", color="0.9")
     axes.set_title("Growth of gradients with the length of a run", loc="left", fontsize=11)
     axes.legend(frameon=False, fontsize=9, loc="upper left", bbox_to_anchor=(0, -0.12))
@@ -113,8 +126,16 @@ def write_growth(results: dict[str, Growth], folder, rounding: float) -> list[st
     """growth.png, .csv, .json in a folder; returns their names."""
     stem = Path(folder) / "growth"
     draw_growth(results, stem.with_suffix(".png"), rounding)
-    write_csv([dict(scene=name, time=t, size=s) for name, result in results.items()
-               for t, s in zip(result.times, result.sizes.max(0))], stem.with_suffix(".csv"))  # fmt: skip
-    write_json({name: asdict(r) | dict(times=r.times.tolist(), sizes=r.sizes.tolist()) for name, r in results.items()},
-               stem.with_suffix(".json"))  # fmt: skip
+    write_csv(
+        [
+            dict(scene=name, time=t, size=s)
+            for name, result in results.items()
+            for t, s in zip(result.times, result.sizes.max(0))
+        ],
+        stem.with_suffix(".csv"),
+    )
+    write_json(
+        {name: asdict(r) | dict(times=r.times.tolist(), sizes=r.sizes.tolist()) for name, r in results.items()},
+        stem.with_suffix(".json"),
+    )
     return [str(stem.with_suffix(s)) for s in (".png", ".csv", ".json")]

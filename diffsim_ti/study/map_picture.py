@@ -9,8 +9,13 @@ from diffsim_ti.study.stability_map import OUTCOMES
 
 OUTCOME_COLORS = ("#009E73", "#8FD0EC", "#F0E442", "#BBBBBB", "#D55E00")  # in the order of OUTCOMES
 LETTERS = "ABLR!"  # the same in letters, for eyes and printers that see no colours
-LEGEND = ("accurate: energy keeps to 1 %", "bounded", "loses more than a tenth of the energy",
-          "raises, refuses or warns", "wrong silently")  # fmt: skip
+LEGEND = (
+    "accurate: energy keeps to 1 %",
+    "bounded",
+    "loses more than a tenth of the energy",
+    "raises, refuses or warns",
+    "wrong silently",
+)
 
 
 def draw_maps(results: list, path) -> None:
@@ -41,8 +46,14 @@ def draw_panel(result, axes) -> None:
     from matplotlib.colors import ListedColormap
 
     outcomes = result.outcomes
-    axes.pcolormesh(outcomes, cmap=ListedColormap(OUTCOME_COLORS), vmin=-0.5, vmax=len(OUTCOMES) - 0.5, edgecolors="white",
-                    linewidth=0.8)  # fmt: skip
+    axes.pcolormesh(
+        outcomes,
+        cmap=ListedColormap(OUTCOME_COLORS),
+        vmin=-0.5,
+        vmax=len(OUTCOMES) - 0.5,
+        edgecolors="white",
+        linewidth=0.8,
+    )
     for (row, column), outcome in np.ndenumerate(outcomes):
         axes.text(column + 0.5, row + 0.5, LETTERS[outcome], ha="center", va="center", fontsize=7, color="0.15")
     height = lambda share: np.interp(np.log(share), np.log(result.shares), np.arange(len(result.shares)) + 0.5)  # noqa: E731
@@ -60,11 +71,14 @@ def draw_legend(results, axes) -> None:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    handles = [Patch(color=color, label=f"{letter}  {words}") for color, letter, words
-               in zip(OUTCOME_COLORS, LETTERS, LEGEND)]  # fmt: skip
+    handles = [
+        Patch(color=color, label=f"{letter}  {words}") for color, letter, words in zip(OUTCOME_COLORS, LETTERS, LEGEND)
+    ]
     handles.append(Line2D([], [], color="black", lw=1.8, label="2 / omega max of the start, by power iteration"))
     if any(np.isfinite(r.bounds).any() for r in results):
-        handles.append(Line2D([], [], color="black", marker="x", ms=8, lw=0, label="up to here bounded, refusal overridden"))
+        handles.append(
+            Line2D([], [], color="black", marker="x", ms=8, lw=0, label="up to here bounded, refusal overridden")
+        )
     axes.axis("off")
     axes.legend(handles=handles, loc="center left", frameon=False, fontsize=9, handlelength=1.6, labelspacing=0.9)
 
@@ -74,7 +88,17 @@ def write_maps(results: list, folder, name: str) -> list[str]:
     stem = Path(folder) / f"stability_{name}"
     draw_maps(results, stem.with_suffix(".png"))
     write_csv([row for result in results for row in result.rows()], stem.with_suffix(".csv"))
-    write_json({r.solver: dict(axis=r.axis.name, values=list(r.axis.values), limits_s=list(r.limits), runs=r.rows(),
-                               bounded_up_to_s=[None if np.isnan(b) else b for b in r.bounds]) for r in results},
-               stem.with_suffix(".json"))  # fmt: skip
+    write_json(
+        {
+            r.solver: dict(
+                axis=r.axis.name,
+                values=list(r.axis.values),
+                limits_s=list(r.limits),
+                runs=r.rows(),
+                bounded_up_to_s=[None if np.isnan(b) else b for b in r.bounds],
+            )
+            for r in results
+        },
+        stem.with_suffix(".json"),
+    )
     return [str(stem.with_suffix(s)) for s in (".png", ".csv", ".json")]

@@ -77,12 +77,18 @@ class Problem:
 
     def quick(self) -> "Problem":
         """The same with its smallest meshes, of the first pattern and kind of elements."""
-        return replace(self, cells=self.cells[:2], patterns=self.patterns[:1], elements=self.elements[:1],
-                       reference_cells=self.reference_cells and (4, 6, 8))  # fmt: skip
+        return replace(
+            self,
+            cells=self.cells[:2],
+            patterns=self.patterns[:1],
+            elements=self.elements[:1],
+            reference_cells=self.reference_cells and (4, 6, 8),
+        )
 
     @classmethod
-    def of_scene(cls, scene, duration: float, name: str = "scene", frames: int = 10,
-                 gradient: str | None = None) -> "Problem":  # fmt: skip
+    def of_scene(
+        cls, scene, duration: float, name: str = "scene", frames: int = 10, gradient: str | None = None
+    ) -> "Problem":
         """The motion of a scene of one's own, against its converged motion on the same mesh; or a gradient through it.
 
         The error is the largest distance of any vertex at any frame, over the largest displacement from the start.
@@ -106,10 +112,22 @@ class Problem:
 
         title = f"{name}: {scene.mesh.num_tetrahedra} tetrahedra, {duration:g} s"
         if gradient is None:
-            return cls(name, title, "error of motion", build, duration, moved, frames, cells=(0,), patterns=("own mesh",))
-        return cls(f"{name}-{gradient}", title, f"error of the gradient by {gradient}", build, duration,
-                   lambda _, gradients: np.atleast_1d(gradients[gradient]), frames, adjoint=adjoint, inputs=(gradient,),
-                   cells=(0,), patterns=("own mesh",))  # fmt: skip
+            return cls(
+                name, title, "error of motion", build, duration, moved, frames, cells=(0,), patterns=("own mesh",)
+            )
+        return cls(
+            f"{name}-{gradient}",
+            title,
+            f"error of the gradient by {gradient}",
+            build,
+            duration,
+            lambda _, gradients: np.atleast_1d(gradients[gradient]),
+            frames,
+            adjoint=adjoint,
+            inputs=(gradient,),
+            cells=(0,),
+            patterns=("own mesh",),
+        )
 
 
 def distance(problem: Problem, quantity, exact) -> float:

@@ -17,13 +17,30 @@ def oscillator() -> Problem:
     def scene(cells, pattern, precision, **element):
         mesh = TetrahedralMesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, height]], [[0, 1, 2, 3]])
         start = mesh.vertices + reach * np.eye(4, 3, -3)
-        return Scene(mesh, StableNeoHookean(E, 0.0), density, fixed=[0, 1, 2], initial_positions=start,
-                     precision=precision, **element)  # fmt: skip
+        return Scene(
+            mesh,
+            StableNeoHookean(E, 0.0),
+            density,
+            fixed=[0, 1, 2],
+            initial_positions=start,
+            precision=precision,
+            **element,
+        )
 
     times = np.linspace(0, time, 17)
-    return Problem("oscillator", "One tetrahedron in shear, closed form", "error of motion", scene, time,
-                   lambda frames, _: frames.displacements[:, 3, 0], exact=reach * np.cos(omega * times), scale=reach,
-                   cells=(1,), patterns=("one tetrahedron",), levels=9)  # fmt: skip
+    return Problem(
+        "oscillator",
+        "One tetrahedron in shear, closed form",
+        "error of motion",
+        scene,
+        time,
+        lambda frames, _: frames.displacements[:, 3, 0],
+        exact=reach * np.cos(omega * times),
+        scale=reach,
+        cells=(1,),
+        patterns=("one tetrahedron",),
+        levels=9,
+    )
 
 
 def lame_mode(X, a: float = 1.0) -> np.ndarray:
@@ -52,8 +69,9 @@ def lame_scene(nu, cells, pattern, precision, **element) -> Scene:
     """A free cube of 1 m in its Lame mode."""
     mesh = TetrahedralMesh.create_cube(cells + 1, 1.0, pattern)
     start = mesh.vertices + LAME["reach"] * lame_mode(mesh.vertices)
-    return Scene(mesh, StableNeoHookean(LAME["E"], nu), LAME["density"], initial_positions=start, precision=precision,
-                 **element)  # fmt: skip
+    return Scene(
+        mesh, StableNeoHookean(LAME["E"], nu), LAME["density"], initial_positions=start, precision=precision, **element
+    )
 
 
 def lame_omega(nu: float) -> float:
@@ -72,9 +90,16 @@ def lame(nu: float = 0.3) -> Problem:
         q = np.tensordot(frames.displacements.astype(float), lame_share(frames.inputs["rest_positions"]), 2)
         return fit_oscillation(frames.times, q / LAME["reach"], omega)
 
-    return Problem("lame", f"Lamé mode of a free cube, nu = {nu:g}, closed form", "error of frequency and decay",
-                   lambda *args, **more: lame_scene(nu, *args, **more), 2 * np.pi / omega, frequency,
-                   exact=np.array([omega, 0.0]), cells=(4, 8, 12, 16, 24))  # fmt: skip
+    return Problem(
+        "lame",
+        f"Lamé mode of a free cube, nu = {nu:g}, closed form",
+        "error of frequency and decay",
+        lambda *args, **more: lame_scene(nu, *args, **more),
+        2 * np.pi / omega,
+        frequency,
+        exact=np.array([omega, 0.0]),
+        cells=(4, 8, 12, 16, 24),
+    )
 
 
 def lame_gradient(nu: float = 0.3) -> Problem:
@@ -89,11 +114,20 @@ def lame_gradient(nu: float = 0.3) -> Problem:
     window = np.sin(omega * t) * np.sin(np.pi * t / time) ** 2
     exact = -LAME["reach"] * omega / 2 * (window * t * np.sin(omega * t)).sum()
     watch = Watch(lame_share_by_mass, window, 0 * t, 0 * t)
-    return Problem("lame-gradient", f"Gradient by E of the Lamé mode, nu = {nu:g}, closed form", "error of the derivative",
-                   lambda *args, **more: lame_scene(nu, *args, **more), time,
-                   lambda _, gradients: LAME["E"] * np.atleast_1d(gradients["youngs_modulus"]), frames=frames,
-                   exact=np.array([exact]), adjoint=watch, inputs=("youngs_modulus",), cells=(4, 8, 12, 16, 24),
-                   patterns=("five",))  # fmt: skip
+    return Problem(
+        "lame-gradient",
+        f"Gradient by E of the Lamé mode, nu = {nu:g}, closed form",
+        "error of the derivative",
+        lambda *args, **more: lame_scene(nu, *args, **more),
+        time,
+        lambda _, gradients: LAME["E"] * np.atleast_1d(gradients["youngs_modulus"]),
+        frames=frames,
+        exact=np.array([exact]),
+        adjoint=watch,
+        inputs=("youngs_modulus",),
+        cells=(4, 8, 12, 16, 24),
+        patterns=("five",),
+    )
 
 
 def fit_oscillation(times, q, guess: float) -> np.ndarray:
@@ -104,8 +138,10 @@ def fit_oscillation(times, q, guess: float) -> np.ndarray:
         wave = np.exp(-p[1] * times)[:, None] * np.stack([np.cos(p[0] * times), np.sin(p[0] * times)], 1)
         return wave @ np.linalg.lstsq(wave, q, rcond=None)[0] - q
 
-    start = min(([guess * s, guess * d] for s in (0.7, 0.85, 1.0, 1.2, 1.5) for d in (0.0, 0.2)),
-                key=lambda p: (remainder(p) ** 2).sum())  # fmt: skip
+    start = min(
+        ([guess * s, guess * d] for s in (0.7, 0.85, 1.0, 1.2, 1.5) for d in (0.0, 0.2)),
+        key=lambda p: (remainder(p) ** 2).sum(),
+    )
     return least_squares(remainder, start, x_scale=guess, xtol=1e-12, ftol=1e-12, gtol=1e-12).x
 
 
@@ -127,23 +163,41 @@ def tip(frames, _=None) -> np.ndarray:
 
 def beam() -> Problem:
     """Large motion of the clamped beam that is let go straight: the path of its end over half a swing."""
-    return Problem("beam", "Clamped beam let go under its own weight, nu = 0.3", "error of motion, over its reach",
-                   lambda *args, **more: beam_scene(SmithNeoHookean, *args, **more), 0.5, tip, frames=10,
-                   cells=(1, 2, 3, 4, 6, 8), elements=("linear", "patches"), reference_cells=(6, 9, 12))  # fmt: skip
+    return Problem(
+        "beam",
+        "Clamped beam let go under its own weight, nu = 0.3",
+        "error of motion, over its reach",
+        lambda *args, **more: beam_scene(SmithNeoHookean, *args, **more),
+        0.5,
+        tip,
+        frames=10,
+        cells=(1, 2, 3, 4, 6, 8),
+        elements=("linear", "patches"),
+        reference_cells=(6, 9, 12),
+    )
 
 
 def sag(nu: float = 0.3) -> Problem:
     """Equilibrium of the clamped beam for small strains: Timoshenko's drop of the end,
 
-        q L^4 / (8 E I) + q L^2 / (2 k G A), k = 10 (1 + nu) / (12 + 11 nu)  (Cowper 1966, doi:10.1115/1.3625046)
+    q L^4 / (8 E I) + q L^2 / (2 k G A), k = 10 (1 + nu) / (12 + 11 nu)  (Cowper 1966, doi:10.1115/1.3625046)
     """
     E, load, L, H = 1e6, 1000 * 9.81 * 0.04, 1.0, 0.2
     shear = 10 * (1 + nu) / (12 + 11 * nu) * E / (2 * (1 + nu)) * H**2
     drop = load * L**4 / (8 * E * H**4 / 12) + load * L**2 / (2 * shear)
-    return Problem("sag", f"Clamped beam at rest, small strains, nu = {nu:g}, beam theory", "error of the end's drop",
-                   lambda *args, **more: beam_scene(LinearElastic, *args, nu=nu, **more), 1.0,
-                   lambda frames, _: tip(frames)[-1:, 1], frames=1, exact=np.array([-drop]), cells=(1, 2, 4, 6, 8),
-                   elements=("linear", "patches"), static=True)  # fmt: skip
+    return Problem(
+        "sag",
+        f"Clamped beam at rest, small strains, nu = {nu:g}, beam theory",
+        "error of the end's drop",
+        lambda *args, **more: beam_scene(LinearElastic, *args, nu=nu, **more),
+        1.0,
+        lambda frames, _: tip(frames)[-1:, 1],
+        frames=1,
+        exact=np.array([-drop]),
+        cells=(1, 2, 4, 6, 8),
+        elements=("linear", "patches"),
+        static=True,
+    )
 
 
 def bounce_scene(precision, speed: float, **element) -> Scene:
@@ -153,8 +207,16 @@ def bounce_scene(precision, speed: float, **element) -> Scene:
     """
     mesh = TetrahedralMesh([[0, 1, 0], [1, 1, 0], [0, 1, 1], [0, 0.015, 0]], [[0, 1, 2, 3]], fix_orientation=True)
     velocities = -speed * np.eye(4, 3, -3)[:, [1, 0, 2]]
-    return Scene(mesh, StableNeoHookean(1e-6, 0.0), 4 / mesh.volume, Ground(0.0, 1e4, 0.01), fixed=[0, 1, 2],
-                 initial_velocities=velocities, precision=precision, **element)  # fmt: skip
+    return Scene(
+        mesh,
+        StableNeoHookean(1e-6, 0.0),
+        4 / mesh.volume,
+        Ground(0.0, 1e4, 0.01),
+        fixed=[0, 1, 2],
+        initial_velocities=velocities,
+        precision=precision,
+        **element,
+    )
 
 
 def barrier_energy(d, stiffness: float = 1e4, width: float = 0.01):
@@ -183,21 +245,42 @@ def bounce_height(speed: float, energy=barrier_energy) -> float:
 
 def bounce(speed: float = 2.0) -> Problem:
     """Bounce on the barrier, by energy: the height after it, in widths of the barrier."""
-    return Problem("bounce", f"A mass meets a floor at {speed:g} m/s, by energy", "error of height, in barrier widths",
-                   lambda cells, pattern, precision, **more: bounce_scene(precision, speed, **more), BOUNCE_TIME,
-                   lambda frames, _: frames.inputs["rest_positions"][3, 1] + frames.displacements[-1:, 3, 1].astype(float),
-                   frames=1, exact=np.array([bounce_height(speed)]), scale=0.01, cells=(1,), patterns=("one mass",),
-                   largest_step=2e-3, levels=9)  # fmt: skip
+    return Problem(
+        "bounce",
+        f"A mass meets a floor at {speed:g} m/s, by energy",
+        "error of height, in barrier widths",
+        lambda cells, pattern, precision, **more: bounce_scene(precision, speed, **more),
+        BOUNCE_TIME,
+        lambda frames, _: frames.inputs["rest_positions"][3, 1] + frames.displacements[-1:, 3, 1].astype(float),
+        frames=1,
+        exact=np.array([bounce_height(speed)]),
+        scale=0.01,
+        cells=(1,),
+        patterns=("one mass",),
+        largest_step=2e-3,
+        levels=9,
+    )
 
 
 def bounce_gradient(speed: float = 2.0) -> Problem:
     """How the height after the bounce depends on that before: d x / d x0 = -1 exactly."""
     height = lambda mesh: np.eye(4, 3, -3)[:, [1, 0, 2]]  # noqa: E731, of the apex
-    return Problem("bounce-gradient", f"Gradient through a bounce at {speed:g} m/s, by energy", "error of the derivative",
-                   lambda cells, pattern, precision, **more: bounce_scene(precision, speed, **more), BOUNCE_TIME,
-                   lambda _, gradients: gradients["initial_positions"][3, 1:2], frames=1, exact=np.array([-1.0]),
-                   adjoint=Watch.end(height, 1), inputs=("initial_positions",), cells=(1,), patterns=("one mass",),
-                   largest_step=2e-3, levels=9)  # fmt: skip
+    return Problem(
+        "bounce-gradient",
+        f"Gradient through a bounce at {speed:g} m/s, by energy",
+        "error of the derivative",
+        lambda cells, pattern, precision, **more: bounce_scene(precision, speed, **more),
+        BOUNCE_TIME,
+        lambda _, gradients: gradients["initial_positions"][3, 1:2],
+        frames=1,
+        exact=np.array([-1.0]),
+        adjoint=Watch.end(height, 1),
+        inputs=("initial_positions",),
+        cells=(1,),
+        patterns=("one mass",),
+        largest_step=2e-3,
+        levels=9,
+    )
 
 
 def identify() -> Problem:
@@ -214,14 +297,31 @@ def identify() -> Problem:
         return weights
 
     watch = Watch(drop, 0 * times, np.full(11, 2 / 11), -4.3 * times**2)
-    return Problem("identify", "Gradient by E of a beam's watched motion, per mesh", "error of d loss / d E",
-                   lambda *args, **more: beam_scene(SmithNeoHookean, *args, **more), 0.25,
-                   lambda _, gradients: np.atleast_1d(gradients["youngs_modulus"]), frames=10, adjoint=watch,
-                   inputs=("youngs_modulus",), cells=(2, 4), patterns=("five",))  # fmt: skip
+    return Problem(
+        "identify",
+        "Gradient by E of a beam's watched motion, per mesh",
+        "error of d loss / d E",
+        lambda *args, **more: beam_scene(SmithNeoHookean, *args, **more),
+        0.25,
+        lambda _, gradients: np.atleast_1d(gradients["youngs_modulus"]),
+        frames=10,
+        adjoint=watch,
+        inputs=("youngs_modulus",),
+        cells=(2, 4),
+        patterns=("five",),
+    )
 
 
-PROBLEMS = {"oscillator": oscillator, "lame": lame, "lame-gradient": lame_gradient, "beam": beam, "sag": sag,
-            "bounce": bounce, "bounce-gradient": bounce_gradient, "identify": identify}  # fmt: skip
+PROBLEMS = {
+    "oscillator": oscillator,
+    "lame": lame,
+    "lame-gradient": lame_gradient,
+    "beam": beam,
+    "sag": sag,
+    "bounce": bounce,
+    "bounce-gradient": bounce_gradient,
+    "identify": identify,
+}
 
 
 def problem(name: str) -> Problem:

@@ -66,16 +66,27 @@ class Recommendation:
 
     def __str__(self) -> str:
         kept = f"{self.megabytes:.3g} MB" if self.gradients else "no states"
-        return "\n".join([
-            f"{self.solver.__name__}(scene, dt={self.dt:.4g}), {self.steps} steps, precision {self.precision}, "
-            f"element {self.element}" + (f", Rollout(..., memory={self.memory:g})" if self.memory else ""),
-            f"expect: {self.seconds:.3g} s of wall time, {kept} kept, error {self.error:.2g} of the largest displacement",
-            *(f"- {line}" for line in self.reasons), "left out: " + "; ".join(self.left_out),
-        ])  # fmt: skip
+        return "\n".join(
+            [
+                f"{self.solver.__name__}(scene, dt={self.dt:.4g}), {self.steps} steps, precision {self.precision}, "
+                f"element {self.element}" + (f", Rollout(..., memory={self.memory:g})" if self.memory else ""),
+                f"expect: {self.seconds:.3g} s of wall time, {kept} kept, "
+                f"error {self.error:.2g} of the largest displacement",
+                *(f"- {line}" for line in self.reasons),
+                "left out: " + "; ".join(self.left_out),
+            ]
+        )
 
 
-def recommend(scene, duration: float, tolerance: float = 1e-2, memory: float | None = None, gradients: bool = True,
-              budget: float = 20.0, frames: int = 8) -> Recommendation:  # fmt: skip
+def recommend(
+    scene,
+    duration: float,
+    tolerance: float = 1e-2,
+    memory: float | None = None,
+    gradients: bool = True,
+    budget: float = 20.0,
+    frames: int = 8,
+) -> Recommendation:
     """The cheapest way to run `scene` for `duration` [s] with a relative error of motion below `tolerance`.
 
     The error meant is that of steps and precision on the scene's own mesh: the largest distance of any vertex at any of
@@ -260,8 +271,11 @@ class Trials:
         if not known and not kind.explicit:
             return self.spent > self.budget
         longer = self.duration / self.span
-        seconds = (min(o.seconds / o.substeps for o in known) * substeps if known
-                   else self.explicit_cost * substeps * self.frames * longer * (3 if self.gradients else 1))  # fmt: skip
+        seconds = (
+            min(o.seconds / o.substeps for o in known) * substeps
+            if known
+            else self.explicit_cost * substeps * self.frames * longer * (3 if self.gradients else 1)
+        )
         trial, dearer = 3 * seconds / longer, best is not None and seconds > 12 * best.seconds
         if dearer or (self.spent + trial > self.budget and (known or best is not None)):
             step = self.span / self.frames / substeps
@@ -284,31 +298,52 @@ class Trials:
                 f"nothing tried meets a tolerance of {self.tolerance:g}: the closest is {closest.label} with an error of "
                 f"{closest.error:.2g}; loosen the tolerance, raise budget= ({self.budget:g} s), or shorten the duration"
             )
-        plan = Rollout(best.solver(self.scene.replace(precision=best.precision), dt=self.duration / self.frames,
-                                   substeps=-(-best.steps // self.frames)), self.frames, memory=self.memory)  # fmt: skip
+        plan = Rollout(
+            best.solver(
+                self.scene.replace(precision=best.precision),
+                dt=self.duration / self.frames,
+                substeps=-(-best.steps // self.frames),
+            ),
+            self.frames,
+            memory=self.memory,
+        )
         return Recommendation(
-            best, self.duration, self.gradients, self.memory, plan.memory if self.gradients else 0.0,
-            max(best.error, self.own_error), "linear", self._reasons(best, plan), self._left_out(best), self.tried,
-        )  # fmt: skip
+            best,
+            self.duration,
+            self.gradients,
+            self.memory,
+            plan.memory if self.gradients else 0.0,
+            max(best.error, self.own_error),
+            "linear",
+            self._reasons(best, plan),
+            self._left_out(best),
+            self.tried,
+        )
 
     def _reasons(self, best, plan) -> list[str]:
         others = {}
         for o in self.tried:
             if o.solver is not best.solver and o.error <= SAFETY * self.tolerance:
                 others[o.solver.__name__] = min(others.get(o.solver.__name__, np.inf), o.seconds / best.seconds)
-        beaten = ", ".join(f"{name} {times:.1f} times as long" for name, times in sorted(others.items(), key=lambda x: x[1]))
+        beaten = ", ".join(
+            f"{name} {times:.1f} times as long" for name, times in sorted(others.items(), key=lambda x: x[1])
+        )
         share = best.substep / self.stable
-        limit = (f"its step is {share:.2g} of the stable step {self.stable:.3g} s" if best.solver.explicit
-                 else f"its step is {share:.2g} times the explicit limit {self.stable:.3g} s")  # fmt: skip
+        limit = (
+            f"its step is {share:.2g} of the stable step {self.stable:.3g} s"
+            if best.solver.explicit
+            else f"its step is {share:.2g} times the explicit limit {self.stable:.3g} s"
+        )
         schedule = plan.schedule
         again = "each step runs once more in the reverse sweep" if schedule.num_segments > 1 else "all steps are kept"
         return [
             f"accuracy: error {best.error:.2g} against a converged run (itself good to {self.own_error:.1g}), order "
             f"{best.solver.order}; {limit}",
             f"time: {beaten or 'no other solver met the tolerance'}",
-            f"memory: {plan.memory:.3g} MB in {schedule.num_segments} segments, {again}" if self.gradients
+            f"memory: {plan.memory:.3g} MB in {schedule.num_segments} segments, {again}"
+            if self.gradients
             else "memory: without gradients no state is kept",
-        ]  # fmt: skip
+        ]
 
     def _left_out(self, best) -> list[str]:
         out = []
@@ -318,7 +353,9 @@ class Trials:
         if best.solver.explicit and implicit:
             close = min(implicit, key=lambda o: o.error)
             times = close.seconds / best.seconds
-            out.append(f"implicit solvers: {close.solver.__name__} takes {times:.2g} times as long, error {close.error:.2g}")
+            out.append(
+                f"implicit solvers: {close.solver.__name__} takes {times:.2g} times as long, error {close.error:.2g}"
+            )
         if self.scene.term(Drag) is None:
             out.append("damping: none in the scene")
         if not any(getattr(t, "acts_on_surface", False) for t in self.scene.terms):

@@ -11,10 +11,10 @@ from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.scene import Scene
 from diffsim_ti.simulator import Simulator
 from diffsim_ti.solvers import SOLVERS, VelocityVerletSolver
-from diffsim_ti.stability import Stiffness
+from diffsim_ti.state.stability import Stiffness
 from diffsim_ti.terms import Ground
-from diffsim_ti.terms.obstacle import Obstacle
-from diffsim_ti.terms.stiffness import barrier_stiffness
+from diffsim_ti.terms.obstacles.obstacle import Obstacle
+from diffsim_ti.terms.obstacles.stiffness import barrier_stiffness
 
 OUTCOMES = ("accurate", "bounded", "loses energy", "raises", "wrong silently")  # "raises": or warns
 ACCURATE = 0.01  # change of the total energy, over the energy that moves
@@ -35,8 +35,16 @@ class Axis:
         return iter(self.values)
 
 
-def body(cells: int = 2, squeeze: float = 1.0, flat: float = 1.0, E: float = 1e5, nu: float = 0.3, terms=(), lift=0.0,
-         speed: float = 0.0) -> Scene:  # fmt: skip
+def body(
+    cells: int = 2,
+    squeeze: float = 1.0,
+    flat: float = 1.0,
+    E: float = 1e5,
+    nu: float = 0.3,
+    terms=(),
+    lift=0.0,
+    speed: float = 0.0,
+) -> Scene:
     """A cube of 0.2 m, its elements flattened to `flat` of their height, the body squeezed to `squeeze` along y, and
     shaken by random velocities of 0.1 % of the speed of sound so that every mode takes part."""
     mesh = TetrahedralMesh.create_box(cells + 1, (0.2, 0.2 * flat, 0.2), "five").translated((0, lift, 0))
@@ -44,8 +52,15 @@ def body(cells: int = 2, squeeze: float = 1.0, flat: float = 1.0, E: float = 1e5
     start = mesh.vertices * [1, squeeze, 1]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # nu near 1/2 and slivers are what is looked at
-        return Scene(mesh, SmithNeoHookean(E, nu), 1000.0, terms, initial_positions=start,
-                     initial_velocities=shake - [0, speed, 0], precision="f64")  # fmt: skip
+        return Scene(
+            mesh,
+            SmithNeoHookean(E, nu),
+            1000.0,
+            terms,
+            initial_positions=start,
+            initial_velocities=shake - [0, speed, 0],
+            precision="f64",
+        )
 
 
 def impact(speed: float) -> Scene:
@@ -57,12 +72,20 @@ def impact(speed: float) -> Scene:
 
 AXES = {
     "stiffness": Axis("Young's modulus", "Pa", tuple(10.0 ** np.arange(3, 8.1, 1.0)), lambda E: body(E=E)),
-    "nu": Axis("Poisson's ratio", "-", (0.0, 0.1, 0.2, 0.3, 0.4, 0.45, 0.48, 0.49, 0.495, 0.499), lambda nu: body(nu=nu)),
+    "nu": Axis(
+        "Poisson's ratio", "-", (0.0, 0.1, 0.2, 0.3, 0.4, 0.45, 0.48, 0.49, 0.495, 0.499), lambda nu: body(nu=nu)
+    ),
     "impact": Axis("speed of impact", "m/s", (0.1, 0.2, 0.5, 1.0, 2.0, 3.0, 5.0, 8.0), impact),
-    "quality": Axis("height of the elements over their width", "-", (1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01),
-                    lambda flat: body(flat=flat)),
-    "compression": Axis("stretch at the start", "-", (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3), lambda s: body(squeeze=s)),
-}  # fmt: skip
+    "quality": Axis(
+        "height of the elements over their width",
+        "-",
+        (1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01),
+        lambda flat: body(flat=flat),
+    ),
+    "compression": Axis(
+        "stretch at the start", "-", (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3), lambda s: body(squeeze=s)
+    ),
+}
 
 
 def power_limit(scene, rounds: int = 3000, tolerance: float = 1e-7) -> float:
@@ -118,7 +141,9 @@ def judge(scene, kind, dt: float, steps: int = 200, overridden: bool = False) ->
                     break
     except (ValueError, FloatingPointError) as error:
         return Run("raises", said=f"{type(error).__name__}: {error}")
-    warned = [str(w.message) for w in said if "energy may be gained" in str(w.message) or "has gained" in str(w.message)]
+    warned = [
+        str(w.message) for w in said if "energy may be gained" in str(w.message) or "has gained" in str(w.message)
+    ]
     if behind > 0:
         said = f"vertices are {behind:.3g} m behind an obstacle"
         return Run("raises", rise, change, warned[0]) if warned else Run("wrong silently", rise, change, said)
@@ -203,26 +228,48 @@ class StabilityMap:
     @property
     def silent(self) -> list[str]:
         """Runs that went wrong without a word."""
-        return [f"{self.solver}, {self.axis.name} {value:g} {self.axis.unit}, dt {share * limit:.3g} s ({share:.2g} of the "
-                f"limit): {run.said}; energy rose by {run.rise:.2g} of what moves"
-                for share, row in zip(self.shares, self.runs)
-                for value, limit, run in zip(self.axis.values, self.limits, row)
-                if run.outcome == "wrong silently"]  # fmt: skip
+        return [
+            f"{self.solver}, {self.axis.name} {value:g} {self.axis.unit}, dt {share * limit:.3g} s ({share:.2g} of the "
+            f"limit): {run.said}; energy rose by {run.rise:.2g} of what moves"
+            for share, row in zip(self.shares, self.runs)
+            for value, limit, run in zip(self.axis.values, self.limits, row)
+            if run.outcome == "wrong silently"
+        ]
 
     def rows(self) -> list[dict]:
         """One row per run, for a table."""
-        return [dict(solver=self.solver, axis=self.axis.name, value=value, dt=share * limit, share=share, limit=limit,
-                     outcome=run.outcome, rise=run.rise, change=run.change, said=run.said)
-                for share, row in zip(self.shares, self.runs)
-                for value, limit, run in zip(self.axis.values, self.limits, row)]  # fmt: skip
+        return [
+            dict(
+                solver=self.solver,
+                axis=self.axis.name,
+                value=value,
+                dt=share * limit,
+                share=share,
+                limit=limit,
+                outcome=run.outcome,
+                rise=run.rise,
+                change=run.change,
+                said=run.said,
+            )
+            for share, row in zip(self.shares, self.runs)
+            for value, limit, run in zip(self.axis.values, self.limits, row)
+        ]
 
 
-SHARES = {True: (0.03, 0.1, 0.2, 0.4, 0.6, 0.8, 0.9, 0.95, 0.99, 1.01, 1.05, 1.2, 2.0),  # explicit
-          False: (0.1, 0.5, 2.0, 5.0, 15.0, 50.0)}
+SHARES = {
+    True: (0.03, 0.1, 0.2, 0.4, 0.6, 0.8, 0.9, 0.95, 0.99, 1.01, 1.05, 1.2, 2.0),  # explicit
+    False: (0.1, 0.5, 2.0, 5.0, 15.0, 50.0),
+}
 
 
-def stability_map(kind, axis: Axis, shares=None, steps: int | None = None, find_bounds: bool = False,
-                  show: Callable = lambda note: None) -> StabilityMap:  # fmt: skip
+def stability_map(
+    kind,
+    axis: Axis,
+    shares=None,
+    steps: int | None = None,
+    find_bounds: bool = False,
+    show: Callable = lambda note: None,
+) -> StabilityMap:
     """Judge a solver at every share of the explicit limit and every value of the axis.
 
     shares: of the explicit limit at the start of each scene; default SHARES. steps: per run, default 200, implicit 40.
@@ -237,5 +284,6 @@ def stability_map(kind, axis: Axis, shares=None, steps: int | None = None, find_
         limits.append(power_limit(scene))
         columns.append([judge(scene, kind, share * limits[-1], steps) for share in shares])
         bounds.append(boundary(scene, kind) if find_bounds and kind.explicit else np.nan)
-    return StabilityMap(kind.__name__, axis, shares, np.array(limits), [list(row) for row in zip(*columns)],
-                        np.array(bounds))  # fmt: skip
+    return StabilityMap(
+        kind.__name__, axis, shares, np.array(limits), [list(row) for row in zip(*columns)], np.array(bounds)
+    )

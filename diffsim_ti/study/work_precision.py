@@ -73,11 +73,19 @@ class Chart:
 
     def record(self) -> dict:
         """Everything in numbers and words, as JSON takes it."""
-        rows = [{k: (None if isinstance(v, float) and not np.isfinite(v) else v) for k, v in asdict(p).items()}
-                for p in self.points]  # fmt: skip
-        return dict(problem=self.problem.name, title=self.problem.title, error=self.problem.error,
-                    duration_s=self.problem.duration, reference_error=self.reference_error, points=rows,
-                    left_out=self.left_out)  # fmt: skip
+        rows = [
+            {k: (None if isinstance(v, float) and not np.isfinite(v) else v) for k, v in asdict(p).items()}
+            for p in self.points
+        ]
+        return dict(
+            problem=self.problem.name,
+            title=self.problem.title,
+            error=self.problem.error,
+            duration_s=self.problem.duration,
+            reference_error=self.reference_error,
+            points=rows,
+            left_out=self.left_out,
+        )
 
 
 def pareto_front(points) -> list:
@@ -184,8 +192,22 @@ class Runs:
             for kind in self.solvers:
                 for k in choose_substeps(self.problem, scene, kind, self.levels):
                     total = k * self.problem.frames
-                    out.append((Point(kind.__name__, cells, pattern, element, precision, scene.mesh.num_tetrahedra,
-                                      self.problem.duration / total, total), kind, scene))  # fmt: skip
+                    out.append(
+                        (
+                            Point(
+                                kind.__name__,
+                                cells,
+                                pattern,
+                                element,
+                                precision,
+                                scene.mesh.num_tetrahedra,
+                                self.problem.duration / total,
+                                total,
+                            ),
+                            kind,
+                            scene,
+                        )
+                    )
         return out
 
     def predict(self, point: Point, explicit: bool) -> float:
@@ -244,12 +266,22 @@ class Runs:
             behind = [p.seconds / min(q.seconds for q in front if q.error <= p.error) for p in own]
             if behind and min(behind) > HOPELESS:
                 self.solvers = tuple(k for k in self.solvers if k is not kind)
-                self.left_out.append(f"{kind.__name__} beyond {own[0].cells} cells {own[0].pattern}: "
-                                     f"{min(behind):.0f} times as long as the front at the same error")  # fmt: skip
+                self.left_out.append(
+                    f"{kind.__name__} beyond {own[0].cells} cells {own[0].pattern}: "
+                    f"{min(behind):.0f} times as long as the front at the same error"
+                )
 
 
-def chart(problem: Problem, solvers=None, precisions=("f32", "f64"), levels: int | None = None, repeats: int = 3,
-          limit: float = 1.0, quick: bool = False, say: Callable = lambda line: None) -> Chart:  # fmt: skip
+def chart(
+    problem: Problem,
+    solvers=None,
+    precisions=("f32", "f64"),
+    levels: int | None = None,
+    repeats: int = 3,
+    limit: float = 1.0,
+    quick: bool = False,
+    say: Callable = lambda line: None,
+) -> Chart:
     """Run a problem by every solver, step, precision and mesh, and measure time and error.
 
     solvers: classes; default all. levels: steps per solver, each half the last; default the problem's.
@@ -257,7 +289,7 @@ def chart(problem: Problem, solvers=None, precisions=("f32", "f64"), levels: int
     limit [s]: runs expected to take longer are left out, and named. quick: small meshes, float32.
     say: called with what the chart will do and how long that takes. Raises ValueError for a problem no solver can do.
     """
-    from diffsim_ti.cli_options import progress
+    from diffsim_ti.cli.options import progress
 
     levels = levels or problem.levels
     if quick:

@@ -1,20 +1,34 @@
 """Loads, contacts and damping: one per file."""
 
-from diffsim_ti.terms.ball import Capsule, Sphere
-from diffsim_ti.terms.box import Box, Cylinder
 from diffsim_ti.terms.drag import Drag
 from diffsim_ti.terms.external_force import ExternalForce
 from diffsim_ti.terms.gravity import Gravity
-from diffsim_ti.terms.ground import Ground
-from diffsim_ti.terms.half_space import HalfSpace
-from diffsim_ti.terms.mesh_obstacle import MeshObstacle
-from diffsim_ti.terms.obstacle import Obstacle
+from diffsim_ti.terms.obstacles.ball import Capsule, Sphere
+from diffsim_ti.terms.obstacles.box import Box, Cylinder
+from diffsim_ti.terms.obstacles.ground import Ground
+from diffsim_ti.terms.obstacles.half_space import HalfSpace
+from diffsim_ti.terms.obstacles.mesh_obstacle import MeshObstacle
+from diffsim_ti.terms.obstacles.obstacle import Obstacle
 from diffsim_ti.terms.self_contact import SelfContact
 from diffsim_ti.terms.term import Term, VertexForce
 
 OBSTACLES = (Ground, HalfSpace, Sphere, Box, Capsule, Cylinder, MeshObstacle)
 TERMS = (Gravity, Drag, ExternalForce, *OBSTACLES, SelfContact)
 __all__ = [
-    "Box", "Capsule", "Cylinder", "Drag", "ExternalForce", "Gravity", "Ground", "HalfSpace", "MeshObstacle", "OBSTACLES",
-    "Obstacle", "SelfContact", "Sphere", "Term", "TERMS", "VertexForce",
-]  # fmt: skip
+    "Box",
+    "Capsule",
+    "Cylinder",
+    "Drag",
+    "ExternalForce",
+    "Gravity",
+    "Ground",
+    "HalfSpace",
+    "MeshObstacle",
+    "OBSTACLES",
+    "Obstacle",
+    "SelfContact",
+    "Sphere",
+    "Term",
+    "TERMS",
+    "VertexForce",
+]

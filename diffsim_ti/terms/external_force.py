@@ -33,4 +33,6 @@ class ExternalForce(Term):
             forces.setflags(write=False)
             self.values["external_forces"] = forces
         if forces.shape[-2] != k:
-            raise ValueError(f"ExternalForce: expected forces for {k} vertices, shape (..., {k}, 3), got {forces.shape}")
+            raise ValueError(
+                f"ExternalForce: expected forces for {k} vertices, shape (..., {k}, 3), got {forces.shape}"
+            )

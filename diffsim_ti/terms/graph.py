@@ -84,9 +84,11 @@ class Graph:
         """a where the condition holds, else b; both are evaluated."""
         a, b, chosen = self.number(a), self.number(b), let(condition)
         one, zero = self.constant(1), self.constant(0)
-        return Number(self, ti.select(chosen, a.value, b.value), [
-            (a, lambda: ti.select(chosen, one, zero)), (b, lambda: ti.select(chosen, zero, one)),
-        ])  # fmt: skip
+        return Number(
+            self,
+            ti.select(chosen, a.value, b.value),
+            [(a, lambda: ti.select(chosen, one, zero)), (b, lambda: ti.select(chosen, zero, one))],
+        )
 
     def maximum(self, a, b) -> Number:
         a, b = self.number(a), self.number(b)

@@ -7,7 +7,7 @@ class SelfContact(Term):
     """Pairs of surface primitives, vertex and triangle or edge and edge, push each other apart nearer than `width`.
 
     Energy of a pair at distance d: m b(d) with b(d) = -stiffness (d - width)^2 log(d / width) for d < width, exactly zero
-    beyond (terms/barrier.py); m fades out edges that become parallel (contact/proximity.py), with lengths as in the mesh.
+    beyond (barrier.py); m fades out edges that become parallel (contact/proximity.py), with lengths as in the mesh.
     Pairs that share a vertex do not count. stiffness [N/m], width [m]. No friction.
 
     The width must be smaller than the rest distance of all primitives of one body that share no vertex, so that a body at

@@ -65,7 +65,7 @@ class VertexForce(ABC):
     precision: str
     first: int
     size = 0
-    # of obstacles only (terms/obstacle.py): is there friction, the column of the path, are nearness and crossing noted?
+    # of obstacles only (obstacle.py): is there friction, the column of the path, are nearness and crossing noted?
     friction, path, watched = False, -1, False
 
     @property

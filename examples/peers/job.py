@@ -26,7 +26,9 @@ class Job:
         self.frames, self.substeps, self.repeats = int(self.frames), int(self.substeps), int(self.repeats)
         self.rest_edges = np.moveaxis(self.edges(self.vertices), 1, 2)
         self.volumes = np.linalg.det(self.rest_edges) / 6
-        self.masses = np.bincount(self.tetrahedra.ravel(), np.repeat(self.density * self.volumes / 4, 4), len(self.vertices))
+        self.masses = np.bincount(
+            self.tetrahedra.ravel(), np.repeat(self.density * self.volumes / 4, 4), len(self.vertices)
+        )
         self.mu = self.E / (2 * (1 + self.nu))
         self.lam = self.E * self.nu / ((1 + self.nu) * (1 - 2 * self.nu))
 

@@ -61,8 +61,9 @@ def work(job):
         compiled = jax.jit(rollout)
         seconds, positions = timed(lambda: np.asarray(compiled(start, velocities, moduli)), job.repeats)
         return seconds, positions, {}
-    weights, linear, square, target, rest = (jnp.asarray(a, jnp.float32) for a in (
-        job.weights, job.linear, job.square, job.target, job.vertices))  # fmt: skip
+    weights, linear, square, target, rest = (
+        jnp.asarray(a, jnp.float32) for a in (job.weights, job.linear, job.square, job.target, job.vertices)
+    )
 
     @jax.jit
     def both(start, velocities, moduli):
@@ -72,10 +73,14 @@ def work(job):
         return positions, back(slope[:, None, None] * weights)
 
     seconds, (positions, (by_start, by_moduli)) = timed(
-        lambda: jax.block_until_ready(both(start, velocities, moduli)), job.repeats)  # fmt: skip
+        lambda: jax.block_until_ready(both(start, velocities, moduli)), job.repeats
+    )
     by_mu, by_lam = (float(np.asarray(a, float).sum()) for a in by_moduli)
-    return seconds, positions, dict(youngs_modulus=job.by_youngs_modulus(by_mu, by_lam),
-                                    initial_positions=np.asarray(by_start, float))  # fmt: skip
+    return (
+        seconds,
+        positions,
+        dict(youngs_modulus=job.by_youngs_modulus(by_mu, by_lam), initial_positions=np.asarray(by_start, float)),
+    )
 
 
 if __name__ == "__main__":

@@ -31,15 +31,20 @@ def simulator_of(job):
     chunk = math.gcd(job.substeps, CHUNK) if checkpointed(job) else job.substeps
     options = dict(dt=chunk * job.h, gravity=job.gravity, damping=job.keep, substeps=chunk)
     if job.differentiates or job.ground.size:
-        simulator = DifferentiableSimulator(mesh, DifferentiableMaterial(float(job.E), float(job.nu)),
-                                            DifferentiableSolver(**options), density=job.density)  # fmt: skip
+        simulator = DifferentiableSimulator(
+            mesh,
+            DifferentiableMaterial(float(job.E), float(job.nu)),
+            DifferentiableSolver(**options),
+            density=job.density,
+        )
         if job.ground.size:
             stiffness, width = job.ground
             energy = -0.81 * stiffness * width**2 * math.log(0.1)
             simulator.solver.contact_handler = DifferentiableBarrierContact(3 * energy / (0.9 * width) ** 3, width)
     else:
-        simulator = Simulator(mesh, StableNeoHookean(float(job.E), float(job.nu)), SemiImplicitSolver(**options),
-                              density=job.density)  # fmt: skip
+        simulator = Simulator(
+            mesh, StableNeoHookean(float(job.E), float(job.nu)), SemiImplicitSolver(**options), density=job.density
+        )
     if job.fixed.size:
         simulator.set_fixed_vertices(job.fixed.tolist())
     return simulator, torch.tensor(lift, dtype=simulator.positions.dtype), job.substeps // chunk
@@ -71,8 +76,9 @@ def work(job):
             return positions, {}
         adjoints = [torch.tensor(a, dtype=dtype) for a in job.adjoints(positions)]
         torch.autograd.backward(seen[1:], adjoints[1:])
-        return positions, dict(youngs_modulus=float(simulator.material.E.grad),
-                               initial_positions=first.grad.double().numpy())  # fmt: skip
+        return positions, dict(
+            youngs_modulus=float(simulator.material.E.grad), initial_positions=first.grad.double().numpy()
+        )
 
     seconds, (positions, gradients) = timed(run, job.repeats, compiles=False)
     return seconds, positions, gradients

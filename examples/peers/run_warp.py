@@ -17,8 +17,15 @@ def cofactor(F: wp.mat33):
 
 
 @wp.kernel
-def elastic(x: wp.array(dtype=wp.vec3), tet: wp.array2d(dtype=int), B: wp.array(dtype=wp.mat33), W: wp.array(dtype=float),
-            mu: wp.array(dtype=float), lam: wp.array(dtype=float), f: wp.array(dtype=wp.vec3)):
+def elastic(
+    x: wp.array(dtype=wp.vec3),
+    tet: wp.array2d(dtype=int),
+    B: wp.array(dtype=wp.mat33),
+    W: wp.array(dtype=float),
+    mu: wp.array(dtype=float),
+    lam: wp.array(dtype=float),
+    f: wp.array(dtype=wp.vec3),
+):
     e = wp.tid()
     x0 = x[tet[e, 0]]
     F = wp.matrix_from_cols(x[tet[e, 1]] - x0, x[tet[e, 2]] - x0, x[tet[e, 3]] - x0) * B[e]
@@ -26,7 +33,11 @@ def elastic(x: wp.array(dtype=wp.vec3), tet: wp.array2d(dtype=int), B: wp.array(
     bulk = lam[e] + 5.0 * mu[e] / 6.0
     P = m * (1.0 - 1.0 / (wp.ddot(F, F) + 1.0)) * F + (bulk * (wp.determinant(F) - 1.0) - 0.75 * m) * cofactor(F)
     Q = (P * wp.transpose(B[e])) * (-W[e])
-    h1, h2, h3 = wp.vec3(Q[0, 0], Q[1, 0], Q[2, 0]), wp.vec3(Q[0, 1], Q[1, 1], Q[2, 1]), wp.vec3(Q[0, 2], Q[1, 2], Q[2, 2])
+    h1, h2, h3 = (
+        wp.vec3(Q[0, 0], Q[1, 0], Q[2, 0]),
+        wp.vec3(Q[0, 1], Q[1, 1], Q[2, 1]),
+        wp.vec3(Q[0, 2], Q[1, 2], Q[2, 2]),
+    )
     wp.atomic_add(f, tet[e, 1], h1)
     wp.atomic_add(f, tet[e, 2], h2)
     wp.atomic_add(f, tet[e, 3], h3)
@@ -34,9 +45,20 @@ def elastic(x: wp.array(dtype=wp.vec3), tet: wp.array2d(dtype=int), B: wp.array(
 
 
 @wp.kernel
-def advance(x: wp.array(dtype=wp.vec3), v: wp.array(dtype=wp.vec3), f: wp.array(dtype=wp.vec3), m: wp.array(dtype=float),
-            free: wp.array(dtype=float), h: float, keep: float, gravity: float, k: float, width: float,
-            x1: wp.array(dtype=wp.vec3), v1: wp.array(dtype=wp.vec3)):
+def advance(
+    x: wp.array(dtype=wp.vec3),
+    v: wp.array(dtype=wp.vec3),
+    f: wp.array(dtype=wp.vec3),
+    m: wp.array(dtype=float),
+    free: wp.array(dtype=float),
+    h: float,
+    keep: float,
+    gravity: float,
+    k: float,
+    width: float,
+    x1: wp.array(dtype=wp.vec3),
+    v1: wp.array(dtype=wp.vec3),
+):
     i = wp.tid()
     g = f[i]
     d = x[i][1]
@@ -81,7 +103,9 @@ def work(job):
             if s and not job.differentiates:
                 f.zero_()
             wp.launch(elastic, m, inputs=[xs[a], tet, B, W, mu, lam], outputs=[f], device="cpu")
-            wp.launch(advance, n, inputs=[xs[a], vs[a], f, masses, free, *constants], outputs=[xs[b], vs[b]], device="cpu")
+            wp.launch(
+                advance, n, inputs=[xs[a], vs[a], f, masses, free, *constants], outputs=[xs[b], vs[b]], device="cpu"
+            )
             if (s + 1) % job.substeps == 0:
                 seen.append(xs[b].numpy().copy())
         return np.stack(seen)
@@ -91,11 +115,14 @@ def work(job):
         with tape:
             positions = forward()
         adjoints = job.adjoints(positions).astype(np.float32)
-        seeds = {xs[j * job.substeps]: wp.array(adjoints[j], dtype=wp.vec3, device="cpu") for j in range(1, job.frames + 1)}
+        seeds = {
+            xs[j * job.substeps]: wp.array(adjoints[j], dtype=wp.vec3, device="cpu") for j in range(1, job.frames + 1)
+        }
         tape.backward(grads=seeds)
         by_mu, by_lam = (float(a.grad.numpy().astype(float).sum()) for a in (mu, lam))
-        gradients = dict(youngs_modulus=job.by_youngs_modulus(by_mu, by_lam),
-                         initial_positions=xs[0].grad.numpy().astype(float))  # fmt: skip
+        gradients = dict(
+            youngs_modulus=job.by_youngs_modulus(by_mu, by_lam), initial_positions=xs[0].grad.numpy().astype(float)
+        )
         tape.zero()
         return positions, gradients
 

@@ -13,8 +13,11 @@ from diffsim_ti.study.work_precision import SHARE
 from diffsim_ti.terms import Drag, Gravity, Obstacle
 
 HERE = Path(__file__).parent
-PEERS = {"torch-diffsim": ("run_torch_diffsim.py", "diffsim"), "Warp (CPU)": ("run_warp.py", "warp"),
-         "JAX": ("run_jax.py", "jax")}  # fmt: skip
+PEERS = {
+    "torch-diffsim": ("run_torch_diffsim.py", "diffsim"),
+    "Warp (CPU)": ("run_warp.py", "warp"),
+    "JAX": ("run_jax.py", "jax"),
+}
 
 
 def installed(python: str) -> list[str]:
@@ -30,14 +33,19 @@ def scene_numbers(scene, h: float) -> dict:
     values, ground, gravity = scene.inputs.values, scene.term(Obstacle), scene.term(Gravity)
     drag = scene.term(Drag)
     return dict(
-        vertices=scene.mesh.vertices, tetrahedra=scene.mesh.tetrahedra, start=values["initial_positions"],
-        velocities=values["initial_velocities"], fixed=np.asarray(scene.fixed, int),
+        vertices=scene.mesh.vertices,
+        tetrahedra=scene.mesh.tetrahedra,
+        start=values["initial_positions"],
+        velocities=values["initial_velocities"],
+        fixed=np.asarray(scene.fixed, int),
         density=float(np.mean(values["density"])),
-        E=float(np.mean(values.get("youngs_modulus", 0))), nu=float(np.mean(values.get("poissons_ratio", 0))), h=h,
+        E=float(np.mean(values.get("youngs_modulus", 0))),
+        nu=float(np.mean(values.get("poissons_ratio", 0))),
+        h=h,
         gravity=0.0 if gravity is None else float(values["gravity"][1]),
         keep=1.0 if drag is None else float(np.exp(-values["drag_rate"] * h)),
         ground=np.array([values[n] for n in ("barrier_stiffness", "barrier_width")], float) if ground else np.zeros(0),
-    )  # fmt: skip
+    )
 
 
 def problem_job(problem: Problem, scene, substeps: int, repeats: int = 3) -> dict:
@@ -46,8 +54,7 @@ def problem_job(problem: Problem, scene, substeps: int, repeats: int = 3) -> dic
     job |= dict(frames=problem.frames, substeps=substeps, repeats=repeats)
     if problem.differentiates:
         watch = problem.adjoint
-        job |= dict(weights=watch.weights(scene.mesh), linear=watch.linear, square=watch.square,
-                    target=watch.target)  # fmt: skip
+        job |= dict(weights=watch.weights(scene.mesh), linear=watch.linear, square=watch.square, target=watch.target)
     return job
 
 
@@ -75,8 +82,12 @@ def numbers(problem: Problem, scene, answer: dict) -> np.ndarray:
     """The problem's numbers from a peer's frames and gradients."""
     rest = scene.mesh.vertices
     times = np.linspace(0, problem.duration, problem.frames + 1)
-    frames = SimpleNamespace(displacements=answer["displacements"], positions=rest + answer["displacements"], times=times,
-                             inputs=dict(rest_positions=rest))  # fmt: skip
+    frames = SimpleNamespace(
+        displacements=answer["displacements"],
+        positions=rest + answer["displacements"],
+        times=times,
+        inputs=dict(rest_positions=rest),
+    )
     return problem.quantity(frames, answer)
 
 
@@ -89,7 +100,9 @@ def first_substeps(problem: Problem, scene) -> int:
     return int(np.ceil(frame / min(SHARE * stable, problem.largest_step)))
 
 
-def peer_points(problem: Problem, who: str, python: str, cells, levels: int = 1, right=None) -> list[tuple[float, float]]:
+def peer_points(
+    problem: Problem, who: str, python: str, cells, levels: int = 1, right=None
+) -> list[tuple[float, float]]:
     """[(seconds per simulated second, error)] of a peer on the problem, pattern "five", on meshes of so many cells across,
     at the stable step and `levels - 1` halves of it.
 
@@ -109,6 +122,9 @@ def peer_points(problem: Problem, who: str, python: str, cells, levels: int = 1,
         exact = problem.exact if right is None else right(n)
         if own:
             exact = 2 * found[-1] - found[-2]
-        out += [(float(a["seconds"]) / problem.duration, distance(problem, q, exact))
-                for a, q in list(zip(answers, found))[:levels] if q is not None]  # fmt: skip
+        out += [
+            (float(a["seconds"]) / problem.duration, distance(problem, q, exact))
+            for a, q in list(zip(answers, found))[:levels]
+            if q is not None
+        ]
     return out

@@ -1,0 +1,213 @@
+"""A scene run forward, frame by frame, with a step that follows the state, and written as a series."""
+
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from diffsim_ti.visual.series import Series
+
+
+class Interrupted(Exception):
+    """Ctrl-C ended a run; says where, and what is written."""
+
+
+@dataclass
+class Seen:
+    """The extremes of a run: smallest J and gap [m], most tetrahedra inside-out and vertices in an obstacle at once."""
+
+    J: float = np.inf
+    gap: float = np.inf
+    inverted: int = 0
+    crossed: int = 0
+    substeps: list[int] = field(default_factory=list)  # per frame
+    retries: list[str] = field(default_factory=list)
+    shortest: float = np.inf  # substep [s]
+    longest: float = 0.0
+    seconds: float = 0.0
+
+
+class ForwardRun:
+    """Frames of equal length; the substeps of each follow the stable step of the state, unless `dt` is given.
+
+    A frame has 16 parts, after each of which the state is looked at. One that diverges, outgrows its step or gains
+    energy is run again from its start with twice the substeps, and that is counted. With an implicit solver a frame has 4
+    parts, whose steps are halved only where one does not converge or gains energy. With dt nothing is chosen and nothing
+    repeated: what goes wrong is an error.
+
+    driven: whether something outside may add energy, which is then no sign of a bad step. before_part: called before each
+    part, for instance to change forces.
+    """
+
+    share, parts, attempts = 0.8, 16, 8  # of the stable step; per frame; per part
+    squeezed = 0.1  # J below which the stable step is looked up in each part
+    # of the energy in a part, as shares of the largest kinetic + elastic + contact energy: what symplectic Euler's
+    # passing error of first order takes, and what is left once the energy is `largest_drift` above its lowest
+    largest_rise, later_rise, largest_drift = 0.01, 0.001, 0.03
+
+    def __init__(self, scene, solver_class, frame_time: float, dt: float | None = None, **options):
+        from diffsim_ti.simulator import Simulator
+        from diffsim_ti.terms import Gravity, Obstacle
+
+        self.scene, self.seen, self.adapts = scene, Seen(), dt is None
+        self.driven, self.before_part = scene.motion is not None or bool(scene.moving), None
+        self.obstacles = tuple(t for t in scene.terms if isinstance(t, Obstacle))
+        gravity = scene.term(Gravity)
+        self._pull = float(np.linalg.norm(gravity.values["gravity"])) if gravity else 0.0
+        self.implicit = not solver_class.explicit
+        if dt is None and self.implicit:
+            self.parts = 4
+            solver = solver_class(scene, dt=frame_time / self.parts, **options)
+        elif dt is None:
+            solver = solver_class(scene, dt=frame_time / self.parts, allow_unstable=True, **options)
+            solver.allow_unstable = False  # each frame's substeps come first; the guard watches all the same
+        else:
+            if not dt > 0:
+                raise ValueError(f"--dt must be > 0 [s], got {dt:g}")
+            steps = max(1, round(frame_time / dt))
+            self.parts = max(
+                p for p in range(1, self.parts + 1) if steps % p == 0
+            )  # dt and the time both stay as asked
+            steps //= self.parts
+            solver = solver_class(scene, dt=steps * dt, substeps=steps, **options)
+        self.simulator = Simulator(solver)
+        self.frame_time = self.parts * solver.dt
+        ws = self.simulator.workspace
+        self._start = ws.history(1)
+        ws.save(self._start, 0)
+        ws.advance(0, 1, solver.num_passes(1))  # compiles
+        ws.restore(self._start, 0)
+        self._limit = self._stable_dt()
+        self._energy, self._refined = self.simulator.compute_energy(), 0
+        self._lowest, self._squeezed = self._energy, False
+        self.energies, self.largest_energy = [self._energy], self._moving(self._energy)
+
+    def balance_anew(self) -> None:
+        """Measure the rise and drift of energy from the present state on, which something outside has changed."""
+        self._energy = self._lowest = self.simulator.compute_energy()
+        self.largest_energy = max(self.largest_energy, self._moving(self._energy))
+
+    def advance(self) -> None:
+        """One frame. Raises FloatingPointError if no number of substeps tried keeps it stable."""
+        begin = time.perf_counter()
+        self.seen.substeps.append(0)
+        for part in range(self.parts):
+            if self.before_part is not None:
+                self.before_part()
+            if self.adapts:
+                self._advance_part(last=part == self.parts - 1)
+            else:
+                self.simulator.step()
+            self._look()
+        self.energies.append(self._energy)
+        self.seen.seconds += time.perf_counter() - begin
+
+    def _advance_part(self, last: bool) -> None:
+        sim, first = self.simulator, self.simulator.step_count
+        substeps = max(self._choose_substeps(), self._refined)
+        sim.workspace.save(self._start, 0)
+        for tried in range(self.attempts):
+            sim.set_substeps(substeps)
+            try:
+                sim.step()
+                why = self._complaint(last or self._squeezed)
+            except FloatingPointError as error:
+                if getattr(error, "stiffness", None) is not None:  # no step helps
+                    raise
+                why = str(error)
+            if why is None:
+                self._refined = substeps if tried else self._refined // 2
+                return
+            self.seen.retries.append(f"t = {first * sim.solver.dt:.4g} s, substep {sim.solver.substep:.3g} s: {why}")
+            sim.workspace.restore(self._start, 0)
+            sim.step_count = first
+            substeps *= 2
+        raise FloatingPointError(
+            f"t = {sim.time:.4g} s: unstable even with a substep of {sim.solver.substep:.3g} s ({why}); lower the impact or "
+            "the load, raise the stiffness, or add --drag; the frames before are written"
+        )
+
+    def _look(self) -> None:
+        """Note the extremes of the present state."""
+        sim, seen = self.simulator, self.seen
+        J = sim.tetrahedron_fields().J
+        self._squeezed = J.min() < self.squeezed
+        seen.J, seen.inverted = min(seen.J, float(J.min())), max(seen.inverted, int((J <= 0).sum()))
+        self._look_at_gaps()
+        seen.substeps[-1] += sim.solver.substeps
+        seen.shortest = min(seen.shortest, sim.solver.substep)
+        seen.longest = max(seen.longest, sim.solver.substep)
+        self._energy = sim.compute_energy()
+        self._lowest = min(self._lowest, self._energy)
+        self.largest_energy = max(self.largest_energy, self._moving(self._energy))
+
+    def _look_at_gaps(self) -> None:
+        sim, seen, places = self.simulator, self.seen, self.scene.places(self.simulator.time)
+        positions, crossed = sim.positions[self.scene.mesh.surface_vertices], 0
+        for term in self.obstacles:
+            gap = term.gap(positions, places.get(term, np.zeros(3)))
+            seen.gap, crossed = min(seen.gap, float(gap.min())), crossed + int((gap < 0).sum())
+        seen.crossed = max(seen.crossed, crossed)
+        seen.gap = min(seen.gap, sim.contact_resolution.smallest_gap)  # of all substeps
+
+    def _complaint(self, look_up: bool) -> str | None:
+        """Why the part that was just run cannot be trusted, or None; `look_up`: find the stable step at its end."""
+        energy, h = self.simulator.compute_energy(), self.simulator.solver.substep
+        rise, scale = energy - self._energy, max(self.largest_energy, self._moving(energy))
+        drifted = energy - self._lowest > self.largest_drift * scale
+        if not self.driven and not rise <= (self.later_rise if drifted else self.largest_rise) * scale:
+            return f"the energy rose by {rise:.3g} J"
+        if not look_up:
+            return None
+        try:
+            self._limit = self._stable_dt()
+        except RuntimeError as error:
+            return f"no stable step was found at the end ({error})"
+        return f"the stable step fell to {self._limit:.3g} s" if h > self._limit else None
+
+    def _stable_dt(self) -> float:
+        from diffsim_ti.state.stability import lanczos_limit
+
+        return lanczos_limit(self.simulator.workspace, 1e-2).dt if self.adapts and not self.implicit else np.inf
+
+    def _choose_substeps(self) -> int:
+        dt = self.simulator.solver.dt
+        fewest = dt / (self.share * self._limit)
+        if self.obstacles and not self.implicit:  # a vertex shall not cross the barrier in a few substeps
+            speed = np.linalg.norm(self.simulator.velocities, axis=1).max() + self._pull * self.frame_time
+            now, then = (self.scene.places(self.simulator.time + step) for step in (0.0, dt))
+            speed += max((np.linalg.norm(then[t] - now[t]) / dt for t in now), default=0.0)
+            fewest = max(fewest, 10 * speed * dt / min(float(t.values["barrier_width"]) for t in self.obstacles))
+        return max(1, int(np.ceil(fewest)))
+
+    @staticmethod
+    def _moving(energy) -> float:
+        return sum(value for name, value in energy.parts.items() if name != "gravity")
+
+
+def run_and_write(run: ForwardRun, frames: int, folder: Path, name: str, keep=()) -> tuple[float, list[str], list]:
+    """Run `frames` frames into a series.
+
+    Returns seconds of writing, file names, and (time, positions, velocities, von Mises stress) of the frames in `keep`.
+    Raises Interrupted on Ctrl-C.
+    """
+    from diffsim_ti.cli.options import progress
+
+    sim, kept, writing = run.simulator, [], 0.0
+    series = Series(folder, run.scene.mesh, name, run.scene)
+    with progress("simulating", frames) as show:
+        for k in range(frames + 1):
+            try:
+                if k:
+                    run.advance()
+                begin = time.perf_counter()
+                series.write(sim.time, sim.positions, sim.displacements, sim.velocities, sim.tetrahedron_fields())
+                writing += time.perf_counter() - begin
+            except KeyboardInterrupt:
+                said = f"interrupted at t = {sim.time:.4g} s; {len(series.files)} frames are in {series.path}"
+                raise Interrupted(said) from None
+            if k in keep:
+                kept.append((sim.time, sim.positions, sim.velocities, sim.tetrahedron_fields().von_mises))
+            show(k, f"t = {sim.time:.3f} s")
+    return writing, [f"{series.path} and {len(series.files)} .vtu frames"], kept

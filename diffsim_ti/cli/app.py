@@ -1,0 +1,312 @@
+"""The command line: `diffsim-ti` or `python -m diffsim_ti`. One function per command; heavy imports inside them."""
+
+import sys
+import time
+import warnings
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from diffsim_ti.adaptive_run import Interrupted
+from diffsim_ti.cli.options import (
+    Backend,
+    Density,
+    FixOrientation,
+    MaterialName,
+    MeshFile,
+    Output,
+    Poisson,
+    Precision,
+    Size,
+    Threads,
+    Up,
+    UpAxis,
+    Volume,
+    Youngs,
+    fall_scene,
+    fixed_vertices,
+    load_body,
+    make_ground,
+    make_material,
+    print_summary,
+    solver_class,
+)
+from diffsim_ti.cli.study import register as register_study
+from diffsim_ti.cli.view import register
+
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, help="Soft bodies on tetrahedra.")
+register_study(app)  # chart, stability, recommend
+ClickException = typer.BadParameter.__mro__[2]  # typer carries click inside or beside it, depending on its version
+register(app)
+
+
+@app.callback()
+def options(traceback: Annotated[bool, typer.Option("--traceback", help="show the traceback of an error")] = False):
+    """Soft bodies on tetrahedra, simulated with Taichi. Errors are one line on stderr, with exit code 2."""
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run a command and exit: 0 done, 2 an error, 130 interrupted."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
+    wants_traceback = "--traceback" in arguments  # wherever it stands
+    with warnings.catch_warnings():
+        warnings.simplefilter("default", UserWarning)
+        warnings.showwarning = lambda message, *_, **__: print(f"warning: {message}", file=sys.stderr)
+        try:
+            code = app([a for a in arguments if a != "--traceback"], standalone_mode=False, prog_name="diffsim-ti")
+        except Interrupted as stop:
+            code = _fail(str(stop), 130)
+        except (KeyboardInterrupt, typer.Abort):
+            code = _fail("interrupted", 130)
+        except ClickException as error:
+            code = _fail(f"{error.format_message()} (see diffsim-ti --help)")
+        except (ValueError, TypeError, RuntimeError, OSError, FloatingPointError, MemoryError) as error:
+            if wants_traceback:
+                raise
+            code = _fail(str(error) or type(error).__name__)
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+def _fail(message: str, code: int = 2) -> int:
+    print("error: " + " ".join(message.split()), file=sys.stderr)
+    return code
+
+
+# ---- commands ---------------------------------------------------------------------------------------------------------
+
+
+@app.command()
+def simulate(
+    mesh: MeshFile,
+    output: Output = Path("output/simulate"),
+    material: MaterialName = "StableNeoHookean",
+    youngs_modulus: Youngs = 1e5,
+    poissons_ratio: Poisson = 0.4,
+    density: Density = 1000.0,
+    volume: Volume = "tetrahedra",
+    size: Size = None,
+    up: UpAxis = Up.y,
+    fix_orientation: FixOrientation = False,
+    duration: Annotated[float, typer.Option(help="simulated time [s]")] = 1.0,
+    fps: Annotated[float, typer.Option(help="frames per second")] = 30.0,
+    dt: Annotated[
+        float | None, typer.Option(help="substep [s], taken as it is; default: follows the stable step")
+    ] = None,
+    solver: Annotated[str, typer.Option(help="semi-implicit, verlet, implicit-euler or bdf2")] = "semi-implicit",
+    gravity: Annotated[float, typer.Option(help="along y [m/s^2]")] = -9.81,
+    drag: Annotated[float, typer.Option(help="rate at which velocities fall [1/s]")] = 0.0,
+    velocity: Annotated[tuple[float, float, float], typer.Option(help="at the start [m/s]")] = (0.0, 0.0, 0.0),
+    fixed: Annotated[
+        list[str] | None, typer.Option(help="vertex set, or xmin .. zmax, to hold; may be repeated")
+    ] = None,
+    ground: Annotated[bool, typer.Option(help="a floor at y = 0, the body above it")] = True,
+    height: Annotated[float | None, typer.Option(help="of the lowest point [m]; default a tenth of the size")] = None,
+    ground_stiffness: Annotated[float | None, typer.Option(help="[N/m]; default from the impact's pressure")] = None,
+    ground_width: Annotated[float | None, typer.Option(help="[m]; default 1 % of the size")] = None,
+    azimuth: Annotated[float, typer.Option(help="where the picture is taken from, about y [degrees]")] = 32.0,
+    backend: Backend = "cpu",
+    precision: Precision = "f32",
+    threads: Threads = None,
+):
+    """Simulate a body, by default its fall onto a floor; write a ParaView series and a picture of the end."""
+    from diffsim_ti import runtime
+    from diffsim_ti.adaptive_run import ForwardRun, run_and_write
+    from diffsim_ti.picture import save_picture
+
+    begin = time.perf_counter()
+    for name, value in (("duration", duration), ("fps", fps), ("density", density)):
+        if not value > 0:
+            raise ValueError(f"--{name} must be > 0, got {value:g}")
+    kind = solver_class(solver)
+    law = make_material(material, youngs_modulus, poissons_ratio)
+    body = load_body(mesh, size, up, fix_orientation)
+    runtime.init(backend, precision, threads)
+    scene, body = fall_scene(
+        body,
+        law,
+        density,
+        gravity,
+        drag,
+        velocity,
+        fixed,
+        ground,
+        height,
+        ground_stiffness,
+        ground_width,
+        volume=volume,
+    )
+    frames = max(1, round(duration * fps))
+    run = ForwardRun(scene, kind, duration / frames, dt)
+    setup = time.perf_counter() - begin
+    writing, files, _ = run_and_write(run, frames, output, mesh.stem)
+    begin = time.perf_counter()
+    sim, picture = run.simulator, output / f"{mesh.stem}.png"
+    save_picture(
+        picture,
+        body,
+        sim.positions,
+        sim.tetrahedron_fields().von_mises,
+        "von Mises stress [Pa]",
+        0.0 if ground else None,
+        f"{mesh.stem}, t = {sim.time:.3g} s",
+        azimuth=azimuth,
+    )
+    print_summary(run, setup, writing + time.perf_counter() - begin, [*files, str(picture)])
+
+
+@app.command()
+def info(
+    mesh: MeshFile,
+    youngs_modulus: Youngs = 1e5,
+    poissons_ratio: Poisson = 0.4,
+    density: Density = 1000.0,
+    material: MaterialName = "StableNeoHookean",
+    size: Size = None,
+    fix_orientation: FixOrientation = False,
+    tight: Annotated[bool, typer.Option("--tight", help="also the tight limit, by Lanczos")] = False,
+):
+    """Say what is in a mesh file: sizes, quality, groups, and the stable explicit step for given moduli."""
+    from diffsim_ti.scene import Scene
+    from diffsim_ti.state import stability
+
+    body = load_body(mesh, size, Up.y, fix_orientation)
+    scene = Scene(body, make_material(material, youngs_modulus, poissons_ratio), density)
+    print(body.describe())
+    print(f"mass: {scene.inputs.derive(scene.inputs.values).mass.sum():.6g} kg")
+    print(f"stable step for {scene.material!r}, density {density:g} kg/m^3, at rest:")
+    print(f"  {stability.element_limit(scene)}")
+    if tight:
+        from diffsim_ti.solvers import SemiImplicitSolver
+
+        print(f"  {SemiImplicitSolver(scene, dt=1.0, allow_unstable=True).stable_dt(tight=True)}")
+
+
+@app.command("check-gradients")
+def check_gradients(
+    mesh: MeshFile,
+    youngs_modulus: Youngs = 1e5,
+    poissons_ratio: Poisson = 0.4,
+    density: Density = 1000.0,
+    material: MaterialName = "StableNeoHookean",
+    size: Size = None,
+    up: UpAxis = Up.y,
+    steps: Annotated[int, typer.Option(help="length of the rollout")] = 50,
+    dt: Annotated[float | None, typer.Option(help="[s]; default half the stable step")] = None,
+    solver: Annotated[str, typer.Option(help="semi-implicit or verlet")] = "semi-implicit",
+    fixed: Annotated[
+        list[str] | None, typer.Option(help="vertex set, or xmin .. zmax, to hold; may be repeated")
+    ] = None,
+    drag: Annotated[float, typer.Option(help="rate at which velocities fall [1/s]")] = 0.5,
+    backend: Backend = "cpu",
+    precision: Precision = "f64",
+):
+    """Check every gradient of a short fall onto a floor against differences and by its Taylor rate.
+
+
+    The body starts half a barrier width above the floor, moving, so that contact takes part. Exit code 1 if one is wrong.
+    """
+    from diffsim_ti import runtime
+    from diffsim_ti.rollout import Rollout
+    from diffsim_ti.scene import Scene
+    from diffsim_ti.terms import Drag, Gravity
+    from diffsim_ti.verify import check_gradients as check
+
+    runtime.init(backend, precision)
+    law, body = make_material(material, youngs_modulus, poissons_ratio), load_body(mesh, size, up)
+    ground = make_ground(body, law, density, -9.81, 0.5, width=0.02 * np.ptp(body.bounding_box, 0).max())
+    lift = 0.5 * float(ground.values["barrier_width"]) - body.bounding_box[0, 1]
+    body = body.translated([0, lift, 0])
+    velocities = 0.1 * np.random.default_rng(0).standard_normal(body.vertices.shape) + [0, -0.5, 0]
+    scene = Scene(
+        body,
+        law,
+        density,
+        [Gravity(), Drag(drag), ground],
+        fixed_vertices(body, fixed or []),
+        initial_velocities=velocities,
+    )
+    kind = solver_class(solver, implicit=False)
+    dt = 0.5 * kind(scene, dt=1.0, allow_unstable=True).stable_dt(tight=True).dt if dt is None else dt
+    report = check(Rollout(kind(scene, dt=dt), steps, gradients="all"))
+    if not report.passed:
+        raise typer.Exit(1)
+
+
+@app.command()
+def demo(
+    output: Output = Path("output/demo"),
+    backend: Backend = "cpu",
+    quick: Annotated[bool, typer.Option("--quick", hidden=True)] = False,
+):
+    """Drop a twisted jelly column, write pictures and a series, and take the gradient of its fall by Young's modulus."""
+    from diffsim_ti import runtime
+    from diffsim_ti.adaptive_run import ForwardRun, run_and_write
+    from diffsim_ti.materials import StableNeoHookean
+    from diffsim_ti.picture import save_picture
+    from diffsim_ti.scene import Scene
+    from diffsim_ti.solvers import SemiImplicitSolver
+    from diffsim_ti.terms import Gravity
+
+    begin = time.perf_counter()
+    runtime.init(backend)
+    body, law = twisted_column(3 if quick else 9), StableNeoHookean(3e4, 0.4)
+    ground = make_ground(body, law, 1000.0, -9.81, np.sqrt(2 * 9.81 * 0.15))
+    scene = Scene(body, law, 1000.0, [Gravity(), ground])
+    frames = 6 if quick else 36
+    run = ForwardRun(scene, SemiImplicitSolver, 1 / 30)
+    setup = time.perf_counter() - begin
+    moments = (frames // 6, frames // 2, frames)
+    writing, files, kept = run_and_write(run, frames, output, "column", moments)
+    begin = time.perf_counter()
+    points = np.concatenate([positions for _, positions, _, _ in kept])
+    box, top = np.stack([points.min(0), points.max(0)]), max(np.percentile(stress, 99.5) for *_, stress in kept)
+    for k, (t, positions, _, stress) in enumerate(kept):
+        files.append(str(output / f"column_{k}.png"))
+        save_picture(
+            files[-1],
+            body,
+            positions,
+            stress,
+            "von Mises stress [Pa]",
+            0.0,
+            f"t = {t:.2f} s",
+            (0.0, float(top)),
+            box=box,
+        )
+    print_summary(run, setup, writing + time.perf_counter() - begin, files)
+    _, positions, velocities, _ = kept[1]
+    print_gradient(scene.replace(initial_positions=positions, initial_velocities=velocities, precision="f64"))
+
+
+def twisted_column(cells: int):
+    """A square column 0.6 m high, wrung by 150 degrees and tilted, its lowest point 0.15 m above y = 0."""
+    from diffsim_ti.mesh import TetrahedralMesh
+
+    mesh = TetrahedralMesh.create_box((cells + 1, 3 * cells + 1, cells + 1), (0.2, 0.6, 0.2), origin=(-0.1, 0.0, -0.1))
+    x, y, z = mesh.vertices.T
+    angle = np.radians(150) * y / 0.6
+    wrung = np.stack([np.cos(angle) * x + np.sin(angle) * z, y, np.cos(angle) * z - np.sin(angle) * x], 1)
+    mesh = TetrahedralMesh(wrung, mesh.tetrahedra).rotated([0.3, 0, 1], np.radians(-28))
+    return mesh.translated([0, 0.15 - mesh.bounding_box[0, 1], 0])
+
+
+def print_gradient(scene, seconds: float = 0.05, change: float = 1e-3) -> None:
+    """Gradient by E of the mean height after `seconds`, in float64, beside a central difference."""
+    from diffsim_ti.rollout import Rollout
+    from diffsim_ti.solvers import SemiImplicitSolver
+
+    dt = 0.5 * SemiImplicitSolver(scene, dt=1.0, allow_unstable=True).stable_dt(tight=True).dt
+    steps = int(np.ceil(seconds / dt))
+    rollout = Rollout(SemiImplicitSolver(scene, dt=seconds / steps), steps, gradients="youngs_modulus")
+    E = float(scene.inputs.values["youngs_modulus"])
+    frames = rollout.forward()
+    by_positions = np.zeros(frames.positions.shape)
+    by_positions[-1, :, 1] = 1 / scene.mesh.num_vertices
+    gradient = float(rollout.vjp(frames, positions=by_positions)["youngs_modulus"])
+    heights = [rollout.forward(youngs_modulus=E * (1 + s * change)).positions[-1, :, 1].mean() for s in (1, -1)]
+    difference = (heights[0] - heights[1]) / (2 * change * E)
+    height = frames.positions[-1, :, 1].mean()
+    print(f"mean height {seconds:g} s after the middle picture: {height:.6f} m ({steps} steps, f64)")
+    print(f"its gradient by Young's modulus: {gradient:.6e} m/Pa; central difference {difference:.6e} m/Pa")

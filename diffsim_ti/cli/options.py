@@ -1,0 +1,211 @@
+"""What the commands share: types of options, the scene that options describe, progress, the summary at the end."""
+
+import sys
+import time
+from contextlib import contextmanager
+from enum import Enum
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+Up = Enum("Up", {name: name for name in ("x", "y", "z", "-x", "-y", "-z")}, type=str)
+SIDES = {f"{axis}{end}": (d, end) for d, axis in enumerate("xyz") for end in ("min", "max")}
+
+MeshFile = Annotated[Path, typer.Argument(metavar="MESH", help="tetrahedra, in any format that meshio reads")]
+Size = Annotated[float | None, typer.Option(help="scale the longest side of the bounding box to this [m]")]
+UpAxis = Annotated[Up, typer.Option(help="axis of the file that points up; the body is turned to have y up")]
+FixOrientation = Annotated[bool, typer.Option("--fix-orientation", help="turn inside-out tetrahedra")]
+MaterialName = Annotated[str, typer.Option(help="the law, by class name; capitals do not matter")]
+Youngs = Annotated[float, typer.Option("--youngs-modulus", "-E", help="Young's modulus [Pa]")]
+Poisson = Annotated[float, typer.Option("--poissons-ratio", "--nu", help="Poisson's ratio [-]")]
+Density = Annotated[float, typer.Option(help="[kg/m^3]")]
+Volume = Annotated[
+    str, typer.Option(help="where a change of volume is resisted: tetrahedra, or patches (near nu = 0.5)")
+]
+Backend = Annotated[str, typer.Option(help="cpu, cuda or vulkan")]
+Precision = Annotated[str, typer.Option(help="f32 or f64")]
+Threads = Annotated[int | None, typer.Option(help="CPU threads, default all")]
+Output = Annotated[Path, typer.Option("--output", "-o", help="folder for the series and the picture")]
+
+
+@contextmanager
+def progress(title: str, total: int):
+    """Yields a function to tell what is done; shows it on stderr after two seconds, as lines if that is no terminal."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    console = Console(stderr=True)
+    bar = Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.fields[note]}"),
+        TimeRemainingColumn(),
+        console=console,
+        transient=True,
+    )
+    task, start, said = bar.add_task(title, total=total, note=""), time.perf_counter(), [time.perf_counter()]
+
+    def update(done: int, note: str = "") -> None:
+        now = time.perf_counter()
+        if console.is_terminal and now - start > 2 and not bar.live.is_started:
+            bar.start()
+        elif not console.is_terminal and now - said[0] > 5:
+            said[0] = now
+            print(f"{title}: {done} of {total}, {note}", file=sys.stderr, flush=True)
+        bar.update(task, completed=done, note=note)
+
+    try:
+        yield update
+    finally:
+        bar.stop()
+
+
+# ---- a scene from options ---------------------------------------------------------------------------------------------
+
+
+def load_body(path: Path, size: float | None = None, up: Up = Up.y, fix_orientation: bool = False):
+    """The mesh of a file, y up and of the size asked for; vertices of no tetrahedron are left out."""
+    from diffsim_ti.mesh import TetrahedralMesh
+
+    mesh = TetrahedralMesh.from_file(path, fix_orientation=fix_orientation, drop_orphans=True)
+    axis, sign = "xyz".index(up.value[-1]), -1 if up.value[0] == "-" else 1
+    if up is not Up.y:
+        rows = np.eye(3)[[(axis + 2) % 3, axis, (axis + 1) % 3]]
+        mesh = mesh.rotated(np.diag([1, sign, sign]) @ rows)
+    if size is not None:
+        if not size > 0:
+            raise ValueError(f"--size must be > 0 [m], got {size:g}")
+        mesh = mesh.scaled(size / np.ptp(mesh.bounding_box, 0).max())
+    return mesh
+
+
+def make_material(name: str, youngs_modulus: float, poissons_ratio: float):
+    """A material by its class's name."""
+    from diffsim_ti.materials import MATERIALS
+
+    for kind in MATERIALS:
+        if kind.__name__.lower() == name.lower().replace("-", "").replace("_", ""):
+            return kind(youngs_modulus=youngs_modulus, poissons_ratio=poissons_ratio)
+    raise ValueError(f"--material: no law is called {name!r}; there are {', '.join(k.__name__ for k in MATERIALS)}")
+
+
+def solver_class(name: str, implicit: bool = True):
+    """A solver's class by the name that --solver takes."""
+    from diffsim_ti.solvers import BDF2Solver, ImplicitEulerSolver, SemiImplicitSolver, VelocityVerletSolver
+
+    solvers = {"semi-implicit": SemiImplicitSolver, "verlet": VelocityVerletSolver}
+    if implicit:
+        solvers |= {"implicit-euler": ImplicitEulerSolver, "bdf2": BDF2Solver}
+    if name not in solvers:
+        raise ValueError(f"--solver must be one of {', '.join(solvers)}, got {name!r}")
+    return solvers[name]
+
+
+def fixed_vertices(mesh, names: list[str]) -> np.ndarray | None:
+    """Vertices of the mesh's sets, or, for xmin .. zmax, those within 1 % of the size from that side."""
+    chosen = []
+    for name in names:
+        if name in SIDES and name not in mesh.vertex_sets:
+            (d, end), box = SIDES[name], mesh.bounding_box
+            off = np.abs(mesh.vertices[:, d] - box[int(end == "max"), d])
+            chosen.append(np.flatnonzero(off <= 0.01 * np.ptp(box, 0).max()))
+        else:
+            chosen.append(mesh.vertex_indices(name))
+    return np.unique(np.concatenate(chosen)) if chosen else None
+
+
+def make_ground(
+    mesh,
+    material,
+    density: float,
+    gravity: float,
+    speed: float,
+    stiffness: float | None = None,
+    width: float | None = None,
+):
+    """The floor y = 0 for a body that meets it at `speed` [m/s]: width 1 % of the size, stiffness from the impact."""
+    from diffsim_ti.terms import Ground
+    from diffsim_ti.terms.obstacles.stiffness import barrier_stiffness
+
+    width = 0.01 * np.ptp(mesh.bounding_box, 0).max() if width is None else width
+    if stiffness is None:
+        stiffness = barrier_stiffness(mesh, material, density, gravity, speed, width)
+    return Ground(0.0, stiffness, width)
+
+
+def fall_scene(
+    body,
+    law,
+    density: float,
+    gravity: float = -9.81,
+    drag: float = 0.0,
+    velocity=(0.0, 0.0, 0.0),
+    fixed=(),
+    floor: bool = True,
+    height: float | None = None,
+    stiffness: float | None = None,
+    width: float | None = None,
+    extra=(),
+    volume: str = "tetrahedra",
+):
+    """(scene, body): a body let go above the floor y = 0, its lowest point at `height` [m], default a tenth of its size.
+
+    fixed: as `fixed_vertices` takes them; stiffness, width: the floor's barrier, see `make_ground`; extra: more terms;
+    volume: as `Scene` takes it.
+    """
+    from diffsim_ti.scene import Scene
+    from diffsim_ti.terms import Drag, Gravity
+
+    terms = ([Gravity(gravity)] if gravity else []) + ([Drag(drag)] if drag else [])
+    if floor:
+        low, height = body.bounding_box[0, 1], 0.1 * np.ptp(body.bounding_box, 0).max() if height is None else height
+        body = body.translated([0, height - low, 0])
+        speed = np.sqrt(min(velocity[1], 0) ** 2 + 2 * abs(gravity) * max(height, 0))
+        terms.append(make_ground(body, law, density, gravity, speed, stiffness, width))
+    fixed = fixed_vertices(body, list(fixed or []))
+    return Scene(body, law, density, terms + list(extra), fixed, initial_velocities=velocity, volume=volume), body
+
+
+# ---- what is said at the end ------------------------------------------------------------------------------------------
+
+
+def print_summary(run, setup: float, writing: float, files: list[str]) -> None:
+    """A table of what was simulated, how fast, how well, and where it was written."""
+    from rich.console import Console
+    from rich.table import Table
+
+    sim, seen = run.simulator, run.seen
+    substeps, m = sum(seen.substeps), run.scene.mesh.num_tetrahedra
+    table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
+    names = iter(("mesh", "material", "", "solver"))
+    for line in sim.describe().splitlines():
+        table.add_row(*line.split(": ", 1) if line.startswith(("terms", "fixed", "built")) else (next(names, ""), line))
+    table.add_row("simulated", f"{sim.time:.4g} s in {len(seen.substeps)} frames")
+    counts = f"{substeps}, from {min(seen.substeps)} to {max(seen.substeps)} a frame"
+    table.add_row("substeps", f"{counts}, {seen.shortest:.3g} to {seen.longest:.3g} s each")
+    parts = f"{len(seen.retries)}, of parts of {sim.solver.dt:.3g} s, again with half the substep; the last:"
+    table.add_row("retries", parts if seen.retries else "none")
+    for retry in seen.retries[-3:]:
+        table.add_row("", retry if len(retry) < 130 else retry[:127] + "...")
+    table.add_row(
+        "wall time", f"compile and setup {setup:.2f} s, stepping {seen.seconds:.2f} s, writing {writing:.2f} s"
+    )
+    each = seen.seconds / substeps
+    table.add_row("speed", f"{1 / each:.0f} substeps/s, {each / m * 1e9:.1f} ns per tetrahedron and substep")
+    for name, energy in (("energy at start", run.energies[0]), ("energy at end", run.energies[-1])):
+        table.add_row(name, f"{energy:.6g} J: " + ", ".join(f"{k} {v:.4g}" for k, v in energy.parts.items()))
+    drift = run.energies[-1] - run.energies[0]
+    share = drift / max(run.largest_energy, 1e-300)
+    table.add_row("energy drift", f"{drift:+.3g} J, {share:+.2%} of the largest kinetic + elastic + contact energy")
+    inverted = f", {seen.inverted} tetrahedra inside-out at once" if seen.inverted else ""
+    table.add_row("smallest J", f"{seen.J:.4g}{inverted}")
+    if run.obstacles:
+        width = min(float(t.values["barrier_width"]) for t in run.obstacles)
+        crossed = f"{seen.crossed} vertices crossed, by up to {-seen.gap:.3g} m" if seen.crossed else "none crossed"
+        table.add_row("smallest gap", f"{seen.gap:.4g} m, barrier {width:.3g} m wide; {crossed}")
+    for k, name in enumerate(files):
+        table.add_row("" if k else "files", name)
+    console = Console()
+    Console(width=console.width if console.is_terminal else 400).print(table)

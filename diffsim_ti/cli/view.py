@@ -1,0 +1,102 @@
+"""The commands that show a run: `diffsim-ti render` writes a film of a series, `diffsim-ti view` opens a window."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from diffsim_ti.cli.options import (
+    Density,
+    FixOrientation,
+    MaterialName,
+    Poisson,
+    Size,
+    Up,
+    UpAxis,
+    Youngs,
+    fall_scene,
+    load_body,
+    make_material,
+    solver_class,
+)
+
+
+def register(app: typer.Typer) -> None:
+    """Add this module's commands to the command line."""
+    app.command()(render)
+    app.command()(view)
+
+
+def render(
+    series: Annotated[Path, typer.Argument(help="the .pvd of a run", exists=True, dir_okay=False)],
+    output: Annotated[Path, typer.Option("--output", "-o", help=".mp4, .gif, or .png of the end")] = Path(
+        "output/film.mp4"
+    ),
+    colour: Annotated[str, typer.Option(help="displacement, speed, von_mises, energy_density or J")] = "von_mises",
+    fps: Annotated[float, typer.Option(help="frames per second of the film")] = 30.0,
+    size: Annotated[tuple[int, int], typer.Option(help="width and height [pixels]")] = (640, 480),
+    ground: Annotated[float | None, typer.Option(help="height of a floor to draw [m]; default the run's own")] = None,
+    azimuth: Annotated[float, typer.Option(help="of the eye, about y [degrees]")] = 32.0,
+    elevation: Annotated[float, typer.Option(help="of the eye, above the floor [degrees]")] = 14.0,
+    wireframe: Annotated[bool, typer.Option("--wireframe", help="draw the edges of the triangles")] = False,
+    backend: Annotated[str, typer.Option(help="vulkan, software, or auto: Vulkan where there is a driver")] = "auto",
+):
+    """Draw a saved series as a film, coloured by a field, without a display."""
+    from diffsim_ti.film import render_series
+
+    count = render_series(
+        series, output, colour, fps, size, ground, azimuth, elevation, backend, print, wireframe=wireframe
+    )
+    print(f"{count} frame{'s' * (count != 1)}: {output}")
+
+
+def view(
+    source: Annotated[
+        Path, typer.Argument(help="the .pvd of a run, or a mesh, which is then simulated", exists=True, dir_okay=False)
+    ],
+    colour: Annotated[str, typer.Option(help="displacement, speed, von_mises, energy_density or J")] = "von_mises",
+    ground: Annotated[float | None, typer.Option(help="height of a floor to draw [m]; default the run's own")] = None,
+    material: MaterialName = "StableNeoHookean",
+    youngs_modulus: Youngs = 1e5,
+    poissons_ratio: Poisson = 0.4,
+    density: Density = 1000.0,
+    size: Size = None,
+    up: UpAxis = Up.y,
+    fix_orientation: FixOrientation = False,
+    fps: Annotated[float, typer.Option(help="of a live run: frames per simulated second")] = 60.0,
+    solver: Annotated[str, typer.Option(help="semi-implicit, verlet, implicit-euler or bdf2")] = "semi-implicit",
+    gravity: Annotated[float, typer.Option(help="along y [m/s^2]")] = -9.81,
+    drag: Annotated[float, typer.Option(help="rate at which velocities fall [1/s]")] = 0.0,
+    fixed: Annotated[
+        list[str] | None, typer.Option(help="vertex set, or xmin .. zmax, to hold; may be repeated")
+    ] = None,
+    floor: Annotated[bool, typer.Option(help="a floor at y = 0, the body above it")] = True,
+):
+    """Look at a saved series in a window, or at a mesh as it falls: play, step, scrub, turn, colour by a field, pull."""
+    from diffsim_ti import runtime
+    from diffsim_ti.adaptive_run import ForwardRun
+    from diffsim_ti.terms import ExternalForce
+    from diffsim_ti.visual.frame_sources import LiveFrames, SavedFrames
+    from diffsim_ti.visual.viewer import NO_DISPLAY, Viewer, has_display
+
+    if not has_display():
+        raise RuntimeError(NO_DISPLAY)
+    if source.suffix == ".pvd":
+        frames = SavedFrames(source)
+    else:
+        if not fps > 0:
+            raise ValueError(f"--fps must be > 0, got {fps:g}")
+        runtime.init()
+        scene, _ = fall_scene(
+            load_body(source, size, up, fix_orientation),
+            make_material(material, youngs_modulus, poissons_ratio),
+            density,
+            gravity,
+            drag,
+            fixed=fixed,
+            floor=floor,
+            extra=[ExternalForce([0.0, 0.0, 0.0])],
+        )
+        frames = LiveFrames(ForwardRun(scene, solver_class(solver), 1 / fps))
+    look = {} if ground is None else dict(ground=ground)
+    Viewer(frames, colour, playing=source.suffix != ".pvd", **look).run()

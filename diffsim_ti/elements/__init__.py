@@ -1,0 +1,1 @@
+"""What a tetrahedron adds to forces, to their differential and to the adjoint."""

@@ -1,0 +1,152 @@
+"""Tetrahedra whose change of volume is averaged over patches, so that they do not lock as nu approaches 0.5.
+
+    E = sum_e V_e psi(F_e; lam = 0) + sum_p W_p lam_p / 2 theta_p^2
+    W_p = sum_e V_e,  lam_p = sum_e V_e lam_e / W_p,  theta_p = sum_e V_e theta_e / W_p     over the tetrahedra e of patch p
+
+A patch is a block of eight (mesh_patches.py; rows left over have no volume), so that sums over a patch are sums over lanes.
+Its pressure pi = lam_p theta_p takes the place of lam theta in each of its tetrahedra: forces are those of an energy.
+Nagtegaal, Parks, Rice 1974, doi:10.1016/0045-7825(74)90032-2 (mean dilatation); de Souza Neto, Andrade Pires, Owen 2005,
+F-bar-based linear triangles and tetrahedra for finite strain analysis of nearly incompressible solids, doi:10.1002/nme.1187.
+"""
+
+from functools import lru_cache
+from types import SimpleNamespace
+
+import taichi as ti
+
+from diffsim_ti.elements.tetrahedron import LANES, A, element_functions
+from diffsim_ti.materials.calculus.tensor import inner, sum_of
+from diffsim_ti.materials.patch_law import PatchLaw
+from diffsim_ti.runtime import Bundle, at, let, traced
+
+
+def functions_of(law, uniform: bool, lanes: bool) -> SimpleNamespace:
+    """`element_functions` of a law; those of patches for a PatchLaw."""
+    return patch_functions(law, uniform, lanes) if isinstance(law, PatchLaw) else element_functions(law, uniform, lanes)
+
+
+@lru_cache(maxsize=None)
+def patch_functions(law, uniform: bool, lanes: bool) -> SimpleNamespace:
+    """The functions of element_functions, with the same meaning. In all of them q = [*p', pi] (patch_law.py)."""
+    el, base = element_functions(law.base, uniform, lanes), law.base
+    fp, most = el.types.fp, 6
+    row_type = ti.types.vector(most, fp)
+
+    @traced
+    def own(item, job) -> SimpleNamespace:
+        """What an item knows by itself; `numbers` are what its patch sums up."""
+        t, scene = SimpleNamespace(), job.scene
+        t.B, t.V = el.gradients_of(item, scene.gradients), el.volume_of(item, scene.volumes)
+        t.p, t.lam = law.split(el.coefficients_of(item, scene.coefficients))
+        t.D = el.edges(item, scene, job.u, job.s)
+        t.H = t.D @ t.B
+        t.theta = base.dilatation(t.H)
+        t.numbers = [t.V, let(t.V * t.lam), let(t.V * t.theta)]
+        if job.w is None:
+            return t
+        t.W, t.gradient = el.edges(item, scene, job.w, 0), base.dilatation_gradient(t.H)
+        t.dH = t.W @ t.B
+        if job.dots is None:
+            t.dtheta = inner(t.gradient, t.dH)
+            t.numbers.append(let(t.V * t.dtheta))
+            return t
+        t.dB, t.dV = el.gradients_of(item, job.dots.gradients), el.volume_of(item, job.dots.volumes)
+        t.dp, dlam = law.split(el.coefficients_of(item, job.dots.coefficients))
+        t.dH = t.dH + t.D @ t.dB
+        t.dtheta = inner(t.gradient, t.dH)
+        t.numbers += [t.dV, let(t.dV * t.lam + t.V * dlam), let(t.dV * t.theta + t.V * t.dtheta)]
+        return t
+
+    @traced
+    def row(item, job):
+        numbers = own(item, job).numbers
+        return row_type(*numbers, *[ti.cast(0, fp)] * (most - len(numbers)))
+
+    @ti.func
+    def sum_one_by_one(item, job: A):
+        total = row_type(0)
+        first = item // LANES * LANES
+        for lane in range(LANES):
+            total += row(first + lane, job)
+        return total
+
+    @traced
+    def patch_of(item, scene, u, s, w=None, dots=None) -> SimpleNamespace:
+        """What an item knows, with its patch's W, lam_p, theta_p, pi and, for changes w of u, their changes."""
+        job = Bundle(scene=scene, u=u, s=s, w=w, dots=dots)
+        t = own(item, job)
+        if lanes:
+            sums = [el.broadcast(let(sum_of(at(x, lane) for lane in range(LANES)))) for x in t.numbers]
+        else:
+            total = let(sum_one_by_one(item, job))
+            sums = [let(at(total, k)) for k in range(len(t.numbers))]
+        volume, stiff, swollen, *changes = sums
+        t.lam_p, t.theta_p = let(stiff / volume), let(swollen / volume)
+        t.q = [*t.p, let(t.lam_p * t.theta_p)]
+        if len(changes) == 1:
+            t.dtheta_p = let(changes[0] / volume)
+            t.dpi = let(t.lam_p * t.dtheta_p)
+        elif changes:
+            dvolume, dstiff, dswollen = changes
+            dlam_p, dtheta_p = (dstiff - t.lam_p * dvolume) / volume, (dswollen - t.theta_p * dvolume) / volume
+            t.dpi = let(dlam_p * t.theta_p + t.lam_p * dtheta_p)
+        return t
+
+    @traced
+    def coefficients_at(item, scene, u, s) -> list:
+        return patch_of(item, scene, u, s).q
+
+    @traced
+    def forces(item, scene, u, s, corner) -> None:
+        t = patch_of(item, scene, u, s)
+        el.store(item, corner, (law.stress(t.H, t.q) * t.V) @ t.B.transpose())
+
+    @traced
+    def pressure_forces(item, scene, u, s, corner) -> None:
+        """Corner forces of a unit pressure: the derivatives of -W_p theta_p by the displacement of the corners."""
+        t = own(item, Bundle(scene=scene, u=u, s=s, w=None, dots=None))
+        el.store(item, corner, (base.dilatation_gradient(t.H) * t.V) @ t.B.transpose())
+
+    @traced
+    def stiffness(item, scene, u, s, w, corner) -> None:
+        t = patch_of(item, scene, u, s, w)
+        dP = law.stress_differential(t.H, t.dH, t.q) + t.gradient * t.dpi
+        el.store(item, corner, (dP * t.V) @ t.B.transpose())
+
+    @traced
+    def forces_jvp(item, scene, u, s, du, corner, dots) -> None:
+        t = patch_of(item, scene, u, s, du, dots)
+        dP = law.stress_differential(t.H, t.dH, t.q) + base.stress(t.H, t.dp) + t.gradient * t.dpi
+        change = t.B * t.dV + t.dB * t.V
+        el.store(item, corner, (dP * t.V) @ t.B.transpose() + law.stress(t.H, t.q) @ change.transpose())
+
+    @traced
+    def forces_vjp(item, scene, u, s, w, corner, adjoint) -> None:
+        """The work of a patch's pressure on w is -W_p lam_p theta_p dtheta_p, with dtheta_p the change of theta_p for w."""
+        t = patch_of(item, scene, u, s, w)
+        dP, products = law.stress_differential_and_products(t.H, t.dH, t.q)
+        el.store(item, corner, ((dP + t.gradient * t.dpi) * t.V) @ t.B.transpose())
+        minus = let(ti.cast(-1, fp) * t.V)
+        by = law.split_vjp([let(minus * x) for x in products], let(minus * t.theta_p * t.dtheta_p))
+        el.add(adjoint.coefficients, len(products), item, by)
+
+    @traced
+    def shape_vjp(item, scene, u, s, w, adjoint) -> None:
+        t = patch_of(item, scene, u, s, w)
+        P, minus = law.stress(t.H, t.q), ti.cast(-1, fp)
+        dP = law.stress_differential(t.H, t.dH, t.q) + t.gradient * t.dpi
+        by_B = (t.D.transpose() @ dP + t.W.transpose() @ P) * let(minus * t.V)
+        el.add(adjoint.gradients, 9, item, by_B.numbers)
+        in_patch = t.dtheta_p * (t.theta_p * (t.lam - t.lam_p - t.lam_p) + t.lam_p * t.theta)
+        el.add(adjoint.volumes, 1, item, [minus * (inner(P, t.dH) + in_patch)])
+
+    replaced = dict(
+        coefficients_at=coefficients_at,
+        forces=forces,
+        stiffness=stiffness,
+        forces_jvp=forces_jvp,
+        forces_vjp=forces_vjp,
+        shape_vjp=shape_vjp,
+        pressure_forces=pressure_forces,
+    )
+    return SimpleNamespace(**vars(el) | replaced)

@@ -1,0 +1,1 @@
+"""Tensor calculus that the laws share."""

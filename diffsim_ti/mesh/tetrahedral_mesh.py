@@ -1,0 +1,381 @@
+"""TetrahedralMesh: the rest shape of a soft body. Make, load, save, check, look at."""
+
+import copy
+import hashlib
+import math
+import warnings
+from collections.abc import Callable
+from functools import cached_property
+from types import MappingProxyType
+
+import numpy as np
+
+from diffsim_ti.mesh import checks, geometry
+from diffsim_ti.mesh.files import KEEPS_SETS, read_mesh, write_mesh
+from diffsim_ti.mesh.grid import box
+from diffsim_ti.mesh.sets import checked_sets, chosen_indices, join_sets, sizes
+
+
+class TetrahedralMesh:
+    """Linear tetrahedra at rest. Immutable: arrays are read-only float64 or int64, changes return a new mesh.
+
+    vertices: positions [m], shape (num_vertices, 3).
+    tetrahedra: vertex indices from 0, integers, shape (num_tetrahedra, 4), positive volume
+        det [x1 - x0, x2 - x0, x3 - x0] / 6 > 0.
+    vertex_sets, tetrahedron_sets: name -> indices or Boolean mask; kept as sorted indices.
+    fix_orientation: swap two vertices of each inside-out tetrahedron instead of refusing it.
+
+    Raises ValueError for wrong shapes or dtypes, indices out of range, non-finite coordinates, a repeated vertex in a
+    tetrahedron, flat, inside-out, repeated or overlapping tetrahedra, and a face of more than two tetrahedra. Warns
+    (UserWarning) of vertices that no tetrahedron uses and of slivers. All thresholds are relative to the tetrahedron.
+    """
+
+    def __init__(
+        self,
+        vertices,
+        tetrahedra,
+        *,
+        vertex_sets: dict | None = None,
+        tetrahedron_sets: dict | None = None,
+        fix_orientation: bool = False,
+    ):
+        self._vertices = checks.checked_vertices(vertices)
+        self._tetrahedra = checks.checked_tetrahedra(tetrahedra, len(self._vertices))
+        det, longest = self._determinants()
+        checks.check_not_flat(self._vertices, self._tetrahedra, det, longest)
+        self._tetrahedra = checks.oriented(self._tetrahedra, det, fix_orientation)
+        self._volumes = np.abs(det) / 6
+        self._surface_triangles = checks.surface_of(self._tetrahedra, self.num_vertices)
+        self._vertex_sets = checked_sets(vertex_sets, self.num_vertices, "vertex")
+        self._tetrahedron_sets = checked_sets(tetrahedron_sets, self.num_tetrahedra, "tetrahedron")
+        self._freeze()
+        checks.warn_of_orphans(self._orphans())
+        checks.warn_of_slivers(self)
+
+    # Making, loading, saving
+
+    @classmethod
+    def create_cube(cls, resolution: int = 5, size: float = 1.0, pattern="kuhn", device=None) -> "TetrahedralMesh":
+        """The cube [0, size]^3 [m], all of it filled; `resolution` counts vertices a side. See `create_box`.
+
+        device: accepted for the seeds' spelling and not used; a mesh lives in NumPy, simulators choose a device.
+        """
+        return cls.create_box(resolution, size, pattern)
+
+    @classmethod
+    def create_box(cls, resolution=5, size=1.0, pattern: str = "kuhn", origin=(0.0, 0.0, 0.0)) -> "TetrahedralMesh":
+        """A box on a regular grid, with vertex sets xmin, xmax, ymin, ymax, zmin, zmax.
+
+        resolution: vertices per side, an integer of at least 2 or three of them.
+        size: edge lengths [m], one number or three. origin: the lowest corner [m].
+        pattern: "kuhn", six tetrahedra per cell, all cells alike; "five", five per cell, mirrored in every other cell
+            (bends more freely when nearly incompressible). Both are conforming.
+        Vertex (i, j, k) has index (i ny + j) nz + k.
+        """
+        vertices, tetrahedra, sides = box(resolution, size, pattern, origin)
+        return cls(vertices, tetrahedra, vertex_sets=sides)
+
+    @classmethod
+    def from_file(cls, path, fix_orientation: bool = False, drop_orphans: bool = False) -> "TetrahedralMesh":
+        """Load tetrahedra from any format that meshio reads: Gmsh .msh (2.2 and 4.x), .vtu, .vtk, MEDIT .mesh, .inp ...
+
+        Blocks of tetrahedra are joined. Named groups of tetrahedra become tetrahedron sets, groups of triangles, lines
+        or points the vertex sets of their vertices; integer tags without a name become "tag_<n>", except 0 and a tag
+        that all tetrahedra share. Triangles, lines and points are otherwise ignored.
+        drop_orphans: leave out vertices that no tetrahedron uses (Gmsh writes some) and renumber; default: warn.
+
+        Raises FileNotFoundError, and ValueError for an unreadable file, one without tetrahedra, 10-node tetrahedra,
+        other cells beside tetrahedra (cell types are named), and whatever the constructor refuses.
+        """
+        vertices, tetrahedra, vertex_sets, tetrahedron_sets = read_mesh(path)
+        if drop_orphans and tetrahedra.min() >= 0 and tetrahedra.max() < len(vertices):
+            used = np.unique(tetrahedra)
+            new = np.full(len(vertices), -1)
+            new[used] = np.arange(len(used))
+            vertex_sets = {name: new[rows][new[rows] >= 0] for name, rows in vertex_sets.items()}
+            vertices, tetrahedra = vertices[used], new[tetrahedra]
+        try:
+            return cls(
+                vertices,
+                tetrahedra,
+                vertex_sets=vertex_sets,
+                tetrahedron_sets=tetrahedron_sets,
+                fix_orientation=fix_orientation,
+            )
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from error
+
+    @classmethod
+    def load_from_msh(cls, path, device=None) -> "TetrahedralMesh":
+        """`from_file(path)` in the seeds' spelling; device is accepted and not used."""
+        return cls.from_file(path)
+
+    def save(self, path) -> None:
+        """Write the mesh through meshio, in the format that the suffix names.
+
+        Sets are kept in .msh (Gmsh 2.2 binary, as physical groups of points and volumes) and in .vtu and .vtk (as 0/1
+        data arrays "vertex_set:<name>", "tetrahedron_set:<name>"; .vtk turns blanks in names into underscores); other
+        formats lose them with a UserWarning. These three keep every digit. ValueError for an unknown suffix.
+        """
+        lost = write_mesh(path, self.vertices, self.tetrahedra, self.vertex_sets, self.tetrahedron_sets)
+        if lost:
+            kept = ", ".join(KEEPS_SETS)
+            warnings.warn(f"{path} cannot keep the sets {', '.join(lost)}; these formats can: {kept}", stacklevel=2)
+
+    @classmethod
+    def joined(cls, meshes) -> "TetrahedralMesh":
+        """Several bodies as one mesh of several pieces, one after the other.
+
+        Sets of the same name become one; each body's vertices and tetrahedra also become sets "body_0", "body_1", ...
+        ValueError for an empty list, and for meshes that have a set of such a name already.
+        """
+        meshes = list(meshes)
+        if not meshes:
+            raise ValueError("joined needs at least one mesh, got none")
+        firsts = np.cumsum([0, *(mesh.num_vertices for mesh in meshes)])
+        first_tets = np.cumsum([0, *(mesh.num_tetrahedra for mesh in meshes)])
+        vertex_sets = join_sets([mesh.vertex_sets for mesh in meshes], firsts)
+        tetrahedron_sets = join_sets([mesh.tetrahedron_sets for mesh in meshes], first_tets)
+        return cls(
+            np.concatenate([mesh.vertices for mesh in meshes]),
+            np.concatenate([mesh.tetrahedra + first for mesh, first in zip(meshes, firsts)]),
+            vertex_sets=vertex_sets,
+            tetrahedron_sets=tetrahedron_sets,
+        )
+
+    # What it consists of
+
+    @property
+    def vertices(self) -> np.ndarray:
+        """Rest positions [m], shape (num_vertices, 3)."""
+        return self._vertices
+
+    @property
+    def tetrahedra(self) -> np.ndarray:
+        """Vertex indices, shape (num_tetrahedra, 4), positively oriented."""
+        return self._tetrahedra
+
+    @property
+    def vertex_sets(self) -> MappingProxyType:
+        """Name -> sorted vertex indices."""
+        return MappingProxyType(self._vertex_sets)
+
+    @property
+    def tetrahedron_sets(self) -> MappingProxyType:
+        """Name -> sorted tetrahedron indices."""
+        return MappingProxyType(self._tetrahedron_sets)
+
+    @property
+    def num_vertices(self) -> int:
+        return len(self._vertices)
+
+    @property
+    def num_tetrahedra(self) -> int:
+        return len(self._tetrahedra)
+
+    @property
+    def num_elements(self) -> int:
+        """Another name of num_tetrahedra, used by the seeds."""
+        return self.num_tetrahedra
+
+    @property
+    def surface_triangles(self) -> np.ndarray:
+        """Faces of one tetrahedron only, normals pointing outwards, shape (k, 3)."""
+        return self._surface_triangles
+
+    @cached_property
+    def surface_vertices(self) -> np.ndarray:
+        """Sorted indices of the vertices of the surface."""
+        return _frozen(np.unique(self.surface_triangles))
+
+    @cached_property
+    def edges(self) -> np.ndarray:
+        """Each edge once, shape (k, 2), the smaller index first."""
+        low, high = np.sort(self.tetrahedra[:, geometry.EDGES].reshape(-1, 2), 1).T
+        return _frozen(np.stack(np.divmod(np.unique(low * self.num_vertices + high), self.num_vertices), 1))
+
+    @cached_property
+    def num_pieces(self) -> int:
+        """How many parts that share no vertex."""
+        from scipy.sparse import coo_matrix
+        from scipy.sparse.csgraph import connected_components
+
+        pairs = self.tetrahedra[:, [0, 1, 0, 2, 0, 3]].reshape(-1, 2).T
+        graph = coo_matrix((np.ones(pairs.shape[1], bool), tuple(pairs)), (self.num_vertices, self.num_vertices))
+        return int(connected_components(graph, directed=False)[0]) - len(self._orphans())
+
+    # Geometry
+
+    @property
+    def volumes(self) -> np.ndarray:
+        """det [x1 - x0, x2 - x0, x3 - x0] / 6 > 0 per tetrahedron [m^3], shape (num_tetrahedra,)."""
+        return self._volumes
+
+    @cached_property
+    def volume(self) -> float:
+        """Of all tetrahedra [m^3], summed without rounding error."""
+        return math.fsum(self._volumes)
+
+    @cached_property
+    def shape_gradients(self) -> np.ndarray:
+        """grad N_a [1/m], shape (num_tetrahedra, 4, 3); displacement gradient = sum_a u_a (x) grad N_a."""
+        return _frozen(geometry.shape_gradients(self.vertices, self.tetrahedra))
+
+    @cached_property
+    def altitudes(self) -> np.ndarray:
+        """Height of each corner over its opposite face [m], h_a = 1 / |grad N_a|, shape (num_tetrahedra, 4)."""
+        return _frozen(1 / np.linalg.norm(self.shape_gradients, axis=2))
+
+    @cached_property
+    def quality(self) -> np.ndarray:
+        """eta = 12 (3 V)^(2/3) / sum of the six squared edges, in (0, 1], 1: regular; shape (num_tetrahedra,)."""
+        squares = geometry.squared_edges(self.vertices, self.tetrahedra).sum(1)
+        return _frozen(12 * np.cbrt(3 * self.volumes) ** 2 / squares)
+
+    @cached_property
+    def centroids(self) -> np.ndarray:
+        """Mean of the four vertices [m], shape (num_tetrahedra, 3)."""
+        return _frozen(self.vertices[self.tetrahedra].mean(1))
+
+    @cached_property
+    def bounding_box(self) -> np.ndarray:
+        """Lowest and highest corner [m], shape (2, 3)."""
+        return _frozen(np.stack([self.vertices.min(0), self.vertices.max(0)]))
+
+    # Choosing vertices and tetrahedra
+
+    def vertex_indices(self, chosen) -> np.ndarray:
+        """Sorted indices from a set's name, several names, indices, or a Boolean mask over the vertices."""
+        return chosen_indices(chosen, self._vertex_sets, self.num_vertices, "vertex")
+
+    def tetrahedron_indices(self, chosen) -> np.ndarray:
+        """Sorted indices from a set's name, several names, indices, or a Boolean mask over the tetrahedra."""
+        return chosen_indices(chosen, self._tetrahedron_sets, self.num_tetrahedra, "tetrahedron")
+
+    def vertices_where(self, predicate: Callable) -> np.ndarray:
+        """Sorted indices of the vertices where a function of all positions is true: `lambda x: x[:, 0] < 0.1`."""
+        mask = np.asarray(predicate(self.vertices))
+        if mask.dtype.kind != "b":
+            raise ValueError(f"the predicate must return {self.num_vertices} Booleans, got dtype {mask.dtype}")
+        return self.vertex_indices(mask)
+
+    def with_vertex_set(self, name: str, chosen) -> "TetrahedralMesh":
+        """A mesh that has this vertex set too (or instead of one of that name); `chosen` as in `vertex_indices`."""
+        sets = {**self._vertex_sets, name: self.vertex_indices(chosen)}
+        return self._changed(_vertex_sets=checked_sets(sets, self.num_vertices, "vertex"))
+
+    def with_tetrahedron_set(self, name: str, chosen) -> "TetrahedralMesh":
+        """A mesh that has this tetrahedron set too (or instead of one of that name)."""
+        sets = {**self._tetrahedron_sets, name: self.tetrahedron_indices(chosen)}
+        return self._changed(_tetrahedron_sets=checked_sets(sets, self.num_tetrahedra, "tetrahedron"))
+
+    # Moving
+
+    def translated(self, offset) -> "TetrahedralMesh":
+        """Moved by offset [m], 3 numbers; sets are kept, as in `scaled` and `rotated`."""
+        return self._moved(self.vertices + geometry.three("offset", offset))
+
+    def scaled(self, factor, center=(0.0, 0.0, 0.0)) -> "TetrahedralMesh":
+        """Scaled about center [m] by a positive factor, or by three, one per axis. ValueError for factors <= 0."""
+        factors, center = geometry.three("factor", factor, one_will_do=True), geometry.three("center", center)
+        if np.any(factors <= 0):
+            raise ValueError(f"scale factors must be positive, got {factor!r}; a mirrored body would be inside-out")
+        new = self._moved((self.vertices - center) * factors + center)
+        if np.ptp(factors) > 0:
+            checks.warn_of_slivers(new)
+        return new
+
+    def rotated(self, rotation, angle: float | None = None, center=(0.0, 0.0, 0.0)) -> "TetrahedralMesh":
+        """Turned about center [m], by a rotation matrix (3, 3), or about an axis (3 numbers) by angle [rad].
+
+        Right-handed. ValueError for a matrix that is not orthogonal to 1e-9 or has det -1, and for a zero axis.
+        """
+        R, center = geometry.rotation_matrix(rotation, angle), geometry.three("center", center)
+        return self._moved((self.vertices - center) @ R.T + center)
+
+    # Describing
+
+    def describe(self) -> str:
+        """Counts, size, edge lengths, worst tetrahedron, sets; a few lines."""
+        low, high = self.bounding_box
+        lengths = np.linalg.norm(np.diff(self.vertices[self.edges], axis=1)[:, 0], axis=1)
+        worst, thin = int(np.argmin(self.quality)), int(np.argmin(self.altitudes.min(1)))
+        orphans = len(self._orphans())
+        return "\n".join(
+            [
+                f"TetrahedralMesh: {self.num_vertices} vertices"
+                + (f" ({orphans} unused)" if orphans else "")
+                + f", {self.num_tetrahedra} tetrahedra, {self.num_pieces} {'piece' if self.num_pieces == 1 else 'pieces'}",
+                f"surface: {len(self.surface_triangles)} triangles, {len(self.surface_vertices)} vertices",
+                "size: "
+                + " x ".join(f"{d:.6g}" for d in high - low)
+                + f" m, from ({_numbers(low)}) to ({_numbers(high)})",
+                f"volume: {self.volume:.6g} m^3",
+                f"edges: {lengths.min():.4g} to {lengths.max():.4g} m, mean {lengths.mean():.4g} m",
+                f"worst quality: {self.quality[worst]:.3g} in tetrahedron {worst}; mean {self.quality.mean():.3g} of 1",
+                f"smallest altitude: {self.altitudes[thin].min():.4g} m in tetrahedron {thin}",
+                f"vertex sets: {sizes(self._vertex_sets)}",
+                f"tetrahedron sets: {sizes(self._tetrahedron_sets)}",
+            ]
+        )
+
+    def __repr__(self) -> str:
+        size = " x ".join(f"{d:.4g}" for d in np.ptp(self.bounding_box, 0))
+        return f"TetrahedralMesh({self.num_vertices} vertices, {self.num_tetrahedra} tetrahedra, {size} m)"
+
+    @cached_property
+    def content_hash(self) -> str:
+        """SHA-256 of vertices and tetrahedra, 64 hexadecimal digits; sets do not count. The same on every machine."""
+        digest = hashlib.sha256(np.array([self.num_vertices, self.num_tetrahedra], "<i8").tobytes())
+        digest.update(self.vertices.astype("<f8").tobytes())
+        digest.update(self.tetrahedra.astype("<i8").tobytes())
+        return digest.hexdigest()
+
+    def _compute_rest_state(self) -> None:
+        """Does nothing: the rest state is always ready. The seeds call it."""
+
+    # Inside
+
+    def _determinants(self) -> tuple[np.ndarray, np.ndarray]:
+        longest = np.sqrt(geometry.squared_edges(self._vertices, self._tetrahedra).max(1))
+        return geometry.determinants(self._vertices, self._tetrahedra), longest
+
+    def _changed(self, **parts) -> "TetrahedralMesh":
+        new = copy.copy(self)
+        new.__dict__.update(parts)
+        return new
+
+    def _moved(self, vertices: np.ndarray) -> "TetrahedralMesh":
+        """The same connectivity at other positions; checked, and nothing cached that depends on positions."""
+        new = object.__new__(type(self))
+        new._vertices, new._tetrahedra = checks.checked_vertices(vertices), self._tetrahedra
+        det, longest = new._determinants()
+        checks.check_not_flat(new._vertices, new._tetrahedra, det, longest)
+        checks.oriented(new._tetrahedra, det, fix_orientation=False)
+        new._volumes, new._surface_triangles = det / 6, self._surface_triangles
+        new._vertex_sets, new._tetrahedron_sets = self._vertex_sets, self._tetrahedron_sets
+        new._freeze()
+        return new
+
+    def _freeze(self) -> None:
+        for array in (self._vertices, self._tetrahedra, self._volumes, self._surface_triangles):
+            _frozen(array)
+
+    def __setstate__(self, state: dict) -> None:
+        """Copies and unpickled meshes are read-only too (NumPy forgets the flag)."""
+        self.__dict__.update(state)
+        for value in (*state.values(), *self._vertex_sets.values(), *self._tetrahedron_sets.values()):
+            if isinstance(value, np.ndarray):
+                _frozen(value)
+
+    def _orphans(self) -> np.ndarray:
+        return np.nonzero(np.bincount(self.tetrahedra.ravel(), minlength=self.num_vertices) == 0)[0]
+
+
+def _frozen(array: np.ndarray) -> np.ndarray:
+    array.flags.writeable = False
+    return array
+
+
+def _numbers(values) -> str:
+    return ", ".join(f"{value:.6g}" for value in values)

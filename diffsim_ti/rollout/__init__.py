@@ -1,0 +1,5 @@
+"""n steps of a solver as one differentiable operation."""
+
+from diffsim_ti.rollout.rollout import Frames, Rollout
+
+__all__ = ["Frames", "Rollout"]

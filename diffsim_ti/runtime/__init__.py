@@ -1,0 +1,34 @@
+"""The one door to Taichi's runtime: start-up, precision, arrays that are freed, fields that are lent and returned.
+
+Nothing else in the package touches `taichi.lang.impl` or `taichi._lib`.
+"""
+
+from diffsim_ti.runtime.arrays import (
+    allocated_megabytes,
+    array,
+    fetch,
+    fetch_row,
+    fill,
+    full_shape,
+    to_numpy_dtype,
+    upload,
+    view,
+)
+from diffsim_ti.runtime.field_pool import FieldPool, current_tape, fields
+from diffsim_ti.runtime.language import Bundle, at, let, traced
+from diffsim_ti.runtime.launch import Launch, TensorLaunch
+from diffsim_ti.runtime.start import (
+    NUMPY,
+    PRECISIONS,
+    arch_name,
+    available_archs,
+    check_alive,
+    check_backend,
+    check_host_init,
+    check_precision,
+    init,
+    is_alive,
+    program,
+    runs_on_cpu,
+    set_precision,
+)

@@ -1,0 +1,110 @@
+"""Arrays on the device that are freed with their last reference, and copies between them and NumPy."""
+
+import weakref
+
+import numpy as np
+import taichi as ti
+from taichi.lang import impl
+
+from diffsim_ti.runtime.start import check_alive, is_alive, program, runs_on_cpu
+
+_allocated = {"bytes": 0}
+
+
+def allocated_megabytes() -> float:
+    """Memory that this package's arrays hold now [MB]."""
+    return _allocated["bytes"] / 1e6
+
+
+def _free(owner, handle, size) -> None:
+    _allocated["bytes"] -= size
+    if is_alive(owner):
+        if not runs_on_cpu():
+            ti.sync()  # an array that a kernel still uses would not be freed, in silence
+        owner().delete_ndarray(handle)
+
+
+class _Scalars(ti.ScalarNdarray):
+    """An array of numbers that is freed like one of vectors, by `_free`."""
+
+    def __del__(self):
+        pass  # Taichi's own frees whatever array of a later program has come to lie at the same address
+
+
+def array(dtype, *shape: int):
+    """A Taichi ndarray whose memory goes back when the last reference goes, and only to the program that gave it."""
+    owner = program()
+    shape = tuple(max(int(s), 1) for s in shape)  # Taichi has no empty arrays
+    out = _Scalars(dtype, shape) if isinstance(dtype, type(ti.f32)) else ti.ndarray(dtype, shape)
+    size = int(np.prod(full_shape(out))) * np.dtype(to_numpy_dtype(out.dtype)).itemsize
+    _allocated["bytes"] += size
+    out.owner = owner
+    weakref.finalize(out, _free, owner, out.arr, size)
+    return out
+
+
+def upload(data: np.ndarray, dtype) -> "ti.Ndarray":
+    """A new Taichi array of element type `dtype` (scalar or vector) holding `data`; three components fit into four."""
+    data = np.asarray(data)
+    shape = data.shape if isinstance(dtype, type(ti.f32)) else data.shape[:-1]
+    out = array(dtype, *shape)
+    fill(out, 0)
+    if data.size:
+        fill(out, data)
+    return out
+
+
+def full_shape(target) -> tuple:
+    """Shape of a Taichi array with its element's shape, as NumPy sees it."""
+    _check_owner(target)
+    return tuple(target.shape) + tuple(getattr(target, "element_shape", ()) or ())
+
+
+def _check_owner(target) -> None:
+    """The memory of an array of a dead program is gone, and so is what describes it."""
+    if hasattr(target, "owner"):
+        check_alive(target.owner)
+
+
+def view(target) -> "np.ndarray | None":
+    """A NumPy array over the memory of a Taichi array, no copy; None where that memory is not the host's."""
+    _check_owner(target)
+    host = getattr(target, "host_view", None)
+    if host is None and runs_on_cpu():
+        dtype, shape = to_numpy_dtype(target.dtype), full_shape(target)
+        kind = np.ctypeslib.as_ctypes_type(dtype) * int(np.prod(shape))
+        address = impl.get_runtime().prog.get_ndarray_data_ptr_as_int(target.arr)
+        host = target.host_view = np.ctypeslib.as_array(kind.from_address(address)).reshape(shape)
+    return host
+
+
+def fill(target, data) -> None:
+    """Copy numbers into a Taichi array; `data` broadcasts to its shape, and three components fit into four."""
+    data, shape = np.asarray(data), full_shape(target)
+    three = shape[-1] == 4 and data.ndim and data.shape[-1] == 3
+    host = view(target)
+    if host is not None:
+        (host[..., :3] if three else host)[...] = data
+        return
+    whole = np.zeros(shape, to_numpy_dtype(target.dtype))
+    (whole[..., :3] if three else whole)[...] = data
+    target.from_numpy(whole)
+
+
+def fetch(source) -> np.ndarray:
+    """A NumPy copy of a Taichi array; of four components the first three."""
+    host = view(source)
+    host = source.to_numpy() if host is None else host
+    is_vector = len(getattr(source, "element_shape", ()) or ()) == 1 and host.shape[-1] == 4
+    return host[..., :3].copy() if is_vector else host.copy()
+
+
+def fetch_row(source, k: int) -> np.ndarray:
+    """Row k of a Taichi array of vectors in float64; of four components the first three."""
+    host = view(source)
+    return (source.to_numpy() if host is None else host)[k, ..., :3].astype(np.float64)
+
+
+def to_numpy_dtype(dtype):
+    """NumPy's type for a Taichi scalar type."""
+    return {ti.f32: np.float32, ti.f64: np.float64, ti.i32: np.int32}[dtype]

@@ -1,0 +1,160 @@
+"""Start-up of Taichi, its backends and precisions, and whether the program that gave something still lives."""
+
+import contextlib
+import io
+import os
+import tempfile
+import warnings
+import weakref
+
+import numpy as np
+import taichi as ti
+from taichi._lib import core as _core
+from taichi.lang import impl
+
+PRECISIONS = {"f32": ti.f32, "f64": ti.f64}
+NUMPY = {"f32": np.float32, "f64": np.float64}
+_ARCHS = {"cpu": ti.cpu, "cuda": ti.cuda, "vulkan": ti.vulkan}
+_settings = {"precision": "f32"}
+
+
+def available_archs() -> list[str]:
+    """Names of the backends this machine and this Taichi build can run, always with "cpu"."""
+    ti.set_logging_level(ti.ERROR)  # a missing driver is an answer here, not a warning
+    return [name for name in _ARCHS if _has_arch(name)]
+
+
+def _has_arch(name: str) -> bool:
+    return {"cpu": lambda: True, "cuda": _core.with_cuda, "vulkan": _core.with_vulkan}[name]()
+
+
+def init(arch: str = "cpu", precision: str = "f32", threads: int | None = None, **options) -> None:
+    """Start Taichi for this process: a thin front of `ti.init`, and the only place that calls it.
+
+    arch: "cpu", "cuda" or "vulkan"; a backend that is not there is an error, never a fall-back.
+    precision: "f32" or "f64", what a Scene uses unless it says otherwise.
+    threads: CPU threads, default all.
+    options: handed to `ti.init`. `fast_math` stays False because it erases NaNs before anyone can see them, and
+    `default_fp` stays f64 so that both precisions can live in one process.
+
+    Used before `init`, the library calls `init()` itself: CPU, f32. A `ti.init` of the host program is respected.
+    Calling it again drops every array of earlier scenes; they say so when used.
+    Raises ValueError for an unknown name, RuntimeError for a backend that is not available.
+    """
+    if arch not in _ARCHS:
+        raise ValueError(f"arch must be one of {', '.join(_ARCHS)}, got {arch!r}")
+    check_precision(precision)
+    ti.set_logging_level(ti.ERROR)
+    if not _has_arch(arch):
+        raise RuntimeError(
+            f"the {arch} backend is not available here (available: {', '.join(available_archs())}); "
+            f"pass one of those to diffsim_ti.init, or install the driver that {arch} needs"
+        )
+    for name in ("default_fp", "fast_math"):
+        if name in options:
+            raise ValueError(f"{name} cannot be chosen: diffsim_ti needs default_fp=f64 and fast_math=False")
+    options.setdefault("log_level", ti.ERROR)
+    if not _can_write_cache(options.get("offline_cache_file_path") or os.environ.get("TI_OFFLINE_CACHE_FILE_PATH")):
+        # Taichi makes the folder even then, and crashes at exit if it cannot
+        options |= dict(offline_cache=False, offline_cache_file_path=tempfile.mkdtemp(prefix="ticache-"))
+        os.environ.pop("TI_OFFLINE_CACHE_FILE_PATH", None)
+    if threads is not None:
+        options["cpu_max_num_threads"] = int(threads)
+    set_precision(precision)
+    with contextlib.redirect_stdout(io.StringIO()):
+        ti.init(arch=_ARCHS[arch], default_fp=ti.f64, fast_math=False, enable_fallback=False, **options)
+
+
+def _can_write_cache(path: str | None) -> bool:
+    folder = os.path.expanduser(path or "~/.cache/taichi/ticache")
+    try:
+        os.makedirs(folder, exist_ok=True)
+    except OSError:
+        return False
+    return os.access(folder, os.W_OK)
+
+
+def set_precision(precision: str) -> None:
+    """Set the precision, "f32" or "f64", of scenes that do not name one."""
+    _settings["precision"] = check_precision(precision)
+
+
+def check_precision(precision: str | None) -> str:
+    """Return a valid precision name; None means the process-wide default."""
+    if precision is None:
+        return _settings["precision"]
+    if precision not in PRECISIONS:
+        raise ValueError(f"precision must be 'f32' or 'f64', got {precision!r}")
+    return precision
+
+
+def _after_fork() -> None:
+    _settings["forked"] = impl.get_runtime().prog is not None
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)
+
+
+def refuse_fork() -> None:
+    if _settings.get("forked"):
+        raise RuntimeError(
+            "this process was forked after Taichi had started, and Taichi's threads do not survive a fork: start workers "
+            "with multiprocessing.get_context('spawn'), or DataLoader(..., multiprocessing_context='spawn')"
+        )
+
+
+def program() -> weakref.ref:
+    """The live Taichi program; starts the stated default (CPU, f32) if nothing did.
+
+    A weak reference: a program that is still held would outlive `ti.init`, and at its end free memory of the next one.
+    """
+    refuse_fork()
+    if impl.get_runtime().prog is None:
+        init()
+    return weakref.ref(impl.get_runtime().prog)
+
+
+def is_alive(owner: weakref.ref) -> bool:
+    """Whether the program `owner` is the one that runs."""
+    return owner() is not None and owner() is impl.get_runtime().prog
+
+
+def check_host_init() -> None:
+    """Warn once about a host program's `ti.init` that weakens the library's promises."""
+    program()
+    config = impl.current_cfg()
+    if config.fast_math and not _settings.get("warned"):
+        _settings["warned"] = True
+        warnings.warn(
+            "ti.init was called with fast_math=True, which can erase NaNs before they are seen; "
+            "use diffsim_ti.init(), or ti.init(fast_math=False, default_fp=ti.f64)",
+            stacklevel=3,
+        )
+
+
+def check_alive(owner: weakref.ref) -> None:
+    """Raise if `ti.init` was called after the program `owner`, or if this process was forked since."""
+    refuse_fork()
+    if not is_alive(owner):
+        raise RuntimeError("ti.init was called again, which destroys all Taichi data: build the scene and solver anew")
+
+
+def arch_name() -> str:
+    """Name of the running backend."""
+    program()
+    arch = impl.current_cfg().arch
+    return next((name for name, value in _ARCHS.items() if value == arch), "cpu")
+
+
+def runs_on_cpu() -> bool:
+    return arch_name() == "cpu"
+
+
+def check_backend(precision: str) -> None:
+    """Raise ValueError if the running backend cannot compute in this precision."""
+    if arch_name() == "vulkan" and precision == "f64":
+        raise ValueError(
+            "Vulkan has no float64 logarithm, which energies and contacts need: use precision='f32' there, "
+            "or diffsim_ti.init('cpu') or ('cuda') for float64"
+        )

@@ -1,0 +1,1 @@
+"""Explicit solvers: a chain of kicks and drifts, its tangent and its adjoint."""

@@ -1,0 +1,1 @@
+"""Implicit solvers: minima of incremental potentials, their tangent and their adjoint."""

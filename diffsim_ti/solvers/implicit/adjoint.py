@@ -1,0 +1,306 @@
+"""The reverse sweep and the tangent of implicit passes: one linear solve per pass with the exact Hessian.
+
+A pass solves R(u*, theta) = 0 with -dR/du = A = c M + d2E/du2, which is symmetric. So du* = A^-1 dR for a change of
+theta, and for the adjoint p of u* the adjoint of theta is lambda . dR/dtheta with A lambda = p.
+"""
+
+import numpy as np
+
+from diffsim_ti import runtime
+from diffsim_ti.inputs import Derived
+from diffsim_ti.solvers.implicit.linear import Operator, solve_symmetric
+from diffsim_ti.solvers.implicit.potential_kernels import potential_kernels
+from diffsim_ti.state.arrays import from_blocks, to_blocks
+
+
+class _Passes:
+    """What tangent and reverse sweep share: a recorded pass with everything that its equation names."""
+
+    def __init__(self, workspace):
+        self.ws = workspace
+        self.eps = np.finfo(runtime.NUMPY[workspace.scene.precision]).eps
+        self.tolerance = max(workspace.solver.tolerance, 20 * self.eps)
+
+    def open(self, j: int, base: int) -> None:
+        """Take pass j from the record, its first slot being the state before pass `base`."""
+        ws = self.ws
+        self.u, self.v, self.before = ws.read(ws.record, j - base)
+        self.u_next = ws.read(ws.record, j - base + 1)[0]
+        self.stage = stage = ws.solver.stage(ws.rate, self.before is None)
+        self.x, self.y = ws.inertial(stage, self.u, self.v, self.before)
+        self.u_star = (self.u_next - (1 - stage.c0) * self.u) / stage.c0
+        self.mass = stage.inertia * ws.mass
+        ws.begin(j, stage, self.u, self.x)
+        ws.potential.place(self.u_star)
+        self.operator = Operator(ws.potential, self.mass, ws.free)
+        self._preconditioner = None
+
+    def solve(self, b: np.ndarray) -> np.ndarray:
+        """A^-1 b on the free vertices, zero elsewhere."""
+        b = b * self.ws.free
+        if not b.any():
+            return b
+        if self._preconditioner is None:
+            self._preconditioner, _ = self.ws.preconditioner(self.mass)
+            self._preconditioner.update(self.u_star)
+        return solve_symmetric(self.operator, b, self._preconditioner, self.tolerance, self.eps, 20 * len(b))
+
+    def weight(self, share: float) -> np.ndarray:
+        """dR/dm of each vertex [m/s^2]: gravity less the acceleration."""
+        features, values = self.ws.arrays.features(), self.ws.arrays.values
+        out = -self.stage.inertia * (self.u_star - self.x - self.stage.gamma * self.y)
+        if features.gravity >= 0:
+            out = out + share * values.parameters[features.gravity :][:3]
+        return out
+
+    @property
+    def v_star(self) -> np.ndarray:
+        return (self.u_star - self.x) / self.stage.gamma
+
+
+class ImplicitAdjoint(_Passes):
+    """Adjoints of one run, in float64 on the host, except those of tetrahedra.
+
+    density, shape: also the adjoints by vertex masses and by the rest shape, which cost extra.
+    """
+
+    def __init__(self, workspace, density: bool, shape: bool):
+        super().__init__(workspace)
+        a = workspace.arrays
+        self.features = a.features(density, shape)
+        kernel = potential_kernels(a.law, self.features, workspace.parallel, a.in_lanes).vjp
+        n, blocks = a.num_vertices, a.num_blocks
+        self.coefficients = runtime.array(a.lanes, a.num_coefficients * blocks)
+        self.sums = runtime.array(a.fp, self.features.sums().total, n)
+        self.gradients = runtime.array(a.lanes, 9 * blocks if shape else 1)
+        self.volumes = runtime.array(a.lanes, blocks if shape else 1)
+        p = self.potential = workspace.potential
+        contacts = len(a.features().contacts)
+        self.lag = runtime.array(a.vector, 2, n if p.rubs else 1)
+        self.walls = runtime.array(a.vector, 3 * contacts, n if contacts else 1)
+        self._vjp = runtime.Launch(
+            kernel,
+            *p.common(),
+            a.corner,
+            p.u,
+            p.w,
+            p.y,
+            self.coefficients,
+            self.gradients,
+            self.volumes,
+            self.sums,
+            self.lag,
+            self.walls,
+            vectorized=a.in_lanes,
+        )
+
+    def fits(self, workspace) -> bool:
+        """Whether kernels and arrays are still those of the run."""
+        same = self.features == workspace.arrays.features(self.features.density, self.features.shape)
+        return same and workspace.potential is self.potential
+
+    def start(self, positions_adj: np.ndarray, velocities_adj: np.ndarray, last_frame_is_input: bool) -> None:
+        """Set the adjoints of the frames, shape (frames, n, 3), and clear the rest."""
+        for target in (self.coefficients, self.sums, self.gradients, self.volumes):
+            runtime.fill(target, 0)
+        if self.ws.pairs:
+            self.ws.pairs.clear_sums()
+        a = self.ws.arrays
+        self.frames = tuple(np.asarray(x, np.float64) for x in (positions_adj, velocities_adj))
+        self.p, self.q = self.frames[0][-1].copy(), self.frames[1][-1].copy()
+        self.pending = [np.zeros_like(self.p), np.zeros_like(self.p)]
+        self.mass_adj, self.gravity, self.rate = np.zeros(len(self.p)), np.zeros(3), 0.0
+        self.forces = None if a.values.forces is None else np.zeros_like(a.values.forces)
+        self.motion = None if a.values.motion is None else np.zeros_like(a.values.motion)
+        self.path = None if a.values.path is None else np.zeros_like(a.values.path)
+        self.anchor = np.zeros((len(a.fixed), 3))
+
+    def reverse(self, base: int, last: int, num_passes: int, save_every: int, stop: int) -> None:
+        """Mirror passes last - 1 .. stop; slot 0 of the record holds the state before pass `base`."""
+        for j in range(last - 1, stop - 1, -1):
+            self.open(j, base)
+            self._mirror(j)
+            if save_every and j % save_every == 0 and j // save_every < len(self.frames[0]) - 1:
+                self.p += self.frames[0][j // save_every]
+                self.q += self.frames[1][j // save_every]
+
+    def _mirror(self, j: int) -> None:
+        ws, s, p, q, fixed = self.ws, self.stage, self.p, self.q, self.ws.arrays.fixed
+        if s.static:
+            q = np.zeros_like(q)
+        p_free, q_free = p * ws.free, q * ws.free
+        # the equation
+        by_star = self.solve(s.c0 * p_free + s.e0 / s.gamma * q_free)
+        runtime.fill(ws.potential.w, by_star[None])
+        for target in (self.lag, self.walls):
+            runtime.fill(target, 0)
+        if ws.pairs:
+            ws.pairs.vjp(ws.potential.u, 0, ws.potential.w, ws.arrays.corner)
+        self._vjp(ws.arrays.num_items, ws.arrays.num_vertices, ws.potential.per_gamma)
+        reaction = runtime.fetch(ws.potential.y)[0].astype(np.float64)
+        share = ws.load_share(j, s)
+        self.gravity += share * (ws.mass * by_star).sum(0)
+        self.mass_adj += (by_star * self.weight(share)).sum(1)
+        if self.forces is not None:
+            row = j // ws.solver.substeps if len(self.forces) > 1 else 0
+            self.forces[row] += share * by_star[ws.force_vertices()]
+        # where inertia starts from
+        inertial = self.mass * by_star
+        x_adj = inertial - s.e0 / s.gamma * q_free
+        by_lag = np.zeros_like(p)
+        if ws.potential.rubs:
+            by_lag, by_x = runtime.fetch(self.lag).astype(np.float64)
+            x_adj = x_adj + by_x
+        if self.path is not None:
+            ws.walls_vjp(runtime.fetch(self.walls).astype(np.float64).sum(1), j, s, self.path)
+        y_adj = s.gamma * inertial + s.e1 * q_free
+        db0, db1, de0, de1 = s.by_rate
+        self.rate += db0 * (y_adj * self.v).sum() + de0 * (q_free * self.v_star).sum() + de1 * (q_free * self.y).sum()
+        if self.before is not None:
+            self.rate += db1 * (y_adj * self.before[1]).sum()
+        u_adj = s.a0 * x_adj + (1 - s.c0) * p_free + by_lag
+        v_adj = s.b0 * y_adj
+        # prescribed places
+        if len(fixed):
+            self._mirror_fixed(j, p, q, reaction, u_adj, v_adj)
+        self.p, self.q = u_adj + self.pending[0], v_adj + self.pending[1]
+        self.pending = [s.a1 * x_adj, s.b1 * y_adj] if self.before is not None else [0 * x_adj, 0 * y_adj]
+
+    def _mirror_fixed(self, j, p, q, reaction, u_adj, v_adj) -> None:
+        fixed, s = self.ws.arrays.fixed, self.stage
+        pull = reaction[fixed]
+        if self.motion is None:
+            u_adj[fixed], v_adj[fixed] = p[fixed] + pull, q[fixed]
+            return
+        r, k = divmod(j, self.ws.solver.substeps)
+        fraction, per_dt = (k + 1) / self.ws.solver.substeps, 1 / self.ws.solver.dt
+        place = p[fixed] + pull / s.c0
+        u_adj[fixed], v_adj[fixed] = (1 - 1 / s.c0) * pull, 0.0
+        self.motion[r] += (1 - fraction) * place - per_dt * q[fixed]
+        self.motion[r + 1] += fraction * place + per_dt * q[fixed]
+        self.anchor += place
+
+    def finish(self) -> None:
+        """The sweep leaves nothing undone."""
+
+    def norm(self) -> tuple[float, float]:
+        """Euclidean norms of the adjoints of displacement and velocity where the sweep stands."""
+        return float(np.linalg.norm(self.p)), float(np.linalg.norm(self.q))
+
+    def scale(self, factor: float) -> None:
+        """Multiply the running adjoint."""
+        self.p, self.q, self.pending = factor * self.p, factor * self.q, [factor * x for x in self.pending]
+
+    def collect(self) -> Derived:
+        """Adjoints of what kernels read, in float64, at the start of the run."""
+        a, rows = self.ws.arrays, self.features.sums()
+        sums, out = runtime.fetch(self.sums).astype(np.float64), a.values.zeros()
+        out.coefficients = from_blocks(runtime.fetch(self.coefficients), a.place, a.num_coefficients)
+        out.displacement, out.velocity, out.mass = self.p, self.q, self.mass_adj
+        out.parameters[: self.features.num_parameters] = sums[rows.of("parameters")].sum(1)
+        if self.features.gravity >= 0:
+            out.parameters[self.features.gravity :][:3] = self.gravity
+        if self.features.drag >= 0:
+            out.parameters[self.features.drag] = self.rate
+        out.rest = self.frames[0].sum(0)
+        if self.ws.pairs:
+            out.parameters[a.parameters_of_self_contact], by_pairs = self.ws.pairs.collect()
+            out.rest = out.rest + by_pairs
+        if self.features.shape:
+            out.rest = out.rest + sums[rows.of("rest")].T
+            out.gradients = from_blocks(runtime.fetch(self.gradients), a.place, 9).reshape(-1, 3, 3)
+            out.volumes = from_blocks(runtime.fetch(self.volumes), a.place, 1)[:, 0]
+        out.forces, out.motion, out.path = self.forces, self.motion, self.path
+        if self.motion is not None:
+            out.displacement[a.fixed] += self.anchor
+        return out
+
+
+class ImplicitTangent(_Passes):
+    """The tangent of a run: changes of the state for changes of everything that the equation names."""
+
+    def __init__(self, workspace, dots: Derived):
+        super().__init__(workspace)
+        a, self.dots = workspace.arrays, dots
+        p = workspace.potential
+        self.du, self.dv, self.before_dots = dots.displacement.copy(), dots.velocity.copy(), None
+        kernel = potential_kernels(a.law, a.features(), workspace.parallel, a.in_lanes).jvp
+        self._arrays = (
+            runtime.upload(a.coefficient_blocks(dots.coefficients), a.lanes),
+            runtime.upload(dots.parameters, a.fp),
+            runtime.upload(dots.rest, a.vector),
+            runtime.upload(to_blocks(dots.gradients, a.order), a.lanes),
+            runtime.upload(a.volume_blocks(dots.volumes), a.lanes),
+            runtime.array(a.vector, *p.lag.shape),
+            runtime.array(a.vector, *p.walls.shape),
+        )
+        self._jvp = runtime.Launch(kernel, *p.common(), a.corner, p.u, p.w, p.y, *self._arrays, vectorized=a.in_lanes)
+        self.rate_dot = float(dots.parameters[a.features().drag]) if a.features().drag >= 0 else 0.0
+        self.frames = [], []
+
+    def advance(self, first: int, last: int, num_passes: int, save_every: int) -> None:
+        """Tangent of passes first .. last - 1, recorded from slot 0."""
+        for j in range(first, last):
+            if j % save_every == 0:
+                self.save_frame(j // save_every)
+            self.open(j, first)
+            self._pass(j)
+
+    def _pass(self, j: int) -> None:
+        ws, s, dots, a = self.ws, self.stage, self.dots, self.ws.arrays
+        db0, db1, de0, de1 = (x * self.rate_dot for x in s.by_rate)
+        dx, dy = s.a0 * self.du, s.b0 * self.dv + db0 * self.v
+        if self.before is not None:
+            dx = dx + s.a1 * self.before_dots[0]
+            dy = dy + s.b1 * self.before_dots[1] + db1 * self.before[1]
+        place, speed = self._prescribed(j)
+        held = np.zeros_like(self.du)
+        held[a.fixed] = self.du[a.fixed] if place is None else self.du[a.fixed] + (place - self.du[a.fixed]) / s.c0
+        runtime.fill(ws.potential.w, held[None])
+        if ws.potential.rubs:
+            runtime.fill(self._arrays[-2], np.stack([self.du, dx]))
+        if dots.path is not None:
+            runtime.fill(self._arrays[-1], ws.walls(dots.path, j, s))
+        if ws.pairs:
+            ws.pairs.product(
+                ws.potential.u,
+                0,
+                ws.potential.w,
+                a.corner,
+                self._arrays[2],
+                dots.parameters[a.parameters_of_self_contact],
+            )
+        self._jvp(a.num_items, a.num_vertices, ws.potential.per_gamma)
+        share = ws.load_share(j, s)
+        dR = runtime.fetch(ws.potential.y)[0].astype(np.float64) + dots.mass[:, None] * self.weight(share)
+        if a.features().gravity >= 0:
+            dR += share * ws.mass * dots.parameters[a.features().gravity :][:3]
+        if dots.forces is not None:
+            dR[ws.force_vertices()] += share * dots.forces[j // ws.solver.substeps if len(dots.forces) > 1 else 0]
+        d_star = held + self.solve(dR + self.mass * (dx + s.gamma * dy))
+        before = self.du, self.dv
+        self.du = s.c0 * d_star + (1 - s.c0) * self.du
+        self.dv = s.e0 * (d_star - dx) / s.gamma + s.e1 * dy + de0 * self.v_star + de1 * self.y
+        self.du[a.fixed], self.dv[a.fixed] = (x[a.fixed] for x in before) if place is None else (place, speed)
+        if s.static:
+            self.dv = np.zeros_like(self.dv)
+        self.before_dots = before
+
+    def _prescribed(self, j: int):
+        motion = self.dots.motion
+        if motion is None:
+            return None, None
+        r, k = divmod(j, self.ws.solver.substeps)
+        change = motion[r + 1] - motion[r]
+        anchor = self.dots.displacement[self.ws.arrays.fixed]
+        return anchor + motion[r] + (k + 1) / self.ws.solver.substeps * change, change / self.ws.solver.dt
+
+    def save_frame(self, frame: int) -> None:
+        """Copy the current tangent to a frame."""
+        for saved, now in zip(self.frames, (self.du, self.dv)):
+            saved.append(now.copy())
+
+    def collect(self) -> tuple[np.ndarray, np.ndarray]:
+        """Changes of the frames' positions and velocities."""
+        du, dv = (np.stack(x) for x in self.frames)
+        return du + self.dots.rest, dv

@@ -1,0 +1,194 @@
+"""Newton's method on the incremental potential, of which an implicit step is a minimum.
+
+    Phi(u) = c/2 sum_i m_i |u_i - a_i|^2 + E(u) - sum_i b_i . u_i,    R = -dPhi/du
+
+a: where inertia alone would lead [m]; b: dead loads [N]; c = 1 / gamma^2 [1/s^2], zero for statics. Directions come from
+conjugate gradients on the exact Hessian. Where that is met to be indefinite they stop with what they have (buckling needs
+that), or, if that is early, each tetrahedron's d2psi/dF2 is made positive definite and the direction computed anew (crushed
+starts need that).
+Kane, Marsden, Ortiz, West 2000, doi:10.1002/1097-0207(20001210)49:10<1295::AID-NME993>3.0.CO;2-W.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from diffsim_ti.solvers.implicit.linear import NotConverged, Operator, conjugate_gradients
+from diffsim_ti.solvers.implicit.projection import Projection
+
+LONGER = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # steps along an indefinite direction that are doubled while Phi falls
+
+
+@dataclass
+class NewtonReport:
+    """What a solve took: relative residual before each round, products of the Hessian, rounds with an indefinite
+    Hessian, saddles that were left, evaluations of the energy."""
+
+    residuals: list = field(default_factory=list)
+    products: int = 0
+    indefinite: int = 0
+    saddles: int = 0
+    trials: int = 0
+
+
+class Newton:
+    """Minimises Phi from a start. Every iterate keeps gaps > 0 where they were, and surfaces never pass through each other
+    on the way. If the start has no J <= 0, J falls by a
+    factor of ten at most, so that the energy's own resistance is felt in time; only where no share of a direction down to
+    `insist` lowers Phi so (a law that is finite at J = 0, pressed beyond it) may it fall further.
+
+    tolerance: |R| over the size of the forces that meet at the vertices (corner by corner, so that it does not vanish
+    at equilibrium), loads and inertia, the largest of the rounds. Beyond it goes only what rounding allows.
+    """
+
+    insist = 2.0**-10
+    trusted = 10  # iterations after which the direction before an indefinite one is good enough
+    shortest = 2.0**-40  # fraction of a direction below which a line search gives up
+
+    def __init__(
+        self, potential, free: np.ndarray, gaps, preconditioners, tolerance: float, max_iterations: int, eps: float
+    ):
+        self.potential, self.free, self.gaps, self.preconditioners = potential, free, gaps, preconditioners
+        self.tolerance, self.max_iterations, self.eps = tolerance, max_iterations, eps
+        self.reach = 0.01 * float(np.ptp(potential.arrays.values.rest, 0).max())  # of the first step away from a saddle
+        self.report = NewtonReport()
+
+    def solve(
+        self, start: np.ndarray, mass: np.ndarray, inertial: np.ndarray, loads: np.ndarray, leave_saddles: bool = False
+    ) -> np.ndarray:
+        """The minimiser; mass = c m, shape (num_vertices, 1). The potential stays placed there.
+
+        leave_saddles: where Phi is stationary but falls in some direction (a column beyond its buckling load), go on
+        that way; `report.saddles` counts it.
+
+        Raises NotConverged.
+        """
+        self.report = report = NewtonReport()
+        self.mass, self.inertial, self.loads = mass, inertial, loads
+        u = self.potential.place(start)
+        self.preconditioner, self.stiffness = self.preconditioners(mass)
+        E, size = self._evaluate(u), 0.0
+        self.upright = bool(np.all(E[2] > 0))
+        for _ in range(self.max_iterations):
+            R, now = self._residual(u)
+            size = max(size, now)
+            floor = 4 * self.eps * np.linalg.norm(self._rigidity() * np.abs(u).max(1, keepdims=True) * self.free)
+            norm = np.linalg.norm(R)
+            report.residuals.append(norm / size if size > 0 else 0.0)
+            if norm <= self.tolerance * size + floor:
+                downhill = self._downhill() if leave_saddles else None
+                if downhill is None:
+                    return u
+                report.saddles += 1
+                moved = self._search(u, *downhill, E)
+                if moved is None:
+                    return u
+                u, E = moved
+                continue
+            if not np.isfinite(norm):
+                break
+            forcing = min(0.1, np.sqrt(norm / size), max(1e-3, 0.5 * self.tolerance * size / norm))
+            self.preconditioner.update(u)
+            direction = self._direction(R, max(forcing, 10 * self.eps))
+            moved = self._search(u, direction, R, E)
+            if moved is None:
+                break
+            u, E = moved
+        if norm <= 100 * floor:  # rounding has the last word
+            return u
+        history = ", ".join(f"{r:.2g}" for r in report.residuals[-8:])
+        raise NotConverged(
+            f"Newton's method stopped after {len(report.residuals)} rounds at a relative residual of "
+            f"{report.residuals[-1]:.2g} (asked for {self.tolerance:g}; the last ones: {history}): take smaller steps, more "
+            "load steps, or a looser tolerance",
+            report.residuals,
+        )
+
+    def _rigidity(self) -> np.ndarray:
+        """How much force a small displacement makes at each vertex [N/m], contact and friction included."""
+        contact = self.potential.contact_blocks()
+        return self.stiffness if contact is None else self.stiffness + np.abs(contact).sum((1, 2))[:, None]
+
+    def operator(self) -> Operator:
+        """The Hessian of Phi where the potential stands."""
+        return Operator(self.potential, self.mass, self.free)
+
+    def _residual(self, u):
+        f, sizes = self.potential.forces()
+        inertia = self.mass * (u - self.inertial)
+        size = np.sqrt((sizes**2).sum() + (self.loads**2).sum() + (inertia**2 * self.free).sum())
+        return (f + self.loads - inertia) * self.free, size
+
+    def _direction(self, R, forcing):
+        A = self.operator()
+        limit = 10 * len(R)
+        d, _, count, negative = conjugate_gradients(A, R, self.preconditioner, forcing, limit, self.eps)
+        self._indefinite = negative is not None
+        if negative is not None:
+            self.report.indefinite += 1
+            if count <= self.trusted:
+                A.correction = Projection(self.potential)
+                d, *_ = conjugate_gradients(A, R, self.preconditioner, forcing, limit, self.eps)
+        self.report.products += A.products
+        return d
+
+    def _downhill(self):
+        """A direction of negative curvature, found by solving for something random, and a slope for its search."""
+        probe = np.random.default_rng(0).standard_normal(self.free.shape[:1] + (3,)) * self.free
+        A = self.operator()
+        self.preconditioner.update(self.potential.held_at)
+        _, _, _, p = conjugate_gradients(A, probe, self.preconditioner, 1e-3, 10 * len(probe), self.eps)
+        self.report.products += A.products
+        if p is None:
+            return None
+        p, self._indefinite = p * (self.reach / np.abs(p).max()), True
+        return p, -p * float((p * A(p)).sum()) / float((p * p).sum())
+
+    def _evaluate(self, u):
+        E, parts, J = self.potential.energy()
+        self.report.trials += 1
+        return E, parts, J, self.gaps(u)
+
+    def _search(self, u, d, R, before):
+        """(u + t d, what was evaluated there) for the first t of 1, 1/2, ... that is admissible and lower; None if there is
+        none. Along an indefinite direction t = 2, 4, ... are tried while they are lower still: its length says little."""
+        slope, best = float((R * d).sum()), None
+        longest = self._safe_share(u, d)
+        fraction = min(1.0, longest)
+        while fraction > self.shortest:
+            trial, after, change, noise = self._try(u, fraction * d, before, self.upright and fraction > self.insist)
+            drowned = abs(slope) * fraction <= noise >= change
+            if change <= -1e-4 * fraction * slope or (drowned and self._falls(trial, d, slope)):
+                best = trial, after, change
+                break
+            fraction *= 0.5
+        while best is not None and self._indefinite and fraction in LONGER and 2 * fraction <= longest:
+            fraction *= 2
+            trial, after, change, _ = self._try(u, fraction * d, before, self.upright)
+            if not change < best[2]:
+                self.potential.place(best[0])
+                break
+            best = trial, after, change
+        return None if best is None else best[:2]
+
+    def _safe_share(self, u, d) -> float:
+        """The longest step along d in which surfaces stay apart."""
+        pairs, most = self.potential.pairs, 2 * LONGER[-1] if self._indefinite else 1.0
+        return pairs.safe_share(u, d, most) if pairs else most
+
+    def _falls(self, u, d, slope) -> bool:
+        """Whether Phi does not rise again at u as steeply as it fell before: what is left to ask where its change drowns in
+        rounding. Hager, Zhang 2005, A New Conjugate Gradient Method with Guaranteed Descent, doi:10.1137/030601880."""
+        R, _ = self._residual(u)
+        return float((R * d).sum()) >= -0.8 * slope
+
+    def _try(self, u, step, before, upright):
+        """(displacement, what is there, change of Phi, rounding of that change); infinite change if not admissible."""
+        trial = self.potential.place(u + step)
+        E, parts, J, gaps = before
+        after, step = self._evaluate(trial), trial - u
+        change = after[0] - E + float((step * (self.mass * (u + 0.5 * step - self.inertial) - self.loads)).sum())
+        if np.any((gaps > 0) & ~(after[3] > 0)) or (upright and np.any(~(after[2] > 0.1 * J))):
+            change = np.inf
+        rounding = parts + after[1] + float((self.stiffness * trial**2).sum())  # of strains that come from large u
+        return trial, after, change, 10 * self.eps * rounding

@@ -1,0 +1,1 @@
+"""A scene on the device: its numbers, the states of a run, and what watches them."""

@@ -1,0 +1,194 @@
+"""How large a step may be: a bound by elements, the tight limit by Lanczos, and a watch during the run."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import taichi as ti
+
+from diffsim_ti import runtime
+from diffsim_ti.elements.patched_tetrahedron import functions_of
+from diffsim_ti.mesh.patches import volume_patches
+from diffsim_ti.runtime import Bundle
+
+
+@dataclass(frozen=True)
+class StepLimit:
+    """Largest stable explicit step [s], the tetrahedron that sets it, and how it was found."""
+
+    dt: float
+    tetrahedron: int
+    method: str
+
+    def __str__(self) -> str:
+        return f"{self.dt:.4g} s ({self.method}, set by tetrahedron {self.tetrahedron})"
+
+
+def element_limit(scene, values: dict | None = None) -> StepLimit:
+    """A step that is safe at rest, from each tetrahedron by itself, without contact.
+
+        omega^2 <= (4 / rho) [max(lam, 0) sum_a |grad N_a|^2 + 2 mu lambda_max(sum_a grad N_a (x) grad N_a)]
+        dt = 2 / omega
+
+    mu, lam are the law's small-strain moduli; with volume="patches" lam is the patch's mean. The eigenvalues of the
+    assembled system never exceed the largest of its elements (Hughes, The Finite Element Method, 9.1); lumped vertex masses
+    are at least those of the element.
+    """
+    values, material = scene.inputs.values if values is None else values, scene.material
+    mu, lam = material.lame({name: values[name] for name in material.inputs})
+    derived = scene.inputs.derive(values)
+    B = derived.gradients
+    if scene.volume == "patches" and np.ndim(lam):
+        patches = volume_patches(scene.mesh)
+        means = np.bincount(patches, lam * derived.volumes) / np.bincount(patches, derived.volumes)
+        lam = means[patches]
+    N = np.concatenate([-B.sum(1, keepdims=True), B], 1)
+    largest = np.linalg.eigvalsh(np.einsum("eai,eaj->eij", N, N))[:, -1]
+    omega2 = 4 / values["density"] * (np.maximum(lam, 0) * (N**2).sum((1, 2)) + 2 * mu * largest)
+    worst = int(np.argmax(omega2))
+    return StepLimit(float(2 / np.sqrt(omega2[worst])), worst, "element bound")
+
+
+@lru_cache(maxsize=None)
+def stiffness_kernel(law, features, parallel: bool, lanes: bool):
+    """y = df/du . w at displacement u: elastic and contact forces."""
+    el = functions_of(law, features.uniform, lanes)
+    t, contacts = el.types, features.contacts
+
+    @ti.kernel
+    def stiffness_product(
+        tets: t.ints,
+        gradients: t.blocks,
+        volumes: t.blocks,
+        coefficients: t.blocks,
+        start: t.ints,
+        corner_of: t.ints,
+        inverse_mass: t.scalars,
+        parameters: t.scalars,
+        rest: t.vectors,
+        surface: t.ints,
+        offsets: t.vectors,
+        corner: t.vectors,
+        u: t.vectors2,
+        v: t.vectors2,
+        w: t.vectors2,
+        y: t.vectors2,
+        num_items: ti.i32,
+        num_vertices: ti.i32,
+    ):
+        scene = Bundle(
+            tets=tets, gradients=gradients, volumes=volumes, coefficients=coefficients, start=start, corner_of=corner_of
+        )
+        ti.loop_config(serialize=not parallel)
+        for e in range(num_items):
+            el.stiffness(e, scene, u, 0, w, corner)
+        ti.loop_config(serialize=not parallel)
+        for i in range(num_vertices):
+            f = el.gather(i, scene, corner)
+            if ti.static(len(contacts) > 0):
+                if surface[i] > 0:
+                    for k in ti.static(range(len(contacts))):
+                        X = rest[i] - offsets[k]
+                        f += contacts[k].force_jvp(parameters, X, u[0, i], v[0, i], w[0, i], t.vector(0))
+            y[0, i] = f
+
+    return stiffness_product
+
+
+class Stiffness:
+    """Products of M^-1/2 (-df/du) M^-1/2 on the free vertices, at the current state of a workspace."""
+
+    def __init__(self, workspace):
+        self.ws = workspace
+        a = workspace.arrays
+        self.w, self.y = runtime.array(a.vector, 1, a.num_vertices), runtime.array(a.vector, 1, a.num_vertices)
+        kernel = stiffness_kernel(a.law, a.features(), workspace.parallel, a.in_lanes)
+        state = workspace.state
+        arrays = (*a.topology(), a.offsets, a.corner, state.u, state.v, self.w, self.y)
+        self._multiply = runtime.Launch(kernel, *arrays, vectorized=a.in_lanes)
+        self.vector, self._random = None, np.random.default_rng(1)
+
+    @property
+    def root(self) -> np.ndarray:
+        """Roots of the inverse masses as they are now, shape (num_vertices, 1)."""
+        return np.sqrt(runtime.fetch(self.ws.arrays.inverse_mass).astype(np.float64))[:, None]
+
+    def product(self, x: np.ndarray) -> np.ndarray:
+        """The product with x, shape (num_vertices, 3), float64."""
+        root = self.root
+        w = root * x
+        scale = np.abs(w).max() or 1.0  # f32 keeps its digits whatever the masses
+        runtime.fill(self.w, (w / scale)[None])
+        if self.ws.pairs:
+            self.ws.pairs.ensure(self.ws.state.u, 0)
+            self.ws.pairs.product(self.ws.state.u, 0, self.w, self.ws.arrays.corner)
+        self._multiply(self.ws.arrays.num_items, self.ws.arrays.num_vertices)
+        return -root * runtime.fetch(self.y)[0].astype(np.float64) * scale
+
+    def largest(self, tolerance: float = 1e-3) -> tuple[float, float]:
+        """(largest eigenvalue omega^2 [1/s^2], residual bound) by Lanczos; keeps the vector for `watch`.
+
+        Some eigenvalue lies within the residual of the Ritz value (Parlett, The Symmetric Eigenvalue Problem, 4.5).
+        """
+        from scipy.sparse.linalg import LinearOperator, eigsh
+
+        n = self.root.size
+        start = np.random.default_rng(0).standard_normal((n, 3)) * (self.root > 0)
+        if not start.any():
+            return 0.0, 0.0
+        with np.errstate(over="ignore", invalid="ignore"):
+            if not np.isfinite(np.linalg.norm(self.product(start))):
+                raise FloatingPointError("the stiffness of this state is not finite")
+        operator = LinearOperator((3 * n, 3 * n), lambda x: self.product(x.reshape(-1, 3)).ravel(), dtype=np.float64)
+        value, vector = eigsh(operator, 1, which="LA", v0=start.ravel(), tol=tolerance, ncv=min(3 * n - 1, 24))
+        self.vector = vector[:, 0].reshape(-1, 3)
+        residual = np.linalg.norm(self.product(self.vector) - value[0] * self.vector)
+        return float(value[0]), float(residual)
+
+    def watch(self, products: int = 4) -> float:
+        """A lower bound of omega^2 at the present state: a few Lanczos steps from the last look's vector.
+
+        Something random is mixed in: a vector that has settled on one mode would not see another mode overtake it.
+        """
+        if self.vector is None:
+            self.largest(1e-2)
+        if self.vector is None:  # nothing is free to move
+            return 0.0
+        x = self._random.standard_normal(self.vector.shape) * (self.root > 0)
+        x = self.vector / np.linalg.norm(self.vector) + 0.3 * x / np.linalg.norm(x)
+        basis, ritz = [], np.zeros((products, products))
+        for k in range(products):
+            size = np.linalg.norm(x)
+            for q in basis:
+                x = x - (q * x).sum() * q
+            if np.linalg.norm(x) < 1e-4 * size:  # few vertices are free: all of their motions are in the basis
+                break
+            basis.append(x / np.linalg.norm(x))
+            x = self.product(basis[-1])
+            if not np.isfinite(np.linalg.norm(x)):
+                return np.inf
+            ritz[k, : k + 1] = [(q * x).sum() for q in basis]
+        count = len(basis)
+        values, vectors = np.linalg.eigh(ritz[:count, :count])  # reads the lower half
+        self.vector = sum(c * q for c, q in zip(vectors[:, -1], basis))
+        return float(values[-1])
+
+    def worst_tetrahedron(self) -> int:
+        """The tetrahedron where the watched vector moves most relative to its size."""
+        mesh = self.ws.scene.mesh
+        w = self.root * self.vector
+        D = w[mesh.tetrahedra[:, 1:]] - w[mesh.tetrahedra[:, :1]]
+        strain = np.einsum("eai,eaj->eij", D, self.ws.arrays.values.gradients)
+        return int(np.argmax((strain**2).sum((1, 2)) * self.ws.arrays.values.volumes))
+
+
+def lanczos_limit(workspace, tolerance: float = 1e-3) -> StepLimit:
+    """The tight stable step 2 / omega_max at the workspace's present state, contact included.
+
+    A residual bound is added to omega^2, so the step errs on the safe side.
+    """
+    stiffness = Stiffness(workspace)
+    value, residual = stiffness.largest(tolerance)
+    if value <= 0:
+        return StepLimit(np.inf, 0, "Lanczos")
+    return StepLimit(float(2 / np.sqrt(value + residual)), stiffness.worst_tetrahedron(), "Lanczos")

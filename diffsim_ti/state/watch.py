@@ -1,0 +1,125 @@
+"""What contacts did during a run, noted by the passes: smallest gaps, and how finely the steps resolve them."""
+
+import weakref
+from dataclasses import dataclass
+
+import numpy as np
+
+from diffsim_ti import runtime
+
+# What keeps the gradient of a bounce within 10 %, measured over 400 starting heights (tests/test_contact_gradients.py): for
+# bounces that use a tenth of the width or more, and a flight of a few widths after them. An error in velocity grows with
+# the time that is left, and grazing bounces are the worst.
+LARGEST_OMEGA_DT, LARGEST_SHARE = 0.5, 0.1
+
+
+@dataclass(frozen=True)
+class ContactResolution:
+    """How well a run's substeps resolve its contacts, over all of its passes.
+
+    omega_dt: largest h sqrt(b''(d) / m), the barrier's stiffness against the vertex's mass.
+    travel: largest approach to an obstacle in one substep, as a share of its width.
+    share: the same as a share of the depth at which the barrier alone would stop the vertex.
+    smallest_gap [m], with the vertex and obstacle that reached it; infinite if no barrier was felt.
+    substep [s]: the substep h; advised_substep [s]: one at which gradients of a bounce stay within 10 %.
+    """
+
+    omega_dt: float
+    travel: float
+    share: float
+    smallest_gap: float
+    vertex: int | None
+    obstacle: str | None
+    substep: float
+
+    @property
+    def coarseness(self) -> float:
+        """How many times larger the substep is than advised; gradients may be off by more than 10 % above 1."""
+        return max(self.omega_dt / LARGEST_OMEGA_DT, self.share / LARGEST_SHARE)
+
+    @property
+    def advised_substep(self) -> float:
+        return self.substep / self.coarseness if self.coarseness > 0 else float("inf")
+
+    @property
+    def resolved(self) -> bool:
+        """Whether gradients through the contacts can be trusted to 10 %."""
+        return self.coarseness <= 1
+
+    def __str__(self) -> str:
+        if self.obstacle is None:
+            return "contact: none"
+        return (
+            f"contact: smallest gap {self.smallest_gap:.4g} m, of vertex {self.vertex} to {self.obstacle}; "
+            f"omega dt {self.omega_dt:.3g} (advised {LARGEST_OMEGA_DT}), |v| dt {self.travel:.3g} of the width and "
+            f"{self.share:.3g} of the depth (advised {LARGEST_SHARE})"
+        )
+
+
+class ContactWatch:
+    """Three rows for each contact term (gap, (omega dt)^2, travel), which each vertex keeps for itself in the passes."""
+
+    def __init__(self, workspace):
+        self.ws, arrays = weakref.proxy(workspace), workspace.arrays  # which holds this: no circle
+        self.contacts = arrays.contacts
+        n = arrays.num_vertices if self.contacts else 1
+        self.array = runtime.array(arrays.fp, 3 * len(self.contacts), n)
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget what was seen."""
+        if self.contacts:
+            rows = np.zeros(self.array.shape)
+            rows[::3] = np.inf
+            runtime.fill(self.array, rows)
+
+    def rows(self) -> np.ndarray:
+        """What was seen, to be put back by `put`."""
+        return runtime.fetch(self.array)
+
+    def put(self, rows: np.ndarray) -> None:
+        runtime.fill(self.array, rows)
+
+    def crossing(self) -> tuple[int, int, float] | None:
+        """(contact, vertex, depth [m]) of the deepest place on or behind an obstacle, or None."""
+        if not self.contacts:
+            return None
+        host = runtime.view(self.array)
+        gaps = (runtime.fetch(self.array) if host is None else host)[::3]
+        k, i = np.unravel_index(np.argmin(gaps), gaps.shape)
+        return (int(k), int(i), -float(gaps[k, i])) if gaps[k, i] <= 0 else None
+
+    def largest_omega_dt(self) -> float:
+        """Largest h sqrt(b''(d) / m) since the run's start."""
+        host = runtime.view(self.array)
+        rows = runtime.fetch(self.array) if host is None else host
+        return float(np.sqrt(rows[1::3].max()))
+
+    def resolution(self) -> ContactResolution:
+        """What was seen since the run's start."""
+        h = self.ws.solver.substep
+        if not self.contacts:
+            return ContactResolution(0.0, 0.0, 0.0, float("inf"), None, None, h)
+        rows = self.rows().astype(np.float64)
+        gaps, travel = rows[::3], rows[2::3]
+        k, i = (int(x) for x in np.unravel_index(np.argmin(gaps), gaps.shape))
+        seen = np.isfinite(gaps[k, i])
+        return ContactResolution(
+            float(np.sqrt(rows[1::3].max())),
+            float(travel.max()),
+            float((travel / self._depths(travel)).max()),
+            float(gaps[k, i]),
+            i if seen else None,
+            repr(self.contacts[k]) if seen else None,
+            h,
+        )
+
+    def _depths(self, travel: np.ndarray) -> np.ndarray:
+        """Depths in the barriers, in widths, that stop vertices with these speeds: m v^2 / 2 = k w^2 beta(1 - depth)."""
+        arrays, h = self.ws.arrays, self.ws.solver.substep
+        stiffness = [
+            arrays.values.parameters[c.first + c.count] if c.watched else 1.0 for c in arrays.features().contacts
+        ]
+        energy = arrays.values.mass * travel**2 / (2 * h * h * np.array(stiffness)[:, None])
+        s = np.linspace(1, 1e-3, 4096)
+        return np.interp(energy, -((s - 1) ** 2) * np.log(s), 1 - s) + 1e-12

@@ -1,0 +1,104 @@
+"""Device data of one run: the scene's numbers, the current state, recorded states and saved frames as needed."""
+
+from diffsim_ti import runtime
+from diffsim_ti.contact.surface_pairs import SurfacePairs
+from diffsim_ti.inputs import Derived
+from diffsim_ti.state.arrays import History, SceneArrays, copy_slot, first_bad_vertex
+from diffsim_ti.state.watch import ContactWatch
+
+
+class Workspace:
+    """What every solver's run needs; `advance` is the solver's own."""
+
+    pairs_kind = SurfacePairs
+    energy_watch = None  # counts energy that long steps add, for solvers that neither damp nor limit it
+
+    def __init__(self, solver, derived: Derived):
+        self.solver, self.scene = solver, solver.scene
+        self.owner = runtime.program()
+        self.arrays = SceneArrays(self.scene)
+        self.parallel = solver.runs_parallel()
+        self.pairs = self.pairs_kind(self.arrays, self.parallel) if self.arrays.self_contact else None
+        self.state = self.history(1)
+        self.record: History | None = None
+        self.frames = (runtime.array(self.arrays.vector, 1, 1), runtime.array(self.arrays.vector, 1, 1))
+        self.watch = ContactWatch(self)
+        self._launches = {}
+        self.load(derived)
+
+    def history(self, num_slots: int, record: bool = False) -> History:
+        """Room for states of this run."""
+        return History(self.arrays, num_slots, record)
+
+    def load(self, derived: Derived) -> None:
+        """Bring inputs to the device and set the start state."""
+        runtime.check_alive(self.owner)
+        if self.arrays.load(derived):
+            self._launches.clear()
+        self.restart()
+        if self.pairs:
+            self.pairs.load(self.state.u)
+
+    def restart(self) -> None:
+        """Set the state to the start."""
+        runtime.fill(self.state.u, self.arrays.values.displacement[None])
+        runtime.fill(self.state.v, self.arrays.values.velocity[None])
+        self.arrays.place_obstacles(0)
+        self.watch.clear()
+
+    def place_obstacles(self, now: int) -> None:
+        """Put obstacles where they are before pass `now`, for what looks at the state there."""
+        row, part = divmod(now, self.solver.substeps)
+        self.arrays.place_obstacles(row, part / self.solver.substeps)
+
+    def forget(self) -> None:
+        """The state was set from outside: forget what came before it."""
+        if self.pairs:
+            self.pairs.forget(self.state.u)
+
+    @property
+    def rate(self) -> float:
+        """The drag rate [1/s]."""
+        at = self.arrays.features().drag
+        return float(self.arrays.values.parameters[at]) if at >= 0 else 0.0
+
+    def make_frames(self, count: int) -> None:
+        """Room for `count` saved states."""
+        self.frames = tuple(runtime.array(self.arrays.vector, count, self.arrays.num_vertices) for _ in range(2))
+        self._launches.clear()
+
+    def make_record(self, num_slots: int) -> History:
+        """Room for `num_slots` recorded states."""
+        if self.record is None or self.record.num_slots < num_slots:
+            self.record = self.history(num_slots, record=True)
+            self._launches.clear()
+            if self.pairs:
+                self.pairs.unbind()
+        return self.record
+
+    def first_bad_vertex(self) -> int | None:
+        """The first vertex whose state is not finite, or None."""
+        return first_bad_vertex(self.state)
+
+    def velocity_of(self, vertex: int):
+        """Velocity of one vertex [m/s]."""
+        return runtime.fetch(self.state.v)[0, vertex]
+
+    def restore_to_record(self) -> None:
+        """Copy the current state to slot 0 of the record."""
+        self.save(self.record, 0)
+
+    def save(self, target: History, slot: int) -> None:
+        """Copy the current state to a slot."""
+        copy_slot(self.state.u, 0, target.u, slot)
+        copy_slot(self.state.v, 0, target.v, slot)
+
+    def restore(self, source: History, slot: int) -> None:
+        """Copy a slot to the current state."""
+        copy_slot(source.u, slot, self.state.u, 0)
+        copy_slot(source.v, slot, self.state.v, 0)
+
+    def save_frame(self, frame: int) -> None:
+        """Copy the current state to a frame."""
+        copy_slot(self.state.u, 0, self.frames[0], frame)
+        copy_slot(self.state.v, 0, self.frames[1], frame)

@@ -1,0 +1,1 @@
+"""Obstacles, one shape per file, and what they share: barrier, friction, path."""

@@ -1,0 +1,105 @@
+"""Round obstacles: a ball or the hollow inside of one, and a capsule."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from diffsim_ti.runtime import traced
+from diffsim_ti.terms.obstacles.obstacle import Obstacle, ObstacleForce
+
+
+def radial(g, r):
+    """(|r|, r / |r|)"""
+    length = g.sqrt(g.dot(r, r))
+    return length, [k / length for k in r]
+
+
+@dataclass(frozen=True)
+class SphereForce(ObstacleForce):
+    """d = |x - center| - radius, or radius - |x - center| inside a hollow one."""
+
+    inside: bool = False
+
+    count = 4
+
+    @traced
+    def distance_and_normal(self, g, p, X, u):
+        length, n = radial(g, [(x - c) + y for x, c, y in zip(X, p, u)])
+        if self.inside:
+            return p[3] - length, [g.number(0) - k for k in n]
+        return length - p[3], n
+
+
+class Sphere(Obstacle):
+    """A ball, or with inside=True the wall of a hollow one (a bowl, seen from within): center, radius [m].
+
+    Inputs with gradient: "sphere_center", shape (3,), "sphere_radius", and those of every `Obstacle`, whose other
+    arguments it takes.
+    """
+
+    def __init__(self, center=(0.0, 0.0, 0.0), radius: float = 1.0, inside: bool = False, **options):
+        super().__init__(dict(sphere_center=center, sphere_radius=radius), **options)
+        check_sizes(self, points=("sphere_center",), positive=("sphere_radius",))
+        self.inside = bool(inside)
+
+    def distance(self, positions):
+        d = np.linalg.norm(positions - self.values["sphere_center"], axis=1) - self.values["sphere_radius"]
+        return -d if self.inside else d
+
+    def kernel(self, precision, first, path=-1):
+        return SphereForce(precision, first, self.has_friction, path, self.inside)
+
+
+@dataclass(frozen=True)
+class CapsuleForce(ObstacleForce):
+    """d = |x - nearest point of the segment a b| - radius."""
+
+    count = 7
+
+    @traced
+    def distance_and_normal(self, g, p, X, u):
+        r = [(x - c) + y for x, c, y in zip(X, p[:3], u)]
+        axis = [b - a for a, b in zip(p[:3], p[3:6])]
+        share = g.minimum(g.maximum(g.dot(r, axis) / g.dot(axis, axis), 0), 1)
+        length, n = radial(g, [x - share * a for x, a in zip(r, axis)])
+        return length - p[6], n
+
+
+class Capsule(Obstacle):
+    """A cylinder with round ends: all points within `radius` [m] of the segment from `start` to `end` [m].
+
+    Inputs with gradient: "capsule_start", "capsule_end", shape (3,), "capsule_radius", and those of every `Obstacle`,
+    whose other arguments it takes.
+    """
+
+    twin = CapsuleForce
+
+    def __init__(self, start, end, radius: float, **options):
+        super().__init__(dict(capsule_start=start, capsule_end=end, capsule_radius=radius), **options)
+        check_sizes(self, points=("capsule_start", "capsule_end"), positive=("capsule_radius",))
+        check_axis(self, "capsule_start", "capsule_end")
+
+    def distance(self, positions):
+        a, b = self.values["capsule_start"], self.values["capsule_end"]
+        share = np.clip((positions - a) @ (b - a) / ((b - a) @ (b - a)), 0, 1)
+        return np.linalg.norm(positions - a - share[:, None] * (b - a), axis=1) - self.values["capsule_radius"]
+
+
+def check_sizes(term, points=(), positive=()) -> None:
+    """Raise ValueError for points that are not 3 numbers and sizes that are not positive."""
+    for name in points:
+        if term.values[name].shape != (3,):
+            raise ValueError(
+                f"{type(term).__name__}: {name} must be 3 numbers [m], got shape {term.values[name].shape}"
+            )
+    for name in positive:
+        if not np.all(term.values[name] > 0):
+            raise ValueError(f"{type(term).__name__}: {name} must be > 0 [m], got {term.values[name]}")
+
+
+def check_axis(term, start: str, end: str) -> None:
+    """Raise ValueError if two ends are one point."""
+    if not np.linalg.norm(term.values[end] - term.values[start]) > 0:
+        raise ValueError(
+            f"{type(term).__name__}: start and end must differ, got {term.values[start]} twice; use a Sphere"
+        )

@@ -1,0 +1,132 @@
+"""Obstacles with edges: a box of any orientation and a cylinder."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import taichi as ti
+
+from diffsim_ti.runtime import traced
+from diffsim_ti.terms.obstacles.ball import check_axis, check_sizes, radial
+from diffsim_ti.terms.obstacles.obstacle import Obstacle, ObstacleForce
+
+
+@traced
+def corner(g, q):
+    """Distance of a point to the region where all q <= 0, by its signed distances q to the sides, and its derivatives.
+
+    Outside |max(q, 0)|, inside the largest q.
+    """
+    outside = [g.maximum(k, 0) for k in q]
+    length = g.sqrt(g.dot(outside, outside))
+    nearest = q[0]
+    for k in q[1:]:
+        nearest = g.maximum(nearest, k)
+    is_outside = nearest.value > 0
+    by, found = [], ti.cast(0, ti.i32)
+    for k, out in zip(q, outside):
+        chosen = ti.select(k.value == nearest.value, 1 - found, 0)  # the first of equal ones
+        found = found + chosen
+        by.append(g.select(is_outside, out / length, ti.cast(chosen, g.fp)))
+    return g.select(is_outside, length, nearest), by
+
+
+@dataclass(frozen=True)
+class BoxForce(ObstacleForce):
+    """Of y = R^T (x - center): d of |y| - half sizes (see `corner`); R the rotation of a quaternion (w, x, y, z)."""
+
+    count = 10
+
+    @traced
+    def distance_and_normal(self, g, p, X, u):
+        r = [(x - c) + y for x, c, y in zip(X, p[:3], u)]
+        R = rotation(g, p[6:10])
+        y = [g.dot([R[d][k] for d in range(3)], r) for k in range(3)]
+        signs = [ti.select(k.value < 0, ti.cast(-1, g.fp), ti.cast(1, g.fp)) for k in y]
+        d, by = corner(g, [k * s - half * 0.5 for k, s, half in zip(y, map(g.leaf, signs), p[3:6])])
+        local = [k * s for k, s in zip(by, map(g.leaf, signs))]
+        return d, [g.dot(R[d], local) for d in range(3)]
+
+
+@traced
+def rotation(g, q):
+    """Rows of the rotation matrix of a quaternion (w, x, y, z) of any length."""
+    w, x, y, z = q
+    two = g.number(2) / g.dot(q, q)
+    one = g.number(1)
+    return [
+        [one - two * (y * y + z * z), two * (x * y - w * z), two * (x * z + w * y)],
+        [two * (x * y + w * z), one - two * (x * x + z * z), two * (y * z - w * x)],
+        [two * (x * z - w * y), two * (y * z + w * x), one - two * (x * x + y * y)],
+    ]
+
+
+class Box(Obstacle):
+    """A box: center [m], size [m] of its three sides, turned by `rotation`, a vector along the axis whose length is the
+    angle [rad].
+
+    Inputs with gradient: "box_center", "box_size", shape (3,), "box_rotation" (a quaternion w, x, y, z, shape (4,)), and
+    those of every `Obstacle`, whose other arguments it takes. Its distance is C1 outside; at the edges' regions the
+    contact's stiffness jumps.
+    """
+
+    twin = BoxForce
+
+    def __init__(self, center=(0.0, 0.0, 0.0), size=(1.0, 1.0, 1.0), rotation=(0.0, 0.0, 0.0), **options):
+        size = np.broadcast_to(np.asarray(size, np.float64), (3,)) if np.ndim(size) == 0 else size
+        turn = np.asarray(rotation, np.float64)
+        if turn.shape != (3,) or not np.all(np.isfinite(turn)):
+            raise ValueError(f"Box: rotation must be 3 finite numbers, axis times angle [rad], got {rotation}")
+        angle = np.linalg.norm(turn)
+        quaternion = [np.cos(angle / 2), *(0.5 * np.sinc(angle / 2 / np.pi) * turn)]
+        super().__init__(dict(box_center=center, box_size=size, box_rotation=quaternion), **options)
+        check_sizes(self, points=("box_center", "box_size"), positive=("box_size",))
+
+    def distance(self, positions):
+        from scipy.spatial.transform import Rotation
+
+        turn = Rotation.from_quat(np.roll(self.values["box_rotation"], -1))
+        q = np.abs(turn.inv().apply(positions - self.values["box_center"])) - self.values["box_size"] / 2
+        return np.linalg.norm(np.maximum(q, 0), axis=1) + np.minimum(q.max(1), 0)
+
+
+@dataclass(frozen=True)
+class CylinderForce(ObstacleForce):
+    """d of (distance to the axis - radius, distance along it to the nearer end), see `corner`."""
+
+    count = 7
+
+    @traced
+    def distance_and_normal(self, g, p, X, u):
+        axis = [b - a for a, b in zip(p[:3], p[3:6])]
+        length = g.sqrt(g.dot(axis, axis))
+        along = [a / length for a in axis]
+        r = [(x - c) + y for x, c, y in zip(X, p[:3], u)]
+        height = g.dot(r, along)
+        across, out = radial(g, [x - height * a for x, a in zip(r, along)])
+        middle = height - length * 0.5
+        sign = g.leaf(ti.select(middle.value < 0, ti.cast(-1, g.fp), ti.cast(1, g.fp)))
+        d, (by_radius, by_height) = corner(g, [across - p[6], middle * sign - length * 0.5])
+        return d, [by_radius * a + by_height * sign * b for a, b in zip(out, along)]
+
+
+class Cylinder(Obstacle):
+    """A cylinder with flat ends: `start` and `end` [m] of its axis, radius [m].
+
+    Inputs with gradient: "cylinder_start", "cylinder_end", shape (3,), "cylinder_radius", and those of every `Obstacle`,
+    whose other arguments it takes.
+    """
+
+    twin = CylinderForce
+
+    def __init__(self, start, end, radius: float, **options):
+        super().__init__(dict(cylinder_start=start, cylinder_end=end, cylinder_radius=radius), **options)
+        check_sizes(self, points=("cylinder_start", "cylinder_end"), positive=("cylinder_radius",))
+        check_axis(self, "cylinder_start", "cylinder_end")
+
+    def distance(self, positions):
+        a, b = self.values["cylinder_start"], self.values["cylinder_end"]
+        length = np.linalg.norm(b - a)
+        height = (positions - a) @ (b - a) / length
+        across = np.linalg.norm(positions - a - height[:, None] * (b - a) / length, axis=1)
+        q = np.stack([across - self.values["cylinder_radius"], np.abs(height - length / 2) - length / 2], 1)
+        return np.linalg.norm(np.maximum(q, 0), axis=1) + np.minimum(q.max(1), 0)

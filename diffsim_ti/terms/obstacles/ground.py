@@ -1,0 +1,78 @@
+"""A floor: the barrier of the ground plane y = height."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import taichi as ti
+
+from diffsim_ti.runtime import traced
+from diffsim_ti.terms.obstacles import barrier
+from diffsim_ti.terms.obstacles.obstacle import Obstacle, ObstacleForce
+
+
+class Ground(Obstacle):
+    """Floor y = height [m], felt by surface vertices through the barrier of their distance d = y - height.
+
+    Energy per vertex b(d) = -stiffness (d - width)^2 log(d / width) for d < width, exactly zero beyond, and its
+    second-order Taylor polynomial below width / 1000 (see barrier.py), so that a vertex that got past still is
+    pushed out. stiffness [N/m], width [m]; friction and path as for every `Obstacle`.
+    Inputs with gradient: "ground_height", "barrier_stiffness", "barrier_width", and with friction and path theirs.
+    Raises ValueError for stiffness <= 0, width <= 0, or a body that starts on or below the floor.
+    Li et al. 2020, Incremental Potential Contact, doi:10.1145/3386569.3392425.
+    """
+
+    def __init__(self, height: float = 0.0, stiffness: float | None = 1e4, width: float = 0.01, **options):
+        super().__init__(dict(ground_height=height), stiffness, width, **options)
+
+    def distance(self, positions: np.ndarray) -> np.ndarray:
+        return positions[:, 1] - float(self.values["ground_height"])
+
+    def _refuse(self, gap: np.ndarray, surface: np.ndarray) -> None:
+        raise ValueError(
+            f"the body starts below or on the ground: vertex {surface[gap.argmin()]} is at {gap.min():.3g} m above y = "
+            f"{float(self.values['ground_height']):g} ({(gap <= 0).sum()} vertices); lift the body or lower the ground"
+        )
+
+    def kernel(self, precision: str, first: int, path: int = -1) -> "GroundForce":
+        return GroundForce(precision, first, self.has_friction, path)
+
+
+@dataclass(frozen=True)
+class GroundForce(ObstacleForce):
+    """Compile-time twin of Ground; the force is written out, since only one component of it is not zero."""
+
+    count = 1
+
+    @traced
+    def distance_and_normal(self, g, p, X, u):
+        return (X[1] - p[0]) + u[1], [g.number(0), g.number(1), g.number(0)]
+
+    @ti.func
+    def scaled(self, parameters: ti.template(), X, u):
+        """(d / width, stiffness, width)"""
+        width = parameters[self.first + 2]
+        return ((X.y - parameters[self.first]) + u.y) / width, parameters[self.first + 1], width
+
+    @ti.func
+    def force(self, parameters: ti.template(), X, u, v):
+        s, stiffness, width = self.scaled(parameters, X, u)
+        f = 0 * u
+        f.y = -stiffness * width * barrier.slope(s, self.fp)
+        return f
+
+    @ti.func
+    def force_jvp(self, parameters: ti.template(), X, u, v, du, dv):
+        s, stiffness, width = self.scaled(parameters, X, u)
+        df = 0 * u
+        df.y = -stiffness * barrier.curvature(s, self.fp) * du.y
+        return df
+
+    @ti.func
+    def parameter_derivatives(self, parameters: ti.template(), X, u, v):
+        s, stiffness, width = self.scaled(parameters, X, u)
+        slope, curvature = barrier.slope(s, self.fp), barrier.curvature(s, self.fp)
+        by = self._zeros(u)
+        by[0].y = stiffness * curvature
+        by[1].y = -width * slope
+        by[2].y = -stiffness * (slope - s * curvature)
+        return by

@@ -1,0 +1,43 @@
+"""A plane of any orientation, solid on one side."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from diffsim_ti.runtime import traced
+from diffsim_ti.terms.obstacles.obstacle import Obstacle, ObstacleForce
+
+
+@dataclass(frozen=True)
+class HalfSpaceForce(ObstacleForce):
+    """d = n . (x - point), n the normal made unit."""
+
+    count = 6
+
+    @traced
+    def distance_and_normal(self, g, p, X, u):
+        length = g.sqrt(g.dot(p[3:], p[3:]))
+        n = [k / length for k in p[3:]]
+        return g.dot(n, [(x - c) + y for x, c, y in zip(X, p, u)]), n
+
+
+class HalfSpace(Obstacle):
+    """All space below a plane: point [m] lies on the plane, normal points out of the solid (of any length).
+
+    Inputs with gradient: "half_space_point", "half_space_normal", shape (3,), and those of every `Obstacle`, whose other
+    arguments it takes.
+    """
+
+    twin = HalfSpaceForce
+
+    def __init__(self, point=(0.0, 0.0, 0.0), normal=(0.0, 1.0, 0.0), **options):
+        super().__init__(dict(half_space_point=point, half_space_normal=normal), **options)
+        for name in ("half_space_point", "half_space_normal"):
+            if self.values[name].shape != (3,):
+                raise ValueError(f"HalfSpace: {name[11:]} must be 3 numbers, got shape {self.values[name].shape}")
+        if not np.linalg.norm(self.values["half_space_normal"]) > 0:
+            raise ValueError("HalfSpace: normal must not be zero; pass the direction that points out of the solid")
+
+    def distance(self, positions):
+        n = self.values["half_space_normal"]
+        return (positions - self.values["half_space_point"]) @ (n / np.linalg.norm(n))

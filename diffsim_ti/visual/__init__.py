@@ -1,0 +1,1 @@
+"""Drawing, films, series of frames and the viewer."""

@@ -1,0 +1,90 @@
+"""From numbers to colours: which map, which limits, which label; and the fields of a state."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from diffsim_ti.visual.fields import Field, field_named
+
+SIGNED = "PuOr"
+
+
+@dataclass(frozen=True)
+class Colouring:
+    """How values are coloured: label with unit, the numbers that the colours span, a matplotlib colour map."""
+
+    label: str = ""
+    limits: tuple[float, float] = (0.0, 1.0)
+    map: str = "viridis"
+
+    def __post_init__(self):
+        from matplotlib import colormaps
+
+        low, high = (float(x) for x in self.limits)
+        if not (np.isfinite(low) and np.isfinite(high) and low < high):
+            raise ValueError(f"limits of colours must be two finite numbers, the lower first, got {self.limits}")
+        if self.map not in colormaps:
+            raise ValueError(f"no matplotlib colour map is called {self.map!r}; viridis, cividis and PuOr read well")
+
+    @classmethod
+    def of(
+        cls, values, label: str = "", limits=None, map: str | None = None, field: Field | None = None
+    ) -> "Colouring":
+        """Map and limits that suit these numbers: 0 (or the least) to the 99.5th percentile; two-sided as the field says.
+
+        Without a field, numbers of both signs are taken as two-sided about 0.
+        """
+        values = np.asarray(values, np.float64).ravel()
+        if not values.size or not np.all(np.isfinite(values)):
+            raise ValueError(
+                "values to colour must be finite numbers, at least one; a diverged state cannot be coloured"
+            )
+        if field is None:
+            signed = values.min() < 0 < values.max()
+            field = Field(label, SIGNED, 0.0) if signed else Field(label)
+        if limits is None:
+            least = values.min() if field.middle is None else np.percentile(values, 0.5)
+            limits = field.limits(float(least), float(np.percentile(values, 99.5)))
+        return cls(label or field.label, tuple(float(x) for x in limits), map or field.colours)
+
+    @classmethod
+    def of_field(cls, name: str, values, limits=None, map: str | None = None) -> "Colouring":
+        """A colouring by the name of a field in series_fields.FIELDS, with its label and unit."""
+        return cls.of(values, "", limits, map, field_named(name))
+
+    def __call__(self, values) -> np.ndarray:
+        """RGB in [0, 1], shape of `values` and 3."""
+        from matplotlib import colormaps
+
+        low, high = self.limits
+        return colormaps[self.map](np.clip((np.asarray(values) - low) / (high - low), 0, 1))[..., :3]
+
+
+def to_vertices(mesh, values) -> np.ndarray:
+    """One value per vertex: given so, or per tetrahedron and averaged, weighted by volume."""
+    values = np.asarray(values, np.float64)
+    if values.shape == (mesh.num_vertices,):
+        return values
+    if values.shape != (mesh.num_tetrahedra,):
+        raise ValueError(
+            f"values: expected one per vertex ({mesh.num_vertices}) or per tetrahedron ({mesh.num_tetrahedra}), "
+            f"got shape {values.shape}"
+        )
+    corners, weight = mesh.tetrahedra.ravel(), np.repeat(mesh.volumes, 4)
+    total = np.bincount(corners, weight, mesh.num_vertices)
+    return np.bincount(corners, weight * np.repeat(values, 4), mesh.num_vertices) / np.where(total > 0, total, 1)
+
+
+def field_of(simulator, name: str) -> np.ndarray:
+    """A field of a simulator's state, per vertex or per tetrahedron; "gradient" is not the state's and must be given."""
+    field_named(name)
+    if name == "displacement":
+        return np.linalg.norm(simulator.displacements, axis=1)
+    if name == "speed":
+        return np.linalg.norm(simulator.velocities, axis=1)
+    if name == "stiffness":
+        modulus = simulator.scene.inputs.values["youngs_modulus"]
+        return np.broadcast_to(modulus, simulator.scene.mesh.num_tetrahedra)
+    if name == "gradient":
+        raise ValueError("a gradient is no field of the state; pass its size per vertex or tetrahedron as values")
+    return getattr(simulator.tetrahedron_fields(), name)

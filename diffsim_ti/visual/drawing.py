@@ -1,0 +1,130 @@
+"""Drawing: frame after frame of one body, with the same camera, colours, floor, obstacles and legend, by either back end."""
+
+import numpy as np
+
+from diffsim_ti.visual.backdrop import Backdrop
+from diffsim_ti.visual.camera import Camera
+from diffsim_ti.visual.colouring import Colouring, to_vertices
+from diffsim_ti.visual.legend import legend, write_text
+from diffsim_ti.visual.surface import OBSTACLE, PLAIN, Soup, Surface, marks, with_edges
+
+BACKENDS = ("auto", "vulkan", "software")
+
+
+def painter(backend: str, size):
+    """What paints triangles: "vulkan", "software" (NumPy, needs no driver), or "auto": Vulkan where there is a driver."""
+    from diffsim_ti.visual.rasteriser import SoftwarePainter
+    from diffsim_ti.visual.vulkan_painter import VulkanPainter, has_vulkan
+
+    if backend not in BACKENDS:
+        raise ValueError(f"backend must be one of {', '.join(BACKENDS)}, got {backend!r}")
+    if backend == "vulkan" and not has_vulkan():
+        raise ValueError(
+            "backend='vulkan': no Vulkan driver was found; install one (mesa-vulkan-drivers) or use 'software'"
+        )
+    return SoftwarePainter(size) if backend == "software" or not has_vulkan() else VulkanPainter(size)
+
+
+class Drawing:
+    """Pictures of a body's surface, y upwards.
+
+    mesh: its rest shape tells sharp edges from curved surfaces.
+    size: width and height in pixels. camera: default one that frames `box` [m], shape (2, 3) (default: the rest shape),
+        from `azimuth` and `elevation` [degrees].
+    ground: height of a floor [m], or None. obstacles: (points, triangles) of what stands around, see `obstacle_surfaces`.
+    fixed: vertices to mark. wireframe: draw the triangles' edges. colouring: how values are coloured.
+    backend: "auto", "vulkan" or "software"; `describe()` says which it became.
+    """
+
+    def __init__(
+        self,
+        mesh,
+        size=(1200, 900),
+        camera: Camera | None = None,
+        ground: float | None = None,
+        obstacles=(),
+        fixed=None,
+        wireframe: bool = False,
+        colouring: Colouring | None = None,
+        box=None,
+        azimuth: float = 32.0,
+        elevation: float = 14.0,
+        backend: str = "auto",
+    ):
+        if len(size) != 2 or any(int(n) != n or not 16 <= n <= 8192 for n in size):
+            raise ValueError(f"size must be two whole numbers of pixels between 16 and 8192, got {size}")
+        self.mesh, self.size, self.wireframe, self.colouring = mesh, tuple(int(n) for n in size), wireframe, colouring
+        fit = mesh.vertices if box is None else np.stack(np.meshgrid(*np.array(box, np.float64).T), -1).reshape(-1, 3)
+        self.camera = camera or Camera.framing(fit, self.size, azimuth, elevation)
+        self.box = np.stack([fit.min(0), fit.max(0)])
+        self.fixed = np.zeros(0, np.int64) if fixed is None else mesh.vertex_indices(fixed)
+        self.obstacles, self._around = tuple(obstacles), [Surface(*shape) for shape in obstacles]
+        self._surface = Surface(mesh.vertices, mesh.surface_triangles)
+        self._backdrop = Backdrop(self.size, ground, self.box)
+        self._painter, self._legend, self._asked = painter(backend, self.size), (None, None), backend
+
+    def describe(self) -> str:
+        """Which back end draws, in a line."""
+        why = " (no Vulkan driver here)" if self._asked == "auto" and self._painter.name == "NumPy" else ""
+        return f"drawn by {self._painter.name}{why}, {self.size[0]} x {self.size[1]} pixels"
+
+    def soup(self, positions, values=None, size=None, obstacles=None) -> tuple[Soup, list]:
+        """The triangles to paint, and (points, triangles) of what throws shadows."""
+        points = np.asarray(positions, np.float64)
+        if points.shape != (self.mesh.num_vertices, 3) or not np.all(np.isfinite(points)):
+            raise ValueError(
+                f"positions: expected finite numbers of shape ({self.mesh.num_vertices}, 3), got shape {points.shape}"
+            )
+        size = size or self.size
+        colour = PLAIN
+        if values is not None:
+            values = to_vertices(self.mesh, values)
+            self.colouring = self.colouring or Colouring.of(values[self.mesh.surface_vertices])
+            colour = self.colouring(values)
+        body = self._surface.lit(points, colour, self.camera, size)
+        soups = [with_edges(body, 0.0006 * size[1]) if self.wireframe else body]
+        placed = [s.points for s in self._around] if obstacles is None else obstacles
+        soups += [s.lit(p, OBSTACLE, self.camera, size) for s, p in zip(self._around, placed)]
+        if len(self.fixed):
+            near = 0.01 * float(np.ptp(self.box, 0).max())
+            soups.append(marks(points[self.fixed], self.camera, size, 0.004 * size[1], near))
+        shapes = [(points, self.mesh.surface_triangles), *((p, s.triangles) for s, p in zip(self._around, placed))]
+        return Soup.joined(soups), shapes
+
+    def backdrop(self, shapes) -> np.ndarray:
+        """What lies behind, with the shadows of `shapes` from `soup`: RGB in [0, 1], float32 (height, width, 3)."""
+        return self._backdrop.image(self.camera, shapes)
+
+    def image(self, positions, values=None, title: str = "", obstacles=None) -> np.ndarray:
+        """A picture, RGB uint8 (height, width, 3), of the body at `positions` [m], shape (num_vertices, 3).
+
+        values: one per vertex or per tetrahedron (averaged to vertices), shown in colours with the legend of the
+        colouring; without a colouring the first frame's values set it. obstacles: points of each obstacle, if they moved.
+        Raises ValueError for shapes that do not fit and for numbers that are not finite.
+        """
+        soup, shapes = self.soup(positions, values, None, obstacles)
+        image = self._painter.paint(soup, self.backdrop(shapes))
+        image = np.ascontiguousarray(np.clip(255 * image + 0.5, 0, 255).astype(np.uint8))
+        if values is not None:
+            self.add_legend(image)
+        return write_text(image, title) if title else image
+
+    def add_legend(self, image: np.ndarray) -> None:
+        """Draw the colouring's bar into a picture, uint8 or in [0, 1]; nothing if it has no label."""
+        if not self.colouring.label:
+            return
+        if self._legend[0] != self.colouring:
+            self._legend = self.colouring, legend(self.colouring, self.size)
+        (rows, columns), colour, cover = self._legend[1]
+        full = 1 if image.dtype == np.uint8 else 255
+        image[rows, columns] = colour / full + image[rows, columns] * (1 - cover)
+
+    def close(self) -> None:
+        """Give back the back end's window."""
+        self._painter.close()
+
+    def __enter__(self) -> "Drawing":
+        return self
+
+    def __exit__(self, *_) -> None:
+        self.close()
