@@ -1,7 +1,7 @@
-"""The pictures and films of the examples, as assets/pictures/gallery_<example>.png or .gif: those of the README.
+"""The pictures and films of the examples, as assets/pictures/gallery_<example>.png or .gif.
 
-Each example runs by the command that its table shows, in a process and a folder of its own; pictures are then made small
-enough for a repository. `--list` prints the commands.
+Each example runs by the command that examples/README.md shows, in a process and a folder of its own; pictures are then
+made small enough for a repository. `--list` prints the commands.
 
     python examples/gallery.py [--only NAME] [--folder assets/pictures] [--list]
 """
@@ -19,28 +19,28 @@ from PIL import Image, ImageSequence
 HERE = Path(__file__).resolve().parent
 PICTURES = HERE.parent / "assets" / "pictures"
 WIDTH, FILM_WIDTH, COLOURS = 600, 400, 128  # [pixels], at most; of a film's palette
-# {example: (its arguments, the file it writes)}
+# {folder/example: (its arguments, the file it writes)}
 EXAMPLES = {
-    "bowl": ("--cells 4 --frames 60 --film output/bowl.gif", "bowl.gif"),
-    "gripper": ("output", "gripper.gif"),
-    "train_controller": ("", "train_controller.gif"),
-    "wall_shot": ("output", "wall_shot.png"),
-    "incline": ("output", "incline.png"),
-    "stack": ("output", "stack.png"),
-    "least_compliance": ("output", "least_compliance.png"),
-    "sag_into_shape": ("output", "sag_into_shape.png"),
-    "inverse_rest_shape": ("output", "inverse_rest_shape.png"),
-    "stiffness_field": ("", "stiffness_field.png"),
-    "learned_material": ("", "learned_material.png"),
-    "cantilever": ("--quick output", "cantilever.png"),
-    "cooks_membrane": ("--quick output", "cooks_membrane.png"),
-    "throw_at_target": ("output", "throw_at_target.png"),
-    "identify_beam": ("output", "identify_beam.png"),
-    "identify_torch": ("", "identify_both.png"),
-    "stiffness_from_picture": ("output", "stiffness_from_picture.png"),
-    "train_distributed": ("", "train_distributed.png"),
+    "identify/stiffness_field": ("", "stiffness_field.png"),
+    "identify/learned_material": ("", "learned_material.png"),
+    "identify/identify_beam": ("output", "identify_beam.png"),
+    "identify/identify_torch": ("", "identify_both.png"),
+    "identify/stiffness_from_picture": ("output", "stiffness_from_picture.png"),
+    "identify/train_distributed": ("", "train_distributed.png"),
+    "design/least_compliance": ("output", "least_compliance.png"),
+    "design/sag_into_shape": ("output", "sag_into_shape.png"),
+    "design/inverse_rest_shape": ("output", "inverse_rest_shape.png"),
+    "control/gripper": ("output", "gripper.gif"),
+    "control/train_controller": ("", "train_controller.gif"),
+    "control/wall_shot": ("output", "wall_shot.png"),
+    "control/throw_at_target": ("output", "throw_at_target.png"),
+    "contact/bowl": ("--cells 4 --frames 60 --film output/bowl.gif", "bowl.gif"),
+    "contact/incline": ("output", "incline.png"),
+    "contact/stack": ("output", "stack.png"),
+    "benchmarks/cantilever": ("--quick output", "cantilever.png"),
+    "benchmarks/cooks_membrane": ("--quick output", "cooks_membrane.png"),
 }
-TORCHRUN = {"train_distributed": "--nproc_per_node=2"}  # examples of several processes
+TORCHRUN = {"identify/train_distributed": "--nproc_per_node=2"}  # examples of several processes
 
 
 def command(name: str) -> str:
@@ -65,7 +65,7 @@ def make(name: str, folder: Path) -> Path:
         made = Path(temporary) / "output" / made
         if done.returncode or not made.exists():
             raise RuntimeError(f"{name}: saved no picture (exit status {done.returncode})\n{done.stderr[-2000:]}")
-        out = folder / f"gallery_{name}{made.suffix}"
+        out = folder / f"gallery_{Path(name).name}{made.suffix}"
         (shrink_film if made.suffix == ".gif" else shrink_picture)(made, out)
     return out
 

@@ -1,24 +1,12 @@
 """The examples of contact run and find what they look for."""
 
-import importlib.util
-from pathlib import Path
-
 import pytest
-
-EXAMPLES = Path(__file__).parent.parent / "examples"
-
-
-def run(name: str, *arguments) -> dict:
-    """The numbers that an example's `main` returns."""
-    spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module.main(*arguments)
+from example_files import example
 
 
 def test_incline(capsys):
     """A whole body, not a point: R21 to 1 %."""
-    numbers = run("incline")
+    numbers = example("contact/incline").main()
     assert numbers["exact"] == pytest.approx(0.274198, rel=1e-5)
     assert numbers["slides"] == pytest.approx(numbers["exact"], rel=1e-2) and 0 < numbers["holds"] < 1e-3
     assert "Coulomb's law" in capsys.readouterr().out
@@ -26,7 +14,7 @@ def test_incline(capsys):
 
 @pytest.mark.filterwarnings("error:gradients through contacts")
 def test_wall_shot(capsys):
-    numbers = run("wall_shot")
+    numbers = example("control/wall_shot").main()
     assert numbers["miss"] <= 1e-6 and numbers["iterations"] <= 6  # Newton's method converges: the gradient is exact
     assert numbers["back"] < -1 and numbers["velocity"][0] > 2 and 0 < numbers["gap"] < 0.06 and numbers["resolved"]
     assert "throw with" in capsys.readouterr().out
@@ -34,7 +22,7 @@ def test_wall_shot(capsys):
 
 @pytest.mark.filterwarnings("error:gradients through contacts")
 def test_gripper(capsys, tmp_path):
-    numbers = run("gripper", tmp_path)
+    numbers = example("control/gripper").main(tmp_path)
     assert numbers["before"] > 0.02 and numbers["after"] < 5e-4 and numbers["evaluations"] <= 15
     assert numbers["squeezes"].shape == (2, 5) and numbers["squeezes"].max() > 2e-3 and numbers["resolved"]
     assert (tmp_path / "gripper.gif").stat().st_size > 10_000

@@ -1,28 +1,17 @@
 """Every example runs and finds what it looks for."""
 
-import importlib.util
 import json
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
-
-ROOT = Path(__file__).parent.parent
-
-
-def run(name: str, *arguments) -> dict:
-    """The numbers that an example's `main` returns."""
-    spec = importlib.util.spec_from_file_location(name, ROOT / "examples" / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module.main(*arguments)
+from example_files import EXAMPLES, example
 
 
 def test_throw_at_target(capsys):
-    numbers = run("throw_at_target")
+    numbers = example("control/throw_at_target").main()
     assert numbers["miss"] <= 1e-6 and numbers["iterations"] <= 6
     # drag c and steps h make v = (target - fall) c / (1 - exp(-c T)) up to the order of the step
     c, T = 0.6, 0.6
@@ -33,27 +22,27 @@ def test_throw_at_target(capsys):
 
 
 def test_identify_beam(capsys):
-    numbers = run("identify_beam")
+    numbers = example("identify/identify_beam").main()
     assert numbers["error"] <= 1e-3 and numbers["evaluations"] <= 20
     assert 0.08 <= numbers["residual_mm"] <= 0.12  # nothing is left but the noise of 0.1 mm
     assert "E = " in capsys.readouterr().out
 
 
 def test_inverse_rest_shape(capsys):
-    numbers = run("inverse_rest_shape")
+    numbers = example("design/inverse_rest_shape").main()
     assert numbers["ratio"] >= 100 and numbers["iterations"] <= 6
     assert numbers["lift"] > numbers["before"] > 0.05  # cast upwards, by more than the mean sag
     assert "sag" in capsys.readouterr().out
 
 
 def test_stack(capsys):
-    numbers = run("stack", 3, 0.3)
+    numbers = example("contact/stack").main(3, 0.3)
     assert 0.29 < numbers["height"] < 0.31 and numbers["drift"] < 1e-5 and numbers["gap"] > 1e-3
     assert min(numbers["between"]) > 0 and "high after" in capsys.readouterr().out
 
 
 def test_bowl(capsys):
-    numbers = run("bowl", 4, 2, 22)
+    numbers = example("contact/bowl").main(4, 2, 22)
     assert 0 < numbers["gap"] < 0.25 * 0.1 / 2 and numbers["radius"] < 0.5
     assert "no surface passed through another" in capsys.readouterr().out
 
@@ -61,20 +50,10 @@ def test_bowl(capsys):
 @pytest.mark.parametrize("precision", ["f32", "f64"])
 def test_benchmark(precision):
     """In a process of its own: it starts Taichi."""
-    command = [
-        sys.executable,
-        ROOT / "examples" / "benchmark.py",
-        "--common",
-        "--json",
-        "--sizes",
-        "4",
-        "--repeats",
-        "1",
-    ]
-    paths = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
-    done = subprocess.run(
-        [*command, "--precision", precision], capture_output=True, text=True, env=os.environ | {"PYTHONPATH": paths}
-    )
+    command = [sys.executable, EXAMPLES / "benchmarks" / "speed.py", "--common", "--json", "--sizes", "4", "--repeats", "1"]
+    paths = os.pathsep.join([str(EXAMPLES.parent), os.environ.get("PYTHONPATH", "")])
+    done = subprocess.run([*command, "--precision", precision], capture_output=True, text=True,
+                          env=os.environ | {"PYTHONPATH": paths})  # fmt: skip
     assert done.returncode == 0, done.stderr
     row = json.loads([line for line in done.stdout.splitlines() if line.startswith("{")][-1])
     assert row["who"] == "diffsim_ti" and row["tets"] == 6 * 3**3 and row["precision"] == precision

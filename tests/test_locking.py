@@ -1,11 +1,10 @@
 """Volume averaged over patches: derivatives, invariances, exactness for constant strain, and how much less it locks."""
 
-import importlib.util
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 import pytest
+from example_files import example
 
 import diffsim_ti as ds
 from diffsim_ti.materials import MATERIALS
@@ -14,10 +13,7 @@ from diffsim_ti.solvers.implicit.preconditioners import _assemble
 from diffsim_ti.state import observe
 from diffsim_ti.state.stability import element_limit, lanczos_limit
 
-path = Path(__file__).parent.parent / "examples" / "benchmark_locking.py"
-spec = importlib.util.spec_from_file_location("benchmark_locking", path)
-benchmark_locking = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(benchmark_locking)
+locking = example("benchmarks/locking")
 
 SOLVERS = (ds.SemiImplicitSolver, ds.VelocityVerletSolver, ds.ImplicitMidpointSolver, ds.StaticSolver)
 every_law = pytest.mark.parametrize("law", MATERIALS, ids=lambda law: law.__name__)
@@ -225,10 +221,10 @@ def test_without_patches_nothing_is_there():
 
 def test_side_by_side_with_other_elements():
     """The benchmark's small meshes: patches beat tetrahedra and nodal averages, and are what diffsim_ti computes."""
-    out = benchmark_locking.main(quick=True)
+    out = locking.main(quick=True)
     assert out["agreement"] < 1e-7
     for pattern in ("five", "kuhn"):
-        rows = {e: out[0.4999, pattern, e] for e in benchmark_locking.ELEMENTS}
+        rows = {e: out[0.4999, pattern, e] for e in locking.ELEMENTS}
         for problem in ("beam", "cook"):
             assert rows["tetrahedra"][problem] < rows["nodal"][problem] < rows["patches"][problem] < 1
         assert rows["patches"]["step"] > rows["tetrahedra"]["step"] > rows["quadratic"]["step"]
@@ -236,10 +232,10 @@ def test_side_by_side_with_other_elements():
 
 def test_membrane_locks_several_times_less():
     """Cook's membrane, nu = 0.4999, eight cells: what is missing of the rise."""
-    missing = [1 - benchmark_locking.membrane(8, "five", 0.4999, e)[0] for e in ("patches", "tetrahedra")]
+    missing = [1 - locking.membrane(8, "five", 0.4999, e)[0] for e in ("patches", "tetrahedra")]
     assert missing[0] < 0.1 < 0.4 < missing[1]
 
 
 def test_beam_of_kuhn_cells_bends():
     """A cantilever of 4 cells across, nu = 0.4999: 6 % of its drop with tetrahedra, 82 % with patches."""
-    assert benchmark_locking.product_drop(4, "kuhn", 0.4999, "patches") == pytest.approx(0.822, abs=1e-3)
+    assert locking.product_drop(4, "kuhn", 0.4999, "patches") == pytest.approx(0.822, abs=1e-3)

@@ -10,8 +10,8 @@ import pytest
 import diffsim_ti as ds
 from diffsim_ti.study import problem
 
-sys.path.insert(0, str(Path(__file__).parent.parent / "examples"))
-sys.path.insert(0, str(Path(__file__).parent.parent / "examples" / "peers"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "examples" / "benchmarks"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "examples" / "benchmarks" / "peers"))
 
 import compare_peers  # noqa: E402
 from job import Job  # noqa: E402

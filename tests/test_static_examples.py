@@ -1,25 +1,13 @@
 """The examples of equilibria and implicit steps find what they look for, on small meshes."""
 
-import importlib.util
-from pathlib import Path
-
 import numpy as np
 import pytest
-
-EXAMPLES = Path(__file__).parent.parent / "examples"
-
-
-def example(name: str):
-    """An example as a module."""
-    spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+from example_files import example
 
 
 def test_cantilever(capsys):
     """Small strains as another code finds them (its numbers have three digits); large rotations as the elastica."""
-    numbers = example("cantilever").main(quick=True)
+    numbers = example("benchmarks/cantilever").main(quick=True)
     for share, known in numbers["shares"].values():
         assert share == pytest.approx(known, abs=6e-3)
     ((fine, extrapolated),) = numbers["elastica"].values()
@@ -30,7 +18,7 @@ def test_cantilever(capsys):
 
 def test_cooks_membrane(capsys):
     """Plane strain is met, the corner rises towards the reference from below, as linear tetrahedra do."""
-    numbers = example("cooks_membrane").main(quick=True)
+    numbers = example("benchmarks/cooks_membrane").main(quick=True)
     for name in ("linear", "large"):
         case = numbers[name]
         rise, exact = np.array(case["corner"]), case["exact"][0]
@@ -42,7 +30,7 @@ def test_cooks_membrane(capsys):
 
 
 def test_sag_into_shape(tmp_path, capsys):
-    numbers = example("sag_into_shape").main(tmp_path, quick=True)
+    numbers = example("design/sag_into_shape").main(tmp_path, quick=True)
     assert numbers["ratio"] >= 1000 and numbers["iterations"] <= 7
     assert numbers["before"] > 0.1 and numbers["lift"] > numbers["before"]  # cast higher, by more than the mean sag
     assert (tmp_path / "sag_into_shape.png").stat().st_size > 10_000
@@ -51,7 +39,7 @@ def test_sag_into_shape(tmp_path, capsys):
 
 def test_stiffness_from_picture(capsys):
     """Within 2 %, and within three times the spread that the noise of the picture leaves."""
-    numbers = example("stiffness_from_picture").main(quick=True)
+    numbers = example("identify/stiffness_from_picture").main(quick=True)
     truth = {"upper": 2e6, "elbow": 2.5e5, "lower": 8e5}
     for part, E in numbers["E"].items():
         assert E == pytest.approx(truth[part], rel=0.02)
@@ -61,7 +49,7 @@ def test_stiffness_from_picture(capsys):
 
 
 def test_least_compliance(tmp_path, capsys):
-    numbers = example("least_compliance").main(tmp_path, quick=True)
+    numbers = example("design/least_compliance").main(tmp_path, quick=True)
     assert numbers["by_even"] >= 4.5 and numbers["volume"] == pytest.approx(0.4, abs=1e-6)
     assert np.all(np.diff(numbers["history"]) < 0)
     assert (tmp_path / "least_compliance.png").stat().st_size > 10_000
@@ -70,7 +58,7 @@ def test_least_compliance(tmp_path, capsys):
 
 def test_derivatives_of_the_compliance():
     """By E they are -f . u shares: E dc/dE adds up to -c; and they equal differences."""
-    module = example("least_compliance")
+    module = example("design/least_compliance")
     panel = module.Panel((4, 2, 1), tolerance=1e-12)
     E = module.E0 * (1 + np.random.default_rng(0).random(panel.mesh.num_tetrahedra))
     c, by_E = panel.compliance(E)
@@ -82,8 +70,8 @@ def test_derivatives_of_the_compliance():
 
 def test_benchmark_of_implicit_steps(capsys):
     """Every part runs; the direct solver takes the same steps."""
-    benchmark = example("benchmark_implicit")
-    ((tetrahedra, ours, theirs, ratio, differ),) = benchmark.direct([160], 2)
+    benchmark = example("benchmarks/implicit_steps")
+    (tetrahedra, ours, theirs, ratio, differ), = benchmark.direct([160], 2)
     assert tetrahedra == 168 and ratio == pytest.approx(theirs / ours) and differ < 1e-6
     rows, exponent = benchmark.growth([60, 400], 1)
     assert np.isfinite(exponent) and rows[-1][2] > 10

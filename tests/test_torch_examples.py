@@ -1,23 +1,13 @@
 """The torch examples recover what they should; each writes a picture, and goes on where it was stopped."""
 
-import importlib.util
 import json
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 import torch
-
-FOLDER = Path(__file__).parents[1] / "examples"
-
-
-def example(name: str):
-    spec = importlib.util.spec_from_file_location(name, FOLDER / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+from example_files import EXAMPLES, example
 
 
 def check_files(folder, *names, kind="png"):
@@ -26,7 +16,7 @@ def check_files(folder, *names, kind="png"):
 
 
 def test_identify(tmp_path, capsys):
-    result = example("identify_torch").main(tmp_path)
+    result = example("identify/identify_torch").main(tmp_path)
     assert result["falling"]["E_error"] < 0.01
     assert result["sagging"]["E_error"] < 1e-3 and result["sagging"]["iterations"] <= 10
     assert result["both"]["E_error"] < 0.01 and result["both"]["nu_error"] < 0.01
@@ -37,27 +27,27 @@ def test_identify(tmp_path, capsys):
 
 
 def test_stiffness_field(tmp_path):
-    result = example("stiffness_field").main(tmp_path, iterations=15)
+    result = example("identify/stiffness_field").main(tmp_path, iterations=15)
     assert result["median_error"] < 0.02 and result["worst_tenth"] < 0.1 and result["classified"] > 0.98
     assert result["start_error"] > 0.6
     check_files(tmp_path, "stiffness_field")
 
 
 def test_learned_material(tmp_path):
-    result = example("learned_material").main(tmp_path, iterations=20)
+    result = example("identify/learned_material").main(tmp_path, iterations=20)
     assert result["median_error"] < 0.12
     assert result["unseen_motion_error"] < 0.02 < 0.2 < result["unseen_motion_error_before"]
     check_files(tmp_path, "learned_material")
 
 
 def test_controller(tmp_path):
-    result = example("train_controller").main(tmp_path, iterations=60)
+    result = example("control/train_controller").main(tmp_path, iterations=60)
     assert result["miss_seen"] < 0.025 and result["miss_unseen"] < 0.04 and result["miss_before"] > 0.1
     check_files(tmp_path, "train_controller", kind="gif")
 
 
 def test_resumed_controller_is_the_uninterrupted_one(tmp_path, monkeypatch):
-    module, states = example("train_controller"), []
+    module, states = example("control/train_controller"), []
     monkeypatch.setattr(module, "save_reaches", lambda *_, **__: None)
     for folder, stops in (("whole", [6]), ("parts", [3, 6])):
         for stop in stops:
@@ -68,8 +58,8 @@ def test_resumed_controller_is_the_uninterrupted_one(tmp_path, monkeypatch):
 
 def distributed(folder, iterations: int) -> dict:
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(FOLDER.parent), *sys.path]), "OMP_NUM_THREADS": "1"}
-    script = [str(FOLDER / "train_distributed.py"), "--folder", str(folder), "--iterations", str(iterations)]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(EXAMPLES.parent), *sys.path]), "OMP_NUM_THREADS": "1"}
+    script = [str(EXAMPLES / "identify" / "train_distributed.py"), "--folder", str(folder), "--iterations", str(iterations)]
     out = subprocess.run([*command, *script], capture_output=True, text=True, timeout=300, env=environment)
     assert out.returncode == 0, out.stderr
     return json.loads(next(line for line in out.stdout.splitlines() if line.startswith("{")))

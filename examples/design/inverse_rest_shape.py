@@ -4,7 +4,7 @@ The unknowns are the rest positions of all free vertices. The bar is let go in t
 hangs still; the residual is how far it then is from the wanted shape. Gauss-Newton: the step solves J^T J d = -J^T r by
 conjugate gradients, where J^T r is the gradient by the rest shape and J^T J d one tangent and one reverse run.
 
-    python examples/inverse_rest_shape.py [folder for a picture]
+    python examples/design/inverse_rest_shape.py [folder for a picture]
 """
 
 import sys

@@ -1,9 +1,9 @@
 """Speed of implicit steps: against a direct solver, as the mesh grows, backward, and where they beat explicit ones.
 
-    python examples/benchmark_implicit.py --part direct       # a Newton step by SciPy's sparse LU of the same equations
-    python examples/benchmark_implicit.py --part growth       # time per step from 1 000 to 200 000 tetrahedra, and memory
-    python examples/benchmark_implicit.py --part backward     # the gradient of one step, in Newton iterations
-    python examples/benchmark_implicit.py --part crossing [mesh.msh]    # one second of motion to 1 %, against explicit
+    python examples/benchmarks/implicit_steps.py --part direct    # a Newton step by SciPy's sparse LU
+    python examples/benchmarks/implicit_steps.py --part growth    # time per step and memory, 1 000 to 200 000 tetrahedra
+    python examples/benchmarks/implicit_steps.py --part backward  # the gradient of one step, in Newton iterations
+    python examples/benchmarks/implicit_steps.py --part crossing [mesh.msh]  # a second to 1 %, and explicit
 
 A beam held at one end, that falls into sag: stable neo-Hookean, nu = 0.45, 1000 kg/m^3, float64; E = 1e6 Pa and steps of
 10 ms unless said. Prints a table in Markdown.

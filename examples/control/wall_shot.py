@@ -3,7 +3,7 @@
 The wall is rough and the ball soft, so that it leaves with other speed and spin than it came with. Three reverse sweeps, one
 for each coordinate of the ball's centre, give the Jacobian that Newton's method needs.
 
-    python examples/wall_shot.py [folder for a picture]
+    python examples/control/wall_shot.py [folder for a picture]
 """
 
 import sys

@@ -11,7 +11,7 @@ plane strain (share of the corner's rise), and the Lamé mode of a free cube (fr
 no part, since the mode is free of divergence). The matrices are assembled here with SciPy, apart from diffsim_ti's kernels;
 the last line holds the two against each other.
 
-    python examples/benchmark_locking.py
+    python examples/benchmarks/locking.py
 """
 
 import time

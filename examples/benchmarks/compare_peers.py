@@ -1,14 +1,14 @@
 """Common work on whatever of torch-diffsim, NVIDIA Warp and JAX is installed, next to ours, in one run.
 
-    python examples/compare_peers.py [--peer-python PATH] [--part common|accuracy|charts|all] [--quick]
+    python examples/benchmarks/compare_peers.py [--peer-python PATH] [--part common|accuracy|charts|all] [--quick]
 
-common: the work of benchmark.py, equal steps; prints ns per tetrahedron and substep.
+common: the work of speed.py, equal steps; prints ns per tetrahedron and substep.
 accuracy: time to a given error, with and without gradients, of a Lamé mode against its closed form and of a bunny that falls
     on a floor against its own converged motion; draws peers.png and prints the times to 1e-2 and 1e-3.
 charts: the work-precision diagrams of `diffsim-ti chart` with torch-diffsim's runs in them.
 
-Each peer runs in a process of its own (examples/peers/), one after the other. --peer-python names an interpreter whose
-environment holds the peers (they need not share ours). Pictures and records go to --output.
+Each peer runs in a process of its own (peers/ beside this file), one after the other. --peer-python names an interpreter
+whose environment holds the peers (they need not share ours). Pictures and records go to --output.
 """
 
 import argparse
@@ -18,15 +18,15 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from benchmark import SUBSTEPS, H, common_rollout, measure
 from peers import work
+from speed import SUBSTEPS, H, common_rollout, measure
 
 import diffsim_ti as ds
 from diffsim_ti.study import chart, charts, pareto_front, problem, problems
 from diffsim_ti.study.problem import Problem, Watch
 from diffsim_ti.study.work_precision import reference
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 EXPLICIT = (ds.SemiImplicitSolver, ds.VelocityVerletSolver)
 ERRORS = (1e-2, 1e-3)
 

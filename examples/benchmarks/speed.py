@@ -4,8 +4,8 @@ The unit cube in Kuhn tetrahedra (6 per cell), Smith neo-Hookean, E = 1e5 Pa, nu
 gravity, drag that keeps 0.999 of the velocity per substep, symplectic Euler, 20 substeps of 2.5e-4 s, float32; the loss is
 the sum of squared final positions, the gradients are by both Lame parameters of every tetrahedron and by the start.
 
-    python examples/benchmark.py --common [--json] [--sizes 6 11 21] [--precision f32] [--repeats 20]
-    python examples/benchmark.py --growth          # cost per tetrahedron from 6 000 to 1 000 000 tetrahedra
+    python examples/benchmarks/speed.py --common [--json] [--sizes 6 11 21] [--precision f32] [--repeats 20]
+    python examples/benchmarks/speed.py --growth          # cost per tetrahedron from 6 000 to 1 000 000 tetrahedra
 """
 
 import argparse

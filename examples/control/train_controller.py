@@ -5,7 +5,7 @@ network of 180 weights sees the tip's place and velocity and the target, and set
 of the tip from the target over the second half of half a second, and the effort. It is trained on four targets and judged on
 three others.
 
-    python examples/train_controller.py
+    python examples/control/train_controller.py
 
 A film of what it learnt goes to output/.
 """

@@ -5,7 +5,7 @@ held at one face that sags, L-BFGS; (c) the same for E and nu together. As the s
 the last frame only, it cannot work: the gradient is 4e-11, Adam adds 1e-8 to what it divides by, and the loss of the last
 frame alone rises before it falls on the way from 2e5 to 8e4.
 
-    python examples/identify_torch.py
+    python examples/identify/identify_torch.py
 
 Pictures of all three go to output/, written while they run.
 """

@@ -4,7 +4,7 @@ The same fall is run with and without self-contact (without it the blocks fall t
 time of a substep is compared. A frame that is refused, because surfaces might cross or the step is unstable, is run again
 with half the substep.
 
-    python examples/bowl.py [--quick] [--cells 10] [--frames 40] [--film output/bowl.gif]
+    python examples/contact/bowl.py [--quick] [--cells 10] [--frames 40] [--film output/bowl.gif]
 """
 
 import argparse

@@ -4,7 +4,7 @@ Each process simulates its share of an ensemble of throws and all average their 
 optimiser step. Rank 0 also computes the whole ensemble alone and compares; it keeps the state file, from which all ranks go
 on, and draws the picture.
 
-    torchrun --nproc_per_node=2 examples/train_distributed.py
+    torchrun --nproc_per_node=2 examples/identify/train_distributed.py
 """
 
 import argparse

@@ -4,8 +4,8 @@ torch-diffsim is no dependency: install it beside diffsim_ti in an environment o
 Its law is Smith's stable neo-Hookean; its ground (barrier of width 0.02 at y = 0) cannot be switched off, so the body is
 lifted above it; damping is off.
 
-    python examples/side_by_side_torch_diffsim.py [--sizes 4 6 8]
-    python examples/side_by_side_torch_diffsim.py --implicit [--sizes 2 3 4 5]    # its dense IPC step, which needs ipctk
+    python examples/benchmarks/side_by_side_torch_diffsim.py [--sizes 4 6 8]
+    python examples/benchmarks/side_by_side_torch_diffsim.py --implicit [--sizes 2 3 4 5]  # its IPC step; needs ipctk
 """
 
 import argparse

@@ -6,7 +6,7 @@ answer does not depend on the mesh. The compliance f . u is least under a given 
 x <- x sqrt(-dc/dx / (multiplier volume)), within a move limit.
 Bendsoe, Sigmund, Topology Optimization, doi:10.1007/978-3-662-05086-6; Andreassen and others, doi:10.1007/s00158-010-0594-7.
 
-    python examples/least_compliance.py [folder for a picture, default output]
+    python examples/design/least_compliance.py [folder for a picture, default output]
 """
 
 import sys

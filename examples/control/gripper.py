@@ -2,7 +2,7 @@
 
 Pads are planes that follow paths; the gradient by the paths goes through friction, which is all that holds the cube.
 
-    python examples/gripper.py [folder for a film]
+    python examples/control/gripper.py [folder for a film]
 """
 
 import sys

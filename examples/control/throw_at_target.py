@@ -3,7 +3,7 @@
 Gradient descent: the first step is the one that would hit without air, where the centre moves as a stone does; the next take
 their length from how the gradient changed (Barzilai, Borwein 1988, doi:10.1093/imanum/8.1.141).
 
-    python examples/throw_at_target.py [folder for a picture]
+    python examples/control/throw_at_target.py [folder for a picture]
 """
 
 import sys

@@ -3,7 +3,7 @@
 The slab first settles on the incline, in drag, at the friction that just holds it; then it is let go. A soft body on a stiff
 barrier would not do: Coulomb friction makes such a body vibrate (as brakes squeal), and then it slides further.
 
-    python examples/incline.py [folder for a picture]
+    python examples/contact/incline.py [folder for a picture]
 """
 
 import sys

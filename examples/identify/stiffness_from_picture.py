@@ -5,7 +5,7 @@ part; the gradient is that of the equilibrium, one linear solve. The places are 
 spread of the answer that follows from that is stated with it: sqrt(noise^2 (S^T S)^-1), S the sensitivities of the places
 to log E.
 
-    python examples/stiffness_from_picture.py [folder for a picture]
+    python examples/identify/stiffness_from_picture.py [folder for a picture]
 """
 
 import sys

@@ -5,7 +5,7 @@ step minimises |r + J d|^2 + damping |d|^2, r = x(X) - wanted, by LSMR, to which
 a direction of the rest shape and J^T r its gradient by the rest shape: one linear solve each with the Hessian of the
 equilibrium, whatever the number of unknowns. A step is halved while it makes things worse or turns a tetrahedron over.
 
-    python examples/sag_into_shape.py [folder for a picture, default output]
+    python examples/design/sag_into_shape.py [folder for a picture, default output]
 """
 
 import sys

@@ -3,7 +3,7 @@
 The parameter is log E, which keeps E positive and makes a factor of ten as far up as down; L-BFGS takes the exact gradient.
 Density must be known: motion under gravity alone tells E / rho and nothing more.
 
-    python examples/identify_beam.py [folder for a picture, which is written while the optimisation runs]
+    python examples/identify/identify_beam.py [folder for a picture, which is written while the optimisation runs]
 """
 
 import sys

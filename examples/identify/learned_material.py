@@ -3,7 +3,7 @@
 The truth is a beam whose stiffness waves along it and falls across it. The network sees one motion (swinging from one end)
 and is judged on its field and on another motion (thrown sideways) that it has not seen.
 
-    python examples/learned_material.py
+    python examples/identify/learned_material.py
 """
 
 import math

@@ -4,7 +4,7 @@ A beam with a stiff middle hangs from one end and swings; the displacements of a
 frames. log E of every tetrahedron is free, so that neighbours must be told to agree: the penalty is the jump of log E across
 each inner face, weighted by its area (total variation, which leaves sharp edges sharp).
 
-    python examples/stiffness_field.py
+    python examples/identify/stiffness_field.py
 """
 
 from pathlib import Path

@@ -1,8 +1,8 @@
 """Where the time of a step goes: share of each kernel and of starting it, by size, and the distance to a C++ bound.
 
-    python examples/profile_step.py [--sizes 6 11 21 44] [--bound PROGRAM ...]
+    python examples/benchmarks/profile_step.py [--sizes 6 11 21 44] [--bound PROGRAM ...]
 
-The common work of benchmark.py, forward, in the Taichi profiler. --bound names programs that print lines with
+The common work of speed.py, forward, in the Taichi profiler. --bound names programs that print lines with
 `M=<tetrahedra>` and `<number> ns/el` (ns per tetrahedron and force evaluation), such as a hand-written C++ loop; the size
 nearest to ours counts.
 """
@@ -14,7 +14,7 @@ import time
 from collections import defaultdict
 
 import taichi as ti
-from benchmark import SUBSTEPS, best_seconds, common_rollout
+from speed import SUBSTEPS, best_seconds, common_rollout
 from taichi.profiler.kernel_profiler import get_default_kernel_profiler
 
 import diffsim_ti as ds

@@ -8,7 +8,7 @@ Two problems, in N, mm and MPa: small strains, whose corner rises 32.18 mm, and 
 14.499 mm in the middle of the edge. Linear tetrahedra approach both from below (locking), with an error of order h^2 or a
 little less, for the corner on the left is singular: so three meshes also give the limit, by Aitken's formula.
 
-    python examples/cooks_membrane.py [--quick] [folder for a picture]
+    python examples/benchmarks/cooks_membrane.py [--quick] [folder for a picture]
 """
 
 import sys

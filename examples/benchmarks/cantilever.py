@@ -7,7 +7,7 @@ What is missing there is locking too, of order h^2: two meshes extrapolate it aw
 loads the bar then hangs lower than the elastica by about P / (E A), a hundredth: it stretches and shears, the elastica
 does not.
 
-    python examples/cantilever.py [--quick] [folder for a picture]
+    python examples/benchmarks/cantilever.py [--quick] [folder for a picture]
 """
 
 import sys
