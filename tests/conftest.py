@@ -5,6 +5,7 @@ DIFFSIM_TI_DEBUG=1: kernels check the bounds of every array; slow, in one proces
 
 import os
 
+import areas
 import pytest
 
 import diffsim_ti
@@ -20,3 +21,15 @@ def taichi():
 def default_precision(taichi):
     """What a file leaves behind (commands choose a precision) is not what the next one starts with."""
     diffsim_ti.runtime.set_precision("f64")
+
+
+def pytest_addoption(parser):
+    parser.addoption("--minutes", action="store_true", help="write the minutes of each area to tests/README.md")
+
+
+def pytest_terminal_summary(terminalreporter, config):
+    if config.getoption("--minutes"):
+        reports = [r for kind in terminalreporter.stats.values() for r in kind if isinstance(r, pytest.TestReport)]
+        minutes = areas.minutes_of(reports)
+        areas.write(minutes)
+        terminalreporter.write_line("minutes: " + ", ".join(f"{area} {spent:.1f}" for area, spent in minutes.items()))

@@ -1,17 +1,24 @@
-"""The README's code blocks run as they stand and print what it says."""
+"""The pages' code blocks run as they stand and print what they say; their commands, links and pictures are there."""
 
 import contextlib
 import io
 import re
-import subprocess
-import sys
+import shlex
 from pathlib import Path
 
+import areas
 import pytest
+import typer
+
+from diffsim_ti import cli
 
 ROOT = Path(__file__).parent.parent
-README = (ROOT / "README.md").read_text()
-BLOCKS = re.findall(r"```python\n(.*?)```(?:\s*```text\n(.*?)```)?", README, re.DOTALL)
+PAGES = {name: (ROOT / name).read_text() for name in ("README.md", "examples/README.md", "tests/README.md")}
+BLOCKS = [
+    pytest.param(*block, id=f"{page.removesuffix('README.md')}block{k}")
+    for page, text in PAGES.items()
+    for k, block in enumerate(re.findall(r"```python\n(.*?)```(?:\s*```text\n(.*?)```)?", text, re.DOTALL))
+]
 
 
 def numbers(text: str) -> list[float]:
@@ -31,9 +38,10 @@ def run(code: str) -> str:
     return out.getvalue()
 
 
-@pytest.mark.parametrize("code, printed", BLOCKS, ids=[f"block{k}" for k in range(len(BLOCKS))])
+@pytest.mark.parametrize("code, printed", BLOCKS)
 @pytest.mark.filterwarnings("ignore::UserWarning")
-def test_code_block_runs_and_prints_what_is_shown(code, printed):
+def test_code_block_runs_and_prints_what_is_shown(code, printed, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     got = run(code)
     if not printed:
         return
@@ -46,9 +54,97 @@ def test_code_block_runs_and_prints_what_is_shown(code, printed):
     assert len(got.splitlines()) >= len(printed.splitlines())
 
 
-def test_every_command_that_the_readme_names_exists():
-    commands = set(re.findall(r"diffsim-ti ([a-z-]+)", README))
-    shown = subprocess.run(
-        [sys.executable, "-m", "diffsim_ti", "--help"], capture_output=True, text=True, cwd=ROOT
-    ).stdout
-    assert commands and all(command in shown for command in commands), commands
+def without_blocks(text: str) -> str:
+    return re.sub(r"```.*?```", "", text, flags=re.DOTALL)
+
+
+def commands(text: str) -> list[str]:
+    """What is to be typed in a shell: the lines of sh blocks, and the code in text that begins like a command."""
+    lines = "\n".join(re.findall(r"```sh\n(.*?)```", text, re.DOTALL)).splitlines()
+    inline = re.findall(r"`((?:diffsim-ti|python|torchrun|pip|ruff) [^`]+)`", without_blocks(text))
+    parts = [part for line in lines + inline for part in re.split(r"&&|;", line.split(" #")[0])]
+    return [part.strip() for part in parts if part.strip()]
+
+
+def check(command: str) -> None:
+    """That the program, the files of this repository and the options of a command exist; nothing is run."""
+    words = [word for word in shlex.split(command) if not re.match(r"\w+=", word)]
+    program, *words = Path(words[0]).name, *words[1:]
+    if program == "diffsim-ti":
+        name, *options = words
+        click_command = typer.main.get_command(cli.app).commands[name]
+        context = click_command.context_class(click_command)
+        click_command.make_parser(context).parse_args(list(options))
+    elif program in ("python", "python3", "torchrun"):
+        if words[:2] == ["-m", "pytest"]:
+            known = ["-n", "--dist", "-k", "-m", "--minutes"]
+            assert all((ROOT / word).exists() for word in words[2:] if word.startswith("tests"))
+            assert all(word in known for word in words[2:] if word.startswith("-"))
+        elif words[0] != "-m":
+            script = next(k for k, word in enumerate(words) if word.endswith(".py"))
+            text = (ROOT / words[script]).read_text()
+            assert all(f'"{word}"' in text for word in words[script + 1 :] if word.startswith("-"))
+    elif program == "pip":
+        extras = (ROOT / "pyproject.toml").read_text().partition("[project.optional-dependencies]")[2]
+        assert words[0] == "install" and all(f"\n{name} = [" in extras for name in re.findall(r"\[(\w+)\]", command))
+    else:
+        assert program == "ruff" and all((ROOT / word).exists() for word in words[1:])
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_commands_are_there(page):
+    shown = commands(PAGES[page])
+    assert len(shown) >= 3
+    for command in shown:
+        try:
+            check(command)
+        except Exception as error:
+            raise AssertionError(f"{page}: {command}: {error}") from error
+
+
+WRONG = """diffsim-ti chart --no-such-option 1
+diffsim-ti nothing
+python examples/benchmark.py
+python examples/gallery.py --quick
+python -m pytest tests/test_nothing.py
+pip install '.[gpu]'
+make all"""
+
+
+@pytest.mark.parametrize("wrong", WRONG.splitlines())
+def test_commands_that_are_not_there_are_found(wrong):
+    with pytest.raises(Exception):  # noqa: B017
+        check(wrong)
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_links_and_pictures_are_there(page):
+    headings = {}
+    for name, text in PAGES.items():
+        titles = re.findall(r"^#+ (.+)$", without_blocks(text), re.M)
+        headings[(ROOT / name).resolve()] = {re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles}
+    for target in re.findall(r"\]\(([^)]+)\)", PAGES[page]):
+        if not target.startswith("https://"):
+            path, _, part = target.partition("#")
+            file = (ROOT / page).parent / path if path else ROOT / page
+            assert file.exists(), target
+            assert not part or part in headings[file.resolve()], target
+
+
+def test_every_picture_is_shown():
+    shown = {Path(target).name for text in PAGES.values() for target in re.findall(r"\]\(([^)]+\.(?:png|gif))\)", text)}
+    assert {path.name for path in (ROOT / "assets" / "pictures").iterdir()} == shown
+
+
+def test_named_tests_exist():
+    named = re.findall(r"`(test_\w+\.py)(?:::(\w+))?`", PAGES["tests/README.md"])
+    assert len(named) > 100
+    for file, name in named:
+        assert f"def {name}" in (ROOT / "tests" / file).read_text(), (file, name)
+
+
+def test_every_test_file_is_in_an_area():
+    files = {path.stem.removeprefix("test_") for path in (ROOT / "tests").glob("test_*.py")}
+    assert files == set(areas.AREA_OF), "name each test file once in tests/areas.py"
+    blank = re.sub(r"[\d.]+ \|$", " |", PAGES["tests/README.md"], flags=re.M)
+    assert areas.table({}) in blank, "run the suite with --minutes"

@@ -15,7 +15,7 @@ def test_named_tests_exist():
 
 
 def test_page_is_up_to_date():
-    assert (torture.HERE / "TORTURE.md").read_text() == torture.table(), "run python tests/torture.py"
+    assert torture.PAGE.read_text() == torture.page(), "run python tests/torture.py"
 
 
 def test_open_rows_are_these_and_no_more():

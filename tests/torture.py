@@ -1,9 +1,11 @@
-"""What a simulator must survive, and the tests that see to it. `python tests/torture.py` writes the table TORTURE.md."""
+"""What a simulator must survive, and the tests that see to it. `python tests/torture.py` writes the tables of README.md."""
 
 import re
 from pathlib import Path
 
 HERE = Path(__file__).parent
+PAGE = HERE / "README.md"
+HEADING = "## What must hold where methods fail"
 
 # what must hold -> the tests, as file:name without "test_"
 ROWS = {
@@ -121,14 +123,19 @@ def missing() -> list[str]:
 
 def table() -> str:
     """Markdown: a table for each group; rows without a test are said to be open."""
-    lines = ["# What must hold where methods fail", "", "Made by `python tests/torture.py`."]
+    lines = [HEADING, "", "Written by `python tests/torture.py`; a test sees to it that all named tests exist."]
     for group, rows in ROWS.items():
-        lines += ["", f"## {group}", "", "| | tests |", "| --- | --- |"]
+        lines += ["", f"### {group}", "", "| | tests |", "| --- | --- |"]
         for words, tests in rows.items():
             cells = [f"`test_{f}.py::test_{name}`" for f, name in (test.split(":") for test in tests.split())]
             lines.append(f"| {words} | {'<br>'.join(cells) or 'open'} |")
     return "\n".join(lines) + "\n"
 
 
+def page() -> str:
+    """README.md with its last section, the table, as it should be."""
+    return PAGE.read_text().partition(HEADING)[0] + table()
+
+
 if __name__ == "__main__":
-    (HERE / "TORTURE.md").write_text(table())
+    PAGE.write_text(page())

@@ -1,0 +1,48 @@
+"""What the test files are about, by area, and the table of README.md that says how many minutes each area takes."""
+
+import re
+from pathlib import Path
+
+PAGE = Path(__file__).parent / "README.md"
+HEAD = "| area | files test_*.py | minutes |\n| --- | --- | ---: |\n"
+
+# area -> files, without test_ and .py
+AREAS = {
+    "meshes, scenes, materials": "mesh scene materials",
+    "motion against closed forms": "reference_motion step_limit hertz torture",
+    "gradients": "gradients gradient_faults checkpoints tape identification",
+    "implicit steps and equilibria": "implicit implicit_gradients implicit_contact",
+    "patches against locking": "locking",
+    "obstacles and friction": "contact contact_crossing contact_friction contact_gradients",
+    "self-contact": "self_contact self_contact_implicit self_contact_pairs",
+    "PyTorch, optimisations": "torch torch_physics torch_solvers seed_snippets optimization",
+    "charts, maps, advice": "study study_stability peers",
+    "pictures, films, the window": "picture_drawing picture_film optimization_picture viewer viewer_window gallery",
+    "examples and pages": "examples contact_examples static_examples torch_examples readme",
+    "command line, resources, Vulkan": "cli resources vulkan",
+}
+AREA_OF = {name: area for area, names in AREAS.items() for name in names.split()}
+
+
+def minutes_of(reports) -> dict[str, float]:
+    """Minutes of each area from pytest's reports; files that are in no area go by their own name."""
+    minutes = {}
+    for report in reports:
+        name = Path(report.nodeid.split("::")[0]).stem.removeprefix("test_")
+        area = AREA_OF.get(name, name)
+        minutes[area] = minutes.get(area, 0.0) + report.duration / 60
+    return minutes
+
+
+def table(minutes: dict) -> str:
+    """Markdown; areas whose minutes are not known keep an empty cell."""
+    cells = {area: minutes.get(area, "") for area in AREAS}
+    return HEAD + "".join(
+        f"| {area} | {', '.join(AREAS[area].split())} | {spent if spent == '' else format(spent, '.1f')} |\n"
+        for area, spent in cells.items()
+    )
+
+
+def write(minutes: dict) -> None:
+    """Put the table into README.md."""
+    PAGE.write_text(re.sub(re.escape(HEAD) + r"(\|.*\n)*", lambda _: table(minutes), PAGE.read_text()))
