@@ -50,10 +50,10 @@ def test_bowl(capsys):
 @pytest.mark.parametrize("precision", ["f32", "f64"])
 def test_benchmark(precision):
     """In a process of its own: it starts Taichi."""
-    command = [sys.executable, EXAMPLES / "benchmarks" / "speed.py", "--common", "--json", "--sizes", "4", "--repeats", "1"]
+    command = [sys.executable, EXAMPLES / "benchmarks" / "speed.py", *"--common --json --sizes 4 --repeats 1".split()]
     paths = os.pathsep.join([str(EXAMPLES.parent), os.environ.get("PYTHONPATH", "")])
-    done = subprocess.run([*command, "--precision", precision], capture_output=True, text=True,
-                          env=os.environ | {"PYTHONPATH": paths})  # fmt: skip
+    environment = os.environ | {"PYTHONPATH": paths}
+    done = subprocess.run([*command, "--precision", precision], capture_output=True, text=True, env=environment)
     assert done.returncode == 0, done.stderr
     row = json.loads([line for line in done.stdout.splitlines() if line.startswith("{")][-1])
     assert row["who"] == "diffsim_ti" and row["tets"] == 6 * 3**3 and row["precision"] == precision

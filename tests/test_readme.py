@@ -122,7 +122,9 @@ def test_links_and_pictures_are_there(page):
     headings = {}
     for name, text in PAGES.items():
         titles = re.findall(r"^#+ (.+)$", without_blocks(text), re.M)
-        headings[(ROOT / name).resolve()] = {re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles}
+        headings[(ROOT / name).resolve()] = {
+            re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles
+        }
     for target in re.findall(r"\]\(([^)]+)\)", PAGES[page]):
         if not target.startswith("https://"):
             path, _, part = target.partition("#")

@@ -71,7 +71,7 @@ def test_derivatives_of_the_compliance():
 def test_benchmark_of_implicit_steps(capsys):
     """Every part runs; the direct solver takes the same steps."""
     benchmark = example("benchmarks/implicit_steps")
-    (tetrahedra, ours, theirs, ratio, differ), = benchmark.direct([160], 2)
+    ((tetrahedra, ours, theirs, ratio, differ),) = benchmark.direct([160], 2)
     assert tetrahedra == 168 and ratio == pytest.approx(theirs / ours) and differ < 1e-6
     rows, exponent = benchmark.growth([60, 400], 1)
     assert np.isfinite(exponent) and rows[-1][2] > 10

@@ -58,8 +58,9 @@ def test_resumed_controller_is_the_uninterrupted_one(tmp_path, monkeypatch):
 
 def distributed(folder, iterations: int) -> dict:
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(EXAMPLES.parent), *sys.path]), "OMP_NUM_THREADS": "1"}
-    script = [str(EXAMPLES / "identify" / "train_distributed.py"), "--folder", str(folder), "--iterations", str(iterations)]
+    paths = os.pathsep.join([str(EXAMPLES.parent), *sys.path])
+    environment = os.environ | {"PYTHONPATH": paths, "OMP_NUM_THREADS": "1"}
+    script = [str(EXAMPLES / "identify" / "train_distributed.py"), f"--folder={folder}", f"--iterations={iterations}"]
     out = subprocess.run([*command, *script], capture_output=True, text=True, timeout=300, env=environment)
     assert out.returncode == 0, out.stderr
     return json.loads(next(line for line in out.stdout.splitlines() if line.startswith("{")))

@@ -1,6 +1,6 @@
 """A stack of soft blocks that stands: each rests on the barrier of the one below.
 
-    python examples/contact/stack.py [folder for a picture]
+python examples/contact/stack.py [folder for a picture]
 """
 
 import sys
