@@ -103,7 +103,7 @@ class DifferentiableMaterial(TorchMaterial):
 
     A gradient by E in pascals is tiny: 4e-11 in the seeds' identification block, far below Adam's eps of 1e-8, so that
     Adam's lr of 5e3 moves E by 20 Pa a step. Optimise log E with a scaled loss over all frames, or use LBFGS
-    (examples/identify_torch.py).
+    (examples/identify/identify_torch.py).
     """
 
     def __init__(

@@ -10,7 +10,7 @@ import areas
 import pytest
 import typer
 
-from diffsim_ti import cli
+from diffsim_ti.cli.app import app
 
 ROOT = Path(__file__).parent.parent
 PAGES = {name: (ROOT / name).read_text() for name in ("README.md", "examples/README.md", "tests/README.md")}
@@ -72,7 +72,7 @@ def check(command: str) -> None:
     program, *words = Path(words[0]).name, *words[1:]
     if program == "diffsim-ti":
         name, *options = words
-        click_command = typer.main.get_command(cli.app).commands[name]
+        click_command = typer.main.get_command(app).commands[name]
         context = click_command.context_class(click_command)
         click_command.make_parser(context).parse_args(list(options))
     elif program in ("python", "python3", "torchrun"):
