@@ -162,7 +162,7 @@ class Rollout(Sweeps):
             first, last = self.schedule.bounds(k)
             self._record(first, last)
             tangent.advance(first, last, self.num_passes, save)
-            ws.advance(first, last, self.num_passes)
+            ws.restore(ws.record, last - first)
         if self.solver.last_frame_is_state:
             tangent.save_frame(self.num_frames - 1)
         self._current = None
