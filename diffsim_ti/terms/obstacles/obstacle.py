@@ -31,6 +31,10 @@ class Obstacle(Term):
 
     Inputs with gradient: the shape's own numbers, "barrier_stiffness", "barrier_width", with friction also "friction" and
     "friction_speed", with a path "<shape>_path", shape (steps + 1, 3). A second obstacle's names end in _2.
+    In explicit steps frictions on one vertex act one after the other: kinds in a fixed order, obstacles of one kind as the
+    scene lists them. Swapping two there, at 90 degrees to each other, moved a body by 7e-4 of the way that it went in 32 ms
+    with substeps of 2 ms, and a gradient by up to 12 % (that of friction_speed); half of both with 1 ms. Elsewhere, and in
+    implicit steps, swapping changes round-off alone.
     Raises ValueError for numbers out of range, or a body that starts on or in the obstacle.
     Li et al. 2020, Incremental Potential Contact, doi:10.1145/3386569.3392425.
     """
