@@ -30,11 +30,15 @@ def crowd() -> dict[str, Term]:
     """Eight terms that all act: two rough obstacles on the same vertices, two half spaces, one obstacle that moves."""
     rng, own = np.random.default_rng(0), dict(stiffness=300.0, width=0.2)
     return {
-        "gravity": ds.Gravity(), "drag": ds.Drag(0.5), "force": ds.ExternalForce(rng.standard_normal((8, 3))),
-        "pairs": ds.SelfContact(300.0, 0.1), "ground": SHAPES["ground"](**own, **ROUGH),
-        "slope": SHAPES["half_space"](**own, **ROUGH), "wall": ds.HalfSpace([-0.1, 0, 0], [1, 0, 0], **own),
+        "gravity": ds.Gravity(),
+        "drag": ds.Drag(0.5),
+        "force": ds.ExternalForce(rng.standard_normal((8, 3))),
+        "pairs": ds.SelfContact(300.0, 0.1),
+        "ground": SHAPES["ground"](**own, **ROUGH),
+        "slope": SHAPES["half_space"](**own, **ROUGH),
+        "wall": ds.HalfSpace([-0.1, 0, 0], [1, 0, 0], **own),
         "sphere": ds.Sphere([0.25, -0.8, 0.2], 0.85, **own, path=lambda t: [0.3 * t, 0.1 * np.sin(5 * t), -0.2 * t]),
-    }  # fmt: skip
+    }
 
 
 def orders(names, count=ORDERS, seed=0):
@@ -51,13 +55,20 @@ def orders(names, count=ORDERS, seed=0):
 
 def scene_of(order, static=False, precision="f64", terms=None, mesh=MESH) -> ds.Scene:
     terms = terms or crowd()
-    return ds.Scene(mesh, ds.StableNeoHookean(2e4, 0.3), 100.0, [terms[name] for name in order], precision=precision,
-                    fixed=[1, 2, 3, 5, 6, 7] if static else None,
-                    initial_velocities=[0.8, -1.0, 0.3])  # fmt: skip
+    return ds.Scene(
+        mesh,
+        ds.StableNeoHookean(2e4, 0.3),
+        100.0,
+        [terms[name] for name in order],
+        precision=precision,
+        fixed=[1, 2, 3, 5, 6, 7] if static else None,
+        initial_velocities=[0.8, -1.0, 0.3],
+    )
 
 
-def rollout_of(order, solver, precision="f64", terms=None, mesh=MESH, dt=4e-3, steps=4, save_every=2,
-               **options) -> ds.Rollout:  # fmt: skip
+def rollout_of(
+    order, solver, precision="f64", terms=None, mesh=MESH, dt=4e-3, steps=4, save_every=2, **options
+) -> ds.Rollout:
     static = solver is ds.StaticSolver
     scene = scene_of(order, static, precision, terms, mesh)
     tolerance = {} if solver.explicit else dict(tolerance=1e-10 if precision == "f64" else 1e-5)
@@ -85,7 +96,9 @@ def found(order, solver, terms=None, **options) -> dict:
     rollout = rollout_of(order, solver, terms=terms, **options)
     frames = rollout.forward()
     gradients = rollout.vjp(frames, *weights(frames.positions.shape))
-    return dict(positions=frames.positions, velocities=frames.velocities) | by_term(rollout.scene, order, gradients, terms)
+    return dict(positions=frames.positions, velocities=frames.velocities) | by_term(
+        rollout.scene, order, gradients, terms
+    )
 
 
 def assert_same_bits(ours: dict, theirs: dict, order) -> None:
@@ -165,8 +178,14 @@ def test_torch(dtype):
     for order in orders(names, 4):
         contact = DifferentiableBarrierContact(300.0, 0.2, ground_height=0.0)
         material = DifferentiableMaterial(E=torch.tensor(2e4, dtype=dtype), nu=torch.tensor(0.3, dtype=dtype))
-        simulator = DifferentiableSimulator(MESH, material, DifferentiableSolver(dt=4e-3, substeps=8), 100.0,
-                                               contact=contact, terms=[crowd()[name] for name in order])  # fmt: skip
+        simulator = DifferentiableSimulator(
+            MESH,
+            material,
+            DifferentiableSolver(dt=4e-3, substeps=8),
+            100.0,
+            contact=contact,
+            terms=[crowd()[name] for name in order],
+        )
         velocity = torch.tensor([[0.8, -1.0, 0.3]], dtype=dtype).expand(8, 3).clone().requires_grad_()
         simulator.reset(velocities=velocity)
         frames = simulator.rollout(4, save_every=2)
@@ -175,8 +194,11 @@ def test_torch(dtype):
         got = dict(x=frames.positions.detach().numpy(), velocity=velocity.grad.numpy(), E=material.E.grad.numpy())
 
         core = simulator.last_rollout
-        tensors = {name: torch.tensor(value, dtype=dtype, requires_grad=True) for name, value in core.values.items()
-                   if name not in ("initial_positions", "rest_positions")}  # fmt: skip
+        tensors = {
+            name: torch.tensor(value, dtype=dtype, requires_grad=True)
+            for name, value in core.values.items()
+            if name not in ("initial_positions", "rest_positions")
+        }
         frames = rollout_frames(core, **tensors)
         ((w * frames.positions).sum() + (z * frames.velocities).sum()).backward()
         by = {name: tensor.grad.numpy() for name, tensor in tensors.items()}
@@ -192,8 +214,11 @@ def test_torch(dtype):
 def swapped(solver, wall, substep=2e-3) -> tuple[float, float]:
     """Largest difference of positions by the way gone, and of a gradient by its size, with two rough half spaces swapped."""
     own = dict(stiffness=300.0, width=0.2)
-    terms = {"gravity": ds.Gravity(), "slope": SHAPES["half_space"](**own, **ROUGH),
-             "wall": ds.HalfSpace(*wall, **own, friction=0.4, friction_speed=2.0)}  # fmt: skip
+    terms = {
+        "gravity": ds.Gravity(),
+        "slope": SHAPES["half_space"](**own, **ROUGH),
+        "wall": ds.HalfSpace(*wall, **own, friction=0.4, friction_speed=2.0),
+    }
     steps = round(32e-3 / (2 * substep))
     options = dict(terms=terms, mesh=tetrahedron(0.15), dt=2 * substep, steps=steps, save_every=steps)
     a, b = (found(order, solver, **options) for order in (["gravity", "slope", "wall"], ["wall", "slope", "gravity"]))
@@ -207,9 +232,11 @@ CEILING = [0, 0.8, 0], [0, -1, 0]  # felt by another vertex than the slope
 CORNER = [-0.1, 0, 0], [1, 0.1, 0]  # by the same
 
 
-@pytest.mark.parametrize("solver, wall", [
-    (ds.SemiImplicitSolver, CEILING), (ds.VelocityVerletSolver, CEILING), (ds.ImplicitEulerSolver, CORNER),
-], ids=["semi_implicit", "verlet", "implicit_euler"])  # fmt: skip
+@pytest.mark.parametrize(
+    "solver, wall",
+    [(ds.SemiImplicitSolver, CEILING), (ds.VelocityVerletSolver, CEILING), (ds.ImplicitEulerSolver, CORNER)],
+    ids=["semi_implicit", "verlet", "implicit_euler"],
+)
 def test_two_of_one_kind_swapped(solver, wall):
     assert max(swapped(solver, wall)) < 1e-12
 
