@@ -63,7 +63,7 @@ class Outcome:
 
 def run_tests(copy: Path, tests, timeout: float) -> tuple[int | None, str]:
     """(pytest's status or None if time ran out, what it printed) of the tests on a copy of the package."""
-    environment = os.environ | {"PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"}
+    environment = os.environ | {"PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1", "COLUMNS": "400"}
     command = [
         sys.executable,
         "-m",
@@ -112,6 +112,7 @@ def judge(mutation: Mutation | None, tests, timeout: float) -> Outcome:
         return Outcome("SURVIVED", seconds=seconds)
     summary = re.findall(r"^(?:FAILED|ERROR) (\S+?)(?: - (.*))?$", said, re.MULTILINE)
     test, error = summary[0] if summary else ("", said.strip()[-300:])
+    test = test.split("tests/")[-1]
     wrong = status == 1 and summary and any(word in error for word in WRONG_NUMBERS)
     return Outcome("CAUGHT" if wrong else "REFUSED", test, error, seconds)
 
@@ -146,7 +147,7 @@ def main() -> int:
                 print_mutation(number, mutation)
                 if outcome.verdict == "CAUGHT":
                     if outcome.test not in passes_without:
-                        alone = str(ROOT / "tests" / outcome.test.split("tests/")[-1])
+                        alone = str(ROOT / "tests" / outcome.test)
                         passes_without[outcome.test] = judge(None, [alone], options.timeout).verdict == "SURVIVED"
                     if not passes_without[outcome.test]:
                         raise SystemExit(f"{outcome.test} fails without any mutation: repair that first")
