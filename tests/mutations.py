@@ -31,22 +31,10 @@ from pathlib import Path
 from mutation_places import PACKAGE, ROOT, Mutation, all_mutations, drawn
 
 TESTS = (
-    "test_every_adjoint.py",
-    "test_term_order.py",
-    "test_contact_gradients.py",
-    "test_implicit_contact.py",
-    "test_implicit_gradients.py",
-    "test_self_contact_implicit.py",
-    "test_gradients.py",
-    "test_checkpoints.py",
-    "test_tape.py",
-    "test_torch.py",
-    "test_torch_physics.py",
-    "test_gradient_faults.py",
-    "test_self_contact.py",
-    "test_locking.py",
-    "test_scene.py",
-)
+    "test_every_adjoint.py test_torch_physics.py test_contact_gradients.py test_checkpoints.py test_gradient_faults.py "
+    "test_torch.py test_tape.py test_implicit_contact.py test_implicit_gradients.py test_self_contact_implicit.py "
+    "test_gradients.py test_term_order.py test_self_contact.py test_locking.py test_scene.py"
+).split()
 
 WRONG_NUMBERS = ("AssertionError", "assert ", "Failed: ", "FloatingPointError")
 
@@ -142,27 +130,25 @@ def main() -> int:
             batch = [m for _, m in zip(range(min(missing, options.jobs)), queue)]
             if not batch:
                 break
-            for mutation, outcome in zip(batch, pool.map(lambda m: judge(m, tests, options.timeout), batch)):
+            for k, mutation in enumerate(batch, start=number + 1):
+                print_mutation(k, mutation)
+            for outcome in pool.map(lambda m: judge(m, tests, options.timeout), batch):
                 number += 1
-                print_mutation(number, mutation)
-                if outcome.verdict == "CAUGHT":
-                    if outcome.test not in passes_without:
-                        alone = str(ROOT / "tests" / outcome.test)
-                        passes_without[outcome.test] = judge(None, [alone], options.timeout).verdict == "SURVIVED"
-                    if not passes_without[outcome.test]:
-                        raise SystemExit(f"{outcome.test} fails without any mutation: repair that first")
+                if outcome.verdict == "CAUGHT" and outcome.test not in passes_without:
+                    alone = judge(None, [ROOT / "tests" / outcome.test], options.timeout)
+                    passes_without[outcome.test] = alone.verdict == "SURVIVED"
+                if not passes_without.get(outcome.test, True):
+                    raise SystemExit(f"{outcome.test} fails without any mutation: repair that first")
                 verdicts[outcome.verdict] += 1
-                print(
-                    f"{outcome.verdict} after {outcome.seconds:.0f} s {outcome.test} {outcome.error[:160]}\n",
-                    flush=True,
-                )
+                said = f"{outcome.verdict} after {outcome.seconds:.0f} s {outcome.test} {outcome.error[:160]}"
+                print(f"{number}. {said}\n", flush=True)
     print(", ".join(f"{count} {verdict.lower()}" for verdict, count in verdicts.items()))
     return verdicts["SURVIVED"] + verdicts["TIMED OUT"]
 
 
 def print_mutation(number: int, mutation: Mutation) -> None:
     print(f"{number}. {mutation.path}:{mutation.line} {mutation.function} ({mutation.kind})")
-    print(mutation.diff((ROOT / mutation.path).read_bytes()))
+    print(mutation.diff((ROOT / mutation.path).read_bytes()), flush=True)
 
 
 if __name__ == "__main__":

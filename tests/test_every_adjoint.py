@@ -7,10 +7,13 @@ from functools import cache
 
 import numpy as np
 import pytest
+import torch
 from test_gradients import random_mesh
 from test_term_order import IMPLICIT, SOLVERS, crowd, rollout_of
 
 import diffsim_ti as ds
+from diffsim_ti.diff_simulator import rollout_frames
+from diffsim_ti.materials import MATERIALS
 
 STEPS = 4
 every = pytest.mark.parametrize("solver", SOLVERS, ids=lambda s: s.__name__)
@@ -104,3 +107,51 @@ def test_frames_and_schedules_do_not_matter(solver):
                 np.testing.assert_array_equal(
                     got[name], expected[name], err_msg=f"{name} {save_every} {options} {then}"
                 )
+
+
+def as_tensors(rollout, **changes) -> dict[str, torch.Tensor]:
+    """All inputs that the torch face copies, displacements for positions, in the graph."""
+    values = rollout.values | changes
+    values["initial_displacements"] = values["initial_positions"] - values["rest_positions"]
+    names = set(values) - {"initial_positions", "rest_positions"}
+    return {name: torch.tensor(values[name], dtype=torch.float64, requires_grad=True) for name in sorted(names)}
+
+
+@pytest.mark.parametrize("truncate", [None, 1])
+@pytest.mark.parametrize("solver", [ds.SemiImplicitSolver, ds.ImplicitEulerSolver], ids=lambda s: s.__name__)
+def test_torch_gives_the_same_gradients(solver, truncate):
+    """Copied on the device (explicit) or by way of the host; of some inputs alone, and after another run."""
+    ours, theirs = (rollout_of(list(crowd()), solver, truncate=truncate) for _ in range(2))
+    frames = ours.forward()
+    w, z = np.random.default_rng(7).standard_normal((2, *frames.positions.shape))
+    expected = ours.vjp(frames, w, z)
+    expected["initial_displacements"] = expected.pop("initial_positions")
+    tensors = as_tensors(theirs)
+    for names in (tensors, ("friction", "initial_velocities"), ("sphere_path",)):
+        for tensor in tensors.values():
+            tensor.grad = None
+        frames = rollout_frames(theirs, **{name: tensors[name] for name in names})
+        rollout_frames(theirs, **as_tensors(theirs, gravity=np.array([1.0, -5.0, 0.0])))
+        ((torch.from_numpy(w) * frames.positions).sum() + (torch.from_numpy(z) * frames.velocities).sum()).backward()
+        for name in names:
+            np.testing.assert_allclose(tensors[name].grad, expected[name], rtol=1e-12, err_msg=name)
+
+
+@pytest.mark.parametrize("uniform", [True, False])
+@pytest.mark.parametrize("material", MATERIALS, ids=lambda m: m.__name__)
+def test_coefficients(material, uniform):
+    """From what a user names to the law's coefficients, in every spelling."""
+    rng, m = np.random.default_rng(3), 5
+    sizes = dict(youngs_modulus=1e5, poissons_ratio=0.3, mu=4e4, lam=6e4, c10=1e4, c01=5e3, bulk_modulus=1e5)
+    for names in material.spellings:
+        values = {n: np.array(sizes[n]) if uniform else sizes[n] * rng.uniform(0.8, 1.2, m) for n in names}
+        made = material(**values)
+        weights = rng.standard_normal((m, np.shape(made.coefficients(values))[-1]))
+        gradients = made.coefficients_vjp(values, weights)
+        for name in names:
+            direction = sizes[name] * rng.standard_normal(values[name].shape)
+            forward = (weights * made.coefficients_jvp(values, {name: direction})).sum()
+            assert forward == pytest.approx((gradients[name] * direction).sum(), rel=1e-12)
+            step = 1e-4 * direction
+            ends = [made.coefficients(values | {name: values[name] + s * step}) for s in (-1, 1)]
+            assert forward == pytest.approx((weights * (ends[1] - ends[0])).sum() / 2e-4, rel=1e-6)
