@@ -69,44 +69,30 @@ def assert_transposed(rollout, gate, unfelt=()) -> None:
 STILL = ("drag_rate",)  # which equilibria do not know
 
 
+@pytest.mark.parametrize("uniform", [True, False])
+@pytest.mark.parametrize("material", MATERIALS, ids=lambda m: m.__name__)
+def test_coefficients(material, uniform):
+    """From what a user names to the law's coefficients, in every spelling."""
+    rng, m = np.random.default_rng(3), 5
+    sizes = dict(youngs_modulus=1e5, poissons_ratio=0.3, mu=4e4, lam=6e4, c10=1e4, c01=5e3, bulk_modulus=1e5)
+    for names in material.spellings:
+        values = {n: np.array(sizes[n]) if uniform else sizes[n] * rng.uniform(0.8, 1.2, m) for n in names}
+        made = material(**values)
+        weights = rng.standard_normal((m, np.shape(made.coefficients(values))[-1]))
+        gradients = made.coefficients_vjp(values, weights)
+        for name in names:
+            direction = sizes[name] * rng.standard_normal(values[name].shape)
+            forward = (weights * made.coefficients_jvp(values, {name: direction})).sum()
+            assert forward == pytest.approx((gradients[name] * direction).sum(), rel=1e-12)
+            step = 1e-4 * direction
+            ends = [made.coefficients(values | {name: values[name] + s * step}) for s in (-1, 1)]
+            assert forward == pytest.approx((weights * (ends[1] - ends[0])).sum() / 2e-4, rel=1e-6)
+
+
 @every
 def test_loads_and_supports(solver):
     gate = 1e-12 if solver.explicit else 1e-9
     assert_transposed(loaded_rollout(solver, checkpoint_every=3), gate, STILL if solver is ds.StaticSolver else ())
-
-
-@every
-def test_contacts(solver):
-    gate = 1e-12 if solver.explicit else 1e-8
-    assert_transposed(rollout_of(list(crowd()), solver), gate, STILL if solver is ds.StaticSolver else ())
-
-
-@pytest.mark.parametrize("solver", [ds.VelocityVerletSolver, ds.ImplicitEulerSolver], ids=lambda s: s.__name__)
-def test_patches(solver):
-    assert_transposed(loaded_rollout(solver, "patches"), 1e-12 if solver.explicit else 1e-9)
-
-
-@pytest.mark.parametrize("solver", [ds.SemiImplicitSolver, *IMPLICIT], ids=lambda s: s.__name__)
-def test_frames_and_schedules_do_not_matter(solver):
-    """A loss of the last frame alone: the same bits however many frames are saved and states kept, and again and again."""
-    expected = None
-    w, z = np.random.default_rng(6).standard_normal((2, 8, 3))
-    for save_every, options in ((4, {}), (1, {}), (2, dict(checkpoint_every=1)), (1, dict(checkpoint_every=3))):
-        rollout = rollout_of(list(crowd()), solver, save_every=save_every, **options)
-        frames = rollout.forward()
-        adjoints = np.zeros((2, *frames.positions.shape))
-        adjoints[:, -1] = w, z
-        for then in ("at first", "twice", "after another run", "anew"):
-            if then == "after another run":
-                rollout.forward(gravity=[1.0, -5.0, 0.0])
-            if then == "anew":
-                frames = rollout.forward()
-            got = rollout.vjp(frames, *adjoints)
-            expected = expected or got
-            for name in expected:
-                np.testing.assert_array_equal(
-                    got[name], expected[name], err_msg=f"{name} {save_every} {options} {then}"
-                )
 
 
 def as_tensors(rollout, **changes) -> dict[str, torch.Tensor]:
@@ -137,21 +123,35 @@ def test_torch_gives_the_same_gradients(solver, truncate):
             np.testing.assert_allclose(tensors[name].grad, expected[name], rtol=1e-12, err_msg=name)
 
 
-@pytest.mark.parametrize("uniform", [True, False])
-@pytest.mark.parametrize("material", MATERIALS, ids=lambda m: m.__name__)
-def test_coefficients(material, uniform):
-    """From what a user names to the law's coefficients, in every spelling."""
-    rng, m = np.random.default_rng(3), 5
-    sizes = dict(youngs_modulus=1e5, poissons_ratio=0.3, mu=4e4, lam=6e4, c10=1e4, c01=5e3, bulk_modulus=1e5)
-    for names in material.spellings:
-        values = {n: np.array(sizes[n]) if uniform else sizes[n] * rng.uniform(0.8, 1.2, m) for n in names}
-        made = material(**values)
-        weights = rng.standard_normal((m, np.shape(made.coefficients(values))[-1]))
-        gradients = made.coefficients_vjp(values, weights)
-        for name in names:
-            direction = sizes[name] * rng.standard_normal(values[name].shape)
-            forward = (weights * made.coefficients_jvp(values, {name: direction})).sum()
-            assert forward == pytest.approx((gradients[name] * direction).sum(), rel=1e-12)
-            step = 1e-4 * direction
-            ends = [made.coefficients(values | {name: values[name] + s * step}) for s in (-1, 1)]
-            assert forward == pytest.approx((weights * (ends[1] - ends[0])).sum() / 2e-4, rel=1e-6)
+@every
+def test_contacts(solver):
+    gate = 1e-12 if solver.explicit else 1e-8
+    assert_transposed(rollout_of(list(crowd()), solver), gate, STILL if solver is ds.StaticSolver else ())
+
+
+@pytest.mark.parametrize("solver", [ds.SemiImplicitSolver, *IMPLICIT], ids=lambda s: s.__name__)
+def test_frames_and_schedules_do_not_matter(solver):
+    """A loss of the last frame alone: the same bits however many frames are saved and states kept, and again and again."""
+    expected = None
+    w, z = np.random.default_rng(6).standard_normal((2, 8, 3))
+    for save_every, options in ((4, {}), (1, {}), (2, dict(checkpoint_every=1)), (1, dict(checkpoint_every=3))):
+        rollout = rollout_of(list(crowd()), solver, save_every=save_every, **options)
+        frames = rollout.forward()
+        adjoints = np.zeros((2, *frames.positions.shape))
+        adjoints[:, -1] = w, z
+        for then in ("at first", "twice", "after another run", "anew"):
+            if then == "after another run":
+                rollout.forward(gravity=[1.0, -5.0, 0.0])
+            if then == "anew":
+                frames = rollout.forward()
+            got = rollout.vjp(frames, *adjoints)
+            expected = expected or got
+            for name in expected:
+                np.testing.assert_array_equal(
+                    got[name], expected[name], err_msg=f"{name} {save_every} {options} {then}"
+                )
+
+
+@pytest.mark.parametrize("solver", [ds.VelocityVerletSolver, ds.ImplicitEulerSolver], ids=lambda s: s.__name__)
+def test_patches(solver):
+    assert_transposed(loaded_rollout(solver, "patches"), 1e-12 if solver.explicit else 1e-9)
