@@ -85,14 +85,16 @@ def run_tests(copy: Path, tests, timeout: float) -> tuple[int | None, str]:
 
 def judge(mutation: Mutation | None, tests, timeout: float) -> Outcome:
     """Run the tests on a copy of the package with one mutation (or none)."""
-    begin = time.time()
+    begin, status, said = time.time(), 0, ""
     with tempfile.TemporaryDirectory(prefix="mutation-") as folder:
         copy = Path(folder)
         shutil.copytree(ROOT / PACKAGE, copy / PACKAGE, ignore=shutil.ignore_patterns("__pycache__"))
         if mutation:
             target = copy / mutation.path
             target.write_bytes(mutation.apply(target.read_bytes()))
-        status, said = run_tests(copy, tests, timeout)
+        for some in (tests[:1], tests[1:]):  # most need no more than the first file
+            if some and status == 0:
+                status, said = run_tests(copy, some, timeout)
     seconds = time.time() - begin
     if status is None:
         return Outcome("TIMED OUT", seconds=seconds)
@@ -109,6 +111,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--count", type=int, default=20, help="mutations that the tests must catch")
     parser.add_argument("--seed", type=int, default=None)
+    parser.add_argument("--skip", type=int, default=0, help="go on after so many mutations of this seed")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--timeout", type=float, default=1800, help="seconds for one mutation")
     parser.add_argument("--tests", nargs="+", default=[ROOT / "tests" / name for name in TESTS])
@@ -124,7 +127,9 @@ def main() -> int:
         for number, mutation in zip(range(options.count), queue):
             print_mutation(number + 1, mutation)
         return 0
-    passes_without, verdicts, number = {}, Counter(), 0
+    passes_without, verdicts, number = {}, Counter(), options.skip
+    for _ in zip(range(options.skip), queue):
+        pass
     with ThreadPoolExecutor(options.jobs) as pool:
         while (missing := options.count - sum(verdicts[v] for v in ("CAUGHT", "SURVIVED", "TIMED OUT"))) > 0:
             batch = [m for _, m in zip(range(min(missing, options.jobs)), queue)]
