@@ -75,8 +75,3 @@ class Camera:
     def zoomed(self, factor: float) -> "Camera":
         """So many times nearer to what it looks at."""
         return replace(self, position=self.look_at + (self.position - self.look_at) / factor)
-
-    def shifted(self, right: float, up: float) -> "Camera":
-        """Moved in its picture plane [m]."""
-        move = right * self.axes[0] + up * self.axes[1]
-        return replace(self, position=self.position + move, look_at=self.look_at + move)

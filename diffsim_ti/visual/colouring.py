@@ -47,11 +47,6 @@ class Colouring:
             limits = field.limits(float(least), float(np.percentile(values, 99.5)))
         return cls(label or field.label, tuple(float(x) for x in limits), map or field.colours)
 
-    @classmethod
-    def of_field(cls, name: str, values, limits=None, map: str | None = None) -> "Colouring":
-        """A colouring by the name of a field in series_fields.FIELDS, with its label and unit."""
-        return cls.of(values, "", limits, map, field_named(name))
-
     def __call__(self, values) -> np.ndarray:
         """RGB in [0, 1], shape of `values` and 3."""
         from matplotlib import colormaps

@@ -12,6 +12,7 @@ from diffsim_ti.terms.graph import Graph
 from diffsim_ti.terms.gravity import Gravity
 from diffsim_ti.terms.motion import sampled
 from diffsim_ti.terms.obstacles import barrier, friction
+from diffsim_ti.terms.obstacles.shapes import Triangles
 from diffsim_ti.terms.obstacles.stiffness import barrier_stiffness
 from diffsim_ti.terms.term import Term, VertexForce
 
@@ -116,6 +117,17 @@ class Obstacle(Term):
         raise ValueError(
             f"the body starts on or in {self!r}: {named} ({len(inside)} vertices); move the body or the obstacle"
         )
+
+    def surface(self, size: float) -> Triangles | None:
+        """(points [m], shape (k, 3), triangles that face outwards) to draw, where the obstacle was made; None: not drawn.
+
+        size [m]: that of the body, for an obstacle that has no end.
+        """
+        return None
+
+    def floor_height(self) -> float | None:
+        """Height y [m] of the floor that the obstacle is, where it was made; None if it is no floor."""
+        return None
 
     @property
     def variant(self) -> tuple:
