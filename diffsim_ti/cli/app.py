@@ -178,9 +178,7 @@ def info(
     print(f"stable step for {scene.material!r}, density {density:g} kg/m^3, at rest:")
     print(f"  {stability.element_limit(scene)}")
     if tight:
-        from diffsim_ti.solvers import SemiImplicitSolver
-
-        print(f"  {SemiImplicitSolver(scene, dt=1.0, allow_unstable=True).stable_dt(tight=True)}")
+        print(f"  {stability.stable_dt(scene)}")
 
 
 @app.command("check-gradients")
@@ -210,6 +208,7 @@ def check_gradients(
     from diffsim_ti import runtime
     from diffsim_ti.rollout import Rollout
     from diffsim_ti.scene import Scene
+    from diffsim_ti.state.stability import stable_dt
     from diffsim_ti.terms import Drag, Gravity
     from diffsim_ti.verify import check_gradients as check
 
@@ -228,7 +227,7 @@ def check_gradients(
         initial_velocities=velocities,
     )
     kind = solver_class(solver, implicit=False)
-    dt = 0.5 * kind(scene, dt=1.0, allow_unstable=True).stable_dt(tight=True).dt if dt is None else dt
+    dt = 0.5 * stable_dt(scene).dt if dt is None else dt
     report = check(Rollout(kind(scene, dt=dt), steps, gradients="all"))
     if not report.passed:
         raise typer.Exit(1)
@@ -296,8 +295,9 @@ def print_gradient(scene, seconds: float = 0.05, change: float = 1e-3) -> None:
     """Gradient by E of the mean height after `seconds`, in float64, beside a central difference."""
     from diffsim_ti.rollout import Rollout
     from diffsim_ti.solvers import SemiImplicitSolver
+    from diffsim_ti.state.stability import stable_dt
 
-    dt = 0.5 * SemiImplicitSolver(scene, dt=1.0, allow_unstable=True).stable_dt(tight=True).dt
+    dt = 0.5 * stable_dt(scene).dt
     steps = int(np.ceil(seconds / dt))
     rollout = Rollout(SemiImplicitSolver(scene, dt=seconds / steps), steps, gradients="youngs_modulus")
     E = float(scene.inputs.values["youngs_modulus"])

@@ -10,6 +10,7 @@ from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.scene import Scene
 from diffsim_ti.solvers import VelocityVerletSolver
+from diffsim_ti.state.stability import stable_dt
 from diffsim_ti.study.charts import COLORS, new_figure, save, write_csv, write_json
 from diffsim_ti.study.problems import beam_scene, lame_scene
 from diffsim_ti.terms import Gravity, Ground
@@ -80,7 +81,7 @@ def study_growth(scenes: dict, duration: float, share: float = 0.1, frames: int 
     contacts are resolved too."""
     out = {}
     for name, scene in scenes.items():
-        dt = share * VelocityVerletSolver(scene, dt=duration, allow_unstable=True).stable_dt(tight=True).dt
+        dt = share * stable_dt(scene).dt
         steps = int(np.ceil(duration / dt))
         out[name] = growth(VelocityVerletSolver(scene, dt=duration / steps), steps, min(frames, steps))
     return out

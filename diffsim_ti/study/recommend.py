@@ -9,6 +9,7 @@ import numpy as np
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.scene import LOCKING_RATIO
 from diffsim_ti.solvers import SOLVERS, BDF2Solver, VelocityVerletSolver
+from diffsim_ti.state.stability import stable_dt
 from diffsim_ti.study.problem import Problem, distance
 from diffsim_ti.terms import Drag, ExternalForce
 
@@ -116,7 +117,7 @@ class Trials:
     def __init__(self, scene, duration, tolerance, memory, gradients, budget, frames):
         self.scene, self.duration, self.tolerance, self.frames = scene, duration, tolerance, frames
         self.memory, self.gradients, self.budget = memory, gradients, budget
-        self.stable = VelocityVerletSolver(scene, dt=duration, allow_unstable=True).stable_dt(tight=True).dt
+        self.stable = stable_dt(scene).dt
         self.tried: list[Option] = []
         self.notes: list[str] = []
         self.spent = 0.0  # [s] of the trials, compile time apart

@@ -10,6 +10,7 @@ import numpy as np
 
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.solvers import SOLVERS, StaticSolver, VelocityVerletSolver
+from diffsim_ti.state.stability import stable_dt
 from diffsim_ti.study.problem import ELEMENTS, Problem, distance
 
 # wall time per tetrahedron and substep, before anything was measured [s]; with gradients three times as much
@@ -103,8 +104,7 @@ def choose_substeps(problem: Problem, scene, kind, levels: int) -> list[int]:
     if kind is StaticSolver:
         return [1]
     frame = problem.duration / problem.frames
-    probe = VelocityVerletSolver(scene, dt=frame, allow_unstable=True)
-    stable = int(np.ceil(frame / min(SHARE * probe.stable_dt(tight=True).dt, problem.largest_step)))
+    stable = int(np.ceil(frame / min(SHARE * stable_dt(scene).dt, problem.largest_step)))
     if kind.explicit:
         return [stable * 2**k for k in range(levels)]
     return [2**k for k in range(levels + 1) if 2**k <= max(4 * stable, 16)]
