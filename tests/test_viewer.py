@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import taichi as ti
+from saved_series import Series
 
 import diffsim_ti as ds
 from diffsim_ti import cli
@@ -15,7 +16,6 @@ from diffsim_ti.visual import viewer
 from diffsim_ti.visual.camera import Camera
 from diffsim_ti.visual.dragging import Grip, picked_vertex
 from diffsim_ti.visual.frame_sources import LiveFrames, SavedFrames
-from diffsim_ti.visual.series import Series
 from diffsim_ti.visual.viewer import Viewer
 
 SIZE = (200, 150)

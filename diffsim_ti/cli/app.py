@@ -14,9 +14,9 @@ from diffsim_ti.cli.options import (
     Backend,
     Density,
     FixOrientation,
+    Folder,
     MaterialName,
     MeshFile,
-    Output,
     Poisson,
     Precision,
     Size,
@@ -80,7 +80,15 @@ def _fail(message: str, code: int = 2) -> int:
 @app.command()
 def simulate(
     mesh: MeshFile,
-    output: Output = Path("output/simulate"),
+    output: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--output",
+            "-o",
+            help="folder for a series and a picture of the end (default output/simulate), or a file: .pvd, .mp4, .gif, "
+            ".png (of the end; run_%04d.png: of all frames), .npz; may be repeated",
+        ),
+    ] = None,
     material: MaterialName = "StableNeoHookean",
     youngs_modulus: Youngs = 1e5,
     poissons_ratio: Poisson = 0.4,
@@ -105,25 +113,28 @@ def simulate(
     height: Annotated[float | None, typer.Option(help="of the lowest point [m]; default a tenth of the size")] = None,
     ground_stiffness: Annotated[float | None, typer.Option(help="[N/m]; default from the impact's pressure")] = None,
     ground_width: Annotated[float | None, typer.Option(help="[m]; default 1 % of the size")] = None,
-    azimuth: Annotated[float, typer.Option(help="where the picture is taken from, about y [degrees]")] = 32.0,
+    azimuth: Annotated[float, typer.Option(help="where pictures are taken from, about y [degrees]")] = 32.0,
     backend: Backend = "cpu",
     precision: Precision = "f32",
     threads: Threads = None,
 ):
-    """Simulate a body, by default its fall onto a floor; write a ParaView series and a picture of the end."""
+    """Simulate a body, by default its fall onto a floor; write a series and a picture of the end, or films, arrays ..."""
     from diffsim_ti import runtime
-    from diffsim_ti.adaptive_run import ForwardRun, run_and_write
-    from diffsim_ti.picture import save_picture
+    from diffsim_ti.adaptive_run import ForwardRun, file_in, run_and_write
+    from diffsim_ti.writers import View, writer_for
 
     begin = time.perf_counter()
     for name, value in (("duration", duration), ("fps", fps), ("density", density)):
         if not value > 0:
             raise ValueError(f"--{name} must be > 0, got {value:g}")
+    view = View(fps=fps, azimuth=azimuth, title=mesh.stem, fit="end")
+    asked = [file_in(o, mesh.stem + suffix) for o in output or [Path("output/simulate")] for suffix in (".pvd", ".png")]
+    writers = [writer_for(path, view) for path in dict.fromkeys(asked)]
     kind = solver_class(solver)
     law = make_material(material, youngs_modulus, poissons_ratio)
     body = load_body(mesh, size, up, fix_orientation)
     runtime.init(backend, precision, threads)
-    scene, body = fall_scene(
+    scene, _ = fall_scene(
         body,
         law,
         density,
@@ -140,20 +151,8 @@ def simulate(
     frames = max(1, round(duration * fps))
     run = ForwardRun(scene, kind, duration / frames, dt)
     setup = time.perf_counter() - begin
-    writing, files, _ = run_and_write(run, frames, output, mesh.stem)
-    begin = time.perf_counter()
-    sim, picture = run.simulator, output / f"{mesh.stem}.png"
-    save_picture(
-        picture,
-        body,
-        sim.positions,
-        sim.tetrahedron_fields().von_mises,
-        "von Mises stress [Pa]",
-        0.0 if ground else None,
-        f"{mesh.stem}, t = {sim.time:.3g} s",
-        azimuth=azimuth,
-    )
-    print_summary(run, setup, writing + time.perf_counter() - begin, [*files, str(picture)])
+    writing, files, _ = run_and_write(run, frames, writers)
+    print_summary(run, setup, writing, files)
 
 
 @app.command()
@@ -235,7 +234,7 @@ def check_gradients(
 
 @app.command()
 def demo(
-    output: Output = Path("output/demo"),
+    output: Folder = Path("output/demo"),
     backend: Backend = "cpu",
     quick: Annotated[bool, typer.Option("--quick", hidden=True)] = False,
 ):
@@ -259,24 +258,24 @@ def demo(
     moments = (frames // 6, frames // 2, frames)
     writing, files, kept = run_and_write(run, frames, output, "column", moments)
     begin = time.perf_counter()
-    points = np.concatenate([positions for _, positions, _, _ in kept])
-    box, top = np.stack([points.min(0), points.max(0)]), max(np.percentile(stress, 99.5) for *_, stress in kept)
-    for k, (t, positions, _, stress) in enumerate(kept):
+    points = np.concatenate([frame.positions for frame in kept])
+    box, top = np.stack([points.min(0), points.max(0)]), max(np.percentile(f.fields["von_mises"], 99.5) for f in kept)
+    for k, frame in enumerate(kept):
         files.append(str(output / f"column_{k}.png"))
         save_picture(
             files[-1],
             body,
-            positions,
-            stress,
+            frame.positions,
+            frame.fields["von_mises"],
             "von Mises stress [Pa]",
             0.0,
-            f"t = {t:.2f} s",
+            f"t = {frame.time:.2f} s",
             (0.0, float(top)),
             box=box,
         )
     print_summary(run, setup, writing + time.perf_counter() - begin, files)
-    _, positions, velocities, _ = kept[1]
-    print_gradient(scene.replace(initial_positions=positions, initial_velocities=velocities, precision="f64"))
+    state = dict(initial_positions=kept[1].positions, initial_velocities=kept[1].velocities)
+    print_gradient(scene.replace(**state, precision="f64"))
 
 
 def twisted_column(cells: int):

@@ -1,8 +1,5 @@
-"""What the commands share: types of options, the scene that options describe, progress, the summary at the end."""
+"""What the commands share: types of options, the scene that options describe, the summary at the end."""
 
-import sys
-import time
-from contextlib import contextmanager
 from enum import Enum
 from pathlib import Path
 from typing import Annotated
@@ -27,39 +24,7 @@ Volume = Annotated[
 Backend = Annotated[str, typer.Option(help="cpu, cuda or vulkan")]
 Precision = Annotated[str, typer.Option(help="f32 or f64")]
 Threads = Annotated[int | None, typer.Option(help="CPU threads, default all")]
-Output = Annotated[Path, typer.Option("--output", "-o", help="folder for the series and the picture")]
-
-
-@contextmanager
-def progress(title: str, total: int):
-    """Yields a function to tell what is done; shows it on stderr after two seconds, as lines if that is no terminal."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
-    console = Console(stderr=True)
-    bar = Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.fields[note]}"),
-        TimeRemainingColumn(),
-        console=console,
-        transient=True,
-    )
-    task, start, said = bar.add_task(title, total=total, note=""), time.perf_counter(), [time.perf_counter()]
-
-    def update(done: int, note: str = "") -> None:
-        now = time.perf_counter()
-        if console.is_terminal and now - start > 2 and not bar.live.is_started:
-            bar.start()
-        elif not console.is_terminal and now - said[0] > 5:
-            said[0] = now
-            print(f"{title}: {done} of {total}, {note}", file=sys.stderr, flush=True)
-        bar.update(task, completed=done, note=note)
-
-    try:
-        yield update
-    finally:
-        bar.stop()
+Folder = Annotated[Path, typer.Option("--output", "-o", help="folder for what is written")]
 
 
 # ---- a scene from options ---------------------------------------------------------------------------------------------

@@ -10,6 +10,7 @@ import typer
 from diffsim_ti.cli.options import (
     Backend,
     Density,
+    Folder,
     MaterialName,
     Poisson,
     Precision,
@@ -18,8 +19,8 @@ from diffsim_ti.cli.options import (
     load_body,
     make_material,
 )
+from diffsim_ti.progress import progress
 
-Folder = Annotated[Path, typer.Option("--output", "-o", help="folder for the picture, the CSV and the JSON")]
 Quick = Annotated[bool, typer.Option("--quick", help="small meshes, few steps: seconds instead of minutes")]
 Fixed = Annotated[list[str] | None, typer.Option(help="vertex set, or xmin .. zmax, to hold; may be repeated")]
 
@@ -116,7 +117,6 @@ def stability(
     from dataclasses import replace
 
     from diffsim_ti import runtime
-    from diffsim_ti.cli.options import progress
     from diffsim_ti.solvers import SOLVERS
     from diffsim_ti.study import map_picture
     from diffsim_ti.study.stability_map import AXES, stability_map

@@ -29,9 +29,9 @@ def register(app: typer.Typer) -> None:
 
 def render(
     series: Annotated[Path, typer.Argument(help="the .pvd of a run", exists=True, dir_okay=False)],
-    output: Annotated[Path, typer.Option("--output", "-o", help=".mp4, .gif, or .png of the end")] = Path(
-        "output/film.mp4"
-    ),
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help=".mp4, .gif, .png of the end (name_%04d.png: all), .npz")
+    ] = Path("output/film.mp4"),
     colour: Annotated[str, typer.Option(help="displacement, speed, von_mises, energy_density or J")] = "von_mises",
     fps: Annotated[float, typer.Option(help="frames per second of the film")] = 30.0,
     size: Annotated[tuple[int, int], typer.Option(help="width and height [pixels]")] = (640, 480),
@@ -71,6 +71,9 @@ def view(
         list[str] | None, typer.Option(help="vertex set, or xmin .. zmax, to hold; may be repeated")
     ] = None,
     floor: Annotated[bool, typer.Option(help="a floor at y = 0, the body above it")] = True,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="file that the key S writes: .mp4, .gif, .png, .pvd or .npz")
+    ] = None,
 ):
     """Look at a saved series in a window, or at a mesh as it falls: play, step, scrub, turn, colour by a field, pull."""
     from diffsim_ti import runtime
@@ -78,9 +81,11 @@ def view(
     from diffsim_ti.terms import ExternalForce
     from diffsim_ti.visual.frame_sources import LiveFrames, SavedFrames
     from diffsim_ti.visual.viewer import NO_DISPLAY, Viewer, has_display
+    from diffsim_ti.writers import View, writer_for
 
     if not has_display():
         raise RuntimeError(NO_DISPLAY)
+    saving = None if output is None else writer_for(output, View(fps=fps, ground=ground))
     if source.suffix == ".pvd":
         frames = SavedFrames(source)
     else:
@@ -99,4 +104,4 @@ def view(
         )
         frames = LiveFrames(ForwardRun(scene, solver_class(solver), 1 / fps))
     look = {} if ground is None else dict(ground=ground)
-    Viewer(frames, colour, playing=source.suffix != ".pvd", **look).run()
+    Viewer(frames, colour, playing=source.suffix != ".pvd", output=saving, **look).run()

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 
+from diffsim_ti.progress import progress
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.solvers import SOLVERS, StaticSolver, VelocityVerletSolver
 from diffsim_ti.state.stability import stable_dt
@@ -289,8 +290,6 @@ def chart(
     limit [s]: runs expected to take longer are left out, and named. quick: small meshes, float32.
     say: called with what the chart will do and how long that takes. Raises ValueError for a problem no solver can do.
     """
-    from diffsim_ti.cli.options import progress
-
     levels = levels or problem.levels
     if quick:
         problem, precisions, levels, repeats, limit = problem.quick(), ("f32",), (levels + 2) // 2, 2, min(limit, 0.4)
