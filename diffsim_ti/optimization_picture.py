@@ -19,7 +19,7 @@ class OptimizationPicture:
 
     mesh, target, truth, loss_label, plane, size: as in `optimization_figure`; path: where the picture goes.
     every [s]: with a path, `add` writes the picture when the last was written so long ago (0: each time; None: only
-    `save` does). A picture takes some 0.3 s; it is replaced at one stroke, so a viewer that follows the file sees it whole.
+    `save` does). A picture takes some 0.3 s; it is replaced as a whole, so that who follows the file never sees half of it.
     """
 
     def __init__(self, mesh, target, path=None, every: float | None = None, **look):

@@ -27,14 +27,14 @@ def draw_maps(results: list, path) -> None:
     rows = -(-(len(results) + 1) // columns)
     figure = Figure(figsize=(4.9 * columns, 4.6 * rows), dpi=110, layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False)
-    places = [axes for row in grid for axes in row]
+    panels = [axes for row in grid for axes in row]
     explicit = [r for r in results if r.explicit]
     if len(explicit) == 2 and len(results) > 2 and columns == 3:  # explicit solvers above, implicit ones below
-        places = [places[0], places[1], *places[3:], places[2]]
-    for result, axes in zip(results, places):
+        panels = [panels[0], panels[1], *panels[3:], panels[2]]
+    for result, axes in zip(results, panels):
         draw_panel(result, axes)
-    draw_legend(results, places[len(results)])
-    for axes in places[len(results) + 1 :]:
+    draw_legend(results, panels[len(results)])
+    for axes in panels[len(results) + 1 :]:
         axes.axis("off")
     silent, total = sum(len(r.silent) for r in results), sum(r.outcomes.size for r in results)
     figure.suptitle(f"{results[0].axis.name}: {silent} of {total} runs went wrong without a word", fontsize=12)

@@ -9,7 +9,7 @@ ELEMENTS = {"linear": {}, "patches": {"volume": "patches"}}  # kinds of element:
 
 
 @dataclass(frozen=True)
-class Watch:
+class FrameLoss:
     """A loss of one number per frame, q_f = sum_i w_i . u_f,i: sum_f [linear_f q_f + square_f (q_f - target_f)^2 / 2].
 
     weights(mesh) -> w, shape (num_vertices, 3); the others have a number for each frame. Called with frames and their mesh,
@@ -22,7 +22,7 @@ class Watch:
     target: np.ndarray
 
     @classmethod
-    def end(cls, weights: Callable, frames: int) -> "Watch":
+    def end(cls, weights: Callable, frames: int) -> "FrameLoss":
         """The number itself at the last of `frames` frames after the start."""
         none = np.zeros(frames + 1)
         return cls(weights, np.append(none[1:], 1.0), none, none)
@@ -42,7 +42,7 @@ class Problem:
     quantity(frames, gradients) -> the numbers to get right; frames are a Rollout's, gradients those of `adjoint`.
     exact: the closed form's numbers, or None: a converged reference is computed, with its own error.
     scale: what errors are divided by; default the largest of the exact numbers.
-    adjoint(frames, mesh) -> the loss's gradient by the frames' positions, such as a Watch; `inputs`: those asked for.
+    adjoint(frames, mesh) -> the loss's gradient by the frames' positions, such as a `FrameLoss`; `inputs`: those asked for.
     cells, patterns, elements: the meshes of the chart, and the kinds of elements (ELEMENTS) to try on each.
     reference_cells: those that the reference is extrapolated from (it then includes the mesh's error); None: the reference
         is of each mesh with linear elements by itself (the error of steps and precision).

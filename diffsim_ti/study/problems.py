@@ -5,8 +5,9 @@ import numpy as np
 from diffsim_ti.materials import LinearElastic, SmithNeoHookean, StableNeoHookean
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.scene import Scene
-from diffsim_ti.study.problem import Problem, Watch
+from diffsim_ti.study.problem import Problem, FrameLoss
 from diffsim_ti.terms import Gravity, Ground
+from diffsim_ti.terms.obstacles.barrier import beta
 
 
 def oscillator() -> Problem:
@@ -113,7 +114,7 @@ def lame_gradient(nu: float = 0.3) -> Problem:
     t = np.linspace(0, time, frames + 1)
     window = np.sin(omega * t) * np.sin(np.pi * t / time) ** 2
     exact = -LAME["reach"] * omega / 2 * (window * t * np.sin(omega * t)).sum()
-    watch = Watch(lame_share_by_mass, window, 0 * t, 0 * t)
+    loss = FrameLoss(lame_share_by_mass, window, 0 * t, 0 * t)
     return Problem(
         "lame-gradient",
         f"Gradient by E of the Lamé mode, nu = {nu:g}, closed form",
@@ -123,7 +124,7 @@ def lame_gradient(nu: float = 0.3) -> Problem:
         lambda _, gradients: LAME["E"] * np.atleast_1d(gradients["youngs_modulus"]),
         frames=frames,
         exact=np.array([exact]),
-        adjoint=watch,
+        adjoint=loss,
         inputs=("youngs_modulus",),
         cells=(4, 8, 12, 16, 24),
         patterns=("five",),
@@ -219,9 +220,9 @@ def bounce_scene(precision, speed: float, **element) -> Scene:
     )
 
 
-def barrier_energy(d, stiffness: float = 1e4, width: float = 0.01):
+def barrier_energy(d: float, stiffness: float = 1e4, width: float = 0.01) -> float:
     """Energy [J] of the barrier at the gap d [m] below its width."""
-    return -stiffness * (d - width) ** 2 * np.log(d / width)
+    return float(stiffness * width**2 * beta(d / width))
 
 
 def time_in_contact(speed: float, energy=barrier_energy, width: float = 0.01) -> float:
@@ -274,7 +275,7 @@ def bounce_gradient(speed: float = 2.0) -> Problem:
         lambda _, gradients: gradients["initial_positions"][3, 1:2],
         frames=1,
         exact=np.array([-1.0]),
-        adjoint=Watch.end(height, 1),
+        adjoint=FrameLoss.end(height, 1),
         inputs=("initial_positions",),
         cells=(1,),
         patterns=("one mass",),
@@ -296,7 +297,7 @@ def identify() -> Problem:
         weights[at, 1] = 1 / len(at)
         return weights
 
-    watch = Watch(drop, 0 * times, np.full(11, 2 / 11), -4.3 * times**2)
+    loss = FrameLoss(drop, 0 * times, np.full(11, 2 / 11), -4.3 * times**2)
     return Problem(
         "identify",
         "Gradient by E of a beam's watched motion, per mesh",
@@ -305,7 +306,7 @@ def identify() -> Problem:
         0.25,
         lambda _, gradients: np.atleast_1d(gradients["youngs_modulus"]),
         frames=10,
-        adjoint=watch,
+        adjoint=loss,
         inputs=("youngs_modulus",),
         cells=(2, 4),
         patterns=("five",),
