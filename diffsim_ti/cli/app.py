@@ -35,6 +35,8 @@ from diffsim_ti.cli.options import (
 )
 from diffsim_ti.cli.study import register as register_study
 from diffsim_ti.cli.view import register
+from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.scene import Scene
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, help="Soft bodies on tetrahedra.")
 register_study(app)  # chart, stability, recommend
@@ -43,7 +45,9 @@ register(app)
 
 
 @app.callback()
-def options(traceback: Annotated[bool, typer.Option("--traceback", help="show the traceback of an error")] = False):
+def options(
+    traceback: Annotated[bool, typer.Option("--traceback", help="show the traceback of an error")] = False,
+) -> None:
     """Soft bodies on tetrahedra, simulated with Taichi. Errors are one line on stderr, with exit code 2."""
 
 
@@ -117,7 +121,7 @@ def simulate(
     backend: Backend = "cpu",
     precision: Precision = "f32",
     threads: Threads = None,
-):
+) -> None:
     """Simulate a body, by default its fall onto a floor; write a series and a picture of the end, or films, arrays ..."""
     from diffsim_ti import runtime
     from diffsim_ti.adaptive_run import ForwardRun, file_in, run_and_write
@@ -165,7 +169,7 @@ def info(
     size: Size = None,
     fix_orientation: FixOrientation = False,
     tight: Annotated[bool, typer.Option("--tight", help="also the tight limit, by Lanczos")] = False,
-):
+) -> None:
     """Say what is in a mesh file: sizes, quality, groups, and the stable explicit step for given moduli."""
     from diffsim_ti.scene import Scene
     from diffsim_ti.state import stability
@@ -198,7 +202,7 @@ def check_gradients(
     drag: Annotated[float, typer.Option(help="rate at which velocities fall [1/s]")] = 0.5,
     backend: Backend = "cpu",
     precision: Precision = "f64",
-):
+) -> None:
     """Check every gradient of a short fall onto a floor against differences and by its Taylor rate.
 
 
@@ -237,7 +241,7 @@ def demo(
     output: Folder = Path("output/demo"),
     backend: Backend = "cpu",
     quick: Annotated[bool, typer.Option("--quick", hidden=True)] = False,
-):
+) -> None:
     """Drop a twisted jelly column, write pictures and a series, and take the gradient of its fall by Young's modulus."""
     from diffsim_ti import runtime
     from diffsim_ti.adaptive_run import ForwardRun, run_and_write
@@ -278,7 +282,7 @@ def demo(
     print_gradient(scene.replace(**state, precision="f64"))
 
 
-def twisted_column(cells: int):
+def twisted_column(cells: int) -> TetrahedralMesh:
     """A square column 0.6 m high, wrung by 150 degrees and tilted, its lowest point 0.15 m above y = 0."""
     from diffsim_ti.mesh import TetrahedralMesh
 
@@ -290,7 +294,7 @@ def twisted_column(cells: int):
     return mesh.translated([0, 0.15 - mesh.bounding_box[0, 1], 0])
 
 
-def print_gradient(scene, seconds: float = 0.05, change: float = 1e-3) -> None:
+def print_gradient(scene: Scene, seconds: float = 0.05, change: float = 1e-3) -> None:
     """Gradient by E of the mean height after `seconds`, in float64, beside a central difference."""
     from diffsim_ti.rollout import Rollout
     from diffsim_ti.solvers import SemiImplicitSolver

@@ -40,7 +40,7 @@ def render(
     elevation: Annotated[float, typer.Option(help="of the eye, above the floor [degrees]")] = 14.0,
     wireframe: Annotated[bool, typer.Option("--wireframe", help="draw the edges of the triangles")] = False,
     backend: Annotated[str, typer.Option(help="vulkan, software, or auto: Vulkan where there is a driver")] = "auto",
-):
+) -> None:
     """Draw a saved series as a film, coloured by a field, without a display."""
     from diffsim_ti.film import render_series
 
@@ -74,7 +74,7 @@ def view(
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="file that the key S writes: .mp4, .gif, .png, .pvd or .npz")
     ] = None,
-):
+) -> None:
     """Look at a saved series in a window, or at a mesh as it falls: play, step, scrub, turn, colour by a field, pull."""
     from diffsim_ti import runtime
     from diffsim_ti.adaptive_run import ForwardRun

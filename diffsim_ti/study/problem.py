@@ -4,6 +4,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
+
+from diffsim_ti.scene import Scene
 
 ELEMENTS = {"linear": {}, "patches": {"volume": "patches"}}  # kinds of element: name -> arguments of Scene
 
@@ -87,7 +90,7 @@ class Problem:
 
     @classmethod
     def of_scene(
-        cls, scene, duration: float, name: str = "scene", frames: int = 10, gradient: str | None = None
+        cls, scene: Scene, duration: float, name: str = "scene", frames: int = 10, gradient: str | None = None
     ) -> "Problem":
         """The motion of a scene of one's own, against its converged motion on the same mesh; or a gradient through it.
 
@@ -130,7 +133,7 @@ class Problem:
         )
 
 
-def distance(problem: Problem, quantity, exact) -> float:
+def distance(problem: Problem, quantity: ArrayLike, exact: ArrayLike) -> float:
     """Error of a problem's numbers: the largest difference over the scale; rows of 3 count by their length."""
     quantity, exact = np.asarray(quantity, np.float64), np.asarray(exact, np.float64)
     apart = np.abs(quantity - exact)

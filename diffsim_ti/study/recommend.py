@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from diffsim_ti.rollout import Rollout
-from diffsim_ti.scene import LOCKING_RATIO
+from diffsim_ti.scene import LOCKING_RATIO, Scene
 from diffsim_ti.solvers import SOLVERS, BDF2Solver, VelocityVerletSolver
 from diffsim_ti.state.stability import stable_dt
 from diffsim_ti.study.problem import Problem, distance
@@ -59,7 +59,7 @@ class Recommendation:
     steps = property(lambda self: self.option.steps)
     seconds = property(lambda self: self.option.seconds)
 
-    def rollout(self, scene, frames: int = 1, **options) -> Rollout:
+    def rollout(self, scene: Scene, frames: int = 1, **options) -> Rollout:
         """The recommended run of the scene, `frames` times saved; options are Rollout's."""
         substeps = -(-self.steps // frames)
         solver = self.solver(scene.replace(precision=self.precision), dt=self.duration / frames, substeps=substeps)
@@ -80,7 +80,7 @@ class Recommendation:
 
 
 def recommend(
-    scene,
+    scene: Scene,
     duration: float,
     tolerance: float = 1e-2,
     memory: float | None = None,
@@ -114,7 +114,16 @@ def recommend(
 class Trials:
     """Trial runs of a scene: a reference, then each solver at the steps that its order of convergence suggests."""
 
-    def __init__(self, scene, duration, tolerance, memory, gradients, budget, frames):
+    def __init__(
+        self,
+        scene: Scene,
+        duration: float,
+        tolerance: float,
+        memory: float | None,
+        gradients: bool,
+        budget: float,
+        frames: int,
+    ):
         self.scene, self.duration, self.tolerance, self.frames = scene, duration, tolerance, frames
         self.memory, self.gradients, self.budget = memory, gradients, budget
         self.stable = stable_dt(scene).dt

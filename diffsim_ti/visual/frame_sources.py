@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.visual.colouring import Colouring, field_of, to_vertices
@@ -135,7 +136,7 @@ class LiveFrames(FrameSource):
         self._note(self.run.seen.substeps[-1] / (time.perf_counter() - begin))
         return True
 
-    def grab(self, vertex: int, target) -> None:
+    def grab(self, vertex: int, target: ArrayLike) -> None:
         """Pull a vertex towards a point [m] by a spring, from the next part of a frame on."""
         if not self.can_drag:
             raise ValueError(

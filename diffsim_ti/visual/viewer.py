@@ -18,6 +18,8 @@ from diffsim_ti.visual.fields import field_named
 from diffsim_ti.visual.surface import Soup, marks
 
 if TYPE_CHECKING:
+    from taichi.ui import Window
+
     from diffsim_ti.visual.frame_sources import FrameSource
     from diffsim_ti.writers import Writer
 
@@ -221,7 +223,7 @@ def has_display() -> bool:
     return screen and "vulkan" in runtime.available_archs()
 
 
-def open_window(title: str, size):
+def open_window(title: str, size: tuple[int, int]) -> "Window | None":
     """A window, or None where none can be had."""
     if not has_display():
         return None

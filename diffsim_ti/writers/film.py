@@ -1,6 +1,7 @@
 """Films: MP4 and GIF."""
 
 from pathlib import Path
+from typing import Any
 
 from diffsim_ti.writers.drawn import DrawnWriter
 from diffsim_ti.writers.writer import View, register
@@ -39,7 +40,7 @@ def check_film(path: Path, size: tuple[int, int]) -> None:
         raise RuntimeError("MP4 needs imageio-ffmpeg: pip install 'diffsim-ti[film]', or write a .gif") from error
 
 
-def encoder(path: Path, fps: float):
+def encoder(path: Path, fps: float) -> Any:
     """What takes the pictures of a film, or one picture, through `append_data`."""
     import imageio.v2 as imageio
 

@@ -1,12 +1,13 @@
 """Triangles of simple shapes, of which obstacles make what is drawn of them: (points [m], shape (k, 3), triangles)."""
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 ROUND = 32  # sides of what is round
 Triangles = tuple[np.ndarray, np.ndarray]
 
 
-def revolved(center, axis, along: np.ndarray, radius: np.ndarray) -> Triangles:
+def revolved(center: ArrayLike, axis: ArrayLike, along: np.ndarray, radius: np.ndarray) -> Triangles:
     """A surface of revolution: rings `along` the axis from `center`, closed where the radius ends in 0."""
     axis = unit(axis)
     first = unit(np.cross(axis, [0.0, 0.0, 1.0] if abs(axis[2]) < 0.9 else [1.0, 0.0, 0.0]))
@@ -19,20 +20,20 @@ def revolved(center, axis, along: np.ndarray, radius: np.ndarray) -> Triangles:
     return points.reshape(-1, 3), np.concatenate([np.stack([a, b, c], 1), np.stack([b, d, c], 1)])
 
 
-def ball(center, radius: float) -> Triangles:
+def ball(center: ArrayLike, radius: float) -> Triangles:
     """A ball, closed and facing outwards."""
     angle = np.linspace(-np.pi / 2, np.pi / 2, ROUND // 2 + 1)
     return revolved(center, (0.0, 1.0, 0.0), radius * np.sin(angle), radius * np.cos(angle))
 
 
-def bowl(center, radius: float) -> Triangles:
+def bowl(center: ArrayLike, radius: float) -> Triangles:
     """The lower half of a hollow ball: it faces inwards, so that the side near the eye is not drawn."""
     angle = np.linspace(-np.pi / 2, 0, ROUND // 2 + 1)
     points, triangles = revolved(center, (0.0, 1.0, 0.0), radius * np.sin(angle), radius * np.cos(angle))
     return points, triangles[:, ::-1]
 
 
-def tube(start, end, radius: float, rounded: bool) -> Triangles:
+def tube(start: ArrayLike, end: ArrayLike, radius: float, rounded: bool) -> Triangles:
     """A cylinder, its ends flat or round."""
     length = np.linalg.norm(end - start)
     sides = np.linspace(0, length, 9)
@@ -45,7 +46,7 @@ def tube(start, end, radius: float, rounded: bool) -> Triangles:
     return revolved(start, end - start, along, np.concatenate([caps, np.full(7, radius), caps[::-1]]))
 
 
-def box(center, size, quaternion):
+def box(center: ArrayLike, size: ArrayLike, quaternion: ArrayLike) -> Triangles:
     """A box turned by a quaternion (w, x, y, z), its sides in small squares."""
     from scipy.spatial.transform import Rotation
 
@@ -61,7 +62,7 @@ def box(center, size, quaternion):
     return turn.apply(np.concatenate(points) * size) + center, np.concatenate(triangles)
 
 
-def square(point, normal, size: float) -> Triangles:
+def square(point: ArrayLike, normal: ArrayLike, size: float) -> Triangles:
     """A square of a plane, four times as wide as `size` [m]."""
     normal = unit(normal)
     first = unit(np.cross(normal, [0.0, 0.0, 1.0] if abs(normal[2]) < 0.9 else [1.0, 0.0, 0.0]))
@@ -78,6 +79,6 @@ def _grid(n: int) -> Triangles:
     return np.stack([x, y], 1), np.concatenate([np.stack([a, b, c], 1), np.stack([b, d, c], 1)])
 
 
-def unit(v) -> np.ndarray:
+def unit(v: ArrayLike) -> np.ndarray:
     """The vector made one long."""
     return np.asarray(v, np.float64) / np.linalg.norm(v)
