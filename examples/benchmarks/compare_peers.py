@@ -23,7 +23,7 @@ from speed import SUBSTEPS, H, common_rollout, measure
 
 import diffsim_ti as ds
 from diffsim_ti.study import chart, charts, pareto_front, problem, problems
-from diffsim_ti.study.problem import Problem, FrameLoss
+from diffsim_ti.study.problem import FrameLoss, Problem
 from diffsim_ti.study.work_precision import reference
 
 ROOT = Path(__file__).parents[2]
