@@ -29,6 +29,7 @@ from diffsim_ti.solvers import (
     VelocityVerletSolver,
 )
 from diffsim_ti.state.guard import Crossing, Divergence
+from diffsim_ti.state.stability import stable_dt
 from diffsim_ti.terms import (
     Box,
     Capsule,
@@ -66,6 +67,7 @@ __all__ = [
     "MeshObstacle",
     "SelfContact",
     "Scene",
+    "stable_dt",
     "SemiImplicitSolver",
     "VelocityVerletSolver",
     "ImplicitEulerSolver",

@@ -85,7 +85,7 @@ def view(
 
     if not has_display():
         raise RuntimeError(NO_DISPLAY)
-    saving = None if output is None else writer_for(output, View(fps=fps, ground=ground))
+    saving = None if output is None else writer_for(output, View(ground=ground))
     if source.suffix == ".pvd":
         frames = SavedFrames(source)
     else:

@@ -178,8 +178,11 @@ class Viewer:
 
     def save(self) -> None:
         """Write the source's frames, with the present camera and colours if the format has such."""
-        out, drawing = self.output, self.drawing
-        out.view = replace(out.view, colour=self.colour, camera=drawing.camera, wireframe=drawing.wireframe)
+        out, drawing, last = self.output, self.drawing, len(self.source) - 1
+        look = dict(colour=self.colour, camera=drawing.camera, wireframe=drawing.wireframe)
+        if last:  # a film keeps the run's time
+            look["fps"] = last / (self.source.frame(last).time - self.source.frame(0).time)
+        out.view = replace(out.view, **look)
         out.open(self.source.setting)
         with out:
             for k in range(len(self.source)):
