@@ -49,7 +49,7 @@ def oscillator() -> Problem:
 
 
 def lame_mode(X: np.ndarray, a: float = 1.0) -> np.ndarray:
-    """Lame mode of a cube of width a [m] at places X, shape (n, 3), of size 1."""
+    """Lame mode of a cube of width a [m] at points X, shape (n, 3), of size 1."""
     p = np.pi / a
     x, y, z = X.T
     return np.stack([np.cos(p * x) * np.sin(p * y), -np.sin(p * x) * np.cos(p * y), 0 * z], 1)
