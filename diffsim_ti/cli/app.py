@@ -11,6 +11,7 @@ import typer
 
 from diffsim_ti.adaptive_run import Interrupted
 from diffsim_ti.cli.options import (
+    SUFFIXES,
     Backend,
     Density,
     FixOrientation,
@@ -89,8 +90,8 @@ def simulate(
         typer.Option(
             "--output",
             "-o",
-            help="folder for a series and a picture of the end (default output/simulate), or a file: .pvd, .mp4, .gif, "
-            ".png (of the end; run_%04d.png: of all frames), .npz; may be repeated",
+            help="folder for a series and a picture of the end (default output/simulate), or a file by its suffix: "
+            f"{SUFFIXES}; may be repeated",
         ),
     ] = None,
     material: MaterialName = "StableNeoHookean",

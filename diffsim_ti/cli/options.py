@@ -14,6 +14,7 @@ from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.scene import Scene
 from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.terms import Ground, Term
+from diffsim_ti.writers import WRITERS
 
 if TYPE_CHECKING:
     from diffsim_ti.adaptive_run import ForwardRun
@@ -36,6 +37,7 @@ Volume = Annotated[
 Backend = Annotated[str, typer.Option(help="cpu, cuda or vulkan")]
 Precision = Annotated[str, typer.Option(help="f32 or f64")]
 Threads = Annotated[int | None, typer.Option(help="CPU threads, default all")]
+SUFFIXES = f"{', '.join(WRITERS)} (run_%04d.png: every frame, run.png: the end)"
 Folder = Annotated[Path, typer.Option("--output", "-o", help="folder for what is written")]
 
 

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from diffsim_ti.cli.options import (
+    SUFFIXES,
     Density,
     FixOrientation,
     MaterialName,
@@ -29,9 +30,9 @@ def register(app: typer.Typer) -> None:
 
 def render(
     series: Annotated[Path, typer.Argument(help="the .pvd of a run", exists=True, dir_okay=False)],
-    output: Annotated[
-        Path, typer.Option("--output", "-o", help=".mp4, .gif, .png of the end (name_%04d.png: all), .npz")
-    ] = Path("output/film.mp4"),
+    output: Annotated[Path, typer.Option("--output", "-o", help=f"file, by its suffix: {SUFFIXES}")] = Path(
+        "output/film.mp4"
+    ),
     colour: Annotated[str, typer.Option(help="displacement, speed, von_mises, energy_density or J")] = "von_mises",
     fps: Annotated[float, typer.Option(help="frames per second of the film")] = 30.0,
     size: Annotated[tuple[int, int], typer.Option(help="width and height [pixels]")] = (640, 480),
@@ -72,7 +73,7 @@ def view(
     ] = None,
     floor: Annotated[bool, typer.Option(help="a floor at y = 0, the body above it")] = True,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="file that the key S writes: .mp4, .gif, .png, .pvd or .npz")
+        Path | None, typer.Option("--output", "-o", help=f"file that the key S writes, by its suffix: {SUFFIXES}")
     ] = None,
 ) -> None:
     """Look at a saved series in a window, or at a mesh as it falls: play, step, scrub, turn, colour by a field, pull."""
