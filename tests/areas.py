@@ -13,11 +13,11 @@ AREAS = {
     "gradients": "every_adjoint term_order gradients gradient_clip gradient_faults gradient_fuzz checkpoints tape identification",
     "implicit steps and equilibria": "implicit implicit_gradients implicit_contact",
     "patches against locking": "locking",
-    "obstacles and friction": "contact contact_crossing contact_friction contact_gradients",
+    "obstacles and friction": "contact contact_crossing contact_friction contact_gradients own_obstacle",
     "self-contact": "self_contact self_contact_implicit self_contact_pairs",
     "PyTorch, optimisations": "torch torch_physics torch_solvers seed_snippets optimization",
     "charts, maps, advice": "study study_stability peers",
-    "pictures, films, the window": "picture_drawing picture_film optimization_picture writers own_obstacle viewer viewer_window gallery",
+    "pictures, films, the window": "picture_drawing picture_film optimization_picture writers viewer viewer_window gallery",
     "examples and pages": "examples contact_examples static_examples torch_examples readme",
     "command line, resources, Vulkan": "cli resources vulkan",
 }
