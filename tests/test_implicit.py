@@ -417,3 +417,27 @@ def test_steps_by_a_simulator_are_those_of_a_rollout():
 def test_impossible_options_are_refused(option, message):
     with pytest.raises(ValueError, match=message):
         ds.ImplicitEulerSolver(oscillator(), **option)
+
+
+def test_blas_is_left_as_it_was():
+    """One thread while a step is solved, also if it fails; before and after it what the program chose."""
+    from threadpoolctl import ThreadpoolController, threadpool_limits
+
+    from diffsim_ti.solvers.implicit.threads import one_blas_thread
+
+    def threads():
+        return [pool["num_threads"] for pool in ThreadpoolController().select(user_api="blas").info()]
+
+    with threadpool_limits(2, "blas"):
+        before = threads()
+        assert before and set(one_blas_thread(threads)()) == {1} and threads() == before
+        with pytest.raises(ZeroDivisionError):
+            one_blas_thread(lambda: 1 / 0)()
+        assert threads() == before
+        solver = ds.ImplicitEulerSolver(oscillator(), dt=1e-3)
+        seen = []
+        workspace = solver.workspace(solver.start_values())
+        solve = workspace.newton.solve
+        workspace.newton.solve = lambda *a, **k: (seen.append(set(threads())), solve(*a, **k))[1]
+        workspace.advance(0, 1, 1)
+        assert seen == [{1}] and threads() == before
