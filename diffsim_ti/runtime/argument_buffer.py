@@ -20,7 +20,9 @@ class ArgumentBuffer:
     """
 
     def __init__(self, context):
-        builder = _word(id(context) + object.__basicsize__).value  # pybind11 keeps the C++ object behind Python's header
+        builder = _word(
+            id(context) + object.__basicsize__
+        ).value  # pybind11 keeps the C++ object behind Python's header
         self._own = _word(builder + 3 * _WORD).value
         self._in_use = _word(_word(builder + 2 * _WORD).value)
         if not self._own or self._in_use.value != self._own:

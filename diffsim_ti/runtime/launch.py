@@ -37,7 +37,9 @@ class Launch:
         for k, array in enumerate(self._arrays):
             if not isinstance(array, ti.Ndarray):  # a torch tensor, set at each launch
                 continue
-            if arch == "cpu":  # a launch replaces an array by its raw pointer, so that a context could not be used twice
+            if (
+                arch == "cpu"
+            ):  # a launch replaces an array by its raw pointer, so that a context could not be used twice
                 pointer, size = prog.get_ndarray_data_ptr_as_int(array.arr), int(np.prod(full_shape(array))) * 8
                 self._context.set_arg_external_array_with_shape((k,), pointer, size, tuple(array.shape), 0)
             else:

@@ -6,13 +6,32 @@ What stands in no table here is no error until a thread reaches it: the driver t
 
 C_TYPES = {f"{kind}{bits}": f"{'' if kind == 's' else 'u'}int{bits}_t" for kind in "bsu" for bits in (8, 16, 32, 64)}
 C_TYPES |= {"f32": "float", "f64": "double", "pred": "_Bool"}
-WIDER = {"s16": "int32_t", "u16": "uint32_t", "s32": "int64_t", "u32": "uint64_t", "s64": "__int128", "u64": "unsigned __int128"}
+WIDER = {
+    "s16": "int32_t",
+    "u16": "uint32_t",
+    "s32": "int64_t",
+    "u32": "uint64_t",
+    "s64": "__int128",
+    "u64": "unsigned __int128",
+}
 
 _BOTH = {
-    "add": "{0} + {1}", "sub": "{0} - {1}", "neg": "-{0}", "and": "{0} & {1}", "or": "{0} | {1}", "xor": "{0} ^ {1}",
-    "not": "~{0}", "cnot": "!{0}", "min": "min_{t}({0}, {1})", "max": "max_{t}({0}, {1})", "abs": "abs_{t}({0})",
-    "popc": "popc_{t}({0})", "clz": "clz_{t}({0})", "brev": "brev_{t}({0})", "prmt": "prmt_{t}({0}, {1}, {2})",
-}  # fmt: skip
+    "add": "{0} + {1}",
+    "sub": "{0} - {1}",
+    "neg": "-{0}",
+    "and": "{0} & {1}",
+    "or": "{0} | {1}",
+    "xor": "{0} ^ {1}",
+    "not": "~{0}",
+    "cnot": "!{0}",
+    "min": "min_{t}({0}, {1})",
+    "max": "max_{t}({0}, {1})",
+    "abs": "abs_{t}({0})",
+    "popc": "popc_{t}({0})",
+    "clz": "clz_{t}({0})",
+    "brev": "brev_{t}({0})",
+    "prmt": "prmt_{t}({0}, {1}, {2})",
+}
 _INTEGER = {"div": "div_{t}({0}, {1})", "rem": "rem_{t}({0}, {1})"}
 _REAL = {"mul": "{0} * {1}", "div": "{0} / {1}", "fma": "fma_{t}({0}, {1}, {2})", "mad": "fma_{t}({0}, {1}, {2})"}
 _REAL |= {name: name + "_{t}({0})" for name in ("sqrt", "rsqrt", "rcp", "sin", "cos", "lg2", "ex2", "tanh")}
@@ -83,7 +102,11 @@ def _shift(name: str, kind: str) -> tuple[str, str, list[str]]:
 
 def _field(name: str, modifiers: list[str], kind: str) -> tuple[str, str, list[str]]:
     if name == "bfe":
-        return f"field({{0}}, {{1}}, {{2}}, {bits(kind)}, {int(kind[0] == 's')})", kind, [f"u{bits(kind)}", "u32", "u32"]
+        return (
+            f"field({{0}}, {{1}}, {{2}}, {bits(kind)}, {int(kind[0] == 's')})",
+            kind,
+            [f"u{bits(kind)}", "u32", "u32"],
+        )
     if name == "bfi":
         return f"insert({{0}}, {{1}}, {{2}}, {{3}}, {bits(kind)})", kind, [kind, kind, "u32", "u32"]
     amount = "({2} & 31)" if "wrap" in modifiers else "({2} < 32 ? {2} : 32)"
@@ -122,12 +145,18 @@ def conversion(modifiers: list[str], target: str, source: str, value: str) -> st
 
 
 def atomic(action: str, kind: str, compared: str | None) -> str:
-    """The new value of memory, from the `old` one and the operand `new`. Threads run one at a time: nothing else is needed."""
+    """The next value of memory, from the `old` one and the operand `new`; threads run one at a time, so that it holds."""
     known = {
-        "add": "old + new", "exch": "new", "and": "old & new", "or": "old | new", "xor": "old ^ new",
-        "min": f"min_{kind}(old, new)", "max": f"max_{kind}(old, new)",
-        "inc": "old >= new ? 0 : old + 1", "dec": "!old || old > new ? new : old - 1",
-    }  # fmt: skip
+        "add": "old + new",
+        "exch": "new",
+        "and": "old & new",
+        "or": "old | new",
+        "xor": "old ^ new",
+        "min": f"min_{kind}(old, new)",
+        "max": f"max_{kind}(old, new)",
+        "inc": "old >= new ? 0 : old + 1",
+        "dec": "!old || old > new ? new : old - 1",
+    }
     if action == "cas":
         return f"old == new ? {compared} : old"
     if action not in known:

@@ -53,7 +53,9 @@ def _first_values(module: ptx.Module, places: dict[str, int], total: int) -> byt
         size = ptx.BYTES[variable.kind]
         for k, word in enumerate(variable.values or []):
             at = places[variable.name] + k * size
-            number = int(word[2:], 16) if re.match("0[fFdD]", word) else int(word, 0)  # the address of a name is an error here
+            number = (
+                int(word[2:], 16) if re.match("0[fFdD]", word) else int(word, 0)
+            )  # the address of a name is an error here
             out[at : at + size] = struct.pack("<Q", number % (1 << 64))[:size]
     return bytes(out)
 
@@ -73,7 +75,8 @@ def _signature(function: ptx.Function) -> str:
         return f"void {identifier(function.name)}(char *parameters)"
     names = [identifier(v.name) for v in function.results] or ["no_result"]
     names += [identifier(v.name) for v in function.parameters]
-    return f"static __attribute__((noinline)) void {identifier(function.name)}({', '.join('char *' + name for name in names)})"
+    parameters = ", ".join("char *" + name for name in names)
+    return f"static __attribute__((noinline)) void {identifier(function.name)}({parameters})"
 
 
 def _parameter_places(function: ptx.Function) -> list[str]:

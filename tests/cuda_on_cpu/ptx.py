@@ -95,7 +95,9 @@ class Reader:
     def _take(self, expected: str | None = None) -> str:
         word = self._peek()
         if not word or (expected and word != expected):
-            raise SyntaxError(f"PTX: {expected or 'more'} expected, found {' '.join(self._words[self._place - 9 : self._place + 3])}")
+            raise SyntaxError(
+                f"PTX: {expected or 'more'} expected, found {' '.join(self._words[self._place - 9 : self._place + 3])}"
+            )
         self._place += 1
         return word
 

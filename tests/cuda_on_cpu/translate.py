@@ -13,7 +13,9 @@ from instructions import C_TYPES, Unsupported
 _REGISTERS = {"pred": "_Bool", "f32": "float", "f64": "double"} | {
     f"{kind}{bits}": f"uint{bits}_t" for kind in "bsu" for bits in (8, 16, 32, 64)
 }
-_SPECIAL = {f"%{name}.{axis}": f"T->{name}[{k}]" for name in ("tid", "ntid", "ctaid", "nctaid") for k, axis in enumerate("xyz")}
+_SPECIAL = {
+    f"%{name}.{axis}": f"T->{name}[{k}]" for name in ("tid", "ntid", "ctaid", "nctaid") for k, axis in enumerate("xyz")
+}
 _SPECIAL |= {"%laneid": "T->lane", "WARP_SZ": "32", "%clock": "1", "%clock64": "1", "%globaltimer": "1"}
 _SPECIAL |= {"%lanemask_lt": "((1u << T->lane) - 1)", "%lanemask_eq": "(1u << T->lane)"}
 _SPACES = {"param", "local", "shared", "global", "const"}
@@ -47,7 +49,9 @@ class Body:
         if isinstance(item, ptx.Variable):
             if item.space == "shared":
                 return []
-            return [f"char {identifier(item.name)}[{max(item.bytes, 1)}] __attribute__((aligned({max(item.alignment, 8)})));"]
+            return [
+                f"char {identifier(item.name)}[{max(item.bytes, 1)}] __attribute__((aligned({max(item.alignment, 8)})));"
+            ]
         return [self._instruction(item)]
 
     # operands
@@ -87,7 +91,9 @@ class Body:
             return f"({value.hex()}{suffix})" if value - value == 0 else f"{kind}_bits(0x{text[2:]})"
         if kind == "pred":
             return str(int(int(text, 0) != 0))
-        return f"({C_TYPES[kind]}){hex(int(text, 0) % (1 << instructions.bits(kind)))}u{'ll' if kind[1:] == '64' else ''}"
+        return (
+            f"({C_TYPES[kind]}){hex(int(text, 0) % (1 << instructions.bits(kind)))}u{'ll' if kind[1:] == '64' else ''}"
+        )
 
     def _address(self, name: str) -> str:
         if name in self._shared:
@@ -151,11 +157,15 @@ class Body:
         kind = modifiers[-1]
         if isinstance(target, list):  # a word into its parts
             bits = instructions.bits(kind) // len(target)
-            parts = [self._write(part, f"u{bits}", f"(uint{bits}_t)(word >> {bits * k})") for k, part in enumerate(target)]
+            parts = [
+                self._write(part, f"u{bits}", f"(uint{bits}_t)(word >> {bits * k})") for k, part in enumerate(target)
+            ]
             return f"{{ uint64_t word = {self._read(source, f'u{kind[1:]}')}; {' '.join(parts)} }}"
         if isinstance(source, list):
             bits, whole = instructions.bits(kind) // len(source), C_TYPES[kind]
-            parts = [f"({whole})(uint{bits}_t){self._read(part, f'u{bits}')} << {bits * k}" for k, part in enumerate(source)]
+            parts = [
+                f"({whole})(uint{bits}_t){self._read(part, f'u{bits}')} << {bits * k}" for k, part in enumerate(source)
+            ]
             return self._write(target, kind, " | ".join(parts))
         return self._write(target, kind, self._read(source, kind))
 
@@ -171,12 +181,18 @@ class Body:
         test = instructions.comparison(modifiers[0], kind, self._read(a, kind), self._read(b, kind))
         sign = {"and": "&", "or": "|", "xor": "^"}[modifiers[1]] if other else None
         parts = target if isinstance(target, list) else [target]
-        values = [value if other is None else f"{value} {sign} {self._read(other, 'pred')}" for value in ("test", "!test")]
-        return f"{{ _Bool test = {test}; {' '.join(self._write(p, 'pred', value) for p, value in zip(parts, values))} }}"
+        values = [
+            value if other is None else f"{value} {sign} {self._read(other, 'pred')}" for value in ("test", "!test")
+        ]
+        return (
+            f"{{ _Bool test = {test}; {' '.join(self._write(p, 'pred', value) for p, value in zip(parts, values))} }}"
+        )
 
     def _do_selp(self, name, modifiers, target, a, b, choice) -> str:
         kind = modifiers[-1]
-        return self._write(target, kind, f"{self._read(choice, 'pred')} ? {self._read(a, kind)} : {self._read(b, kind)}")
+        return self._write(
+            target, kind, f"{self._read(choice, 'pred')} ? {self._read(a, kind)} : {self._read(b, kind)}"
+        )
 
     def _do_ld(self, name, modifiers, target, address) -> str:
         kind, (place, access) = modifiers[-1], self._place(address, modifiers)
@@ -189,7 +205,9 @@ class Body:
         kind, (place, access) = modifiers[-1], self._place(address, modifiers)
         parts = source if isinstance(source, list) else [source]
         size = ptx.BYTES[kind]
-        code = [f"{access}({C_TYPES[kind]}, at + {k * size}) = {self._read(part, kind)};" for k, part in enumerate(parts)]
+        code = [
+            f"{access}({C_TYPES[kind]}, at + {k * size}) = {self._read(part, kind)};" for k, part in enumerate(parts)
+        ]
         return f"{{ uint64_t at = {place}; {' '.join(code)} }}"
 
     def _do_atom(self, name, modifiers, target, address, operand, other=None) -> str:
