@@ -29,6 +29,7 @@ static char *stacks;
 static jmp_buf scheduler, next_thread;
 static struct kernel *running;
 static int as_coroutines, current, thread_count, reversed;
+static long reverse_each;
 
 static void leave(void) {
     if (!as_coroutines) longjmp(next_thread, 1);
@@ -68,7 +69,7 @@ static void stop_kernel(const char *why) { stop("%s", why); }
 void launch_start(void) {
     thread = (struct thread){.shared = shared, .leave = leave, .stop = stop_kernel, .wrong_address = wrong_address,
                              .assertion = assertion, .print = print, .barrier = barrier, .exchange = exchange};
-    reversed = option("REVERSE", 0);
+    reverse_each = option("REVERSE", 0);
 }
 
 static void take_place(int number) {
@@ -188,6 +189,7 @@ enum result launch(struct kernel *kernel, const uint32_t blocks[3], const uint32
     unsigned rounding = _mm_getcsr();
     if (kernel->flushes_denormals) _mm_setcsr(rounding | FLUSH_DENORMALS);
     running = kernel;
+    reversed = reverse_each && counters.launches % reverse_each == 0;
     for (uint32_t k = 0; k < count; k++) {
         uint32_t block = reversed ? count - 1 - k : k;
         thread.ctaid[0] = block % blocks[0], thread.ctaid[1] = block / blocks[0] % blocks[1], thread.ctaid[2] = block / blocks[0] / blocks[1];
