@@ -1,4 +1,6 @@
-"""Runs pytest on executed PTX: `python tests/cuda_on_cpu/run.py [arguments of pytest]`, by default the tests marked `backends`.
+"""Runs pytest on executed PTX: `python tests/cuda_on_cpu/run.py [arguments of pytest]`.
+
+Without arguments, the tests marked `backends`; `python tests/cuda_on_cpu/run.py tests` runs the whole suite.
 
 New memory is poisoned, and every third launch runs its threads in reverse. Environment, which other values replace:
 CUDA_ON_CPU_POISON, _REVERSE (every n-th launch, 0 for none), _MEMORY_MB and _DEVICES of the device, _CACHE (a folder).
