@@ -1,6 +1,7 @@
 """What the stand-in has counted in this process."""
 
 import ctypes
+from collections import Counter
 from pathlib import Path
 
 
@@ -35,8 +36,10 @@ class Counters:
     def launches(self) -> dict[str, int]:
         """How often each kernel was launched, those only that were."""
         before = self._launched + [0] * (len(self._kernels()) - len(self._launched))
-        counted = [(k.name.decode(), k.launches - old) for k, old in zip(self._kernels(), before)]
-        return {name: count for name, count in counted if count}
+        counted = Counter()
+        for kernel, old in zip(self._kernels(), before):
+            counted[kernel.name.decode()] += kernel.launches - old
+        return {name: count for name, count in counted.items() if count}
 
     def ptx(self) -> dict[str, str]:
         """The text of the module of each kernel that was launched; kernels are named there by their place."""

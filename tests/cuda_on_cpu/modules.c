@@ -21,6 +21,7 @@
 enum { MOST_KERNELS = 1 << 16, MOST_ENTRIES = 256 };
 
 struct module {
+    struct kernel *kernels[MOST_ENTRIES]; /* Taichi asks for a kernel at each launch */
     char *names[MOST_ENTRIES], *ptx;
     int count, flushes_denormals;
     const struct entry *entries;
@@ -126,8 +127,10 @@ struct module *module_load(const char *ptx) {
 struct kernel *module_kernel(struct module *module, const char *name) {
     for (int k = 0; k < module->count; k++) {
         if (strcmp(module->names[k], name)) continue;
+        if (module->kernels[k]) return module->kernels[k];
         struct kernel *kernel = malloc(sizeof *kernel);
         *kernel = (struct kernel){module->names[k], 0, module->ptx, module->entries + k, module->flushes_denormals};
+        module->kernels[k] = kernel;
         if (cuda_on_cpu_kernel_count < MOST_KERNELS) cuda_on_cpu_kernels[cuda_on_cpu_kernel_count++] = kernel;
         return kernel;
     }
