@@ -1,14 +1,16 @@
 """Arrays on the device that are freed with their last reference, and copies between them and NumPy."""
 
+import math
 import weakref
 
 import numpy as np
 import taichi as ti
 from taichi.lang import impl
 
-from diffsim_ti.runtime.start import check_alive, is_alive, program, runs_on_cpu
+from diffsim_ti.runtime.start import arch_name, check_alive, is_alive, program, runs_on_cpu
 
 _allocated = {"bytes": 0}
+_MOST_NUMBERS = 2**31 - 1
 
 
 def allocated_megabytes() -> float:
@@ -32,11 +34,29 @@ class _Scalars(ti.ScalarNdarray):
 
 
 def array(dtype, *shape: int):
-    """A Taichi ndarray whose memory goes back when the last reference goes, and only to the program that gave it."""
+    """A Taichi ndarray whose memory goes back when the last reference goes, and only to the program that gave it.
+
+    Raises ValueError beyond 2^31 - 1 numbers, which Taichi's indices wrap around in silence, and MemoryError.
+    """
     owner = program()
     shape = tuple(max(int(s), 1) for s in shape)  # Taichi has no empty arrays
-    out = _Scalars(dtype, shape) if isinstance(dtype, type(ti.f32)) else ti.ndarray(dtype, shape)
-    size = int(np.prod(full_shape(out))) * np.dtype(to_numpy_dtype(out.dtype)).itemsize
+    is_scalar = isinstance(dtype, type(ti.f32))
+    count = math.prod(shape) * (1 if is_scalar else math.prod(dtype.get_shape()))
+    if count > _MOST_NUMBERS:
+        raise ValueError(
+            f"an array of {count:.3g} numbers is beyond the {_MOST_NUMBERS:.3g} that Taichi's 32-bit indices reach: "
+            "keep fewer states (checkpoint_every, save_every), or use a coarser mesh"
+        )
+    size = count * np.dtype(to_numpy_dtype(dtype if is_scalar else dtype.dtype)).itemsize
+    try:
+        out = _Scalars(dtype, shape) if is_scalar else ti.ndarray(dtype, shape)
+    except RuntimeError as error:
+        if "out of memory" not in str(error).lower():
+            raise
+        raise MemoryError(
+            f"{size / 1e6:.0f} MB do not fit into the memory of the {arch_name()} device, of which this process holds "
+            f"{allocated_megabytes():.0f} MB: keep fewer states (checkpoint_every, save_every), or use a coarser mesh"
+        ) from error
     _allocated["bytes"] += size
     out.owner = owner
     weakref.finalize(out, _free, owner, out.arr, size)
