@@ -56,3 +56,22 @@ def test_launch_takes_other_tensors_each_time():
         assert tensor.tolist() == before
         before = runtime.fetch(array).tolist()
         assert before == [k + 1.0] * 3
+
+
+@pytest.mark.parametrize("dtype", [ti.i32, ti.f32, ti.f64, ti.types.vector(3, ti.f32), ti.types.vector(4, ti.f64)])
+def test_arrays_hold_what_is_copied_to_them(dtype):
+    number = getattr(dtype, "dtype", dtype)
+    if runtime.arch_name() == "vulkan" and number == ti.f64:
+        pytest.skip("Vulkan has float32 only")
+    shape = (4, 5, *getattr(dtype, "get_shape", tuple)())
+    numbers = np.arange(np.prod(shape)).reshape(shape).astype(runtime.to_numpy_dtype(number))
+    array, kept = runtime.upload(numbers, dtype), slice(0, 3 if len(shape) == 3 else None)
+    assert np.array_equal(runtime.fetch(array), numbers[..., kept])
+    runtime.fill(array, numbers[:1] + 1)  # a row for all
+    assert np.array_equal(runtime.fetch(array), np.broadcast_to(numbers[:1] + 1, shape)[..., kept])
+    runtime.fill(array, 0)
+    assert not runtime.fetch(array).any()
+    if len(shape) == 3:
+        runtime.fill(array, numbers[..., :3])
+        for row in (2, -1):
+            assert np.array_equal(runtime.fetch_row(array, row), numbers[row, :, :3])

@@ -7,6 +7,7 @@ import numpy as np
 import taichi as ti
 from taichi.lang import impl
 
+from diffsim_ti.runtime import device
 from diffsim_ti.runtime.start import arch_name, check_alive, is_alive, program, runs_on_cpu
 
 _allocated = {"bytes": 0}
@@ -21,7 +22,7 @@ def allocated_megabytes() -> float:
 def _free(owner, handle, size) -> None:
     _allocated["bytes"] -= size
     if is_alive(owner):
-        if not runs_on_cpu():
+        if arch_name() == "vulkan":
             ti.sync()  # an array that a kernel still uses would not be freed, in silence
         owner().delete_ndarray(handle)
 
@@ -68,7 +69,8 @@ def upload(data: np.ndarray, dtype) -> "ti.Ndarray":
     data = np.asarray(data)
     shape = data.shape if isinstance(dtype, type(ti.f32)) else data.shape[:-1]
     out = array(dtype, *shape)
-    fill(out, 0)
+    if runs_on_cpu() or not data.size:  # elsewhere `fill` writes the whole array
+        fill(out, 0)
     if data.size:
         fill(out, data)
     return out
@@ -93,8 +95,7 @@ def view(target) -> "np.ndarray | None":
     if host is None and runs_on_cpu():
         dtype, shape = to_numpy_dtype(target.dtype), full_shape(target)
         kind = np.ctypeslib.as_ctypes_type(dtype) * int(np.prod(shape))
-        address = impl.get_runtime().prog.get_ndarray_data_ptr_as_int(target.arr)
-        host = target.host_view = np.ctypeslib.as_array(kind.from_address(address)).reshape(shape)
+        host = target.host_view = np.ctypeslib.as_array(kind.from_address(_address(target))).reshape(shape)
     return host
 
 
@@ -106,23 +107,45 @@ def fill(target, data) -> None:
     if host is not None:
         (host[..., :3] if three else host)[...] = data
         return
+    on_cuda = arch_name() == "cuda"
+    if on_cuda and data.ndim == 0 and data == 0:
+        impl.get_runtime().prog.fill_uint(target.arr, 0)  # a memset, whatever the type
+        return
     whole = np.zeros(shape, to_numpy_dtype(target.dtype))
     (whole[..., :3] if three else whole)[...] = data
-    target.from_numpy(whole)
+    if on_cuda:  # Taichi would copy both ways, and wait three times
+        device.copy_to_card(_address(target), whole)
+    else:
+        target.from_numpy(whole)
 
 
 def fetch(source) -> np.ndarray:
     """A NumPy copy of a Taichi array; of four components the first three."""
     host = view(source)
-    host = source.to_numpy() if host is None else host
+    host = _copied(source) if host is None else host
     is_vector = len(getattr(source, "element_shape", ()) or ()) == 1 and host.shape[-1] == 4
     return host[..., :3].copy() if is_vector else host.copy()
+
+
+def _copied(source, row: int | None = None) -> np.ndarray:
+    """All of an array whose memory is not the host's, or a row of it."""
+    if arch_name() != "cuda":
+        return source.to_numpy() if row is None else source.to_numpy()[row]
+    shape = full_shape(source)
+    out = np.empty(shape if row is None else shape[1:], to_numpy_dtype(source.dtype))
+    before = 0 if row is None else range(shape[0])[row] * out.nbytes
+    device.copy_from_card(out, _address(source) + before)
+    return out
+
+
+def _address(target) -> int:
+    return impl.get_runtime().prog.get_ndarray_data_ptr_as_int(target.arr)
 
 
 def fetch_row(source, k: int) -> np.ndarray:
     """Row k of a Taichi array of vectors in float64; of four components the first three."""
     host = view(source)
-    return (source.to_numpy() if host is None else host)[k, ..., :3].astype(np.float64)
+    return (_copied(source, k) if host is None else host[k])[..., :3].astype(np.float64)
 
 
 def to_numpy_dtype(dtype):

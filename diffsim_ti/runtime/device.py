@@ -1,26 +1,63 @@
-"""What a user calls a device, and the cards that CUDA's driver sees."""
+"""What a user calls a device, the cards that CUDA's driver sees, and copies that the driver makes by itself."""
 
 import ctypes
+from functools import cache
 
+import numpy as np
 from taichi._lib import core as _core
 from taichi.lang import impl
 
-_DRIVERS = ("libcuda.so", "libcuda.so.1", "nvcuda.dll")
+_DRIVERS = ("libcuda.so", "libcuda.so.1", "/usr/lib/wsl/lib/libcuda.so", "nvcuda.dll")
+
+
+@cache
+def _driver():
+    """CUDA's driver library, which Taichi has loaded too."""
+    for name in _DRIVERS:
+        try:
+            return ctypes.CDLL(name)
+        except OSError:
+            continue
+    raise RuntimeError(
+        f"Taichi found CUDA's driver, but not as {', '.join(_DRIVERS)}: add its folder to the library path"
+    )
 
 
 def count_cards() -> int:
     """Cards that CUDA's driver sees: the driver may be installed where there is none, which Taichi takes for a card."""
     if not _core.with_cuda():
         return 0
-    for name in _DRIVERS:
-        try:
-            driver = ctypes.CDLL(name)
-        except OSError:
-            continue
-        count = ctypes.c_int(0)
-        failed = driver.cuInit(0) or driver.cuDeviceGetCount(ctypes.byref(count))
-        return 0 if failed else count.value
-    return 1  # Taichi found its driver under a name that is not known here, and will ask it
+    count = ctypes.c_int(0)
+    failed = _driver().cuInit(0) or _driver().cuDeviceGetCount(ctypes.byref(count))
+    return 0 if failed else count.value
+
+
+@cache
+def _context() -> ctypes.c_void_p:
+    """The first card's primary context, which Taichi and torch share."""
+    context = ctypes.c_void_p()
+    if status := _driver().cuDevicePrimaryCtxRetain(ctypes.byref(context), 0):
+        raise RuntimeError(f"CUDA's driver gives no context, error {status}")
+    return context
+
+
+def _copy(function: str, to: int, source: int, size: int) -> None:
+    status = _driver().cuCtxSetCurrent(_context())  # a thread that has launched nothing has none
+    status = status or getattr(_driver(), function)(ctypes.c_void_p(to), ctypes.c_void_p(source), ctypes.c_size_t(size))
+    if status:
+        raise RuntimeError(
+            f"CUDA's driver failed with error {status} in {function}; an earlier kernel may be the cause"
+        )
+
+
+def copy_to_card(address: int, numbers: np.ndarray) -> None:
+    """Contiguous numbers to an address of the card, after the kernels that were launched before."""
+    _copy("cuMemcpyHtoD_v2", address, numbers.ctypes.data, numbers.nbytes)
+
+
+def copy_from_card(numbers: np.ndarray, address: int) -> None:
+    """Contiguous numbers from an address of the card, after the kernels that were launched before."""
+    _copy("cuMemcpyDtoH_v2", numbers.ctypes.data, address, numbers.nbytes)
 
 
 def use_device(device) -> None:
