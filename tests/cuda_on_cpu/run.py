@@ -1,6 +1,6 @@
 """Runs pytest on executed PTX: `python tests/cuda_on_cpu/run.py [arguments of pytest]`.
 
-Without arguments, the tests marked `backends`; `python tests/cuda_on_cpu/run.py tests` runs the whole suite.
+`--marked` stands for the tests that CI runs here; `python tests/cuda_on_cpu/run.py tests` runs the whole suite.
 
 New memory is poisoned, and every third launch runs its threads in reverse. Environment, which other values replace:
 CUDA_ON_CPU_POISON, _REVERSE (every n-th launch, 0 for none), _MEMORY_MB and _DEVICES of the device, _CACHE (a folder).
@@ -13,7 +13,7 @@ import sys
 
 from build import CannotBuild, environment
 
-MARKED = ["tests", "-m", "backends"]
+MARKED = ["tests", "-m", "backends or executed_ptx"]
 
 
 def main(arguments: list[str]) -> int:
@@ -23,7 +23,8 @@ def main(arguments: list[str]) -> int:
         print(f"the stand-in for the CUDA driver cannot be built: {error}")
         return 1
     variables |= {name: value for name, value in os.environ.items() if name.startswith("CUDA_ON_CPU_")}
-    command = [sys.executable, "-m", "pytest", *(arguments or MARKED)]
+    arguments = [*MARKED, *(a for a in arguments if a != "--marked")] if "--marked" in arguments else arguments
+    command = [sys.executable, "-m", "pytest", *arguments]
     run = subprocess.Popen(command, env=variables, stdout=subprocess.PIPE, text=True)
     last = ""
     for line in run.stdout:
