@@ -1,6 +1,7 @@
 """What a user calls a device, the cards that CUDA's driver sees, and copies that the driver makes by itself."""
 
 import ctypes
+import platform
 from functools import cache
 
 import numpy as np
@@ -30,6 +31,18 @@ def count_cards() -> int:
     count = ctypes.c_int(0)
     failed = _driver().cuInit(0) or _driver().cuDeviceGetCount(ctypes.byref(count))
     return 0 if failed else count.value
+
+
+def device_name() -> str:
+    """Name and driver of the first card, or of the processor where Taichi runs there."""
+    from diffsim_ti.runtime.start import arch_name
+
+    if arch_name() != "cuda":
+        return f"{platform.processor() or platform.machine()} ({arch_name()})"
+    name, version = ctypes.create_string_buffer(128), ctypes.c_int(0)
+    _driver().cuDeviceGetName(name, len(name), 0)
+    _driver().cuDriverGetVersion(ctypes.byref(version))
+    return f"{name.value.decode()}, CUDA {version.value // 1000}.{version.value % 1000 // 10}"
 
 
 @cache
