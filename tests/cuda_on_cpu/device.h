@@ -10,7 +10,8 @@
 #define SHIFT 0x010000000000ull
 #define PAGE_BITS 12
 #define PAGE (1ull << PAGE_BITS)
-#define ALLOCATED ((const uint8_t *)0x0f0000000000ull) /* one byte for each page of the window: 1 where memory was given out */
+#define ALLOCATED \
+    ((const uint8_t *)0x0f0000000000ull) /* one byte for each page of the window: 1 where memory was given out */
 enum { SHARED_BYTES = 48 << 10 };
 
 enum exchange { SHUFFLE_UP, SHUFFLE_DOWN, SHUFFLE_XOR, SHUFFLE_INDEX, VOTE_BALLOT, VOTE_ANY, VOTE_ALL, WARP_BARRIER };
@@ -25,7 +26,8 @@ struct thread { /* the thread that runs, and what the driver does for it */
     void (*assertion)(uint64_t message, uint64_t file, uint32_t line, uint64_t function);
     uint32_t (*print)(uint64_t format, uint64_t arguments);
     void (*barrier)(void);
-    uint32_t (*exchange)(enum exchange what, uint32_t members, uint32_t value, uint32_t operand, uint32_t limits, int *valid);
+    uint32_t (*exchange)(enum exchange what, uint32_t members, uint32_t value, uint32_t operand, uint32_t limits,
+                         int *valid);
 };
 
 enum { MAX_PARAMETERS = 8 };

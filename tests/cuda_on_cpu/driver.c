@@ -12,10 +12,20 @@
 
 enum { MEMORY_TYPE_DEVICE = 2 };
 enum attribute { /* CUdevice_attribute */
-    MOST_THREADS_PER_BLOCK = 1, MOST_THREADS_IN_X = 2, SHARED_PER_BLOCK = 8, WARP_SIZE = 10, MULTIPROCESSORS = 16,
-    CAPABILITY_MAJOR = 75, CAPABILITY_MINOR = 76, SHARED_PER_BLOCK_ON_REQUEST = 97, MOST_BLOCKS = 106, HAS_MEMORY_POOLS = 115,
+                 MOST_THREADS_PER_BLOCK = 1,
+                 MOST_THREADS_IN_X = 2,
+                 SHARED_PER_BLOCK = 8,
+                 WARP_SIZE = 10,
+                 MULTIPROCESSORS = 16,
+                 CAPABILITY_MAJOR = 75,
+                 CAPABILITY_MINOR = 76,
+                 SHARED_PER_BLOCK_ON_REQUEST = 97,
+                 MOST_BLOCKS = 106,
+                 HAS_MEMORY_POOLS = 115,
 };
-enum { BLOCKS = 2 }; /* per multiprocessor, of which there is one: loops over more items than threads are walked through */
+enum {
+    BLOCKS = 2
+}; /* per multiprocessor, of which there is one: loops over more items than threads are walked through */
 
 typedef uint32_t status;
 struct counters counters;
@@ -63,7 +73,9 @@ void stop(const char *format, ...) {
 status cuInit(unsigned flags) { return option("DEVICES", 1) ? SUCCESS : NO_DEVICE; }
 status cuDriverGetVersion(int *version) { return *version = 12040, SUCCESS; }
 status cuDeviceGetCount(int *count) { return *count = option("DEVICES", 1), SUCCESS; }
-status cuDeviceGet(int *device, int number) { return *device = number, number < option("DEVICES", 1) ? SUCCESS : NO_DEVICE; }
+status cuDeviceGet(int *device, int number) {
+    return *device = number, number < option("DEVICES", 1) ? SUCCESS : NO_DEVICE;
+}
 status cuDeviceGetName(char *name, int room, int device) { return snprintf(name, room, "executed PTX"), SUCCESS; }
 status cuDeviceGetDefaultMemPool(void **pool, int device) { return *pool = handle, SUCCESS; }
 status cuDeviceGetAttribute(int *value, enum attribute which, int device) {
@@ -73,8 +85,10 @@ status cuDeviceGetAttribute(int *value, enum attribute which, int device) {
     case MULTIPROCESSORS: *value = 1; break;
     case MOST_BLOCKS: *value = BLOCKS; break;
     case WARP_SIZE: *value = 32; break;
-    case MOST_THREADS_PER_BLOCK: case MOST_THREADS_IN_X: *value = 1024; break;
-    case SHARED_PER_BLOCK: case SHARED_PER_BLOCK_ON_REQUEST: *value = SHARED_BYTES; break;
+    case MOST_THREADS_PER_BLOCK:
+    case MOST_THREADS_IN_X: *value = 1024; break;
+    case SHARED_PER_BLOCK:
+    case SHARED_PER_BLOCK_ON_REQUEST: *value = SHARED_BYTES; break;
     case HAS_MEMORY_POOLS: *value = 1; break;
     default: *value = 1;
     }
@@ -82,11 +96,16 @@ status cuDeviceGetAttribute(int *value, enum attribute which, int device) {
 }
 status cuGetErrorName(status error, const char **name) {
     static char text[32];
-    snprintf(text, sizeof text, "%s", error == OUT_OF_MEMORY ? "CUDA_ERROR_OUT_OF_MEMORY" : error == NO_DEVICE ? "CUDA_ERROR_NO_DEVICE" : "CUDA_ERROR");
+    snprintf(text, sizeof text, "%s",
+             error == OUT_OF_MEMORY ? "CUDA_ERROR_OUT_OF_MEMORY"
+             : error == NO_DEVICE   ? "CUDA_ERROR_NO_DEVICE"
+                                    : "CUDA_ERROR");
     return *name = text, SUCCESS;
 }
 status cuGetErrorString(status error, const char **text) {
-    *text = error == OUT_OF_MEMORY ? "out of memory" : error == NO_DEVICE ? "no CUDA-capable device is detected" : "see stderr";
+    *text = error == OUT_OF_MEMORY ? "out of memory"
+            : error == NO_DEVICE   ? "no CUDA-capable device is detected"
+                                   : "see stderr";
     return SUCCESS;
 }
 
@@ -112,10 +131,16 @@ status cuMemFreeAsync(void *device, void *stream) { return SERVE(memory_take_bac
 status cuMemcpyHtoD_v2(void *to, void *from, size_t bytes) { return SERVE(memory_copy(to, from, bytes, 1, 0)); }
 status cuMemcpyDtoH_v2(void *to, void *from, size_t bytes) { return SERVE(memory_copy(to, from, bytes, 0, 1)); }
 status cuMemcpyDtoD_v2(void *to, void *from, size_t bytes) { return SERVE(memory_copy(to, from, bytes, 1, 1)); }
-status cuMemcpyHtoDAsync_v2(void *to, void *from, size_t bytes, void *stream) { return SERVE(memory_copy(to, from, bytes, 1, 0)); }
-status cuMemcpyDtoHAsync_v2(void *to, void *from, size_t bytes, void *stream) { return SERVE(memory_copy(to, from, bytes, 0, 1)); }
+status cuMemcpyHtoDAsync_v2(void *to, void *from, size_t bytes, void *stream) {
+    return SERVE(memory_copy(to, from, bytes, 1, 0));
+}
+status cuMemcpyDtoHAsync_v2(void *to, void *from, size_t bytes, void *stream) {
+    return SERVE(memory_copy(to, from, bytes, 0, 1));
+}
 status cuMemsetD8_v2(void *device, uint8_t value, size_t count) { return SERVE(memory_fill(device, value, count, 1)); }
-status cuMemsetD32_v2(void *device, uint32_t value, size_t count) { return SERVE(memory_fill(device, value, count, 4)); }
+status cuMemsetD32_v2(void *device, uint32_t value, size_t count) {
+    return SERVE(memory_fill(device, value, count, 4));
+}
 status cuMemGetInfo_v2(size_t *unused, size_t *total) { return SERVE((memory_left(unused, total), SUCCESS)); }
 status cuMemAdvise(void *device, size_t bytes, unsigned advice, int where) { return SUCCESS; }
 status cuMemPoolSetAttribute(void *pool, unsigned attribute, void *value) { return SUCCESS; }
@@ -132,17 +157,27 @@ status cuModuleLoadDataEx(void **module, const char *ptx, unsigned count, void *
 status cuModuleGetFunction(void **kernel, void *module, const char *name) {
     return SERVE((*kernel = module_kernel(module, name)) ? SUCCESS : NOT_FOUND);
 }
-status cuLaunchKernel(void *kernel, uint32_t blocks_x, uint32_t blocks_y, uint32_t blocks_z, uint32_t threads_x, uint32_t threads_y,
-                      uint32_t threads_z, unsigned dynamic_shared, void *stream, void **arguments, void **extra) {
+status cuLaunchKernel(void *kernel, uint32_t blocks_x, uint32_t blocks_y, uint32_t blocks_z, uint32_t threads_x,
+                      uint32_t threads_y, uint32_t threads_z, unsigned dynamic_shared, void *stream, void **arguments,
+                      void **extra) {
     const uint32_t blocks[] = {blocks_x, blocks_y, blocks_z}, threads[] = {threads_x, threads_y, threads_z};
     return SERVE(launch(kernel, blocks, threads, arguments));
 }
 status cuFuncGetAttribute(int *value, unsigned attribute, void *kernel) { return *value = 0, SUCCESS; }
 status cuFuncSetAttribute(void *kernel, unsigned attribute, int value) { return SUCCESS; }
-status cuOccupancyMaxActiveBlocksPerMultiprocessor(int *count, void *kernel, int threads, size_t shared) { return *count = BLOCKS, SUCCESS; }
+status cuOccupancyMaxActiveBlocksPerMultiprocessor(int *count, void *kernel, int threads, size_t shared) {
+    return *count = BLOCKS, SUCCESS;
+}
 
 /* ---- looked up, never needed: managed memory, and what draws on the screen ---- */
-#define ABSENT(name) status name(void) { return NOT_SUPPORTED; }
-ABSENT(cuMemAllocManaged) ABSENT(cuImportExternalMemory) ABSENT(cuImportExternalSemaphore) ABSENT(cuExternalMemoryGetMappedBuffer)
-ABSENT(cuExternalMemoryGetMappedMipmappedArray) ABSENT(cuMipmappedArrayGetLevel) ABSENT(cuSurfObjectCreate)
-ABSENT(cuSignalExternalSemaphoresAsync) ABSENT(cuWaitExternalSemaphoresAsync)
+#define ABSENT(name) \
+    status name(void) { return NOT_SUPPORTED; }
+ABSENT(cuMemAllocManaged)
+ABSENT(cuImportExternalMemory)
+ABSENT(cuImportExternalSemaphore)
+ABSENT(cuExternalMemoryGetMappedBuffer)
+ABSENT(cuExternalMemoryGetMappedMipmappedArray)
+ABSENT(cuMipmappedArrayGetLevel)
+ABSENT(cuSurfObjectCreate)
+ABSENT(cuSignalExternalSemaphoresAsync)
+ABSENT(cuWaitExternalSemaphoresAsync)

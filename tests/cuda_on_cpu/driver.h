@@ -6,10 +6,12 @@
 #include "device.h"
 
 #define COUNTERS(X) \
-    X(launches) X(synchronisations) X(copies_to_device) X(bytes_to_device) X(copies_to_host) X(bytes_to_host) \
-    X(copies_on_device) X(bytes_on_device) X(fills) X(allocations) X(frees) X(modules) X(compiled_modules)
+    X(launches) X(synchronisations) X(modules) X(compiled_modules) X(fills) X(allocations) X(frees) \
+    X(copies_to_device) X(bytes_to_device) X(copies_to_host) X(bytes_to_host) X(copies_on_device) X(bytes_on_device)
 #define X(name) long name;
-struct counters { COUNTERS(X) };
+struct counters {
+    COUNTERS(X)
+};
 #undef X
 extern struct counters counters;
 
@@ -21,7 +23,15 @@ struct kernel { /* what cuModuleGetFunction gives out; Python reads the first th
     int flushes_denormals;
 };
 
-enum result { SUCCESS, INVALID_VALUE, OUT_OF_MEMORY, NO_DEVICE = 100, INVALID_PTX = 218, NOT_FOUND = 500, NOT_SUPPORTED = 801 };
+enum result {
+    SUCCESS,
+    INVALID_VALUE,
+    OUT_OF_MEMORY,
+    NO_DEVICE = 100,
+    INVALID_PTX = 218,
+    NOT_FOUND = 500,
+    NOT_SUPPORTED = 801
+};
 
 long option(const char *name, long otherwise); /* CUDA_ON_CPU_name */
 void stop(const char *format, ...);            /* ends the process, naming the kernel that runs */

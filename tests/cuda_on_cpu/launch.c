@@ -44,7 +44,8 @@ static void wait(enum state state) {
 
 static void barrier(void) { wait(AT_BARRIER); }
 
-static uint32_t exchange(enum exchange what, uint32_t members, uint32_t value, uint32_t operand, uint32_t limits, int *valid) {
+static uint32_t exchange(enum exchange what, uint32_t members, uint32_t value, uint32_t operand, uint32_t limits,
+                         int *valid) {
     struct coroutine *own = &coroutines[current];
     own->what = what, own->members = members, own->value = value, own->operand = operand, own->limits = limits;
     wait(IN_EXCHANGE);
@@ -67,8 +68,14 @@ static uint32_t print(uint64_t format, uint64_t arguments) {
 static void stop_kernel(const char *why) { stop("%s", why); }
 
 void launch_start(void) {
-    thread = (struct thread){.shared = shared, .leave = leave, .stop = stop_kernel, .wrong_address = wrong_address,
-                             .assertion = assertion, .print = print, .barrier = barrier, .exchange = exchange};
+    thread = (struct thread){.shared = shared,
+                             .leave = leave,
+                             .stop = stop_kernel,
+                             .wrong_address = wrong_address,
+                             .assertion = assertion,
+                             .print = print,
+                             .barrier = barrier,
+                             .exchange = exchange};
     reverse_each = option("REVERSE", 0);
 }
 
@@ -119,10 +126,22 @@ static void settle_one(struct coroutine *all, int own, uint32_t present) {
     int segment = lane->limits >> 8 & 31, clamp = lane->limits & 31, by = lane->operand & 31, from = own;
     int first = own & segment, last = first | (clamp & ~segment);
     switch (lane->what) {
-    case SHUFFLE_UP: from = own - by; lane->valid = from >= last; break; /* here the limit is the first lane */
-    case SHUFFLE_DOWN: from = own + by; lane->valid = from <= last; break;
-    case SHUFFLE_XOR: from = own ^ by; lane->valid = from <= last; break;
-    case SHUFFLE_INDEX: from = first | (by & ~segment); lane->valid = from <= last; break;
+    case SHUFFLE_UP:
+        from = own - by;
+        lane->valid = from >= last;
+        break; /* here the limit is the first lane */
+    case SHUFFLE_DOWN:
+        from = own + by;
+        lane->valid = from <= last;
+        break;
+    case SHUFFLE_XOR:
+        from = own ^ by;
+        lane->valid = from <= last;
+        break;
+    case SHUFFLE_INDEX:
+        from = first | (by & ~segment);
+        lane->valid = from <= last;
+        break;
     case VOTE_BALLOT: lane->result = ballot; return;
     case VOTE_ANY: lane->result = ballot != 0; return;
     case VOTE_ALL: lane->result = ballot == present; return;
@@ -154,7 +173,9 @@ static int settle(struct coroutine *all, int lanes) {
 }
 
 static void run_together(void) {
-    if (!stacks) stacks = mmap(0, (size_t)MOST_THREADS * STACK, PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS | MAP_NORESERVE, -1, 0);
+    if (!stacks)
+        stacks = mmap(0, (size_t)MOST_THREADS * STACK, PROT_READ | PROT_WRITE,
+                      MAP_PRIVATE | MAP_ANONYMOUS | MAP_NORESERVE, -1, 0);
     for (int k = 0; k < thread_count; k++) coroutines[k].state = FRESH;
     as_coroutines = 1;
     for (int left = thread_count; left;) {
@@ -163,9 +184,11 @@ static void run_together(void) {
             int number = reversed ? thread_count - 1 - k : k;
             if (coroutines[number].state <= READY) enter(number), moved++;
         }
-        for (int k = 0; k < thread_count; k += WARP) moved += settle(coroutines + k, thread_count - k < WARP ? thread_count - k : WARP);
+        for (int k = 0; k < thread_count; k += WARP)
+            moved += settle(coroutines + k, thread_count - k < WARP ? thread_count - k : WARP);
         left = 0;
-        for (int k = 0; k < thread_count; k++) left += coroutines[k].state != OVER, waiting += coroutines[k].state == AT_BARRIER;
+        for (int k = 0; k < thread_count; k++)
+            left += coroutines[k].state != OVER, waiting += coroutines[k].state == AT_BARRIER;
         if (waiting && waiting == left) {
             for (int k = 0; k < thread_count; k++)
                 if (coroutines[k].state == AT_BARRIER) coroutines[k].state = READY;
@@ -181,7 +204,8 @@ enum result launch(struct kernel *kernel, const uint32_t blocks[3], const uint32
     uint32_t count = blocks[0] * blocks[1] * blocks[2];
     thread_count = threads[0] * threads[1] * threads[2];
     if (!count || !thread_count || thread_count > MOST_THREADS) {
-        fprintf(stderr, "cuda_on_cpu: %s is launched with %u blocks of %u threads\n", kernel->name, count, thread_count);
+        fprintf(stderr, "cuda_on_cpu: %s is launched with %u blocks of %u threads\n", kernel->name, count,
+                thread_count);
         return INVALID_VALUE;
     }
     for (int k = 0; k < entry->count; k++) memcpy(parameters + entry->offset[k], arguments[k], entry->bytes[k]);
@@ -192,7 +216,8 @@ enum result launch(struct kernel *kernel, const uint32_t blocks[3], const uint32
     reversed = reverse_each && counters.launches % reverse_each == 0;
     for (uint32_t k = 0; k < count; k++) {
         uint32_t block = reversed ? count - 1 - k : k;
-        thread.ctaid[0] = block % blocks[0], thread.ctaid[1] = block / blocks[0] % blocks[1], thread.ctaid[2] = block / blocks[0] / blocks[1];
+        thread.ctaid[0] = block % blocks[0], thread.ctaid[1] = block / blocks[0] % blocks[1],
+        thread.ctaid[2] = block / blocks[0] / blocks[1];
         if (entry->exchanges) run_together();
         else run_in_turn();
     }

@@ -10,15 +10,18 @@ enum { SMALL = 1024 }; /* pages: pieces up to this size are used again, larger o
 
 static uint8_t *const allocated = (uint8_t *)ALLOCATED;
 static uint64_t next_page = 1, used_pages, limit_pages;
-static uint32_t *pages_of;           /* length of the piece that starts at a page */
-static uint64_t free_pieces[SMALL + 1]; /* by length, the first page of a free piece, which holds the number of the next */
+static uint32_t *pages_of; /* length of the piece that starts at a page */
+static uint64_t
+    free_pieces[SMALL + 1]; /* by length, the first page of a free piece, which holds the number of the next */
 static int poison;
 
 static char *page_memory(uint64_t page) { return (char *)(DEVICE_BASE + SHIFT + page * PAGE); }
 
 static void *reserve(uint64_t address, uint64_t bytes, int access) {
-    void *at = mmap((void *)address, bytes, access, MAP_PRIVATE | MAP_ANONYMOUS | MAP_NORESERVE | (address ? MAP_FIXED_NOREPLACE : 0), -1, 0);
-    if (at == MAP_FAILED || (address && at != (void *)address)) stop("no room for %llu GB of addresses", (unsigned long long)bytes >> 30);
+    void *at = mmap((void *)address, bytes, access,
+                    MAP_PRIVATE | MAP_ANONYMOUS | MAP_NORESERVE | (address ? MAP_FIXED_NOREPLACE : 0), -1, 0);
+    if (at == MAP_FAILED || (address && at != (void *)address))
+        stop("no room for %llu GB of addresses", (unsigned long long)bytes >> 30);
     return at;
 }
 
@@ -45,7 +48,8 @@ enum result memory_give(void **out, size_t bytes) {
     }
     memset(allocated + page, 1, pages);
     pages_of[page] = pages, used_pages += pages;
-    if (poison && pages <= SMALL) memset(page_memory(page), 0xff, pages * PAGE); /* NaN as real numbers, -1 as integers */
+    if (poison && pages <= SMALL)
+        memset(page_memory(page), 0xff, pages * PAGE); /* NaN as real numbers, -1 as integers */
     *out = (void *)(DEVICE_BASE + page * PAGE);
     counters.allocations++;
     return SUCCESS;
@@ -82,7 +86,8 @@ static int reach(const void **address, size_t bytes) {
     if (!bytes) return 1;
     *address = first + SHIFT;
     if (memory_is_device(first) && memory_is_device(first + bytes - 1)) return 1;
-    fprintf(stderr, "cuda_on_cpu: %zu bytes at %p are copied or filled, which are not the device's\n", bytes, (void *)first);
+    fprintf(stderr, "cuda_on_cpu: %zu bytes at %p are copied or filled, which are not the device's\n", bytes,
+            (void *)first);
     return 0;
 }
 
@@ -100,7 +105,8 @@ enum result memory_fill(void *device, uint32_t value, size_t count, int bytes_ea
     const void *target = device;
     if (!reach(&target, count * bytes_each)) return INVALID_VALUE;
     if (bytes_each == 1 || !value) memset((void *)target, value, count * bytes_each);
-    else for (size_t i = 0; i < count; i++) memcpy((char *)target + i * bytes_each, &value, bytes_each);
+    else
+        for (size_t i = 0; i < count; i++) memcpy((char *)target + i * bytes_each, &value, bytes_each);
     counters.fills++;
     return SUCCESS;
 }

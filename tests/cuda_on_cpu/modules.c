@@ -1,6 +1,7 @@
 /* Modules: PTX is translated and compiled by module.py once, and kept by its text; the next process loads the library.
  *
- * Taichi's names of kernels hold counters of the process, so kernels are renamed by their place before anything else. */
+ * Taichi's names of kernels hold counters of the process, so kernels are renamed by their place before anything else.
+ */
 #define _GNU_SOURCE
 #include <dlfcn.h>
 #include <spawn.h>
@@ -31,7 +32,9 @@ int cuda_on_cpu_kernel_count;
 struct kernel *cuda_on_cpu_kernels[MOST_KERNELS];
 extern char **environ;
 
-static int is_word(char c) { return (c >= 'a' && c <= 'z') || (c >= 'A' && c <= 'Z') || (c >= '0' && c <= '9') || c == '_' || c == '$'; }
+static int is_word(char c) {
+    return (c >= 'a' && c <= 'z') || (c >= 'A' && c <= 'Z') || (c >= '0' && c <= '9') || c == '_' || c == '$';
+}
 
 static void find_entries(struct module *module, const char *ptx) {
     for (const char *at = ptx; (at = strstr(at, ".entry ")) && module->count < MOST_ENTRIES;) {
@@ -79,10 +82,12 @@ static int write_file(const char *path, const char *text) {
     return fclose(file) || status < 0 ? -1 : 0;
 }
 
-/* Makes `library` from `ptx`; files get their names at the end, because other processes look for them at the same time. */
+/* Makes `library` from `ptx`; files get their names at the end, because other processes look for them at the same time.
+ */
 static int compile(const char *ptx, const char *kept, const char *library) {
     char source[4096], target[4096];
-    snprintf(source, sizeof source, "%s/%d.ptx", FOLDER, getpid()), snprintf(target, sizeof target, "%s/%d.so", FOLDER, getpid());
+    snprintf(source, sizeof source, "%s/%d.ptx", FOLDER, getpid()),
+        snprintf(target, sizeof target, "%s/%d.so", FOLDER, getpid());
     if (write_file(source, ptx)) return -1;
     char *command[] = {PYTHON, "-S", "-E", TRANSLATOR, source, target, 0};
     pid_t child;
@@ -114,7 +119,8 @@ struct module *module_load(const char *ptx) {
     module->flushes_denormals = *(int *)dlsym(loaded, "flushes_denormals");
     int bytes = *(int *)dlsym(loaded, "global_bytes");
     void *globals = 0;
-    if (bytes && (memory_give(&globals, bytes) || memory_copy(globals, dlsym(loaded, "initial"), bytes, 1, 0))) return 0;
+    if (bytes && (memory_give(&globals, bytes) || memory_copy(globals, dlsym(loaded, "initial"), bytes, 1, 0)))
+        return 0;
     if (*(int *)dlsym(loaded, "entry_count") != module->count || *(int *)dlsym(loaded, "shared_bytes") > SHARED_BYTES) {
         fprintf(stderr, "cuda_on_cpu: %s does not fit its module\n", library);
         return 0;

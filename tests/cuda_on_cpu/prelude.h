@@ -22,18 +22,38 @@ INLINE char *resolve(uint64_t address, int bytes) {
     return 0;
 }
 #define CHECKED(type, address) (*(type *)resolve(address, sizeof(type)))
-#define OWN(type, address) (*(type *)(address)) /* parameters, locals, shared variables: places known while compiling */
+#define OWN(type, address) (*(type *)(address)) /* parameters, locals, shared: places known while compiling */
 
 /* ---- bits ---- */
-INLINE uint32_t bits_f32(float x) { uint32_t y; memcpy(&y, &x, 4); return y; }
-INLINE uint64_t bits_f64(double x) { uint64_t y; memcpy(&y, &x, 8); return y; }
-INLINE float f32_bits(uint32_t x) { float y; memcpy(&y, &x, 4); return y; }
-INLINE double f64_bits(uint64_t x) { double y; memcpy(&y, &x, 8); return y; }
+INLINE uint32_t bits_f32(float x) {
+    uint32_t y;
+    memcpy(&y, &x, 4);
+    return y;
+}
+INLINE uint64_t bits_f64(double x) {
+    uint64_t y;
+    memcpy(&y, &x, 8);
+    return y;
+}
+INLINE float f32_bits(uint32_t x) {
+    float y;
+    memcpy(&y, &x, 4);
+    return y;
+}
+INLINE double f64_bits(uint64_t x) {
+    double y;
+    memcpy(&y, &x, 8);
+    return y;
+}
 INLINE uint32_t clz_b32(uint32_t x) { return x ? __builtin_clz(x) : 32; }
 INLINE uint32_t clz_b64(uint64_t x) { return x ? __builtin_clzll(x) : 64; }
 INLINE uint32_t popc_b32(uint32_t x) { return __builtin_popcount(x); }
 INLINE uint32_t popc_b64(uint64_t x) { return __builtin_popcountll(x); }
-INLINE uint64_t brev_b64(uint64_t x) { uint64_t y = 0; for (int i = 0; i < 64; i++) y |= (x >> i & 1) << (63 - i); return y; }
+INLINE uint64_t brev_b64(uint64_t x) {
+    uint64_t y = 0;
+    for (int i = 0; i < 64; i++) y |= (x >> i & 1) << (63 - i);
+    return y;
+}
 INLINE uint32_t brev_b32(uint32_t x) { return brev_b64(x) >> 32; }
 INLINE uint32_t prmt_b32(uint32_t a, uint32_t b, uint32_t selector) {
     uint64_t both = (uint64_t)b << 32 | a, out = 0;
@@ -65,14 +85,20 @@ INLINE uint64_t insert(uint64_t part, uint64_t into, uint32_t start, uint32_t le
     INLINE type min_##name(type a, type b) { return a < b ? a : b; } \
     INLINE type max_##name(type a, type b) { return a > b ? a : b; } \
     INLINE type abs_##name(type a) { return a < 0 ? -a : a; } \
-    INLINE type div_##name(type a, type b) { return !b ? (type)-1 : b == (type)-1 && (type)-1 < 0 ? -a : a / b; } \
-    INLINE type rem_##name(type a, type b) { return !b ? a : b == (type)-1 && (type)-1 < 0 ? 0 : a % b; }
+    INLINE type div_##name(type a, type b) { \
+        return !b ? (type) - 1 : b == (type) - 1 && (type) - 1 < 0 ? -a : a / b; \
+    } \
+    INLINE type rem_##name(type a, type b) { return !b ? a : b == (type) - 1 && (type) - 1 < 0 ? 0 : a % b; }
 INTEGERS(X)
 #undef X
 /* Of a number and a NaN the number; -0 is below +0. */
 #define REALS(name, type, bits, suffix) \
-    INLINE type min_##name(type a, type b) { return a != a ? b : b != b ? a : a == b ? (signbit(a) ? a : b) : a < b ? a : b; } \
-    INLINE type max_##name(type a, type b) { return a != a ? b : b != b ? a : a == b ? (signbit(a) ? b : a) : a > b ? a : b; } \
+    INLINE type min_##name(type a, type b) { \
+        return a != a ? b : b != b ? a : a == b ? (signbit(a) ? a : b) : a < b ? a : b; \
+    } \
+    INLINE type max_##name(type a, type b) { \
+        return a != a ? b : b != b ? a : a == b ? (signbit(a) ? b : a) : a > b ? a : b; \
+    } \
     INLINE type abs_##name(type a) { return __builtin_fabs##suffix(a); } \
     INLINE type fma_##name(type a, type b, type c) { return __builtin_fma##suffix(a, b, c); } \
     INLINE type sqrt_##name(type a) { return __builtin_sqrt##suffix(a); } \
@@ -91,7 +117,7 @@ REALS(f64, double, uint64_t, )
 /* A real number becomes the nearest integer that there is; NaN becomes 0. */
 #define X(name, type) \
     INLINE type to_##name(double x) { \
-        const type least = (type)-1 < 0 ? (type)(1ull << (8 * sizeof(type) - 1)) : 0, most = ~least; \
+        const type least = (type) - 1 < 0 ? (type)(1ull << (8 * sizeof(type) - 1)) : 0, most = ~least; \
         return x != x ? 0 : x <= (double)least ? least : x >= (double)most ? most : (type)x; \
     }
 INTEGERS(X)
