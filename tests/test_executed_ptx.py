@@ -25,8 +25,8 @@ pytestmark = pytest.mark.backends
 SUBSTEPS = 10
 NO_TRAFFIC = dict(synchronisations=0, copies_to_host=0, copies_on_device=0, fills=0)
 # Calls of the driver for each substep, as measured; a copy to the host waits, and so counts like a synchronisation. Each
-# call of Taichi's launcher copies one buffer of arguments (half a kilobyte to one, by the list of arrays) and takes and returns two pieces of memory; each loop is two
-# launches, of one thread for its bounds and of all.
+# call of Taichi's launcher copies one buffer of arguments (half a kilobyte to one, by the list of arrays) and takes and
+# returns two pieces of memory; each loop is two launches, of one thread for its bounds and of all.
 FORWARD = dict(launches=4, copies_to_device=1, bytes_to_device=1024, allocations=2, frees=2, **NO_TRAFFIC)
 REVERSE = dict(launches=5, copies_to_device=1, bytes_to_device=1024, allocations=2, frees=2, **NO_TRAFFIC)
 # ... for each pass with self-contact that keeps its list of pairs, which reads one number to know that it may
