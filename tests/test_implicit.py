@@ -141,6 +141,7 @@ def test_damping_is_a_rate_whatever_the_step(solver):
 # ---- statics ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.executed_ptx
 def test_static_twin_of_the_oscillator():
     """An apex force f gives u = f h^2 / (mu V), at any amplitude."""
     force, mu, volume = 2000.0, E / 2.6, one_tetrahedron().volumes[0]
@@ -331,6 +332,7 @@ def test_where_a_hanging_body_comes_to_rest_does_not_depend_on_the_step():
         np.testing.assert_allclose(x, rest, atol=1e-8)
 
 
+@pytest.mark.executed_ptx
 @pytest.mark.parametrize("precision", ["f64", "f32"])
 @pytest.mark.parametrize("solver", [ds.ImplicitEulerSolver, ds.BDF2Solver], ids=lambda s: s.__name__)
 def test_a_block_dropped_on_the_ground_comes_to_rest_above_it(solver, precision):
