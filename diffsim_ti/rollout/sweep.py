@@ -24,12 +24,8 @@ class Sweeps:
         if self.save_every < 1 or self.steps % self.save_every:
             raise ValueError(f"save_every = {save_every} must be >= 1 and divide steps = {steps}")
         self.num_frames = self.steps // self.save_every + 1
-        values = dict(self.scene.inputs.values)
-        if self.scene.motion is not None:
-            values["prescribed_motion"] = self.scene.motion_rows(np.arange(self.steps + 1) * solver.dt)
-        values |= self.scene.path_rows(np.arange(self.steps + 1) * solver.dt)
-        self.values = values
-        self.inputs = tuple(values)
+        self.values = self.scene.inputs.at_times(np.arange(self.steps + 1) * solver.dt)
+        self.inputs = tuple(self.values)
         self.num_passes = solver.num_passes(self.steps)
         every = None if checkpoint_every is None else max(1, int(checkpoint_every)) * solver.substeps
         self.state_bytes = 4 * self.scene.mesh.num_vertices * runtime.NUMPY[self.scene.precision]().itemsize
@@ -58,7 +54,7 @@ class Sweeps:
         if self._loaded is not None and all(run[name] is self._loaded[name] for name in run):
             self._workspace.restart()
             return run
-        self._check_lengths(run)
+        self.scene.inputs.check_steps(run, self.steps)
         derived = self.scene.inputs.derive(run)
         if self._workspace is None:
             self._workspace = self.solver.workspace(derived)
@@ -69,14 +65,6 @@ class Sweeps:
             self._workspace.load(derived)
         self._loaded = run
         return run
-
-    def _check_lengths(self, run: dict) -> None:
-        forces = run.get("external_forces")
-        if forces is not None and forces.ndim == 3 and len(forces) < self.steps:
-            raise ValueError(f"external_forces: {self.steps} steps need as many rows, got {len(forces)}")
-        for name in ("prescribed_motion", *self.scene.inputs.paths):
-            if name in run and run[name].shape != self.values[name].shape:
-                raise ValueError(f"{name}: expected shape {self.values[name].shape}, got {run[name].shape}")
 
     def _sweep_forward(self) -> None:
         """All passes; keeps the first snapshots of the schedule on the way."""

@@ -145,7 +145,7 @@ class TensorRollout:
             given = next(x for x in pair if x is not None)
             missing = ("displacement", "velocity")
             pair = [
-                torch.from_numpy(getattr(rollout._workspace.arrays.values, missing[k])).to(given) if x is None else x
+                torch.tensor(getattr(rollout._workspace.arrays.values, missing[k])).to(given) if x is None else x
                 for k, x in enumerate(pair)
             ]
             self._copy("in", [x[None] for x in pair], (state.u, state.v))
