@@ -4,7 +4,7 @@ from diffsim_ti.inputs import POSITIVE, Input
 from diffsim_ti.inputs.description import length
 
 
-def positive(argument: str, value, unit: str, plain: str) -> Input:
+def positive(argument: str, value, unit: str, plain: str = "") -> Input:
     """One number > 0, which errors call by its argument."""
     return Input(argument, value, ((),), unit, POSITIVE, plain=plain, label=f"{argument} [{unit}]")
 

@@ -49,7 +49,7 @@ class Obstacle(Term):
 
     def __init__(
         self,
-        shape: Sequence[Input],
+        shape: Sequence[Input] | dict,
         stiffness: float | None = None,
         width: float = 0.01,
         friction: float = 0.0,
@@ -57,19 +57,16 @@ class Obstacle(Term):
         path=None,
         name: str | None = None,
     ):
-        barrier_of = [
-            positive("stiffness", 1.0 if stiffness is None else stiffness, "N/m", "barrier_stiffness"),
-            positive("width", width, "m", "barrier_width"),
-        ]
-        friction_of = [
-            Input("friction", friction, ((),), range=NOT_NEGATIVE),
-            positive("friction_speed", friction_speed, "m/s", "friction_speed"),
-        ]
+        if isinstance(shape, dict):  # {name: value}, with nothing more to say of them
+            shape = [Input(plain, value) for plain, value in shape.items()]
+        k, speed = 1.0 if stiffness is None else stiffness, positive("friction_speed", friction_speed, "m/s")
+        felt = positive("stiffness", k, "N/m", "barrier_stiffness"), positive("width", width, "m", "barrier_width")
+        friction_of = Input("friction", friction, ((),), range=NOT_NEGATIVE), speed
         for described in friction_of:  # also of what is smooth
             described.check_given(type(self).__name__)
-        rough = friction_of if friction_of[0].value > 0 else []
+        rough = friction_of if friction_of[0].value > 0 else ()
         rows = [Input("path", None, (("steps + 1", 3),), "m", change=length_per_step, plain=self.path_name)]
-        super().__init__(*shape, *barrier_of, *rough, *(rows if path is not None else []), name=name)
+        super().__init__(*shape, *felt, *rough, *(rows if path is not None else []), name=name)
         self.chooses_stiffness, self.path = stiffness is None, path
 
     @property
