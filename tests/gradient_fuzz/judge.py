@@ -165,7 +165,10 @@ class Judge:
                 dx + 2 * h * direction if name == "rest_positions" else dx, one.velocities - other.velocities
             )
 
-        noise = 1e-16 * float(np.sqrt(((self.w * np.abs(self.frames.positions).max()) ** 2).sum()))
+        # rounding of positions, and what a solve leaves of the displacements
+        rounding = 1e-16 * np.abs(self.frames.positions).max()
+        rounding += getattr(exact.solver, "tolerance", 0.0) * np.abs(self.frames.displacements).max()
+        noise = rounding * float(np.linalg.norm(self.w))
         row.difference, row.error = derivative(change, 0.1 * gate * row.size, noise, row.reverse)
         off = abs(row.reverse - row.difference)
         if abs(row.reverse - row.tangent) > dot_gate * row.size:
