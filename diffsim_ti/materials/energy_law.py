@@ -1,0 +1,117 @@
+"""Laws written by their energy alone."""
+
+from dataclasses import dataclass
+
+from diffsim_ti.differentiation import Graph, Number
+from diffsim_ti.materials.calculus.tensor import Tensor
+from diffsim_ti.materials.law import Law
+from diffsim_ti.runtime import spread, traced
+
+
+@dataclass(frozen=True)
+class EnergyLaw(Law):
+    """A law that writes `psi(H, p)`; stress, differential and derivatives by the coefficients follow from it.
+
+    H (a `Tensor` of the displacement gradient, F = I + H) and p (a list of the coefficients named by `coefficient_names`)
+    are made of `Number`s, which know + - * / ** and the functions of `diffsim_ti.differentiation`, and take any Python
+    numbers as constants. Coefficients may enter in any way: factors, exponents, limits, the components of a direction.
+    `calculus.tensor` has what an energy is made of: `invariants(H)` is accurate near rest, where F - I is.
+
+    volume="patches" needs `theta(H)`, and the last coefficient as the factor of theta^2 / 2 and nowhere else.
+
+    The graph is Griewank, Walther, Evaluating Derivatives, ch. 3 and 5, doi:10.1137/1.9780898717761.
+    """
+
+    linear = False
+
+    @traced
+    def psi(self, H: Tensor, p: list) -> Number:
+        """psi [J/m^3], zero at rest."""
+        raise NotImplementedError(f"{type(self).__name__} writes psi(H, p)")
+
+    @traced
+    def theta(self, H: Tensor) -> Number:
+        """The change of volume of which the last coefficient resists theta^2 / 2 [-]."""
+
+    @property
+    def has_dilatation(self) -> bool:
+        return type(self).theta is not EnergyLaw.theta
+
+    # ---- recording --------------------------------------------------------------------------------------------------
+
+    @traced
+    def _record(self, H, p):
+        """(graph, leaves of H, leaves of p, psi)"""
+        g = Graph(self.fp)
+        h, numbers = Tensor(g.leaf(x) for x in H.numbers), [g.leaf(x) for x in p]
+        return g, h.numbers, numbers, self.psi(h, numbers)
+
+    @traced
+    def _record_stress(self, H, p):
+        g, h, numbers, psi = self._record(H, p)
+        return g, h, numbers, g.gradient(psi, h)
+
+    @traced
+    def _record_dilatation(self, H):
+        g = Graph(self.fp)
+        h = Tensor(g.leaf(x) for x in H.numbers)
+        theta = self.theta(h)
+        return g, h.numbers, theta, g.gradient(theta, h.numbers)
+
+    # ---- what kernels call ------------------------------------------------------------------------------------------
+
+    @traced
+    def energy_density(self, H, p):
+        return spread(self._record(H, p)[3].value, H[0, 0])
+
+    @traced
+    def energy_by_coefficients(self, H, p):
+        g, _, numbers, psi = self._record(H, p)
+        return _spread(g.reverse([(psi, g.one())], numbers), H)
+
+    @traced
+    def stress(self, H, p):
+        return _tensor([x.value for x in self._record_stress(H, p)[3]], H)
+
+    @traced
+    def stress_differential(self, H, dH, p):
+        g, h, _, P = self._record_stress(H, p)
+        return _tensor(g.forward([*zip(h, dH.numbers)], P), H)
+
+    @traced
+    def stress_change(self, H, p, dp):
+        g, _, numbers, P = self._record_stress(H, p)
+        return _tensor(g.forward([*zip(numbers, dp)], P), H)
+
+    @traced
+    def stress_jvp(self, H, dH, p, dp):
+        g, h, numbers, P = self._record_stress(H, p)
+        return _tensor(g.forward([*zip(h, dH.numbers), *zip(numbers, dp)], P), H)
+
+    @traced
+    def stress_differential_and_products(self, H, dH, p):
+        g, h, numbers, P = self._record_stress(H, p)
+        by = _spread(g.reverse([*zip(P, dH.numbers)], [*h, *numbers]), H)  # d2psi/dF2 is symmetric
+        return Tensor(by[:9]), by[9:]
+
+    @traced
+    def dilatation(self, H):
+        return spread(self._record_dilatation(H)[2].value, H[0, 0])
+
+    @traced
+    def dilatation_gradient(self, H):
+        return _tensor([x.value for x in self._record_dilatation(H)[3]], H)
+
+    @traced
+    def dilatation_gradient_differential(self, H, dH):
+        g, h, _, gradient = self._record_dilatation(H)
+        return _tensor(g.forward([*zip(h, dH.numbers)], gradient), H)
+
+
+def _spread(numbers: list, H) -> list:
+    """With as many lanes as H has: what does not depend on H or p is a single constant."""
+    return [spread(x, H[0, 0]) for x in numbers]
+
+
+def _tensor(numbers: list, H) -> Tensor:
+    return Tensor(_spread(numbers, H))
