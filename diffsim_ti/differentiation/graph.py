@@ -7,6 +7,7 @@ Griewank, Walther, Evaluating Derivatives, ch. 3 and 5, doi:10.1137/1.9780898717
 """
 
 import operator
+from numbers import Integral, Real
 
 import taichi as ti
 
@@ -21,6 +22,7 @@ class Number:
     """
 
     _data_oriented = True  # Taichi hands it on as it is, so that tensors may be made of it
+    __array_ufunc__ = None  # NumPy's numbers leave operations to this class
 
     def __init__(self, graph, value, parents=()):
         self.graph, self.value = graph, let(value)
@@ -32,7 +34,7 @@ class Number:
         for entry in self.parents:
             if entry[2] is None:
                 entry[2] = entry[1]()
-                if not isinstance(entry[2], (Number, int, float)):
+                if not isinstance(entry[2], (Number, Real)):
                     entry[2] = let(entry[2])
             yield entry[0], entry[2]
 
@@ -65,9 +67,8 @@ class Number:
         return self._with(self._value_of(other) * self.value, (self, lambda: other))
 
     def __truediv__(self, other):
-        out = self._with(
-            self.value / self._value_of(other), (self, lambda: 1 / other), (other, lambda: 0 - out / other)
-        )
+        value = self.value / self._value_of(other)
+        out = self._with(value, (self, lambda: 1 / other), (other, lambda: 0 - out / other))
         return out
 
     def __rtruediv__(self, other):
@@ -76,10 +77,11 @@ class Number:
 
     def __pow__(self, n):
         """x^n for a Python number or a Number n; unless n is a Python integer, x must be positive."""
+        n = int(n) if isinstance(n, Integral) else n
         value = self.value**n if isinstance(n, int) else each_lane(operator.pow, self.value, self._value_of(n))
         out = self._with(
             value,
-            (self, lambda: 1 if isinstance(n, int) and n == 1 else n * self ** (n - 1)),
+            (self, lambda: n if isinstance(n, int) and n in (0, 1) else n * self ** (n - 1)),
             (n, lambda: out * self.graph.log(self)),
         )
         return out
@@ -209,18 +211,18 @@ class Graph:
 
     def _product(self, partial, x):
         """partial x as a value of the kernel."""
-        if isinstance(partial, (int, float)):
+        if isinstance(partial, Real):
             return x if partial == 1 else let(self.constant(partial) * x)
         return let((partial.value if isinstance(partial, Number) else partial) * x)
 
     @staticmethod
     def _product_of_numbers(partial, x):
         """partial x as a Number, or a Python number."""
-        if not isinstance(partial, (Number, int, float)):
+        if not isinstance(partial, (Number, Real)):
             raise TypeError("second derivatives need a function's derivative as a Number, got a value of the kernel")
-        if isinstance(partial, (int, float)) and partial == 1:
+        if isinstance(partial, Real) and partial == 1:
             return x
-        return partial if isinstance(x, (int, float)) and x == 1 else partial * x
+        return partial if isinstance(x, Real) and x == 1 else partial * x
 
     @staticmethod
     def _sum(terms):

@@ -19,7 +19,7 @@ class PowerLaw(EnergyLaw):
 
 
 class Knowles(Material):
-    """youngs_modulus [Pa], poissons_ratio, b, n [-]. Knowles 1977, The finite anti-plane shear field near the tip of a crack."""
+    """youngs_modulus [Pa], poissons_ratio, b, n [-]. Knowles 1977, doi:10.1007/BF00017296."""
 
     spellings = (("youngs_modulus", "poissons_ratio", "b", "n"),)
 
