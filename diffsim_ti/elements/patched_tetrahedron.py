@@ -101,7 +101,7 @@ class PatchedTetrahedron(Tetrahedron):
     # ---- forces and their derivatives -------------------------------------------------------------------------------
 
     @traced
-    def forces(self, item, scene, u, s, corner) -> None:
+    def forces(self, item, scene, u, s, corner, v=None) -> None:
         t = self._patch_of(item, scene, u, s)
         self.store(item, corner, (self.law.stress(t.H, t.q) * t.V) @ t.B.transpose())
 
@@ -118,14 +118,14 @@ class PatchedTetrahedron(Tetrahedron):
         self.store(item, corner, (dP * t.V) @ t.B.transpose())
 
     @traced
-    def forces_jvp(self, item, scene, u, s, du, corner, dots) -> None:
+    def forces_jvp(self, item, scene, u, s, du, corner, dots, v=None, dv=None) -> None:
         t = self._patch_of(item, scene, u, s, du, dots)
         dP = self.law.stress_jvp(t.H, t.dH, t.q, [*t.dp, t.dpi])
         change = t.B * t.dV + t.dB * t.V
         self.store(item, corner, (dP * t.V) @ t.B.transpose() + self.law.stress(t.H, t.q) @ change.transpose())
 
     @traced
-    def forces_vjp(self, item, scene, u, s, w, corner, adjoint) -> None:
+    def forces_vjp(self, item, scene, u, s, w, corner, adjoint, v=None, rate_corner=None) -> None:
         """The work of a patch's pressure on w is -W_p lam_p theta_p dtheta_p, with dtheta_p the change of theta_p for w."""
         t = self._patch_of(item, scene, u, s, w)
         dP, products = self.law.stress_differential_and_products(t.H, t.dH, t.q)
@@ -135,7 +135,7 @@ class PatchedTetrahedron(Tetrahedron):
         self.items.add(adjoint.coefficients, len(products), item, by)
 
     @traced
-    def shape_vjp(self, item, scene, u, s, w, adjoint) -> None:
+    def shape_vjp(self, item, scene, u, s, w, adjoint, v=None) -> None:
         t = self._patch_of(item, scene, u, s, w)
         P, minus = self.law.stress(t.H, t.q), ti.cast(-1, self.fp)
         dP = self.law.stress_differential(t.H, t.dH, t.q) + t.gradient * t.dpi

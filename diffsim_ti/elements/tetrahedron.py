@@ -106,13 +106,23 @@ class Tetrahedron:
             f = f + corner[scene.corner_of[c]]
         return f
 
-    # ---- forces and their derivatives -------------------------------------------------------------------------------
+    # ---- forces and their derivatives. v: velocities, for laws that read their gradient ------------------------------
+
+    @property
+    def reads_rates(self) -> bool:
+        return "H_dot" in self.law.reads
 
     @traced
-    def forces(self, item, scene, u, s, corner) -> None:
-        """Elastic corner forces at slot s."""
+    def _edges_read(self, item, scene, u, v, s) -> list:
+        """Edges of all whose gradients the law reads, at slot s."""
+        return [self.edges(item, scene, x, s) for x in ((u, v) if self.reads_rates else (u,))]
+
+    @traced
+    def forces(self, item, scene, u, s, corner, v=None) -> None:
+        """Corner forces at slot s."""
         B = self.gradients_of(item, scene.gradients)
-        P = self.law.stress(self.edges(item, scene, u, s) @ B, self.coefficients_of(item, scene.coefficients))
+        x = [D @ B for D in self._edges_read(item, scene, u, v, s)]
+        P = self.law.stress_at(x, self.coefficients_of(item, scene.coefficients))
         self.store(item, corner, (P * self.volume_of(item, scene.volumes)) @ B.transpose())
 
     @traced
@@ -124,38 +134,40 @@ class Tetrahedron:
         self.store(item, corner, (dP * self.volume_of(item, scene.volumes)) @ B.transpose())
 
     @traced
-    def forces_jvp(self, item, scene, u, s, du, corner, dots) -> None:
-        """Change of the corner forces for changes of displacements, coefficients and rest shape."""
+    def forces_jvp(self, item, scene, u, s, du, corner, dots, v=None, dv=None) -> None:
+        """Change of the corner forces for changes of displacements, velocities, coefficients and rest shape."""
         B, B_dot = self.gradients_of(item, scene.gradients), self.gradients_of(item, dots.gradients)
         volume, p = self.volume_of(item, scene.volumes), self.coefficients_of(item, scene.coefficients)
-        D = self.edges(item, scene, u, s)
-        H, dH = D @ B, self.edges(item, scene, du, 0) @ B + D @ B_dot
-        dP = self.law.stress_jvp(H, dH, p, self.coefficients_of(item, dots.coefficients))
+        D, dD = self._edges_read(item, scene, u, v, s), self._edges_read(item, scene, du, dv, 0)
+        x, dx = [d @ B for d in D], [change @ B + d @ B_dot for d, change in zip(D, dD)]
+        dP = self.law.stress_jvp_at(x, dx, p, self.coefficients_of(item, dots.coefficients))
         change = B * self.volume_of(item, dots.volumes) + B_dot * volume
-        self.store(item, corner, (dP * volume) @ B.transpose() + self.law.stress(H, p) @ change.transpose())
+        self.store(item, corner, (dP * volume) @ B.transpose() + self.law.stress_at(x, p) @ change.transpose())
 
     @traced
-    def forces_vjp(self, item, scene, u, s, w, corner, adjoint) -> None:
-        """Corner products K w of the symmetric stiffness; adds the adjoint of the coefficients.
+    def forces_vjp(self, item, scene, u, s, w, corner, adjoint, v=None, rate_corner=None) -> None:
+        """Corner products with w of the transposed derivatives of the force, by u to `corner`, by v to `rate_corner`;
+        adds the adjoint of the coefficients.
 
-        The work of the forces on w is -V P(H) : dH, with dH the displacement gradient of w.
+        The work of the forces on w is -V P : W, with W the displacement gradient of w.
         """
         B, volume = self.gradients_of(item, scene.gradients), self.volume_of(item, scene.volumes)
-        H, dH = self.edges(item, scene, u, s) @ B, self.edges(item, scene, w, 0) @ B
         p = self.coefficients_of(item, scene.coefficients)
-        dP, products = self.law.stress_differential_and_products(H, dH, p)
-        self.store(item, corner, (dP * volume) @ B.transpose())
+        x, W = [D @ B for D in self._edges_read(item, scene, u, v, s)], self.edges(item, scene, w, 0) @ B
+        by_x, products = self.law.stress_vjp_at(x, W, p)
+        for by, target in zip(by_x, (corner, rate_corner)):
+            self.store(item, target, (by * volume) @ B.transpose())
         minus = let(ti.cast(-1, self.fp) * volume)
         self.items.add(adjoint.coefficients, len(p), item, [minus * product for product in products])
 
     @traced
-    def shape_vjp(self, item, scene, u, s, w, adjoint) -> None:
+    def shape_vjp(self, item, scene, u, s, w, adjoint, v=None) -> None:
         """Adds the adjoints of grad N and V: the work is -V P(D B) : (W B)."""
         B, volume = self.gradients_of(item, scene.gradients), self.volume_of(item, scene.volumes)
         p = self.coefficients_of(item, scene.coefficients)
-        D, W = self.edges(item, scene, u, s), self.edges(item, scene, w, 0)
-        H, dH = D @ B, W @ B
-        P, dP, minus = self.law.stress(H, p), self.law.stress_differential(H, dH, p), ti.cast(-1, self.fp)
-        by_B = (D.transpose() @ dP + W.transpose() @ P) * let(minus * volume)
-        self.items.add(adjoint.gradients, 9, item, by_B.numbers)
+        D, W = self._edges_read(item, scene, u, v, s), self.edges(item, scene, w, 0)
+        x, dH = [d @ B for d in D], W @ B
+        P, (by_x, _), minus = self.law.stress_at(x, p), self.law.stress_vjp_at(x, dH, p), ti.cast(-1, self.fp)
+        by_B = sum_of([*(d.transpose() @ by for d, by in zip(D, by_x)), W.transpose() @ P])
+        self.items.add(adjoint.gradients, 9, item, (by_B * let(minus * volume)).numbers)
         self.items.add(adjoint.volumes, 1, item, [minus * inner(P, dH)])

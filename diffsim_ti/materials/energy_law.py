@@ -30,6 +30,11 @@ class EnergyLaw(Law):
         raise NotImplementedError(f"{type(self).__name__} writes psi(H, p)")
 
     @traced
+    def dissipation(self, H: Tensor, H_dot: Tensor, p: list) -> Number:
+        """phi [W/m^3] of a law that reads ("H", "H_dot"): its stress is dpsi/dF + dphi/dF_dot, F_dot = H_dot."""
+        raise NotImplementedError(f"{type(self).__name__} reads H_dot: it writes dissipation(H, H_dot, p)")
+
+    @traced
     def theta(self, H: Tensor) -> Number:
         """The change of volume of which the last coefficient resists theta^2 / 2 [-]."""
 
@@ -50,6 +55,16 @@ class EnergyLaw(Law):
     def _record_stress(self, H, p):
         g, h, numbers, psi = self._record(H, p)
         return g, h, numbers, g.gradient(psi, h)
+
+    @traced
+    def _record_all(self, x, p):
+        """(graph, leaves of x and p, P) of a law that reads H and H_dot."""
+        g = Graph(self.fp)
+        h, rate = (Tensor(g.leaf(number) for number in one.numbers) for one in x)
+        numbers = [g.leaf(number) for number in p]
+        elastic = g.gradient(self.psi(h, numbers), h.numbers)
+        viscous = g.gradient(self.dissipation(h, rate, numbers), rate.numbers)
+        return g, [*h.numbers, *rate.numbers, *numbers], [a + b for a, b in zip(elastic, viscous)]
 
     @traced
     def _record_dilatation(self, H):
@@ -93,6 +108,28 @@ class EnergyLaw(Law):
         g, h, numbers, P = self._record_stress(H, p)
         by = _spread(g.reverse([*zip(P, dH.numbers)], [*h, *numbers]), H)  # d2psi/dF2 is symmetric
         return Tensor(by[:9]), by[9:]
+
+    @traced
+    def stress_at(self, x, p):
+        if self.reads == ("H",):
+            return self.stress(*x, p)
+        return _tensor([number.value for number in self._record_all(x, p)[2]], x[0])
+
+    @traced
+    def stress_jvp_at(self, x, dx, p, dp):
+        if self.reads == ("H",):
+            return self.stress_jvp(*x, *dx, p, dp)
+        g, leaves, P = self._record_all(x, p)
+        return _tensor(g.forward([*zip(leaves, [*dx[0].numbers, *dx[1].numbers, *dp])], P), x[0])
+
+    @traced
+    def stress_vjp_at(self, x, W, p):
+        if self.reads == ("H",):
+            by_H, products = self.stress_differential_and_products(*x, W, p)
+            return [by_H], products
+        g, leaves, P = self._record_all(x, p)
+        by = _spread(g.reverse([*zip(P, W.numbers)], leaves), x[0])
+        return [Tensor(by[:9]), Tensor(by[9:18])], by[18:]
 
     @traced
     def dilatation(self, H):

@@ -17,6 +17,10 @@ class Law:
     as well, or their energy alone (`EnergyLaw`), from which everything follows.
     The differential is exact and symmetric, and indefinite where the energy is not convex.
 
+    `reads` lists what the stress depends on: ("H",), or ("H", "H_dot") with the rate of H, the velocity's gradient. What a
+    law does not read costs nothing. Kernels call `stress_at`, `stress_jvp_at` and `stress_vjp_at`, whose `x` are
+    Tensors in the order of `reads`.
+
     A law is compile-time data: constants only, equal laws share compiled kernels. precision: "f32" or "f64".
     In its functions constants are integers, or `self.real(0.5)`, and no integer is divided or divides: Taichi computes a
     bare 0.5, x / 2 and 1 / x in f64, which makes f32 kernels slow. No unary minus on numbers: lanes have none.
@@ -25,6 +29,7 @@ class Law:
     precision: str
 
     coefficient_names = ()
+    reads = ("H",)
     last_without_lam = ()  # factors f: with lam = 0 the last coefficient is sum_k f_k p_k; empty: zero
     lanes = True  # written with + - * / and max alone, so that a number may be a vector of lanes
 
@@ -81,6 +86,22 @@ class Law:
     def stress_jvp(self, H, dH, p, dp):
         """The stress's change for changes dH and dp [Pa], a Tensor."""
         return self.stress_differential(H, dH, p) + self.stress_change(H, p, dp)
+
+    @traced
+    def stress_at(self, x, p):
+        """P of all that the law reads [Pa], a Tensor."""
+        return self.stress(*x, p)
+
+    @traced
+    def stress_jvp_at(self, x, dx, p, dp):
+        """Its change for changes dx and dp, a Tensor."""
+        return self.stress_jvp(*x, *dx, p, dp)
+
+    @traced
+    def stress_vjp_at(self, x, W, p):
+        """(adjoints of x, a list of Tensors, and W : dP/dp_k, a list of K) for the adjoint W of P."""
+        dP, products = self.stress_differential_and_products(*x, W, p)  # d2psi/dF2 is symmetric
+        return [dP], products
 
     @traced
     def energy_by_coefficients(self, H, p):

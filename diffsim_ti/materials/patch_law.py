@@ -19,6 +19,11 @@ class PatchLaw(Law):
     base: Law
 
     def __post_init__(self):
+        if self.base.reads != ("H",):
+            raise ValueError(
+                f'volume="patches" averages energies, but {type(self.base).__name__} reads {", ".join(self.base.reads)}; '
+                'take volume="tetrahedra"'
+            )
         if not self.base.has_dilatation:
             name = type(self.base).__name__
             raise ValueError(
