@@ -11,6 +11,7 @@ import taichi as ti
 from open_laws.fibres import FibreTissue
 from open_laws.gent import Gent
 from open_laws.power_law import Knowles
+from open_laws.viscous import ViscousRubber
 
 import diffsim_ti as ds
 from diffsim_ti import runtime, verify
@@ -290,6 +291,39 @@ def test_fibres_per_set():
     np.testing.assert_array_equal(fibre[:3], [[0, 1, 0], [1, 0, 0], [0, 1, 0]])
 
 
+# ---- a law that sees the velocity's gradient ---------------------------------------------------------------------------
+
+
+def test_viscous_stress_is_that_of_its_formula():
+    """One substep from a homogeneous state: dv = h f / m with P = mu (F - K) + lam (J - 1) K + F 2 eta E_dot, K = cof F."""
+    rng = np.random.default_rng(4)
+    F, L = np.eye(3) + rng.uniform(-0.2, 0.2, (3, 3)), rng.standard_normal((3, 3))
+    mesh, mu, lam, eta = ds.TetrahedralMesh.create_cube(2, 1.0), 2e3, 3e3, 40.0
+    x, v = mesh.vertices @ F.T, mesh.vertices @ L.T
+    material = ViscousRubber(mu * (3 * lam + 2 * mu) / (lam + mu), lam / (2 * (lam + mu)), eta)
+    s = ds.Scene(mesh, material, 1000.0, initial_positions=x, initial_velocities=v, precision="f64")
+    frames = ds.Rollout(ds.SemiImplicitSolver(s, dt=1e-4), 1).forward()
+    K, E_dot = np.linalg.det(F) * np.linalg.inv(F).T, (F.T @ L + L.T @ F) / 2
+    P = mu * (F - K) + lam * (np.linalg.det(F) - 1) * K + F @ (2 * eta * E_dot)
+    derived, force = s.inputs.derive(s.inputs.values), np.zeros_like(v)
+    N = np.concatenate([-derived.gradients.sum(1, keepdims=True), derived.gradients], 1)
+    np.add.at(force, mesh.tetrahedra, -derived.volumes[:, None, None] * (N @ P.T))
+    change = frames.velocities[-1] - v
+    np.testing.assert_allclose(change, 1e-4 * force / derived.mass[:, None], rtol=0, atol=1e-11 * np.abs(change).max())
+
+
+def shaken(**changes) -> ds.Scene:
+    velocities = np.random.default_rng(7).standard_normal((8, 3))
+    eta = per_tetrahedron(20, 40)
+    motion = changes.pop("motion", lambda t: [0, 0.3 * t, 0])
+    return scene(ViscousRubber(1e4, 0.3, eta), initial_velocities=velocities, motion=motion, **changes)
+
+
+@pytest.mark.parametrize("solver", EXPLICIT)
+def test_gradients_through_viscosity(solver):
+    gates(rollout(shaken(), solver))
+
+
 @pytest.mark.parametrize(
     "build, words",
     [
@@ -302,6 +336,11 @@ def test_fibres_per_set():
             lambda: scene(MATERIALS["knowles"](), volume="patches").law,
             r"PowerLaw does not say what its theta is; write",
         ),
+        (
+            lambda: rollout(shaken(), ds.ImplicitEulerSolver),
+            r"ViscousLaw reads H, H_dot, but ImplicitEulerSolver knows",
+        ),
+        (lambda: shaken(volume="patches").law, r"averages energies, but ViscousLaw reads H, H_dot; take"),
         (lambda: rollout(scene(MATERIALS["tissue"]())).forward(fibre=np.ones(2)), r"fibre: expected shape"),
     ],
 )

@@ -14,7 +14,6 @@ from types import SimpleNamespace
 
 import taichi as ti
 
-
 from diffsim_ti.elements.tetrahedron import A, Tetrahedron
 from diffsim_ti.materials.calculus.tensor import inner, sum_of
 from diffsim_ti.materials.patch_law import PatchLaw

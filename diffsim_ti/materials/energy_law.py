@@ -31,7 +31,11 @@ class EnergyLaw(Law):
 
     @traced
     def dissipation(self, H: Tensor, H_dot: Tensor, p: list) -> Number:
-        """phi [W/m^3] of a law that reads ("H", "H_dot"): its stress is dpsi/dF + dphi/dF_dot, F_dot = H_dot."""
+        """phi [W/m^3] of a law that reads ("H", "H_dot"): its stress is dpsi/dF + dphi/dF_dot, F_dot = H_dot.
+
+        For explicit solvers, which take the velocity before the kick; their limit of steps does not know phi. What shows
+        stresses shows those of psi.
+        """
         raise NotImplementedError(f"{type(self).__name__} reads H_dot: it writes dissipation(H, H_dot, p)")
 
     @traced
