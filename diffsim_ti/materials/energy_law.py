@@ -22,14 +22,14 @@ class EnergyLaw(Law):
     The graph is Griewank, Walther, Evaluating Derivatives, ch. 3 and 5, doi:10.1137/1.9780898717761.
     """
 
-    linear = False
+    def __post_init__(self):
+        if self.reads not in (("H",), ("H", "H_dot")):
+            raise ValueError(f'{type(self).__name__}: reads must be ("H",) or ("H", "H_dot"), got {self.reads}')
 
-    @traced
     def psi(self, H: Tensor, p: list) -> Number:
         """psi [J/m^3], zero at rest."""
         raise NotImplementedError(f"{type(self).__name__} writes psi(H, p)")
 
-    @traced
     def dissipation(self, H: Tensor, H_dot: Tensor, p: list) -> Number:
         """phi [W/m^3] of a law that reads ("H", "H_dot"): its stress is dpsi/dF + dphi/dF_dot, F_dot = H_dot.
 
@@ -38,7 +38,6 @@ class EnergyLaw(Law):
         """
         raise NotImplementedError(f"{type(self).__name__} reads H_dot: it writes dissipation(H, H_dot, p)")
 
-    @traced
     def theta(self, H: Tensor) -> Number:
         """The change of volume of which the last coefficient resists theta^2 / 2 [-]."""
 
@@ -50,25 +49,21 @@ class EnergyLaw(Law):
 
     @traced
     def _record(self, H, p):
-        """(graph, leaves of H, leaves of p, psi)"""
+        """(graph, leaves of p, psi)"""
         g = Graph(self.fp)
-        h, numbers = Tensor(g.leaf(x) for x in H.numbers), [g.leaf(x) for x in p]
-        return g, h.numbers, numbers, self.psi(h, numbers)
+        numbers = [g.leaf(x) for x in p]
+        return g, numbers, self.psi(Tensor(g.leaf(x) for x in H.numbers), numbers)
 
     @traced
-    def _record_stress(self, H, p):
-        g, h, numbers, psi = self._record(H, p)
-        return g, h, numbers, g.gradient(psi, h)
-
-    @traced
-    def _record_all(self, x, p):
-        """(graph, leaves of x and p, P) of a law that reads H and H_dot."""
+    def _record_stress(self, x, p):
+        """(graph, leaves of x and p, P); x holds H alone, for the stress of psi, or H and H_dot."""
         g = Graph(self.fp)
-        h, rate = (Tensor(g.leaf(number) for number in one.numbers) for one in x)
-        numbers = [g.leaf(number) for number in p]
-        elastic = g.gradient(self.psi(h, numbers), h.numbers)
-        viscous = g.gradient(self.dissipation(h, rate, numbers), rate.numbers)
-        return g, [*h.numbers, *rate.numbers, *numbers], [a + b for a, b in zip(elastic, viscous)]
+        read, numbers = [Tensor(g.leaf(number) for number in one.numbers) for one in x], [g.leaf(c) for c in p]
+        P = g.gradient(self.psi(read[0], numbers), read[0].numbers)
+        if len(read) > 1:
+            viscous = g.gradient(self.dissipation(*read, numbers), read[1].numbers)
+            P = [a + b for a, b in zip(P, viscous)]
+        return g, [*_numbers(read), *numbers], P
 
     @traced
     def _record_dilatation(self, H):
@@ -81,59 +76,49 @@ class EnergyLaw(Law):
 
     @traced
     def energy_density(self, H, p):
-        return spread(self._record(H, p)[3].value, H[0, 0])
+        return spread(self._record(H, p)[2].value, H[0, 0])
 
     @traced
     def energy_by_coefficients(self, H, p):
-        g, _, numbers, psi = self._record(H, p)
+        g, numbers, psi = self._record(H, p)
         return _spread(g.reverse([(psi, g.one())], numbers), H)
 
     @traced
-    def stress(self, H, p):
-        return _tensor([x.value for x in self._record_stress(H, p)[3]], H)
-
-    @traced
-    def stress_differential(self, H, dH, p):
-        g, h, _, P = self._record_stress(H, p)
-        return _tensor(g.forward([*zip(h, dH.numbers)], P), H)
-
-    @traced
-    def stress_change(self, H, p, dp):
-        g, _, numbers, P = self._record_stress(H, p)
-        return _tensor(g.forward([*zip(numbers, dp)], P), H)
-
-    @traced
-    def stress_jvp(self, H, dH, p, dp):
-        g, h, numbers, P = self._record_stress(H, p)
-        return _tensor(g.forward([*zip(h, dH.numbers), *zip(numbers, dp)], P), H)
-
-    @traced
-    def stress_differential_and_products(self, H, dH, p):
-        g, h, numbers, P = self._record_stress(H, p)
-        by = _spread(g.reverse([*zip(P, dH.numbers)], [*h, *numbers]), H)  # d2psi/dF2 is symmetric
-        return Tensor(by[:9]), by[9:]
-
-    @traced
     def stress_at(self, x, p):
-        if self.reads == ("H",):
-            return self.stress(*x, p)
-        return _tensor([number.value for number in self._record_all(x, p)[2]], x[0])
+        return _tensor([number.value for number in self._record_stress(x, p)[2]], x[0])
 
     @traced
     def stress_jvp_at(self, x, dx, p, dp):
-        if self.reads == ("H",):
-            return self.stress_jvp(*x, *dx, p, dp)
-        g, leaves, P = self._record_all(x, p)
-        return _tensor(g.forward([*zip(leaves, [*dx[0].numbers, *dx[1].numbers, *dp])], P), x[0])
+        g, leaves, P = self._record_stress(x, p)
+        return _tensor(g.forward([*zip(leaves, [*_numbers(dx), *dp])], P), x[0])
 
     @traced
     def stress_vjp_at(self, x, W, p):
-        if self.reads == ("H",):
-            by_H, products = self.stress_differential_and_products(*x, W, p)
-            return [by_H], products
-        g, leaves, P = self._record_all(x, p)
+        g, leaves, P = self._record_stress(x, p)
         by = _spread(g.reverse([*zip(P, W.numbers)], leaves), x[0])
-        return [Tensor(by[:9]), Tensor(by[9:18])], by[18:]
+        return [Tensor(by[9 * k : 9 * k + 9]) for k in range(len(x))], by[9 * len(x) :]
+
+    @traced
+    def stress(self, H, p):
+        return self.stress_at([H], p)
+
+    @traced
+    def stress_differential(self, H, dH, p):
+        return self.stress_jvp_at([H], [dH], p, [])
+
+    @traced
+    def stress_change(self, H, p, dp):
+        g, leaves, P = self._record_stress([H], p)
+        return _tensor(g.forward([*zip(leaves[9:], dp)], P), H)
+
+    @traced
+    def stress_jvp(self, H, dH, p, dp):
+        return self.stress_jvp_at([H], [dH], p, dp)
+
+    @traced
+    def stress_differential_and_products(self, H, dH, p):
+        (dP,), products = self.stress_vjp_at([H], dH, p)  # d2psi/dF2 is symmetric
+        return dP, products
 
     @traced
     def dilatation(self, H):
@@ -147,6 +132,10 @@ class EnergyLaw(Law):
     def dilatation_gradient_differential(self, H, dH):
         g, h, _, gradient = self._record_dilatation(H)
         return _tensor(g.forward([*zip(h, dH.numbers)], gradient), H)
+
+
+def _numbers(tensors) -> list:
+    return [number for one in tensors for number in one.numbers]
 
 
 def _spread(numbers: list, H) -> list:
