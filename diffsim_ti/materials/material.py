@@ -94,9 +94,12 @@ class Material(ABC):
         return values
 
     def described(self, mesh) -> list[Input]:
-        """The inputs of a body of this material: each number is one, or one per tetrahedron."""
-        unit = dict(poissons_ratio="")
-        return [Input(n, v, ((), ("tetrahedra",)), unit.get(n, "Pa")) for n, v in self.values(mesh).items()]
+        """The inputs of a body of this material: each number (or vector) is one, or one per tetrahedron."""
+        unit, out = dict(poissons_ratio=""), []
+        for name, value in self.values(mesh).items():
+            one = self.shape_of(name)
+            out.append(Input(name, value, (one, ("tetrahedra", *one)), unit.get(name, "Pa")))
+        return out
 
     def links(self) -> list[Link]:
         """From the inputs to what the law's kernels read: the links that write "coefficients"."""
