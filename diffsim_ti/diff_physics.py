@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from diffsim_ti.materials import StableNeoHookean
+from diffsim_ti.materials import StableNeoHookean, moduli
 from diffsim_ti.materials.evaluate import evaluate
 from diffsim_ti.terms import Ground
 from diffsim_ti.terms.obstacles.barrier import CROSSOVER
@@ -54,12 +54,12 @@ class TorchMaterial(torch.nn.Module):
     @property
     def mu(self) -> torch.Tensor:
         """Shear modulus E / (2 (1 + nu)) [Pa], in the graph."""
-        return self.E / (2 * (1 + self.nu))
+        return moduli.lame(self.E, self.nu)[0]
 
     @property
     def lam(self) -> torch.Tensor:
         """First Lame parameter E nu / ((1 + nu)(1 - 2 nu)) [Pa], in the graph."""
-        return self.E * self.nu / ((1 + self.nu) * (1 - 2 * self.nu))
+        return moduli.lame(self.E, self.nu)[1]
 
     def energy_density(self, F: torch.Tensor) -> torch.Tensor:
         """Energy density [J/m^3], shape (m,), of deformation gradients F, shape (m, 3, 3); gradients to F, E and nu.

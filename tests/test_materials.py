@@ -255,7 +255,7 @@ def test_differential_and_products_taken_alone_are_those_of_the_pair(material):
             dP[i] = law.stress_differential(
                 tensor(H[i]), tensor(dH[i]), [p[0][c] for c in ti.static(range(k))]
             ).matrix()
-            work = law.coefficient_products(tensor(H[i]), tensor(dH[i]))
+            _, work = law.stress_differential_and_products(tensor(H[i]), tensor(dH[i]), law.unit(0))
             for c in ti.static(range(k)):
                 products[i][c] = work[c]
 

@@ -3,82 +3,83 @@
     E = sum_e V_e psi(F_e; lam = 0) + sum_p W_p lam_p / 2 theta_p^2
     W_p = sum_e V_e,  lam_p = sum_e V_e lam_e / W_p,  theta_p = sum_e V_e theta_e / W_p     over the tetrahedra e of patch p
 
-A patch is a block of eight (mesh_patches.py; rows left over have no volume), so that sums over a patch are sums over lanes.
+A patch is a block of eight (mesh/patches.py; rows left over have no volume), so that sums over a patch are sums over lanes.
 Its pressure pi = lam_p theta_p takes the place of lam theta in each of its tetrahedra: forces are those of an energy.
 Nagtegaal, Parks, Rice 1974, doi:10.1016/0045-7825(74)90032-2 (mean dilatation); de Souza Neto, Andrade Pires, Owen 2005,
 F-bar-based linear triangles and tetrahedra for finite strain analysis of nearly incompressible solids, doi:10.1002/nme.1187.
 """
 
-from functools import lru_cache
+from dataclasses import dataclass
 from types import SimpleNamespace
 
 import taichi as ti
 
-from diffsim_ti.elements.tetrahedron import LANES, A, element_functions
+from diffsim_ti.elements.tetrahedron import A, Tetrahedron
 from diffsim_ti.materials.calculus.tensor import inner, sum_of
 from diffsim_ti.materials.patch_law import PatchLaw
-from diffsim_ti.runtime import Bundle, at, let, traced
+from diffsim_ti.runtime import LANES, Bundle, at, let, traced
+
+MOST = 6  # numbers of an item that its patch sums up
 
 
-def functions_of(law, uniform: bool, lanes: bool) -> SimpleNamespace:
-    """`element_functions` of a law; those of patches for a PatchLaw."""
-    return patch_functions(law, uniform, lanes) if isinstance(law, PatchLaw) else element_functions(law, uniform, lanes)
+def functions_of(law, uniform: bool, lanes: bool) -> Tetrahedron:
+    """The element of a law; patches for a PatchLaw."""
+    return (PatchedTetrahedron if isinstance(law, PatchLaw) else Tetrahedron)(law, uniform, lanes)
 
 
-@lru_cache(maxsize=None)
-def patch_functions(law, uniform: bool, lanes: bool) -> SimpleNamespace:
-    """The functions of element_functions, with the same meaning. In all of them q = [*p', pi] (patch_law.py)."""
-    el, base = element_functions(law.base, uniform, lanes), law.base
-    fp, most = el.types.fp, 6
-    row_type = ti.types.vector(most, fp)
+@dataclass(frozen=True)
+class PatchedTetrahedron(Tetrahedron):
+    """The functions of `Tetrahedron`, with the same meaning. In all of them q = [*p', pi] (patch_law.py)."""
+
+    # ---- what a patch knows -----------------------------------------------------------------------------------------
 
     @traced
-    def own(item, job) -> SimpleNamespace:
+    def _own(self, item, job) -> SimpleNamespace:
         """What an item knows by itself; `numbers` are what its patch sums up."""
-        t, scene = SimpleNamespace(), job.scene
-        t.B, t.V = el.gradients_of(item, scene.gradients), el.volume_of(item, scene.volumes)
-        t.p, t.lam = law.split(el.coefficients_of(item, scene.coefficients))
-        t.D = el.edges(item, scene, job.u, job.s)
+        t, scene, base = SimpleNamespace(), job.scene, self.law.base
+        t.B, t.V = self.gradients_of(item, scene.gradients), self.volume_of(item, scene.volumes)
+        t.p, t.lam = self.law.split(self.coefficients_of(item, scene.coefficients))
+        t.D = self.edges(item, scene, job.u, job.s)
         t.H = t.D @ t.B
         t.theta = base.dilatation(t.H)
         t.numbers = [t.V, let(t.V * t.lam), let(t.V * t.theta)]
         if job.w is None:
             return t
-        t.W, t.gradient = el.edges(item, scene, job.w, 0), base.dilatation_gradient(t.H)
+        t.W, t.gradient = self.edges(item, scene, job.w, 0), base.dilatation_gradient(t.H)
         t.dH = t.W @ t.B
         if job.dots is None:
             t.dtheta = inner(t.gradient, t.dH)
             t.numbers.append(let(t.V * t.dtheta))
             return t
-        t.dB, t.dV = el.gradients_of(item, job.dots.gradients), el.volume_of(item, job.dots.volumes)
-        t.dp, dlam = law.split(el.coefficients_of(item, job.dots.coefficients))
+        t.dB, t.dV = self.gradients_of(item, job.dots.gradients), self.volume_of(item, job.dots.volumes)
+        t.dp, dlam = self.law.split(self.coefficients_of(item, job.dots.coefficients))
         t.dH = t.dH + t.D @ t.dB
         t.dtheta = inner(t.gradient, t.dH)
         t.numbers += [t.dV, let(t.dV * t.lam + t.V * dlam), let(t.dV * t.theta + t.V * t.dtheta)]
         return t
 
     @traced
-    def row(item, job):
-        numbers = own(item, job).numbers
-        return row_type(*numbers, *[ti.cast(0, fp)] * (most - len(numbers)))
+    def _row(self, item, job):
+        numbers = self._own(item, job).numbers
+        return ti.types.vector(MOST, self.fp)(*numbers, *[ti.cast(0, self.fp)] * (MOST - len(numbers)))
 
     @ti.func
-    def sum_one_by_one(item, job: A):
-        total = row_type(0)
+    def _sum_one_by_one(self, item, job: A):
+        total = ti.types.vector(MOST, self.fp)(0)
         first = item // LANES * LANES
         for lane in range(LANES):
-            total += row(first + lane, job)
+            total += self._row(first + lane, job)
         return total
 
     @traced
-    def patch_of(item, scene, u, s, w=None, dots=None) -> SimpleNamespace:
+    def _patch_of(self, item, scene, u, s, w=None, dots=None) -> SimpleNamespace:
         """What an item knows, with its patch's W, lam_p, theta_p, pi and, for changes w of u, their changes."""
         job = Bundle(scene=scene, u=u, s=s, w=w, dots=dots)
-        t = own(item, job)
-        if lanes:
-            sums = [el.broadcast(let(sum_of(at(x, lane) for lane in range(LANES)))) for x in t.numbers]
+        t = self._own(item, job)
+        if self.lanes:
+            sums = [self.items.broadcast(let(sum_of(at(x, lane) for lane in range(LANES)))) for x in t.numbers]
         else:
-            total = let(sum_one_by_one(item, job))
+            total = let(self._sum_one_by_one(item, job))
             sums = [let(at(total, k)) for k in range(len(t.numbers))]
         volume, stiff, swollen, *changes = sums
         t.lam_p, t.theta_p = let(stiff / volume), let(swollen / volume)
@@ -93,60 +94,51 @@ def patch_functions(law, uniform: bool, lanes: bool) -> SimpleNamespace:
         return t
 
     @traced
-    def coefficients_at(item, scene, u, s) -> list:
-        return patch_of(item, scene, u, s).q
+    def coefficients_at(self, item, scene, u, s) -> list:
+        return self._patch_of(item, scene, u, s).q
+
+    # ---- forces and their derivatives -------------------------------------------------------------------------------
 
     @traced
-    def forces(item, scene, u, s, corner) -> None:
-        t = patch_of(item, scene, u, s)
-        el.store(item, corner, (law.stress(t.H, t.q) * t.V) @ t.B.transpose())
+    def forces(self, item, scene, u, s, corner, v=None) -> None:
+        t = self._patch_of(item, scene, u, s)
+        self.store(item, corner, (self.law.stress(t.H, t.q) * t.V) @ t.B.transpose())
 
     @traced
-    def pressure_forces(item, scene, u, s, corner) -> None:
+    def pressure_forces(self, item, scene, u, s, corner) -> None:
         """Corner forces of a unit pressure: the derivatives of -W_p theta_p by the displacement of the corners."""
-        t = own(item, Bundle(scene=scene, u=u, s=s, w=None, dots=None))
-        el.store(item, corner, (base.dilatation_gradient(t.H) * t.V) @ t.B.transpose())
+        t = self._own(item, Bundle(scene=scene, u=u, s=s, w=None, dots=None))
+        self.store(item, corner, (self.law.base.dilatation_gradient(t.H) * t.V) @ t.B.transpose())
 
     @traced
-    def stiffness(item, scene, u, s, w, corner) -> None:
-        t = patch_of(item, scene, u, s, w)
-        dP = law.stress_differential(t.H, t.dH, t.q) + t.gradient * t.dpi
-        el.store(item, corner, (dP * t.V) @ t.B.transpose())
+    def stiffness(self, item, scene, u, s, w, corner) -> None:
+        t = self._patch_of(item, scene, u, s, w)
+        dP = self.law.stress_differential(t.H, t.dH, t.q) + t.gradient * t.dpi
+        self.store(item, corner, (dP * t.V) @ t.B.transpose())
 
     @traced
-    def forces_jvp(item, scene, u, s, du, corner, dots) -> None:
-        t = patch_of(item, scene, u, s, du, dots)
-        dP = law.stress_differential(t.H, t.dH, t.q) + base.stress(t.H, t.dp) + t.gradient * t.dpi
+    def forces_jvp(self, item, scene, u, s, du, corner, dots, v=None, dv=None) -> None:
+        t = self._patch_of(item, scene, u, s, du, dots)
+        dP = self.law.stress_jvp(t.H, t.dH, t.q, [*t.dp, t.dpi])
         change = t.B * t.dV + t.dB * t.V
-        el.store(item, corner, (dP * t.V) @ t.B.transpose() + law.stress(t.H, t.q) @ change.transpose())
+        self.store(item, corner, (dP * t.V) @ t.B.transpose() + self.law.stress(t.H, t.q) @ change.transpose())
 
     @traced
-    def forces_vjp(item, scene, u, s, w, corner, adjoint) -> None:
+    def forces_vjp(self, item, scene, u, s, w, corner, adjoint, v=None, rate_corner=None) -> None:
         """The work of a patch's pressure on w is -W_p lam_p theta_p dtheta_p, with dtheta_p the change of theta_p for w."""
-        t = patch_of(item, scene, u, s, w)
-        dP, products = law.stress_differential_and_products(t.H, t.dH, t.q)
-        el.store(item, corner, ((dP + t.gradient * t.dpi) * t.V) @ t.B.transpose())
-        minus = let(ti.cast(-1, fp) * t.V)
-        by = law.split_vjp([let(minus * x) for x in products], let(minus * t.theta_p * t.dtheta_p))
-        el.add(adjoint.coefficients, len(products), item, by)
+        t = self._patch_of(item, scene, u, s, w)
+        dP, products = self.law.stress_differential_and_products(t.H, t.dH, t.q)
+        self.store(item, corner, ((dP + t.gradient * t.dpi) * t.V) @ t.B.transpose())
+        minus = let(ti.cast(-1, self.fp) * t.V)
+        by = self.law.split_vjp([let(minus * x) for x in products], let(minus * t.theta_p * t.dtheta_p))
+        self.items.add(adjoint.coefficients, len(products), item, by)
 
     @traced
-    def shape_vjp(item, scene, u, s, w, adjoint) -> None:
-        t = patch_of(item, scene, u, s, w)
-        P, minus = law.stress(t.H, t.q), ti.cast(-1, fp)
-        dP = law.stress_differential(t.H, t.dH, t.q) + t.gradient * t.dpi
+    def shape_vjp(self, item, scene, u, s, w, adjoint, v=None) -> None:
+        t = self._patch_of(item, scene, u, s, w)
+        P, minus = self.law.stress(t.H, t.q), ti.cast(-1, self.fp)
+        dP = self.law.stress_differential(t.H, t.dH, t.q) + t.gradient * t.dpi
         by_B = (t.D.transpose() @ dP + t.W.transpose() @ P) * let(minus * t.V)
-        el.add(adjoint.gradients, 9, item, by_B.numbers)
+        self.items.add(adjoint.gradients, 9, item, by_B.numbers)
         in_patch = t.dtheta_p * (t.theta_p * (t.lam - t.lam_p - t.lam_p) + t.lam_p * t.theta)
-        el.add(adjoint.volumes, 1, item, [minus * (inner(P, t.dH) + in_patch)])
-
-    replaced = dict(
-        coefficients_at=coefficients_at,
-        forces=forces,
-        stiffness=stiffness,
-        forces_jvp=forces_jvp,
-        forces_vjp=forces_vjp,
-        shape_vjp=shape_vjp,
-        pressure_forces=pressure_forces,
-    )
-    return SimpleNamespace(**vars(el) | replaced)
+        self.items.add(adjoint.volumes, 1, item, [minus * (inner(P, t.dH) + in_patch)])

@@ -3,6 +3,7 @@
 from diffsim_ti.materials.calculus.invariants import InvariantLaw
 from diffsim_ti.materials.calculus.strains import StrainLaw
 from diffsim_ti.materials.corotated import Corotated
+from diffsim_ti.materials.energy_law import EnergyLaw
 from diffsim_ti.materials.law import Law
 from diffsim_ti.materials.linear_elastic import LinearElastic
 from diffsim_ti.materials.material import Material
@@ -16,6 +17,7 @@ MATERIALS = (StableNeoHookean, SmithNeoHookean, LinearElastic, Corotated, StVena
 __all__ = [
     "MATERIALS",
     "Corotated",
+    "EnergyLaw",
     "InvariantLaw",
     "Law",
     "LinearElastic",

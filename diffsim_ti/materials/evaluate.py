@@ -21,8 +21,9 @@ def _kernel(law):
             h, coefficients = tensor(H[i]), [p[i][c] for c in ti.static(range(K))]
             psi[i] = law.energy_density(h, coefficients)
             P[i] = law.stress(h, coefficients).matrix()
+            by = law.energy_by_coefficients(h, coefficients)
             for c in ti.static(range(K)):
-                by_coefficient[i][c] = law.energy_density(h, law.unit(c))
+                by_coefficient[i][c] = by[c]
 
     return evaluate_law
 

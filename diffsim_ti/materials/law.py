@@ -11,9 +11,15 @@ from diffsim_ti.runtime import PRECISIONS, traced
 class Law:
     """A constitutive formula: Taichi functions of one displacement gradient H = grad u (F = I + H), a `Tensor`.
 
-    `p` is a list of the K coefficients [Pa] named by `coefficient_names`. Every law's energy is LINEAR in p, so
-    that stress(H, e_k) is the derivative of the stress by coefficient k, and stress(H, dp) its change for a change dp.
+    `p` is a list of the K coefficients named by `coefficient_names`: moduli [Pa], exponents, components of a direction.
+    A law whose energy is linear in p needs no derivative by it: stress(H, e_k) is the derivative of the stress by
+    coefficient k, and stress(H, dp) its change for a change dp. Others write `stress_change` and `energy_by_coefficients`
+    as well, or their energy alone (`EnergyLaw`), from which everything follows.
     The differential is exact and symmetric, and indefinite where the energy is not convex.
+
+    `reads` lists what the stress depends on: ("H",), or ("H", "H_dot") with the rate of H, the velocity's gradient. What a
+    law does not read costs nothing. Kernels call `stress_at`, `stress_jvp_at` and `stress_vjp_at`, whose `x` are
+    Tensors in the order of `reads`.
 
     A law is compile-time data: constants only, equal laws share compiled kernels. precision: "f32" or "f64".
     In its functions constants are integers, or `self.real(0.5)`, and no integer is divided or divides: Taichi computes a
@@ -23,6 +29,7 @@ class Law:
     precision: str
 
     coefficient_names = ()
+    reads = ("H",)
     last_without_lam = ()  # factors f: with lam = 0 the last coefficient is sum_k f_k p_k; empty: zero
     lanes = True  # written with + - * / and max alone, so that a number may be a vector of lanes
 
@@ -47,6 +54,11 @@ class Law:
     def stress_differential_and_products(self, H, dH, p):
         """(dP, products): dP = d2psi/dF2 : dH, a Tensor, and dH : dP/dp_k, a list of K, from the same scalars."""
 
+    @property
+    def has_dilatation(self) -> bool:
+        """Whether the law says which part of it resists a change of volume, as volume="patches" needs."""
+        return type(self).dilatation is not Law.dilatation
+
     @traced
     def dilatation(self, H):
         """theta, the change of volume of which lam resists lam/2 theta^2 [-]; tr(e) for small strains e."""
@@ -66,10 +78,35 @@ class Law:
         return dP
 
     @traced
-    def coefficient_products(self, H, dH):
-        """dH : dP/dp_k, a list of K; they do not depend on p."""
-        _, products = self.stress_differential_and_products(H, dH, self.unit(0))
-        return products
+    def stress_change(self, H, p, dp):
+        """The stress's change for changes dp of the coefficients [Pa], a Tensor."""
+        return self.stress(H, dp)
+
+    @traced
+    def stress_jvp(self, H, dH, p, dp):
+        """The stress's change for changes dH and dp [Pa], a Tensor."""
+        return self.stress_differential(H, dH, p) + self.stress_change(H, p, dp)
+
+    @traced
+    def stress_at(self, x, p):
+        """P of all that the law reads [Pa], a Tensor."""
+        return self.stress(*x, p)
+
+    @traced
+    def stress_jvp_at(self, x, dx, p, dp):
+        """Its change for changes dx and dp, a Tensor."""
+        return self.stress_jvp(*x, *dx, p, dp)
+
+    @traced
+    def stress_vjp_at(self, x, W, p):
+        """(adjoints of x, a list of Tensors, and W : dP/dp_k, a list of K) for the adjoint W of P."""
+        dP, products = self.stress_differential_and_products(*x, W, p)  # d2psi/dF2 is symmetric
+        return [dP], products
+
+    @traced
+    def energy_by_coefficients(self, H, p):
+        """dpsi/dp_k, a list of K."""
+        return [self.energy_density(H, self.unit(k)) for k in range(len(self.coefficient_names))]
 
     @traced
     def unit(self, k: int) -> list:

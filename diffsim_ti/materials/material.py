@@ -21,14 +21,20 @@ class Material(ABC):
     "default" serves the tetrahedra in none of the sets named.
 
     A subclass gives `law` and constant matrices `from_lame` (K x 2) from (mu, lam) to the law's K coefficients and
-    `to_lame` (2 x K) back.
+    `to_lame` (2 x K) back. One with numbers of its own lists them in `spellings`, in the order of the law's coefficients;
+    a spelling may begin with (youngs_modulus, poissons_ratio), which become mu and lam. `shapes` names the numbers that are
+    vectors, such as {"fibre": (3,)}: one of shape (3,) for all, or (num_tetrahedra, 3). `from_own` is a constant matrix from
+    a spelling's numbers, vectors spread out, to the coefficients. `lame` says the moduli of small strains (those of
+    the stiffest direction), which the limit of explicit steps and the stiffness of a barrier are taken from.
 
     Raises ValueError with rule, value and remedy.
     """
 
     spellings = (("youngs_modulus", "poissons_ratio"), ("mu", "lam"))
+    shapes: dict[str, tuple] = {}
     from_lame = np.eye(2)
-    to_lame = np.eye(2)
+    to_lame: np.ndarray | None = None
+    from_own: np.ndarray | None = None  # None: the coefficients are the numbers themselves
 
     def __init__(self, *numbers, J_floor: float | None = None, **named):
         if J_floor is not None and not 0 < J_floor < 1:
@@ -38,15 +44,15 @@ class Material(ABC):
         self.J_floor = None if J_floor is None else float(J_floor)
         self._numbers = self._spell(numbers, named)
         self._extra = ""
-        self.check({name: _all_values(name, number) for name, number in self._numbers.items()})
+        self.check({name: _all_values(name, number, self.shape_of(name)) for name, number in self._numbers.items()})
 
     def _spell(self, numbers: tuple, named: dict) -> dict:
         """{input name: number} in the order of the one spelling that fits."""
         usage = " or ".join(f"({', '.join(names)})" for names in self.spellings)
-        if len(numbers) > 2:
-            raise ValueError(
-                f"{self.name}: at most two numbers go without a name (E, nu), got {len(numbers)}; use {usage}"
-            )
+        most = len(self.spellings[0])
+        if len(numbers) > most:
+            count = "two numbers go without a name (E, nu)" if most == 2 else f"{most} numbers go without a name"
+            raise ValueError(f"{self.name}: at most {count}, got {len(numbers)}; use {usage}")
         given = dict(zip(self.spellings[0], numbers))
         for key, number in named.items():
             name = _ALIASES.get(key, key)
@@ -70,23 +76,30 @@ class Material(ABC):
         """Names of the numbers, as the user gave them: what a gradient can be asked for."""
         return tuple(self._numbers)
 
+    def shape_of(self, name: str) -> tuple:
+        """Shape of a number where it is uniform, () unless it is a vector."""
+        return self.shapes.get(name, ())
+
     @abstractmethod
     def law(self, precision: str):
         """The compile-time law, "f32" or "f64"; equal laws share compiled kernels."""
 
     def values(self, mesh) -> dict[str, np.ndarray]:
-        """The numbers in float64: shape () where uniform, else (mesh.num_tetrahedra,).
+        """The numbers in float64: shape () where uniform, else (mesh.num_tetrahedra,); vectors have an axis more.
 
         Raises ValueError for a wrong length, an unknown or overlapping set, or tetrahedra left out.
         """
-        values = {name: _on_mesh(name, number, mesh) for name, number in self._numbers.items()}
+        values = {name: _on_mesh(name, number, mesh, self.shape_of(name)) for name, number in self._numbers.items()}
         self.check(values)
         return values
 
     def described(self, mesh) -> list[Input]:
-        """The inputs of a body of this material: each number is one, or one per tetrahedron."""
-        unit = dict(poissons_ratio="")
-        return [Input(n, v, ((), ("tetrahedra",)), unit.get(n, "Pa")) for n, v in self.values(mesh).items()]
+        """The inputs of a body of this material: each number (or vector) is one, or one per tetrahedron."""
+        unit, out = dict(poissons_ratio=""), []
+        for name, value in self.values(mesh).items():
+            one = self.shape_of(name)
+            out.append(Input(name, value, (one, ("tetrahedra", *one)), unit.get(name, "Pa")))
+        return out
 
     def links(self) -> list[Link]:
         """From the inputs to what the law's kernels read: the links that write "coefficients"."""
@@ -104,14 +117,24 @@ class Material(ABC):
             check_range("poissons_ratio", values["poissons_ratio"], -1, 0.5, False, remedy)
         if "mu" in values:
             check_range("mu", values["mu"], 0, np.inf, False, "a stiffness [Pa]")
-            if values["mu"].shape == values["lam"].shape or 1 in (values["mu"].size, values["lam"].size):
+            lam = values.get("lam")
+            if lam is not None and (values["mu"].shape == lam.shape or 1 in (values["mu"].size, lam.size)):
                 bulk = moduli.bulk_modulus(values["mu"], values["lam"])
                 check_range("bulk modulus lam + 2/3 mu", bulk, 0, np.inf, False, "raise lam")
 
     def lame(self, values: dict) -> tuple[np.ndarray, np.ndarray]:
         """Small-strain (mu, lam) [Pa], each shape () or (num_tetrahedra,)."""
-        p = self.coefficients(values) @ self.to_lame.T
-        return p[..., 0], p[..., 1]
+        self.check(values)
+        if self.to_lame is not None:
+            p = self.coefficients(values) @ self.to_lame.T
+            return p[..., 0], p[..., 1]
+        if self._begins_with_E_and_nu():
+            return moduli.lame(*(np.asarray(values[name], np.float64) for name in self.inputs[:2]))
+        if {"mu", "lam"} <= {*self.inputs}:
+            return tuple(np.broadcast_arrays(*(np.asarray(values[name], np.float64) for name in ("mu", "lam"))))
+        raise NotImplementedError(
+            f"{self.name} does not say its moduli of small strains: write lame(self, values), which returns (mu, lam) [Pa]"
+        )
 
     def coefficients(self, values: dict) -> np.ndarray:
         """The law's coefficients [Pa]: shape (K,) if all values are uniform, else (num_tetrahedra, K)."""
@@ -130,22 +153,38 @@ class Material(ABC):
         A uniform value takes the sum over all tetrahedra.
         """
         adj = np.asarray(coefficients_adj, np.float64)
-        v = [np.asarray(values[name], np.float64) for name in self.inputs]
-        if self.inputs in Material.spellings:
-            parts = np.moveaxis(adj @ self.from_lame, -1, 0)
-            if self.inputs == Material.spellings[0]:
-                parts = moduli.lame_vjp(*v, *parts)
-        else:
-            parts = np.moveaxis(adj @ self.from_own, -1, 0)
-        return {n: np.sum(part) if x.ndim == 0 else part for n, x, part in zip(self.inputs, v, parts)}
+        v, matrix = self._columns(values), self._matrix()
+        parts = list(np.moveaxis(adj if matrix is None else adj @ matrix, -1, 0))
+        if self._begins_with_E_and_nu():
+            parts[:2] = moduli.lame_vjp(*v[:2], *parts[:2])
+        out, at = {}, 0
+        for name in self.inputs:
+            shape, value = self.shape_of(name), np.asarray(values[name])
+            own = [np.sum(x) if value.shape == shape else x for x in parts[at : at + int(np.prod(shape))]]
+            out[name], at = np.stack(own, -1).reshape(value.shape) if shape else own[0], at + len(own)
+        return out
+
+    def _begins_with_E_and_nu(self) -> bool:
+        return self.inputs[:2] == Material.spellings[0]
+
+    def _matrix(self) -> "np.ndarray | None":
+        return self.from_lame if self.inputs in Material.spellings else self.from_own
+
+    def _columns(self, values: dict) -> list:
+        """The components of all numbers, one after the other, each of shape () or (num_tetrahedra,)."""
+        columns = []
+        for name in self.inputs:
+            value, shape = np.asarray(values[name], np.float64), self.shape_of(name)
+            columns += [value[..., k] for k in range(shape[0])] if shape else [value]
+        return columns
 
     def _linear(self, values: dict, arguments: dict, derivative: bool = False) -> np.ndarray:
         """Coefficients of `arguments`, or their change for changes `arguments` at `values`."""
-        v, a = ([np.asarray(d[name], np.float64) for name in self.inputs] for d in (values, arguments))
-        matrix = self.from_lame if self.inputs in Material.spellings else self.from_own
-        if self.inputs == Material.spellings[0]:
-            a = moduli.lame_jvp(*v, *a) if derivative else moduli.lame(*a)
-        return np.stack(np.broadcast_arrays(*a), -1) @ matrix.T
+        v, a = self._columns(values), self._columns(arguments)
+        if self._begins_with_E_and_nu():
+            a[:2] = moduli.lame_jvp(*v[:2], *a[:2]) if derivative else moduli.lame(*a[:2])
+        numbers, matrix = np.stack(np.broadcast_arrays(*a), -1), self._matrix()
+        return numbers if matrix is None else numbers @ matrix.T
 
     def __repr__(self) -> str:
         numbers = ", ".join(f"{name}={_short(number)}" for name, number in self._numbers.items())
@@ -181,43 +220,49 @@ def check_range(name: str, value, low: float, high: float, low_included: bool, r
         raise ValueError(f"{name} must {rule}, got {np.ravel(value)[first]:g}{where}: {remedy}")
 
 
-def _number(name: str, number) -> np.ndarray:
+def _number(name: str, number, shape: tuple) -> np.ndarray:
     try:
         value = np.asarray(number)
         if value.dtype.kind not in "iuf":
             raise TypeError
     except (TypeError, ValueError):
         raise ValueError(f"{name} must be a number, an array of numbers or a dict of numbers, got {number!r}") from None
-    if value.ndim > 1:
-        raise ValueError(f"{name} must be one number or one per tetrahedron, got an array of shape {value.shape}")
+    if value.ndim not in (len(shape), len(shape) + 1) or value.shape[value.ndim - len(shape) :] != shape:
+        one = f"{shape[0]} numbers or {shape[0]}" if shape else "one number or one"
+        raise ValueError(f"{name} must be {one} per tetrahedron, got an array of shape {value.shape}")
     return value.astype(np.float64)
 
 
-def _all_values(name: str, number) -> np.ndarray:
-    """Every number given, for checks that need no mesh; a dict as an array of its numbers."""
-    if not isinstance(number, dict):
-        return _number(name, number)
-    for key, value in number.items():
-        if _number(f"{name}[{key!r}]", value).ndim:
-            raise ValueError(f"{name}[{key!r}] must be one number, got shape {np.shape(value)}")
-    if not number:
-        raise ValueError(f'{name}: the dict is empty; name tetrahedron sets, or give a number for "default"')
-    return np.array([float(value) for value in number.values()])
-
-
-def _on_mesh(name: str, number, mesh) -> np.ndarray:
-    if isinstance(number, dict):
-        return _from_sets(name, number, mesh)
-    value = _number(name, number)
-    if value.ndim and value.shape != (mesh.num_tetrahedra,):
-        raise ValueError(
-            f"{name}: expected one number or one per tetrahedron, shape ({mesh.num_tetrahedra},), got shape {value.shape}"
-        )
+def _one(name: str, number, shape: tuple) -> np.ndarray:
+    """The number of a tetrahedron set."""
+    value = _number(name, number, shape)
+    if value.shape != shape:
+        expected = f"{shape[0]} numbers" if shape else "one number"
+        raise ValueError(f"{name} must be {expected}, got shape {np.shape(number)}")
     return value
 
 
-def _from_sets(name: str, numbers: dict, mesh) -> np.ndarray:
-    value = np.full(mesh.num_tetrahedra, float(numbers.get("default", np.nan)))
+def _all_values(name: str, number, shape: tuple) -> np.ndarray:
+    """Every number given, for checks that need no mesh; a dict as an array of its numbers."""
+    if not isinstance(number, dict):
+        return _number(name, number, shape)
+    if not number:
+        raise ValueError(f'{name}: the dict is empty; name tetrahedron sets, or give a number for "default"')
+    return np.array([_one(f"{name}[{key!r}]", value, shape) for key, value in number.items()])
+
+
+def _on_mesh(name: str, number, mesh, shape: tuple) -> np.ndarray:
+    if isinstance(number, dict):
+        return _from_sets(name, number, mesh, shape)
+    value, whole = _number(name, number, shape), (mesh.num_tetrahedra, *shape)
+    if value.shape not in (shape, whole):
+        one = f"{shape[0]} numbers or {shape[0]}" if shape else "one number or one"
+        raise ValueError(f"{name}: expected {one} per tetrahedron, shape {whole}, got shape {value.shape}")
+    return value
+
+
+def _from_sets(name: str, numbers: dict, mesh, shape: tuple) -> np.ndarray:
+    value = np.full((mesh.num_tetrahedra, *shape), np.asarray(numbers.get("default", np.nan), np.float64))
     owner = np.zeros(mesh.num_tetrahedra, np.int64)  # 1 + number of the set that a tetrahedron took its value from
     names = [key for key in numbers if key != "default"]
     for rank, key in enumerate(names, 1):
@@ -230,7 +275,7 @@ def _from_sets(name: str, numbers: dict, mesh) -> np.ndarray:
             other = names[owner[first] - 1]
             raise ValueError(f"{name}: tetrahedron {first} is in both {other!r} and {key!r}; make the sets disjoint")
         owner[members] = rank
-        value[members] = float(numbers[key])
+        value[members] = np.asarray(numbers[key], np.float64)
     if "default" not in numbers and not owner.all():
         left_out = np.flatnonzero(owner == 0)
         raise ValueError(

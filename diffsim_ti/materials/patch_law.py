@@ -18,6 +18,19 @@ class PatchLaw(Law):
 
     base: Law
 
+    def __post_init__(self):
+        if self.base.reads != ("H",):
+            raise ValueError(
+                f'volume="patches" averages energies, but {type(self.base).__name__} reads {", ".join(self.base.reads)}; '
+                'take volume="tetrahedra"'
+            )
+        if not self.base.has_dilatation:
+            name = type(self.base).__name__
+            raise ValueError(
+                f'volume="patches" averages the part lam/2 theta^2 of an energy, but {name} does not say what its theta is; '
+                'write theta(H) and make lam its last coefficient, or take volume="tetrahedra"'
+            )
+
     @property
     def coefficient_names(self) -> tuple:
         return self.base.coefficient_names
@@ -55,3 +68,8 @@ class PatchLaw(Law):
         """At a fixed pressure; the products are those of p'."""
         dP, products = self.base.stress_differential_and_products(H, dH, q[:-1])
         return dP + self.base.dilatation_gradient_differential(H, dH) * q[-1], products
+
+    @traced
+    def stress_jvp(self, H, dH, q, dq):
+        by_rest = self.base.stress_change(H, q[:-1], dq[:-1])
+        return self.stress_differential(H, dH, q) + by_rest + self.base.dilatation_gradient(H) * dq[-1]

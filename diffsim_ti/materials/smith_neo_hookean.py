@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 import taichi as ti
 
+from diffsim_ti.differentiation.functions import x_minus_log1p_value
 from diffsim_ti.materials.calculus.invariants import InvariantLaw
-from diffsim_ti.materials.calculus.logarithm import x_minus_log1p
 from diffsim_ti.materials.material import Material
 
 
@@ -20,7 +20,7 @@ class SmithNeoHookeanLaw(InvariantLaw):
     @ti.func
     def psi(self, j, s, q, p):
         x = self.real(0.25) * (s + 2 * j)
-        return self.real(0.5) * (p[0] * (self.real(0.75) * s + x_minus_log1p(x, self.fp)) + p[1] * j * j)
+        return self.real(0.5) * (p[0] * (self.real(0.75) * s + x_minus_log1p_value(x, self.fp)) + p[1] * j * j)
 
     @ti.func
     def slopes(self, j, s, q, p):

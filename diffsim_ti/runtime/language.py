@@ -3,6 +3,7 @@
 from types import SimpleNamespace
 
 from taichi.lang import impl
+from taichi.types import vector
 
 
 def traced(function):
@@ -19,6 +20,30 @@ def let(value):
 def at(array, *index):
     """array[index] in a traced function."""
     return impl.subscript(None, array, *index)
+
+
+def num_lanes(value) -> int:
+    """How many lanes a number of a kernel has, 0 if it is a scalar."""
+    return value.get_shape()[0] if value.is_tensor() else 0
+
+
+def _in_lanes(numbers: list):
+    dtype = impl.Expr(numbers[0]).ptr.get_rvalue_type()
+    return let(vector(len(numbers), dtype)(*numbers))
+
+
+def each_lane(function, *values):
+    """function(*values), lane by lane where values have lanes: Taichi has no vector code for log, exp and powers."""
+    lanes = max(map(num_lanes, values))
+    if not lanes:
+        return let(function(*values))
+    return _in_lanes([let(function(*(at(v, k) if num_lanes(v) else v for v in values))) for k in range(lanes)])
+
+
+def spread(value, like):
+    """A number with as many lanes as another one."""
+    lanes = 0 if num_lanes(value) else num_lanes(like)
+    return _in_lanes([value] * lanes) if lanes else value
 
 
 @traced

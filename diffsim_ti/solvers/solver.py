@@ -41,6 +41,11 @@ class Solver(ABC):
         self.parallel, self.allow_unstable, self.check_start = parallel, allow_unstable, check_start
         runtime.check_host_init()
         runtime.check_backend(scene.precision)
+        if not self.explicit and scene.law.reads != ("H",):
+            raise ValueError(
+                f"{type(scene.law).__name__} reads {', '.join(scene.law.reads)}, but {type(self).__name__} knows forces of "
+                "displacements only; take SemiImplicitSolver or VelocityVerletSolver"
+            )
         self._tight: stability.StepLimit | None = None
         self._deformed: bool | None = None
         if self.explicit and check_start and not allow_unstable:

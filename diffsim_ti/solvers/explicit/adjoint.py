@@ -23,10 +23,11 @@ class ExplicitAdjoint:
         self.features = a.features(density, shape)
         self.numbers = Adjoint(a, self.features, more=OF_STEPS)
         self.u, self.v, self.w = (runtime.array(a.vector, 1, a.num_vertices) for _ in range(3))
-        self.whole = SimpleNamespace(
-            u=runtime.array(a.vector, 1, a.num_vertices)
-        )  # u with what is still to be gathered
         self.corner = runtime.array(a.vector, *a.corner.shape)  # products with the stiffness, still to be gathered
+        rates = "H_dot" in a.law.reads
+        self.rate_corner = runtime.array(a.vector, *(a.corner.shape if rates else (1,)))
+        whole = [runtime.array(a.vector, 1, a.num_vertices) for _ in range(1 + rates)]
+        self.whole = SimpleNamespace(u=whole[0], v=whole[-1] if rates else self.v)  # with what is still to be gathered
         moving = self.features.moving
         self.felt = runtime.array(a.vector, 2 * moving, a.num_vertices if moving else 1)  # of paths, by each vertex
         self.frames = FrameArrays.of(a, *workspace.frames.frames_u.shape)
@@ -94,7 +95,7 @@ class ExplicitAdjoint:
         self._gather(self)
 
     def _gather(self, into) -> None:
-        """Add to `into.u` what the last pass handed to the corners of tetrahedra."""
+        """Add to `into.u` and `into.v` what the last pass handed to the corners of tetrahedra."""
         ws = self.ws
         gather = ws.bound(ws.kernels(self.features).finish_vjp, adjoint=(into, self))
         gather(num_vertices=ws.arrays.num_vertices)
@@ -105,14 +106,16 @@ class ExplicitAdjoint:
         Held vertices have no velocity.
         """
         copy_slot(self.u, 0, self.whole.u, 0)
+        if self.whole.v is not self.v:
+            copy_slot(self.v, 0, self.whole.v, 0)
         self._gather(self.whole)
-        u, v = (runtime.fetch(x)[0].astype(np.float64) for x in (self.whole.u, self.v))
+        u, v = (runtime.fetch(x)[0].astype(np.float64) for x in (self.whole.u, self.whole.v))
         v[self.ws.arrays.fixed] = 0
         return float(np.linalg.norm(u)), float(np.linalg.norm(v))
 
     def scale(self, factor: float) -> None:
         """Multiply the running adjoint (clipping; the pending gather is scaled with it)."""
-        for x in (self.u, self.v, self.corner):
+        for x in (self.u, self.v, self.corner, self.rate_corner):
             runtime.fill(x, runtime.fetch(x) * factor)
 
     def collect(self, state: bool = True) -> Derived:

@@ -13,6 +13,7 @@ from diffsim_ti.state.schedule import pass_at, reversed_pass
 A = ti.template()
 STATE = dict(u="vectors2", v="vectors2", f="vectors2", frames_u="vectors2", frames_v="vectors2", seen="scalars2")
 CHANGE = dict(u="vectors2", v="vectors2", frames_u="vectors2", frames_v="vectors2")  # of a state, or its adjoint
+CORNERS = dict(corner="vectors", rate_corner="vectors")  # adjoints of u and v, still to be gathered
 PLAN = dict(ints="ints2", floats="scalars2")  # the tables of the passes, from pass `window` on
 NUMBERS = dict.fromkeys(("num_items", "num_vertices", "window", "first", "count", "base"), "int")
 
@@ -35,14 +36,14 @@ class ExplicitKernels:
         """Slot 0 holds the state before pass `base`; with stride 1 each pass writes the next slot, and its forces."""
         if ti.static(self.parallel):
             for e in range(plan.num_items):
-                self.element.forces(e, scene, state.u, (plan.first - plan.base) * plan.stride, scene.corner)
+                self.element.forces(e, scene, state.u, (plan.first - plan.base) * plan.stride, scene.corner, state.v)
             for i in range(plan.num_vertices):
                 self.vertex.step(i, plan.first, pass_at(table, plan.first - plan.window), scene, state, plan)
         else:
             ti.loop_config(serialize=True)
             for j in range(plan.first, plan.first + plan.count):
                 for e in range(plan.num_items):
-                    self.element.forces(e, scene, state.u, (j - plan.base) * plan.stride, scene.corner)
+                    self.element.forces(e, scene, state.u, (j - plan.base) * plan.stride, scene.corner, state.v)
                 now = pass_at(table, j - plan.window)
                 for i in range(plan.num_vertices):
                     self.vertex.step(i, j, now, scene, state, plan)
@@ -58,7 +59,8 @@ class ExplicitKernels:
     def passes_jvp(self, scene: A, state: A, tangent: A, table: A, plan: A):
         ti.loop_config(serialize=not self.parallel)
         for e in range(plan.num_items):
-            self.element.forces_jvp(e, scene, state.u, plan.first - plan.base, tangent.u, scene.corner, tangent)
+            s = plan.first - plan.base
+            self.element.forces_jvp(e, scene, state.u, s, tangent.u, scene.corner, tangent, state.v, tangent.v)
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.num_vertices):
             now = pass_at(table, plan.first - plan.window)
@@ -73,9 +75,10 @@ class ExplicitKernels:
 
     @ti.func
     def elements_vjp(self, e, j, scene: A, state: A, adjoint: A, plan: A):
-        self.element.forces_vjp(e, scene, state.u, j - plan.base, adjoint.w, adjoint.corner, adjoint)
+        s = j - plan.base
+        self.element.forces_vjp(e, scene, state.u, s, adjoint.w, adjoint.corner, adjoint, state.v, adjoint.rate_corner)
         if ti.static(self.vertex.features.shape):
-            self.element.shape_vjp(e, scene, state.u, j - plan.base, adjoint.w, adjoint)
+            self.element.shape_vjp(e, scene, state.u, s, adjoint.w, adjoint, state.v)
 
     @ti.func
     def passes_vjp(self, scene: A, state: A, adjoint: A, table: A, plan: A):
@@ -109,7 +112,7 @@ class ExplicitKernels:
         halt: the pass at whose state the sweep stops, between its two kicks; kick: only the kick before the state.
         """
         numbers = dict.fromkeys(("num_passes", "halt", "kick"), "int")
-        own = CHANGE | ADJOINT | OF_STEPS | dict(w="vectors2", corner="vectors", felt="vectors2")
+        own = CHANGE | ADJOINT | OF_STEPS | dict(w="vectors2", felt="vectors2") | CORNERS
         return self._kernel("step_vjp", self.passes_vjp, dict(state=STATE, adjoint=own), **numbers)
 
     @ti.func
@@ -117,11 +120,13 @@ class ExplicitKernels:
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.num_vertices):
             adjoint.u[0, i] = adjoint.u[0, i] + self.element.gather(i, scene, adjoint.corner)
+            if ti.static(self.element.reads_rates):
+                adjoint.v[0, i] = adjoint.v[0, i] + self.element.gather(i, scene, adjoint.rate_corner)
 
     @cached_property
     def finish_vjp(self) -> Kernel:
         """Add the gather that the first pass of the run has left."""
-        own = dict(scene=SCENE, adjoint=dict(u="vectors2", corner="vectors"))
+        own = dict(scene=SCENE, adjoint=dict(u="vectors2", v="vectors2") | CORNERS)
         return Kernel("finish_vjp", self.gather_rest, self.vertex.law.precision, own, dict(num_vertices="int"))
 
     def _kernel(self, name: str, body, arrays: dict, **numbers) -> Kernel:

@@ -183,6 +183,8 @@ class KickDrift:
         p, q = adjoint.u[0, i], adjoint.v[0, i]
         if j < plan.num_passes - 1:
             p += self.element.gather(i, scene, adjoint.corner)
+            if ti.static(self.element.reads_rates):
+                q += self.element.gather(i, scene, adjoint.rate_corner)
         # prescribed motion: the state after the pass comes from the motion alone
         k = self.prescribed(i, scene)
         if ti.static(self.features.motion):

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 import taichi as ti
 
+from diffsim_ti.differentiation import Graph
 from diffsim_ti.inputs import NOT_NEGATIVE, Input
 from diffsim_ti.inputs.description import length_per_step
 from diffsim_ti.materials.calculus.tensor import sum_of
 from diffsim_ti.runtime import at, let, traced
 from diffsim_ti.terms.described import positive
-from diffsim_ti.terms.graph import Graph
 from diffsim_ti.terms.gravity import Gravity
 from diffsim_ti.terms.motion import sampled
 from diffsim_ti.terms.obstacles import barrier, friction

@@ -1,0 +1,58 @@
+"""Functions of the numbers of a graph, for formulas written in them; + - * / and ** are Python's."""
+
+import taichi as ti
+
+from diffsim_ti.differentiation.graph import Number
+from diffsim_ti.runtime import each_lane
+
+
+def sqrt(x: Number) -> Number:
+    """The root; its derivative is zero where x is."""
+    return x.graph.sqrt(x)
+
+
+def log(x: Number) -> Number:
+    """The natural logarithm; near x = 1 `x_minus_log1p` keeps more digits."""
+    return x.graph.log(x)
+
+
+def exp(x: Number) -> Number:
+    """e^x"""
+    return x.graph.exp(x)
+
+
+def where(condition, a, b) -> Number:
+    """a where the condition (x > y or x < y) holds, else b; both must be finite, one of them a Number."""
+    return (a if isinstance(a, Number) else b).graph.select(condition, a, b)
+
+
+def maximum(a: Number, b) -> Number:
+    """The larger of the two; `a` is a Number."""
+    return a.graph.maximum(a, b)
+
+
+def minimum(a: Number, b) -> Number:
+    """The smaller of the two; `a` is a Number."""
+    return a.graph.minimum(a, b)
+
+
+def x_minus_log1p(x: Number) -> Number:
+    """x - log(1 + x) for x > -1, with all its digits near zero: what logarithmic energies are made of."""
+    fp = x.graph.fp
+    value = each_lane(lambda one: x_minus_log1p_value(one, fp), x.value)
+    return x.graph.function(value, (x, lambda: x / (1 + x)))
+
+
+@ti.func
+def x_minus_log1p_value(x, fp: ti.template()):
+    """x - log(1 + x) with all its digits: plain subtraction loses the leading x^2 / 2, and Taichi has no log1p."""
+    y = x - ti.log(1 + x)
+    if ti.abs(x) * 5 < 1:
+        # log(1 + x) = 2 artanh(z) = 2 z (1 + w/3 + w^2/5 + ...); eight terms leave 1e-17 at |x| = 1/5
+        z = x / (2 + x)
+        w = z * z
+        series = 0 * x
+        for k in ti.static(range(8)):
+            series = ti.cast(1 / (17 - 2 * k), fp) + w * series
+        y = z * (x - 2 * w * series)
+    return y

@@ -1,0 +1,91 @@
+"""What a kernel works on at a time: eight tetrahedra in lanes, or one; how their numbers are read and written.
+
+Data of tetrahedra lie in blocks of eight. On the CPU a block is worked on at once, each number of a formula being a
+vector of eight lanes that becomes vector instructions; elsewhere, and for laws that need a loop, tetrahedra go one by one
+over the same data. Vectors of vertices have four components (the last is zero), since whole loads and stores of four are
+what vector units do well.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import taichi as ti
+
+from diffsim_ti.runtime import LANES, at, let
+
+
+@dataclass(frozen=True)
+class Items:
+    """Reading and writing of items in a float type."""
+
+    fp: object
+
+    @cached_property
+    def vector(self):
+        return ti.types.vector(4, self.fp)
+
+
+class Block(Items):
+    """Eight tetrahedra at once: item b is block b."""
+
+    @cached_property
+    def lanes(self):
+        return ti.types.vector(LANES, self.fp)
+
+    def broadcast(self, number):
+        return let(self.lanes(*[number] * LANES))
+
+    def numbers(self, array, first: int, count: int, rows: int, item):
+        """`count` numbers from `first` on, of the `rows` that each block has."""
+        return [let(at(array, rows * item + first + k)) for k in range(count)]
+
+    def corners(self, vectors, slot, tets, item):
+        """[a][d]: component d of the vector at corner a."""
+        out = []
+        for a in range(4):
+            whole = [let(at(vectors, slot, at(tets, 4 * LANES * item + LANES * a + lane))) for lane in range(LANES)]
+            out.append([let(self.lanes(*(at(w, d) for w in whole))) for d in range(3)])
+        return out
+
+    def store(self, corner, item, forces, zero):
+        for a in range(4):
+            for lane in range(LANES):
+                force = self.vector(*(at(forces[a][d], lane) for d in range(3)), zero)
+                at(corner, 4 * LANES * item + 4 * lane + a)._assign(force)
+
+    def put(self, array, rows: int, item, first, numbers):
+        for k, number in enumerate(numbers):
+            at(array, rows * item + first + k)._assign(number)
+
+    def add(self, array, rows: int, item, numbers):
+        for k, number in enumerate(numbers):
+            target = at(array, rows * item + k)
+            target._assign(target + number)
+
+
+class Single(Items):
+    """One tetrahedron: item e is tetrahedron e, a lane of its block."""
+
+    def broadcast(self, number):
+        return number
+
+    def numbers(self, array, first: int, count: int, rows: int, item):
+        return [let(at(at(array, rows * (item // LANES) + first + k), item % LANES)) for k in range(count)]
+
+    def corners(self, vectors, slot, tets, item):
+        block, lane = item // LANES, item % LANES
+        whole = [let(at(vectors, slot, at(tets, 4 * LANES * block + LANES * a + lane))) for a in range(4)]
+        return [[let(at(w, d)) for d in range(3)] for w in whole]
+
+    def store(self, corner, item, forces, zero):
+        for a in range(4):
+            at(corner, 4 * item + a)._assign(self.vector(*forces[a], zero))
+
+    def put(self, array, rows: int, item, first, numbers):
+        for k, number in enumerate(numbers):
+            at(at(array, rows * (item // LANES) + first + k), item % LANES)._assign(number)
+
+    def add(self, array, rows: int, item, numbers):
+        for k, number in enumerate(numbers):
+            target = at(at(array, rows * (item // LANES) + k), item % LANES)
+            target._assign(target + number)

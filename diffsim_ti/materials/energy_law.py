@@ -1,0 +1,147 @@
+"""Laws written by their energy alone."""
+
+from dataclasses import dataclass
+
+from diffsim_ti.differentiation import Graph, Number
+from diffsim_ti.materials.calculus.tensor import Tensor
+from diffsim_ti.materials.law import Law
+from diffsim_ti.runtime import spread, traced
+
+
+@dataclass(frozen=True)
+class EnergyLaw(Law):
+    """A law that writes `psi(H, p)`; stress, differential and derivatives by the coefficients follow from it.
+
+    H (a `Tensor` of the displacement gradient, F = I + H) and p (a list of the coefficients named by `coefficient_names`)
+    are made of `Number`s, which know + - * / ** and the functions of `diffsim_ti.differentiation`, and take any Python
+    numbers as constants. Coefficients may enter in any way: factors, exponents, limits, the components of a direction.
+    `calculus.tensor` has what an energy is made of: `invariants(H)` is accurate near rest, where F - I is.
+
+    volume="patches" needs `theta(H)`, and the last coefficient as the factor of theta^2 / 2 and nowhere else.
+
+    The graph is Griewank, Walther, Evaluating Derivatives, ch. 3 and 5, doi:10.1137/1.9780898717761.
+    """
+
+    def __post_init__(self):
+        if self.reads not in (("H",), ("H", "H_dot")):
+            raise ValueError(f'{type(self).__name__}: reads must be ("H",) or ("H", "H_dot"), got {self.reads}')
+
+    def psi(self, H: Tensor, p: list) -> Number:
+        """psi [J/m^3], zero at rest."""
+        raise NotImplementedError(f"{type(self).__name__} writes psi(H, p)")
+
+    def dissipation(self, H: Tensor, H_dot: Tensor, p: list) -> Number:
+        """phi [W/m^3] of a law that reads ("H", "H_dot"): its stress is dpsi/dF + dphi/dF_dot, F_dot = H_dot.
+
+        For explicit solvers, which take the velocity before the kick; their limit of steps does not know phi. What shows
+        stresses shows those of psi.
+        """
+        raise NotImplementedError(f"{type(self).__name__} reads H_dot: it writes dissipation(H, H_dot, p)")
+
+    def theta(self, H: Tensor) -> Number:
+        """The change of volume of which the last coefficient resists theta^2 / 2 [-]."""
+
+    @property
+    def has_dilatation(self) -> bool:
+        return type(self).theta is not EnergyLaw.theta
+
+    # ---- recording --------------------------------------------------------------------------------------------------
+
+    @traced
+    def _record(self, H, p):
+        """(graph, leaves of p, psi)"""
+        g = Graph(self.fp)
+        numbers = [g.leaf(x) for x in p]
+        return g, numbers, self.psi(Tensor(g.leaf(x) for x in H.numbers), numbers)
+
+    @traced
+    def _record_stress(self, x, p):
+        """(graph, leaves of x and p, P); x holds H alone, for the stress of psi, or H and H_dot."""
+        g = Graph(self.fp)
+        read, numbers = [Tensor(g.leaf(number) for number in one.numbers) for one in x], [g.leaf(c) for c in p]
+        P = g.gradient(self.psi(read[0], numbers), read[0].numbers)
+        if len(read) > 1:
+            viscous = g.gradient(self.dissipation(*read, numbers), read[1].numbers)
+            P = [a + b for a, b in zip(P, viscous)]
+        return g, [*_numbers(read), *numbers], P
+
+    @traced
+    def _record_dilatation(self, H):
+        g = Graph(self.fp)
+        h = Tensor(g.leaf(x) for x in H.numbers)
+        theta = self.theta(h)
+        return g, h.numbers, theta, g.gradient(theta, h.numbers)
+
+    # ---- what kernels call ------------------------------------------------------------------------------------------
+
+    @traced
+    def energy_density(self, H, p):
+        return spread(self._record(H, p)[2].value, H[0, 0])
+
+    @traced
+    def energy_by_coefficients(self, H, p):
+        g, numbers, psi = self._record(H, p)
+        return _spread(g.reverse([(psi, g.one())], numbers), H)
+
+    @traced
+    def stress_at(self, x, p):
+        return _tensor([number.value for number in self._record_stress(x, p)[2]], x[0])
+
+    @traced
+    def stress_jvp_at(self, x, dx, p, dp):
+        g, leaves, P = self._record_stress(x, p)
+        return _tensor(g.forward([*zip(leaves, [*_numbers(dx), *dp])], P), x[0])
+
+    @traced
+    def stress_vjp_at(self, x, W, p):
+        g, leaves, P = self._record_stress(x, p)
+        by = _spread(g.reverse([*zip(P, W.numbers)], leaves), x[0])
+        return [Tensor(by[9 * k : 9 * k + 9]) for k in range(len(x))], by[9 * len(x) :]
+
+    @traced
+    def stress(self, H, p):
+        return self.stress_at([H], p)
+
+    @traced
+    def stress_differential(self, H, dH, p):
+        return self.stress_jvp_at([H], [dH], p, [])
+
+    @traced
+    def stress_change(self, H, p, dp):
+        g, leaves, P = self._record_stress([H], p)
+        return _tensor(g.forward([*zip(leaves[9:], dp)], P), H)
+
+    @traced
+    def stress_jvp(self, H, dH, p, dp):
+        return self.stress_jvp_at([H], [dH], p, dp)
+
+    @traced
+    def stress_differential_and_products(self, H, dH, p):
+        (dP,), products = self.stress_vjp_at([H], dH, p)  # d2psi/dF2 is symmetric
+        return dP, products
+
+    @traced
+    def dilatation(self, H):
+        return spread(self._record_dilatation(H)[2].value, H[0, 0])
+
+    @traced
+    def dilatation_gradient(self, H):
+        return _tensor([x.value for x in self._record_dilatation(H)[3]], H)
+
+    @traced
+    def dilatation_gradient_differential(self, H, dH):
+        g, h, _, gradient = self._record_dilatation(H)
+        return _tensor(g.forward([*zip(h, dH.numbers)], gradient), H)
+
+
+def _numbers(tensors) -> list:
+    return [number for one in tensors for number in one.numbers]
+
+
+def _spread(numbers: list, H) -> list:
+    """With as many lanes as H has: what does not depend on H or p is a single constant."""
+    return [spread(x, H[0, 0]) for x in numbers]
+
+
+def _tensor(numbers: list, H) -> Tensor:
+    return Tensor(_spread(numbers, H))

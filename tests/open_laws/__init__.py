@@ -1,0 +1,1 @@
+"""Materials as a user would write them, outside the package, one file each."""

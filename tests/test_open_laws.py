@@ -1,0 +1,364 @@
+"""Laws of users, outside the package: exponents, fibres, energies alone, against mpmath and every gate of gradients."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from types import SimpleNamespace
+
+import mpmath as mp
+import numpy as np
+import pytest
+import taichi as ti
+from open_laws.fibres import FibreTissue
+from open_laws.gent import Gent
+from open_laws.power_law import Knowles
+from open_laws.viscous import ViscousRubber
+
+import diffsim_ti as ds
+from diffsim_ti import runtime, verify
+from diffsim_ti.differentiation import x_minus_log1p
+from diffsim_ti.elements.items import Block, Single
+from diffsim_ti.materials import EnergyLaw
+from diffsim_ti.materials.calculus.tensor import Tensor, invariants
+from diffsim_ti.runtime import traced
+
+COUNT = 8  # states, one for each lane
+
+# ---- the same energies in mpmath, written from the papers -------------------------------------------------------------
+
+
+def squares(A):
+    return mp.fsum(x * x for x in A)
+
+
+def gent(F, mu, limit, lam):
+    J, I1 = mp.det(F), squares(F)
+    return -mu / 2 * limit * mp.log(1 - (I1 - 3) / limit) - mu * mp.log(J) + lam / 2 * (J - 1) ** 2
+
+
+def knowles(F, mu, lam, b, n):
+    J, I1 = mp.det(F), squares(F)
+    return mu / (2 * b) * ((1 + b / n * (I1 - 3 - 2 * (J - 1))) ** n - 1) + lam / 2 * (J - 1) ** 2
+
+
+def tissue(F, mu, lam, k1, k2, *a):
+    J, a = mp.det(F), mp.matrix(a)
+    e = max(squares(F * a) / squares(a) - 1, mp.mpf(0))
+    matrix = mu / 2 * (squares(F) - 3) - mu * mp.log(J) + lam / 2 * (J - 1) ** 2
+    return matrix + k1 / (2 * k2) * (mp.exp(k2 * e**2) - 1)
+
+
+OWN = {  # class, the energy again, one set of coefficients
+    "gent": (Gent, gent, [2.0, 6.0, 3.0]),
+    "knowles": (Knowles, knowles, [2.0, 3.0, 0.5, 0.7]),
+    "tissue": (FibreTissue, tissue, [2.0, 3.0, 1.5, 0.8, 1.0, 0.5, -0.3]),
+}
+every_own = pytest.mark.parametrize("name", OWN)
+
+
+def states() -> tuple[np.ndarray, np.ndarray]:
+    """Displacement gradients up to 0.4, one of them at rest, and directions."""
+    rng = np.random.default_rng(5)
+    H, dH = rng.uniform(-0.25, 0.25, (COUNT, 3, 3)), rng.standard_normal((COUNT, 3, 3))
+    H[0] = 0
+    H[1] = np.diag([0.4, -0.1, -0.1])
+    return H, dH
+
+
+@lru_cache(maxsize=None)
+def exact(name: str) -> list:
+    """The FUNCTIONS at each state by differences with fifty digits."""
+    _, psi, p = OWN[name]
+    return [exact_at(psi, H, dH, p, changes(p)) for H, dH in zip(*states())]
+
+
+def changes(p) -> np.ndarray:
+    return np.random.default_rng(6).standard_normal(len(p))
+
+
+def exact_at(psi, H, dH, p, dp) -> dict:
+    h = mp.mpf(10) ** -15
+
+    def energy(x, q):
+        return psi(mp.eye(3) + mp.matrix(x), *q)
+
+    def slope(f):
+        return (f(h) - f(-h)) / (2 * h)
+
+    def along(x, q, E):
+        return slope(lambda t: energy(x + t * E, q))
+
+    with mp.workdps(50):
+        to_mp = np.vectorize(mp.mpf, otypes=[object])
+        x, dx, q, dq, units, basis = (to_mp(a) for a in (H, dH, p, dp, np.eye(9).reshape(9, 3, 3), np.eye(len(p))))
+        dP = [slope(lambda t, E=E: along(x + t * dx, q, E)) for E in units]
+        by_p = [slope(lambda t, E=E: along(x, q + t * dq, E)) for E in units]
+        out = dict(
+            psi=[energy(x, q)],
+            P=[along(x, q, E) for E in units],
+            dP=dP,
+            by_p=by_p,
+            jvp=[a + b for a, b in zip(dP, by_p)],
+            products=dP + [slope(lambda t, e=e: along(x, q + t * e, dx)) for e in basis],
+            psi_by_p=[slope(lambda t, e=e: energy(x, q + t * e)) for e in basis],
+        )
+        return {key: np.array(value, dtype=np.float64) for key, value in out.items()}
+
+
+# ---- a law evaluated, one state at a time or eight in lanes ----------------------------------------------------------
+
+
+FUNCTIONS = {  # what a law offers, as numbers
+    "psi": lambda law, h, dh, q, dq: [law.energy_density(h, q)],
+    "P": lambda law, h, dh, q, dq: law.stress(h, q).numbers,
+    "dP": lambda law, h, dh, q, dq: law.stress_differential(h, dh, q).numbers,
+    "by_p": lambda law, h, dh, q, dq: law.stress_change(h, q, dq).numbers,
+    "jvp": lambda law, h, dh, q, dq: law.stress_jvp(h, dh, q, dq).numbers,
+    "products": lambda law, h, dh, q, dq: numbers_of(*law.stress_differential_and_products(h, dh, q)),
+    "psi_by_p": lambda law, h, dh, q, dq: law.energy_by_coefficients(h, q),
+}
+
+
+def numbers_of(dP, products):
+    return [*dP.numbers, *products]
+
+
+@lru_cache(maxsize=None)
+def kernel(law, name, in_lanes: bool):
+    items, K = (Block if in_lanes else Single)(law.fp), len(law.coefficient_names)
+    blocks = ti.types.ndarray(ti.types.vector(8, law.fp), 1)
+
+    @traced
+    def numbers(e, H, dH, p, dp, out):
+        h, dh = (Tensor(items.numbers(a, 0, 9, 9, e)) for a in (H, dH))
+        q, dq = (items.numbers(a, 0, K, K, e) for a in (p, dp))
+        items.put(out, 9 + K, e, 0, FUNCTIONS[name](law, h, dh, q, dq))
+
+    @ti.kernel
+    def evaluate(H: blocks, dH: blocks, p: blocks, dp: blocks, out: blocks, n: ti.i32):
+        ti.loop_config(serialize=True)
+        for e in range(n):
+            numbers(e, H, dH, p, dp, out)
+
+    return evaluate
+
+
+def evaluate(law, name, H, dH, p, dp, in_lanes) -> np.ndarray:
+    """One of the FUNCTIONS at eight states, shape (8, 9 + K), zero where it has no numbers."""
+    lanes = ti.types.vector(8, law.fp)
+    rows = [x.reshape(COUNT, -1).T for x in (H, dH, np.tile(p, (COUNT, 1)), np.tile(dp, (COUNT, 1)))]
+    arrays, out = [runtime.upload(x, lanes) for x in rows], runtime.upload(np.zeros((9 + len(p), 8)), lanes)
+    runtime.Launch(kernel(law, name, in_lanes), *arrays, out, vectorized=in_lanes)(1 if in_lanes else COUNT)
+    return runtime.fetch(out).T.astype(np.float64)
+
+
+@pytest.mark.parametrize("precision, in_lanes", [("f64", True), ("f32", False)], ids=["f64-lanes", "f32-single"])
+@every_own
+def test_everything_follows_from_the_energy(name, precision, in_lanes):
+    material, _, p = OWN[name]
+    H, dH = states()
+    law, first = material.law(SimpleNamespace(), precision), int(name == "tissue")  # at rest its curvature jumps
+    want = exact(name)[first:]
+    tolerance = 1e-13 if precision == "f64" else 3e-5  # round-off, where 1 - (I_C - 3)/limit is as small as 0.7
+    for key in FUNCTIONS:
+        got = evaluate(law, key, H, dH, np.array(p), changes(p), in_lanes)[first:]
+        right = np.zeros_like(got)
+        for k, state in enumerate(want):
+            right[k, : len(state[key])] = state[key]
+        error, size = np.abs(got - right).max(1), np.abs(right).max(1)
+        assert np.all(error <= tolerance * np.maximum(10, size)), (key, error)
+
+
+def test_small_strains_keep_their_digits_in_float32():
+    """Strains of 1e-4: I_C - 3 and J - 1 never come from differences with 3 and 1."""
+    H, dH = states()
+    material, _, p = OWN["tissue"]
+    single, double = (
+        evaluate(material.law(SimpleNamespace(), x), "P", 1e-4 * H, dH, np.array(p), np.zeros(len(p)), x == "f64")
+        for x in ("f32", "f64")
+    )
+    assert np.abs(single - double).max() <= 1e-5 * np.abs(double).max()
+
+
+# ---- the same law twice ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class SmithEnergy(EnergyLaw):
+    """SmithNeoHookean by its energy alone."""
+
+    coefficient_names = ("m", "l")
+    last_without_lam = (5 / 8,)
+
+    def psi(self, H, p):
+        _, j, s = invariants(H)
+        return p[0] / 2 * (3 * s / 4 + x_minus_log1p((s + 2 * j) / 4)) + p[1] / 2 * j * j
+
+    def theta(self, H):
+        return invariants(H)[1]
+
+
+class SmithByEnergy(ds.SmithNeoHookean):
+    def law(self, precision):
+        return SmithEnergy(precision)
+
+
+def scene(material, **changes) -> ds.Scene:
+    """A cube held at one face, stretched and shaken, so that every number matters."""
+    mesh = ds.TetrahedralMesh.create_cube(2, 1.0)
+    noise = 0.02 * np.random.default_rng(3).standard_normal(mesh.vertices.shape)
+    start = dict(initial_positions=mesh.vertices * [1.3, 1, 1] + noise, fixed="xmin", precision="f64")
+    return ds.Scene(mesh, material, 1000.0, [ds.Gravity()], **start | changes)
+
+
+def rollout(scene: ds.Scene, solver=ds.SemiImplicitSolver, steps: int = 2, **options) -> ds.Rollout:
+    options = dict(substeps=4) | options if solver in EXPLICIT else dict(tolerance=1e-12) | options
+    return ds.Rollout(solver(scene, dt=8e-3, **options), steps, gradients="all")
+
+
+EXPLICIT = (ds.SemiImplicitSolver, ds.VelocityVerletSolver)
+
+
+@pytest.mark.parametrize("volume", ["tetrahedra", "patches"])
+def test_a_law_by_its_energy_moves_like_the_one_written_by_hand(volume):
+    """Motion and gradients agree to round-off, also with the change of volume averaged over patches."""
+    found = []
+    for material in (SmithByEnergy, ds.SmithNeoHookean):
+        r = rollout(scene(material(1e4, 0.4), volume=volume))
+        frames = r.forward()
+        found.append((frames.positions, r.vjp(frames, np.ones_like(frames.positions) * np.arange(3))))
+    (x, g), (y, h) = found
+    np.testing.assert_allclose(x, y, rtol=0, atol=1e-13)
+    for name in g:
+        np.testing.assert_allclose(g[name], h[name], rtol=0, atol=1e-11 * np.abs(h[name]).max())
+
+
+# ---- gates -------------------------------------------------------------------------------------------------------------
+
+
+def per_tetrahedron(low, high):
+    return np.random.default_rng(0).uniform(low, high, ds.TetrahedralMesh.create_cube(2, 1.0).num_tetrahedra)
+
+
+def directions():
+    return np.random.default_rng(1).standard_normal((ds.TetrahedralMesh.create_cube(2, 1.0).num_tetrahedra, 3))
+
+
+MATERIALS = {
+    "gent": lambda: Gent(mu=1e4, limit=per_tetrahedron(5, 8), lam=2e4),
+    "knowles": lambda: Knowles(1e4, 0.3, 0.5, per_tetrahedron(0.6, 0.9)),
+    "tissue": lambda: FibreTissue(mu=1e4, lam=2e4, k1=5e3, k2=2.0, fibre=directions()),
+}
+
+
+def gates(r: ds.Rollout, round_off: float = 1e-12) -> None:
+    assert verify.dot_product_test(r) <= round_off
+    report = ds.check_gradients(r, verbose=False)
+    assert report.passed, report
+    assert {*r.scene.material.inputs} <= {row.input for row in report.rows}
+
+
+@pytest.mark.parametrize(
+    "name, solver", [(name, ds.SemiImplicitSolver) for name in MATERIALS] + [("tissue", ds.ImplicitEulerSolver)]
+)
+def test_gradients_by_every_number(name, solver):
+    gates(rollout(scene(MATERIALS[name]()), solver), 1e-12 if solver in EXPLICIT else 1e-10)
+
+
+@pytest.mark.parametrize("name", ["gent", "tissue"])
+def test_gradients_on_patches(name):
+    gates(rollout(scene(MATERIALS[name](), volume="patches")))
+
+
+def test_gradients_in_float32():
+    gates(rollout(scene(MATERIALS["tissue"](), precision="f32")), 1e-5)
+
+
+def test_one_direction_for_all_takes_the_sum_of_the_gradients():
+    m = directions()
+    uniform, each = (
+        rollout(scene(FibreTissue(mu=1e4, lam=2e4, k1=5e3, k2=2.0, fibre=a)))
+        for a in (m[0], np.tile(m[0], (len(m), 1)))
+    )
+    one, many = (r.vjp(frames := r.forward(), np.ones_like(frames.positions))["fibre"] for r in (uniform, each))
+    assert one.shape == (3,) and many.shape == m.shape
+    np.testing.assert_allclose(one, many.sum(0), rtol=1e-10)
+
+
+def test_fibres_per_set():
+    mesh = ds.TetrahedralMesh.create_cube(2, 1.0)
+    mesh = ds.TetrahedralMesh(mesh.vertices, mesh.tetrahedra, tetrahedron_sets={"up": [0, 2]})
+    numbers = dict(mu=1.0, lam=1.0, k1=1.0, k2=1.0)
+    fibre = FibreTissue(**numbers, fibre={"up": (0, 1, 0), "default": (1, 0, 0)}).values(mesh)["fibre"]
+    np.testing.assert_array_equal(fibre[:3], [[0, 1, 0], [1, 0, 0], [0, 1, 0]])
+
+
+# ---- a law that sees the velocity's gradient ---------------------------------------------------------------------------
+
+
+def test_viscous_stress_is_that_of_its_formula():
+    """One substep from a homogeneous state: dv = h f / m with P = mu (F - K) + lam (J - 1) K + F 2 eta E_dot, K = cof F."""
+    rng = np.random.default_rng(4)
+    F, L = np.eye(3) + rng.uniform(-0.2, 0.2, (3, 3)), rng.standard_normal((3, 3))
+    mesh, mu, lam, eta = ds.TetrahedralMesh.create_cube(2, 1.0), 2e3, 3e3, 40.0
+    x, v = mesh.vertices @ F.T, mesh.vertices @ L.T
+    material = ViscousRubber(mu * (3 * lam + 2 * mu) / (lam + mu), lam / (2 * (lam + mu)), eta)
+    s = ds.Scene(mesh, material, 1000.0, initial_positions=x, initial_velocities=v, precision="f64")
+    frames = ds.Rollout(ds.SemiImplicitSolver(s, dt=1e-4), 1).forward()
+    K, E_dot = np.linalg.det(F) * np.linalg.inv(F).T, (F.T @ L + L.T @ F) / 2
+    P = mu * (F - K) + lam * (np.linalg.det(F) - 1) * K + F @ (2 * eta * E_dot)
+    derived, force = s.inputs.derive(s.inputs.values), np.zeros_like(v)
+    N = np.concatenate([-derived.gradients.sum(1, keepdims=True), derived.gradients], 1)
+    np.add.at(force, mesh.tetrahedra, -derived.volumes[:, None, None] * (N @ P.T))
+    change = frames.velocities[-1] - v
+    np.testing.assert_allclose(change, 1e-4 * force / derived.mass[:, None], rtol=0, atol=1e-11 * np.abs(change).max())
+
+
+def shaken(**changes) -> ds.Scene:
+    velocities = np.random.default_rng(7).standard_normal((8, 3))
+    eta = per_tetrahedron(20, 40)
+    motion = changes.pop("motion", lambda t: [0, 0.3 * t, 0])
+    return scene(ViscousRubber(1e4, 0.3, eta), initial_velocities=velocities, motion=motion, **changes)
+
+
+@pytest.mark.parametrize("solver", EXPLICIT)
+def test_gradients_through_viscosity(solver):
+    gates(rollout(shaken(), solver))
+
+
+@dataclass(frozen=True)
+class ReadsTime(EnergyLaw):
+    reads = ("t",)
+
+
+@pytest.mark.parametrize(
+    "build, words",
+    [
+        (lambda: FibreTissue(1.0, 1.0, 1.0, 1.0, [1.0, 2.0]), r"fibre must be 3 numbers or 3 per tetrahedron"),
+        (lambda: FibreTissue(1.0, 1.0, 1.0, 1.0, [0.0, 0, 0]), r"length of fibre must be > 0"),
+        (lambda: FibreTissue(1.0, 1.0, 1.0, 1.0, {"up": 1.0}), r"fibre\['up'\] must be 3 numbers"),
+        (lambda: FibreTissue(1.0, 1.0, 1.0, 1.0, [1.0, 0, 0], 7.0), r"at most 5 numbers go without a name, got 6"),
+        (lambda: scene(FibreTissue(1.0, 1.0, 1.0, 1.0, np.ones((2, 3)))), r"shape \(\d+, 3\), got shape \(2, 3\)"),
+        (
+            lambda: scene(MATERIALS["knowles"](), volume="patches").law,
+            r"PowerLaw does not say what its theta is; write",
+        ),
+        (
+            lambda: rollout(shaken(), ds.ImplicitEulerSolver),
+            r"ViscousLaw reads H, H_dot, but ImplicitEulerSolver knows",
+        ),
+        (lambda: ReadsTime("f64"), r"ReadsTime: reads must be .* got \('t',\)"),
+        (lambda: shaken(volume="patches").law, r"averages energies, but ViscousLaw reads H, H_dot; take"),
+        (lambda: rollout(scene(MATERIALS["tissue"]())).forward(fibre=np.ones(2)), r"fibre: expected shape"),
+    ],
+)
+def test_what_does_not_fit_is_refused(build, words):
+    with pytest.raises(ValueError, match=words):
+        build()
+
+
+def test_a_material_must_say_its_moduli():
+    class Silent(Gent):
+        spellings = (("c", "limit", "bulk"),)
+
+    with pytest.raises(NotImplementedError, match=r"Silent does not say its moduli .* write lame\(self, values\)"):
+        scene(Silent(1.0, 2.0, 3.0))
