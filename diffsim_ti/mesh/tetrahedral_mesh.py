@@ -13,6 +13,7 @@ import numpy as np
 from diffsim_ti.mesh import checks, geometry
 from diffsim_ti.mesh.files import KEEPS_SETS, read_mesh, write_mesh
 from diffsim_ti.mesh.grid import box
+from diffsim_ti.mesh.locate import LocatedPoints, locate
 from diffsim_ti.mesh.sets import checked_sets, chosen_indices, join_sets, sizes
 
 
@@ -268,6 +269,13 @@ class TetrahedralMesh:
         """A mesh that has this tetrahedron set too (or instead of one of that name)."""
         sets = {**self._tetrahedron_sets, name: self.tetrahedron_indices(chosen)}
         return self._changed(_tetrahedron_sets=checked_sets(sets, self.num_tetrahedra, "tetrahedron"))
+
+    def locate(self, points, nearest: bool = False) -> LocatedPoints:
+        """Where points [m], shape (k, 3), lie: tetrahedra, corners, barycentric weights; `.matrix` is the sparse map.
+
+        nearest: take the nearest point of the body for each point outside; default: ValueError that says how far out.
+        """
+        return locate(self, points, nearest)
 
     # Moving
 

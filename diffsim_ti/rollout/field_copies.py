@@ -1,0 +1,100 @@
+"""Copies between device arrays and Taichi fields, and sums into fields, without the host between them."""
+
+import taichi as ti
+
+# Fields of frames have shape (frames, vertices), or (runs, frames, vertices) in a rollout of several runs.
+
+
+@ti.func
+def _row(field: ti.template(), k, f, i):
+    if ti.static(len(field.shape) == 3):
+        return field[k, f, i]
+    else:
+        return field[f, i]
+
+
+@ti.func
+def _sum(a, b, c):
+    """a + b + c, where c is small, rounded once: Knuth's two-sum of a and b keeps what their sum loses."""
+    total = a + b
+    part = total - a
+    return total + (((a - (total - part)) + (b - part)) + c)
+
+
+@ti.func
+def _put(field: ti.template(), k, f, i, value):
+    if ti.static(len(field.shape) == 3):
+        field[k, f, i] = value
+    else:
+        field[f, i] = value
+
+
+@ti.kernel
+def show_frames(
+    u: ti.types.ndarray(ndim=2),
+    v: ti.types.ndarray(ndim=2),
+    rest: ti.types.ndarray(ndim=2),
+    k: ti.i32,
+    positions: ti.template(),
+    velocities: ti.template(),
+    displacements: ti.template(),
+):
+    """Row k of the fields from frames; rest[0] + rest[1] are the rest positions, to twice the digits of a number.
+
+    Positions are then the same numbers as on the host, which adds in float64.
+    """
+    for f, i in ti.ndrange(u.shape[0], u.shape[1]):
+        x = ti.Vector([_sum(rest[0, i][d], u[f, i][d], rest[1, i][d]) for d in ti.static(range(3))])
+        _put(positions, k, f, i, x)
+        _put(velocities, k, f, i, ti.Vector([v[f, i][0], v[f, i][1], v[f, i][2]]))
+        _put(displacements, k, f, i, ti.Vector([u[f, i][0], u[f, i][1], u[f, i][2]]))
+
+
+@ti.kernel
+def take_seeds(
+    positions: ti.template(),
+    velocities: ti.template(),
+    displacements: ti.template(),
+    k: ti.i32,
+    u_adj: ti.types.ndarray(ndim=2),
+    v_adj: ti.types.ndarray(ndim=2),
+):
+    """Adjoints of the frames from row k of the fields' gradients."""
+    for f, i in ti.ndrange(u_adj.shape[0], u_adj.shape[1]):
+        x, v = _row(positions, k, f, i) + _row(displacements, k, f, i), _row(velocities, k, f, i)
+        for d in ti.static(range(3)):
+            u_adj[f, i][d] = x[d]
+            v_adj[f, i][d] = v[d]
+
+
+@ti.kernel
+def take_positions(field: ti.template(), known: ti.types.ndarray(ndim=2), u: ti.types.ndarray(ndim=2)):
+    """u[0] += field - known[0]: u belongs to the positions `known`, which cost it no digits where the field has them."""
+    for i in range(u.shape[1]):
+        for d in ti.static(range(3)):
+            u[0, i][d] += field[i][d] - known[0, i][d]
+
+
+@ti.kernel
+def take_velocities(field: ti.template(), fixed: ti.types.ndarray(ti.i32, ndim=1), v: ti.types.ndarray(ndim=2)):
+    """v[0] = field, but zero where fixed."""
+    for i in range(v.shape[1]):
+        for d in ti.static(range(3)):
+            v[0, i][d] = field[i][d]
+            if fixed[i] > 0:
+                v[0, i][d] = 0
+
+
+@ti.kernel
+def add_numbers(field: ti.template(), values: ti.types.ndarray()):
+    """field += values, for a field of numbers."""
+    for I in ti.grouped(field):
+        field[I] += values[I]
+
+
+@ti.kernel
+def add_vectors(field: ti.template(), values: ti.types.ndarray()):
+    """field += values, for a field of 3-vectors."""
+    for I in ti.grouped(field):
+        for d in ti.static(range(3)):
+            field[I][d] += values[I, d]

@@ -1,0 +1,256 @@
+"""A rollout between Taichi kernels: its fields, and its runs as operations of a `ti.ad.Tape`."""
+
+import weakref
+
+import numpy as np
+import taichi as ti
+
+from diffsim_ti import runtime
+from diffsim_ti.outputs import Change
+from diffsim_ti.rollout import field_copies
+from diffsim_ti.rollout.frames import HostSeed, check_finite, norm
+from diffsim_ti.state.arrays import copy_slot
+
+STATES = ("positions", "velocities", "displacements")
+START = ("initial_positions", "initial_velocities")
+
+
+class TapeFace:
+    """Fields of inputs and outputs of a Rollout, and which of its runs the present tape holds.
+
+    Frames, and initial positions and velocities where only they depend on them, are copied on the device; so are, with
+    explicit solvers, the gradients by frames. All other inputs are small, and checked and prepared on the host by `Inputs`.
+    """
+
+    def __init__(self, rollout, runs: int | None):
+        if runs is not None and not (int(runs) == runs and runs >= 1):
+            raise ValueError(f"runs must be a whole number >= 1, or None for one run, got {runs}")
+        self._rollout, self.runs = weakref.ref(rollout), runs  # the rollout holds this: no circle
+        scene = rollout.scene
+        self.fp, self.number = runtime.PRECISIONS[scene.precision], runtime.NUMPY[scene.precision]
+        self._fields, self._constants, self._rows = {}, {}, {}
+        self._tape, self._held, self._summed = None, set(), False
+
+    @property
+    def rollout(self):
+        return self._rollout()
+
+    # ---- fields -----------------------------------------------------------------------------------------------------
+
+    def field(self, name: str):
+        """See `Rollout.field`."""
+        if not self._fields:
+            self._program = runtime.program()
+        runtime.check_alive(self._program)
+        if name not in self._fields:
+            rollout = self.rollout
+            if name in rollout.outputs:
+                rows = () if self.runs is None else (self.runs,)
+                self._fields[name] = self._take((*rows, *rollout.outputs[name].shape(rollout.num_frames)))
+            elif name in rollout.inputs:
+                self._fields[name] = self._take(rollout.values[name].shape)
+                self._fields[name].from_numpy(np.asarray(rollout.values[name], self.number))
+            else:
+                raise ValueError(f"no input named {name!r}; this rollout has {', '.join(rollout.inputs)}")
+        return self._fields[name]
+
+    def _take(self, shape: tuple):
+        components = 3 if shape[-1:] == (3,) else 0
+        return runtime.fields.take(self, self.fp, shape[:-1] if components else shape, components)
+
+    def has(self, name: str) -> bool:
+        """Whether a field of that name was asked for."""
+        return name in self._fields
+
+    def row(self, k: int | None, name: str) -> np.ndarray:
+        """The gradient by an output of run k, in float64."""
+        grad = self.field(name).grad.to_numpy().astype(np.float64)
+        return grad if self.runs is None else grad[k]
+
+    def fill_row(self, k: int | None, name: str, value: np.ndarray) -> None:
+        """Put the value of an output of run k into its field."""
+        if self.runs is not None:
+            rows = self._rows.setdefault(name, np.zeros((self.runs, *value.shape), self.number))
+            rows[k] = value
+            value = rows
+        self.field(name).from_numpy(np.asarray(value, self.number))
+
+    def add(self, name: str, gradient: np.ndarray) -> None:
+        """Add to the .grad of an input's field."""
+        grad, gradient = self.field(name).grad, np.array(gradient, self.number, order="C")
+        if gradient.ndim == 0:
+            grad[None] += float(gradient)
+        elif gradient.shape == (3,) and grad.shape == ():
+            grad.from_numpy(grad.to_numpy() + gradient)
+        elif isinstance(grad, ti.MatrixField):
+            field_copies.add_vectors(grad, gradient)
+        else:
+            field_copies.add_numbers(grad, gradient)
+
+    # ---- runs -------------------------------------------------------------------------------------------------------
+
+    def run(self, k: int | None) -> None:
+        """See `Rollout.run`."""
+        if (k is None) != (self.runs is None) or k is not None and not (int(k) == k and 0 <= k < self.runs):
+            rule = (
+                "make the Rollout with runs=..."
+                if self.runs is None
+                else f"give a whole number of 0 .. {self.runs - 1}"
+            )
+            raise ValueError(
+                f"run({'' if k is None else k}): this rollout has {self.runs or 'no numbered'} runs: {rule}"
+            )
+        tape = runtime.current_tape()
+        if tape is None or self._tape is None or self._tape() is not tape:
+            self._tape, self._held = None if tape is None else weakref.ref(tape), set()
+            self._summed = False
+        elif k in self._held:
+            raise RuntimeError(
+                f"{'this rollout' if k is None else f'run {k}'} already ran in this tape and would overwrite its frames: "
+                "make a second Rollout, or one with runs=... whose run(k) has frames of its own"
+            )
+        self._held.add(k)
+        TapedRun(self.rollout, k).forward()
+
+    def values(self) -> tuple[dict, bool]:
+        """(values of inputs from their fields, whether the start is left out because it is copied on the device)."""
+        rollout = self.rollout
+        if self._fields:
+            runtime.check_alive(self._program)
+        direct = rollout.scene.motion is None and "rest_positions" not in self._fields
+        out = {}
+        for name in rollout.inputs:
+            if name in self._fields and not (direct and name in START):
+                value = self._fields[name].to_numpy()
+                known = rollout.values[name].astype(value.dtype)
+                out[name] = rollout.values[name] if np.array_equal(value, known) else value.astype(np.float64)
+        return out, direct and any(name in self._fields for name in START)
+
+    def place(self, workspace) -> None:
+        """Set the start of a workspace from the fields; what is loaded there is that of the scene."""
+        if "initial_positions" in self._fields:
+            positions = self.rollout.values["initial_positions"]
+            known = self._constant("initial_positions", positions, lambda: positions[None])
+            field_copies.take_positions(self._fields["initial_positions"], known, workspace.state.u)
+        if "initial_velocities" in self._fields:
+            fixed = self._constant("fixed", None, self._fixed, ti.i32)
+            field_copies.take_velocities(self._fields["initial_velocities"], fixed, workspace.state.v)
+        bad = workspace.first_bad_vertex()
+        if bad is not None:
+            raise ValueError(f"initial_positions and initial_velocities must be finite: those of vertex {bad} are not")
+
+    def _fixed(self) -> np.ndarray:
+        out = np.zeros(self.rollout.scene.mesh.num_vertices, np.int32)
+        out[self.rollout.scene.fixed] = 1
+        return out
+
+    def show(self, k: int | None, run) -> None:
+        """Fill the fields of outputs with those of the run that ran last."""
+        rollout = self.rollout
+        rest = run.values["rest_positions"]
+        halves = self._constant(
+            "rest", rest, lambda: np.stack([rest.astype(self.number), rest - rest.astype(self.number)])
+        )
+        field_copies.show_frames(*rollout.sweep.workspace.frames, halves, k or 0, *map(self.field, STATES))
+
+    def _constant(self, name: str, source, make, dtype=None):
+        """A device array made once for each source."""
+        if name not in self._constants or self._constants[name][0] is not source:
+            array = runtime.upload(make(), dtype or ti.types.vector(4, self.fp))
+            self._constants[name] = source, array
+        return self._constants[name][1]
+
+    def sum_up(self, gradients: dict) -> None:
+        """Add the gradients of a run to those of the other runs of this tape."""
+        rollout = self.rollout
+        if self._summed:
+            gradients = {name: rollout.gradients[name] + gradient for name, gradient in gradients.items()}
+        rollout.gradients, self._summed = gradients, True
+
+
+class TapedRun:
+    """One run of a rollout in a tape, which holds it: it owns what its backward needs.
+
+    `forward` and `backward` are the package's one pair for `ti.ad.grad_replaced`: such pairs must not nest.
+    """
+
+    def __init__(self, rollout, k: int | None):
+        self.rollout, self.face, self.k = rollout, rollout.tape_face, k
+        self.run = self.frames = self._start = None
+
+    @ti.ad.grad_replaced
+    def forward(self):
+        face, rollout = self.face, self.rollout
+        values, direct = face.values()
+        self.run = rollout.sweep.run(values, self.place if direct else None)
+        face.show(self.k, self.run)
+        if rollout.computed:
+            self.frames = rollout.frames_of(self.run)
+            for name in rollout.computed:
+                face.fill_row(self.k, name, self.frames[name])
+
+    def place(self, workspace) -> None:
+        """The start that the fields gave, also after kernels have overwritten them."""
+        if self._start is None:
+            self.face.place(workspace)
+            self._start = workspace.history(1)
+            workspace.save(self._start, 0)
+        else:
+            workspace.restore(self._start, 0)
+
+    @ti.ad.grad_for(forward)
+    def backward(self):
+        """Adds to the .grad of the input fields and sets the rollout's `gradients`."""
+        if self.run is None:  # the run failed, and its error is on its way
+            return
+        face, rollout = self.face, self.rollout
+        seeds = {name: face.row(self.k, name) for name in rollout.computed}
+        change = rollout.pulled_to_frames(self.frames, {name: x for name, x in seeds.items() if x.any()})
+        if "rest_positions" in rollout.wanted:  # what displacements say of it directly
+            by_rest = rollout.outputs["displacements"].vjp(None, face.row(self.k, "displacements"))
+            change.add(Change(inputs=by_rest.inputs))
+        kind = FieldSeed if rollout.solver.explicit else _host_seed
+        derived = rollout.sweep.pull_back(self.run, kind(face, self.k, change))
+        gradients = rollout.gradients_of(self.run, derived, change)
+        for name in rollout.inputs:
+            if face.has(name) and name in gradients:
+                face.add(name, gradients[name])
+        face.sum_up(gradients)
+
+
+def _host_seed(face: TapeFace, k: int | None, change: Change) -> HostSeed:
+    """For solvers whose adjoint is on the host."""
+    by_frames = Change(face.row(k, "positions") + face.row(k, "displacements"), face.row(k, "velocities"))
+    by_frames.add(Change(change.positions, change.velocities))
+    for name in ("positions", "velocities"):
+        check_finite(name, getattr(by_frames, name), face.rollout.save_every)
+    return HostSeed(by_frames.positions, by_frames.velocities)
+
+
+class FieldSeed(HostSeed):
+    """Gradients by the frames in the fields, copied on the device, with those that came by further outputs."""
+
+    def __init__(self, face: TapeFace, k: int | None, change: Change):
+        self.face, self.k, self.change = face, k, change
+
+    def put(self, adjoint, last_frame_is_state: bool) -> tuple[float, float]:
+        face = self.face
+        adjoint.clear()
+        field_copies.take_seeds(*(face.field(name).grad for name in STATES), self.k or 0, *adjoint.frames)
+        norms = []
+        for name, frames, running in zip(STATES, adjoint.frames, (adjoint.u, adjoint.v)):
+            further = getattr(self.change, name)
+            if further is not None:
+                runtime.fill(frames, runtime.fetch(frames) + further)
+            if last_frame_is_state:
+                copy_slot(frames, frames.shape[0] - 1, running, 0)
+            norms.append(_norm(frames))
+            if not np.isfinite(norms[-1]):
+                check_finite(name, runtime.fetch(frames), face.rollout.save_every)
+        return tuple(norms)
+
+
+def _norm(array) -> float:
+    """Euclidean norm of an array of vectors."""
+    host = runtime.view(array)
+    return norm((runtime.fetch(array) if host is None else host)[..., :3])
