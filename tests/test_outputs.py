@@ -1,4 +1,4 @@
-"""Outputs that a loss may name: their derivatives, in NumPy, under a tape and in torch; one of the package, one of a user."""
+"""Outputs that a loss may name: their derivatives, in NumPy, under a tape and in torch; one of ours, one of a user."""
 
 import numpy as np
 import pytest

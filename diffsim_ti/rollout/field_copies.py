@@ -68,6 +68,13 @@ def take_seeds(
 
 
 @ti.kernel
+def add_squares(x: ti.types.ndarray(ndim=2), total: ti.types.ndarray(ndim=1)):
+    """total[0] += |x|^2."""
+    for f, i in ti.ndrange(x.shape[0], x.shape[1]):
+        total[0] += x[f, i][0] * x[f, i][0] + x[f, i][1] * x[f, i][1] + x[f, i][2] * x[f, i][2]
+
+
+@ti.kernel
 def take_positions(field: ti.template(), known: ti.types.ndarray(ndim=2), u: ti.types.ndarray(ndim=2)):
     """u[0] += field - known[0]: u belongs to the positions `known`, which cost it no digits where the field has them."""
     for i in range(u.shape[1]):

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from diffsim_ti.inputs import Derived
-from diffsim_ti.rollout.sweep import Run
+from diffsim_ti.rollout.run import Run
 from diffsim_ti.state.watch import ContactResolution
 
 
@@ -58,7 +58,7 @@ def norm(x: np.ndarray) -> float:
 
 @dataclass
 class HostSeed:
-    """Gradients by the frames as NumPy arrays of shape (frames, num_vertices, 3); see `Seed` in sweep.py."""
+    """Gradients by the frames as NumPy arrays of shape (frames, num_vertices, 3); see `Seed` in run.py."""
 
     positions: np.ndarray
     velocities: np.ndarray

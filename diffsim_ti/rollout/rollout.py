@@ -6,7 +6,8 @@ from diffsim_ti import runtime
 from diffsim_ti.outputs import Change, Displacements, Output, Positions, Velocities
 from diffsim_ti.rollout.checkpoints import Schedule
 from diffsim_ti.rollout.frames import Frames, HostSeed, check_finite
-from diffsim_ti.rollout.sweep import Run, Sweep
+from diffsim_ti.rollout.run import Run
+from diffsim_ti.rollout.sweep import Sweep
 from diffsim_ti.rollout.taped import TapeFace
 from diffsim_ti.solvers.solver import Solver
 
@@ -208,7 +209,8 @@ class Rollout:
         """Run from the input fields and fill the outputs' fields; in a `ti.ad.Tape`, the tape will pull gradients back.
 
         In a Rollout of several `runs`, run k fills row k of these fields: kernels may write the inputs of run k + 1 from the
-        frames of run k, in one tape. Input fields are read at once, and may be overwritten for the next run.
+        frames of run k, in one tape. Input fields are read at once, and may be overwritten for the next run. The device
+        keeps what the reverse sweep needs of one run: all but the last run once more when the tape goes back.
         Gradients add to the .grad of the input fields; `gradients` has their sum over the runs of the tape.
         Raises RuntimeError for a run that this tape already holds, ValueError for k outside 0 .. runs - 1.
         """

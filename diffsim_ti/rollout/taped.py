@@ -8,10 +8,8 @@ import taichi as ti
 from diffsim_ti import runtime
 from diffsim_ti.outputs import Change
 from diffsim_ti.rollout import field_copies
-from diffsim_ti.rollout.frames import HostSeed, check_finite, norm
-from diffsim_ti.state.arrays import copy_slot
+from diffsim_ti.rollout.field_seed import STATES, field_seed
 
-STATES = ("positions", "velocities", "displacements")
 START = ("initial_positions", "initial_velocities")
 
 
@@ -209,48 +207,9 @@ class TapedRun:
         if "rest_positions" in rollout.wanted:  # what displacements say of it directly
             by_rest = rollout.outputs["displacements"].vjp(None, face.row(self.k, "displacements"))
             change.add(Change(inputs=by_rest.inputs))
-        kind = FieldSeed if rollout.solver.explicit else _host_seed
-        derived = rollout.sweep.pull_back(self.run, kind(face, self.k, change))
+        derived = rollout.sweep.pull_back(self.run, field_seed(face, self.k, change))
         gradients = rollout.gradients_of(self.run, derived, change)
         for name in rollout.inputs:
             if face.has(name) and name in gradients:
                 face.add(name, gradients[name])
         face.sum_up(gradients)
-
-
-def _host_seed(face: TapeFace, k: int | None, change: Change) -> HostSeed:
-    """For solvers whose adjoint is on the host."""
-    by_frames = Change(face.row(k, "positions") + face.row(k, "displacements"), face.row(k, "velocities"))
-    by_frames.add(Change(change.positions, change.velocities))
-    for name in ("positions", "velocities"):
-        check_finite(name, getattr(by_frames, name), face.rollout.save_every)
-    return HostSeed(by_frames.positions, by_frames.velocities)
-
-
-class FieldSeed(HostSeed):
-    """Gradients by the frames in the fields, copied on the device, with those that came by further outputs."""
-
-    def __init__(self, face: TapeFace, k: int | None, change: Change):
-        self.face, self.k, self.change = face, k, change
-
-    def put(self, adjoint, last_frame_is_state: bool) -> tuple[float, float]:
-        face = self.face
-        adjoint.clear()
-        field_copies.take_seeds(*(face.field(name).grad for name in STATES), self.k or 0, *adjoint.frames)
-        norms = []
-        for name, frames, running in zip(STATES, adjoint.frames, (adjoint.u, adjoint.v)):
-            further = getattr(self.change, name)
-            if further is not None:
-                runtime.fill(frames, runtime.fetch(frames) + further)
-            if last_frame_is_state:
-                copy_slot(frames, frames.shape[0] - 1, running, 0)
-            norms.append(_norm(frames))
-            if not np.isfinite(norms[-1]):
-                check_finite(name, runtime.fetch(frames), face.rollout.save_every)
-        return tuple(norms)
-
-
-def _norm(array) -> float:
-    """Euclidean norm of an array of vectors."""
-    host = runtime.view(array)
-    return norm((runtime.fetch(array) if host is None else host)[..., :3])

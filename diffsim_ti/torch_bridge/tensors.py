@@ -13,7 +13,7 @@ import taichi as ti
 from diffsim_ti import runtime
 from diffsim_ti.outputs import Change
 from diffsim_ti.rollout.frames import HostSeed, check_finite
-from diffsim_ti.rollout.sweep import Run
+from diffsim_ti.rollout.run import Run
 from diffsim_ti.state.arrays import copy_slot
 from diffsim_ti.torch_bridge.autograd import torch
 
@@ -84,7 +84,7 @@ class TensorStart:
 
 
 class TensorSeed:
-    """Gradients by the frames as tensors, copied on the device; see `Seed` in rollout/sweep.py."""
+    """Gradients by the frames as tensors, copied on the device; see `Seed` in rollout/run.py."""
 
     def __init__(self, face: "TensorRollout", pair: list, with_positions: bool):
         self.face, self.pair, self.with_positions = face, pair, with_positions
