@@ -443,9 +443,16 @@ def test_fields_come_back(monkeypatch):
 
 
 def test_device_memory_comes_back():
+    total = scalar_field()
+
     def use():
         rollout = small()
         rollout.vjp(rollout.forward(), np.ones((4, 27, 3)))
+        chain = rollout_of(free_scene(), steps=4, runs=RUNS)
+        chained(chain, total)
+        start = torch.zeros(27, 3, dtype=torch.float64, requires_grad=True)
+        frames = rollout_frames(chain, initial_displacements=start)
+        frames.positions.sum().backward()
 
     use()
     before = runtime.allocated_megabytes()

@@ -123,7 +123,8 @@ class Rollout:
         positions = (run.values["rest_positions"] + u).astype(u.dtype)
         inputs = run.values
         if run.place is not None:
-            inputs = inputs | dict(initial_positions=positions[0], initial_velocities=v[0])
+            start = dict(initial_positions=positions[0], initial_velocities=v[0])
+            inputs = inputs | {name: x.astype(np.float64) for name, x in start.items()}
         frames = Frames(positions, v, u, self.times, inputs, run.contact_resolution, run=run)
         for name, output in self.computed.items():
             value, shape = np.asarray(output.value(frames)), tuple(output.shape(self.num_frames))

@@ -166,6 +166,21 @@ class TapeFace:
         rollout.gradients, self._summed = gradients, True
 
 
+class FieldStart:
+    """The start that the fields gave to a run, also after kernels have overwritten them."""
+
+    def __init__(self, face: TapeFace):
+        self.face, self._kept = face, None
+
+    def __call__(self, workspace) -> None:
+        if self._kept is None:
+            self.face.place(workspace)
+            self._kept = workspace.history(1)
+            workspace.save(self._kept, 0)
+        else:
+            workspace.restore(self._kept, 0)
+
+
 class TapedRun:
     """One run of a rollout in a tape, which holds it: it owns what its backward needs.
 
@@ -174,27 +189,18 @@ class TapedRun:
 
     def __init__(self, rollout, k: int | None):
         self.rollout, self.face, self.k = rollout, rollout.tape_face, k
-        self.run = self.frames = self._start = None
+        self.run = self.frames = None
 
     @ti.ad.grad_replaced
     def forward(self):
         face, rollout = self.face, self.rollout
         values, direct = face.values()
-        self.run = rollout.sweep.run(values, self.place if direct else None)
+        self.run = rollout.sweep.run(values, FieldStart(face) if direct else None)
         face.show(self.k, self.run)
         if rollout.computed:
             self.frames = rollout.frames_of(self.run)
             for name in rollout.computed:
                 face.fill_row(self.k, name, self.frames[name])
-
-    def place(self, workspace) -> None:
-        """The start that the fields gave, also after kernels have overwritten them."""
-        if self._start is None:
-            self.face.place(workspace)
-            self._start = workspace.history(1)
-            workspace.save(self._start, 0)
-        else:
-            workspace.restore(self._start, 0)
 
     @ti.ad.grad_for(forward)
     def backward(self):

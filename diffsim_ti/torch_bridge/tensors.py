@@ -181,7 +181,7 @@ class TensorRollout:
     def vjp(self, run: Run, by_displacements: torch.Tensor, by_velocities: torch.Tensor, wanted) -> dict:
         """Gradients by the wanted inputs from those by the frames: tensors for START if direct, NumPy arrays else."""
         rollout, adjoints = self.rollout, (by_displacements, by_velocities)
-        direct = is_direct(rollout, wanted) and "rest_positions" not in rollout.wanted
+        direct = is_direct(rollout, wanted)
         on_host = [name for name in wanted if not (direct and name in START)]
         on_host = ["initial_positions" if name == "initial_displacements" else name for name in on_host]
         if direct:
