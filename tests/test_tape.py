@@ -340,6 +340,51 @@ def test_kernels_close_a_loop_between_runs(solver):
     assert slope == pytest.approx(verify.central_difference(loss)[0], rel=1e-7)
 
 
+@pytest.mark.backends
+def test_a_chain_is_one_long_run():
+    """Displacements and velocities handed over as they are, in f32: the same bits, and the same gradient."""
+    scene = free_scene(precision="f32", fixed="ymax")
+    chain, whole, total = (
+        rollout_of(scene, steps=4, runs=3),
+        rollout_of(scene, steps=12),
+        ti.field(ti.f32, (), needs_grad=True),
+    )
+    u0, v0, E = (chain.field(name) for name in ("initial_displacements", "initial_velocities", "youngs_modulus"))
+
+    @ti.kernel
+    def hand_on(u: ti.template(), v: ti.template(), k: int):
+        for i in u0:
+            u0[i], v0[i] = u[k, 1, i], v[k, 1, i]
+
+    @ti.kernel
+    def squares_of_last(x: ti.template(), v: ti.template()):
+        for i in range(27):
+            total[None] += x[2, 1, i].norm_sqr() + v[2, 1, i].norm_sqr()
+
+    with ti.ad.Tape(total):
+        for k in range(3):
+            chain.run(k)
+            if k < 2:
+                hand_on(chain.field("displacements"), chain.velocities, k)
+        squares_of_last(chain.positions, chain.velocities)
+    frames = whole.forward()
+    assert np.array_equal(chain.positions.to_numpy()[2, 1], frames.positions[1])
+    seeds = [2 * x * np.array([0, 1])[:, None, None] for x in (frames.positions, frames.velocities)]
+    expected = whole.vjp(frames, *seeds)
+    for field, name in ((u0, "initial_positions"), (v0, "initial_velocities"), (E, "youngs_modulus")):
+        size = np.abs(expected[name]).max()
+        np.testing.assert_allclose(field.grad.to_numpy(), expected[name], rtol=1e-4, atol=1e-5 * size, err_msg=name)
+
+
+def test_two_spellings_of_the_start():
+    rollout = rollout_of(free_scene(), steps=4)
+    rollout.field("initial_displacements")
+    with pytest.raises(ValueError, match="two spellings of one input"):
+        rollout.field("initial_positions")
+    with pytest.raises(ValueError, match="with rest_positions, use initial_positions"):
+        rollout.field("rest_positions")
+
+
 def test_runs_and_their_rows():
     """Fields have a row for each run; a run that is repeated, or out of range, is refused; a new tape is a new chance."""
     rollout, total = rollout_of(free_scene(), steps=4, runs=2), scalar_field()

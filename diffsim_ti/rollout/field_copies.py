@@ -83,13 +83,13 @@ def take_positions(field: ti.template(), known: ti.types.ndarray(ndim=2), u: ti.
 
 
 @ti.kernel
-def take_velocities(field: ti.template(), fixed: ti.types.ndarray(ti.i32, ndim=1), v: ti.types.ndarray(ndim=2)):
-    """v[0] = field, but zero where fixed."""
-    for i in range(v.shape[1]):
+def take_vectors(field: ti.template(), zero: ti.types.ndarray(ti.i32, ndim=1), target: ti.types.ndarray(ndim=2)):
+    """target[0] = field, but nothing where `zero` says so."""
+    for i in range(target.shape[1]):
         for d in ti.static(range(3)):
-            v[0, i][d] = field[i][d]
-            if fixed[i] > 0:
-                v[0, i][d] = 0
+            target[0, i][d] = field[i][d]
+            if zero[i] > 0:
+                target[0, i][d] = 0
 
 
 @ti.kernel

@@ -193,6 +193,7 @@ class Rollout:
 
         Input fields hold the scene's values until a kernel or `from_numpy` writes others; `run` reads them. Those of outputs
         have shape (frames, num_vertices), and (runs, frames, num_vertices) in a Rollout of several `runs`.
+        "initial_displacements" is another spelling of "initial_positions", which keeps its digits in float32.
         """
         return self.tape_face.field(name)
 

@@ -11,6 +11,7 @@ from diffsim_ti.rollout import field_copies
 from diffsim_ti.rollout.field_seed import STATES, field_seed
 
 START = ("initial_positions", "initial_velocities")
+SPELLING = {"initial_displacements": "initial_positions"}  # less the rest positions; they keep their digits in float32
 
 
 class TapeFace:
@@ -45,20 +46,38 @@ class TapeFace:
             if name in rollout.outputs:
                 rows = () if self.runs is None else (self.runs,)
                 self._fields[name] = self._take((*rows, *rollout.outputs[name].shape(rollout.num_frames)))
-            elif name in rollout.inputs:
-                self._fields[name] = self._take(rollout.values[name].shape)
-                self._fields[name].from_numpy(np.asarray(rollout.values[name], self.number))
+            elif SPELLING.get(name, name) in rollout.inputs:
+                if {name, *self._fields} >= {"initial_positions", "initial_displacements"}:
+                    raise ValueError(
+                        "initial_positions and initial_displacements are two spellings of one input: use one"
+                    )
+                if {name, *self._fields} >= {"rest_positions", "initial_displacements"}:
+                    raise ValueError(
+                        "with rest_positions, use initial_positions: displacements are those from the mesh"
+                    )
+                value = self._loaded(name)
+                self._fields[name] = self._take(value.shape)
+                self._fields[name].from_numpy(np.asarray(value, self.number))
             else:
                 raise ValueError(f"no input named {name!r}; this rollout has {', '.join(rollout.inputs)}")
         return self._fields[name]
+
+    def _loaded(self, name: str) -> np.ndarray:
+        """The scene's value of an input."""
+        values = self.rollout.values
+        if name == "initial_displacements":
+            return values["initial_positions"] - values["rest_positions"]
+        return values[name]
 
     def _take(self, shape: tuple):
         components = 3 if shape[-1:] == (3,) else 0
         return runtime.fields.take(self, self.fp, shape[:-1] if components else shape, components)
 
-    def has(self, name: str) -> bool:
-        """Whether a field of that name was asked for."""
-        return name in self._fields
+    def add_gradients(self, gradients: dict) -> None:
+        """Add to the .grad of the inputs' fields."""
+        for name in self._fields:
+            if SPELLING.get(name, name) in gradients:
+                self._add(self._fields[name].grad, gradients[SPELLING.get(name, name)])
 
     def row(self, k: int | None, name: str) -> np.ndarray:
         """The gradient by an output of run k, in float64."""
@@ -73,9 +92,8 @@ class TapeFace:
             value = rows
         self.field(name).from_numpy(np.asarray(value, self.number))
 
-    def add(self, name: str, gradient: np.ndarray) -> None:
-        """Add to the .grad of an input's field."""
-        grad, gradient = self.field(name).grad, np.array(gradient, self.number, order="C")
+    def _add(self, grad, gradient: np.ndarray) -> None:
+        gradient = np.array(gradient, self.number, order="C")
         if gradient.ndim == 0:
             grad[None] += float(gradient)
         elif gradient.shape == (3,) and grad.shape == ():
@@ -115,32 +133,34 @@ class TapeFace:
         rollout = self.rollout
         if self._fields:
             runtime.check_alive(self._program)
+        start = [name for name in (*START, *SPELLING) if name in self._fields]
         direct = rollout.scene.motion is None and "rest_positions" not in self._fields
         out = {}
-        for name in rollout.inputs:
-            if name in self._fields and not (direct and name in START):
-                value = self._fields[name].to_numpy()
-                known = rollout.values[name].astype(value.dtype)
-                out[name] = rollout.values[name] if np.array_equal(value, known) else value.astype(np.float64)
-        return out, direct and any(name in self._fields for name in START)
+        for name, field in self._fields.items():
+            if SPELLING.get(name, name) in rollout.inputs and not (direct and name in start):
+                value, known = field.to_numpy(), self._loaded(name)
+                value = known if np.array_equal(value, known.astype(value.dtype)) else value.astype(np.float64)
+                if name == "initial_displacements":
+                    value = value + rollout.values["rest_positions"]
+                out[SPELLING.get(name, name)] = value
+        return out, direct and bool(start)
 
     def place(self, workspace) -> None:
         """Set the start of a workspace from the fields; what is loaded there is that of the scene."""
-        if "initial_positions" in self._fields:
-            positions = self.rollout.values["initial_positions"]
-            known = self._constant("initial_positions", positions, lambda: positions[None])
-            field_copies.take_positions(self._fields["initial_positions"], known, workspace.state.u)
-        if "initial_velocities" in self._fields:
-            fixed = self._constant("fixed", None, self._fixed, ti.i32)
-            field_copies.take_velocities(self._fields["initial_velocities"], fixed, workspace.state.v)
+        fields, state = self._fields, workspace.state
+        n = self.rollout.scene.mesh.num_vertices
+        if "initial_positions" in fields:
+            known = self._constant("initial_positions", None, lambda: self._loaded("initial_positions")[None])
+            field_copies.take_positions(fields["initial_positions"], known, state.u)
+        if "initial_displacements" in fields:
+            nowhere = self._constant("nowhere", None, lambda: np.zeros(n), ti.i32)
+            field_copies.take_vectors(fields["initial_displacements"], nowhere, state.u)
+        if "initial_velocities" in fields:
+            fixed = self._constant("fixed", None, lambda: np.isin(np.arange(n), self.rollout.scene.fixed), ti.i32)
+            field_copies.take_vectors(fields["initial_velocities"], fixed, state.v)
         bad = workspace.first_bad_vertex()
         if bad is not None:
             raise ValueError(f"initial_positions and initial_velocities must be finite: those of vertex {bad} are not")
-
-    def _fixed(self) -> np.ndarray:
-        out = np.zeros(self.rollout.scene.mesh.num_vertices, np.int32)
-        out[self.rollout.scene.fixed] = 1
-        return out
 
     def show(self, k: int | None, run) -> None:
         """Fill the fields of outputs with those of the run that ran last."""
@@ -215,7 +235,5 @@ class TapedRun:
             change.add(Change(inputs=by_rest.inputs))
         derived = rollout.sweep.pull_back(self.run, field_seed(face, self.k, change))
         gradients = rollout.gradients_of(self.run, derived, change)
-        for name in rollout.inputs:
-            if face.has(name) and name in gradients:
-                face.add(name, gradients[name])
+        face.add_gradients(gradients)
         face.sum_up(gradients)
