@@ -14,14 +14,6 @@ def _row(field: ti.template(), k, f, i):
 
 
 @ti.func
-def _sum(a, b, c):
-    """a + b + c, where c is small, rounded once: Knuth's two-sum of a and b keeps what their sum loses."""
-    total = a + b
-    part = total - a
-    return total + (((a - (total - part)) + (b - part)) + c)
-
-
-@ti.func
 def _put(field: ti.template(), k, f, i, value):
     if ti.static(len(field.shape) == 3):
         field[k, f, i] = value
@@ -33,19 +25,16 @@ def _put(field: ti.template(), k, f, i, value):
 def show_frames(
     u: ti.types.ndarray(ndim=2),
     v: ti.types.ndarray(ndim=2),
-    rest: ti.types.ndarray(ndim=2),
+    rest: ti.types.ndarray(ndim=1),
     k: ti.i32,
     positions: ti.template(),
     velocities: ti.template(),
     displacements: ti.template(),
 ):
-    """Row k of the fields from frames; rest[0] + rest[1] are the rest positions, to twice the digits of a number.
-
-    Positions are then the same numbers as on the host, which adds in float64.
-    """
+    """Row k of the fields from frames; positions are added in float64, in which `rest` is, as on the host."""
     for f, i in ti.ndrange(u.shape[0], u.shape[1]):
-        x = ti.Vector([_sum(rest[0, i][d], u[f, i][d], rest[1, i][d]) for d in ti.static(range(3))])
-        _put(positions, k, f, i, x)
+        x = ti.Vector([rest[i][d] + ti.cast(u[f, i][d], ti.f64) for d in ti.static(range(3))])
+        _put(positions, k, f, i, ti.cast(x, positions.dtype))
         _put(velocities, k, f, i, ti.Vector([v[f, i][0], v[f, i][1], v[f, i][2]]))
         _put(displacements, k, f, i, ti.Vector([u[f, i][0], u[f, i][1], u[f, i][2]]))
 

@@ -17,8 +17,9 @@ SPELLING = {"initial_displacements": "initial_positions"}  # less the rest posit
 class TapeFace:
     """Fields of inputs and outputs of a Rollout, and which of its runs the present tape holds.
 
-    Frames, and initial positions and velocities where only they depend on them, are copied on the device; so are, with
-    explicit solvers, the gradients by frames. All other inputs are small, and checked and prepared on the host by `Inputs`.
+    Frames (but not on Vulkan) and, where nothing else depends on them, initial positions and velocities are copied on the
+    device; so are, with explicit solvers, the gradients by frames. All other inputs are small: they are checked and prepared
+    on the host by `Inputs`, as are the gradients by inputs, which are then added to the fields by kernels.
     """
 
     def __init__(self, rollout, runs: int | None):
@@ -164,12 +165,14 @@ class TapeFace:
 
     def show(self, k: int | None, run) -> None:
         """Fill the fields of outputs with those of the run that ran last."""
-        rollout = self.rollout
-        rest = run.values["rest_positions"]
-        halves = self._constant(
-            "rest", rest, lambda: np.stack([rest.astype(self.number), rest - rest.astype(self.number)])
-        )
-        field_copies.show_frames(*rollout.sweep.workspace.frames, halves, k or 0, *map(self.field, STATES))
+        frames, rest = self.rollout.sweep.workspace.frames, run.values["rest_positions"]
+        if runtime.arch_name() in ("cpu", "cuda"):
+            exact = self._constant("rest", rest, lambda: rest, ti.types.vector(4, ti.f64))
+            field_copies.show_frames(*frames, exact, k or 0, *map(self.field, STATES))
+        else:  # Vulkan may lack float64
+            u, v = map(runtime.fetch, frames)
+            for name, value in zip(STATES, (rest + u, v, u)):
+                self.fill_row(k, name, value)
 
     def _constant(self, name: str, source, make, dtype=None):
         """A device array made once for each source."""
