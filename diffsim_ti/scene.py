@@ -15,7 +15,7 @@ from diffsim_ti.terms.motion import sampled
 
 def _kind(term) -> tuple:
     """What kernels go through terms by: obstacles last, each kind's together, so that the order of a list means nothing."""
-    return term.acts_on_surface, type(term).__qualname__, type(term).__module__
+    return term.acts_on_surface, type(term).__qualname__, type(term).__module__, term.variant
 
 
 LOCKING_RATIO = 0.45  # Poisson's ratio above which linear tetrahedra lock noticeably

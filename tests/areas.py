@@ -10,7 +10,7 @@ HEAD = "| area | files test_*.py | minutes |\n| --- | --- | ---: |\n"
 AREAS = {
     "meshes, scenes, materials": "mesh scene materials",
     "motion against closed forms": "reference_motion step_limit hertz torture",
-    "gradients": "gradients gradient_faults checkpoints tape identification",
+    "gradients": "gradients gradient_clip gradient_faults gradient_fuzz checkpoints tape identification",
     "implicit steps and equilibria": "implicit implicit_gradients implicit_contact",
     "patches against locking": "locking",
     "obstacles and friction": "contact contact_crossing contact_friction contact_gradients",

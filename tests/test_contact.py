@@ -19,7 +19,7 @@ def evaluate(term, positions, precision="f64"):
     fp = runtime.PRECISIONS[precision]
     vec = ti.types.vector(4, fp)
     own = dict(table=len(np.concatenate([v.ravel() for v in term.values.values()]))) if term.table.size else {}
-    twin = term.kernel(precision, 0, **own)
+    twin = term.kernel(precision, **own)
 
     @ti.kernel
     def look(
@@ -31,9 +31,9 @@ def evaluate(term, positions, precision="f64"):
     ):
         for i in range(x.shape[0]):
             zero = vec(0)
-            gap[i] = twin.gap(parameters, x[i], zero)
-            energy[i] = twin.energy(parameters, x[i], zero)
-            force[i] = twin.force(parameters, x[i], zero, zero)
+            gap[i] = twin.gap(parameters, 0, x[i], zero)
+            energy[i] = twin.energy(parameters, 0, x[i], zero)
+            force[i] = twin.force(parameters, 0, x[i], zero, zero)
 
     numbers = np.concatenate([*(v.ravel() for v in term.values.values()), term.table])
     n = len(positions)
@@ -182,11 +182,11 @@ def test_weight_at_rest_on_a_slope(solver, mass, gap):
 def test_absent_obstacles_compile_nothing():
     bare = ds.Simulator(ds.SemiImplicitSolver(ds.Scene(tetrahedron(), ds.StableNeoHookean(1e5, 0.3)), dt=1e-4))
     arrays = bare.workspace.arrays
-    assert arrays.features().contacts == () and np.prod(bare.workspace.watch.array.shape) == 1
+    assert arrays.features().groups == () and np.prod(bare.workspace.watch.seen.shape) == 1
     assert np.prod(arrays.path.shape) == 1 and str(bare.contact_resolution) == "contact: none"
     plain = ds.Simulator(ds.SemiImplicitSolver(points(tetrahedron(0.5), ds.Ground()), dt=1e-4))
-    (twin,) = plain.workspace.arrays.features().contacts
-    assert not twin.friction and twin.path < 0 and twin.size == 3
+    (group,) = plain.workspace.arrays.features().groups
+    assert not group.force.friction and group.path < 0 and group.size == 3
 
 
 @pytest.mark.parametrize("solver", [ds.SemiImplicitSolver, ds.VelocityVerletSolver])

@@ -283,7 +283,7 @@ def test_absent_features_take_no_memory():
     for name in ("surface", "force_slot", "motion_slot", "forces", "motion", "anchor", "rest"):
         assert np.prod(getattr(bare, name).shape) == 1, name
     features = bare.features()
-    assert features.contacts == () and features.gravity == -1 and features.drag == -1
+    assert features.groups == () and features.gravity == -1 and features.drag == -1
     assert not (features.forces or features.motion) and features.uniform
     assert np.prod(bare.coefficients.shape) == len(bare.law.coefficient_names)  # one block for all tetrahedra
     full = workspace(
@@ -291,7 +291,7 @@ def test_absent_features_take_no_memory():
     ).arrays
     n = full.num_vertices
     assert full.surface.shape == full.rest.shape == full.force_slot.shape == full.motion_slot.shape == (n,)
-    assert len(full.features().contacts) == 1 and full.features().forces and full.features().motion
+    assert len(full.features().groups) == 1 and full.features().forces and full.features().motion
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
@@ -332,7 +332,7 @@ def test_torch_is_not_needed():
 
 
 def test_vulkan_refuses_float64_with_a_remedy(monkeypatch):
-    monkeypatch.setattr(runtime, "arch_name", lambda: "vulkan")
+    monkeypatch.setattr("diffsim_ti.runtime.start.arch_name", lambda: "vulkan")
     runtime.check_backend("f32")
     with pytest.raises(ValueError, match="no float64 logarithm.*precision='f32'"):
         runtime.check_backend("f64")

@@ -16,9 +16,8 @@ from types import SimpleNamespace
 import taichi as ti
 
 from diffsim_ti.materials.calculus.tensor import Tensor, inner, sum_of
-from diffsim_ti.runtime import PRECISIONS, at, let, traced
+from diffsim_ti.runtime import LANES, PRECISIONS, at, let, traced
 
-LANES = 8
 A = ti.template()  # an array or Bundle handed to a Taichi function
 
 

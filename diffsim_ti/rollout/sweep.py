@@ -208,7 +208,7 @@ class Sweep:
         while end > 0 and schedule.bounds(end - 1)[1] > stop:
             at = kept[-1]
             if self._recorded:
-                self._reverse_segment(0, self.num_passes, stop, careful)
+                self._reverse_segment(0, self.num_passes, stop, stop, careful)
                 break
             ws.restore(self._snapshots, len(kept) - 1)
             for segment in schedule.path(at, end, schedule.snapshots - len(kept)):
@@ -220,7 +220,7 @@ class Sweep:
             if at < end - 1:  # no snapshot is left: come here anew
                 ws.advance(schedule.bounds(at)[0], first, self.num_passes)
             self._record(first, last)
-            self._reverse_segment(first, last, max(first, stop), careful)
+            self._reverse_segment(first, last, max(first, stop), stop, careful)
             end -= 1
             if kept[-1] == end:
                 kept.pop()
@@ -228,29 +228,37 @@ class Sweep:
             self._adjoint.finish()
         return norms
 
-    def _reverse_segment(self, first: int, last: int, stop: int, careful: bool) -> None:
-        save, adjoint, substeps = self.passes_per_frame, self._adjoint, self.solver.substeps
+    def _reverse_segment(self, first: int, last: int, stop: int, end: int, careful: bool) -> None:
+        """Passes last - 1 .. stop of a segment that begins with pass `first`; the whole sweep stops at pass `end`."""
+        save, adjoint = self.passes_per_frame, self._adjoint
         if not careful:
-            adjoint.reverse(first, last, self.num_passes, save, stop)
+            adjoint.reverse(first, last, self.num_passes, save, stop, to_state=0 < stop == end)
             return
+        substeps, passes = self.solver.substeps, self.steps * self.solver.substeps
         while last > stop:
-            begin = max(stop, (last - 1) // substeps * substeps)
-            adjoint.reverse(first, last, self.num_passes, save, begin)
-            by_position, by_velocity = adjoint.norm()
-            step, scaled = begin // substeps, 1.0
-            if not np.isfinite(by_position + by_velocity):
-                raise FloatingPointError(
-                    f"the adjoint became not finite in step {step} (t = {step * self.solver.dt:g} s): "
-                    "look at the loss and at how long the rollout stays smooth; parameters are unchanged"
-                )
-            norm = float(np.hypot(by_position, by_velocity))
-            if self.clip is not None and norm > self.clip:
-                scaled = self.clip / norm
-                adjoint.scale(scaled)
-            self.health.append(
-                {"step": step, "norm_position": by_position, "norm_velocity": by_velocity, "scaled": scaled}
-            )
+            begin = max(stop, (min(last, passes) - 1) // substeps * substeps)
+            at_step = begin % substeps == 0 and begin < passes  # and not where a segment happens to begin
+            adjoint.reverse(first, last, self.num_passes, save, begin, to_state=at_step and begin > 0)
+            if at_step:
+                self._look_at_adjoint(begin // substeps)
+                if begin > end:
+                    adjoint.reverse_kick(begin, first, self.num_passes)
             last = begin
+
+    def _look_at_adjoint(self, step: int) -> None:
+        """Between steps: report the running adjoint, and scale it back to `clip`."""
+        by_position, by_velocity = self._adjoint.norm()
+        if not np.isfinite(by_position + by_velocity):
+            raise FloatingPointError(
+                f"the adjoint became not finite in step {step} (t = {step * self.solver.dt:g} s): "
+                "look at the loss and at how long the rollout stays smooth; parameters are unchanged"
+            )
+        scaled = 1.0
+        norm = float(np.hypot(by_position, by_velocity))
+        if self.clip is not None and norm > self.clip:
+            scaled = self.clip / norm
+            self._adjoint.scale(scaled)
+        self.health.append({"step": step, "norm_position": by_position, "norm_velocity": by_velocity, "scaled": scaled})
 
     def _warn_if_coarse(self, seen: ContactResolution) -> None:
         """Once."""

@@ -15,6 +15,7 @@ from diffsim_ti.runtime.arrays import (
     view,
 )
 from diffsim_ti.runtime.field_pool import FieldPool, current_tape, fields
+from diffsim_ti.runtime.kernels import LANES, Kernel, array_types
 from diffsim_ti.runtime.language import Bundle, at, let, traced
 from diffsim_ti.runtime.launch import Launch, TensorLaunch
 from diffsim_ti.runtime.start import (

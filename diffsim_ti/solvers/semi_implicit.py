@@ -62,8 +62,7 @@ class SemiImplicitSolver(ExplicitSolver):
     def num_passes(self, steps: int) -> int:
         return steps * self.substeps
 
-    def groups(self, first, last, num_passes, rate):
+    def weights(self, j, num_passes, rate):
         h = self.dt / self.substeps
         decay = math.exp(-rate * h)
-        weights = Weights(0, 0, 0.0, h, h * decay, decay, -h * h * decay, -h * decay)
-        return [(first, last - first, weights)] if last > first else []
+        return Weights(0, 0, 0.0, h, h * decay, decay, -h * h * decay, -h * decay)

@@ -8,6 +8,7 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.state import stability
+from diffsim_ti.state.schedule import Schedule
 
 
 class Solver(ABC):
@@ -41,6 +42,11 @@ class Solver(ABC):
         """The same solver for another scene."""
         own = dict(dt=self.dt, substeps=self.substeps, parallel=self.parallel, allow_unstable=self.allow_unstable)
         return type(self)(scene, **own)
+
+    @property
+    def schedule(self) -> Schedule:
+        """Where each pass lies in time."""
+        return Schedule(self.dt, self.substeps)
 
     @property
     def substep(self) -> float:

@@ -2,6 +2,8 @@
 
 import math
 
+import numpy as np
+
 from diffsim_ti.solvers.explicit.solver import ExplicitSolver, Weights
 
 
@@ -19,16 +21,18 @@ class VelocityVerletSolver(ExplicitSolver):
     def num_passes(self, steps: int) -> int:
         return steps * self.substeps + 1
 
-    def groups(self, first, last, num_passes, rate):
+    def weights(self, j, num_passes, rate):
         h = self.dt / self.substeps
         decay = math.exp(-rate * h)
-        drift = (h * (1 + decay) / 2, decay, -h * h * decay / 2, -h * decay)
-        runs = [
-            (0, 1, Weights(0, 0, 0.0, h / 2, *drift)),
-            (1, num_passes - 1, Weights(1, 0, h / 2, h / 2, *drift)),
-            (num_passes - 1, num_passes, Weights(1, 1, h / 2, 0.0, 0.0, 1.0)),
-        ]
-        if num_passes == 1:  # no step: the pass only shows the start
-            runs = [(0, 1, Weights(0, 0, 0.0, 0.0, 0.0, 1.0))]
-        cut = ((max(first, a), min(last, b), w) for a, b, w in runs)
-        return [(a, b - a, w) for a, b, w in cut if b > a]
+        kicked, kicks = j > 0, j < num_passes - 1  # the half kicks that end a step, and that begin one
+        drifts = lambda x, none=0.0: np.where(kicks, x, none)  # noqa: E731
+        return Weights(
+            kicked * 1,
+            (~kicks & kicked) * 1,
+            kicked * h / 2,
+            kicks * h / 2,
+            drifts(h * (1 + decay) / 2),
+            drifts(decay, 1.0),
+            drifts(-h * h * decay / 2),
+            drifts(-h * decay),
+        )

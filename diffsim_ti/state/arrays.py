@@ -4,10 +4,12 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
-from diffsim_ti.elements.tetrahedron import LANES
 from diffsim_ti.inputs import Derived
 from diffsim_ti.mesh.patches import in_eights, volume_patches
-from diffsim_ti.solvers.explicit.kick_drift import Features
+from diffsim_ti.runtime import LANES
+from diffsim_ti.state.features import Features, grouped
+from diffsim_ti.state.numbers import TANGENT, on_device
+from diffsim_ti.state.schedule import Schedule
 from diffsim_ti.terms import Drag, ExternalForce, Gravity, SelfContact
 
 
@@ -31,73 +33,40 @@ def slots(indices: np.ndarray, num_vertices: int) -> np.ndarray:
     return out
 
 
-def to_blocks(per_tetrahedron: np.ndarray, order: np.ndarray) -> np.ndarray:
-    """(num_tetrahedra, rows) as (num_blocks * rows, LANES); order: the tetrahedron in each lane."""
-    rows = per_tetrahedron.reshape(len(per_tetrahedron), -1)[order]
-    return np.swapaxes(rows.reshape(len(order) // LANES, LANES, -1), 1, 2).reshape(-1, LANES)
-
-
-def from_blocks(blocks: np.ndarray, place, rows: int) -> np.ndarray:
-    """The inverse: (num_tetrahedra, rows) in float64; place: where each tetrahedron stands, among all lanes."""
-    return np.swapaxes(blocks.reshape(-1, rows, LANES), 1, 2).reshape(-1, rows)[place].astype(np.float64)
-
-
 class SceneArrays:
-    """What the kernels read of a scene: its topology, once, and the numbers derived from its inputs, per load."""
+    """What the kernels read of a scene: its topology, once, and its numbers (state/numbers.py), per load."""
 
     def __init__(self, scene):
         mesh, precision = scene.mesh, scene.precision
         fp = runtime.PRECISIONS[precision]
         self.fp, self.vector, self.lanes = fp, ti.types.vector(4, fp), ti.types.vector(LANES, fp)
         self.law = scene.law
-        self._place_tetrahedra(scene)
+        self._order_tetrahedra(scene)
         self.num_coefficients, self.num_blocks = len(self.law.coefficient_names), len(self.order) // LANES
         self.in_lanes = self.law.lanes and runtime.runs_on_cpu()
         self.num_items = self.num_blocks if self.in_lanes else self.num_places
         self.num_vertices, self.num_tetrahedra = mesh.num_vertices, mesh.num_tetrahedra
         self.contacts = tuple(t for t in scene.ordered_terms if t.acts_on_surface)
         self.fixed = scene.fixed
-        self.tets = runtime.upload(to_blocks(mesh.tetrahedra, self.order).ravel(), ti.i32)
         self.mesh, self.precision, self.self_contact = mesh, precision, scene.term(SelfContact)
-        self.first_contact_corner, num_corners = 4 * LANES * self.num_blocks, 4 * LANES * self.num_blocks
-        start, corner_of = vertex_corners(mesh.tetrahedra, mesh.num_vertices)
-        if self.patches is not None:
-            corner_of = 4 * self.place[corner_of // 4] + corner_of % 4
-        if self.self_contact:  # each surface vertex gathers one corner more, after those of its tetrahedra
-            self.parameters_of_self_contact = scene.inputs.parameters.of(self.self_contact)
-            start, corner_of = with_own_corner(start, corner_of, mesh.surface_vertices, num_corners)
-            num_corners += len(mesh.surface_vertices)
-        self.start, self.corner_of = runtime.upload(start, ti.i32), runtime.upload(corner_of, ti.i32)
-        none = runtime.array(ti.i32, 1)
-        self.surface = none
-        if self.contacts:
-            surface = np.zeros(mesh.num_vertices, np.int32)
-            surface[mesh.surface_vertices] = 1
-            self.surface = runtime.upload(surface, ti.i32)
-        external = scene.term(ExternalForce)
-        self.force_slot = none
-        if external:
-            self.force_slot = runtime.upload(slots(external.indices(mesh), mesh.num_vertices), ti.i32)
-        self.motion_slot = none
-        if scene.motion is not None:
-            self.motion_slot = runtime.upload(slots(scene.fixed, mesh.num_vertices), ti.i32)
+        self._upload_topology(scene)
         rows = scene.inputs.parameters
+        self.obstacles = self._twins(scene)
         self._features = dict(
-            contacts=self._twins(scene),
+            groups=grouped(self.obstacles),
             moving=len(scene.moving),
             gravity=rows.first(scene.term(Gravity)),
             drag=rows.first(scene.term(Drag)),
-            forces=external is not None,
+            forces=scene.term(ExternalForce) is not None,
             motion=scene.motion is not None,
             num_parameters=rows.total,
         )
         self.offsets = runtime.array(
-            self.vector, len(self.contacts)
-        )  # where obstacles are when one looks between passes
+            self.vector, 3 * len(self.contacts)
+        )  # walls (potential/) as one looks between passes
         self.values: Derived | None = None
-        self.corner = runtime.array(self.vector, num_corners)
 
-    def _place_tetrahedra(self, scene) -> None:
+    def _order_tetrahedra(self, scene) -> None:
         """`order`: the tetrahedron in each lane; `place`: the lane of each; `num_places`: lanes to go through."""
         m = scene.mesh.num_tetrahedra
         self.patches = volume_patches(scene.mesh) if scene.volume == "patches" else None
@@ -111,21 +80,43 @@ class SceneArrays:
         self.order[:m] = np.arange(m)
         self.place, self.num_places = slice(m), m
 
-    def _twins(self, scene) -> tuple:
-        """Compile-time twins of the contacts; their tables stand behind the parameters, one after the other."""
-        columns, twins, at = {term: k for k, term in enumerate(scene.moving)}, [], max(scene.inputs.parameters.total, 1)
+    def _upload_topology(self, scene) -> None:
+        mesh, n = self.mesh, self.num_vertices
+        self.tets = runtime.upload(self.to_blocks(mesh.tetrahedra).ravel(), ti.i32)
+        self.first_contact_corner, num_corners = 4 * LANES * self.num_blocks, 4 * LANES * self.num_blocks
+        start, corner_of = vertex_corners(mesh.tetrahedra, n)
+        if self.patches is not None:
+            corner_of = 4 * self.place[corner_of // 4] + corner_of % 4
+        if self.self_contact:  # each surface vertex gathers one corner more, after those of its tetrahedra
+            self.parameters_of_self_contact = scene.inputs.parameters.of(self.self_contact)
+            start, corner_of = with_own_corner(start, corner_of, mesh.surface_vertices, num_corners)
+            num_corners += len(mesh.surface_vertices)
+        self.start, self.corner_of = runtime.upload(start, ti.i32), runtime.upload(corner_of, ti.i32)
+        self.corner = runtime.array(self.vector, num_corners)
+        self.surface = self.force_slot = self.motion_slot = runtime.array(ti.i32, 1)
+        if self.contacts:
+            self.surface = runtime.upload(np.isin(np.arange(n), mesh.surface_vertices), ti.i32)
+        if scene.term(ExternalForce):
+            self.force_slot = runtime.upload(slots(scene.term(ExternalForce).indices(mesh), n), ti.i32)
+        if scene.motion is not None:
+            self.motion_slot = runtime.upload(slots(scene.fixed, n), ti.i32)
+
+    def _twins(self, scene) -> list[tuple]:
+        """(compile-time twin, first parameter, column of the path or -1) of the obstacles; their tables stand behind the
+        parameters, one after the other."""
+        columns, out = {term: k for k, term in enumerate(scene.moving)}, []
+        at = max(scene.inputs.parameters.total, 1)
         self.tables = np.concatenate([np.zeros(0), *(t.table for t in self.contacts)])
         for term in self.contacts:
-            own = dict(path=columns[term]) if term in columns else {}
             rows = scene.inputs.parameters.of(term)
-            twin = term.kernel(scene.precision, rows.start, **own | (dict(table=at) if term.table.size else {}))
-            if slice(twin.first, twin.first + twin.size) != rows:  # it would read, and add to, another term's rows
+            twin = term.kernel(scene.precision, **(dict(table=at) if term.table.size else {}))
+            if twin.size != rows.stop - rows.start:  # it would read, and add to, another term's rows
                 raise AssertionError(
                     f"the kernel of {term!r} has {twin.size} numbers, its term {rows.stop - rows.start}"
                 )
-            twins.append(twin)
+            out.append((twin, rows.start, columns.get(term, -1)))
             at += term.table.size
-        return tuple(twins)
+        return out
 
     def features(self, density: bool = False, shape: bool = False) -> Features:
         """What kernels must contain for the values that are loaded."""
@@ -143,20 +134,11 @@ class SceneArrays:
         old, before = self.values, None if self.values is None else self.features()
         self.values = values
         moved = before != self.features()
-        inverse_mass = np.divide(1.0, values.mass, out=np.zeros_like(values.mass), where=values.mass > 0)
-        inverse_mass[self.fixed] = 0
-        sources = {
-            "gradients": (to_blocks(values.gradients, self.order), self.lanes),
-            "volumes": (self.volume_blocks(values.volumes), self.lanes),
-            "coefficients": (self.coefficient_blocks(values.coefficients), self.lanes),
-            "inverse_mass": (inverse_mass, self.fp),
-            "parameters": (np.concatenate([values.parameters, self.tables]), self.fp),
-            "rest": (values.rest if self.contacts or self.self_contact else np.zeros((1, 3)), self.vector),
-            "forces": (np.zeros((1, 1, 3)) if values.forces is None else values.forces, self.vector),
-            "motion": (np.zeros((1, 1, 3)) if values.motion is None else values.motion, self.vector),
-            "path": (np.zeros((1, 1, 3)) if values.path is None else values.path, self.vector),
-            "anchor": (np.zeros((1, 3)) if values.motion is None else values.displacement[self.fixed], self.vector),
-        }
+        sources = {name: on_device(self, name, values) for name in TANGENT if name != "mass"}
+        sources["parameters"] = np.concatenate([values.parameters, self.tables]), self.fp
+        if not (self.contacts or self.self_contact):
+            sources["rest"] = np.zeros((1, 3)), self.vector
+        sources["inverse_mass"] = self._inverse_mass(values.mass), self.fp
         for name, (data, dtype) in sources.items():
             current = getattr(self, name, None)
             if current is None or tuple(current.shape) != data.shape[: len(current.shape)]:
@@ -166,40 +148,42 @@ class SceneArrays:
                 runtime.fill(current, data)
         return moved
 
-    def place_obstacles(self, row: int, share: float = 0.0) -> None:
-        """Put what looks at a state between passes where the obstacles are: `share` of a step beyond row `row` of paths."""
-        features = self.features()
-        if features.moving:
-            rows, places = runtime.fetch(self.path).astype(np.float64), np.zeros((len(features.contacts), 3))
-            row, after = min(row, len(rows) - 1), min(row + 1, len(rows) - 1)
-            for k, contact in enumerate(features.contacts):
-                if contact.path >= 0:
-                    places[k] = (1 - share) * rows[row, contact.path] + share * rows[after, contact.path]
-            runtime.fill(self.offsets, places)
+    def _inverse_mass(self, mass: np.ndarray) -> np.ndarray:
+        """1 / m of the vertices that move freely, 0 of the others."""
+        out = np.divide(1.0, mass, out=np.zeros_like(mass), where=mass > 0)
+        out[self.fixed] = 0
+        return out
+
+    def place_obstacles(self, schedule: Schedule, j: int) -> None:
+        """Put what looks at a state between passes where the obstacles are when pass j begins."""
+        if self.values.path is not None:
+            now = schedule.place(self.values.path, j, schedule.begin(j))
+            walls = np.zeros((3 * len(self.obstacles), 3))
+            walls[::3] = [now[c] if c >= 0 else np.zeros(3) for _, _, c in self.obstacles]
+            runtime.fill(self.offsets, walls)
+
+    # ---- numbers of tetrahedra in blocks -----------------------------------------------------------------------------
+
+    def to_blocks(self, per_tetrahedron: np.ndarray, order: np.ndarray | None = None) -> np.ndarray:
+        """(num_tetrahedra, rows) as (num_blocks * rows, LANES); order: the tetrahedron in each lane."""
+        order = self.order if order is None else order
+        rows = per_tetrahedron.reshape(len(per_tetrahedron), -1)[order]
+        return np.swapaxes(rows.reshape(len(order) // LANES, LANES, -1), 1, 2).reshape(-1, LANES)
+
+    def from_blocks(self, blocks: np.ndarray, rows: int) -> np.ndarray:
+        """The inverse: (num_tetrahedra, rows) in float64."""
+        flat = np.swapaxes(blocks.reshape(-1, rows, LANES), 1, 2).reshape(-1, rows)
+        return flat[self.place].astype(np.float64)
 
     def coefficient_blocks(self, coefficients: np.ndarray) -> np.ndarray:
         """Blocks of coefficients, shape (K,) or (num_tetrahedra, K); a single block serves all if they are uniform."""
-        return to_blocks(np.atleast_2d(coefficients), np.zeros(LANES, int) if coefficients.ndim == 1 else self.order)
+        uniform = np.zeros(LANES, int) if coefficients.ndim == 1 else None
+        return self.to_blocks(np.atleast_2d(coefficients), uniform)
 
     def volume_blocks(self, volumes: np.ndarray) -> np.ndarray:
         """Blocks of volumes; repetitions in a patch have none."""
-        blocks = to_blocks(volumes, self.order)
+        blocks = self.to_blocks(volumes)
         return blocks if self.patches is None else blocks * self._alone.reshape(-1, LANES)
-
-    def topology(self) -> tuple:
-        """Arguments that every pass starts with."""
-        return (
-            self.tets,
-            self.gradients,
-            self.volumes,
-            self.coefficients,
-            self.start,
-            self.corner_of,
-            self.inverse_mass,
-            self.parameters,
-            self.rest,
-            self.surface,
-        )
 
 
 class History:

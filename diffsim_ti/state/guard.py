@@ -194,10 +194,11 @@ class Guard:
 
         The present state counts: kinetic energy and what the barrier already holds, against k w^2 beta(1 / 1000).
         """
-        arrays, twin = self.ws.arrays, self.ws.arrays.features().contacts[k]
-        stiffness, width = (float(arrays.values.parameters[twin.first + twin.count + m]) for m in (0, 1))
+        arrays = self.ws.arrays
+        twin, first, _ = arrays.obstacles[k]
+        stiffness, width = (float(arrays.values.parameters[first + twin.count + m]) for m in (0, 1))
         self.ws.place_obstacles(self.good_pass)
-        place = runtime.fetch(arrays.offsets)[k].astype(np.float64)
+        place = runtime.fetch(arrays.offsets)[3 * k].astype(np.float64)
         position = arrays.values.rest[vertex] + runtime.fetch(self.ws.state.u)[0, vertex]
         gap = float(self.ws.watch.contacts[k].gap(position[None], place)[0])
         s = np.clip(gap / width, 1e-3, 1)

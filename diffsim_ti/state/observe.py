@@ -1,58 +1,59 @@
 """What can be read off a state: energies, stress, volume ratio."""
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
+from types import SimpleNamespace
 
 import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
 from diffsim_ti.elements.patched_tetrahedron import functions_of
-from diffsim_ti.runtime import Bundle
+from diffsim_ti.potential.kernels import potential_kernels
+from diffsim_ti.runtime import Kernel
+from diffsim_ti.state.features import Features
+from diffsim_ti.state.numbers import SCENE
+
+A = ti.template()
+
+
+@dataclass(frozen=True)
+class ObserverKernels:
+    """What the tetrahedra show at a displacement."""
+
+    law: object
+    features: Features
+
+    @cached_property
+    def element(self):
+        return functions_of(self.law, self.features.uniform, False)
+
+    @ti.func
+    def observe(self, scene: A, at: A, out: A, plan: A):
+        for e in range(plan.num_places):
+            H = self.element.edges(e, scene, at.u, 0).dot(self.element.gradients_of(e, scene.gradients))
+            p = self.element.coefficients_at(e, scene, at.u, 0)
+            F = H.matrix() + ti.Matrix.identity(self.element.types.fp, 3)
+            det = F.determinant()
+            S = self.law.stress(H, p).matrix() @ F.transpose() / det  # Cauchy
+            out.energy[e] = self.law.energy_density(H, p)
+            out.J[e] = det
+            a, b, c = S[0, 0] - S[1, 1], S[1, 1] - S[2, 2], S[2, 2] - S[0, 0]
+            shear = S[0, 1] * S[0, 1] + S[1, 2] * S[1, 2] + S[2, 0] * S[2, 0]
+            out.von_mises[e] = ti.sqrt(ti.cast(0.5, self.element.types.fp) * (a * a + b * b + c * c) + 3 * shear)
+
+    @cached_property
+    def fields(self) -> Kernel:
+        """Energy density [J/m^3], von Mises stress [Pa], J of each tetrahedron."""
+        out = dict.fromkeys(("energy", "von_mises", "J"), "scalars")
+        own = dict(scene=SCENE, at=dict(u="vectors2"), out=out)
+        return Kernel("fields", self.observe, self.law.precision, own, dict(num_places="int"))
 
 
 @lru_cache(maxsize=None)
-def observer_kernels(law, features):
-    """Kernels (fields of the tetrahedra, contact energy of the vertices) at a displacement."""
-    el = functions_of(law, features.uniform, False)
-    t, contacts = el.types, features.contacts
-
-    @ti.kernel
-    def tetrahedron_fields(
-        tets: t.ints,
-        gradients: t.blocks,
-        volumes: t.blocks,
-        coefficients: t.blocks,
-        u: t.vectors2,
-        energy: t.scalars,
-        von_mises: t.scalars,
-        J: t.scalars,
-        num_places: ti.i32,
-    ):
-        scene = Bundle(tets=tets, gradients=gradients, volumes=volumes, coefficients=coefficients)
-        for e in range(num_places):
-            H, p = el.edges(e, scene, u, 0).dot(el.gradients_of(e, gradients)), el.coefficients_at(e, scene, u, 0)
-            F = H.matrix() + ti.Matrix.identity(t.fp, 3)
-            det = F.determinant()
-            S = law.stress(H, p).matrix() @ F.transpose() / det  # Cauchy
-            energy[e] = law.energy_density(H, p)
-            J[e] = det
-            a, b, c = S[0, 0] - S[1, 1], S[1, 1] - S[2, 2], S[2, 2] - S[0, 0]
-            shear = S[0, 1] * S[0, 1] + S[1, 2] * S[1, 2] + S[2, 0] * S[2, 0]
-            von_mises[e] = ti.sqrt(ti.cast(0.5, t.fp) * (a * a + b * b + c * c) + 3 * shear)
-
-    @ti.kernel
-    def contact_energy(
-        rest: t.vectors, offsets: t.vectors, surface: t.ints, parameters: t.scalars, u: t.vectors2, energy: t.scalars
-    ):
-        for i in range(u.shape[1]):
-            energy[i] = 0
-            if ti.static(len(contacts) > 0):
-                if surface[i] > 0:
-                    for k in ti.static(range(len(contacts))):
-                        energy[i] += contacts[k].energy(parameters, rest[i] - offsets[k], u[0, i])
-
-    return tetrahedron_fields, contact_energy
+def observer_kernels(law, features: Features) -> ObserverKernels:
+    """Kernels for a law and a scene's features."""
+    return ObserverKernels(law, features)
 
 
 class Energy(float):
@@ -78,10 +79,31 @@ class TetrahedronFields:
 def tetrahedron_fields(workspace) -> TetrahedronFields:
     """Fields of the current state. von Mises is sqrt(3/2 dev S : dev S) of the Cauchy stress S = P F^T / J."""
     a = workspace.arrays
-    out = [runtime.array(a.fp, a.num_places) for _ in range(3)]
-    kernel = observer_kernels(a.law, a.features())[0]
-    kernel(a.tets, a.gradients, a.volumes, a.coefficients, workspace.state.u, *out, a.num_places)
-    return TetrahedronFields(*(runtime.fetch(x)[a.place].astype(np.float64) for x in out))
+
+    def bind():
+        out = SimpleNamespace(**{name: runtime.array(a.fp, a.num_places) for name in ("energy", "von_mises", "J")})
+        return out, observer_kernels(a.law, a.features()).fields.bind(scene=a, at=workspace.state, out=out)
+
+    out, look = workspace.kept("fields", bind)
+    look(num_places=a.num_places)
+    return TetrahedronFields(
+        *(runtime.fetch(x)[a.place].astype(np.float64) for x in (out.energy, out.von_mises, out.J))
+    )
+
+
+def barrier_energies(workspace) -> np.ndarray:
+    """Energy of the obstacles' barriers at each vertex [J], in the current state."""
+    a = workspace.arrays
+
+    def bind():
+        out = SimpleNamespace(contact=runtime.array(a.fp, a.num_vertices))
+        walls = SimpleNamespace(walls=a.offsets, lag=runtime.array(a.vector, 2, 1))
+        kernel = potential_kernels(a.law, a.features(), workspace.parallel, a.in_lanes).barrier_energy
+        return out, kernel.bind(scene=a, pass_=walls, at=workspace.state, out=out)
+
+    out, look = workspace.kept("barriers", bind)
+    look(num_items=a.num_items, num_tetrahedra=a.num_places, num_vertices=a.num_vertices, per_gamma=0.0)
+    return runtime.fetch(out.contact).astype(np.float64)
 
 
 def energy(workspace) -> Energy:
@@ -94,10 +116,8 @@ def energy(workspace) -> Energy:
     if features.gravity >= 0:
         g = values.parameters[features.gravity :][:3]
         parts["gravity"] = float(-(values.mass * ((values.rest + u) @ g)).sum())
-    if features.contacts:
-        per_vertex = runtime.array(a.fp, a.num_vertices)
-        observer_kernels(a.law, features)[1](a.rest, a.offsets, a.surface, a.parameters, workspace.state.u, per_vertex)
-        parts["contact"] = float(runtime.fetch(per_vertex).astype(np.float64).sum())
+    if features.groups:
+        parts["contact"] = float(barrier_energies(workspace).sum())
     if workspace.pairs:
         parts["contact"] = parts.get("contact", 0.0) + workspace.pairs.look(workspace.state.u)[0]
     return Energy(parts)

@@ -1,15 +1,12 @@
 """How large a step may be: a bound by elements, the tight limit by Lanczos, and a watch during the run."""
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
-import taichi as ti
 
 from diffsim_ti import runtime
-from diffsim_ti.elements.patched_tetrahedron import functions_of
 from diffsim_ti.mesh.patches import volume_patches
-from diffsim_ti.runtime import Bundle
+from diffsim_ti.potential.kernels import potential_kernels
 
 
 @dataclass(frozen=True)
@@ -49,52 +46,6 @@ def element_limit(scene, values: dict | None = None) -> StepLimit:
     return StepLimit(float(2 / np.sqrt(omega2[worst])), worst, "element bound")
 
 
-@lru_cache(maxsize=None)
-def stiffness_kernel(law, features, parallel: bool, lanes: bool):
-    """y = df/du . w at displacement u: elastic and contact forces."""
-    el = functions_of(law, features.uniform, lanes)
-    t, contacts = el.types, features.contacts
-
-    @ti.kernel
-    def stiffness_product(
-        tets: t.ints,
-        gradients: t.blocks,
-        volumes: t.blocks,
-        coefficients: t.blocks,
-        start: t.ints,
-        corner_of: t.ints,
-        inverse_mass: t.scalars,
-        parameters: t.scalars,
-        rest: t.vectors,
-        surface: t.ints,
-        offsets: t.vectors,
-        corner: t.vectors,
-        u: t.vectors2,
-        v: t.vectors2,
-        w: t.vectors2,
-        y: t.vectors2,
-        num_items: ti.i32,
-        num_vertices: ti.i32,
-    ):
-        scene = Bundle(
-            tets=tets, gradients=gradients, volumes=volumes, coefficients=coefficients, start=start, corner_of=corner_of
-        )
-        ti.loop_config(serialize=not parallel)
-        for e in range(num_items):
-            el.stiffness(e, scene, u, 0, w, corner)
-        ti.loop_config(serialize=not parallel)
-        for i in range(num_vertices):
-            f = el.gather(i, scene, corner)
-            if ti.static(len(contacts) > 0):
-                if surface[i] > 0:
-                    for k in ti.static(range(len(contacts))):
-                        X = rest[i] - offsets[k]
-                        f += contacts[k].force_jvp(parameters, X, u[0, i], v[0, i], w[0, i], t.vector(0))
-            y[0, i] = f
-
-    return stiffness_product
-
-
 class Stiffness:
     """Products of M^-1/2 (-df/du) M^-1/2 on the free vertices, at the current state of a workspace."""
 
@@ -102,10 +53,10 @@ class Stiffness:
         self.ws = workspace
         a = workspace.arrays
         self.w, self.y = runtime.array(a.vector, 1, a.num_vertices), runtime.array(a.vector, 1, a.num_vertices)
-        kernel = stiffness_kernel(a.law, a.features(), workspace.parallel, a.in_lanes)
-        state = workspace.state
-        arrays = (*a.topology(), a.offsets, a.corner, state.u, state.v, self.w, self.y)
-        self._multiply = runtime.Launch(kernel, *arrays, vectorized=a.in_lanes)
+        self.walls, self.lag = a.offsets, runtime.array(a.vector, 2, 1)
+        kernels = potential_kernels(a.law, a.features(), workspace.parallel, a.in_lanes)
+        at = (workspace.state, self)
+        self._multiply = kernels.stiffness.bind(a.in_lanes, scene=a, pass_=self, at=at, out=self)
         self.vector, self._random = None, np.random.default_rng(1)
 
     @property
@@ -122,7 +73,8 @@ class Stiffness:
         if self.ws.pairs:
             self.ws.pairs.ensure(self.ws.state.u, 0)
             self.ws.pairs.product(self.ws.state.u, 0, self.w, self.ws.arrays.corner)
-        self._multiply(self.ws.arrays.num_items, self.ws.arrays.num_vertices)
+        a = self.ws.arrays
+        self._multiply(num_items=a.num_items, num_tetrahedra=a.num_places, num_vertices=a.num_vertices, per_gamma=0.0)
         return -root * runtime.fetch(self.y)[0].astype(np.float64) * scale
 
     def largest(self, tolerance: float = 1e-3) -> tuple[float, float]:

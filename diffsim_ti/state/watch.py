@@ -63,36 +63,36 @@ class ContactWatch:
         self.ws, arrays = weakref.proxy(workspace), workspace.arrays  # which holds this: no circle
         self.contacts = arrays.contacts
         n = arrays.num_vertices if self.contacts else 1
-        self.array = runtime.array(arrays.fp, 3 * len(self.contacts), n)
+        self.seen = runtime.array(arrays.fp, 3 * len(self.contacts), n)
         self.clear()
 
     def clear(self) -> None:
         """Forget what was seen."""
         if self.contacts:
-            rows = np.zeros(self.array.shape)
+            rows = np.zeros(self.seen.shape)
             rows[::3] = np.inf
-            runtime.fill(self.array, rows)
+            runtime.fill(self.seen, rows)
 
     def rows(self) -> np.ndarray:
         """What was seen, to be put back by `put`."""
-        return runtime.fetch(self.array)
+        return runtime.fetch(self.seen)
 
     def put(self, rows: np.ndarray) -> None:
-        runtime.fill(self.array, rows)
+        runtime.fill(self.seen, rows)
 
     def crossing(self) -> tuple[int, int, float] | None:
         """(contact, vertex, depth [m]) of the deepest place on or behind an obstacle, or None."""
         if not self.contacts:
             return None
-        host = runtime.view(self.array)
-        gaps = (runtime.fetch(self.array) if host is None else host)[::3]
+        host = runtime.view(self.seen)
+        gaps = (runtime.fetch(self.seen) if host is None else host)[::3]
         k, i = np.unravel_index(np.argmin(gaps), gaps.shape)
         return (int(k), int(i), -float(gaps[k, i])) if gaps[k, i] <= 0 else None
 
     def largest_omega_dt(self) -> float:
         """Largest h sqrt(b''(d) / m) since the run's start."""
-        host = runtime.view(self.array)
-        rows = runtime.fetch(self.array) if host is None else host
+        host = runtime.view(self.seen)
+        rows = runtime.fetch(self.seen) if host is None else host
         return float(np.sqrt(rows[1::3].max()))
 
     def resolution(self) -> ContactResolution:
@@ -118,7 +118,7 @@ class ContactWatch:
         """Depths in the barriers, in widths, that stop vertices with these speeds: m v^2 / 2 = k w^2 beta(1 - depth)."""
         arrays, h = self.ws.arrays, self.ws.solver.substep
         stiffness = [
-            arrays.values.parameters[c.first + c.count] if c.watched else 1.0 for c in arrays.features().contacts
+            arrays.values.parameters[first + twin.count] if twin.watched else 1.0 for twin, first, _ in arrays.obstacles
         ]
         energy = arrays.values.mass * travel**2 / (2 * h * h * np.array(stiffness)[:, None])
         s = np.linspace(1, 1e-3, 4096)

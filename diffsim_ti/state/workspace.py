@@ -1,10 +1,25 @@
 """Device data of one run: the scene's numbers, the current state, recorded states and saved frames as needed."""
 
+from typing import NamedTuple
+
+import taichi as ti
+
 from diffsim_ti import runtime
 from diffsim_ti.contact.surface_pairs import SurfacePairs
 from diffsim_ti.inputs import Derived
 from diffsim_ti.state.arrays import History, SceneArrays, copy_slot, first_bad_vertex
 from diffsim_ti.state.watch import ContactWatch
+
+
+class FrameArrays(NamedTuple):
+    """Displacements and velocities of the saved frames."""
+
+    frames_u: ti.Ndarray
+    frames_v: ti.Ndarray
+
+    @classmethod
+    def of(cls, arrays: SceneArrays, *shape: int) -> "FrameArrays":
+        return cls(runtime.array(arrays.vector, *shape), runtime.array(arrays.vector, *shape))
 
 
 class Workspace:
@@ -21,7 +36,7 @@ class Workspace:
         self.pairs = self.pairs_kind(self.arrays, self.parallel) if self.arrays.self_contact else None
         self.state = self.history(1)
         self.record: History | None = None
-        self.frames = (runtime.array(self.arrays.vector, 1, 1), runtime.array(self.arrays.vector, 1, 1))
+        self.frames = FrameArrays.of(self.arrays, 1, 1)
         self.watch = ContactWatch(self)
         self._launches = {}
         self.load(derived)
@@ -43,13 +58,18 @@ class Workspace:
         """Set the state to the start."""
         runtime.fill(self.state.u, self.arrays.values.displacement[None])
         runtime.fill(self.state.v, self.arrays.values.velocity[None])
-        self.arrays.place_obstacles(0)
+        self.place_obstacles(0)
         self.watch.clear()
 
     def place_obstacles(self, now: int) -> None:
         """Put obstacles where they are before pass `now`, for what looks at the state there."""
-        row, part = divmod(now, self.solver.substeps)
-        self.arrays.place_obstacles(row, part / self.solver.substeps)
+        self.arrays.place_obstacles(self.solver.schedule, now)
+
+    def kept(self, name, make):
+        """make(), kept until launches must be bound anew."""
+        if name not in self._launches:
+            self._launches[name] = make()
+        return self._launches[name]
 
     def forget(self) -> None:
         """The state was set from outside: forget what came before it."""
@@ -64,7 +84,7 @@ class Workspace:
 
     def make_frames(self, count: int) -> None:
         """Room for `count` saved states."""
-        self.frames = tuple(runtime.array(self.arrays.vector, count, self.arrays.num_vertices) for _ in range(2))
+        self.frames = FrameArrays.of(self.arrays, count, self.arrays.num_vertices)
         self._launches.clear()
 
     def make_record(self, num_slots: int) -> History:

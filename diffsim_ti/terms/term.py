@@ -20,6 +20,7 @@ class Term(ABC):
     acts_on_surface = False
     path = None  # displacement over time, of an obstacle that moves
     table = np.zeros(0)  # numbers without gradient, laid behind the parameters on the device
+    variant: tuple = ()  # what else than its class decides about the kernels of a term
 
     def __init__(self, **values):
         self.values = {name: np.array(value, dtype=np.float64) for name, value in values.items()}
@@ -38,11 +39,8 @@ class Term(ABC):
     def check_start(self, positions: np.ndarray, surface: np.ndarray) -> None:
         """Raise ValueError if the body may not start at `positions` [m], shape (num_vertices, 3)."""
 
-    def kernel(self, precision: str, first: int) -> "VertexForce | None":
-        """Compile-time twin; `first` is where its numbers start in the scene's parameter array.
-
-        A term with a path or a table is also given `path`, its column among those that move, and `table`, where it starts.
-        """
+    def kernel(self, precision: str) -> "VertexForce | None":
+        """Compile-time twin; a term with a table is also given `table`, where it starts in the scene's parameter array."""
         return None
 
     def __repr__(self) -> str:
@@ -58,36 +56,35 @@ def _short(value: np.ndarray) -> str:
 class VertexForce(ABC):
     """Compile-time twin of a term: Taichi functions of one vertex, at rest position X, displacement u, velocity v.
 
-    Vectors have four components, the last zero. Equal twins share compiled kernels.
+    Vectors have four components, the last zero. Equal twins share compiled kernels, and those of one scene a loop.
     `size` numbers start at `first` in the parameter array.
     """
 
     precision: str
-    first: int
     size = 0
-    # of obstacles only (obstacle.py): is there friction, the column of the path, are nearness and crossing noted?
-    friction, path, watched = False, -1, False
+    # of obstacles only (obstacle.py): is there friction, are nearness and crossing noted?
+    friction, watched = False, False
 
     @property
     def fp(self):
         return PRECISIONS[self.precision]
 
     @ti.func
-    def energy(self, parameters: ti.template(), X, u):
+    def energy(self, parameters: ti.template(), first, X, u):
         """Potential energy [J]."""
 
     @ti.func
-    def force(self, parameters: ti.template(), X, u, v):
+    def force(self, parameters: ti.template(), first, X, u, v):
         """Force [N]."""
 
     @ti.func
-    def force_jvp(self, parameters: ti.template(), X, u, v, du, dv):
+    def force_jvp(self, parameters: ti.template(), first, X, u, v, du, dv):
         """Change of the force for changes du, dv."""
 
     @ti.func
-    def force_vjp(self, parameters: ti.template(), X, u, v, w):
+    def force_vjp(self, parameters: ti.template(), first, X, u, v, w):
         """(adjoint of u, adjoint of v) for the adjoint w of the force."""
 
     @ti.func
-    def parameter_derivatives(self, parameters: ti.template(), X, u, v):
+    def parameter_derivatives(self, parameters: ti.template(), first, X, u, v):
         """Derivatives of the force by the term's own numbers: a tuple of `size` vectors."""

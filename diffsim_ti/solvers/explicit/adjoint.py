@@ -1,11 +1,14 @@
 """The reverse sweep and the tangent of a chain of kick-drift passes, along recorded states."""
 
+from types import SimpleNamespace
+
 import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.inputs import Derived
-from diffsim_ti.solvers.explicit.kick_drift import kick_drift_kernels
-from diffsim_ti.state.arrays import copy_slot, from_blocks, to_blocks
+from diffsim_ti.state.arrays import copy_slot
+from diffsim_ti.state.numbers import OF_STEPS, Adjoint, Tangent
+from diffsim_ti.state.workspace import FrameArrays
 
 
 class ExplicitAdjoint:
@@ -18,38 +21,21 @@ class ExplicitAdjoint:
         self.ws = workspace
         a = workspace.arrays
         self.features = a.features(density, shape)
-        self.kernels = kick_drift_kernels(a.law, self.features, workspace.parallel, a.in_lanes)
-        n, blocks = a.num_vertices, a.num_blocks
-        self.u, self.v, self.w = (runtime.array(a.vector, 1, n) for _ in range(3))
-        self.corner = runtime.array(a.vector, *a.corner.shape)
-        self.coefficients = runtime.array(a.lanes, a.num_coefficients * blocks)
-        self.sums = runtime.array(a.fp, self.features.sums().total, n)
-        self.forces, self.motion = (runtime.array(a.vector, *x.shape) for x in (a.forces, a.motion))
-        self.anchor = runtime.array(a.vector, *a.anchor.shape)
-        self.path = runtime.array(a.vector, *a.path.shape)
-        self.felt = runtime.array(a.vector, 2 * self.features.moving, n if self.features.moving else 1)
-        self.gradients = runtime.array(a.lanes, 9 * blocks if shape else 1)
-        self.volumes = runtime.array(a.lanes, blocks if shape else 1)
-        self.frames = tuple(runtime.array(a.vector, *f.shape) for f in workspace.frames)
+        self.numbers = Adjoint(a, self.features, more=OF_STEPS)
+        self.u, self.v, self.w = (runtime.array(a.vector, 1, a.num_vertices) for _ in range(3))
+        self.whole = SimpleNamespace(
+            u=runtime.array(a.vector, 1, a.num_vertices)
+        )  # u with what is still to be gathered
+        self.corner = runtime.array(a.vector, *a.corner.shape)  # products with the stiffness, still to be gathered
+        moving = self.features.moving
+        self.felt = runtime.array(a.vector, 2 * moving, a.num_vertices if moving else 1)  # of paths, by each vertex
+        self.frames = FrameArrays.of(a, *workspace.frames.frames_u.shape)
 
     def fits(self, workspace) -> bool:
         """Whether kernels and shapes are still those of the run."""
-        a, kept = workspace.arrays, (self.forces, self.path, *self.frames)
-        same = self.features == a.features(self.features.density, self.features.shape)
-        return same and all(x.shape == y.shape for x, y in zip(kept, (a.forces, a.path, *workspace.frames)))
-
-    def _sums(self) -> tuple:
-        return (
-            self.coefficients,
-            self.sums,
-            self.forces,
-            self.motion,
-            self.anchor,
-            self.path,
-            self.felt,
-            self.gradients,
-            self.volumes,
-        )
+        a = workspace.arrays
+        same = self.numbers.fits(a, a.features(self.features.density, self.features.shape))
+        return same and self.frames.frames_u.shape == workspace.frames.frames_u.shape
 
     def start(self, positions_adj: np.ndarray, velocities_adj: np.ndarray, last_frame_is_input: bool) -> None:
         """Set the adjoints of the frames, shape (frames, n, 3), and clear the rest.
@@ -57,79 +43,72 @@ class ExplicitAdjoint:
         last_frame_is_input: the last frame is the state after the last pass (else the last pass shows it itself).
         """
         self.clear()
-        runtime.fill(self.frames[0], positions_adj)
-        runtime.fill(self.frames[1], velocities_adj)
+        runtime.fill(self.frames.frames_u, positions_adj)
+        runtime.fill(self.frames.frames_v, velocities_adj)
         if last_frame_is_input:
             runtime.fill(self.u, positions_adj[-1:])
             runtime.fill(self.v, velocities_adj[-1:])
 
     def clear(self) -> None:
         """All adjoints zero, but those of the frames."""
-        for target in (*self._sums(), self.u, self.v, self.w):
+        self.numbers.clear()
+        for target in (self.felt, self.u, self.v, self.w):
             runtime.fill(target, 0)
         if self.ws.pairs:
             self.ws.pairs.clear_sums()
 
-    def reverse(self, base: int, last: int, num_passes: int, save_every: int, stop: int) -> None:
-        """Mirror passes last - 1 .. stop; slot 0 of the record holds the state before pass `base`."""
-        ws, a = self.ws, self.ws.arrays
-        history = ws.record
-        launch = ws._launch(
-            "vjp",
-            self.kernels.step_vjp,
-            *a.topology(),
-            a.force_slot,
-            a.motion_slot,
-            a.path,
-            self.corner,
-            history.u,
-            history.v,
-            history.f,
-            self.u,
-            self.v,
-            self.w,
-            *self._sums(),
-            *self.frames,
-        )
-        substeps, inverse_dt = ws.solver.substeps, 1 / ws.solver.dt
-        chunk = 1 if ws.parallel or ws.pairs else max(1, ws.work_per_launch // (2 * a.num_tetrahedra))
-        for start, count, w in reversed(ws.solver.groups(stop, last, num_passes, ws.rate)):
-            end = start + count
-            while end > start:
-                begin = max(start, end - chunk)
-                launch(
-                    a.num_items,
-                    a.num_vertices,
-                    begin,
-                    end - begin,
-                    base,
-                    num_passes,
-                    substeps,
-                    save_every,
-                    w.lag0,
-                    w.lag1,
-                    w.pre,
-                    w.post,
-                    w.alpha,
-                    w.decay,
-                    inverse_dt,
-                    ws.solver.substep,
-                    w.alpha_by_rate,
-                    w.decay_by_rate,
-                )
-                if ws.pairs:
-                    ws.pairs.ensure(history.u, begin - base)
-                    ws.pairs.vjp(history.u, begin - base, self.w, self.corner)
-                end = begin
+    def reverse(
+        self, base: int, last: int, num_passes: int, save_every: int, stop: int, to_state: bool = False
+    ) -> None:
+        """Go back through passes last - 1 .. stop; slot 0 of the record holds the state before pass `base`.
+
+        to_state: stop at the state that pass `stop` shows, and leave the half kick that leads to it to `reverse_kick`.
+        """
+        halt = stop if to_state else -1
+        for numbers in self.ws.launches(stop, last, num_passes, save_every, self._work, backwards=True):
+            self._launch(numbers, base, num_passes, halt, kick=0)
+
+    def reverse_kick(self, j: int, base: int, num_passes: int) -> None:
+        """Go back through the half kick that leads to the state which pass j shows."""
+        if np.any(self.ws.solver.weights(np.array([j]), num_passes, self.ws.rate).pre):
+            for numbers in self.ws.launches(j, j + 1, num_passes, 0, self._work):
+                self._launch(numbers, base, num_passes, halt=-1, kick=1)
+
+    @property
+    def _work(self) -> int:
+        """Of a pass, in those of tetrahedra forward."""
+        return 2 * self.ws.arrays.num_tetrahedra
+
+    def _launch(self, numbers: dict, base: int, num_passes: int, halt: int, kick: int) -> None:
+        ws, history, own = self.ws, self.ws.record, (self, self.numbers, self.frames)
+        states = (history, ws.frames, ws.watch)
+        launch = ws.bound(ws.kernels(self.features).step_vjp, state=states, adjoint=own, table=ws.table)
+        launch(**numbers, base=base, num_passes=num_passes, halt=halt, kick=kick)
+        if ws.pairs:
+            slot = numbers["first"] - base
+            ws.pairs.ensure(history.u, slot)
+            ws.pairs.vjp(history.u, slot, self.w, self.corner)
 
     def finish(self) -> None:
         """Complete the adjoint of the start."""
-        a = self.ws.arrays
-        self.ws._launch("finish", self.kernels.finish_vjp, a.start, a.corner_of, self.corner, self.u)(a.num_vertices)
+        self._gather(self)
+
+    def _gather(self, into) -> None:
+        """Add to `into.u` what the last pass handed to the corners of tetrahedra."""
+        ws = self.ws
+        gather = ws.bound(ws.kernels(self.features).finish_vjp, adjoint=(into, self))
+        gather(num_vertices=ws.arrays.num_vertices)
 
     def norm(self) -> tuple[float, float]:
-        """Euclidean norms of the adjoints of displacement and velocity where the sweep stands."""
-        return tuple(float(np.linalg.norm(runtime.fetch(x).astype(np.float64))) for x in (self.u, self.v))
+        """Euclidean norms of the adjoints of displacement and velocity where the sweep stands.
+
+        Held vertices have no velocity.
+        """
+        copy_slot(self.u, 0, self.whole.u, 0)
+        self._gather(self.whole)
+        u, v = (runtime.fetch(x)[0].astype(np.float64) for x in (self.whole.u, self.v))
+        v[self.ws.arrays.fixed] = 0
+        return float(np.linalg.norm(u)), float(np.linalg.norm(v))
 
     def scale(self, factor: float) -> None:
         """Multiply the running adjoint (clipping; the pending gather is scaled with it)."""
@@ -138,118 +117,50 @@ class ExplicitAdjoint:
 
     def collect(self, state: bool = True) -> Derived:
         """Adjoints of what kernels read, in float64, at the start of the run; state=False leaves out those of the state."""
-        a, values = self.ws.arrays, self.ws.arrays.values
-        rows = self.features.sums()
-        sums = runtime.fetch(self.sums).astype(np.float64)
-        out = values.zeros()
-        out.coefficients = from_blocks(runtime.fetch(self.coefficients), a.place, a.num_coefficients)
+        out, rest = self.numbers.collect(), 0.0
         if state:
-            out.displacement = runtime.fetch(self.u)[0].astype(np.float64)
-            out.velocity = runtime.fetch(self.v)[0].astype(np.float64)
-        if self.features.density:
-            out.mass = sums[rows.first("mass")]
-        out.parameters[: self.features.num_parameters] = sums[rows.of("parameters")].sum(1)
+            out.displacement += runtime.fetch(self.u)[0]
+            out.velocity += runtime.fetch(self.v)[0]
         if self.ws.pairs:
-            out.parameters[a.parameters_of_self_contact], out.rest = self.ws.pairs.collect()
+            out.parameters[self.ws.arrays.parameters_of_self_contact], rest = self.ws.pairs.collect()
         if self.features.shape:
-            out.rest = out.rest + runtime.fetch(self.frames[0]).astype(np.float64).sum(0)
-            out.rest += sums[rows.of("rest")].T
-            out.gradients = from_blocks(runtime.fetch(self.gradients), a.place, 9).reshape(-1, 3, 3)
-            out.volumes = from_blocks(runtime.fetch(self.volumes), a.place, 1)[:, 0]
-        if out.forces is not None:
-            out.forces = runtime.fetch(self.forces).astype(np.float64)
-        if out.motion is not None:
-            out.motion = runtime.fetch(self.motion).astype(np.float64)
-            out.displacement[a.fixed] += runtime.fetch(self.anchor)
-        if out.path is not None:
-            out.path = runtime.fetch(self.path).astype(np.float64)
+            rest = rest + runtime.fetch(self.frames.frames_u).astype(np.float64).sum(0)
+        out.rest = rest + out.rest
         return out
 
 
 class ExplicitTangent:
     """The tangent of a run: changes of the state for changes of everything that kernels read."""
 
-    def __init__(self, workspace, dots: Derived):
-        self.ws = workspace
+    def __init__(self, workspace, tangent: Derived):
+        self.ws, self.tangent = workspace, tangent
         a = workspace.arrays
         self.features = a.features(density=True, shape=True)
-        self.kernels = kick_drift_kernels(a.law, self.features, workspace.parallel, a.in_lanes)
-        self.u = runtime.upload(dots.displacement[None], a.vector)
-        self.v = runtime.upload(dots.velocity[None], a.vector)
-        self.frames = tuple(runtime.array(a.vector, *f.shape) for f in workspace.frames)
-        motion = np.zeros((1, 1, 3)) if dots.motion is None else dots.motion
-        anchor = np.zeros((1, 3)) if dots.motion is None else dots.displacement[a.fixed]
-        self._dots = (
-            runtime.upload(a.coefficient_blocks(dots.coefficients), a.lanes),
-            runtime.upload(dots.mass, a.fp),
-            runtime.upload(dots.parameters, a.fp),
-            runtime.upload(dots.rest, a.vector),
-            runtime.upload(np.zeros((1, 1, 3)) if dots.forces is None else dots.forces, a.vector),
-            runtime.upload(motion, a.vector),
-            runtime.upload(anchor, a.vector),
-            runtime.upload(np.zeros((1, 1, 3)) if dots.path is None else dots.path, a.vector),
-            runtime.upload(to_blocks(dots.gradients, a.order), a.lanes),
-            runtime.upload(a.volume_blocks(dots.volumes), a.lanes),
-        )
-        self._rate_dot = float(dots.parameters[self.features.drag]) if self.features.drag >= 0 else 0.0
-        self._rest_dot, self._parameters_dot = dots.rest, dots.parameters
+        self.u = runtime.upload(tangent.displacement[None], a.vector)
+        self.v = runtime.upload(tangent.velocity[None], a.vector)
+        self.frames = FrameArrays.of(a, *workspace.frames.frames_u.shape)
+        self.numbers = Tangent(a, tangent)
+        self._rate_dot = float(tangent.parameters[self.features.drag]) if self.features.drag >= 0 else 0.0
 
     def advance(self, first: int, last: int, num_passes: int, save_every: int) -> None:
         """Tangent of passes first .. last - 1, recorded from slot 0."""
         ws, a, history = self.ws, self.ws.arrays, self.ws.record
-        launch = runtime.Launch(
-            self.kernels.step_jvp,
-            *a.topology(),
-            a.force_slot,
-            a.motion_slot,
-            a.path,
-            a.corner,
-            history.u,
-            history.v,
-            history.f,
-            self.u,
-            self.v,
-            *self._dots,
-            *self.frames,
-            vectorized=a.in_lanes,
-        )
-        for start, count, w in ws.solver.groups(first, last, num_passes, ws.rate):
-            for j in range(start, start + count):
-                if ws.pairs:
-                    ws.pairs.ensure(history.u, j - first)
-                    ws.pairs.product(
-                        history.u,
-                        j - first,
-                        self.u,
-                        a.corner,
-                        self._dots[3],
-                        self._parameters_dot[a.parameters_of_self_contact],
-                    )
-                launch(
-                    a.num_items,
-                    a.num_vertices,
-                    j,
-                    first,
-                    ws.solver.substeps,
-                    save_every,
-                    w.lag0,
-                    w.lag1,
-                    w.pre,
-                    w.post,
-                    w.alpha,
-                    w.decay,
-                    1 / ws.solver.dt,
-                    ws.solver.substep,
-                    w.alpha_by_rate * self._rate_dot,
-                    w.decay_by_rate * self._rate_dot,
-                )
+        states, own = (history, ws.frames, ws.watch), (self, self.numbers, self.frames)
+        launch = ws.bound(ws.kernels(self.features).step_jvp, state=states, tangent=own, table=ws.table)
+        for numbers in ws.launches(first, last, num_passes, save_every, ws.work_per_launch):  # pass by pass
+            slot = numbers["first"] - first
+            if ws.pairs:
+                ws.pairs.ensure(history.u, slot)
+                of_contact = self.tangent.parameters[a.parameters_of_self_contact]
+                ws.pairs.product(history.u, slot, self.u, a.corner, self.numbers.rest, of_contact)
+            launch(**numbers, base=first, rate_dot=self._rate_dot)
 
     def save_frame(self, frame: int) -> None:
         """Copy the current tangent to a frame."""
-        copy_slot(self.u, 0, self.frames[0], frame)
-        copy_slot(self.v, 0, self.frames[1], frame)
+        copy_slot(self.u, 0, self.frames.frames_u, frame)
+        copy_slot(self.v, 0, self.frames.frames_v, frame)
 
     def collect(self) -> tuple[np.ndarray, np.ndarray]:
         """Changes of the frames' positions and velocities, float64."""
         du, dv = (runtime.fetch(x).astype(np.float64) for x in self.frames)
-        return du + self._rest_dot, dv
+        return du + self.tangent.rest, dv

@@ -1,18 +1,27 @@
 """What the explicit solvers share: a chain of kick-drift passes (kick_drift.py), forward, tangent and reverse."""
 
 from abc import abstractmethod
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+
+import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.inputs import Derived
-from diffsim_ti.solvers.explicit.kick_drift import kick_drift_kernels
+from diffsim_ti.runtime import Kernel
+from diffsim_ti.solvers.explicit.adjoint import ExplicitAdjoint, ExplicitTangent
+from diffsim_ti.solvers.explicit.kernels import ExplicitKernels, explicit_kernels
 from diffsim_ti.solvers.solver import Solver
+from diffsim_ti.state.schedule import PassTable
 from diffsim_ti.state.workspace import Workspace
 
 
 @dataclass(frozen=True)
 class Weights:
-    """Numbers of a pass (kick_drift.py) and their derivatives by the drag rate."""
+    """Numbers of passes (kick_drift.py) and their derivatives by the drag rate: one for all, or one for each.
+
+    A kick of pass j takes the mean of the external forces of the steps of passes j - lag0 and j - lag1.
+    """
 
     lag0: int
     lag1: int
@@ -20,8 +29,8 @@ class Weights:
     post: float
     alpha: float
     decay: float
-    alpha_by_rate: float = 0.0
-    decay_by_rate: float = 0.0
+    alpha_by_rate: float
+    decay_by_rate: float
 
 
 class ExplicitSolver(Solver):
@@ -34,8 +43,13 @@ class ExplicitSolver(Solver):
     serial_limit_in_lanes = 10_000
 
     @abstractmethod
-    def groups(self, first: int, last: int, num_passes: int, rate: float) -> list[tuple[int, int, Weights]]:
-        """Passes first .. last - 1 as runs (first, count, weights) of equal weights."""
+    def weights(self, j: np.ndarray, num_passes: int, rate: float) -> Weights:
+        """Numbers of the passes j of a run of `num_passes`, at a drag rate [1/s]."""
+
+    def pass_table(self, first: int, last: int, num_passes: int, num_rows: int, save_every: int, rate: float) -> tuple:
+        """The tables of passes first .. last - 1 for kernels; num_rows: of motions and paths."""
+        weights = vars(self.weights(np.arange(first, last), num_passes, rate))
+        return self.schedule.table(first, last, num_rows, save_every, weights)
 
     @abstractmethod
     def num_passes(self, steps: int) -> int:
@@ -47,15 +61,11 @@ class ExplicitSolver(Solver):
 
     def adjoint(self, workspace, density: bool, shape: bool):
         """The reverse sweep of a run."""
-        from diffsim_ti.solvers.explicit.adjoint import ExplicitAdjoint
-
         return ExplicitAdjoint(workspace, density, shape)
 
-    def tangent(self, workspace, dots: Derived):
+    def tangent(self, workspace, tangent: Derived):
         """The tangent of a run."""
-        from diffsim_ti.solvers.explicit.adjoint import ExplicitTangent
-
-        return ExplicitTangent(workspace, dots)
+        return ExplicitTangent(workspace, tangent)
 
 
 class ExplicitWorkspace(Workspace):
@@ -63,59 +73,48 @@ class ExplicitWorkspace(Workspace):
 
     work_per_launch = 4_000_000  # tetrahedra x passes in one launch: a tenth of a second, so that Ctrl-C is heard
 
-    def _launch(self, name: str, kernel, *arrays) -> runtime.Launch:
-        if name not in self._launches:
-            self._launches[name] = runtime.Launch(kernel, *arrays, vectorized=self.arrays.in_lanes)
-        return self._launches[name]
+    def __init__(self, solver, derived: Derived):
+        self.table = PassTable(runtime.PRECISIONS[solver.scene.precision])
+        super().__init__(solver, derived)
+
+    def kernels(self, features) -> ExplicitKernels:
+        """The kernels for some features of the scene."""
+        return explicit_kernels(self.arrays.law, features, self.parallel, self.arrays.in_lanes)
+
+    def bound(self, kernel: Kernel, **records) -> Callable:
+        """A kernel bound to the scene and other records, kept as long as the arrays are."""
+        parts = [part for record in records.values() for part in (record if type(record) is tuple else (record,))]
+        key = (kernel, *map(id, parts))
+        return self.kept(key, lambda: (kernel.bind(self.arrays.in_lanes, scene=self.arrays, **records), parts))[0]
+
+    def launches(self, first: int, last: int, num_passes: int, save_every: int, work: int, backwards=False) -> Iterator:
+        """Numbers of the launches that passes first .. last - 1 take, for each of which their table is shown.
+
+        work: of a pass, against `work_per_launch`. backwards: from the last passes to the first.
+        """
+        a, solver = self.arrays, self.solver
+        chunk = 1 if self.parallel or self.pairs else max(1, self.work_per_launch // work)
+        num_rows = max((len(x) for x in (a.values.path, a.values.motion) if x is not None), default=1)
+        run = num_passes, num_rows, save_every, self.rate, solver.schedule
+        turn, sizes = -1 if backwards else 1, dict(num_items=a.num_items, num_vertices=a.num_vertices)
+        for window, begin, end in self.table.windows(first, last)[::turn]:
+            self.table.show(window, run, lambda first, last: solver.pass_table(first, last, *run[:4]))
+            stops = [*range(end, begin, -chunk), begin][::-1] if backwards else [*range(begin, end, chunk), end]
+            for start, stop in list(zip(stops, stops[1:]))[::turn]:
+                yield sizes | dict(window=window, first=start, count=stop - start)
 
     def advance(self, first: int, last: int, num_passes: int, save_every: int = 0, base: int | None = None) -> None:
         """Passes first .. last - 1 from the current state; or recorded: slot j - base holds the state before pass j."""
-        a, recording = self.arrays, base is not None
-        history = self.record if recording else self.state
-        kernels = kick_drift_kernels(a.law, a.features(), self.parallel, a.in_lanes)
-        launch = self._launch(
-            f"step {recording}",
-            kernels.step,
-            *a.topology(),
-            a.force_slot,
-            a.motion_slot,
-            a.forces,
-            a.motion,
-            a.anchor,
-            a.path,
-            a.corner,
-            history.u,
-            history.v,
-            history.f,
-            *self.frames,
-            self.watch.array,
-        )
-        stride, substeps, inverse_dt = int(recording), self.solver.substeps, 1 / self.solver.dt
-        pairs, base = self.pairs, base or 0
+        recording = base is not None
+        history, stride, base, pairs = self.record if recording else self.state, int(recording), base or 0, self.pairs
+        step, states = self.kernels(self.arrays.features()).step, (history, self.frames, self.watch)
+        launch = self.bound(step, state=states, table=self.table)
         if pairs:
             pairs.ensure(history.u, (first - base) * stride)
-        chunk = 1 if self.parallel or pairs else max(1, self.work_per_launch // a.num_tetrahedra)
-        for start, count, w in self.solver.groups(first, last, num_passes, self.rate):
-            for j in range(start, start + count, chunk):
-                if pairs:
-                    pairs.forces(history.u, (j - base) * stride, a.corner)
-                launch(
-                    a.num_items,
-                    a.num_vertices,
-                    j,
-                    min(chunk, start + count - j),
-                    base,
-                    stride,
-                    substeps,
-                    save_every,
-                    w.lag0,
-                    w.lag1,
-                    w.pre,
-                    w.post,
-                    w.alpha,
-                    w.decay,
-                    inverse_dt,
-                    self.solver.substep,
-                )
-                if pairs:
-                    pairs.check_pass(history.u, (j + 1 - base) * stride, self.solver.substep)
+        for numbers in self.launches(first, last, num_passes, save_every, self.arrays.num_tetrahedra):
+            slot = (numbers["first"] - base) * stride
+            if pairs:
+                pairs.forces(history.u, slot, self.arrays.corner)
+            launch(**numbers, base=base, stride=stride)
+            if pairs:
+                pairs.check_pass(history.u, slot + stride, self.solver.substep)

@@ -8,9 +8,9 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.inputs import Derived
+from diffsim_ti.potential.kernels import potential_kernels
 from diffsim_ti.solvers.implicit.linear import Operator, solve_symmetric
-from diffsim_ti.solvers.implicit.potential_kernels import potential_kernels
-from diffsim_ti.state.arrays import from_blocks, to_blocks
+from diffsim_ti.state.numbers import Adjoint, Tangent
 
 
 class _Passes:
@@ -68,31 +68,14 @@ class ImplicitAdjoint(_Passes):
         super().__init__(workspace)
         a = workspace.arrays
         self.features = a.features(density, shape)
-        kernel = potential_kernels(a.law, self.features, workspace.parallel, a.in_lanes).vjp
-        n, blocks = a.num_vertices, a.num_blocks
-        self.coefficients = runtime.array(a.lanes, a.num_coefficients * blocks)
-        self.sums = runtime.array(a.fp, self.features.sums().total, n)
-        self.gradients = runtime.array(a.lanes, 9 * blocks if shape else 1)
-        self.volumes = runtime.array(a.lanes, blocks if shape else 1)
-        p = self.potential = workspace.potential
-        contacts = len(a.features().contacts)
-        self.lag = runtime.array(a.vector, 2, n if p.rubs else 1)
-        self.walls = runtime.array(a.vector, 3 * contacts, n if contacts else 1)
-        self._vjp = runtime.Launch(
-            kernel,
-            *p.common(),
-            a.corner,
-            p.u,
-            p.w,
-            p.y,
-            self.coefficients,
-            self.gradients,
-            self.volumes,
-            self.sums,
-            self.lag,
-            self.walls,
-            vectorized=a.in_lanes,
-        )
+        self.kernels = potential_kernels(a.law, self.features, workspace.parallel, a.in_lanes)
+        self.numbers, p = Adjoint(a, self.features), workspace.potential
+        n, num_obstacles = a.num_vertices, len(a.obstacles)
+        self.potential = p
+        self.lag = runtime.array(a.vector, 2, n if p.has_friction else 1)
+        self.walls = runtime.array(a.vector, 3 * num_obstacles, n if num_obstacles else 1)
+        own = dict(scene=a, pass_=p, at=p, out=p, adjoint=(self, self.numbers))
+        self._vjp = self.kernels.vjp.bind(a.in_lanes, **own)
 
     def fits(self, workspace) -> bool:
         """Whether kernels and arrays are still those of the run."""
@@ -101,8 +84,7 @@ class ImplicitAdjoint(_Passes):
 
     def start(self, positions_adj: np.ndarray, velocities_adj: np.ndarray, last_frame_is_input: bool) -> None:
         """Set the adjoints of the frames, shape (frames, n, 3), and clear the rest."""
-        for target in (self.coefficients, self.sums, self.gradients, self.volumes):
-            runtime.fill(target, 0)
+        self.numbers.clear()
         if self.ws.pairs:
             self.ws.pairs.clear_sums()
         a = self.ws.arrays
@@ -115,16 +97,21 @@ class ImplicitAdjoint(_Passes):
         self.path = None if a.values.path is None else np.zeros_like(a.values.path)
         self.anchor = np.zeros((len(a.fixed), 3))
 
-    def reverse(self, base: int, last: int, num_passes: int, save_every: int, stop: int) -> None:
-        """Mirror passes last - 1 .. stop; slot 0 of the record holds the state before pass `base`."""
+    def reverse(
+        self, base: int, last: int, num_passes: int, save_every: int, stop: int, to_state: bool = False
+    ) -> None:
+        """Go back through passes last - 1 .. stop; slot 0 of the record holds the state before pass `base`.
+
+        to_state: stop at the state that pass `stop` shows, which is the one before it.
+        """
         for j in range(last - 1, stop - 1, -1):
             self.open(j, base)
-            self._mirror(j)
+            self._pull_back(j)
             if save_every and j % save_every == 0 and j // save_every < len(self.frames[0]) - 1:
                 self.p += self.frames[0][j // save_every]
                 self.q += self.frames[1][j // save_every]
 
-    def _mirror(self, j: int) -> None:
+    def _pull_back(self, j: int) -> None:
         ws, s, p, q, fixed = self.ws, self.stage, self.p, self.q, self.ws.arrays.fixed
         if s.static:
             q = np.zeros_like(q)
@@ -136,19 +123,19 @@ class ImplicitAdjoint(_Passes):
             runtime.fill(target, 0)
         if ws.pairs:
             ws.pairs.vjp(ws.potential.u, 0, ws.potential.w, ws.arrays.corner)
-        self._vjp(ws.arrays.num_items, ws.arrays.num_vertices, ws.potential.per_gamma)
+        self._vjp(**ws.potential.sizes())
         reaction = runtime.fetch(ws.potential.y)[0].astype(np.float64)
         share = ws.load_share(j, s)
         self.gravity += share * (ws.mass * by_star).sum(0)
         self.mass_adj += (by_star * self.weight(share)).sum(1)
         if self.forces is not None:
-            row = j // ws.solver.substeps if len(self.forces) > 1 else 0
+            row = ws.solver.schedule.row(j) if len(self.forces) > 1 else 0
             self.forces[row] += share * by_star[ws.force_vertices()]
         # where inertia starts from
         inertial = self.mass * by_star
         x_adj = inertial - s.e0 / s.gamma * q_free
         by_lag = np.zeros_like(p)
-        if ws.potential.rubs:
+        if ws.potential.has_friction:
             by_lag, by_x = runtime.fetch(self.lag).astype(np.float64)
             x_adj = x_adj + by_x
         if self.path is not None:
@@ -162,30 +149,36 @@ class ImplicitAdjoint(_Passes):
         v_adj = s.b0 * y_adj
         # prescribed places
         if len(fixed):
-            self._mirror_fixed(j, p, q, reaction, u_adj, v_adj)
+            self._pull_back_fixed(j, p, q, reaction, u_adj, v_adj)
         self.p, self.q = u_adj + self.pending[0], v_adj + self.pending[1]
         self.pending = [s.a1 * x_adj, s.b1 * y_adj] if self.before is not None else [0 * x_adj, 0 * y_adj]
 
-    def _mirror_fixed(self, j, p, q, reaction, u_adj, v_adj) -> None:
+    def _pull_back_fixed(self, j, p, q, reaction, u_adj, v_adj) -> None:
         fixed, s = self.ws.arrays.fixed, self.stage
         pull = reaction[fixed]
         if self.motion is None:
             u_adj[fixed], v_adj[fixed] = p[fixed] + pull, q[fixed]
             return
-        r, k = divmod(j, self.ws.solver.substeps)
-        fraction, per_dt = (k + 1) / self.ws.solver.substeps, 1 / self.ws.solver.dt
+        schedule = self.ws.solver.schedule
         place = p[fixed] + pull / s.c0
         u_adj[fixed], v_adj[fixed] = (1 - 1 / s.c0) * pull, 0.0
-        self.motion[r] += (1 - fraction) * place - per_dt * q[fixed]
-        self.motion[r + 1] += fraction * place + per_dt * q[fixed]
+        schedule.add_place(self.motion, j, schedule.end(j), place)
+        schedule.add_rate(self.motion, j, q[fixed])
         self.anchor += place
+
+    def reverse_kick(self, j: int, base: int, num_passes: int) -> None:
+        """No pass shows a state that it changed before."""
 
     def finish(self) -> None:
         """The sweep leaves nothing undone."""
 
     def norm(self) -> tuple[float, float]:
-        """Euclidean norms of the adjoints of displacement and velocity where the sweep stands."""
-        return float(np.linalg.norm(self.p)), float(np.linalg.norm(self.q))
+        """Euclidean norms of the adjoints of displacement and velocity where the sweep stands.
+
+        Held vertices have no velocity.
+        """
+        q = np.delete(self.q, self.ws.arrays.fixed, axis=0)
+        return float(np.linalg.norm(self.p)), float(np.linalg.norm(q))
 
     def scale(self, factor: float) -> None:
         """Multiply the running adjoint."""
@@ -193,23 +186,17 @@ class ImplicitAdjoint(_Passes):
 
     def collect(self) -> Derived:
         """Adjoints of what kernels read, in float64, at the start of the run."""
-        a, rows = self.ws.arrays, self.features.sums()
-        sums, out = runtime.fetch(self.sums).astype(np.float64), a.values.zeros()
-        out.coefficients = from_blocks(runtime.fetch(self.coefficients), a.place, a.num_coefficients)
+        a, features, out = self.ws.arrays, self.features, self.numbers.collect()
         out.displacement, out.velocity, out.mass = self.p, self.q, self.mass_adj
-        out.parameters[: self.features.num_parameters] = sums[rows.of("parameters")].sum(1)
-        if self.features.gravity >= 0:
-            out.parameters[self.features.gravity :][:3] = self.gravity
-        if self.features.drag >= 0:
-            out.parameters[self.features.drag] = self.rate
-        out.rest = self.frames[0].sum(0)
+        if features.gravity >= 0:
+            out.parameters[features.gravity :][:3] = self.gravity
+        if features.drag >= 0:
+            out.parameters[features.drag] = self.rate
+        rest = self.frames[0].sum(0)
         if self.ws.pairs:
             out.parameters[a.parameters_of_self_contact], by_pairs = self.ws.pairs.collect()
-            out.rest = out.rest + by_pairs
-        if self.features.shape:
-            out.rest = out.rest + sums[rows.of("rest")].T
-            out.gradients = from_blocks(runtime.fetch(self.gradients), a.place, 9).reshape(-1, 3, 3)
-            out.volumes = from_blocks(runtime.fetch(self.volumes), a.place, 1)[:, 0]
+            rest = rest + by_pairs
+        out.rest = rest + out.rest
         out.forces, out.motion, out.path = self.forces, self.motion, self.path
         if self.motion is not None:
             out.displacement[a.fixed] += self.anchor
@@ -219,23 +206,17 @@ class ImplicitAdjoint(_Passes):
 class ImplicitTangent(_Passes):
     """The tangent of a run: changes of the state for changes of everything that the equation names."""
 
-    def __init__(self, workspace, dots: Derived):
+    def __init__(self, workspace, tangent: Derived):
         super().__init__(workspace)
-        a, self.dots = workspace.arrays, dots
+        a, self.tangent = workspace.arrays, tangent
         p = workspace.potential
-        self.du, self.dv, self.before_dots = dots.displacement.copy(), dots.velocity.copy(), None
-        kernel = potential_kernels(a.law, a.features(), workspace.parallel, a.in_lanes).jvp
-        self._arrays = (
-            runtime.upload(a.coefficient_blocks(dots.coefficients), a.lanes),
-            runtime.upload(dots.parameters, a.fp),
-            runtime.upload(dots.rest, a.vector),
-            runtime.upload(to_blocks(dots.gradients, a.order), a.lanes),
-            runtime.upload(a.volume_blocks(dots.volumes), a.lanes),
-            runtime.array(a.vector, *p.lag.shape),
-            runtime.array(a.vector, *p.walls.shape),
-        )
-        self._jvp = runtime.Launch(kernel, *p.common(), a.corner, p.u, p.w, p.y, *self._arrays, vectorized=a.in_lanes)
-        self.rate_dot = float(dots.parameters[a.features().drag]) if a.features().drag >= 0 else 0.0
+        self.du, self.dv, self.tangent_before = tangent.displacement.copy(), tangent.velocity.copy(), None
+        kernels = potential_kernels(a.law, a.features(), workspace.parallel, a.in_lanes)
+        self.numbers = Tangent(a, tangent)
+        self.lag, self.walls = runtime.array(a.vector, *p.lag.shape), runtime.array(a.vector, *p.walls.shape)
+        own = dict(scene=a, pass_=p, at=p, out=p, tangent=(self, self.numbers))
+        self._jvp = kernels.jvp.bind(a.in_lanes, **own)
+        self.rate_dot = float(tangent.parameters[a.features().drag]) if a.features().drag >= 0 else 0.0
         self.frames = [], []
 
     def advance(self, first: int, last: int, num_passes: int, save_every: int) -> None:
@@ -247,36 +228,37 @@ class ImplicitTangent(_Passes):
             self._pass(j)
 
     def _pass(self, j: int) -> None:
-        ws, s, dots, a = self.ws, self.stage, self.dots, self.ws.arrays
+        ws, s, tangent, a = self.ws, self.stage, self.tangent, self.ws.arrays
         db0, db1, de0, de1 = (x * self.rate_dot for x in s.by_rate)
         dx, dy = s.a0 * self.du, s.b0 * self.dv + db0 * self.v
         if self.before is not None:
-            dx = dx + s.a1 * self.before_dots[0]
-            dy = dy + s.b1 * self.before_dots[1] + db1 * self.before[1]
+            dx = dx + s.a1 * self.tangent_before[0]
+            dy = dy + s.b1 * self.tangent_before[1] + db1 * self.before[1]
         place, speed = self._prescribed(j)
         held = np.zeros_like(self.du)
         held[a.fixed] = self.du[a.fixed] if place is None else self.du[a.fixed] + (place - self.du[a.fixed]) / s.c0
         runtime.fill(ws.potential.w, held[None])
-        if ws.potential.rubs:
-            runtime.fill(self._arrays[-2], np.stack([self.du, dx]))
-        if dots.path is not None:
-            runtime.fill(self._arrays[-1], ws.walls(dots.path, j, s))
+        if ws.potential.has_friction:
+            runtime.fill(self.lag, np.stack([self.du, dx]))
+        if tangent.path is not None:
+            runtime.fill(self.walls, ws.walls(tangent.path, j, s))
         if ws.pairs:
             ws.pairs.product(
                 ws.potential.u,
                 0,
                 ws.potential.w,
                 a.corner,
-                self._arrays[2],
-                dots.parameters[a.parameters_of_self_contact],
+                self.numbers.rest,
+                tangent.parameters[a.parameters_of_self_contact],
             )
-        self._jvp(a.num_items, a.num_vertices, ws.potential.per_gamma)
+        self._jvp(**ws.potential.sizes())
         share = ws.load_share(j, s)
-        dR = runtime.fetch(ws.potential.y)[0].astype(np.float64) + dots.mass[:, None] * self.weight(share)
+        dR = runtime.fetch(ws.potential.y)[0].astype(np.float64) + tangent.mass[:, None] * self.weight(share)
         if a.features().gravity >= 0:
-            dR += share * ws.mass * dots.parameters[a.features().gravity :][:3]
-        if dots.forces is not None:
-            dR[ws.force_vertices()] += share * dots.forces[j // ws.solver.substeps if len(dots.forces) > 1 else 0]
+            dR += share * ws.mass * tangent.parameters[a.features().gravity :][:3]
+        if tangent.forces is not None:
+            row = ws.solver.schedule.row(j) if len(tangent.forces) > 1 else 0
+            dR[ws.force_vertices()] += share * tangent.forces[row]
         d_star = held + self.solve(dR + self.mass * (dx + s.gamma * dy))
         before = self.du, self.dv
         self.du = s.c0 * d_star + (1 - s.c0) * self.du
@@ -284,16 +266,14 @@ class ImplicitTangent(_Passes):
         self.du[a.fixed], self.dv[a.fixed] = (x[a.fixed] for x in before) if place is None else (place, speed)
         if s.static:
             self.dv = np.zeros_like(self.dv)
-        self.before_dots = before
+        self.tangent_before = before
 
     def _prescribed(self, j: int):
-        motion = self.dots.motion
+        motion, schedule = self.tangent.motion, self.ws.solver.schedule
         if motion is None:
             return None, None
-        r, k = divmod(j, self.ws.solver.substeps)
-        change = motion[r + 1] - motion[r]
-        anchor = self.dots.displacement[self.ws.arrays.fixed]
-        return anchor + motion[r] + (k + 1) / self.ws.solver.substeps * change, change / self.ws.solver.dt
+        anchor = self.tangent.displacement[self.ws.arrays.fixed]
+        return anchor + schedule.place(motion, j, schedule.end(j)), schedule.rate(motion, j)
 
     def save_frame(self, frame: int) -> None:
         """Copy the current tangent to a frame."""
@@ -303,4 +283,4 @@ class ImplicitTangent(_Passes):
     def collect(self) -> tuple[np.ndarray, np.ndarray]:
         """Changes of the frames' positions and velocities."""
         du, dv = (np.stack(x) for x in self.frames)
-        return du + self.dots.rest, dv
+        return du + self.tangent.rest, dv

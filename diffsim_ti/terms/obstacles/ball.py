@@ -46,8 +46,12 @@ class Sphere(Obstacle):
         d = np.linalg.norm(positions - self.values["sphere_center"], axis=1) - self.values["sphere_radius"]
         return -d if self.inside else d
 
-    def kernel(self, precision, first, path=-1):
-        return SphereForce(precision, first, self.has_friction, path, self.inside)
+    @property
+    def variant(self):
+        return (*super().variant, self.inside)
+
+    def kernel(self, precision):
+        return SphereForce(precision, self.has_friction, self.inside)
 
 
 @dataclass(frozen=True)

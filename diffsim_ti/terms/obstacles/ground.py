@@ -33,8 +33,8 @@ class Ground(Obstacle):
             f"{float(self.values['ground_height']):g} ({(gap <= 0).sum()} vertices); lift the body or lower the ground"
         )
 
-    def kernel(self, precision: str, first: int, path: int = -1) -> "GroundForce":
-        return GroundForce(precision, first, self.has_friction, path)
+    def kernel(self, precision: str) -> "GroundForce":
+        return GroundForce(precision, self.has_friction)
 
 
 @dataclass(frozen=True)
@@ -48,28 +48,28 @@ class GroundForce(ObstacleForce):
         return (X[1] - p[0]) + u[1], [g.number(0), g.number(1), g.number(0)]
 
     @ti.func
-    def scaled(self, parameters: ti.template(), X, u):
+    def scaled(self, parameters: ti.template(), first, X, u):
         """(d / width, stiffness, width)"""
-        width = parameters[self.first + 2]
-        return ((X.y - parameters[self.first]) + u.y) / width, parameters[self.first + 1], width
+        width = parameters[first + 2]
+        return ((X.y - parameters[first]) + u.y) / width, parameters[first + 1], width
 
     @ti.func
-    def force(self, parameters: ti.template(), X, u, v):
-        s, stiffness, width = self.scaled(parameters, X, u)
+    def force(self, parameters: ti.template(), first, X, u, v):
+        s, stiffness, width = self.scaled(parameters, first, X, u)
         f = 0 * u
         f.y = -stiffness * width * barrier.slope(s, self.fp)
         return f
 
     @ti.func
-    def force_jvp(self, parameters: ti.template(), X, u, v, du, dv):
-        s, stiffness, width = self.scaled(parameters, X, u)
+    def force_jvp(self, parameters: ti.template(), first, X, u, v, du, dv):
+        s, stiffness, width = self.scaled(parameters, first, X, u)
         df = 0 * u
         df.y = -stiffness * barrier.curvature(s, self.fp) * du.y
         return df
 
     @ti.func
-    def parameter_derivatives(self, parameters: ti.template(), X, u, v):
-        s, stiffness, width = self.scaled(parameters, X, u)
+    def parameter_derivatives(self, parameters: ti.template(), first, X, u, v):
+        s, stiffness, width = self.scaled(parameters, first, X, u)
         slope, curvature = barrier.slope(s, self.fp), barrier.curvature(s, self.fp)
         by = self._zeros(u)
         by[0].y = stiffness * curvature

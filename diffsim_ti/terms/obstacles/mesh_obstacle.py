@@ -54,8 +54,8 @@ class MeshObstacle(Obstacle):
     def distance(self, positions):
         return self._exact(positions - self.values["mesh_position"])
 
-    def kernel(self, precision, first, path=-1, table=0):
-        return MeshForce(precision, first, self.has_friction, path, table, self.counts, self.cell, tuple(self.origin))
+    def kernel(self, precision, table=0):
+        return MeshForce(precision, self.has_friction, table, self.counts, self.cell, tuple(self.origin))
 
 
 def check_closed(vertices: np.ndarray, triangles: np.ndarray) -> None:

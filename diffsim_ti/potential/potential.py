@@ -1,0 +1,133 @@
+"""The potential energy of a displacement on the device, with its derivatives, as arrays of float64."""
+
+from functools import cached_property
+from types import SimpleNamespace
+
+import numpy as np
+
+from diffsim_ti import runtime
+from diffsim_ti.potential.kernels import potential_kernels
+from diffsim_ti.potential.patch_coupling import PatchCoupling
+
+
+class Potential:
+    """Elastic and contact energy E(u) of a scene; displacements and results are NumPy arrays, shape (num_vertices, 3).
+
+    Everything after `place(u)` is at that displacement, which has the precision of the scene.
+    """
+
+    def __init__(self, arrays, tetrahedra: np.ndarray, parallel: bool, pairs=None):
+        self.arrays, self.tetrahedra, self.pairs, a = arrays, tetrahedra, pairs, arrays
+        self.kernels = potential_kernels(a.law, a.features(), parallel, a.in_lanes)
+        n, m, num_obstacles = a.num_vertices, a.num_places, len(a.obstacles)
+        self.u, self.w, self.y = (runtime.array(a.vector, 1, n) for _ in range(3))
+        self.has_friction = bool(a.features().rough)
+        self.lag = runtime.array(a.vector, 2, n if self.has_friction else 1)
+        self.walls = runtime.array(a.vector, 3 * num_obstacles)
+        self.per_gamma, self.held_at = 1.0, np.zeros((n, 3))
+        self.size, self.contact = runtime.array(a.fp, n), runtime.array(a.fp, n)
+        self.elastic, self.J = runtime.array(a.fp, m), runtime.array(a.fp, m)
+        self._launches, self._coupling, self._barrier_blocks = {}, None, None
+
+    def launch(self, name: str, lanes: bool = True, **records) -> None:
+        """Run a kernel at the present displacement; records: more arrays than the potential's own."""
+        a = self.arrays
+        if name not in self._launches:
+            own = dict(scene=a, pass_=self, at=self, out=self) | records
+            self._launches[name] = getattr(self.kernels, name).bind(lanes and a.in_lanes, **own)
+        self._launches[name](**self.sizes())
+
+    def sizes(self) -> dict:
+        """The numbers that every kernel takes."""
+        a = self.arrays
+        sizes = dict(num_items=a.num_items, num_tetrahedra=a.num_places, num_vertices=a.num_vertices)
+        return sizes | dict(per_gamma=self.per_gamma)
+
+    def begin(self, u: np.ndarray, x: np.ndarray, per_gamma: float, walls: np.ndarray) -> None:
+        """What contact sees of a pass: its first displacement, x and 1 / gamma, and the obstacles (obstacles.py)."""
+        self.per_gamma = per_gamma
+        if self.has_friction:
+            runtime.fill(self.lag, np.stack([u, x]))
+        if len(walls):
+            runtime.fill(self.walls, walls)
+        if self.pairs:
+            self.pairs.begin(u)
+
+    def place(self, u: np.ndarray) -> np.ndarray:
+        """Go to displacement u [m]; returns it as the device holds it."""
+        runtime.fill(self.u, u[None])
+        self.held_at = runtime.fetch(self.u)[0].astype(np.float64)
+        if self.pairs:
+            self.pairs.place(self.u)
+        return self.held_at
+
+    def energy(self) -> tuple[float, float, np.ndarray]:
+        """(energy [J], the sum of its absolute parts, J of each tetrahedron)."""
+        self.launch("energy", lanes=False)
+        elastic, contact, J = (runtime.fetch(x).astype(np.float64) for x in (self.elastic, self.contact, self.J))
+        if self.pairs:
+            contact = np.concatenate([contact, self.pairs.energies()])
+        return elastic.sum() + contact.sum(), np.abs(elastic).sum() + np.abs(contact).sum(), J
+
+    def forces(self) -> tuple[np.ndarray, np.ndarray]:
+        """(forces -dE/du [N], sum of the sizes of the forces that meet at each vertex)."""
+        if self.pairs:
+            self.pairs.forces(self.u, 0, self.arrays.corner)
+        self.launch("forces")
+        return runtime.fetch(self.y)[0].astype(np.float64), runtime.fetch(self.size).astype(np.float64)
+
+    def product(self, w: np.ndarray, convex: bool = False) -> np.ndarray:
+        """d2E/du2 w [N]; `convex`: of contact between surfaces, only its convex part."""
+        scale = np.abs(w).max() or 1.0  # f32 keeps its digits whatever the units
+        runtime.fill(self.w, (w / scale)[None])
+        if self.pairs:
+            self.pairs.hessian_product(self.u, self.w, convex)
+        self.launch("product")
+        return runtime.fetch(self.y)[0].astype(np.float64) * -scale
+
+    def blocks(self) -> np.ndarray:
+        """3x3 diagonal blocks of d2E/du2 [N/m], shape (num_vertices, 3, 3)."""
+        a = self.arrays
+        self.launch("blocks", out=self._block_arrays)
+        if self.pairs:
+            self.pairs.add_blocks(self.u, self._block_arrays.blocks)
+        blocks = np.swapaxes(runtime.fetch(self._block_arrays.blocks).astype(np.float64), 0, 1)
+        return blocks if a.patches is None else blocks + self.coupling.diagonal(self.patch_gradients())
+
+    @cached_property
+    def _block_arrays(self) -> SimpleNamespace:
+        a = self.arrays
+        corners = {f"corner{d}": runtime.array(a.vector, *a.corner.shape) for d in range(3)}
+        tangent, blocks = runtime.array(a.lanes, 81 * a.num_blocks), runtime.array(a.vector, 3, a.num_vertices)
+        return SimpleNamespace(tangent=tangent, blocks=blocks, **corners)
+
+    @property
+    def coupling(self) -> PatchCoupling:
+        """What patches add to d2E/du2, by the numbers that are loaded."""
+        if self._coupling is None or self._coupling[0] is not self.arrays.values:
+            self._coupling = self.arrays.values, PatchCoupling(self.arrays, self.tetrahedra)
+        return self._coupling[1]
+
+    def patch_gradients(self) -> np.ndarray:
+        """g of `coupling` at the present displacement."""
+        a = self.arrays
+        self.launch("pressure_forces")
+        return self.coupling.rows(runtime.fetch(a.corner)[: a.first_contact_corner].astype(np.float64))
+
+    def tangents(self) -> np.ndarray:
+        """d2psi/dF2 [Pa] of each tetrahedron, its patch's pressure held, where `blocks` was last called, shape
+        (num_tetrahedra, 9, 9)."""
+        return self.arrays.from_blocks(runtime.fetch(self._block_arrays.tangent), 81).reshape(-1, 9, 9)
+
+    def contact_blocks(self) -> np.ndarray | None:
+        """The part of contact in `blocks`; None without contacts."""
+        if not (self.arrays.contacts or self.pairs):
+            return None
+        if self._barrier_blocks is None:
+            self._barrier_blocks = SimpleNamespace(
+                blocks=runtime.array(self.arrays.vector, 3, self.arrays.num_vertices)
+            )
+        self.launch("contact_blocks", lanes=False, out=self._barrier_blocks)
+        if self.pairs:
+            self.pairs.add_blocks(self.u, self._barrier_blocks.blocks)
+        return np.swapaxes(runtime.fetch(self._barrier_blocks.blocks).astype(np.float64), 0, 1)

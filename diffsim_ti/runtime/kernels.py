@@ -1,0 +1,69 @@
+"""Kernels whose signatures are made from descriptions of their arrays, so that none is typed by hand."""
+
+import linecache
+from collections.abc import Callable
+from itertools import count
+
+import taichi as ti
+
+from diffsim_ti.runtime.language import Bundle
+from diffsim_ti.runtime.launch import Launch
+from diffsim_ti.runtime.start import PRECISIONS
+
+LANES = 8  # tetrahedra in a block
+_serial = count()
+
+
+def array_types(precision: str) -> dict:
+    """Taichi's annotation for each kind of array, and for numbers "int" and "float"."""
+    fp = PRECISIONS[precision]
+    vector, lanes = ti.types.vector(4, fp), ti.types.vector(LANES, fp)
+    ndarray = ti.types.ndarray
+    return {
+        "ints": ndarray(ti.i32, 1),
+        "ints2": ndarray(ti.i32, 2),
+        "scalars": ndarray(fp, 1),
+        "scalars2": ndarray(fp, 2),
+        "vectors": ndarray(vector, 1),
+        "vectors2": ndarray(vector, 2),
+        "blocks": ndarray(lanes, 1),
+        "int": ti.i32,
+        "float": fp,
+    }
+
+
+class Kernel:
+    """A Taichi kernel whose code is `body(*bundles, numbers)`; loops of the body are loops of the kernel.
+
+    arrays: {bundle: {array: kind}}, kinds as in `array_types`; each bundle reaches the body as a `Bundle` of its arrays,
+    and `numbers`, {name: "int" or "float"}, as one more.
+    """
+
+    def __init__(self, name: str, body: Callable, precision: str, arrays: dict[str, dict], numbers: dict[str, str]):
+        self.arrays, self.numbers = arrays, tuple(numbers)
+        types = array_types(precision)
+        arguments = [(f"{b}_{a}", types[kind]) for b, own in arrays.items() for a, kind in own.items()]
+        arguments += [(n, types[kind]) for n, kind in numbers.items()]
+        bundles = [f"Bundle({', '.join(f'{a}={b}_{a}' for a in own)})" for b, own in arrays.items()]
+        bundles.append(f"Bundle({', '.join(f'{n}={n}' for n in numbers)})")
+        signature = ", ".join(f"{argument}: types[{k}]" for k, (argument, _) in enumerate(arguments))
+        source = f"def {name}({signature}):\n    body({', '.join(bundles)})\n"
+        file = f"<{name} {next(_serial)}>"
+        linecache.cache[file] = (len(source), None, source.splitlines(True), file)  # Taichi reads a kernel's source
+        scope = dict(body=body, Bundle=Bundle, types=[kind for _, kind in arguments])
+        exec(compile(source, file, "exec"), scope)
+        self.kernel = ti.kernel(scope[name])
+
+    def bind(self, vectorized: bool = False, **records) -> Callable:
+        """The kernel with its arrays bound; call it with the numbers, by name.
+
+        records: for each bundle the object whose attributes its arrays are, or a tuple of objects that share them.
+        """
+        arrays = [_found(records[bundle], name) for bundle, own in self.arrays.items() for name in own]
+        launch, names = Launch(self.kernel, *arrays, vectorized=vectorized), self.numbers
+        return lambda **numbers: launch(*(numbers[name] for name in names))
+
+
+def _found(record, name: str):
+    parts = record if type(record) is tuple else (record,)
+    return next(getattr(part, name) for part in parts if hasattr(part, name))

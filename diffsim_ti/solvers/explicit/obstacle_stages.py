@@ -1,0 +1,223 @@
+"""What obstacles do in an explicit pass: where they are, what is noted, their forces, friction with tangent and adjoint.
+
+Functions of a shape take positions relative to the obstacle, so that a displaced obstacle is a vertex whose rest position X
+is displaced the other way. Obstacles of one kind are gone through in a loop (state/features.py).
+"""
+
+from dataclasses import dataclass
+
+import taichi as ti
+
+from diffsim_ti.runtime import PRECISIONS
+from diffsim_ti.state.features import Features
+
+A = ti.template()  # an array or Bundle handed to a Taichi function
+
+
+@dataclass(frozen=True)
+class ObstacleStages:
+    """Taichi functions of one vertex; `now` is the pass (state/schedule.py), g a group of obstacles, k a place in it."""
+
+    features: Features
+    precision: str
+
+    @property
+    def fp(self):
+        return PRECISIONS[self.precision]
+
+    @property
+    def vector(self):
+        return ti.types.vector(4, self.fp)
+
+    # ---- where obstacles are -----------------------------------------------------------------------------------------
+
+    @ti.func
+    def place_at(self, g: A, k, share, now: A, path: A):
+        """Displacement of an obstacle at a share of the step."""
+        place = self.vector(0)
+        if ti.static(g.path >= 0):
+            start = path[now.row, g.path + k]
+            place = start + share * (path[now.next, g.path + k] - start)
+        return place
+
+    @ti.func
+    def place(self, g: A, k, now: A, path: A):
+        """Displacement of an obstacle when the pass begins."""
+        return self.place_at(g, k, now.begin, now, path)
+
+    @ti.func
+    def speed(self, g: A, k, now: A, path: A):
+        """Velocity of an obstacle in the pass."""
+        speed = self.vector(0)
+        if ti.static(g.path >= 0):
+            speed = now.per_step * (path[now.next, g.path + k] - path[now.row, g.path + k])
+        return speed
+
+    @ti.func
+    def add_to_path(self, g: A, k, i, now: A, by_X, by_wall, adjoint: A):
+        """Adjoints of the rows of the path that vertex i felt; `fold_path` sums them over the vertices."""
+        if ti.static(g.path >= 0):
+            c, rate = 2 * (g.path + k), now.per_step * by_wall
+            adjoint.felt[c, i] = adjoint.felt[c, i] - ((1 - now.begin) * by_X + rate)
+            adjoint.felt[c + 1, i] = adjoint.felt[c + 1, i] - (now.begin * by_X - rate)
+
+    @ti.func
+    def fold_path(self, c, now: A, num_vertices, adjoint: A):
+        """At the first pass of a step, the last to be gone back through: sum what all vertices felt, in a fixed order."""
+        if now.opens > 0:
+            to_row, to_next = self.vector(0), self.vector(0)
+            for i in range(num_vertices):
+                to_row += adjoint.felt[2 * c, i]
+                to_next += adjoint.felt[2 * c + 1, i]
+                adjoint.felt[2 * c, i] = self.vector(0)
+                adjoint.felt[2 * c + 1, i] = self.vector(0)
+            adjoint.path[now.row, c] = adjoint.path[now.row, c] + to_row
+            adjoint.path[now.next, c] = adjoint.path[now.next, c] + to_next
+
+    # ---- what is noted -----------------------------------------------------------------------------------------------
+
+    @ti.func
+    def note(self, i, u, u_next, now: A, scene: A, state: A):
+        """How near vertex i comes to each obstacle in the pass, and how well the pass resolves it (state/watch.py)."""
+        for g in ti.static(self.features.groups):
+            if ti.static(g.force.watched):
+                for k in range(g.count):
+                    self.note_one(g, k, i, u, u_next, now, scene, state)
+
+    @ti.func
+    def note_one(self, g: A, k, i, u, u_next, now: A, scene: A, state: A):
+        first, at = g.first + k * g.size, 3 * (g.number + k)
+        place = self.place(g, k, now, scene.path)
+        moved = self.place_at(g, k, now.end, now, scene.path) - place
+        X, move = scene.rest[i] - place, u_next - u - moved
+        d, width = g.force.gap(scene.parameters, first, X, u), g.force.width(scene.parameters, first)
+        if d < width or move.dot(move) >= d * d:
+            approach = g.force.approach(scene.parameters, first, X, u, move)
+            reached = ti.min(d, d + approach)
+            if reached < width:
+                omega2 = scene.inverse_mass[i] * g.force.rigidity(scene.parameters, first, X, u)
+                state.seen[at, i] = ti.min(state.seen[at, i], reached)
+                state.seen[at + 1, i] = ti.max(state.seen[at + 1, i], now.h * now.h * omega2)
+                state.seen[at + 2, i] = ti.max(state.seen[at + 2, i], ti.abs(approach) / width)
+
+    # ---- forces ------------------------------------------------------------------------------------------------------
+
+    @ti.func
+    def add_force(self, i, f, u, v, now: A, scene: A):
+        """f and the force of all obstacles on vertex i."""
+        for g in ti.static(self.features.groups):
+            for k in range(g.count):
+                X = scene.rest[i] - self.place(g, k, now, scene.path)
+                f += g.force.force(scene.parameters, g.first + k * g.size, X, u, v)
+        return f
+
+    @ti.func
+    def add_force_jvp(self, i, df, u, v, du, dv, now: A, scene: A, tangent: A):
+        """df and its change."""
+        for g in ti.static(self.features.groups):
+            for k in range(g.count):
+                first = g.first + k * g.size
+                X = scene.rest[i] - self.place(g, k, now, scene.path)
+                dX = tangent.rest[i] - self.place(g, k, now, tangent.path)
+                df += g.force.force_jvp(scene.parameters, first, X, u, v, du + dX, dv)
+                by = g.force.parameter_derivatives(scene.parameters, first, X, u, v)
+                for m in ti.static(range(g.size)):
+                    df += by[m] * tangent.parameters[first + m]
+        return df
+
+    @ti.func
+    def add_force_vjp(self, i, u_adj, v_adj, u, v, f_adj, now: A, scene: A, adjoint: A):
+        """u_adj, v_adj and the adjoints of u and v for that of the force; adds those of all else."""
+        for g in ti.static(self.features.groups):
+            for k in range(g.count):
+                first = g.first + k * g.size
+                X = scene.rest[i] - self.place(g, k, now, scene.path)
+                by_u, by_v = g.force.force_vjp(scene.parameters, first, X, u, v, f_adj)
+                u_adj += by_u
+                v_adj += by_v
+                self.add_to_path(g, k, i, now, by_u, self.vector(0), adjoint)
+                by = g.force.parameter_derivatives(scene.parameters, first, X, u, v)
+                for m in ti.static(range(g.size)):
+                    adjoint.sums[first + m, i] = adjoint.sums[first + m, i] + by[m].dot(f_adj)
+                self.add_to_rest(i, by_u, adjoint)
+        return u_adj, v_adj
+
+    @ti.func
+    def add_to_rest(self, i, by_X, adjoint: A):
+        row = ti.static(self.features.sums().first("rest"))
+        if ti.static(self.features.shape):
+            for d in ti.static(range(3)):
+                adjoint.sums[row + d, i] = adjoint.sums[row + d, i] + by_X[d]
+
+    # ---- friction, its tangent and its adjoint -----------------------------------------------------------------------
+
+    @ti.func
+    def slide(self, g: A, k, i, u, v, now: A, scene: A):
+        """Velocity of vertex i after the friction of one obstacle."""
+        first, after = g.first + k * g.size, v
+        X = scene.rest[i] - self.place(g, k, now, scene.path)
+        if g.force.touches(scene.parameters, first, X, u):
+            wall = self.speed(g, k, now, scene.path)
+            after = g.force.slide(scene.parameters, first, X, u, v, wall, now.h * scene.inverse_mass[i])
+        return after
+
+    @ti.func
+    def slide_all(self, i, u, v, now: A, scene: A):
+        """Velocity of vertex i after the friction of all obstacles, one after the other."""
+        for g in ti.static(self.features.rough):
+            for k in range(g.count):
+                v = self.slide(g, k, i, u, v, now, scene)
+        return v
+
+    @ti.func
+    def slide_before(self, number, i, u, v, now: A, scene: A):
+        """Velocity of vertex i after the friction of the obstacles before the one of that number."""
+        for g in ti.static(self.features.rough):
+            for k in range(ti.min(g.count, number - g.number)):
+                v = self.slide(g, k, i, u, v, now, scene)
+        return v
+
+    @ti.func
+    def slide_jvp(self, i, u, v, du, dv, now: A, scene: A, tangent: A):
+        """Change of the velocity after friction, v and dv being those before it."""
+        inverse = scene.inverse_mass[i]
+        h_over_m = now.h * inverse
+        for g in ti.static(self.features.rough):
+            for k in range(g.count):
+                first = g.first + k * g.size
+                X = scene.rest[i] - self.place(g, k, now, scene.path)
+                if g.force.touches(scene.parameters, first, X, u):
+                    moved = du + tangent.rest[i] - self.place(g, k, now, tangent.path)
+                    wall, dwall = self.speed(g, k, now, scene.path), self.speed(g, k, now, tangent.path)
+                    lighter = -h_over_m * inverse * tangent.mass[i]
+                    dv = g.force.slide_jvp(
+                        scene.parameters, first, X, u, v, wall, h_over_m, tangent.parameters, moved, dv, dwall, lighter
+                    )
+                    v = g.force.slide(scene.parameters, first, X, u, v, wall, h_over_m)
+        return dv
+
+    @ti.func
+    def slide_vjp(self, i, u, v, v_adj, now: A, scene: A, adjoint: A):
+        """Adjoints of u and of the velocity v before friction, for the adjoint of that after it; adds those of all else."""
+        inverse, u_adj = scene.inverse_mass[i], self.vector(0)
+        h_over_m = now.h * inverse
+        for g in ti.static(self.features.rough_backwards):
+            for back in range(g.count):
+                k = g.count - 1 - back
+                first = g.first + k * g.size
+                X = scene.rest[i] - self.place(g, k, now, scene.path)
+                if g.force.touches(scene.parameters, first, X, u):
+                    start = self.slide_before(g.number + k, i, u, v, now, scene)
+                    by_u, by_v, by_wall, by_ratio, by = g.force.slide_vjp(
+                        scene.parameters, first, X, u, start, self.speed(g, k, now, scene.path), h_over_m, v_adj
+                    )
+                    v_adj = by_v
+                    u_adj += by_u
+                    for m in ti.static(range(g.size)):
+                        adjoint.sums[first + m, i] = adjoint.sums[first + m, i] + by[m]
+                    if ti.static(self.features.density):
+                        row = ti.static(self.features.sums().first("mass"))
+                        adjoint.sums[row, i] = adjoint.sums[row, i] - h_over_m * inverse * by_ratio
+                    self.add_to_rest(i, by_u, adjoint)
+                    self.add_to_path(g, k, i, now, by_u, by_wall, adjoint)
+        return u_adj, v_adj

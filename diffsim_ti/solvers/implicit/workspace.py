@@ -1,0 +1,291 @@
+"""A run of an implicit solver: its passes, what they are told of obstacles, motion and loads."""
+
+import weakref
+
+import numpy as np
+
+from diffsim_ti import runtime
+from diffsim_ti.contact.implicit_pairs import ImplicitPairs
+from diffsim_ti.potential.potential import Potential
+from diffsim_ti.solvers.implicit.linear import NotConverged
+from diffsim_ti.solvers.implicit.newton import Newton
+from diffsim_ti.solvers.implicit.preconditioners import BlockJacobi, Multigrid
+from diffsim_ti.solvers.implicit.stage import Stage
+from diffsim_ti.state.arrays import History, copy_slot
+from diffsim_ti.state.energy_watch import EnergyWatch
+from diffsim_ti.state.workspace import Workspace
+
+
+class TwoStepHistory(History):
+    """States with the one before each, for two-step solvers; fresh[k]: slot k has none."""
+
+    def __init__(self, arrays, num_slots: int, record: bool):
+        super().__init__(arrays, num_slots, record=False)
+        self.before = History(arrays, 1 if record else num_slots, record=False)
+        self.fresh = [True] * num_slots
+
+
+class ImplicitWorkspace(Workspace):
+    """A run of an implicit solver. Vectors of vertices are worked on in float64 on the host, tetrahedra on the device."""
+
+    pairs_kind = ImplicitPairs
+
+    def __init__(self, solver, derived):
+        self.potential, self._length = None, solver.substep
+        self.energy_watch = EnergyWatch(self) if solver.may_gain_energy else None
+        super().__init__(solver, derived)
+
+    def history(self, num_slots, record=False):
+        kind = TwoStepHistory if self.solver.multistep else History
+        return kind(self.arrays, num_slots, record and self.solver.multistep)
+
+    def load(self, derived) -> None:
+        self._launches.clear()
+        super().load(derived)
+        if not self._launches.get("potential"):
+            self.potential = Potential(self.arrays, self.scene.mesh.tetrahedra, self.parallel, self.pairs)
+            self._launches["potential"] = True
+        a = self.arrays
+        self.mass = derived.mass[:, None]
+        self.free = (runtime.fetch(a.inverse_mass)[:, None] > 0).astype(np.float64)
+        eps = np.finfo(runtime.NUMPY[self.scene.precision]).eps
+        tolerance, rounds = self.solver.tolerance, self.solver.max_iterations
+        me = weakref.proxy(self)  # no circle: a dropped run gives its memory back at once
+        gaps, preconditioner = (lambda u: me._gaps(u)), (lambda mass: me.preconditioner(mass))
+        self.newton = Newton(self.potential, self.free, gaps, preconditioner, tolerance, rounds, eps)
+        self._preconditioners = {}
+
+    def restart(self) -> None:
+        super().restart()
+        self._begin_anew()
+        if self.energy_watch:
+            self.energy_watch.clear()
+
+    def forget(self) -> None:
+        """The state was set from outside: there is none before it."""
+        super().forget()
+        self._begin_anew()
+
+    def _begin_anew(self) -> None:
+        if self.solver.multistep:
+            self.state.fresh[0] = True
+
+    def save(self, target, slot) -> None:
+        super().save(target, slot)
+        if self.solver.multistep and not (target is self.record and slot > 0):  # its slots follow one another
+            self._copy_before(self.state, 0, target, slot)
+
+    def restore(self, source, slot) -> None:
+        super().restore(source, slot)
+        if self.solver.multistep:
+            if source is self.record and slot > 0:  # its slots follow one another
+                copy_slot(source.u, slot - 1, self.state.before.u, 0)
+                copy_slot(source.v, slot - 1, self.state.before.v, 0)
+                self.state.fresh[0] = False
+            else:
+                self._copy_before(source, slot, self.state, 0)
+
+    @staticmethod
+    def _copy_before(source, s, target, t) -> None:
+        copy_slot(source.before.u, s, target.before.u, min(t, target.before.num_slots - 1))
+        copy_slot(source.before.v, s, target.before.v, min(t, target.before.num_slots - 1))
+        target.fresh[t] = source.fresh[s]
+
+    # ---- a pass -----------------------------------------------------------------------------------------------------
+
+    def advance(self, first: int, last: int, num_passes: int, save_every: int = 0, base: int | None = None) -> None:
+        """Passes first .. last - 1 from the current state; or recorded: slot j - base holds the state before pass j."""
+        if base is not None:
+            self.restore(self.record, first - base)
+        if self.solver.substep != self._length:
+            self._length = self.solver.substep
+            self._begin_anew()
+        for j in range(first, last):
+            if save_every and j % save_every == 0:
+                self.save_frame(j // save_every)
+            u, v, before = self.read(self.state, 0)
+            try:
+                u_next, v_next = self._pass(j, u, v, before)
+            except NotConverged as error:
+                step = j // self.solver.substeps
+                raise NotConverged(
+                    f"step {step}, t = {step * self.solver.dt:.6g} s: {error}", error.residuals
+                ) from None
+            if self.solver.multistep:
+                copy_slot(self.state.u, 0, self.state.before.u, 0)
+                copy_slot(self.state.v, 0, self.state.before.v, 0)
+                self.state.fresh[0] = False
+            runtime.fill(self.state.u, u_next[None])
+            runtime.fill(self.state.v, v_next[None])
+            if base is not None:
+                copy_slot(self.state.u, 0, self.record.u, j + 1 - base)
+                copy_slot(self.state.v, 0, self.record.v, j + 1 - base)
+                if self.solver.multistep:
+                    self.record.fresh[j + 1 - base] = False
+
+    def preconditioner(self, mass: np.ndarray) -> tuple:
+        """(preconditioner for c M + K with mass = c m, size of the diagonal of that at rest [N/m])."""
+        key = float(mass.sum())
+        if key not in self._preconditioners:
+            held = self.potential.held_at
+            self.potential.place(np.zeros_like(held))
+            blocks, contact = self.potential.blocks(), self.potential.contact_blocks()
+            size = np.abs(blocks if contact is None else blocks - contact).sum((1, 2))[:, None]
+            self.potential.place(held)
+            kind = Multigrid if self._wants_multigrid(size, mass) else BlockJacobi
+            if len(self._preconditioners) > 2:
+                self._preconditioners.pop(next(iter(self._preconditioners)))
+            self._preconditioners[key] = kind(self.potential, mass, self.free, size), size + mass
+        return self._preconditioners[key]
+
+    def _wants_multigrid(self, size: np.ndarray, mass: np.ndarray) -> bool:
+        if self.solver.preconditioner != "auto":
+            return self.solver.preconditioner == "multigrid"
+        ratio = np.max(size[mass > 0] / mass[mass > 0], initial=0.0) if mass.any() else np.inf
+        return len(size) > 1000 and ratio > 1000
+
+    def read(self, history, slot: int) -> tuple:
+        """(u, v, (u-, v-) or None) of a slot, in float64."""
+        get = runtime.fetch_row
+        before = None
+        if self.solver.multistep and not history.fresh[slot]:
+            if history is self.record and slot > 0:
+                before = get(history.u, slot - 1), get(history.v, slot - 1)
+            else:
+                at = min(slot, history.before.num_slots - 1)
+                before = get(history.before.u, at), get(history.before.v, at)
+        return get(history.u, slot), get(history.v, slot), before
+
+    def inertial(self, stage: Stage, u, v, before) -> tuple:
+        """(x, y): where inertia starts from."""
+        if before is None:
+            return stage.a0 * u, stage.b0 * v
+        return stage.a0 * u + stage.a1 * before[0], stage.b0 * v + stage.b1 * before[1]
+
+    def _pass(self, j, u, v, before):
+        stage = self.solver.stage(self.rate, before is None)
+        x, y = self.inertial(stage, u, v, before)
+        place, speed = self.prescribed(j)
+        fixed = self.arrays.fixed
+        mass, loads = stage.inertia * self.mass, self.loads(j, stage)
+        inertial = x + stage.gamma * y
+        if not stage.static:  # dead loads act like a shift of where inertia leads: free flight is then exact
+            inertial = inertial + np.divide(loads, mass, out=np.zeros_like(loads), where=mass > 0)
+            loads = np.zeros_like(loads)
+        start = u if stage.static else u + self.free * (inertial - u)
+        if len(fixed) and place is not None:
+            middle = u[fixed] + (place - u[fixed]) / stage.c0
+            start = start.copy()
+            start[fixed] = middle
+        self.begin(j, stage, u, x)
+        start = self._admissible(start, u)
+        u_star = self.newton.solve(start, mass, inertial, loads, leave_saddles=stage.static)
+        v_star = (u_star - x) / stage.gamma
+        u_next = stage.c0 * u_star + (1 - stage.c0) * u
+        if self.pairs and stage.c0 != 1:
+            self.pairs.check_end(u_star, u_next)
+        v_next = stage.e0 * v_star + stage.e1 * y
+        if len(fixed):
+            u_next[fixed], v_next[fixed] = (u[fixed], v[fixed]) if place is None else (place, speed)
+        if self.energy_watch:
+            self.energy_watch.note(u, u_star, u_next, v_next)
+        return u_next, np.zeros_like(v) if stage.static else v_next
+
+    def _admissible(self, start, u):
+        """The start of Newton's method: where inertia leads, or less far where that would turn something inside out."""
+        held = start * (1 - self.free) + u * self.free
+        longest = self._safe_share(u, held, start)
+        _, _, J0 = self._looked_at(held)
+        gaps0 = self._gaps(held)
+        for fraction in (longest, 0.5 * longest, 0.25 * longest):
+            at = held + fraction * (start - held)
+            _, _, J = self._looked_at(at)
+            if not (np.any((J0 > 0) & ~(J > 0)) or np.any((gaps0 > 0) & ~(self._gaps(at) > 0))):
+                return at
+        return held
+
+    def _safe_share(self, u, held, start) -> float:
+        """How far from `held` towards `start` no surfaces meet; prescribed vertices have to get where they are held."""
+        if not self.pairs:
+            return 1.0
+        if not self.pairs.way_is_free(u, held - u):
+            raise NotConverged("prescribed motion drives surfaces through each other: take smaller steps", [])
+        return self.pairs.safe_share(held, start - held)
+
+    def _looked_at(self, u):
+        self.potential.place(u)
+        return self.potential.energy()
+
+    def _gaps(self, u: np.ndarray) -> np.ndarray:
+        """Distance of the surface vertices to each obstacle [m], one after the other."""
+        a = self.arrays
+        if not a.contacts:
+            return np.zeros(0)
+        surface = self.scene.mesh.surface_vertices
+        at = a.values.rest[surface] + u[surface]
+        return np.concatenate([term.gap(at, self._walls[3 * k]) for k, term in enumerate(a.contacts)])
+
+    def begin(self, j: int, stage: Stage, u: np.ndarray, x: np.ndarray) -> None:
+        """Tell the potential where obstacles are in pass j and where friction is measured from."""
+        self._walls = self.walls(self.arrays.values.path, j, stage)
+        self.potential.begin(u, x, 1 / stage.gamma, self._walls)
+
+    def walls(self, path: np.ndarray | None, j: int, stage: Stage) -> np.ndarray:
+        """Three rows for each obstacle: displacement where forces are taken, displacement before, velocity."""
+        obstacles, schedule = self.arrays.obstacles, self.solver.schedule
+        out = np.zeros((3 * len(obstacles), 3))
+        if path is not None:
+            before = schedule.place(path, j, schedule.begin(j))
+            at_stage = schedule.place(path, j, self._share_at_stage(j, stage))
+            speed = schedule.rate(path, j)
+            for k, (_, _, column) in enumerate(obstacles):
+                if column >= 0:
+                    out[3 * k : 3 * k + 3] = at_stage[column], before[column], speed[column]
+        return out
+
+    def _share_at_stage(self, j: int, stage: Stage) -> float:
+        """Share of the step at which pass j takes its forces."""
+        schedule = self.solver.schedule
+        return schedule.begin(j) + (schedule.end(j) - schedule.begin(j)) / stage.c0
+
+    def walls_vjp(self, walls_adj: np.ndarray, j: int, stage: Stage, path_adj: np.ndarray) -> None:
+        """Add the adjoints of the rows of paths for those of `walls`."""
+        schedule = self.solver.schedule
+        for k, (_, _, column) in enumerate(self.arrays.obstacles):
+            if column >= 0:
+                by_stage, by_before, by_speed = walls_adj[3 * k : 3 * k + 3]
+                rows = path_adj[:, column]
+                schedule.add_place(rows, j, self._share_at_stage(j, stage), by_stage)
+                schedule.add_place(rows, j, schedule.begin(j), by_before)
+                schedule.add_rate(rows, j, by_speed)
+
+    def prescribed(self, j: int) -> tuple:
+        """(displacement [m], velocity [m/s]) of the fixed vertices after pass j; None where they are held."""
+        values, schedule = self.arrays.values, self.solver.schedule
+        if values.motion is None:
+            return None, None
+        anchor = values.displacement[self.arrays.fixed]
+        return anchor + schedule.place(values.motion, j, schedule.end(j)), schedule.rate(values.motion, j)
+
+    def loads(self, j: int, stage: Stage) -> np.ndarray:
+        """Dead loads on each vertex [N]: weight and external forces; statics lay them on in substeps."""
+        values, features = self.arrays.values, self.arrays.features()
+        out = np.zeros_like(values.displacement)
+        if features.gravity >= 0:
+            out += self.mass * values.parameters[features.gravity :][:3]
+        if values.forces is not None:
+            row = self.solver.schedule.row(j) if len(values.forces) > 1 else 0
+            out[self.force_vertices()] += values.forces[row]
+        return out * self.load_share(j, stage)
+
+    def load_share(self, j: int, stage: Stage) -> float:
+        """Share of the loads in pass j."""
+        if not stage.static:
+            return 1.0
+        return min(1.0, (j + 1) / self.solver.substeps)
+
+    def force_vertices(self) -> np.ndarray:
+        """Vertices that external forces act on."""
+        from diffsim_ti.terms import ExternalForce
+
+        return self.scene.term(ExternalForce).indices(self.scene.mesh)

@@ -1,0 +1,72 @@
+"""What a scene contains, known when kernels compile: an absent feature leaves no code."""
+
+from dataclasses import dataclass
+
+from diffsim_ti.rows import Rows
+from diffsim_ti.terms import VertexForce
+
+
+@dataclass(frozen=True)
+class ObstacleGroup:
+    """Obstacles of one kind, which kernels go through in a loop: the k-th of them has its numbers at first + k size."""
+
+    force: VertexForce  # the compile-time twin of all of them
+    first: int  # where the numbers of the first start in the parameter array
+    number: int  # place of the first among all obstacles
+    path: int = -1  # column of the first's path among those that move, -1 if they stand still
+    count: int = 1
+
+    @property
+    def size(self) -> int:
+        return self.force.size
+
+    def holds(self, force: VertexForce, first: int, path: int) -> bool:
+        """Whether one more obstacle, next in the parameters and the paths, belongs to the group."""
+        next_path = -1 if self.path < 0 else self.path + self.count
+        return force == self.force and first == self.first + self.count * self.size and path == next_path
+
+
+def grouped(obstacles) -> tuple[ObstacleGroup, ...]:
+    """Groups of obstacles given as (twin, first parameter, column of the path or -1), neighbours of one kind together."""
+    groups = []
+    for number, (force, first, path) in enumerate(obstacles):
+        last = groups[-1] if groups else None
+        if last and last.holds(force, first, path):
+            groups[-1] = ObstacleGroup(last.force, last.first, last.number, last.path, last.count + 1)
+        else:
+            groups.append(ObstacleGroup(force, first, number, path))
+    return tuple(groups)
+
+
+@dataclass(frozen=True)
+class Features:
+    """What kernels are compiled for, besides the law."""
+
+    groups: tuple[ObstacleGroup, ...] = ()
+    gravity: int = -1  # where it starts in the parameter array, -1: none
+    drag: int = -1
+    forces: bool = False
+    forces_per_step: bool = False
+    motion: bool = False
+    moving: int = 0  # obstacles that follow a path
+    num_parameters: int = 0  # numbers of all terms
+    uniform: bool = True  # one set of coefficients for all tetrahedra
+    density: bool = False  # the last two: adjoints that cost extra, only if asked for
+    shape: bool = False
+
+    @property
+    def rough(self) -> tuple[ObstacleGroup, ...]:
+        """Groups with friction."""
+        return tuple(group for group in self.groups if group.force.friction)
+
+    @property
+    def rough_backwards(self) -> tuple[ObstacleGroup, ...]:
+        return self.rough[::-1]
+
+    @property
+    def num_obstacles(self) -> int:
+        return sum(group.count for group in self.groups)
+
+    def sums(self) -> Rows:
+        """Rows of the per-vertex adjoint sums: those of the parameters stand as the parameters do."""
+        return Rows({"parameters": self.num_parameters, "mass": int(self.density), "rest": 3 * self.shape})

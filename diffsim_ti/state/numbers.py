@@ -1,0 +1,122 @@
+"""Every number of a scene that kernels read, described once: its kind of array, how it comes to the device and back.
+
+The same description serves three records: the values (state/arrays.py), their changes (`Tangent`), their adjoints
+(`Adjoint`). Numbers of tetrahedra lie in blocks of eight. Adjoints of numbers that many vertices feel are summed per vertex
+first, in rows (`Features.sums`).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from diffsim_ti import runtime
+from diffsim_ti.inputs import Derived
+
+
+@dataclass(frozen=True)
+class Part:
+    """kind: as in `runtime.array_types`; pack(arrays, derived): what is uploaded, None for what the scene has not;
+    unpack(arrays, on host): its adjoint as `Derived` holds it, None for what comes from the sums of vertices."""
+
+    kind: str
+    pack: Callable
+    unpack: Callable | None = None
+
+
+def _given(name: str) -> Callable:
+    return lambda arrays, derived: getattr(derived, name)
+
+
+def _anchor(arrays, derived):
+    return None if derived.motion is None else derived.displacement[arrays.fixed]
+
+
+def _whole(arrays, x):
+    return x.astype(np.float64)
+
+
+PARTS = {
+    "gradients": Part(
+        "blocks", lambda a, d: a.to_blocks(d.gradients), lambda a, x: a.from_blocks(x, 9).reshape(-1, 3, 3)
+    ),
+    "volumes": Part("blocks", lambda a, d: a.volume_blocks(d.volumes), lambda a, x: a.from_blocks(x, 1)[:, 0]),
+    "coefficients": Part(
+        "blocks", lambda a, d: a.coefficient_blocks(d.coefficients), lambda a, x: a.from_blocks(x, a.num_coefficients)
+    ),
+    "mass": Part("scalars", _given("mass")),
+    "parameters": Part("scalars", _given("parameters")),
+    "rest": Part("vectors", _given("rest")),
+    "forces": Part("vectors2", _given("forces"), _whole),
+    "motion": Part("vectors2", _given("motion"), _whole),
+    "anchor": Part("vectors", _anchor, _whole),
+    "path": Part("vectors2", _given("path"), _whole),
+}
+TOPOLOGY = dict.fromkeys(("tets", "start", "corner_of", "surface", "force_slot", "motion_slot"), "ints")
+TANGENT = {name: part.kind for name, part in PARTS.items()}
+SCENE = TOPOLOGY | TANGENT | dict(inverse_mass="scalars", corner="vectors")  # all that a kernel may read of a scene
+del SCENE["mass"]
+OF_TETRAHEDRA = {name: PARTS[name].kind for name in ("gradients", "volumes", "coefficients")}
+OF_STEPS = {name: PARTS[name].kind for name in ("forces", "motion", "anchor", "path")}
+ADJOINT = OF_TETRAHEDRA | dict(sums="scalars2")
+
+
+def on_device(arrays, name: str, derived: Derived):
+    """(data, element type) of a part; a single zero where the scene has no such thing."""
+    kind = PARTS[name].kind
+    element = {"blocks": arrays.lanes, "scalars": arrays.fp}.get(kind, arrays.vector)
+    data = PARTS[name].pack(arrays, derived)
+    return np.zeros((1, 1, 3) if kind == "vectors2" else (1, 3)) if data is None else data, element
+
+
+class Tangent:
+    """Changes of all numbers, on the device."""
+
+    def __init__(self, arrays, tangent: Derived):
+        for name in PARTS:
+            setattr(self, name, runtime.upload(*on_device(arrays, name, tangent)))
+
+
+class Adjoint:
+    """Adjoints of a scene's numbers on the device: those of tetrahedra, sums per vertex, and parts of `more`.
+
+    density, shape: whether masses and the rest shape are among them.
+    """
+
+    def __init__(self, arrays, features, more=()):
+        self._arrays, self._features = arrays, features
+        a, blocks = arrays, arrays.num_blocks
+        shape = blocks if features.shape else 0
+        self.coefficients = runtime.array(a.lanes, a.num_coefficients * blocks)
+        self.gradients, self.volumes = runtime.array(a.lanes, 9 * shape), runtime.array(a.lanes, shape)
+        self.sums = runtime.array(a.fp, features.sums().total, a.num_vertices)
+        for name in more:
+            setattr(self, name, runtime.array(a.vector, *getattr(a, name).shape))
+        self._names = (*ADJOINT, *more)
+
+    def fits(self, arrays, features) -> bool:
+        """Whether kernels and shapes are still those of the run."""
+        same = (getattr(self, name).shape == getattr(arrays, name).shape for name in self._names if name in OF_STEPS)
+        return self._features == features and all(same)
+
+    def clear(self) -> None:
+        """All zero."""
+        for name in self._names:
+            runtime.fill(getattr(self, name), 0)
+
+    def collect(self) -> Derived:
+        """All of them in float64 on the host, those of the state being zero."""
+        a, features, rows = self._arrays, self._features, self._features.sums()
+        out, sums = a.values.zeros(), runtime.fetch(self.sums).astype(np.float64)
+        out.parameters[: features.num_parameters] = sums[rows.of("parameters")].sum(1)
+        if features.density:
+            out.mass = sums[rows.first("mass")]
+        if features.shape:
+            out.rest = sums[rows.of("rest")].T
+        for name in self._names:
+            missing = getattr(out, name, None) is None or (name in ("gradients", "volumes") and not features.shape)
+            if name in PARTS and not missing:
+                setattr(out, name, PARTS[name].unpack(a, runtime.fetch(getattr(self, name))))
+        if "anchor" in self._names and out.motion is not None:
+            out.displacement[a.fixed] += runtime.fetch(self.anchor)
+        return out

@@ -1,0 +1,152 @@
+"""Where each pass of a run lies in time: its step, its share of it, its length. One description for host and kernels.
+
+A motion, a path or a force is given by rows, one for each step's end; within step r it goes linearly from row r to row
+r + 1. Pass j begins at the share `begin` of its step and ends at the share `end`, so that a row's value there is
+
+    (1 - share) row[r] + share row[r + 1],        its rate of change (row[r + 1] - row[r]) / (length of the step).
+
+Rows may be arrays of any shape; nothing here says that they are three numbers.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import taichi as ti
+
+from diffsim_ti import runtime
+
+INTS = ("row", "next", "force0", "force1", "frame", "opens")
+FLOATS = ("begin", "end", "per_step", "h", "pre", "post", "alpha", "decay", "alpha_by_rate", "decay_by_rate")
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Equal steps of dt [s], each of `substeps` equal passes; j may be a number or an array of passes."""
+
+    dt: float
+    substeps: int
+
+    def row(self, j):
+        """The step that pass j lies in."""
+        return j // self.substeps
+
+    def begin(self, j):
+        """Share of its step at which pass j begins."""
+        return j % self.substeps / self.substeps
+
+    def end(self, j):
+        """Share of its step at which pass j ends."""
+        return (j % self.substeps + 1) / self.substeps
+
+    def step_length(self, j):
+        """Length of the step of pass j [s]."""
+        return self.dt + 0 * j
+
+    def length(self, j):
+        """Length h of pass j [s]."""
+        return self.dt / self.substeps + 0 * j
+
+    # ---- rows of a motion, and their adjoints ------------------------------------------------------------------------
+
+    def place(self, rows: np.ndarray, j: int, share: float) -> np.ndarray:
+        """The value at a share of the step of pass j; beyond the last row it stays."""
+        r, after = self._rows(rows, j)
+        return rows[r] + share * (rows[after] - rows[r])
+
+    def rate(self, rows: np.ndarray, j: int) -> np.ndarray:
+        """The rate of change in the step of pass j [1/s]."""
+        r, after = self._rows(rows, j)
+        return (rows[after] - rows[r]) / self.step_length(j)
+
+    def add_place(self, rows_adj: np.ndarray, j: int, share: float, adjoint: np.ndarray) -> None:
+        """Adjoint of `place`."""
+        r, after = self._rows(rows_adj, j)
+        rows_adj[r] += (1 - share) * adjoint
+        rows_adj[after] += share * adjoint
+
+    def add_rate(self, rows_adj: np.ndarray, j: int, adjoint: np.ndarray) -> None:
+        """Adjoint of `rate`."""
+        r, after = self._rows(rows_adj, j)
+        rows_adj[r] -= adjoint / self.step_length(j)
+        rows_adj[after] += adjoint / self.step_length(j)
+
+    def _rows(self, rows, j):
+        r = min(self.row(j), len(rows) - 1)
+        return r, min(r + 1, len(rows) - 1)
+
+    # ---- for kernels -------------------------------------------------------------------------------------------------
+
+    def table(
+        self, first: int, last: int, num_rows: int, save_every: int, weights: dict
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """(INTS, FLOATS) of passes first .. last - 1, one row each; weights: the solver's numbers by name (explicit/)."""
+        j = np.arange(first, last)
+        row = np.minimum(self.row(j), num_rows - 1)
+        saved = (j % save_every == 0) if save_every else np.zeros(len(j), bool)
+        ints = {
+            "row": row,
+            "next": np.minimum(row + 1, num_rows - 1),
+            "force0": self.row(j - weights["lag0"]),
+            "force1": self.row(j - weights["lag1"]),
+            "frame": np.where(saved, j // max(save_every, 1), -1),
+            "opens": j % self.substeps == 0,
+        }
+        floats = dict(begin=self.begin(j), end=self.end(j), per_step=1 / self.step_length(j), h=self.length(j))
+        floats |= {name: weights[name] for name in FLOATS if name in weights}
+        return tuple(
+            np.stack([np.broadcast_to(columns[name], len(j)) for name in names], 1)
+            for names, columns in ((INTS, ints), (FLOATS, floats))
+        )
+
+
+@runtime.traced
+def reversed_pass(now, j, plan) -> runtime.Bundle:
+    """Pass j on the way back, `pre_adj` being what the kick before the state counts: none if the sweep halts at the state
+    (j = plan.halt); with plan.kick the pass is that kick alone."""
+    own, alone = dict(vars(now)), runtime.let(plan.kick > 0)
+    own["pre_adj"] = runtime.let(ti.select(j == plan.halt, 0 * now.pre, now.pre))
+    for name in ("post", "alpha", "alpha_by_rate", "decay_by_rate"):
+        own[name] = runtime.let(ti.select(alone, 0 * own[name], own[name]))
+    own["decay"] = runtime.let(ti.select(alone, 0 * now.decay + 1, now.decay))
+    own["frame"] = runtime.let(ti.select(alone, -1, now.frame))
+    return runtime.Bundle(**own)
+
+
+class PassTable:
+    """The tables of some passes on the device: `ints` and `floats`, whose first row is that of pass `window`."""
+
+    size = 1024  # passes
+
+    def __init__(self, fp):
+        self.ints = runtime.array(ti.i32, self.size, len(INTS))
+        self.floats = runtime.array(fp, self.size, len(FLOATS))
+        self._made, self._shown = {}, None
+
+    def windows(self, first: int, last: int) -> list[tuple[int, int, int]]:
+        """(window, first pass, last pass) of the windows that passes first .. last - 1 lie in."""
+        starts = range(first // self.size * self.size, last, self.size)
+        return [(start, max(first, start), min(last, start + self.size)) for start in starts]
+
+    def show(self, window: int, run: tuple, make: Callable) -> None:
+        """Bring a window's tables, make(first, last), to the device; `run` is what they depend on besides."""
+        if self._shown == (window, run):
+            return
+        if (window, run) not in self._made:
+            if len(self._made) > 8:
+                self._made.pop(next(iter(self._made)))
+            self._made[window, run] = make(window, min(window + self.size, run[0]))
+        self._shown = window, run
+        for target, rows in zip((self.ints, self.floats), self._made[window, run]):
+            whole = np.zeros(target.shape)
+            whole[: len(rows)] = rows
+            runtime.fill(target, whole)
+
+
+@runtime.traced
+def pass_at(table, k) -> runtime.Bundle:
+    """Row k of the tables in a kernel: what a pass is, by name."""
+    columns = {name: runtime.let(runtime.at(table.ints, k, c)) for c, name in enumerate(INTS)}
+    return runtime.Bundle(
+        **columns, **{name: runtime.let(runtime.at(table.floats, k, c)) for c, name in enumerate(FLOATS)}
+    )

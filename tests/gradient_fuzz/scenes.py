@@ -1,0 +1,204 @@
+"""A configuration: a structure with numbers, drawn from one seed."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+import diffsim_ti as ds
+
+from . import bodies
+from .obstacles import MESH_WIDTH, Placed, place, push_direction
+from .structures import CELL, PER_STRUCTURE, Structure, structure
+
+
+@dataclass
+class Configuration:
+    """What one seed stands for."""
+
+    seed: int
+    structure: Structure
+    solver: object
+    steps: int
+    options: dict  # of the Rollout
+    placed: list[Placed]
+    paths: list  # of the obstacles in `placed`, None for those that stand still
+    terms: list
+
+    @property
+    def scene(self):
+        return self.solver.scene
+
+    def rollout(self, **changes) -> ds.Rollout:
+        return ds.Rollout(self.solver, self.steps, **self.options | changes)
+
+    def rng(self, salt: int):
+        return np.random.default_rng([self.seed, salt])
+
+
+def smooth_path(rng, size: float, duration: float):
+    """A function of time that starts at zero, or keyframes."""
+    if rng.random() < 0.3:
+        times = duration * np.array([0.0, rng.uniform(0.2, 0.8), 1.0])
+        return times, size * np.vstack([np.zeros(3), rng.standard_normal((2, 3))])
+    a, b = rng.standard_normal((2, 3))
+    return lambda t: size * (a * np.sin(2 * t / duration) + b * (t / duration) ** 2)
+
+
+def path_at(path, t: float) -> np.ndarray:
+    if callable(path):
+        return np.asarray(path(t))
+    return np.array([np.interp(t, path[0], column) for column in path[1].T])
+
+
+def material(kind: Structure, rng, mesh):
+    """In one of its spellings; moduli uniform, per set or per tetrahedron."""
+    m = mesh.num_tetrahedra
+    E, nu = 10 ** rng.uniform(4.0, 4.6), rng.uniform(0.15, 0.42)
+
+    def spread(x, share):
+        if kind.uniform:
+            return x
+        if "part" in mesh.tetrahedron_sets:
+            return {"part": x, "default": x * (1 + share)}
+        return x * (1 + share * rng.random(m))
+
+    mu, lam = E / (2 * (1 + nu)), E * nu / ((1 + nu) * (1 - 2 * nu))
+    if kind.law is ds.MooneyRivlin and rng.random() < 0.5:
+        own = next(names for names in kind.law.spellings if names[0] not in ("youngs_modulus", "mu"))
+        numbers = dict(zip(own, (0.3 * mu, 0.2 * mu, lam + 2 / 3 * mu)))
+        return kind.law(**{name: spread(x, 0.5) for name, x in numbers.items()}), E
+    if rng.random() < 0.3:
+        return kind.law(mu=spread(mu, 0.5), lam=spread(lam, 0.5)), E
+    return kind.law(E=spread(E, 1.0), nu=spread(nu, 0.1) if rng.random() < 0.5 else nu), E
+
+
+def build(seed: int, precision: str | None = None) -> Configuration:
+    """The configuration of a seed, or the same in another precision; raises what the package raises."""
+    kind, rng = structure(seed // PER_STRUCTURE), np.random.default_rng([10, seed])
+    kind = replace(kind, precision=precision or kind.precision)
+    way = None
+    if kind.self_contact:
+        mesh, start, way = (bodies.pair if rng.random() < 0.6 else bodies.fold)(rng)
+    else:
+        mesh = bodies.body(rng)
+        if rng.random() < 0.25:
+            other = bodies.body(rng)
+            mesh = ds.TetrahedralMesh.joined([mesh, other.translated([6 * CELL, 0, 0])])
+        start = np.array(mesh.vertices)
+        if rng.random() < 0.5:
+            middle = start.mean(0)
+            start = middle + (start - middle) @ (np.eye(3) + 0.05 * rng.standard_normal((3, 3)))
+            start = start + 0.02 * CELL * rng.standard_normal(start.shape)
+    mesh = mesh.translated(shift := CELL * rng.uniform(-3, 3, 3))
+    start = start + shift
+    mesh = bodies.with_part(mesh, rng) if rng.random() < 0.5 else mesh
+    law, E = material(kind, rng, mesh)
+    density = rng.uniform(600, 1200) * (1 + 0.3 * rng.random(mesh.num_tetrahedra) if rng.random() < 0.4 else 1.0)
+    fixed = _fixed(kind, rng, mesh) if kind.fixed else None
+    steps, substeps, dt = _schedule(
+        kind, rng, mesh, E, np.min(density), np.abs(start - mesh.vertices).max() > 0.1 * CELL
+    )
+    duration = steps * dt
+
+    mass = np.bincount(mesh.tetrahedra.ravel(), np.repeat(density * mesh.volumes / 4 * np.ones(mesh.num_tetrahedra), 4))
+    beat = 2e-3 if kind.static else dt / substeps if kind.explicit else duration / 25
+    stiff = mass.min() * (rng.uniform(0.15, 0.4) / beat) ** 2 / 35  # omega dt at a fifth of the width
+    placed, paths, push = _obstacles(kind, rng, start, fixed, stiff, duration)
+
+    terms = [p.term for p in placed]
+    if kind.gravity:
+        terms.append(ds.Gravity(9.81 * (rng.uniform(0.5, 1.5) * -push + 0.3 * rng.standard_normal(3))))
+    if kind.drag:
+        terms.append(ds.Drag(rng.uniform(0.2, 5.0)))
+    if kind.forces != "none":
+        terms.append(_forces(kind, rng, mesh, steps, mass.mean()))
+    if kind.self_contact:
+        terms.append(ds.SelfContact(stiffness=stiff * rng.uniform(0.05, 0.3), width=bodies.SELF_WIDTH))
+    terms = [terms[k] for k in rng.permutation(len(terms))]
+
+    velocities = None
+    if not kind.static and rng.random() < 0.9:
+        speed = 0.05 * CELL / duration * rng.uniform(0.3, 1.5)
+        velocities = speed * (rng.standard_normal(3) - push + 0.3 * rng.standard_normal(start.shape))
+        if way is not None and mesh.num_pieces == 2:
+            velocities[mesh.vertex_sets["body_1"]] -= speed * way
+    motion = smooth_path(rng, 0.05 * CELL, duration) if kind.motion else None
+    deformed = start if np.any(start != mesh.vertices) else None
+    scene = ds.Scene(
+        mesh,
+        law,
+        density,
+        terms,
+        fixed=fixed,
+        motion=motion,
+        initial_positions=deformed,
+        initial_velocities=velocities,
+        precision=kind.precision,
+        volume=kind.volume,
+    )
+    options = dict(save_every=int(rng.choice([k for k in range(1, steps + 1) if steps % k == 0])), gradients="all")
+    solver = _solver(kind, scene, dt, substeps)
+    return Configuration(seed, kind, solver, steps, options, placed, paths, terms)
+
+
+def _fixed(kind, rng, mesh):
+    """Vertices to hold; for statics three of every piece."""
+    pieces = [mesh.vertex_sets[name] for name in mesh.vertex_sets if name.startswith("body_")] or [
+        np.arange(mesh.num_vertices)
+    ]
+    if kind.static:
+        return np.sort(np.concatenate([np.sort(rng.permutation(piece)[:3]) for piece in pieces]))
+    return np.sort(rng.permutation(mesh.num_vertices)[: rng.integers(1, 4)])
+
+
+def _schedule(kind, rng, mesh, E, density, bent) -> tuple[int, int, float]:
+    if kind.static:
+        return int(rng.integers(1, 3)), int(rng.integers(1, 3)), 1.0
+    corners = mesh.vertices[mesh.tetrahedra]
+    D = np.moveaxis(corners[:, 1:] - corners[:, :1], 1, 2)
+    B = np.linalg.inv(D)
+    altitude = 1 / np.linalg.norm(np.concatenate([B, B.sum(1, keepdims=True)], 1), axis=2).max()
+    substep = rng.uniform(0.2, 0.4) * altitude / np.sqrt(5 * E / density) * (0.5 if bent else 1.0)
+    if kind.explicit:
+        steps, substeps = int(rng.integers(2, 13)), int(rng.integers(1, 4))
+        return steps, substeps, float(substep * substeps)
+    steps, substeps = int(rng.integers(2, 5)), int(rng.integers(1, 3))
+    return steps, substeps, float(5 * substep * substeps)
+
+
+def _obstacles(kind, rng, start, fixed, stiff, duration) -> tuple[list, list, np.ndarray]:
+    """(obstacles, their paths, the direction in which the first of them pushes)."""
+    free = np.setdiff1d(np.arange(len(start)), [] if fixed is None else fixed)
+    placed, paths, push = [], [], None
+    for o in kind.obstacles:
+        for _ in range(20):  # so that the lowest vertex is free to move
+            n = push_direction(o.name, rng)
+            if np.argmin(start @ n) in free:
+                break
+        push = n if push is None else push
+        width = MESH_WIDTH if o.name == "MeshObstacle" else CELL * rng.uniform(0.25, 0.5)
+        options = dict(stiffness=stiff * rng.uniform(0.3, 1.0))
+        if o.friction:
+            typical = 0.05 * CELL / duration
+            options |= dict(friction=rng.uniform(0.1, 0.8), friction_speed=typical * 10 ** rng.uniform(-1.0, 0.8))
+        path = smooth_path(rng, 0.05 * CELL, duration) if o.path else None
+        placed.append(place(o, rng, start, n, width, options | dict(path=path)))
+        paths.append(path)
+    return placed, paths, rng.standard_normal(3) if push is None else push
+
+
+def _forces(kind, rng, mesh, steps, mass):
+    chosen = np.sort(rng.permutation(mesh.num_vertices)[: rng.integers(1, mesh.num_vertices + 1)])
+    if kind.forces == "constant" and rng.random() < 0.3:
+        return ds.ExternalForce(5 * mass * rng.standard_normal(3))
+    shape = (len(chosen), 3) if kind.forces == "constant" else (steps, len(chosen), 3)
+    return ds.ExternalForce(5 * mass * rng.standard_normal(shape), chosen)
+
+
+def _solver(kind, scene, dt, substeps):
+    tolerance = 1e-11 if kind.precision == "f64" else 1e-6
+    if kind.static:
+        return ds.StaticSolver(scene, load_steps=substeps, tolerance=tolerance, parallel=kind.parallel)
+    if kind.explicit:
+        return kind.solver(scene, dt=dt, substeps=substeps, parallel=kind.parallel)
+    return kind.solver(scene, dt=dt, substeps=substeps, tolerance=tolerance, parallel=kind.parallel)

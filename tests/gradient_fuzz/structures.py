@@ -1,0 +1,104 @@
+"""What kernels are compiled for, drawn from a number: law, solver, precision, kinds of terms, friction, paths, motion."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+import diffsim_ti as ds
+
+PER_STRUCTURE = 8  # configurations of numbers on each
+CELL = 0.1  # edge of a grid cell [m]
+
+LAWS = (ds.StableNeoHookean, ds.SmithNeoHookean, ds.MooneyRivlin, ds.Corotated, ds.StVenantKirchhoff, ds.LinearElastic)
+EXPLICIT = (ds.SemiImplicitSolver, ds.VelocityVerletSolver)
+IMPLICIT = (ds.ImplicitEulerSolver, ds.ImplicitMidpointSolver, ds.BDF2Solver)
+SOLVERS = (*EXPLICIT, *IMPLICIT, ds.StaticSolver)
+WHEEL = (*EXPLICIT * 3, *IMPLICIT * 2, *(ds.StaticSolver,) * 3, ds.SemiImplicitSolver)  # how often each is drawn
+OBSTACLES = ("Ground", "HalfSpace", "Sphere", "Bowl", "Box", "Capsule", "Cylinder", "MeshObstacle")
+
+
+@dataclass(frozen=True)
+class ObstacleKind:
+    """An obstacle as kernels know it."""
+
+    name: str
+    friction: bool
+    path: bool
+
+
+@dataclass(frozen=True)
+class Structure:
+    """Everything that kernels are compiled for."""
+
+    number: int
+    law: type
+    solver: type
+    precision: str
+    volume: str
+    parallel: bool | None
+    obstacles: tuple[ObstacleKind, ...]
+    self_contact: bool
+    gravity: bool
+    drag: bool
+    forces: str  # "none", "constant", "per step"
+    fixed: bool
+    motion: bool
+    uniform: bool  # moduli
+    torch: bool  # whether its torch simulator is tried
+
+    @property
+    def explicit(self) -> bool:
+        return self.solver in EXPLICIT
+
+    @property
+    def static(self) -> bool:
+        return self.solver is ds.StaticSolver
+
+    def __str__(self) -> str:
+        kinds = [k.name + " rough" * k.friction + " moving" * k.path for k in self.obstacles]
+        flags = ("self_contact", "gravity", "drag", "fixed", "motion", "uniform")
+        words = [name for name in flags if getattr(self, name)]
+        return (
+            f"structure {self.number}: {self.law.__name__}, {self.solver.__name__}, {self.precision}, {self.volume}"
+            f"{', parallel' if self.parallel else ''}; obstacles: {', '.join(kinds) or 'none'}; forces {self.forces}; "
+            f"{', '.join(words)}"
+        )
+
+
+def turn(wheel: tuple, number: int, salt: int):
+    """The number-th entry of a wheel that is shuffled anew in every round: all entries come equally often."""
+    at, place = divmod(number, len(wheel))
+    return wheel[np.random.default_rng([salt, at]).permutation(len(wheel))[place]]
+
+
+def structure(number: int) -> Structure:
+    """The number-th structure; the same for ever."""
+    rng = np.random.default_rng([1, number])
+    solver = turn(WHEEL, number, 2)
+    static = solver is ds.StaticSolver
+    self_contact = bool(turn((True, False, False), number, 3))
+    count = int(
+        rng.choice([0, 1, 2, 3, 4], p=[0.0, 0.35, 0.35, 0.2, 0.1] if not self_contact else [0.2, 0.4, 0.3, 0.1, 0])
+    )
+    names = [turn(OBSTACLES, 4 * number + k, 4) for k in range(max(count, int(static)))]
+    if len(names) > 1 and rng.random() < 0.25:
+        names[1] = names[0]  # two of a kind
+    obstacles = tuple(ObstacleKind(name, rng.random() < 0.65, rng.random() < 0.45) for name in names)
+    fixed = static or rng.random() < 0.5
+    return Structure(
+        number,
+        turn(LAWS, number, 5),
+        solver,
+        "f32" if rng.random() < 0.2 else "f64",
+        "patches" if rng.random() < 0.2 else "tetrahedra",
+        True if solver in EXPLICIT and rng.random() < 0.2 else None,
+        obstacles,
+        self_contact,
+        static or rng.random() < 0.75,
+        not static and rng.random() < 0.5,
+        str(rng.choice(["none", "constant", "per step"], p=[0.4, 0.3, 0.3])),
+        fixed,
+        fixed and rng.random() < 0.5,
+        rng.random() < 0.4,
+        number % 3 == 0,
+    )

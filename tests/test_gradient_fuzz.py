@@ -1,0 +1,45 @@
+"""Two dozen fixed configurations of the fuzz of gradients; `fuzz_gradients.py` draws as many as one likes."""
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from gradient_fuzz.differences import derivative
+from gradient_fuzz.judge import PASSED, ZERO, judge
+from gradient_fuzz.report import Report, failure_text
+
+# Eight compiled structures: Euler, Verlet, midpoint and statics; f32; patches; one launch per pass; self-contact
+EXPLICIT = (36, 34, 39, 40, 41, 43, 58, 60, 61, 90, 91, 93, 131, 134, 135, 208, 210, 211)
+IMPLICIT = (0, 3, 4, 49, 50, 52)
+
+
+@lru_cache(maxsize=None)
+def result(seed):
+    return judge(seed)
+
+
+@pytest.mark.parametrize("seed", EXPLICIT + IMPLICIT)
+def test_configuration(seed):
+    found = result(seed)
+    assert not found.failed, failure_text(found)
+    assert not found.refusal, found.refusal
+    assert len(found.rows) >= 6 and sum(row.verdict in (PASSED, ZERO) for row in found.rows) >= len(found.rows) - 1
+
+
+def test_they_feel_what_they_should():
+    """Scenes go where gradients are hard: contact is felt, friction sticks and slides, bodies and statics press."""
+    report = Report()
+    for seed in EXPLICIT + IMPLICIT:
+        report.add(result(seed))
+    shares = report.shares()
+    assert shares["obstacle"] >= 0.5 and min(shares["sticks"], shares["slides"]) >= 0.2
+    assert shares["self_contact"] >= 0.15 and shares["static_contact"] >= 0.1
+    assert report.counts()[ZERO] <= 0.1 * sum(report.counts().values())
+
+
+def test_differences_know_how_far_off_they_are():
+    for f, exact in ((np.sin, 1.0), (lambda x: np.exp(3 * x), 3.0), (lambda x: x + x * abs(x), 1.0)):
+        value, error = derivative(lambda h, f=f: f(h) - f(-h), 1e-12)
+        assert abs(value - exact) <= 3 * error + 1e-14 and error < 1e-5
+    _, error = derivative(lambda h: abs(h + 1e-3) - abs(-h + 1e-3), 1e-9, noise=1e-9)
+    assert error >= 1e-9 / 0.05  # rounding of the function cannot be extrapolated away
