@@ -232,13 +232,13 @@ class Sweep:
         """Passes last - 1 .. stop of a segment that begins with pass `first`; the whole sweep stops at pass `end`."""
         save, adjoint = self.passes_per_frame, self._adjoint
         if not careful:
-            adjoint.reverse(first, last, self.num_passes, save, stop, to_state=0 < stop == end)
+            adjoint.reverse(first, last, self.num_passes, save, stop, 0 < stop == end)
             return
         substeps, passes = self.solver.substeps, self.steps * self.solver.substeps
         while last > stop:
             begin = max(stop, (min(last, passes) - 1) // substeps * substeps)
             at_step = begin % substeps == 0 and begin < passes  # and not where a segment happens to begin
-            adjoint.reverse(first, last, self.num_passes, save, begin, to_state=at_step and begin > 0)
+            adjoint.reverse(first, last, self.num_passes, save, begin, at_step and begin > 0)
             if at_step:
                 self._look_at_adjoint(begin // substeps)
                 if begin > end:
