@@ -30,6 +30,7 @@ from diffsim_ti.solvers import (
     VelocityVerletSolver,
 )
 from diffsim_ti.state.guard import Crossing, Divergence
+from diffsim_ti.state.stability import stable_dt
 from diffsim_ti.terms import (
     Box,
     Capsule,
@@ -67,6 +68,7 @@ __all__ = [
     "MeshObstacle",
     "SelfContact",
     "Scene",
+    "stable_dt",
     "SemiImplicitSolver",
     "VelocityVerletSolver",
     "ImplicitEulerSolver",

@@ -1,12 +1,22 @@
-"""A scene run forward, frame by frame, with a step that follows the state, and written as a series."""
+"""A scene run forward, frame by frame, with a step that follows the state, and written to files."""
 
 import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from diffsim_ti.visual.series import Series
+from diffsim_ti.progress import progress
+from diffsim_ti.scene import Scene
+from diffsim_ti.simulator import Simulator
+from diffsim_ti.solvers.solver import Solver
+from diffsim_ti.state.observe import Energy
+from diffsim_ti.state.stability import lanczos_limit
+from diffsim_ti.terms import Gravity, Obstacle
+from diffsim_ti.visual.frame import Frame, Setting
+from diffsim_ti.writers import Writer, writer_for
 
 
 class Interrupted(Exception):
@@ -46,12 +56,10 @@ class ForwardRun:
     # passing error of first order takes, and what is left once the energy is `largest_drift` above its lowest
     largest_rise, later_rise, largest_drift = 0.01, 0.001, 0.03
 
-    def __init__(self, scene, solver_class, frame_time: float, dt: float | None = None, **options):
-        from diffsim_ti.simulator import Simulator
-        from diffsim_ti.terms import Gravity, Obstacle
-
+    def __init__(self, scene: Scene, solver_class: type[Solver], frame_time: float, dt: float | None = None, **options):
         self.scene, self.seen, self.adapts = scene, Seen(), dt is None
-        self.driven, self.before_part = scene.motion is not None or bool(scene.moving), None
+        self.driven = scene.motion is not None or bool(scene.moving)
+        self.before_part: Callable[[], object] | None = None
         self.obstacles = tuple(t for t in scene.terms if isinstance(t, Obstacle))
         gravity = scene.term(Gravity)
         self._pull = float(np.linalg.norm(gravity.values["gravity"])) if gravity else 0.0
@@ -60,8 +68,7 @@ class ForwardRun:
             self.parts = 4
             solver = solver_class(scene, dt=frame_time / self.parts, **options)
         elif dt is None:
-            solver = solver_class(scene, dt=frame_time / self.parts, allow_unstable=True, **options)
-            solver.allow_unstable = False  # each frame's substeps come first; the guard watches all the same
+            solver = solver_class(scene, dt=frame_time / self.parts, check_start=False, **options)
         else:
             if not dt > 0:
                 raise ValueError(f"--dt must be > 0 [s], got {dt:g}")
@@ -143,10 +150,10 @@ class ForwardRun:
         self.largest_energy = max(self.largest_energy, self._moving(self._energy))
 
     def _look_at_gaps(self) -> None:
-        sim, seen, places = self.simulator, self.seen, self.scene.places(self.simulator.time)
+        sim, seen, offsets = self.simulator, self.seen, self.scene.places(self.simulator.time)
         positions, crossed = sim.positions[self.scene.mesh.surface_vertices], 0
         for term in self.obstacles:
-            gap = term.gap(positions, places.get(term, np.zeros(3)))
+            gap = term.gap(positions, offsets.get(term, np.zeros(3)))
             seen.gap, crossed = min(seen.gap, float(gap.min())), crossed + int((gap < 0).sum())
         seen.crossed = max(seen.crossed, crossed)
         seen.gap = min(seen.gap, sim.contact_resolution.smallest_gap)  # of all substeps
@@ -167,8 +174,6 @@ class ForwardRun:
         return f"the stable step fell to {self._limit:.3g} s" if h > self._limit else None
 
     def _stable_dt(self) -> float:
-        from diffsim_ti.state.stability import lanczos_limit
-
         return lanczos_limit(self.simulator.workspace, 1e-2).dt if self.adapts and not self.implicit else np.inf
 
     def _choose_substeps(self) -> int:
@@ -182,32 +187,52 @@ class ForwardRun:
         return max(1, int(np.ceil(fewest)))
 
     @staticmethod
-    def _moving(energy) -> float:
+    def _moving(energy: Energy) -> float:
         return sum(value for name, value in energy.parts.items() if name != "gravity")
 
 
-def run_and_write(run: ForwardRun, frames: int, folder: Path, name: str, keep=()) -> tuple[float, list[str], list]:
-    """Run `frames` frames into a series.
+def run_and_write(
+    run: ForwardRun,
+    frames: int,
+    output: str | Path | Writer | Sequence[str | Path | Writer],
+    name: str = "frames",
+    keep: Sequence[int] = (),
+) -> tuple[float, list[str], list[Frame]]:
+    """Run `frames` frames and write them, and the start, to one output or to several at once.
 
-    Returns seconds of writing, file names, and (time, positions, velocities, von Mises stress) of the frames in `keep`.
-    Raises Interrupted on Ctrl-C.
+    output: a file, whose suffix says the format, a folder, which gets the series `name`.pvd, or a `Writer`.
+    Returns seconds of writing, what was written, and the frames numbered in `keep`.
+    Raises ValueError for a suffix that is not known, Interrupted on Ctrl-C; what was run before any error is written.
     """
-    from diffsim_ti.cli.options import progress
-
-    sim, kept, writing = run.simulator, [], 0.0
-    series = Series(folder, run.scene.mesh, name, run.scene)
-    with progress("simulating", frames) as show:
+    outputs = [output] if isinstance(output, str | Path | Writer) else output
+    writers = [o if isinstance(o, Writer) else writer_for(file_in(o, f"{name}.pvd")) for o in outputs]
+    setting, kept, begin = Setting.of(run.scene), [], time.perf_counter()
+    with progress("simulating", frames) as show, ExitStack() as opened:
+        for writer in writers:
+            writer.open(setting)
+            opened.enter_context(writer)
+        writing = time.perf_counter() - begin
         for k in range(frames + 1):
             try:
                 if k:
                     run.advance()
                 begin = time.perf_counter()
-                series.write(sim.time, sim.positions, sim.displacements, sim.velocities, sim.tetrahedron_fields())
+                frame = Frame.of(run.simulator)
+                for writer in writers:
+                    writer.write(frame)
                 writing += time.perf_counter() - begin
             except KeyboardInterrupt:
-                said = f"interrupted at t = {sim.time:.4g} s; {len(series.files)} frames are in {series.path}"
-                raise Interrupted(said) from None
+                said = f"interrupted at t = {run.simulator.time:.4g} s; {k} frames are in "
+                raise Interrupted(said + ", ".join(str(writer.path) for writer in writers)) from None
             if k in keep:
-                kept.append((sim.time, sim.positions, sim.velocities, sim.tetrahedron_fields().von_mises))
-            show(k, f"t = {sim.time:.3f} s")
-    return writing, [f"{series.path} and {len(series.files)} .vtu frames"], kept
+                kept.append(frame)
+            show(k, f"t = {frame.time:.3f} s")
+        begin = time.perf_counter()
+    writing += time.perf_counter() - begin
+    return writing, [writer.describe() for writer in writers], kept
+
+
+def file_in(output: str | Path, name: str) -> Path:
+    """The output itself, or where it is a folder, which has no suffix or is there, the file of that name in it."""
+    output = Path(output)
+    return output / name if not output.suffix or output.is_dir() else output

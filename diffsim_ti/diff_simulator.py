@@ -8,6 +8,7 @@ import warnings
 
 import numpy as np
 
+from diffsim_ti import runtime
 from diffsim_ti.diff_physics import DifferentiableBarrierContact
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.scene import Scene
@@ -17,7 +18,7 @@ from diffsim_ti.terms import Drag, ExternalForce, Gravity
 from diffsim_ti.terms.obstacles import barrier
 from diffsim_ti.torch_bridge.autograd import torch
 from diffsim_ti.torch_bridge.rollout_node import TorchFrames, rollout_frames
-from diffsim_ti.torch_bridge.tensors import DTYPES
+from diffsim_ti.torch_bridge.tensors import DTYPES, checked_device
 
 __all__ = ["DifferentiableSimulator", "DifferentiableSolver", "TorchFrames", "rollout_frames"]
 
@@ -79,6 +80,7 @@ class DifferentiableSimulator:
 
     The seeds' ground is a barrier (stiffness 1e4, width 0.01) at y = 0 where the body starts at least one width above it,
     otherwise one width below its lowest vertex; it is fixed at the start. `describe()` says which.
+    device: where tensors live. "cuda" also starts Taichi on the card; RuntimeError if it runs elsewhere already.
     The precision follows the material's dtype. Raises Divergence if the run outgrows its substeps; the state is then as
     it was before that step.
     """
@@ -96,7 +98,7 @@ class DifferentiableSimulator:
         terms=None,
         device="cpu",
     ):
-        self.mesh, self.material, self.solver, self.device = mesh, material, solver, torch.device(device)
+        self.mesh, self.material, self.solver, self.device = mesh, material, solver, checked_device(device)
         self.density, self.fixed_vertices = density, fixed_vertices
         self._terms = list(terms or [])
         self._contact = self._choose_contact(contact)
@@ -180,7 +182,8 @@ class DifferentiableSimulator:
 
     def describe(self) -> str:
         """What is simulated, and how."""
-        return self._rollout(1, False, None, None).solver.describe() + "\n" + self._scene(False).describe()
+        parts = [self._rollout(1, False, None, None).solver.describe(), self._scene(False).describe()]
+        return "\n".join([*parts, f"computed on {runtime.arch_name()}, tensors on {self.device}"])
 
     def _checked(self, name: str, value, *shapes) -> torch.Tensor:
         """A floating point tensor of one of these shapes, brought to this simulator's dtype and device in the graph."""

@@ -10,12 +10,13 @@ import warnings
 from collections.abc import Callable
 from pathlib import Path
 
+from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.torch_bridge.autograd import torch
 
 MAGIC = b"diffsim_ti optimisation state, version 1\n"
 
 
-def save_state(path, mesh, state: dict) -> None:
+def save_state(path: str | Path, mesh: TetrahedralMesh, state: dict) -> None:
     """Write tensors, numbers and state_dicts to `path`, at once or not at all; the file before it stays as `.previous`.
 
     The file carries its version, the mesh's content hash and a checksum. If writing fails (disk full, read-only), the old
@@ -40,7 +41,7 @@ def save_state(path, mesh, state: dict) -> None:
         raise
 
 
-def load_state(path, mesh) -> dict | None:
+def load_state(path: str | Path, mesh: TetrahedralMesh) -> dict | None:
     """The state at `path`; where that file is refused, the one before it, with a warning; None if there is neither.
 
     Raises ValueError with the reasons if there are files but none is good: truncated, foreign, of another version or mesh.
@@ -88,7 +89,14 @@ class Optimization:
     `best_loss` the lowest, whose parameters `restore_best()` brings back; `seconds` counts all parts of the run.
     """
 
-    def __init__(self, module: torch.nn.Module, optimizer: torch.optim.Optimizer, mesh, path=None, save_every: int = 1):
+    def __init__(
+        self,
+        module: torch.nn.Module,
+        optimizer: torch.optim.Optimizer,
+        mesh: TetrahedralMesh,
+        path: str | Path | None = None,
+        save_every: int = 1,
+    ):
         self.module, self.optimizer, self.mesh, self.path, self.save_every = module, optimizer, mesh, path, save_every
         self.iteration, self.losses, self.seconds = 0, [], 0.0
         self.best_loss, self._best = math.inf, copy.deepcopy(module.state_dict())

@@ -6,8 +6,16 @@
 import os
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
+
+from diffsim_ti.mesh import TetrahedralMesh
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 
 CURVES = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00")  # Okabe and Ito's, told apart by all eyes
 START, FOUND, TARGET = "#b8b8b8", "#6fa8dc", "#d55e00"
@@ -19,17 +27,24 @@ class OptimizationPicture:
 
     mesh, target, truth, loss_label, plane, size: as in `optimization_figure`; path: where the picture goes.
     every [s]: with a path, `add` writes the picture when the last was written so long ago (0: each time; None: only
-    `save` does). A picture takes some 0.3 s; it is replaced at one stroke, so a viewer that follows the file sees it whole.
+    `save` does). A picture takes some 0.3 s; it is replaced as a whole, so that who follows the file never sees half of it.
     """
 
-    def __init__(self, mesh, target, path=None, every: float | None = None, **look):
+    def __init__(
+        self,
+        mesh: TetrahedralMesh,
+        target: ArrayLike,
+        path: str | Path | None = None,
+        every: float | None = None,
+        **look,
+    ):
         if every is not None and (path is None or not every >= 0):
             raise ValueError(f"every: must be >= 0 [s] and go with a path, got {every} and path {path}; leave it out")
         self.mesh, self.target, self.path, self.every, self.look = mesh, target, path and Path(path), every, look
         self.losses, self.parameters, self.start, self.found = [], {}, None, None
         self._written = time.perf_counter()
 
-    def add(self, loss: float, parameters: dict, positions) -> None:
+    def add(self, loss: float, parameters: dict, positions: ArrayLike) -> None:
         """An evaluation: its loss, {name with unit: number or numbers}, and the body's positions [m], (num_vertices, 3)."""
         if self.losses and set(parameters) != set(self.parameters):
             raise ValueError(f"parameters: must be {sorted(self.parameters)} each time, got {sorted(parameters)}")
@@ -41,7 +56,7 @@ class OptimizationPicture:
         if self.every is not None and time.perf_counter() - self._written >= self.every:
             self.save()
 
-    def save(self, path=None) -> None:
+    def save(self, path: str | Path | None = None) -> None:
         """Write the picture to `path` or the one given at first."""
         if path is None and self.path is None:
             raise ValueError(
@@ -60,23 +75,23 @@ class OptimizationPicture:
         self._written = time.perf_counter()
 
 
-def save_optimization(path, *arguments, **options) -> None:
+def save_optimization(path: str | Path, *arguments, **options) -> None:
     """Write `optimization_figure` of the arguments in the format of the suffix (PNG, SVG, PDF ...)."""
     optimization_figure(*arguments, **options).savefig(path)
 
 
 def optimization_figure(
-    losses,
+    losses: ArrayLike,
     parameters: dict,
-    mesh,
-    found,
-    target,
-    start=None,
+    mesh: TetrahedralMesh,
+    found: ArrayLike,
+    target: ArrayLike,
+    start: ArrayLike | None = None,
     truth: dict | None = None,
     loss_label: str = "loss",
     plane: str = "xy",
-    size=(960, 320),
-):
+    size: tuple[int, int] = (960, 320),
+) -> "Figure":
     """A matplotlib figure: a panel for the loss, one for each parameter, one for the body; `size` in pixels.
 
     losses: shape (n,), one per evaluation, drawn on a logarithmic axis; a loss of nothing falls out of it below.

@@ -3,19 +3,21 @@
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.visual.colouring import Colouring, to_vertices
 from diffsim_ti.visual.drawing import Drawing
 
 
 def draw(
-    mesh,
-    positions,
-    values=None,
-    limits=None,
+    mesh: TetrahedralMesh,
+    positions: ArrayLike,
+    values: ArrayLike | None = None,
+    limits: tuple[float, float] | None = None,
     ground: float | None = None,
-    box=None,
-    size=(1200, 900),
+    box: ArrayLike | None = None,
+    size: tuple[int, int] = (1200, 900),
     azimuth: float = 32.0,
     elevation: float = 14.0,
     colours: str | None = None,
@@ -48,14 +50,14 @@ def draw(
 
 
 def save_picture(
-    path,
-    mesh,
-    positions,
-    values=None,
+    path: str | Path,
+    mesh: TetrahedralMesh,
+    positions: ArrayLike,
+    values: ArrayLike | None = None,
     label: str = "",
     ground: float | None = None,
     title: str = "",
-    limits=None,
+    limits: tuple[float, float] | None = None,
     **view,
 ) -> None:
     """Write a picture of the body's surface at `positions` [m], y upwards, in the format of the suffix (PNG, JPEG ...).

@@ -3,6 +3,7 @@
 import weakref
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
 from diffsim_ti.state import observe
@@ -110,7 +111,7 @@ class Simulator:
         """Velocities [m/s]."""
         return runtime.fetch(self.workspace.state.v)[0]
 
-    def set_state(self, positions=None, velocities=None) -> None:
+    def set_state(self, positions: ArrayLike | None = None, velocities: ArrayLike | None = None) -> None:
         """Put the body elsewhere: positions [m], velocities [m/s], shape (num_vertices, 3); None leaves a part as it is."""
         state, shape = self.workspace.state, (self.scene.mesh.num_vertices, 3)
         for name, value, target, origin in (
@@ -124,7 +125,7 @@ class Simulator:
                 runtime.fill(target, (value - origin)[None])
         self.workspace.forget()
 
-    def set_forces(self, forces) -> None:
+    def set_forces(self, forces: ArrayLike) -> None:
         """Other external forces [N] from now on, in the shape of the scene's constant ExternalForce, until a reset."""
         given, forces = self.scene.inputs.values.get("external_forces"), np.asarray(forces, np.float64)
         if given is None or given.ndim == 3:

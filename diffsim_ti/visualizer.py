@@ -1,11 +1,17 @@
 """SimulationVisualizer: a window that shows a moving body, or a picture file where there is no display."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.visual.backdrop import Backdrop
 from diffsim_ti.visual.viewer import open_window
+
+if TYPE_CHECKING:
+    from taichi.ui import Window
 
 
 class SimulationVisualizer:
@@ -15,7 +21,13 @@ class SimulationVisualizer:
     `show()` writes a PNG to `path` and prints where. `has_window` says which.
     """
 
-    def __init__(self, mesh, path="output/simulation.png", title: str = "diffsim_ti", ground: float | None = None):
+    def __init__(
+        self,
+        mesh: TetrahedralMesh,
+        path: str | Path = "output/simulation.png",
+        title: str = "diffsim_ti",
+        ground: float | None = None,
+    ):
         self.mesh, self.path, self.ground = mesh, Path(path), ground
         self.positions = np.array(mesh.vertices)
         self.window = open_window(title, (1024, 768))
@@ -26,7 +38,7 @@ class SimulationVisualizer:
     def has_window(self) -> bool:
         return self.window is not None
 
-    def update(self, positions) -> None:
+    def update(self, positions: ArrayLike) -> None:
         """Show these positions [m], shape (num_vertices, 3), a NumPy array or what becomes one."""
         positions = np.asarray(positions, np.float64)
         if positions.shape != self.mesh.vertices.shape:
@@ -51,7 +63,7 @@ class SimulationVisualizer:
 class _Scene:
     """The window's picture, drawn as `Drawing` draws it."""
 
-    def __init__(self, window, mesh, ground):
+    def __init__(self, window: "Window", mesh: TetrahedralMesh, ground: float):
         from diffsim_ti.visual.drawing import Drawing
         from diffsim_ti.visual.vulkan_painter import Canvas
 

@@ -10,16 +10,17 @@ HEAD = "| area | files test_*.py | minutes |\n| --- | --- | ---: |\n"
 AREAS = {
     "meshes, scenes, materials": "mesh scene materials",
     "motion against closed forms": "reference_motion step_limit hertz torture",
-    "gradients": "gradients gradient_clip gradient_faults gradient_fuzz checkpoints tape identification",
+    "every adjoint, order, fuzz": "every_adjoint term_order gradient_fuzz",
+    "gradients": "gradients gradient_clip gradient_faults checkpoints tape identification",
     "implicit steps and equilibria": "implicit implicit_gradients implicit_contact",
     "patches against locking": "locking",
-    "obstacles and friction": "contact contact_crossing contact_friction contact_gradients",
+    "obstacles and friction": "contact contact_crossing contact_friction contact_gradients own_obstacle",
     "self-contact": "self_contact self_contact_implicit self_contact_pairs",
     "PyTorch, optimisations": "torch torch_physics torch_solvers seed_snippets optimization",
     "charts, maps, advice": "study study_stability peers",
-    "pictures, films, the window": "picture_drawing picture_film optimization_picture viewer viewer_window gallery",
+    "pictures, films, the window": "picture_drawing picture_film optimization_picture writers viewer viewer_window gallery",
     "examples and pages": "examples contact_examples static_examples torch_examples readme",
-    "command line, resources, Vulkan": "cli resources vulkan",
+    "command line, resources, backends": "cli resources devices launch executed_ptx vulkan",
 }
 AREA_OF = {name: area for area, names in AREAS.items() for name in names.split()}
 

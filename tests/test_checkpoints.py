@@ -56,6 +56,7 @@ def test_budgets_give_the_same_bits(solver, states):
     assert_same_bits(gradients_of(small), stored_whole(solver))
 
 
+@pytest.mark.executed_ptx
 @by_solver
 def test_budget_and_segments_together(solver):
     both = rollout(solver, checkpoint_every=2, memory=21 * STATE)
@@ -199,6 +200,7 @@ OPTIONS = [{}, {"checkpoint_every": 5}, {"memory": 12 * STATE}]
 by_options = pytest.mark.parametrize("options", OPTIONS, ids=["whole", "segments", "binomial"])
 
 
+@pytest.mark.executed_ptx
 @by_options
 @by_solver
 def test_two_sweeps_of_the_same_frames(solver, options):

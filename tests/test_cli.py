@@ -6,16 +6,17 @@ import sys
 import meshio
 import numpy as np
 import pytest
+import saved_series as series
 
 from diffsim_ti import adaptive_run as forward
-from diffsim_ti import cli, picture
+from diffsim_ti import picture
+from diffsim_ti.cli import app as cli
 from diffsim_ti.materials import StableNeoHookean
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.scene import Scene
 from diffsim_ti.solvers import SemiImplicitSolver, VelocityVerletSolver
 from diffsim_ti.state.observe import TetrahedronFields
 from diffsim_ti.terms import Gravity
-from diffsim_ti.visual import series
 
 
 def command(*arguments):

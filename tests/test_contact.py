@@ -86,6 +86,8 @@ def test_barrier_near_its_ends(precision, tolerance):
     curvature = -2 * np.log(c) - 4 * (c - 1) / c + ((c - 1) / c) ** 2
     slope0 = -(c - 1) * (2 * np.log(c) + (c - 1) / c)
     value = -((c - 1) ** 2) * np.log(c) + (s - c) * (slope0 + (s - c) / 2 * curvature)
+    np.testing.assert_allclose(barrier.beta(s), value, rtol=1e-12, atol=1e-15)
+    assert barrier.beta(1.5) == 0
     expected = [value, slope0 + (s - c) * curvature, curvature]
     np.testing.assert_allclose(runtime.fetch(out), expected, rtol=tolerance, atol=1e-6 if precision == "f32" else 1e-15)
     assert np.all(runtime.fetch(out)[:, 0] == 0) and np.all(runtime.fetch(out)[1, 1:] < 0)

@@ -55,6 +55,7 @@ def test_stopping_distance(solver, friction, distance, precision):
     assert np.abs(frames.velocities[-1, :3]).max() < 1e-5
 
 
+@pytest.mark.executed_ptx
 @solvers
 def test_moving_floor_drags_and_carries(solver):
     """A conveyor's speed is reached after v / (mu g), and then kept."""

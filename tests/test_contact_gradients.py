@@ -49,6 +49,7 @@ def test_every_input(name):
         assert row.analytic != 0 or row.input == "friction_speed", row.input  # which is not felt while all slides
 
 
+@pytest.mark.executed_ptx
 @solvers
 @pytest.mark.parametrize("name", ["ground", "box", "sphere"])
 def test_tangent_and_mirror(name, solver):

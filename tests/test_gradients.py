@@ -95,6 +95,7 @@ def error(a, b) -> float:
 # ---- one step ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.executed_ptx
 @by_solver
 @by_material
 @pytest.mark.parametrize("precision, gate", [("f64", 1e-13), ("f32", 1e-5)])
@@ -391,6 +392,7 @@ def dot(a: dict, b: dict) -> float:
     return sum(float((a[name] * b[name]).sum()) for name in a)
 
 
+@pytest.mark.executed_ptx
 @by_solver
 def test_hessian_product(solver):
     rollout = rollout_of(full_scene(), solver, 20)

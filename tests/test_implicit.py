@@ -141,6 +141,7 @@ def test_damping_is_a_rate_whatever_the_step(solver):
 # ---- statics ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.executed_ptx
 def test_static_twin_of_the_oscillator():
     """An apex force f gives u = f h^2 / (mu V), at any amplitude."""
     force, mu, volume = 2000.0, E / 2.6, one_tetrahedron().volumes[0]
@@ -331,6 +332,7 @@ def test_where_a_hanging_body_comes_to_rest_does_not_depend_on_the_step():
         np.testing.assert_allclose(x, rest, atol=1e-8)
 
 
+@pytest.mark.executed_ptx
 @pytest.mark.parametrize("precision", ["f64", "f32"])
 @pytest.mark.parametrize("solver", [ds.ImplicitEulerSolver, ds.BDF2Solver], ids=lambda s: s.__name__)
 def test_a_block_dropped_on_the_ground_comes_to_rest_above_it(solver, precision):
@@ -417,3 +419,27 @@ def test_steps_by_a_simulator_are_those_of_a_rollout():
 def test_impossible_options_are_refused(option, message):
     with pytest.raises(ValueError, match=message):
         ds.ImplicitEulerSolver(oscillator(), **option)
+
+
+def test_blas_is_left_as_it_was():
+    """One thread while a step is solved, also if it fails; before and after it what the program chose."""
+    from threadpoolctl import ThreadpoolController, threadpool_limits
+
+    from diffsim_ti.solvers.implicit.threads import one_blas_thread
+
+    def threads():
+        return [pool["num_threads"] for pool in ThreadpoolController().select(user_api="blas").info()]
+
+    with threadpool_limits(2, "blas"):
+        before = threads()
+        assert before and set(one_blas_thread(threads)()) == {1} and threads() == before
+        with pytest.raises(ZeroDivisionError):
+            one_blas_thread(lambda: 1 / 0)()
+        assert threads() == before
+        solver = ds.ImplicitEulerSolver(oscillator(), dt=1e-3)
+        seen = []
+        workspace = solver.workspace(solver.start_values())
+        solve = workspace.newton.solve
+        workspace.newton.solve = lambda *a, **k: (seen.append(set(threads())), solve(*a, **k))[1]
+        workspace.advance(0, 1, 1)
+        assert seen == [{1}] and threads() == before

@@ -35,6 +35,7 @@ def test_incline(solver):
             assert np.all(way > 0) and np.all(way <= (1.02 if solver is ds.ImplicitEulerSolver else 1.5) * 1e-4 * 2.5)
 
 
+@pytest.mark.executed_ptx
 @solvers
 @pytest.mark.parametrize("friction, distance", [(0.2, 1.019368), (0.4, 0.509684)])
 @pytest.mark.parametrize("precision", ["f32", "f64"])
@@ -109,6 +110,7 @@ def test_gradients_through_friction_on_a_moving_obstacle(solver):
     assert {"ground_path", "friction", "friction_speed"} <= {row.input for row in report.rows}
 
 
+@pytest.mark.executed_ptx
 @pytest.mark.parametrize("shape", ["half_space", "sphere", "box"])
 def test_reverse_sweep_against_tangent_on_every_shape(shape):
     assert ds.dot_product_test(rubbing(ds.ImplicitEulerSolver, shape)) < 1e-9

@@ -70,12 +70,14 @@ def test_moduli_and_state_of_every_law(law):
     assert report.passed, str(report)
 
 
+@pytest.mark.executed_ptx
 @every
 def test_the_reverse_sweep_is_the_transpose_of_the_tangent(solver):
     """To the solver's tolerance: both are linear solves."""
     assert ds.dot_product_test(make(solver)) < 1e-9
 
 
+@pytest.mark.executed_ptx
 @dynamic
 def test_checkpoints_give_the_same_bits(solver):
     results = []
@@ -212,6 +214,7 @@ def test_a_wrong_adjoint_is_noticed(mutation, monkeypatch):
     assert not ds.check_gradients(rollout, verbose=False).passed
 
 
+@pytest.mark.executed_ptx
 def test_a_tape_differentiates_an_implicit_run():
     rollout = make(ds.BDF2Solver, gradients=None)
     loss = ti.field(ti.f64, shape=(), needs_grad=True)

@@ -165,6 +165,7 @@ def test_gradients_of_moduli_rest_shape_and_state(solver):
     assert ds.dot_product_test(made) < (1e-13 if solver.explicit else 1e-10)  # the latter: to the solves' tolerance
 
 
+@pytest.mark.executed_ptx
 @pytest.mark.parametrize(
     "law, precision, rounding",
     [(ds.StableNeoHookean, "f32", 1e-5), (ds.StVenantKirchhoff, "f64", 1e-13), (ds.MooneyRivlin, "f64", 1e-13)],

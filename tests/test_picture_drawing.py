@@ -3,12 +3,15 @@
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import contact_scenes
 import numpy as np
 import pytest
 
+import diffsim_ti as ds
 from diffsim_ti import obstacles
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.visual import rasteriser
@@ -124,7 +127,8 @@ def test_camera_turns_zooms_and_projects():
     assert camera.project(camera.position + 3 * ray, SIZE)[:2] == pytest.approx([30, 40])
     assert camera.orbited(90, 0).position - camera.look_at == pytest.approx([middle[2], 0, 0], abs=1e-9)
     assert np.linalg.norm(camera.zoomed(2).position - camera.look_at) == pytest.approx(middle[2] / 2)
-    shifted = camera.shifted(0.1, 0.0)
+    right = 0.1 * camera.axes[0]
+    shifted = replace(camera, position=camera.position + right, look_at=camera.look_at + right)
     assert shifted.project(camera.look_at, SIZE)[0] == pytest.approx(100 - 0.1 * camera.focal(SIZE) / middle[2])
     with pytest.raises(ValueError, match="elevation"):
         Camera.framing(np.array(BOX), SIZE, 0.0, 90.0)
@@ -186,15 +190,31 @@ def test_the_nearer_triangle_is_seen_and_colours_are_linear_in_space():
     assert image[30, 2, 2] == pytest.approx((0.25 + y / 40 * 0.75) / (0.5 + y / 80), abs=0.02)
 
 
-def test_obstacles_of_a_scene_by_type():
-    term = SimpleNamespace(
-        values={"sphere_center": np.zeros(3), "sphere_radius": np.array(0.5)}, inside=False, path=None
-    )
-    floor = SimpleNamespace(values={"ground_height": np.array(-0.25)})
-    scene = SimpleNamespace(terms=[floor, term], mesh=None)
+def test_obstacles_of_a_scene_by_type(cube):
+    floor, ball = ds.Ground(-0.25), ds.Sphere((0, 0, 0), 0.5)
+    scene = SimpleNamespace(terms=[ds.Gravity(), floor, ball], mesh=cube)
     assert obstacles.floor_of(scene) == -0.25
     ((points, _),) = obstacles.obstacle_surfaces(scene)
     assert np.linalg.norm(points, axis=1) == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("name", contact_scenes.SHAPES)
+def test_what_is_drawn_of_an_obstacle_is_where_its_distance_is_zero(name):
+    """Corners of what is round lie on it; what faces the eye faces outwards."""
+    term = contact_scenes.SHAPES[name]()
+    surface, floor = term.surface(0.2), term.floor_height()
+    assert (surface is None) == (floor is not None)
+    if surface is None:
+        assert term.distance(np.array([[0.3, floor, 0.7]])) == pytest.approx(0)
+        return
+    points, triangles = surface
+    assert np.abs(term.distance(points)).max() < 1e-9
+    corners = points[triangles]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    size = np.linalg.norm(normals, axis=1)
+    large = size > 1e-3 * size.max()  # at the poles of what is round triangles have no area
+    outside = corners.mean(1)[large] + 1e-2 * normals[large] / size[large, None]
+    assert term.distance(outside).min() > 0
 
 
 @pytest.mark.parametrize(

@@ -6,12 +6,12 @@ import imageio.v2 as imageio
 import numpy as np
 import pytest
 from matplotlib import colormaps
+from saved_series import Series
 
 import diffsim_ti as ds
 from diffsim_ti import cli, film
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.visual import fields as series_fields
-from diffsim_ti.visual.series import Series
 
 SIZE = (160, 120)
 LEFT = slice(0, 110)  # columns without the legend

@@ -54,11 +54,13 @@ def test_gradients_agree_with_differences():
         assert (values[1] - values[0]) / (2 * step) == pytest.approx(slope, rel=1e-5, abs=1e-8), name
 
 
+@pytest.mark.executed_ptx
 @solvers
 def test_tangent_and_adjoint_agree(solver):
     assert verify.dot_product_test(meeting(solver)) <= 1e-9
 
 
+@pytest.mark.executed_ptx
 def test_checkpoints_do_not_change_a_bit():
     scene = two_blocks().scene
     whole, pieces = (

@@ -423,3 +423,24 @@ def test_solver_describes_itself(solver):
     assert re.match(rf"{solver.__name__}: dt 0.001 s, 2 substeps of 0.0005 s; serial", described)
     assert "parallel, one launch per substep" in solver(block(), dt=1e-3, parallel=True).describe()
     assert repr(solver(block(), dt=1e-3)) == f"{solver.__name__}(dt=0.001, substeps=1)"
+
+
+# ---- asked of a scene, and checked when told to ---------------------------------------------------------------------------
+
+
+def test_a_scene_tells_its_stable_step():
+    scene = block()
+    tight, bound = stability.stable_dt(scene), stability.stable_dt(scene, tight=False)
+    assert tight == any_step(scene, ds.VelocityVerletSolver).stable_dt(tight=True) and tight.method == "Lanczos"
+    assert bound == stability.element_limit(scene) and bound.dt < tight.dt
+
+
+@solvers
+def test_a_start_that_is_not_checked_is_checked_on_the_way(solver):
+    """A solver whose substeps are chosen later may be made with any step, but not run with it."""
+    scene = block()
+    dt = 1.05 * stability.stable_dt(scene).dt
+    own = solver(scene, dt=dt, check_start=False)
+    assert not own.allow_unstable and own.twin(scene).dt == dt
+    with pytest.raises(ds.Divergence, match="outgrown the stable step"):
+        ds.Rollout(own, 1000).forward()

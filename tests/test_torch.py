@@ -105,6 +105,7 @@ def test_gradcheck_of_numbers(name, value):
     assert gradcheck(lambda x: moved(**{name: x}), variable(value), **GATE)
 
 
+@pytest.mark.executed_ptx
 @pytest.mark.parametrize("name", ["positions", "velocities"])
 def test_gradcheck_of_start(name):
     assert gradcheck(lambda x: moved(**{name: x}), variable(start()[name == "velocities"]), **GATE)
@@ -144,6 +145,7 @@ def test_gradcheck_of_the_functional_face():
     assert gradcheck(run, inputs, **GATE)
 
 
+@pytest.mark.executed_ptx
 def test_gradients_agree_with_the_cores():
     """One reverse sweep serves both: the numbers of the seeds' first block, against `Rollout.vjp` to the last digit."""
     sim = simulator()
@@ -431,6 +433,7 @@ def test_to_dtype_changes_the_precision():
         sim.reset()
 
 
+@pytest.mark.executed_ptx
 def test_float32_gradients_agree_with_float64():
     gradients = []
     for dtype in (torch.float32, torch.float64):
@@ -619,6 +622,7 @@ def test_workers_by_fork_are_refused_with_a_remedy():
         list(loader)
 
 
+@pytest.mark.executed_ptx
 def test_workers_by_spawn():
     data = Motions(simulator())
     loader = torch.utils.data.DataLoader(

@@ -1,10 +1,13 @@
 """What a window shows and does, with a window of ours that is told what the mouse and keys do; no display is needed."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
+import imageio.v2 as imageio
 import numpy as np
 import pytest
 import taichi as ti
+from saved_series import Series
 
 import diffsim_ti as ds
 from diffsim_ti import cli
@@ -14,9 +17,10 @@ from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.visual import viewer
 from diffsim_ti.visual.camera import Camera
 from diffsim_ti.visual.dragging import Grip, picked_vertex
+from diffsim_ti.visual.drawing import Drawing
 from diffsim_ti.visual.frame_sources import LiveFrames, SavedFrames
-from diffsim_ti.visual.series import Series
 from diffsim_ti.visual.viewer import Viewer
+from diffsim_ti.writers import View, writer_for
 
 SIZE = (200, 150)
 
@@ -329,7 +333,7 @@ def test_the_command_opens_a_series_or_a_live_run(series, tmp_path, monkeypatch)
     monkeypatch.setattr("diffsim_ti.runtime.init", lambda: None)
     TetrahedralMesh.create_cube(3, 0.2).save(tmp_path / "cube.vtu")
     for arguments in (
-        [str(series), "--ground", "-0.5"],
+        [str(series), "--ground", "-0.5", "-o", str(tmp_path / "seen.gif")],
         [str(tmp_path / "cube.vtu"), "--colour", "J", "--fixed", "xmin"],
     ):
         with pytest.raises(SystemExit) as stop:
@@ -337,8 +341,33 @@ def test_the_command_opens_a_series_or_a_live_run(series, tmp_path, monkeypatch)
         assert stop.value.code == 0
     (saved, _, playing, look), (live, colour, plays, _) = opened
     assert isinstance(saved, SavedFrames) and not playing and look["ground"] == -0.5
+    assert look["output"].path.name == "seen.gif" and look["output"].view.ground == -0.5
     assert isinstance(live, LiveFrames) and plays and colour == "J" and live.can_drag and live.look["ground"] == 0.0
     assert len(live.look["fixed"]) == 9 and live.frame(0).positions[:, 1].min() == pytest.approx(0.02, abs=1e-6)
+
+
+def test_frames_are_saved_as_they_are_seen(series, live, make_viewer, tmp_path):
+    """S and the button write what the source has: a series as it was, a film from where one looks."""
+    view, window = make_viewer(SavedFrames(series), output=writer_for(tmp_path / "again.pvd"))
+    window.keys = ["s"]
+    view.draw()
+    view.draw()
+    assert any("again.pvd and 3 .vtu frames" in line for line in window.panel.lines)
+    again, first = SavedFrames(tmp_path / "again.pvd"), SavedFrames(series)
+    assert again.setting.ground == first.setting.ground and np.array_equal(again.setting.fixed, first.setting.fixed)
+    for name in ("positions", "displacements", "velocities"):
+        assert np.array_equal(getattr(again.frame(2), name), getattr(first.frame(2), name))
+    assert np.array_equal(again.frame(2).obstacles[0], first.frame(2).obstacles[0])
+    live.advance()
+    view, window = make_viewer(live, colour="speed", output=writer_for(tmp_path / "a.gif", View(size=SIZE)))
+    view.drawing.camera, window.clicked = view.drawing.camera.zoomed(0.5), "save"
+    view.draw()
+    images = imageio.mimread(tmp_path / "a.gif")
+    with Drawing(live.mesh, SIZE, camera=view.drawing.camera, backend="software", ground=0.0) as drawing:
+        drawing.colouring = replace(live.colouring("speed"), limits=(0.0, float(live.frame(1).fields["speed"].max())))
+        expected = drawing.image(live.frame(1).positions, live.frame(1).fields["speed"])
+    assert len(images) == 2 and view.output.view.fps == pytest.approx(60)
+    assert np.abs(images[1][40:, :140, :3].astype(float) - expected[40:, :140]).mean() < 6  # of 256 colours
 
 
 def test_without_a_display_the_viewer_says_what_to_do(series, monkeypatch, capsys):

@@ -12,9 +12,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from saved_series import Series
 
 from diffsim_ti.mesh import TetrahedralMesh
-from diffsim_ti.visual.series import Series
 from diffsim_ti.visual.vulkan_painter import has_vulkan
 
 ROOT = Path(__file__).parents[1]

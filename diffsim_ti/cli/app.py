@@ -11,12 +11,13 @@ import typer
 
 from diffsim_ti.adaptive_run import Interrupted
 from diffsim_ti.cli.options import (
+    SUFFIXES,
     Backend,
     Density,
     FixOrientation,
+    Folder,
     MaterialName,
     MeshFile,
-    Output,
     Poisson,
     Precision,
     Size,
@@ -35,6 +36,8 @@ from diffsim_ti.cli.options import (
 )
 from diffsim_ti.cli.study import register as register_study
 from diffsim_ti.cli.view import register
+from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.scene import Scene
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, help="Soft bodies on tetrahedra.")
 register_study(app)  # chart, stability, recommend
@@ -43,7 +46,9 @@ register(app)
 
 
 @app.callback()
-def options(traceback: Annotated[bool, typer.Option("--traceback", help="show the traceback of an error")] = False):
+def options(
+    traceback: Annotated[bool, typer.Option("--traceback", help="show the traceback of an error")] = False,
+) -> None:
     """Soft bodies on tetrahedra, simulated with Taichi. Errors are one line on stderr, with exit code 2."""
 
 
@@ -80,7 +85,15 @@ def _fail(message: str, code: int = 2) -> int:
 @app.command()
 def simulate(
     mesh: MeshFile,
-    output: Output = Path("output/simulate"),
+    output: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--output",
+            "-o",
+            help="folder for a series and a picture of the end (default output/simulate), or a file by its suffix: "
+            f"{SUFFIXES}; may be repeated",
+        ),
+    ] = None,
     material: MaterialName = "StableNeoHookean",
     youngs_modulus: Youngs = 1e5,
     poissons_ratio: Poisson = 0.4,
@@ -105,25 +118,28 @@ def simulate(
     height: Annotated[float | None, typer.Option(help="of the lowest point [m]; default a tenth of the size")] = None,
     ground_stiffness: Annotated[float | None, typer.Option(help="[N/m]; default from the impact's pressure")] = None,
     ground_width: Annotated[float | None, typer.Option(help="[m]; default 1 % of the size")] = None,
-    azimuth: Annotated[float, typer.Option(help="where the picture is taken from, about y [degrees]")] = 32.0,
+    azimuth: Annotated[float, typer.Option(help="where pictures are taken from, about y [degrees]")] = 32.0,
     backend: Backend = "cpu",
     precision: Precision = "f32",
     threads: Threads = None,
-):
-    """Simulate a body, by default its fall onto a floor; write a ParaView series and a picture of the end."""
+) -> None:
+    """Simulate a body, by default its fall onto a floor; write a series and a picture of the end, or films, arrays ..."""
     from diffsim_ti import runtime
-    from diffsim_ti.adaptive_run import ForwardRun, run_and_write
-    from diffsim_ti.picture import save_picture
+    from diffsim_ti.adaptive_run import ForwardRun, file_in, run_and_write
+    from diffsim_ti.writers import View, writer_for
 
     begin = time.perf_counter()
     for name, value in (("duration", duration), ("fps", fps), ("density", density)):
         if not value > 0:
             raise ValueError(f"--{name} must be > 0, got {value:g}")
+    view = View(fps=fps, azimuth=azimuth, title=mesh.stem, fit="end")
+    asked = [file_in(o, mesh.stem + suffix) for o in output or [Path("output/simulate")] for suffix in (".pvd", ".png")]
+    writers = [writer_for(path, view) for path in dict.fromkeys(asked)]
     kind = solver_class(solver)
     law = make_material(material, youngs_modulus, poissons_ratio)
     body = load_body(mesh, size, up, fix_orientation)
     runtime.init(backend, precision, threads)
-    scene, body = fall_scene(
+    scene, _ = fall_scene(
         body,
         law,
         density,
@@ -140,20 +156,8 @@ def simulate(
     frames = max(1, round(duration * fps))
     run = ForwardRun(scene, kind, duration / frames, dt)
     setup = time.perf_counter() - begin
-    writing, files, _ = run_and_write(run, frames, output, mesh.stem)
-    begin = time.perf_counter()
-    sim, picture = run.simulator, output / f"{mesh.stem}.png"
-    save_picture(
-        picture,
-        body,
-        sim.positions,
-        sim.tetrahedron_fields().von_mises,
-        "von Mises stress [Pa]",
-        0.0 if ground else None,
-        f"{mesh.stem}, t = {sim.time:.3g} s",
-        azimuth=azimuth,
-    )
-    print_summary(run, setup, writing + time.perf_counter() - begin, [*files, str(picture)])
+    writing, files, _ = run_and_write(run, frames, writers)
+    print_summary(run, setup, writing, files)
 
 
 @app.command()
@@ -166,7 +170,7 @@ def info(
     size: Size = None,
     fix_orientation: FixOrientation = False,
     tight: Annotated[bool, typer.Option("--tight", help="also the tight limit, by Lanczos")] = False,
-):
+) -> None:
     """Say what is in a mesh file: sizes, quality, groups, and the stable explicit step for given moduli."""
     from diffsim_ti.scene import Scene
     from diffsim_ti.state import stability
@@ -178,9 +182,7 @@ def info(
     print(f"stable step for {scene.material!r}, density {density:g} kg/m^3, at rest:")
     print(f"  {stability.element_limit(scene)}")
     if tight:
-        from diffsim_ti.solvers import SemiImplicitSolver
-
-        print(f"  {SemiImplicitSolver(scene, dt=1.0, allow_unstable=True).stable_dt(tight=True)}")
+        print(f"  {stability.stable_dt(scene)}")
 
 
 @app.command("check-gradients")
@@ -201,7 +203,7 @@ def check_gradients(
     drag: Annotated[float, typer.Option(help="rate at which velocities fall [1/s]")] = 0.5,
     backend: Backend = "cpu",
     precision: Precision = "f64",
-):
+) -> None:
     """Check every gradient of a short fall onto a floor against differences and by its Taylor rate.
 
 
@@ -210,6 +212,7 @@ def check_gradients(
     from diffsim_ti import runtime
     from diffsim_ti.rollout import Rollout
     from diffsim_ti.scene import Scene
+    from diffsim_ti.state.stability import stable_dt
     from diffsim_ti.terms import Drag, Gravity
     from diffsim_ti.verify import check_gradients as check
 
@@ -228,7 +231,7 @@ def check_gradients(
         initial_velocities=velocities,
     )
     kind = solver_class(solver, implicit=False)
-    dt = 0.5 * kind(scene, dt=1.0, allow_unstable=True).stable_dt(tight=True).dt if dt is None else dt
+    dt = 0.5 * stable_dt(scene).dt if dt is None else dt
     report = check(Rollout(kind(scene, dt=dt), steps, gradients="all"))
     if not report.passed:
         raise typer.Exit(1)
@@ -236,10 +239,10 @@ def check_gradients(
 
 @app.command()
 def demo(
-    output: Output = Path("output/demo"),
+    output: Folder = Path("output/demo"),
     backend: Backend = "cpu",
     quick: Annotated[bool, typer.Option("--quick", hidden=True)] = False,
-):
+) -> None:
     """Drop a twisted jelly column, write pictures and a series, and take the gradient of its fall by Young's modulus."""
     from diffsim_ti import runtime
     from diffsim_ti.adaptive_run import ForwardRun, run_and_write
@@ -260,27 +263,27 @@ def demo(
     moments = (frames // 6, frames // 2, frames)
     writing, files, kept = run_and_write(run, frames, output, "column", moments)
     begin = time.perf_counter()
-    points = np.concatenate([positions for _, positions, _, _ in kept])
-    box, top = np.stack([points.min(0), points.max(0)]), max(np.percentile(stress, 99.5) for *_, stress in kept)
-    for k, (t, positions, _, stress) in enumerate(kept):
+    points = np.concatenate([frame.positions for frame in kept])
+    box, top = np.stack([points.min(0), points.max(0)]), max(np.percentile(f.fields["von_mises"], 99.5) for f in kept)
+    for k, frame in enumerate(kept):
         files.append(str(output / f"column_{k}.png"))
         save_picture(
             files[-1],
             body,
-            positions,
-            stress,
+            frame.positions,
+            frame.fields["von_mises"],
             "von Mises stress [Pa]",
             0.0,
-            f"t = {t:.2f} s",
+            f"t = {frame.time:.2f} s",
             (0.0, float(top)),
             box=box,
         )
     print_summary(run, setup, writing + time.perf_counter() - begin, files)
-    _, positions, velocities, _ = kept[1]
-    print_gradient(scene.replace(initial_positions=positions, initial_velocities=velocities, precision="f64"))
+    state = dict(initial_positions=kept[1].positions, initial_velocities=kept[1].velocities)
+    print_gradient(scene.replace(**state, precision="f64"))
 
 
-def twisted_column(cells: int):
+def twisted_column(cells: int) -> TetrahedralMesh:
     """A square column 0.6 m high, wrung by 150 degrees and tilted, its lowest point 0.15 m above y = 0."""
     from diffsim_ti.mesh import TetrahedralMesh
 
@@ -292,12 +295,13 @@ def twisted_column(cells: int):
     return mesh.translated([0, 0.15 - mesh.bounding_box[0, 1], 0])
 
 
-def print_gradient(scene, seconds: float = 0.05, change: float = 1e-3) -> None:
+def print_gradient(scene: Scene, seconds: float = 0.05, change: float = 1e-3) -> None:
     """Gradient by E of the mean height after `seconds`, in float64, beside a central difference."""
     from diffsim_ti.rollout import Rollout
     from diffsim_ti.solvers import SemiImplicitSolver
+    from diffsim_ti.state.stability import stable_dt
 
-    dt = 0.5 * SemiImplicitSolver(scene, dt=1.0, allow_unstable=True).stable_dt(tight=True).dt
+    dt = 0.5 * stable_dt(scene).dt
     steps = int(np.ceil(seconds / dt))
     rollout = Rollout(SemiImplicitSolver(scene, dt=seconds / steps), steps, gradients="youngs_modulus")
     E = float(scene.inputs.values["youngs_modulus"])

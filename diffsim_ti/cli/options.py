@@ -1,14 +1,24 @@
-"""What the commands share: types of options, the scene that options describe, progress, the summary at the end."""
+"""What the commands share: types of options, the scene that options describe, the summary at the end."""
 
-import sys
-import time
-from contextlib import contextmanager
+from collections.abc import Sequence
 from enum import Enum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import typer
+from numpy.typing import ArrayLike
+
+from diffsim_ti.materials.material import Material
+from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.scene import Scene
+from diffsim_ti.solvers.solver import Solver
+from diffsim_ti.terms import Ground, Term
+from diffsim_ti.writers import WRITERS
+
+if TYPE_CHECKING:
+    from diffsim_ti.adaptive_run import ForwardRun
+
 
 Up = Enum("Up", {name: name for name in ("x", "y", "z", "-x", "-y", "-z")}, type=str)
 SIDES = {f"{axis}{end}": (d, end) for d, axis in enumerate("xyz") for end in ("min", "max")}
@@ -27,45 +37,14 @@ Volume = Annotated[
 Backend = Annotated[str, typer.Option(help="cpu, cuda or vulkan")]
 Precision = Annotated[str, typer.Option(help="f32 or f64")]
 Threads = Annotated[int | None, typer.Option(help="CPU threads, default all")]
-Output = Annotated[Path, typer.Option("--output", "-o", help="folder for the series and the picture")]
-
-
-@contextmanager
-def progress(title: str, total: int):
-    """Yields a function to tell what is done; shows it on stderr after two seconds, as lines if that is no terminal."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
-    console = Console(stderr=True)
-    bar = Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.fields[note]}"),
-        TimeRemainingColumn(),
-        console=console,
-        transient=True,
-    )
-    task, start, said = bar.add_task(title, total=total, note=""), time.perf_counter(), [time.perf_counter()]
-
-    def update(done: int, note: str = "") -> None:
-        now = time.perf_counter()
-        if console.is_terminal and now - start > 2 and not bar.live.is_started:
-            bar.start()
-        elif not console.is_terminal and now - said[0] > 5:
-            said[0] = now
-            print(f"{title}: {done} of {total}, {note}", file=sys.stderr, flush=True)
-        bar.update(task, completed=done, note=note)
-
-    try:
-        yield update
-    finally:
-        bar.stop()
+SUFFIXES = f"{', '.join(WRITERS)} (run_%04d.png: every frame, run.png: the end)"
+Folder = Annotated[Path, typer.Option("--output", "-o", help="folder for what is written")]
 
 
 # ---- a scene from options ---------------------------------------------------------------------------------------------
 
 
-def load_body(path: Path, size: float | None = None, up: Up = Up.y, fix_orientation: bool = False):
+def load_body(path: Path, size: float | None = None, up: Up = Up.y, fix_orientation: bool = False) -> TetrahedralMesh:
     """The mesh of a file, y up and of the size asked for; vertices of no tetrahedron are left out."""
     from diffsim_ti.mesh import TetrahedralMesh
 
@@ -81,7 +60,7 @@ def load_body(path: Path, size: float | None = None, up: Up = Up.y, fix_orientat
     return mesh
 
 
-def make_material(name: str, youngs_modulus: float, poissons_ratio: float):
+def make_material(name: str, youngs_modulus: float, poissons_ratio: float) -> Material:
     """A material by its class's name."""
     from diffsim_ti.materials import MATERIALS
 
@@ -91,7 +70,7 @@ def make_material(name: str, youngs_modulus: float, poissons_ratio: float):
     raise ValueError(f"--material: no law is called {name!r}; there are {', '.join(k.__name__ for k in MATERIALS)}")
 
 
-def solver_class(name: str, implicit: bool = True):
+def solver_class(name: str, implicit: bool = True) -> type[Solver]:
     """A solver's class by the name that --solver takes."""
     from diffsim_ti.solvers import BDF2Solver, ImplicitEulerSolver, SemiImplicitSolver, VelocityVerletSolver
 
@@ -103,7 +82,7 @@ def solver_class(name: str, implicit: bool = True):
     return solvers[name]
 
 
-def fixed_vertices(mesh, names: list[str]) -> np.ndarray | None:
+def fixed_vertices(mesh: TetrahedralMesh, names: list[str]) -> np.ndarray | None:
     """Vertices of the mesh's sets, or, for xmin .. zmax, those within 1 % of the size from that side."""
     chosen = []
     for name in names:
@@ -117,14 +96,14 @@ def fixed_vertices(mesh, names: list[str]) -> np.ndarray | None:
 
 
 def make_ground(
-    mesh,
-    material,
+    mesh: TetrahedralMesh,
+    material: Material,
     density: float,
     gravity: float,
     speed: float,
     stiffness: float | None = None,
     width: float | None = None,
-):
+) -> Ground:
     """The floor y = 0 for a body that meets it at `speed` [m/s]: width 1 % of the size, stiffness from the impact."""
     from diffsim_ti.terms import Ground
     from diffsim_ti.terms.obstacles.stiffness import barrier_stiffness
@@ -136,20 +115,20 @@ def make_ground(
 
 
 def fall_scene(
-    body,
-    law,
+    body: TetrahedralMesh,
+    law: Material,
     density: float,
     gravity: float = -9.81,
     drag: float = 0.0,
-    velocity=(0.0, 0.0, 0.0),
-    fixed=(),
+    velocity: ArrayLike = (0.0, 0.0, 0.0),
+    fixed: Sequence[str] | None = (),
     floor: bool = True,
     height: float | None = None,
     stiffness: float | None = None,
     width: float | None = None,
-    extra=(),
+    extra: Sequence[Term] = (),
     volume: str = "tetrahedra",
-):
+) -> tuple[Scene, TetrahedralMesh]:
     """(scene, body): a body let go above the floor y = 0, its lowest point at `height` [m], default a tenth of its size.
 
     fixed: as `fixed_vertices` takes them; stiffness, width: the floor's barrier, see `make_ground`; extra: more terms;
@@ -171,7 +150,7 @@ def fall_scene(
 # ---- what is said at the end ------------------------------------------------------------------------------------------
 
 
-def print_summary(run, setup: float, writing: float, files: list[str]) -> None:
+def print_summary(run: "ForwardRun", setup: float, writing: float, files: list[str]) -> None:
     """A table of what was simulated, how fast, how well, and where it was written."""
     from rich.console import Console
     from rich.table import Table

@@ -1,6 +1,7 @@
 """Commands that measure: chart, stability, growth, recommend."""
 
 import runpy
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -10,6 +11,7 @@ import typer
 from diffsim_ti.cli.options import (
     Backend,
     Density,
+    Folder,
     MaterialName,
     Poisson,
     Precision,
@@ -18,8 +20,9 @@ from diffsim_ti.cli.options import (
     load_body,
     make_material,
 )
+from diffsim_ti.progress import progress
+from diffsim_ti.scene import Scene
 
-Folder = Annotated[Path, typer.Option("--output", "-o", help="folder for the picture, the CSV and the JSON")]
 Quick = Annotated[bool, typer.Option("--quick", help="small meshes, few steps: seconds instead of minutes")]
 Fixed = Annotated[list[str] | None, typer.Option(help="vertex set, or xmin .. zmax, to hold; may be repeated")]
 
@@ -32,7 +35,9 @@ def register(app: typer.Typer) -> None:
     app.command()(recommend)
 
 
-def own_scene(path: Path, material: str, youngs_modulus: float, poissons_ratio: float, density: float, fixed):
+def own_scene(
+    path: Path, material: str, youngs_modulus: float, poissons_ratio: float, density: float, fixed: Sequence[str] | None
+) -> Scene:
     """A scene from a Python file that defines `scene` or `scene()`, or from a mesh under its own weight."""
     from diffsim_ti.scene import Scene
     from diffsim_ti.terms import Gravity
@@ -72,7 +77,7 @@ def chart(
     limit: Annotated[float, typer.Option(help="leave out runs expected to take longer than this [s]")] = 1.0,
     repeats: Annotated[int, typer.Option(help="timed rounds, of which the best counts")] = 3,
     backend: Backend = "cpu",
-):
+) -> None:
     """Measure time against error for every solver, step, precision and mesh; draw the work-precision diagram."""
     from diffsim_ti import runtime
     from diffsim_ti.study import PROBLEMS, Problem, charts
@@ -111,12 +116,11 @@ def stability(
     output: Folder = Path("output/stability"),
     quick: Quick = False,
     backend: Backend = "cpu",
-):
+) -> None:
     """Map where each solver is accurate, bounded, loses energy, raises, or is wrong silently. Exit code 1 if one is."""
     from dataclasses import replace
 
     from diffsim_ti import runtime
-    from diffsim_ti.cli.options import progress
     from diffsim_ti.solvers import SOLVERS
     from diffsim_ti.study import map_picture
     from diffsim_ti.study.stability_map import AXES, stability_map
@@ -175,7 +179,7 @@ def growth(
     density: Density = 1000.0,
     fixed: Fixed = None,
     backend: Backend = "cpu",
-):
+) -> None:
     """How fast gradients grow with the length of a run (a Lyapunov-like rate), and until when they are of use."""
     from diffsim_ti import runtime
     from diffsim_ti.study.growth import GROWTH_SCENES, study_growth, write_growth
@@ -209,7 +213,7 @@ def recommend(
     density: Density = 1000.0,
     fixed: Fixed = None,
     backend: Backend = "cpu",
-):
+) -> None:
     """Name the cheapest solver, step, precision and checkpoints for a tolerance, from short trial runs."""
     from diffsim_ti import runtime
     from diffsim_ti.study import recommend as advise

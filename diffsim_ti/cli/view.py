@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from diffsim_ti.cli.options import (
+    SUFFIXES,
     Density,
     FixOrientation,
     MaterialName,
@@ -29,7 +30,7 @@ def register(app: typer.Typer) -> None:
 
 def render(
     series: Annotated[Path, typer.Argument(help="the .pvd of a run", exists=True, dir_okay=False)],
-    output: Annotated[Path, typer.Option("--output", "-o", help=".mp4, .gif, or .png of the end")] = Path(
+    output: Annotated[Path, typer.Option("--output", "-o", help=f"file, by its suffix: {SUFFIXES}")] = Path(
         "output/film.mp4"
     ),
     colour: Annotated[str, typer.Option(help="displacement, speed, von_mises, energy_density or J")] = "von_mises",
@@ -40,7 +41,7 @@ def render(
     elevation: Annotated[float, typer.Option(help="of the eye, above the floor [degrees]")] = 14.0,
     wireframe: Annotated[bool, typer.Option("--wireframe", help="draw the edges of the triangles")] = False,
     backend: Annotated[str, typer.Option(help="vulkan, software, or auto: Vulkan where there is a driver")] = "auto",
-):
+) -> None:
     """Draw a saved series as a film, coloured by a field, without a display."""
     from diffsim_ti.film import render_series
 
@@ -71,16 +72,21 @@ def view(
         list[str] | None, typer.Option(help="vertex set, or xmin .. zmax, to hold; may be repeated")
     ] = None,
     floor: Annotated[bool, typer.Option(help="a floor at y = 0, the body above it")] = True,
-):
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help=f"file that the key S writes, by its suffix: {SUFFIXES}")
+    ] = None,
+) -> None:
     """Look at a saved series in a window, or at a mesh as it falls: play, step, scrub, turn, colour by a field, pull."""
     from diffsim_ti import runtime
     from diffsim_ti.adaptive_run import ForwardRun
     from diffsim_ti.terms import ExternalForce
     from diffsim_ti.visual.frame_sources import LiveFrames, SavedFrames
     from diffsim_ti.visual.viewer import NO_DISPLAY, Viewer, has_display
+    from diffsim_ti.writers import View, writer_for
 
     if not has_display():
         raise RuntimeError(NO_DISPLAY)
+    saving = None if output is None else writer_for(output, View(ground=ground))
     if source.suffix == ".pvd":
         frames = SavedFrames(source)
     else:
@@ -99,4 +105,4 @@ def view(
         )
         frames = LiveFrames(ForwardRun(scene, solver_class(solver), 1 / fps))
     look = {} if ground is None else dict(ground=ground)
-    Viewer(frames, colour, playing=source.suffix != ".pvd", **look).run()
+    Viewer(frames, colour, playing=source.suffix != ".pvd", output=saving, **look).run()

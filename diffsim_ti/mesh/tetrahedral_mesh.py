@@ -10,6 +10,7 @@ from types import MappingProxyType
 
 import numpy as np
 
+from diffsim_ti import runtime
 from diffsim_ti.mesh import checks, geometry
 from diffsim_ti.mesh.description import describe
 from diffsim_ti.mesh.files import KEEPS_SETS, read_mesh, write_mesh
@@ -60,8 +61,9 @@ class TetrahedralMesh:
     def create_cube(cls, resolution: int = 5, size: float = 1.0, pattern="kuhn", device=None) -> "TetrahedralMesh":
         """The cube [0, size]^3 [m], all of it filled; `resolution` counts vertices a side. See `create_box`.
 
-        device: accepted for the seeds' spelling and not used; a mesh lives in NumPy, simulators choose a device.
+        device: "cuda" starts Taichi on the card, or refuses if it runs elsewhere; the mesh itself lives in NumPy.
         """
+        runtime.use_device(device)
         return cls.create_box(resolution, size, pattern)
 
     @classmethod
@@ -105,7 +107,8 @@ class TetrahedralMesh:
 
     @classmethod
     def load_from_msh(cls, path, device=None) -> "TetrahedralMesh":
-        """`from_file(path)` in the seeds' spelling; device is accepted and not used."""
+        """`from_file(path)` in the seeds' spelling; device as for `create_cube`."""
+        runtime.use_device(device)
         return cls.from_file(path)
 
     def save(self, path) -> None:

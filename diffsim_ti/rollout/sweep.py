@@ -167,8 +167,7 @@ class Sweep:
             first, last = schedule.bounds(k)
             self._record(first, last)
             tangent.advance(first, last, self.num_passes, self.passes_per_frame)
-            if k + 1 < schedule.num_segments:
-                ws.advance(first, last, self.num_passes)
+            ws.restore(ws.record, last - first)
         if self.solver.last_frame_is_state:
             tangent.save_frame(self.num_frames - 1)
         self._current = run if current is run else None  # its frames and snapshots are untouched

@@ -14,6 +14,7 @@ from diffsim_ti.runtime.arrays import (
     upload,
     view,
 )
+from diffsim_ti.runtime.device import device_name, use_device
 from diffsim_ti.runtime.field_pool import FieldPool, current_tape, fields
 from diffsim_ti.runtime.kernels import LANES, Kernel, array_types
 from diffsim_ti.runtime.language import Bundle, at, let, traced

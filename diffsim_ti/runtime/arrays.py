@@ -1,14 +1,17 @@
 """Arrays on the device that are freed with their last reference, and copies between them and NumPy."""
 
+import math
 import weakref
 
 import numpy as np
 import taichi as ti
 from taichi.lang import impl
 
-from diffsim_ti.runtime.start import check_alive, is_alive, program, runs_on_cpu
+from diffsim_ti.runtime import device
+from diffsim_ti.runtime.start import arch_name, check_alive, is_alive, program, runs_on_cpu
 
 _allocated = {"bytes": 0}
+_MOST_NUMBERS = 2**31 - 1
 
 
 def allocated_megabytes() -> float:
@@ -19,7 +22,7 @@ def allocated_megabytes() -> float:
 def _free(owner, handle, size) -> None:
     _allocated["bytes"] -= size
     if is_alive(owner):
-        if not runs_on_cpu():
+        if arch_name() == "vulkan":
             ti.sync()  # an array that a kernel still uses would not be freed, in silence
         owner().delete_ndarray(handle)
 
@@ -32,11 +35,29 @@ class _Scalars(ti.ScalarNdarray):
 
 
 def array(dtype, *shape: int):
-    """A Taichi ndarray whose memory goes back when the last reference goes, and only to the program that gave it."""
+    """A Taichi ndarray whose memory goes back when the last reference goes, and only to the program that gave it.
+
+    Raises ValueError beyond 2^31 - 1 numbers, which Taichi's indices wrap around in silence, and MemoryError.
+    """
     owner = program()
     shape = tuple(max(int(s), 1) for s in shape)  # Taichi has no empty arrays
-    out = _Scalars(dtype, shape) if isinstance(dtype, type(ti.f32)) else ti.ndarray(dtype, shape)
-    size = int(np.prod(full_shape(out))) * np.dtype(to_numpy_dtype(out.dtype)).itemsize
+    is_scalar = isinstance(dtype, type(ti.f32))
+    count = math.prod(shape) * (1 if is_scalar else math.prod(dtype.get_shape()))
+    if count > _MOST_NUMBERS:
+        raise ValueError(
+            f"an array of {count:.3g} numbers is beyond the {_MOST_NUMBERS:.3g} that Taichi's 32-bit indices reach: "
+            "keep fewer states (checkpoint_every, save_every), or use a coarser mesh"
+        )
+    size = count * np.dtype(to_numpy_dtype(dtype if is_scalar else dtype.dtype)).itemsize
+    try:
+        out = _Scalars(dtype, shape) if is_scalar else ti.ndarray(dtype, shape)
+    except RuntimeError as error:
+        if "out of memory" not in str(error).lower():
+            raise
+        raise MemoryError(
+            f"{size / 1e6:.0f} MB do not fit into the memory of the {arch_name()} device, of which this process holds "
+            f"{allocated_megabytes():.0f} MB: keep fewer states (checkpoint_every, save_every), or use a coarser mesh"
+        ) from error
     _allocated["bytes"] += size
     out.owner = owner
     weakref.finalize(out, _free, owner, out.arr, size)
@@ -48,7 +69,8 @@ def upload(data: np.ndarray, dtype) -> "ti.Ndarray":
     data = np.asarray(data)
     shape = data.shape if isinstance(dtype, type(ti.f32)) else data.shape[:-1]
     out = array(dtype, *shape)
-    fill(out, 0)
+    if runs_on_cpu() or not data.size:  # elsewhere `fill` writes the whole array
+        fill(out, 0)
     if data.size:
         fill(out, data)
     return out
@@ -73,8 +95,7 @@ def view(target) -> "np.ndarray | None":
     if host is None and runs_on_cpu():
         dtype, shape = to_numpy_dtype(target.dtype), full_shape(target)
         kind = np.ctypeslib.as_ctypes_type(dtype) * int(np.prod(shape))
-        address = impl.get_runtime().prog.get_ndarray_data_ptr_as_int(target.arr)
-        host = target.host_view = np.ctypeslib.as_array(kind.from_address(address)).reshape(shape)
+        host = target.host_view = np.ctypeslib.as_array(kind.from_address(_address(target))).reshape(shape)
     return host
 
 
@@ -86,23 +107,45 @@ def fill(target, data) -> None:
     if host is not None:
         (host[..., :3] if three else host)[...] = data
         return
+    on_cuda = arch_name() == "cuda"
+    if on_cuda and data.ndim == 0 and data == 0:
+        impl.get_runtime().prog.fill_uint(target.arr, 0)  # a memset, whatever the type
+        return
     whole = np.zeros(shape, to_numpy_dtype(target.dtype))
     (whole[..., :3] if three else whole)[...] = data
-    target.from_numpy(whole)
+    if on_cuda:  # Taichi would copy both ways, and wait three times
+        device.copy_to_card(_address(target), whole)
+    else:
+        target.from_numpy(whole)
 
 
 def fetch(source) -> np.ndarray:
     """A NumPy copy of a Taichi array; of four components the first three."""
     host = view(source)
-    host = source.to_numpy() if host is None else host
+    host = _copied(source) if host is None else host
     is_vector = len(getattr(source, "element_shape", ()) or ()) == 1 and host.shape[-1] == 4
     return host[..., :3].copy() if is_vector else host.copy()
+
+
+def _copied(source, row: int | None = None) -> np.ndarray:
+    """All of an array whose memory is not the host's, or a row of it."""
+    if arch_name() != "cuda":
+        return source.to_numpy() if row is None else source.to_numpy()[row]
+    shape = full_shape(source)
+    out = np.empty(shape if row is None else shape[1:], to_numpy_dtype(source.dtype))
+    before = 0 if row is None else range(shape[0])[row] * out.nbytes
+    device.copy_from_card(out, _address(source) + before)
+    return out
+
+
+def _address(target) -> int:
+    return impl.get_runtime().prog.get_ndarray_data_ptr_as_int(target.arr)
 
 
 def fetch_row(source, k: int) -> np.ndarray:
     """Row k of a Taichi array of vectors in float64; of four components the first three."""
     host = view(source)
-    return (source.to_numpy() if host is None else host)[k, ..., :3].astype(np.float64)
+    return (_copied(source, k) if host is None else host[k])[..., :3].astype(np.float64)
 
 
 def to_numpy_dtype(dtype):

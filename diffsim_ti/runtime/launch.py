@@ -5,8 +5,9 @@ import taichi as ti
 from taichi.lang import impl
 from taichi.types import primitive_types
 
+from diffsim_ti.runtime.argument_buffer import ArgumentBuffer
 from diffsim_ti.runtime.arrays import full_shape
-from diffsim_ti.runtime.start import check_alive, program, runs_on_cpu
+from diffsim_ti.runtime.start import arch_name, check_alive, program
 
 
 class Launch:
@@ -18,7 +19,7 @@ class Launch:
 
     def __init__(self, kernel, *arrays, vectorized: bool = False):
         self._kernel, self._arrays, self._vectorized = kernel._primal, arrays, vectorized
-        self._setters, self._owner = None, program()
+        self._setters, self._buffer, self._owner = None, None, program()
 
     def _prepare(self, numbers: tuple) -> None:
         prog = impl.get_runtime().prog
@@ -30,11 +31,15 @@ class Launch:
             self._code = prog.compile_kernel(config, prog.get_device_caps(), compiled)
         finally:
             config.real_matrix_scalarize = scalarize
-        self._context, on_cpu = compiled.make_launch_context(), runs_on_cpu()
+        self._context, arch = compiled.make_launch_context(), arch_name()
+        if arch == "cuda":
+            self._buffer = ArgumentBuffer(self._context)
         for k, array in enumerate(self._arrays):
             if not isinstance(array, ti.Ndarray):  # a torch tensor, set at each launch
                 continue
-            if on_cpu:  # a launch replaces an array by its raw pointer, so that a context could not be used twice
+            if (
+                arch == "cpu"
+            ):  # a launch replaces an array by its raw pointer, so that a context could not be used twice
                 pointer, size = prog.get_ndarray_data_ptr_as_int(array.arr), int(np.prod(full_shape(array))) * 8
                 self._context.set_arg_external_array_with_shape((k,), pointer, size, tuple(array.shape), 0)
             else:
@@ -50,6 +55,8 @@ class Launch:
         check_alive(self._owner)
         if self._setters is None:
             self._prepare(numbers)
+        if self._buffer:
+            self._buffer.restore()
         for (setter, index), number in zip(self._setters, numbers):
             setter(index, number)
         self._owner().launch_kernel(self._code, self._context)
@@ -65,6 +72,8 @@ class TensorLaunch(Launch):
             self._arrays = (*tensors, *arrays)
             self._prepare(())
             self._arrays = arrays  # keeps no tensor alive
+        if self._buffer:
+            self._buffer.restore()
         for k, tensor in enumerate(tensors):
             size = tensor.numel() * tensor.element_size()
             self._context.set_arg_external_array_with_shape((k,), tensor.data_ptr(), size, tuple(tensor.shape), 0)

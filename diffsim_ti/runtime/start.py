@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import multiprocessing
 import os
 import tempfile
 import warnings
@@ -12,9 +13,12 @@ import taichi as ti
 from taichi._lib import core as _core
 from taichi.lang import impl
 
+from diffsim_ti.runtime.device import count_cards
+
 PRECISIONS = {"f32": ti.f32, "f64": ti.f64}
 NUMPY = {"f32": np.float32, "f64": np.float64}
 _ARCHS = {"cpu": ti.cpu, "cuda": ti.cuda, "vulkan": ti.vulkan}
+_PARENT = "DIFFSIM_TI_PARENT"  # process and backend that its spawned workers start on
 _settings = {"precision": "f32"}
 
 
@@ -25,7 +29,7 @@ def available_archs() -> list[str]:
 
 
 def _has_arch(name: str) -> bool:
-    return {"cpu": lambda: True, "cuda": _core.with_cuda, "vulkan": _core.with_vulkan}[name]()
+    return {"cpu": lambda: True, "cuda": lambda: count_cards() > 0, "vulkan": _core.with_vulkan}[name]()
 
 
 def init(arch: str = "cpu", precision: str = "f32", threads: int | None = None, **options) -> None:
@@ -46,9 +50,12 @@ def init(arch: str = "cpu", precision: str = "f32", threads: int | None = None, 
     check_precision(precision)
     ti.set_logging_level(ti.ERROR)
     if not _has_arch(arch):
+        cardless = arch == "cuda" and _core.with_cuda()
         raise RuntimeError(
-            f"the {arch} backend is not available here (available: {', '.join(available_archs())}); "
-            f"pass one of those to diffsim_ti.init, or install the driver that {arch} needs"
+            f"the {arch} backend is not available here (available: {', '.join(available_archs())}"
+            + ("; CUDA's driver is installed, but sees no card" if cardless else "")
+            + "); pass one of those to diffsim_ti.init"
+            + ("" if cardless else f", or install the driver that {arch} needs")
         )
     for name in ("default_fp", "fast_math"):
         if name in options:
@@ -105,14 +112,30 @@ def refuse_fork() -> None:
 
 
 def program() -> weakref.ref:
-    """The live Taichi program; starts the stated default (CPU, f32) if nothing did.
+    """The live Taichi program; starts the stated default (CPU, f32; a spawned worker where its parent runs) if nothing did.
 
     A weak reference: a program that is still held would outlive `ti.init`, and at its end free memory of the next one.
     """
     refuse_fork()
     if impl.get_runtime().prog is None:
-        init()
+        init(_arch_of_parent())
+    _tell_workers()
     return weakref.ref(impl.get_runtime().prog)
+
+
+def _tell_workers() -> None:
+    """Processes that multiprocessing spawns inherit the environment: they start where this one runs."""
+    arch = impl.current_cfg().arch
+    if _settings.get("told") != arch:
+        _settings["told"] = arch
+        os.environ[_PARENT] = f"{os.getpid()} {arch_name()}"
+
+
+def _arch_of_parent() -> str:
+    """The backend of the process that spawned this one as a worker; the default for any other process."""
+    parent = multiprocessing.parent_process()
+    pid, _, arch = os.environ.get(_PARENT, "").partition(" ")
+    return arch if parent is not None and pid == str(parent.pid) else "cpu"
 
 
 def is_alive(owner: weakref.ref) -> bool:
@@ -144,7 +167,13 @@ def arch_name() -> str:
     """Name of the running backend."""
     program()
     arch = impl.current_cfg().arch
-    return next((name for name, value in _ARCHS.items() if value == arch), "cpu")
+    for name, value in _ARCHS.items():
+        if value == arch:
+            return name
+    raise RuntimeError(
+        f"Taichi was started on {_core.arch_name(arch)}, which diffsim_ti does not know: "
+        f"use one of {', '.join(_ARCHS)}, by diffsim_ti.init or ti.init"
+    )
 
 
 def runs_on_cpu() -> bool:

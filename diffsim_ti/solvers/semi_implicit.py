@@ -44,9 +44,7 @@ class SemiImplicitSolver(ExplicitSolver):
         """Make the scene of a mesh and a material, and choose the substeps."""
         if getattr(self, "scene", None) is not None:
             raise ValueError("this solver already has a scene: use Simulator(solver)")
-        self._waiting["allow_unstable"] = True  # until the substeps are chosen
-        super().__init__(Scene(mesh, material, **self._own), **self._waiting)
-        self.allow_unstable = False
+        super().__init__(Scene(mesh, material, **self._own), **self._waiting, check_start=False)
         self.choose_substeps()
 
     @property

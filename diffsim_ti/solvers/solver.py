@@ -15,7 +15,9 @@ class Solver(ABC):
     """Advances a scene by steps of dt [s], each divided into `substeps` equal substeps.
 
     parallel: one launch per substep on all threads, or one serial launch for many substeps; None chooses by size.
-    allow_unstable: take a step beyond the stable one all the same.
+    allow_unstable: take a step beyond the stable one all the same: neither the start nor the run is checked.
+    check_start: whether the constructor refuses a step beyond the stable one; False where `substeps` is chosen later, before
+        each step or by `choose_substeps`. The run is checked all the same.
     Raises ValueError for dt <= 0, substeps < 1, or a step beyond the stable one.
     """
 
@@ -23,25 +25,31 @@ class Solver(ABC):
     order = 0
 
     def __init__(
-        self, scene, dt: float = 0.01, substeps: int = 1, parallel: bool | None = None, allow_unstable: bool = False
+        self,
+        scene,
+        dt: float = 0.01,
+        substeps: int = 1,
+        parallel: bool | None = None,
+        allow_unstable: bool = False,
+        check_start: bool = True,
     ):
         if not (math.isfinite(dt) and dt > 0):
             raise ValueError(f"dt must be > 0 [s], got {dt}")
         if int(substeps) != substeps or substeps < 1:
             raise ValueError(f"substeps must be a whole number >= 1, got {substeps}")
         self.scene, self.dt, self.substeps = scene, float(dt), int(substeps)
-        self.parallel, self.allow_unstable = parallel, allow_unstable
+        self.parallel, self.allow_unstable, self.check_start = parallel, allow_unstable, check_start
         runtime.check_host_init()
         runtime.check_backend(scene.precision)
         self._tight: stability.StepLimit | None = None
         self._deformed: bool | None = None
-        if self.explicit and not allow_unstable:
+        if self.explicit and check_start and not allow_unstable:
             self._refuse_unstable()
 
     def twin(self, scene) -> "Solver":
         """The same solver for another scene."""
-        own = dict(dt=self.dt, substeps=self.substeps, parallel=self.parallel, allow_unstable=self.allow_unstable)
-        return type(self)(scene, **own)
+        own = ("dt", "substeps", "parallel", "allow_unstable", "check_start")
+        return type(self)(scene, **{name: getattr(self, name) for name in own})
 
     @property
     def schedule(self) -> Schedule:

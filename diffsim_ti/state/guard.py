@@ -6,6 +6,7 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.state import observe, stability
+from diffsim_ti.terms.obstacles.barrier import beta
 
 
 class Divergence(FloatingPointError):
@@ -195,16 +196,15 @@ class Guard:
         The present state counts: kinetic energy and what the barrier already holds, against k w^2 beta(1 / 1000).
         """
         arrays = self.ws.arrays
-        twin, first, _ = arrays.obstacles[k]
-        stiffness, width = (float(arrays.values.parameters[first + twin.count + m]) for m in (0, 1))
+        force, first, _ = arrays.obstacles[k]
+        stiffness, width = (float(arrays.values.parameters[first + force.count + m]) for m in (0, 1))
         self.ws.place_obstacles(self.good_pass)
-        place = runtime.fetch(arrays.offsets)[3 * k].astype(np.float64)
+        offset = runtime.fetch(arrays.offsets)[3 * k].astype(np.float64)
         position = arrays.values.rest[vertex] + runtime.fetch(self.ws.state.u)[0, vertex]
-        gap = float(self.ws.watch.contacts[k].gap(position[None], place)[0])
-        s = np.clip(gap / width, 1e-3, 1)
-        beta = lambda s: -((s - 1) ** 2) * np.log(s)  # noqa: E731
-        energy = 0.5 * arrays.values.mass[vertex] * speed**2 + stiffness * width**2 * beta(s)
-        return energy / (width**2 * beta(0.02)) if energy > stiffness * width**2 * beta(1e-3) else None
+        gap = float(self.ws.watch.contacts[k].gap(position[None], offset)[0])
+        held = stiffness * width**2 * beta(np.clip(gap / width, 1e-3, 1))
+        energy = float(0.5 * arrays.values.mass[vertex] * speed**2 + held)
+        return energy / float(width**2 * beta(0.02)) if energy > stiffness * width**2 * beta(1e-3) else None
 
     def _diagnose(self, bad_by: int, num_passes: int) -> None:
         """Run again from the last good state, pass by pass, and raise at the first bad one; that state is restored."""
@@ -240,7 +240,7 @@ class Guard:
         )
 
     def _stable_step(self) -> tuple[float, str]:
-        """The stable step of the last good state or, where that one is a wreck already, of the start."""
+        """The stable step of the last good state or, where that one is too far gone, of the start."""
         start = self.ws.solver.stable_dt(tight=True).dt
         try:
             here = stability.lanczos_limit(self.ws).dt

@@ -2,9 +2,18 @@
 
 import csv
 import json
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from diffsim_ti.study.work_precision import Chart, Point
+
 
 COLORS = {
     "SemiImplicit": "#E69F00",
@@ -25,7 +34,7 @@ MARKERS = {
 }
 
 
-def new_figure(width: float = 9.2, height: float = 5.4):
+def new_figure(width: float = 9.2, height: float = 5.4) -> "tuple[Figure, Axes]":
     """(figure, axes) in the style of all pictures, without a display."""
     from matplotlib.figure import Figure
 
@@ -36,7 +45,7 @@ def new_figure(width: float = 9.2, height: float = 5.4):
     return figure, axes
 
 
-def draw_chart(chart, path, peers: dict | None = None) -> None:
+def draw_chart(chart: "Chart", path: str | Path, peers: dict | None = None) -> None:
     """The work-precision diagram: time against error, a mark per run, the Pareto front as a line with its labels.
 
     peers: other systems' runs of the same problem, name -> [(seconds per simulated second, error), ...].
@@ -92,7 +101,7 @@ def draw_chart(chart, path, peers: dict | None = None) -> None:
     save(figure, path)
 
 
-def label_front(axes, front, most: int = 9) -> None:
+def label_front(axes: "Axes", front: "Sequence[Point]", most: int = 9) -> None:
     """Number some of the front's runs and say beside the diagram what they are."""
     apart = front[:1]
     for p in front[1:]:  # of runs that lie close together the first one is named
@@ -115,19 +124,19 @@ def label_front(axes, front, most: int = 9) -> None:
     axes.text(1.02, 0.0, "\n".join(lines), transform=axes.transAxes, fontsize=7.5, va="bottom", linespacing=1.5)
 
 
-def save(figure, path) -> None:
+def save(figure: "Figure", path: str | Path) -> None:
     """Write a figure, making its folder."""
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path)
 
 
-def write_json(record: dict, path) -> None:
+def write_json(record: dict, path: str | Path) -> None:
     """Numbers and words as JSON, NaN as null."""
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     Path(path).write_text(json.dumps(record, indent=1, default=str) + "\n")
 
 
-def write_csv(rows: list[dict], path) -> None:
+def write_csv(rows: list[dict], path: str | Path) -> None:
     """Rows with the same keys as CSV."""
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     with open(path, "w", newline="") as file:
@@ -136,7 +145,7 @@ def write_csv(rows: list[dict], path) -> None:
         writer.writerows(rows)
 
 
-def write_chart(chart, folder, peers: dict | None = None) -> list[str]:
+def write_chart(chart: "Chart", folder: str | Path, peers: dict | None = None) -> list[str]:
     """chart_<problem>.png, .csv, .json in a folder; returns their names."""
     stem = Path(folder) / f"chart_{chart.problem.name.replace('-', '_')}"
     record = chart.record()

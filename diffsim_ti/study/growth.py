@@ -10,6 +10,8 @@ from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.scene import Scene
 from diffsim_ti.solvers import VelocityVerletSolver
+from diffsim_ti.solvers.solver import Solver
+from diffsim_ti.state.stability import stable_dt
 from diffsim_ti.study.charts import COLORS, new_figure, save, write_csv, write_json
 from diffsim_ti.study.problems import beam_scene, lame_scene
 from diffsim_ti.terms import Gravity, Ground
@@ -35,7 +37,9 @@ class Growth:
         return f"gradients grow to {self.sizes[:, -1].max():.3g} at rate {self.rate:.3g} 1/s; {until}"
 
 
-def growth(solver, steps: int, frames: int = 50, directions: int = 2, useful: float = 1e-2, seed: int = 0) -> Growth:
+def growth(
+    solver: Solver, steps: int, frames: int = 50, directions: int = 2, useful: float = 1e-2, seed: int = 0
+) -> Growth:
     """Tangents of the positions by the start along random directions, through `steps` steps of the solver.
 
     Benettin et al. 1980, doi:10.1007/BF02128236; Metz et al. 2021, Gradients are not all you need, arXiv:2111.05803.
@@ -80,13 +84,13 @@ def study_growth(scenes: dict, duration: float, share: float = 0.1, frames: int 
     contacts are resolved too."""
     out = {}
     for name, scene in scenes.items():
-        dt = share * VelocityVerletSolver(scene, dt=duration, allow_unstable=True).stable_dt(tight=True).dt
+        dt = share * stable_dt(scene).dt
         steps = int(np.ceil(duration / dt))
         out[name] = growth(VelocityVerletSolver(scene, dt=duration / steps), steps, min(frames, steps))
     return out
 
 
-def draw_growth(results: dict[str, Growth], path, rounding: float) -> None:
+def draw_growth(results: dict[str, Growth], path: str | Path, rounding: float) -> None:
     """Size of the tangent against time, a line per run, with the size at which rounding has grown to 1 % of the state."""
     figure, axes = new_figure()
     styles = ("-", "--", "-.", ":")
@@ -122,7 +126,7 @@ def draw_growth(results: dict[str, Growth], path, rounding: float) -> None:
     save(figure, path)
 
 
-def write_growth(results: dict[str, Growth], folder, rounding: float) -> list[str]:
+def write_growth(results: dict[str, Growth], folder: str | Path, rounding: float) -> list[str]:
     """growth.png, .csv, .json in a folder; returns their names."""
     stem = Path(folder) / "growth"
     draw_growth(results, stem.with_suffix(".png"), rounding)

@@ -1,11 +1,19 @@
 """Pictures and files of stability maps."""
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from diffsim_ti.study.charts import save, write_csv, write_json
 from diffsim_ti.study.stability_map import OUTCOMES
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from diffsim_ti.study.stability_map import StabilityMap
+
 
 OUTCOME_COLORS = ("#009E73", "#8FD0EC", "#F0E442", "#BBBBBB", "#D55E00")  # in the order of OUTCOMES
 LETTERS = "ABLR!"  # the same in letters, for eyes and printers that see no colours
@@ -18,7 +26,7 @@ LEGEND = (
 )
 
 
-def draw_maps(results: list, path) -> None:
+def draw_maps(results: list, path: str | Path) -> None:
     """A panel per solver: a cell per run, dt against the maps' quantity, with the theoretical limit and where
     boundedness ends; three panels a row, the legend in the last place."""
     from matplotlib.figure import Figure
@@ -27,21 +35,21 @@ def draw_maps(results: list, path) -> None:
     rows = -(-(len(results) + 1) // columns)
     figure = Figure(figsize=(4.9 * columns, 4.6 * rows), dpi=110, layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False)
-    places = [axes for row in grid for axes in row]
+    panels = [axes for row in grid for axes in row]
     explicit = [r for r in results if r.explicit]
     if len(explicit) == 2 and len(results) > 2 and columns == 3:  # explicit solvers above, implicit ones below
-        places = [places[0], places[1], *places[3:], places[2]]
-    for result, axes in zip(results, places):
+        panels = [panels[0], panels[1], *panels[3:], panels[2]]
+    for result, axes in zip(results, panels):
         draw_panel(result, axes)
-    draw_legend(results, places[len(results)])
-    for axes in places[len(results) + 1 :]:
+    draw_legend(results, panels[len(results)])
+    for axes in panels[len(results) + 1 :]:
         axes.axis("off")
     silent, total = sum(len(r.silent) for r in results), sum(r.outcomes.size for r in results)
     figure.suptitle(f"{results[0].axis.name}: {silent} of {total} runs went wrong without a word", fontsize=12)
     save(figure, path)
 
 
-def draw_panel(result, axes) -> None:
+def draw_panel(result: "StabilityMap", axes: "Axes") -> None:
     """One solver's map. Rows are as high as each other, whatever lies between their steps."""
     from matplotlib.colors import ListedColormap
 
@@ -66,7 +74,7 @@ def draw_panel(result, axes) -> None:
     axes.set_title(result.solver.removesuffix("Solver"), loc="left", fontsize=10)
 
 
-def draw_legend(results, axes) -> None:
+def draw_legend(results: "Sequence[StabilityMap]", axes: "Axes") -> None:
     """What colours, letters, line and crosses mean."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
@@ -83,7 +91,7 @@ def draw_legend(results, axes) -> None:
     axes.legend(handles=handles, loc="center left", frameon=False, fontsize=9, handlelength=1.6, labelspacing=0.9)
 
 
-def write_maps(results: list, folder, name: str) -> list[str]:
+def write_maps(results: list, folder: str | Path, name: str) -> list[str]:
     """stability_<name>.png, .csv, .json of all solvers on one axis in a folder; returns their names."""
     stem = Path(folder) / f"stability_{name}"
     draw_maps(results, stem.with_suffix(".png"))

@@ -4,12 +4,15 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
+
+from diffsim_ti.scene import Scene
 
 ELEMENTS = {"linear": {}, "patches": {"volume": "patches"}}  # kinds of element: name -> arguments of Scene
 
 
 @dataclass(frozen=True)
-class Watch:
+class FrameLoss:
     """A loss of one number per frame, q_f = sum_i w_i . u_f,i: sum_f [linear_f q_f + square_f (q_f - target_f)^2 / 2].
 
     weights(mesh) -> w, shape (num_vertices, 3); the others have a number for each frame. Called with frames and their mesh,
@@ -22,7 +25,7 @@ class Watch:
     target: np.ndarray
 
     @classmethod
-    def end(cls, weights: Callable, frames: int) -> "Watch":
+    def end(cls, weights: Callable, frames: int) -> "FrameLoss":
         """The number itself at the last of `frames` frames after the start."""
         none = np.zeros(frames + 1)
         return cls(weights, np.append(none[1:], 1.0), none, none)
@@ -42,7 +45,7 @@ class Problem:
     quantity(frames, gradients) -> the numbers to get right; frames are a Rollout's, gradients those of `adjoint`.
     exact: the closed form's numbers, or None: a converged reference is computed, with its own error.
     scale: what errors are divided by; default the largest of the exact numbers.
-    adjoint(frames, mesh) -> the loss's gradient by the frames' positions, such as a Watch; `inputs`: those asked for.
+    adjoint(frames, mesh) -> the loss's gradient by the frames' positions, such as a `FrameLoss`; `inputs`: those asked for.
     cells, patterns, elements: the meshes of the chart, and the kinds of elements (ELEMENTS) to try on each.
     reference_cells: those that the reference is extrapolated from (it then includes the mesh's error); None: the reference
         is of each mesh with linear elements by itself (the error of steps and precision).
@@ -87,7 +90,7 @@ class Problem:
 
     @classmethod
     def of_scene(
-        cls, scene, duration: float, name: str = "scene", frames: int = 10, gradient: str | None = None
+        cls, scene: Scene, duration: float, name: str = "scene", frames: int = 10, gradient: str | None = None
     ) -> "Problem":
         """The motion of a scene of one's own, against its converged motion on the same mesh; or a gradient through it.
 
@@ -130,7 +133,7 @@ class Problem:
         )
 
 
-def distance(problem: Problem, quantity, exact) -> float:
+def distance(problem: Problem, quantity: ArrayLike, exact: ArrayLike) -> float:
     """Error of a problem's numbers: the largest difference over the scale; rows of 3 count by their length."""
     quantity, exact = np.asarray(quantity, np.float64), np.asarray(exact, np.float64)
     apart = np.abs(quantity - exact)

@@ -1,12 +1,17 @@
 """The built-in problems: closed forms where there are some, else converged references."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 from diffsim_ti.materials import LinearElastic, SmithNeoHookean, StableNeoHookean
+from diffsim_ti.materials.material import Material
 from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.rollout import Frames
 from diffsim_ti.scene import Scene
-from diffsim_ti.study.problem import Problem, Watch
+from diffsim_ti.study.problem import FrameLoss, Problem
 from diffsim_ti.terms import Gravity, Ground
+from diffsim_ti.terms.obstacles.barrier import beta
 
 
 def oscillator() -> Problem:
@@ -43,19 +48,19 @@ def oscillator() -> Problem:
     )
 
 
-def lame_mode(X, a: float = 1.0) -> np.ndarray:
-    """Lame mode of a cube of width a [m] at places X, shape (n, 3), of size 1."""
+def lame_mode(X: np.ndarray, a: float = 1.0) -> np.ndarray:
+    """Lame mode of a cube of width a [m] at points X, shape (n, 3), of size 1."""
     p = np.pi / a
     x, y, z = X.T
     return np.stack([np.cos(p * x) * np.sin(p * y), -np.sin(p * x) * np.cos(p * y), 0 * z], 1)
 
 
-def lame_share(X) -> np.ndarray:
+def lame_share(X: np.ndarray) -> np.ndarray:
     """Weights that give the mode's share [m] in displacements: its projection by least squares."""
     return lame_mode(X) / (lame_mode(X) ** 2).sum()
 
 
-def lame_share_by_mass(mesh) -> np.ndarray:
+def lame_share_by_mass(mesh: TetrahedralMesh) -> np.ndarray:
     """Weights that give the mode's share [m], weighed by mass: what the mesh mixes in counts squared only."""
     mass = np.bincount(mesh.tetrahedra.ravel(), np.repeat(mesh.volumes / 4, 4), mesh.num_vertices)[:, None]
     mode = lame_mode(mesh.vertices)
@@ -65,7 +70,7 @@ def lame_share_by_mass(mesh) -> np.ndarray:
 LAME = dict(E=1e5, density=1000.0, reach=1e-3)  # the reach is so small that what is nonlinear stays below 1e-5
 
 
-def lame_scene(nu, cells, pattern, precision, **element) -> Scene:
+def lame_scene(nu: float, cells: int, pattern: str, precision: str, **element) -> Scene:
     """A free cube of 1 m in its Lame mode."""
     mesh = TetrahedralMesh.create_cube(cells + 1, 1.0, pattern)
     start = mesh.vertices + LAME["reach"] * lame_mode(mesh.vertices)
@@ -113,7 +118,7 @@ def lame_gradient(nu: float = 0.3) -> Problem:
     t = np.linspace(0, time, frames + 1)
     window = np.sin(omega * t) * np.sin(np.pi * t / time) ** 2
     exact = -LAME["reach"] * omega / 2 * (window * t * np.sin(omega * t)).sum()
-    watch = Watch(lame_share_by_mass, window, 0 * t, 0 * t)
+    loss = FrameLoss(lame_share_by_mass, window, 0 * t, 0 * t)
     return Problem(
         "lame-gradient",
         f"Gradient by E of the Lamé mode, nu = {nu:g}, closed form",
@@ -123,14 +128,14 @@ def lame_gradient(nu: float = 0.3) -> Problem:
         lambda _, gradients: LAME["E"] * np.atleast_1d(gradients["youngs_modulus"]),
         frames=frames,
         exact=np.array([exact]),
-        adjoint=watch,
+        adjoint=loss,
         inputs=("youngs_modulus",),
         cells=(4, 8, 12, 16, 24),
         patterns=("five",),
     )
 
 
-def fit_oscillation(times, q, guess: float) -> np.ndarray:
+def fit_oscillation(times: np.ndarray, q: np.ndarray, guess: float) -> np.ndarray:
     """(omega, sigma) [1/s] of q = exp(-sigma t) (A cos omega t + B sin omega t), by least squares from omega = guess."""
     from scipy.optimize import least_squares
 
@@ -145,18 +150,18 @@ def fit_oscillation(times, q, guess: float) -> np.ndarray:
     return least_squares(remainder, start, x_scale=guess, xtol=1e-12, ftol=1e-12, gtol=1e-12).x
 
 
-def beam_scene(law, cells, pattern, precision, nu=0.3, **element) -> Scene:
+def beam_scene(law: type[Material], cells: int, pattern: str, precision: str, nu: float = 0.3, **element) -> Scene:
     """A beam 1 m long and 0.2 m thick, held at x = 0, under its own weight; E = 1e6 Pa, 1000 kg/m^3."""
     mesh = TetrahedralMesh.create_box((5 * cells + 1, cells + 1, cells + 1), (1.0, 0.2, 0.2), pattern)
     return Scene(mesh, law(1e6, nu), 1000.0, Gravity(), fixed="xmin", precision=precision, **element)
 
 
-def corners(rest) -> np.ndarray:
+def corners(rest: np.ndarray) -> np.ndarray:
     """The four corners of the beam's end, which every mesh has."""
     return np.flatnonzero((rest[:, 0] == 1) & np.isin(rest[:, 1], (0, 0.2)) & np.isin(rest[:, 2], (0, 0.2)))
 
 
-def tip(frames, _=None) -> np.ndarray:
+def tip(frames: Frames, _: object | None = None) -> np.ndarray:
     """Mean displacement of the beam's end, shape (frames, 3) [m]."""
     return frames.displacements[:, corners(frames.inputs["rest_positions"])].astype(np.float64).mean(1)
 
@@ -200,7 +205,7 @@ def sag(nu: float = 0.3) -> Problem:
     )
 
 
-def bounce_scene(precision, speed: float, **element) -> Scene:
+def bounce_scene(precision: str, speed: float, **element) -> Scene:
     """A mass of 1 kg that meets a floor at `speed` [m/s] from 5 mm above the barrier: stiffness 1e4 N/m, width 0.01 m.
 
     It is the apex of a tetrahedron too soft to be felt (1e-6 Pa), hanging from three fixed vertices.
@@ -219,12 +224,12 @@ def bounce_scene(precision, speed: float, **element) -> Scene:
     )
 
 
-def barrier_energy(d, stiffness: float = 1e4, width: float = 0.01):
+def barrier_energy(d: float, stiffness: float = 1e4, width: float = 0.01) -> float:
     """Energy [J] of the barrier at the gap d [m] below its width."""
-    return -stiffness * (d - width) ** 2 * np.log(d / width)
+    return float(stiffness * width**2 * beta(d / width))
 
 
-def time_in_contact(speed: float, energy=barrier_energy, width: float = 0.01) -> float:
+def time_in_contact(speed: float, energy: Callable[[float], float] = barrier_energy, width: float = 0.01) -> float:
     """Time [s] that a mass of 1 kg spends in the barrier: 2 int dd / sqrt(v^2 - 2 b(d)) from the deepest point."""
     from scipy.integrate import quad
     from scipy.optimize import brentq
@@ -238,7 +243,7 @@ def time_in_contact(speed: float, energy=barrier_energy, width: float = 0.01) ->
 BOUNCE_TIME = 0.03  # [s]
 
 
-def bounce_height(speed: float, energy=barrier_energy) -> float:
+def bounce_height(speed: float, energy: Callable[[float], float] = barrier_energy) -> float:
     """Height [m] after BOUNCE_TIME: down from 15 mm, in the barrier, up again."""
     return 0.01 + speed * (BOUNCE_TIME - 0.005 / speed - time_in_contact(speed, energy))
 
@@ -274,7 +279,7 @@ def bounce_gradient(speed: float = 2.0) -> Problem:
         lambda _, gradients: gradients["initial_positions"][3, 1:2],
         frames=1,
         exact=np.array([-1.0]),
-        adjoint=Watch.end(height, 1),
+        adjoint=FrameLoss.end(height, 1),
         inputs=("initial_positions",),
         cells=(1,),
         patterns=("one mass",),
@@ -296,7 +301,7 @@ def identify() -> Problem:
         weights[at, 1] = 1 / len(at)
         return weights
 
-    watch = Watch(drop, 0 * times, np.full(11, 2 / 11), -4.3 * times**2)
+    loss = FrameLoss(drop, 0 * times, np.full(11, 2 / 11), -4.3 * times**2)
     return Problem(
         "identify",
         "Gradient by E of a beam's watched motion, per mesh",
@@ -305,7 +310,7 @@ def identify() -> Problem:
         0.25,
         lambda _, gradients: np.atleast_1d(gradients["youngs_modulus"]),
         frames=10,
-        adjoint=watch,
+        adjoint=loss,
         inputs=("youngs_modulus",),
         cells=(2, 4),
         patterns=("five",),

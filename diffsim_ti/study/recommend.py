@@ -2,84 +2,24 @@
 
 import time
 import warnings
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 
 from diffsim_ti.rollout import Rollout
-from diffsim_ti.scene import LOCKING_RATIO
+from diffsim_ti.scene import LOCKING_RATIO, Scene
 from diffsim_ti.solvers import SOLVERS, BDF2Solver, VelocityVerletSolver
+from diffsim_ti.state.stability import stable_dt
 from diffsim_ti.study.problem import Problem, distance
+from diffsim_ti.study.recommendation import Option, Recommendation
 from diffsim_ti.terms import Drag, ExternalForce
 
 SAFETY = 0.7  # of the tolerance: what a trial run must keep, for the error of the whole run is predicted
 SHARE = 0.8  # of the stable step at the start, which may fall on the way
 
 
-@dataclass
-class Option:
-    """A way to run a scene, with what a trial run says of it."""
-
-    solver: type
-    precision: str
-    substep: float  # [s]
-    steps: int  # of the whole duration
-    error: float = np.nan  # over the whole duration, relative to the largest displacement
-    seconds: float = np.nan  # wall time of the whole duration, with its gradient if asked for
-    substeps: int = 0  # per frame of the trial
-
-    @property
-    def label(self) -> str:
-        return f"{self.solver.__name__}, {self.substep:.3g} s, {self.precision}"
-
-
-@dataclass
-class Recommendation:
-    """What to use: `solver`, `dt` [s], `steps`, `precision`, `memory` [MB] for the checkpoints, `element`; what to expect
-    of it: `seconds` of wall time, `megabytes` kept for gradients, `error` relative to the largest displacement.
-
-    `reasons`: three lines; `left_out`: what the scene does without, and why. `rollout(scene)` makes it.
-    """
-
-    option: Option
-    duration: float
-    gradients: bool
-    memory: float | None
-    megabytes: float
-    error: float
-    element: str
-    reasons: list[str]
-    left_out: list[str]
-    tried: list[Option] = field(repr=False, default_factory=list)
-
-    solver = property(lambda self: self.option.solver)
-    precision = property(lambda self: self.option.precision)
-    dt = property(lambda self: self.option.substep)
-    steps = property(lambda self: self.option.steps)
-    seconds = property(lambda self: self.option.seconds)
-
-    def rollout(self, scene, frames: int = 1, **options) -> Rollout:
-        """The recommended run of the scene, `frames` times saved; options are Rollout's."""
-        substeps = -(-self.steps // frames)
-        solver = self.solver(scene.replace(precision=self.precision), dt=self.duration / frames, substeps=substeps)
-        return Rollout(solver, frames, save_every=1, memory=self.memory, **options)
-
-    def __str__(self) -> str:
-        kept = f"{self.megabytes:.3g} MB" if self.gradients else "no states"
-        return "\n".join(
-            [
-                f"{self.solver.__name__}(scene, dt={self.dt:.4g}), {self.steps} steps, precision {self.precision}, "
-                f"element {self.element}" + (f", Rollout(..., memory={self.memory:g})" if self.memory else ""),
-                f"expect: {self.seconds:.3g} s of wall time, {kept} kept, "
-                f"error {self.error:.2g} of the largest displacement",
-                *(f"- {line}" for line in self.reasons),
-                "left out: " + "; ".join(self.left_out),
-            ]
-        )
-
-
 def recommend(
-    scene,
+    scene: Scene,
     duration: float,
     tolerance: float = 1e-2,
     memory: float | None = None,
@@ -113,10 +53,19 @@ def recommend(
 class Trials:
     """Trial runs of a scene: a reference, then each solver at the steps that its order of convergence suggests."""
 
-    def __init__(self, scene, duration, tolerance, memory, gradients, budget, frames):
+    def __init__(
+        self,
+        scene: Scene,
+        duration: float,
+        tolerance: float,
+        memory: float | None,
+        gradients: bool,
+        budget: float,
+        frames: int,
+    ):
         self.scene, self.duration, self.tolerance, self.frames = scene, duration, tolerance, frames
         self.memory, self.gradients, self.budget = memory, gradients, budget
-        self.stable = VelocityVerletSolver(scene, dt=duration, allow_unstable=True).stable_dt(tight=True).dt
+        self.stable = stable_dt(scene).dt
         self.tried: list[Option] = []
         self.notes: list[str] = []
         self.spent = 0.0  # [s] of the trials, compile time apart

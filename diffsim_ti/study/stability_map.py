@@ -1,7 +1,7 @@
 """Where a solver is accurate, stays bounded, loses energy, is refused, or goes wrong without saying so."""
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,9 +10,10 @@ from diffsim_ti.materials import SmithNeoHookean
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.scene import Scene
 from diffsim_ti.simulator import Simulator
-from diffsim_ti.solvers import SOLVERS, VelocityVerletSolver
-from diffsim_ti.state.stability import Stiffness
-from diffsim_ti.terms import Ground
+from diffsim_ti.solvers import SOLVERS
+from diffsim_ti.solvers.solver import Solver
+from diffsim_ti.state.stability import Stiffness, start_workspace
+from diffsim_ti.terms import Ground, Term
 from diffsim_ti.terms.obstacles.obstacle import Obstacle
 from diffsim_ti.terms.obstacles.stiffness import barrier_stiffness
 
@@ -41,8 +42,8 @@ def body(
     flat: float = 1.0,
     E: float = 1e5,
     nu: float = 0.3,
-    terms=(),
-    lift=0.0,
+    terms: Sequence[Term] = (),
+    lift: float = 0.0,
     speed: float = 0.0,
 ) -> Scene:
     """A cube of 0.2 m, its elements flattened to `flat` of their height, the body squeezed to `squeeze` along y, and
@@ -88,13 +89,12 @@ AXES = {
 }
 
 
-def power_limit(scene, rounds: int = 3000, tolerance: float = 1e-7) -> float:
+def power_limit(scene: Scene, rounds: int = 3000, tolerance: float = 1e-7) -> float:
     """The explicit limit 2 / omega_max [s] at the scene's start, by plain power iteration on the assembled stiffness.
 
     Independent of the Lanczos iteration by which solvers look at their steps; converges from above.
     """
-    solver = VelocityVerletSolver(scene, dt=1.0, allow_unstable=True)
-    stiffness = Stiffness(solver.workspace(solver.start_values()))
+    stiffness = Stiffness(start_workspace(scene))
     x = np.random.default_rng(5).standard_normal((scene.mesh.num_vertices, 3)) * (stiffness.root > 0)
     value = 0.0
     for k in range(rounds):
@@ -117,7 +117,7 @@ class Run:
     said: str = ""
 
 
-def judge(scene, kind, dt: float, steps: int = 200, overridden: bool = False) -> Run:
+def judge(scene: Scene, kind: type[Solver], dt: float, steps: int = 200, overridden: bool = False) -> Run:
     """Run `steps` steps and judge them by the energy, relative to the energy that can move: kinetic, elastic, contact.
 
     An explicit step swaps energy to and fro within its stable range, but keeps a neighbouring one (`kept_energy`): that
@@ -154,14 +154,14 @@ def judge(scene, kind, dt: float, steps: int = 200, overridden: bool = False) ->
     return Run("accurate" if change < ACCURATE else "bounded", rise, change)
 
 
-def depth_behind(simulator) -> float:
+def depth_behind(simulator: Simulator) -> float:
     """How far [m] the deepest vertex is behind an obstacle; negative if none is, minus infinity without obstacles."""
     x = simulator.positions[simulator.scene.mesh.surface_vertices].astype(np.float64)
     gaps = [t.gap(x, np.zeros(3)).min() for t in simulator.scene.terms if isinstance(t, Obstacle)]
     return -float(min(gaps, default=np.inf))
 
 
-def measure(simulator) -> tuple[float, float, float]:
+def measure(simulator: Simulator) -> tuple[float, float, float]:
     """(total energy, its parts that move, the energy that the solver keeps) [J] at the present state; takes a step."""
     solver, mass = simulator.solver, simulator.scene.inputs.derive(simulator.scene.inputs.values).mass[:, None]
     u, v = simulator.displacements.astype(float), simulator.velocities.astype(float)
@@ -174,7 +174,9 @@ def measure(simulator) -> tuple[float, float, float]:
         return float(energy), float(sum(part for name, part in energy.parts.items() if name != "gravity")), kept
 
 
-def kept_energy(solver, mass, u, v, du, dv) -> float:
+def kept_energy(
+    solver: Solver, mass: np.ndarray, u: np.ndarray, v: np.ndarray, du: np.ndarray, dv: np.ndarray
+) -> float:
     """What an explicit solver keeps besides the energy H, exactly for linear forces f:
 
     symplectic Euler H + (h / 2) v . f, velocity Verlet H - (h^2 / 8) f . f / m. Forces are those that made the step.
@@ -187,7 +189,7 @@ def kept_energy(solver, mass, u, v, du, dv) -> float:
     return float(-(h**2 / 8 * f * f / mass).sum())
 
 
-def boundary(scene, kind, steps: int = 2000, accuracy: float = 0.005) -> float:
+def boundary(scene: Scene, kind: type[Solver], steps: int = 2000, accuracy: float = 0.005) -> float:
     """Largest dt [s] at which the solver, its refusal overridden, stays bounded: by bisection around the limit.
 
     NaN if that is no place within 0.8 and 1.3 of the limit at the start: the motion changes it (contact, unloading).
@@ -263,9 +265,9 @@ SHARES = {
 
 
 def stability_map(
-    kind,
+    kind: type[Solver],
     axis: Axis,
-    shares=None,
+    shares: Sequence[float] | None = None,
     steps: int | None = None,
     find_bounds: bool = False,
     show: Callable = lambda note: None,

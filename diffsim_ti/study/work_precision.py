@@ -2,14 +2,18 @@
 
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 
+from diffsim_ti.progress import progress
 from diffsim_ti.rollout import Rollout
+from diffsim_ti.scene import Scene
 from diffsim_ti.solvers import SOLVERS, StaticSolver, VelocityVerletSolver
+from diffsim_ti.solvers.solver import Solver
+from diffsim_ti.state.stability import stable_dt
 from diffsim_ti.study.problem import ELEMENTS, Problem, distance
 
 # wall time per tetrahedron and substep, before anything was measured [s]; with gradients three times as much
@@ -88,7 +92,7 @@ class Chart:
         )
 
 
-def pareto_front(points) -> list:
+def pareto_front(points: Iterable) -> list:
     """Those of `points` (seconds, error) that no other beats in both, by time."""
     front, best = [], np.inf
     for p in sorted((p for p in points if np.isfinite(p.error)), key=lambda p: (p.seconds, p.error)):
@@ -98,19 +102,18 @@ def pareto_front(points) -> list:
     return front
 
 
-def choose_substeps(problem: Problem, scene, kind, levels: int) -> list[int]:
+def choose_substeps(problem: Problem, scene: Scene, kind: type[Solver], levels: int) -> list[int]:
     """Substeps per frame to try: an explicit solver starts at its stable step, an implicit one at a frame."""
     if kind is StaticSolver:
         return [1]
     frame = problem.duration / problem.frames
-    probe = VelocityVerletSolver(scene, dt=frame, allow_unstable=True)
-    stable = int(np.ceil(frame / min(SHARE * probe.stable_dt(tight=True).dt, problem.largest_step)))
+    stable = int(np.ceil(frame / min(SHARE * stable_dt(scene).dt, problem.largest_step)))
     if kind.explicit:
         return [stable * 2**k for k in range(levels)]
     return [2**k for k in range(levels + 1) if 2**k <= max(4 * stable, 16)]
 
 
-def make_rollout(problem: Problem, scene, kind, substeps: int) -> Rollout:
+def make_rollout(problem: Problem, scene: Scene, kind: type[Solver], substeps: int) -> Rollout:
     """The problem's frames, by one solver and step."""
     if kind is StaticSolver:
         return Rollout(StaticSolver(scene), 1, gradients=problem.inputs)
@@ -159,7 +162,7 @@ def reference(problem: Problem, cells: int | None = None, pattern: str = "five",
 
 
 @contextmanager
-def refused(point: Point):
+def refused(point: Point) -> Iterator[None]:
     """A run that raises counts as refused: the point keeps what was said and no error. Warnings of coarse steps are
     left out, for their error is what is measured."""
     try:
@@ -173,18 +176,26 @@ def refused(point: Point):
 class Runs:
     """The runs of a chart, mesh by mesh; predicts what they cost and leaves out those beyond `limit` seconds each."""
 
-    def __init__(self, problem: Problem, solvers, precisions, levels: int, repeats: int, limit: float):
+    def __init__(
+        self,
+        problem: Problem,
+        solvers: Sequence[type[Solver]],
+        precisions: Sequence[str],
+        levels: int,
+        repeats: int,
+        limit: float,
+    ):
         self.problem, self.solvers, self.precisions = problem, solvers, precisions
         self.levels, self.repeats, self.limit = levels, repeats, limit
         self.rate: dict = {}  # (solver, precision) -> [s] per tetrahedron and substep
         self.left_out: list[str] = []
         self._done: list[Point] = []
 
-    def meshes(self):
+    def meshes(self) -> list[tuple[int, str, str]]:
         """(cells, pattern, element) of each mesh, the small ones first."""
         return [(n, p, e) for n in self.problem.cells for p in self.problem.patterns for e in self.problem.elements]
 
-    def of_mesh(self, cells, pattern, element) -> list[tuple[Point, type, object]]:
+    def of_mesh(self, cells: int, pattern: str, element: str) -> list[tuple[Point, type, object]]:
         """(point, solver class, scene) of everything to run on a mesh."""
         out = []
         for precision in self.precisions:
@@ -225,7 +236,7 @@ class Runs:
                 total += 0 if cost > self.limit else (1 + self.repeats) * cost
         return total
 
-    def measure(self, mesh, right: np.ndarray, show: Callable = lambda note: None) -> list[Point]:
+    def measure(self, mesh: tuple[int, str, str], right: np.ndarray, show: Callable = lambda note: None) -> list[Point]:
         """All runs of a mesh: once to compile and to see the error, then round by round; the best time counts."""
         points, timed = [], []
         for point, kind, scene in self.of_mesh(*mesh):
@@ -274,8 +285,8 @@ class Runs:
 
 def chart(
     problem: Problem,
-    solvers=None,
-    precisions=("f32", "f64"),
+    solvers: Sequence[type[Solver]] | None = None,
+    precisions: Sequence[str] = ("f32", "f64"),
     levels: int | None = None,
     repeats: int = 3,
     limit: float = 1.0,
@@ -289,8 +300,6 @@ def chart(
     limit [s]: runs expected to take longer are left out, and named. quick: small meshes, float32.
     say: called with what the chart will do and how long that takes. Raises ValueError for a problem no solver can do.
     """
-    from diffsim_ti.cli.options import progress
-
     levels = levels or problem.levels
     if quick:
         problem, precisions, levels, repeats, limit = problem.quick(), ("f32",), (levels + 2) // 2, 2, min(limit, 0.4)

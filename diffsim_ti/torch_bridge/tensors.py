@@ -115,6 +115,18 @@ class TensorSeed:
         return derived, tuple(float(x.double().norm()) for x in out)
 
 
+def checked_device(device) -> torch.device:
+    """torch's device of that name; "cuda" is the card that Taichi computes on, which `runtime.use_device` sees to."""
+    runtime.use_device(device)
+    device = torch.device(device or "cpu")
+    if device.type == "cuda" and not torch.cuda.is_available():
+        raise RuntimeError(
+            f"this build of torch ({torch.__version__}) sees no card, and device={str(device)!r} puts tensors there: "
+            "install torch for CUDA, or pass device='cpu' after diffsim_ti.init('cuda')"
+        )
+    return device
+
+
 class TensorRollout:
     """Runs of one Rollout from tensors, and their gradients."""
 
@@ -143,6 +155,7 @@ class TensorRollout:
 
     def _ready(self, tensor: torch.Tensor) -> torch.Tensor:
         device = tensor.device if runtime.arch_name() == "cuda" else "cpu"
+        runtime.use_device(device)  # a tensor on another card than Taichi's
         return tensor.detach().to(device, self.dtype).contiguous()
 
     def checked(self, name: str, tensor: torch.Tensor) -> torch.Tensor:

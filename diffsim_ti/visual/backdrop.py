@@ -1,7 +1,12 @@
 """What lies behind a body: the sky, and a floor with a grid that fades away and the shadows that fall on it."""
 
-import numpy as np
+from collections.abc import Sequence
 
+import numpy as np
+from numpy.typing import ArrayLike
+
+from diffsim_ti.terms.obstacles.shapes import Triangles
+from diffsim_ti.visual.camera import Camera
 from diffsim_ti.visual.rasteriser import covered
 from diffsim_ti.visual.surface import LIGHT
 
@@ -15,11 +20,11 @@ class Backdrop:
     ground: height of the floor [m] or None. box: what the pictures show, shape (2, 3) [m]; it sets the grid's cells.
     """
 
-    def __init__(self, size, ground: float | None, box):
+    def __init__(self, size: tuple[int, int], ground: float | None, box: ArrayLike):
         self.size, self.ground, self.box = tuple(size), ground, np.asarray(box, np.float64)
         self._camera = None
 
-    def image(self, camera, shapes) -> np.ndarray:
+    def image(self, camera: Camera, shapes: Sequence[Triangles]) -> np.ndarray:
         """RGB in [0, 1], float32 (height, width, 3). shapes: (points, triangles) of what throws a shadow."""
         if camera is not self._camera:
             self._camera, self._image = camera, self._without_shadow(camera)

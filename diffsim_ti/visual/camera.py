@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 FIELD_OF_VIEW = 28.0  # [degrees]
 NEAREST = 1e-9  # [m], the least depth a point is projected with
@@ -18,7 +19,9 @@ class Camera:
     field_of_view: float = FIELD_OF_VIEW
 
     @classmethod
-    def framing(cls, points, size=(4, 3), azimuth: float = 32.0, elevation: float = 14.0) -> "Camera":
+    def framing(
+        cls, points: ArrayLike, size: tuple[float, float] = (4, 3), azimuth: float = 32.0, elevation: float = 14.0
+    ) -> "Camera":
         """A camera that sees all points [m], shape (k, 3), in a picture of this size (only its ratio counts).
 
         azimuth about y (0: from +z, 90: from +x) and elevation above the floor, below 90, in degrees.
@@ -46,18 +49,18 @@ class Camera:
         right /= np.linalg.norm(right)
         return np.stack([right, np.cross(back, right), back])
 
-    def focal(self, size) -> float:
+    def focal(self, size: tuple[int, int]) -> float:
         """Focal length in pixels of a picture of `size` (width, height)."""
         return size[1] / 2 / np.tan(np.radians(self.field_of_view) / 2)
 
-    def project(self, points: np.ndarray, size) -> np.ndarray:
+    def project(self, points: np.ndarray, size: tuple[int, int]) -> np.ndarray:
         """Pixel column, row and depth [m] of points, shape (..., 3)."""
         x, y, z = np.moveaxis((points - self.position) @ self.axes.T, -1, 0)
         depth = np.maximum(-z, NEAREST)
         scale = self.focal(size) / depth
         return np.stack([size[0] / 2 + scale * x, size[1] / 2 - scale * y, depth], -1)
 
-    def rays(self, column, row, size) -> np.ndarray:
+    def rays(self, column: ArrayLike, row: ArrayLike, size: tuple[int, int]) -> np.ndarray:
         """Unit direction of the ray through picture points (in pixels), shape (n, 3)."""
         x, y = np.asarray(column) - size[0] / 2, size[1] / 2 - np.asarray(row)
         rays = np.stack([x, y, np.full(x.shape, -self.focal(size))], -1) @ self.axes
@@ -75,8 +78,3 @@ class Camera:
     def zoomed(self, factor: float) -> "Camera":
         """So many times nearer to what it looks at."""
         return replace(self, position=self.look_at + (self.position - self.look_at) / factor)
-
-    def shifted(self, right: float, up: float) -> "Camera":
-        """Moved in its picture plane [m]."""
-        move = right * self.axes[0] + up * self.axes[1]
-        return replace(self, position=self.position + move, look_at=self.look_at + move)

@@ -3,7 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.simulator import Simulator
 from diffsim_ti.visual.fields import Field, field_named
 
 SIGNED = "PuOr"
@@ -28,7 +31,12 @@ class Colouring:
 
     @classmethod
     def of(
-        cls, values, label: str = "", limits=None, map: str | None = None, field: Field | None = None
+        cls,
+        values: ArrayLike,
+        label: str = "",
+        limits: tuple[float, float] | None = None,
+        map: str | None = None,
+        field: Field | None = None,
     ) -> "Colouring":
         """Map and limits that suit these numbers: 0 (or the least) to the 99.5th percentile; two-sided as the field says.
 
@@ -47,11 +55,6 @@ class Colouring:
             limits = field.limits(float(least), float(np.percentile(values, 99.5)))
         return cls(label or field.label, tuple(float(x) for x in limits), map or field.colours)
 
-    @classmethod
-    def of_field(cls, name: str, values, limits=None, map: str | None = None) -> "Colouring":
-        """A colouring by the name of a field in series_fields.FIELDS, with its label and unit."""
-        return cls.of(values, "", limits, map, field_named(name))
-
     def __call__(self, values) -> np.ndarray:
         """RGB in [0, 1], shape of `values` and 3."""
         from matplotlib import colormaps
@@ -60,7 +63,7 @@ class Colouring:
         return colormaps[self.map](np.clip((np.asarray(values) - low) / (high - low), 0, 1))[..., :3]
 
 
-def to_vertices(mesh, values) -> np.ndarray:
+def to_vertices(mesh: TetrahedralMesh, values: ArrayLike) -> np.ndarray:
     """One value per vertex: given so, or per tetrahedron and averaged, weighted by volume."""
     values = np.asarray(values, np.float64)
     if values.shape == (mesh.num_vertices,):
@@ -75,7 +78,7 @@ def to_vertices(mesh, values) -> np.ndarray:
     return np.bincount(corners, weight * np.repeat(values, 4), mesh.num_vertices) / np.where(total > 0, total, 1)
 
 
-def field_of(simulator, name: str) -> np.ndarray:
+def field_of(simulator: Simulator, name: str) -> np.ndarray:
     """A field of a simulator's state, per vertex or per tetrahedron; "gradient" is not the state's and must be given."""
     field_named(name)
     if name == "displacement":

@@ -1,13 +1,16 @@
 """Taking hold of a body with the mouse: which vertex is under the cursor, and the spring that pulls it."""
 
 import numpy as np
+from numpy.typing import ArrayLike
+
+from diffsim_ti.mesh import TetrahedralMesh
 
 RATE, FASTEST = 15.0, 150.0  # of the whole body on the spring, and at most of what is held [1/s]
 REACH = 0.2  # radius of what is held, as a share of the body's size
 NEAR = 1e-12  # a ray along a triangle does not meet it
 
 
-def picked_vertex(origin, ray, points, triangles) -> int | None:
+def picked_vertex(origin: ArrayLike, ray: ArrayLike, points: np.ndarray, triangles: np.ndarray) -> int | None:
     """The corner next to where a ray first enters a surface, or None if it misses.
 
     origin [m] and ray (unit), shape (3,); points [m], shape (k, 3); triangles, shape (n, 3), seen from outside only.
@@ -38,14 +41,14 @@ class Grip:
     body can be lifted, and no step that animates it is too long.
     """
 
-    def __init__(self, mesh, mass, vertex: int):
+    def __init__(self, mesh: TetrahedralMesh, mass: np.ndarray, vertex: int):
         size = float(np.ptp(mesh.bounding_box, 0).max())
         away = np.linalg.norm(mesh.vertices - mesh.vertices[vertex], axis=1)
         self.vertex, self.longest, self.target = vertex, size, None
         self.held = mass * np.exp(-((away / (REACH * size)) ** 2))
         self.rate = min(RATE * float(np.sqrt(mass.sum() / self.held.sum())), FASTEST)
 
-    def forces(self, positions, velocities) -> np.ndarray:
+    def forces(self, positions: np.ndarray, velocities: np.ndarray) -> np.ndarray:
         """Forces [N], shape (num_vertices, 3); zero without a target, and those of at most the body's size when further."""
         if self.target is None:
             return np.zeros(positions.shape)

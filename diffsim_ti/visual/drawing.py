@@ -1,17 +1,28 @@
 """Drawing: frame after frame of one body, with the same camera, colours, floor, obstacles and legend, by either back end."""
 
-import numpy as np
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
+import numpy as np
+from numpy.typing import ArrayLike
+
+from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.terms.obstacles.shapes import Triangles
 from diffsim_ti.visual.backdrop import Backdrop
 from diffsim_ti.visual.camera import Camera
 from diffsim_ti.visual.colouring import Colouring, to_vertices
 from diffsim_ti.visual.legend import legend, write_text
 from diffsim_ti.visual.surface import OBSTACLE, PLAIN, Soup, Surface, marks, with_edges
 
+if TYPE_CHECKING:
+    from diffsim_ti.visual.rasteriser import SoftwarePainter
+    from diffsim_ti.visual.vulkan_painter import VulkanPainter
+
+
 BACKENDS = ("auto", "vulkan", "software")
 
 
-def painter(backend: str, size):
+def painter(backend: str, size: tuple[int, int]) -> "SoftwarePainter | VulkanPainter":
     """What paints triangles: "vulkan", "software" (NumPy, needs no driver), or "auto": Vulkan where there is a driver."""
     from diffsim_ti.visual.rasteriser import SoftwarePainter
     from diffsim_ti.visual.vulkan_painter import VulkanPainter, has_vulkan
@@ -38,15 +49,15 @@ class Drawing:
 
     def __init__(
         self,
-        mesh,
-        size=(1200, 900),
+        mesh: TetrahedralMesh,
+        size: tuple[int, int] = (1200, 900),
         camera: Camera | None = None,
         ground: float | None = None,
-        obstacles=(),
-        fixed=None,
+        obstacles: Sequence[Triangles] = (),
+        fixed: ArrayLike | None = None,
         wireframe: bool = False,
         colouring: Colouring | None = None,
-        box=None,
+        box: ArrayLike | None = None,
         azimuth: float = 32.0,
         elevation: float = 14.0,
         backend: str = "auto",
@@ -68,7 +79,13 @@ class Drawing:
         why = " (no Vulkan driver here)" if self._asked == "auto" and self._painter.name == "NumPy" else ""
         return f"drawn by {self._painter.name}{why}, {self.size[0]} x {self.size[1]} pixels"
 
-    def soup(self, positions, values=None, size=None, obstacles=None) -> tuple[Soup, list]:
+    def soup(
+        self,
+        positions: ArrayLike,
+        values: ArrayLike | None = None,
+        size: tuple[int, int] | None = None,
+        obstacles: Sequence[np.ndarray] | None = None,
+    ) -> tuple[Soup, list]:
         """The triangles to paint, and (points, triangles) of what throws shadows."""
         points = np.asarray(positions, np.float64)
         if points.shape != (self.mesh.num_vertices, 3) or not np.all(np.isfinite(points)):
@@ -91,11 +108,17 @@ class Drawing:
         shapes = [(points, self.mesh.surface_triangles), *((p, s.triangles) for s, p in zip(self._around, placed))]
         return Soup.joined(soups), shapes
 
-    def backdrop(self, shapes) -> np.ndarray:
+    def backdrop(self, shapes: Sequence[Triangles]) -> np.ndarray:
         """What lies behind, with the shadows of `shapes` from `soup`: RGB in [0, 1], float32 (height, width, 3)."""
         return self._backdrop.image(self.camera, shapes)
 
-    def image(self, positions, values=None, title: str = "", obstacles=None) -> np.ndarray:
+    def image(
+        self,
+        positions: ArrayLike,
+        values: ArrayLike | None = None,
+        title: str = "",
+        obstacles: Sequence[np.ndarray] | None = None,
+    ) -> np.ndarray:
         """A picture, RGB uint8 (height, width, 3), of the body at `positions` [m], shape (num_vertices, 3).
 
         values: one per vertex or per tetrahedron (averaged to vertices), shown in colours with the legend of the

@@ -6,8 +6,6 @@ for what goes both ways.
 
 from dataclasses import dataclass
 
-import numpy as np
-
 
 @dataclass(frozen=True)
 class Field:
@@ -42,15 +40,3 @@ def field_named(name: str) -> Field:
     if name not in FIELDS:
         raise ValueError(f"colour: must be one of {', '.join(FIELDS)}, got {name!r}; choose one of these")
     return FIELDS[name]
-
-
-def values_of(frame, name: str) -> np.ndarray:
-    """The field in a frame read by meshio: per vertex (displacement, speed) or per tetrahedron (the others)."""
-    field_named(name)
-    source = {"displacement": "displacement", "speed": "velocity"}.get(name)
-    try:
-        if source is None:
-            return np.asarray(frame.cell_data[name][0], np.float64)
-        return np.linalg.norm(np.asarray(frame.point_data[source], np.float64), axis=1)
-    except KeyError as error:
-        raise ValueError(f"colour: the frame must hold {error}, it does not; choose another colour") from error

@@ -1,110 +1,131 @@
-"""Where a viewer's frames come from: a saved series, or a run that goes on while one looks.
-
-A source has `mesh`, `look` (what `Drawing` takes: floor, obstacles, fixed vertices, box), `len`, `frame(k)`,
-`colouring(field)` and `advance()`, which makes another frame and returns whether it could.
-"""
+"""Where a viewer's frames come from: a saved series, or a run that goes on while one looks."""
 
 import time
+from abc import ABC, abstractmethod
 from collections import deque
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from diffsim_ti.film import extent, fixed_of, read_frame, rest_of
-from diffsim_ti.obstacles import floor_of, obstacle_surfaces
+from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.visual.colouring import Colouring, field_of, to_vertices
 from diffsim_ti.visual.dragging import Grip
-from diffsim_ti.visual.fields import field_named, values_of
-from diffsim_ti.visual.series import Surroundings, frames_of
+from diffsim_ti.visual.extent import Extent
+from diffsim_ti.visual.fields import field_named
+from diffsim_ti.visual.frame import Frame, Setting
+from diffsim_ti.visual.series import SavedSeries
 
-SAVED = ("displacement", "speed", "von_mises", "energy_density", "J")
+if TYPE_CHECKING:
+    from diffsim_ti.adaptive_run import ForwardRun
 
 
 @dataclass
-class Frame:
-    """A moment: time [s], positions [m], fields by name, points of the obstacles [m], and lines of text for the panel."""
+class ShownFrame(Frame):
+    """A frame with lines of text for the viewer's panel."""
 
-    time: float
-    positions: np.ndarray
-    fields: dict
-    obstacles: list = field(default_factory=list)
-    notes: list = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
 
 
-class SavedFrames:
-    """Frames of a .pvd series, read when they are asked for."""
+class FrameSource(ABC):
+    """Frames to be shown; `setting`: what they share; `can_drag`: whether the body can be pulled."""
 
+    setting: Setting
     can_drag = False
 
-    def __init__(self, series):
-        self._frames, self._last, self._colourings = frames_of(series), (-1, None), {}
-        if not self._frames:
-            raise ValueError(f"{series}: must list at least one frame, lists none; run the simulation first")
-        self.mesh, self._around = rest_of(self._frames[0][1]), Surroundings(series)
-        self.look = dict(
-            ground=self._around.ground,
-            obstacles=self._around.shapes(0),
-            box=self.box(),
-            fixed=fixed_of(read_frame(self._frames[0][1])),
-        )
+    @property
+    def mesh(self) -> TetrahedralMesh:
+        return self.setting.mesh
 
+    @property
+    def look(self) -> dict:
+        """What `Drawing` takes: floor, obstacles, fixed vertices, box."""
+        shared = self.setting
+        return dict(ground=shared.ground, obstacles=shared.obstacles, fixed=shared.fixed, box=self.box())
+
+    @abstractmethod
+    def box(self) -> np.ndarray:
+        """What is to be seen, shape (2, 3) [m]."""
+
+    @abstractmethod
     def __len__(self) -> int:
-        return len(self._frames)
+        """Frames there are."""
+
+    @abstractmethod
+    def frame(self, k: int) -> ShownFrame:
+        """Frame k."""
+
+    @abstractmethod
+    def colouring(self, name: str) -> Colouring:
+        """Colours of a field whose limits span all frames."""
 
     def advance(self) -> bool:
+        """Make another frame; whether that can be done."""
         return False
 
+
+class SavedFrames(FrameSource):
+    """Frames of a .pvd series, read when they are asked for; its box is what all of them lie in."""
+
+    def __init__(self, series: str | Path):
+        self._series, self._last, self._extents = SavedSeries(series), (-1, None), {}
+        self.setting = self._series.setting
+
+    def __len__(self) -> int:
+        return len(self._series)
+
     def box(self) -> np.ndarray:
-        """What all frames lie in, shape (2, 3) [m]."""
-        return extent(self.mesh, self._frames, "displacement", field_named("displacement"))[0]
+        return self._extent("displacement").box
 
     def colouring(self, name: str) -> Colouring:
-        """Colours whose limits span all frames."""
-        if name not in self._colourings:
-            kind = field_named(name)
-            limits = extent(self.mesh, self._frames, name, kind)[1]
-            self._colourings[name] = Colouring(kind.label, limits, kind.colours)
-        return self._colourings[name]
+        return self._extent(name).colouring
 
-    def frame(self, k: int) -> Frame:
+    def _extent(self, name: str) -> Extent:
+        if not self._extents:
+            for frame in map(self._series.frame, range(len(self))):
+                for known, values in frame.fields.items():
+                    self._extents.setdefault(known, Extent(self.mesh, known)).add(frame.positions, values)
+        return self._extents[name]
+
+    def frame(self, k: int) -> ShownFrame:
         if self._last[0] != k:
-            when, path = self._frames[k]
-            saved = read_frame(path)
-            fields = {name: values_of(saved, name) for name in SAVED}
-            obstacles = [points for points, _ in self._around.shapes(k)]
-            notes = [f"smallest J {fields['J'].min():.3g}"]
-            self._last = k, Frame(when, saved.points, fields, obstacles, notes)
+            frame = self._series.frame(k)
+            self._last = k, ShownFrame(**vars(frame), notes=[f"smallest J {frame.fields['J'].min():.3g}"])
         return self._last[1]
 
 
-class LiveFrames:
-    """Frames of a `ForwardRun`, made when asked to advance; the last `keep` can be looked at again.
+class LiveFrames(FrameSource):
+    """Frames of a `ForwardRun`, made when asked to advance; the last `keep` can be looked at again. Its box is the start's.
 
     The scene must have an `ExternalForce` on all vertices for the body to be dragged (`can_drag`); its forces are added to.
     """
 
-    def __init__(self, run, keep: int = 300):
-        self.run, self.mesh, sim = run, run.scene.mesh, run.simulator
+    def __init__(self, run: "ForwardRun", keep: int = 300):
+        self.run, self.setting, sim = run, Setting.of(run.scene), run.simulator
         self._frames, self._limits, self._grip = deque(maxlen=keep), {}, None
         given = run.scene.inputs.values.get("external_forces")
         self.can_drag = given is not None and given.shape == self.mesh.vertices.shape
         self._given, self._mass = given, run.scene.inputs.derive(run.scene.inputs.values).mass
         shown = sim.positions[self.mesh.surface_vertices]
-        box, ground = np.stack([shown.min(0), shown.max(0)]), floor_of(run.scene)
-        if ground is not None:
-            box[0, 1] = min(box[0, 1], ground)
-        self.look = dict(ground=ground, obstacles=obstacle_surfaces(run.scene), fixed=run.scene.fixed, box=box)
+        self._box = np.stack([shown.min(0), shown.max(0)])
+        if self.setting.ground is not None:
+            self._box[0, 1] = min(self._box[0, 1], self.setting.ground)
         self._driven, self.run.before_part = run.driven, self._pull
         self._note(0.0)
 
     def __len__(self) -> int:
         return len(self._frames)
 
-    def frame(self, k: int) -> Frame:
+    def box(self) -> np.ndarray:
+        return self._box
+
+    def frame(self, k: int) -> ShownFrame:
         return self._frames[k]
 
     def colouring(self, name: str) -> Colouring:
-        """Colours whose limits span all frames so far, with some room."""
+        """Their limits span all frames so far, with some room."""
         kind = field_named(name)
         return Colouring(kind.label, kind.limits(*self._limits[name]), kind.colours)
 
@@ -115,7 +136,7 @@ class LiveFrames:
         self._note(self.run.seen.substeps[-1] / (time.perf_counter() - begin))
         return True
 
-    def grab(self, vertex: int, target) -> None:
+    def grab(self, vertex: int, target: ArrayLike) -> None:
         """Pull a vertex towards a point [m] by a spring, from the next part of a frame on."""
         if not self.can_drag:
             raise ValueError(
@@ -140,10 +161,9 @@ class LiveFrames:
 
     def _note(self, rate: float) -> None:
         sim, seen = self.run.simulator, self.run.seen
-        energy, measured = sim.compute_energy(), sim.tetrahedron_fields()
-        fields = {name: field_of(sim, name) for name in ("displacement", "speed", "stiffness")}
-        fields |= {name: getattr(measured, name) for name in ("von_mises", "energy_density", "J")}
-        for name, values in fields.items():
+        frame, energy = ShownFrame.of(sim), sim.compute_energy()
+        frame.fields["stiffness"] = field_of(sim, "stiffness")
+        for name, values in frame.fields.items():
             shown = to_vertices(self.mesh, values)[self.mesh.surface_vertices]
             low, high = np.percentile(shown, [0.5, 99.5])
             least, most = self._limits.get(name, (low, high))
@@ -152,9 +172,9 @@ class LiveFrames:
                 least, most = (low - room if low < least else least), (high + room if high > most else most)
             self._limits[name] = least, most
         notes = [f"energy {energy:.4g} J", *(f"  {name} {part:.4g} J" for name, part in energy.parts.items())]
-        notes.append(f"smallest J {measured.J.min():.3g}")
+        notes.append(f"smallest J {frame.fields['J'].min():.3g}")
         if np.isfinite(seen.gap):
             notes.append(f"smallest gap so far {1000 * seen.gap:.3g} mm")
         notes.append(f"{rate:.0f} steps a second")
-        obstacles = [points for points, _ in obstacle_surfaces(self.run.scene, sim.time)]
-        self._frames.append(Frame(sim.time, sim.positions.astype(np.float64), fields, obstacles, notes))
+        frame.notes = notes
+        self._frames.append(frame)

@@ -4,10 +4,12 @@ from functools import lru_cache
 
 import numpy as np
 
+from diffsim_ti.visual.colouring import Colouring
+
 INK = "#333333"
 
 
-def legend(colouring, size) -> tuple:
+def legend(colouring: Colouring, size: tuple[int, int]) -> tuple:
     """((rows, columns), premultiplied RGB in 0 .. 255, cover in [0, 1]): the colour bar with label and unit, made once."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.cm import ScalarMappable

@@ -1,8 +1,12 @@
 """The lit triangles of a picture: surfaces with smooth or sharp edges, wireframe and marks, in picture coordinates."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
+
+from diffsim_ti.visual.camera import Camera
 
 LIGHT = np.array([-0.45, 1.0, 0.55]) / np.linalg.norm([-0.45, 1.0, 0.55])
 PLAIN, OBSTACLE, EDGE, MARK = (
@@ -23,14 +27,14 @@ class Soup:
     distance: np.ndarray
 
     @staticmethod
-    def joined(soups) -> "Soup":
+    def joined(soups: Sequence["Soup"]) -> "Soup":
         return Soup(*(np.concatenate([getattr(s, part) for s in soups]) for part in ("corners", "colours", "distance")))
 
 
 class Surface:
     """A closed triangle surface whose points move. points: the shape that tells edges from curves, (k, 3) [m]."""
 
-    def __init__(self, points, triangles):
+    def __init__(self, points: ArrayLike, triangles: ArrayLike):
         from scipy.sparse import coo_matrix
 
         self.points, self.triangles = np.asarray(points, np.float64), np.ascontiguousarray(triangles)
@@ -50,7 +54,7 @@ class Surface:
         """Unit normal of each triangle's corners, shape (n, 3, 3): mean of those around, weighted by area, up to creases."""
         return _normalized(self._around @ self._face_normals(points)).reshape(-1, 3, 3)
 
-    def lit(self, points, colour, camera, size) -> Soup:
+    def lit(self, points: ArrayLike, colour: ArrayLike, camera: Camera, size: tuple[int, int]) -> Soup:
         """The triangles that face the camera, shaded. colour: RGB of all or of each point, shape (3,) or (k, 3)."""
         screen = camera.project(points, size)[self.triangles]
         (ax, ay), (bx, by) = ((screen[:, k, :2] - screen[:, 0, :2]).T for k in (1, 2))
@@ -82,7 +86,7 @@ def with_edges(soup: Soup, width: float) -> Soup:
     return Soup(corners.reshape(-1, 3, 3), colours.reshape(-1, 3, 3), np.repeat(soup.distance, 2))
 
 
-def marks(points, camera, size, radius: float, nearer: float) -> Soup:
+def marks(points: ArrayLike, camera: Camera, size: tuple[int, int], radius: float, nearer: float) -> Soup:
     """A disc of `radius` pixels at each point, drawn `nearer` [m] to the eye than it lies."""
     angle = np.linspace(0, 2 * np.pi, 9)
     rim = radius * np.stack([np.cos(angle), np.sin(angle)], 1)

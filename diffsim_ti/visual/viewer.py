@@ -1,11 +1,13 @@
 """Viewer: a window on a body's frames, saved or being computed: play, step, scrub, colour, turn, pull.
 
-Space plays and pauses, the arrows step, R goes to the first frame, W shows edges, C changes the colours; the right button
-turns, the left one pulls a body that is being simulated, + and - zoom, Escape closes. Frames are drawn as pictures are
-(`Drawing`), so the window shows what a film would.
+Space plays and pauses, the arrows step, R goes to the first frame, W shows edges, C changes the colours, S saves; the right
+button turns, the left one pulls a body that is being simulated, + and - zoom, Escape closes. Frames are drawn as pictures
+are (`Drawing`), so the window shows what a film would.
 """
 
 import time
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,6 +17,12 @@ from diffsim_ti.visual.drawing import Drawing
 from diffsim_ti.visual.fields import field_named
 from diffsim_ti.visual.surface import Soup, marks
 
+if TYPE_CHECKING:
+    from taichi.ui import Window
+
+    from diffsim_ti.visual.frame_sources import FrameSource
+    from diffsim_ti.writers import Writer
+
 STRIDE = 2  # the backdrop is drawn this much smaller and stretched
 NO_DISPLAY = "there is no display with a Vulkan driver; use `diffsim-ti render` to draw a film instead"
 PANEL = (0.01, 0.01, 0.3)  # left, top and width of the panel, as shares of the window
@@ -23,16 +31,18 @@ PANEL = (0.01, 0.01, 0.3)  # left, top and width of the panel, as shares of the 
 class Viewer:
     """Shows a source's frames (frame_sources.py) in a Taichi window; RuntimeError where there is none to be had.
 
-    colour: the field to begin with; playing: whether to play at once; look: what `Drawing` takes, instead of the source's.
+    colour: the field to begin with; playing: whether to play at once; output: what `save` writes the frames with
+    (writers/); look: what `Drawing` takes, instead of the source's.
     """
 
     def __init__(
         self,
-        source,
+        source: "FrameSource",
         colour: str = "von_mises",
         title: str = "diffsim_ti",
-        size=(1024, 768),
+        size: tuple[int, int] = (1024, 768),
         playing: bool = False,
+        output: "Writer | None" = None,
         **look,
     ):
         field_named(colour)
@@ -41,17 +51,14 @@ class Viewer:
             raise RuntimeError(NO_DISPLAY)
         from diffsim_ti.visual.vulkan_painter import Canvas
 
-        self.source, self.colour, self.size = source, colour, tuple(size)
+        self.source, self.colour, self.size, self.output, self._saved = source, colour, tuple(size), output, ""
         look = source.look | look
         self.drawing, self._canvas = Drawing(source.mesh, size, backend="software", **look), Canvas(self.window)
         self._small = Drawing(source.mesh, tuple(n // STRIDE for n in size), backend="software", **look)
         self.at, self.playing, self.speed = 0, playing, 1.0
         self._cursor, self._clock, self._rate, self._panel_height = np.full(2, np.nan), time.perf_counter(), 0.0, 0.0
-        self.held, self._depth, self._pressed = (
-            None,
-            0.0,
-            False,
-        )  # the vertex that the mouse holds, how far from the eye [m]
+        # the vertex that the mouse holds, how far from the eye [m]
+        self.held, self._depth, self._pressed = None, 0.0, False
 
     def run(self) -> None:
         """Until the window is closed."""
@@ -102,6 +109,8 @@ class Viewer:
             elif event.key == "c":
                 names = list(self.source.frame(self.at).fields)
                 self.colour = names[(names.index(self.colour) + 1) % len(names)] if self.colour in names else names[0]
+            elif event.key == "s" and self.output is not None:
+                self.save()
             elif event.key in ("+", "=", "-"):
                 self.drawing.camera = self.drawing.camera.zoomed(1 / 1.1 if event.key == "-" else 1.1)
 
@@ -165,11 +174,28 @@ class Viewer:
             else:
                 self.at += 1
 
+    # ---- saving -----------------------------------------------------------------------------------------------------
+
+    def save(self) -> None:
+        """Write the source's frames, with the present camera and colours if the format has such."""
+        out, drawing, last = self.output, self.drawing, len(self.source) - 1
+        look = dict(colour=self.colour, camera=drawing.camera, wireframe=drawing.wireframe)
+        if last:  # a film keeps the run's time
+            look["fps"] = last / (self.source.frame(last).time - self.source.frame(0).time)
+        out.view = replace(out.view, **look)
+        out.open(self.source.setting)
+        with out:
+            for k in range(len(self.source)):
+                out.write(self.source.frame(k))
+        self._saved = f"saved {out.describe()}"
+
     # ---- panel ------------------------------------------------------------------------------------------------------
 
     def _panel(self, frame) -> None:
         left, top, width = PANEL
-        self._panel_height = 0.02 + 0.032 * (7 + len(frame.fields)) + 0.024 * len(frame.notes)
+        saving = self.output is not None
+        notes = [*frame.notes, *filter(None, [self._saved])]
+        self._panel_height = 0.02 + 0.032 * (7 + saving + len(frame.fields)) + 0.024 * len(notes)
         with self.window.get_gui().sub_window("diffsim_ti", left, top, width, self._panel_height) as gui:
             gui.text(f"t = {frame.time:.4f} s, frame {self.at} of {len(self.source) - 1}, {self._rate:.0f} a second")
             if gui.button("pause" if self.playing else "play"):
@@ -185,8 +211,10 @@ class Viewer:
             if self.colour in frame.fields:
                 low, high = self.source.colouring(self.colour).limits
                 gui.text(f"colours from {low:.3g} to {high:.3g}")
-            for line in frame.notes:
+            for line in notes:
                 gui.text(line)
+            if saving and gui.button("save"):
+                self.save()
 
 
 def has_display() -> bool:
@@ -198,7 +226,7 @@ def has_display() -> bool:
     return screen and "vulkan" in runtime.available_archs()
 
 
-def open_window(title: str, size):
+def open_window(title: str, size: tuple[int, int]) -> "Window | None":
     """A window, or None where none can be had."""
     if not has_display():
         return None

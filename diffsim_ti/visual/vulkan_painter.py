@@ -7,12 +7,18 @@ memory for every mesh of every frame (Taichi 1.7.4), where this keeps none.
 import atexit
 import os
 import tempfile
+from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.visual.surface import Soup
+
+if TYPE_CHECKING:
+    from taichi.ui import Window
+
 
 SUPERSAMPLING = 2
 _open: "list[VulkanPainter]" = []  # two hidden windows at once end in a crash when the process exits
@@ -26,11 +32,11 @@ def has_vulkan() -> bool:
 class Canvas:
     """A Taichi window's canvas with arrays for a background and for triangles, made once and reused."""
 
-    def __init__(self, window):
+    def __init__(self, window: "Window"):
         self.window, self.canvas = window, window.get_canvas()
         self._room, self._image = 0, None
 
-    def draw(self, soup: Soup, background: np.ndarray, size) -> None:
+    def draw(self, soup: Soup, background: np.ndarray, size: tuple[int, int]) -> None:
         """Put triangles, in pixels of a picture of `size`, over a background of any size (it is stretched)."""
         import taichi as ti
 
@@ -98,7 +104,7 @@ def _close_all() -> None:
 
 
 @contextmanager
-def settings_elsewhere():
+def settings_elsewhere() -> Iterator[None]:
     """The window's toolkit leaves an imgui.ini in the working directory; let that be a temporary one."""
     here = os.getcwd()
     with tempfile.TemporaryDirectory() as folder:

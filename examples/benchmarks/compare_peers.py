@@ -23,7 +23,7 @@ from speed import SUBSTEPS, H, common_rollout, measure
 
 import diffsim_ti as ds
 from diffsim_ti.study import chart, charts, pareto_front, problem, problems
-from diffsim_ti.study.problem import Problem, Watch
+from diffsim_ti.study.problem import FrameLoss, Problem
 from diffsim_ti.study.work_precision import reference
 
 ROOT = Path(__file__).parents[2]
@@ -95,7 +95,7 @@ def drop(gradient: bool = False, duration: float = 0.05) -> Problem:
     )
     if not gradient:
         return out
-    mean = Watch.end(lambda mesh: np.eye(3)[1] * np.ones((mesh.num_vertices, 1)) / mesh.num_vertices, 5)
+    mean = FrameLoss.end(lambda mesh: np.eye(3)[1] * np.ones((mesh.num_vertices, 1)) / mesh.num_vertices, 5)
     return replace(
         out,
         name="drop-gradient",

@@ -10,6 +10,7 @@ from diffsim_ti import runtime
 from diffsim_ti.inputs import Derived
 from diffsim_ti.potential.kernels import potential_kernels
 from diffsim_ti.solvers.implicit.linear import Operator, solve_symmetric
+from diffsim_ti.solvers.implicit.threads import one_blas_thread
 from diffsim_ti.state.numbers import Adjoint, Tangent
 
 
@@ -97,6 +98,7 @@ class ImplicitAdjoint(_Passes):
         self.path = None if a.values.path is None else np.zeros_like(a.values.path)
         self.anchor = np.zeros((len(a.fixed), 3))
 
+    @one_blas_thread
     def reverse(
         self, base: int, last: int, num_passes: int, save_every: int, stop: int, to_state: bool = False
     ) -> None:
@@ -219,6 +221,7 @@ class ImplicitTangent(_Passes):
         self.rate_dot = float(tangent.parameters[a.features().drag]) if a.features().drag >= 0 else 0.0
         self.frames = [], []
 
+    @one_blas_thread
     def advance(self, first: int, last: int, num_passes: int, save_every: int) -> None:
         """Tangent of passes first .. last - 1, recorded from slot 0."""
         for j in range(first, last):

@@ -11,6 +11,7 @@ from diffsim_ti.solvers.implicit.linear import NotConverged
 from diffsim_ti.solvers.implicit.newton import Newton
 from diffsim_ti.solvers.implicit.preconditioners import BlockJacobi, Multigrid
 from diffsim_ti.solvers.implicit.stage import Stage
+from diffsim_ti.solvers.implicit.threads import one_blas_thread
 from diffsim_ti.state.arrays import History, copy_slot
 from diffsim_ti.state.energy_watch import EnergyWatch
 from diffsim_ti.state.workspace import Workspace
@@ -93,6 +94,7 @@ class ImplicitWorkspace(Workspace):
 
     # ---- a pass -----------------------------------------------------------------------------------------------------
 
+    @one_blas_thread
     def advance(self, first: int, last: int, num_passes: int, save_every: int = 0, base: int | None = None) -> None:
         """Passes first .. last - 1 from the current state; or recorded: slot j - base holds the state before pass j."""
         if base is not None:

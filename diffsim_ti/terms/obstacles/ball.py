@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from diffsim_ti.runtime import traced
+from diffsim_ti.terms.obstacles import shapes
 from diffsim_ti.terms.obstacles.obstacle import Obstacle, ObstacleForce
 
 
@@ -45,6 +46,11 @@ class Sphere(Obstacle):
     def distance(self, positions):
         d = np.linalg.norm(positions - self.values["sphere_center"], axis=1) - self.values["sphere_radius"]
         return -d if self.inside else d
+
+    def surface(self, size):
+        """The ball, or of a hollow one the bowl that its lower half is, seen from within."""
+        shape = shapes.bowl if self.inside else shapes.ball
+        return shape(self.values["sphere_center"], float(self.values["sphere_radius"]))
 
     @property
     def variant(self):
@@ -87,6 +93,12 @@ class Capsule(Obstacle):
         a, b = self.values["capsule_start"], self.values["capsule_end"]
         share = np.clip((positions - a) @ (b - a) / ((b - a) @ (b - a)), 0, 1)
         return np.linalg.norm(positions - a - share[:, None] * (b - a), axis=1) - self.values["capsule_radius"]
+
+    def surface(self, size):
+        values = self.values
+        return shapes.tube(
+            values["capsule_start"], values["capsule_end"], float(values["capsule_radius"]), rounded=True
+        )
 
 
 def check_sizes(term, points=(), positive=()) -> None:

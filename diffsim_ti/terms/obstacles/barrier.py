@@ -9,6 +9,7 @@ it, so that f32 code stays in f32.
 
 import math
 
+import numpy as np
 import taichi as ti
 
 CROSSOVER = 1e-3
@@ -49,6 +50,13 @@ def curvature(s, fp: ti.template()):
     elif s < 1:
         b = -2 * ti.log(s) - 4 * (s - 1) / s + (s - 1) * (s - 1) / (s * s)
     return b
+
+
+def beta(s) -> np.ndarray:
+    """beta(s) on the host, for numbers or arrays, in float64."""
+    s = np.asarray(s, np.float64)
+    t, inside = s - CROSSOVER, np.clip(s, CROSSOVER, 1)
+    return np.where(s < CROSSOVER, _VALUE + t * (_SLOPE + t * _CURVATURE / 2), -((inside - 1) ** 2) * np.log(inside))
 
 
 def reference_curvature() -> float:

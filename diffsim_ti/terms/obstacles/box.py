@@ -6,6 +6,7 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti.runtime import traced
+from diffsim_ti.terms.obstacles import shapes
 from diffsim_ti.terms.obstacles.ball import check_axis, check_sizes, radial
 from diffsim_ti.terms.obstacles.obstacle import Obstacle, ObstacleForce
 
@@ -88,6 +89,9 @@ class Box(Obstacle):
         q = np.abs(turn.inv().apply(positions - self.values["box_center"])) - self.values["box_size"] / 2
         return np.linalg.norm(np.maximum(q, 0), axis=1) + np.minimum(q.max(1), 0)
 
+    def surface(self, size):
+        return shapes.box(self.values["box_center"], self.values["box_size"], self.values["box_rotation"])
+
 
 @dataclass(frozen=True)
 class CylinderForce(ObstacleForce):
@@ -130,3 +134,8 @@ class Cylinder(Obstacle):
         across = np.linalg.norm(positions - a - height[:, None] * (b - a) / length, axis=1)
         q = np.stack([across - self.values["cylinder_radius"], np.abs(height - length / 2) - length / 2], 1)
         return np.linalg.norm(np.maximum(q, 0), axis=1) + np.minimum(q.max(1), 0)
+
+    def surface(self, size):
+        values = self.values
+        ends = values["cylinder_start"], values["cylinder_end"]
+        return shapes.tube(*ends, float(values["cylinder_radius"]), rounded=False)

@@ -27,6 +27,9 @@ class Ground(Obstacle):
     def distance(self, positions: np.ndarray) -> np.ndarray:
         return positions[:, 1] - float(self.values["ground_height"])
 
+    def floor_height(self):
+        return float(self.values["ground_height"])
+
     def _refuse(self, gap: np.ndarray, surface: np.ndarray) -> None:
         raise ValueError(
             f"the body starts below or on the ground: vertex {surface[gap.argmin()]} is at {gap.min():.3g} m above y = "

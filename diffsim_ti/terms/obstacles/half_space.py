@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from diffsim_ti.runtime import traced
+from diffsim_ti.terms.obstacles import shapes
 from diffsim_ti.terms.obstacles.obstacle import Obstacle, ObstacleForce
 
 
@@ -41,3 +42,13 @@ class HalfSpace(Obstacle):
     def distance(self, positions):
         n = self.values["half_space_normal"]
         return (positions - self.values["half_space_point"]) @ (n / np.linalg.norm(n))
+
+    def floor_height(self):
+        upwards = np.allclose(shapes.unit(self.values["half_space_normal"]), [0, 1, 0])
+        return float(self.values["half_space_point"][1]) if upwards else None
+
+    def surface(self, size):
+        """A square; a floor is drawn as one."""
+        if self.floor_height() is not None:
+            return None
+        return shapes.square(self.values["half_space_point"], self.values["half_space_normal"], size)

@@ -54,6 +54,10 @@ class MeshObstacle(Obstacle):
     def distance(self, positions):
         return self._exact(positions - self.values["mesh_position"])
 
+    def surface(self, size):
+        points, triangles = self._surface
+        return points + self.values["mesh_position"], triangles
+
     def kernel(self, precision, table=0):
         return MeshForce(precision, self.has_friction, table, self.counts, self.cell, tuple(self.origin))
 

@@ -12,6 +12,7 @@ from diffsim_ti.terms.graph import Graph
 from diffsim_ti.terms.gravity import Gravity
 from diffsim_ti.terms.motion import sampled
 from diffsim_ti.terms.obstacles import barrier, friction
+from diffsim_ti.terms.obstacles.shapes import Triangles
 from diffsim_ti.terms.obstacles.stiffness import barrier_stiffness
 from diffsim_ti.terms.term import Term, VertexForce
 
@@ -31,6 +32,10 @@ class Obstacle(Term):
 
     Inputs with gradient: the shape's own numbers, "barrier_stiffness", "barrier_width", with friction also "friction" and
     "friction_speed", with a path "<shape>_path", shape (steps + 1, 3). A second obstacle's names end in _2.
+    In explicit steps frictions on one vertex act one after the other: kinds in a fixed order, obstacles of one kind as the
+    scene lists them. Swapping two there, at 90 degrees to each other, moved a body by 7e-4 of the way that it went in 32 ms
+    with substeps of 2 ms, and a gradient by up to 12 % (that of friction_speed); half of both with 1 ms. Elsewhere, and in
+    implicit steps, swapping changes round-off alone.
     Raises ValueError for numbers out of range, or a body that starts on or in the obstacle.
     Li et al. 2020, Incremental Potential Contact, doi:10.1145/3386569.3392425.
     """
@@ -112,6 +117,17 @@ class Obstacle(Term):
         raise ValueError(
             f"the body starts on or in {self!r}: {named} ({len(inside)} vertices); move the body or the obstacle"
         )
+
+    def surface(self, size: float) -> Triangles | None:
+        """(points [m], shape (k, 3), triangles that face outwards) to draw, where the obstacle was made; None: not drawn.
+
+        size [m]: that of the body, for an obstacle that has no end.
+        """
+        return None
+
+    def floor_height(self) -> float | None:
+        """Height y [m] of the floor that the obstacle is, where it was made; None if it is no floor."""
+        return None
 
     @property
     def variant(self) -> tuple:

@@ -1,0 +1,95 @@
+"""A series that ParaView opens: one .vtu per frame, and a .pvd that lists them with their times (visual/series.py reads it).
+
+Part 0 of a moment is the body, part 1 the obstacles; the list's attribute `ground` is the floor's height [m].
+"""
+
+import os
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+
+from diffsim_ti.visual.frame import Frame, Setting
+from diffsim_ti.visual.series import listed
+from diffsim_ti.writers.writer import Writer, register
+
+PER_TETRAHEDRON = ("von_mises", "energy_density", "J")
+
+
+@register
+class ParaViewWriter(Writer):
+    """Writes `name`.pvd and, beside it, `name`_0000.vtu, `name`_0001.vtu, ...
+
+    Each frame can be read once it is written: the .pvd is replaced as a whole after each, so an interrupted run leaves a
+    valid series. Frames that an earlier series of that name left in the folder are removed first. Frames hold
+    displacement [m], velocity [m/s] and what is fixed per vertex, and von_mises [Pa], energy_density [J/m^3] and J [-] per
+    tetrahedron, in the precision of the displacements. Raises OSError if the folder cannot be written.
+    """
+
+    suffixes = (".pvd",)
+
+    def open(self, setting: Setting) -> None:
+        self.setting, self.count = setting, 0
+        self.folder, self.name = self.path.parent, self.path.stem
+        self._rows: list[tuple[float, list[Path]]] = []
+        self._around: list[np.ndarray] | None = None  # obstacles as they were last written
+        self._obstacles: list[Path] = []
+        self.folder.mkdir(parents=True, exist_ok=True)
+        for _, _, old in listed(self.path) if self.path.exists() else []:
+            if old.parent == self.folder and old.stem.startswith(f"{self.name}_"):
+                old.unlink(missing_ok=True)
+        self._write_list()
+
+    def write(self, frame: Frame) -> None:
+        import meshio
+
+        dtype = np.float32 if np.asarray(frame.displacements).dtype == np.float32 else np.float64
+        path = self.folder / f"{self.name}_{self.count:04d}.vtu"
+        held = np.isin(np.arange(len(frame.positions)), self.setting.fixed).astype("u1")
+        point_data = {"displacement": frame.displacements, "velocity": frame.velocities}
+        saved = meshio.Mesh(
+            np.asarray(frame.positions, np.float64),
+            [("tetra", self.setting.mesh.tetrahedra)],
+            point_data={name: np.asarray(value, dtype) for name, value in point_data.items()} | {"fixed": held},
+            cell_data={name: [np.asarray(frame.fields[name], dtype)] for name in PER_TETRAHEDRON},
+        )
+        saved.write(path, file_format="vtu", binary=True)
+        self._write_obstacles(frame)
+        self._rows.append((float(frame.time), [path, *self._obstacles[-1:]]))
+        self._write_list()
+        self.count += 1
+
+    def _write_obstacles(self, frame: Frame) -> None:
+        """The obstacles as triangles, numbered, where they are not as they were written last."""
+        import meshio
+
+        shapes = self.setting.obstacles
+        points = [points for points, _ in shapes] if frame.obstacles is None else frame.obstacles
+        if not shapes or (self._around is not None and all(map(np.array_equal, points, self._around))):
+            return
+        self._obstacles.append(self.folder / f"{self.name}_obstacles_{len(self._obstacles):04d}.vtu")
+        self._around = [np.array(p) for p in points]
+        first = np.cumsum([0, *map(len, points)])
+        triangles = np.concatenate([cells + at for (_, cells), at in zip(shapes, first)])
+        number = np.repeat(np.arange(len(shapes)), [len(cells) for _, cells in shapes])
+        surface = meshio.Mesh(np.concatenate(points), [("triangle", triangles)], cell_data={"obstacle": [number]})
+        surface.write(self._obstacles[-1], file_format="vtu", binary=True)
+
+    def _write_list(self) -> None:
+        root = ElementTree.Element("VTKFile", type="Collection", version="0.1", byte_order="LittleEndian")
+        ground = self.setting.ground
+        rows = ElementTree.SubElement(root, "Collection", {} if ground is None else {"ground": f"{ground:.9g}"})
+        for at, parts in self._rows:
+            for part, file in enumerate(parts):
+                row = dict(timestep=f"{at:.9g}", group="", part=str(part), file=file.name)
+                ElementTree.SubElement(rows, "DataSet", row)
+        ElementTree.indent(root)
+        draft = self.path.with_suffix(f".pvd.{os.getpid()}")
+        try:
+            ElementTree.ElementTree(root).write(draft, encoding="utf-8", xml_declaration=True)
+            os.replace(draft, self.path)
+        finally:
+            draft.unlink(missing_ok=True)
+
+    def describe(self) -> str:
+        return f"{self.path} and {self.count} .vtu frames"

@@ -1,0 +1,115 @@
+"""What writes the frames of a run, chosen by the suffix of the file: one class per format, registered by its suffixes."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from diffsim_ti.scene import Scene
+from diffsim_ti.visual.camera import Camera
+from diffsim_ti.visual.drawing import BACKENDS
+from diffsim_ti.visual.fields import field_named
+from diffsim_ti.visual.frame import Frame, Setting
+
+WRITERS: dict[str, type["Writer"]] = {}
+
+
+@dataclass(frozen=True)
+class View:
+    """How a run is shown, for formats that draw it.
+
+    colour: a name in visual/fields.py; fps: frames per second of a film; size: width and height [pixels], None for what
+    suits the format. camera, or azimuth and elevation [degrees] of one that sees all; ground: height of a floor [m]
+    instead of the setting's own; wireframe: draw edges; backend: "software", "vulkan" or "auto"; title: words before the
+    time. fit: what camera and colours of a picture of the end are chosen by: the whole "run", or the "end" alone.
+    say: told once what draws.
+    Raises ValueError for what is out of range.
+    """
+
+    colour: str = "von_mises"
+    fps: float = 30.0
+    size: tuple[int, int] | None = None
+    camera: Camera | None = None
+    azimuth: float = 32.0
+    elevation: float = 14.0
+    ground: float | None = None
+    wireframe: bool = False
+    backend: str = "software"
+    title: str = ""
+    fit: str = "run"
+    say: Callable[[str], object] | None = None
+
+    def __post_init__(self):
+        field_named(self.colour)
+        if not (np.isfinite(self.fps) and self.fps > 0):
+            raise ValueError(f"fps: must be finite and > 0, got {self.fps:g}; 30 is usual")
+        if self.size is not None and min(self.size) < 16:
+            raise ValueError(f"size: must be at least 16 pixels a side, got {tuple(self.size)}; try 640 480")
+        if not abs(self.elevation) < 90:
+            raise ValueError(
+                f"elevation must lie between -90 and 90 degrees, got {self.elevation:g}; use 89 to look down"
+            )
+        for name, value, known in (("backend", self.backend, BACKENDS), ("fit", self.fit, ("run", "end"))):
+            if value not in known:
+                raise ValueError(f"{name} must be one of {', '.join(known)}, got {value!r}")
+
+
+class Writer(ABC):
+    """Writes the frames of a run to `path`: made before anything runs, then `open`, `write` each frame, `close`.
+
+    A format of one's own: a subclass with `suffixes` and these methods, given to `register`. The constructor raises what
+    can be known without a run, such as a package that is missing. `count`: frames that the file has got.
+    """
+
+    suffixes: tuple[str, ...] = ()
+
+    def __init__(self, path: str | Path, view: View | None = None):
+        self.path, self.view, self.count = Path(path), view or View(), 0
+
+    @abstractmethod
+    def open(self, setting: Setting) -> None:
+        """Begin, or begin anew. The folder may have to be made."""
+
+    @abstractmethod
+    def write(self, frame: Frame) -> None:
+        """Add a frame."""
+
+    def close(self) -> None:
+        """Finish, also after an error, with the frames there are."""
+
+    def describe(self) -> str:
+        """What was written, in a line."""
+        return f"{self.path}, {self.count} frame{'s' * (self.count != 1)}"
+
+    def __enter__(self) -> "Writer":
+        return self
+
+    def __exit__(self, *_) -> None:
+        self.close()
+
+
+def register(kind: type[Writer]) -> type[Writer]:
+    """Make `writer_for` know a class by its suffixes. Raises ValueError for none, or one that another class has."""
+    if not kind.suffixes or not all(s.startswith(".") and s == s.lower() for s in kind.suffixes):
+        raise ValueError(f"{kind.__name__}.suffixes: must be like ('.abc',), in small letters, got {kind.suffixes!r}")
+    for suffix in kind.suffixes:
+        if WRITERS.setdefault(suffix, kind) is not kind:
+            raise ValueError(f"{suffix} is written by {WRITERS[suffix].__name__} already; choose another suffix")
+    return kind
+
+
+def writer_for(path: str | Path, view: View | None = None) -> Writer:
+    """The writer for a file, by its suffix. Raises ValueError for one that is not known, naming those that are."""
+    suffix = Path(path).suffix.lower()
+    if suffix not in WRITERS:
+        raise ValueError(f"output: must end in {', '.join(sorted(WRITERS))}, got {Path(path).name!r}; rename it")
+    return WRITERS[suffix](path, view)
+
+
+def open_writer(path: str | Path, scene: Scene, view: View | None = None) -> Writer:
+    """The writer for a file, opened for runs of a scene: `with open_writer("run.mp4", scene) as out: out.write(...)`."""
+    writer = writer_for(path, view)
+    writer.open(Setting.of(scene))
+    return writer

@@ -1,0 +1,240 @@
+"""What a card computes, and how fast: for the day one is there. Ten minutes at most; exit code 1 if a part fails.
+
+    python examples/benchmarks/gpu_gate.py [--arch cuda|vulkan|cpu] [--minutes 10] [--largest 5000000]
+
+Each part runs in a process of its own with a time limit, prints one JSON line, and is a row of the table at the end: the
+device; copies and launches; correctness against the CPU, in float64 and float32; time per substep by size beside what
+copying the same bytes takes. What does not fit the time or the memory is left out, and said so.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import taichi as ti
+from speed import SUBSTEPS, common_rollout
+
+import diffsim_ti as ds
+from diffsim_ti import runtime, verify
+
+SIZES = {6_000: 11, 48_000: 21, 196_608: 33, 998_250: 56, 4_983_504: 95}  # tetrahedra: vertices a side
+# relative to the CPU's float64; float32 divides approximately on CUDA
+GATES = {
+    "f64": dict(motion=1e-11, gradient=1e-9, transpose=1e-12),
+    "f32": dict(motion=1e-5, gradient=2e-3, transpose=1e-4),
+}
+
+
+@ti.kernel
+def copy(source: ti.types.ndarray(ti.f32, 1), target: ti.types.ndarray(ti.f32, 1)):
+    for i in target:
+        target[i] = source[i]
+
+
+def seconds(function, repeats: int) -> float:
+    """Best wall time of a call, until the device is done [s]."""
+    best = np.inf
+    for _ in range(repeats):
+        start = time.perf_counter()
+        function()
+        ti.sync()
+        best = min(best, time.perf_counter() - start)
+    return best
+
+
+def device(options) -> dict:
+    try:
+        import torch
+
+        torch_sees = torch.cuda.get_device_name(0) if torch.cuda.is_available() else "no card"
+    except ImportError:
+        torch_sees = "not installed"
+    return dict(arch=runtime.arch_name(), name=runtime.device_name(), taichi=ti.__version__, torch_sees=torch_sees)
+
+
+def bandwidth(options) -> dict:
+    n = min(2**26, options.largest * 12)
+    source, target = runtime.array(ti.f32, n), runtime.array(ti.f32, n)
+    launch = runtime.Launch(copy, source, target)
+    small = runtime.Launch(copy, runtime.array(ti.f32, 1), runtime.array(ti.f32, 1))
+    launch(), small()
+    many = seconds(lambda: [small() for _ in range(100)], 5) / 100
+    return dict(copy_GB_per_s=round(8 * n / seconds(launch, 5) / 1e9, 2), launch_us=round(1e6 * many, 1))
+
+
+def two_boxes() -> ds.TetrahedralMesh:
+    box = ds.TetrahedralMesh.create_box(2, 0.1)
+    return ds.TetrahedralMesh.joined([box, box.translated([0.02, 0.125, 0.01])])
+
+
+def solver(kind: str, precision: str):
+    """Scenes of the comparison: explicit with friction, implicit, and two bodies that meet."""
+    mesh = two_boxes() if kind == "self-contact" else ds.TetrahedralMesh.create_cube(4, 0.3)
+    ground = ds.Ground(mesh.vertices[:, 1].min() - 5e-3, 1e3, 0.01, friction=0.3)
+    terms = [ds.Gravity(-9.8), ground] + ([ds.SelfContact(2e4, 2e-2)] if kind == "self-contact" else [])
+    scene = ds.Scene(mesh, ds.StableNeoHookean(5e4, 0.3), 1000.0, terms, precision=precision)
+    if kind == "implicit":
+        return ds.ImplicitEulerSolver(scene, dt=5e-3)
+    return ds.SemiImplicitSolver(scene, dt=5e-3, substeps=50, allow_unstable=True)
+
+
+def results(kind: str, precision: str) -> tuple[ds.Rollout, dict[str, np.ndarray]]:
+    rollout = ds.Rollout(solver(kind, precision), 4, gradients=["youngs_modulus", "initial_velocities"])
+    frames = rollout.forward()
+    return rollout, dict(motion=frames.displacements) | rollout.vjp(frames, frames.displacements)
+
+
+def reference(options) -> dict:
+    """The comparison's numbers on the CPU in float64, written for the parts that follow."""
+    for kind in ("explicit", "implicit", "self-contact"):
+        np.savez(Path(options.folder) / f"{kind}.npz", **results(kind, "f64")[1])
+    return {}
+
+
+def correctness(options, kind: str, precision: str) -> dict:
+    rollout, found = results(kind, precision)
+    expected = np.load(Path(options.folder) / f"{kind}.npz")
+    off = {name: float(np.abs(x - expected[name]).max() / np.abs(expected[name]).max()) for name, x in found.items()}
+    again = results(kind, precision)[1]
+    row = dict(
+        motion=off.pop("motion"),
+        gradient=max(off.values()),
+        transpose=verify.dot_product_test(rollout),
+        same_bits=all(np.array_equal(x, again[name]) for name, x in found.items()),
+    )
+    gate = GATES[precision]
+    if kind == "implicit":  # solved to a tolerance, not to the last digit
+        gate = gate | dict(transpose=1e-4)
+    return row | dict(passed=row["same_bits"] and all(row[name] <= gate[name] for name in gate))
+
+
+def divergence(options) -> dict:
+    """A state that is not finite is found where it lies."""
+    mesh = ds.TetrahedralMesh.create_cube(3)
+    scene = ds.Scene(mesh, ds.StableNeoHookean(5e4, 0.3), 1000.0, [ds.Gravity(-9.8)])
+    simulator = ds.Simulator(ds.SemiImplicitSolver(scene, dt=1e-3))
+    bad = np.zeros(mesh.vertices.shape)
+    bad[5] = np.nan
+    runtime.fill(simulator.workspace.state.v, bad[None])
+    try:
+        simulator.step()
+    except ds.Divergence as error:
+        return dict(vertex=error.vertex, passed=error.vertex is not None)
+    return dict(passed=False)
+
+
+def torch_streams(options) -> dict:
+    """A step and its gradient on torch's default stream and on another: the same bits."""
+    import torch
+
+    from diffsim_ti.diff_physics import DifferentiableMaterial
+    from diffsim_ti.diff_simulator import DifferentiableSimulator, DifferentiableSolver
+
+    where = "cuda" if torch.cuda.is_available() and runtime.arch_name() == "cuda" else "cpu"
+    streams = [torch.cuda.default_stream(), torch.cuda.Stream()] if where == "cuda" else [None]
+    out = []
+    for stream in streams:
+        with torch.cuda.stream(stream):
+            E, nu = (torch.tensor(x, device=where) for x in (1e5, 0.3))
+            material = DifferentiableMaterial(E, nu)
+            mesh = ds.TetrahedralMesh.create_cube(3)
+            simulator = DifferentiableSimulator(mesh, material, DifferentiableSolver(dt=1e-3), device=where)
+            simulator.rollout(5)
+            simulator.positions.square().sum().backward()
+            out.append(
+                [p.grad.cpu().numpy() for p in material.parameters()] + [simulator.positions.detach().cpu().numpy()]
+            )
+    same = all(np.array_equal(a, b) for other in out[1:] for a, b in zip(out[0], other))
+    return dict(tensors_on=where, streams=len(streams), passed=same and all(np.isfinite(x).all() for x in out[0]))
+
+
+def speed(options, tetrahedra: int) -> dict:
+    """Time of a substep, forward and with its reverse; and of copying its state and tetrahedra once."""
+    if tetrahedra > options.largest:
+        return dict(left_out="beyond --largest")
+    rollout = common_rollout(SIZES[tetrahedra], "f32", per_tetrahedron=False)
+    frames = rollout.forward()
+    adjoint = np.ones_like(frames.positions)
+    rollout.vjp(frames, adjoint)
+    forward = seconds(rollout.forward, 3) / SUBSTEPS
+    both = seconds(lambda: rollout.vjp(rollout.forward(), adjoint), 3) / SUBSTEPS
+    vertices, m = rollout.scene.mesh.num_vertices, rollout.scene.mesh.num_tetrahedra
+    touched = 4 * (m * (4 + 10 + 2 * 12) + vertices * 12)  # indices, shape, corner forces there and back, state
+    return dict(
+        forward_us=round(1e6 * forward, 1),
+        with_reverse_us=round(1e6 * both, 1),
+        forward_GB_per_s=round(touched / forward / 1e9, 2),
+        megabytes=round(runtime.allocated_megabytes()),
+    )
+
+
+PARTS = {"device": device, "bandwidth": bandwidth, "reference": reference}
+for _kind in ("explicit", "implicit", "self-contact"):
+    for _precision in ("f64", "f32"):
+        PARTS[f"{_kind} {_precision}"] = lambda options, k=_kind, p=_precision: correctness(options, k, p)
+PARTS |= {"divergence": divergence, "torch": torch_streams}
+PARTS |= {f"{n:,} tetrahedra": lambda options, n=n: speed(options, n) for n in SIZES}
+
+
+def run_part(options, name: str) -> dict:
+    arch = "cpu" if name == "reference" else options.arch
+    if name.endswith("f64") and arch == "vulkan":
+        return dict(left_out="Vulkan has float32 only")
+    ds.init(arch)
+    try:
+        return PARTS[name](options)
+    except MemoryError as error:
+        return dict(left_out=str(error))
+
+
+def ask(options, name: str, limit: float, folder: str) -> dict:
+    """The answer of a part's own process."""
+    command = [sys.executable, __file__, "--arch", options.arch, "--largest", str(options.largest)]
+    try:
+        done = subprocess.run(
+            [*command, "--part", name, "--folder", folder], capture_output=True, text=True, timeout=limit
+        )
+    except subprocess.TimeoutExpired:
+        return dict(left_out=f"not done in {limit:.0f} s")
+    if done.returncode:
+        return dict(
+            passed=False, error=(done.stderr.strip() or f"ended with {done.returncode}").splitlines()[-1][-200:]
+        )
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--arch", default="cuda", choices=["cpu", "cuda", "vulkan"])
+    parser.add_argument("--minutes", type=float, default=10.0, help="for all parts together")
+    parser.add_argument("--largest", type=int, default=5_000_000, help="tetrahedra of the largest mesh")
+    parser.add_argument("--part", help=argparse.SUPPRESS)
+    parser.add_argument("--folder", help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.part:
+        print(json.dumps(run_part(options, options.part)))
+        return 0
+    end, rows = time.monotonic() + 60 * options.minutes, {}
+    with tempfile.TemporaryDirectory() as folder:
+        for name in PARTS:
+            left = end - time.monotonic()
+            start = time.monotonic()
+            rows[name] = ask(options, name, min(left, 120), folder) if left > 5 else dict(left_out="no time left")
+            print(json.dumps(dict(part=name, seconds=round(time.monotonic() - start, 1)) | rows[name]), flush=True)
+    print("\n| part | |\n| --- | --- |")
+    for name, row in rows.items():
+        cells = (
+            f"{key} {value:.2g}" if isinstance(value, float) and value < 1 else f"{key} {value}"
+            for key, value in row.items()
+        )
+        print(f"| {name} | {', '.join(cells) or 'done'} |")
+    return int(any(row.get("passed") is False for row in rows.values()))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,153 @@
+"""On executed PTX: how often the driver is called, what single precision compiles to, and that launches may be repeated."""
+
+import re
+
+import numpy as np
+import pytest
+from cuda_on_cpu.counters import Absent, Counters
+
+from diffsim_ti import (
+    BDF2Solver,
+    Corotated,
+    Gravity,
+    Ground,
+    ImplicitEulerSolver,
+    Rollout,
+    Scene,
+    SelfContact,
+    SemiImplicitSolver,
+    SmithNeoHookean,
+    TetrahedralMesh,
+    VelocityVerletSolver,
+)
+
+pytestmark = pytest.mark.backends
+SUBSTEPS = 10
+NO_TRAFFIC = dict(synchronisations=0, copies_to_host=0, copies_on_device=0, fills=0)
+# Calls of the driver for each substep, as measured; a copy to the host waits, and so counts like a synchronisation. Each
+# call of Taichi's launcher copies one buffer of arguments (half a kilobyte to one, by the list of arrays) and takes and
+# returns two pieces of memory; each loop is two launches, of one thread for its bounds and of all.
+FORWARD = dict(launches=4, copies_to_device=1, bytes_to_device=1024, allocations=2, frees=2, **NO_TRAFFIC)
+REVERSE = dict(launches=5, copies_to_device=1, bytes_to_device=1024, allocations=2, frees=2, **NO_TRAFFIC)
+# ... for each pass with self-contact that keeps its list of pairs, which reads one number to know that it may
+CONTACT_FORWARD = NO_TRAFFIC | dict(launches=20, copies_to_device=3, bytes_to_device=2048, copies_to_host=1)
+CONTACT_REVERSE = NO_TRAFFIC | dict(launches=23, copies_to_device=4, bytes_to_device=2048, copies_to_host=1)
+# ... for each implicit step of this scene; the vectors of its linear solver live on the host
+IMPLICIT_FORWARD = NO_TRAFFIC | dict(launches=136, copies_to_device=61, copies_to_host=73)
+IMPLICIT_REVERSE = NO_TRAFFIC | dict(launches=28, copies_to_device=15, copies_to_host=12, fills=2)
+# ... for a whole explicit run, besides its substeps: arrays go each way once, zeroing is a memset
+ONCE_FORWARD = dict(synchronisations=0, copies_to_device=16, copies_to_host=8, fills=4)
+ONCE_REVERSE = dict(synchronisations=0, copies_to_device=6, copies_to_host=5, fills=14)
+DOUBLE_IN_SINGLE = {"_find_bad": "ti.math.isinf compares with a double"}
+
+
+@pytest.fixture
+def driver() -> Counters:
+    try:
+        return Counters()
+    except Absent as absent:
+        pytest.skip(str(absent))
+
+
+@pytest.fixture(scope="module")
+def cube() -> TetrahedralMesh:
+    return TetrahedralMesh.create_cube(3)
+
+
+def scene(mesh, *terms, law=None, precision="f64") -> Scene:
+    ground = Ground(mesh.vertices[:, 1].min() - 1e-3, 1e3, 0.01)
+    law = law or SmithNeoHookean(1e5, 0.4)
+    return Scene(mesh, law, 1000.0, [Gravity(-9.8), ground, *terms], precision=precision)
+
+
+def two_boxes() -> TetrahedralMesh:
+    box = TetrahedralMesh.create_box(2, 0.1)
+    return TetrahedralMesh.joined([box, box.translated([0.02, 0.125, 0.01])])
+
+
+def explicit(scene, solver=SemiImplicitSolver):
+    return solver(scene, dt=1e-3, substeps=SUBSTEPS, allow_unstable=True)
+
+
+def sweeps(driver, solver, frames: int) -> list[dict[str, int]]:
+    """Counts of a forward run and of its reverse, each made for the second time."""
+    rollout = Rollout(solver, frames, gradients=["youngs_modulus", "initial_positions"])
+    for _ in range(2):
+        driver.restart()
+        result = rollout.forward()
+        forward = driver.counts()
+        driver.restart()
+        rollout.vjp(result, np.ones(result.positions.shape))
+    return [forward, driver.counts()]
+
+
+def check_ceilings(driver, solver, passes: int, frames: tuple[int, int], forward: dict, reverse: dict) -> None:
+    """Each sweep may add so many calls for each further pass; what a run costs once drops out of the difference."""
+    short, long = (sweeps(driver, solver, n) for n in frames)
+    more = passes * (frames[1] - frames[0])
+    for way, ceiling, few, many in zip(("forward", "reverse"), (forward, reverse), short, long):
+        found = {name: (many[name] - few[name]) / more for name in ceiling}
+        assert all(found[name] <= ceiling[name] for name in ceiling), f"{way}: {found}, allowed {ceiling}"
+        assert found["launches"] > 0
+
+
+def test_explicit_sweeps_neither_copy_nor_wait(driver, cube):
+    check_ceilings(driver, explicit(scene(cube)), SUBSTEPS, (4, 8), FORWARD, REVERSE)
+
+
+def test_explicit_runs_move_their_arrays_once(driver, cube):
+    frames = 8
+    for found, ceiling in zip(sweeps(driver, explicit(scene(cube)), frames), (ONCE_FORWARD, ONCE_REVERSE)):
+        found["copies_to_device"] -= SUBSTEPS * frames  # arguments of launches
+        assert all(found[name] <= ceiling[name] for name in ceiling), f"{found}, allowed {ceiling}"
+
+
+def test_passes_with_self_contact_stay_below_their_ceilings(driver):
+    solver = explicit(scene(two_boxes(), SelfContact(2e4, 2e-2), law=Corotated(5e4, 0.3)))
+    check_ceilings(driver, solver, SUBSTEPS, (2, 4), CONTACT_FORWARD, CONTACT_REVERSE)
+
+
+def test_implicit_steps_stay_below_their_ceilings(driver, cube):
+    solver = ImplicitEulerSolver(scene(cube), dt=5e-3)
+    check_ceilings(driver, solver, 1, (3, 6), IMPLICIT_FORWARD, IMPLICIT_REVERSE)
+
+
+def test_every_kernel_is_launched_again_and_again(driver, cube):
+    """Taichi's launcher leaves a dead address in a launch context: the second launch is the one that crashed."""
+    rollout = Rollout(explicit(scene(cube)), 3, gradients=["youngs_modulus", "initial_velocities"])
+    runs = []
+    driver.restart()
+    for _ in range(3):
+        frames = rollout.forward()
+        runs.append((frames.positions, rollout.vjp(frames, frames.positions)))
+    assert min(n for name, n in driver.launches().items() if not name.startswith("runtime_")) >= 3  # Taichi's own apart
+    for positions, gradients in runs[1:]:
+        assert np.array_equal(positions, runs[0][0])
+        assert all(np.array_equal(gradients[name], runs[0][1][name]) for name in gradients)
+
+
+def solvers_in_single_precision(cube):
+    friction = Ground(cube.vertices[:, 1].min() - 1e-3, 1e3, 0.01, friction=0.5)
+    yield explicit(Scene(cube, SmithNeoHookean(1e5, 0.4), 1000.0, [Gravity(-9.8), friction], precision="f32"))
+    yield explicit(scene(cube, law=Corotated(1e5, 0.3), precision="f32"), VelocityVerletSolver)
+    yield explicit(scene(two_boxes(), SelfContact(2e4, 2e-2), precision="f32"))
+    yield ImplicitEulerSolver(scene(cube, precision="f32"), dt=5e-3)
+    yield BDF2Solver(scene(cube, precision="f32"), dt=5e-3)
+
+
+def test_single_precision_computes_in_single_precision(driver, cube):
+    """A double costs a card 32 to 64 times as much as a float; one number without a type is enough to compile to them."""
+    driver.restart()
+    for solver in solvers_in_single_precision(cube):
+        rollout = Rollout(solver, 2, gradients=["youngs_modulus", "initial_positions"])
+        frames = rollout.forward()
+        rollout.vjp(frames, frames.positions)
+        rollout.jvp(frames, youngs_modulus=1.0)
+    found = {}
+    for name, text in driver.ptx().items():
+        kernel = re.sub(r"_c\d+_\d+_kernel_.*", "", name)
+        doubles = set(re.findall(r"\s([a-z][\w.]*\.f64[\w.]*)\s", text))
+        if doubles and kernel not in DOUBLE_IN_SINGLE:
+            found[kernel] = doubles
+    assert not found
+    assert len(driver.ptx()) > 30

@@ -1,0 +1,77 @@
+"""Prepared launches: the same kernel with the same arrays again and again, other numbers and other tensors each time."""
+
+import numpy as np
+import pytest
+import taichi as ti
+import torch
+
+from diffsim_ti import runtime
+
+pytestmark = pytest.mark.backends
+
+
+@ti.kernel
+def add_multiple(
+    source: ti.types.ndarray(ti.f32, 1), target: ti.types.ndarray(ti.f32, 1), factor: ti.f32, first: ti.i32
+):
+    for i in range(source.shape[0]):
+        if i >= first:
+            target[i] += factor * source[i]
+
+
+@ti.kernel
+def exchange(tensor: ti.types.ndarray(ti.f32, 1), array: ti.types.ndarray(ti.f32, 1)):
+    for i in range(array.shape[0]):
+        kept = array[i]
+        array[i] = tensor[i]
+        tensor[i] = kept
+
+
+def test_launch_takes_other_numbers_each_time():
+    numbers = np.arange(5, dtype=np.float32)
+    source, target = runtime.upload(numbers, ti.f32), runtime.upload(np.zeros(5), ti.f32)
+    launch, expected = runtime.Launch(add_multiple, source, target), np.zeros(5, np.float32)
+    for k in range(20):
+        launch(0.5 * k, k % 5)
+        expected[k % 5 :] += np.float32(0.5 * k) * numbers[k % 5 :]
+    assert np.array_equal(runtime.fetch(target), expected)
+
+
+def test_two_launches_of_one_kernel_keep_their_own_arrays():
+    source, targets = runtime.upload(np.ones(4), ti.f32), [runtime.upload(np.zeros(4), ti.f32) for _ in range(2)]
+    launches = [runtime.Launch(add_multiple, source, target) for target in targets]
+    for k in range(6):
+        launches[k % 2](1.0 + k % 2, 0)
+    assert [runtime.fetch(target).tolist() for target in targets] == [[3.0] * 4, [6.0] * 4]
+
+
+def test_launch_takes_other_tensors_each_time():
+    if runtime.arch_name() == "vulkan":
+        pytest.skip("Vulkan's memory is none that torch could see")
+    array = runtime.upload(np.zeros(3), ti.f32)
+    launch, before = runtime.TensorLaunch(exchange, array), [0.0] * 3
+    for k in range(5):
+        tensor = torch.full((3,), float(k + 1))
+        launch(tensor)
+        assert tensor.tolist() == before
+        before = runtime.fetch(array).tolist()
+        assert before == [k + 1.0] * 3
+
+
+@pytest.mark.parametrize("dtype", [ti.i32, ti.f32, ti.f64, ti.types.vector(3, ti.f32), ti.types.vector(4, ti.f64)])
+def test_arrays_hold_what_is_copied_to_them(dtype):
+    number = getattr(dtype, "dtype", dtype)
+    if runtime.arch_name() == "vulkan" and number == ti.f64:
+        pytest.skip("Vulkan has float32 only")
+    shape = (4, 5, *getattr(dtype, "get_shape", tuple)())
+    numbers = np.arange(np.prod(shape)).reshape(shape).astype(runtime.to_numpy_dtype(number))
+    array, kept = runtime.upload(numbers, dtype), slice(0, 3 if len(shape) == 3 else None)
+    assert np.array_equal(runtime.fetch(array), numbers[..., kept])
+    runtime.fill(array, numbers[:1] + 1)  # a row for all
+    assert np.array_equal(runtime.fetch(array), np.broadcast_to(numbers[:1] + 1, shape)[..., kept])
+    runtime.fill(array, 0)
+    assert not runtime.fetch(array).any()
+    if len(shape) == 3:
+        runtime.fill(array, numbers[..., :3])
+        for row in (2, -1):
+            assert np.array_equal(runtime.fetch_row(array, row), numbers[row, :, :3])
