@@ -28,7 +28,8 @@ class Scene:
     material: a law with its numbers (materials/).
     density [kg/m^3]: one number or one per tetrahedron; vertices carry the lumped mass sum rho V / 4.
     terms: loads, contacts, damping (terms/), each at most once except contacts. What is not listed costs nothing. Their
-        order means nothing but that of obstacles of one kind, whose forces and frictions act one after the other.
+        order means nothing but that of obstacles of one kind, whose forces and frictions act one after the other. Names
+        of terms, each another (Ground(name="floor")), begin the names of their inputs: "floor.stiffness".
     fixed: vertices that do not move freely: a vertex set's name, indices, a Boolean mask or a list of set names.
     motion: displacement of the fixed vertices from where they start: a function of time [s] that returns 3 numbers or
         shape (num_fixed, 3) [m], or keyframes (times, displacements) between which it is linear. Default: held still.
@@ -103,6 +104,11 @@ class Scene:
         for kind in (Gravity, Drag, ExternalForce, SelfContact):
             if sum(isinstance(t, kind) for t in self.terms) > 1:
                 raise ValueError(f"a scene takes one {kind.__name__}, got several; add their numbers instead")
+        named = [t for t in self.terms if t.name is not None]
+        for k, term in enumerate(named):
+            other = next((t for t in named[:k] if t.name == term.name), None)
+            if other is not None:
+                raise ValueError(f"two terms have the name {term.name!r}: {other!r} and {term!r}; give each its own")
         if self.motion is not None and len(self.fixed) == 0:
             raise ValueError("motion moves the fixed vertices, but none is fixed; pass fixed=...")
         if self.motion is not None:
@@ -135,7 +141,8 @@ class Scene:
         return next((t for t in self.terms if isinstance(t, kind)), None)
 
     def input_names(self, term: Term) -> dict[str, str]:
-        """{a term's own name of an input: its name in this scene}, where a second obstacle's end in _2, paths included."""
+        """{plain name of a term's input: its name in this scene}, paths included: a second obstacle's end in _2, those of
+        a term with a name begin with it."""
         for terms in (self.terms, self._given):
             if term in terms:
                 return self.inputs.names_of(terms.index(term))

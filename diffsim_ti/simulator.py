@@ -10,6 +10,7 @@ from diffsim_ti.state import observe
 from diffsim_ti.state.guard import Guard
 from diffsim_ti.state.observe import Energy, TetrahedronFields
 from diffsim_ti.state.watch import ContactResolution
+from diffsim_ti.terms import ExternalForce
 
 
 class Simulator:
@@ -85,15 +86,11 @@ class Simulator:
         if values.path is not None:
             rows = self.scene.path_rows([self.time, self.time + self.solver.dt])
             runtime.fill(arrays.path, np.stack(list(rows.values()), 1))
-        if values.forces is not None and len(self._forces_rows()) > 1:
-            rows = self._forces_rows()
+        if values.forces is not None and len(values.forces) > 1:
+            rows = values.forces
             if self.step_count >= len(rows):
                 raise ValueError(f"external_forces are given for {len(rows)} steps, this is step {self.step_count}")
             runtime.fill(arrays.forces, rows[self.step_count][None])
-
-    def _forces_rows(self) -> np.ndarray:
-        rows = self.scene.inputs.values["external_forces"]
-        return rows if rows.ndim == 3 else rows[None]
 
     @property
     def displacements(self) -> np.ndarray:
@@ -127,7 +124,8 @@ class Simulator:
 
     def set_forces(self, forces: ArrayLike) -> None:
         """Other external forces [N] from now on, in the shape of the scene's constant ExternalForce, until a reset."""
-        given, forces = self.scene.inputs.values.get("external_forces"), np.asarray(forces, np.float64)
+        term, forces = self.scene.term(ExternalForce), np.asarray(forces, np.float64)
+        given = None if term is None else term.values.get("external_forces")
         if given is None or given.ndim == 3:
             raise ValueError(
                 "set_forces needs a scene with a constant ExternalForce, of shape (k, 3); add one of zeros"

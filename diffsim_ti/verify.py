@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from diffsim_ti.inputs import RunSize
 from diffsim_ti.rollout import Frames, Rollout
 
 Loss = Callable[[Frames], tuple]
@@ -70,24 +71,13 @@ def central_difference(f: Callable[[float], float], scale: float = 1.0) -> tuple
 
 def input_scale(rollout: Rollout, name: str) -> float:
     """A size of change that matters for an input: its own, or for lengths and velocities that of a tetrahedron's edge."""
-    mesh = rollout.scene.mesh
-    edge = float(np.cbrt(np.mean(mesh.volumes)))
-    if name.rstrip("_0123456789").endswith("_path"):
-        return 0.1 * edge / max(rollout.steps, 1)  # rows of their own: larger changes would be jumps
-    places = ("_positions", "_motion", "_center", "_point", "_start", "_end", "_position")
-    if name.rstrip("_0123456789").endswith(places):
-        return 0.1 * edge
-    if name == "initial_velocities":
-        return 0.1 * edge / max(rollout.steps * rollout.solver.dt, rollout.solver.dt)
-    size = float(np.abs(rollout.values[name]).max())
-    return 0.1 * size if size > 0 else 0.1
+    scene = rollout.scene
+    run = RunSize(float(np.cbrt(np.mean(scene.mesh.volumes))), rollout.steps, rollout.solver.dt)
+    return scene.inputs.described[name].change(rollout.values[name], run)
 
 
 def _random_direction(rollout: Rollout, name: str, rng) -> np.ndarray:
-    direction = rng.standard_normal(rollout.values[name].shape) * input_scale(rollout, name)
-    if name == "initial_velocities":
-        direction[rollout.scene.fixed] = 0
-    return direction
+    return rng.standard_normal(rollout.values[name].shape) * input_scale(rollout, name)
 
 
 def linear_loss(rollout: Rollout, seed: int = 0) -> Loss:

@@ -8,7 +8,7 @@ HEAD = "| area | files test_*.py | minutes |\n| --- | --- | ---: |\n"
 
 # area -> files, without test_ and .py
 AREAS = {
-    "meshes, scenes, materials": "mesh scene materials",
+    "meshes, scenes, materials": "mesh scene inputs materials",
     "motion against closed forms": "reference_motion step_limit hertz torture",
     "every adjoint, order, fuzz": "every_adjoint term_order gradient_fuzz",
     "gradients": "gradients gradient_clip gradient_faults checkpoints tape identification",

@@ -4,6 +4,7 @@ from abc import ABC, abstractmethod
 
 import numpy as np
 
+from diffsim_ti.inputs import Input, Link
 from diffsim_ti.materials import moduli
 
 _ALIASES = {"E": "youngs_modulus", "nu": "poissons_ratio"}
@@ -82,6 +83,15 @@ class Material(ABC):
         self.check(values)
         return values
 
+    def described(self, mesh) -> list[Input]:
+        """The inputs of a body of this material: each number is one, or one per tetrahedron."""
+        unit = dict(poissons_ratio="")
+        return [Input(n, v, ((), ("tetrahedra",)), unit.get(n, "Pa")) for n, v in self.values(mesh).items()]
+
+    def links(self) -> list[Link]:
+        """From the inputs to what the law's kernels read: the links that write "coefficients"."""
+        return [Coefficients(self)]
+
     def check(self, values: dict) -> None:
         """Raise ValueError, naming range, value and remedy, for numbers that no material can have."""
         for name, value in values.items():
@@ -140,6 +150,24 @@ class Material(ABC):
     def __repr__(self) -> str:
         numbers = ", ".join(f"{name}={_short(number)}" for name, number in self._numbers.items())
         return f"{self.name}({numbers}{self._extra})"
+
+
+class Coefficients(Link):
+    """A law's coefficients of a material's numbers; adjoints may come per tetrahedron also where all are uniform."""
+
+    writes = ("coefficients",)
+
+    def __init__(self, material: Material):
+        self.material, self.reads = material, material.inputs
+
+    def value(self, *x):
+        return (self.material.coefficients(dict(zip(self.reads, x))),)
+
+    def jvp(self, x, dx):
+        return (self.material.coefficients_jvp(dict(zip(self.reads, x)), dict(zip(self.reads, dx))),)
+
+    def vjp(self, x, y_adj):
+        return tuple(self.material.coefficients_vjp(dict(zip(self.reads, x)), y_adj[0]).values())
 
 
 def check_range(name: str, value, low: float, high: float, low_included: bool, remedy: str) -> None:

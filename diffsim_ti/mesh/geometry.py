@@ -26,12 +26,14 @@ def squared_edges(vertices: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
     return out
 
 
+def edge_matrices(vertices: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
+    """D = [x1 - x0, x2 - x0, x3 - x0] by columns, shape (num_tetrahedra, 3, 3) [m]."""
+    return np.moveaxis(vertices[tetrahedra[:, 1:]] - vertices[tetrahedra[:, :1]], 1, 2)
+
+
 def shape_gradients(vertices: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
     """grad N_a [1/m], shape (num_tetrahedra, 4, 3); rows 1..3 invert the edge matrix, row 0 is their negative sum."""
-    x0, x1, x2, x3 = (vertices[tetrahedra[:, a]] for a in range(4))
-    e1, e2, e3 = x1 - x0, x2 - x0, x3 - x0
-    rows = np.stack([np.cross(e2, e3), np.cross(e3, e1), np.cross(e1, e2)], 1)
-    rows /= np.einsum("ij,ij->i", e1, rows[:, 0])[:, None, None]
+    rows = np.linalg.inv(edge_matrices(vertices, tetrahedra))
     return np.concatenate([-rows.sum(1, keepdims=True), rows], 1)
 
 

@@ -41,11 +41,7 @@ class Sweep:
         if self.save_every < 1 or self.steps % self.save_every:
             raise ValueError(f"save_every = {save_every} must be >= 1 and divide steps = {steps}")
         self.num_frames = self.steps // self.save_every + 1
-        times = np.arange(self.steps + 1) * solver.dt
-        self.values = dict(self.scene.inputs.values)
-        if self.scene.motion is not None:
-            self.values["prescribed_motion"] = self.scene.motion_rows(times)
-        self.values |= self.scene.path_rows(times)
+        self.values = self.scene.inputs.at_times(np.arange(self.steps + 1) * solver.dt)
         self.inputs = tuple(self.values)
         self.wanted = self._check_names(gradients)
         self.clip, self.truncate, self.careful = clip, truncate, health or clip is not None
@@ -99,12 +95,7 @@ class Sweep:
             same = value is known[name] or value.shape == known[name].shape and np.array_equal(value, known[name])
             given[name] = known[name] if same else value.copy()
         out = self.values | self.scene.inputs.check(given)
-        forces = out.get("external_forces")
-        if forces is not None and forces.ndim == 3 and len(forces) < self.steps:
-            raise ValueError(f"external_forces: {self.steps} steps need as many rows, got {len(forces)}")
-        for name in ("prescribed_motion", *self.scene.inputs.paths):
-            if name in out and out[name].shape != self.values[name].shape:
-                raise ValueError(f"{name}: expected shape {self.values[name].shape}, got {out[name].shape}")
+        self.scene.inputs.check_steps(out, self.steps)
         return out
 
     def _load(self, run: Run) -> None:

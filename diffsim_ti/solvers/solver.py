@@ -79,11 +79,7 @@ class Solver(ABC):
 
     def start_values(self):
         """What kernels read at the start; a step of motion rows if fixed vertices move."""
-        inputs, values = self.scene.inputs, dict(self.scene.inputs.values)
-        if self.scene.motion is not None:
-            values["prescribed_motion"] = self.scene.motion_rows([0.0, self.dt])
-        values |= self.scene.path_rows([0.0, self.dt])
-        return inputs.derive(values)
+        return self.scene.inputs.derive(self.scene.inputs.at_times([0.0, self.dt]))
 
     def starts_deformed(self, strain: float = 0.05) -> bool:
         """Whether the start is strained so much that the bound at rest may not hold."""

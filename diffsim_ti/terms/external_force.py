@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from diffsim_ti.inputs import Input
+from diffsim_ti.inputs.links import PerStep
 from diffsim_ti.terms.term import Term
 
 
@@ -10,15 +12,18 @@ class ExternalForce(Term):
 
     vertices: which k vertices, as indices or the name of a vertex set; None means all. A single vector of 3 is laid
     on each of them. Per-step forces hold during one step dt; a run longer than the list is an error.
-    Input with gradient: "external_forces", of the shape given. One per scene.
+    Input with gradient: "external_forces", of the shape given, or "<name>.forces". One per scene.
     """
 
-    def __init__(self, forces, vertices=None):
-        super().__init__(external_forces=forces)
+    def __init__(self, forces, vertices=None, name: str | None = None):
+        shapes = (3,), ("k", 3), ("steps", "k", 3)
+        super().__init__(Input("forces", forces, shapes, "N", plain="external_forces", label="forces"), name=name)
         self.vertices = vertices
-        if self.values["external_forces"].ndim not in (1, 2, 3) or self.values["external_forces"].shape[-1] != 3:
-            shape = self.values["external_forces"].shape
-            raise ValueError(f"ExternalForce: forces must have shape (3,), (k, 3) or (steps, k, 3), got {shape}")
+
+    num_numbers = 0  # forces lie in an array of their own
+
+    def links(self, names, own):
+        return [PerStep(names["external_forces"], "forces", 3)]
 
     def indices(self, mesh) -> np.ndarray:
         """Vertices that are acted upon, shape (k,)."""
@@ -27,12 +32,12 @@ class ExternalForce(Term):
         return mesh.vertex_indices(self.vertices)
 
     def check(self, mesh) -> None:
-        k, forces = len(self.indices(mesh)), self.values["external_forces"]
-        if forces.ndim == 1:
-            forces = np.tile(forces, (k, 1))
-            forces.setflags(write=False)
-            self.values["external_forces"] = forces
-        if forces.shape[-2] != k:
-            raise ValueError(
-                f"ExternalForce: expected forces for {k} vertices, shape (..., {k}, 3), got {forces.shape}"
-            )
+        k, shape = len(self.indices(mesh)), self.values["external_forces"].shape
+        if len(shape) > 1 and shape[-2] != k:
+            raise ValueError(f"ExternalForce: expected forces for {k} vertices, shape (..., {k}, 3), got {shape}")
+
+    def settled(self, scene, density, initial_positions, initial_velocities) -> "ExternalForce":
+        """With a force for each of the vertices acted upon."""
+        k, forces = len(self.indices(scene.mesh)), self.values["external_forces"]
+        rows = np.tile(forces, (k, 1)) if forces.ndim == 1 else forces
+        return self.with_input("external_forces", value=rows, shapes=((k, 3), ("steps", k, 3)))

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from diffsim_ti.inputs import Input
 from diffsim_ti.terms.term import Term
 
 
@@ -9,13 +10,13 @@ class Gravity(Term):
     """Uniform gravity: acceleration g [m/s^2] of every vertex, energy -m g . x.
 
     acceleration: a vector of 3, or one number along y (so -9.81 pulls down). Default (0, -9.81, 0).
-    Input with gradient: "gravity", shape (3,).
+    Input with gradient: "gravity", shape (3,), or "<name>.acceleration".
     """
 
-    def __init__(self, acceleration=(0.0, -9.81, 0.0)):
+    def __init__(self, acceleration=(0.0, -9.81, 0.0), name: str | None = None):
         g = np.array(acceleration, dtype=np.float64)
         if g.shape == ():
             g = np.array([0.0, float(g), 0.0])
         if g.shape != (3,):
             raise ValueError(f"Gravity: acceleration must be a number (along y) or 3 numbers, got shape {g.shape}")
-        super().__init__(gravity=g)
+        super().__init__(Input("acceleration", g, unit="m/s^2", plain="gravity"), name=name)

@@ -1,17 +1,21 @@
 """What a term is: a load, a contact or a damping that a scene lists, inlined into the step at compile time."""
 
 from abc import ABC
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
 
 import numpy as np
 import taichi as ti
 
+from diffsim_ti.inputs import Input, Link
 from diffsim_ti.runtime import PRECISIONS
 
 
 class Term(ABC):
-    """A load, contact or damping. `values` are its numbers, by input name, in SI units and float64.
+    """A load, contact or damping: its inputs, in SI units and float64, and how kernels come to read them.
 
+    name: a word that its inputs' names begin with, "floor.stiffness"; without one they have plain names,
+    "barrier_stiffness", to which a second such term adds _2.
     A term that the scene does not list leaves no code and no memory behind. Three hooks, each optional:
     `kernel` makes the compile-time twin of a term that acts by a force on each vertex (see VertexForce); gravity,
     drag and external forces are stages of the step itself.
@@ -22,12 +26,39 @@ class Term(ABC):
     table = np.zeros(0)  # numbers without gradient, laid behind the parameters on the device
     variant: tuple = ()  # what else than its class decides about the kernels of a term
 
-    def __init__(self, **values):
-        self.values = {name: np.array(value, dtype=np.float64) for name, value in values.items()}
-        for name, value in self.values.items():
-            if not np.all(np.isfinite(value)):
-                raise ValueError(f"{type(self).__name__}: {name} must be finite, got {value}")
-            value.setflags(write=False)
+    def __init__(self, *inputs: Input, name: str | None = None):
+        kind = type(self).__name__
+        if name is not None and not (isinstance(name, str) and name.isidentifier()):
+            raise ValueError(
+                f"{kind}: name must be a word such as 'floor', got {name!r}: its inputs' names begin with it"
+            )
+        for described in inputs:
+            if described.value is not None:
+                described.check_given(kind)
+        self.described, self.name = inputs, name
+
+    @property
+    def values(self) -> dict[str, np.ndarray]:
+        """{plain name of an input: its value}, without those that are sampled per run."""
+        return {i.plain: i.value for i in self.described if i.value is not None}
+
+    def with_input(self, plain: str, **changes) -> "Term":
+        """A copy in which the input of a plain name has another value, shapes ..."""
+        out = copy(self)
+        out.described = tuple(replace(i, **changes) if i.plain == plain else i for i in self.described)
+        return out
+
+    @property
+    def num_numbers(self) -> int:
+        """How many numbers kernels read of it, in the scene's parameter array."""
+        return sum(value.size for value in self.values.values())
+
+    def links(self, names: dict[str, str], own: str) -> list[Link]:
+        """From its inputs to what kernels read; `names`: {plain name: name in the scene}.
+
+        Where none writes `own`, the `num_numbers` that its kernels take, they take those of its inputs as they are.
+        """
+        return []
 
     def check(self, mesh) -> None:
         """Raise ValueError if the term does not fit the mesh."""
@@ -44,8 +75,9 @@ class Term(ABC):
         return None
 
     def __repr__(self) -> str:
-        numbers = ", ".join(f"{name}={_short(value)}" for name, value in self.values.items())
-        return f"{type(self).__name__}({numbers})"
+        named = [] if self.name is None else [f"name={self.name!r}"]
+        numbers = [f"{name}={_short(value)}" for name, value in self.values.items()]
+        return f"{type(self).__name__}({', '.join(named + numbers)})"
 
 
 def _short(value: np.ndarray) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.terms import ExternalForce
 from diffsim_ti.visual.colouring import Colouring, field_of, to_vertices
 from diffsim_ti.visual.dragging import Grip
 from diffsim_ti.visual.extent import Extent
@@ -105,7 +106,8 @@ class LiveFrames(FrameSource):
     def __init__(self, run: "ForwardRun", keep: int = 300):
         self.run, self.setting, sim = run, Setting.of(run.scene), run.simulator
         self._frames, self._limits, self._grip = deque(maxlen=keep), {}, None
-        given = run.scene.inputs.values.get("external_forces")
+        loads = run.scene.term(ExternalForce)
+        given = None if loads is None else loads.values.get("external_forces")
         self.can_drag = given is not None and given.shape == self.mesh.vertices.shape
         self._given, self._mass = given, run.scene.inputs.derive(run.scene.inputs.values).mass
         shown = sim.positions[self.mesh.surface_vertices]

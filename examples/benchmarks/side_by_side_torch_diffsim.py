@@ -90,7 +90,7 @@ def implicit(sizes=(2, 3, 4, 5), steps: int = 2) -> list[tuple]:
         solver = IPCImplicitEulerSolver(dt=dt, dhat=1e-3, newton_tolerance=tolerance)
         law, masses = (
             diffsim.DifferentiableMaterial(E, nu),
-            torch.as_tensor(scene.inputs.derive(scene.inputs.values).mass),
+            torch.tensor(scene.inputs.derive(scene.inputs.values).mass),
         )
         state = torch.as_tensor(mesh.vertices.copy()), torch.zeros(mesh.vertices.shape, dtype=torch.float64)
         seconds = []

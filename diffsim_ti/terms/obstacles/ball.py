@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from diffsim_ti.runtime import traced
+from diffsim_ti.terms.described import extent, place
 from diffsim_ti.terms.obstacles import shapes
 from diffsim_ti.terms.obstacles.obstacle import Obstacle, ObstacleForce
 
@@ -39,8 +40,8 @@ class Sphere(Obstacle):
     """
 
     def __init__(self, center=(0.0, 0.0, 0.0), radius: float = 1.0, inside: bool = False, **options):
-        super().__init__(dict(sphere_center=center, sphere_radius=radius), **options)
-        check_sizes(self, points=("sphere_center",), positive=("sphere_radius",))
+        shape = place("center", center, "sphere_center"), extent("radius", radius, "sphere_radius")
+        super().__init__(shape, **options)
         self.inside = bool(inside)
 
     def distance(self, positions):
@@ -85,8 +86,8 @@ class Capsule(Obstacle):
     twin = CapsuleForce
 
     def __init__(self, start, end, radius: float, **options):
-        super().__init__(dict(capsule_start=start, capsule_end=end, capsule_radius=radius), **options)
-        check_sizes(self, points=("capsule_start", "capsule_end"), positive=("capsule_radius",))
+        ends = place("start", start, "capsule_start"), place("end", end, "capsule_end")
+        super().__init__([*ends, extent("radius", radius, "capsule_radius")], **options)
         check_axis(self, "capsule_start", "capsule_end")
 
     def distance(self, positions):
@@ -99,18 +100,6 @@ class Capsule(Obstacle):
         return shapes.tube(
             values["capsule_start"], values["capsule_end"], float(values["capsule_radius"]), rounded=True
         )
-
-
-def check_sizes(term, points=(), positive=()) -> None:
-    """Raise ValueError for points that are not 3 numbers and sizes that are not positive."""
-    for name in points:
-        if term.values[name].shape != (3,):
-            raise ValueError(
-                f"{type(term).__name__}: {name} must be 3 numbers [m], got shape {term.values[name].shape}"
-            )
-    for name in positive:
-        if not np.all(term.values[name] > 0):
-            raise ValueError(f"{type(term).__name__}: {name} must be > 0 [m], got {term.values[name]}")
 
 
 def check_axis(term, start: str, end: str) -> None:

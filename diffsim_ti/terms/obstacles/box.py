@@ -5,9 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 import taichi as ti
 
+from diffsim_ti.inputs import POSITIVE, Input
 from diffsim_ti.runtime import traced
+from diffsim_ti.terms.described import extent, place
 from diffsim_ti.terms.obstacles import shapes
-from diffsim_ti.terms.obstacles.ball import check_axis, check_sizes, radial
+from diffsim_ti.terms.obstacles.ball import check_axis, radial
 from diffsim_ti.terms.obstacles.obstacle import Obstacle, ObstacleForce
 
 
@@ -79,8 +81,9 @@ class Box(Obstacle):
             raise ValueError(f"Box: rotation must be 3 finite numbers, axis times angle [rad], got {rotation}")
         angle = np.linalg.norm(turn)
         quaternion = [np.cos(angle / 2), *(0.5 * np.sinc(angle / 2 / np.pi) * turn)]
-        super().__init__(dict(box_center=center, box_size=size, box_rotation=quaternion), **options)
-        check_sizes(self, points=("box_center", "box_size"), positive=("box_size",))
+        sides = Input("size", size, ((3,),), "m", POSITIVE, plain="box_size")
+        turned = Input("rotation", quaternion, plain="box_rotation")
+        super().__init__([place("center", center, "box_center"), sides, turned], **options)
 
     def distance(self, positions):
         from scipy.spatial.transform import Rotation
@@ -123,8 +126,8 @@ class Cylinder(Obstacle):
     twin = CylinderForce
 
     def __init__(self, start, end, radius: float, **options):
-        super().__init__(dict(cylinder_start=start, cylinder_end=end, cylinder_radius=radius), **options)
-        check_sizes(self, points=("cylinder_start", "cylinder_end"), positive=("cylinder_radius",))
+        ends = place("start", start, "cylinder_start"), place("end", end, "cylinder_end")
+        super().__init__([*ends, extent("radius", radius, "cylinder_radius")], **options)
         check_axis(self, "cylinder_start", "cylinder_end")
 
     def distance(self, positions):

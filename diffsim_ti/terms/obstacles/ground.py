@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import taichi as ti
 
+from diffsim_ti.inputs import Input
 from diffsim_ti.runtime import traced
 from diffsim_ti.terms.obstacles import barrier
 from diffsim_ti.terms.obstacles.obstacle import Obstacle, ObstacleForce
@@ -22,7 +23,7 @@ class Ground(Obstacle):
     """
 
     def __init__(self, height: float = 0.0, stiffness: float | None = 1e4, width: float = 0.01, **options):
-        super().__init__(dict(ground_height=height), stiffness, width, **options)
+        super().__init__([Input("height", height, ((),), "m", plain="ground_height")], stiffness, width, **options)
 
     def distance(self, positions: np.ndarray) -> np.ndarray:
         return positions[:, 1] - float(self.values["ground_height"])

@@ -4,7 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from diffsim_ti.inputs import Input
 from diffsim_ti.runtime import traced
+from diffsim_ti.terms.described import place
 from diffsim_ti.terms.obstacles import shapes
 from diffsim_ti.terms.obstacles.obstacle import Obstacle, ObstacleForce
 
@@ -32,10 +34,8 @@ class HalfSpace(Obstacle):
     twin = HalfSpaceForce
 
     def __init__(self, point=(0.0, 0.0, 0.0), normal=(0.0, 1.0, 0.0), **options):
-        super().__init__(dict(half_space_point=point, half_space_normal=normal), **options)
-        for name in ("half_space_point", "half_space_normal"):
-            if self.values[name].shape != (3,):
-                raise ValueError(f"HalfSpace: {name[11:]} must be 3 numbers, got shape {self.values[name].shape}")
+        turn = Input("normal", normal, ((3,),), plain="half_space_normal")
+        super().__init__([place("point", point, "half_space_point"), turn], **options)
         if not np.linalg.norm(self.values["half_space_normal"]) > 0:
             raise ValueError("HalfSpace: normal must not be zero; pass the direction that points out of the solid")
 

@@ -6,7 +6,7 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti.runtime import at, let, traced
-from diffsim_ti.terms.obstacles.ball import check_sizes
+from diffsim_ti.terms.described import place
 from diffsim_ti.terms.obstacles.obstacle import Obstacle, ObstacleForce
 
 
@@ -24,8 +24,7 @@ class MeshObstacle(Obstacle):
     """
 
     def __init__(self, vertices, triangles, position=(0.0, 0.0, 0.0), resolution: int = 48, **options):
-        super().__init__(dict(mesh_position=position), **options)
-        check_sizes(self, points=("mesh_position",))
+        super().__init__([place("position", position, "mesh_position")], **options)
         vertices, triangles = np.asarray(vertices, np.float64), np.asarray(triangles, np.int64)
         check_closed(vertices, triangles)
         if int(resolution) != resolution or resolution < 4:

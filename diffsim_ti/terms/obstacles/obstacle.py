@@ -1,13 +1,16 @@
 """What all obstacles share: a barrier of the distance, friction, a path, and every derivative of these."""
 
-from copy import copy
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import taichi as ti
 
+from diffsim_ti.inputs import NOT_NEGATIVE, Input
+from diffsim_ti.inputs.description import length_per_step
 from diffsim_ti.materials.calculus.tensor import sum_of
 from diffsim_ti.runtime import at, let, traced
+from diffsim_ti.terms.described import positive
 from diffsim_ti.terms.graph import Graph
 from diffsim_ti.terms.gravity import Gravity
 from diffsim_ti.terms.motion import sampled
@@ -31,7 +34,8 @@ class Obstacle(Term):
     (times, displacements) between which it is linear. It is sampled at the steps and linear within each.
 
     Inputs with gradient: the shape's own numbers, "barrier_stiffness", "barrier_width", with friction also "friction" and
-    "friction_speed", with a path "<shape>_path", shape (steps + 1, 3). A second obstacle's names end in _2.
+    "friction_speed", with a path "<shape>_path", shape (steps + 1, 3). A second obstacle's names end in _2; those of one
+    with a name begin with it and go on as the argument: "floor.stiffness", "floor.path".
     In explicit steps frictions on one vertex act one after the other: kinds in a fixed order, obstacles of one kind as the
     scene lists them. Swapping two there, at 90 degrees to each other, moved a body by 7e-4 of the way that it went in 32 ms
     with substeps of 2 ms, and a gradient by up to 12 % (that of friction_speed); half of both with 1 ms. Elsewhere, and in
@@ -45,30 +49,29 @@ class Obstacle(Term):
 
     def __init__(
         self,
-        shape: dict,
-        stiffness=None,
+        shape: Sequence[Input] | dict,
+        stiffness: float | None = None,
         width: float = 0.01,
         friction: float = 0.0,
         friction_speed: float = 1e-3,
         path=None,
+        name: str | None = None,
     ):
-        own = dict(barrier_stiffness=1.0 if stiffness is None else stiffness, barrier_width=width)
-        if np.ndim(friction) or not float(friction) >= 0:
-            raise ValueError(f"{type(self).__name__}: friction must be one number >= 0, got {friction}")
-        if float(friction) > 0:
-            own |= dict(friction=friction, friction_speed=friction_speed)
-        super().__init__(**shape, **own)
-        positive = [("width [m]", width), ("friction_speed [m/s]", friction_speed)]
-        if stiffness is not None:
-            positive.insert(0, ("stiffness [N/m]", stiffness))
-        for name, value in positive:
-            if np.ndim(value) or not float(value) > 0:
-                raise ValueError(f"{type(self).__name__}: {name} must be > 0, got {value}")
+        if isinstance(shape, dict):  # {name: value}, with nothing more to say of them
+            shape = [Input(plain, value) for plain, value in shape.items()]
+        k, speed = 1.0 if stiffness is None else stiffness, positive("friction_speed", friction_speed, "m/s")
+        felt = positive("stiffness", k, "N/m", "barrier_stiffness"), positive("width", width, "m", "barrier_width")
+        friction_of = Input("friction", friction, ((),), range=NOT_NEGATIVE), speed
+        for described in friction_of:  # also of what is smooth
+            described.check_given(type(self).__name__)
+        rough = friction_of if friction_of[0].value > 0 else ()
+        rows = [Input("path", None, (("steps + 1", 3),), "m", change=length_per_step, plain=self.path_name)]
+        super().__init__(*shape, *felt, *rough, *(rows if path is not None else []), name=name)
         self.chooses_stiffness, self.path = stiffness is None, path
 
     @property
     def path_name(self) -> str:
-        """Name of the input that moves the obstacle."""
+        """Plain name of the input that moves the obstacle."""
         kind = type(self).__name__
         return "".join("_" * (k > 0 and c.isupper()) + c.lower() for k, c in enumerate(kind)) + "_path"
 
@@ -93,9 +96,7 @@ class Obstacle(Term):
                 f"{type(self).__name__}: without gravity and velocity nothing says how stiff the barrier must be; pass "
                 "stiffness [N/m]"
             )
-        out = copy(self)
-        out.values = self.values | {"barrier_stiffness": np.array(stiffness)}
-        return out
+        return self.with_input("barrier_stiffness", value=stiffness)
 
     def distance(self, positions: np.ndarray) -> np.ndarray:
         """Distance [m] of each position, shape (k, 3), to the obstacle as it was made; negative inside."""

@@ -1,0 +1,125 @@
+"""The chain rule as a list of links: each a function with its derivatives beside it, and three loops over all of them."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping, Sequence
+from operator import is_
+
+import numpy as np
+
+from diffsim_ti.inputs.description import frozen
+
+Arrays = Sequence[np.ndarray]
+
+
+class Link(ABC):
+    """y = f(x), for arrays x named by `reads` and y named by `writes`; all methods return one array per name.
+
+    What a link reads are inputs, or what links before it write. A link must not write into what it is given, and y may
+    depend on nothing else that changes.
+    """
+
+    reads: tuple[str, ...]
+    writes: tuple[str, ...]
+
+    @abstractmethod
+    def value(self, *x: np.ndarray) -> Arrays:
+        """y = f(x)"""
+
+    @abstractmethod
+    def jvp(self, x: Arrays, dx: Arrays) -> Arrays:
+        """dy = f'(x) dx"""
+
+    @abstractmethod
+    def vjp(self, x: Arrays, y_adj: Arrays) -> Arrays:
+        """Adjoints of x, f'(x)^T y_adj, each of its x's shape."""
+
+
+class Chain:
+    """Links one after the other, from some inputs on. What a link wrote is kept for as long as its arrays are the same.
+
+    Raises ValueError for a link that reads what is not there yet, for two that write one name, and for an idle input.
+    """
+
+    def __init__(self, links: Iterable[Link], inputs: Iterable[str]):
+        self.links = tuple(links)
+        known = unread = set(inputs)
+        for link in self.links:
+            kind = type(link).__name__
+            for name in link.reads:
+                if name not in known:
+                    raise ValueError(f"{kind} reads {name!r}, which is no input and which no link before it writes")
+            for name in link.writes:
+                if name in known:
+                    raise ValueError(f"{kind} writes {name!r}, which is an input or written by a link before it")
+            known, unread = known.union(link.writes), unread.difference(link.reads)
+        if unread:
+            raise ValueError(f"no link reads the input {sorted(unread)[0]!r}: give its term or material one that does")
+        self._kept: dict[Link, tuple[Arrays, Arrays]] = {}
+        self._ways: dict[tuple[str, ...], tuple[list[Link], list[Link]]] = {}
+
+    def value(self, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """The values and what all links write; links that miss something are left out."""
+        return self._through(self.links, values)
+
+    def _through(self, links: Iterable[Link], values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        known = dict(values)
+        for link in links:
+            try:
+                x = [known[name] for name in link.reads]
+            except KeyError:
+                continue
+            known.update(zip(link.writes, self._written(link, x)))
+        return known
+
+    def _written(self, link: Link, x: Arrays) -> Arrays:
+        before = self._kept.get(link)
+        if before is not None and all(map(is_, before[0], x)):
+            return before[1]
+        y = [frozen(part) for part in link.value(*x)]
+        if not any(part.flags.writeable for part in x):  # what may be written to may change and stay the same array
+            self._kept[link] = x, y
+        return y
+
+    def jvp(self, values: Mapping[str, np.ndarray], tangents: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Tangents of what links write, of those alone that change."""
+        known, out = self.value(values), dict(tangents)
+        for link in self.links:
+            if any(name in out for name in link.reads) and all(name in known for name in link.reads):
+                x = [known[name] for name in link.reads]
+                dx = [out[name] if name in out else np.zeros_like(part) for name, part in zip(link.reads, x)]
+                out.update(zip(link.writes, link.jvp(x, dx)))
+        return out
+
+    def vjp(
+        self, values: Mapping[str, np.ndarray], adjoints: Mapping[str, np.ndarray], wanted
+    ) -> dict[str, np.ndarray]:
+        """Adjoints of the wanted inputs for adjoints of what links write (None: zero)."""
+        pulled, before = self._way(tuple(wanted))
+        known, total = self._through(before, values), {n: y for n, y in adjoints.items() if y is not None}
+        for link in reversed(pulled):
+            x = [known[name] for name in link.reads]
+            try:
+                y_adj = [total[name] for name in link.writes]
+            except KeyError:  # nothing depends on some of it
+                y_adj = [total.get(n, np.zeros_like(y)) for n, y in zip(link.writes, self._written(link, x))]
+            for name, adjoint in zip(link.reads, link.vjp(x, y_adj)):
+                total[name] = total[name] + adjoint if name in total else adjoint
+        return {name: np.asarray(total[name] if name in total else np.zeros_like(values[name])) for name in wanted}
+
+    def _way(self, wanted: tuple[str, ...]) -> tuple[list[Link], list[Link]]:
+        """(links between the wanted inputs and what kernels read, links that give what those read)."""
+        if wanted not in self._ways:
+            reached = set(wanted)
+            pulled = []
+            for link in self.links:
+                if not reached.isdisjoint(link.reads):
+                    reached.update(link.writes)
+                    pulled.append(link)
+            needed = {name for link in pulled for name in link.reads}
+            before = []
+            for link in reversed(self.links):
+                if not needed.isdisjoint(link.writes):
+                    needed.update(link.reads)
+                    before.insert(0, link)
+            self._ways[wanted] = pulled, before
+        return self._ways[wanted]

@@ -1,0 +1,180 @@
+"""The inputs of a scene: names, values, and what kernels read of them, with derivatives both ways."""
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from diffsim_ti.inputs import links
+from diffsim_ti.inputs.chain import Chain, Link
+from diffsim_ti.inputs.description import POSITIVE, Input, frozen, length, speed
+from diffsim_ti.rows import Rows
+
+
+@dataclass
+class Derived:
+    """What kernels read; also used for tangents and adjoints of the same numbers. None: the scene has no such thing."""
+
+    displacement: np.ndarray  # (num_vertices, 3) [m]
+    velocity: np.ndarray  # (num_vertices, 3) [m/s]
+    coefficients: np.ndarray  # (K,) or (num_tetrahedra, K)
+    mass: np.ndarray  # (num_vertices,) [kg]
+    parameters: np.ndarray  # the numbers of all terms, one after the other
+    rest: np.ndarray  # (num_vertices, 3) [m]
+    gradients: np.ndarray  # (num_tetrahedra, 3, 3), rows grad N_1..3 [1/m]
+    volumes: np.ndarray  # (num_tetrahedra,) [m^3]
+    forces: np.ndarray | None = None  # (1 or steps, k, 3) [N]
+    motion: np.ndarray | None = None  # (steps + 1, num_fixed, 3) [m]
+    path: np.ndarray | None = None  # displacements of obstacles, (steps + 1, num_moving, 3) [m]
+
+    def zeros(self) -> "Derived":
+        """The same shapes, all zero."""
+        return Derived(*(None if part is None else np.zeros_like(part) for part in self.parts().values()))
+
+    def parts(self) -> dict[str, np.ndarray | None]:
+        """{name: array}"""
+        return {name: getattr(self, name) for name in READ}
+
+
+READ = tuple(field.name for field in fields(Derived))
+
+
+class Inputs:
+    """The numbers of a scene that a gradient can be asked for: names, values, what kernels make of them.
+
+    `values`: dict of float64 arrays, read-only. Names: initial_positions, initial_velocities, the material's own inputs,
+    density, rest_positions, and those of the terms. prescribed_motion and paths of obstacles join per run, sampled at its
+    steps. `described`: {name: Input}, those too.
+    """
+
+    def __init__(self, scene, density, initial_positions, initial_velocities):
+        self.scene, self.mesh = scene, scene.mesh
+        self.sizes = {"vertices": self.mesh.num_vertices, "tetrahedra": self.mesh.num_tetrahedra}
+        last = {i.plain: i for i in self._at_last()}
+        self.described = {i.plain: i for i in self._of_body(density, initial_positions, initial_velocities)}
+        self._names = []  # {a term's own name: its name here}, for each term in the order of the scene's list
+        for term in scene.terms:
+            self._names.append({})
+            for i in term.described:
+                name = self._names[-1][i.plain] = _free_name(term, i, self.described.keys() | last.keys())
+                self.described[name] = i
+        self.described |= last
+        self.values = self.check({name: i.value for name, i in self.described.items() if i.value is not None})
+        named = dict(zip(scene.terms, self._names))
+        self._per_step = [name for name, i in self.described.items() if i.is_per_step]
+        self.parameters = Rows({term: term.num_numbers for term in scene.ordered_terms})
+        self.paths = [named[term][term.path_name] for term in scene.moving]  # names, in the order of kernels' columns
+        self.chain = Chain(self._links(named), self.described)
+
+    def _of_body(self, density, positions, velocities) -> list[Input]:
+        n, X = self.mesh.num_vertices, self.mesh.vertices
+        velocities = np.zeros(3) if velocities is None else velocities
+        velocities = np.broadcast_to(np.asarray(velocities, np.float64), (n, 3))
+        places, per_tetrahedron = (("vertices", 3),), ((), ("tetrahedra",))
+        return [
+            Input("initial_positions", X if positions is None else positions, places, "m", change=length),
+            Input("initial_velocities", velocities, places, "m/s", change=speed),
+            *self.scene.material.described(self.mesh),
+            Input("density", density, per_tetrahedron, "kg/m^3", POSITIVE),
+        ]
+
+    def _at_last(self) -> list[Input]:
+        out = [Input("rest_positions", self.mesh.vertices, (("vertices", 3),), "m", change=length)]
+        if self.scene.motion is not None:
+            shape = ("steps + 1", len(self.scene.fixed), 3)
+            out.append(Input("prescribed_motion", None, (shape,), "m", change=length))
+        return out
+
+    def _links(self, named: dict) -> list[Link]:
+        """Those of the body, of its material, of the terms, and what joins the terms' numbers and paths."""
+        mesh, scene, places = self.mesh, self.scene, {}
+        out = [
+            links.RestShape(mesh.tetrahedra),
+            links.Displacement(),
+            links.FreeVelocity(scene.fixed),
+            links.LumpedMass(mesh.tetrahedra, mesh.num_vertices),
+            *scene.material.links(),
+        ]
+        for k, term in enumerate(scene.ordered_terms):
+            own, rows = f"numbers of term {k}", self.parameters.of(term)
+            links_of = term.links(named[term], own)
+            out += links_of
+            as_they_are = not any(own in link.writes for link in links_of)
+            places |= _placed(term, named[term], rows) if as_they_are else {own: rows}
+        out.append(links.Placed(places, "parameters", max(self.parameters.total, 1)))
+        if self.paths:
+            out.append(links.Columns(self.paths, "path"))
+        if scene.motion is not None:
+            out.append(links.Same("prescribed_motion", "motion"))
+        return out
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(self.values)
+
+    def names_of(self, place: int) -> dict[str, str]:
+        """{own name: name here} of the inputs of the term at a place of the scene's list."""
+        return dict(self._names[place])
+
+    def at_times(self, times) -> dict[str, np.ndarray]:
+        """The values of a run, with those that are sampled at its times [s]."""
+        scene = self.scene
+        rows = {"prescribed_motion": scene.motion_rows(times)} if scene.motion is not None else {}
+        return self.values | {name: frozen(value) for name, value in (rows | scene.path_rows(times)).items()}
+
+    def check(self, values: dict) -> dict[str, np.ndarray]:
+        """Float64 arrays of the right shapes, or ValueError naming expected and got."""
+        unknown = [name for name in values if name not in self.described]
+        if unknown:
+            raise ValueError(f"no input named {unknown[0]!r}; this scene has {', '.join(self.described)}")
+        return {name: self.described[name].checked(name, value, self.sizes) for name, value in values.items()}
+
+    def check_steps(self, values: dict, steps: int) -> None:
+        """Raise ValueError unless what is given per step has the rows that a run of so many steps reads."""
+        for name in self._per_step:
+            if name in values:
+                self.described[name].check_steps(name, values[name].shape, steps)
+
+    def derive(self, values: dict) -> Derived:
+        """What kernels read; arrays that may be kept and handed out again: do not write into them."""
+        known = self.chain.value(values)
+        return Derived(*map(known.get, READ))
+
+    @property
+    def rest_gradients(self) -> np.ndarray:
+        """grad N_1..3 of each tetrahedron of the mesh [1/m], shape (num_tetrahedra, 3, 3)."""
+        return self.derive(self.values).gradients
+
+    def derive_jvp(self, values: dict, dots: dict) -> Derived:
+        """Change of what kernels read for changes `dots` of some inputs."""
+        out, tangents = self.derive(values).zeros(), self.chain.jvp(values, dots)
+        for name in out.parts():
+            setattr(out, name, tangents.get(name, getattr(out, name)))
+        return out
+
+    def derive_vjp(self, values: dict, adj: Derived, wanted) -> dict[str, np.ndarray]:
+        """Adjoints of the wanted inputs for adjoints of what kernels read; those of coefficients come per tetrahedron."""
+        return self.chain.vjp(values, adj.parts(), wanted)
+
+
+def _free_name(term, described: Input, taken) -> str:
+    """Name of a term's input: that of the term, a dot, the argument's; of a term without one the plain name, or with _2."""
+    if term.name is not None:
+        return f"{term.name}.{described.name}"
+    candidate, number = described.plain, 2
+    while candidate in taken:
+        candidate, number = f"{described.plain}_{number}", number + 1
+    return candidate
+
+
+def _placed(term, names: dict[str, str], rows: slice) -> dict[str, slice]:
+    """{name of an input: where its numbers stand} of a term whose kernels take them as they are."""
+    out, at = {}, rows.start
+    if rows.stop > rows.start:
+        for name, value in term.values.items():
+            out[names[name]] = slice(at, at + value.size)
+            at += value.size
+    if at != rows.stop:
+        raise ValueError(
+            f"{term!r}: kernels take {rows.stop - rows.start} numbers and its inputs have {at - rows.start}; give it links"
+        )
+    return out

@@ -1,0 +1,180 @@
+"""Links of a body, its rest shape, mass and start, and what joins the numbers of terms and the paths of obstacles."""
+
+import numpy as np
+
+from diffsim_ti.inputs.chain import Link
+from diffsim_ti.mesh import geometry
+
+
+class RestShape(Link):
+    """Of rest positions X: X itself, rows grad N_1..3 = D^-1 and volumes V = det D / 6, D the edges from corner 0.
+
+    dD^-1 = -D^-1 dD D^-1 and dV = V tr(D^-1 dD). Raises ValueError for a tetrahedron that is turned inside out.
+    """
+
+    reads, writes = ("rest_positions",), ("rest", "gradients", "volumes")
+
+    def __init__(self, tetrahedra: np.ndarray):
+        self.tetrahedra = tetrahedra
+        self._last = None  # X, D^-1, V: derivatives need what the value was made of
+
+    def value(self, X):
+        return X, *self._inverse(X)
+
+    def _inverse(self, X):
+        """(D^-1, V)"""
+        if self._last is not None and self._last[0] is X:
+            return self._last[1:]
+        D = geometry.edge_matrices(X, self.tetrahedra)
+        volumes = np.linalg.det(D) / 6
+        if not np.all(volumes > 0):
+            worst = int(np.argmin(volumes))
+            raise ValueError(
+                f"rest_positions turn tetrahedron {worst} inside out (volume {volumes[worst]:.3g} m^3, "
+                f"{(~(volumes > 0)).sum()} in all); take a smaller step in the rest shape"
+            )
+        out = np.linalg.inv(D), volumes
+        self._last = None if X.flags.writeable else (X, *out)
+        return out
+
+    def jvp(self, x, dx):
+        B, V = self._inverse(*x)
+        dD = geometry.edge_matrices(dx[0], self.tetrahedra)
+        return dx[0], -B @ dD @ B, V * np.einsum("eij,eji->e", B, dD)
+
+    def vjp(self, x, y_adj):
+        B, V = self._inverse(*x)
+        rest_adj, gradients_adj, volumes_adj = y_adj
+        Bt = np.swapaxes(B, 1, 2)
+        D_adj = -Bt @ gradients_adj @ Bt + (V * volumes_adj)[:, None, None] * Bt
+        by_edge = np.swapaxes(D_adj, 1, 2)  # one row per edge, the derivative by X_a - X_0
+        X_adj = np.array(rest_adj)
+        np.add.at(X_adj, self.tetrahedra[:, 1:].ravel(), by_edge.reshape(-1, 3))
+        np.add.at(X_adj, self.tetrahedra[:, 0], -by_edge.sum(1))
+        return (X_adj,)
+
+
+class Displacement(Link):
+    """u = x - X."""
+
+    reads, writes = ("initial_positions", "rest"), ("displacement",)
+
+    def value(self, x, X):
+        return (x - X,)
+
+    def jvp(self, x, dx):
+        return (dx[0] - dx[1],)
+
+    def vjp(self, x, y_adj):
+        return y_adj[0], -y_adj[0]
+
+
+class FreeVelocity(Link):
+    """Velocities; fixed vertices have none."""
+
+    reads, writes = ("initial_velocities",), ("velocity",)
+
+    def __init__(self, fixed: np.ndarray):
+        self.fixed = fixed
+
+    def value(self, v):
+        out = np.array(v)
+        out[self.fixed] = 0
+        return (out,)
+
+    def jvp(self, x, dx):
+        return self.value(dx[0])
+
+    def vjp(self, x, y_adj):
+        return self.value(y_adj[0])
+
+
+class LumpedMass(Link):
+    """Of each vertex, sum rho V / 4 over its tetrahedra; rho is one number or one per tetrahedron."""
+
+    reads, writes = ("density", "volumes"), ("mass",)
+
+    def __init__(self, tetrahedra: np.ndarray, num_vertices: int):
+        self.tetrahedra, self.num_vertices = tetrahedra, num_vertices
+
+    def value(self, density, volumes):
+        return (self._to_vertices(density * volumes / 4),)
+
+    def jvp(self, x, dx):
+        (density, volumes), (d_density, d_volumes) = x, dx
+        return (self._to_vertices((d_density * volumes + density * d_volumes) / 4),)
+
+    def vjp(self, x, y_adj):
+        (density, volumes), mass_adj = x, y_adj[0][self.tetrahedra].sum(1) / 4
+        by_density = volumes * mass_adj
+        return by_density if density.ndim else by_density.sum(), density * mass_adj
+
+    def _to_vertices(self, per_tetrahedron: np.ndarray) -> np.ndarray:
+        return np.bincount(self.tetrahedra.ravel(), np.repeat(per_tetrahedron, 4), self.num_vertices)
+
+
+class Same(Link):
+    """y = x, an input that kernels read as it is."""
+
+    def __init__(self, reads: str, writes: str):
+        self.reads, self.writes = (reads,), (writes,)
+
+    def value(self, x):
+        return (x,)
+
+    def jvp(self, x, dx):
+        return (np.array(dx[0]),)
+
+    def vjp(self, x, y_adj):
+        return y_adj
+
+
+class PerStep(Link):
+    """What holds during each step, as a list: what is given for all steps is a list of one."""
+
+    def __init__(self, reads: str, writes: str, ndim: int):
+        self.reads, self.writes, self.ndim = (reads,), (writes,), ndim  # ndim: of the list
+
+    def value(self, x):
+        return (x[None] if x.ndim < self.ndim else x,)
+
+    def jvp(self, x, dx):
+        return self.value(np.array(dx[0]))
+
+    def vjp(self, x, y_adj):
+        return (y_adj[0][0] if x[0].ndim < self.ndim else y_adj[0],)
+
+
+class Placed(Link):
+    """All numbers of some arrays, those of each in its range of one list of `size`, which is zero elsewhere."""
+
+    def __init__(self, places: dict[str, slice], writes: str, size: int):
+        self.reads, self.places, self.writes, self.size = tuple(places), tuple(places.values()), (writes,), size
+
+    def value(self, *x):
+        out = np.zeros(self.size)
+        for place, part in zip(self.places, x):
+            out[place] = part.ravel()
+        return (out,)
+
+    def jvp(self, x, dx):
+        return self.value(*dx)
+
+    def vjp(self, x, y_adj):
+        return [y_adj[0][place].reshape(part.shape) for place, part in zip(self.places, x)]
+
+
+class Columns(Link):
+    """Arrays of one shape (rows, ...) as columns, shape (rows, columns, ...)."""
+
+    def __init__(self, reads, writes: str):
+        self.reads, self.writes = tuple(reads), (writes,)
+
+    def value(self, *x):
+        return (np.stack(x, 1),)
+
+    def jvp(self, x, dx):
+        return self.value(*dx)
+
+    def vjp(self, x, y_adj):
+        return [y_adj[0][:, k] for k in range(len(self.reads))]
