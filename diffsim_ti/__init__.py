@@ -15,6 +15,7 @@ from diffsim_ti.materials import (
     StVenantKirchhoff,
 )
 from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.outputs import MaterialPoints
 from diffsim_ti.rollout import Frames, Rollout
 from diffsim_ti.runtime import init
 from diffsim_ti.scene import Scene
@@ -81,6 +82,7 @@ __all__ = [
     "NotConverged",
     "Rollout",
     "Frames",
+    "MaterialPoints",
     "taylor_test",
     "dot_product_test",
     "check_gradients",

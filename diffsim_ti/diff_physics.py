@@ -1,6 +1,7 @@
 """PyTorch face: learnable materials, smooth contact, implicit differentiation, checkpointed rollouts."""
 
 import math
+from functools import lru_cache
 
 import numpy as np
 
@@ -68,7 +69,7 @@ class TorchMaterial(torch.nn.Module):
         """
         if F.ndim != 3 or F.shape[1:] != (3, 3):
             raise ValueError(f"F: expected shape (m, 3, 3), got {tuple(F.shape)}")
-        material = self.core(None)
+        material = self.material(*(x.detach().double().cpu().numpy() for x in (self.E, self.nu)))
         lame = torch.stack(torch.broadcast_tensors(self.mu, self.lam), -1)
         coefficients = lame @ torch.as_tensor(np.array(material.from_lame), dtype=lame.dtype, device=lame.device).T
         if coefficients.ndim == 2 and len(coefficients) != len(F):
@@ -81,9 +82,8 @@ class TorchMaterial(torch.nn.Module):
         return {"youngs_modulus": self.E, "poissons_ratio": self.nu}
 
     def core(self, mesh):
-        """The core's material at the present values."""
-        E, nu = (x.detach().double().cpu().numpy() for x in self.tensors(mesh).values()) if mesh else (1e5, 0.3)
-        return self.material(E, nu)
+        """The core's material on a mesh, at the present values."""
+        return self.material(*(x.detach().double().cpu().numpy() for x in self.tensors(mesh).values()))
 
 
 def _one_of(name: str, *given):
@@ -134,7 +134,7 @@ class SpatiallyVaryingMaterial(TorchMaterial):
     `SpatiallyVaryingMaterial(num_elements, base_youngs, base_poisson)`: Parameters log_E and nu, one per tetrahedron.
     `SpatiallyVaryingMaterial(base_E=, base_nu=, grid_resolution=, E_range=, requires_grad=)`: one Parameter of control
     values in Pa on a regular grid over the mesh's bounding box, trilinear at the tetrahedra's centroids and clamped to
-    E_range; nu is a buffer.
+    E_range; nu is a buffer. E is then a function of the mesh: `youngs_modulus(mesh)`.
     """
 
     def __init__(
@@ -151,7 +151,7 @@ class SpatiallyVaryingMaterial(TorchMaterial):
         law=StableNeoHookean,
     ):
         super().__init__()
-        self.material, self._mesh = law, None
+        self.material = law
         E = (
             1e5
             if base_youngs is None and base_E is None
@@ -181,37 +181,40 @@ class SpatiallyVaryingMaterial(TorchMaterial):
 
     @property
     def E(self) -> torch.Tensor:
-        """Young's modulus per tetrahedron [Pa], in the graph; on a grid once a simulator has named the mesh."""
-        if self.grid_resolution is None:
-            return torch.exp(self.log_E)
-        if self._mesh is None:
-            raise RuntimeError("the grid's values need a mesh: build a DifferentiableSimulator, or call tensors(mesh)")
-        low, high = self.E_range
-        return (self._weights(self._mesh) * self.control.reshape(-1)[self._corners]).sum(1).clamp(low, high)
+        """Young's modulus per tetrahedron [Pa], in the graph; RuntimeError on a grid, whose values need a mesh."""
+        if self.grid_resolution is not None:
+            raise RuntimeError("the grid's values need a mesh: call youngs_modulus(mesh)")
+        return torch.exp(self.log_E)
 
-    def _weights(self, mesh) -> torch.Tensor:
-        """Trilinear weights (num_tetrahedra, 8) of the grid points `_corners` around each centroid."""
-        if getattr(self, "_grid_of", None) is not mesh:
-            low, high = mesh.bounding_box
-            size = np.array(self.grid_resolution)
-            at = (mesh.centroids - low) / (high - low) * (size - 1)
-            cell = np.clip(np.floor(at).astype(int), 0, size - 2)
-            part = at - cell
-            weights, corners = [], []
-            for corner in np.ndindex(2, 2, 2):
-                weights.append(np.prod(np.where(corner, part, 1 - part), 1))
-                corners.append(np.ravel_multi_index((cell + corner).T, self.grid_resolution))
-            self._grid_of, self._grid = mesh, (np.stack(weights, 1), np.stack(corners, 1))
-        self._corners = torch.from_numpy(self._grid[1]).to(self.control.device)
-        return torch.from_numpy(self._grid[0]).to(self.control)
-
-    def tensors(self, mesh) -> dict[str, torch.Tensor]:
-        self._mesh = mesh if mesh is not None else self._mesh
-        if self.grid_resolution is None and mesh is not None and len(self.log_E) != mesh.num_tetrahedra:
+    def youngs_modulus(self, mesh) -> torch.Tensor:
+        """Young's modulus per tetrahedron of a mesh [Pa], in the graph."""
+        if self.grid_resolution is not None:
+            weights, corners = _trilinear(mesh, self.grid_resolution)
+            values = self.control.reshape(-1)[torch.from_numpy(corners).to(self.control.device)]
+            return (torch.from_numpy(weights).to(self.control) * values).sum(1).clamp(*self.E_range)
+        if len(self.log_E) != mesh.num_tetrahedra:
             raise ValueError(
                 f"num_elements: the mesh has {mesh.num_tetrahedra} tetrahedra, the material {len(self.log_E)}"
             )
-        return super().tensors(mesh)
+        return self.E
+
+    def tensors(self, mesh) -> dict[str, torch.Tensor]:
+        return {"youngs_modulus": self.youngs_modulus(mesh), "poissons_ratio": self.nu}
+
+
+@lru_cache(maxsize=4)
+def _trilinear(mesh, resolution: tuple) -> tuple[np.ndarray, np.ndarray]:
+    """Weights and indices (num_tetrahedra, 8) of the points of a grid over the mesh's bounding box around each centroid."""
+    low, high = mesh.bounding_box
+    size = np.array(resolution)
+    at = (mesh.centroids - low) / (high - low) * (size - 1)
+    cell = np.clip(np.floor(at).astype(int), 0, size - 2)
+    part = at - cell
+    weights, corners = [], []
+    for corner in np.ndindex(2, 2, 2):
+        weights.append(np.prod(np.where(corner, part, 1 - part), 1))
+        corners.append(np.ravel_multi_index((cell + corner).T, resolution))
+    return np.stack(weights, 1), np.stack(corners, 1)
 
 
 class DifferentiableBarrierContact:

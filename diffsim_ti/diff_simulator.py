@@ -1,11 +1,10 @@
 """PyTorch face: a rollout as one autograd node, and the seeds' DifferentiableSolver and DifferentiableSimulator.
 
-No physics lives here: forward calls `Rollout.forward`, backward calls `Rollout.vjp`.
+No physics lives here: forward is a run of a Rollout's sweep, backward pulls back through it (torch_bridge/).
 """
 
 import math
 import warnings
-from typing import NamedTuple
 
 import numpy as np
 
@@ -17,96 +16,11 @@ from diffsim_ti.solvers import SemiImplicitSolver, Solver, StaticSolver
 from diffsim_ti.state import stability
 from diffsim_ti.terms import Drag, ExternalForce, Gravity
 from diffsim_ti.terms.obstacles import barrier
-from diffsim_ti.torch_bridge.autograd import first_order_only, torch
-from diffsim_ti.torch_bridge.tensors import DTYPES, TensorRollout, checked_device, is_direct
+from diffsim_ti.torch_bridge.autograd import torch
+from diffsim_ti.torch_bridge.rollout_node import TorchFrames, rollout_frames
+from diffsim_ti.torch_bridge.tensors import DTYPES, checked_device
 
-
-class TorchFrames(NamedTuple):
-    """Saved states as tensors of shape (frames, num_vertices, 3): positions [m], velocities [m/s], displacements [m]."""
-
-    positions: torch.Tensor
-    velocities: torch.Tensor
-    displacements: torch.Tensor
-
-
-class _DirectRolloutFunction(torch.autograd.Function):
-    """Inputs of a rollout -> displacements and velocities of its frames, copied on the device."""
-
-    @staticmethod
-    def forward(ctx, rollout: Rollout, names: tuple, *tensors):
-        ctx.run, *frames = rollout.face.forward(dict(zip(names, tensors)))
-        ctx.rollout, ctx.names, ctx.tensors = rollout, names, tensors
-        return tuple(x.to(tensors[0].device) if tensors else x for x in frames)
-
-    @staticmethod
-    @first_order_only("use verify.hessian_product or verify.gauss_newton_product")
-    def backward(ctx, *adjoints):
-        wanted = [name for name, needed in zip(ctx.names, ctx.needs_input_grad[2:]) if needed]
-        gradients = ctx.rollout.face.vjp(ctx.run, *adjoints, wanted)
-        out = [None, None]
-        for name, tensor, needed in zip(ctx.names, ctx.tensors, ctx.needs_input_grad[2:]):
-            out.append(torch.as_tensor(gradients[name]).to(tensor.device, tensor.dtype) if needed else None)
-        return tuple(out)
-
-
-class _RolloutFunction(torch.autograd.Function):
-    """The same by way of the host, for what cannot be copied directly (`is_direct`)."""
-
-    @staticmethod
-    def forward(ctx, rollout: Rollout, names: tuple, *tensors):
-        values = {}
-        for name, tensor in zip(names, tensors):
-            value = tensor.detach().to("cpu", torch.float64).numpy()  # the rollout keeps a copy of its own
-            if name == "initial_displacements":
-                name, value = "initial_positions", rollout.values["rest_positions"] + value
-            values[name] = value
-        frames = rollout.forward(**values)
-        ctx.rollout, ctx.names, ctx.frames, ctx.tensors = rollout, names, frames, tensors
-        device = tensors[0].device if tensors else "cpu"
-        return tuple(torch.from_numpy(x).to(device) for x in (frames.displacements, frames.velocities))
-
-    @staticmethod
-    @first_order_only("use verify.hessian_product or verify.gauss_newton_product")
-    def backward(ctx, by_displacements, by_velocities):
-        adjoints = (g.detach().to("cpu", torch.float64).numpy() for g in (by_displacements, by_velocities))
-        gradients = ctx.rollout.vjp(ctx.frames, *adjoints)
-        out = [None, None]
-        for name, tensor, needed in zip(ctx.names, ctx.tensors, ctx.needs_input_grad[2:]):
-            name = "initial_positions" if name == "initial_displacements" else name
-            out.append(torch.from_numpy(np.array(gradients[name])).to(tensor.device, tensor.dtype) if needed else None)
-        return tuple(out)
-
-
-def rollout_frames(rollout: Rollout, **tensors: torch.Tensor) -> TorchFrames:
-    """Functional face: run a Rollout with some inputs given as tensors; one autograd node, gradients to all of them.
-
-    Names are those of `rollout.inputs`, or "initial_displacements" instead of "initial_positions" (which keeps its digits
-    in float32). Two runs before one backward are right. Second derivatives are refused (see `verify.hessian_product`).
-
-    Explicit solvers copy initial displacements and velocities, frames, and the gradients by them between tensors and the
-    device by one kernel each way (tensors.py); all other inputs are small and go through the host, as does everything with
-    implicit solvers, prescribed motion, rest_positions, and on Vulkan, whose memory torch cannot see.
-    Raises ValueError for unknown names, wrong shapes and types that are not floating point.
-    """
-    if "initial_positions" in tensors and "initial_displacements" in tensors:
-        raise ValueError("initial_positions and initial_displacements are two spellings of one input: give one")
-    if "rest_positions" in tensors and "initial_displacements" in tensors:
-        raise ValueError("with rest_positions, give initial_positions: initial_displacements are those from the mesh")
-    for name, value in tensors.items():
-        tensors[name] = value if isinstance(value, torch.Tensor) else torch.as_tensor(value, dtype=torch.float64)
-        if not tensors[name].is_floating_point():
-            raise ValueError(f"{name}: expected a floating point tensor, got {tensors[name].dtype}")
-    if is_direct(rollout, tensors):
-        if rollout.face is None:
-            rollout.face = TensorRollout(rollout)
-        displacements, velocities = _DirectRolloutFunction.apply(rollout, tuple(tensors), *tensors.values())
-    else:
-        displacements, velocities = _RolloutFunction.apply(rollout, tuple(tensors), *tensors.values())
-    if "rest_positions" not in tensors:
-        rest = torch.from_numpy(np.array(rollout.values["rest_positions"])).to(displacements)
-        return TorchFrames(rest + displacements, velocities, displacements)
-    rest = tensors["rest_positions"].to(displacements)  # the reverse sweep gives the gradient of positions = rest + u
-    return TorchFrames(rest.detach() + displacements, velocities, displacements + (rest.detach() - rest))
+__all__ = ["DifferentiableSimulator", "DifferentiableSolver", "TorchFrames", "rollout_frames"]
 
 
 class DifferentiableSolver:

@@ -96,7 +96,7 @@ def linear_loss(rollout: Rollout, seed: int = 0) -> Loss:
 def dot_product_test(rollout: Rollout, inputs=None, seed: int = 0, **values) -> float:
     """Relative difference of <w, J v> and <J^T w, v> for random v in all inputs and random w in all frames.
 
-    Round-off alone (1e-13 in f64, 1e-5 in f32) if `run_vjp` is the transpose of the tangent.
+    Round-off alone (1e-13 in f64, 1e-5 in f32) if `vjp` is the transpose of the tangent.
     """
     rng = np.random.default_rng(seed)
     frames = rollout.forward(**values)

@@ -183,8 +183,8 @@ def test_an_adjoint_that_becomes_nan_names_its_step(monkeypatch, solver, options
     right = rollout.vjp(frames, w)
     reverse, bad_step = ExplicitAdjoint.reverse, 5
 
-    def poisoned(self, base, last, num_passes, save_every, stop):
-        reverse(self, base, last, num_passes, save_every, stop)
+    def poisoned(self, base, last, num_passes, save_every, stop, to_state=False):
+        reverse(self, base, last, num_passes, save_every, stop, to_state)
         if stop < (bad_step + 1) * rollout.solver.substeps:
             runtime.fill(self.v, np.nan)
 

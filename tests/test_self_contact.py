@@ -130,9 +130,9 @@ def test_checkpoints_and_list_age_do_not_change_a_bit(monkeypatch):
     for numbers in ([getattr(SurfacePairs, name) for name in names], (0.02, 0.05, 2)):
         for name, number in zip(names, numbers):
             monkeypatch.setattr(SurfacePairs, name, number)
-        before = again._workspace.pairs.builds if again._workspace else 0
+        before = again.sweep.workspace.pairs.builds if again.sweep.workspace else 0
         other = again.forward()
-        builds.append(again._workspace.pairs.builds - before)
+        builds.append(again.sweep.workspace.pairs.builds - before)
         np.testing.assert_array_equal(other.positions, frames.positions)
     assert builds[1] > 1.5 * builds[0]  # other lists
     pieces = again.vjp(other, *adjoints)

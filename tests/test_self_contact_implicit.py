@@ -130,7 +130,7 @@ def test_equilibrium_of_two_bodies_pressed_together():
     """Forces balance: what the upper body presses with is what the lower one bears; and the gradient of that."""
     rollout = ds.Rollout(pressed(0.01), 1, gradients="all")
     frames = rollout.forward()
-    workspace = rollout._workspace
+    workspace = rollout.sweep.workspace
     workspace.potential.place(frames.displacements[-1])
     forces, _ = workspace.potential.forces()
     y = rollout.solver.scene.mesh.vertices[:, 1]

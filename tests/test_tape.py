@@ -5,10 +5,12 @@ from functools import cache
 import numpy as np
 import pytest
 import taichi as ti
-from test_gradients import by_solver, full_scene, rollout_of
+import torch
+from test_gradients import by_solver, free_scene, full_scene, rollout_of
 
 import diffsim_ti as ds
 from diffsim_ti import runtime, verify
+from diffsim_ti.diff_simulator import rollout_frames
 
 STEPS = 12
 
@@ -262,6 +264,161 @@ def test_backend_tape(solver):
         np.testing.assert_allclose(field.grad.to_numpy(), expected[name], rtol=1e-5, atol=1e-5 * size)
 
 
+# ---- many runs in one tape --------------------------------------------------------------------------------------------
+
+RUNS = 5
+
+
+@ti.kernel
+def hand_over(x: ti.template(), v: ti.template(), k: int, x0: ti.template(), v0: ti.template()):
+    """The start of the next run from the last frame of run k: damped by a wave, and drawn to a point."""
+    for i in x0:
+        x0[i] = x[k, 1, i]
+        v0[i] = 0.9 * v[k, 1, i] + 0.1 * ti.sin(3.0 * x[k, 1, i]) * v[k, 1, i].norm_sqr()
+
+
+@ti.kernel
+def spread_rows(positions: ti.template(), velocities: ti.template(), total: ti.template()):
+    """Some loss over all frames of all runs."""
+    for r, f, i in positions:
+        weight = 0.1 + r + 2 * f + ti.sin(1.0 * i)
+        total[None] += weight * positions[r, f, i].norm_sqr() + velocities[r, f, i].dot(positions[r, f, i])
+
+
+def chained(rollout, total):
+    x0, v0 = rollout.field("initial_positions"), rollout.field("initial_velocities")
+    with ti.ad.Tape(total):
+        for k in range(RUNS):
+            rollout.run(k)
+            if k + 1 < RUNS:
+                hand_over(rollout.positions, rollout.velocities, k, x0, v0)
+        spread_rows(rollout.positions, rollout.velocities, total)
+    return total[None]
+
+
+def chained_in_torch(rollout, E, x, v):
+    total, wave = 0.0, torch.sin(torch.arange(27.0, dtype=torch.float64))[:, None]
+    for r in range(RUNS):
+        frames = rollout_frames(rollout, youngs_modulus=E, initial_positions=x, initial_velocities=v)
+        for f in range(2):
+            p, q = frames.positions[f], frames.velocities[f]
+            total = total + ((0.1 + r + 2 * f + wave) * p**2).sum() + (p * q).sum()
+        x, v = frames.positions[1], frames.velocities[1]
+        v = 0.9 * v + 0.1 * torch.sin(3 * x) * (v**2).sum(1, keepdim=True)
+    return total
+
+
+def tight_euler(scene, **options):
+    return ds.ImplicitEulerSolver(scene, tolerance=1e-13, **options)
+
+
+@pytest.mark.parametrize("solver", [ds.SemiImplicitSolver, ds.VelocityVerletSolver, tight_euler])
+def test_kernels_close_a_loop_between_runs(solver):
+    """One rollout five times, each from where a kernel puts it: against differences, and against torch's chain."""
+    scene = free_scene(fixed="ymax")
+    rollout, total = rollout_of(scene, solver, 4, runs=RUNS), scalar_field()
+    E, x0, v0 = (rollout.field(name) for name in ("youngs_modulus", "initial_positions", "initial_velocities"))
+    starts = [scene.inputs.values[name] for name in ("youngs_modulus", "initial_positions", "initial_velocities")]
+    rng = np.random.default_rng(0)
+    directions = [scale * rng.normal(size=x.shape) for scale, x in zip((1e4, 0.01, 0.1), starts)]
+
+    def loss(t):
+        for field, start, direction in zip((E, x0, v0), starts, directions):
+            field.from_numpy(start + t * direction)
+        return chained(rollout, total)
+
+    tensors = [torch.tensor(x, requires_grad=True) for x in starts]
+    of_torch = chained_in_torch(rollout, *tensors)
+    of_torch.backward()
+    assert loss(0.0) == pytest.approx(float(of_torch), rel=1e-12)
+    gradients = [field.grad.to_numpy() for field in (E, x0, v0)]
+    # kernels overwrite the start after each run: what is left there is the gradient by the first one
+    for got, tensor in zip(gradients, tensors):
+        np.testing.assert_allclose(got, tensor.grad.numpy(), rtol=1e-8, atol=1e-9 * float(tensor.grad.abs().max()))
+    assert np.array_equal(rollout.gradients["youngs_modulus"], gradients[0])
+    slope = sum((gradient * direction).sum() for gradient, direction in zip(gradients, directions))
+    assert slope == pytest.approx(verify.central_difference(loss)[0], rel=1e-7)
+
+
+@pytest.mark.backends
+def test_a_chain_is_one_long_run():
+    """Displacements and velocities handed over as they are, in f32: the same bits, and the same gradient."""
+    scene = free_scene(precision="f32", fixed="ymax")
+    chain, whole, total = (
+        rollout_of(scene, steps=4, runs=3),
+        rollout_of(scene, steps=12),
+        ti.field(ti.f32, (), needs_grad=True),
+    )
+    u0, v0, E = (chain.field(name) for name in ("initial_displacements", "initial_velocities", "youngs_modulus"))
+
+    @ti.kernel
+    def hand_on(u: ti.template(), v: ti.template(), k: int):
+        for i in u0:
+            u0[i], v0[i] = u[k, 1, i], v[k, 1, i]
+
+    @ti.kernel
+    def squares_of_last(x: ti.template(), v: ti.template()):
+        for i in range(27):
+            total[None] += x[2, 1, i].norm_sqr() + v[2, 1, i].norm_sqr()
+
+    with ti.ad.Tape(total):
+        for k in range(3):
+            chain.run(k)
+            if k < 2:
+                hand_on(chain.field("displacements"), chain.velocities, k)
+        squares_of_last(chain.positions, chain.velocities)
+    frames = whole.forward()
+    assert np.array_equal(chain.positions.to_numpy()[2, 1], frames.positions[1])
+    seeds = [2 * x * np.array([0, 1])[:, None, None] for x in (frames.positions, frames.velocities)]
+    expected = whole.vjp(frames, *seeds)
+    for field, name in ((u0, "initial_positions"), (v0, "initial_velocities"), (E, "youngs_modulus")):
+        size = np.abs(expected[name]).max()
+        np.testing.assert_allclose(field.grad.to_numpy(), expected[name], rtol=1e-4, atol=1e-5 * size, err_msg=name)
+
+
+def test_two_spellings_of_the_start():
+    rollout = rollout_of(free_scene(), steps=4)
+    rollout.field("initial_displacements")
+    with pytest.raises(ValueError, match="two spellings of one input"):
+        rollout.field("initial_positions")
+    with pytest.raises(ValueError, match="with rest_positions, use initial_positions"):
+        rollout.field("rest_positions")
+
+
+def test_runs_and_their_rows():
+    """Fields have a row for each run; a run that is repeated, or out of range, is refused; a new tape is a new chance."""
+    rollout, total = rollout_of(free_scene(), steps=4, runs=2), scalar_field()
+    assert rollout.positions.shape == (2, 2, 27) and rollout.field("youngs_modulus").shape == (48,)
+    with pytest.raises(RuntimeError, match="run 1 already ran in this tape"):
+        with ti.ad.Tape(total):
+            rollout.run(0)
+            rollout.run(1)
+            rollout.run(1)
+    for bad in (2, -1, 0.5, None):
+        with pytest.raises(ValueError, match="this rollout has 2 runs: give a whole number of 0 .. 1"):
+            rollout.run(bad)
+    with pytest.raises(ValueError, match="no numbered runs: make the Rollout with runs=..."):
+        rollout_of(free_scene(), steps=4).run(0)
+    with pytest.raises(ValueError, match="runs must be a whole number >= 1"):
+        rollout_of(free_scene(), steps=4, runs=0)
+    rollout.field("initial_velocities").from_numpy(np.full((27, 3), np.nan))
+    with pytest.raises(ValueError, match="initial_positions and initial_velocities must be finite: those of vertex 0"):
+        rollout.run(0)
+
+
+def test_a_run_between_a_tapes_runs():
+    """Another run of the same rollout, before the tape goes back: each run owns what its backward needs."""
+    rollout, total = rollout_of(free_scene(), steps=4, save_every=2), scalar_field()
+    E, x0 = rollout.field("youngs_modulus"), rollout.field("initial_positions")
+    taped(rollout, total)
+    expected = E.grad.to_numpy(), x0.grad.to_numpy()
+    with ti.ad.Tape(total):
+        rollout.run()
+        rollout.forward(youngs_modulus=2 * rollout.values["youngs_modulus"])
+        spread(rollout.positions, rollout.velocities, total)
+    assert np.array_equal(E.grad.to_numpy(), expected[0]) and np.array_equal(x0.grad.to_numpy(), expected[1])
+
+
 # ---- misuse -----------------------------------------------------------------------------------------------------------
 
 
@@ -331,9 +488,16 @@ def test_fields_come_back(monkeypatch):
 
 
 def test_device_memory_comes_back():
+    total = scalar_field()
+
     def use():
         rollout = small()
         rollout.vjp(rollout.forward(), np.ones((4, 27, 3)))
+        chain = rollout_of(free_scene(), steps=4, runs=RUNS)
+        chained(chain, total)
+        start = torch.zeros(27, 3, dtype=torch.float64, requires_grad=True)
+        frames = rollout_frames(chain, initial_displacements=start)
+        frames.positions.sum().backward()
 
     use()
     before = runtime.allocated_megabytes()

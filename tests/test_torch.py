@@ -20,6 +20,7 @@ from diffsim_ti.diff_physics import (
     TorchMaterial,
 )
 from diffsim_ti.diff_simulator import DifferentiableSimulator, DifferentiableSolver, rollout_frames
+from diffsim_ti.state.guard import Guard
 
 pytestmark = pytest.mark.filterwarnings("ignore:dt = .* is divided")
 GATE = dict(eps=1e-6, atol=1e-8, rtol=1e-5)
@@ -337,7 +338,7 @@ def test_an_exception_in_the_middle_leaves_the_next_step_right(where, monkeypatc
             sim.step(torch.full((N, 3), torch.nan))
         elif where == "sweep":
             with monkeypatch.context() as patch:
-                patch.setattr(Rollout, "_sweep_forward", interrupt)
+                patch.setattr(Guard, "advance", interrupt)
                 sim.step()
         else:
             (sim.positions.sum() * torch.nan).backward()

@@ -56,6 +56,36 @@ def join_sets(parts: list[dict], firsts: np.ndarray) -> dict[str, np.ndarray]:
     return out
 
 
+def join(meshes: list) -> tuple[np.ndarray, np.ndarray, dict, dict]:
+    """(vertices, tetrahedra, vertex sets, tetrahedron sets) of several bodies, one after the other."""
+    firsts = np.cumsum([0, *(mesh.num_vertices for mesh in meshes)])
+    first_tets = np.cumsum([0, *(mesh.num_tetrahedra for mesh in meshes)])
+    return (
+        np.concatenate([mesh.vertices for mesh in meshes]),
+        np.concatenate([mesh.tetrahedra + first for mesh, first in zip(meshes, firsts)]),
+        join_sets([mesh.vertex_sets for mesh in meshes], firsts),
+        join_sets([mesh.tetrahedron_sets for mesh in meshes], first_tets),
+    )
+
+
+def without_unused(vertices: np.ndarray, tetrahedra: np.ndarray, sets: dict) -> tuple[np.ndarray, np.ndarray, dict]:
+    """The same without vertices that no tetrahedron uses, renumbered."""
+    used = np.unique(tetrahedra)
+    new = np.full(len(vertices), -1)
+    new[used] = np.arange(len(used))
+    return vertices[used], new[tetrahedra], {name: new[rows][new[rows] >= 0] for name, rows in sets.items()}
+
+
+def pieces(mesh) -> np.ndarray:
+    """For each vertex the number of the part that it belongs to; parts share no vertex, and an unused vertex is one."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    pairs = mesh.tetrahedra[:, [0, 1, 0, 2, 0, 3]].reshape(-1, 2).T
+    graph = coo_matrix((np.ones(pairs.shape[1], bool), tuple(pairs)), (mesh.num_vertices, mesh.num_vertices))
+    return connected_components(graph, directed=False)[1]
+
+
 def sizes(sets: dict) -> str:
     """Names with the number of members."""
     return ", ".join(f"{name} ({len(rows)})" for name, rows in sets.items()) or "none"

@@ -12,9 +12,11 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.mesh import checks, geometry
+from diffsim_ti.mesh.description import describe
 from diffsim_ti.mesh.files import KEEPS_SETS, read_mesh, write_mesh
 from diffsim_ti.mesh.grid import box
-from diffsim_ti.mesh.sets import checked_sets, chosen_indices, join_sets, sizes
+from diffsim_ti.mesh.locate import LocatedPoints, locate
+from diffsim_ti.mesh.sets import checked_sets, chosen_indices, join, pieces, without_unused
 
 
 class TetrahedralMesh:
@@ -50,7 +52,7 @@ class TetrahedralMesh:
         self._vertex_sets = checked_sets(vertex_sets, self.num_vertices, "vertex")
         self._tetrahedron_sets = checked_sets(tetrahedron_sets, self.num_tetrahedra, "tetrahedron")
         self._freeze()
-        checks.warn_of_orphans(self._orphans())
+        checks.warn_of_orphans(self.unused_vertices)
         checks.warn_of_slivers(self)
 
     # Making, loading, saving
@@ -91,11 +93,7 @@ class TetrahedralMesh:
         """
         vertices, tetrahedra, vertex_sets, tetrahedron_sets = read_mesh(path)
         if drop_orphans and tetrahedra.min() >= 0 and tetrahedra.max() < len(vertices):
-            used = np.unique(tetrahedra)
-            new = np.full(len(vertices), -1)
-            new[used] = np.arange(len(used))
-            vertex_sets = {name: new[rows][new[rows] >= 0] for name, rows in vertex_sets.items()}
-            vertices, tetrahedra = vertices[used], new[tetrahedra]
+            vertices, tetrahedra, vertex_sets = without_unused(vertices, tetrahedra, vertex_sets)
         try:
             return cls(
                 vertices,
@@ -135,16 +133,8 @@ class TetrahedralMesh:
         meshes = list(meshes)
         if not meshes:
             raise ValueError("joined needs at least one mesh, got none")
-        firsts = np.cumsum([0, *(mesh.num_vertices for mesh in meshes)])
-        first_tets = np.cumsum([0, *(mesh.num_tetrahedra for mesh in meshes)])
-        vertex_sets = join_sets([mesh.vertex_sets for mesh in meshes], firsts)
-        tetrahedron_sets = join_sets([mesh.tetrahedron_sets for mesh in meshes], first_tets)
-        return cls(
-            np.concatenate([mesh.vertices for mesh in meshes]),
-            np.concatenate([mesh.tetrahedra + first for mesh, first in zip(meshes, firsts)]),
-            vertex_sets=vertex_sets,
-            tetrahedron_sets=tetrahedron_sets,
-        )
+        vertices, tetrahedra, vertex_sets, tetrahedron_sets = join(meshes)
+        return cls(vertices, tetrahedra, vertex_sets=vertex_sets, tetrahedron_sets=tetrahedron_sets)
 
     # What it consists of
 
@@ -191,6 +181,11 @@ class TetrahedralMesh:
         """Sorted indices of the vertices of the surface."""
         return _frozen(np.unique(self.surface_triangles))
 
+    @property
+    def unused_vertices(self) -> np.ndarray:
+        """Indices of the vertices that no tetrahedron uses."""
+        return np.nonzero(np.bincount(self.tetrahedra.ravel(), minlength=self.num_vertices) == 0)[0]
+
     @cached_property
     def edges(self) -> np.ndarray:
         """Each edge once, shape (k, 2), the smaller index first."""
@@ -200,12 +195,7 @@ class TetrahedralMesh:
     @cached_property
     def num_pieces(self) -> int:
         """How many parts that share no vertex."""
-        from scipy.sparse import coo_matrix
-        from scipy.sparse.csgraph import connected_components
-
-        pairs = self.tetrahedra[:, [0, 1, 0, 2, 0, 3]].reshape(-1, 2).T
-        graph = coo_matrix((np.ones(pairs.shape[1], bool), tuple(pairs)), (self.num_vertices, self.num_vertices))
-        return int(connected_components(graph, directed=False)[0]) - len(self._orphans())
+        return int(pieces(self).max(initial=-1)) + 1 - len(self.unused_vertices)
 
     # Geometry
 
@@ -272,6 +262,13 @@ class TetrahedralMesh:
         sets = {**self._tetrahedron_sets, name: self.tetrahedron_indices(chosen)}
         return self._changed(_tetrahedron_sets=checked_sets(sets, self.num_tetrahedra, "tetrahedron"))
 
+    def locate(self, points, nearest: bool = False) -> LocatedPoints:
+        """Where points [m], shape (k, 3), lie: tetrahedra, corners, barycentric weights; `.matrix` is the sparse map.
+
+        nearest: take the nearest point of the body for each point outside; default: ValueError that says how far out.
+        """
+        return locate(self, points, nearest)
+
     # Moving
 
     def translated(self, offset) -> "TetrahedralMesh":
@@ -300,27 +297,7 @@ class TetrahedralMesh:
 
     def describe(self) -> str:
         """Counts, size, edge lengths, worst tetrahedron, sets; a few lines."""
-        low, high = self.bounding_box
-        lengths = np.linalg.norm(np.diff(self.vertices[self.edges], axis=1)[:, 0], axis=1)
-        worst, thin = int(np.argmin(self.quality)), int(np.argmin(self.altitudes.min(1)))
-        orphans = len(self._orphans())
-        return "\n".join(
-            [
-                f"TetrahedralMesh: {self.num_vertices} vertices"
-                + (f" ({orphans} unused)" if orphans else "")
-                + f", {self.num_tetrahedra} tetrahedra, {self.num_pieces} {'piece' if self.num_pieces == 1 else 'pieces'}",
-                f"surface: {len(self.surface_triangles)} triangles, {len(self.surface_vertices)} vertices",
-                "size: "
-                + " x ".join(f"{d:.6g}" for d in high - low)
-                + f" m, from ({_numbers(low)}) to ({_numbers(high)})",
-                f"volume: {self.volume:.6g} m^3",
-                f"edges: {lengths.min():.4g} to {lengths.max():.4g} m, mean {lengths.mean():.4g} m",
-                f"worst quality: {self.quality[worst]:.3g} in tetrahedron {worst}; mean {self.quality.mean():.3g} of 1",
-                f"smallest altitude: {self.altitudes[thin].min():.4g} m in tetrahedron {thin}",
-                f"vertex sets: {sizes(self._vertex_sets)}",
-                f"tetrahedron sets: {sizes(self._tetrahedron_sets)}",
-            ]
-        )
+        return describe(self)
 
     def __repr__(self) -> str:
         size = " x ".join(f"{d:.4g}" for d in np.ptp(self.bounding_box, 0))
@@ -336,8 +313,6 @@ class TetrahedralMesh:
 
     def _compute_rest_state(self) -> None:
         """Does nothing: the rest state is always ready. The seeds call it."""
-
-    # Inside
 
     def _determinants(self) -> tuple[np.ndarray, np.ndarray]:
         longest = np.sqrt(geometry.squared_edges(self._vertices, self._tetrahedra).max(1))
@@ -371,14 +346,7 @@ class TetrahedralMesh:
             if isinstance(value, np.ndarray):
                 _frozen(value)
 
-    def _orphans(self) -> np.ndarray:
-        return np.nonzero(np.bincount(self.tetrahedra.ravel(), minlength=self.num_vertices) == 0)[0]
-
 
 def _frozen(array: np.ndarray) -> np.ndarray:
     array.flags.writeable = False
     return array
-
-
-def _numbers(values) -> str:
-    return ", ".join(f"{value:.6g}" for value in values)

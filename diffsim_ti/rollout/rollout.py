@@ -1,36 +1,18 @@
 """Rollout: n steps of a solver as one differentiable operation."""
 
-import warnings
-import weakref
-from dataclasses import dataclass, field
-
 import numpy as np
-import taichi as ti
 
 from diffsim_ti import runtime
-from diffsim_ti.rollout.sweep import Sweeps
-from diffsim_ti.state.watch import ContactResolution
+from diffsim_ti.outputs import Change, Displacements, Output, Positions, Velocities
+from diffsim_ti.rollout.checkpoints import Schedule
+from diffsim_ti.rollout.frames import Frames, HostSeed, check_finite
+from diffsim_ti.rollout.run import Run
+from diffsim_ti.rollout.sweep import Sweep
+from diffsim_ti.rollout.taped import TapeFace
+from diffsim_ti.solvers.solver import Solver
 
 
-@dataclass(eq=False)
-class Frames:
-    """Saved states of one run: positions [m], velocities [m/s], displacements from the rest shape [m] (which
-    keep their digits in float32), each of shape (frames, num_vertices, 3), and times [s].
-
-    `contact_resolution` says how near the body came to obstacles and how finely the steps resolve that (state/watch.py).
-
-    `inputs` are the values that the run started from, so that its gradient can be taken whenever it is wanted.
-    """
-
-    positions: np.ndarray
-    velocities: np.ndarray
-    displacements: np.ndarray
-    times: np.ndarray
-    inputs: dict = field(repr=False)
-    contact_resolution: ContactResolution | None = None
-
-
-class Rollout(Sweeps):
+class Rollout:
     """n steps of a solver from given inputs, with saved frames and gradients of everything that went in.
 
     solver: any solver; its scene names the inputs (`rollout.inputs`): initial_positions, initial_velocities,
@@ -43,6 +25,8 @@ class Rollout(Sweeps):
     clip: largest norm of the running adjoint; it is scaled back when it exceeds that (the gradient is then no gradient).
     truncate: differentiate only the last so many steps.
     health: keep a report of the adjoint's norm per step (`rollout.health`).
+    outputs: what a loss may name besides positions, velocities and displacements, such as MaterialPoints (outputs/).
+    runs: how many runs one tape may hold, each with frames of its own; see `run`.
 
     Two ways to use it. With arrays: `frames = rollout.forward(youngs_modulus=...)`, then `rollout.vjp(frames, ...)`.
     In Taichi: `rollout.run()` under `ti.ad.Tape`, with fields `rollout.positions`, `rollout.velocities` (frames x
@@ -54,7 +38,7 @@ class Rollout(Sweeps):
 
     def __init__(
         self,
-        solver,
+        solver: Solver,
         steps: int,
         save_every: int | None = None,
         checkpoint_every: int | None = None,
@@ -63,9 +47,18 @@ class Rollout(Sweeps):
         clip: float | None = None,
         truncate: int | None = None,
         health: bool = False,
+        outputs=(),
+        runs: int | None = None,
     ):
-        super().__init__(solver, steps, save_every, checkpoint_every, memory)
-        self.wanted = self._check_names(gradients)
+        self.solver, self.scene = solver, solver.scene
+        self.sweep = sweep = Sweep(
+            solver, steps, save_every, checkpoint_every, memory, gradients, clip, truncate, health
+        )
+        self.steps, self.save_every, self.num_frames = sweep.steps, sweep.save_every, sweep.num_frames
+        self.values, self.inputs, self.wanted = sweep.values, sweep.inputs, sweep.wanted
+        given = (outputs,) if isinstance(outputs, Output) else tuple(outputs)
+        self.outputs = self._check_outputs((Positions(), Velocities(), Displacements(), *given))
+        self.computed = {output.name: self.outputs[output.name] for output in given}  # besides the states themselves
         self._options = dict(
             save_every=self.save_every,
             checkpoint_every=checkpoint_every,
@@ -74,124 +67,135 @@ class Rollout(Sweeps):
             clip=clip,
             truncate=truncate,
             health=health,
+            outputs=given,
+            runs=runs,
         )
-        self.clip, self.truncate, self.wants_health = clip, truncate, health
         self.gradients: dict[str, np.ndarray] = {}
-        self._warned = False
-        self._fields, self._tape, self._taped = {}, None, None
-        self.face = None  # of torch (tensors.py)
+        self.tape_face = TapeFace(self, runs)
+        self.torch_face = None  # made by the first run from tensors (torch_bridge/tensors.py)
 
-    def _check_names(self, names) -> tuple[str, ...]:
-        if names is None:
-            return tuple(name for name in self.inputs if name != "rest_positions")
-        names = self.inputs if names == "all" else tuple([names] if isinstance(names, str) else names)
-        unknown = [name for name in names if name not in self.inputs]
-        if unknown:
-            raise ValueError(f"gradients: no input named {unknown[0]!r}; this rollout has {', '.join(self.inputs)}")
-        return names
+    def _check_outputs(self, outputs) -> dict[str, Output]:
+        out: dict[str, Output] = {}
+        for output in outputs:
+            if not isinstance(output, Output):
+                raise ValueError(f"outputs: expected an Output such as MaterialPoints(points), got {output!r}")
+            if not output.name.isidentifier() or output.name in out or output.name in self.inputs:
+                taken = ", ".join((*out, *self.inputs))
+                raise ValueError(
+                    f"outputs: need names of their own without blanks, got {output.name!r}; taken: {taken}"
+                )
+            out[output.name] = output.settled(self.scene)
+        return out
 
     def twin(self, **changes) -> "Rollout":
         """The same rollout of a scene with some arguments replaced, such as precision="f64"."""
         return Rollout(self.solver.twin(self.scene.replace(**changes)), self.steps, **self._options)
 
+    @property
+    def times(self) -> np.ndarray:
+        """Times of the frames [s]."""
+        return np.arange(self.num_frames) * self.save_every * self.solver.dt
+
+    @property
+    def schedule(self) -> Schedule:
+        """Which states are kept for the reverse sweep."""
+        return self.sweep.schedule
+
+    @property
+    def memory(self) -> float:
+        """What the reverse sweep keeps [MB]: snapshots, recorded states."""
+        return self.schedule.states() * self.sweep.state_bytes / 1e6
+
+    @property
+    def health(self) -> list[dict]:
+        """Norms of the adjoint in the steps of the last reverse sweep, last step first, if asked for."""
+        return self.sweep.health
+
     # ---- with arrays ------------------------------------------------------------------------------------------------
 
     def forward(self, **values) -> Frames:
         """Run from the scene's inputs, with some of them replaced, and return the saved frames."""
-        own = self.values  # callers may change their arrays later: keep copies
-        run = self._start({name: x if x is own.get(name) else np.array(x, np.float64) for name, x in values.items()})
-        self._sweep_forward()
-        u, v = (runtime.fetch(x) for x in self._workspace.frames)
-        rest = run["rest_positions"]
-        frames = Frames((rest + u).astype(u.dtype), v, u, self.times, run, self._workspace.watch.resolution())
-        self._current = run
+        return self.frames_of(self.sweep.run(values))
+
+    def frames_of(self, run: Run) -> Frames:
+        """The frames of the run that the sweep ran last, with all outputs."""
+        u, v = (runtime.fetch(x) for x in self.sweep.workspace.frames)
+        positions = (run.values["rest_positions"] + u).astype(u.dtype)
+        inputs = run.values
+        if run.place is not None:
+            start = dict(initial_positions=positions[0], initial_velocities=v[0])
+            inputs = inputs | {name: x.astype(np.float64) for name, x in start.items()}
+        frames = Frames(positions, v, u, self.times, inputs, run.contact_resolution, run=run)
+        for name, output in self.computed.items():
+            value, shape = np.asarray(output.value(frames)), tuple(output.shape(self.num_frames))
+            if value.shape != shape:
+                raise ValueError(f"output {name!r}: its value has shape {value.shape}, but it says {shape}")
+            frames.outputs[name] = value
         return frames
 
-    def vjp(self, frames: Frames, positions=None, velocities=None) -> dict[str, np.ndarray]:
-        """Gradients of a loss by every wanted input, from its gradients by the frames' positions and velocities.
+    def vjp(self, frames: Frames, positions=None, velocities=None, **seeds) -> dict[str, np.ndarray]:
+        """Gradients of a loss by every wanted input, from its gradients by positions, velocities and other outputs.
 
-        Float64 arrays of the inputs' shapes; None for a part that the loss does not name.
+        Float64 arrays of the inputs' shapes; None for a part that the loss does not name. Further seeds of the same
+        frames cost a reverse sweep each: no pass runs forward again unless the schedule of states asks for it.
         """
-        if self._current is not frames.inputs:  # another run came between: bring this one back
-            self._start(frames.inputs)
-            self._sweep_forward()
-            self._current = frames.inputs
-        shape = (self.num_frames, self.scene.mesh.num_vertices, 3)
-        adjoints = []
-        for name, adjoint in (("positions", positions), ("velocities", velocities)):
-            adjoint = np.zeros(shape) if adjoint is None else np.asarray(adjoint)
-            if adjoint.shape != shape:
-                raise ValueError(f"gradient by the frames' {name}: expected shape {shape}, got {adjoint.shape}")
-            self.check_adjoint(name, adjoint)
-            adjoints.append(adjoint)
-        self._warn_if_coarse(frames.contact_resolution)
-        self.gradients = self._sweep_reverse(*adjoints, self.wants_health or self.clip is not None)
+        change = self.pulled_to_frames(frames, dict(positions=positions, velocities=velocities) | seeds)
+        zero = np.zeros(frames.positions.shape)
+        at_frames = [zero if x is None else x for x in (change.positions, change.velocities)]
+        self.gradients = self.gradients_of(frames.run, self.sweep.pull_back(frames.run, HostSeed(*at_frames)), change)
         return self.gradients
 
-    def _warn_if_coarse(self, seen: ContactResolution) -> None:
-        """Once per rollout."""
-        if not seen.resolved and not self._warned:
-            self._warned = True
-            warnings.warn(
-                f"gradients through contacts may be off by more than 10 %: {seen}; take substeps of at most "
-                f"{seen.advised_substep:.3g} s instead of {seen.substep:.3g} s, or a softer or wider barrier",
-                stacklevel=3,
-            )
+    def pulled_to_frames(self, frames: Frames, seeds: dict) -> Change:
+        """Gradients of a loss by the frames' states and, directly, by inputs, from those by outputs."""
+        out = Change()
+        for name, seed in seeds.items():
+            if name not in self.outputs:
+                raise ValueError(f"no output named {name!r}; this rollout has {', '.join(self.outputs)}")
+            if seed is not None:
+                seed, shape = np.asarray(seed), tuple(self.outputs[name].shape(self.num_frames))
+                if seed.shape != shape:
+                    raise ValueError(f"gradient by the frames' {name}: expected shape {shape}, got {seed.shape}")
+                check_finite(name, seed, self.save_every)
+                out.add(self.outputs[name].vjp(frames, seed))
+        return out
 
-    def check_adjoint(self, name: str, adjoint: np.ndarray) -> None:
-        """Raise FloatingPointError naming the step at which a loss's gradient by the frames is not finite."""
-        if not np.all(np.isfinite(adjoint)):
-            frame = int(np.argwhere(~np.isfinite(adjoint))[0][0])
-            raise FloatingPointError(
-                f"the loss's gradient by {name} is not finite at step {frame * self.save_every} "
-                f"(frame {frame}): look at the loss; parameters are unchanged"
-            )
+    def gradients_of(self, run: Run, derived, change: Change, wanted=None) -> dict[str, np.ndarray]:
+        """Gradients by the wanted inputs from adjoints of what kernels read, and those by inputs directly."""
+        out = self.scene.inputs.derive_vjp(run.values, derived, self.wanted if wanted is None else wanted)
+        for name, direct in change.inputs.items():
+            if name in out:
+                out[name] = out[name] + direct
+        return out
 
     def jvp(self, frames: Frames, **tangents) -> tuple[np.ndarray, np.ndarray]:
         """Changes (positions, velocities) of the frames for changes of inputs, to first order, float64."""
+        change = self._pushed_to_frames(frames, tangents)
+        return change.positions, change.velocities
+
+    def tangents(self, frames: Frames, **tangents) -> dict[str, np.ndarray]:
+        """Changes of all outputs, by name, for changes of inputs, to first order, float64."""
+        change = self._pushed_to_frames(frames, tangents)
+        return {name: output.jvp(frames, change) for name, output in self.outputs.items()}
+
+    def _pushed_to_frames(self, frames: Frames, tangents: dict) -> Change:
         unknown = [name for name in tangents if name not in self.inputs]
         if unknown:
             raise ValueError(f"jvp: no input named {unknown[0]!r}; this rollout has {', '.join(self.inputs)}")
         values = frames.inputs
-        ws = self._start(values) and self._workspace
         dots = {k: np.broadcast_to(np.asarray(x, np.float64), values[k].shape) for k, x in tangents.items()}
-        tangent = self.solver.tangent(ws, self.scene.inputs.derive_jvp(values, dots))
-        ws.make_record(self.schedule.segment + 1)
-        save = self.save_every * self.solver.substeps
-        for k in range(self.schedule.num_segments):
-            first, last = self.schedule.bounds(k)
-            self._record(first, last)
-            tangent.advance(first, last, self.num_passes, save)
-            ws.restore(ws.record, last - first)
-        if self.solver.last_frame_is_state:
-            tangent.save_frame(self.num_frames - 1)
-        self._current = None
-        return tangent.collect()
+        derived = self.scene.inputs.derive_jvp(values, dots)
+        return Change(*self.sweep.push_forward(frames.run, derived), dots)
 
     # ---- under ti.ad.Tape -------------------------------------------------------------------------------------------
 
     def field(self, name: str):
-        """The Taichi field of an input (with .grad), or of the frames' "positions" or "velocities".
+        """The Taichi field of an input or of an output ("positions", "velocities", ...), with .grad.
 
-        Input fields hold the scene's values until a kernel or `from_numpy` writes others; `run` reads them.
+        Input fields hold the scene's values until a kernel or `from_numpy` writes others; `run` reads them. Those of outputs
+        have shape (frames, num_vertices), and (runs, frames, num_vertices) in a Rollout of several `runs`.
+        "initial_displacements" is another spelling of "initial_positions", which keeps its digits in float32.
         """
-        if not self._fields:
-            self._program = runtime.program()
-        runtime.check_alive(self._program)
-        if name not in self._fields:
-            fp = runtime.PRECISIONS[self.scene.precision]
-            if name in ("positions", "velocities"):
-                shape, components = (self.num_frames, self.scene.mesh.num_vertices), 3
-                self._fields[name] = runtime.fields.take(self, fp, shape, components)
-            elif name in self.inputs:
-                value = self.values[name]
-                components = 3 if value.shape[-1:] == (3,) else 0
-                shape = value.shape[:-1] if components else value.shape
-                self._fields[name] = runtime.fields.take(self, fp, shape, components)
-                self._fields[name].from_numpy(np.asarray(value, runtime.NUMPY[self.scene.precision]))
-            else:
-                raise ValueError(f"no input named {name!r}; this rollout has {', '.join(self.inputs)}")
-        return self._fields[name]
+        return self.tape_face.field(name)
 
     @property
     def positions(self):
@@ -203,42 +207,13 @@ class Rollout(Sweeps):
         """Taichi field of the frames' velocities [m/s], shape (frames, num_vertices) of 3-vectors, with .grad."""
         return self.field("velocities")
 
-    @ti.ad.grad_replaced
-    def run(self):
-        """Run from the input fields and fill the frames; inside a `ti.ad.Tape`, the tape will call `run_vjp`."""
-        tape = runtime.current_tape()
-        if tape is not None and self._tape is not None and tape is self._tape():
-            raise RuntimeError(
-                "this rollout already ran in this tape and would overwrite its frames: make a second Rollout"
-            )
-        self._tape = None if tape is None else weakref.ref(tape)  # a tape holds its rollouts: no circle
-        self._taped = None
-        self._taped = frames = self.forward(**self._field_values())
-        for name in ("positions", "velocities"):
-            self.field(name).from_numpy(getattr(frames, name))
+    def run(self, k: int | None = None) -> None:
+        """Run from the input fields and fill the outputs' fields; in a `ti.ad.Tape`, the tape will pull gradients back.
 
-    @ti.ad.grad_for(run)
-    def run_vjp(self):
-        """Mirror of `run`: adds to the .grad of the input fields and sets `gradients`."""
-        if self._taped is None:  # the run failed, and its error is on its way
-            return
-        gradients = self.vjp(self._taped, *(self.field(name).grad.to_numpy() for name in ("positions", "velocities")))
-        for name in self.inputs:
-            if name in self._fields and name in gradients:
-                grad = self._fields[name].grad
-                grad.from_numpy(np.asarray(grad.to_numpy() + gradients[name], runtime.NUMPY[self.scene.precision]))
-
-    def _field_values(self) -> dict:
-        if self._fields:
-            runtime.check_alive(self._program)
-        exact = {}
-        for name, taichi_field in self._fields.items():
-            if name in self.inputs:
-                value = taichi_field.to_numpy()
-                known = self.values[name].astype(value.dtype)
-                exact[name] = self.values[name] if np.array_equal(value, known) else value.astype(np.float64)
-        return exact
-
-
-for _method, _name in ((Rollout.run, "run"), (Rollout.run_vjp, "run_vjp")):
-    _method.__name__ = _name
+        In a Rollout of several `runs`, run k fills row k of these fields: kernels may write the inputs of run k + 1 from the
+        frames of run k, in one tape. Input fields are read at once, and may be overwritten for the next run. The device
+        keeps what the reverse sweep needs of one run: all but the last run once more when the tape goes back.
+        Gradients add to the .grad of the input fields; `gradients` has their sum over the runs of the tape.
+        Raises RuntimeError for a run that this tape already holds, ValueError for k outside 0 .. runs - 1.
+        """
+        self.tape_face.run(k)

@@ -1,22 +1,39 @@
-"""What a rollout does with its solver: a forward sweep, and a reverse sweep from the states that a schedule keeps."""
+"""n steps of a solver on the device: forward, in reverse from the states that a schedule keeps, and in tangents."""
 
 import warnings
+from collections.abc import Callable
 
 import numpy as np
 
 from diffsim_ti import runtime
+from diffsim_ti.inputs import Derived
 from diffsim_ti.rollout.checkpoints import choose_schedule
+from diffsim_ti.rollout.run import Run, Seed
+from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.state.guard import Guard
+from diffsim_ti.state.watch import ContactResolution
 
 
-class Sweeps:
-    """n steps of a solver, forward and in reverse; the arguments are those of `Rollout` (rollout.py)."""
+class Sweep:
+    """Runs of a solver over `steps` steps: `run`, `pull_back` (adjoints) and `push_forward` (tangents).
 
-    wanted: tuple[str, ...] = ()
-    clip: float | None = None
-    truncate: int | None = None
+    NumPy, `ti.ad.Tape` and torch read the same `Run`: its frames are in `workspace.frames` until the next one. A run that
+    was overwritten is done again where its adjoint is asked for; one whose passes are all recorded still is not, however
+    many seeds are pulled back. The arguments are those of `Rollout` (rollout.py).
+    """
 
-    def __init__(self, solver, steps: int, save_every: int | None, checkpoint_every: int | None, memory: float | None):
+    def __init__(
+        self,
+        solver: Solver,
+        steps: int,
+        save_every: int | None = None,
+        checkpoint_every: int | None = None,
+        memory: float | None = None,
+        gradients=None,
+        clip: float | None = None,
+        truncate: int | None = None,
+        health: bool = False,
+    ):
         self.solver, self.scene, self.steps = solver, solver.scene, int(steps)
         if self.steps != steps or steps < 0:
             raise ValueError(f"steps must be a whole number >= 0, got {steps}")
@@ -26,86 +43,154 @@ class Sweeps:
         self.num_frames = self.steps // self.save_every + 1
         self.values = self.scene.inputs.at_times(np.arange(self.steps + 1) * solver.dt)
         self.inputs = tuple(self.values)
+        self.wanted = self._check_names(gradients)
+        self.clip, self.truncate, self.careful = clip, truncate, health or clip is not None
+        self.health: list[dict] = []
         self.num_passes = solver.num_passes(self.steps)
+        self.passes_per_frame = self.save_every * solver.substeps
         every = None if checkpoint_every is None else max(1, int(checkpoint_every)) * solver.substeps
         self.state_bytes = 4 * self.scene.mesh.num_vertices * runtime.NUMPY[self.scene.precision]().itemsize
         self.schedule = choose_schedule(self.num_passes, self.state_bytes, every, memory)
-        self.health: list[dict] = []
-        self._workspace, self._current, self._loaded, self._adjoint = None, None, None, None
+        self.workspace = None  # made by the first run
+        self._loaded, self._current, self._adjoint = None, None, None
+        self._recorded, self._warned = False, False
 
-    @property
-    def times(self) -> np.ndarray:
-        """Times of the frames [s]."""
-        return np.arange(self.num_frames) * self.save_every * self.solver.dt
-
-    @property
-    def memory(self) -> float:
-        """What the reverse sweep keeps [MB]: snapshots, recorded states."""
-        return self.schedule.states() * self.state_bytes / 1e6
-
-    def _start(self, values: dict) -> dict:
-        unknown = [name for name in values if name not in self.inputs]
+    def _check_names(self, names) -> tuple[str, ...]:
+        if names is None:
+            return tuple(name for name in self.inputs if name != "rest_positions")
+        names = self.inputs if names == "all" else tuple([names] if isinstance(names, str) else names)
+        unknown = [name for name in names if name not in self.inputs]
         if unknown:
-            raise ValueError(f"no input named {unknown[0]!r}; this rollout has {', '.join(self.inputs)}")
-        if self.solver.num_passes(self.steps) != self.num_passes:
-            raise RuntimeError("the solver's substeps changed since this Rollout was made: make a new one")
-        run = self.values | self.scene.inputs.check(values)
-        self._current = None  # until the sweep is through
-        if self._loaded is not None and all(run[name] is self._loaded[name] for name in run):
-            self._workspace.restart()
-            return run
-        self.scene.inputs.check_steps(run, self.steps)
-        derived = self.scene.inputs.derive(run)
-        if self._workspace is None:
-            self._workspace = self.solver.workspace(derived)
-            self._workspace.make_frames(self.num_frames)
-            self._snapshots = self._workspace.history(self.schedule.snapshots)
-            self._guard = Guard(self._workspace)
-        else:
-            self._workspace.load(derived)
-        self._loaded = run
-        return run
-
-    def _sweep_forward(self) -> None:
-        """All passes; keeps the first snapshots of the schedule on the way."""
-        ws, schedule = self._workspace, self.schedule
-        self._guard.restart()
-        self._recorded = schedule.num_segments == 1 and self._adjoint is not None  # a gradient was asked for before
-        if self._recorded:
-            ws.make_record(schedule.segment + 1)
-        path = [0, *schedule.path(0, schedule.num_segments, schedule.snapshots - 1)]
-        save = self.save_every * self.solver.substeps
-        for k, segment in enumerate(path):
-            ws.save(self._snapshots, k)
-            first = schedule.bounds(segment)[0]
-            last = schedule.bounds(path[k + 1])[0] if k + 1 < len(path) else self.num_passes
-            self._guard.advance(first, last, self.num_passes, save, self._recorded)
-        if self.solver.last_frame_is_state:
-            ws.save_frame(self.num_frames - 1)
-        self._kept = path
-
-    def _record(self, first: int, last: int) -> None:
-        """Passes first .. last - 1 from the current state, recorded."""
-        ws = self._workspace
-        ws.make_record(self.schedule.segment + 1)
-        ws.restore_to_record()
-        ws.advance(first, last, self.num_passes, base=first)
+            raise ValueError(f"gradients: no input named {unknown[0]!r}; this rollout has {', '.join(self.inputs)}")
+        return names
 
     @property
     def truncates(self) -> bool:
         """Whether the reverse sweep stops before it comes to the start."""
         return self.truncate is not None and self.truncate < self.steps
 
-    def _mirror(self, begin, careful: bool):
-        """The reverse sweep; begin(adjoint) sets the adjoints of the frames. Returns the adjoint at the start."""
-        ws, schedule = self._workspace, self.schedule
+    # ---- forward ----------------------------------------------------------------------------------------------------
+
+    def run(self, values: dict, place: Callable | None = None) -> Run:
+        """Run from the scene's inputs with some values replaced; see `Run` for `place`."""
+        run = Run(self._checked(values), place)
+        self._forward(run)
+        run.contact_resolution = self.workspace.watch.resolution()
+        return run
+
+    def bring_back(self, run: Run) -> None:
+        """See to it that frames and kept states are those of a run."""
+        if self._current is not run:
+            run.values = self._checked(run.values)  # which may be another rollout's
+            self._forward(run)
+
+    def _checked(self, values: dict) -> dict:
+        """All values of a run: copies of those given, for callers may change theirs, or what is loaded if it is the same."""
+        unknown = [name for name in values if name not in self.inputs]
+        if unknown:
+            raise ValueError(f"no input named {unknown[0]!r}; this rollout has {', '.join(self.inputs)}")
+        known, given = self._loaded or self.values, {}
+        for name, value in values.items():
+            value = np.asarray(value, np.float64)
+            same = value is known[name] or value.shape == known[name].shape and np.array_equal(value, known[name])
+            given[name] = known[name] if same else value.copy()
+        out = self.values | self.scene.inputs.check(given)
+        self.scene.inputs.check_steps(out, self.steps)
+        return out
+
+    def _load(self, run: Run) -> None:
+        """Put a run's inputs and its start on the device."""
+        if self.solver.num_passes(self.steps) != self.num_passes:
+            raise RuntimeError("the solver's substeps changed since this Rollout was made: make a new one")
+        self._current = None  # until the sweep is through
+        values = run.values
+        if self._loaded is not None and all(values[name] is self._loaded[name] for name in values):
+            self.workspace.restart()
+        else:
+            derived, self._loaded = self.scene.inputs.derive(values), None
+            if self.workspace is None:
+                self.workspace = self.solver.workspace(derived)
+                self.workspace.make_frames(self.num_frames)
+                self._snapshots = self.workspace.history(self.schedule.snapshots)
+                self._guard = Guard(self.workspace)
+            else:
+                self.workspace.load(derived)
+            self._loaded = values
+        if run.place is not None:
+            run.place(self.workspace)
+            self.workspace.forget()
+
+    def _forward(self, run: Run) -> None:
+        """All passes; keeps the first snapshots of the schedule on the way."""
+        self._load(run)
+        ws, schedule = self.workspace, self.schedule
+        self._guard.restart()
+        self._recorded = schedule.num_segments == 1 and self._adjoint is not None  # a gradient was asked for before
+        if self._recorded:
+            ws.make_record(schedule.segment + 1)
+        path = [0, *schedule.path(0, schedule.num_segments, schedule.snapshots - 1)]
+        for k, segment in enumerate(path):
+            ws.save(self._snapshots, k)
+            first = schedule.bounds(segment)[0]
+            last = schedule.bounds(path[k + 1])[0] if k + 1 < len(path) else self.num_passes
+            self._guard.advance(first, last, self.num_passes, self.passes_per_frame, self._recorded)
+        if self.solver.last_frame_is_state:
+            ws.save_frame(self.num_frames - 1)
+        self._kept, self._current = path, run
+
+    def _record(self, first: int, last: int) -> None:
+        """Passes first .. last - 1 from the current state, recorded."""
+        ws = self.workspace
+        ws.make_record(self.schedule.segment + 1)
+        ws.restore_to_record()
+        ws.advance(first, last, self.num_passes, base=first)
+        self._recorded = self.schedule.num_segments == 1
+
+    # ---- tangents ---------------------------------------------------------------------------------------------------
+
+    def push_forward(self, run: Run, change: Derived) -> tuple[np.ndarray, np.ndarray]:
+        """Changes of the frames' positions and velocities, float64, for a change of what kernels read."""
+        current = self._current
+        self._load(run)
+        ws, schedule = self.workspace, self.schedule
+        tangent = self.solver.tangent(ws, change)
+        for k in range(schedule.num_segments):
+            first, last = schedule.bounds(k)
+            self._record(first, last)
+            tangent.advance(first, last, self.num_passes, self.passes_per_frame)
+            ws.restore(ws.record, last - first)
+        if self.solver.last_frame_is_state:
+            tangent.save_frame(self.num_frames - 1)
+        self._current = run if current is run else None  # its frames and snapshots are untouched
+        return tangent.collect()
+
+    # ---- adjoints ---------------------------------------------------------------------------------------------------
+
+    def pull_back(self, run: Run, seed: Seed) -> Derived:
+        """Adjoints of what kernels read at the start of a run.
+
+        Raises FloatingPointError, naming the step, where an adjoint is not finite. Warns of contacts that the steps
+        hardly resolve, and of an adjoint that grew out of use.
+        """
+        self.bring_back(run)
+        self._warn_if_coarse(run.contact_resolution)
+        of_frames = self._reverse(seed, self.careful)
+        derived, of_start = seed.collect(self._adjoint, self.truncates)
+        if not np.isfinite(sum(of_start) + derived.coefficients.sum()):
+            if not self.careful:
+                self._reverse(seed, True)  # raises where it happens
+            raise FloatingPointError("the adjoint is not finite at the start of the run")
+        self._warn_if_exploded(of_frames, of_start)
+        return derived
+
+    def _reverse(self, seed: Seed, careful: bool) -> tuple[float, float]:
+        """The reverse sweep; the norms of its seed."""
+        ws, schedule = self.workspace, self.schedule
         if self._adjoint is None or not self._adjoint.fits(ws):
             shape = "rest_positions" in self.wanted
-            self._adjoint = self.solver.adjoint(
-                ws, shape or "density" in self.wanted, shape
-            )  # the rest shape makes masses
-        adjoint = self._adjoint
-        begin(adjoint)
+            density = shape or "density" in self.wanted  # the rest shape makes masses
+            self._adjoint = self.solver.adjoint(ws, density, shape)
+        norms = seed.put(self._adjoint, self.solver.last_frame_is_state)
         self.health = []
         stop = 0 if self.truncate is None else max(0, self.steps - self.truncate) * self.solver.substeps
         kept, end = self._kept, schedule.num_segments
@@ -130,44 +215,20 @@ class Sweeps:
             if kept[-1] == end:
                 kept.pop()
         if self.num_passes > stop:
-            adjoint.finish()
-        return adjoint
-
-    def _sweep_reverse(self, positions_adj, velocities_adj, careful: bool) -> dict[str, np.ndarray]:
-        last = self.solver.last_frame_is_state
-        derived = self._mirror(lambda adjoint: adjoint.start(positions_adj, velocities_adj, last), careful).collect()
-        if self.truncates:
-            derived.displacement[:], derived.velocity[:] = 0, 0
-        if not np.isfinite(derived.displacement.sum() + derived.velocity.sum() + derived.coefficients.sum()):
-            if careful:
-                raise FloatingPointError("the adjoint is not finite at the start of the run")
-            return self._sweep_reverse(positions_adj, velocities_adj, careful=True)
-        norms = [np.linalg.norm(np.asarray(x, np.float64)) for x in (positions_adj, velocities_adj)]
-        self._warn_if_exploded(norms, [np.linalg.norm(x) for x in (derived.displacement, derived.velocity)])
-        return self.scene.inputs.derive_vjp(self._current, derived, self.wanted)
-
-    def _warn_if_exploded(self, of_frames, of_start) -> None:
-        """Norms of the adjoints of displacements and velocities, where the sweep began and where it ended."""
-        duration = max(self.steps, 1) * self.solver.dt
-        start, end = (by_u + by_v / duration for by_u, by_v in (of_frames, of_start))
-        if end > 1e8 * start > 0:
-            warnings.warn(
-                f"the adjoint grew by {end / start:.1g} over the run: the motion is chaotic or unstable, and this "
-                "gradient is of little use; shorten the rollout, pass truncate=, or see gradient_health",
-                stacklevel=4,
-            )
+            self._adjoint.finish()
+        return norms
 
     def _reverse_segment(self, first: int, last: int, stop: int, end: int, careful: bool) -> None:
         """Passes last - 1 .. stop of a segment that begins with pass `first`; the whole sweep stops at pass `end`."""
-        save, adjoint = self.save_every * self.solver.substeps, self._adjoint
+        save, adjoint = self.passes_per_frame, self._adjoint
         if not careful:
-            adjoint.reverse(first, last, self.num_passes, save, stop, to_state=0 < stop == end)
+            adjoint.reverse(first, last, self.num_passes, save, stop, 0 < stop == end)
             return
         substeps, passes = self.solver.substeps, self.steps * self.solver.substeps
         while last > stop:
             begin = max(stop, (min(last, passes) - 1) // substeps * substeps)
             at_step = begin % substeps == 0 and begin < passes  # and not where a segment happens to begin
-            adjoint.reverse(first, last, self.num_passes, save, begin, to_state=at_step and begin > 0)
+            adjoint.reverse(first, last, self.num_passes, save, begin, at_step and begin > 0)
             if at_step:
                 self._look_at_adjoint(begin // substeps)
                 if begin > end:
@@ -188,3 +249,24 @@ class Sweeps:
             scaled = self.clip / norm
             self._adjoint.scale(scaled)
         self.health.append({"step": step, "norm_position": by_position, "norm_velocity": by_velocity, "scaled": scaled})
+
+    def _warn_if_coarse(self, seen: ContactResolution) -> None:
+        """Once."""
+        if not seen.resolved and not self._warned:
+            self._warned = True
+            warnings.warn(
+                f"gradients through contacts may be off by more than 10 %: {seen}; take substeps of at most "
+                f"{seen.advised_substep:.3g} s instead of {seen.substep:.3g} s, or a softer or wider barrier",
+                stacklevel=4,
+            )
+
+    def _warn_if_exploded(self, of_frames, of_start) -> None:
+        """Norms of the adjoints of displacements and velocities, where the sweep began and where it ended."""
+        duration = max(self.steps, 1) * self.solver.dt
+        start, end = (by_u + by_v / duration for by_u, by_v in (of_frames, of_start))
+        if end > 1e8 * start > 0:
+            warnings.warn(
+                f"the adjoint grew by {end / start:.1g} over the run: the motion is chaotic or unstable, and this "
+                "gradient is of little use; shorten the rollout, pass truncate=, or see gradient_health",
+                stacklevel=4,
+            )

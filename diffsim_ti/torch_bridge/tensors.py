@@ -11,11 +11,14 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
+from diffsim_ti.outputs import Change
+from diffsim_ti.rollout.frames import HostSeed, check_finite
+from diffsim_ti.rollout.run import Run
 from diffsim_ti.state.arrays import copy_slot
 from diffsim_ti.torch_bridge.autograd import torch
 
 DTYPES = {"f32": torch.float32, "f64": torch.float64}
-START = ("initial_displacements", "initial_velocities")  # what is copied; all else goes through Inputs
+START = ("initial_displacements", "initial_velocities")  # what can be copied; all else goes through Inputs
 
 
 @lru_cache(maxsize=None)
@@ -51,14 +54,65 @@ def _kernels(serial: bool):
     return {"in": copy_in, "out": copy_out}
 
 
-def is_direct(rollout, names) -> bool:
-    """Whether a run with these inputs can be copied directly.
+def shares_memory() -> bool:
+    """Whether torch sees the device's memory; on Vulkan the host stands between, with the same numbers."""
+    return runtime.arch_name() in ("cpu", "cuda")
 
-    Not with implicit solvers, which work on the host; not where the start also sets what fixed vertices or the rest shape
-    are measured from; not on Vulkan, whose memory torch cannot see. The host then stands between, with the same numbers.
+
+def is_direct(rollout, names) -> bool:
+    """Whether the start of a run with these inputs, and the gradients by its frames, can be copied directly.
+
+    Not with implicit solvers, whose adjoint is on the host; not where the start also sets what fixed vertices or the rest
+    shape are measured from. The host then stands between, with the same numbers.
     """
-    shared = runtime.arch_name() in ("cpu", "cuda")
-    return shared and rollout.solver.explicit and rollout.scene.motion is None and "rest_positions" not in names
+    scene = rollout.scene
+    return shares_memory() and rollout.solver.explicit and scene.motion is None and "rest_positions" not in names
+
+
+class TensorStart:
+    """Initial displacements and velocities as tensors of the run's own, to be put into a workspace."""
+
+    def __init__(self, face: "TensorRollout", start: dict):
+        self.face, self.start = face, {name: face.checked(name, tensor) for name, tensor in start.items()}
+        self.device = next(iter(self.start.values())).device
+
+    def __call__(self, workspace) -> None:
+        given, values, pair = next(iter(self.start.values())), workspace.arrays.values, []
+        for name, loaded in zip(START, (values.displacement, values.velocity)):
+            pair.append(self.start[name] if name in self.start else torch.tensor(loaded).to(given))
+        self.face.copy("in", [x[None] for x in pair], (workspace.state.u, workspace.state.v))
+
+
+class TensorSeed:
+    """Gradients by the frames as tensors, copied on the device; see `Seed` in rollout/run.py."""
+
+    def __init__(self, face: "TensorRollout", pair: list, with_positions: bool):
+        self.face, self.pair, self.with_positions = face, pair, with_positions
+
+    def put(self, adjoint, last_frame_is_state: bool) -> tuple[float, float]:
+        norms = []
+        for name, x in zip(("positions", "velocities"), self.pair):
+            norms.append(float(x.double().norm()))
+            if not np.isfinite(norms[-1]):
+                check_finite(name, x.cpu().numpy(), self.face.rollout.save_every)
+        adjoint.clear()
+        self.face.copy("in", self.pair, adjoint.frames)
+        if last_frame_is_state:
+            for frames, running in zip(adjoint.frames, (adjoint.u, adjoint.v)):
+                copy_slot(frames, len(self.pair[0]) - 1, running, 0)
+        return tuple(norms)
+
+    def collect(self, adjoint, truncated: bool):
+        pair = self.pair
+        out = tuple(torch.empty_like(x[:1]) for x in pair)
+        self.face.copy("out", out, (adjoint.u, adjoint.v))
+        if truncated:
+            out[0].zero_(), out[1].zero_()
+        self.start = tuple(x[0] for x in out)
+        derived = adjoint.collect(state=self.with_positions)
+        if truncated:
+            derived.displacement[:], derived.velocity[:] = 0, 0
+        return derived, tuple(float(x.double().norm()) for x in out)
 
 
 def checked_device(device) -> torch.device:
@@ -86,7 +140,7 @@ class TensorRollout:
     def rollout(self):
         return self._rollout()
 
-    def _copy(self, way: str, pair, arrays) -> None:
+    def copy(self, way: str, pair, arrays) -> None:
         """Between two tensors of shape (k, n, 3), contiguous and of the scene's precision, and two device arrays."""
         key = (way, *map(id, arrays))
         known = self._launches.get(key)
@@ -104,26 +158,7 @@ class TensorRollout:
         runtime.use_device(device)  # a tensor on another card than Taichi's
         return tensor.detach().to(device, self.dtype).contiguous()
 
-    def forward(self, tensors: dict) -> tuple[dict, torch.Tensor, torch.Tensor]:
-        """(what `vjp` needs, displacements, velocities of the frames)."""
-        rollout = self.rollout
-        loaded, start, values = rollout._loaded or {}, {}, {}
-        for name, tensor in tensors.items():
-            if name in START:
-                start[name] = self._checked(name, tensor)
-            else:
-                value = tensor.detach().to("cpu", torch.float64).numpy()
-                known = loaded.get(name)
-                same = known is not None and known.shape == value.shape and np.array_equal(known, value)
-                values[name] = known if same else value.copy()  # what is loaded already need not be prepared again
-        run = dict(values=values, start=start)
-        self._run(run)
-        device = next((t.device for t in start.values()), torch.device("cpu"))
-        frames = tuple(torch.empty(self.shape, dtype=self.dtype, device=device) for _ in range(2))
-        self._copy("out", frames, rollout._workspace.frames)
-        return run, *frames
-
-    def _checked(self, name: str, tensor: torch.Tensor) -> torch.Tensor:
+    def checked(self, name: str, tensor: torch.Tensor) -> torch.Tensor:
         """A copy of the node's own: the caller may change his tensor before backward."""
         if tuple(tensor.shape) != self.shape[1:]:
             raise ValueError(f"{name}: expected shape {self.shape[1:]}, got {tuple(tensor.shape)}")
@@ -136,61 +171,44 @@ class TensorRollout:
             own[self._fixed.to(own.device)] = 0
         return own
 
-    def _run(self, run: dict) -> None:
-        rollout = self.rollout
-        rollout._start(run["values"])
-        state = rollout._workspace.state
-        if run["start"]:
-            pair = [run["start"].get(name) for name in START]
-            given = next(x for x in pair if x is not None)
-            missing = ("displacement", "velocity")
-            pair = [
-                torch.tensor(getattr(rollout._workspace.arrays.values, missing[k])).to(given) if x is None else x
-                for k, x in enumerate(pair)
-            ]
-            self._copy("in", [x[None] for x in pair], (state.u, state.v))
-        rollout._sweep_forward()
-        rollout._current = run
+    def forward(self, tensors: dict) -> tuple[Run, torch.Tensor, torch.Tensor]:
+        """(the run, displacements, velocities of its frames)."""
+        sweep, direct, values, start = self.rollout.sweep, is_direct(self.rollout, tensors), {}, {}
+        for name, tensor in tensors.items():
+            if direct and name in START:
+                start[name] = tensor
+                continue
+            value = tensor.detach().to("cpu", torch.float64).numpy()  # the run keeps a copy of its own
+            if name == "initial_displacements":
+                name, value = "initial_positions", self.rollout.values["rest_positions"] + value
+            values[name] = value
+        place = TensorStart(self, start) if start else None
+        run = sweep.run(values, place)
+        if not shares_memory():
+            return run, *(torch.from_numpy(runtime.fetch(x)) for x in sweep.workspace.frames)
+        device = place.device if place else torch.device("cpu")
+        frames = tuple(torch.empty(self.shape, dtype=self.dtype, device=device) for _ in range(2))
+        self.copy("out", frames, sweep.workspace.frames)
+        return run, *frames
 
-    def vjp(self, run: dict, by_displacements: torch.Tensor, by_velocities: torch.Tensor, wanted) -> dict:
-        """Gradients by the wanted inputs from those by the frames: tensors for START, NumPy arrays for the rest."""
-        rollout = self.rollout
-        if rollout._current is not run:  # another run came between: bring this one back
-            self._run(run)
-        pair = [self._ready(x) for x in (by_displacements, by_velocities)]
-        rollout._warn_if_coarse(rollout._workspace.watch.resolution())
-        norms = [self._norm(name, x) for name, x in zip(("positions", "velocities"), pair)]
-        careful = rollout.wants_health or rollout.clip is not None
-        adjoint = rollout._mirror(lambda adjoint: self._start_adjoint(adjoint, pair), careful)
-        out = tuple(torch.empty((1, *self.shape[1:]), dtype=self.dtype, device=pair[0].device) for _ in range(2))
-        self._copy("out", out, (adjoint.u, adjoint.v))
-        if rollout.truncates:
-            out[0].zero_(), out[1].zero_()
-        ends = [float(x.double().norm()) for x in out]
-        on_host = [name for name in wanted if name not in START]
-        derived = adjoint.collect(state="initial_positions" in on_host)
-        if not np.isfinite(sum(ends) + derived.coefficients.sum()):
-            if careful:
-                raise FloatingPointError("the adjoint is not finite at the start of the run")
-            rollout._mirror(lambda adjoint: self._start_adjoint(adjoint, pair), True)  # raises where it happens
-            raise FloatingPointError("the adjoint is not finite at the start of the run")
-        rollout._warn_if_exploded(norms, ends)
-        values = rollout.values | rollout.scene.inputs.check(run["values"])
-        rollout.gradients = rollout.scene.inputs.derive_vjp(values, derived, on_host)
-        velocity = out[1][0]
-        if len(self._fixed):
-            velocity[self._fixed.to(velocity.device)] = 0
-        return rollout.gradients | dict(zip(START, (out[0][0], velocity)))
-
-    def _start_adjoint(self, adjoint, pair) -> None:
-        adjoint.clear()
-        self._copy("in", pair, adjoint.frames)
-        if self.rollout.solver.last_frame_is_state:
-            for frames, running in zip(adjoint.frames, (adjoint.u, adjoint.v)):
-                copy_slot(frames, self.shape[0] - 1, running, 0)
-
-    def _norm(self, name: str, adjoint: torch.Tensor) -> float:
-        norm = float(adjoint.double().norm())
-        if not np.isfinite(norm):
-            self.rollout.check_adjoint(name, adjoint.cpu().numpy())
-        return norm
+    def vjp(self, run: Run, by_displacements: torch.Tensor, by_velocities: torch.Tensor, wanted) -> dict:
+        """Gradients by the wanted inputs from those by the frames: tensors for START if direct, NumPy arrays else."""
+        rollout, adjoints = self.rollout, (by_displacements, by_velocities)
+        direct = is_direct(rollout, wanted)
+        on_host = [name for name in wanted if not (direct and name in START)]
+        on_host = ["initial_positions" if name == "initial_displacements" else name for name in on_host]
+        if direct:
+            seed = TensorSeed(self, [self._ready(x) for x in adjoints], "initial_positions" in on_host)
+        else:
+            seed = HostSeed(*(x.detach().to("cpu", torch.float64).numpy() for x in adjoints))
+            for name, x in (("positions", seed.positions), ("velocities", seed.velocities)):
+                check_finite(name, x, rollout.save_every)
+        derived = rollout.sweep.pull_back(run, seed)
+        out = rollout.gradients = rollout.gradients_of(run, derived, Change(), on_host)
+        if "initial_displacements" in wanted and not direct:
+            out = out | {"initial_displacements": out["initial_positions"]}
+        if direct:
+            if len(self._fixed):
+                seed.start[1][self._fixed.to(seed.start[1].device)] = 0
+            out = out | dict(zip(START, seed.start))
+        return out

@@ -1,5 +1,6 @@
 """The reverse sweep and the tangent of a chain of kick-drift passes, along recorded states."""
 
+import weakref
 from types import SimpleNamespace
 
 import numpy as np
@@ -18,7 +19,7 @@ class ExplicitAdjoint:
     """
 
     def __init__(self, workspace, density: bool, shape: bool):
-        self.ws = workspace
+        self.ws = weakref.proxy(workspace)  # which keeps launches with these arrays: no circle
         a = workspace.arrays
         self.features = a.features(density, shape)
         self.numbers = Adjoint(a, self.features, more=OF_STEPS)
@@ -136,7 +137,7 @@ class ExplicitTangent:
     """The tangent of a run: changes of the state for changes of everything that kernels read."""
 
     def __init__(self, workspace, tangent: Derived):
-        self.ws, self.tangent = workspace, tangent
+        self.ws, self.tangent = weakref.proxy(workspace), tangent
         a = workspace.arrays
         self.features = a.features(density=True, shape=True)
         self.u = runtime.upload(tangent.displacement[None], a.vector)

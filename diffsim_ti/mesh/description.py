@@ -1,0 +1,32 @@
+"""What a mesh is, in a few lines for people."""
+
+import numpy as np
+
+from diffsim_ti.mesh.sets import sizes
+
+
+def describe(mesh) -> str:
+    """Counts, size, edge lengths, worst tetrahedron, sets."""
+    low, high = mesh.bounding_box
+    lengths = np.linalg.norm(np.diff(mesh.vertices[mesh.edges], axis=1)[:, 0], axis=1)
+    worst, thin = int(np.argmin(mesh.quality)), int(np.argmin(mesh.altitudes.min(1)))
+    orphans = len(mesh.unused_vertices)
+    return "\n".join(
+        [
+            f"TetrahedralMesh: {mesh.num_vertices} vertices"
+            + (f" ({orphans} unused)" if orphans else "")
+            + f", {mesh.num_tetrahedra} tetrahedra, {mesh.num_pieces} {'piece' if mesh.num_pieces == 1 else 'pieces'}",
+            f"surface: {len(mesh.surface_triangles)} triangles, {len(mesh.surface_vertices)} vertices",
+            "size: " + " x ".join(f"{d:.6g}" for d in high - low) + f" m, from ({_numbers(low)}) to ({_numbers(high)})",
+            f"volume: {mesh.volume:.6g} m^3",
+            f"edges: {lengths.min():.4g} to {lengths.max():.4g} m, mean {lengths.mean():.4g} m",
+            f"worst quality: {mesh.quality[worst]:.3g} in tetrahedron {worst}; mean {mesh.quality.mean():.3g} of 1",
+            f"smallest altitude: {mesh.altitudes[thin].min():.4g} m in tetrahedron {thin}",
+            f"vertex sets: {sizes(mesh.vertex_sets)}",
+            f"tetrahedron sets: {sizes(mesh.tetrahedron_sets)}",
+        ]
+    )
+
+
+def _numbers(values) -> str:
+    return ", ".join(f"{value:.6g}" for value in values)

@@ -1,0 +1,62 @@
+"""What a loss may name: a function of a run's frames and inputs, with its derivatives beside it."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+
+import numpy as np
+
+
+@dataclass
+class Change:
+    """A change of frames and inputs, or the gradient of a loss by them; None, and inputs left out, are zero.
+
+    positions [m], velocities [m/s]: shape (frames, num_vertices, 3); inputs: name -> array of the input's shape.
+    positions are those of the frames, which move with rest_positions where displacements are kept, and the other way
+    round: they are the variable of the chain rule, and displacements are positions less rest_positions.
+    """
+
+    positions: np.ndarray | None = None
+    velocities: np.ndarray | None = None
+    inputs: dict[str, np.ndarray] = field(default_factory=dict)
+
+    def add(self, other: "Change") -> None:
+        """Add another one."""
+        for name in ("positions", "velocities"):
+            mine, theirs = getattr(self, name), getattr(other, name)
+            setattr(self, name, mine if theirs is None else theirs if mine is None else mine + theirs)
+        for name, value in other.inputs.items():
+            self.inputs[name] = self.inputs[name] + value if name in self.inputs else value
+
+
+class Output(ABC):
+    """A function y(positions, velocities, inputs) of a run's frames, for `Rollout(..., outputs=[...])`.
+
+    Write one outside the package by giving it `name`, `shape`, `value`, `jvp` and `vjp`, in NumPy and float64; it is then
+    in `frames[name]` and `Rollout.tangents`, takes a seed in `Rollout.vjp(frames, name=...)`, and has a field under
+    `ti.ad.Tape` and a tensor in torch. `frames` (rollout/frames.py) holds the states and, in `frames.inputs`, the values of
+    all inputs. Rollout.tangents and Rollout.vjp must agree in <w, J d> = <J^T w, d>: check a new output by that and by
+    differences.
+    Griewank, Walther, Evaluating Derivatives, ch. 3, doi:10.1137/1.9780898717761.
+    """
+
+    name: str
+
+    def settled(self, scene) -> "Output":
+        """This output for a scene: checked, with what depends on the scene alone; raises ValueError if it does not fit."""
+        return self
+
+    @abstractmethod
+    def shape(self, num_frames: int) -> tuple[int, ...]:
+        """Shape of the value; three numbers at the end make vectors of a Taichi field."""
+
+    @abstractmethod
+    def value(self, frames) -> np.ndarray:
+        """y."""
+
+    @abstractmethod
+    def jvp(self, frames, change: Change) -> np.ndarray:
+        """Change of y for a change of frames and inputs, to first order."""
+
+    @abstractmethod
+    def vjp(self, frames, seed: np.ndarray) -> Change:
+        """Gradient by frames and inputs of a loss whose gradient by y is `seed`."""

@@ -1,0 +1,96 @@
+"""Copies between device arrays and Taichi fields, and sums into fields, without the host between them."""
+
+import taichi as ti
+
+# Fields of frames have shape (frames, vertices), or (runs, frames, vertices) in a rollout of several runs.
+
+
+@ti.func
+def _row(field: ti.template(), k, f, i):
+    if ti.static(len(field.shape) == 3):
+        return field[k, f, i]
+    else:
+        return field[f, i]
+
+
+@ti.func
+def _put(field: ti.template(), k, f, i, value):
+    if ti.static(len(field.shape) == 3):
+        field[k, f, i] = value
+    else:
+        field[f, i] = value
+
+
+@ti.kernel
+def show_frames(
+    u: ti.types.ndarray(ndim=2),
+    v: ti.types.ndarray(ndim=2),
+    rest: ti.types.ndarray(ndim=1),
+    k: ti.i32,
+    positions: ti.template(),
+    velocities: ti.template(),
+    displacements: ti.template(),
+):
+    """Row k of the fields from frames; positions are added in float64, in which `rest` is, as on the host."""
+    for f, i in ti.ndrange(u.shape[0], u.shape[1]):
+        x = ti.Vector([rest[i][d] + ti.cast(u[f, i][d], ti.f64) for d in ti.static(range(3))])
+        _put(positions, k, f, i, ti.cast(x, positions.dtype))
+        _put(velocities, k, f, i, ti.Vector([v[f, i][0], v[f, i][1], v[f, i][2]]))
+        _put(displacements, k, f, i, ti.Vector([u[f, i][0], u[f, i][1], u[f, i][2]]))
+
+
+@ti.kernel
+def take_seeds(
+    positions: ti.template(),
+    velocities: ti.template(),
+    displacements: ti.template(),
+    k: ti.i32,
+    u_adj: ti.types.ndarray(ndim=2),
+    v_adj: ti.types.ndarray(ndim=2),
+):
+    """Adjoints of the frames from row k of the fields' gradients."""
+    for f, i in ti.ndrange(u_adj.shape[0], u_adj.shape[1]):
+        x, v = _row(positions, k, f, i) + _row(displacements, k, f, i), _row(velocities, k, f, i)
+        for d in ti.static(range(3)):
+            u_adj[f, i][d] = x[d]
+            v_adj[f, i][d] = v[d]
+
+
+@ti.kernel
+def add_squares(x: ti.types.ndarray(ndim=2), total: ti.types.ndarray(ndim=1)):
+    """total[0] += |x|^2."""
+    for f, i in ti.ndrange(x.shape[0], x.shape[1]):
+        total[0] += x[f, i][0] * x[f, i][0] + x[f, i][1] * x[f, i][1] + x[f, i][2] * x[f, i][2]
+
+
+@ti.kernel
+def take_positions(field: ti.template(), known: ti.types.ndarray(ndim=2), u: ti.types.ndarray(ndim=2)):
+    """u[0] += field - known[0]: u belongs to the positions `known`, which cost it no digits where the field has them."""
+    for i in range(u.shape[1]):
+        for d in ti.static(range(3)):
+            u[0, i][d] += field[i][d] - known[0, i][d]
+
+
+@ti.kernel
+def take_vectors(field: ti.template(), zero: ti.types.ndarray(ti.i32, ndim=1), target: ti.types.ndarray(ndim=2)):
+    """target[0] = field, but nothing where `zero` says so."""
+    for i in range(target.shape[1]):
+        for d in ti.static(range(3)):
+            target[0, i][d] = field[i][d]
+            if zero[i] > 0:
+                target[0, i][d] = 0
+
+
+@ti.kernel
+def add_numbers(field: ti.template(), values: ti.types.ndarray()):
+    """field += values, for a field of numbers."""
+    for I in ti.grouped(field):
+        field[I] += values[I]
+
+
+@ti.kernel
+def add_vectors(field: ti.template(), values: ti.types.ndarray()):
+    """field += values, for a field of 3-vectors."""
+    for I in ti.grouped(field):
+        for d in ti.static(range(3)):
+            field[I][d] += values[I, d]

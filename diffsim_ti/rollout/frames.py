@@ -1,0 +1,74 @@
+"""Saved states of a run, and gradients of a loss by them, as NumPy arrays."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from diffsim_ti.inputs import Derived
+from diffsim_ti.rollout.run import Run
+from diffsim_ti.state.watch import ContactResolution
+
+
+@dataclass(eq=False)
+class Frames:
+    """Saved states of one run: positions [m], velocities [m/s], displacements from the rest shape [m] (which
+    keep their digits in float32), each of shape (frames, num_vertices, 3), and times [s].
+
+    `outputs` has what the Rollout was told to compute besides, by name; `frames["name"]` gives any of them.
+
+    `contact_resolution` says how near the body came to obstacles and how finely the steps resolve that (state/watch.py).
+
+    `inputs` are the values that the run started from, so that its gradient can be taken whenever it is wanted.
+    """
+
+    positions: np.ndarray
+    velocities: np.ndarray
+    displacements: np.ndarray
+    times: np.ndarray
+    inputs: dict = field(repr=False)
+    contact_resolution: ContactResolution | None = None
+    outputs: dict[str, np.ndarray] = field(default_factory=dict)
+    run: Run | None = field(default=None, repr=False)
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        if name in ("positions", "velocities", "displacements"):
+            return getattr(self, name)
+        if name not in self.outputs:
+            known = ", ".join(("positions", "velocities", "displacements", *self.outputs))
+            raise KeyError(f"no output named {name!r}; there are {known}: pass others to Rollout(..., outputs=[...])")
+        return self.outputs[name]
+
+
+def check_finite(name: str, adjoint: np.ndarray, save_every: int) -> None:
+    """Raise FloatingPointError, naming the step, where a loss's gradient by some frames is not finite."""
+    if not np.all(np.isfinite(adjoint)):
+        frame = int(np.argwhere(~np.isfinite(adjoint))[0][0]) if adjoint.ndim else 0
+        raise FloatingPointError(
+            f"the loss's gradient by {name} is not finite at step {frame * save_every} "
+            f"(frame {frame}): look at the loss; parameters are unchanged"
+        )
+
+
+def norm(x: np.ndarray) -> float:
+    """Euclidean norm in float64, without overflow."""
+    x = np.asarray(x, np.float64)
+    largest = float(np.abs(x).max(initial=0.0))
+    return largest * float(np.linalg.norm(x / largest)) if 0 < largest < np.inf else largest
+
+
+@dataclass
+class HostSeed:
+    """Gradients by the frames as NumPy arrays of shape (frames, num_vertices, 3); see `Seed` in run.py."""
+
+    positions: np.ndarray
+    velocities: np.ndarray
+
+    def put(self, adjoint, last_frame_is_state: bool) -> tuple[float, float]:
+        adjoint.start(self.positions, self.velocities, last_frame_is_state)
+        return norm(self.positions), norm(self.velocities)
+
+    def collect(self, adjoint, truncated: bool) -> tuple[Derived, tuple[float, float]]:
+        derived = adjoint.collect()
+        if truncated:
+            derived.displacement[:], derived.velocity[:] = 0, 0
+        return derived, (norm(derived.displacement), norm(derived.velocity))

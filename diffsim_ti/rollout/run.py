@@ -1,0 +1,33 @@
+"""What a sweep takes and gives: a run that can be done again, and a loss's gradients by its frames."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+from diffsim_ti.inputs import Derived
+from diffsim_ti.state.watch import ContactResolution
+
+
+@dataclass(eq=False)
+class Run:
+    """A forward run, by what it takes to do it again: the values of its inputs, and what else sets its start.
+
+    place: called with the workspace after the values are loaded; puts another state there, the same each time.
+    """
+
+    values: dict
+    place: Callable | None = None
+    contact_resolution: ContactResolution | None = None
+
+
+class Seed(Protocol):
+    """Gradients of a loss by the frames' positions and velocities, wherever they lie."""
+
+    def put(self, adjoint, last_frame_is_state: bool) -> tuple[float, float]:
+        """Set a solver's adjoint to them and everything else in it to zero; their norms, or FloatingPointError."""
+
+    def collect(self, adjoint, truncated: bool) -> tuple[Derived, tuple[float, float]]:
+        """Adjoints of what kernels read, and the norms of those of the start's displacement and velocity.
+
+        truncated: the sweep did not come to the start, whose adjoints are then zero.
+        """

@@ -1,0 +1,242 @@
+"""A rollout between Taichi kernels: its fields, and its runs as operations of a `ti.ad.Tape`."""
+
+import weakref
+
+import numpy as np
+import taichi as ti
+
+from diffsim_ti import runtime
+from diffsim_ti.outputs import Change
+from diffsim_ti.rollout import field_copies
+from diffsim_ti.rollout.field_seed import STATES, field_seed
+
+START = ("initial_positions", "initial_velocities")
+SPELLING = {"initial_displacements": "initial_positions"}  # less the rest positions; they keep their digits in float32
+
+
+class TapeFace:
+    """Fields of inputs and outputs of a Rollout, and which of its runs the present tape holds.
+
+    Frames (but not on Vulkan) and, where nothing else depends on them, initial positions and velocities are copied on the
+    device; so are, with explicit solvers, the gradients by frames. All other inputs are small: they are checked and prepared
+    on the host by `Inputs`, as are the gradients by inputs, which are then added to the fields by kernels.
+    """
+
+    def __init__(self, rollout, runs: int | None):
+        if runs is not None and not (int(runs) == runs and runs >= 1):
+            raise ValueError(f"runs must be a whole number >= 1, or None for one run, got {runs}")
+        self._rollout, self.runs = weakref.ref(rollout), runs  # the rollout holds this: no circle
+        scene = rollout.scene
+        self.fp, self.number = runtime.PRECISIONS[scene.precision], runtime.NUMPY[scene.precision]
+        self._fields, self._constants, self._rows = {}, {}, {}
+        self._tape, self._held, self._summed = None, set(), False
+
+    @property
+    def rollout(self):
+        return self._rollout()
+
+    # ---- fields -----------------------------------------------------------------------------------------------------
+
+    def field(self, name: str):
+        """See `Rollout.field`."""
+        if not self._fields:
+            self._program = runtime.program()
+        runtime.check_alive(self._program)
+        if name not in self._fields:
+            rollout = self.rollout
+            if name in rollout.outputs:
+                rows = () if self.runs is None else (self.runs,)
+                self._fields[name] = self._take((*rows, *rollout.outputs[name].shape(rollout.num_frames)))
+            elif SPELLING.get(name, name) in rollout.inputs:
+                if {name, *self._fields} >= {"initial_positions", "initial_displacements"}:
+                    raise ValueError(
+                        "initial_positions and initial_displacements are two spellings of one input: use one"
+                    )
+                if {name, *self._fields} >= {"rest_positions", "initial_displacements"}:
+                    raise ValueError(
+                        "with rest_positions, use initial_positions: displacements are those from the mesh"
+                    )
+                value = self._loaded(name)
+                self._fields[name] = self._take(value.shape)
+                self._fields[name].from_numpy(np.asarray(value, self.number))
+            else:
+                raise ValueError(f"no input named {name!r}; this rollout has {', '.join(rollout.inputs)}")
+        return self._fields[name]
+
+    def _loaded(self, name: str) -> np.ndarray:
+        """The scene's value of an input."""
+        values = self.rollout.values
+        if name == "initial_displacements":
+            return values["initial_positions"] - values["rest_positions"]
+        return values[name]
+
+    def _take(self, shape: tuple):
+        components = 3 if shape[-1:] == (3,) else 0
+        return runtime.fields.take(self, self.fp, shape[:-1] if components else shape, components)
+
+    def add_gradients(self, gradients: dict) -> None:
+        """Add to the .grad of the inputs' fields."""
+        for name in self._fields:
+            if SPELLING.get(name, name) in gradients:
+                self._add(self._fields[name].grad, gradients[SPELLING.get(name, name)])
+
+    def row(self, k: int | None, name: str) -> np.ndarray:
+        """The gradient by an output of run k, in float64."""
+        grad = self.field(name).grad.to_numpy().astype(np.float64)
+        return grad if self.runs is None else grad[k]
+
+    def fill_row(self, k: int | None, name: str, value: np.ndarray) -> None:
+        """Put the value of an output of run k into its field."""
+        if self.runs is not None:
+            rows = self._rows.setdefault(name, np.zeros((self.runs, *value.shape), self.number))
+            rows[k] = value
+            value = rows
+        self.field(name).from_numpy(np.asarray(value, self.number))
+
+    def _add(self, grad, gradient: np.ndarray) -> None:
+        gradient = np.array(gradient, self.number, order="C")
+        if gradient.ndim == 0:
+            grad[None] += float(gradient)
+        elif gradient.shape == (3,) and grad.shape == ():
+            grad.from_numpy(grad.to_numpy() + gradient)
+        elif isinstance(grad, ti.MatrixField):
+            field_copies.add_vectors(grad, gradient)
+        else:
+            field_copies.add_numbers(grad, gradient)
+
+    # ---- runs -------------------------------------------------------------------------------------------------------
+
+    def run(self, k: int | None) -> None:
+        """See `Rollout.run`."""
+        if (k is None) != (self.runs is None) or k is not None and not (int(k) == k and 0 <= k < self.runs):
+            rule = (
+                "make the Rollout with runs=..."
+                if self.runs is None
+                else f"give a whole number of 0 .. {self.runs - 1}"
+            )
+            raise ValueError(
+                f"run({'' if k is None else k}): this rollout has {self.runs or 'no numbered'} runs: {rule}"
+            )
+        tape = runtime.current_tape()
+        if tape is None or self._tape is None or self._tape() is not tape:
+            self._tape, self._held = None if tape is None else weakref.ref(tape), set()
+            self._summed = False
+        elif k in self._held:
+            raise RuntimeError(
+                f"{'this rollout' if k is None else f'run {k}'} already ran in this tape and would overwrite its frames: "
+                "make a second Rollout, or one with runs=... whose run(k) has frames of its own"
+            )
+        self._held.add(k)
+        TapedRun(self.rollout, k).forward()
+
+    def values(self) -> tuple[dict, bool]:
+        """(values of inputs from their fields, whether the start is left out because it is copied on the device)."""
+        rollout = self.rollout
+        if self._fields:
+            runtime.check_alive(self._program)
+        start = [name for name in (*START, *SPELLING) if name in self._fields]
+        direct = rollout.scene.motion is None and "rest_positions" not in self._fields
+        out = {}
+        for name, field in self._fields.items():
+            if SPELLING.get(name, name) in rollout.inputs and not (direct and name in start):
+                value, known = field.to_numpy(), self._loaded(name)
+                value = known if np.array_equal(value, known.astype(value.dtype)) else value.astype(np.float64)
+                if name == "initial_displacements":
+                    value = value + rollout.values["rest_positions"]
+                out[SPELLING.get(name, name)] = value
+        return out, direct and bool(start)
+
+    def place(self, workspace) -> None:
+        """Set the start of a workspace from the fields; what is loaded there is that of the scene."""
+        fields, state = self._fields, workspace.state
+        n = self.rollout.scene.mesh.num_vertices
+        if "initial_positions" in fields:
+            known = self._constant("initial_positions", None, lambda: self._loaded("initial_positions")[None])
+            field_copies.take_positions(fields["initial_positions"], known, state.u)
+        if "initial_displacements" in fields:
+            nowhere = self._constant("nowhere", None, lambda: np.zeros(n), ti.i32)
+            field_copies.take_vectors(fields["initial_displacements"], nowhere, state.u)
+        if "initial_velocities" in fields:
+            fixed = self._constant("fixed", None, lambda: np.isin(np.arange(n), self.rollout.scene.fixed), ti.i32)
+            field_copies.take_vectors(fields["initial_velocities"], fixed, state.v)
+        bad = workspace.first_bad_vertex()
+        if bad is not None:
+            raise ValueError(f"initial_positions and initial_velocities must be finite: those of vertex {bad} are not")
+
+    def show(self, k: int | None, run) -> None:
+        """Fill the fields of outputs with those of the run that ran last."""
+        frames, rest = self.rollout.sweep.workspace.frames, run.values["rest_positions"]
+        if runtime.arch_name() in ("cpu", "cuda"):
+            exact = self._constant("rest", rest, lambda: rest, ti.types.vector(4, ti.f64))
+            field_copies.show_frames(*frames, exact, k or 0, *map(self.field, STATES))
+        else:  # Vulkan may lack float64
+            u, v = map(runtime.fetch, frames)
+            for name, value in zip(STATES, (rest + u, v, u)):
+                self.fill_row(k, name, value)
+
+    def _constant(self, name: str, source, make, dtype=None):
+        """A device array made once for each source."""
+        if name not in self._constants or self._constants[name][0] is not source:
+            array = runtime.upload(make(), dtype or ti.types.vector(4, self.fp))
+            self._constants[name] = source, array
+        return self._constants[name][1]
+
+    def sum_up(self, gradients: dict) -> None:
+        """Add the gradients of a run to those of the other runs of this tape."""
+        rollout = self.rollout
+        if self._summed:
+            gradients = {name: rollout.gradients[name] + gradient for name, gradient in gradients.items()}
+        rollout.gradients, self._summed = gradients, True
+
+
+class FieldStart:
+    """The start that the fields gave to a run, also after kernels have overwritten them."""
+
+    def __init__(self, face: TapeFace):
+        self.face, self._kept = face, None
+
+    def __call__(self, workspace) -> None:
+        if self._kept is None:
+            self.face.place(workspace)
+            self._kept = workspace.history(1)
+            workspace.save(self._kept, 0)
+        else:
+            workspace.restore(self._kept, 0)
+
+
+class TapedRun:
+    """One run of a rollout in a tape, which holds it: it owns what its backward needs.
+
+    `forward` and `backward` are the package's one pair for `ti.ad.grad_replaced`: such pairs must not nest.
+    """
+
+    def __init__(self, rollout, k: int | None):
+        self.rollout, self.face, self.k = rollout, rollout.tape_face, k
+        self.run = self.frames = None
+
+    @ti.ad.grad_replaced
+    def forward(self):
+        face, rollout = self.face, self.rollout
+        values, direct = face.values()
+        self.run = rollout.sweep.run(values, FieldStart(face) if direct else None)
+        face.show(self.k, self.run)
+        if rollout.computed:
+            self.frames = rollout.frames_of(self.run)
+            for name in rollout.computed:
+                face.fill_row(self.k, name, self.frames[name])
+
+    @ti.ad.grad_for(forward)
+    def backward(self):
+        """Adds to the .grad of the input fields and sets the rollout's `gradients`."""
+        if self.run is None:  # the run failed, and its error is on its way
+            return
+        face, rollout = self.face, self.rollout
+        seeds = {name: face.row(self.k, name) for name in rollout.computed}
+        change = rollout.pulled_to_frames(self.frames, {name: x for name, x in seeds.items() if x.any()})
+        if "rest_positions" in rollout.wanted:  # what displacements say of it directly
+            by_rest = rollout.outputs["displacements"].vjp(None, face.row(self.k, "displacements"))
+            change.add(Change(inputs=by_rest.inputs))
+        derived = rollout.sweep.pull_back(self.run, field_seed(face, self.k, change))
+        gradients = rollout.gradients_of(self.run, derived, change)
+        face.add_gradients(gradients)
+        face.sum_up(gradients)

@@ -1,0 +1,125 @@
+"""A rollout as a node of torch's graph, and each of its further outputs as another."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from diffsim_ti.rollout import Rollout
+from diffsim_ti.torch_bridge.autograd import first_order_only, torch
+from diffsim_ti.torch_bridge.tensors import TensorRollout
+
+REMEDY = "use verify.hessian_product or verify.gauss_newton_product"
+
+
+class _States(NamedTuple):
+    positions: torch.Tensor
+    velocities: torch.Tensor
+    displacements: torch.Tensor
+
+
+class TorchFrames(_States):
+    """Saved states as tensors of shape (frames, num_vertices, 3): positions [m], velocities [m/s], displacements [m].
+
+    `outputs` has what the Rollout was told to compute besides, by name; `frames["name"]` gives any of them.
+    """
+
+    outputs: dict[str, torch.Tensor]
+
+    def __new__(cls, positions, velocities, displacements, outputs=None):
+        frames = super().__new__(cls, positions, velocities, displacements)
+        frames.outputs = outputs or {}
+        return frames
+
+    def __getitem__(self, key):
+        if isinstance(key, str):
+            return getattr(self, key) if key in self._fields else self.outputs[key]
+        return super().__getitem__(key)
+
+
+class _RolloutNode(torch.autograd.Function):
+    """Inputs of a rollout -> displacements and velocities of its frames; the gradient by the first is that by positions."""
+
+    @staticmethod
+    def forward(ctx, rollout: Rollout, names: tuple, kept: list, *tensors):
+        run, *frames = rollout.torch_face.forward(dict(zip(names, tensors)))
+        if rollout.computed:
+            kept.append(rollout.frames_of(run))
+        ctx.run, ctx.rollout, ctx.names, ctx.tensors = run, rollout, names, tensors
+        return tuple(x.to(tensors[0].device) if tensors else x for x in frames)
+
+    @staticmethod
+    @first_order_only(REMEDY)
+    def backward(ctx, *adjoints):
+        needed = ctx.needs_input_grad[3:]
+        gradients = ctx.rollout.torch_face.vjp(ctx.run, *adjoints, [n for n, need in zip(ctx.names, needed) if need])
+        return None, None, None, *_as_tensors(gradients, ctx.names, ctx.tensors, needed)
+
+
+class _OutputNode(torch.autograd.Function):
+    """Frames and inputs of a rollout -> one of its outputs, on the host."""
+
+    @staticmethod
+    def forward(ctx, rollout: Rollout, name: str, frames, names: tuple, *tensors):
+        ctx.rollout, ctx.name, ctx.frames, ctx.names, ctx.tensors = rollout, name, frames, names, tensors
+        return torch.from_numpy(np.array(frames[name])).to(tensors[0])
+
+    @staticmethod
+    @first_order_only(REMEDY)
+    def backward(ctx, seed):
+        seeds = {ctx.name: seed.detach().to("cpu", torch.float64).numpy()}
+        change = ctx.rollout.pulled_to_frames(ctx.frames, seeds)
+        gradients = dict(positions=change.positions, velocities=change.velocities) | change.inputs
+        if "initial_positions" in gradients:
+            gradients["initial_displacements"] = gradients["initial_positions"]
+        return None, None, None, None, *_as_tensors(gradients, ctx.names, ctx.tensors, ctx.needs_input_grad[4:])
+
+
+def _as_tensors(gradients: dict, names, tensors, needed) -> list:
+    out = []
+    for name, tensor, need in zip(names, tensors, needed):
+        value = gradients.get(name) if need else None
+        value = torch.tensor(value) if isinstance(value, np.ndarray) else value  # a copy: gradients may be read-only
+        out.append(None if value is None else value.to(tensor.device, tensor.dtype))
+    return out
+
+
+def rollout_frames(rollout: Rollout, **tensors: torch.Tensor) -> TorchFrames:
+    """Functional face: run a Rollout with some inputs given as tensors; one autograd node, gradients to all of them.
+
+    Names are those of `rollout.inputs`, or "initial_displacements" instead of "initial_positions" (which keeps its digits
+    in float32). Two runs before one backward are right. Second derivatives are refused (see `verify.hessian_product`).
+
+    Frames are copied between tensors and the device by one kernel, and so are, with explicit solvers, initial displacements
+    and velocities and the gradients by all of these (tensors.py); all other inputs are small and go through the host, as do
+    further outputs, gradients with implicit solvers, prescribed motion, rest_positions, and everything on Vulkan, whose
+    memory torch cannot see.
+    Raises ValueError for unknown names, wrong shapes, types that are not floating point, and tensors that require a
+    gradient by density or rest_positions which the Rollout was told not to compute.
+    """
+    if "initial_positions" in tensors and "initial_displacements" in tensors:
+        raise ValueError("initial_positions and initial_displacements are two spellings of one input: give one")
+    if "rest_positions" in tensors and "initial_displacements" in tensors:
+        raise ValueError("with rest_positions, give initial_positions: initial_displacements are those from the mesh")
+    for name, value in tensors.items():
+        tensors[name] = value if isinstance(value, torch.Tensor) else torch.as_tensor(value, dtype=torch.float64)
+        if not tensors[name].is_floating_point():
+            raise ValueError(f"{name}: expected a floating point tensor, got {tensors[name].dtype}")
+        costs_extra = name in ("density", "rest_positions") and name not in rollout.wanted
+        if tensors[name].requires_grad and costs_extra and torch.is_grad_enabled():
+            raise ValueError(
+                f"{name} requires a gradient, but this rollout computes {', '.join(rollout.wanted)}: name it in "
+                'Rollout(gradients=[...]), or pass gradients="all"'
+            )
+    if rollout.torch_face is None:
+        rollout.torch_face = TensorRollout(rollout)
+    names, kept = tuple(tensors), []
+    displacements, velocities = _RolloutNode.apply(rollout, names, kept, *tensors.values())
+    states, outputs = (displacements, velocities), {}
+    for name in rollout.computed:
+        around = ("positions", "velocities", *names)
+        outputs[name] = _OutputNode.apply(rollout, name, kept[0], around, *states, *tensors.values())
+    if "rest_positions" not in tensors:
+        rest = torch.from_numpy(np.array(rollout.values["rest_positions"])).to(displacements)
+        return TorchFrames(rest + displacements, velocities, displacements, outputs)
+    rest = tensors["rest_positions"].to(displacements)  # the reverse sweep gives the gradient of positions = rest + u
+    return TorchFrames(rest.detach() + displacements, velocities, displacements + (rest.detach() - rest), outputs)
