@@ -8,10 +8,10 @@ HEAD = "| area | files test_*.py | minutes |\n| --- | --- | ---: |\n"
 
 # area -> files, without test_ and .py
 AREAS = {
-    "meshes, scenes, materials": "mesh scene inputs materials",
+    "meshes, scenes, materials": "mesh locate scene inputs materials open_laws",
     "motion against closed forms": "reference_motion step_limit hertz torture",
     "every adjoint, order, fuzz": "every_adjoint term_order gradient_fuzz",
-    "gradients": "gradients gradient_clip gradient_faults checkpoints tape identification",
+    "gradients": "gradients gradient_clip gradient_faults checkpoints tape outputs identification",
     "implicit steps and equilibria": "implicit implicit_gradients implicit_contact",
     "patches against locking": "locking",
     "obstacles and friction": "contact contact_crossing contact_friction contact_gradients own_obstacle",
