@@ -7,8 +7,10 @@ import taichi as ti
 import diffsim_ti as ds
 from diffsim_ti import runtime
 from diffsim_ti.contact.broad_phase import CandidatePairs
-from diffsim_ti.contact.proximity import EDGE_EDGE, VERTEX_TRIANGLE, evaluate_pairs
-from diffsim_ti.contact.surface_pairs import pieces, surface_edges
+from diffsim_ti.contact.evaluate import evaluate_pairs
+from diffsim_ti.contact.proximity import EDGE_EDGE, VERTEX_TRIANGLE
+from diffsim_ti.contact.surface_pairs import surface_edges
+from diffsim_ti.mesh.sets import pieces
 
 by_kind = pytest.mark.parametrize("kind", [VERTEX_TRIANGLE, EDGE_EDGE])
 STIFFNESS, WIDTH = 2.0, 3.0

@@ -5,7 +5,9 @@ import taichi as ti
 
 from diffsim_ti import runtime
 from diffsim_ti.contact.broad_phase import CandidatePairs
+from diffsim_ti.contact.motion_kernels import motion_kernels
 from diffsim_ti.contact.pair_kernels import BLOCK, OPPOSITE, pair_kernels
+from diffsim_ti.mesh.sets import pieces
 
 
 class Tunnelling(FloatingPointError):
@@ -35,6 +37,7 @@ class SurfacePairs:
         self.a, mesh, term = arrays, arrays.mesh, arrays.self_contact
         self.mesh, self.first, self.parallel = mesh, arrays.parameters_of_self_contact.start, parallel
         self.kernels = pair_kernels(arrays.precision, self.first, parallel)
+        self.motion = motion_kernels(arrays.precision, self.first, parallel)
         edges = surface_edges(mesh)
         lengths = np.linalg.norm(mesh.vertices[edges[:, 1]] - mesh.vertices[edges[:, 0]], axis=1)
         self.edges, self.term = edges, term
@@ -120,7 +123,7 @@ class SurfacePairs:
             take("energies", self.kernels.fp, count),
             take("numbers", self.kernels.vector, count),
         )
-        self._launch(self.kernels.begin, self.list.surface, u, self.built, self.plane)(
+        self._launch(self.motion.begin, self.list.surface, u, self.built, self.plane)(
             slot, self.list.num_surface, count
         )
         self.fresh, self.age = True, 0
@@ -156,7 +159,7 @@ class SurfacePairs:
         """Whether the list is stale, whether pairs beyond it may have crossed, and whether pairs of it may have."""
         k = self.list
         self._launch(
-            self.kernels.check,
+            self.motion.check,
             k.pairs,
             k.surface,
             k.place,
@@ -313,16 +316,6 @@ class SurfacePairs:
 def surface_edges(mesh) -> np.ndarray:
     """Each edge of the surface once, the smaller index first, sorted; shape (k, 2)."""
     return np.unique(np.sort(mesh.surface_triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1), axis=0)
-
-
-def pieces(mesh) -> np.ndarray:
-    """Number of the piece that each vertex belongs to; pieces share no vertex."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    i, k = mesh.tetrahedra[:, [0, 1, 0, 2, 0, 3]].reshape(-1, 2).T
-    graph = coo_matrix((np.ones(len(i), bool), (i, k)), (mesh.num_vertices, mesh.num_vertices))
-    return connected_components(graph, directed=False)[1]
 
 
 def spread(body: np.ndarray, count: int) -> np.ndarray:

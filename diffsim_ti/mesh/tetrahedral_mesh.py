@@ -55,8 +55,6 @@ class TetrahedralMesh:
         checks.warn_of_orphans(self.unused_vertices)
         checks.warn_of_slivers(self)
 
-    # Making, loading, saving
-
     @classmethod
     def create_cube(cls, resolution: int = 5, size: float = 1.0, pattern="kuhn", device=None) -> "TetrahedralMesh":
         """The cube [0, size]^3 [m], all of it filled; `resolution` counts vertices a side. See `create_box`.

@@ -128,7 +128,7 @@ class PotentialKernels:
     # ---- products with the stiffness ---------------------------------------------------------------------------------
 
     @ti.func
-    def products(self, scene: A, pass_: A, at: A, out: A, plan: A):
+    def multiply(self, scene: A, pass_: A, at: A, out: A, plan: A, friction: A):
         ti.loop_config(serialize=not self.parallel)
         for e in range(plan.num_items):
             self.element.stiffness(e, scene, at.u, 0, at.w, scene.corner)
@@ -136,8 +136,15 @@ class PotentialKernels:
         for i in range(plan.num_vertices):
             f = self.element.gather(i, scene, scene.corner)
             if self.felt(i, scene):
-                f += self.obstacles.whole_product(i, at.u[0, i], at.w[0, i], scene, pass_, plan)
+                if ti.static(friction):
+                    f += self.obstacles.whole_product(i, at.u[0, i], at.w[0, i], scene, pass_, plan)
+                else:
+                    f += self.obstacles.product(i, at.u[0, i], at.w[0, i], scene, pass_)
             out.y[0, i] = f
+
+    @ti.func
+    def products(self, scene: A, pass_: A, at: A, out: A, plan: A):
+        self.multiply(scene, pass_, at, out, plan, True)
 
     @cached_property
     def product(self) -> Kernel:
@@ -145,22 +152,14 @@ class PotentialKernels:
         return self._kernel("product", self.products, at=dict(u="vectors2", w="vectors2"), out=dict(y="vectors2"))
 
     @ti.func
-    def elastic_products(self, scene: A, pass_: A, at: A, out: A, plan: A):
-        ti.loop_config(serialize=not self.parallel)
-        for e in range(plan.num_items):
-            self.element.stiffness(e, scene, at.u, 0, at.w, scene.corner)
-        ti.loop_config(serialize=not self.parallel)
-        for i in range(plan.num_vertices):
-            f = self.element.gather(i, scene, scene.corner)
-            if self.felt(i, scene):
-                f += self.obstacles.product(i, at.u[0, i], at.w[0, i], scene, pass_)
-            out.y[0, i] = f
+    def smooth_products(self, scene: A, pass_: A, at: A, out: A, plan: A):
+        self.multiply(scene, pass_, at, out, plan, False)
 
     @cached_property
     def stiffness(self) -> Kernel:
         """y = df/du w without friction: what bounds an explicit step."""
         own = dict(at=dict(u="vectors2", w="vectors2"), out=dict(y="vectors2"))
-        return self._kernel("stiffness", self.elastic_products, **own)
+        return self._kernel("stiffness", self.smooth_products, **own)
 
     # ---- block diagonal ----------------------------------------------------------------------------------------------
 

@@ -9,26 +9,14 @@ from dataclasses import dataclass
 
 import taichi as ti
 
-from diffsim_ti.runtime import PRECISIONS
-from diffsim_ti.state.features import Features
+from diffsim_ti.state.obstacle_functions import ObstacleFunctions
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
 
 
 @dataclass(frozen=True)
-class ObstaclePotential:
+class ObstaclePotential(ObstacleFunctions):
     """Taichi functions of one vertex; g is a group of obstacles, k a place in it (state/features.py)."""
-
-    features: Features
-    precision: str
-
-    @property
-    def fp(self):
-        return PRECISIONS[self.precision]
-
-    @property
-    def vector(self):
-        return ti.types.vector(4, self.fp)
 
     @ti.func
     def rest_now(self, g: A, k, i, scene: A, pass_: A):
@@ -185,10 +173,3 @@ class ObstaclePotential:
                 adjoint.walls[n + 1, i] = zero - by_lag
                 adjoint.walls[n + 2, i] = by_wall
         return by_u
-
-    @ti.func
-    def add_to_rest(self, i, by_X, adjoint: A):
-        row = ti.static(self.features.sums().first("rest"))
-        if ti.static(self.features.shape):
-            for d in ti.static(range(3)):
-                adjoint.sums[row + d, i] = adjoint.sums[row + d, i] + by_X[d]

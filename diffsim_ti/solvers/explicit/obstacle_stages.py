@@ -8,26 +8,14 @@ from dataclasses import dataclass
 
 import taichi as ti
 
-from diffsim_ti.runtime import PRECISIONS
-from diffsim_ti.state.features import Features
+from diffsim_ti.state.obstacle_functions import ObstacleFunctions
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
 
 
 @dataclass(frozen=True)
-class ObstacleStages:
+class ObstacleStages(ObstacleFunctions):
     """Taichi functions of one vertex; `now` is the pass (state/schedule.py), g a group of obstacles, k a place in it."""
-
-    features: Features
-    precision: str
-
-    @property
-    def fp(self):
-        return PRECISIONS[self.precision]
-
-    @property
-    def vector(self):
-        return ti.types.vector(4, self.fp)
 
     # ---- where obstacles are -----------------------------------------------------------------------------------------
 
@@ -141,13 +129,6 @@ class ObstacleStages:
                     adjoint.sums[first + m, i] = adjoint.sums[first + m, i] + by[m].dot(f_adj)
                 self.add_to_rest(i, by_u, adjoint)
         return u_adj, v_adj
-
-    @ti.func
-    def add_to_rest(self, i, by_X, adjoint: A):
-        row = ti.static(self.features.sums().first("rest"))
-        if ti.static(self.features.shape):
-            for d in ti.static(range(3)):
-                adjoint.sums[row + d, i] = adjoint.sums[row + d, i] + by_X[d]
 
     # ---- friction, its tangent and its adjoint -----------------------------------------------------------------------
 
