@@ -1,5 +1,6 @@
 """On executed PTX: how often the driver is called, what single precision compiles to, and that launches may be repeated."""
 
+import gc
 import re
 
 import numpy as np
@@ -73,6 +74,7 @@ def sweeps(driver, solver, frames: int) -> list[dict[str, int]]:
     """Counts of a forward run and of its reverse, each made for the second time."""
     rollout = Rollout(solver, frames, gradients=["youngs_modulus", "initial_positions"])
     for _ in range(2):
+        gc.collect()  # what earlier runs held goes back now, not in the middle of a count
         driver.restart()
         result = rollout.forward()
         forward = driver.counts()
