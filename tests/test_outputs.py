@@ -1,11 +1,12 @@
 """Outputs that a loss may name: their derivatives, in NumPy, under a tape and in torch; one of ours, one of a user."""
 
+from functools import lru_cache
+
 import numpy as np
 import pytest
 import taichi as ti
 import torch
 from test_gradients import free_scene, full_scene, random_mesh, rollout_of
-from test_tape import scalar_field
 
 import diffsim_ti as ds
 from diffsim_ti import verify
@@ -15,6 +16,12 @@ from diffsim_ti.solvers.explicit.solver import ExplicitWorkspace
 
 RNG = np.random.default_rng(3)
 STEPS = 6
+
+
+@lru_cache(maxsize=None)
+def scalar_field():
+    """One field for all tests of this file: kernels compile anew for each."""
+    return ti.field(ti.f64, (), needs_grad=True)
 
 
 def tight_bdf2(scene, **options):

@@ -97,7 +97,7 @@ def test_growth_beyond_the_limit_is_the_fastest_modes_and_has_a_horizon():
 def test_growth_of_ones_own_scene_by_the_command(tmp_path):
     from typer.testing import CliRunner
 
-    from diffsim_ti.cli import app
+    from diffsim_ti.cli.app import app
 
     (tmp_path / "hang.py").write_text(
         "from diffsim_ti.study.growth import GROWTH_SCENES\nscene = GROWTH_SCENES['clamped beam let go']('f64')\n"
