@@ -77,11 +77,12 @@ def products(it) -> str:
     def loss(frames):  # quadratic in positions
         return 0.0, self_weight(it, frames), it.z
 
+    rough = any(placed.kind.friction for placed in it.configuration.placed)  # C1: differences meet its kinks
     one, other = (verify.hessian_product(it.rollout, loss, both | d, epsilon=1e-4) for d in (a, b))
     left = sum(float((one[n] * d).sum()) for n, d in b.items())
     right = sum(float((other[n] * d).sum()) for n, d in a.items())
     size = max(abs(left), abs(right), 1e-3 * np.linalg.norm(it.w) * np.linalg.norm(dx) * np.linalg.norm(dy) / CELL)
-    if abs(left - right) > 1e-4 * size:
+    if abs(left - right) > (1e-3 if rough else 1e-4) * size:
         return f"hessian_product of {list(both)} is not symmetric: {left} and {right}"
     return RIGHT
 
@@ -194,7 +195,9 @@ def truncate(it) -> str:
     if any(np.any(found[name]) for name in ("initial_positions", "initial_velocities")):
         return "gradients by the start are not zero"
     for name, rows in chain.rows(cut, steps - cut).items():
-        if np.any(found[name][: rows.start]):
+        # the kick at the cut takes half of the force of the step before it
+        shared = int(name == "external_forces" and configuration.structure.solver is ds.VelocityVerletSolver)
+        if np.any(found[name][: rows.start - shared]):
             return f"{name}: rows before the cut are not zero"
         if np.any(found[name][rows.start + 1 :] != it.gradients[name][rows.start + 1 :]):
             return f"{name}: rows after the cut are not those of the full sweep"

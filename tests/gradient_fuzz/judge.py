@@ -26,6 +26,7 @@ PASSED, ZERO, REFUSED, UNRESOLVED, INACCURATE, FAILED = CLASSES = (
 GATES = {("f64", True): (1e-10, 1e-6), ("f64", False): (1e-7, 1e-5)}  # (precision, explicit): (tangent, differences)
 SINGLE = (2e-4, 2e-3)
 ROUNDING = {"f64": 1e-12, "f32": 1e-4}  # a derivative this much smaller than the largest of a configuration is rounding
+TINY = {"f64": 1e-16, "f32": 1e-8}  # what is left of terms that cancel, against the same
 REFUSALS = (ValueError, FloatingPointError, RuntimeError)
 LENGTHS = ("_positions", "_motion", "_path", "_center", "_point", "_start", "_end", "_position", "_height")
 
@@ -149,7 +150,7 @@ class Judge:
             if name in compared:  # all where runs are cheap
                 self._compare(row, exact, name, floor, resolved)
                 out.append(row)
-            elif abs(reverse - tangent) > self.gates[0] * size:
+            elif abs(reverse - tangent) > max(self.gates[0] * size, TINY[kind.precision] * max(norms.values())):
                 out.append(replace(row, verdict=FAILED))
         return out
 
@@ -171,9 +172,13 @@ class Judge:
         noise = rounding * float(np.linalg.norm(self.w))
         row.difference, row.error = derivative(change, 0.1 * gate * row.size, noise, row.reverse)
         off = abs(row.reverse - row.difference)
-        if abs(row.reverse - row.tangent) > dot_gate * row.size:
+        tiny = TINY[self.configuration.structure.precision] / ROUNDING[self.configuration.structure.precision] * floor
+        if abs(row.reverse - row.tangent) > max(dot_gate * row.size, tiny):
             row.verdict = FAILED
-        elif max(abs(row.reverse), abs(row.tangent)) <= dot_gate * floor and abs(row.difference) <= 3 * row.error:
+        elif (
+            max(abs(row.reverse), abs(row.tangent)) <= max(dot_gate * floor, tiny)
+            and abs(row.difference) <= 3 * row.error
+        ):
             row.verdict = ZERO
         elif off <= gate * row.size:
             row.verdict = PASSED
