@@ -114,13 +114,13 @@ def reversed_pass(now, j, plan) -> runtime.Bundle:
 
 
 class PassTable:
-    """The tables of some passes on the device: `ints` and `floats`, whose first row is that of pass `window`."""
+    """Tables of some passes on the device, row after row: `ints` and `floats`; the first row is that of pass `window`."""
 
     size = 1024  # passes
 
     def __init__(self, fp):
-        self.ints = runtime.array(ti.i32, self.size, len(INTS))
-        self.floats = runtime.array(fp, self.size, len(FLOATS))
+        self.ints = runtime.array(ti.i32, self.size * len(INTS))
+        self.floats = runtime.array(fp, self.size * len(FLOATS))
         self._made, self._shown = {}, None
 
     def windows(self, first: int, last: int) -> list[tuple[int, int, int]]:
@@ -139,14 +139,15 @@ class PassTable:
         self._shown = window, run
         for target, rows in zip((self.ints, self.floats), self._made[window, run]):
             whole = np.zeros(target.shape)
-            whole[: len(rows)] = rows
+            whole[: rows.size] = rows.ravel()
             runtime.fill(target, whole)
 
 
 @runtime.traced
 def pass_at(table, k) -> runtime.Bundle:
     """Row k of the tables in a kernel: what a pass is, by name."""
-    columns = {name: runtime.let(runtime.at(table.ints, k, c)) for c, name in enumerate(INTS)}
-    return runtime.Bundle(
-        **columns, **{name: runtime.let(runtime.at(table.floats, k, c)) for c, name in enumerate(FLOATS)}
-    )
+    columns = {}
+    for array, names in ((table.ints, INTS), (table.floats, FLOATS)):
+        first = runtime.let(k * len(names))
+        columns |= {name: runtime.let(runtime.at(array, first + c)) for c, name in enumerate(names)}
+    return runtime.Bundle(**columns)

@@ -14,7 +14,7 @@ A = ti.template()
 STATE = dict(u="vectors2", v="vectors2", f="vectors2", frames_u="vectors2", frames_v="vectors2", seen="scalars2")
 CHANGE = dict(u="vectors2", v="vectors2", frames_u="vectors2", frames_v="vectors2")  # of a state, or its adjoint
 CORNERS = dict(corner="vectors", rate_corner="vectors")  # adjoints of u and v, still to be gathered
-PLAN = dict(ints="ints2", floats="scalars2")  # the tables of the passes, from pass `window` on
+PLAN = dict(ints="ints", floats="scalars")  # the tables of the passes, from pass `window` on
 NUMBERS = dict.fromkeys(("num_items", "num_vertices", "window", "first", "count", "base"), "int")
 
 
