@@ -21,7 +21,6 @@ def array_types(precision: str) -> dict:
     ndarray = ti.types.ndarray
     return {
         "ints": ndarray(ti.i32, 1),
-        "ints2": ndarray(ti.i32, 2),
         "scalars": ndarray(fp, 1),
         "scalars2": ndarray(fp, 2),
         "vectors": ndarray(vector, 1),

@@ -63,10 +63,6 @@ class Features:
     def rough_backwards(self) -> tuple[ObstacleGroup, ...]:
         return self.rough[::-1]
 
-    @property
-    def num_obstacles(self) -> int:
-        return sum(group.count for group in self.groups)
-
     def sums(self) -> Rows:
         """Rows of the per-vertex adjoint sums: those of the parameters stand as the parameters do."""
         return Rows({"parameters": self.num_parameters, "mass": int(self.density), "rest": 3 * self.shape})
