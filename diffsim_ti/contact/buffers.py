@@ -1,56 +1,69 @@
 """Arrays that grow and kernels bound to them, for lists whose length changes from build to build."""
 
-from functools import lru_cache
+from dataclasses import dataclass
+from functools import cached_property
+from types import SimpleNamespace
 
+import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
+from diffsim_ti.runtime import Kernel, kernels_of
 
+A = ti.template()
 BLOCK = 256  # numbers that one thread sums
 
 
-@lru_cache(maxsize=None)
-def _scan_kernel(parallel: bool):
-    ints = ti.types.ndarray(ti.i32, 1)
+@dataclass(frozen=True)
+class Scan:
+    """Sums of the numbers before each."""
 
-    @ti.kernel
-    def scan(values: ints, sums: ints, count: ti.i32, blocks: ti.i32):
-        """values[k] becomes the sum of those before k; values[count], which must be there, the sum of all."""
-        ti.loop_config(serialize=not parallel)
-        for b in range(blocks):
+    parallel: bool
+
+    @ti.func
+    def scan(self, of: A, plan: A):
+        ti.loop_config(serialize=not self.parallel)
+        for b in range(plan.blocks):
             total = 0
-            for k in range(b * BLOCK, ti.min((b + 1) * BLOCK, count)):
-                total += values[k]
-            sums[b] = total
+            for k in range(b * BLOCK, ti.min((b + 1) * BLOCK, plan.count)):
+                total += of.values[k]
+            of.sums[b] = total
         ti.loop_config(serialize=True)
         for _ in range(1):
             total = 0
-            for b in range(blocks):
-                part = sums[b]
-                sums[b] = total
+            for b in range(plan.blocks):
+                part = of.sums[b]
+                of.sums[b] = total
                 total += part
-            values[count] = total
-        ti.loop_config(serialize=not parallel)
-        for b in range(blocks):
-            total = sums[b]
-            for k in range(b * BLOCK, ti.min((b + 1) * BLOCK, count)):
-                part = values[k]
-                values[k] = total
+            of.values[plan.count] = total
+        ti.loop_config(serialize=not self.parallel)
+        for b in range(plan.blocks):
+            total = of.sums[b]
+            for k in range(b * BLOCK, ti.min((b + 1) * BLOCK, plan.count)):
+                part = of.values[k]
+                of.values[k] = total
                 total += part
 
-    return scan
+    @cached_property
+    def kernel(self) -> Kernel:
+        """values[k] becomes the sum of those before k; values[count], which must be there, the sum of all."""
+        arrays = dict(of=dict(values="ints", sums="ints"))
+        return Kernel("scan", self.scan, "f64", arrays, dict(count="int", blocks="int"))  # whatever the precision
 
 
 class Launches:
-    """Kernels bound to arrays, each once: `launches(kernel, *arrays)(*numbers)`; they keep those arrays alive."""
+    """Kernels bound to arrays, each once: `launches(kernel, **records)(**numbers)`; they keep those arrays alive.
+
+    Arrays of a SimpleNamespace may be others in each call; those of other records must stay, or be followed by `clear`.
+    """
 
     def __init__(self):
         self._bound = {}
 
-    def __call__(self, kernel, *arrays, vectorized: bool = False) -> runtime.Launch:
-        key = (id(kernel), *map(id, arrays))
+    def __call__(self, kernel: Kernel, vectorized: bool = False, **records):
+        key = (id(kernel), *(i for record in records.values() for i in _ids(record)))
         if key not in self._bound:
-            self._bound[key] = runtime.Launch(kernel, *arrays, vectorized=vectorized)
+            self._bound[key] = kernel.bind(vectorized, **records)
         return self._bound[key]
 
     def clear(self) -> None:
@@ -58,11 +71,23 @@ class Launches:
         self._bound.clear()
 
 
+def _ids(record) -> list[int]:
+    if type(record) is tuple:
+        return [i for part in record for i in _ids(part)]
+    return list(map(id, vars(record).values())) if type(record) is SimpleNamespace else [id(record)]
+
+
+def whole(source) -> np.ndarray:
+    """All components of an array, on the CPU without a copy."""
+    host = runtime.view(source)
+    return source.to_numpy() if host is None else host
+
+
 class Buffers:
     """Arrays that grow: `take` hands out one of at least the length asked for, by name."""
 
     def __init__(self, launch: Launches, parallel: bool):
-        self._arrays, self._launch, self._kernel = {}, launch, _scan_kernel(parallel)
+        self._arrays, self._launch, self._scan = {}, launch, kernels_of(Scan, parallel).kernel
 
     def take(self, name: str, dtype, count: int):
         """The array of that name, made anew, half as long again, if it is too short; then nothing stays bound."""
@@ -75,4 +100,5 @@ class Buffers:
     def scan(self, values, count: int) -> None:
         """Exclusive sums in place, over count + 1 numbers, the last of them the sum of all."""
         blocks = -(-count // BLOCK)
-        self._launch(self._kernel, values, self.take(f"sums of {count}", ti.i32, blocks))(count, blocks)
+        of = SimpleNamespace(values=values, sums=self.take(f"sums of {count}", ti.i32, blocks))
+        self._launch(self._scan, of=of)(count=count, blocks=blocks)

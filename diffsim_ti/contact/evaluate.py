@@ -1,67 +1,61 @@
 """Distances, energies and their derivatives of many pairs at once, outside any scene (proximity.py)."""
 
-from functools import lru_cache
+from dataclasses import dataclass
+from functools import cached_property
 from types import SimpleNamespace
 
 import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
-from diffsim_ti.contact.proximity import PARALLEL, pair_functions
+from diffsim_ti.contact.buffers import whole
+from diffsim_ti.contact.listed_pair import between
+from diffsim_ti.contact.proximity import PARALLEL, Pair
+from diffsim_ti.runtime import Kernel, kernels_of
+
+A = ti.template()
+OUT = ("square_gradient", "square_product", "gradient", "product")
 
 
-@lru_cache(maxsize=None)
-def _evaluate_kernel(precision: str, kind: int):
-    f = pair_functions(precision)
-    array1, array2, array3 = (ti.types.ndarray(f.fp, k) for k in (1, 2, 3))
+@dataclass(frozen=True)
+class EvaluateKernel(Pair):
+    """Pairs of one kind whose corners lie in the rows of an array."""
+
+    kind: int
 
     @ti.func
-    def row(a: ti.template(), p, k):
-        return f.vec3(a[p, k, 0] - a[p, 0, 0], a[p, k, 1] - a[p, 0, 1], a[p, k, 2] - a[p, 0, 2])
-
-    @ti.func
-    def write(out: ti.template(), p, h1, h2, h3):
-        h0 = f.vec3(0) - (h1 + h2 + h3)
+    def write(self, y: A, p, h1, h2, h3):
         for d in ti.static(range(3)):
-            out[p, 0, d], out[p, 1, d], out[p, 2, d], out[p, 3, d] = h0[d], h1[d], h2[d], h3[d]
+            y[p, 0][d], y[p, 1][d], y[p, 2][d], y[p, 3][d] = 0 - (h1[d] + h2[d] + h3[d]), h1[d], h2[d], h3[d]
 
-    @ti.kernel
-    def evaluate(
-        x: array3,
-        dx: array3,
-        scale: array1,
-        numbers: array2,
-        square_gradient: array3,
-        square_product: array3,
-        gradient: array3,
-        product: array3,
-        stiffness: f.fp,
-        width: f.fp,
-    ):
-        for p in range(x.shape[0]):
-            y1, y2, y3, dy1, dy2, dy3 = (
-                row(x, p, 1),
-                row(x, p, 2),
-                row(x, p, 3),
-                row(dx, p, 1),
-                row(dx, p, 2),
-                row(dx, p, 3),
-            )
-            w, r, g = f.nearest(kind, y1, y2, y3)
-            dw, dr, _ = f.nearest_jvp(kind, y1, y2, y3, dy1, dy2, dy3, w, r, g)
+    @ti.func
+    def evaluate_all(self, at: A, out: A, plan: A):
+        for p in range(plan.count):
+            y1, y2, y3 = between(at.x, 0, 1, p), between(at.x, 0, 2, p), between(at.x, 0, 3, p)
+            dy1, dy2, dy3 = between(at.dx, 0, 1, p), between(at.dx, 0, 2, p), between(at.dx, 0, 3, p)
+            w, r, g = self.nearest(self.kind, y1, y2, y3)
+            dw, dr, _ = self.nearest_jvp(self.kind, y1, y2, y3, dy1, dy2, dy3, w, r, g)
             for k in ti.static(range(4)):
                 for d in ti.static(range(3)):
-                    square_gradient[p, k, d] = 2 * w[k] * r[d]
-                    square_product[p, k, d] = 2 * (w[k] * dr[d] + dw[k] * r[d])
-            energy, n, d, g1, g2, g3 = f.gradient(kind, y1, y2, y3, scale[p], stiffness, width)
-            h1, h2, h3, by_stiffness, by_width = f.gradient_jvp(
-                kind, y1, y2, y3, dy1, dy2, dy3, scale[p], stiffness, width, ti.cast(0, f.fp), ti.cast(0, f.fp)
+                    out.square_gradient[p, k][d] = 2 * w[k] * r[d]
+                    out.square_product[p, k][d] = 2 * (w[k] * dr[d] + dw[k] * r[d])
+            scale, stiffness, width, zero = at.scale[p], plan.stiffness, plan.width, ti.cast(0, self.fp)
+            energy, n, d, g1, g2, g3 = self.gradient(self.kind, y1, y2, y3, scale, stiffness, width)
+            h1, h2, h3, by_stiffness, by_width = self.gradient_jvp(
+                self.kind, y1, y2, y3, dy1, dy2, dy3, scale, stiffness, width, zero, zero
             )
-            numbers[p, 0], numbers[p, 1], numbers[p, 2], numbers[p, 3] = d, energy, by_stiffness, by_width
-            write(gradient, p, g1, g2, g3)
-            write(product, p, h1, h2, h3)
+            out.numbers[p] = self.vec4(d, energy, by_stiffness, by_width)
+            self.write(out.gradient, p, g1, g2, g3)
+            self.write(out.product, p, h1, h2, h3)
 
-    return evaluate
+    @cached_property
+    def kernel(self) -> Kernel:
+        """What `evaluate_pairs` returns; numbers: distance, energy, by_stiffness, by_width."""
+        at, out = dict(x="vectors2", dx="vectors2", scale="scalars"), dict.fromkeys(OUT, "vectors2")
+        numbers = dict(count="int", stiffness="float", width="float")
+        return Kernel(
+            "evaluate", self.evaluate_all, self.precision, dict(at=at, out=out | dict(numbers="vectors")), numbers
+        )
 
 
 def evaluate_pairs(
@@ -87,20 +81,13 @@ def evaluate_pairs(
     dx = np.zeros_like(x) if direction is None else np.ascontiguousarray(np.broadcast_to(direction, x.shape), x.dtype)
     if threshold is None:
         threshold = PARALLEL * ((x[:, 1] - x[:, 0]) ** 2).sum(1) * ((x[:, 3] - x[:, 2]) ** 2).sum(1)
-    scale = np.ascontiguousarray(np.broadcast_to(1 / np.sqrt(threshold), len(x)), x.dtype)
-    runtime.program()
-    numbers = np.zeros((len(x), 4), x.dtype)
-    square_gradient, square_product, gradient, product = (np.zeros_like(x) for _ in range(4))
-    _evaluate_kernel(precision, kind)(
-        x, dx, scale, numbers, square_gradient, square_product, gradient, product, float(stiffness), float(width)
+    scale = np.broadcast_to(1 / np.sqrt(threshold), len(x))
+    kernel = kernels_of(EvaluateKernel, precision, kind)
+    fp, vector = kernel.fp, kernel.vec4
+    at = SimpleNamespace(x=runtime.upload(x, vector), dx=runtime.upload(dx, vector), scale=runtime.upload(scale, fp))
+    out = SimpleNamespace(
+        **{name: runtime.array(vector, len(x), 4) for name in OUT}, numbers=runtime.array(vector, len(x))
     )
-    return SimpleNamespace(
-        distance=numbers[:, 0],
-        energy=numbers[:, 1],
-        by_stiffness=numbers[:, 2],
-        by_width=numbers[:, 3],
-        square_gradient=square_gradient,
-        square_product=square_product,
-        gradient=gradient,
-        product=product,
-    )
+    kernel.kernel.bind(at=at, out=out)(count=len(x), stiffness=float(stiffness), width=float(width))
+    numbers = dict(zip(("distance", "energy", "by_stiffness", "by_width"), whole(out.numbers)[: len(x)].T.copy()))
+    return SimpleNamespace(**numbers, **{name: runtime.fetch(getattr(out, name))[: len(x)] for name in OUT})

@@ -3,9 +3,10 @@
 import numpy as np
 
 from diffsim_ti import runtime
-from diffsim_ti.contact.hessian_kernels import hessian_kernels
-from diffsim_ti.contact.pair_kernels import SAFE
+from diffsim_ti.contact.hessian_kernels import HessianKernels
+from diffsim_ti.contact.listed_pair import SAFE
 from diffsim_ti.contact.surface_pairs import SurfacePairs, Tunnelling
+from diffsim_ti.runtime import kernels_of
 
 
 class ImplicitPairs(SurfacePairs):
@@ -18,9 +19,9 @@ class ImplicitPairs(SurfacePairs):
 
     def __init__(self, arrays, parallel: bool):
         super().__init__(arrays, parallel)
-        self.hessian = hessian_kernels(arrays.precision, self.first, parallel)
-        self.step = runtime.array(self.kernels.vector, 1, arrays.num_vertices)
-        self.next = runtime.array(self.kernels.vector, 1, arrays.num_vertices)
+        self.hessian = kernels_of(HessianKernels, arrays.precision, self.first, parallel)
+        self.step = runtime.array(self.kernels.vec4, 1, arrays.num_vertices)
+        self.next = runtime.array(self.kernels.vec4, 1, arrays.num_vertices)
 
     def begin(self, u: np.ndarray) -> None:
         """A new pass from u: from here on all is a function of u, whatever came before."""
@@ -39,39 +40,14 @@ class ImplicitPairs(SurfacePairs):
 
     def hessian_product(self, u, w, convex: bool) -> None:
         """Change of the contact forces for changes w[0] of the positions, to the last corners of `arrays.corner`."""
-        k = self.list
-        self._launch(
-            self.hessian.products,
-            k.pairs,
-            k.scale,
-            k.row,
-            k.corner,
-            self.a.rest,
-            self.a.parameters,
-            u,
-            w,
-            self.corner,
-            self.plane,
-            self.a.corner,
-        )(k.num_vt, k.num_ee, k.num_surface, self.a.first_contact_corner, int(convex))
+        if convex:
+            self._run(self.hessian.products, dict(u=u, w=w, out=self.a.corner), slot=0)
+        else:
+            self.product(u, 0, w, self.a.corner, has_planes=True)
 
     def add_blocks(self, u, out) -> None:
         """Add the diagonal blocks of the Hessian's convex part to rows 0..2 of `out` (potential_kernels.py)."""
-        k = self.list
-        self._launch(
-            self.hessian.blocks,
-            k.pairs,
-            k.scale,
-            k.row,
-            k.corner,
-            k.surface,
-            self.a.rest,
-            self.a.parameters,
-            u,
-            self.corner,
-            self.plane,
-            out,
-        )(k.num_vt, k.num_ee, k.num_surface)
+        self._run(self.hessian.blocks, dict(u=u, out=out), slot=0)
 
     def safe_share(self, u: np.ndarray, step: np.ndarray, most: float = 1.0) -> float:
         """A share of the step, at most `most`, up to which no two primitives meet on the way; close to the largest such
@@ -96,9 +72,9 @@ class ImplicitPairs(SurfacePairs):
         return share
 
     def _shares(self) -> np.ndarray:
-        out, k = self.list.buffers.take("shares", self.kernels.fp, self.list.count), self.list
-        self.hessian.shares(k.pairs, self.step, self.plane, out, k.num_vt, k.num_ee, SAFE)
-        return runtime.fetch(out)[: k.count].astype(np.float64)
+        out = self.list.buffers.take("shares", self.kernels.fp, self.list.count)
+        self._run(self.hessian.shares, dict(w=self.step, out=out), slot=0, most=SAFE)
+        return runtime.fetch(out)[: self.list.count].astype(np.float64)
 
     def way_is_free(self, u: np.ndarray, step: np.ndarray) -> bool:
         """Whether no two primitives meet on the way from u to u + step; narrow gaps may pass for closed."""

@@ -1,129 +1,120 @@
-"""Kernels that follow the motion of a surface: whether a list of pairs still holds, and whether a pair may have crossed."""
+"""Kernels that follow the motion of a surface: whether a list of pairs still holds, and whether a pair may have crossed.
 
-from functools import lru_cache
-from types import SimpleNamespace
+A list holds until a vertex has used up its slack by moving relative to its body, or to the mean of all bodies. Two convex
+sets that a plane parts cannot meet while their corners move in straight lines and stay parted.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
 
 import taichi as ti
 
-from diffsim_ti.contact.pair_kernels import BLOCK, MARGIN, OPPOSITE, SAFE, pair_kernels
+from diffsim_ti.contact.listed_pair import MARGIN, OPPOSITE, SAFE, ListedPair, between, three
 from diffsim_ti.contact.proximity import EDGE_EDGE, VERTEX_TRIANGLE
-from diffsim_ti.runtime import Bundle
+from diffsim_ti.runtime import Kernel
 
 A = ti.template()
+BLOCK = 256  # vertices whose motion one thread compares
 
 
-@lru_cache(maxsize=None)
-def motion_kernels(precision: str, first: int, parallel: bool) -> SimpleNamespace:
-    """Kernels beside those of `pair_kernels`."""
-    pairs_of = pair_kernels(precision, first, parallel)
-    fp, vec3, vec4, of = pairs_of.fp, pairs_of.vec3, pairs_of.vector, pairs_of.of
-    ints, scalars = ti.types.ndarray(ti.i32, 1), ti.types.ndarray(fp, 1)
-    vectors, vectors2 = ti.types.ndarray(vec4, 1), ti.types.ndarray(vec4, 2)
+@dataclass(frozen=True)
+class MotionKernels(ListedPair):
+    """`frame`: mean motion of each body's markers since the list was made, then their mean, then that since `forces`."""
 
     @ti.func
-    def closing(kind: ti.template(), p, scene: A):
+    def follow_frames(self, scene: A, at: A, plan: A):
+        ti.loop_config(serialize=not self.parallel)
+        for b in range(plan.num_bodies):
+            total = self.vec4(0)
+            for k in range(b * plan.markers, (b + 1) * plan.markers):
+                total += at.u[plan.slot, scene.surface[scene.marked[k]]] - scene.built[scene.marked[k]]
+            scene.frame[b] = (ti.cast(1, self.fp) / ti.cast(plan.markers, self.fp)) * total
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            total, latest, n = self.vec4(0), self.vec4(0), plan.num_bodies
+            for b in range(n):
+                s = scene.marked[b * plan.markers]
+                total += scene.frame[b]
+                latest += at.u[plan.slot, scene.surface[s]] - scene.before[s]
+            scene.frame[n] = (ti.cast(1, self.fp) / ti.cast(n, self.fp)) * total
+            scene.frame[n + 1] = (ti.cast(1, self.fp) / ti.cast(n, self.fp)) * latest
+
+    @ti.func
+    def compare_slacks(self, scene: A, at: A, plan: A):
+        ti.loop_config(serialize=not self.parallel)
+        for s in range(plan.num_surface):
+            move = at.u[plan.slot, scene.surface[s]] - scene.built[s]
+            for k in range(1 + ti.cast(plan.num_bodies > 1, ti.i32)):
+                origin, limit = scene.frame[scene.body[s]], scene.slack[s][0]
+                if k == 1:
+                    origin, limit = scene.frame[plan.num_bodies], scene.slack[s][1]
+                square = (move - origin).norm_sqr()
+                if not square <= limit * limit:
+                    scene.flags[0] = 1
+                if not square <= (limit + plan.lost) * (limit + plan.lost):
+                    scene.flags[1] = 1
+
+    @ti.func
+    def find_farthest(self, scene: A, at: A, plan: A):
+        """`farthest`: of each BLOCK of vertices the square of the longest way since `forces`, relative to the mean; then
+        twice the longest of all, by which no pair closes more: that spares most pairs the look at their corners."""
+        blocks = (plan.num_surface + BLOCK - 1) // BLOCK
+        ti.loop_config(serialize=not self.parallel)
+        for b in range(blocks):
+            most = ti.cast(0, self.fp)
+            for s in range(b * BLOCK, ti.min((b + 1) * BLOCK, plan.num_surface)):
+                move = at.u[plan.slot, scene.surface[s]] - scene.before[s] - scene.frame[plan.num_bodies + 1]
+                most = ti.max(most, move.norm_sqr())
+            scene.farthest[b] = most
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            most = ti.cast(0, self.fp)
+            for b in range(blocks):
+                most = ti.max(most, scene.farthest[b])
+            scene.farthest[blocks] = ti.cast(2 * MARGIN, self.fp) * ti.sqrt(most)
+
+    @ti.func
+    def closing(self, kind: A, p, scene: A, at: A, plan: A):
         """How far the corners of pair p have come towards each other along n since `forces`."""
-        n, most = vec3(scene.plane[p][0], scene.plane[p][1], scene.plane[p][2]), ti.cast(-1e30, fp)
+        n, most = three(scene.plane[p]), ti.cast(-1e30, self.fp)
         for a, b in ti.static(OPPOSITE[kind]):
             i, k = scene.pairs[4 * p + a], scene.pairs[4 * p + b]
             y = scene.before[scene.place[i]] - scene.before[scene.place[k]]
-            most = ti.max(most, n.dot(of(scene.u, i, k, scene.slot) + vec3(y[0], y[1], y[2])))
+            most = ti.max(most, n.dot(between(at.u, i, k, plan.slot) + three(y)))
         return most
 
-    @ti.kernel
-    def check(
-        pairs: ints,
-        surface: ints,
-        place: ints,
-        body: ints,
-        slack: vectors,
-        marked: ints,
-        u: vectors2,
-        before: vectors,
-        built: vectors,
-        frame: vectors,
-        farthest: scalars,
-        plane: vectors,
-        flags: ints,
-        slot: ti.i32,
-        num_vt: ti.i32,
-        num_ee: ti.i32,
-        num_surface: ti.i32,
-        num_bodies: ti.i32,
-        markers: ti.i32,
-        lost: fp,
-    ):
-        """flags: a vertex has used up its slack (0), or that and `lost` (1); a pair may have crossed (2).
-
-        frame: mean motion of each body's markers since the list was made, and their mean, which motion is relative to.
-        Two convex sets that a plane parts cannot meet while their corners move in straight lines and stay parted. No pair
-        closes by more than twice the farthest that a vertex has moved relative to the mean since `forces`, which spares
-        most pairs the look at their corners. farthest: that of each BLOCK vertices, squared, then of all.
-        """
-        scene = Bundle(pairs=pairs, place=place, u=u, before=before, plane=plane, slot=slot)
+    @ti.func
+    def check_all(self, scene: A, at: A, plan: A):
         ti.loop_config(serialize=True)
         for k in range(3):
-            flags[k] = 0
-        ti.loop_config(serialize=not parallel)
-        for b in range(num_bodies):
-            total = vec4(0)
-            for k in range(b * markers, (b + 1) * markers):
-                total += u[slot, surface[marked[k]]] - built[marked[k]]
-            frame[b] = (ti.cast(1, fp) / ti.cast(markers, fp)) * total
-        ti.loop_config(serialize=True)
-        for _ in range(1):
-            total, latest = vec4(0), vec4(0)
-            for b in range(num_bodies):
-                total += frame[b]
-                latest += u[slot, surface[marked[b * markers]]] - before[marked[b * markers]]
-            frame[num_bodies] = (ti.cast(1, fp) / ti.cast(num_bodies, fp)) * total
-            frame[num_bodies + 1] = (ti.cast(1, fp) / ti.cast(num_bodies, fp)) * latest
-        ti.loop_config(serialize=not parallel)
-        for s in range(num_surface):
-            move = u[slot, surface[s]] - built[s]
-            for k in range(1 + ti.cast(num_bodies > 1, ti.i32)):
-                origin, limit = frame[body[s]], slack[s][0]
-                if k == 1:
-                    origin, limit = frame[num_bodies], slack[s][1]
-                square = (move - origin).norm_sqr()
-                if not square <= limit * limit:
-                    flags[0] = 1
-                if not square <= (limit + lost) * (limit + lost):
-                    flags[1] = 1
-        blocks = (num_surface + BLOCK - 1) // BLOCK
-        ti.loop_config(serialize=not parallel)
-        for b in range(blocks):
-            most = ti.cast(0, fp)
-            for s in range(b * BLOCK, ti.min((b + 1) * BLOCK, num_surface)):
-                most = ti.max(most, (u[slot, surface[s]] - before[s] - frame[num_bodies + 1]).norm_sqr())
-            farthest[b] = most
-        ti.loop_config(serialize=True)
-        for _ in range(1):
-            most = ti.cast(0, fp)
-            for b in range(blocks):
-                most = ti.max(most, farthest[b])
-            farthest[blocks] = ti.cast(2 * MARGIN, fp) * ti.sqrt(most)
-        ti.loop_config(serialize=not parallel)
-        for p in range(num_vt):
-            room = ti.cast(SAFE, fp) * plane[p][3]
-            if not farthest[blocks] <= room:
-                if not closing(VERTEX_TRIANGLE, p, scene) <= room:
-                    flags[2] = 1
-        ti.loop_config(serialize=not parallel)
-        for q in range(num_ee):
-            room = ti.cast(SAFE, fp) * plane[num_vt + q][3]
-            if not farthest[blocks] <= room:
-                if not closing(EDGE_EDGE, num_vt + q, scene) <= room:
-                    flags[2] = 1
+            scene.flags[k] = 0
+        self.follow_frames(scene, at, plan)
+        self.compare_slacks(scene, at, plan)
+        self.find_farthest(scene, at, plan)
+        for kind in ti.static((VERTEX_TRIANGLE, EDGE_EDGE)):
+            ti.loop_config(serialize=not self.parallel)
+            for p in range(kind * plan.num_vt, plan.num_vt + kind * plan.num_ee):
+                room = ti.cast(SAFE, self.fp) * scene.plane[p][3]
+                if not scene.farthest[(plan.num_surface + BLOCK - 1) // BLOCK] <= room:
+                    if not self.closing(kind, p, scene, at, plan) <= room:
+                        scene.flags[2] = 1
 
-    @ti.kernel
-    def begin(
-        surface: ints, u: vectors2, built: vectors, plane: vectors, slot: ti.i32, num_surface: ti.i32, count: ti.i32
-    ):
+    @cached_property
+    def check(self) -> Kernel:
+        """flags: a vertex has used up its slack (0), or that and `lost` (1); a pair may have crossed (2)."""
+        own = dict(body="ints", marked="ints", flags="ints", slack="vectors", frame="vectors", farthest="scalars")
+        own |= dict(before="vectors", built="vectors")
+        numbers = dict(num_bodies="int", markers="int", lost="float")
+        return self.kernel("check", self.check_all, dict(u="vectors2"), own, **numbers)
+
+    @ti.func
+    def begin_all(self, scene: A, at: A, plan: A):
+        for p in range(plan.num_vt + plan.num_ee):
+            scene.plane[p] = self.vec4(0)
+        for s in range(plan.num_surface):
+            scene.built[s] = at.u[plan.slot, scene.surface[s]]
+
+    @cached_property
+    def begin(self) -> Kernel:
         """A new list: where the surface is, and no planes yet."""
-        for p in range(count):
-            plane[p] = vec4(0)
-        for s in range(num_surface):
-            built[s] = u[slot, surface[s]]
-
-    return SimpleNamespace(check=check, begin=begin)
+        return self.kernel("begin", self.begin_all, dict(u="vectors2"), dict(built="vectors"))

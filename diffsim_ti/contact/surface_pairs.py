@@ -1,13 +1,18 @@
 """Contact within a run: the list of near pairs, kept while it holds, and the forces of its pairs."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
 from diffsim_ti.contact.broad_phase import CandidatePairs
-from diffsim_ti.contact.motion_kernels import motion_kernels
-from diffsim_ti.contact.pair_kernels import BLOCK, OPPOSITE, pair_kernels
+from diffsim_ti.contact.buffers import whole
+from diffsim_ti.contact.listed_pair import OPPOSITE
+from diffsim_ti.contact.motion_kernels import BLOCK, MotionKernels
+from diffsim_ti.contact.pair_kernels import PairKernels
 from diffsim_ti.mesh.sets import pieces
+from diffsim_ti.runtime import kernels_of
 
 
 class Tunnelling(FloatingPointError):
@@ -36,8 +41,8 @@ class SurfacePairs:
     def __init__(self, arrays, parallel: bool):
         self.a, mesh, term = arrays, arrays.mesh, arrays.self_contact
         self.mesh, self.first, self.parallel = mesh, arrays.parameters_of_self_contact.start, parallel
-        self.kernels = pair_kernels(arrays.precision, self.first, parallel)
-        self.motion = motion_kernels(arrays.precision, self.first, parallel)
+        self.kernels = kernels_of(PairKernels, arrays.precision, self.first, parallel)
+        self.motion = kernels_of(MotionKernels, arrays.precision, self.first, parallel)
         edges = surface_edges(mesh)
         lengths = np.linalg.norm(mesh.vertices[edges[:, 1]] - mesh.vertices[edges[:, 0]], axis=1)
         self.edges, self.term = edges, term
@@ -46,7 +51,7 @@ class SurfacePairs:
         self.list = CandidatePairs(
             mesh.surface_vertices, mesh.surface_triangles, edges, lengths, self.body, arrays.precision, parallel
         )
-        self._launch, n, vector = self.list.launch, len(mesh.surface_vertices), self.kernels.vector
+        self._launch, n, vector = self.list.launch, len(mesh.surface_vertices), self.kernels.vec4
         self.before, self.built, self.sums, self.rest_adj = (runtime.array(vector, n) for _ in range(4))
         self.none, self.flags = runtime.array(vector, 1), runtime.array(ti.i32, 3)
         marked = spread(self.body[mesh.surface_vertices], self.markers)
@@ -65,7 +70,7 @@ class SurfacePairs:
         self.fresh = False
         checked = (self.a.values.rest, self.width)
         if self._checked_rest is None or self._checked_rest[0] is not checked[0] or self._checked_rest[1] != checked[1]:
-            rest_state = runtime.array(self.kernels.vector, 1, self.a.num_vertices)
+            rest_state = runtime.array(self.kernels.vec4, 1, self.a.num_vertices)
             runtime.fill(rest_state, 0)
             self._check_rest(rest_state)
             self._checked_rest = checked
@@ -105,6 +110,13 @@ class SurfacePairs:
         self._build(u, 0)
         self.check_apart(u)
 
+    def _run(self, kernel, at: dict, **numbers) -> None:
+        """Launch a kernel of pairs, with the arrays `at`."""
+        k, a = self.list, self.a
+        numbers |= dict(num_surface=k.num_surface, first_out=a.first_contact_corner)
+        scene = k, self, SimpleNamespace(rest=a.rest, parameters=a.parameters)
+        self._launch(kernel, scene=scene, at=SimpleNamespace(**at))(**dict(num_vt=k.num_vt, num_ee=k.num_ee) | numbers)
+
     # ---- the list ---------------------------------------------------------------------------------------------------
 
     def _build(self, u, slot: int, wanted=0.0) -> None:
@@ -115,17 +127,10 @@ class SurfacePairs:
         runtime.fill(self.list.slack, self._slacks(x, wanted))
         self.list.build(self.a.rest, u, slot, self.width)
         count, take = self.list.count, self.list.buffers.take
-        self.corner, self.plane = (
-            take("forces", self.kernels.vector, 4 * count),
-            take("planes", self.kernels.vector, count),
-        )
-        self.energy, self.numbers = (
-            take("energies", self.kernels.fp, count),
-            take("numbers", self.kernels.vector, count),
-        )
-        self._launch(self.motion.begin, self.list.surface, u, self.built, self.plane)(
-            slot, self.list.num_surface, count
-        )
+        vector, fp = self.kernels.vec4, self.kernels.fp
+        self.corner, self.plane = take("forces", vector, 4 * count), take("planes", vector, count)
+        self.energy, self.numbers = take("energies", fp, count), take("numbers", vector, count)
+        self._run(self.motion.begin, dict(u=u), slot=slot)
         self.fresh, self.age = True, 0
         self.builds += 1
 
@@ -134,13 +139,13 @@ class SurfacePairs:
         slack, least = np.zeros((len(x), 4)), self.least_slack * self.width
         slack[:, :2] = wanted
         if self.fresh and self.age:
-            whole, last = self._travel(x - runtime.fetch(self.built)), self._travel(x - runtime.fetch(self.before))
-            pace = np.maximum(whole / self.age, last)
+            overall, last = self._travel(x - runtime.fetch(self.built)), self._travel(x - runtime.fetch(self.before))
+            pace = np.maximum(overall / self.age, last)
             pace += pace.mean(0)  # the mean, for what will be hit
             passes = self.typical_slack * self.width / max(float(np.median(pace.max(1))), 1e-300)
             slack[:, :2] = np.clip(passes, self.fewest_passes, self.most_passes) * pace
             # the slack before, for what shakes
-            slack[:, :2] = np.maximum(slack, 0.9 * _all_four(self.list.slack))[:, :2]
+            slack[:, :2] = np.maximum(slack, 0.9 * whole(self.list.slack))[:, :2]
         for k, largest in enumerate(self.largest_reach):
             slack[:, k] = slack[:, k].clip(least, max(least, 0.5 * (largest * self.list.typical - self.width)))
         return slack
@@ -157,23 +162,8 @@ class SurfacePairs:
 
     def _check(self, u, slot: int, num_vt: int, num_ee: int) -> tuple[bool, bool, bool]:
         """Whether the list is stale, whether pairs beyond it may have crossed, and whether pairs of it may have."""
-        k = self.list
-        self._launch(
-            self.motion.check,
-            k.pairs,
-            k.surface,
-            k.place,
-            k.body,
-            k.slack,
-            self.marked,
-            u,
-            self.before,
-            self.built,
-            self.frame,
-            self.farthest,
-            self.plane,
-            self.flags,
-        )(slot, num_vt, num_ee, k.num_surface, self.num_bodies, self.markers, 0.5 * self.width)
+        bodies = dict(num_bodies=self.num_bodies, markers=self.markers, lost=0.5 * self.width)
+        self._run(self.motion.check, dict(u=u), slot=slot, num_vt=num_vt, num_ee=num_ee, **bodies)
         flags = runtime.view(self.flags)
         stale, lost, crossed = runtime.fetch(self.flags) if flags is None else flags
         return bool(stale), bool(lost), bool(crossed)
@@ -207,7 +197,7 @@ class SurfacePairs:
                 f"too far for a contact of width {self.width:.3g} m to see what it passes; {remedy}"
             )
         pairs = runtime.fetch(self.list.pairs)[: 4 * self.list.count].reshape(-1, 4)
-        plane = _all_four(self.plane)[: self.list.count].astype(np.float64)
+        plane = whole(self.plane)[: self.list.count].astype(np.float64)
         closing = np.full(len(pairs), -np.inf)
         for kind, part in enumerate((slice(0, self.list.num_vt), slice(self.list.num_vt, None))):
             for a, b in OPPOSITE[kind]:
@@ -229,52 +219,18 @@ class SurfacePairs:
 
     def forces(self, u, slot: int, out, exact: bool = False) -> None:
         """Contact forces at u[slot], to the last corners of `out`."""
-        k = self.list
-        self._launch(
-            self.kernels.forces,
-            k.pairs,
-            k.scale,
-            k.surface,
-            k.place,
-            k.row,
-            k.corner,
-            self.a.rest,
-            self.a.parameters,
-            u,
-            self.corner,
-            self.plane,
-            self.energy,
-            self.touched,
-            self.before,
-            out,
-        )(slot, k.num_vt, k.num_ee, k.num_surface, self.a.first_contact_corner, int(exact))
+        self._run(self.kernels.forces, dict(u=u, out=out), slot=slot, exact=int(exact))
 
-    def product(self, u, slot: int, w, out, rest_dot=None, parameters_dot=(0.0, 0.0)) -> None:
-        """Change of the contact forces for changes w[0] of the positions (and of rest shape, stiffness, width)."""
-        k = self.list
-        self._launch(
-            self.kernels.products,
-            k.pairs,
-            k.scale,
-            k.row,
-            k.corner,
-            self.a.rest,
-            self.a.parameters,
-            u,
-            w,
-            self.none if rest_dot is None else rest_dot,
-            self.corner,
-            self.numbers,
-            out,
-        )(
-            slot,
-            k.num_vt,
-            k.num_ee,
-            k.num_surface,
-            self.a.first_contact_corner,
-            int(rest_dot is not None),
-            *parameters_dot,
+    def product(self, u, slot: int, w, out, rest_dot=None, parameters_dot=(0.0, 0.0), has_planes=False) -> None:
+        """Change of the contact forces for changes w[0] of the positions (and of rest shape, stiffness, width).
+
+        has_planes: `forces` were last computed at u[slot].
+        """
+        at = dict(u=u, w=w, rest_dot=self.none if rest_dot is None else rest_dot, out=out)
+        numbers = dict(
+            zip(("d_stiffness", "d_width"), parameters_dot), by_rest=int(rest_dot is not None), has_planes=has_planes
         )
+        self._run(self.kernels.products, at, slot=slot, **numbers)
 
     def clear_sums(self) -> None:
         """Begin a reverse sweep."""
@@ -284,26 +240,23 @@ class SurfacePairs:
     def vjp(self, u, slot: int, w, out) -> None:
         """The product with the adjoint w[0] of the forces; adds the adjoints of stiffness, width and rest shape."""
         self.product(u, slot, w, out)
-        k = self.list
-        self._launch(self.kernels.add_sums, k.row, k.corner, self.numbers, out, self.sums, self.rest_adj)(
-            k.num_surface, self.a.first_contact_corner
-        )
+        self._run(self.kernels.add_sums, dict(out=out), slot=slot)
 
     def collect(self) -> tuple[np.ndarray, np.ndarray]:
         """Adjoints of (stiffness, width) and of the rest shape, (num_vertices, 3), by the forces alone; float64."""
         rest = np.zeros((self.mesh.num_vertices, 3))
         rest[self.mesh.surface_vertices] = runtime.fetch(self.rest_adj)
-        return _all_four(self.sums).astype(np.float64).sum(0)[:2], rest
+        return whole(self.sums).astype(np.float64).sum(0)[:2], rest
 
     # ---- to look at -------------------------------------------------------------------------------------------------
 
     def _distances(self, u) -> tuple[np.ndarray, np.ndarray]:
         """Distances [m] and corners of all pairs of the list at u[0]."""
         if self._scratch is None:
-            self._scratch = runtime.array(self.kernels.vector, self.a.first_contact_corner + self.list.num_surface)
+            self._scratch = runtime.array(self.kernels.vec4, self.a.first_contact_corner + self.list.num_surface)
         self.forces(u, 0, self._scratch, exact=True)
         pairs = runtime.fetch(self.list.pairs)[: 4 * self.list.count].reshape(-1, 4)
-        return _all_four(self.plane)[: self.list.count, 3].astype(np.float64), pairs
+        return whole(self.plane)[: self.list.count, 3].astype(np.float64), pairs
 
     def look(self, u) -> tuple[float, float]:
         """Contact energy [J] and smallest gap [m] (infinite beyond the list's reach) at u[0]."""
@@ -324,11 +277,6 @@ def spread(body: np.ndarray, count: int) -> np.ndarray:
     first = np.searchsorted(body[members], np.arange(body.max() + 2))
     share = (np.arange(count) + 0.5) / count
     return members[(first[:-1, None] + np.diff(first)[:, None] * share).astype(int)]
-
-
-def _all_four(vectors) -> np.ndarray:
-    host = runtime.view(vectors)
-    return vectors.to_numpy() if host is None else host
 
 
 def _numbers(indices) -> str:

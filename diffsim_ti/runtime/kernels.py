@@ -2,6 +2,7 @@
 
 import linecache
 from collections.abc import Callable
+from functools import lru_cache
 from itertools import count
 
 import taichi as ti
@@ -61,6 +62,12 @@ class Kernel:
         arrays = [_found(records[bundle], name) for bundle, own in self.arrays.items() for name in own]
         launch, names = Launch(self.kernel, *arrays, vectorized=vectorized), self.numbers
         return lambda **numbers: launch(*(numbers[name] for name in names))
+
+
+@lru_cache(maxsize=None)
+def kernels_of(kind: type, *fields):
+    """The object kind(*fields) that all share, so that its kernels compile once in a process."""
+    return kind(*fields)
 
 
 def _found(record, name: str):

@@ -22,36 +22,21 @@ START = ("initial_displacements", "initial_velocities")  # what can be copied; a
 
 
 @lru_cache(maxsize=None)
-def _kernels(serial: bool):
-    """Copies of two tensors (k, n, 3) to and from two arrays of four-vectors (k, n), whose last component stays."""
+def _copy_kernel(way: str, serial: bool):
+    """Copies two tensors (k, n, 3) "in" to two arrays of four-vectors (k, n), whose last component stays, or "out"."""
+    tensors, arrays = ti.types.ndarray(ndim=3), ti.types.ndarray(ndim=2)
 
     @ti.kernel
-    def copy_in(
-        p: ti.types.ndarray(ndim=3),
-        q: ti.types.ndarray(ndim=3),
-        u: ti.types.ndarray(ndim=2),
-        v: ti.types.ndarray(ndim=2),
-    ):
+    def copy(p: tensors, q: tensors, u: arrays, v: arrays):
         ti.loop_config(serialize=serial)
         for k, i in ti.ndrange(p.shape[0], p.shape[1]):
             for d in ti.static(range(3)):
-                u[k, i][d] = p[k, i, d]
-                v[k, i][d] = q[k, i, d]
+                if ti.static(way == "in"):
+                    u[k, i][d], v[k, i][d] = p[k, i, d], q[k, i, d]
+                else:
+                    p[k, i, d], q[k, i, d] = u[k, i][d], v[k, i][d]
 
-    @ti.kernel
-    def copy_out(
-        p: ti.types.ndarray(ndim=3),
-        q: ti.types.ndarray(ndim=3),
-        u: ti.types.ndarray(ndim=2),
-        v: ti.types.ndarray(ndim=2),
-    ):
-        ti.loop_config(serialize=serial)
-        for k, i in ti.ndrange(p.shape[0], p.shape[1]):
-            for d in ti.static(range(3)):
-                p[k, i, d] = u[k, i][d]
-                q[k, i, d] = v[k, i][d]
-
-    return {"in": copy_in, "out": copy_out}
+    return copy
 
 
 def shares_memory() -> bool:
@@ -145,7 +130,7 @@ class TensorRollout:
         key = (way, *map(id, arrays))
         known = self._launches.get(key)
         if known is None:  # the arrays are kept, so that their ids stay theirs
-            kernel = _kernels(runtime.runs_on_cpu() and not self.rollout.solver.runs_parallel())[way]
+            kernel = _copy_kernel(way, runtime.runs_on_cpu() and not self.rollout.solver.runs_parallel())
             known = self._launches[key] = (runtime.TensorLaunch(kernel, *arrays), arrays)
         if pair[0].is_cuda:  # torch and Taichi order their work on streams of their own
             torch.cuda.current_stream(pair[0].device).synchronize()
