@@ -6,7 +6,10 @@ import taichi as ti
 
 import diffsim_ti as ds
 from diffsim_ti import runtime
+from diffsim_ti.contact.box_tree import beyond
 from diffsim_ti.contact.broad_phase import CandidatePairs
+from diffsim_ti.contact.broad_phase_kernels import bits_from, lowest, sort
+from diffsim_ti.contact.buffers import BLOCK, Buffers, Launches
 from diffsim_ti.contact.evaluate import evaluate_pairs
 from diffsim_ti.contact.proximity import EDGE_EDGE, VERTEX_TRIANGLE
 from diffsim_ti.contact.surface_pairs import surface_edges
@@ -180,3 +183,50 @@ def test_broad_phase_finds_what_brute_force_finds(precision):
     found.build(rest, u, 0, reach)
     edge, triangle = found.first_piercing(rest, u, 0)
     assert (edges[edge][0] < box.num_vertices) != (triangles[triangle][0] < box.num_vertices)
+
+
+@pytest.mark.parametrize("parallel", [False, True])
+@pytest.mark.parametrize("count", [0, 1, BLOCK, 3 * BLOCK + 7])
+def test_scan_sums_what_lies_before(parallel, count):
+    runtime.program()
+    numbers = np.random.default_rng(count).integers(0, 9, count + 1)
+    values = runtime.upload(numbers, ti.i32)
+    Buffers(Launches(), parallel).scan(values, count)
+    np.testing.assert_array_equal(runtime.fetch(values), np.cumsum(numbers) - numbers)
+
+
+def test_walk_that_skips_children_meets_every_other_node_once():
+    """The walk that goes down wherever it can sees all nodes 1..2n-1 of a whole tree."""
+
+    @ti.kernel
+    def walk(leaves: ti.i32, seen: ti.types.ndarray(ti.i32, 1)):
+        for _ in range(1):
+            node = 1
+            while node > 0:
+                seen[node] += 1
+                if node < leaves:
+                    node = 2 * node
+                else:
+                    node = beyond(node)
+
+    runtime.program()
+    for leaves in (1, 2, 8, 64):
+        seen = np.zeros(2 * leaves, np.int32)
+        walk(leaves, seen)
+        np.testing.assert_array_equal(seen, [0] + [1] * (2 * leaves - 1))
+
+
+def test_sort_and_bits():
+    @ti.kernel
+    def work(row: ti.types.ndarray(ti.i32, 1), bits: ti.types.ndarray(ti.i32, 1)):
+        for _ in range(1):
+            sort(row, 3, 17)
+        for k in range(bits.shape[0]):
+            bits[k] = lowest(bits_from(k))
+
+    runtime.program()
+    given = np.random.default_rng(0).integers(0, 50, 20).astype(np.int32)
+    row, bits = given.copy(), np.zeros(8, np.int32)
+    work(row, bits)
+    np.testing.assert_array_equal(row, np.concatenate([given[:3], np.sort(given[3:17]), given[17:]]))
+    np.testing.assert_array_equal(bits, np.arange(8))

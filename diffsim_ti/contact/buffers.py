@@ -61,20 +61,18 @@ class Launches:
         self._bound = {}
 
     def __call__(self, kernel: Kernel, vectorized: bool = False, **records):
-        key = (id(kernel), *(i for record in records.values() for i in _ids(record)))
-        if key not in self._bound:
-            self._bound[key] = kernel.bind(vectorized, **records)
-        return self._bound[key]
+        key = [id(kernel)]
+        for record in records.values():
+            for part in record if type(record) is tuple else (record,):
+                key += map(id, vars(part).values()) if type(part) is SimpleNamespace else (id(part),)
+        bound = self._bound.get(tuple(key))
+        if bound is None:
+            bound = self._bound[tuple(key)] = kernel.bind(vectorized, **records)
+        return bound
 
     def clear(self) -> None:
         """Let go of the arrays."""
         self._bound.clear()
-
-
-def _ids(record) -> list[int]:
-    if type(record) is tuple:
-        return [i for part in record for i in _ids(part)]
-    return list(map(id, vars(record).values())) if type(record) is SimpleNamespace else [id(record)]
 
 
 def whole(source) -> np.ndarray:

@@ -227,9 +227,8 @@ class SurfacePairs:
         has_planes: `forces` were last computed at u[slot].
         """
         at = dict(u=u, w=w, rest_dot=self.none if rest_dot is None else rest_dot, out=out)
-        numbers = dict(
-            zip(("d_stiffness", "d_width"), parameters_dot), by_rest=int(rest_dot is not None), has_planes=has_planes
-        )
+        numbers = dict(zip(("d_stiffness", "d_width"), parameters_dot))
+        numbers |= dict(by_rest=int(rest_dot is not None), has_planes=int(has_planes))
         self._run(self.kernels.products, at, slot=slot, **numbers)
 
     def clear_sums(self) -> None:
