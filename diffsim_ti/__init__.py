@@ -15,6 +15,7 @@ from diffsim_ti.materials import (
     StVenantKirchhoff,
 )
 from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.monitor.guard import Crossing, Divergence
 from diffsim_ti.outputs import MaterialPoints
 from diffsim_ti.rollout import Frames, Rollout
 from diffsim_ti.runtime import init
@@ -28,9 +29,8 @@ from diffsim_ti.solvers import (
     SemiImplicitSolver,
     StaticSolver,
     VelocityVerletSolver,
+    stable_dt,
 )
-from diffsim_ti.state.guard import Crossing, Divergence
-from diffsim_ti.state.stability import stable_dt
 from diffsim_ti.terms import (
     Box,
     Capsule,

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
+from diffsim_ti.monitor.quantities import Energy
+from diffsim_ti.monitor.stability import lanczos_limit
 from diffsim_ti.progress import progress
 from diffsim_ti.scene import Scene
 from diffsim_ti.simulator import Simulator
 from diffsim_ti.solvers.solver import Solver
-from diffsim_ti.state.observe import Energy
-from diffsim_ti.state.stability import lanczos_limit
 from diffsim_ti.terms import Gravity, Obstacle
 from diffsim_ti.visual.frame import Frame, Setting
 from diffsim_ti.writers import Writer, writer_for

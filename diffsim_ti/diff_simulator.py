@@ -10,10 +10,10 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.diff_physics import DifferentiableBarrierContact
+from diffsim_ti.monitor import stability
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.scene import Scene
 from diffsim_ti.solvers import SemiImplicitSolver, Solver, StaticSolver
-from diffsim_ti.state import stability
 from diffsim_ti.terms import Drag, ExternalForce, Gravity
 from diffsim_ti.terms.obstacles import barrier
 from diffsim_ti.torch_bridge.autograd import torch

@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
-from diffsim_ti.state import observe
-from diffsim_ti.state.guard import Guard
-from diffsim_ti.state.observe import Energy, TetrahedronFields
+from diffsim_ti.monitor import quantities
+from diffsim_ti.monitor.guard import Guard
+from diffsim_ti.monitor.quantities import Energy, TetrahedronFields
 from diffsim_ti.state.watch import ContactResolution
 from diffsim_ti.terms import ExternalForce
 
@@ -141,7 +141,7 @@ class Simulator:
 
     def compute_energy(self) -> Energy:
         """Total energy [J], a float with `.parts`: kinetic, elastic, gravity, contact."""
-        return observe.energy(self.workspace)
+        return quantities.energy(self.workspace)
 
     def smallest_gap(self) -> float:
         """Smallest distance [m] of surface primitives that share no vertex; infinite beyond the reach of SelfContact."""
@@ -156,7 +156,7 @@ class Simulator:
 
     def tetrahedron_fields(self) -> TetrahedronFields:
         """Energy density [J/m^3], von Mises stress [Pa] and volume ratio J of each tetrahedron."""
-        return observe.tetrahedron_fields(self.workspace)
+        return quantities.tetrahedron_fields(self.workspace)
 
     def describe(self) -> str:
         """What is simulated, how, and what was built for it."""

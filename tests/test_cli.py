@@ -13,9 +13,9 @@ from diffsim_ti import picture
 from diffsim_ti.cli import app as cli
 from diffsim_ti.materials import StableNeoHookean
 from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.monitor.quantities import TetrahedronFields
 from diffsim_ti.scene import Scene
 from diffsim_ti.solvers import SemiImplicitSolver, VelocityVerletSolver
-from diffsim_ti.state.observe import TetrahedronFields
 from diffsim_ti.terms import Gravity
 
 

@@ -9,9 +9,9 @@ from example_files import example
 import diffsim_ti as ds
 from diffsim_ti.materials import MATERIALS
 from diffsim_ti.mesh.patches import SIZE, in_eights, volume_patches
+from diffsim_ti.monitor import quantities
+from diffsim_ti.monitor.stability import element_limit, lanczos_limit
 from diffsim_ti.solvers.implicit.preconditioners import _assemble
-from diffsim_ti.state import observe
-from diffsim_ti.state.stability import element_limit, lanczos_limit
 
 locking = example("benchmarks/locking")
 
@@ -203,8 +203,8 @@ def test_observed_energy_is_the_energy_of_the_forces():
     p.place(state())
     workspace = p.keep
     workspace.state.u.from_numpy(p.u.to_numpy())
-    assert observe.energy(workspace).parts["elastic"] == pytest.approx(p.energy()[0], rel=1e-12)
-    F_of = observe.tetrahedron_fields(workspace).J
+    assert quantities.energy(workspace).parts["elastic"] == pytest.approx(p.energy()[0], rel=1e-12)
+    F_of = quantities.tetrahedron_fields(workspace).J
     D = np.swapaxes(p.held_at[mesh().tetrahedra[:, 1:]] - p.held_at[mesh().tetrahedra[:, :1]], 1, 2)
     assert np.allclose(F_of, np.linalg.det(np.eye(3) + D @ mesh().shape_gradients[:, 1:]), rtol=1e-12)
 

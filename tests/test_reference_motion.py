@@ -6,8 +6,8 @@ import pytest
 import diffsim_ti as ds
 from diffsim_ti import runtime
 from diffsim_ti.materials import MATERIALS
+from diffsim_ti.monitor.stability import Stiffness
 from diffsim_ti.solvers import SOLVERS as ALL_SOLVERS
-from diffsim_ti.state.stability import Stiffness
 
 SOLVERS = [s for s in ALL_SOLVERS if s.explicit]  # the implicit ones: test_implicit*.py
 E, RHO, G = 1e5, 1000.0, 9.81

@@ -8,8 +8,8 @@ import pytest
 
 import diffsim_ti as ds
 from diffsim_ti.materials import MATERIALS
+from diffsim_ti.monitor import stability
 from diffsim_ti.solvers import SOLVERS as ALL_SOLVERS
-from diffsim_ti.state import stability
 
 SOLVERS = [s for s in ALL_SOLVERS if s.explicit]  # the implicit ones: test_implicit*.py
 E, RHO = 1e5, 1000.0
@@ -430,7 +430,7 @@ def test_solver_describes_itself(solver):
 
 def test_a_scene_tells_its_stable_step():
     scene = block()
-    tight, bound = stability.stable_dt(scene), stability.stable_dt(scene, tight=False)
+    tight, bound = ds.stable_dt(scene), ds.stable_dt(scene, tight=False)
     assert tight == any_step(scene, ds.VelocityVerletSolver).stable_dt(tight=True) and tight.method == "Lanczos"
     assert bound == stability.element_limit(scene) and bound.dt < tight.dt
 
@@ -439,7 +439,7 @@ def test_a_scene_tells_its_stable_step():
 def test_a_start_that_is_not_checked_is_checked_on_the_way(solver):
     """A solver whose substeps are chosen later may be made with any step, but not run with it."""
     scene = block()
-    dt = 1.05 * stability.stable_dt(scene).dt
+    dt = 1.05 * ds.stable_dt(scene).dt
     own = solver(scene, dt=dt, check_start=False)
     assert not own.allow_unstable and own.twin(scene).dt == dt
     with pytest.raises(ds.Divergence, match="outgrown the stable step"):

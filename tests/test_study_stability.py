@@ -18,7 +18,7 @@ def test_power_iteration_agrees_with_the_eigenvalues_of_the_assembled_matrix():
     """Against a dense matrix of differences of forces at rest, column by column."""
     scene = body(1)
     solver = ds.VelocityVerletSolver(scene, dt=1.0, allow_unstable=True)
-    from diffsim_ti.state.stability import Stiffness
+    from diffsim_ti.monitor.stability import Stiffness
 
     stiffness, n = Stiffness(solver.workspace(solver.start_values())), scene.mesh.num_vertices
     dense = np.stack([stiffness.product(e.reshape(n, 3)).ravel() for e in np.eye(3 * n)], 1)

@@ -20,7 +20,7 @@ from diffsim_ti.diff_physics import (
     TorchMaterial,
 )
 from diffsim_ti.diff_simulator import DifferentiableSimulator, DifferentiableSolver, rollout_frames
-from diffsim_ti.state.guard import Guard
+from diffsim_ti.monitor.guard import Guard
 
 pytestmark = pytest.mark.filterwarnings("ignore:dt = .* is divided")
 GATE = dict(eps=1e-6, atol=1e-8, rtol=1e-5)

@@ -172,17 +172,18 @@ def info(
     tight: Annotated[bool, typer.Option("--tight", help="also the tight limit, by Lanczos")] = False,
 ) -> None:
     """Say what is in a mesh file: sizes, quality, groups, and the stable explicit step for given moduli."""
+    from diffsim_ti.monitor.stability import element_limit
     from diffsim_ti.scene import Scene
-    from diffsim_ti.state import stability
+    from diffsim_ti.solvers import stable_dt
 
     body = load_body(mesh, size, Up.y, fix_orientation)
     scene = Scene(body, make_material(material, youngs_modulus, poissons_ratio), density)
     print(body.describe())
     print(f"mass: {scene.inputs.derive(scene.inputs.values).mass.sum():.6g} kg")
     print(f"stable step for {scene.material!r}, density {density:g} kg/m^3, at rest:")
-    print(f"  {stability.element_limit(scene)}")
+    print(f"  {element_limit(scene)}")
     if tight:
-        print(f"  {stability.stable_dt(scene)}")
+        print(f"  {stable_dt(scene)}")
 
 
 @app.command("check-gradients")
@@ -212,7 +213,7 @@ def check_gradients(
     from diffsim_ti import runtime
     from diffsim_ti.rollout import Rollout
     from diffsim_ti.scene import Scene
-    from diffsim_ti.state.stability import stable_dt
+    from diffsim_ti.solvers import stable_dt
     from diffsim_ti.terms import Drag, Gravity
     from diffsim_ti.verify import check_gradients as check
 
@@ -298,8 +299,7 @@ def twisted_column(cells: int) -> TetrahedralMesh:
 def print_gradient(scene: Scene, seconds: float = 0.05, change: float = 1e-3) -> None:
     """Gradient by E of the mean height after `seconds`, in float64, beside a central difference."""
     from diffsim_ti.rollout import Rollout
-    from diffsim_ti.solvers import SemiImplicitSolver
-    from diffsim_ti.state.stability import stable_dt
+    from diffsim_ti.solvers import SemiImplicitSolver, stable_dt
 
     dt = 0.5 * stable_dt(scene).dt
     steps = int(np.ceil(seconds / dt))

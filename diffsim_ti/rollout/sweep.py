@@ -7,10 +7,10 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.inputs import Derived
+from diffsim_ti.monitor.guard import Guard
 from diffsim_ti.rollout.checkpoints import choose_schedule
 from diffsim_ti.rollout.run import Run, Seed
 from diffsim_ti.solvers.solver import Solver
-from diffsim_ti.state.guard import Guard
 from diffsim_ti.state.watch import ContactResolution
 
 

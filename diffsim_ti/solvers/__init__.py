@@ -6,6 +6,7 @@ from diffsim_ti.solvers.implicit_euler import ImplicitEulerSolver
 from diffsim_ti.solvers.implicit_midpoint import ImplicitMidpointSolver
 from diffsim_ti.solvers.semi_implicit import SemiImplicitSolver
 from diffsim_ti.solvers.solver import Solver
+from diffsim_ti.solvers.stable_step import stable_dt
 from diffsim_ti.solvers.static import StaticSolver
 from diffsim_ti.solvers.velocity_verlet import VelocityVerletSolver
 
@@ -20,4 +21,5 @@ __all__ = [
     "Solver",
     "StaticSolver",
     "VelocityVerletSolver",
+    "stable_dt",
 ]

@@ -7,7 +7,7 @@ from abc import ABC
 import numpy as np
 
 from diffsim_ti import runtime
-from diffsim_ti.state import stability
+from diffsim_ti.monitor import stability
 from diffsim_ti.state.schedule import Schedule
 
 

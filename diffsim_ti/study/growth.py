@@ -9,9 +9,8 @@ from diffsim_ti.materials import SmithNeoHookean
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.scene import Scene
-from diffsim_ti.solvers import VelocityVerletSolver
+from diffsim_ti.solvers import VelocityVerletSolver, stable_dt
 from diffsim_ti.solvers.solver import Solver
-from diffsim_ti.state.stability import stable_dt
 from diffsim_ti.study.charts import COLORS, new_figure, save, write_csv, write_json
 from diffsim_ti.study.problems import beam_scene, lame_scene
 from diffsim_ti.terms import Gravity, Ground

@@ -8,8 +8,7 @@ import numpy as np
 
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.scene import LOCKING_RATIO, Scene
-from diffsim_ti.solvers import SOLVERS, BDF2Solver, VelocityVerletSolver
-from diffsim_ti.state.stability import stable_dt
+from diffsim_ti.solvers import SOLVERS, BDF2Solver, VelocityVerletSolver, stable_dt
 from diffsim_ti.study.problem import Problem, distance
 from diffsim_ti.study.recommendation import Option, Recommendation
 from diffsim_ti.terms import Drag, ExternalForce

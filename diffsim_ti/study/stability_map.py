@@ -8,11 +8,12 @@ import numpy as np
 
 from diffsim_ti.materials import SmithNeoHookean
 from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.monitor.stability import Stiffness
 from diffsim_ti.scene import Scene
 from diffsim_ti.simulator import Simulator
 from diffsim_ti.solvers import SOLVERS
 from diffsim_ti.solvers.solver import Solver
-from diffsim_ti.state.stability import Stiffness, start_workspace
+from diffsim_ti.solvers.stable_step import start_workspace
 from diffsim_ti.terms import Ground, Term
 from diffsim_ti.terms.obstacles.obstacle import Obstacle
 from diffsim_ti.terms.obstacles.stiffness import barrier_stiffness

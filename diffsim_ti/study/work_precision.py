@@ -11,9 +11,8 @@ import numpy as np
 from diffsim_ti.progress import progress
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.scene import Scene
-from diffsim_ti.solvers import SOLVERS, StaticSolver, VelocityVerletSolver
+from diffsim_ti.solvers import SOLVERS, StaticSolver, VelocityVerletSolver, stable_dt
 from diffsim_ti.solvers.solver import Solver
-from diffsim_ti.state.stability import stable_dt
 from diffsim_ti.study.problem import ELEMENTS, Problem, distance
 
 # wall time per tetrahedron and substep, before anything was measured [s]; with gradients three times as much

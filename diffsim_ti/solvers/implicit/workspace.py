@@ -6,6 +6,7 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.contact.implicit_pairs import ImplicitPairs
+from diffsim_ti.monitor.energy_watch import EnergyWatch
 from diffsim_ti.potential.potential import Potential
 from diffsim_ti.solvers.implicit.linear import NotConverged
 from diffsim_ti.solvers.implicit.newton import Newton
@@ -13,7 +14,6 @@ from diffsim_ti.solvers.implicit.preconditioners import BlockJacobi, Multigrid
 from diffsim_ti.solvers.implicit.stage import Stage
 from diffsim_ti.solvers.implicit.threads import one_blas_thread
 from diffsim_ti.state.arrays import History, copy_slot
-from diffsim_ti.state.energy_watch import EnergyWatch
 from diffsim_ti.state.workspace import Workspace
 
 

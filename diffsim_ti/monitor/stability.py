@@ -144,20 +144,3 @@ def lanczos_limit(workspace, tolerance: float = 1e-3) -> StepLimit:
     if value <= 0:
         return StepLimit(np.inf, 0, "Lanczos")
     return StepLimit(float(2 / np.sqrt(value + residual)), stiffness.worst_tetrahedron(), "Lanczos")
-
-
-def stable_dt(scene, tight: bool = True) -> StepLimit:
-    """Largest stable explicit step [s] of a scene at its start.
-
-    tight: 2 / omega_max of the assembled system, contact included (`lanczos_limit`); else the element bound at rest, without
-    contact (`element_limit`), which needs no kernels and is smaller.
-    """
-    return lanczos_limit(start_workspace(scene)) if tight else element_limit(scene)
-
-
-def start_workspace(scene):
-    """A workspace of the scene at its start; every explicit solver's has the same stiffness."""
-    from diffsim_ti.solvers import SemiImplicitSolver
-
-    solver = SemiImplicitSolver(scene, dt=1e-9, check_start=False)  # motions are asked for their values at 0 and dt
-    return solver.workspace(solver.start_values())

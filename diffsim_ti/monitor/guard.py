@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 
 from diffsim_ti import runtime
-from diffsim_ti.state import observe, stability
+from diffsim_ti.monitor import quantities, stability
 from diffsim_ti.terms.obstacles.barrier import beta
 
 
@@ -218,7 +218,7 @@ class Guard:
                 break
         bad = "velocity" if not np.all(np.isfinite(ws.velocity_of(vertex))) else "displacement"
         ws.restore(self.good, 0)
-        J = observe.tetrahedron_fields(ws).J
+        J = quantities.tetrahedron_fields(ws).J
         around = np.nonzero((ws.scene.mesh.tetrahedra == vertex).any(1))[0]
         J_around = np.where(np.isfinite(J[around]), J[around], -np.inf)
         tet = int(around[J_around.argmin()]) if around.size else 0
