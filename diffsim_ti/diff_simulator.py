@@ -254,11 +254,9 @@ class DifferentiableSimulator:
 
     def _core_solver(self, scene: Scene, substeps: int) -> Solver:
         options = dict(dt=self.solver.dt, substeps=substeps) | self.solver.options
-        if not self.solver.method.explicit:
-            return self.solver.method(scene, **options)
-        solver = self.solver.method(scene, allow_unstable=True, **options)
-        solver.allow_unstable = False  # the count is chosen at reset; outgrowing it raises
-        return solver
+        if self.solver.method.explicit:
+            options["check_start"] = False  # the count is chosen at reset; a run that outgrows it raises
+        return self.solver.method(scene, **options)
 
     def _choose_substeps(self) -> None:
         """What stability and contact ask for at the present numbers; the count only grows, so that losses stay smooth."""

@@ -157,12 +157,12 @@ def check_gradients(
     """Check the gradient by every input against extrapolated central differences and by its Taylor rate; print the table.
 
     loss(frames) -> (value, gradient by positions, gradient by velocities or None); default `linear_loss`.
-    Differences and Taylor rates are taken in float64 (on a float64 twin of an f32 scene: differences in f32 see nothing).
+    Differences and Taylor rates are taken in float64, of an f32 scene too: differences in f32 see nothing.
     tolerance: largest relative error, default 1e-6 in f64 (what differences resolve on a long run), 1e-3 in f32.
     A row passes if its error is within the tolerance and its Taylor rate is at least 1.9.
     """
     single = rollout.scene.precision == "f32"
-    twin = rollout.twin(precision="f64") if single else rollout
+    double = rollout.with_scene(precision="f64") if single else rollout
     loss = loss or linear_loss(rollout, seed)
     tolerance = tolerance or (1e-3 if single else 1e-6)
     rng = np.random.default_rng(seed + 1)
@@ -174,13 +174,13 @@ def check_gradients(
         direction, x = _random_direction(rollout, name, rng), rollout.values[name]
 
         def along(t, name=name, x=x, direction=direction):
-            return loss(twin.forward(**{name: x + t * direction}))[0]
+            return loss(double.forward(**{name: x + t * direction}))[0]
 
         analytic = float((gradients[name] * direction).sum())
         exact = analytic
         if single:
-            exact_frames = twin.forward()
-            exact = float((twin.vjp(exact_frames, *loss(exact_frames)[1:])[name] * direction).sum())
+            exact_frames = double.forward()
+            exact = float((double.vjp(exact_frames, *loss(exact_frames)[1:])[name] * direction).sum())
         differences, uncertainty = central_difference(along)
         for epsilon in (0.1, 0.01, 0.001):  # where the loss is strongly curved only a closer look sees the order
             taylor = taylor_test(along, 0.0, exact, 1.0, epsilon)

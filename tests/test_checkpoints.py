@@ -10,7 +10,7 @@ from test_gradients import by_solver, full_scene, rollout_of
 
 import diffsim_ti as ds
 from diffsim_ti import runtime
-from diffsim_ti.rollout.checkpoints import Schedule, choose_schedule
+from diffsim_ti.rollout.checkpoints import Checkpoints, choose_checkpoints
 from diffsim_ti.solvers.explicit.solver import ExplicitWorkspace
 
 STEPS = 24
@@ -35,7 +35,7 @@ def assert_same_bits(a: dict, b: dict):
 @cache
 def stored_whole(solver):
     whole = rollout(solver)
-    assert whole.schedule.num_segments == 1
+    assert whole.checkpoints.num_segments == 1
     return gradients_of(whole)
 
 
@@ -52,7 +52,7 @@ STATE = 4 * 27 * 8 / 1e6  # MB of one array of vertex vectors, which have four c
 @pytest.mark.parametrize("states", [8, 9, 10, 12, 14, 20, 40, 80, 200])
 def test_budgets_give_the_same_bits(solver, states):
     small = rollout(solver, memory=states * STATE)
-    assert small.schedule.states() <= states and small.memory <= states * STATE * (1 + 1e-12)
+    assert small.checkpoints.states() <= states and small.memory <= states * STATE * (1 + 1e-12)
     assert_same_bits(gradients_of(small), stored_whole(solver))
 
 
@@ -60,14 +60,14 @@ def test_budgets_give_the_same_bits(solver, states):
 @by_solver
 def test_budget_and_segments_together(solver):
     both = rollout(solver, checkpoint_every=2, memory=21 * STATE)
-    assert both.schedule.segment == 4 and both.schedule.snapshots == 3 < both.schedule.num_segments
+    assert both.checkpoints.segment == 4 and both.checkpoints.snapshots == 3 < both.checkpoints.num_segments
     assert_same_bits(gradients_of(both), stored_whole(solver))
 
 
 def test_budgets_reach_every_kind_of_schedule():
     """One snapshot, several levels of repeats, two levels, everything: the tests above mean something."""
-    schedules = [choose_schedule(48, 1, None, states / 1e6) for states in (8, 9, 10, 12, 14, 20, 40, 80, 200)]
-    assert schedules[0] == Schedule(48, 1, 1) and schedules[-1].num_segments == 1
+    schedules = [choose_checkpoints(48, 1, None, states / 1e6) for states in (8, 9, 10, 12, 14, 20, 40, 80, 200)]
+    assert schedules[0] == Checkpoints(48, 1, 1) and schedules[-1].num_segments == 1
     assert any(1 < s.snapshots < s.num_segments for s in schedules)
     assert any(s.snapshots == s.num_segments > 1 for s in schedules)
     assert all(s.states() <= states for s, states in zip(schedules, (8, 9, 10, 12, 14, 20, 40, 80, 200)))
@@ -113,13 +113,13 @@ def test_what_is_kept_is_what_the_schedule_says(options):
 def test_memory_falls_as_the_theory_says():
     """Everything: 3 n states; roots: a multiple of sqrt(n); binomial: the budget, whatever n."""
     n = 2000
-    whole, root = choose_schedule(n, 100, None, 1.0), choose_schedule(n, 100, None, 0.1)
+    whole, root = choose_checkpoints(n, 100, None, 1.0), choose_checkpoints(n, 100, None, 0.1)
     assert whole.states() == 2 + 3 * (n + 1)
     assert (
         root.snapshots == root.num_segments and root.states() <= 2 * math.sqrt(6 * n) + 8
     )  # 2 n / s + 3 s at its least
     for states in (20, 50, 100):
-        assert choose_schedule(n, 100, None, states * 1e-4).states() <= states
+        assert choose_checkpoints(n, 100, None, states * 1e-4).states() <= states
 
 
 # ---- work -------------------------------------------------------------------------------------------------------------
@@ -161,7 +161,7 @@ def count(rollout, monkeypatch) -> int:
 def test_passes_of_the_binomial_schedule(monkeypatch, states):
     """One run forward; the optimal number of advances, less those up to the last snapshot of that run; each recorded."""
     small = rollout_of(full_scene(), steps=STEPS, substeps=1, save_every=8, memory=states * STATE)
-    schedule = small.schedule
+    schedule = small.checkpoints
     assert schedule.segment == 1 and schedule.num_segments == STEPS
     kept = [0, *schedule.path(0, STEPS, schedule.snapshots - 1)]
     expected = STEPS + optimal(STEPS, schedule.snapshots) - kept[-1] + STEPS
@@ -176,7 +176,7 @@ def test_theory(length, snapshots):
     def advances(begin, end, free):
         if end - begin <= 1:
             return 0
-        path = Schedule(end, 1, 1).path(begin, end, free)
+        path = Checkpoints(end, 1, 1).path(begin, end, free)
         if not path:
             return (end - begin) * (end - begin - 1) // 2
         return path[0] - begin + advances(path[0], end, free - 1) + advances(begin, path[0], free)
@@ -248,7 +248,7 @@ def test_an_interrupted_sweep(monkeypatch, options):
 
     def interrupted(self, *arguments):
         calls.append(1)
-        if len(calls) == max(1, r.schedule.num_segments // 2):
+        if len(calls) == max(1, r.checkpoints.num_segments // 2):
             raise KeyboardInterrupt
         reverse(self, *arguments)
 

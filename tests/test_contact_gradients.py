@@ -111,7 +111,7 @@ def test_the_same_however_it_is_run(solver):
 def test_single_precision():
     """f32 gradients against f64 ones, to 1e-3."""
     double = rollout_of("ground", ds.SemiImplicitSolver)
-    single = double.twin(precision="f32")
+    single = double.with_scene(precision="f32")
     adjoint = np.random.default_rng(0).standard_normal((5, 4, 3))
     ours, exact = (r.vjp(r.forward(), adjoint) for r in (single, double))
     for name, value in exact.items():

@@ -161,7 +161,7 @@ def test_a_smooth_thousand_steps(solver):
 def test_f32_gradients_agree_with_f64(solver, material):
     """100 steps; each input's gradient as a whole."""
     single = rollout_of(full_scene(material, "f32"), solver, 100)
-    double = single.twin(precision="f64")
+    double = single.with_scene(precision="f64")
     frames = double.forward()
     w, z = verify.linear_loss(double)(frames)[1:]
     exact, rough = double.vjp(frames, w, z), single.vjp(single.forward(), w, z)

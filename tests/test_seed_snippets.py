@@ -94,8 +94,8 @@ def test_spatially_varying_materials(names):
 def test_memory_efficient_rollouts(names):
     run("Memory-Efficient Rollouts", names)
     assert torch.isfinite(names["loss"]) and names["spatial_material"].control.grad.abs().max() > 0
-    schedule = names["simulator"]._rollout(1000, False, 10, None).schedule
-    assert schedule.num_segments == 100
+    kept = names["simulator"]._rollout(1000, False, 10, None).checkpoints
+    assert kept.num_segments == 100
 
 
 def test_contact_and_collision(names):

@@ -441,6 +441,6 @@ def test_a_start_that_is_not_checked_is_checked_on_the_way(solver):
     scene = block()
     dt = 1.05 * ds.stable_dt(scene).dt
     own = solver(scene, dt=dt, check_start=False)
-    assert not own.allow_unstable and own.twin(scene).dt == dt
+    assert not own.allow_unstable and own.for_scene(scene).dt == dt
     with pytest.raises(ds.Divergence, match="outgrown the stable step"):
         ds.Rollout(own, 1000).forward()

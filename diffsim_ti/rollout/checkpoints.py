@@ -5,11 +5,11 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class Schedule:
+class Checkpoints:
     """`num_passes` passes cut into segments of `segment` passes; `snapshots` of their starts are kept at a time.
 
     With a snapshot for every segment each pass runs once more in the reverse sweep; with fewer, the binomial
-    schedule of Griewank (1992, Optimization Methods and Software 1, 35-54, doi:10.1080/10556789208805505) applies.
+    checkpointing of Griewank (1992, Optimization Methods and Software 1, 35-54, doi:10.1080/10556789208805505) applies.
     """
 
     num_passes: int
@@ -50,37 +50,37 @@ def _split(begin: int, end: int, free: int) -> int:
     return begin + min(math.comb(free + repeats, free + 1), length - math.comb(free + repeats - 1, free))
 
 
-def choose_schedule(num_passes: int, state_bytes: int, every: int | None, memory: float | None) -> Schedule:
-    """A schedule from the user's wish.
+def choose_checkpoints(num_passes: int, state_bytes: int, every: int | None, memory: float | None) -> Checkpoints:
+    """What to keep, from the user's wish.
 
     every: passes per segment, all segment starts kept. memory: budget [MB] for all that is kept; `state_bytes` is the
-    size of one (num_vertices, 3) array. Neither: 1000 MB. Raises ValueError if the budget is too small for any schedule.
+    size of one (num_vertices, 3) array. Neither: 1000 MB. Raises ValueError if the budget is too small for any choice.
     """
     if num_passes == 0:
-        return Schedule(0, 1, 1)
+        return Checkpoints(0, 1, 1)
     if every is not None:
         every = min(every, num_passes)
-        full = Schedule(num_passes, every, -(-num_passes // every))
+        full = Checkpoints(num_passes, every, -(-num_passes // every))
         if memory is None or full.states() * state_bytes <= memory * 1e6:
             return full
         snapshots = int((memory * 1e6 / state_bytes - 3 * (every + 1)) // 2)
         if snapshots < 1:
-            least = Schedule(num_passes, every, 1).states() * state_bytes / 1e6
+            least = Checkpoints(num_passes, every, 1).states() * state_bytes / 1e6
             raise ValueError(
                 f"memory = {memory:g} MB is too little for segments of {every} passes: {least:.3g} MB needed"
             )
-        return Schedule(num_passes, every, snapshots)
+        return Checkpoints(num_passes, every, snapshots)
     budget = (1000.0 if memory is None else memory) * 1e6 / state_bytes
-    everything = Schedule(num_passes, num_passes, 1)
+    everything = Checkpoints(num_passes, num_passes, 1)
     if everything.states() <= budget:
         return everything
     root = max(1, round(math.sqrt(2 * num_passes / 3)))
-    two_levels = Schedule(num_passes, root, -(-num_passes // root))
+    two_levels = Checkpoints(num_passes, root, -(-num_passes // root))
     if two_levels.states() <= budget:
         return two_levels
     segment = max(1, min(root, int(budget / 6) - 1))
     snapshots = int((budget - 3 * (segment + 1)) // 2)
     if snapshots < 1:
-        least = Schedule(num_passes, 1, 1).states() * state_bytes / 1e6
+        least = Checkpoints(num_passes, 1, 1).states() * state_bytes / 1e6
         raise ValueError(f"memory = {memory:g} MB is too little to differentiate at all: {least:.3g} MB is the least")
-    return Schedule(num_passes, segment, min(snapshots, -(-num_passes // segment)))
+    return Checkpoints(num_passes, segment, min(snapshots, -(-num_passes // segment)))

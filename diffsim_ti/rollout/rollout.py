@@ -4,7 +4,7 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.outputs import Change, Displacements, Output, Positions, Velocities
-from diffsim_ti.rollout.checkpoints import Schedule
+from diffsim_ti.rollout.checkpoints import Checkpoints
 from diffsim_ti.rollout.frames import Frames, HostSeed, check_finite
 from diffsim_ti.rollout.run import Run
 from diffsim_ti.rollout.sweep import Sweep
@@ -20,7 +20,7 @@ class Rollout:
     steps: number of steps of solver.dt.
     save_every: a frame every so many steps, besides the start; must divide `steps`. Default: only the end.
     checkpoint_every: keep a state every so many steps and compute the rest again in the reverse sweep.
-    memory: or a budget [MB] from which a schedule is chosen (default 1000). The gradient is bitwise the same.
+    memory: or a budget [MB] from which they are chosen (default 1000). The gradient is bitwise the same.
     gradients: names of inputs whose gradient is wanted; default all but rest_positions, which costs extra.
     clip: largest norm of the running adjoint; it is scaled back when it exceeds that (the gradient is then no gradient).
     truncate: differentiate only the last so many steps.
@@ -51,25 +51,22 @@ class Rollout:
         runs: int | None = None,
     ):
         self.solver, self.scene = solver, solver.scene
-        self.sweep = sweep = Sweep(
-            solver, steps, save_every, checkpoint_every, memory, gradients, clip, truncate, health
+        options = dict(
+            save_every=save_every,
+            checkpoint_every=checkpoint_every,
+            memory=memory,
+            gradients=gradients,
+            clip=clip,
+            truncate=truncate,
+            health=health,
         )
+        self.sweep = sweep = Sweep(solver, steps, **options)
         self.steps, self.save_every, self.num_frames = sweep.steps, sweep.save_every, sweep.num_frames
         self.values, self.inputs, self.wanted = sweep.values, sweep.inputs, sweep.wanted
         given = (outputs,) if isinstance(outputs, Output) else tuple(outputs)
         self.outputs = self._check_outputs((Positions(), Velocities(), Displacements(), *given))
         self.computed = {output.name: self.outputs[output.name] for output in given}  # besides the states themselves
-        self._options = dict(
-            save_every=self.save_every,
-            checkpoint_every=checkpoint_every,
-            memory=memory,
-            gradients=self.wanted,
-            clip=clip,
-            truncate=truncate,
-            health=health,
-            outputs=given,
-            runs=runs,
-        )
+        self._options = options | dict(outputs=given, runs=runs)
         self.gradients: dict[str, np.ndarray] = {}
         self.tape_face = TapeFace(self, runs)
         self.torch_face = None  # made by the first run from tensors (torch_bridge/tensors.py)
@@ -87,9 +84,9 @@ class Rollout:
             out[output.name] = output.settled(self.scene)
         return out
 
-    def twin(self, **changes) -> "Rollout":
+    def with_scene(self, **changes) -> "Rollout":
         """The same rollout of a scene with some arguments replaced, such as precision="f64"."""
-        return Rollout(self.solver.twin(self.scene.replace(**changes)), self.steps, **self._options)
+        return Rollout(self.solver.for_scene(self.scene.replace(**changes)), self.steps, **self._options)
 
     @property
     def times(self) -> np.ndarray:
@@ -97,14 +94,14 @@ class Rollout:
         return np.arange(self.num_frames) * self.save_every * self.solver.dt
 
     @property
-    def schedule(self) -> Schedule:
+    def checkpoints(self) -> Checkpoints:
         """Which states are kept for the reverse sweep."""
-        return self.sweep.schedule
+        return self.sweep.checkpoints
 
     @property
     def memory(self) -> float:
         """What the reverse sweep keeps [MB]: snapshots, recorded states."""
-        return self.schedule.states() * self.sweep.state_bytes / 1e6
+        return self.checkpoints.states() * self.sweep.state_bytes / 1e6
 
     @property
     def health(self) -> list[dict]:
@@ -137,7 +134,7 @@ class Rollout:
         """Gradients of a loss by every wanted input, from its gradients by positions, velocities and other outputs.
 
         Float64 arrays of the inputs' shapes; None for a part that the loss does not name. Further seeds of the same
-        frames cost a reverse sweep each: no pass runs forward again unless the schedule of states asks for it.
+        frames cost a reverse sweep each: no pass runs forward again unless too few states are kept.
         """
         change = self.pulled_to_frames(frames, dict(positions=positions, velocities=velocities) | seeds)
         zero = np.zeros(frames.positions.shape)

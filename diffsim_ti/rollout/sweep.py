@@ -1,4 +1,4 @@
-"""n steps of a solver on the device: forward, in reverse from the states that a schedule keeps, and in tangents."""
+"""n steps of a solver on the device: forward, in reverse from kept states, and in tangents."""
 
 import warnings
 from collections.abc import Callable
@@ -8,7 +8,7 @@ import numpy as np
 from diffsim_ti import runtime
 from diffsim_ti.inputs import Derived
 from diffsim_ti.monitor.guard import Guard
-from diffsim_ti.rollout.checkpoints import choose_schedule
+from diffsim_ti.rollout.checkpoints import choose_checkpoints
 from diffsim_ti.rollout.run import Run, Seed
 from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.state.watch import ContactResolution
@@ -50,7 +50,7 @@ class Sweep:
         self.passes_per_frame = self.save_every * solver.substeps
         every = None if checkpoint_every is None else max(1, int(checkpoint_every)) * solver.substeps
         self.state_bytes = 4 * self.scene.mesh.num_vertices * runtime.NUMPY[self.scene.precision]().itemsize
-        self.schedule = choose_schedule(self.num_passes, self.state_bytes, every, memory)
+        self.checkpoints = choose_checkpoints(self.num_passes, self.state_bytes, every, memory)
         self.workspace = None  # made by the first run
         self._loaded, self._current, self._adjoint = None, None, None
         self._recorded, self._warned = False, False
@@ -111,7 +111,7 @@ class Sweep:
             if self.workspace is None:
                 self.workspace = self.solver.workspace(derived)
                 self.workspace.make_frames(self.num_frames)
-                self._snapshots = self.workspace.history(self.schedule.snapshots)
+                self._snapshots = self.workspace.history(self.checkpoints.snapshots)
                 self._guard = Guard(self.workspace)
             else:
                 self.workspace.load(derived)
@@ -121,18 +121,18 @@ class Sweep:
             self.workspace.forget()
 
     def _forward(self, run: Run) -> None:
-        """All passes; keeps the first snapshots of the schedule on the way."""
+        """All passes; keeps the first snapshots on the way."""
         self._load(run)
-        ws, schedule = self.workspace, self.schedule
+        ws, checkpoints = self.workspace, self.checkpoints
         self._guard.restart()
-        self._recorded = schedule.num_segments == 1 and self._adjoint is not None  # a gradient was asked for before
+        self._recorded = checkpoints.num_segments == 1 and self._adjoint is not None  # a gradient was asked for before
         if self._recorded:
-            ws.make_record(schedule.segment + 1)
-        path = [0, *schedule.path(0, schedule.num_segments, schedule.snapshots - 1)]
+            ws.make_record(checkpoints.segment + 1)
+        path = [0, *checkpoints.path(0, checkpoints.num_segments, checkpoints.snapshots - 1)]
         for k, segment in enumerate(path):
             ws.save(self._snapshots, k)
-            first = schedule.bounds(segment)[0]
-            last = schedule.bounds(path[k + 1])[0] if k + 1 < len(path) else self.num_passes
+            first = checkpoints.bounds(segment)[0]
+            last = checkpoints.bounds(path[k + 1])[0] if k + 1 < len(path) else self.num_passes
             self._guard.advance(first, last, self.num_passes, self.passes_per_frame, self._recorded)
         if self.solver.last_frame_is_state:
             ws.save_frame(self.num_frames - 1)
@@ -141,10 +141,10 @@ class Sweep:
     def _record(self, first: int, last: int) -> None:
         """Passes first .. last - 1 from the current state, recorded."""
         ws = self.workspace
-        ws.make_record(self.schedule.segment + 1)
+        ws.make_record(self.checkpoints.segment + 1)
         ws.restore_to_record()
         ws.advance(first, last, self.num_passes, base=first)
-        self._recorded = self.schedule.num_segments == 1
+        self._recorded = self.checkpoints.num_segments == 1
 
     # ---- tangents ---------------------------------------------------------------------------------------------------
 
@@ -152,10 +152,10 @@ class Sweep:
         """Changes of the frames' positions and velocities, float64, for a change of what kernels read."""
         current = self._current
         self._load(run)
-        ws, schedule = self.workspace, self.schedule
+        ws, checkpoints = self.workspace, self.checkpoints
         tangent = self.solver.tangent(ws, change)
-        for k in range(schedule.num_segments):
-            first, last = schedule.bounds(k)
+        for k in range(checkpoints.num_segments):
+            first, last = checkpoints.bounds(k)
             self._record(first, last)
             tangent.advance(first, last, self.num_passes, self.passes_per_frame)
             ws.restore(ws.record, last - first)
@@ -185,7 +185,7 @@ class Sweep:
 
     def _reverse(self, seed: Seed, careful: bool) -> tuple[float, float]:
         """The reverse sweep; the norms of its seed."""
-        ws, schedule = self.workspace, self.schedule
+        ws, checkpoints = self.workspace, self.checkpoints
         if self._adjoint is None or not self._adjoint.fits(ws):
             shape = "rest_positions" in self.wanted
             density = shape or "density" in self.wanted  # the rest shape makes masses
@@ -193,22 +193,22 @@ class Sweep:
         norms = seed.put(self._adjoint, self.solver.last_frame_is_state)
         self.health = []
         stop = 0 if self.truncate is None else max(0, self.steps - self.truncate) * self.solver.substeps
-        kept, end = self._kept, schedule.num_segments
+        kept, end = self._kept, checkpoints.num_segments
         self._kept = kept[:1]  # the sweep overwrites the others, also if it does not get to its end
-        while end > 0 and schedule.bounds(end - 1)[1] > stop:
+        while end > 0 and checkpoints.bounds(end - 1)[1] > stop:
             at = kept[-1]
             if self._recorded:
                 self._reverse_segment(0, self.num_passes, stop, stop, careful)
                 break
             ws.restore(self._snapshots, len(kept) - 1)
-            for segment in schedule.path(at, end, schedule.snapshots - len(kept)):
-                ws.advance(schedule.bounds(at)[0], schedule.bounds(segment)[0], self.num_passes)
+            for segment in checkpoints.path(at, end, checkpoints.snapshots - len(kept)):
+                ws.advance(checkpoints.bounds(at)[0], checkpoints.bounds(segment)[0], self.num_passes)
                 kept.append(segment)
                 ws.save(self._snapshots, len(kept) - 1)
                 at = segment
-            first, last = schedule.bounds(end - 1)
+            first, last = checkpoints.bounds(end - 1)
             if at < end - 1:  # no snapshot is left: come here anew
-                ws.advance(schedule.bounds(at)[0], first, self.num_passes)
+                ws.advance(checkpoints.bounds(at)[0], first, self.num_passes)
             self._record(first, last)
             self._reverse_segment(first, last, max(first, stop), stop, careful)
             end -= 1

@@ -23,6 +23,11 @@ class Solver(ABC):
 
     explicit = False
     order = 0
+    # tetrahedra up to which one thread beats two (measured): starting two costs 20 us per loop, and Taichi cuts loops
+    # into pieces of at least 512 items, which are blocks of eight where the law works in lanes
+    serial_limit = 3_000
+    serial_limit_in_lanes = 10_000
+    arguments = ("dt", "substeps", "parallel", "allow_unstable", "check_start")  # of the constructor, besides the scene
 
     def __init__(
         self,
@@ -51,10 +56,9 @@ class Solver(ABC):
         if self.explicit and check_start and not allow_unstable:
             self._refuse_unstable()
 
-    def twin(self, scene) -> "Solver":
+    def for_scene(self, scene) -> "Solver":
         """The same solver for another scene."""
-        own = ("dt", "substeps", "parallel", "allow_unstable", "check_start")
-        return type(self)(scene, **{name: getattr(self, name) for name in own})
+        return type(self)(scene, **{name: getattr(self, name) for name in self.arguments})
 
     @property
     def schedule(self) -> Schedule:

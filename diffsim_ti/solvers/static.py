@@ -15,6 +15,7 @@ class StaticSolver(ImplicitSolver):
     """
 
     order = 0
+    arguments = ("load_steps", "tolerance", "max_iterations", "dt", "parallel", "preconditioner")
 
     def __init__(
         self,
@@ -29,9 +30,10 @@ class StaticSolver(ImplicitSolver):
         super().__init__(scene, dt, load_steps, tolerance, max_iterations, parallel, preconditioner)
         self._refuse_rigid_modes()
 
-    def twin(self, scene) -> "StaticSolver":
-        own = (self.substeps, self.tolerance, self.max_iterations, self.dt, self.parallel, self.preconditioner)
-        return StaticSolver(scene, *own)
+    @property
+    def load_steps(self) -> int:
+        """Parts in which loads, motions and paths are applied."""
+        return self.substeps
 
     def stage(self, rate, fresh):
         return Stage(self.substep, b0=0.0, e0=0.0, static=True)

@@ -282,13 +282,13 @@ class Trials:
             if best.solver.explicit
             else f"its step is {share:.2g} times the explicit limit {self.stable:.3g} s"
         )
-        schedule = plan.schedule
-        again = "each step runs once more in the reverse sweep" if schedule.num_segments > 1 else "all steps are kept"
+        kept = plan.checkpoints
+        again = "each step runs once more in the reverse sweep" if kept.num_segments > 1 else "all steps are kept"
         return [
             f"accuracy: error {best.error:.2g} against a converged run (itself good to {self.own_error:.1g}), order "
             f"{best.solver.order}; {limit}",
             f"time: {beaten or 'no other solver met the tolerance'}",
-            f"memory: {plan.memory:.3g} MB in {schedule.num_segments} segments, {again}"
+            f"memory: {plan.memory:.3g} MB in {kept.num_segments} segments, {again}"
             if self.gradients
             else "memory: without gradients no state is kept",
         ]

@@ -37,10 +37,6 @@ class ExplicitSolver(Solver):
     """Explicit steps: each costs one force evaluation, and dt may not exceed 2 / omega_max."""
 
     explicit = True
-    # tetrahedra up to which one thread beats two (measured): starting two costs 20 us per loop, and Taichi cuts loops
-    # into pieces of at least 512 items, which are blocks of eight where the law works in lanes
-    serial_limit = 3_000
-    serial_limit_in_lanes = 10_000
 
     @abstractmethod
     def weights(self, j: np.ndarray, num_passes: int, rate: float) -> Weights:

@@ -24,7 +24,7 @@ class ImplicitSolver(Solver):
     max_iterations: Newton rounds per substep, after which NotConverged is raised and the state stays as it was.
     """
 
-    serial_limit, serial_limit_in_lanes = 3_000, 10_000  # as for the explicit solvers
+    arguments = ("dt", "substeps", "tolerance", "max_iterations", "parallel", "preconditioner")
     last_frame_is_state = True
     multistep = False
     may_gain_energy = False  # whether long steps can add energy, so that it must be watched
@@ -48,10 +48,6 @@ class ImplicitSolver(Solver):
             raise ValueError(f"max_iterations must be a whole number >= 1, got {max_iterations}")
         self.tolerance, self.max_iterations = float(tolerance), int(max_iterations)
         super().__init__(scene, dt, substeps, parallel)
-
-    def twin(self, scene) -> "ImplicitSolver":
-        own = (self.dt, self.substeps, self.tolerance, self.max_iterations, self.parallel, self.preconditioner)
-        return type(self)(scene, *own)
 
     def num_passes(self, steps: int) -> int:
         return steps * self.substeps
