@@ -178,6 +178,7 @@ class Scene:
                 f"terms: {terms}",
                 f"fixed vertices: {len(self.fixed)}" + (", moving" if self.motion is not None else ""),
                 *chosen,
+                "inputs: " + ", ".join(f"{name}{i.in_brackets}" for name, i in self.inputs.described.items()),
             ]
         )
 

@@ -356,6 +356,27 @@ def test_what_does_not_fit_is_refused(build, words):
         build()
 
 
+@pytest.mark.parametrize(
+    "material, units, wrong",
+    [
+        (
+            MATERIALS["tissue"](),
+            "mu [Pa], lam [Pa], k1 [Pa], k2 [-], fibre [-],",
+            "k2 must be finite: .* its unit is -",
+        ),
+        (MATERIALS["gent"](), "mu [Pa], limit [-], lam [Pa],", "lam must be finite: .* its unit is Pa"),
+        (MATERIALS["knowles"](), "poissons_ratio [-], b [-], n [-],", "n must be finite: .* its unit is -"),
+        (ViscousRubber(1e4, 0.3, 5.0), "viscosity [Pa s],", "viscosity must be finite: .* its unit is Pa s"),
+    ],
+)
+def test_numbers_have_units_of_their_own(material, units, wrong):
+    of = scene(material)
+    assert units in of.describe()
+    name = wrong.split(" ")[0]
+    with pytest.raises(ValueError, match=wrong):
+        rollout(of).forward(**{name: np.full(of.inputs.values[name].shape, np.nan)})
+
+
 def test_a_material_must_say_its_moduli():
     class Silent(Gent):
         spellings = (("c", "limit", "bulk"),)

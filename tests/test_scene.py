@@ -270,6 +270,8 @@ def test_describe():
         "Gravity(gravity=[ 0.  , -9.81,  0.  ])",
         "Drag(drag_rate=0.5)",
         "fixed vertices: 9, moving",
+        "inputs: initial_positions [m], initial_velocities [m/s], youngs_modulus [Pa], poissons_ratio [-], density [kg/m^3], "
+        "gravity [m/s^2], drag_rate [1/s], rest_positions [m], prescribed_motion [m]",
     ):
         assert part in text, text
     assert "terms: none" in scene().describe() and "fixed vertices: 0" in scene().describe()

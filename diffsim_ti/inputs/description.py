@@ -5,9 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-Shape = tuple[
-    int | str, ...
-]  # lengths: numbers, or "vertices", "tetrahedra" of the mesh, "steps", "steps + 1" of a run
+# lengths: numbers, or "vertices", "tetrahedra" of the mesh, "steps", "steps + 1" of a run
+Shape = tuple[int | str, ...]
 
 
 @dataclass(frozen=True)
@@ -70,6 +69,7 @@ class Input:
     shapes: those it may have, () for one number; default that of the value alone. A length "steps" means a run's number of
         steps at least, "steps + 1" exactly; other words that the mesh does not know stand for any length.
     change: (value, RunSize) -> how large a change of it matters, for `verify`.
+    unit: "-" of a number without dimension, "" where it is not said.
     label: how errors of a constructor call it; default `plain`. The unit stands behind if not in it.
     """
 
@@ -88,12 +88,17 @@ class Input:
             object.__setattr__(self, "shapes", self.shapes or (self.value.shape,))
         object.__setattr__(self, "plain", self.plain or self.name)
 
+    @property
+    def in_brackets(self) -> str:
+        """The unit behind a blank; nothing where it is not said."""
+        return f" [{self.unit}]" if self.unit else ""
+
     def check_given(self, kind: str) -> None:
         """Raise ValueError unless the value that a constructor was given (`kind`: its class) is finite and fits."""
         value, label = self.value, f"{kind}: {self.label or self.plain}"
-        unit = f" [{self.unit}]" if self.unit and "[" not in label else ""
+        unit = "" if "[" in label else self.in_brackets
         if not np.all(np.isfinite(value)):
-            raise ValueError(f"{kind}: {self.plain} must be finite, got {value}")
+            raise ValueError(f"{kind}: {self.plain} must be finite, got {value}{self.in_brackets}")
         if not self.fits(value.shape, {}):
             if len(self.shapes) > 1:
                 *others, last = map(_spelled, self.shapes)
@@ -107,12 +112,12 @@ class Input:
         value = frozen(value)
         finite = np.isfinite(value)
         if not finite.all():
-            raise ValueError(f"{name} must be finite: {(~finite).sum()} of {value.size} values are not")
+            unit = f"; its unit is {self.unit}" if self.unit else ""
+            raise ValueError(f"{name} must be finite: {(~finite).sum()} of {value.size} values are not{unit}")
         if not self.fits(value.shape, sizes):
             raise ValueError(f"{name}: expected {self.expected(sizes)}, got {value.shape}")
         if self.range and self.range.in_runs and not self.range.holds(value).all():
-            unit = f" [{self.unit}]" if self.unit else ""
-            raise ValueError(f"{name} must be {self.range.words}{unit}, got {value.min():g}")
+            raise ValueError(f"{name} must be {self.range.words}{self.in_brackets}, got {value.min():g}")
         return value
 
     def fits(self, shape: tuple[int, ...], sizes: Mapping[str, int]) -> bool:

@@ -111,9 +111,9 @@ class Inputs:
     def names(self) -> tuple[str, ...]:
         return tuple(self.values)
 
-    def names_of(self, place: int) -> dict[str, str]:
-        """{own name: name here} of the inputs of the term at a place of the scene's list."""
-        return dict(self._names[place])
+    def names_of(self, k: int) -> dict[str, str]:
+        """{own name: name here} of the inputs of term k of the scene's list."""
+        return dict(self._names[k])
 
     def at_times(self, times) -> dict[str, np.ndarray]:
         """The values of a run, with those that are sampled at its times [s]."""
@@ -144,11 +144,11 @@ class Inputs:
         """grad N_1..3 of each tetrahedron of the mesh [1/m], shape (num_tetrahedra, 3, 3)."""
         return self.derive(self.values).gradients
 
-    def derive_jvp(self, values: dict, dots: dict) -> Derived:
-        """Change of what kernels read for changes `dots` of some inputs."""
-        out, tangents = self.derive(values).zeros(), self.chain.jvp(values, dots)
+    def derive_jvp(self, values: dict, tangents: dict) -> Derived:
+        """Change of what kernels read for changes `tangents` of some inputs."""
+        out, changed = self.derive(values).zeros(), self.chain.jvp(values, tangents)
         for name in out.parts():
-            setattr(out, name, tangents.get(name, getattr(out, name)))
+            setattr(out, name, changed.get(name, getattr(out, name)))
         return out
 
     def derive_vjp(self, values: dict, adj: Derived, wanted) -> dict[str, np.ndarray]:

@@ -21,17 +21,20 @@ class Material(ABC):
     "default" serves the tetrahedra in none of the sets named.
 
     A subclass gives `law` and constant matrices `from_lame` (K x 2) from (mu, lam) to the law's K coefficients and
-    `to_lame` (2 x K) back. One with numbers of its own lists them in `spellings`, in the order of the law's coefficients;
-    a spelling may begin with (youngs_modulus, poissons_ratio), which become mu and lam. `shapes` names the numbers that are
-    vectors, such as {"fibre": (3,)}: one of shape (3,) for all, or (num_tetrahedra, 3). `from_own` is a constant matrix from
-    a spelling's numbers, vectors spread out, to the coefficients. `lame` says the moduli of small strains (those of
-    the stiffest direction), which the limit of explicit steps and the stiffness of a barrier are taken from.
+    `to_lame` (2 x K) back. One with numbers of its own lists them in `spellings`, in the order of the law's
+    coefficients; a spelling may begin with (youngs_modulus, poissons_ratio), which become mu and lam. `shapes` names
+    the numbers that are vectors, such as {"fibre": (3,)}: one of shape (3,) for all, or (num_tetrahedra, 3). `units`
+    says the units of numbers that are not in Pa, such as {"exponent": "-", "viscosity": "Pa s"}. `from_own` is a
+    constant matrix from a spelling's numbers, vectors spread out, to the coefficients. `lame` says the moduli of small
+    strains (those of the stiffest direction), which the limit of explicit steps and the stiffness of a barrier are
+    taken from.
 
     Raises ValueError with rule, value and remedy.
     """
 
     spellings = (("youngs_modulus", "poissons_ratio"), ("mu", "lam"))
     shapes: dict[str, tuple] = {}
+    units: dict[str, str] = {}
     from_lame = np.eye(2)
     to_lame: np.ndarray | None = None
     from_own: np.ndarray | None = None  # None: the coefficients are the numbers themselves
@@ -80,6 +83,10 @@ class Material(ABC):
         """Shape of a number where it is uniform, () unless it is a vector."""
         return self.shapes.get(name, ())
 
+    def unit_of(self, name: str) -> str:
+        """Unit of a number."""
+        return self.units.get(name, "-" if name == "poissons_ratio" else "Pa")
+
     @abstractmethod
     def law(self, precision: str):
         """The compile-time law, "f32" or "f64"; equal laws share compiled kernels."""
@@ -95,11 +102,8 @@ class Material(ABC):
 
     def described(self, mesh) -> list[Input]:
         """The inputs of a body of this material: each number (or vector) is one, or one per tetrahedron."""
-        unit, out = dict(poissons_ratio=""), []
-        for name, value in self.values(mesh).items():
-            one = self.shape_of(name)
-            out.append(Input(name, value, (one, ("tetrahedra", *one)), unit.get(name, "Pa")))
-        return out
+        shapes = {name: (self.shape_of(name), ("tetrahedra", *self.shape_of(name))) for name in self.inputs}
+        return [Input(name, value, shapes[name], self.unit_of(name)) for name, value in self.values(mesh).items()]
 
     def links(self) -> list[Link]:
         """From the inputs to what the law's kernels read: the links that write "coefficients"."""
@@ -110,7 +114,8 @@ class Material(ABC):
         for name, value in values.items():
             if not np.all(np.isfinite(value)):
                 bad = value[~np.isfinite(value)] if np.ndim(value) else value
-                raise ValueError(f"{name} must be finite, got {np.ravel(bad)[0]} ({np.size(bad)} of {np.size(value)})")
+                got = f"got {np.ravel(bad)[0]} ({np.size(bad)} of {np.size(value)})"
+                raise ValueError(f"{name} must be finite, {got}; its unit is {self.unit_of(name)}")
         if "youngs_modulus" in values:
             check_range("youngs_modulus", values["youngs_modulus"], 0, np.inf, False, "a stiffness [Pa]")
             remedy = '0.5 is incompressible; take 0.45, or up to 0.4999 with volume="patches" of the Scene'

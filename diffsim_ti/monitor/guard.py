@@ -126,7 +126,7 @@ class Guard:
         self.ws.place_obstacles(now)
         if self._stiffness is None:
             self._stiffness = stability.Stiffness(self.ws)
-        omega2 = self._stiffness.watch()
+        omega2 = self._stiffness.lower_bound()
         apart = self._flies_apart()
         if np.isfinite(omega2) and omega2 * solver.substep**2 <= 4 and not apart:
             near = omega2 * solver.substep**2 > 0.9**2 * 4

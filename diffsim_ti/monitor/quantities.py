@@ -84,8 +84,8 @@ def tetrahedron_fields(workspace) -> TetrahedronFields:
         out = SimpleNamespace(**{name: runtime.array(a.fp, a.num_places) for name in ("energy", "von_mises", "J")})
         return out, observer_kernels(a.law, a.features()).fields.bind(scene=a, at=workspace.state, out=out)
 
-    out, look = workspace.kept("fields", bind)
-    look(num_places=a.num_places)
+    out, launch = workspace.kept("fields", bind)
+    launch(num_places=a.num_places)
     return TetrahedronFields(
         *(runtime.fetch(x)[a.place].astype(np.float64) for x in (out.energy, out.von_mises, out.J))
     )
@@ -101,8 +101,8 @@ def barrier_energies(workspace) -> np.ndarray:
         kernel = potential_kernels(a.law, a.features(), workspace.parallel, a.in_lanes).barrier_energy
         return out, kernel.bind(scene=a, pass_=walls, at=workspace.state, out=out)
 
-    out, look = workspace.kept("barriers", bind)
-    look(num_items=a.num_items, num_tetrahedra=a.num_places, num_vertices=a.num_vertices, per_gamma=0.0)
+    out, launch = workspace.kept("barriers", bind)
+    launch(num_items=a.num_items, num_tetrahedra=a.num_places, num_vertices=a.num_vertices, per_gamma=0.0)
     return runtime.fetch(out.contact).astype(np.float64)
 
 

@@ -1,4 +1,4 @@
-"""How large a step may be: a bound by elements, the tight limit by Lanczos, and a watch during the run."""
+"""How large a step may be: a bound by elements, the tight limit by Lanczos, and a bound during the run."""
 
 from dataclasses import dataclass
 
@@ -78,7 +78,7 @@ class Stiffness:
         return -root * runtime.fetch(self.y)[0].astype(np.float64) * scale
 
     def largest(self, tolerance: float = 1e-3) -> tuple[float, float]:
-        """(largest eigenvalue omega^2 [1/s^2], residual bound) by Lanczos; keeps the vector for `watch`.
+        """(largest eigenvalue omega^2 [1/s^2], residual bound) by Lanczos; keeps the vector for `lower_bound`.
 
         Some eigenvalue lies within the residual of the Ritz value (Parlett, The Symmetric Eigenvalue Problem, 4.5).
         """
@@ -97,8 +97,8 @@ class Stiffness:
         residual = np.linalg.norm(self.product(self.vector) - value[0] * self.vector)
         return float(value[0]), float(residual)
 
-    def watch(self, products: int = 4) -> float:
-        """A lower bound of omega^2 at the present state: a few Lanczos steps from the last look's vector.
+    def lower_bound(self, products: int = 4) -> float:
+        """A lower bound of omega^2 at the present state: a few Lanczos steps from the vector of the last call.
 
         Something random is mixed in: a vector that has settled on one mode would not see another mode overtake it.
         """
@@ -126,7 +126,7 @@ class Stiffness:
         return float(values[-1])
 
     def worst_tetrahedron(self) -> int:
-        """The tetrahedron where the watched vector moves most relative to its size."""
+        """The tetrahedron where that vector moves most relative to its size."""
         mesh = self.ws.scene.mesh
         w = self.root * self.vector
         D = w[mesh.tetrahedra[:, 1:]] - w[mesh.tetrahedra[:, :1]]

@@ -119,7 +119,7 @@ class Rollout:
         u, v = (runtime.fetch(x) for x in self.sweep.workspace.frames)
         positions = (run.values["rest_positions"] + u).astype(u.dtype)
         inputs = run.values
-        if run.place is not None:
+        if run.start is not None:
             start = dict(initial_positions=positions[0], initial_velocities=v[0])
             inputs = inputs | {name: x.astype(np.float64) for name, x in start.items()}
         frames = Frames(positions, v, u, self.times, inputs, run.contact_resolution, run=run)
@@ -179,9 +179,9 @@ class Rollout:
         if unknown:
             raise ValueError(f"jvp: no input named {unknown[0]!r}; this rollout has {', '.join(self.inputs)}")
         values = frames.inputs
-        dots = {k: np.broadcast_to(np.asarray(x, np.float64), values[k].shape) for k, x in tangents.items()}
-        derived = self.scene.inputs.derive_jvp(values, dots)
-        return Change(*self.sweep.push_forward(frames.run, derived), dots)
+        tangents = {k: np.broadcast_to(np.asarray(x, np.float64), values[k].shape) for k, x in tangents.items()}
+        derived = self.scene.inputs.derive_jvp(values, tangents)
+        return Change(*self.sweep.push_forward(frames.run, derived), tangents)
 
     # ---- under ti.ad.Tape -------------------------------------------------------------------------------------------
 

@@ -12,11 +12,11 @@ from diffsim_ti.state.watch import ContactResolution
 class Run:
     """A forward run, by what it takes to do it again: the values of its inputs, and what else sets its start.
 
-    place: called with the workspace after the values are loaded; puts another state there, the same each time.
+    start: called with the workspace after the values are loaded; sets another start there, the same each time.
     """
 
     values: dict
-    place: Callable | None = None
+    start: Callable | None = None
     contact_resolution: ContactResolution | None = None
 
 

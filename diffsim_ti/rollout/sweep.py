@@ -71,9 +71,9 @@ class Sweep:
 
     # ---- forward ----------------------------------------------------------------------------------------------------
 
-    def run(self, values: dict, place: Callable | None = None) -> Run:
-        """Run from the scene's inputs with some values replaced; see `Run` for `place`."""
-        run = Run(self._checked(values), place)
+    def run(self, values: dict, start: Callable | None = None) -> Run:
+        """Run from the scene's inputs with some values replaced; see `Run` for `start`."""
+        run = Run(self._checked(values), start)
         self._forward(run)
         run.contact_resolution = self.workspace.watch.resolution()
         return run
@@ -116,8 +116,8 @@ class Sweep:
             else:
                 self.workspace.load(derived)
             self._loaded = values
-        if run.place is not None:
-            run.place(self.workspace)
+        if run.start is not None:
+            run.start(self.workspace)
             self.workspace.forget()
 
     def _forward(self, run: Run) -> None:

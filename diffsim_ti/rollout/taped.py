@@ -146,7 +146,7 @@ class TapeFace:
                 out[SPELLING.get(name, name)] = value
         return out, direct and bool(start)
 
-    def place(self, workspace) -> None:
+    def set_start(self, workspace) -> None:
         """Set the start of a workspace from the fields; what is loaded there is that of the scene."""
         fields, state = self._fields, workspace.state
         n = self.rollout.scene.mesh.num_vertices
@@ -197,7 +197,7 @@ class FieldStart:
 
     def __call__(self, workspace) -> None:
         if self._kept is None:
-            self.face.place(workspace)
+            self.face.set_start(workspace)
             self._kept = workspace.history(1)
             workspace.save(self._kept, 0)
         else:

@@ -167,11 +167,11 @@ class TensorRollout:
             if name == "initial_displacements":
                 name, value = "initial_positions", self.rollout.values["rest_positions"] + value
             values[name] = value
-        place = TensorStart(self, start) if start else None
-        run = sweep.run(values, place)
+        from_tensors = TensorStart(self, start) if start else None
+        run = sweep.run(values, from_tensors)
         if not shares_memory():
             return run, *(torch.from_numpy(runtime.fetch(x)) for x in sweep.workspace.frames)
-        device = place.device if place else torch.device("cpu")
+        device = from_tensors.device if from_tensors else torch.device("cpu")
         frames = tuple(torch.empty(self.shape, dtype=self.dtype, device=device) for _ in range(2))
         self.copy("out", frames, sweep.workspace.frames)
         return run, *frames

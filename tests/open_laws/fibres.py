@@ -35,6 +35,7 @@ class FibreTissue(Material):
     """
 
     spellings = (("mu", "lam", "k1", "k2", "fibre"),)
+    units = {"k2": "-", "fibre": "-"}
     shapes = {"fibre": (3,)}
 
     def law(self, precision):

@@ -27,6 +27,7 @@ class Gent(Material):
     """mu [Pa], limit [-], lam [Pa]. Gent 1996, A new constitutive relation for rubber, doi:10.5254/1.3538357."""
 
     spellings = (("mu", "limit", "lam"),)
+    units = {"limit": "-"}
 
     def law(self, precision):
         return GentLaw(precision)

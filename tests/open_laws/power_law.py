@@ -22,6 +22,7 @@ class Knowles(Material):
     """youngs_modulus [Pa], poissons_ratio, b, n [-]. Knowles 1977, doi:10.1007/BF00017296."""
 
     spellings = (("youngs_modulus", "poissons_ratio", "b", "n"),)
+    units = {"b": "-", "n": "-"}
 
     def law(self, precision):
         return PowerLaw(precision)

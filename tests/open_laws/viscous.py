@@ -30,6 +30,7 @@ class ViscousRubber(Material):
     """youngs_modulus [Pa], poissons_ratio [-], viscosity eta [Pa s]: Kelvin, Voigt."""
 
     spellings = (("youngs_modulus", "poissons_ratio", "viscosity"),)
+    units = {"viscosity": "Pa s"}
 
     def law(self, precision):
         return ViscousLaw(precision)
