@@ -60,30 +60,30 @@ def checked_tetrahedra(tetrahedra, num_vertices: int) -> np.ndarray:
     return tetrahedra
 
 
-def check_not_flat(vertices: np.ndarray, tetrahedra: np.ndarray, det: np.ndarray, longest: np.ndarray) -> None:
-    """ValueError where |det| <= (1e-12 L + 8 eps max|x|) L^2, L the longest edge and x the coordinates."""
+def check_not_flat(vertices: np.ndarray, tetrahedra: np.ndarray, volumes: np.ndarray, longest: np.ndarray) -> None:
+    """ValueError where 6 |V| <= (1e-12 L + 8 eps max|x|) L^2, L the longest edge and x the coordinates."""
     size = np.abs(vertices).max(1)[tetrahedra].max(1)
-    flat = np.nonzero(np.abs(det) <= (FLAT * longest + FLAT_ROUNDING * size) * longest**2)[0]
+    flat = np.nonzero(6 * np.abs(volumes) <= (FLAT * longest + FLAT_ROUNDING * size) * longest**2)[0]
     if len(flat):
         first = flat[0]
         raise ValueError(
-            f"tetrahedron {first} is flat: volume {det[first] / 6:.3g} m^3, longest edge {longest[first]:.3g} m, "
+            f"tetrahedron {first} is flat: volume {volumes[first]:.3g} m^3, longest edge {longest[first]:.3g} m, "
             f"vertices {tetrahedra[first].tolist()} ({len(flat)} such tetrahedra); remove them or remesh"
         )
 
 
-def oriented(tetrahedra: np.ndarray, det: np.ndarray, fix_orientation: bool) -> np.ndarray:
+def oriented(tetrahedra: np.ndarray, volumes: np.ndarray, fix_orientation: bool) -> np.ndarray:
     """The tetrahedra, all of positive volume: swapped where asked to, otherwise a ValueError with the worst."""
-    inside_out = np.nonzero(det < 0)[0]
+    inside_out = np.nonzero(volumes < 0)[0]
     if len(inside_out) == 0:
         return tetrahedra
     if not fix_orientation:
-        worst = int(np.argmin(det))
+        worst = int(np.argmin(volumes))
         subject = f"tetrahedron {worst} is inside-out"
         if len(inside_out) > 1:
-            subject = f"{len(inside_out)} of {len(det)} tetrahedra are inside-out, worst is tetrahedron {worst}"
+            subject = f"{len(inside_out)} of {len(volumes)} tetrahedra are inside-out, worst is tetrahedron {worst}"
         raise ValueError(
-            f"{subject} (volume {det[worst] / 6:.3g} m^3); pass fix_orientation=True or swap two of its vertices"
+            f"{subject} (volume {volumes[worst]:.3g} m^3); pass fix_orientation=True or swap two of its vertices"
         )
     tetrahedra = tetrahedra.copy()
     tetrahedra[inside_out, 2:] = tetrahedra[inside_out, :1:-1]

@@ -9,14 +9,6 @@ FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
 EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
 
 
-def determinants(vertices: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
-    """det [x1 - x0, x2 - x0, x3 - x0] = 6 V per tetrahedron, signed, [m^3]."""
-    (ax, ay, az), (bx, by, bz), (cx, cy, cz) = (
-        (vertices[tetrahedra[:, a]] - vertices[tetrahedra[:, 0]]).T for a in (1, 2, 3)
-    )
-    return ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx)
-
-
 def squared_edges(vertices: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
     """Squared edge lengths, shape (num_tetrahedra, 6) [m^2], edges in the order of EDGES."""
     out = np.empty((len(tetrahedra), 6))
@@ -31,10 +23,20 @@ def edge_matrices(vertices: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
     return np.moveaxis(vertices[tetrahedra[:, 1:]] - vertices[tetrahedra[:, :1]], 1, 2)
 
 
-def shape_gradients(vertices: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
-    """grad N_a [1/m], shape (num_tetrahedra, 4, 3); rows 1..3 invert the edge matrix, row 0 is their negative sum."""
-    rows = np.linalg.inv(edge_matrices(vertices, tetrahedra))
-    return np.concatenate([-rows.sum(1, keepdims=True), rows], 1)
+def inverse_edges(vertices: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
+    """D^-1 [1/m]; its rows are grad N_1..3."""
+    return np.linalg.inv(edge_matrices(vertices, tetrahedra))
+
+
+def signed_volumes(D: np.ndarray) -> np.ndarray:
+    """V = det D / 6 of each edge matrix [m^3], negative where a tetrahedron is turned inside out."""
+    a, b, c = np.moveaxis(D, 2, 0)
+    return np.einsum("ei,ei->e", a, np.cross(b, c)) / 6
+
+
+def shape_gradients(inverse_D: np.ndarray) -> np.ndarray:
+    """grad N_a [1/m], shape (num_tetrahedra, 4, 3): rows 1..3 are those of D^-1, row 0 is their negative sum."""
+    return np.concatenate([-inverse_D.sum(1, keepdims=True), inverse_D], 1)
 
 
 def rotation_matrix(rotation, angle: float | None) -> np.ndarray:

@@ -5,7 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
-from diffsim_ti.mesh.geometry import FACES, shape_gradients
+from diffsim_ti.mesh.geometry import FACES
 
 TOLERANCE = 1e-9  # how far below zero a barycentric coordinate may fall to round-off
 
@@ -62,7 +62,7 @@ def _containing(mesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     corners = mesh.vertices[mesh.tetrahedra]
     centres = corners.mean(1)
     reach = np.linalg.norm(corners - centres[:, None], axis=2).max(1)
-    gradients = shape_gradients(mesh.vertices, mesh.tetrahedra)
+    gradients = mesh.shape_gradients
     found, weights = np.full(len(points), -1), np.zeros((len(points), 4))
     # the trees of tetrahedra of one size each, so that a few large ones do not make all of the small ones candidates
     classes = np.floor(np.log2(reach / reach.min())).astype(int)
@@ -92,7 +92,7 @@ def _nearest(mesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarr
         best = int(((on - point) ** 2).sum(1).argmin())
         places[k], near[k] = on[best], owner[best]
     X = mesh.vertices[mesh.tetrahedra[near]]
-    gradients = shape_gradients(mesh.vertices, mesh.tetrahedra[near])
+    gradients = mesh.shape_gradients[near]
     return places, near, 0.25 + np.einsum("eai,ei->ea", gradients, places - X.mean(1))
 
 

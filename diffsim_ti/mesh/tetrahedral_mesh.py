@@ -44,10 +44,9 @@ class TetrahedralMesh:
     ):
         self._vertices = checks.checked_vertices(vertices)
         self._tetrahedra = checks.checked_tetrahedra(tetrahedra, len(self._vertices))
-        det, longest = self._determinants()
-        checks.check_not_flat(self._vertices, self._tetrahedra, det, longest)
-        self._tetrahedra = checks.oriented(self._tetrahedra, det, fix_orientation)
-        self._volumes = np.abs(det) / 6
+        volumes = self._checked_volumes()
+        self._tetrahedra = checks.oriented(self._tetrahedra, volumes, fix_orientation)
+        self._volumes = np.abs(volumes)
         self._surface_triangles = checks.surface_of(self._tetrahedra, self.num_vertices)
         self._vertex_sets = checked_sets(vertex_sets, self.num_vertices, "vertex")
         self._tetrahedron_sets = checked_sets(tetrahedron_sets, self.num_tetrahedra, "tetrahedron")
@@ -210,7 +209,7 @@ class TetrahedralMesh:
     @cached_property
     def shape_gradients(self) -> np.ndarray:
         """grad N_a [1/m], shape (num_tetrahedra, 4, 3); displacement gradient = sum_a u_a (x) grad N_a."""
-        return _frozen(geometry.shape_gradients(self.vertices, self.tetrahedra))
+        return _frozen(geometry.shape_gradients(geometry.inverse_edges(self.vertices, self.tetrahedra)))
 
     @cached_property
     def altitudes(self) -> np.ndarray:
@@ -312,9 +311,12 @@ class TetrahedralMesh:
     def _compute_rest_state(self) -> None:
         """Does nothing: the rest state is always ready. The seeds call it."""
 
-    def _determinants(self) -> tuple[np.ndarray, np.ndarray]:
+    def _checked_volumes(self) -> np.ndarray:
+        """Signed volumes [m^3]; ValueError for a flat tetrahedron."""
+        volumes = geometry.signed_volumes(geometry.edge_matrices(self._vertices, self._tetrahedra))
         longest = np.sqrt(geometry.squared_edges(self._vertices, self._tetrahedra).max(1))
-        return geometry.determinants(self._vertices, self._tetrahedra), longest
+        checks.check_not_flat(self._vertices, self._tetrahedra, volumes, longest)
+        return volumes
 
     def _changed(self, **parts) -> "TetrahedralMesh":
         new = copy.copy(self)
@@ -325,10 +327,8 @@ class TetrahedralMesh:
         """The same connectivity at other positions; checked, and nothing cached that depends on positions."""
         new = object.__new__(type(self))
         new._vertices, new._tetrahedra = checks.checked_vertices(vertices), self._tetrahedra
-        det, longest = new._determinants()
-        checks.check_not_flat(new._vertices, new._tetrahedra, det, longest)
-        checks.oriented(new._tetrahedra, det, fix_orientation=False)
-        new._volumes, new._surface_triangles = det / 6, self._surface_triangles
+        new._volumes, new._surface_triangles = new._checked_volumes(), self._surface_triangles
+        checks.oriented(new._tetrahedra, new._volumes, fix_orientation=False)
         new._vertex_sets, new._tetrahedron_sets = self._vertex_sets, self._tetrahedron_sets
         new._freeze()
         return new

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from diffsim_ti import runtime
+from diffsim_ti.mesh.geometry import shape_gradients
 from diffsim_ti.mesh.patches import volume_patches
 from diffsim_ti.potential.kernels import potential_kernels
 
@@ -34,12 +35,11 @@ def element_limit(scene, values: dict | None = None) -> StepLimit:
     values, material = scene.inputs.values if values is None else values, scene.material
     mu, lam = material.lame({name: values[name] for name in material.inputs})
     derived = scene.inputs.derive(values)
-    B = derived.gradients
     if scene.volume == "patches" and np.ndim(lam):
         patches = volume_patches(scene.mesh)
         means = np.bincount(patches, lam * derived.volumes) / np.bincount(patches, derived.volumes)
         lam = means[patches]
-    N = np.concatenate([-B.sum(1, keepdims=True), B], 1)
+    N = shape_gradients(derived.gradients)
     largest = np.linalg.eigvalsh(np.einsum("eai,eaj->eij", N, N))[:, -1]
     omega2 = 4 / values["density"] * (np.maximum(lam, 0) * (N**2).sum((1, 2)) + 2 * mu * largest)
     worst = int(np.argmax(omega2))

@@ -4,6 +4,7 @@ from copy import copy
 
 import numpy as np
 
+from diffsim_ti.mesh.geometry import inverse_edges
 from diffsim_ti.outputs.output import Change, Output
 
 
@@ -40,9 +41,9 @@ class MaterialPoints(Output):
 
     def _weights(self, frames) -> tuple[np.ndarray, np.ndarray]:
         """(B, N): edge matrices inverted, shape (num_points, 3, 3), and coordinates, (num_points, 4), at the rest shape."""
-        X = frames.inputs["rest_positions"][self.located.vertices]
-        B = np.linalg.inv(np.swapaxes(X[:, 1:] - X[:, :1], 1, 2))
-        inner = np.einsum("pij,pj->pi", B, self.points - X[:, 0])
+        X, corners = frames.inputs["rest_positions"], self.located.vertices
+        B = inverse_edges(X, corners)
+        inner = np.einsum("pij,pj->pi", B, self.points - X[corners[:, 0]])
         return B, np.concatenate([1 - inner.sum(1, keepdims=True), inner], 1)
 
     def _deformation(self, frames, B: np.ndarray) -> np.ndarray:

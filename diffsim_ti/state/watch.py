@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from diffsim_ti import runtime
+from diffsim_ti.terms.obstacles.barrier import beta
 
 # What keeps the gradient of a bounce within 10 %, measured over 400 starting heights (tests/test_contact_gradients.py): for
 # bounces that use a tenth of the width or more, and a flight of a few widths after them. An error in velocity grows with
@@ -122,4 +123,4 @@ class ContactWatch:
         ]
         energy = arrays.values.mass * travel**2 / (2 * h * h * np.array(stiffness)[:, None])
         s = np.linspace(1, 1e-3, 4096)
-        return np.interp(energy, -((s - 1) ** 2) * np.log(s), 1 - s) + 1e-12
+        return np.interp(energy, beta(s), 1 - s) + 1e-12

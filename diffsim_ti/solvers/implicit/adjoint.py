@@ -237,7 +237,7 @@ class ImplicitTangent(_Passes):
         if self.before is not None:
             dx = dx + s.a1 * self.tangent_before[0]
             dy = dy + s.b1 * self.tangent_before[1] + db1 * self.before[1]
-        place, speed = self._prescribed(j)
+        place, speed = ws.prescribed(j, tangent)
         held = np.zeros_like(self.du)
         held[a.fixed] = self.du[a.fixed] if place is None else self.du[a.fixed] + (place - self.du[a.fixed]) / s.c0
         runtime.fill(ws.potential.w, held[None])
@@ -270,13 +270,6 @@ class ImplicitTangent(_Passes):
         if s.static:
             self.dv = np.zeros_like(self.dv)
         self.tangent_before = before
-
-    def _prescribed(self, j: int):
-        motion, schedule = self.tangent.motion, self.ws.solver.schedule
-        if motion is None:
-            return None, None
-        anchor = self.tangent.displacement[self.ws.arrays.fixed]
-        return anchor + schedule.place(motion, j, schedule.end(j)), schedule.rate(motion, j)
 
     def save_frame(self, frame: int) -> None:
         """Copy the current tangent to a frame."""

@@ -6,6 +6,7 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.contact.implicit_pairs import ImplicitPairs
+from diffsim_ti.inputs import Derived
 from diffsim_ti.monitor.energy_watch import EnergyWatch
 from diffsim_ti.potential.potential import Potential
 from diffsim_ti.solvers.implicit.linear import NotConverged
@@ -167,7 +168,7 @@ class ImplicitWorkspace(Workspace):
     def _pass(self, j, u, v, before):
         stage = self.solver.stage(self.rate, before is None)
         x, y = self.inertial(stage, u, v, before)
-        place, speed = self.prescribed(j)
+        place, speed = self.prescribed(j, self.arrays.values)
         fixed = self.arrays.fixed
         mass, loads = stage.inertia * self.mass, self.loads(j, stage)
         inertial = x + stage.gamma * y
@@ -261,13 +262,15 @@ class ImplicitWorkspace(Workspace):
                 schedule.add_place(rows, j, schedule.begin(j), by_before)
                 schedule.add_rate(rows, j, by_speed)
 
-    def prescribed(self, j: int) -> tuple:
-        """(displacement [m], velocity [m/s]) of the fixed vertices after pass j; None where they are held."""
-        values, schedule = self.arrays.values, self.solver.schedule
-        if values.motion is None:
+    def prescribed(self, j: int, of: Derived) -> tuple:
+        """(displacement [m], velocity [m/s]) of the fixed vertices after pass j; None where they are held.
+
+        of: the values of the run, or their tangent: what is prescribed is linear in them.
+        """
+        if of.motion is None:
             return None, None
-        anchor = values.displacement[self.arrays.fixed]
-        return anchor + schedule.place(values.motion, j, schedule.end(j)), schedule.rate(values.motion, j)
+        schedule, anchor = self.solver.schedule, of.displacement[self.arrays.fixed]
+        return anchor + schedule.place(of.motion, j, schedule.end(j)), schedule.rate(of.motion, j)
 
     def loads(self, j: int, stage: Stage) -> np.ndarray:
         """Dead loads on each vertex [N]: weight and external forces; statics lay them on in substeps."""
