@@ -8,7 +8,7 @@ import numpy as np
 from diffsim_ti.inputs import RunSize
 from diffsim_ti.rollout import Frames, Rollout
 
-Loss = Callable[[Frames], tuple]
+Loss = Callable[[Frames], tuple]  # frames -> (value, gradient by positions, by velocities[, {output: gradient by it}])
 
 
 @dataclass
@@ -80,15 +80,29 @@ def _random_direction(rollout: Rollout, name: str, rng) -> np.ndarray:
     return rng.standard_normal(rollout.values[name].shape) * input_scale(rollout, name)
 
 
+def pull_back(rollout: Rollout, frames: Frames, loss: Loss) -> dict[str, np.ndarray]:
+    """Gradients of a loss by every wanted input."""
+    _, *parts = loss(frames)
+    outputs = parts.pop() if isinstance(parts[-1], dict) else {}
+    return rollout.vjp(frames, *parts, **outputs)
+
+
 def linear_loss(rollout: Rollout, seed: int = 0) -> Loss:
-    """A loss that no symmetry hides from: w . positions + z . velocities + |positions|^2 / 2 with random w, z."""
+    """A loss that no symmetry hides from: w . positions + z . velocities + |positions|^2 / 2 with random w, z.
+
+    Where the rollout computes further outputs it adds r . output for each of them, r random and in units of its size.
+    """
     rng = np.random.default_rng(seed)
     shape = (rollout.num_frames, rollout.scene.mesh.num_vertices, 3)
     w, z = rng.standard_normal(shape), rng.standard_normal(shape)
+    first = rollout.forward().outputs if rollout.computed else {}
+    weights = {name: rng.standard_normal(y.shape) / (np.abs(y).max(initial=0.0) or 1.0) for name, y in first.items()}
 
     def loss(frames: Frames):
         x, v = frames.positions.astype(np.float64), frames.velocities.astype(np.float64)
-        return float((w * x).sum() + (z * v).sum() + 0.5 * (x**2).sum()), w + x, z
+        value = (w * x).sum() + (z * v).sum() + 0.5 * (x**2).sum()
+        value += sum((r * frames[name]).sum() for name, r in weights.items())
+        return (float(value), w + x, z, weights) if weights else (float(value), w + x, z)
 
     return loss
 
@@ -96,19 +110,23 @@ def linear_loss(rollout: Rollout, seed: int = 0) -> Loss:
 def dot_product_test(rollout: Rollout, inputs=None, seed: int = 0, **values) -> float:
     """Relative difference of <w, J v> and <J^T w, v> for random v in all inputs and random w in all frames.
 
+    Further outputs of the rollout are tried each by itself, since they have other units; the largest difference counts.
     Round-off alone (1e-13 in f64, 1e-5 in f32) if `vjp` is the transpose of the tangent.
     """
     rng = np.random.default_rng(seed)
     frames = rollout.forward(**values)
     names = rollout.wanted if inputs is None else tuple(inputs)
     directions = {name: _random_direction(rollout, name, rng) for name in names}
-    w, z = (rng.standard_normal(frames.positions.shape) for _ in range(2))
-    dx, dv = rollout.jvp(frames, **directions)
-    gradients = rollout.vjp(frames, w, z)
-    forward = float((w * dx).sum() + (z * dv).sum())
-    terms = [float((gradients[name] * directions[name]).sum()) for name in names]
-    scale = max(np.abs(w * dx).sum() + np.abs(z * dv).sum(), 1e-300) / np.sqrt(w.size)
-    return abs(forward - sum(terms)) / max(abs(forward), scale)
+    changes, differences = rollout.tangents(frames, **directions), []
+    for outputs in (("positions", "velocities"), *((name,) for name in rollout.computed)):
+        seeds = {output: rng.standard_normal(frames[output].shape) for output in outputs}
+        gradients = rollout.vjp(frames, **seeds)
+        forward = float(sum((seeds[output] * changes[output]).sum() for output in outputs))
+        reverse = sum(float((gradients[name] * directions[name]).sum()) for name in names)
+        size = sum(np.abs(seeds[output] * changes[output]).sum() for output in outputs)
+        scale = max(size, 1e-300) / np.sqrt(seeds[outputs[0]].size)
+        differences.append(abs(forward - reverse) / max(abs(forward), scale))
+    return max(differences)
 
 
 @dataclass
@@ -156,7 +174,8 @@ def check_gradients(
 ) -> GradientReport:
     """Check the gradient by every input against extrapolated central differences and by its Taylor rate; print the table.
 
-    loss(frames) -> (value, gradient by positions, gradient by velocities or None); default `linear_loss`.
+    loss(frames) -> (value, gradient by positions, gradient by velocities or None), and a dict {output: gradient by it}
+    where it names further outputs; default `linear_loss`, which names all.
     Differences and Taylor rates are taken in float64, of an f32 scene too: differences in f32 see nothing.
     tolerance: largest relative error, default 1e-6 in f64 (what differences resolve on a long run), 1e-3 in f32.
     A row passes if its error is within the tolerance and its Taylor rate is at least 1.9.
@@ -167,8 +186,7 @@ def check_gradients(
     tolerance = tolerance or (1e-3 if single else 1e-6)
     rng = np.random.default_rng(seed + 1)
     frames = rollout.forward()
-    _, *adjoints = loss(frames)
-    gradients = rollout.vjp(frames, *adjoints)
+    gradients = pull_back(rollout, frames, loss)
     report = GradientReport()
     for name in rollout.wanted if inputs is None else inputs:
         direction, x = _random_direction(rollout, name, rng), rollout.values[name]
@@ -179,8 +197,7 @@ def check_gradients(
         analytic = float((gradients[name] * direction).sum())
         exact = analytic
         if single:
-            exact_frames = double.forward()
-            exact = float((double.vjp(exact_frames, *loss(exact_frames)[1:])[name] * direction).sum())
+            exact = float((pull_back(double, double.forward(), loss)[name] * direction).sum())
         differences, uncertainty = central_difference(along)
         for epsilon in (0.1, 0.01, 0.001):  # where the loss is strongly curved only a closer look sees the order
             taylor = taylor_test(along, 0.0, exact, 1.0, epsilon)
@@ -296,7 +313,7 @@ def hessian_product(rollout: Rollout, loss: Loss, direction: dict, epsilon: floa
     out = {}
     for sign in (1, -1):
         frames = rollout.forward(**values | {n: base[n] + sign * epsilon * np.asarray(d) for n, d in direction.items()})
-        gradients = rollout.vjp(frames, *loss(frames)[1:])
+        gradients = pull_back(rollout, frames, loss)
         for name in direction:
             out[name] = out.get(name, 0.0) + sign * gradients[name] / (2 * epsilon)
     return out

@@ -103,7 +103,7 @@ def outputs():
 
 def small(solver=ds.SemiImplicitSolver, scene=None, steps=STEPS, **options):
     scene = full_scene(steps=steps) if scene is None else scene
-    return rollout_of(scene, solver, steps, save_every=3, outputs=outputs(), **options)
+    return rollout_of(scene, solver, steps, save_every=3, **dict(outputs=outputs()) | options)
 
 
 @by_solver
@@ -143,6 +143,42 @@ def test_gradients_agree_with_differences(solver, name, key):
         lambda t: (rollout.forward(**{key: base + t * direction})[name] * seed).sum()
     )
     assert slope == pytest.approx(differences, rel=1e-6)
+
+
+class Wrong(KineticEnergy):
+    """A transpose that is right by velocities, and leaves out what it owes the density."""
+
+    def settled(self, scene):
+        out = super().settled(scene)
+        out.__class__ = Wrong
+        return out
+
+    def vjp(self, frames, seed):
+        change = super().vjp(frames, seed)
+        del change.inputs["density"]
+        return change
+
+
+def test_checks_see_outputs():
+    right, wrong = (small(outputs=[of]) for of in (KineticEnergy("ymax"), Wrong("ymax")))
+    assert verify.dot_product_test(right) <= 1e-11 and verify.dot_product_test(wrong) >= 1e-4
+    assert verify.dot_product_test(wrong, ["gravity", "youngs_modulus"]) <= 1e-11  # which it does not owe anything
+    names = ["density", "gravity", "rest_positions"]
+    options = dict(inputs=names, verbose=False)
+    assert ds.check_gradients(right, **options).passed
+    assert [row.passed for row in ds.check_gradients(wrong, **options).rows] == [False, True, True]
+
+
+def test_a_loss_may_name_outputs_in_checks():
+    rollout = small()
+
+    def loss(frames):
+        energy = frames["kinetic_energy"]
+        return float((energy**2).sum()), None, None, {"kinetic_energy": 2 * energy}
+
+    assert ds.check_gradients(rollout, loss, inputs=["density", "gravity", "youngs_modulus"], verbose=False).passed
+    direction = {"gravity": np.array([0.0, 1.0, 0.0])}
+    assert np.abs(verify.hessian_product(rollout, loss, direction)["gravity"]).max() > 0
 
 
 def test_seeds_of_several_outputs_add_up():

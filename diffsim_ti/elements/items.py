@@ -11,7 +11,7 @@ from functools import cached_property
 
 import taichi as ti
 
-from diffsim_ti.runtime import LANES, at, let
+from diffsim_ti.runtime import LANES, assign, at, let
 
 
 @dataclass(frozen=True)
@@ -51,16 +51,16 @@ class Block(Items):
         for a in range(4):
             for lane in range(LANES):
                 force = self.vector(*(at(forces[a][d], lane) for d in range(3)), zero)
-                at(corner, 4 * LANES * item + 4 * lane + a)._assign(force)
+                assign(at(corner, 4 * LANES * item + 4 * lane + a), force)
 
     def put(self, array, rows: int, item, first, numbers):
         for k, number in enumerate(numbers):
-            at(array, rows * item + first + k)._assign(number)
+            assign(at(array, rows * item + first + k), number)
 
     def add(self, array, rows: int, item, numbers):
         for k, number in enumerate(numbers):
             target = at(array, rows * item + k)
-            target._assign(target + number)
+            assign(target, target + number)
 
 
 class Single(Items):
@@ -79,13 +79,13 @@ class Single(Items):
 
     def store(self, corner, item, forces, zero):
         for a in range(4):
-            at(corner, 4 * item + a)._assign(self.vector(*forces[a], zero))
+            assign(at(corner, 4 * item + a), self.vector(*forces[a], zero))
 
     def put(self, array, rows: int, item, first, numbers):
         for k, number in enumerate(numbers):
-            at(at(array, rows * (item // LANES) + first + k), item % LANES)._assign(number)
+            assign(at(at(array, rows * (item // LANES) + first + k), item % LANES), number)
 
     def add(self, array, rows: int, item, numbers):
         for k, number in enumerate(numbers):
             target = at(at(array, rows * (item // LANES) + k), item % LANES)
-            target._assign(target + number)
+            assign(target, target + number)

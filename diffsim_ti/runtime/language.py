@@ -22,6 +22,11 @@ def at(array, *index):
     return impl.subscript(None, array, *index)
 
 
+def assign(target, value) -> None:
+    """target = value in a traced function, where the target is a variable or an element of an array."""
+    target._assign(value)
+
+
 def num_lanes(value) -> int:
     """How many lanes a number of a kernel has, 0 if it is a scalar."""
     return value.get_shape()[0] if value.is_tensor() else 0

@@ -10,7 +10,7 @@ from diffsim_ti.differentiation import Graph
 from diffsim_ti.inputs import NOT_NEGATIVE, Input
 from diffsim_ti.inputs.description import length_per_step
 from diffsim_ti.materials.calculus.tensor import sum_of
-from diffsim_ti.runtime import at, let, traced
+from diffsim_ti.runtime import assign, at, let, traced
 from diffsim_ti.terms.described import positive
 from diffsim_ti.terms.gravity import Gravity
 from diffsim_ti.terms.motion import sampled
@@ -268,7 +268,7 @@ class ObstacleForce(VertexForce):
         g, p, _, f = self._record_force(parameters, first, X, u)
         rows = [g.reverse([(f[d], g.one())], p) for d in range(3)]
         for m, target in enumerate(by):
-            target._assign(self._vector([row[m] for row in rows]))
+            assign(target, self._vector([row[m] for row in rows]))
 
     # ---- friction as a stage of explicit passes ----------------------------------------------------------------------
 
