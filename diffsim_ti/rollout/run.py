@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 from diffsim_ti.inputs import Derived
@@ -12,12 +13,18 @@ from diffsim_ti.state.watch import ContactResolution
 class Run:
     """A forward run, by what it takes to do it again: the values of its inputs, and what else sets its start.
 
+    contacts: what it noted of them, worked out when asked for.
     start: called with the workspace after the values are loaded; sets another start there, the same each time.
     """
 
     values: dict
     start: Callable | None = None
-    contact_resolution: ContactResolution | None = None
+    contacts: Callable[[], ContactResolution] | None = None
+
+    @cached_property
+    def contact_resolution(self) -> ContactResolution:
+        """How near it came to obstacles, and how finely its substeps resolved that."""
+        return self.contacts()
 
 
 class Seed(Protocol):

@@ -75,7 +75,7 @@ class Sweep:
         """Run from the scene's inputs with some values replaced; see `Run` for `start`."""
         run = Run(self._checked(values), start)
         self._forward(run)
-        run.contact_resolution = self.workspace.watch.resolution()
+        run.contacts = self.workspace.watch.seen_so_far()
         return run
 
     def bring_back(self, run: Run) -> None:

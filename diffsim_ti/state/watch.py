@@ -1,17 +1,22 @@
 """What contacts did during a run, noted by the passes: smallest gaps, and how finely the steps resolve them."""
 
 import weakref
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from diffsim_ti import runtime
+from diffsim_ti.inputs import Derived
 from diffsim_ti.terms.obstacles.barrier import beta
 
 # What keeps the gradient of a bounce within 10 %, measured over 400 starting heights (tests/test_contact_gradients.py): for
 # bounces that use a tenth of the width or more, and a flight of a few widths after them. An error in velocity grows with
 # the time that is left, and grazing bounces are the worst.
 LARGEST_OMEGA_DT, LARGEST_SHARE = 0.5, 0.1
+
+DEPTHS = 1 - np.linspace(1, 1e-3, 4096)  # in a barrier, in widths, and the energy that it takes to come there
+STOPPED = beta(1 - DEPTHS)
 
 
 @dataclass(frozen=True)
@@ -62,7 +67,8 @@ class ContactWatch:
 
     def __init__(self, workspace):
         self.ws, arrays = weakref.proxy(workspace), workspace.arrays  # which holds this: no circle
-        self.contacts = arrays.contacts
+        self.contacts, self._obstacles = arrays.contacts, arrays.obstacles
+        self._shown = [repr(term) for term in self.contacts]
         n = arrays.num_vertices if self.contacts else 1
         self.seen = runtime.array(arrays.fp, 3 * len(self.contacts), n)
         self.clear()
@@ -98,29 +104,34 @@ class ContactWatch:
 
     def resolution(self) -> ContactResolution:
         """What was seen since the run's start."""
-        h = self.ws.solver.substep
+        return self.seen_so_far()()
+
+    def seen_so_far(self) -> Callable[[], ContactResolution]:
+        """The same, worked out when it is asked for: most runs never are."""
+        rows, values, h = self.rows(), self.ws.arrays.values, self.ws.solver.substep
+        return lambda: self._resolution(rows, values, h)
+
+    def _resolution(self, rows: np.ndarray, values: Derived, h: float) -> ContactResolution:
         if not self.contacts:
             return ContactResolution(0.0, 0.0, 0.0, float("inf"), None, None, h)
-        rows = self.rows().astype(np.float64)
+        rows = rows.astype(np.float64)
         gaps, travel = rows[::3], rows[2::3]
         k, i = (int(x) for x in np.unravel_index(np.argmin(gaps), gaps.shape))
         seen = np.isfinite(gaps[k, i])
         return ContactResolution(
             float(np.sqrt(rows[1::3].max())),
             float(travel.max()),
-            float((travel / self._depths(travel)).max()),
+            float((travel / self._depths(travel, values, h)).max()),
             float(gaps[k, i]),
             i if seen else None,
-            repr(self.contacts[k]) if seen else None,
+            self._shown[k] if seen else None,
             h,
         )
 
-    def _depths(self, travel: np.ndarray) -> np.ndarray:
+    def _depths(self, travel: np.ndarray, values: Derived, h: float) -> np.ndarray:
         """Depths in the barriers, in widths, that stop vertices with these speeds: m v^2 / 2 = k w^2 beta(1 - depth)."""
-        arrays, h = self.ws.arrays, self.ws.solver.substep
         stiffness = [
-            arrays.values.parameters[first + twin.count] if twin.watched else 1.0 for twin, first, _ in arrays.obstacles
+            values.parameters[first + twin.count] if twin.watched else 1.0 for twin, first, _ in self._obstacles
         ]
-        energy = arrays.values.mass * travel**2 / (2 * h * h * np.array(stiffness)[:, None])
-        s = np.linspace(1, 1e-3, 4096)
-        return np.interp(energy, beta(s), 1 - s) + 1e-12
+        energy = values.mass * travel**2 / (2 * h * h * np.array(stiffness)[:, None])
+        return np.interp(energy, STOPPED, DEPTHS) + 1e-12
