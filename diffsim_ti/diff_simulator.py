@@ -5,16 +5,19 @@ No physics lives here: forward is a run of a Rollout's sweep, backward pulls bac
 
 import math
 import warnings
+from collections.abc import Iterable
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
-from diffsim_ti.diff_physics import DifferentiableBarrierContact
+from diffsim_ti.diff_physics import DifferentiableBarrierContact, TorchMaterial
+from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.monitor import stability
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.scene import Scene
 from diffsim_ti.solvers import SemiImplicitSolver, Solver, StaticSolver
-from diffsim_ti.terms import Drag, ExternalForce, Gravity
+from diffsim_ti.terms import Drag, ExternalForce, Gravity, Term
 from diffsim_ti.terms.obstacles import barrier
 from diffsim_ti.torch_bridge.autograd import torch
 from diffsim_ti.torch_bridge.rollout_node import TorchFrames, rollout_frames
@@ -40,7 +43,7 @@ class DifferentiableSolver:
     def __init__(
         self,
         dt: float = 0.01,
-        gravity=-9.8,
+        gravity: float | ArrayLike | torch.Tensor = -9.8,
         damping: float = 1.0,
         substeps: int = 1,
         method: type[Solver] = SemiImplicitSolver,
@@ -89,14 +92,14 @@ class DifferentiableSimulator:
 
     def __init__(
         self,
-        mesh,
-        material,
+        mesh: TetrahedralMesh,
+        material: TorchMaterial,
         solver: DifferentiableSolver,
-        density=1000.0,
-        fixed_vertices=None,
-        contact=None,
-        terms=None,
-        device="cpu",
+        density: float | torch.Tensor = 1000.0,
+        fixed_vertices: str | ArrayLike | None = None,
+        contact: DifferentiableBarrierContact | bool | None = None,
+        terms: Iterable[Term] | None = None,
+        device: str | torch.device = "cpu",
     ):
         self.mesh, self.material, self.solver, self.device = mesh, material, solver, checked_device(device)
         self.density, self.fixed_vertices = density, fixed_vertices

@@ -1,16 +1,20 @@
 """Scene: what is simulated, and nothing about how."""
 
 import warnings
+from collections.abc import Iterable
 from copy import copy
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
 from diffsim_ti.inputs import Inputs
+from diffsim_ti.materials.material import Material
 from diffsim_ti.materials.moduli import youngs_poisson
 from diffsim_ti.materials.patch_law import PatchLaw
+from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.terms import Drag, ExternalForce, Gravity, Obstacle, SelfContact, Term
-from diffsim_ti.terms.motion import sampled
+from diffsim_ti.terms.motion import Motion, sampled
 
 
 def _kind(term) -> tuple:
@@ -44,14 +48,14 @@ class Scene:
 
     def __init__(
         self,
-        mesh,
-        material,
-        density=1000.0,
-        terms=(),
-        fixed=None,
-        motion=None,
-        initial_positions=None,
-        initial_velocities=None,
+        mesh: TetrahedralMesh,
+        material: Material,
+        density: ArrayLike = 1000.0,
+        terms: Term | Iterable[Term] = (),
+        fixed: str | ArrayLike | None = None,
+        motion: Motion | None = None,
+        initial_positions: ArrayLike | None = None,
+        initial_velocities: ArrayLike | None = None,
         precision: str | None = None,
         volume: str = "tetrahedra",
     ):
@@ -148,11 +152,11 @@ class Scene:
                 return self.inputs.names_of(terms.index(term))
         raise ValueError(f"this scene does not list {term!r}; it has {', '.join(map(repr, self.terms)) or 'no terms'}")
 
-    def motion_rows(self, times) -> np.ndarray:
+    def motion_rows(self, times: ArrayLike) -> np.ndarray:
         """Displacement of the fixed vertices from their start at each time [s], shape (len(times), num_fixed, 3) [m]."""
         return sampled("motion", self.motion, times, len(self.fixed))
 
-    def path_rows(self, times) -> dict[str, np.ndarray]:
+    def path_rows(self, times: ArrayLike) -> dict[str, np.ndarray]:
         """Displacement of each moving obstacle at each time [s], by input name, shape (len(times), 3) [m]."""
         names = self.inputs.paths
         return {name: sampled(name, t.path, times, 1)[:, 0] for name, t in zip(names, self.moving)}

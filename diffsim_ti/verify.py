@@ -1,9 +1,10 @@
 """Proofs that a user can run: Taylor test, dot-product test, a table of every gradient, its health, Hessian products."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from diffsim_ti.inputs import RunSize
 from diffsim_ti.rollout import Frames, Rollout
@@ -37,9 +38,9 @@ class TaylorResult:
 
 def taylor_test(
     f: Callable[[np.ndarray], float],
-    x,
-    gradient,
-    direction=None,
+    x: ArrayLike,
+    gradient: ArrayLike,
+    direction: ArrayLike | None = None,
     epsilon: float = 1e-2,
     halvings: int = 6,
     seed: int = 0,
@@ -107,7 +108,7 @@ def linear_loss(rollout: Rollout, seed: int = 0) -> Loss:
     return loss
 
 
-def dot_product_test(rollout: Rollout, inputs=None, seed: int = 0, **values) -> float:
+def dot_product_test(rollout: Rollout, inputs: Iterable[str] | None = None, seed: int = 0, **values) -> float:
     """Relative difference of <w, J v> and <J^T w, v> for random v in all inputs and random w in all frames.
 
     Further outputs of the rollout are tried each by itself, since they have other units; the largest difference counts.
@@ -167,7 +168,7 @@ class GradientReport:
 def check_gradients(
     rollout: Rollout,
     loss: Loss | None = None,
-    inputs=None,
+    inputs: Iterable[str] | None = None,
     seed: int = 0,
     verbose: bool = True,
     tolerance: float | None = None,
@@ -271,7 +272,9 @@ class Identifiability:
         return "\n".join(lines)
 
 
-def identifiability(rollout: Rollout, inputs, groups: dict | None = None, **values) -> Identifiability:
+def identifiability(
+    rollout: Rollout, inputs: str | Iterable[str], groups: dict | None = None, **values
+) -> Identifiability:
     """Which inputs can be recovered from the frames' positions: eigenvalues and directions of the Fisher matrix J^T J.
 
     J, shape (3 frames vertices, parameters) [m], has a column x_j d positions / d x_j for each number x_j of the inputs, by
@@ -319,7 +322,7 @@ def hessian_product(rollout: Rollout, loss: Loss, direction: dict, epsilon: floa
     return out
 
 
-def gauss_newton_product(rollout: Rollout, frames: Frames, direction: dict, weight=1.0) -> dict:
+def gauss_newton_product(rollout: Rollout, frames: Frames, direction: dict, weight: ArrayLike = 1.0) -> dict:
     """J^T (weight J d): the Gauss-Newton Hessian of 1/2 |sqrt(weight) (positions - target)|^2 times a direction; exact.
 
     One tangent run and one reverse sweep; positive semi-definite, so CG works on it.

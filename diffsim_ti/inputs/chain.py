@@ -91,7 +91,7 @@ class Chain:
         return out
 
     def vjp(
-        self, values: Mapping[str, np.ndarray], adjoints: Mapping[str, np.ndarray], wanted
+        self, values: Mapping[str, np.ndarray], adjoints: Mapping[str, np.ndarray], wanted: Iterable[str]
     ) -> dict[str, np.ndarray]:
         """Adjoints of the wanted inputs for adjoints of what links write (None: zero)."""
         pulled, before = self._way(tuple(wanted))

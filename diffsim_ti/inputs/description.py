@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 # lengths: numbers, or "vertices", "tetrahedra" of the mesh, "steps", "steps + 1" of a run
 Shape = tuple[int | str, ...]
@@ -107,7 +108,7 @@ class Input:
         if self.range and not np.all(self.range.holds(value)):
             raise ValueError(f"{label} must be {self.range.words}{unit}, got {value.min():g}")
 
-    def checked(self, name: str, value, sizes: Mapping[str, int]) -> np.ndarray:
+    def checked(self, name: str, value: ArrayLike, sizes: Mapping[str, int]) -> np.ndarray:
         """A value for a run as a float64 array, or ValueError; sizes: what the words for lengths mean."""
         value = frozen(value)
         finite = np.isfinite(value)
@@ -149,7 +150,7 @@ class Input:
                         raise ValueError(f"{name}: expected {self.expected({word: steps + 1})}, got {shape}")
 
 
-def frozen(value) -> np.ndarray:
+def frozen(value: ArrayLike) -> np.ndarray:
     """A float64 array that cannot be written to, so that what was made of it may be kept."""
     value = np.asarray(value, np.float64)
     if value.flags.writeable:

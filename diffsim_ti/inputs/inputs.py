@@ -1,13 +1,19 @@
 """The inputs of a scene: names, values, and what kernels read of them, with derivatives both ways."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from diffsim_ti.inputs import links
 from diffsim_ti.inputs.chain import Chain, Link
 from diffsim_ti.inputs.description import POSITIVE, Input, frozen, length, speed
 from diffsim_ti.rows import Rows
+
+if TYPE_CHECKING:
+    from diffsim_ti.scene import Scene
 
 
 @dataclass
@@ -46,7 +52,13 @@ class Inputs:
     steps. `described`: {name: Input}, those too.
     """
 
-    def __init__(self, scene, density, initial_positions, initial_velocities):
+    def __init__(
+        self,
+        scene: "Scene",
+        density: ArrayLike,
+        initial_positions: ArrayLike | None,
+        initial_velocities: ArrayLike | None,
+    ):
         self.scene, self.mesh = scene, scene.mesh
         self.sizes = {"vertices": self.mesh.num_vertices, "tetrahedra": self.mesh.num_tetrahedra}
         last = {i.plain: i for i in self._at_last()}
@@ -115,7 +127,7 @@ class Inputs:
         """{own name: name here} of the inputs of term k of the scene's list."""
         return dict(self._names[k])
 
-    def at_times(self, times) -> dict[str, np.ndarray]:
+    def at_times(self, times: ArrayLike) -> dict[str, np.ndarray]:
         """The values of a run, with those that are sampled at its times [s]."""
         scene = self.scene
         rows = {"prescribed_motion": scene.motion_rows(times)} if scene.motion is not None else {}
@@ -151,7 +163,7 @@ class Inputs:
             setattr(out, name, changed.get(name, getattr(out, name)))
         return out
 
-    def derive_vjp(self, values: dict, adj: Derived, wanted) -> dict[str, np.ndarray]:
+    def derive_vjp(self, values: dict, adj: Derived, wanted: Iterable[str]) -> dict[str, np.ndarray]:
         """Adjoints of the wanted inputs for adjoints of what kernels read; those of coefficients come per tetrahedron."""
         return self.chain.vjp(values, adj.parts(), wanted)
 

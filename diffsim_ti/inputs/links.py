@@ -1,5 +1,7 @@
 """Links of a body, its rest shape, mass and start, and what joins the numbers of terms and the paths of obstacles."""
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from diffsim_ti.inputs.chain import Link
@@ -167,7 +169,7 @@ class Placed(Link):
 class Columns(Link):
     """Arrays of one shape (rows, ...) as columns, shape (rows, columns, ...)."""
 
-    def __init__(self, reads, writes: str):
+    def __init__(self, reads: Iterable[str], writes: str):
         self.reads, self.writes = tuple(reads), (writes,)
 
     def value(self, *x):

@@ -6,6 +6,7 @@ import numpy as np
 
 from diffsim_ti.inputs import Input, Link
 from diffsim_ti.materials import moduli
+from diffsim_ti.mesh import TetrahedralMesh
 
 _ALIASES = {"E": "youngs_modulus", "nu": "poissons_ratio"}
 
@@ -91,7 +92,7 @@ class Material(ABC):
     def law(self, precision: str):
         """The compile-time law, "f32" or "f64"; equal laws share compiled kernels."""
 
-    def values(self, mesh) -> dict[str, np.ndarray]:
+    def values(self, mesh: TetrahedralMesh) -> dict[str, np.ndarray]:
         """The numbers in float64: shape () where uniform, else (mesh.num_tetrahedra,); vectors have an axis more.
 
         Raises ValueError for a wrong length, an unknown or overlapping set, or tetrahedra left out.
@@ -100,7 +101,7 @@ class Material(ABC):
         self.check(values)
         return values
 
-    def described(self, mesh) -> list[Input]:
+    def described(self, mesh: TetrahedralMesh) -> list[Input]:
         """The inputs of a body of this material: each number (or vector) is one, or one per tetrahedron."""
         shapes = {name: (self.shape_of(name), ("tetrahedra", *self.shape_of(name))) for name in self.inputs}
         return [Input(name, value, shapes[name], self.unit_of(name)) for name, value in self.values(mesh).items()]

@@ -7,7 +7,7 @@ import warnings
 
 import numpy as np
 
-from diffsim_ti.mesh.geometry import FACES
+from diffsim_ti.mesh.geometry import FACES, edge_matrices, signed_volumes, squared_edges
 
 # A tetrahedron with det [e1 e2 e3] below this share of its longest edge cubed is flat. The determinant's own rounding
 # is about 1e-15 of it, so 1e-12 leaves three digits of volume; the quality is then 1e-8, a usable sliver's above 1e-4.
@@ -60,8 +60,10 @@ def checked_tetrahedra(tetrahedra, num_vertices: int) -> np.ndarray:
     return tetrahedra
 
 
-def check_not_flat(vertices: np.ndarray, tetrahedra: np.ndarray, volumes: np.ndarray, longest: np.ndarray) -> None:
-    """ValueError where 6 |V| <= (1e-12 L + 8 eps max|x|) L^2, L the longest edge and x the coordinates."""
+def checked_volumes(vertices: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
+    """Signed volumes V [m^3]; ValueError where 6 |V| <= (1e-12 L + 8 eps max|x|) L^2, L the longest edge, x coordinates."""
+    volumes = signed_volumes(edge_matrices(vertices, tetrahedra))
+    longest = np.sqrt(squared_edges(vertices, tetrahedra).max(1))
     size = np.abs(vertices).max(1)[tetrahedra].max(1)
     flat = np.nonzero(6 * np.abs(volumes) <= (FLAT * longest + FLAT_ROUNDING * size) * longest**2)[0]
     if len(flat):
@@ -70,6 +72,7 @@ def check_not_flat(vertices: np.ndarray, tetrahedra: np.ndarray, volumes: np.nda
             f"tetrahedron {first} is flat: volume {volumes[first]:.3g} m^3, longest edge {longest[first]:.3g} m, "
             f"vertices {tetrahedra[first].tolist()} ({len(flat)} such tetrahedra); remove them or remesh"
         )
+    return volumes
 
 
 def oriented(tetrahedra: np.ndarray, volumes: np.ndarray, fix_orientation: bool) -> np.ndarray:

@@ -1,11 +1,17 @@
-"""What a mesh is, in a few lines for people."""
+"""What a mesh is, in a few lines for people, and as a number for files."""
+
+import hashlib
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from diffsim_ti.mesh.sets import sizes
 
+if TYPE_CHECKING:
+    from diffsim_ti.mesh.tetrahedral_mesh import TetrahedralMesh
 
-def describe(mesh) -> str:
+
+def describe(mesh: "TetrahedralMesh") -> str:
     """Counts, size, edge lengths, worst tetrahedron, sets."""
     low, high = mesh.bounding_box
     lengths = np.linalg.norm(np.diff(mesh.vertices[mesh.edges], axis=1)[:, 0], axis=1)
@@ -30,3 +36,11 @@ def describe(mesh) -> str:
 
 def _numbers(values) -> str:
     return ", ".join(f"{value:.6g}" for value in values)
+
+
+def content_hash(mesh: "TetrahedralMesh") -> str:
+    """SHA-256 of vertices and tetrahedra, 64 hexadecimal digits."""
+    digest = hashlib.sha256(np.array([mesh.num_vertices, mesh.num_tetrahedra], "<i8").tobytes())
+    digest.update(mesh.vertices.astype("<f8").tobytes())
+    digest.update(mesh.tetrahedra.astype("<i8").tobytes())
+    return digest.hexdigest()

@@ -1,18 +1,19 @@
 """TetrahedralMesh: the rest shape of a soft body. Make, load, save, check, look at."""
 
 import copy
-import hashlib
 import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import cached_property
+from os import PathLike
 from types import MappingProxyType
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
 from diffsim_ti.mesh import checks, geometry
-from diffsim_ti.mesh.description import describe
+from diffsim_ti.mesh.description import content_hash, describe
 from diffsim_ti.mesh.files import KEEPS_SETS, read_mesh, write_mesh
 from diffsim_ti.mesh.grid import box
 from diffsim_ti.mesh.locate import LocatedPoints, locate
@@ -35,8 +36,8 @@ class TetrahedralMesh:
 
     def __init__(
         self,
-        vertices,
-        tetrahedra,
+        vertices: ArrayLike,
+        tetrahedra: ArrayLike,
         *,
         vertex_sets: dict | None = None,
         tetrahedron_sets: dict | None = None,
@@ -44,7 +45,7 @@ class TetrahedralMesh:
     ):
         self._vertices = checks.checked_vertices(vertices)
         self._tetrahedra = checks.checked_tetrahedra(tetrahedra, len(self._vertices))
-        volumes = self._checked_volumes()
+        volumes = checks.checked_volumes(self._vertices, self._tetrahedra)
         self._tetrahedra = checks.oriented(self._tetrahedra, volumes, fix_orientation)
         self._volumes = np.abs(volumes)
         self._surface_triangles = checks.surface_of(self._tetrahedra, self.num_vertices)
@@ -55,7 +56,9 @@ class TetrahedralMesh:
         checks.warn_of_slivers(self)
 
     @classmethod
-    def create_cube(cls, resolution: int = 5, size: float = 1.0, pattern="kuhn", device=None) -> "TetrahedralMesh":
+    def create_cube(
+        cls, resolution: int = 5, size: float = 1.0, pattern: str = "kuhn", device: str | None = None
+    ) -> "TetrahedralMesh":
         """The cube [0, size]^3 [m], all of it filled; `resolution` counts vertices a side. See `create_box`.
 
         device: "cuda" starts Taichi on the card, or refuses if it runs elsewhere; the mesh itself lives in NumPy.
@@ -64,7 +67,9 @@ class TetrahedralMesh:
         return cls.create_box(resolution, size, pattern)
 
     @classmethod
-    def create_box(cls, resolution=5, size=1.0, pattern: str = "kuhn", origin=(0.0, 0.0, 0.0)) -> "TetrahedralMesh":
+    def create_box(
+        cls, resolution: ArrayLike = 5, size: ArrayLike = 1.0, pattern: str = "kuhn", origin: ArrayLike = (0, 0, 0)
+    ) -> "TetrahedralMesh":
         """A box on a regular grid, with vertex sets xmin, xmax, ymin, ymax, zmin, zmax.
 
         resolution: vertices per side, an integer of at least 2 or three of them.
@@ -77,7 +82,9 @@ class TetrahedralMesh:
         return cls(vertices, tetrahedra, vertex_sets=sides)
 
     @classmethod
-    def from_file(cls, path, fix_orientation: bool = False, drop_orphans: bool = False) -> "TetrahedralMesh":
+    def from_file(
+        cls, path: str | PathLike, fix_orientation: bool = False, drop_orphans: bool = False
+    ) -> "TetrahedralMesh":
         """Load tetrahedra from any format that meshio reads: Gmsh .msh (2.2 and 4.x), .vtu, .vtk, MEDIT .mesh, .inp ...
 
         Blocks of tetrahedra are joined. Named groups of tetrahedra become tetrahedron sets, groups of triangles, lines
@@ -103,12 +110,12 @@ class TetrahedralMesh:
             raise ValueError(f"{path}: {error}") from error
 
     @classmethod
-    def load_from_msh(cls, path, device=None) -> "TetrahedralMesh":
+    def load_from_msh(cls, path: str | PathLike, device: str | None = None) -> "TetrahedralMesh":
         """`from_file(path)` in the seeds' spelling; device as for `create_cube`."""
         runtime.use_device(device)
         return cls.from_file(path)
 
-    def save(self, path) -> None:
+    def save(self, path: str | PathLike) -> None:
         """Write the mesh through meshio, in the format that the suffix names.
 
         Sets are kept in .msh (Gmsh 2.2 binary, as physical groups of points and volumes) and in .vtu and .vtk (as 0/1
@@ -121,7 +128,7 @@ class TetrahedralMesh:
             warnings.warn(f"{path} cannot keep the sets {', '.join(lost)}; these formats can: {kept}", stacklevel=2)
 
     @classmethod
-    def joined(cls, meshes) -> "TetrahedralMesh":
+    def joined(cls, meshes: Iterable["TetrahedralMesh"]) -> "TetrahedralMesh":
         """Several bodies as one mesh of several pieces, one after the other.
 
         Sets of the same name become one; each body's vertices and tetrahedra also become sets "body_0", "body_1", ...
@@ -234,11 +241,11 @@ class TetrahedralMesh:
 
     # Choosing vertices and tetrahedra
 
-    def vertex_indices(self, chosen) -> np.ndarray:
+    def vertex_indices(self, chosen: str | ArrayLike | Iterable[str]) -> np.ndarray:
         """Sorted indices from a set's name, several names, indices, or a Boolean mask over the vertices."""
         return chosen_indices(chosen, self._vertex_sets, self.num_vertices, "vertex")
 
-    def tetrahedron_indices(self, chosen) -> np.ndarray:
+    def tetrahedron_indices(self, chosen: str | ArrayLike | Iterable[str]) -> np.ndarray:
         """Sorted indices from a set's name, several names, indices, or a Boolean mask over the tetrahedra."""
         return chosen_indices(chosen, self._tetrahedron_sets, self.num_tetrahedra, "tetrahedron")
 
@@ -249,17 +256,17 @@ class TetrahedralMesh:
             raise ValueError(f"the predicate must return {self.num_vertices} Booleans, got dtype {mask.dtype}")
         return self.vertex_indices(mask)
 
-    def with_vertex_set(self, name: str, chosen) -> "TetrahedralMesh":
+    def with_vertex_set(self, name: str, chosen: str | ArrayLike | Iterable[str]) -> "TetrahedralMesh":
         """A mesh that has this vertex set too (or instead of one of that name); `chosen` as in `vertex_indices`."""
         sets = {**self._vertex_sets, name: self.vertex_indices(chosen)}
         return self._changed(_vertex_sets=checked_sets(sets, self.num_vertices, "vertex"))
 
-    def with_tetrahedron_set(self, name: str, chosen) -> "TetrahedralMesh":
+    def with_tetrahedron_set(self, name: str, chosen: str | ArrayLike | Iterable[str]) -> "TetrahedralMesh":
         """A mesh that has this tetrahedron set too (or instead of one of that name)."""
         sets = {**self._tetrahedron_sets, name: self.tetrahedron_indices(chosen)}
         return self._changed(_tetrahedron_sets=checked_sets(sets, self.num_tetrahedra, "tetrahedron"))
 
-    def locate(self, points, nearest: bool = False) -> LocatedPoints:
+    def locate(self, points: ArrayLike, nearest: bool = False) -> LocatedPoints:
         """Where points [m], shape (k, 3), lie: tetrahedra, corners, barycentric weights; `.matrix` is the sparse map.
 
         nearest: take the nearest point of the body for each point outside; default: ValueError that says how far out.
@@ -268,11 +275,11 @@ class TetrahedralMesh:
 
     # Moving
 
-    def translated(self, offset) -> "TetrahedralMesh":
+    def translated(self, offset: ArrayLike) -> "TetrahedralMesh":
         """Moved by offset [m], 3 numbers; sets are kept, as in `scaled` and `rotated`."""
         return self._moved(self.vertices + geometry.three("offset", offset))
 
-    def scaled(self, factor, center=(0.0, 0.0, 0.0)) -> "TetrahedralMesh":
+    def scaled(self, factor: ArrayLike, center: ArrayLike = (0.0, 0.0, 0.0)) -> "TetrahedralMesh":
         """Scaled about center [m] by a positive factor, or by three, one per axis. ValueError for factors <= 0."""
         factors, center = geometry.three("factor", factor, one_will_do=True), geometry.three("center", center)
         if np.any(factors <= 0):
@@ -282,7 +289,9 @@ class TetrahedralMesh:
             checks.warn_of_slivers(new)
         return new
 
-    def rotated(self, rotation, angle: float | None = None, center=(0.0, 0.0, 0.0)) -> "TetrahedralMesh":
+    def rotated(
+        self, rotation: ArrayLike, angle: float | None = None, center: ArrayLike = (0, 0, 0)
+    ) -> "TetrahedralMesh":
         """Turned about center [m], by a rotation matrix (3, 3), or about an axis (3 numbers) by angle [rad].
 
         Right-handed. ValueError for a matrix that is not orthogonal to 1e-9 or has det -1, and for a zero axis.
@@ -303,20 +312,10 @@ class TetrahedralMesh:
     @cached_property
     def content_hash(self) -> str:
         """SHA-256 of vertices and tetrahedra, 64 hexadecimal digits; sets do not count. The same on every machine."""
-        digest = hashlib.sha256(np.array([self.num_vertices, self.num_tetrahedra], "<i8").tobytes())
-        digest.update(self.vertices.astype("<f8").tobytes())
-        digest.update(self.tetrahedra.astype("<i8").tobytes())
-        return digest.hexdigest()
+        return content_hash(self)
 
     def _compute_rest_state(self) -> None:
         """Does nothing: the rest state is always ready. The seeds call it."""
-
-    def _checked_volumes(self) -> np.ndarray:
-        """Signed volumes [m^3]; ValueError for a flat tetrahedron."""
-        volumes = geometry.signed_volumes(geometry.edge_matrices(self._vertices, self._tetrahedra))
-        longest = np.sqrt(geometry.squared_edges(self._vertices, self._tetrahedra).max(1))
-        checks.check_not_flat(self._vertices, self._tetrahedra, volumes, longest)
-        return volumes
 
     def _changed(self, **parts) -> "TetrahedralMesh":
         new = copy.copy(self)
@@ -327,7 +326,8 @@ class TetrahedralMesh:
         """The same connectivity at other positions; checked, and nothing cached that depends on positions."""
         new = object.__new__(type(self))
         new._vertices, new._tetrahedra = checks.checked_vertices(vertices), self._tetrahedra
-        new._volumes, new._surface_triangles = new._checked_volumes(), self._surface_triangles
+        new._volumes = checks.checked_volumes(new._vertices, new._tetrahedra)
+        new._surface_triangles = self._surface_triangles
         checks.oriented(new._tetrahedra, new._volumes, fix_orientation=False)
         new._vertex_sets, new._tetrahedron_sets = self._vertex_sets, self._tetrahedron_sets
         new._freeze()

@@ -2,6 +2,10 @@
 
 import weakref
 
+import numpy as np
+
+from diffsim_ti.state.workspace import Workspace
+
 
 class EnergyWatch:
     """Sums what implicit midpoint steps add to the energy, against the largest energy that moved so far.
@@ -15,7 +19,7 @@ class EnergyWatch:
     Simo, Tarnow 1992, The discrete energy-momentum method, doi:10.1007/BF00913408.
     """
 
-    def __init__(self, workspace):
+    def __init__(self, workspace: Workspace):
         self.ws = weakref.proxy(workspace)  # which holds this: no circle
         self.clear()
 
@@ -23,7 +27,7 @@ class EnergyWatch:
         """Forget what was seen."""
         self.gained, self.moving = 0.0, 0.0  # [J]
 
-    def note(self, u, u_star, u_next, v_next) -> None:
+    def note(self, u: np.ndarray, u_star: np.ndarray, u_next: np.ndarray, v_next: np.ndarray) -> None:
         """A step went from u by u_star to u_next; contacts are as in its pass."""
         potential, energies = self.ws.potential, []
         for place in (u, u_next):

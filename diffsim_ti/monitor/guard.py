@@ -6,6 +6,7 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.monitor import quantities, stability
+from diffsim_ti.state.workspace import Workspace
 from diffsim_ti.terms.obstacles.barrier import beta
 
 
@@ -47,7 +48,7 @@ class Guard:
 
     usual, close, first = 400, 50, 10  # passes between two looks; the first one of a deformed start
 
-    def __init__(self, workspace):
+    def __init__(self, workspace: Workspace):
         self.ws = workspace
         self.good = workspace.history(1)
         self.good_pass, self.offset = 0, 0  # offset: passes before this run, for reports

@@ -13,6 +13,7 @@ from diffsim_ti.potential.kernels import potential_kernels
 from diffsim_ti.runtime import Kernel
 from diffsim_ti.state.features import Features
 from diffsim_ti.state.numbers import SCENE
+from diffsim_ti.state.workspace import Workspace
 
 A = ti.template()
 
@@ -76,7 +77,7 @@ class TetrahedronFields:
     J: np.ndarray
 
 
-def tetrahedron_fields(workspace) -> TetrahedronFields:
+def tetrahedron_fields(workspace: Workspace) -> TetrahedronFields:
     """Fields of the current state. von Mises is sqrt(3/2 dev S : dev S) of the Cauchy stress S = P F^T / J."""
     a = workspace.arrays
 
@@ -91,7 +92,7 @@ def tetrahedron_fields(workspace) -> TetrahedronFields:
     )
 
 
-def barrier_energies(workspace) -> np.ndarray:
+def barrier_energies(workspace: Workspace) -> np.ndarray:
     """Energy of the obstacles' barriers at each vertex [J], in the current state."""
     a = workspace.arrays
 
@@ -106,7 +107,7 @@ def barrier_energies(workspace) -> np.ndarray:
     return runtime.fetch(out.contact).astype(np.float64)
 
 
-def energy(workspace) -> Energy:
+def energy(workspace: Workspace) -> Energy:
     """Energy of the current state, summed in float64."""
     a, values = workspace.arrays, workspace.arrays.values
     u, v = (runtime.fetch(x)[0].astype(np.float64) for x in (workspace.state.u, workspace.state.v))

@@ -1,6 +1,7 @@
 """How large a step may be: a bound by elements, the tight limit by Lanczos, and a bound during the run."""
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -8,6 +9,10 @@ from diffsim_ti import runtime
 from diffsim_ti.mesh.geometry import shape_gradients
 from diffsim_ti.mesh.patches import volume_patches
 from diffsim_ti.potential.kernels import potential_kernels
+from diffsim_ti.state.workspace import Workspace
+
+if TYPE_CHECKING:
+    from diffsim_ti.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -22,7 +27,7 @@ class StepLimit:
         return f"{self.dt:.4g} s ({self.method}, set by tetrahedron {self.tetrahedron})"
 
 
-def element_limit(scene, values: dict | None = None) -> StepLimit:
+def element_limit(scene: "Scene", values: dict | None = None) -> StepLimit:
     """A step that is safe at rest, from each tetrahedron by itself, without contact.
 
         omega^2 <= (4 / rho) [max(lam, 0) sum_a |grad N_a|^2 + 2 mu lambda_max(sum_a grad N_a (x) grad N_a)]
@@ -49,7 +54,7 @@ def element_limit(scene, values: dict | None = None) -> StepLimit:
 class Stiffness:
     """Products of M^-1/2 (-df/du) M^-1/2 on the free vertices, at the current state of a workspace."""
 
-    def __init__(self, workspace):
+    def __init__(self, workspace: Workspace):
         self.ws = workspace
         a = workspace.arrays
         self.w, self.y = runtime.array(a.vector, 1, a.num_vertices), runtime.array(a.vector, 1, a.num_vertices)
@@ -134,7 +139,7 @@ class Stiffness:
         return int(np.argmax((strain**2).sum((1, 2)) * self.ws.arrays.values.volumes))
 
 
-def lanczos_limit(workspace, tolerance: float = 1e-3) -> StepLimit:
+def lanczos_limit(workspace: Workspace, tolerance: float = 1e-3) -> StepLimit:
     """The tight stable step 2 / omega_max at the workspace's present state, contact included.
 
     A residual bound is added to omega^2, so the step errs on the safe side.

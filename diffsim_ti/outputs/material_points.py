@@ -1,11 +1,17 @@
 """Positions of points of the body, such as markers that a camera follows."""
 
 from copy import copy
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from diffsim_ti.mesh.geometry import inverse_edges
 from diffsim_ti.outputs.output import Change, Output
+
+if TYPE_CHECKING:
+    from diffsim_ti.rollout.frames import Frames
+    from diffsim_ti.scene import Scene
 
 
 class MaterialPoints(Output):
@@ -24,13 +30,13 @@ class MaterialPoints(Output):
     Zienkiewicz, Taylor, The Finite Element Method, vol. 1, 5th ed., 2000, sec. 8.6, on volume coordinates.
     """
 
-    def __init__(self, points, name: str = "material_points", nearest: bool = False):
+    def __init__(self, points: ArrayLike, name: str = "material_points", nearest: bool = False):
         self.points, self.name, self.nearest = np.array(points, np.float64), name, bool(nearest)
 
     def __repr__(self) -> str:
         return f"MaterialPoints({len(self.points)} points, name={self.name!r})"
 
-    def settled(self, scene) -> "MaterialPoints":
+    def settled(self, scene: "Scene") -> "MaterialPoints":
         out = copy(self)
         out.located = scene.mesh.locate(self.points, nearest=self.nearest)
         out.points = out.located.points
@@ -51,11 +57,11 @@ class MaterialPoints(Output):
         u = frames.displacements[:, self.located.vertices].astype(np.float64)
         return np.eye(3) + np.einsum("fpai,paj->fpij", u[:, :, 1:] - u[:, :, :1], B)
 
-    def value(self, frames) -> np.ndarray:
+    def value(self, frames: "Frames") -> np.ndarray:
         u = frames.displacements[:, self.located.vertices].astype(np.float64)
         return self.points + np.einsum("pa,fpai->fpi", self._weights(frames)[1], u)
 
-    def jvp(self, frames, change: Change) -> np.ndarray:
+    def jvp(self, frames: "Frames", change: Change) -> np.ndarray:
         B, N = self._weights(frames)
         out = np.zeros(self.shape(len(frames.positions)))
         if change.positions is not None:
@@ -65,7 +71,7 @@ class MaterialPoints(Output):
             out -= np.einsum("fpij,pj->fpi", self._deformation(frames, B), moved)
         return out
 
-    def vjp(self, frames, seed: np.ndarray) -> Change:
+    def vjp(self, frames: "Frames", seed: np.ndarray) -> Change:
         B, N = self._weights(frames)
         positions, rest = np.zeros(frames.positions.shape), np.zeros(frames.positions.shape[1:])
         for frame, s in zip(positions, seed):

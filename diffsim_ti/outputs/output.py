@@ -2,8 +2,13 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from diffsim_ti.rollout.frames import Frames
+    from diffsim_ti.scene import Scene
 
 
 @dataclass
@@ -41,7 +46,7 @@ class Output(ABC):
 
     name: str
 
-    def settled(self, scene) -> "Output":
+    def settled(self, scene: "Scene") -> "Output":
         """This output for a scene: checked, with what depends on the scene alone; raises ValueError if it does not fit."""
         return self
 
@@ -50,13 +55,13 @@ class Output(ABC):
         """Shape of the value; three numbers at the end make vectors of a Taichi field."""
 
     @abstractmethod
-    def value(self, frames) -> np.ndarray:
+    def value(self, frames: "Frames") -> np.ndarray:
         """y."""
 
     @abstractmethod
-    def jvp(self, frames, change: Change) -> np.ndarray:
+    def jvp(self, frames: "Frames", change: Change) -> np.ndarray:
         """Change of y for a change of frames and inputs, to first order."""
 
     @abstractmethod
-    def vjp(self, frames, seed: np.ndarray) -> Change:
+    def vjp(self, frames: "Frames", seed: np.ndarray) -> Change:
         """Gradient by frames and inputs of a loss whose gradient by y is `seed`."""

@@ -1,8 +1,12 @@
 """Rollout: n steps of a solver as one differentiable operation."""
 
+from collections.abc import Iterable
+
 import numpy as np
+from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
+from diffsim_ti.inputs import Derived
 from diffsim_ti.outputs import Change, Displacements, Output, Positions, Velocities
 from diffsim_ti.rollout.checkpoints import Checkpoints
 from diffsim_ti.rollout.frames import Frames, HostSeed, check_finite
@@ -43,11 +47,11 @@ class Rollout:
         save_every: int | None = None,
         checkpoint_every: int | None = None,
         memory: float | None = None,
-        gradients=None,
+        gradients: str | Iterable[str] | None = None,
         clip: float | None = None,
         truncate: int | None = None,
         health: bool = False,
-        outputs=(),
+        outputs: Output | Iterable[Output] = (),
         runs: int | None = None,
     ):
         self.solver, self.scene = solver, solver.scene
@@ -130,7 +134,9 @@ class Rollout:
             frames.outputs[name] = value
         return frames
 
-    def vjp(self, frames: Frames, positions=None, velocities=None, **seeds) -> dict[str, np.ndarray]:
+    def vjp(
+        self, frames: Frames, positions: ArrayLike | None = None, velocities: ArrayLike | None = None, **seeds
+    ) -> dict[str, np.ndarray]:
         """Gradients of a loss by every wanted input, from its gradients by positions, velocities and other outputs.
 
         Float64 arrays of the inputs' shapes; None for a part that the loss does not name. Further seeds of the same
@@ -156,7 +162,9 @@ class Rollout:
                 out.add(self.outputs[name].vjp(frames, seed))
         return out
 
-    def gradients_of(self, run: Run, derived, change: Change, wanted=None) -> dict[str, np.ndarray]:
+    def gradients_of(
+        self, run: Run, derived: Derived, change: Change, wanted: Iterable[str] | None = None
+    ) -> dict[str, np.ndarray]:
         """Gradients by the wanted inputs from adjoints of what kernels read, and those by inputs directly."""
         out = self.scene.inputs.derive_vjp(run.values, derived, self.wanted if wanted is None else wanted)
         for name, direct in change.inputs.items():

@@ -1,7 +1,7 @@
 """n steps of a solver on the device: forward, in reverse from kept states, and in tangents."""
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
@@ -29,7 +29,7 @@ class Sweep:
         save_every: int | None = None,
         checkpoint_every: int | None = None,
         memory: float | None = None,
-        gradients=None,
+        gradients: str | Iterable[str] | None = None,
         clip: float | None = None,
         truncate: int | None = None,
         health: bool = False,

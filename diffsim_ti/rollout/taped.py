@@ -1,6 +1,7 @@
 """A rollout between Taichi kernels: its fields, and its runs as operations of a `ti.ad.Tape`."""
 
 import weakref
+from typing import TYPE_CHECKING
 
 import numpy as np
 import taichi as ti
@@ -9,6 +10,11 @@ from diffsim_ti import runtime
 from diffsim_ti.outputs import Change
 from diffsim_ti.rollout import field_copies
 from diffsim_ti.rollout.field_seed import STATES, field_seed
+from diffsim_ti.rollout.run import Run
+from diffsim_ti.state.workspace import Workspace
+
+if TYPE_CHECKING:
+    from diffsim_ti.rollout.rollout import Rollout
 
 START = ("initial_positions", "initial_velocities")
 SPELLING = {"initial_displacements": "initial_positions"}  # less the rest positions; they keep their digits in float32
@@ -22,7 +28,7 @@ class TapeFace:
     on the host by `Inputs`, as are the gradients by inputs, which are then added to the fields by kernels.
     """
 
-    def __init__(self, rollout, runs: int | None):
+    def __init__(self, rollout: "Rollout", runs: int | None):
         if runs is not None and not (int(runs) == runs and runs >= 1):
             raise ValueError(f"runs must be a whole number >= 1, or None for one run, got {runs}")
         self._rollout, self.runs = weakref.ref(rollout), runs  # the rollout holds this: no circle
@@ -146,7 +152,7 @@ class TapeFace:
                 out[SPELLING.get(name, name)] = value
         return out, direct and bool(start)
 
-    def set_start(self, workspace) -> None:
+    def set_start(self, workspace: Workspace) -> None:
         """Set the start of a workspace from the fields; what is loaded there is that of the scene."""
         fields, state = self._fields, workspace.state
         n = self.rollout.scene.mesh.num_vertices
@@ -163,7 +169,7 @@ class TapeFace:
         if bad is not None:
             raise ValueError(f"initial_positions and initial_velocities must be finite: those of vertex {bad} are not")
 
-    def show(self, k: int | None, run) -> None:
+    def show(self, k: int | None, run: Run) -> None:
         """Fill the fields of outputs with those of the run that ran last."""
         frames, rest = self.rollout.sweep.workspace.frames, run.values["rest_positions"]
         if runtime.arch_name() in ("cpu", "cuda"):
@@ -210,7 +216,7 @@ class TapedRun:
     `forward` and `backward` are the package's one pair for `ti.ad.grad_replaced`: such pairs must not nest.
     """
 
-    def __init__(self, rollout, k: int | None):
+    def __init__(self, rollout: "Rollout", k: int | None):
         self.rollout, self.face, self.k = rollout, rollout.tape_face, k
         self.run = self.frames = None
 

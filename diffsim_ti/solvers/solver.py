@@ -3,12 +3,16 @@
 import math
 import warnings
 from abc import ABC
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.monitor import stability
 from diffsim_ti.state.schedule import Schedule
+
+if TYPE_CHECKING:
+    from diffsim_ti.scene import Scene
 
 
 class Solver(ABC):
@@ -31,7 +35,7 @@ class Solver(ABC):
 
     def __init__(
         self,
-        scene,
+        scene: "Scene",
         dt: float = 0.01,
         substeps: int = 1,
         parallel: bool | None = None,
@@ -56,7 +60,7 @@ class Solver(ABC):
         if self.explicit and check_start and not allow_unstable:
             self._refuse_unstable()
 
-    def for_scene(self, scene) -> "Solver":
+    def for_scene(self, scene: "Scene") -> "Solver":
         """The same solver for another scene."""
         return type(self)(scene, **{name: getattr(self, name) for name in self.arguments})
 

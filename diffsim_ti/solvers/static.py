@@ -1,8 +1,13 @@
 """Equilibria."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from diffsim_ti.solvers.implicit.solver import ImplicitSolver, Stage
+
+if TYPE_CHECKING:
+    from diffsim_ti.scene import Scene
 
 
 class StaticSolver(ImplicitSolver):
@@ -19,7 +24,7 @@ class StaticSolver(ImplicitSolver):
 
     def __init__(
         self,
-        scene,
+        scene: "Scene",
         load_steps: int = 1,
         tolerance: float = 1e-8,
         max_iterations: int = 100,

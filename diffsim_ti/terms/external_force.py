@@ -1,9 +1,11 @@
 """Given forces on vertices, constant or one set per step."""
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from diffsim_ti.inputs import Input
 from diffsim_ti.inputs.links import PerStep
+from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.terms.term import Term
 
 
@@ -15,7 +17,7 @@ class ExternalForce(Term):
     Input with gradient: "external_forces", of the shape given, or "<name>.forces". One per scene.
     """
 
-    def __init__(self, forces, vertices=None, name: str | None = None):
+    def __init__(self, forces: ArrayLike, vertices: str | ArrayLike | None = None, name: str | None = None):
         shapes = (3,), ("k", 3), ("steps", "k", 3)
         super().__init__(Input("forces", forces, shapes, "N", plain="external_forces", label="forces"), name=name)
         self.vertices = vertices
@@ -25,7 +27,7 @@ class ExternalForce(Term):
     def links(self, names, own):
         return [PerStep(names["external_forces"], "forces", 3)]
 
-    def indices(self, mesh) -> np.ndarray:
+    def indices(self, mesh: TetrahedralMesh) -> np.ndarray:
         """Vertices that are acted upon, shape (k,)."""
         if self.vertices is None:
             return np.arange(mesh.num_vertices)

@@ -1,6 +1,7 @@
 """Uniform gravity."""
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from diffsim_ti.inputs import Input
 from diffsim_ti.terms.term import Term
@@ -13,7 +14,7 @@ class Gravity(Term):
     Input with gradient: "gravity", shape (3,), or "<name>.acceleration".
     """
 
-    def __init__(self, acceleration=(0.0, -9.81, 0.0), name: str | None = None):
+    def __init__(self, acceleration: ArrayLike = (0.0, -9.81, 0.0), name: str | None = None):
         g = np.array(acceleration, dtype=np.float64)
         if g.shape == ():
             g = np.array([0.0, float(g), 0.0])

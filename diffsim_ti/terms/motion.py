@@ -1,9 +1,15 @@
 """A motion that is given over time, read at some times."""
 
+from collections.abc import Callable
+
 import numpy as np
+from numpy.typing import ArrayLike
+
+# a function of time [s], or keyframes (times [s], displacements [m])
+Motion = Callable[[float], ArrayLike] | tuple[ArrayLike, ArrayLike]
 
 
-def sampled(name: str, motion, times, k: int) -> np.ndarray:
+def sampled(name: str, motion: Motion, times: ArrayLike, k: int) -> np.ndarray:
     """A motion of k points at each time [s], shape (len(times), k, 3) [m].
 
     motion: a function of time that returns 3 numbers or shape (k, 3), or keyframes (times, displacements).

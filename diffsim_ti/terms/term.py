@@ -3,12 +3,18 @@
 from abc import ABC
 from copy import copy
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import taichi as ti
+from numpy.typing import ArrayLike
 
 from diffsim_ti.inputs import Input, Link
+from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.runtime import PRECISIONS
+
+if TYPE_CHECKING:
+    from diffsim_ti.scene import Scene
 
 
 class Term(ABC):
@@ -60,10 +66,16 @@ class Term(ABC):
         """
         return []
 
-    def check(self, mesh) -> None:
+    def check(self, mesh: TetrahedralMesh) -> None:
         """Raise ValueError if the term does not fit the mesh."""
 
-    def settled(self, scene, density, initial_positions, initial_velocities) -> "Term":
+    def settled(
+        self,
+        scene: "Scene",
+        density: ArrayLike,
+        initial_positions: ArrayLike | None,
+        initial_velocities: ArrayLike | None,
+    ) -> "Term":
         """The term with what it leaves to the scene to choose."""
         return self
 

@@ -10,11 +10,15 @@ velocities by exp(-c h) in a stage of its own. Statics: no inertia, u* is where 
 """
 
 from abc import abstractmethod
+from typing import TYPE_CHECKING
 
 from diffsim_ti.solvers.implicit.adjoint import ImplicitAdjoint, ImplicitTangent
 from diffsim_ti.solvers.implicit.stage import Stage
 from diffsim_ti.solvers.implicit.workspace import ImplicitWorkspace
 from diffsim_ti.solvers.solver import Solver
+
+if TYPE_CHECKING:
+    from diffsim_ti.scene import Scene
 
 
 class ImplicitSolver(Solver):
@@ -31,7 +35,7 @@ class ImplicitSolver(Solver):
 
     def __init__(
         self,
-        scene,
+        scene: "Scene",
         dt: float = 0.01,
         substeps: int = 1,
         tolerance: float = 1e-6,

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from diffsim_ti.runtime import traced
 from diffsim_ti.terms.described import extent, place
@@ -39,7 +40,7 @@ class Sphere(Obstacle):
     arguments it takes.
     """
 
-    def __init__(self, center=(0.0, 0.0, 0.0), radius: float = 1.0, inside: bool = False, **options):
+    def __init__(self, center: ArrayLike = (0.0, 0.0, 0.0), radius: float = 1.0, inside: bool = False, **options):
         shape = place("center", center, "sphere_center"), extent("radius", radius, "sphere_radius")
         super().__init__(shape, **options)
         self.inside = bool(inside)
@@ -85,7 +86,7 @@ class Capsule(Obstacle):
 
     twin = CapsuleForce
 
-    def __init__(self, start, end, radius: float, **options):
+    def __init__(self, start: ArrayLike, end: ArrayLike, radius: float, **options):
         ends = place("start", start, "capsule_start"), place("end", end, "capsule_end")
         super().__init__([*ends, extent("radius", radius, "capsule_radius")], **options)
         check_axis(self, "capsule_start", "capsule_end")

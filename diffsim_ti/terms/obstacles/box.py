@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import taichi as ti
+from numpy.typing import ArrayLike
 
 from diffsim_ti.inputs import POSITIVE, Input
 from diffsim_ti.runtime import traced
@@ -74,7 +75,13 @@ class Box(Obstacle):
 
     twin = BoxForce
 
-    def __init__(self, center=(0.0, 0.0, 0.0), size=(1.0, 1.0, 1.0), rotation=(0.0, 0.0, 0.0), **options):
+    def __init__(
+        self,
+        center: ArrayLike = (0.0, 0.0, 0.0),
+        size: ArrayLike = (1.0, 1.0, 1.0),
+        rotation: ArrayLike = (0.0, 0.0, 0.0),
+        **options,
+    ):
         size = np.broadcast_to(np.asarray(size, np.float64), (3,)) if np.ndim(size) == 0 else size
         turn = np.asarray(rotation, np.float64)
         if turn.shape != (3,) or not np.all(np.isfinite(turn)):
@@ -125,7 +132,7 @@ class Cylinder(Obstacle):
 
     twin = CylinderForce
 
-    def __init__(self, start, end, radius: float, **options):
+    def __init__(self, start: ArrayLike, end: ArrayLike, radius: float, **options):
         ends = place("start", start, "cylinder_start"), place("end", end, "cylinder_end")
         super().__init__([*ends, extent("radius", radius, "cylinder_radius")], **options)
         check_axis(self, "cylinder_start", "cylinder_end")

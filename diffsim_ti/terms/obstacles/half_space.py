@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from diffsim_ti.inputs import Input
 from diffsim_ti.runtime import traced
@@ -33,7 +34,7 @@ class HalfSpace(Obstacle):
 
     twin = HalfSpaceForce
 
-    def __init__(self, point=(0.0, 0.0, 0.0), normal=(0.0, 1.0, 0.0), **options):
+    def __init__(self, point: ArrayLike = (0.0, 0.0, 0.0), normal: ArrayLike = (0.0, 1.0, 0.0), **options):
         turn = Input("normal", normal, ((3,),), plain="half_space_normal")
         super().__init__([place("point", point, "half_space_point"), turn], **options)
         if not np.linalg.norm(self.values["half_space_normal"]) > 0:

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import taichi as ti
+from numpy.typing import ArrayLike
 
 from diffsim_ti.runtime import at, let, traced
 from diffsim_ti.terms.described import place
@@ -23,7 +24,14 @@ class MeshObstacle(Obstacle):
     Baerentzen, Aanaes 2005, Signed distance computation using the angle weighted pseudonormal, doi:10.1109/TVCG.2005.49.
     """
 
-    def __init__(self, vertices, triangles, position=(0.0, 0.0, 0.0), resolution: int = 48, **options):
+    def __init__(
+        self,
+        vertices: ArrayLike,
+        triangles: ArrayLike,
+        position: ArrayLike = (0.0, 0.0, 0.0),
+        resolution: int = 48,
+        **options,
+    ):
         super().__init__([place("position", position, "mesh_position")], **options)
         vertices, triangles = np.asarray(vertices, np.float64), np.asarray(triangles, np.int64)
         check_closed(vertices, triangles)

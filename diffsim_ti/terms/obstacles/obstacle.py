@@ -13,7 +13,7 @@ from diffsim_ti.materials.calculus.tensor import sum_of
 from diffsim_ti.runtime import assign, at, let, traced
 from diffsim_ti.terms.described import positive
 from diffsim_ti.terms.gravity import Gravity
-from diffsim_ti.terms.motion import sampled
+from diffsim_ti.terms.motion import Motion, sampled
 from diffsim_ti.terms.obstacles import barrier, friction
 from diffsim_ti.terms.obstacles.shapes import Triangles
 from diffsim_ti.terms.obstacles.stiffness import barrier_stiffness
@@ -54,7 +54,7 @@ class Obstacle(Term):
         width: float = 0.01,
         friction: float = 0.0,
         friction_speed: float = 1e-3,
-        path=None,
+        path: Motion | None = None,
         name: str | None = None,
     ):
         if isinstance(shape, dict):  # {name: value}, with nothing more to say of them

@@ -1,0 +1,79 @@
+"""What the folder tree promises: imports go one way, nobody reaches into others, no file is long."""
+
+import ast
+import re
+from pathlib import Path
+
+PACKAGE = Path(__file__).parent.parent / "diffsim_ti"
+MODULES = {path: ast.parse(path.read_text()) for path in sorted(PACKAGE.rglob("*.py"))}
+
+
+def room(path: Path) -> str:
+    """The folder that a module lies in, or the module itself where it lies at the top."""
+    return path.relative_to(PACKAGE).with_suffix("").parts[0]
+
+
+def rooms_used(tree: ast.Module) -> set[str]:
+    """Rooms that a module imports from, also inside functions; what only type checkers read does not count."""
+    ifs = [node for node in ast.walk(tree) if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"]
+    typing_only = {id(inner) for node in ifs for inner in node.body}
+    found = set()
+    for node in ast.walk(tree):
+        if id(node) in typing_only:
+            continue
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "diffsim_ti":
+            parts = node.module.split(".")[1:]
+            found |= {parts[0]} if parts else {alias.name for alias in node.names}
+    return found
+
+
+def circles(uses: dict[str, set[str]]) -> list[str]:
+    """Rooms that can be reached from themselves."""
+
+    def reached(start: str) -> set[str]:
+        seen, waiting = set(), [start]
+        while waiting:
+            fresh = uses.get(waiting.pop(), set()) - seen
+            seen |= fresh
+            waiting += fresh
+        return seen
+
+    return sorted(name for name in uses if name in reached(name))
+
+
+def test_imports_between_folders_go_one_way():
+    uses = {}
+    for path, tree in MODULES.items():
+        uses.setdefault(room(path), set()).update(rooms_used(tree) - {room(path)})
+    del uses["__init__"]
+    assert len(uses) > 30 and "potential" in uses["monitor"] and not circles(uses)
+
+
+def test_a_circle_would_be_found():
+    assert circles({"a": {"b"}, "b": {"c"}, "c": {"b"}}) == ["b", "c"]
+
+
+def private_attributes(tree: ast.Module) -> list[str]:
+    """Names with one underscore that are read off something else than self, and that the module does not make itself."""
+    own = {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
+    read = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and re.match(r"_[a-z]", node.attr):
+            if isinstance(node.value, ast.Name) and node.value.id in ("self", "cls"):
+                own.add(node.attr)
+            else:
+                read.append(node.attr)
+    return [name for name in read if name not in own]
+
+
+def test_no_module_reaches_into_another():
+    taichis = PACKAGE / "runtime"  # the one place that knows Taichi's internals
+    reached = {path.name: private_attributes(tree) for path, tree in MODULES.items() if taichis not in path.parents}
+    assert {name: names for name, names in reached.items() if names} == {}
+    assert private_attributes(ast.parse("def f(x):\n    return x._secret")) == ["_secret"]
+
+
+def test_files_are_short():
+    lengths = {path.name: len(path.read_text().splitlines()) for path in MODULES}
+    assert {name: length for name, length in lengths.items() if length > 350} == {}
+    assert sorted(lengths.values())[len(lengths) // 2] <= 110
