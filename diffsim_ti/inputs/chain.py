@@ -54,7 +54,7 @@ class Chain:
             known, unread = known.union(link.writes), unread.difference(link.reads)
         if unread:
             raise ValueError(f"no link reads the input {sorted(unread)[0]!r}: give its term or material one that does")
-        self._kept: dict[Link, tuple[Arrays, Arrays]] = {}
+        self._kept: dict[Link, tuple[Arrays, Arrays]] = {}  # (what it read, what it wrote)
         self._ways: dict[tuple[str, ...], tuple[list[Link], list[Link]]] = {}
 
     def value(self, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

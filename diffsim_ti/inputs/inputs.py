@@ -41,6 +41,7 @@ class Derived:
         return {name: getattr(self, name) for name in READ}
 
 
+# the names of the arrays that kernels read
 READ = tuple(field.name for field in fields(Derived))
 
 
@@ -78,6 +79,7 @@ class Inputs:
         self.chain = Chain(self._links(named), self.described)
 
     def _of_body(self, density, positions, velocities) -> list[Input]:
+        """What every scene has: its start, its material's numbers, its density."""
         n, X = self.mesh.num_vertices, self.mesh.vertices
         velocities = np.zeros(3) if velocities is None else velocities
         velocities = np.broadcast_to(np.asarray(velocities, np.float64), (n, 3))
@@ -90,6 +92,7 @@ class Inputs:
         ]
 
     def _at_last(self) -> list[Input]:
+        """What stands at the end of the list: the rest shape, whose gradient costs extra, and the prescribed motion."""
         out = [Input("rest_positions", self.mesh.vertices, (("vertices", 3),), "m", change=length)]
         if self.scene.motion is not None:
             shape = ("steps + 1", len(self.scene.fixed), 3)

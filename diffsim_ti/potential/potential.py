@@ -20,14 +20,14 @@ class Potential:
         self.arrays, self.tetrahedra, self.pairs, a = arrays, tetrahedra, pairs, arrays
         self.kernels = potential_kernels(a.law, a.features(), parallel, a.in_lanes)
         n, m, num_obstacles = a.num_vertices, a.num_places, len(a.obstacles)
-        self.u, self.w, self.y = (runtime.array(a.vector, 1, n) for _ in range(3))
+        self.u, self.w, self.y = (runtime.array(a.vector, 1, n) for _ in range(3))  # displacement, direction, result
         self.has_friction = bool(a.features().rough)
-        self.lag = runtime.array(a.vector, 2, n if self.has_friction else 1)
+        self.lag = runtime.array(a.vector, 2, n if self.has_friction else 1)  # as obstacles.py says, like the walls
         self.walls = runtime.array(a.vector, 3 * num_obstacles)
         self.per_gamma, self.held_at = 1.0, np.zeros((n, 3))
         self.size, self.contact = runtime.array(a.fp, n), runtime.array(a.fp, n)
         self.elastic, self.J = runtime.array(a.fp, m), runtime.array(a.fp, m)
-        self._launches, self._coupling, self._barrier_blocks = {}, None, None
+        self._launches, self._coupling, self._barrier_blocks = {}, None, None  # made when first needed
 
     def launch(self, name: str, lanes: bool = True, **records) -> None:
         """Run a kernel at the present displacement; records: more arrays than the potential's own."""

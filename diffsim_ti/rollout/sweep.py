@@ -52,8 +52,10 @@ class Sweep:
         self.state_bytes = 4 * self.scene.mesh.num_vertices * runtime.NUMPY[self.scene.precision]().itemsize
         self.checkpoints = choose_checkpoints(self.num_passes, self.state_bytes, every, memory)
         self.workspace = None  # made by the first run
-        self._loaded, self._current, self._adjoint = None, None, None
-        self._recorded, self._warned = False, False
+        self._loaded = None  # the values that are on the device
+        self._current = None  # the run whose frames and snapshots the workspace holds
+        self._adjoint = None  # the solver's, made by the first pull-back
+        self._recorded, self._warned = False, False  # whether the record holds all passes; whether of coarse contacts
 
     def _check_names(self, names) -> tuple[str, ...]:
         if names is None:
@@ -136,7 +138,7 @@ class Sweep:
             self._guard.advance(first, last, self.num_passes, self.passes_per_frame, self._recorded)
         if self.solver.last_frame_is_state:
             ws.save_frame(self.num_frames - 1)
-        self._kept, self._current = path, run
+        self._kept, self._current = path, run  # segments whose starts are in the snapshots
 
     def _record(self, first: int, last: int) -> None:
         """Passes first .. last - 1 from the current state, recorded."""

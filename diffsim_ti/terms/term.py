@@ -22,9 +22,10 @@ class Term(ABC):
 
     name: a word that its inputs' names begin with, "floor.stiffness"; without one they have plain names,
     "barrier_stiffness", to which a second such term adds _2.
-    A term that the scene does not list leaves no code and no memory behind. Three hooks, each optional:
-    `kernel` makes the compile-time twin of a term that acts by a force on each vertex (see VertexForce); gravity,
-    drag and external forces are stages of the step itself.
+    A term that the scene does not list leaves no code and no memory behind. What a subclass may write, each optional:
+    `links`, where kernels read something else than its inputs as they are; `check`, `settled` and `check_start`, to refuse
+    what does not fit and to choose what is left to the scene; `kernel`, the compile-time twin of a term that acts by a
+    force on each vertex (VertexForce). Gravity, drag and external forces are stages of the step itself.
     """
 
     acts_on_surface = False
