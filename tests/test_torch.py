@@ -307,7 +307,7 @@ def test_a_simulator_used_twice_in_one_graph():
 
     def run(E, sims):
         for sim in sims:
-            sim.material = Given(1e5 * E, 0.3)
+            sim.material = Given(2.0**17 * E, 0.3)  # a power of two: its product with a sum is the sum of products
         sims[0].reset()
         sims[0].rollout(4)
         carried = sims[0].velocities.roll(1, 0)

@@ -30,8 +30,8 @@ def inverse_edges(vertices: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
 
 def signed_volumes(D: np.ndarray) -> np.ndarray:
     """V = det D / 6 of each edge matrix [m^3], negative where a tetrahedron is turned inside out."""
-    a, b, c = np.moveaxis(D, 2, 0)
-    return np.einsum("ei,ei->e", a, np.cross(b, c)) / 6
+    (ax, bx, cx), (ay, by, cy), (az, bz, cz) = np.moveaxis(D, 0, 2)
+    return (ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx)) / 6
 
 
 def shape_gradients(inverse_D: np.ndarray) -> np.ndarray:
