@@ -24,6 +24,11 @@ class Items:
     def vector(self):
         return ti.types.vector(4, self.fp)
 
+    @staticmethod
+    def put_force(target, force, add: bool):
+        """To a corner; add: to what is there."""
+        assign(target, target + force if add else force)
+
 
 class Block(Items):
     """Eight tetrahedra at once: item b is block b."""
@@ -39,6 +44,14 @@ class Block(Items):
         """`count` numbers from `first` on, of the `rows` that each block has."""
         return [let(at(array, rows * item + first + k)) for k in range(count)]
 
+    def row(self, array, slot, count: int, item):
+        """`count` numbers of an item in a slot of an array of slots."""
+        return [let(at(array, slot, count * item + k)) for k in range(count)]
+
+    def put_row(self, array, slot, item, numbers):
+        for k, number in enumerate(numbers):
+            assign(at(array, slot, len(numbers) * item + k), number)
+
     def corners(self, vectors, slot, tets, item):
         """[a][d]: component d of the vector at corner a."""
         out = []
@@ -47,11 +60,11 @@ class Block(Items):
             out.append([let(self.lanes(*(at(w, d) for w in whole))) for d in range(3)])
         return out
 
-    def store(self, corner, item, forces, zero):
+    def store(self, corner, item, forces, zero, add: bool = False):
         for a in range(4):
             for lane in range(LANES):
                 force = self.vector(*(at(forces[a][d], lane) for d in range(3)), zero)
-                assign(at(corner, 4 * LANES * item + 4 * lane + a), force)
+                self.put_force(at(corner, 4 * LANES * item + 4 * lane + a), force, add)
 
     def put(self, array, rows: int, item, first, numbers):
         for k, number in enumerate(numbers):
@@ -72,14 +85,21 @@ class Single(Items):
     def numbers(self, array, first: int, count: int, rows: int, item):
         return [let(at(at(array, rows * (item // LANES) + first + k), item % LANES)) for k in range(count)]
 
+    def row(self, array, slot, count: int, item):
+        return [let(at(at(array, slot, count * (item // LANES) + k), item % LANES)) for k in range(count)]
+
+    def put_row(self, array, slot, item, numbers):
+        for k, number in enumerate(numbers):
+            assign(at(at(array, slot, len(numbers) * (item // LANES) + k), item % LANES), number)
+
     def corners(self, vectors, slot, tets, item):
         block, lane = item // LANES, item % LANES
         whole = [let(at(vectors, slot, at(tets, 4 * LANES * block + LANES * a + lane))) for a in range(4)]
         return [[let(at(w, d)) for d in range(3)] for w in whole]
 
-    def store(self, corner, item, forces, zero):
+    def store(self, corner, item, forces, zero, add: bool = False):
         for a in range(4):
-            assign(at(corner, 4 * item + a), self.vector(*forces[a], zero))
+            self.put_force(at(corner, 4 * item + a), self.vector(*forces[a], zero), add)
 
     def put(self, array, rows: int, item, first, numbers):
         for k, number in enumerate(numbers):

@@ -17,7 +17,8 @@ import taichi as ti
 from diffsim_ti.elements.tetrahedron import A, Tetrahedron
 from diffsim_ti.materials.calculus.tensor import inner, sum_of
 from diffsim_ti.materials.patch_law import PatchLaw
-from diffsim_ti.runtime import LANES, Bundle, at, let, traced
+from diffsim_ti.runtime import LANES, Bundle, let, traced
+from diffsim_ti.runtime import at as entry
 
 MOST = 6  # numbers of an item that its patch sums up
 
@@ -39,7 +40,7 @@ class PatchedTetrahedron(Tetrahedron):
         t, scene, base = SimpleNamespace(), job.scene, self.law.base
         t.B, t.V = self.gradients_of(item, scene.gradients), self.volume_of(item, scene.volumes)
         t.p, t.lam = self.law.split(self.coefficients_of(item, scene.coefficients))
-        t.D = self.edges(item, scene, job.u, job.s)
+        t.D = self.edges(item, scene, job.at.u, job.s)
         t.H = t.D @ t.B
         t.theta = base.dilatation(t.H)
         t.numbers = [t.V, let(t.V * t.lam), let(t.V * t.theta)]
@@ -72,15 +73,15 @@ class PatchedTetrahedron(Tetrahedron):
         return total
 
     @traced
-    def _patch_of(self, item, scene, u, s, w=None, dots=None) -> SimpleNamespace:
+    def _patch_of(self, item, scene, at, s, w=None, dots=None) -> SimpleNamespace:
         """What an item knows, with its patch's W, lam_p, theta_p, pi and, for changes w of u, their changes."""
-        job = Bundle(scene=scene, u=u, s=s, w=w, dots=dots)
+        job = Bundle(scene=scene, at=at, s=s, w=w, dots=dots)
         t = self._own(item, job)
         if self.lanes:
-            sums = [self.items.broadcast(let(sum_of(at(x, lane) for lane in range(LANES)))) for x in t.numbers]
+            sums = [self.items.broadcast(let(sum_of(entry(x, lane) for lane in range(LANES)))) for x in t.numbers]
         else:
             total = let(self._sum_one_by_one(item, job))
-            sums = [let(at(total, k)) for k in range(len(t.numbers))]
+            sums = [let(entry(total, k)) for k in range(len(t.numbers))]
         volume, stiff, swollen, *changes = sums
         t.lam_p, t.theta_p = let(stiff / volume), let(swollen / volume)
         t.q = [*t.p, let(t.lam_p * t.theta_p)]
@@ -94,50 +95,51 @@ class PatchedTetrahedron(Tetrahedron):
         return t
 
     @traced
-    def coefficients_at(self, item, scene, u, s) -> list:
-        return self._patch_of(item, scene, u, s).q
+    def numbers_at(self, item, scene, at, s) -> list:
+        return self._patch_of(item, scene, at, s).q
 
     # ---- forces and their derivatives -------------------------------------------------------------------------------
 
     @traced
-    def forces(self, item, scene, u, s, corner, v=None) -> None:
-        t = self._patch_of(item, scene, u, s)
+    def forces(self, item, scene, at, s, corner) -> None:
+        t = self._patch_of(item, scene, at, s)
         self.store(item, corner, (self.law.stress(t.H, t.q) * t.V) @ t.B.transpose())
 
     @traced
-    def pressure_forces(self, item, scene, u, s, corner) -> None:
+    def pressure_forces(self, item, scene, at, s, corner) -> None:
         """Corner forces of a unit pressure: the derivatives of -W_p theta_p by the displacement of the corners."""
-        t = self._own(item, Bundle(scene=scene, u=u, s=s, w=None, dots=None))
+        t = self._own(item, Bundle(scene=scene, at=at, s=s, w=None, dots=None))
         self.store(item, corner, (self.law.base.dilatation_gradient(t.H) * t.V) @ t.B.transpose())
 
     @traced
-    def stiffness(self, item, scene, u, s, w, corner) -> None:
-        t = self._patch_of(item, scene, u, s, w)
+    def stiffness(self, item, scene, at, s, corner) -> None:
+        t = self._patch_of(item, scene, at, s, at.w)
         dP = self.law.stress_differential(t.H, t.dH, t.q) + t.gradient * t.dpi
         self.store(item, corner, (dP * t.V) @ t.B.transpose())
 
     @traced
-    def forces_jvp(self, item, scene, u, s, du, corner, dots, v=None, dv=None) -> None:
-        t = self._patch_of(item, scene, u, s, du, dots)
+    def forces_jvp(self, item, scene, at, s, change, corner, dots) -> None:
+        t = self._patch_of(item, scene, at, s, change.u, dots)
         dP = self.law.stress_jvp(t.H, t.dH, t.q, [*t.dp, t.dpi])
         change = t.B * t.dV + t.dB * t.V
         self.store(item, corner, (dP * t.V) @ t.B.transpose() + self.law.stress(t.H, t.q) @ change.transpose())
 
     @traced
-    def forces_vjp(self, item, scene, u, s, w, corner, adjoint, v=None, rate_corner=None) -> None:
+    def forces_vjp(self, item, scene, at, s, w, corner, adjoint, shape: bool, add: bool = False) -> None:
         """The work of a patch's pressure on w is -W_p lam_p theta_p dtheta_p, with dtheta_p the change of theta_p for w."""
-        t = self._patch_of(item, scene, u, s, w)
+        t = self._patch_of(item, scene, at, s, w)
         dP, products = self.law.stress_differential_and_products(t.H, t.dH, t.q)
-        self.store(item, corner, ((dP + t.gradient * t.dpi) * t.V) @ t.B.transpose())
+        dP = dP + t.gradient * t.dpi
+        self.store(item, corner, (dP * t.V) @ t.B.transpose(), add)
         minus = let(ti.cast(-1, self.fp) * t.V)
         by = self.law.split_vjp([let(minus * x) for x in products], let(minus * t.theta_p * t.dtheta_p))
         self.items.add(adjoint.coefficients, len(products), item, by)
+        if shape:
+            self._shape_vjp(item, t, dP, adjoint)
 
     @traced
-    def shape_vjp(self, item, scene, u, s, w, adjoint, v=None) -> None:
-        t = self._patch_of(item, scene, u, s, w)
+    def _shape_vjp(self, item, t, dP, adjoint) -> None:
         P, minus = self.law.stress(t.H, t.q), ti.cast(-1, self.fp)
-        dP = self.law.stress_differential(t.H, t.dH, t.q) + t.gradient * t.dpi
         by_B = (t.D.transpose() @ dP + t.W.transpose() @ P) * let(minus * t.V)
         self.items.add(adjoint.gradients, 9, item, by_B.numbers)
         in_patch = t.dtheta_p * (t.theta_p * (t.lam - t.lam_p - t.lam_p) + t.lam_p * t.theta)

@@ -17,9 +17,17 @@ import taichi as ti
 from diffsim_ti.elements.items import Block, Single
 from diffsim_ti.materials.calculus.tensor import Tensor, inner, sum_of
 from diffsim_ti.materials.law import Law
-from diffsim_ti.runtime import LANES, let, traced
+from diffsim_ti.runtime import LANES, Bundle, let, traced
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
+
+
+@traced
+class Onwards(Bundle):
+    """How a law's state goes on in a pass: its length h, and `moves`, whether time goes on, None where it always does."""
+
+    def pick(self, moved, held):
+        return moved if self.moves is None else let(ti.select(self.moves, moved, held))
 
 
 @dataclass(frozen=True)
@@ -80,9 +88,16 @@ class Tetrahedron:
         return self.items.numbers(array, 0, K, K, 0 if self.uniform else item)
 
     @traced
-    def coefficients_at(self, item, scene, u, s) -> list:
-        """What the law takes at slot s of the displacement."""
-        return self.coefficients_of(item, scene.coefficients)
+    def state_of(self, item, z, s) -> list:
+        """The law's state in slot s of z; none if it has no state."""
+        S = len(self.law.state_names)
+        return self.items.row(z, s, S, item) if S else []
+
+    @traced
+    def numbers_at(self, item, scene, at, s) -> list:
+        """What the law takes besides tensors at slot s: its coefficients and its state."""
+        p = self.coefficients_of(item, scene.coefficients)
+        return [*p, *self.state_of(item, at.z, s)] if self.has_state else p
 
     @traced
     def volume_of(self, item, array):
@@ -91,12 +106,12 @@ class Tetrahedron:
     # ---- corners ----------------------------------------------------------------------------------------------------
 
     @traced
-    def store(self, item, corner, Q) -> None:
-        """Columns of Q are minus the forces of corners 1..3; corner 0 balances them."""
+    def store(self, item, corner, Q, add: bool = False) -> None:
+        """Columns of Q are minus the forces of corners 1..3; corner 0 balances them. add: to what is there."""
         minus, zero = ti.cast(-1, self.fp), ti.cast(0, self.fp)
         forces = [[let(minus * Q[d, a]) for d in range(3)] for a in range(3)]
         balance = [let(sum_of(Q[d, a] for a in range(3))) for d in range(3)]
-        self.items.store(corner, item, [balance, *forces], zero)
+        self.items.store(corner, item, [balance, *forces], zero, add)
 
     @ti.func
     def gather(self, i, scene: A, corner: A):
@@ -106,68 +121,126 @@ class Tetrahedron:
             f = f + corner[scene.corner_of[c]]
         return f
 
-    # ---- forces and their derivatives. v: velocities, for laws that read their gradient ------------------------------
+    # ---- forces and their derivatives --------------------------------------------------------------------------------
+    # `at` has arrays of slots: displacements u and what the law reads besides, velocities v, its state z
 
     @property
     def reads_rates(self) -> bool:
         return "H_dot" in self.law.reads
 
-    @traced
-    def _edges_read(self, item, scene, u, v, s) -> list:
-        """Edges of all whose gradients the law reads, at slot s."""
-        return [self.edges(item, scene, x, s) for x in ((u, v) if self.reads_rates else (u,))]
+    @property
+    def has_state(self) -> bool:
+        return bool(self.law.state_names)
 
     @traced
-    def forces(self, item, scene, u, s, corner, v=None) -> None:
+    def _edges_read(self, item, scene, at, s) -> list:
+        """Edges of all whose gradients the law reads, at slot s."""
+        return [self.edges(item, scene, x, s) for x in ((at.u, at.v) if self.reads_rates else (at.u,))]
+
+    @traced
+    def forces(self, item, scene, at, s, corner) -> None:
         """Corner forces at slot s."""
         B = self.gradients_of(item, scene.gradients)
-        x = [D @ B for D in self._edges_read(item, scene, u, v, s)]
-        P = self.law.stress_at(x, self.coefficients_of(item, scene.coefficients))
+        x = [D @ B for D in self._edges_read(item, scene, at, s)]
+        P = self.law.stress_at(x, self.numbers_at(item, scene, at, s))
         self.store(item, corner, (P * self.volume_of(item, scene.volumes)) @ B.transpose())
 
     @traced
-    def stiffness(self, item, scene, u, s, w, corner) -> None:
-        """Corner products of the derivative of the elastic force with w (negative semi-definite at rest)."""
+    def stiffness(self, item, scene, at, s, corner) -> None:
+        """Corner products of the derivative of the elastic force with at.w (negative semi-definite at rest)."""
         B = self.gradients_of(item, scene.gradients)
-        H, dH = self.edges(item, scene, u, s) @ B, self.edges(item, scene, w, 0) @ B
-        dP = self.law.stress_differential(H, dH, self.coefficients_of(item, scene.coefficients))
+        H, dH = self.edges(item, scene, at.u, s) @ B, self.edges(item, scene, at.w, 0) @ B
+        dP = self.law.stress_differential(H, dH, self.numbers_at(item, scene, at, s))
         self.store(item, corner, (dP * self.volume_of(item, scene.volumes)) @ B.transpose())
 
     @traced
-    def forces_jvp(self, item, scene, u, s, du, corner, dots, v=None, dv=None) -> None:
-        """Change of the corner forces for changes of displacements, velocities, coefficients and rest shape."""
+    def forces_jvp(self, item, scene, at, s, change, corner, dots) -> None:
+        """Change of the corner forces for a change of what `at` has, in slot 0, and of coefficients and rest shape."""
         B, B_dot = self.gradients_of(item, scene.gradients), self.gradients_of(item, dots.gradients)
-        volume, p = self.volume_of(item, scene.volumes), self.coefficients_of(item, scene.coefficients)
-        D, dD = self._edges_read(item, scene, u, v, s), self._edges_read(item, scene, du, dv, 0)
-        x, dx = [d @ B for d in D], [change @ B + d @ B_dot for d, change in zip(D, dD)]
-        dP = self.law.stress_jvp_at(x, dx, p, self.coefficients_of(item, dots.coefficients))
-        change = B * self.volume_of(item, dots.volumes) + B_dot * volume
-        self.store(item, corner, (dP * volume) @ B.transpose() + self.law.stress_at(x, p) @ change.transpose())
+        volume, q = self.volume_of(item, scene.volumes), self.numbers_at(item, scene, at, s)
+        D, dD = self._edges_read(item, scene, at, s), self._edges_read(item, scene, change, 0)
+        x, dx = [d @ B for d in D], [moved @ B + d @ B_dot for d, moved in zip(D, dD)]
+        dP = self.law.stress_jvp_at(x, dx, q, self._numbers_jvp(item, change, dots))
+        turned = B * self.volume_of(item, dots.volumes) + B_dot * volume
+        self.store(item, corner, (dP * volume) @ B.transpose() + self.law.stress_at(x, q) @ turned.transpose())
 
     @traced
-    def forces_vjp(self, item, scene, u, s, w, corner, adjoint, v=None, rate_corner=None) -> None:
-        """Corner products with w of the transposed derivatives of the force, by u to `corner`, by v to `rate_corner`;
-        adds the adjoint of the coefficients.
+    def _numbers_jvp(self, item, change, dots) -> list:
+        dp = self.coefficients_of(item, dots.coefficients)
+        return [*dp, *self.state_of(item, change.z, 0)] if self.has_state else dp
 
-        The work of the forces on w is -V P : W, with W the displacement gradient of w.
+    @traced
+    def forces_vjp(self, item, scene, at, s, w, corner, adjoint, shape: bool, add: bool = False) -> None:
+        """Corner products with w of the transposed derivatives of the force by u, to `corner` (add: to what is there), and
+        by v, to adjoint.rate_corner; adds the adjoints of coefficients and state and, if `shape`, of grad N and V.
+
+        The work of the forces on w is -V P(D B) : (W B), with D, W the edges of u and w.
         """
         B, volume = self.gradients_of(item, scene.gradients), self.volume_of(item, scene.volumes)
-        p = self.coefficients_of(item, scene.coefficients)
-        x, W = [D @ B for D in self._edges_read(item, scene, u, v, s)], self.edges(item, scene, w, 0) @ B
-        by_x, products = self.law.stress_vjp_at(x, W, p)
-        for by, target in zip(by_x, (corner, rate_corner)):
-            self.store(item, target, (by * volume) @ B.transpose())
+        q, D, W = (
+            self.numbers_at(item, scene, at, s),
+            self._edges_read(item, scene, at, s),
+            self.edges(item, scene, w, 0),
+        )
+        x, dH = [d @ B for d in D], W @ B
+        by_x, products = self.law.stress_vjp_at(x, dH, q)
+        self.store(item, corner, (by_x[0] * volume) @ B.transpose(), add)
+        if self.reads_rates:
+            self.store(item, adjoint.rate_corner, (by_x[1] * volume) @ B.transpose())
         minus = let(ti.cast(-1, self.fp) * volume)
-        self.items.add(adjoint.coefficients, len(p), item, [minus * product for product in products])
+        by_p, by_z = self._parted([minus * product for product in products])
+        self.items.add(adjoint.coefficients, len(by_p), item, by_p)
+        if self.has_state:
+            known = self.state_of(item, adjoint.z, 0)
+            self.items.put_row(adjoint.z, 0, item, [a + b for a, b in zip(known, by_z)])
+        if shape:
+            P = self.law.stress_at(x, q)
+            by_B = sum_of([*(d.transpose() @ by for d, by in zip(D, by_x)), W.transpose() @ P])
+            self.items.add(adjoint.gradients, 9, item, (by_B * minus).numbers)
+            self.items.add(adjoint.volumes, 1, item, [ti.cast(-1, self.fp) * inner(P, dH)])
 
     @traced
-    def shape_vjp(self, item, scene, u, s, w, adjoint, v=None) -> None:
-        """Adds the adjoints of grad N and V: the work is -V P(D B) : (W B)."""
-        B, volume = self.gradients_of(item, scene.gradients), self.volume_of(item, scene.volumes)
-        p = self.coefficients_of(item, scene.coefficients)
-        D, W = self._edges_read(item, scene, u, v, s), self.edges(item, scene, w, 0)
-        x, dH = [d @ B for d in D], W @ B
-        P, (by_x, _), minus = self.law.stress_at(x, p), self.law.stress_vjp_at(x, dH, p), ti.cast(-1, self.fp)
-        by_B = sum_of([*(d.transpose() @ by for d, by in zip(D, by_x)), W.transpose() @ P])
-        self.items.add(adjoint.gradients, 9, item, (by_B * let(minus * volume)).numbers)
-        self.items.add(adjoint.volumes, 1, item, [minus * inner(P, dH)])
+    def _parted(self, numbers: list) -> tuple[list, list]:
+        """(those of the coefficients, those of the state)"""
+        K = len(self.law.coefficient_names)
+        return numbers[:K], numbers[K:]
+
+    # ---- the law's state after a pass --------------------------------------------------------------------------------
+
+    @traced
+    def _read_onwards(self, item, scene, at, s, u_slot) -> tuple:
+        """(B, D, H, numbers of the law) for the state in slot s and the displacement in slot `u_slot`, default s."""
+        B, D = self.gradients_of(item, scene.gradients), self.edges(item, scene, at.u, s if u_slot is None else u_slot)
+        return B, D, D @ B, self.numbers_at(item, scene, at, s)
+
+    @traced
+    def move_on(self, item, scene, at, s, slot, onwards, u_slot=None) -> None:
+        """Put the state after a pass into a slot."""
+        _, _, H, q = self._read_onwards(item, scene, at, s, u_slot)
+        after, held = self.law.next_state_at(H, q, onwards.h), self._parted(q)[1]
+        self.items.put_row(at.z, slot, item, [onwards.pick(a, b) for a, b in zip(after, held)])
+
+    @traced
+    def move_on_jvp(self, item, scene, at, s, change, dots, onwards, u_slot=None) -> None:
+        """Its change, in place of that of the state before."""
+        B, D, H, q = self._read_onwards(item, scene, at, s, u_slot)
+        dH = self.edges(item, scene, change.u, 0) @ B + D @ self.gradients_of(item, dots.gradients)
+        dq = self._numbers_jvp(item, change, dots)
+        after, held = self.law.next_state_jvp(H, dH, q, dq, onwards.h), self._parted(dq)[1]
+        self.items.put_row(change.z, 0, item, [onwards.pick(a, b) for a, b in zip(after, held)])
+
+    @traced
+    def move_on_vjp(self, item, scene, at, s, onwards, corner, adjoint, shape: bool, u_slot=None) -> None:
+        """From the adjoint of the state after a pass to that of the state before, in its place, and, in corners, to that of
+        the displacement; adds those of coefficients and, if `shape`, of grad N."""
+        B, D, H, q = self._read_onwards(item, scene, at, s, u_slot)
+        later = self.state_of(item, adjoint.z, 0)
+        zero = [let(0 * x) for x in later]
+        by_H, by_q = self.law.next_state_vjp(H, q, onwards.h, [onwards.pick(x, o) for x, o in zip(later, zero)])
+        by_p, by_z = self._parted(by_q)
+        held = [onwards.pick(o, x) for x, o in zip(later, zero)]
+        self.items.put_row(adjoint.z, 0, item, [a + b for a, b in zip(by_z, held)])
+        self.items.add(adjoint.coefficients, len(by_p), item, by_p)
+        self.store(item, corner, (by_H * ti.cast(-1, self.fp)) @ B.transpose())
+        if shape:
+            self.items.add(adjoint.gradients, 9, item, (D.transpose() @ by_H).numbers)

@@ -19,16 +19,34 @@ class EnergyLaw(Law):
 
     volume="patches" needs `theta(H)`, and the last coefficient as the factor of theta^2 / 2 and nowhere else.
 
+    A law with a state (`state_names`, law.py) writes `psi(H, p, z)` and `next_state(H, p, z, h)`, z being a list of the S
+    numbers: z is held while psi gives stresses, and next_state is what it becomes in a pass of length h [s]. Write that
+    as the exact solution for a held H where there is one: relaxation towards H within a time tau is
+    z + (1 - exp(-h / tau)) (H - z). `lame` of its material says the moduli of what is fast, all springs together.
+
     The graph is Griewank, Walther, Evaluating Derivatives, ch. 3 and 5, doi:10.1137/1.9780898717761.
     """
 
     def __post_init__(self):
         if self.reads not in (("H",), ("H", "H_dot")):
             raise ValueError(f'{type(self).__name__}: reads must be ("H",) or ("H", "H_dot"), got {self.reads}')
+        if self.initial_state and len(self.initial_state) != len(self.state_names):
+            raise ValueError(
+                f"{type(self).__name__}: initial_state has {len(self.initial_state)} numbers for {len(self.state_names)} "
+                "state_names; give one for each, or none for zeros"
+            )
+        if self.state_names and type(self).next_state is EnergyLaw.next_state:
+            raise ValueError(
+                f"{type(self).__name__} has a state ({', '.join(self.state_names)}) that nothing moves on: write "
+                "next_state(H, p, z, h), or make them coefficients"
+            )
 
     def psi(self, H: Tensor, p: list) -> Number:
-        """psi [J/m^3], zero at rest."""
+        """psi [J/m^3], zero at rest; psi(H, p, z) where the law has a state."""
         raise NotImplementedError(f"{type(self).__name__} writes psi(H, p)")
+
+    def next_state(self, H: Tensor, p: list, z: list, h: Number) -> list:
+        """What the state z becomes in a pass of length h [s]: one number for each of `state_names`."""
 
     def dissipation(self, H: Tensor, H_dot: Tensor, p: list) -> Number:
         """phi [W/m^3] of a law that reads ("H", "H_dot"): its stress is dpsi/dF + dphi/dF_dot, F_dot = H_dot.
@@ -47,23 +65,42 @@ class EnergyLaw(Law):
 
     # ---- recording --------------------------------------------------------------------------------------------------
 
+    def _parted(self, numbers: list) -> list:
+        """[p], or [p, z] where the law has a state."""
+        K = len(self.coefficient_names)
+        return [numbers[:K], numbers[K:]] if self.state_names else [numbers]
+
     @traced
     def _record(self, H, p):
         """(graph, leaves of p, psi)"""
         g = Graph(self.fp)
         numbers = [g.leaf(x) for x in p]
-        return g, numbers, self.psi(Tensor(g.leaf(x) for x in H.numbers), numbers)
+        return g, numbers, self.psi(Tensor(g.leaf(x) for x in H.numbers), *self._parted(numbers))
 
     @traced
     def _record_stress(self, x, p):
         """(graph, leaves of x and p, P); x holds H alone, for the stress of psi, or H and H_dot."""
         g = Graph(self.fp)
         read, numbers = [Tensor(g.leaf(number) for number in one.numbers) for one in x], [g.leaf(c) for c in p]
-        P = g.gradient(self.psi(read[0], numbers), read[0].numbers)
+        parted = self._parted(numbers)
+        P = g.gradient(self.psi(read[0], *parted), read[0].numbers)
         if len(read) > 1:
-            viscous = g.gradient(self.dissipation(*read, numbers), read[1].numbers)
+            viscous = g.gradient(self.dissipation(*read, parted[0]), read[1].numbers)
             P = [a + b for a, b in zip(P, viscous)]
         return g, [*_numbers(read), *numbers], P
+
+    @traced
+    def _record_next_state(self, H, q, h):
+        """(graph, leaves of H and q, next state)"""
+        g = Graph(self.fp)
+        read, numbers = Tensor(g.leaf(x) for x in H.numbers), [g.leaf(x) for x in q]
+        following = list(self.next_state(read, *self._parted(numbers), g.leaf(h)))
+        if len(following) != len(self.state_names):
+            raise ValueError(
+                f"{type(self).__name__}: next_state must give {len(self.state_names)} numbers, one for each of "
+                f"{', '.join(self.state_names)}, got {len(following)}"
+            )
+        return g, [*read.numbers, *numbers], [g.number(x) for x in following]
 
     @traced
     def _record_dilatation(self, H):
@@ -119,6 +156,21 @@ class EnergyLaw(Law):
     def stress_differential_and_products(self, H, dH, p):
         (dP,), products = self.stress_vjp_at([H], dH, p)  # d2psi/dF2 is symmetric
         return dP, products
+
+    @traced
+    def next_state_at(self, H, q, h):
+        return _spread([x.value for x in self._record_next_state(H, q, h)[2]], H)
+
+    @traced
+    def next_state_jvp(self, H, dH, q, dq, h):
+        g, leaves, following = self._record_next_state(H, q, h)
+        return _spread(g.forward([*zip(leaves, [*dH.numbers, *dq])], following), H)
+
+    @traced
+    def next_state_vjp(self, H, q, h, z_adj):
+        g, leaves, following = self._record_next_state(H, q, h)
+        by = _spread(g.reverse([*zip(following, z_adj)], leaves), H)
+        return Tensor(by[:9]), by[9:]
 
     @traced
     def dilatation(self, H):

@@ -21,6 +21,12 @@ class Law:
     law does not read costs nothing. Kernels call `stress_at`, `stress_jvp_at` and `stress_vjp_at`, whose `x` are
     Tensors in the order of `reads`.
 
+    `state_names` names S numbers z of each tetrahedron that remember (viscous strains, damage); they begin at
+    `initial_state`, zero by default. All functions then take [*p, *z] for p, and give derivatives by all of these. z is
+    held during a pass of a solver, at whose end it becomes `next_state_at(H, [*p, *z], h)`: h [s] is the length of the
+    pass, H that of the displacement at which an explicit pass takes its forces, or at which an implicit one ends. The step
+    is thus split, which is of first order in h.
+
     A law is compile-time data: constants only, equal laws share compiled kernels. precision: "f32" or "f64".
     In its functions constants are integers, or `self.real(0.5)`, and no integer is divided or divides: Taichi computes a
     bare 0.5, x / 2 and 1 / x in f64, which makes f32 kernels slow. No unary minus on numbers: lanes have none.
@@ -29,6 +35,8 @@ class Law:
     precision: str
 
     coefficient_names = ()
+    state_names = ()
+    initial_state = ()  # one number for each of them, or none: zero
     reads = ("H",)
     last_without_lam = ()  # factors f: with lam = 0 the last coefficient is sum_k f_k p_k; empty: zero
     lanes = True  # written with + - * / and max alone, so that a number may be a vector of lanes
@@ -102,6 +110,23 @@ class Law:
         """(adjoints of x, a list of Tensors, and W : dP/dp_k, a list of K) for the adjoint W of P."""
         dP, products = self.stress_differential_and_products(*x, W, p)  # d2psi/dF2 is symmetric
         return [dP], products
+
+    @traced
+    def next_state_at(self, H, q, h):
+        """The state after a pass of length h, a list of S; q = [*p, *z]."""
+        raise NotImplementedError(
+            f"{type(self).__name__} has a state ({', '.join(self.state_names)}): write next_state_at"
+        )
+
+    @traced
+    def next_state_jvp(self, H, dH, q, dq, h):
+        """Its change for changes dH and dq, a list of S."""
+        raise NotImplementedError(f"{type(self).__name__} has a state: write next_state_jvp, beside next_state_at")
+
+    @traced
+    def next_state_vjp(self, H, q, h, z_adj):
+        """(adjoint of H, a Tensor, adjoints of q, a list) for the adjoint z_adj of the state after the pass."""
+        raise NotImplementedError(f"{type(self).__name__} has a state: write next_state_vjp, beside next_state_at")
 
     @traced
     def energy_by_coefficients(self, H, p):

@@ -24,6 +24,11 @@ class PatchLaw(Law):
                 f'volume="patches" averages energies, but {type(self.base).__name__} reads {", ".join(self.base.reads)}; '
                 'take volume="tetrahedra"'
             )
+        if self.base.state_names:
+            raise ValueError(
+                f'volume="patches" averages energies of displacements, but {type(self.base).__name__} has a state '
+                f'({", ".join(self.base.state_names)}); take volume="tetrahedra"'
+            )
         if not self.base.has_dilatation:
             name = type(self.base).__name__
             raise ValueError(

@@ -12,7 +12,7 @@ from diffsim_ti.elements.patched_tetrahedron import functions_of
 from diffsim_ti.potential.kernels import potential_kernels
 from diffsim_ti.runtime import Kernel
 from diffsim_ti.state.features import Features
-from diffsim_ti.state.numbers import SCENE
+from diffsim_ti.state.numbers import SCENE, with_state
 from diffsim_ti.state.workspace import Workspace
 
 A = ti.template()
@@ -33,7 +33,7 @@ class ObserverKernels:
     def observe(self, scene: A, at: A, out: A, plan: A):
         for e in range(plan.num_places):
             H = self.element.edges(e, scene, at.u, 0).dot(self.element.gradients_of(e, scene.gradients))
-            p = self.element.coefficients_at(e, scene, at.u, 0)
+            p = self.element.numbers_at(e, scene, at, 0)
             F = H.matrix() + ti.Matrix.identity(self.element.types.fp, 3)
             det = F.determinant()
             S = self.law.stress(H, p).matrix() @ F.transpose() / det  # Cauchy
@@ -47,7 +47,7 @@ class ObserverKernels:
     def fields(self) -> Kernel:
         """Energy density [J/m^3], von Mises stress [Pa], J of each tetrahedron."""
         out = dict.fromkeys(("energy", "von_mises", "J"), "scalars")
-        own = dict(scene=SCENE, at=dict(u="vectors2"), out=out)
+        own = dict(scene=SCENE, at=with_state(dict(u="vectors2"), self.law), out=out)
         return Kernel("fields", self.observe, self.law.precision, own, dict(num_places="int"))
 
 

@@ -8,9 +8,9 @@ import taichi as ti
 from diffsim_ti.elements.patched_tetrahedron import functions_of
 from diffsim_ti.materials.calculus.tensor import Tensor, sum_of
 from diffsim_ti.potential.obstacles import ObstaclePotential
-from diffsim_ti.runtime import PRECISIONS, Kernel, let, traced
+from diffsim_ti.runtime import PRECISIONS, Bundle, Kernel, let, traced
 from diffsim_ti.state.features import Features
-from diffsim_ti.state.numbers import ADJOINT, SCENE, TANGENT
+from diffsim_ti.state.numbers import ADJOINT, SCENE, TANGENT, with_state
 
 A = ti.template()
 PASS = dict(walls="vectors", lag="vectors2")  # what contact sees of a pass (obstacles.py)
@@ -44,7 +44,7 @@ class PotentialKernels:
         return ObstaclePotential(self.features, self.law.precision)
 
     def _kernel(self, name: str, body, **arrays) -> Kernel:
-        own = dict(scene=SCENE, pass_=PASS) | arrays
+        own = dict(scene=SCENE, pass_=PASS) | arrays | dict(at=with_state(arrays["at"], self.law))
         return Kernel(name, body, self.law.precision, own, NUMBERS)
 
     @ti.func
@@ -66,7 +66,7 @@ class PotentialKernels:
         ti.loop_config(serialize=not self.parallel)
         for e in range(plan.num_tetrahedra):
             H = self.single.edges(e, scene, at.u, 0).dot(self.single.gradients_of(e, scene.gradients))
-            psi = self.law.energy_density(H, self.single.coefficients_at(e, scene, at.u, 0))
+            psi = self.law.energy_density(H, self.single.numbers_at(e, scene, at, 0))
             out.elastic[e] = psi * self.single.volume_of(e, scene.volumes)
             out.J[e] = self.volume_ratio(H)
         ti.loop_config(serialize=not self.parallel)
@@ -106,7 +106,7 @@ class PotentialKernels:
     def all_forces(self, scene: A, pass_: A, at: A, out: A, plan: A):
         ti.loop_config(serialize=not self.parallel)
         for e in range(plan.num_items):
-            self.element.forces(e, scene, at.u, 0, scene.corner)
+            self.element.forces(e, scene, at, 0, scene.corner)
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.num_vertices):
             pushed, total = self.obstacles.vector(0), self.obstacles.vector(0)
@@ -131,7 +131,7 @@ class PotentialKernels:
     def multiply(self, scene: A, pass_: A, at: A, out: A, plan: A, friction: A):
         ti.loop_config(serialize=not self.parallel)
         for e in range(plan.num_items):
-            self.element.stiffness(e, scene, at.u, 0, at.w, scene.corner)
+            self.element.stiffness(e, scene, at, 0, scene.corner)
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.num_vertices):
             f = self.element.gather(i, scene, scene.corner)
@@ -164,12 +164,12 @@ class PotentialKernels:
     # ---- block diagonal ----------------------------------------------------------------------------------------------
 
     @traced
-    def tangent_column(self, e, scene, u, c, tangent):
+    def tangent_column(self, e, scene, at, c, tangent):
         """Column c of d2psi/dF2, nine numbers, to rows 9 c .. 9 c + 8 of its block."""
         el = self.element
-        H = el.edges(e, scene, u, 0) @ el.gradients_of(e, scene.gradients)
+        H = el.edges(e, scene, at.u, 0) @ el.gradients_of(e, scene.gradients)
         dH = Tensor(el.broadcast(ti.cast(c == k, self.fp)) for k in range(9))
-        dP = self.law.stress_differential(H, dH, el.coefficients_at(e, scene, u, 0))
+        dP = self.law.stress_differential(H, dH, el.numbers_at(e, scene, at, 0))
         el.put(tangent, 81, e, 9 * c, dP.numbers)
 
     @traced
@@ -203,7 +203,7 @@ class PotentialKernels:
         ti.loop_config(serialize=not self.parallel)
         for e in range(plan.num_items):
             for c in range(9):
-                self.tangent_column(e, scene, at.u, c, out.tangent)
+                self.tangent_column(e, scene, at, c, out.tangent)
             self.corner_blocks(e, scene, out.tangent, (out.corner0, out.corner1, out.corner2))
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.num_vertices):
@@ -236,7 +236,7 @@ class PotentialKernels:
     def unit_pressure(self, scene: A, pass_: A, at: A, out: A, plan: A):
         ti.loop_config(serialize=not self.parallel)
         for e in range(plan.num_items):
-            self.element.pressure_forces(e, scene, at.u, 0, scene.corner)
+            self.element.pressure_forces(e, scene, at, 0, scene.corner)
 
     @cached_property
     def pressure_forces(self) -> Kernel:
@@ -245,11 +245,16 @@ class PotentialKernels:
 
     # ---- derivatives by everything -----------------------------------------------------------------------------------
 
+    @traced
+    def change(self, at, tangent) -> Bundle:
+        """What forces see of a change: w of the displacement, z of the law's state."""
+        return Bundle(u=at.w, z=tangent.z) if self.element.has_state else Bundle(u=at.w)
+
     @ti.func
     def all_jvp(self, scene: A, pass_: A, at: A, out: A, tangent: A, plan: A):
         ti.loop_config(serialize=not self.parallel)
         for e in range(plan.num_items):
-            self.element.forces_jvp(e, scene, at.u, 0, at.w, scene.corner, tangent)
+            self.element.forces_jvp(e, scene, at, 0, self.change(at, tangent), scene.corner, tangent)
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.num_vertices):
             f = self.element.gather(i, scene, scene.corner)
@@ -260,16 +265,15 @@ class PotentialKernels:
     @cached_property
     def jvp(self) -> Kernel:
         """Change y of the forces for changes w of the displacement and of everything else that they depend on."""
-        own = dict(at=dict(u="vectors2", w="vectors2"), out=dict(y="vectors2"), tangent=TANGENT | PASS)
+        own = dict(at=dict(u="vectors2", w="vectors2"), out=dict(y="vectors2"))
+        own["tangent"] = with_state(TANGENT | PASS, self.law)
         return self._kernel("jvp", self.all_jvp, **own)
 
     @ti.func
     def all_vjp(self, scene: A, pass_: A, at: A, out: A, adjoint: A, plan: A):
         ti.loop_config(serialize=not self.parallel)
         for e in range(plan.num_items):
-            self.element.forces_vjp(e, scene, at.u, 0, at.w, scene.corner, adjoint)
-            if ti.static(self.features.shape):
-                self.element.shape_vjp(e, scene, at.u, 0, at.w, adjoint)
+            self.element.forces_vjp(e, scene, at, 0, at.w, scene.corner, adjoint, self.features.shape)
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.num_vertices):
             f = self.element.gather(i, scene, scene.corner)
@@ -281,7 +285,7 @@ class PotentialKernels:
     def vjp(self) -> Kernel:
         """y = df/du w (it is symmetric) and adjoints of the pass; adds the adjoints of all else that forces depend on."""
         adjoint = ADJOINT | dict(lag="vectors2", walls="vectors2")
-        own = dict(at=dict(u="vectors2", w="vectors2"), out=dict(y="vectors2"), adjoint=adjoint)
+        own = dict(at=dict(u="vectors2", w="vectors2"), out=dict(y="vectors2"), adjoint=with_state(adjoint, self.law))
         return self._kernel("vjp", self.all_vjp, **own)
 
 

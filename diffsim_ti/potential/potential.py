@@ -1,5 +1,6 @@
 """The potential energy of a displacement on the device, with its derivatives, as arrays of float64."""
 
+from contextlib import contextmanager
 from functools import cached_property
 from types import SimpleNamespace
 
@@ -8,6 +9,7 @@ import numpy as np
 from diffsim_ti import runtime
 from diffsim_ti.potential.kernels import potential_kernels
 from diffsim_ti.potential.patch_coupling import PatchCoupling
+from diffsim_ti.state.arrays import copy_slot
 
 
 class Potential:
@@ -28,6 +30,7 @@ class Potential:
         self.size, self.contact = runtime.array(a.fp, n), runtime.array(a.fp, n)
         self.elastic, self.J = runtime.array(a.fp, m), runtime.array(a.fp, m)
         self._launches, self._coupling, self._barrier_blocks = {}, None, None  # made when first needed
+        self.z = arrays.law_states(1)  # the state of the law, held during a pass
 
     def launch(self, name: str, lanes: bool = True, **records) -> None:
         """Run a kernel at the present displacement; records: more arrays than the potential's own."""
@@ -60,6 +63,23 @@ class Potential:
         if self.pairs:
             self.pairs.place(self.u)
         return self.held_at
+
+    def hold(self, history, slot: int) -> None:
+        """Hold the state that the law has in a slot."""
+        if self.z is not None:
+            copy_slot(history.z, slot, self.z, 0)
+
+    @contextmanager
+    def at_rest(self):
+        """At rest, and then back to where it was."""
+        held, state = self.held_at, None if self.z is None else runtime.fetch(self.z)
+        self.place(np.zeros_like(held))
+        if state is not None:
+            runtime.fill(self.z, self.arrays.initial_state_blocks())
+        yield
+        self.place(held)
+        if state is not None:
+            runtime.fill(self.z, state)
 
     def energy(self) -> tuple[float, float, np.ndarray]:
         """(energy [J], the sum of its absolute parts, J of each tetrahedron)."""

@@ -27,6 +27,7 @@ def array_types(precision: str) -> dict:
         "vectors": ndarray(vector, 1),
         "vectors2": ndarray(vector, 2),
         "blocks": ndarray(lanes, 1),
+        "blocks2": ndarray(lanes, 2),
         "int": ti.i32,
         "float": fp,
     }

@@ -32,6 +32,12 @@ class StaticSolver(ImplicitSolver):
         parallel: bool | None = None,
         preconditioner: str = "auto",
     ):
+        law = scene.law
+        if law.state_names:
+            raise ValueError(
+                f"{type(law).__name__} has a state ({', '.join(law.state_names)}) that moves on with time, and an "
+                "equilibrium has none; take a solver with inertia, or a law of what is left when it has settled"
+            )
         super().__init__(scene, dt, load_steps, tolerance, max_iterations, parallel, preconditioner)
         self._refuse_rigid_modes()
 

@@ -175,6 +175,16 @@ class SceneArrays:
         flat = np.swapaxes(blocks.reshape(-1, rows, LANES), 1, 2).reshape(-1, rows)
         return flat[self.place].astype(np.float64)
 
+    def law_states(self, num_slots: int):
+        """Room for what the law remembers; None if it has no state."""
+        rows = len(self.law.state_names) * self.num_blocks
+        return runtime.array(self.lanes, num_slots, rows) if rows else None
+
+    def initial_state_blocks(self) -> np.ndarray:
+        """Blocks of the law's initial state."""
+        initial = self.law.initial_state or (0.0,) * len(self.law.state_names)
+        return np.repeat(np.tile(initial, self.num_blocks)[:, None], LANES, 1)
+
     def coefficient_blocks(self, coefficients: np.ndarray) -> np.ndarray:
         """Blocks of coefficients, shape (K,) or (num_tetrahedra, K); a single block serves all if they are uniform."""
         uniform = np.zeros(LANES, int) if coefficients.ndim == 1 else None
@@ -187,7 +197,7 @@ class SceneArrays:
 
 
 class History:
-    """States of a run: u, v (and forces f if recorded) in `slots` slots."""
+    """States of a run: u, v (and forces f if recorded) in `slots` slots, and z, what the law remembers, if it does."""
 
     def __init__(self, arrays: SceneArrays, num_slots: int, record: bool):
         n = arrays.num_vertices
@@ -195,6 +205,12 @@ class History:
         self.u = runtime.array(arrays.vector, num_slots, n)
         self.v = runtime.array(arrays.vector, num_slots, n)
         self.f = runtime.array(arrays.vector, num_slots, n) if record else runtime.array(arrays.vector, 1, 1)
+        self.z = arrays.law_states(num_slots)
+
+    def copy(self, slot: int, target: "History", to: int) -> None:
+        """Copy the state in a slot to one of another history."""
+        for name in ("u", "v") if self.z is None else ("u", "v", "z"):
+            copy_slot(getattr(self, name), slot, getattr(target, name), to)
 
 
 @ti.kernel

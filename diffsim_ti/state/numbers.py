@@ -61,6 +61,11 @@ OF_STEPS = {name: PARTS[name].kind for name in ("forces", "motion", "anchor", "p
 ADJOINT = OF_TETRAHEDRA | dict(sums="scalars2")
 
 
+def with_state(arrays: dict, law) -> dict:
+    """The arrays of a state with what a law remembers, z, if it does: the numbers of each tetrahedron, by slots."""
+    return arrays | dict(z="blocks2") if law.state_names else arrays
+
+
 def on_device(arrays, name: str, derived: Derived):
     """(data, element type) of a part; a single zero where the scene has no such thing."""
     kind = PARTS[name].kind

@@ -1,5 +1,6 @@
 """Device data of one run: the scene's numbers, the current state, recorded states and saved frames as needed."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import taichi as ti
@@ -7,6 +8,7 @@ import taichi as ti
 from diffsim_ti import runtime
 from diffsim_ti.contact.surface_pairs import SurfacePairs
 from diffsim_ti.inputs import Derived
+from diffsim_ti.runtime import Kernel
 from diffsim_ti.state.arrays import History, SceneArrays, copy_slot, first_bad_vertex
 from diffsim_ti.state.watch import ContactWatch
 
@@ -58,6 +60,8 @@ class Workspace:
         """Set the state to the start."""
         runtime.fill(self.state.u, self.arrays.values.displacement[None])
         runtime.fill(self.state.v, self.arrays.values.velocity[None])
+        if self.state.z is not None:
+            runtime.fill(self.state.z, self.arrays.initial_state_blocks())
         self.place_obstacles(0)
         self.watch.clear()
 
@@ -70,6 +74,12 @@ class Workspace:
         if name not in self._launches:
             self._launches[name] = make()
         return self._launches[name]
+
+    def bound(self, kernel: Kernel, **records) -> Callable:
+        """A kernel bound to the scene and other records, kept as long as the arrays are."""
+        parts = [part for record in records.values() for part in (record if type(record) is tuple else (record,))]
+        key = (kernel, *map(id, parts))
+        return self.kept(key, lambda: (kernel.bind(self.arrays.in_lanes, scene=self.arrays, **records), parts))[0]
 
     def forget(self) -> None:
         """The state was set from outside: forget what came before it."""
@@ -110,13 +120,11 @@ class Workspace:
 
     def save(self, target: History, slot: int) -> None:
         """Copy the current state to a slot."""
-        copy_slot(self.state.u, 0, target.u, slot)
-        copy_slot(self.state.v, 0, target.v, slot)
+        self.state.copy(0, target, slot)
 
     def restore(self, source: History, slot: int) -> None:
         """Copy a slot to the current state."""
-        copy_slot(source.u, slot, self.state.u, 0)
-        copy_slot(source.v, slot, self.state.v, 0)
+        source.copy(slot, self.state, 0)
 
     def save_frame(self, frame: int) -> None:
         """Copy the current state to a frame."""

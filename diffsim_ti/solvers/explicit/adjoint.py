@@ -32,6 +32,7 @@ class ExplicitAdjoint:
         moving = self.features.moving
         self.felt = runtime.array(a.vector, 2 * moving, a.num_vertices if moving else 1)  # of paths, by each vertex
         self.frames = FrameArrays.of(a, *workspace.frames.frames_u.shape)
+        self.z = a.law_states(1)  # of the state of the law
 
     def fits(self, workspace) -> bool:
         """Whether kernels and shapes are still those of the run."""
@@ -54,8 +55,9 @@ class ExplicitAdjoint:
     def clear(self) -> None:
         """All adjoints zero, but those of the frames."""
         self.numbers.clear()
-        for target in (self.felt, self.u, self.v, self.w):
-            runtime.fill(target, 0)
+        for target in (self.felt, self.u, self.v, self.w, self.z):
+            if target is not None:
+                runtime.fill(target, 0)
         if self.ws.pairs:
             self.ws.pairs.clear_sums()
 
@@ -116,8 +118,9 @@ class ExplicitAdjoint:
 
     def scale(self, factor: float) -> None:
         """Multiply the running adjoint (clipping; the pending gather is scaled with it)."""
-        for x in (self.u, self.v, self.corner, self.rate_corner):
-            runtime.fill(x, runtime.fetch(x) * factor)
+        for x in (self.u, self.v, self.corner, self.rate_corner, self.z):
+            if x is not None:
+                runtime.fill(x, runtime.fetch(x) * factor)
 
     def collect(self, state: bool = True) -> Derived:
         """Adjoints of what kernels read, in float64, at the start of the run; state=False leaves out those of the state."""
@@ -143,7 +146,9 @@ class ExplicitTangent:
         self.u = runtime.upload(tangent.displacement[None], a.vector)
         self.v = runtime.upload(tangent.velocity[None], a.vector)
         self.frames = FrameArrays.of(a, *workspace.frames.frames_u.shape)
-        self.numbers = Tangent(a, tangent)
+        self.numbers, self.z = Tangent(a, tangent), a.law_states(1)
+        if self.z is not None:
+            runtime.fill(self.z, 0)
         self._rate_dot = float(tangent.parameters[self.features.drag]) if self.features.drag >= 0 else 0.0
 
     def advance(self, first: int, last: int, num_passes: int, save_every: int) -> None:

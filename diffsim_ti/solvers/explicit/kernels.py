@@ -5,9 +5,10 @@ from functools import cached_property, lru_cache
 
 import taichi as ti
 
-from diffsim_ti.runtime import Kernel
+from diffsim_ti.elements.tetrahedron import Onwards
+from diffsim_ti.runtime import Kernel, let, traced
 from diffsim_ti.solvers.explicit.kick_drift import KickDrift
-from diffsim_ti.state.numbers import ADJOINT, OF_STEPS, SCENE, TANGENT
+from diffsim_ti.state.numbers import ADJOINT, OF_STEPS, SCENE, TANGENT, with_state
 from diffsim_ti.state.schedule import pass_at, reversed_pass
 
 A = ti.template()
@@ -29,21 +30,37 @@ class ExplicitKernels:
     def element(self):
         return self.vertex.element
 
+    @traced
+    def onwards(self, now) -> Onwards:
+        """How the law's state goes on in a pass; one that only kicks leaves it as it is."""
+        return Onwards(h=now.h, moves=let(now.alpha > 0))
+
+    def with_state(self, arrays: dict) -> dict:
+        return with_state(arrays, self.vertex.law)
+
     # ---- forward -----------------------------------------------------------------------------------------------------
+
+    @ti.func
+    def elements(self, e, j, scene: A, state: A, table: A, plan: A):
+        s = (j - plan.base) * plan.stride
+        self.element.forces(e, scene, state, s, scene.corner)
+        if ti.static(self.element.has_state):
+            now = pass_at(table, j - plan.window)
+            self.element.move_on(e, scene, state, s, s + plan.stride, self.onwards(now))
 
     @ti.func
     def passes(self, scene: A, state: A, table: A, plan: A):
         """Slot 0 holds the state before pass `base`; with stride 1 each pass writes the next slot, and its forces."""
         if ti.static(self.parallel):
             for e in range(plan.num_items):
-                self.element.forces(e, scene, state.u, (plan.first - plan.base) * plan.stride, scene.corner, state.v)
+                self.elements(e, plan.first, scene, state, table, plan)
             for i in range(plan.num_vertices):
                 self.vertex.step(i, plan.first, pass_at(table, plan.first - plan.window), scene, state, plan)
         else:
             ti.loop_config(serialize=True)
             for j in range(plan.first, plan.first + plan.count):
                 for e in range(plan.num_items):
-                    self.element.forces(e, scene, state.u, (j - plan.base) * plan.stride, scene.corner, state.v)
+                    self.elements(e, j, scene, state, table, plan)
                 now = pass_at(table, j - plan.window)
                 for i in range(plan.num_vertices):
                     self.vertex.step(i, j, now, scene, state, plan)
@@ -51,7 +68,7 @@ class ExplicitKernels:
     @cached_property
     def step(self) -> Kernel:
         """`count` passes from pass `first` on."""
-        return self._kernel("step", self.passes, dict(state=STATE), stride="int")
+        return self._kernel("step", self.passes, dict(state=self.with_state(STATE)), stride="int")
 
     # ---- tangent -----------------------------------------------------------------------------------------------------
 
@@ -60,7 +77,10 @@ class ExplicitKernels:
         ti.loop_config(serialize=not self.parallel)
         for e in range(plan.num_items):
             s = plan.first - plan.base
-            self.element.forces_jvp(e, scene, state.u, s, tangent.u, scene.corner, tangent, state.v, tangent.v)
+            self.element.forces_jvp(e, scene, state, s, tangent, scene.corner, tangent)
+            if ti.static(self.element.has_state):
+                now = pass_at(table, plan.first - plan.window)
+                self.element.move_on_jvp(e, scene, state, s, tangent, tangent, self.onwards(now))
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.num_vertices):
             now = pass_at(table, plan.first - plan.window)
@@ -69,16 +89,21 @@ class ExplicitKernels:
     @cached_property
     def step_jvp(self) -> Kernel:
         """The tangent of pass `first` along recorded slots; the change of the state is advanced in place."""
-        return self._kernel("step_jvp", self.passes_jvp, dict(state=STATE, tangent=CHANGE | TANGENT), rate_dot="float")
+        own = dict(state=self.with_state(STATE), tangent=self.with_state(CHANGE) | TANGENT)
+        return self._kernel("step_jvp", self.passes_jvp, own, rate_dot="float")
 
     # ---- adjoint -----------------------------------------------------------------------------------------------------
 
     @ti.func
-    def elements_vjp(self, e, j, scene: A, state: A, adjoint: A, plan: A):
+    def elements_vjp(self, e, j, scene: A, state: A, adjoint: A, table: A, plan: A):
         s = j - plan.base
-        self.element.forces_vjp(e, scene, state.u, s, adjoint.w, adjoint.corner, adjoint, state.v, adjoint.rate_corner)
-        if ti.static(self.vertex.features.shape):
-            self.element.shape_vjp(e, scene, state.u, s, adjoint.w, adjoint, state.v)
+        if ti.static(self.element.has_state):
+            now = reversed_pass(pass_at(table, j - plan.window), j, plan)
+            on = self.onwards(now)
+            self.element.move_on_vjp(e, scene, state, s, on, adjoint.corner, adjoint, self.vertex.features.shape)
+        self.element.forces_vjp(
+            e, scene, state, s, adjoint.w, adjoint.corner, adjoint, self.vertex.features.shape, self.element.has_state
+        )
 
     @ti.func
     def passes_vjp(self, scene: A, state: A, adjoint: A, table: A, plan: A):
@@ -89,7 +114,7 @@ class ExplicitKernels:
                 now = reversed_pass(pass_at(table, plan.first - plan.window), plan.first, plan)
                 self.vertex.step_vjp(i, plan.first, now, scene, state, adjoint, plan)
             for e in range(plan.num_items):
-                self.elements_vjp(e, plan.first, scene, state, adjoint, plan)
+                self.elements_vjp(e, plan.first, scene, state, adjoint, table, plan)
             for c in range(moving):
                 now = pass_at(table, plan.first - plan.window)
                 self.vertex.obstacles.fold_path(c, now, plan.num_vertices, adjoint)
@@ -101,7 +126,7 @@ class ExplicitKernels:
                 for i in range(plan.num_vertices):
                     self.vertex.step_vjp(i, j, now, scene, state, adjoint, plan)
                 for e in range(plan.num_items):
-                    self.elements_vjp(e, j, scene, state, adjoint, plan)
+                    self.elements_vjp(e, j, scene, state, adjoint, table, plan)
                 for c in range(moving):
                     self.vertex.obstacles.fold_path(c, now, plan.num_vertices, adjoint)
 
@@ -112,8 +137,8 @@ class ExplicitKernels:
         halt: the pass at whose state the sweep stops, between its two kicks; kick: only the kick before the state.
         """
         numbers = dict.fromkeys(("num_passes", "halt", "kick"), "int")
-        own = CHANGE | ADJOINT | OF_STEPS | dict(w="vectors2", felt="vectors2") | CORNERS
-        return self._kernel("step_vjp", self.passes_vjp, dict(state=STATE, adjoint=own), **numbers)
+        own = self.with_state(CHANGE) | ADJOINT | OF_STEPS | dict(w="vectors2", felt="vectors2") | CORNERS
+        return self._kernel("step_vjp", self.passes_vjp, dict(state=self.with_state(STATE), adjoint=own), **numbers)
 
     @ti.func
     def gather_rest(self, scene: A, adjoint: A, plan: A):

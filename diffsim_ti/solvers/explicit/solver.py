@@ -1,14 +1,13 @@
 """What the explicit solvers share: a chain of kick-drift passes (kick_drift.py), forward, tangent and reverse."""
 
 from abc import abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.inputs import Derived
-from diffsim_ti.runtime import Kernel
 from diffsim_ti.solvers.explicit.adjoint import ExplicitAdjoint, ExplicitTangent
 from diffsim_ti.solvers.explicit.kernels import ExplicitKernels, explicit_kernels
 from diffsim_ti.solvers.solver import Solver
@@ -76,12 +75,6 @@ class ExplicitWorkspace(Workspace):
     def kernels(self, features) -> ExplicitKernels:
         """The kernels for some features of the scene."""
         return explicit_kernels(self.arrays.law, features, self.parallel, self.arrays.in_lanes)
-
-    def bound(self, kernel: Kernel, **records) -> Callable:
-        """A kernel bound to the scene and other records, kept as long as the arrays are."""
-        parts = [part for record in records.values() for part in (record if type(record) is tuple else (record,))]
-        key = (kernel, *map(id, parts))
-        return self.kept(key, lambda: (kernel.bind(self.arrays.in_lanes, scene=self.arrays, **records), parts))[0]
 
     def launches(self, first: int, last: int, num_passes: int, save_every: int, work: int, backwards=False) -> Iterator:
         """Numbers of the launches that passes first .. last - 1 take, for each of which their table is shown.

@@ -4,6 +4,8 @@ A pass solves R(u*, theta) = 0 with -dR/du = A = c M + d2E/du2, which is symmetr
 theta, and for the adjoint p of u* the adjoint of theta is lambda . dR/dtheta with A lambda = p.
 """
 
+from types import SimpleNamespace
+
 import numpy as np
 
 from diffsim_ti import runtime
@@ -32,6 +34,7 @@ class _Passes:
         self.u_star = (self.u_next - (1 - stage.c0) * self.u) / stage.c0
         self.mass = stage.inertia * ws.mass
         ws.begin(j, stage, self.u, self.x)
+        ws.potential.hold(ws.record, j - base)
         ws.potential.place(self.u_star)
         self.operator = Operator(ws.potential, self.mass, ws.free)
         self._preconditioner = None
@@ -75,7 +78,11 @@ class ImplicitAdjoint(_Passes):
         self.potential = p
         self.lag = runtime.array(a.vector, 2, n if p.has_friction else 1)
         self.walls = runtime.array(a.vector, 3 * num_obstacles, n if num_obstacles else 1)
-        own = dict(scene=a, pass_=p, at=p, out=p, adjoint=(self, self.numbers))
+        self.z, own = a.law_states(1), dict(scene=a, pass_=p, at=p, out=p, adjoint=(self, self.numbers))
+        if self.z is not None:  # the state of the law
+            corner, y = runtime.array(a.vector, *a.corner.shape), runtime.array(a.vector, 1, n)
+            runtime.fill(corner, 0)  # also where surfaces in contact have theirs
+            self._law = SimpleNamespace(z=self.z, corner=corner, y=y)
         self._vjp = self.kernels.vjp.bind(a.in_lanes, **own)
 
     def fits(self, workspace) -> bool:
@@ -86,6 +93,8 @@ class ImplicitAdjoint(_Passes):
     def start(self, positions_adj: np.ndarray, velocities_adj: np.ndarray, last_frame_is_input: bool) -> None:
         """Set the adjoints of the frames, shape (frames, n, 3), and clear the rest."""
         self.numbers.clear()
+        if self.z is not None:
+            runtime.fill(self.z, 0)
         if self.ws.pairs:
             self.ws.pairs.clear_sums()
         a = self.ws.arrays
@@ -108,10 +117,18 @@ class ImplicitAdjoint(_Passes):
         """
         for j in range(last - 1, stop - 1, -1):
             self.open(j, base)
+            if self.z is not None:
+                self._pull_back_law(j, j - base)
             self._pull_back(j)
             if save_every and j % save_every == 0 and j // save_every < len(self.frames[0]) - 1:
                 self.p += self.frames[0][j // save_every]
                 self.q += self.frames[1][j // save_every]
+
+    def _pull_back_law(self, j: int, slot: int) -> None:
+        """The state of the law after pass j comes from that before, in a slot of the record, and from where it ends."""
+        own = dict(at=self.ws.record, adjoint=(self._law, self.numbers))
+        self.ws.launch_law_state("vjp", self.features, j, slot, slot + 1, **own)
+        self.p = self.p + runtime.fetch_row(self._law.y, 0)
 
     def _pull_back(self, j: int) -> None:
         ws, s, p, q, fixed = self.ws, self.stage, self.p, self.q, self.ws.arrays.fixed
@@ -185,6 +202,8 @@ class ImplicitAdjoint(_Passes):
     def scale(self, factor: float) -> None:
         """Multiply the running adjoint."""
         self.p, self.q, self.pending = factor * self.p, factor * self.q, [factor * x for x in self.pending]
+        if self.z is not None:
+            runtime.fill(self.z, runtime.fetch(self.z) * factor)
 
     def collect(self) -> Derived:
         """Adjoints of what kernels read, in float64, at the start of the run."""
@@ -213,10 +232,14 @@ class ImplicitTangent(_Passes):
         a, self.tangent = workspace.arrays, tangent
         p = workspace.potential
         self.du, self.dv, self.tangent_before = tangent.displacement.copy(), tangent.velocity.copy(), None
-        kernels = potential_kernels(a.law, a.features(), workspace.parallel, a.in_lanes)
+        self.features = a.features()
+        kernels = potential_kernels(a.law, self.features, workspace.parallel, a.in_lanes)
         self.numbers = Tangent(a, tangent)
         self.lag, self.walls = runtime.array(a.vector, *p.lag.shape), runtime.array(a.vector, *p.walls.shape)
-        own = dict(scene=a, pass_=p, at=p, out=p, tangent=(self, self.numbers))
+        self.z, own = a.law_states(1), dict(scene=a, pass_=p, at=p, out=p, tangent=(self, self.numbers))
+        if self.z is not None:
+            runtime.fill(self.z, 0)
+            self._law = SimpleNamespace(z=self.z, w=p.w)
         self._jvp = kernels.jvp.bind(a.in_lanes, **own)
         self.rate_dot = float(tangent.parameters[a.features().drag]) if a.features().drag >= 0 else 0.0
         self.frames = [], []
@@ -229,6 +252,10 @@ class ImplicitTangent(_Passes):
                 self.save_frame(j // save_every)
             self.open(j, first)
             self._pass(j)
+            if self.z is not None:
+                runtime.fill(self.ws.potential.w, self.du[None])
+                own = dict(at=self.ws.record, tangent=(self._law, self.numbers))
+                self.ws.launch_law_state("jvp", self.features, j, j - first, j - first + 1, **own)
 
     def _pass(self, j: int) -> None:
         ws, s, tangent, a = self.ws, self.stage, self.tangent, self.ws.arrays

@@ -39,11 +39,9 @@ class Multigrid:
         import pyamg
 
         self.potential, self.free = potential, free
-        held = potential.held_at
-        potential.place(np.zeros_like(held))
-        potential.blocks()
-        self._matrix, self._diagonal = _assemble(potential, mass, free)
-        potential.place(held)
+        with potential.at_rest():
+            potential.blocks()
+            self._matrix, self._diagonal = _assemble(potential, mass, free)
         sweep = ("block_gauss_seidel", {"sweep": "symmetric", "iterations": 1})
         state = np.random.get_state()
         np.random.seed(0)  # pyamg estimates a spectral radius from a random vector

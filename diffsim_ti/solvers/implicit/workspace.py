@@ -9,6 +9,7 @@ from diffsim_ti.contact.implicit_pairs import ImplicitPairs
 from diffsim_ti.inputs import Derived
 from diffsim_ti.monitor.energy_watch import EnergyWatch
 from diffsim_ti.potential.potential import Potential
+from diffsim_ti.solvers.implicit.law_state import law_state_kernels
 from diffsim_ti.solvers.implicit.linear import NotConverged
 from diffsim_ti.solvers.implicit.newton import Newton
 from diffsim_ti.solvers.implicit.preconditioners import BlockJacobi, Multigrid
@@ -107,6 +108,7 @@ class ImplicitWorkspace(Workspace):
             if save_every and j % save_every == 0:
                 self.save_frame(j // save_every)
             u, v, before = self.read(self.state, 0)
+            self.potential.hold(self.state, 0)
             try:
                 u_next, v_next = self._pass(j, u, v, before)
             except NotConverged as error:
@@ -120,21 +122,27 @@ class ImplicitWorkspace(Workspace):
                 self.state.fresh[0] = False
             runtime.fill(self.state.u, u_next[None])
             runtime.fill(self.state.v, v_next[None])
+            if self.state.z is not None:
+                self.launch_law_state("forward", self.arrays.features(), j, 0, 0, at=self.state)
             if base is not None:
-                copy_slot(self.state.u, 0, self.record.u, j + 1 - base)
-                copy_slot(self.state.v, 0, self.record.v, j + 1 - base)
+                self.state.copy(0, self.record, j + 1 - base)
                 if self.solver.multistep:
                     self.record.fresh[j + 1 - base] = False
+
+    def launch_law_state(self, name: str, features, j: int, slot: int, end: int, **records) -> None:
+        """Launch one of the LawStateKernels for pass j, from z in `slot` and u in slot `end`."""
+        a = self.arrays
+        kernel = getattr(law_state_kernels(a.law, features, self.parallel, a.in_lanes), name)
+        sizes = dict(num_items=a.num_items, num_vertices=a.num_vertices, slot=slot, end=end)
+        self.bound(kernel, **records)(**sizes, h=float(self.solver.schedule.length(j)))
 
     def preconditioner(self, mass: np.ndarray) -> tuple:
         """(preconditioner for c M + K with mass = c m, size of the diagonal of that at rest [N/m])."""
         key = float(mass.sum())
         if key not in self._preconditioners:
-            held = self.potential.held_at
-            self.potential.place(np.zeros_like(held))
-            blocks, contact = self.potential.blocks(), self.potential.contact_blocks()
+            with self.potential.at_rest():
+                blocks, contact = self.potential.blocks(), self.potential.contact_blocks()
             size = np.abs(blocks if contact is None else blocks - contact).sum((1, 2))[:, None]
-            self.potential.place(held)
             kind = Multigrid if self._wants_multigrid(size, mass) else BlockJacobi
             if len(self._preconditioners) > 2:
                 self._preconditioners.pop(next(iter(self._preconditioners)))
