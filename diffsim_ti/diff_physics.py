@@ -43,6 +43,13 @@ class _EnergyDensity(torch.autograd.Function):
         return None, grad[:, None, None] * P, by_coefficients.sum(0) if ctx.uniform else by_coefficients
 
 
+def refuse_state(law, where: str, remedy: str) -> None:
+    """Raise ValueError for a law that remembers, where nothing says what."""
+    if law.state_names:
+        names = ", ".join(law.state_names)
+        raise ValueError(f"{type(law).__name__} has a state ({names}) that {where} does not know: {remedy}")
+
+
 class TorchMaterial(torch.nn.Module):
     """What learnable materials share: E and nu as tensors, and the one law that exists in Taichi.
 
@@ -70,6 +77,7 @@ class TorchMaterial(torch.nn.Module):
         if F.ndim != 3 or F.shape[1:] != (3, 3):
             raise ValueError(f"F: expected shape (m, 3, 3), got {tuple(F.shape)}")
         material = self.material(*(x.detach().double().cpu().numpy() for x in (self.E, self.nu)))
+        refuse_state(material.law("f64"), "energy_density(F)", "ask Simulator.compute_energy(), which has the state")
         lame = torch.stack(torch.broadcast_tensors(self.mu, self.lam), -1)
         coefficients = lame @ torch.as_tensor(np.array(material.from_lame), dtype=lame.dtype, device=lame.device).T
         if coefficients.ndim == 2 and len(coefficients) != len(F):

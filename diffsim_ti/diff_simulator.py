@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
-from diffsim_ti.diff_physics import DifferentiableBarrierContact, TorchMaterial
+from diffsim_ti.diff_physics import DifferentiableBarrierContact, TorchMaterial, refuse_state
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.monitor import stability
 from diffsim_ti.rollout import Rollout
@@ -103,6 +103,8 @@ class DifferentiableSimulator:
     ):
         self.mesh, self.material, self.solver, self.device = mesh, material, solver, checked_device(device)
         self.density, self.fixed_vertices = density, fixed_vertices
+        remedy = "each step and rollout starts afresh; take rollout_frames(Rollout(solver, steps), ...) for a whole run"
+        refuse_state(material.core(mesh).law("f64"), "DifferentiableSimulator", remedy)
         self._terms = list(terms or [])
         self._contact = self._choose_contact(contact)
         self._substeps, self._rollouts, self._scenes = solver.substeps, {}, {}

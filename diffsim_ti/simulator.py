@@ -108,8 +108,17 @@ class Simulator:
         """Velocities [m/s]."""
         return runtime.fetch(self.workspace.state.v)[0]
 
+    @property
+    def law_state(self) -> np.ndarray:
+        """What the law remembers of each tetrahedron, shape (num_tetrahedra, S), in the order of its `state_names`."""
+        arrays, z, S = self.workspace.arrays, self.workspace.state.z, len(self.scene.law.state_names)
+        return np.zeros((arrays.num_tetrahedra, 0)) if z is None else arrays.from_blocks(runtime.fetch(z)[0], S)
+
     def set_state(self, positions: ArrayLike | None = None, velocities: ArrayLike | None = None) -> None:
-        """Put the body elsewhere: positions [m], velocities [m/s], shape (num_vertices, 3); None leaves a part as it is."""
+        """Put the body elsewhere: positions [m], velocities [m/s], shape (num_vertices, 3); None leaves a part as it is.
+
+        What the law remembers stays; `reset` clears it.
+        """
         state, shape = self.workspace.state, (self.scene.mesh.num_vertices, 3)
         for name, value, target, origin in (
             ("positions", positions, state.u, self._start.rest),

@@ -15,6 +15,7 @@ class Checkpoints:
     num_passes: int
     segment: int
     snapshots: int
+    law_state: float = 0.0  # size of what the law remembers, in arrays of (num_vertices, 3) numbers
 
     @property
     def num_segments(self) -> int:
@@ -34,8 +35,8 @@ class Checkpoints:
         return out
 
     def states(self) -> int:
-        """Stored arrays of (num_vertices, 3) numbers: two for a snapshot, three for a recorded pass."""
-        return 2 * self.snapshots + 3 * (self.segment + 1)
+        """Stored arrays of (num_vertices, 3) numbers: two for a snapshot, three for a recorded pass, and the law's."""
+        return (2 + self.law_state) * self.snapshots + (3 + self.law_state) * (self.segment + 1)
 
 
 def _split(begin: int, end: int, free: int) -> int:
@@ -50,37 +51,45 @@ def _split(begin: int, end: int, free: int) -> int:
     return begin + min(math.comb(free + repeats, free + 1), length - math.comb(free + repeats - 1, free))
 
 
-def choose_checkpoints(num_passes: int, state_bytes: int, every: int | None, memory: float | None) -> Checkpoints:
+def choose_checkpoints(
+    num_passes: int, state_bytes: int, every: int | None, memory: float | None, law_state: float = 0.0
+) -> Checkpoints:
     """What to keep, from the user's wish.
 
     every: passes per segment, all segment starts kept. memory: budget [MB] for all that is kept; `state_bytes` is the
-    size of one (num_vertices, 3) array. Neither: 1000 MB. Raises ValueError if the budget is too small for any choice.
+    size of one (num_vertices, 3) array, law_state that of the law's state in such arrays. Neither: 1000 MB. Raises
+    ValueError if the budget is too small for any choice.
     """
+    kept, recorded = 2 + law_state, 3 + law_state
+
+    def made(segment: int, snapshots: int) -> Checkpoints:
+        return Checkpoints(num_passes, segment, snapshots, law_state)
+
     if num_passes == 0:
-        return Checkpoints(0, 1, 1)
+        return made(1, 1)
     if every is not None:
         every = min(every, num_passes)
-        full = Checkpoints(num_passes, every, -(-num_passes // every))
+        full = made(every, -(-num_passes // every))
         if memory is None or full.states() * state_bytes <= memory * 1e6:
             return full
-        snapshots = int((memory * 1e6 / state_bytes - 3 * (every + 1)) // 2)
+        snapshots = int((memory * 1e6 / state_bytes - recorded * (every + 1)) // kept)
         if snapshots < 1:
-            least = Checkpoints(num_passes, every, 1).states() * state_bytes / 1e6
+            least = made(every, 1).states() * state_bytes / 1e6
             raise ValueError(
                 f"memory = {memory:g} MB is too little for segments of {every} passes: {least:.3g} MB needed"
             )
-        return Checkpoints(num_passes, every, snapshots)
+        return made(every, snapshots)
     budget = (1000.0 if memory is None else memory) * 1e6 / state_bytes
-    everything = Checkpoints(num_passes, num_passes, 1)
+    everything = made(num_passes, 1)
     if everything.states() <= budget:
         return everything
-    root = max(1, round(math.sqrt(2 * num_passes / 3)))
-    two_levels = Checkpoints(num_passes, root, -(-num_passes // root))
+    root = max(1, round(math.sqrt(kept * num_passes / recorded)))
+    two_levels = made(root, -(-num_passes // root))
     if two_levels.states() <= budget:
         return two_levels
-    segment = max(1, min(root, int(budget / 6) - 1))
-    snapshots = int((budget - 3 * (segment + 1)) // 2)
+    segment = max(1, min(root, int(budget / (2 * recorded)) - 1))
+    snapshots = int((budget - recorded * (segment + 1)) // kept)
     if snapshots < 1:
-        least = Checkpoints(num_passes, 1, 1).states() * state_bytes / 1e6
+        least = made(1, 1).states() * state_bytes / 1e6
         raise ValueError(f"memory = {memory:g} MB is too little to differentiate at all: {least:.3g} MB is the least")
-    return Checkpoints(num_passes, segment, min(snapshots, -(-num_passes // segment)))
+    return made(segment, min(snapshots, -(-num_passes // segment)))

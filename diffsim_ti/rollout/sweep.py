@@ -50,7 +50,9 @@ class Sweep:
         self.passes_per_frame = self.save_every * solver.substeps
         every = None if checkpoint_every is None else max(1, int(checkpoint_every)) * solver.substeps
         self.state_bytes = 4 * self.scene.mesh.num_vertices * runtime.NUMPY[self.scene.precision]().itemsize
-        self.checkpoints = choose_checkpoints(self.num_passes, self.state_bytes, every, memory)
+        places = -(-self.scene.mesh.num_tetrahedra // runtime.LANES) * runtime.LANES
+        law_state = places * len(self.scene.law.state_names) / (4 * self.scene.mesh.num_vertices)
+        self.checkpoints = choose_checkpoints(self.num_passes, self.state_bytes, every, memory, law_state)
         self.workspace = None  # made by the first run
         self._loaded = None  # the values that are on the device
         self._current = None  # the run whose frames and snapshots the workspace holds

@@ -199,13 +199,13 @@ class SceneArrays:
 class History:
     """States of a run: u, v (and forces f if recorded) in `slots` slots, and z, what the law remembers, if it does."""
 
-    def __init__(self, arrays: SceneArrays, num_slots: int, record: bool):
+    def __init__(self, arrays: SceneArrays, num_slots: int, record: bool, remembers: bool = True):
         n = arrays.num_vertices
         self.num_slots = num_slots
         self.u = runtime.array(arrays.vector, num_slots, n)
         self.v = runtime.array(arrays.vector, num_slots, n)
         self.f = runtime.array(arrays.vector, num_slots, n) if record else runtime.array(arrays.vector, 1, 1)
-        self.z = arrays.law_states(num_slots)
+        self.z = arrays.law_states(num_slots) if remembers else None
 
     def copy(self, slot: int, target: "History", to: int) -> None:
         """Copy the state in a slot to one of another history."""

@@ -1,4 +1,4 @@
-"""Rubber that relaxes: a spring beside a spring and a dashpot in series (Zener), in Green's strain, whichever way it turns."""
+"""Rubber that relaxes: a spring beside a spring and a dashpot in series (Zener), in the strain of Green."""
 
 from dataclasses import dataclass
 

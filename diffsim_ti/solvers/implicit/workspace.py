@@ -24,7 +24,7 @@ class TwoStepHistory(History):
 
     def __init__(self, arrays, num_slots: int, record: bool):
         super().__init__(arrays, num_slots, record=False)
-        self.before = History(arrays, 1 if record else num_slots, record=False)
+        self.before = History(arrays, 1 if record else num_slots, record=False, remembers=False)
         self.fresh = [True] * num_slots
 
 

@@ -1,0 +1,385 @@
+"""Laws that remember, as users write them: relaxation in closed form, the rule of a pass, and every gate of gradients."""
+
+import gc
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import pytest
+import taichi as ti
+from open_laws.relaxing import PAIRS, RelaxingLaw, RelaxingRubber
+
+import diffsim_ti as ds
+from diffsim_ti import runtime, verify
+from diffsim_ti.differentiation import exp
+from diffsim_ti.materials import EnergyLaw, Material
+from diffsim_ti.materials.calculus.tensor import add_to_diagonal, inner, invariants
+
+EXPLICIT = (ds.SemiImplicitSolver, ds.VelocityVerletSolver)
+SOLVERS = (*EXPLICIT, ds.ImplicitEulerSolver, ds.BDF2Solver, ds.ImplicitMidpointSolver)
+every_solver = pytest.mark.parametrize("solver", SOLVERS)
+MESH = ds.TetrahedralMesh.create_cube(2, 1.0)
+MU, LAM, G, TAU = 4e3, 6e3, 3e3, 0.02
+
+
+def rubber(each: bool = False) -> RelaxingRubber:
+    """uniform, or with numbers of each tetrahedron."""
+    m = MESH.num_tetrahedra if each else None
+    factor = np.random.default_rng(0).uniform(0.7, 1.4, (3, m)) if each else np.ones(3)
+    return RelaxingRubber(mu=MU, lam=LAM * factor[0], g=G * factor[1], tau=TAU * factor[2])
+
+
+def scene(material=None, **changes) -> ds.Scene:
+    """A cube held at one face that is drawn along, stretched, falling and slowed down."""
+    noise = 0.02 * np.random.default_rng(3).standard_normal(MESH.vertices.shape)
+    usual = dict(
+        initial_positions=MESH.vertices * [1.3, 1, 1] + noise,
+        initial_velocities=np.random.default_rng(7).standard_normal(MESH.vertices.shape),
+        fixed="xmin",
+        motion=lambda t: [0, 0.3 * t, 0],
+        precision="f64",
+    )
+    density = np.random.default_rng(8).uniform(800, 1200, MESH.num_tetrahedra)
+    return ds.Scene(MESH, material or rubber(), density, [ds.Gravity(), ds.Drag(0.3)], **usual | changes)
+
+
+def rollout(scene: ds.Scene, solver=ds.SemiImplicitSolver, steps: int = 3, parallel=None, **options) -> ds.Rollout:
+    own = dict(substeps=3) if solver in EXPLICIT else dict(tolerance=1e-12)
+    made = solver(scene, dt=8e-3, parallel=parallel, **own)
+    return ds.Rollout(made, steps, **dict(gradients="all") | options)
+
+
+# ---- what the stress does ----------------------------------------------------------------------------------------------
+
+
+def held(material, F, solver, dt: float, **options) -> ds.Simulator:
+    """A body all of whose vertices are held at a homogeneous deformation."""
+    everything = np.arange(MESH.num_vertices)
+    body = scene(
+        material, fixed=everything, motion=None, initial_positions=MESH.vertices @ F.T, initial_velocities=None
+    )
+    return ds.Simulator(solver(body, dt=dt, **options))
+
+
+@every_solver
+@pytest.mark.parametrize("steps_in_tau", [40, 0.5])
+def test_stress_under_held_strain_relaxes_exponentially(solver, steps_in_tau):
+    """S = S_lasting + 2 g exp(-t / tau) E, whatever the step."""
+    F = np.eye(3) + np.random.default_rng(4).uniform(-0.2, 0.2, (3, 3))
+    J, E, K = np.linalg.det(F), (F.T @ F - np.eye(3)) / 2, np.linalg.det(F) * np.linalg.inv(F).T
+    simulator = held(rubber(), F, solver, TAU / steps_in_tau, substeps=2)
+    for step in range(5):
+        left = np.exp(-step / steps_in_tau)
+        psi = MU / 2 * ((F**2).sum() - 3 - 2 * (J - 1)) + LAM / 2 * (J - 1) ** 2 + G * (left * E**2 * left).sum()
+        P = MU * (F - K) + LAM * (J - 1) * K + F @ (2 * G * left * E)
+        S = P @ F.T / J
+        dev = S - np.trace(S) / 3 * np.eye(3)
+        fields = simulator.tetrahedron_fields()
+        np.testing.assert_allclose(fields.energy_density, psi, rtol=1e-12)
+        np.testing.assert_allclose(fields.von_mises, np.sqrt(1.5 * (dev**2).sum()), rtol=1e-12)
+        assert simulator.compute_energy().parts["elastic"] == pytest.approx(psi * MESH.volumes.sum(), rel=1e-12)
+        np.testing.assert_allclose(
+            simulator.law_state, [[(1 - left) * E[pair] for pair in PAIRS]] * len(fields.J), atol=1e-13
+        )
+        simulator.step()
+
+
+@every_solver
+def test_a_pass_moves_the_state_on_once(solver):
+    """z' from z and H: where an explicit pass takes its forces, where an implicit one ends."""
+    body = scene(rubber(each=True))
+    options = {} if solver in EXPLICIT else dict(tolerance=1e-12)
+    simulator = ds.Simulator(solver(body, dt=2e-3, **options))
+    z, tau = np.zeros((MESH.num_tetrahedra, 6)), body.inputs.values["tau"]
+    B, tets = body.inputs.rest_gradients, MESH.tetrahedra
+    for _ in range(4):
+        before = simulator.displacements
+        simulator.step()
+        u = before if solver in EXPLICIT else simulator.displacements
+        D = np.swapaxes(u[tets[:, 1:]] - u[tets[:, :1]], 1, 2)
+        F = np.eye(3) + D @ B
+        E = (np.swapaxes(F, 1, 2) @ F - np.eye(3)) / 2
+        z += (1 - np.exp(-2e-3 / tau))[:, None] * (np.stack([E[:, i, j] for i, j in PAIRS], 1) - z)
+        np.testing.assert_allclose(simulator.law_state, z, rtol=0, atol=1e-14)
+
+
+@dataclass(frozen=True)
+class FadingLaw(EnergyLaw):
+    """A neo-Hookean body whose stiffness fades: psi = d psi_0, dd/dt = -rate d."""
+
+    coefficient_names = ("mu", "lam", "rate")
+    state_names = ("d",)
+    initial_state = (1.0,)
+
+    def psi(self, H, p, z):
+        _, j, s = invariants(H)
+        return z[0] * (p[0] / 2 * s + p[1] / 2 * j * j)
+
+    def next_state(self, H, p, z, h):
+        return [z[0] * exp(-h * p[2])]
+
+
+class Fading(Material):
+    spellings = (("mu", "lam", "rate"),)
+
+    def law(self, precision):
+        return FadingLaw(precision)
+
+
+def test_a_state_may_begin_elsewhere_than_at_zero():
+    F = np.diag([1.2, 0.9, 1.1])
+    simulator = held(Fading(MU, LAM, 30.0), F, ds.SemiImplicitSolver, 1e-2)
+    first = simulator.compute_energy().parts["elastic"]
+    simulator.run(3)
+    assert simulator.compute_energy().parts["elastic"] == pytest.approx(first * np.exp(-0.9), rel=1e-12)
+    simulator.reset()
+    assert simulator.compute_energy().parts["elastic"] == first
+
+
+# ---- gradients ---------------------------------------------------------------------------------------------------------
+
+
+def gates(r: ds.Rollout, round_off: float) -> None:
+    assert verify.dot_product_test(r) <= round_off
+    report = ds.check_gradients(r, verbose=False)
+    assert report.passed, report
+    assert {*r.scene.material.inputs, "rest_positions", "density"} <= {row.input for row in report.rows}
+
+
+@pytest.mark.parametrize("each", [False, True], ids=["uniform", "each"])
+@every_solver
+def test_gradients_by_every_number(solver, each):
+    gates(rollout(scene(rubber(each)), solver), 1e-12 if solver in EXPLICIT else 1e-10)
+
+
+def test_gradients_in_float32():
+    gates(rollout(scene(precision="f32")), 1e-5)
+
+
+def test_gradients_with_one_launch_for_each_pass():
+    gates(rollout(scene(rubber(each=True)), ds.VelocityVerletSolver, parallel=True), 1e-12)
+
+
+def touching(solver) -> ds.Rollout:
+    """Two cubes that nearly touch, on a rough floor: surfaces in contact have corners of their own."""
+    two = ds.TetrahedralMesh.joined([MESH, MESH.translated([0.1, 1.04, 0.07])])
+    terms = [ds.Ground(-0.05, stiffness=300.0, width=0.2, friction=0.3), ds.SelfContact(300.0, 0.1)]
+    velocities = np.repeat([[0.3, -1, 0], [0, -2.0, 0.2]], MESH.num_vertices, 0)
+    body = ds.Scene(two, rubber(), 1000.0, terms, initial_velocities=velocities, precision="f64")
+    return rollout(body, solver, steps=2)
+
+
+@pytest.mark.parametrize("solver", [ds.SemiImplicitSolver, ds.ImplicitMidpointSolver])
+def test_gradients_beside_contact(solver):
+    r = touching(solver)
+    gates(r, 1e-12 if solver in EXPLICIT else 1e-10)
+    assert r.sweep.workspace.pairs.list.count > 0
+
+
+@dataclass(frozen=True)
+class ViscousToo(RelaxingLaw):
+    reads = ("H", "H_dot")
+
+    def dissipation(self, H, H_dot, p):
+        half = add_to_diagonal(H, 1).transpose() @ H_dot
+        E_dot = (half + half.transpose()) * 0.5
+        return p[2] * p[3] * inner(E_dot, E_dot)
+
+
+@dataclass(frozen=True)
+class OneByOne(RelaxingLaw):
+    lanes = False
+
+
+class Variant(RelaxingRubber):
+    def __init__(self, law):
+        self.kind = law
+        super().__init__(mu=MU, lam=LAM, g=G, tau=TAU)
+
+    def law(self, precision):
+        return self.kind(precision)
+
+
+def test_gradients_of_a_law_that_also_reads_the_velocity():
+    gates(rollout(scene(Variant(ViscousToo))), 1e-12)
+
+
+@cache
+def seeds(r: tuple) -> tuple:
+    return np.random.default_rng(9).standard_normal((2, *r))
+
+
+def gradients(r: ds.Rollout, **options) -> dict:
+    frames = r.forward(**options)
+    return r.vjp(frames, *seeds(frames.positions.shape))
+
+
+@pytest.mark.parametrize("solver", [ds.SemiImplicitSolver, ds.ImplicitEulerSolver])
+def test_lanes_change_nothing(solver):
+    """Eight tetrahedra at a time and one at a time agree to round-off."""
+    pair = [gradients(rollout(scene(Variant(law)), solver)) for law in (RelaxingLaw, OneByOne)]
+    for name, one in pair[0].items():
+        np.testing.assert_allclose(one, pair[1][name], rtol=0, atol=1e-11 * np.abs(one).max(), err_msg=name)
+
+
+@pytest.mark.parametrize("solver", [*EXPLICIT, ds.BDF2Solver])
+@pytest.mark.parametrize("options", [dict(checkpoint_every=2), dict(memory=0.008)], ids=str)
+def test_what_is_kept_changes_no_bit(solver, options):
+    whole, other = (rollout(scene(), solver, 7, **own) for own in ({}, options))
+    assert whole.schedule.num_segments == 1 and other.schedule.num_segments > 2
+    want, got = gradients(whole), gradients(other)
+    for name in want:
+        assert got[name].tobytes() == want[name].tobytes(), name
+
+
+@pytest.mark.parametrize("memory", [0.05, 1000.0])
+def test_a_budget_holds_with_the_state(memory):
+    """What is allocated for a long run, above what an idle one takes, is what the schedule says."""
+    gc.collect()
+    sizes, kept = [runtime.allocated_megabytes()], []
+    for steps in (0, 300):
+        kept.append(ds.Rollout(ds.SemiImplicitSolver(scene(motion=None), dt=2e-3), steps, memory=memory))
+        frames = kept[-1].forward()
+        kept[-1].vjp(frames, np.zeros_like(frames.positions))
+        sizes.append(runtime.allocated_megabytes())
+    idle, whole = np.diff(sizes)
+    assert kept[1].memory <= memory
+    assert whole - idle == pytest.approx(kept[1].memory - kept[0].memory, abs=6e-3)
+
+
+@pytest.mark.parametrize("solver", [*EXPLICIT, ds.ImplicitEulerSolver])
+def test_clip_scales_all_that_the_past_has_done(solver):
+    """A limit that only the largest norm exceeds: what came after that step counts whole, what came before it less."""
+    body, shape = scene(), (2, MESH.num_vertices, 3)
+    w = seeds(shape)[0] * [[[0]], [[1]]]  # of the last frame
+    whole = rollout(body, solver, 6, health=True)
+    full = whole.vjp(whole.forward(), w)
+    norms = {row["step"]: np.hypot(row["norm_position"], row["norm_velocity"]) for row in whole.health}
+    second, largest = sorted(norms.values())[-2:]
+    step, limit = next(s for s, norm in norms.items() if norm == largest), (second + largest) / 2
+    assert 0 < step
+    last, clipped = (rollout(body, solver, 6, **own) for own in (dict(truncate=6 - step), dict(clip=limit)))
+    after, less = (r.vjp(r.forward(), w) for r in (last, clipped))
+    for name in ("mu", "lam", "g", "tau"):
+        expected = after[name] + limit / largest * (full[name] - after[name])
+        np.testing.assert_allclose(less[name], expected, rtol=1e-9)
+        assert abs(full[name] - after[name]) > 1e-3 * abs(full[name])
+
+
+# ---- the other faces ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("solver", [ds.SemiImplicitSolver, ds.ImplicitEulerSolver])
+def test_a_tape_finds_the_same_gradients(solver):
+    r = rollout(scene(rubber(each=True)), solver)
+    shape = (r.num_frames, MESH.num_vertices, 3)
+    w = ti.Vector.field(3, ti.f64, shape[:2])
+    w.from_numpy(seeds(shape)[0])
+    loss, tau = ti.field(ti.f64, (), needs_grad=True), r.field("tau")
+
+    @ti.kernel
+    def compute(x: ti.template()):
+        for f, i in x:
+            loss[None] += w[f, i].dot(x[f, i])
+
+    with ti.ad.Tape(loss):
+        r.run()
+        compute(r.positions)
+    want = r.vjp(r.forward(), seeds(shape)[0])
+    np.testing.assert_allclose(tau.grad.to_numpy(), want["tau"], rtol=1e-12)
+
+
+def test_torch_finds_the_same_gradients():
+    torch = pytest.importorskip("torch")
+    from diffsim_ti.torch_bridge.rollout_node import rollout_frames
+
+    r = rollout(scene(rubber(each=True)))
+    names = ("mu", "lam", "g", "tau", "density", "rest_positions")
+    tensors = {name: torch.tensor(r.values[name], requires_grad=True) for name in names}
+    positions, velocities = rollout_frames(r, **tensors)[:2]
+    w, z = map(torch.from_numpy, seeds(tuple(positions.shape)))
+    ((w * positions).sum() + (z * velocities).sum()).backward()
+    want = gradients(r)
+    for name, x in tensors.items():
+        np.testing.assert_allclose(x.grad.numpy(), want[name], rtol=1e-10, atol=1e-12 * np.abs(want[name]).max())
+
+
+@every_solver
+def test_steps_are_those_of_a_rollout(solver):
+    """Also after a reset, and after a step that failed, which leaves the state before it."""
+    body = scene(motion=None)
+    r = ds.Rollout(solver(body, dt=2e-3), 3, save_every=1)
+    frames, simulator = r.forward().positions, ds.Simulator(solver(body, dt=2e-3))
+    z = []
+    for again in range(2):
+        for k in range(3):
+            z.append(simulator.law_state)
+            simulator.step()
+            if solver is not ds.BDF2Solver or k == 0 or not again:
+                np.testing.assert_array_equal(simulator.positions, frames[k + 1])
+        if not again:
+            simulator.reset()
+    np.testing.assert_array_equal(z[:3], z[3:])
+    known = simulator.law_state
+    simulator.set_state(velocities=np.full(MESH.vertices.shape, np.inf))
+    with pytest.raises(FloatingPointError):
+        simulator.step()
+    np.testing.assert_array_equal(simulator.law_state, known)
+
+
+# ---- what does not work says so ----------------------------------------------------------------------------------------
+
+
+def learnable(law):
+    from diffsim_ti.diff_physics import DifferentiableMaterial
+
+    class OfTwo(law):
+        """In E and nu alone, as learnable materials are."""
+
+        def __init__(self, E, nu):
+            super().__init__(mu=E / 3, lam=E / 2, g=E / 5, tau=TAU)
+
+    return DifferentiableMaterial(1e4, 0.3, law=OfTwo)
+
+
+def simulated():
+    from diffsim_ti.diff_simulator import DifferentiableSimulator, DifferentiableSolver
+
+    DifferentiableSimulator(MESH, learnable(RelaxingRubber), DifferentiableSolver())
+
+
+def energy_of_gradients():
+    torch = pytest.importorskip("torch")
+    learnable(RelaxingRubber).energy_density(torch.eye(3)[None])
+
+
+@dataclass(frozen=True)
+class Idle(EnergyLaw):
+    state_names = ("z",)
+
+
+@dataclass(frozen=True)
+class TwoForOne(FadingLaw):
+    initial_state = (1.0, 2.0)
+
+
+@pytest.mark.parametrize(
+    "build, words",
+    [
+        (
+            lambda: ds.StaticSolver(scene(motion=None)),
+            r"RelaxingLaw has a state \(z_xx, .*\) .* an equilibrium has none",
+        ),
+        (
+            lambda: scene(volume="patches").law,
+            r"averages energies of displacements, but RelaxingLaw has a state .*; take",
+        ),
+        (simulated, r"has a state .* that DifferentiableSimulator does not know: .* rollout_frames"),
+        (energy_of_gradients, r"has a state .* that energy_density\(F\) does not know: ask Simulator"),
+        (lambda: Idle("f64"), r"Idle has a state \(z\) that nothing moves on: write next_state"),
+        (lambda: TwoForOne("f64"), r"initial_state has 2 numbers for 1 state_names"),
+    ],
+)
+def test_what_does_not_fit_is_refused(build, words):
+    with pytest.raises(ValueError, match=words):
+        build()
