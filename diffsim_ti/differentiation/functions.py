@@ -3,7 +3,7 @@
 import taichi as ti
 
 from diffsim_ti.differentiation.graph import Number
-from diffsim_ti.runtime import each_lane
+from diffsim_ti.runtime import each_lane, let, traced
 
 
 def sqrt(x: Number) -> Number:
@@ -36,6 +36,22 @@ def minimum(a: Number, b) -> Number:
     return a.graph.minimum(a, b)
 
 
+def log1p(x: Number) -> Number:
+    """log(1 + x) for x > -1, with all its digits near zero."""
+    return x.graph.function(log1p_value(x.value), (x, lambda: 1 / (1 + x)))
+
+
+def expm1(x: Number) -> Number:
+    """e^x - 1, with all its digits near zero."""
+    out = x.graph.function(x.value + expm1_minus_x_value(x.value, x.graph.fp), (x, lambda: 1 + out))
+    return out
+
+
+def expm1_minus_x(x: Number) -> Number:
+    """e^x - 1 - x, with all its digits near zero: what energies of powers are made of."""
+    return x.graph.function(expm1_minus_x_value(x.value, x.graph.fp), (x, lambda: expm1(x)))
+
+
 def x_minus_log1p(x: Number) -> Number:
     """x - log(1 + x) for x > -1, with all its digits near zero: what logarithmic energies are made of."""
     fp = x.graph.fp
@@ -56,3 +72,25 @@ def x_minus_log1p_value(x, fp: ti.template()):
             series = ti.cast(1 / (17 - 2 * k), fp) + w * series
         y = z * (x - 2 * w * series)
     return y
+
+
+@traced
+def log1p_value(x):
+    """log(1 + x) with all its digits, of a number or of lanes: the rounding of 1 + x is in numerator and denominator.
+
+    Higham, Accuracy and Stability of Numerical Algorithms, 2nd ed. 2002, sec. 1.14.1.
+    """
+    u = let(1 + x)
+    rounded = let(u - 1)
+    exact = let(rounded * rounded > 0)
+    return let(ti.select(exact, each_lane(ti.log, u) * x / ti.select(exact, rounded, u), x))
+
+
+@traced
+def expm1_minus_x_value(x, fp):
+    """e^x - 1 - x with all its digits, of a number or of lanes: plain subtraction loses the leading x^2 / 2."""
+    series = let(0 * x + 1)  # x^2 / 2 (1 + x/3 (1 + x/4 (1 + ...))); sixteen factors leave 1e-16 at |x| = 1
+    for k in range(16):
+        series = let(1 + x * series * ti.cast(1 / (18 - k), fp))
+    plain, close = each_lane(ti.exp, x) - 1 - x, x * x * series * ti.cast(0.5, fp)
+    return let(ti.select(x * x < 1, close, plain))
