@@ -10,6 +10,7 @@ import pytest
 import taichi as ti
 from open_laws.fibres import FibreTissue
 from open_laws.gent import Gent
+from open_laws.ogden import Ogden, OgdenLaw
 from open_laws.power_law import Knowles
 from open_laws.viscous import ViscousRubber
 
@@ -47,10 +48,19 @@ def tissue(F, mu, lam, k1, k2, *a):
     return matrix + k1 / (2 * k2) * (mp.exp(k2 * e**2) - 1)
 
 
+def ogden(F, mu_1, a_1, mu_2, a_2, lam):
+    J, squared = mp.det(F), mp.eigsy(F.T * F, eigvals_only=True)
+    terms = (
+        mu / a * (mp.fsum(c ** (a / 2) for c in squared) - 3 - a * mp.log(J)) for mu, a in ((mu_1, a_1), (mu_2, a_2))
+    )
+    return mp.fsum(terms) + lam / 2 * (J - 1) ** 2
+
+
 OWN = {  # class, the energy again, one set of coefficients
     "gent": (Gent, gent, [2.0, 6.0, 3.0]),
     "knowles": (Knowles, knowles, [2.0, 3.0, 0.5, 0.7]),
     "tissue": (FibreTissue, tissue, [2.0, 3.0, 1.5, 0.8, 1.0, 0.5, -0.3]),
+    "ogden": (Ogden, ogden, [2.0, 1.3, -0.5, -2.0, 3.0]),
 }
 every_own = pytest.mark.parametrize("name", OWN)
 
@@ -168,15 +178,75 @@ def test_everything_follows_from_the_energy(name, precision, in_lanes):
         assert np.all(error <= tolerance * np.maximum(10, size)), (key, error)
 
 
-def test_small_strains_keep_their_digits_in_float32():
-    """Strains of 1e-4: I_C - 3 and J - 1 never come from differences with 3 and 1."""
+@pytest.mark.parametrize("name", ["tissue", "ogden"])
+def test_small_strains_keep_their_digits_in_float32(name):
+    """Strains of 1e-4: I_C - 3, J - 1 and powers of stretches less 1 never come from differences with 3 and 1."""
     H, dH = states()
-    material, _, p = OWN["tissue"]
+    material, _, p = OWN[name]
     single, double = (
         evaluate(material.law(SimpleNamespace(), x), "P", 1e-4 * H, dH, np.array(p), np.zeros(len(p)), x == "f64")
         for x in ("f32", "f64")
     )
     assert np.abs(single - double).max() <= 1e-5 * np.abs(double).max()
+
+
+# ---- principal stretches -----------------------------------------------------------------------------------------------
+
+
+def coincident() -> np.ndarray:
+    """Turned stretches of which two or three are equal, nearly equal, or on both sides of what counts as near."""
+    rng = np.random.default_rng(12)
+    gaps = [(0.3, 0.3), (0.3, 0.0), (1e-12, 1.0), (1e-7, 1e-7), (1e-3, 2e-3), (0.0067, 0.0073), (0.0, 1.5)]
+    out = [np.zeros((3, 3))]  # F = I
+    for a, b in gaps:
+        (R, Q), scale = np.linalg.qr(rng.standard_normal((2, 3, 3)))[0], rng.uniform(0.7, 1.3)
+        F = R @ np.diag(scale * np.array([1, 1 + a, 1 + b])) @ Q
+        out.append(F * np.sign(np.linalg.det(F)) - np.eye(3))
+    return np.stack(out)
+
+
+@pytest.mark.parametrize("precision, in_lanes", [("f64", True), ("f32", True)])
+def test_stretches_may_coincide(precision, in_lanes):
+    """Stress, its change and both derivatives by moduli and exponents, against differences of fifty digits."""
+    H, (_, dH), (_, psi, p) = coincident(), states(), OWN["ogden"]
+    tolerance = 1e-13 if precision == "f64" else 3e-5
+    got = {
+        key: evaluate(OgdenLaw(precision), key, H, dH, np.array(p), changes(p), in_lanes)
+        for key in ("P", "products", "jvp")
+    }
+    for k in range(COUNT):
+        right = exact_at(psi, H[k], dH[k], p, changes(p))
+        for key, found in got.items():
+            size = max(10, np.abs(right[key]).max())
+            np.testing.assert_allclose(
+                found[k, : len(right[key])], right[key], rtol=0, atol=tolerance * size, err_msg=(k, key)
+            )
+
+
+def test_ogden_with_exponent_2_is_neo_hookean():
+    H, dH = states()
+    one = OgdenLaw("f64"), np.array([1.5, 2.0, 0.5, 2.0, 3.0])
+    other = ds.StableNeoHookean(mu=2.0, lam=3.0).law("f64"), np.array([2.0, 3.0])
+    for F in (H, coincident()):
+        for key in ("psi", "P", "dP"):
+            a, b = (evaluate(law, key, F, dH, p, 0 * p, False)[:, :9] for law, p in (one, other))
+            np.testing.assert_allclose(a, b[:, : a.shape[1]], rtol=0, atol=1e-13 * max(1, np.abs(b).max()))
+
+
+def test_ogden_with_exponents_2_and_minus_2_is_mooney_rivlin_at_constant_volume():
+    """Its energy there, and the part of F^T P that no pressure can add."""
+    H = np.concatenate([states()[0][:4], coincident()[:4]])
+    F = np.eye(3) + H
+    H = F / np.cbrt(np.linalg.det(F))[:, None, None] - np.eye(3)
+    c10, c01 = 0.7, 0.4
+    one = OgdenLaw("f64"), np.array([2 * c10, 2.0, -2 * c01, -2.0, 3.0])
+    other = ds.MooneyRivlin(c10=c10, c01=c01, bulk_modulus=5.0).law("f64"), np.array([c10, c01, 3.0])
+    found = []
+    for law, p in (one, other):
+        psi, P = (evaluate(law, key, H, H, p, 0 * p, False) for key in ("psi", "P"))
+        S = P[:, :9].reshape(-1, 3, 3) @ np.swapaxes(np.eye(3) + H, 1, 2)
+        found.append(np.append(psi[:, 0], S - np.trace(S, axis1=1, axis2=2)[:, None, None] / 3 * np.eye(3)))
+    np.testing.assert_allclose(*found, rtol=0, atol=1e-13)
 
 
 # ---- the same law twice ------------------------------------------------------------------------------------------------
@@ -247,6 +317,7 @@ MATERIALS = {
     "gent": lambda: Gent(mu=1e4, limit=per_tetrahedron(5, 8), lam=2e4),
     "knowles": lambda: Knowles(1e4, 0.3, 0.5, per_tetrahedron(0.6, 0.9)),
     "tissue": lambda: FibreTissue(mu=1e4, lam=2e4, k1=5e3, k2=2.0, fibre=directions()),
+    "ogden": lambda: Ogden(mu_1=8e3, a_1=per_tetrahedron(1.2, 2.5), mu_2=-2e3, a_2=-2.0, lam=2e4),
 }
 
 
@@ -333,6 +404,7 @@ class ReadsTime(EnergyLaw):
 @pytest.mark.parametrize(
     "build, words",
     [
+        (lambda: Ogden(1.0, -2.0, 1.0, 2.0, 1.0), r"mu_1 a_1 must be > 0, got -2"),
         (lambda: FibreTissue(1.0, 1.0, 1.0, 1.0, [1.0, 2.0]), r"fibre must be 3 numbers or 3 per tetrahedron"),
         (lambda: FibreTissue(1.0, 1.0, 1.0, 1.0, [0.0, 0, 0]), r"length of fibre must be > 0"),
         (lambda: FibreTissue(1.0, 1.0, 1.0, 1.0, {"up": 1.0}), r"fibre\['up'\] must be 3 numbers"),

@@ -3,7 +3,7 @@
 import taichi as ti
 
 from diffsim_ti.differentiation.graph import Number
-from diffsim_ti.runtime import each_lane, let, traced
+from diffsim_ti.runtime import each_lane, let, spread, traced
 
 
 def sqrt(x: Number) -> Number:
@@ -43,13 +43,13 @@ def log1p(x: Number) -> Number:
 
 def expm1(x: Number) -> Number:
     """e^x - 1, with all its digits near zero."""
-    out = x.graph.function(x.value + expm1_minus_x_value(x.value, x.graph.fp), (x, lambda: 1 + out))
+    out = x.graph.function(expm1_values(x.value, x.graph.fp)[0], (x, lambda: 1 + out))
     return out
 
 
 def expm1_minus_x(x: Number) -> Number:
     """e^x - 1 - x, with all its digits near zero: what energies of powers are made of."""
-    return x.graph.function(expm1_minus_x_value(x.value, x.graph.fp), (x, lambda: expm1(x)))
+    return x.graph.function(expm1_values(x.value, x.graph.fp)[1], (x, lambda: expm1(x)))
 
 
 def x_minus_log1p(x: Number) -> Number:
@@ -86,11 +86,17 @@ def log1p_value(x):
     return let(ti.select(exact, each_lane(ti.log, u) * x / ti.select(exact, rounded, u), x))
 
 
+# B_2n / (2n)!, n = 1 .. 7: x / (e^x - 1) = 1 - x / 2 + sum_n B_2n / (2n)! x^2n, to 1e-17 for |x| < 1/2
+BERNOULLI = (1 / 12, -1 / 720, 1 / 30240, -1 / 1209600, 1 / 47900160, -691 / 1307674368000, 1 / 74724249600)
+
+
 @traced
-def expm1_minus_x_value(x, fp):
-    """e^x - 1 - x with all its digits, of a number or of lanes: plain subtraction loses the leading x^2 / 2."""
-    series = let(0 * x + 1)  # x^2 / 2 (1 + x/3 (1 + x/4 (1 + ...))); sixteen factors leave 1e-16 at |x| = 1
-    for k in range(16):
-        series = let(1 + x * series * ti.cast(1 / (18 - k), fp))
-    plain, close = each_lane(ti.exp, x) - 1 - x, x * x * series * ti.cast(0.5, fp)
-    return let(ti.select(x * x < 1, close, plain))
+def expm1_values(x, fp) -> tuple:
+    """(e^x - 1, e^x - 1 - x) with all their digits, of a number or of lanes: plain subtraction loses x and x^2 / 2."""
+    (one, half), y = (spread(let(ti.cast(c, fp)), x) for c in (1, 0.5)), let(x * x)
+    series = spread(let(ti.cast(BERNOULLI[-1], fp)), x)
+    for c in BERNOULLI[-2::-1]:
+        series = let(series * y + ti.cast(c, fp))
+    scale = let(x / (one - x * half + y * series))
+    plain, close = let(each_lane(ti.exp, x) - one), let(y * 4 < 1)
+    return let(ti.select(close, scale, plain)), let(ti.select(close, scale * x * (half - x * series), plain - x))

@@ -160,9 +160,9 @@ class Tetrahedron:
         volume, q = self.volume_of(item, scene.volumes), self.numbers_at(item, scene, at, s)
         D, dD = self._edges_read(item, scene, at, s), self._edges_read(item, scene, change, 0)
         x, dx = [d @ B for d in D], [moved @ B + d @ B_dot for d, moved in zip(D, dD)]
-        dP = self.law.stress_jvp_at(x, dx, q, self._numbers_jvp(item, change, dots))
+        P, dP = self.law.stress_and_jvp_at(x, dx, q, self._numbers_jvp(item, change, dots))
         turned = B * self.volume_of(item, dots.volumes) + B_dot * volume
-        self.store(item, corner, (dP * volume) @ B.transpose() + self.law.stress_at(x, q) @ turned.transpose())
+        self.store(item, corner, (dP * volume) @ B.transpose() + P @ turned.transpose())
 
     @traced
     def _numbers_jvp(self, item, change, dots) -> list:
@@ -183,7 +183,8 @@ class Tetrahedron:
             self.edges(item, scene, w, 0),
         )
         x, dH = [d @ B for d in D], W @ B
-        by_x, products = self.law.stress_vjp_at(x, dH, q)
+        both = self.law.stress_and_vjp_at if shape else self.law.stress_vjp_at
+        *P, by_x, products = both(x, dH, q)  # the stress itself is felt by the rest shape alone
         self.store(item, corner, (by_x[0] * volume) @ B.transpose(), add)
         if self.reads_rates:
             self.store(item, adjoint.rate_corner, (by_x[1] * volume) @ B.transpose())
@@ -194,7 +195,7 @@ class Tetrahedron:
             known = self.state_of(item, adjoint.z, 0)
             self.items.put_row(adjoint.z, 0, item, [a + b for a, b in zip(known, by_z)])
         if shape:
-            P = self.law.stress_at(x, q)
+            (P,) = P
             by_B = sum_of([*(d.transpose() @ by for d, by in zip(D, by_x)), W.transpose() @ P])
             self.items.add(adjoint.gradients, 9, item, (by_B * minus).numbers)
             self.items.add(adjoint.volumes, 1, item, [ti.cast(-1, self.fp) * inner(P, dH)])

@@ -125,15 +125,25 @@ class EnergyLaw(Law):
         return _tensor([number.value for number in self._record_stress(x, p)[2]], x[0])
 
     @traced
-    def stress_jvp_at(self, x, dx, p, dp):
+    def stress_and_jvp_at(self, x, dx, p, dp):
         g, leaves, P = self._record_stress(x, p)
-        return _tensor(g.forward([*zip(leaves, [*_numbers(dx), *dp])], P), x[0])
+        dP = g.forward([*zip(leaves, [*_numbers(dx), *dp])], P)
+        return _tensor([number.value for number in P], x[0]), _tensor(dP, x[0])
+
+    @traced
+    def stress_and_vjp_at(self, x, W, p):
+        g, leaves, P = self._record_stress(x, p)
+        by = _spread(g.reverse([*zip(P, W.numbers)], leaves), x[0])
+        by_x = [Tensor(by[9 * k : 9 * k + 9]) for k in range(len(x))]
+        return _tensor([number.value for number in P], x[0]), by_x, by[9 * len(x) :]
+
+    @traced
+    def stress_jvp_at(self, x, dx, p, dp):
+        return self.stress_and_jvp_at(x, dx, p, dp)[1]
 
     @traced
     def stress_vjp_at(self, x, W, p):
-        g, leaves, P = self._record_stress(x, p)
-        by = _spread(g.reverse([*zip(P, W.numbers)], leaves), x[0])
-        return [Tensor(by[9 * k : 9 * k + 9]) for k in range(len(x))], by[9 * len(x) :]
+        return self.stress_and_vjp_at(x, W, p)[1:]
 
     @traced
     def stress(self, H, p):

@@ -112,6 +112,16 @@ class Law:
         return [dP], products
 
     @traced
+    def stress_and_jvp_at(self, x, dx, p, dp):
+        """(P, its change), for who wants both."""
+        return self.stress_at(x, p), self.stress_jvp_at(x, dx, p, dp)
+
+    @traced
+    def stress_and_vjp_at(self, x, W, p):
+        """(P, adjoints of x, W : dP/dp_k), for who wants P too."""
+        return self.stress_at(x, p), *self.stress_vjp_at(x, W, p)
+
+    @traced
     def next_state_at(self, H, q, h):
         """The state after a pass of length h, a list of S; q = [*p, *z]."""
         raise NotImplementedError(

@@ -27,23 +27,23 @@ def eigenbasis(A: list, fp) -> list:
 @ti.func
 def _turn(m: ti.template(), fp: ti.template()):
     for _ in range(6 if fp == ti.f64 else 4):
-        _sweep(m)
+        _sweep(m, fp)
 
 
 @traced
-def _sweep(m) -> None:
+def _sweep(m, fp) -> None:
     for r in range(3):
-        _rotate(m, (r + 1) % 3, (r + 2) % 3, r)
+        _rotate(m, (r + 1) % 3, (r + 2) % 3, r, fp)
 
 
 @traced
-def _rotate(m, p: int, q: int, r: int) -> None:
+def _rotate(m, p: int, q: int, r: int, fp) -> None:
     """Make the entry (p, q) zero by a rotation in their plane."""
     d, o = let(m.diagonal[q] - m.diagonal[p]), let(m.off[r] * 2)
     root = let(ti.sqrt(d * d + o * o))
     bottom = let(ti.select(d < 0, d - root, d + root))
     t = let(o / ti.select(root > 0, bottom, root + 1))
-    c = let(1 / ti.sqrt(t * t + 1))
+    c = let(ti.cast(1, fp) / ti.sqrt(t * t + 1))
     s = let(t * c)
     moved = let(t * m.off[r])
     changes = [(m.diagonal[p], m.diagonal[p] - moved), (m.diagonal[q], m.diagonal[q] + moved), (m.off[r], 0 * moved)]
