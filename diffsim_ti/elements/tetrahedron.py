@@ -177,12 +177,8 @@ class Tetrahedron:
         The work of the forces on w is -V P(D B) : (W B), with D, W the edges of u and w.
         """
         B, volume = self.gradients_of(item, scene.gradients), self.volume_of(item, scene.volumes)
-        q, D, W = (
-            self.numbers_at(item, scene, at, s),
-            self._edges_read(item, scene, at, s),
-            self.edges(item, scene, w, 0),
-        )
-        x, dH = [d @ B for d in D], W @ B
+        D, W = self._edges_read(item, scene, at, s), self.edges(item, scene, w, 0)
+        x, dH, q = [d @ B for d in D], W @ B, self.numbers_at(item, scene, at, s)
         both = self.law.stress_and_vjp_at if shape else self.law.stress_vjp_at
         *P, by_x, products = both(x, dH, q)  # the stress itself is felt by the rest shape alone
         self.store(item, corner, (by_x[0] * volume) @ B.transpose(), add)

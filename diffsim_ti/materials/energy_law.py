@@ -15,7 +15,8 @@ class EnergyLaw(Law):
     H (a `Tensor` of the displacement gradient, F = I + H) and p (a list of the coefficients named by `coefficient_names`)
     are made of `Number`s, which know + - * / ** and the functions of `diffsim_ti.differentiation`, and take any Python
     numbers as constants. Coefficients may enter in any way: factors, exponents, limits, the components of a direction.
-    `calculus.tensor` has what an energy is made of: `invariants(H)` is accurate near rest, where F - I is.
+    `calculus.tensor` has what an energy is made of: `invariants(H)` is accurate near rest, where F - I is;
+    `calculus.stretches` has energies of principal stretches, which may coincide.
 
     volume="patches" needs `theta(H)`, and the last coefficient as the factor of theta^2 / 2 and nowhere else.
 
