@@ -121,6 +121,7 @@ class FadingLaw(EnergyLaw):
 
 class Fading(Material):
     spellings = (("mu", "lam", "rate"),)
+    units = {"rate": "1/s"}
 
     def law(self, precision):
         return FadingLaw(precision)
@@ -231,7 +232,7 @@ def test_lanes_change_nothing(solver):
 @pytest.mark.parametrize("options", [dict(checkpoint_every=2), dict(memory=0.008)], ids=str)
 def test_what_is_kept_changes_no_bit(solver, options):
     whole, other = (rollout(scene(), solver, 7, **own) for own in ({}, options))
-    assert whole.schedule.num_segments == 1 and other.schedule.num_segments > 2
+    assert whole.checkpoints.num_segments == 1 and other.checkpoints.num_segments > 2
     want, got = gradients(whole), gradients(other)
     for name in want:
         assert got[name].tobytes() == want[name].tobytes(), name

@@ -34,6 +34,7 @@ class Ogden(Material):
     """
 
     spellings = (("mu_1", "a_1", "mu_2", "a_2", "lam"),)
+    units = {"a_1": "-", "a_2": "-"}
 
     def law(self, precision):
         return OgdenLaw(precision)

@@ -47,6 +47,7 @@ class RelaxingRubber(Material):
     """
 
     spellings = (("mu", "lam", "g", "tau"),)
+    units = {"tau": "s"}
 
     def law(self, precision):
         return RelaxingLaw(precision)

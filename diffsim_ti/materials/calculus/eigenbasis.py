@@ -2,7 +2,7 @@
 
 import taichi as ti
 
-from diffsim_ti.runtime import Bundle, let, traced
+from diffsim_ti.runtime import Bundle, assign, let, traced
 
 
 @traced
@@ -51,4 +51,4 @@ def _rotate(m, p: int, q: int, r: int, fp) -> None:
         changes += [(x, c * x - s * y), (y, s * x + c * y)]
     values = [let(value) for _, value in changes]
     for (variable, _), value in zip(changes, values):
-        variable._assign(value)
+        assign(variable, value)

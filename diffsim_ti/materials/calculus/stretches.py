@@ -17,7 +17,7 @@ import taichi as ti
 from diffsim_ti.differentiation import Graph, Number, log1p
 from diffsim_ti.materials.calculus.eigenbasis import eigenbasis
 from diffsim_ti.materials.calculus.tensor import Tensor, sum_of
-from diffsim_ti.runtime import Bundle, let, spread, traced
+from diffsim_ti.runtime import Bundle, assign, let, spread, traced
 
 # where rounding of the difference is as large as the quadrature's error, as a share of the mean of 1 + 2 e
 NEAR = {ti.f64: 0.007, ti.f32: 0.1}
@@ -93,4 +93,4 @@ def _add_curvature(job, k) -> None:
     real = job.graph.constant
     weight = ti.select(k == 1, real(8 / 18), real(5 / 18))
     at = let(job.middle + job.gap * (real(k - 1) * real(math.sqrt(0.15))))
-    job.total._assign(job.total + _derivative(job.graph, job.f, at, 2) * weight)
+    assign(job.total, job.total + _derivative(job.graph, job.f, at, 2) * weight)
