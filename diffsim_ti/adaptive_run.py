@@ -8,13 +8,15 @@ from pathlib import Path
 
 import numpy as np
 
+from diffsim_ti import runtime
 from diffsim_ti.monitor.quantities import Energy
 from diffsim_ti.monitor.stability import lanczos_limit
 from diffsim_ti.progress import progress
 from diffsim_ti.scene import Scene
 from diffsim_ti.simulator import Simulator
+from diffsim_ti.solvers import ImplicitEulerSolver
 from diffsim_ti.solvers.solver import Solver
-from diffsim_ti.terms import Gravity, Obstacle
+from diffsim_ti.terms import ExternalForce, Gravity, Obstacle
 from diffsim_ti.visual.frame import Frame, Setting
 from diffsim_ti.writers import Writer, writer_for
 
@@ -30,6 +32,7 @@ class Seen:
     J: float = np.inf
     gap: float = np.inf
     inverted: int = 0
+    implicit_parts: int = 0  # done by implicit Euler, where no explicit step tried held
     crossed: int = 0
     substeps: list[int] = field(default_factory=list)  # per frame
     retries: list[str] = field(default_factory=list)
@@ -42,7 +45,8 @@ class ForwardRun:
     """Frames of equal length; the substeps of each follow the stable step of the state, unless `dt` is given.
 
     A frame has 16 parts, after each of which the state is looked at. One that diverges, outgrows its step or gains
-    energy is run again from its start with twice the substeps, and that is counted. With an implicit solver a frame has 4
+    energy is run again from its start with twice the substeps, and that is counted; where that helps no more, the part is
+    done by implicit Euler, and that is said. With an implicit solver a frame has 4
     parts, whose steps are halved only where one does not converge or gains energy. With dt nothing is chosen and nothing
     repeated: what goes wrong is an error.
 
@@ -50,11 +54,11 @@ class ForwardRun:
     part, for instance to change forces.
     """
 
-    share, parts, attempts = 0.8, 16, 8  # of the stable step; per frame; per part
+    share, parts, attempts = 0.8, 16, 7  # of the stable step; per frame; per part
     squeezed = 0.1  # J below which the stable step is looked up in each part
     # of the energy in a part, as shares of the largest kinetic + elastic + contact energy: what symplectic Euler's
-    # passing error of first order takes, and what is left once the energy is `largest_drift` above its lowest
-    largest_rise, later_rise, largest_drift = 0.01, 0.001, 0.03
+    # passing error of first (or second) order takes, and what is left once it is `largest_drift` above its lowest
+    allowed = {1: (0.01, 0.001, 0.03), 2: (0.002, 0.0002, 0.006)}
 
     def __init__(self, scene: Scene, solver_class: type[Solver], frame_time: float, dt: float | None = None, **options):
         self.scene, self.seen, self.adapts = scene, Seen(), dt is None
@@ -87,7 +91,7 @@ class ForwardRun:
         ws.restore(self._start, 0)
         self._limit = self._stable_dt()
         self._energy, self._refined = self.simulator.compute_energy(), 0
-        self._lowest, self._squeezed = self._energy, False
+        self._lowest, self._squeezed, self._implicit = self._energy, False, None
         self.energies, self.largest_energy = [self._energy], self._moving(self._energy)
 
     def balance_anew(self) -> None:
@@ -120,8 +124,6 @@ class ForwardRun:
                 sim.step()
                 why = self._complaint(last or self._squeezed)
             except FloatingPointError as error:
-                if getattr(error, "stiffness", None) is not None:  # no step helps
-                    raise
                 why = str(error)
             if why is None:
                 self._refined = substeps if tried else self._refined // 2
@@ -130,10 +132,35 @@ class ForwardRun:
             sim.workspace.restore(self._start, 0)
             sim.step_count = first
             substeps *= 2
-        raise FloatingPointError(
-            f"t = {sim.time:.4g} s: unstable even with a substep of {sim.solver.substep:.3g} s ({why}); lower the impact or "
-            "the load, raise the stiffness, or add --drag; the frames before are written"
-        )
+        if self.implicit or not self._advance_part_implicitly(why):
+            raise FloatingPointError(
+                f"t = {sim.time:.4g} s: unstable even with a substep of {sim.solver.substep:.3g} s ({why}); lower the "
+                "impact or the load, raise the stiffness, or add --drag; the frames before are written"
+            )
+
+    def _advance_part_implicitly(self, why: str) -> bool:
+        """The part by implicit Euler, where no explicit step tried holds; whether that could be done."""
+        sim = self.simulator
+        if self._implicit is None:
+            self._implicit = Simulator(ImplicitEulerSolver(self.scene, dt=sim.solver.dt))
+        other = self._implicit
+        if self.scene.term(ExternalForce) is not None:
+            runtime.fill(other.workspace.arrays.forces, runtime.fetch(sim.workspace.arrays.forces))
+        for substeps in (1, 4, 16, 64):
+            other.set_substeps(substeps)
+            other.set_state(sim.positions, sim.velocities)
+            other.step_count = sim.step_count
+            try:
+                other.step()
+            except FloatingPointError:
+                continue
+            self.seen.implicit_parts += 1
+            self.seen.retries.append(f"t = {sim.time:.4g} s: {why}; this part by {substeps} steps of implicit Euler")
+            sim.set_state(other.positions, other.velocities)
+            sim.step_count += 1
+            self._limit = self._stable_dt()
+            return True
+        return False
 
     def _look(self) -> None:
         """Note the extremes of the present state."""
@@ -162,8 +189,9 @@ class ForwardRun:
         """Why the part that was just run cannot be trusted, or None; `look_up`: find the stable step at its end."""
         energy, h = self.simulator.compute_energy(), self.simulator.solver.substep
         rise, scale = energy - self._energy, max(self.largest_energy, self._moving(energy))
-        drifted = energy - self._lowest > self.largest_drift * scale
-        if not self.driven and not rise <= (self.later_rise if drifted else self.largest_rise) * scale:
+        largest_rise, later_rise, largest_drift = self.allowed[1 if self.implicit else self.simulator.solver.order]
+        drifted = energy - self._lowest > largest_drift * scale
+        if not self.driven and not rise <= (later_rise if drifted else largest_rise) * scale:
             return f"the energy rose by {rise:.3g} J"
         if not look_up:
             return None
@@ -183,7 +211,10 @@ class ForwardRun:
             speed = np.linalg.norm(self.simulator.velocities, axis=1).max() + self._pull * self.frame_time
             now, then = (self.scene.places(self.simulator.time + step) for step in (0.0, dt))
             speed += max((np.linalg.norm(then[t] - now[t]) / dt for t in now), default=0.0)
-            fewest = max(fewest, 10 * speed * dt / min(float(t.values["barrier_width"]) for t in self.obstacles))
+            in_a_width = 4 if self.simulator.solver.stages_contact else 10
+            fewest = max(
+                fewest, in_a_width * speed * dt / min(float(t.values["barrier_width"]) for t in self.obstacles)
+            )
         return max(1, int(np.ceil(fewest)))
 
     @staticmethod

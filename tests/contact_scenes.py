@@ -20,6 +20,19 @@ def box_surface(size, origin):
     return box.vertices, box.surface_triangles
 
 
+def with_options(kind: type, **options) -> type:
+    """An explicit solver's class with other defaults."""
+    name = kind.__name__ + "".join(f"_{value}" for value in options.values())
+    return type(name, (kind,), {"__init__": lambda self, *a, **o: kind.__init__(self, *a, **(options | o))})
+
+
+EXPLICIT = [ds.SemiImplicitSolver, ds.VelocityVerletSolver]
+FORCE = [with_options(kind, contact="force") for kind in EXPLICIT]
+KEEPING = [with_options(kind, contact_damping=0.0) for kind in EXPLICIT]
+# of the stage's, those of which rest is a state to round-off: drift and push are taken where the solver takes its forces
+RESTING = [with_options(kind, contact_damping=c) for kind, c in zip(EXPLICIT, (1.0, 0.0))]
+
+
 SHAPES = {
     "ground": lambda **o: ds.Ground(0.0, **o),
     "half_space": lambda **o: ds.HalfSpace([0, 0.0, 0], [0.2, 1, 0.1], **o),

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import taichi as ti
-from contact_scenes import BASE, SHAPES, G, points, resting_gap, tetrahedron
+from contact_scenes import BASE, EXPLICIT, FORCE, KEEPING, RESTING, SHAPES, G, points, resting_gap, tetrahedron
 
 import diffsim_ti as ds
 from diffsim_ti import runtime
@@ -165,7 +165,7 @@ def test_stiffness_is_chosen_and_said():
         ds.Scene(mesh, material, terms=[ds.HalfSpace()])
 
 
-@pytest.mark.parametrize("solver", [ds.SemiImplicitSolver, ds.VelocityVerletSolver])
+@pytest.mark.parametrize("solver", FORCE + RESTING)
 @pytest.mark.parametrize("mass, gap", [(1e-3, 9.9429e-3), (1e-1, 9.4391e-3), (10.0, 5.3589e-3)])
 def test_weight_at_rest_on_a_slope(solver, mass, gap):
     """R22 on a tilted plane: the load across it decides; friction holds the vertex."""
@@ -191,7 +191,7 @@ def test_absent_obstacles_compile_nothing():
     assert not group.force.friction and group.path < 0 and group.size == 3
 
 
-@pytest.mark.parametrize("solver", [ds.SemiImplicitSolver, ds.VelocityVerletSolver])
+@pytest.mark.parametrize("solver", FORCE + KEEPING)
 def test_several_obstacles_and_energy(solver):
     """A body between a floor, a ball and a wall: kinetic, elastic and contact energy add up to what it started with."""
     mesh = ds.TetrahedralMesh.create_box(2, size=0.2, origin=[0, 0.12, 0])
@@ -217,7 +217,7 @@ def test_several_obstacles_and_energy(solver):
     }
 
 
-@pytest.mark.parametrize("solver", [ds.SemiImplicitSolver, ds.VelocityVerletSolver])
+@pytest.mark.parametrize("solver", FORCE + EXPLICIT)
 def test_symmetric_contact_stays_symmetric(solver):
     """Row 48: all lower vertices meet the floor in the same pass, one exactly at the width; nothing breaks the symmetry."""
     x = np.array([[1.0, 0, 0], [-1, 0, 0], [0, 0, 1], [0, 0, -1], [0, 1, 0], [0, 0, 0]]) * 0.2
@@ -232,7 +232,7 @@ def test_symmetric_contact_stays_symmetric(solver):
     np.testing.assert_allclose(turned, p, atol=1e-10)
 
 
-@pytest.mark.parametrize("solver", [ds.SemiImplicitSolver, ds.VelocityVerletSolver])
+@pytest.mark.parametrize("solver", FORCE)
 def test_momentum_balance(solver):
     """What a moving wall does to a body: its impulse is the change of momentum, its work the change of energy.
 

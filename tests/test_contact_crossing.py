@@ -1,13 +1,12 @@
 """No vertex gets through an obstacle in silence."""
 
 import pytest
-from contact_scenes import SHAPES, points, tetrahedron
+from contact_scenes import EXPLICIT, FORCE, SHAPES, points, tetrahedron
 
 import diffsim_ti as ds
 from diffsim_ti.adaptive_run import ForwardRun
 
-SOLVERS = [ds.SemiImplicitSolver, ds.VelocityVerletSolver]
-solvers = pytest.mark.parametrize("solver", SOLVERS)
+solvers = pytest.mark.parametrize("solver", FORCE)
 
 
 @solvers
@@ -80,7 +79,7 @@ def test_a_fast_obstacle_does_not_run_over_a_vertex(solver):
     assert caught.value.vertex in (0, 1, 2, 3) and caught.value.depth > 0
 
 
-@solvers
+@pytest.mark.parametrize("solver", FORCE + EXPLICIT)
 @pytest.mark.parametrize("name", ["half_space", "sphere", "capsule"])
 def test_forward_runs_divide_the_step(solver, name):
     """A run that follows the state takes finer steps until nothing crosses, and reports the smallest gap."""

@@ -2,12 +2,11 @@
 
 import numpy as np
 import pytest
-from contact_scenes import BASE, G, points, resting_gap, tetrahedron
+from contact_scenes import BASE, FORCE, RESTING, G, points, resting_gap, tetrahedron
 
 import diffsim_ti as ds
 
-SOLVERS = [ds.SemiImplicitSolver, ds.VelocityVerletSolver]
-solvers = pytest.mark.parametrize("solver", SOLVERS)
+solvers = pytest.mark.parametrize("solver", FORCE + RESTING)
 
 
 def on_incline(friction: float, friction_speed: float, **options):
@@ -121,7 +120,8 @@ def test_static_and_sliding_are_one_continuous_law(solver):
     assert found[0] < 0.9 and found[-1] > 0.99
 
 
-def test_two_rough_walls_act_one_after_the_other():
+@solvers
+def test_two_rough_walls_act_one_after_the_other(solver):
     """In a corner both frictions hold; a vertex that rests in it does not move."""
     wall = ds.HalfSpace([-resting_gap(5.0), 0, 0], [1, 0, 0], stiffness=1e4, friction=0.6)
     scene = points(
@@ -130,5 +130,5 @@ def test_two_rough_walls_act_one_after_the_other():
         terms=[ds.Gravity([-5.0, -G, 2.0])],
         fixed=[1, 2, 3],
     )
-    end = ds.Rollout(ds.SemiImplicitSolver(scene, dt=1e-3), 1000).forward()
+    end = ds.Rollout(solver(scene, dt=1e-3), 1000).forward()
     assert np.abs(end.positions[-1, 0] - BASE[0] - [0, resting_gap(G), 0]).max() < 1.1e-3  # creep of friction_speed

@@ -5,7 +5,7 @@ import warnings
 
 import numpy as np
 import pytest
-from contact_scenes import SHAPES, points, tetrahedron
+from contact_scenes import EXPLICIT, FORCE, KEEPING, SHAPES, points, tetrahedron
 
 import diffsim_ti as ds
 
@@ -150,7 +150,7 @@ def test_first_contact(solver):
     term = ds.Ground(stiffness=1e3, width=0.1, friction=0.3)
     for height, touched in ((0.35, False), (0.2 + 1e-9, False), (0.2 - 1e-9, True), (0.15, True)):
         scene = points(tetrahedron(height), term, initial_velocities=[0.2, -1, 0])
-        rollout = ds.Rollout(solver(scene, dt=1e-3), 101 if solver.order == 1 else 100)  # the last force is at 0.1 s
+        rollout = ds.Rollout(solver(scene, dt=1e-3), 100)  # the last pass ends at 0.1 s
         frames = rollout.forward()
         gradients = rollout.vjp(frames, np.ones_like(frames.positions))
         obstacle = [gradients[n] for n in ("ground_height", "barrier_stiffness", "barrier_width", "friction")]
@@ -183,7 +183,7 @@ def bounces(solver, speed: float):
     return scene
 
 
-@solvers
+@pytest.mark.parametrize("solver", FORCE + KEEPING + EXPLICIT)
 @pytest.mark.parametrize("speed", [0.2, 0.5, 1.0, 2.0, 3.0])
 def test_bounce_sweep(solver, speed):
     """R23: height after a bounce falls as the start rises, d y / d y0 = -1. No warning: within 10 %. Signs wrong: a warning.
@@ -192,7 +192,7 @@ def test_bounce_sweep(solver, speed):
     """
     scene, silent, warned_wrong = bounces(solver, speed), 0, 0
     fine = {0.2: 1.0e-3, 0.5: 6e-4, 1.0: 6e-4, 2.0: 4e-4, 3.0: 4.8e-5}[speed]
-    for dt in fine * np.array([1, 1.5, 2.2, 3.2]):
+    for dt in fine * np.array([1, 1.5, 2.2, 3.2] if solver in FORCE else [2, 4, 8, 16]):
         steps = int(0.08 / speed / dt)
         rollout = ds.Rollout(solver(scene, dt=dt, allow_unstable=True), steps, gradients=["initial_positions"])
         frames = rollout.forward()
@@ -210,15 +210,15 @@ def test_bounce_sweep(solver, speed):
             assert "gradients through contacts may be off by more than 10 %" in str(said[0].message)
             assert frames.contact_resolution.advised_substep < dt
             warned_wrong += bool(np.any(by >= 0))
-    assert silent >= 1
-    assert speed != 2.0 or warned_wrong >= 1
+    assert silent >= (1 if solver in FORCE else 2)  # a stage takes steps at least four times as long
+    assert speed != 2.0 or warned_wrong >= 1 or solver not in FORCE
 
 
-@solvers
+@pytest.mark.parametrize("solver", FORCE + EXPLICIT)
 def test_advised_step_is_enough(solver):
     """Taking the step that the warning names silences it."""
-    scene, dt = bounces(solver, 2.0), 1e-3
-    coarse = ds.Rollout(solver(scene, dt=dt, allow_unstable=True), 40).forward().contact_resolution
+    scene, dt = bounces(solver, 2.0), 1e-3 if solver in FORCE else 8e-3
+    coarse = ds.Rollout(solver(scene, dt=dt, allow_unstable=True), int(0.04 / dt)).forward().contact_resolution
     assert not coarse.resolved
     dt = 0.9 * coarse.advised_substep
     fine = ds.Rollout(solver(scene, dt=dt, allow_unstable=True), int(0.04 / dt)).forward().contact_resolution

@@ -5,13 +5,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 import taichi as ti
+from contact_scenes import with_options
 from test_gradients import by_solver, final_loss_gradient, free_scene, full_scene, random_mesh, rollout_of
 
 import diffsim_ti as ds
 from diffsim_ti import verify
 from diffsim_ti.materials.stable_neo_hookean import StableNeoHookeanLaw
 from diffsim_ti.runtime import traced
+from diffsim_ti.solvers.explicit import kick_drift
 from diffsim_ti.solvers.explicit.adjoint import ExplicitAdjoint
+from diffsim_ti.solvers.explicit.contact_stage import ContactStage
 from diffsim_ti.terms.obstacles.ground import GroundForce
 
 # ---- mutations: each must fail the dot-product test or the table of gradients -----------------------------------------
@@ -55,6 +58,29 @@ class GroundWithoutCurvature(GroundForce):
     @ti.func
     def force_vjp(self, parameters: ti.template(), first, X, u, v, w):
         return 0 * w, 0 * w
+
+
+class StageWithoutMove(ContactStage):
+    @ti.func
+    def by_move(self, i, state: ti.template()):
+        return self.vector(0)
+
+
+class StageWithoutPush(ContactStage):
+    @ti.func
+    def push_all_vjp(
+        self,
+        i,
+        u,
+        z,
+        total_adj,
+        now: ti.template(),
+        scene: ti.template(),
+        state: ti.template(),
+        adjoint: ti.template(),
+        plan: ti.template(),
+    ):
+        return self.vector(0)
 
 
 def scaled(adjoint, derived):
@@ -128,6 +154,16 @@ def test_mutated_laws(law, dot_product_sees_it):
 
 def test_mutated_contact(monkeypatch):
     monkeypatch.setattr(ds.Ground, "kernel", lambda self, precision: GroundWithoutCurvature(precision))
+    force = with_options(ds.SemiImplicitSolver, contact="force")
+    assert gates_passed(rollout_of(full_scene(), force, steps=3)) == (False, False)
+
+
+@pytest.mark.parametrize("stage", [StageWithoutMove, StageWithoutPush])
+def test_mutated_stage(monkeypatch, stage):
+    """The adjoint of the move that obstacles push, and that of the pushes."""
+    own = type(f"Ground{stage.__name__}", (GroundForce,), {})  # compiles anew
+    monkeypatch.setattr(ds.Ground, "kernel", lambda self, precision: own(precision))
+    monkeypatch.setattr(kick_drift, "ContactStage", stage)
     assert gates_passed(rollout_of(full_scene(), steps=3)) == (False, False)
 
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from contact_scenes import FORCE, KEEPING, RESTING
 
 import diffsim_ti as ds
 from diffsim_ti import runtime
@@ -615,7 +616,7 @@ def test_ground_beyond_its_width_is_not_felt(solver, precision):
         assert simulator.compute_energy().parts["contact"] > 0 if felt else simulator.compute_energy() == 0
 
 
-@solvers
+@pytest.mark.parametrize("solver", FORCE + RESTING)
 @pytest.mark.parametrize(
     "mass, gap", [(1e-3, 9.9429e-3), (1e-2, 9.8203e-3), (1e-1, 9.4391e-3), (1.0, 8.3006e-3), (10.0, 5.3589e-3)]
 )
@@ -631,7 +632,7 @@ def test_weight_at_rest_on_the_ground(solver, mass, gap):
     assert np.abs(end.velocities[-1]).max() < 1e-10
 
 
-@solvers
+@pytest.mark.parametrize("solver", FORCE + KEEPING)
 @pytest.mark.parametrize("v, d_min, omega", [(1.0, 3.292e-3, 381.0), (2.0, 8.956e-4, 1220.0)])
 def test_barrier_bounce(solver, v, d_min, omega):
     """R23: vertices of 1 kg, nearly free of each other, fly into the barrier and come back as fast."""
@@ -646,7 +647,7 @@ def test_barrier_bounce(solver, v, d_min, omega):
     assert frames.velocities[-1, :3, 1] == pytest.approx(np.full(3, v), rel=2e-2 if solver.order == 1 else 1e-4)
 
 
-@solvers
+@pytest.mark.parametrize("solver", FORCE + KEEPING)
 def test_block_bounces_without_losing_energy(solver):
     mesh = ds.TetrahedralMesh.create_box(2).translated([0, 0.1, 0])
     scene = ds.Scene(mesh, ds.StableNeoHookean(E, 0.3), 100.0, terms=[ds.Gravity(), ds.Ground(width=0.05)])

@@ -107,7 +107,7 @@ def simulate(
     dt: Annotated[
         float | None, typer.Option(help="substep [s], taken as it is; default: follows the stable step")
     ] = None,
-    solver: Annotated[str, typer.Option(help="semi-implicit, verlet, implicit-euler or bdf2")] = "semi-implicit",
+    solver: Annotated[str, typer.Option(help="verlet, semi-implicit, implicit-euler or bdf2")] = "verlet",
     gravity: Annotated[float, typer.Option(help="along y [m/s^2]")] = -9.81,
     drag: Annotated[float, typer.Option(help="rate at which velocities fall [1/s]")] = 0.0,
     velocity: Annotated[tuple[float, float, float], typer.Option(help="at the start [m/s]")] = (0.0, 0.0, 0.0),

@@ -65,7 +65,7 @@ def view(
     up: UpAxis = Up.y,
     fix_orientation: FixOrientation = False,
     fps: Annotated[float, typer.Option(help="of a live run: frames per simulated second")] = 60.0,
-    solver: Annotated[str, typer.Option(help="semi-implicit, verlet, implicit-euler or bdf2")] = "semi-implicit",
+    solver: Annotated[str, typer.Option(help="verlet, semi-implicit, implicit-euler or bdf2")] = "verlet",
     gravity: Annotated[float, typer.Option(help="along y [m/s^2]")] = -9.81,
     drag: Annotated[float, typer.Option(help="rate at which velocities fall [1/s]")] = 0.0,
     fixed: Annotated[

@@ -90,12 +90,13 @@ class Guard:
 
     def _warn_of_stiff_contact(self) -> None:
         """Once, where a barrier was stiffer than a step can follow: energy may then come from nowhere."""
-        if self._warned or not self.ws.solver.explicit or not self.ws.watch.contacts:
+        solver = self.ws.solver
+        if self._warned or not solver.explicit or solver.stages_contact or not self.ws.watch.contacts:
             return
         omega_dt = self.ws.watch.largest_omega_dt()
         if omega_dt > 2:
             self._warned = True
-            h = self.ws.solver.substep
+            h = solver.substep
             warnings.warn(
                 f"a contact was stiffer than the substep {h:.3g} s can follow (omega dt = {omega_dt:.3g} > 2), so that "
                 f"energy may be gained in it: take substeps of {1.8 * h / omega_dt:.3g} s, or a softer or wider barrier",

@@ -1,6 +1,6 @@
 """How large a step may be: a bound by elements, the tight limit by Lanczos, and a bound during the run."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -59,7 +59,9 @@ class Stiffness:
         a = workspace.arrays
         self.w, self.y = runtime.array(a.vector, 1, a.num_vertices), runtime.array(a.vector, 1, a.num_vertices)
         self.walls, self.lag = a.offsets, runtime.array(a.vector, 2, 1)
-        kernels = potential_kernels(a.law, a.features(), workspace.parallel, a.in_lanes)
+        features = a.features()
+        felt = replace(features, groups=features.pressing)  # a stage limits no step
+        kernels = potential_kernels(a.law, felt, workspace.parallel, a.in_lanes)
         at = (workspace.state, self)
         self._multiply = kernels.stiffness.bind(a.in_lanes, scene=a, pass_=self, at=at, out=self)
         self.vector, self._random = None, np.random.default_rng(1)

@@ -258,9 +258,11 @@ class Sweep:
         """Once."""
         if not seen.resolved and not self._warned:
             self._warned = True
+            damped = self.solver.stages_contact and self.solver.contact_damping > 0
             warnings.warn(
                 f"gradients through contacts may be off by more than 10 %: {seen}; take substeps of at most "
-                f"{seen.advised_substep:.3g} s instead of {seen.substep:.3g} s, or a softer or wider barrier",
+                f"{seen.advised_substep:.3g} s instead of {seen.substep:.3g} s, or a softer or wider barrier"
+                + (", or a smaller contact_damping" if damped else ""),
                 stacklevel=4,
             )
 

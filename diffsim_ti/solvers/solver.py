@@ -32,6 +32,7 @@ class Solver(ABC):
     serial_limit = 3_000
     serial_limit_in_lanes = 10_000
     arguments = ("dt", "substeps", "parallel", "allow_unstable", "check_start")  # of the constructor, besides the scene
+    stages_contact = False  # whether obstacles act as a stage of its passes, not as a force
 
     def __init__(
         self,

@@ -36,7 +36,7 @@ def slots(indices: np.ndarray, num_vertices: int) -> np.ndarray:
 class SceneArrays:
     """What the kernels read of a scene: its topology, once, and its numbers (state/numbers.py), per load."""
 
-    def __init__(self, scene):
+    def __init__(self, scene, stages_contact: bool = False):
         mesh, precision = scene.mesh, scene.precision
         fp = runtime.PRECISIONS[precision]
         self.fp, self.vector, self.lanes = fp, ti.types.vector(4, fp), ti.types.vector(LANES, fp)
@@ -54,6 +54,7 @@ class SceneArrays:
         self.obstacles = self._twins(scene)
         self._features = dict(
             groups=grouped(self.obstacles),
+            stages=stages_contact,
             moving=len(scene.moving),
             gravity=rows.first(scene.term(Gravity)),
             drag=rows.first(scene.term(Drag)),

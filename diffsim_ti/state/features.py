@@ -43,6 +43,7 @@ class Features:
     """What kernels are compiled for, besides the law."""
 
     groups: tuple[ObstacleGroup, ...] = ()
+    stages: bool = False  # whether obstacles with a distance act as a stage of the passes, not as a force
     gravity: int = -1  # where it starts in the parameter array, -1: none
     drag: int = -1
     forces: bool = False
@@ -55,9 +56,32 @@ class Features:
     shape: bool = False
 
     @property
+    def staged(self) -> tuple[ObstacleGroup, ...]:
+        """Groups that act as a stage of explicit passes."""
+        return tuple(group for group in self.groups if self.stages and group.force.watched)
+
+    @property
+    def num_staged(self) -> int:
+        return sum(group.count for group in self.staged)
+
+    @property
+    def first_staged(self) -> int:
+        """Number of the first obstacle that acts as a stage; the others of them follow it."""
+        return self.staged[0].number if self.staged else 0
+
+    @property
+    def pressing(self) -> tuple[ObstacleGroup, ...]:
+        """Groups that act by a force of their own."""
+        return tuple(group for group in self.groups if group not in self.staged)
+
+    @property
+    def staged_rough(self) -> tuple[ObstacleGroup, ...]:
+        return tuple(group for group in self.staged if group.force.friction)
+
+    @property
     def rough(self) -> tuple[ObstacleGroup, ...]:
         """Groups with friction."""
-        return tuple(group for group in self.groups if group.force.friction)
+        return tuple(group for group in self.pressing if group.force.friction)
 
     @property
     def rough_backwards(self) -> tuple[ObstacleGroup, ...]:

@@ -19,6 +19,17 @@ DEPTHS = 1 - np.linspace(1, 1e-3, 4096)  # in a barrier, in widths, and the ener
 STOPPED = beta(1 - DEPTHS)
 
 
+def limits(solver) -> tuple[float, float]:
+    """Largest omega dt, and largest share, at which gradients of a bounce stay within 10 %, measured likewise.
+
+    A stage that keeps the energy resolves a bounce in two steps; what it damps grows with both.
+    """
+    if not solver.stages_contact:
+        return LARGEST_OMEGA_DT, LARGEST_SHARE
+    c = max(solver.contact_damping, 1e-12)
+    return min(2.0, 0.05 / c), min(1.0, 0.02 / c)
+
+
 @dataclass(frozen=True)
 class ContactResolution:
     """How well a run's substeps resolve its contacts, over all of its passes.
@@ -26,6 +37,7 @@ class ContactResolution:
     omega_dt: largest h sqrt(b''(d) / m), the barrier's stiffness against the vertex's mass.
     travel: largest approach to an obstacle in one substep, as a share of its width.
     share: the same as a share of the depth at which the barrier alone would stop the vertex.
+    The last two are the largest of these at which gradients of a bounce stay within 10 %, with these solver's contacts.
     smallest_gap [m], with the vertex and obstacle that reached it; infinite if no barrier was felt.
     substep [s]: the substep h; advised_substep [s]: one at which gradients of a bounce stay within 10 %.
     """
@@ -37,11 +49,13 @@ class ContactResolution:
     vertex: int | None
     obstacle: str | None
     substep: float
+    largest_omega_dt: float = LARGEST_OMEGA_DT
+    largest_share: float = LARGEST_SHARE
 
     @property
     def coarseness(self) -> float:
         """How many times larger the substep is than advised; gradients may be off by more than 10 % above 1."""
-        return max(self.omega_dt / LARGEST_OMEGA_DT, self.share / LARGEST_SHARE)
+        return max(self.omega_dt / self.largest_omega_dt, self.share / self.largest_share)
 
     @property
     def advised_substep(self) -> float:
@@ -57,8 +71,8 @@ class ContactResolution:
             return "contact: none"
         return (
             f"contact: smallest gap {self.smallest_gap:.4g} m, of vertex {self.vertex} to {self.obstacle}; "
-            f"omega dt {self.omega_dt:.3g} (advised {LARGEST_OMEGA_DT}), |v| dt {self.travel:.3g} of the width and "
-            f"{self.share:.3g} of the depth (advised {LARGEST_SHARE})"
+            f"omega dt {self.omega_dt:.3g} (advised {self.largest_omega_dt:.3g}), |v| dt {self.travel:.3g} of the width and "
+            f"{self.share:.3g} of the depth (advised {self.largest_share:.3g})"
         )
 
 
@@ -108,12 +122,15 @@ class ContactWatch:
 
     def seen_so_far(self) -> Callable[[], ContactResolution]:
         """The same, worked out when it is asked for: most runs never are."""
-        rows, values, h = self.rows(), self.ws.arrays.values, self.ws.solver.substep
-        return lambda: self._resolution(rows, values, h)
+        rows, values, solver = self.rows(), self.ws.arrays.values, self.ws.solver
+        h, largest = solver.substep, limits(solver)
+        return lambda: self._resolution(rows, values, h, largest)
 
-    def _resolution(self, rows: np.ndarray, values: Derived, h: float) -> ContactResolution:
+    def _resolution(
+        self, rows: np.ndarray, values: Derived, h: float, largest: tuple[float, float]
+    ) -> ContactResolution:
         if not self.contacts:
-            return ContactResolution(0.0, 0.0, 0.0, float("inf"), None, None, h)
+            return ContactResolution(0.0, 0.0, 0.0, float("inf"), None, None, h, *largest)
         rows = rows.astype(np.float64)
         gaps, travel = rows[::3], rows[2::3]
         k, i = (int(x) for x in np.unravel_index(np.argmin(gaps), gaps.shape))
@@ -126,6 +143,7 @@ class ContactWatch:
             i if seen else None,
             self._shown[k] if seen else None,
             h,
+            *largest,
         )
 
     def _depths(self, travel: np.ndarray, values: Derived, h: float) -> np.ndarray:

@@ -85,7 +85,7 @@ class ExplicitAdjoint:
 
     def _launch(self, numbers: dict, base: int, num_passes: int, halt: int, kick: int) -> None:
         ws, history, own = self.ws, self.ws.record, (self, self.numbers, self.frames)
-        states = (history, ws.frames, ws.watch)
+        states = (history, ws.frames, ws.watch, ws.contact)
         launch = ws.bound(ws.kernels(self.features).step_vjp, state=states, adjoint=own, table=ws.table)
         launch(**numbers, base=base, num_passes=num_passes, halt=halt, kick=kick)
         if ws.pairs:
@@ -154,7 +154,7 @@ class ExplicitTangent:
     def advance(self, first: int, last: int, num_passes: int, save_every: int) -> None:
         """Tangent of passes first .. last - 1, recorded from slot 0."""
         ws, a, history = self.ws, self.ws.arrays, self.ws.record
-        states, own = (history, ws.frames, ws.watch), (self, self.numbers, self.frames)
+        states, own = (history, ws.frames, ws.watch, ws.contact), (self, self.numbers, self.frames)
         launch = ws.bound(ws.kernels(self.features).step_jvp, state=states, tangent=own, table=ws.table)
         for numbers in ws.launches(first, last, num_passes, save_every, ws.work_per_launch):  # pass by pass
             slot = numbers["first"] - first

@@ -12,11 +12,21 @@ from diffsim_ti.state.numbers import ADJOINT, OF_STEPS, SCENE, TANGENT, with_sta
 from diffsim_ti.state.schedule import pass_at, reversed_pass
 
 A = ti.template()
-STATE = dict(u="vectors2", v="vectors2", f="vectors2", frames_u="vectors2", frames_v="vectors2", seen="scalars2")
+STATE = dict(
+    u="vectors2",
+    v="vectors2",
+    f="vectors2",
+    frames_u="vectors2",
+    frames_v="vectors2",
+    seen="scalars2",
+    stage="vectors2",
+)
 CHANGE = dict(u="vectors2", v="vectors2", frames_u="vectors2", frames_v="vectors2")  # of a state, or its adjoint
 CORNERS = dict(corner="vectors", rate_corner="vectors")  # adjoints of u and v, still to be gathered
 PLAN = dict(ints="ints", floats="scalars")  # the tables of the passes, from pass `window` on
-NUMBERS = dict.fromkeys(("num_items", "num_vertices", "window", "first", "count", "base"), "int")
+NUMBERS = dict.fromkeys(("num_items", "num_vertices", "window", "first", "count", "base"), "int") | dict(
+    contact_damping="float"
+)
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ import taichi as ti
 
 from diffsim_ti.elements.patched_tetrahedron import functions_of
 from diffsim_ti.runtime import PRECISIONS
+from diffsim_ti.solvers.explicit.contact_stage import ContactStage
 from diffsim_ti.solvers.explicit.obstacle_stages import ObstacleStages
 from diffsim_ti.state.features import Features
 
@@ -51,6 +52,10 @@ class KickDrift:
     @cached_property
     def obstacles(self) -> ObstacleStages:
         return ObstacleStages(self.features, self.law.precision)
+
+    @cached_property
+    def contact(self) -> ContactStage:
+        return ContactStage(self.features, self.law.precision)
 
     @ti.func
     def half(self):
@@ -98,7 +103,7 @@ class KickDrift:
         u, v = state.u[s, i], state.v[s, i]
         # forces
         f = self.element.gather(i, scene, scene.corner)
-        if ti.static(len(self.features.groups) > 0):
+        if ti.static(len(self.features.pressing) > 0):
             if scene.surface[i] > 0:
                 f = self.obstacles.add_force(i, f, u, v, now, scene)
         if ti.static(self.features.forces):
@@ -113,6 +118,8 @@ class KickDrift:
                 v_plus = self.obstacles.slide_all(i, u, v_plus, now, scene)
         # drift and damping
         u_next, v_next = u + now.alpha * v_plus, now.decay * v_plus
+        if ti.static(self.features.num_staged > 0):
+            u_next, v_next = self.contact.advance(i, u, v_plus, now, scene, state, plan)
         # prescribed motion
         if ti.static(self.features.motion):
             k = self.prescribed(i, scene)
@@ -138,7 +145,7 @@ class KickDrift:
         u, v, du, dv = state.u[s, i], state.v[s, i], tangent.u[0, i], tangent.v[0, i]
         # forces
         df = self.element.gather(i, scene, scene.corner)
-        if ti.static(len(self.features.groups) > 0):
+        if ti.static(len(self.features.pressing) > 0):
             if scene.surface[i] > 0:
                 df = self.obstacles.add_force_jvp(i, df, u, v, du, dv, now, scene, tangent)
         if ti.static(self.features.forces):
@@ -161,6 +168,9 @@ class KickDrift:
         # drift and damping
         du_next = du + now.alpha * dv_plus + now.alpha_by_rate * plan.rate_dot * v_plus
         dv_next = now.decay * dv_plus + now.decay_by_rate * plan.rate_dot * v_plus
+        if ti.static(self.features.num_staged > 0):
+            _, before = self.kicked(i, v, state.f[s, i], now, scene)
+            du_next, dv_next = self.contact.advance_jvp(i, u, before, du, dv_plus, now, scene, state, tangent, plan)
         # prescribed motion
         if ti.static(self.features.motion):
             k = self.prescribed(i, scene)
@@ -198,7 +208,13 @@ class KickDrift:
         v_plus_adj = now.alpha * p + now.decay * q
         if k >= 0:
             v_plus_adj = q
-        if ti.static(self.features.drag >= 0):
+        if ti.static(self.features.num_staged > 0):
+            _, before = self.kicked(i, v, state.f[s, i], now, scene)
+            by_u, v_plus_adj = self.contact.advance_vjp(i, u, before, p, q, now, scene, state, adjoint, plan)
+            p += by_u
+            if k >= 0:
+                v_plus_adj = q
+        elif ti.static(self.features.drag >= 0):
             v_plus, row = state.v[t, i] / now.decay, ti.static(self.features.drag)
             by_rate = now.alpha_by_rate * p.dot(v_plus) + now.decay_by_rate * q.dot(v_plus)
             adjoint.sums[row, i] = adjoint.sums[row, i] + by_rate
@@ -226,7 +242,7 @@ class KickDrift:
                     adjoint.sums[row, i] = adjoint.sums[row, i] + a_adj[d]
         if ti.static(self.features.forces):
             self.force_at_vjp(i, f_adj, now, scene, adjoint)
-        if ti.static(len(self.features.groups) > 0):
+        if ti.static(len(self.features.pressing) > 0):
             if scene.surface[i] > 0:
                 p, q = self.obstacles.add_force_vjp(i, p, q, u, v, f_adj, now, scene, adjoint)
         adjoint.u[0, i] = p

@@ -93,7 +93,7 @@ class ObstacleStages(ObstacleFunctions):
     @ti.func
     def add_force(self, i, f, u, v, now: A, scene: A):
         """f and the force of all obstacles on vertex i."""
-        for g in ti.static(self.features.groups):
+        for g in ti.static(self.features.pressing):
             for k in range(g.count):
                 X = scene.rest[i] - self.place(g, k, now, scene.path)
                 f += g.force.force(scene.parameters, g.first + k * g.size, X, u, v)
@@ -102,7 +102,7 @@ class ObstacleStages(ObstacleFunctions):
     @ti.func
     def add_force_jvp(self, i, df, u, v, du, dv, now: A, scene: A, tangent: A):
         """df and its change."""
-        for g in ti.static(self.features.groups):
+        for g in ti.static(self.features.pressing):
             for k in range(g.count):
                 first = g.first + k * g.size
                 X = scene.rest[i] - self.place(g, k, now, scene.path)
@@ -116,7 +116,7 @@ class ObstacleStages(ObstacleFunctions):
     @ti.func
     def add_force_vjp(self, i, u_adj, v_adj, u, v, f_adj, now: A, scene: A, adjoint: A):
         """u_adj, v_adj and the adjoints of u and v for that of the force; adds those of all else."""
-        for g in ti.static(self.features.groups):
+        for g in ti.static(self.features.pressing):
             for k in range(g.count):
                 first = g.first + k * g.size
                 X = scene.rest[i] - self.place(g, k, now, scene.path)

@@ -3,12 +3,14 @@
 from abc import abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.inputs import Derived
 from diffsim_ti.solvers.explicit.adjoint import ExplicitAdjoint, ExplicitTangent
+from diffsim_ti.solvers.explicit.contact_stage import ROWS
 from diffsim_ti.solvers.explicit.kernels import ExplicitKernels, explicit_kernels
 from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.state.schedule import PassTable
@@ -32,10 +34,34 @@ class Weights:
     decay_by_rate: float
 
 
+CONTACT_DAMPING = 0.005  # measured: tests/README.md
+
+
 class ExplicitSolver(Solver):
-    """Explicit steps: each costs one force evaluation, and dt may not exceed 2 / omega_max."""
+    """Explicit steps: each costs one force evaluation, and dt may not exceed 2 / omega_max.
+
+    contact: "stage", the default: obstacles act in a stage of each pass (contact_stage.py), which no step is too large
+        for; or "force": their barriers are one more force, which the step has to follow.
+    contact_damping: of the stage, from 0, which keeps the energy of a contact, to 1, which damps what the step does not
+        resolve and is the smoothest. A vertex that is pressed with N rests at velocity (1 - c) h N / 2 m in the
+        semi-implicit solver, whose rest is exact with 1, and at -c h N / 2 m in velocity Verlet, exact with 0.
+    Raises ValueError for another `contact`, or damping outside [0, 1].
+    """
 
     explicit = True
+    arguments = (*Solver.arguments, "contact", "contact_damping")
+
+    def __init__(self, *arguments, contact: str = "stage", contact_damping: float = CONTACT_DAMPING, **options):
+        if contact not in ("stage", "force"):
+            raise ValueError(f'contact must be "stage" or "force", got {contact!r}')
+        if not 0 <= contact_damping <= 1:
+            raise ValueError(f"contact_damping must lie between 0 and 1, got {contact_damping}")
+        self.contact, self.contact_damping = contact, float(contact_damping)
+        super().__init__(*arguments, **options)
+
+    @property
+    def stages_contact(self) -> bool:
+        return self.contact == "stage"
 
     @abstractmethod
     def weights(self, j: np.ndarray, num_passes: int, rate: float) -> Weights:
@@ -71,6 +97,9 @@ class ExplicitWorkspace(Workspace):
     def __init__(self, solver, derived: Derived):
         self.table = PassTable(runtime.PRECISIONS[solver.scene.precision])
         super().__init__(solver, derived)
+        features, a = self.arrays.features(), self.arrays
+        noted = ROWS * len(a.obstacles), a.num_vertices
+        self.contact = SimpleNamespace(stage=runtime.array(a.vector, *(noted if features.staged else (1, 1))))
 
     def kernels(self, features) -> ExplicitKernels:
         """The kernels for some features of the scene."""
@@ -86,6 +115,7 @@ class ExplicitWorkspace(Workspace):
         num_rows = max((len(x) for x in (a.values.path, a.values.motion) if x is not None), default=1)
         run = num_passes, num_rows, save_every, self.rate, solver.schedule
         turn, sizes = -1 if backwards else 1, dict(num_items=a.num_items, num_vertices=a.num_vertices)
+        sizes["contact_damping"] = solver.contact_damping
         for window, begin, end in self.table.windows(first, last)[::turn]:
             self.table.show(window, run, lambda first, last: solver.pass_table(first, last, *run[:4]))
             stops = [*range(end, begin, -chunk), begin][::-1] if backwards else [*range(begin, end, chunk), end]
@@ -96,7 +126,7 @@ class ExplicitWorkspace(Workspace):
         """Passes first .. last - 1 from the current state; or recorded: slot j - base holds the state before pass j."""
         recording = base is not None
         history, stride, base, pairs = self.record if recording else self.state, int(recording), base or 0, self.pairs
-        step, states = self.kernels(self.arrays.features()).step, (history, self.frames, self.watch)
+        step, states = self.kernels(self.arrays.features()).step, (history, self.frames, self.watch, self.contact)
         launch = self.bound(step, state=states, table=self.table)
         if pairs:
             pairs.ensure(history.u, (first - base) * stride)

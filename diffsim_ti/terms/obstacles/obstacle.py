@@ -162,7 +162,7 @@ class ObstacleForce(VertexForce):
     # ---- recording --------------------------------------------------------------------------------------------------
 
     @traced
-    def _record(self, parameters, first, X, u):
+    def record(self, parameters, first, X, u):
         """(graph, all numbers, components of u, d, n) at a point."""
         g = Graph(self.fp, parameters)
         p = [g.leaf(at(parameters, first + k)) for k in range(self.size)]
@@ -180,7 +180,7 @@ class ObstacleForce(VertexForce):
 
     @traced
     def _record_force(self, parameters, first, X, u):
-        g, p, moved, d, n = self._record(parameters, first, X, u)
+        g, p, moved, d, n = self.record(parameters, first, X, u)
         push = self._push(g, p, d)
         return g, p, moved, [push * k for k in n]
 
@@ -193,7 +193,7 @@ class ObstacleForce(VertexForce):
     @traced
     def gap(self, parameters, first, X, u):
         """Distance d [m]."""
-        return self._record(parameters, first, X, u)[3].value
+        return self.record(parameters, first, X, u)[3].value
 
     @ti.func
     def width(self, parameters: ti.template(), first):
@@ -208,7 +208,7 @@ class ObstacleForce(VertexForce):
     @traced
     def approach(self, parameters, first, X, u, move):
         """Change of the distance for a small move, n . move [m]."""
-        n = self._record(parameters, first, X, u)[4]
+        n = self.record(parameters, first, X, u)[4]
         return let(sum_of(n[d].value * at(move, d) for d in range(3)))
 
     @ti.func
@@ -274,7 +274,7 @@ class ObstacleForce(VertexForce):
 
     @traced
     def _record_slide(self, parameters, first, X, u, v, wall, h_over_m):
-        g, p, moved, d, n = self._record(parameters, first, X, u)
+        g, p, moved, d, n = self.record(parameters, first, X, u)
         before, mu, eps = [g.leaf(at(v, d)) for d in range(3)], p[self.count + 2], p[self.count + 3]
         ratio, wall = g.leaf(h_over_m), [g.leaf(at(wall, d)) for d in range(3)]
         after = friction.slide(g, n, self._push(g, p, d), before, wall, mu, ratio, eps)
@@ -306,7 +306,7 @@ class ObstacleForce(VertexForce):
 
     @traced
     def _record_rub(self, parameters, first, X, u, v, wall):
-        g, p, moved, d, n = self._record(parameters, first, X, u)
+        g, p, moved, d, n = self.record(parameters, first, X, u)
         speed, wall = ([g.leaf(at(vector, d)) for d in range(3)] for vector in (v, wall))
         return g, p, moved, speed, wall, n, self._push(g, p, d)
 

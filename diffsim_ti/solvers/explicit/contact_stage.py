@@ -1,0 +1,339 @@
+"""Contact with obstacles as a stage of explicit passes, which no step is too large for.
+
+After the kick by all other forces, a vertex of mass m moves by
+
+    u' - u = alpha w,    v' = vs + delta - (1 - decay) w,    w = vs + (1 + c) / 2 delta,    delta = (h / m) sum_k P_k n_k
+
+P_k is the push of obstacle k's barrier for the distance d_k at the pass's begin and the one it leads to (secant.py),
+y_k = d_k + n_k . (z - h wall_k); z = alpha v+ + alpha (1 + c) / 2 delta is solved for all obstacles of a vertex together,
+the minimum of a convex function, so there is one. vs is v+ after the friction of each obstacle with normal force P_k.
+
+c is the solver's `contact_damping`: 1 is backward Euler of the barriers alone, 0 their discrete gradients, which keep the
+energy. The kinetic and the barriers' energy together never grow but by walls that move: where obstacles are flat they fall
+by c m |delta|^2 / 2 or more. The distance to a curved obstacle is that to its tangent plane, the safe side if it is convex.
+"""
+
+from dataclasses import dataclass
+
+import taichi as ti
+
+from diffsim_ti.solvers.explicit.obstacle_stages import ObstacleStages
+from diffsim_ti.terms.obstacles import secant, stage
+
+A = ti.template()  # an array or Bundle handed to a Taichi function
+MOST_ROUNDS = 60
+# what is noted of obstacle o at vertex i, in state.stage[ROWS o + row, i]: (n, d); (stiffness, width, mu, friction speed);
+# its velocity; (P, -dP/dy, adjoint of mu, of the friction speed); change or adjoint of (n, P)
+PLANE, FELT, WALL, PUSH, SEED = range(5)
+ROWS = 5
+
+
+@dataclass(frozen=True)
+class ContactStage(ObstacleStages):
+    """Taichi functions of one vertex; `now` is the pass (state/schedule.py), g a group of obstacles, k a place in it.
+
+    Obstacles of all kinds are gone through in one loop, over what `look` notes of them.
+    """
+
+    @property
+    def epsilon(self) -> float:
+        return 2.0**-52 if self.precision == "f64" else 2.0**-23
+
+    @ti.func
+    def normal(self, plane):
+        return self.vector(plane.x, plane.y, plane.z, ti.cast(0, self.fp))
+
+    @ti.func
+    def blend(self, plan: A):
+        """(1 + c) / 2"""
+        half = ti.cast(0.5, self.fp)
+        return half + half * plan.contact_damping
+
+    # ---- where obstacles are, and what they push ---------------------------------------------------------------------
+
+    @ti.func
+    def look(self, i, u, move, now: A, scene: A, state: A):
+        """Is an obstacle felt, now or after `move`? If so, note what all of them are."""
+        near = False
+        for turn in range(2):
+            if turn == 0 or near:
+                for g in ti.static(self.features.staged):
+                    for k in range(g.count):
+                        first, wall = g.first + k * g.size, self.speed(g, k, now, scene.path)
+                        X = scene.rest[i] - self.place(g, k, now, scene.path)
+                        plane, width = (
+                            stage.plane(g.force, scene.parameters, first, X, u),
+                            g.force.width(scene.parameters, first),
+                        )
+                        if turn == 0:
+                            y = plane.w + self.normal(plane).dot(move - now.h * wall)
+                            near = near or ti.min(plane.w, y) < width
+                        else:
+                            row = ROWS * (g.number + k)
+                            state.stage[row + PLANE, i] = plane
+                            state.stage[row + FELT, i] = stage.numbers(g.force, scene.parameters, first)
+                            state.stage[row + WALL, i] = wall
+        return near
+
+    @ti.func
+    def push(self, o, i, z, now: A, state: A, plan: A):
+        """Note the push of an obstacle for the move z; returns (n, P, -dP/dy)."""
+        plane, felt = state.stage[ROWS * o + PLANE, i], state.stage[ROWS * o + FELT, i]
+        n, width = self.normal(plane), felt.y
+        y = plane.w + n.dot(z - now.h * state.stage[ROWS * o + WALL, i])
+        p, _, by_t = secant.push(plane.w / width, y / width, plan.contact_damping, self.fp)
+        P, K, zero = felt.x * width * p, felt.x * by_t, ti.cast(0, self.fp)
+        state.stage[ROWS * o + PUSH, i] = self.vector(P, K, zero, zero)
+        return n, P, K
+
+    # ---- the move that all obstacles of a vertex agree on -------------------------------------------------------------
+
+    @ti.func
+    def solve(self, i, free, a, now: A, state: A, plan: A):
+        """z = free + a sum P n by Newton's method, shorter where the slope along its step changes sign.
+
+        Returns z, sum P n, and the entries of sum K n (x) n there.
+        """
+        z, step, trial = self.vector(0), self.vector(0), self.vector(0)
+        total, xyz, mixed = self.vector(0), self.vector(0), self.vector(0)
+        before, share, half = ti.cast(0, self.fp), ti.cast(1, self.fp), ti.cast(0.5, self.fp)
+        for turn in range(MOST_ROUNDS):
+            total, xyz, mixed = self.vector(0), self.vector(0), self.vector(0)
+            for o in range(ti.static(self.features.num_staged)):
+                n, P, K = self.push(ti.static(self.features.first_staged) + o, i, trial, now, state, plan)
+                total += P * n
+                xyz += K * n * n
+                mixed += K * self.vector(n.y * n.z, n.z * n.x, n.x * n.y, ti.cast(0, self.fp))
+            r = trial - free - a * total
+            if turn > 0 and r.dot(step) > half * before:
+                share = half * share
+            else:
+                z, share = trial, ti.cast(1, self.fp)
+                step = self.vector(0) - stage.solve_linear(a, xyz, mixed, r)
+                before = -r.dot(step)
+                if step.norm() <= ti.cast(4 * self.epsilon, self.fp) * z.norm():
+                    break
+            trial = z + share * step
+        return z, total, xyz, mixed
+
+    # ---- the stage -----------------------------------------------------------------------------------------------------
+
+    @ti.func
+    def slide(self, o, i, v, ratio, state: A):
+        """Velocity after the friction of an obstacle, whose push is noted."""
+        pushed, felt, after = state.stage[ROWS * o + PUSH, i], state.stage[ROWS * o + FELT, i], v
+        if pushed.x > 0 and felt.z > 0:
+            plane, wall = state.stage[ROWS * o + PLANE, i], state.stage[ROWS * o + WALL, i]
+            after = stage.slide(self.fp, plane, pushed.x, v, wall, ratio, felt.z, felt.w)
+        return after
+
+    @ti.func
+    def slide_by(self, count, i, v, ratio, state: A):
+        """Velocity after the friction of the first `count` obstacles, one after the other."""
+        for o in range(count):
+            v = self.slide(ti.static(self.features.first_staged) + o, i, v, ratio, state)
+        return v
+
+    @ti.func
+    def slide_all(self, i, v, ratio, state: A):
+        """Velocity after the friction of all obstacles."""
+        if ti.static(len(self.features.staged_rough) > 0):
+            v = self.slide_by(ti.static(self.features.num_staged), i, v, ratio, state)
+        return v
+
+    @ti.func
+    def acts(self, i, ratio, now: A, scene: A):
+        return now.alpha > 0 and scene.surface[i] > 0 and ratio > 0
+
+    @ti.func
+    def advance(self, i, u, v_plus, now: A, scene: A, state: A, plan: A):
+        """(u', v') for the velocity v+ after the kick."""
+        v, delta, free, ratio = v_plus, self.vector(0), now.alpha * v_plus, now.h * scene.inverse_mass[i]
+        if self.acts(i, ratio, now, scene):
+            if self.look(i, u, free, now, scene, state):
+                _, total, _, _ = self.solve(i, free, now.alpha * self.blend(plan) * ratio, now, state, plan)
+                delta, v = ratio * total, self.slide_all(i, v_plus, ratio, state)
+        w = v + self.blend(plan) * delta
+        return u + now.alpha * w, v + delta - (1 - now.decay) * w
+
+    # ---- its tangent ---------------------------------------------------------------------------------------------------
+
+    @ti.func
+    def advance_jvp(self, i, u, v_plus, du, dv_plus, now: A, scene: A, state: A, tangent: A, plan: A):
+        """Changes of u' and v'."""
+        v, dv, delta, ddelta = v_plus, dv_plus, self.vector(0), self.vector(0)
+        inverse = scene.inverse_mass[i]
+        ratio, blend, free = now.h * inverse, self.blend(plan), now.alpha * v_plus
+        dalpha = now.alpha_by_rate * plan.rate_dot
+        if self.acts(i, ratio, now, scene):
+            if self.look(i, u, free, now, scene, state):
+                a, dratio = now.alpha * blend * ratio, -ratio * inverse * tangent.mass[i]
+                z, total, xyz, mixed = self.solve(i, free, a, now, state, plan)
+                dtotal = self.note_changes(i, u, du, z, now, scene, state, tangent, plan)
+                b = dalpha * v_plus + now.alpha * dv_plus + blend * (dalpha * ratio + now.alpha * dratio) * total
+                dz = stage.solve_linear(a, xyz, mixed, b + a * dtotal)
+                dtotal += self.add_change(i, dz, state)
+                delta, ddelta = ratio * total, dratio * total + ratio * dtotal
+                v, dv = self.slide_all_jvp(i, v, dv, ratio, dratio, now, scene, state, tangent)
+        w, dw = v + blend * delta, dv + blend * ddelta
+        du_next = du + dalpha * w + now.alpha * dw
+        return du_next, dv + ddelta - (1 - now.decay) * dw + now.decay_by_rate * plan.rate_dot * w
+
+    @ti.func
+    def note_changes(self, i, u, du, z, now: A, scene: A, state: A, tangent: A, plan: A):
+        """Note the change of (n, P) of each obstacle for the move z as it is; returns that of sum P n."""
+        total = self.vector(0)
+        for g in ti.static(self.features.staged):
+            for k in range(g.count):
+                row, first = ROWS * (g.number + k), g.first + k * g.size
+                X = scene.rest[i] - self.place(g, k, now, scene.path)
+                moved = du + tangent.rest[i] - self.place(g, k, now, tangent.path)
+                own, dmove = z - now.h * state.stage[row + WALL, i], -now.h * self.speed(g, k, now, tangent.path)
+                change = stage.push_jvp(
+                    g.force, scene.parameters, first, X, u, own, plan.contact_damping, tangent.parameters, moved, dmove
+                )
+                state.stage[row + SEED, i] = change
+                pushed = state.stage[row + PUSH, i]
+                total += pushed.x * self.normal(change) + change.w * self.normal(state.stage[row + PLANE, i])
+        return total
+
+    @ti.func
+    def add_change(self, i, dz, state: A):
+        """Add what the change dz of the move does to the noted pushes; returns the change of sum P n by it."""
+        total = self.vector(0)
+        for c in range(ti.static(self.features.num_staged)):
+            row = ROWS * (ti.static(self.features.first_staged) + c)
+            n, pushed, change = (
+                self.normal(state.stage[row + PLANE, i]),
+                state.stage[row + PUSH, i],
+                state.stage[row + SEED, i],
+            )
+            more = -pushed.y * n.dot(dz)
+            change.w = change.w + more
+            state.stage[row + SEED, i] = change
+            total += more * n
+        return total
+
+    @ti.func
+    def slide_all_jvp(self, i, v, dv, ratio, dratio, now: A, scene: A, state: A, tangent: A):
+        """Velocity after friction, and its change."""
+        for g in ti.static(self.features.staged_rough):
+            for k in range(g.count):
+                row, numbers = ROWS * (g.number + k), g.first + k * g.size + g.force.count
+                pushed, felt = state.stage[row + PUSH, i], state.stage[row + FELT, i]
+                if pushed.x > 0:
+                    plane, wall = state.stage[row + PLANE, i], state.stage[row + WALL, i]
+                    dwall, change = self.speed(g, k, now, tangent.path), state.stage[row + SEED, i]
+                    dmu, deps = tangent.parameters[numbers + 2], tangent.parameters[numbers + 3]
+                    dv = stage.slide_jvp(
+                        self.fp, plane, pushed.x, v, wall, ratio, felt.z, felt.w, change, dv, dwall, dratio, dmu, deps
+                    )
+                    v = stage.slide(self.fp, plane, pushed.x, v, wall, ratio, felt.z, felt.w)
+        return v, dv
+
+    # ---- its adjoint ---------------------------------------------------------------------------------------------------
+
+    @ti.func
+    def advance_vjp(self, i, u, v_plus, p, q, now: A, scene: A, state: A, adjoint: A, plan: A):
+        """(adjoint of u besides p, adjoint of v+) for adjoints p and q of u' and v'; adds those of all else."""
+        free, w, u_adj = now.alpha * v_plus, v_plus, self.vector(0)
+        inverse, blend = scene.inverse_mass[i], self.blend(plan)
+        ratio, w_adj = now.h * inverse, now.alpha * p - (1 - now.decay) * q
+        v_adj, by_alpha = q + w_adj, p.dot(v_plus)
+        if self.acts(i, ratio, now, scene):
+            if self.look(i, u, free, now, scene, state):
+                a = now.alpha * blend * ratio
+                z, total, xyz, mixed = self.solve(i, free, a, now, state, plan)
+                w = self.slide_all(i, v_plus, ratio, state) + blend * ratio * total
+                delta_adj = q + blend * w_adj
+                by_alpha, by_ratio = p.dot(w), delta_adj.dot(total)
+                self.seed_all(i, ratio * delta_adj, state)
+                if ti.static(len(self.features.staged_rough) > 0):
+                    v_adj, more = self.slide_all_vjp(i, v_plus, v_adj, ratio, state)
+                    by_ratio += more
+                z_adj = stage.solve_linear(a, xyz, mixed, self.by_move(i, state))
+                v_adj += now.alpha * z_adj
+                by_alpha += z_adj.dot(v_plus + blend * ratio * total)
+                by_ratio += blend * now.alpha * z_adj.dot(total)
+                u_adj = self.push_all_vjp(i, u, z, a * z_adj, now, scene, state, adjoint, plan)
+                if ti.static(self.features.density):
+                    row = ti.static(self.features.sums().first("mass"))
+                    adjoint.sums[row, i] = adjoint.sums[row, i] - ratio * inverse * by_ratio
+        if ti.static(self.features.drag >= 0):
+            row = ti.static(self.features.drag)
+            by_rate = now.alpha_by_rate * by_alpha + now.decay_by_rate * q.dot(w)
+            adjoint.sums[row, i] = adjoint.sums[row, i] + by_rate
+        return u_adj, v_adj
+
+    @ti.func
+    def seed_all(self, i, total_adj, state: A):
+        """Note the adjoints of (n, P) of each obstacle for that of sum P n."""
+        for c in range(ti.static(self.features.num_staged)):
+            row = ROWS * (ti.static(self.features.first_staged) + c)
+            pushed = state.stage[row + PUSH, i]
+            seed = pushed.x * total_adj
+            seed.w = self.normal(state.stage[row + PLANE, i]).dot(total_adj)
+            state.stage[row + SEED, i] = seed
+
+    @ti.func
+    def slide_all_vjp(self, i, v, v_adj, ratio, state: A):
+        """(adjoint of the velocity v before friction, of h / m); notes those of all else, of the wall in its place."""
+        by_ratio = ti.cast(0, self.fp)
+        for back in range(ti.static(self.features.num_staged)):
+            before = ti.static(self.features.num_staged) - 1 - back
+            row = ROWS * (ti.static(self.features.first_staged) + before)
+            pushed, felt, by_wall = state.stage[row + PUSH, i], state.stage[row + FELT, i], self.vector(0)
+            if pushed.x > 0 and felt.z > 0:
+                start, plane, wall = (
+                    self.slide_by(before, i, v, ratio, state),
+                    state.stage[row + PLANE, i],
+                    state.stage[row + WALL, i],
+                )
+                by_plane, by_v, of_wall, more, by_mu, by_eps = stage.slide_vjp(
+                    self.fp, plane, pushed.x, start, wall, ratio, felt.z, felt.w, v_adj
+                )
+                v_adj, by_wall = by_v, of_wall
+                by_ratio += more
+                state.stage[row + SEED, i] = state.stage[row + SEED, i] + by_plane
+                pushed.z, pushed.w = by_mu, by_eps
+                state.stage[row + PUSH, i] = pushed
+            state.stage[row + WALL, i] = by_wall
+        return v_adj, by_ratio
+
+    @ti.func
+    def by_move(self, i, state: A):
+        """Adjoint of the move z, from the noted adjoints of the pushes."""
+        out = self.vector(0)
+        for c in range(ti.static(self.features.num_staged)):
+            row = ROWS * (ti.static(self.features.first_staged) + c)
+            pushed, seed = state.stage[row + PUSH, i], state.stage[row + SEED, i]
+            out += -pushed.y * seed.w * self.normal(state.stage[row + PLANE, i])
+        return out  # Taichi 1.7.4 knows no -= and no minus sign of vectors
+
+    @ti.func
+    def push_all_vjp(self, i, u, z, total_adj, now: A, scene: A, state: A, adjoint: A, plan: A):
+        """Adjoint of u, from the noted adjoints and that of sum P n in the equation of the move; adds those of all else."""
+        u_adj = self.vector(0)
+        for g in ti.static(self.features.staged):
+            for k in range(g.count):
+                row, first = ROWS * (g.number + k), g.first + k * g.size
+                pushed, seed = state.stage[row + PUSH, i], state.stage[row + SEED, i]
+                X = scene.rest[i] - self.place(g, k, now, scene.path)
+                own = z - now.h * self.speed(g, k, now, scene.path)
+                by_n = self.normal(seed) + pushed.x * total_adj
+                by_push = seed.w + self.normal(state.stage[row + PLANE, i]).dot(total_adj)
+                by_u, by_own, by = stage.push_vjp(
+                    g.force, scene.parameters, first, X, u, own, plan.contact_damping, by_n, by_push
+                )
+                u_adj += by_u
+                for m in ti.static(range(g.force.count + 2)):
+                    adjoint.sums[first + m, i] = adjoint.sums[first + m, i] + by[m]
+                by_wall = -now.h * by_own
+                if ti.static(g.force.friction):
+                    at = first + g.force.count + 2
+                    adjoint.sums[at, i] = adjoint.sums[at, i] + pushed.z
+                    adjoint.sums[at + 1, i] = adjoint.sums[at + 1, i] + pushed.w
+                    by_wall += state.stage[row + WALL, i]
+                self.add_to_rest(i, by_u, adjoint)
+                self.add_to_path(g, k, i, now, by_u, by_wall, adjoint)
+        return u_adj

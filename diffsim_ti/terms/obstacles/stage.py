@@ -1,0 +1,124 @@
+"""An obstacle at a vertex as a stage of explicit passes: Taichi functions of one obstacle, with tangents and adjoints.
+
+`force` is the obstacle's compile-time class (obstacle.py), of which only the distance is used. A plane is the vector
+(n, d): normal and distance where the pass begins. The push P is that of secant.py, for a distance that goes from d to
+y = d + n . move, `move` being the vertex's displacement in the pass relative to the obstacle. Friction is that of
+friction.py, with P as the normal force.
+"""
+
+import taichi as ti
+
+from diffsim_ti.differentiation import Graph
+from diffsim_ti.runtime import at, let, traced
+from diffsim_ti.terms.obstacles import friction, secant
+
+
+@traced
+def _vector(fp, numbers, last=0):
+    return let(ti.types.vector(4, fp)(*numbers, ti.cast(last, fp)))
+
+
+@traced
+def plane(force, parameters, first, X, u):
+    """(n, d)"""
+    _, _, _, d, n = force.record(parameters, first, X, u)
+    return _vector(force.fp, [k.value for k in n], d.value)
+
+
+@ti.func
+def numbers(force: ti.template(), parameters: ti.template(), first):
+    """(stiffness, width, mu, friction speed)"""
+    out = ti.types.vector(4, force.fp)(0)
+    for k in ti.static(range(force.size - force.count)):
+        out[k] = parameters[first + force.count + k]
+    return out
+
+
+@ti.func
+def solve_linear(a, xyz, mixed, b):
+    """(I + a sum K n (x) n)^-1 b, by L D L^T; xyz and mixed are the entries of the sum, xx, yy, zz and yz, zx, xy."""
+    d0 = 1 + a * xyz.x
+    l1, l2 = a * mixed.z / d0, a * mixed.y / d0
+    d1 = 1 + a * xyz.y - l1 * a * mixed.z
+    rest = a * mixed.x - l1 * a * mixed.y
+    l3 = rest / d1
+    d2 = 1 + a * xyz.z - l2 * a * mixed.y - l3 * rest
+    y1 = b.y - l1 * b.x
+    y2 = b.z - l2 * b.x - l3 * y1
+    x2 = y2 / d2
+    x1 = y1 / d1 - l3 * x2
+    x = 0 * b
+    x.x, x.y, x.z = b.x / d0 - l1 * x1 - l2 * x2, x1, x2
+    return x
+
+
+@traced
+def _record_push(force, parameters, first, X, u, move, damping):
+    """(graph, the obstacle's numbers, leaves of u, leaves of move, n, P)"""
+    g, p, moved, d, n = force.record(parameters, first, X, u)
+    leaves = [g.leaf(at(move, k)) for k in range(3)]
+    stiffness, width = p[force.count], p[force.count + 1]
+    s, t = d / width, (d + g.dot(n, leaves)) / width
+    value, by_s, by_t = _three(secant.push(s.value, t.value, damping, force.fp))
+    p_of = g.function(value, (s, lambda: let(-by_s)), (t, lambda: let(-by_t)))
+    return g, p, moved, leaves, n, stiffness * width * p_of
+
+
+@traced
+def _three(values):
+    return [let(value) for value in values]
+
+
+@traced
+def push_jvp(force, parameters, first, X, u, move, damping, parameters_dot, du, dmove):
+    """Change of (n, P)"""
+    g, p, moved, leaves, n, pushed = _record_push(force, parameters, first, X, u, move, damping)
+    dots = [(q, at(parameters_dot, first + k)) for k, q in enumerate(p)]
+    for own, change in ((moved, du), (leaves, dmove)):
+        dots += [(leaf, at(change, d)) for d, leaf in enumerate(own)]
+    *dn, dp = g.forward(dots, [*n, pushed])
+    return _vector(force.fp, dn, dp)
+
+
+@traced
+def push_vjp(force, parameters, first, X, u, move, damping, n_adj, push_adj):
+    """(adjoints of u and move as vectors, those of the obstacle's numbers as a tuple) for those of n and P."""
+    g, p, moved, leaves, n, pushed = _record_push(force, parameters, first, X, u, move, damping)
+    seeds = [(k, let(at(n_adj, d))) for d, k in enumerate(n)] + [(pushed, push_adj)]
+    adjoints = g.reverse(seeds, [*moved, *leaves, *p])
+    return _vector(force.fp, adjoints[:3]), _vector(force.fp, adjoints[3:6]), tuple(adjoints[6:])
+
+
+# ---- friction, for a plane and a push that are known -------------------------------------------------------------------
+
+
+@traced
+def _record_slide(fp, plane, push, v, wall, ratio, mu, eps):
+    """(graph, leaves: n, P, v, wall, ratio, mu, eps, and the velocity after it)"""
+    g = Graph(fp)
+    n, before, walls = ([g.leaf(at(x, d)) for d in range(3)] for x in (plane, v, wall))
+    pushed, ratio, mu, eps = (g.leaf(x) for x in (push, ratio, mu, eps))
+    after = friction.slide(g, n, pushed, before, walls, mu, ratio, eps)
+    return g, [*n, pushed, *before, *walls, ratio, mu, eps], after
+
+
+@traced
+def slide(fp, plane, push, v, wall, ratio, mu, eps):
+    """Velocity after friction; ratio: h / m [s/kg]."""
+    return _vector(fp, [k.value for k in _record_slide(fp, plane, push, v, wall, ratio, mu, eps)[-1]])
+
+
+@traced
+def slide_jvp(fp, plane, push, v, wall, ratio, mu, eps, dplane, dv, dwall, dratio, dmu, deps):
+    """Its change; dplane: that of (n, P)."""
+    g, leaves, after = _record_slide(fp, plane, push, v, wall, ratio, mu, eps)
+    vectors = [at(x, d) for x, size in ((dplane, 4), (dv, 3), (dwall, 3)) for d in range(size)]
+    return _vector(fp, g.forward(list(zip(leaves, [*vectors, dratio, dmu, deps])), after))
+
+
+@traced
+def slide_vjp(fp, plane, push, v, wall, ratio, mu, eps, w):
+    """(adjoints of (n, P), v, wall as vectors, of ratio, mu, eps) for that of the velocity after it."""
+    g, leaves, after = _record_slide(fp, plane, push, v, wall, ratio, mu, eps)
+    x = g.reverse([(k, let(at(w, d))) for d, k in enumerate(after)], leaves)
+    return (_vector(fp, x[:3], x[3]), _vector(fp, x[4:7]), _vector(fp, x[7:10]), *x[10:])

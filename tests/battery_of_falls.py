@@ -1,0 +1,136 @@
+"""Falls of bodies that nobody made for this: python tests/battery_of_falls.py [MESH ...] [--cases 60] [--seed 0].
+
+Each draw takes a mesh, a size, a modulus, a height and a solver, all else as `diffsim-ti simulate` has it, and runs until
+half a second after the first contact. A fall is good where it ends, nothing is ever below the floor, and the energy never
+rises above that of the start by more than 1 % of weight times height; where the impact is faster than the body's waves, or
+it cannot carry its weight, an error before the first frame would be as good. A draw that takes longer than `--patience`
+seconds is named and replaced. Prints a line for each, and what all of them come to; exit code 1 if one is bad.
+"""
+
+import argparse
+import json
+import multiprocessing
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+ASSETS = sorted((Path(__file__).resolve().parents[1] / "assets" / "tetmesh").glob("*.msh"))
+SIZES, MODULI, HEIGHTS, SOLVERS = (0.05, 0.2, 1.0, 5.0), (1e4, 1e5, 1e7), (0.1, 1.0), ("verlet", "bdf2")
+RHO, G = 1000.0, 9.81
+
+
+def draw(rng, meshes) -> dict:
+    """One fall."""
+    return dict(
+        mesh=str(meshes[rng.integers(len(meshes))]),
+        size=float(rng.choice(SIZES)),
+        youngs_modulus=float(rng.choice(MODULI)),
+        height=float(rng.choice(HEIGHTS)),
+        solver=str(rng.choice(SOLVERS)),
+    )
+
+
+def is_beyond(case: dict) -> bool:
+    """Whether the impact is faster than waves, or the body cannot carry its weight."""
+    speed = np.sqrt(2 * G * case["height"] * case["size"])
+    return bool(speed > np.sqrt(case["youngs_modulus"] / RHO) or RHO * G * case["size"] > case["youngs_modulus"])
+
+
+def fall(case: dict) -> dict:
+    """Run one, and say how it went."""
+    import diffsim_ti as ds
+    from diffsim_ti.adaptive_run import ForwardRun
+    from diffsim_ti.cli.options import fall_scene, load_body, make_material, solver_class
+
+    ds.init()
+    begin, height = time.perf_counter(), case["height"] * case["size"]
+    body = load_body(Path(case["mesh"]), case["size"])
+    law = make_material("StableNeoHookean", case["youngs_modulus"], 0.4)
+    scene, _ = fall_scene(body, law, RHO, height=height)
+    out = dict(case, tetrahedra=body.num_tetrahedra)
+    try:
+        frame = min(1 / 30, np.sqrt(2 * height / G) / 4)
+        run = ForwardRun(scene, solver_class(case["solver"]), frame)
+        start, highest, touched = float(run.simulator.compute_energy()), 0.0, None
+        while touched is None or run.simulator.time < touched + 0.5:
+            run.advance()
+            highest = max(highest, float(run.energies[-1]) - start)
+            if touched is None and run.seen.gap < float(run.obstacles[0].values["barrier_width"]):
+                touched = run.simulator.time
+    except FloatingPointError as error:
+        return out | dict(ended=False, said=str(error), seconds=time.perf_counter() - begin)
+    weight = scene.inputs.derive(scene.inputs.values).mass.sum() * G
+    return out | dict(
+        ended=True,
+        gap=run.seen.gap,
+        rise=highest / (weight * height),
+        J=run.seen.J,
+        retries=len(run.seen.retries),
+        implicit_parts=run.seen.implicit_parts,
+        seconds=time.perf_counter() - begin,
+    )
+
+
+def judge(result: dict) -> str:
+    """ "good", "said" (an error before the first frame, beyond what a body can do), or what is wrong."""
+    if not result["ended"]:
+        return "said" if is_beyond(result) and "before the first frame" in result["said"] else f"died: {result['said']}"
+    if not result["gap"] > 0:
+        return f"is {-result['gap']:.3g} m below the floor"
+    return "good" if result["rise"] < 0.01 else f"gained {result['rise']:.2%} of weight times height"
+
+
+def _work(case, queue):
+    queue.put(fall(case))
+
+
+def within(case: dict, patience: float) -> dict | None:
+    """The fall, in a process of its own; None if it takes too long."""
+    context = multiprocessing.get_context("spawn")
+    queue = context.Queue()
+    process = context.Process(target=_work, args=(case, queue))
+    process.start()
+    try:
+        return queue.get(timeout=patience)
+    except Exception:  # queue.Empty
+        return None
+    finally:
+        process.kill()
+        process.join()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("meshes", nargs="*", type=Path, default=ASSETS)
+    parser.add_argument("--cases", type=int, default=60)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--patience", type=float, default=120.0, help="seconds for one")
+    options = parser.parse_args()
+    rng, results, slow, draws = np.random.default_rng(options.seed), [], [], 0
+    while len(results) < options.cases:
+        case, draws = draw(rng, options.meshes), draws + 1
+        result = within(case, options.patience)
+        name = "{} of {size:g} m, E {youngs_modulus:g} Pa, from {height:g} sizes, {solver}".format(
+            Path(case["mesh"]).stem, **case
+        )
+        if result is None:
+            slow.append(name)
+            print(f"slow  {name}", flush=True)
+            continue
+        results.append(result | dict(judged=judge(result)))
+        numbers = {k: v for k, v in results[-1].items() if k not in case and k not in ("judged", "said")}
+        print(f"{results[-1]['judged'][:90]}  {name}  {json.dumps(numbers)}", flush=True)
+    explicit = [r for r in results if r["solver"] == "verlet" and r["ended"]]
+    alone = sum(r["implicit_parts"] == 0 for r in explicit)
+    bad = sum(r["judged"] not in ("good", "said") for r in results)
+    print(
+        f"{len(results)} falls, {bad} bad; {alone} of {len(explicit)} explicit ones by explicit steps alone; "
+        f"{len(slow)} of {draws} draws took longer than {options.patience:g} s"
+    )
+    sys.exit(bad > 0)
+
+
+if __name__ == "__main__":
+    main()
