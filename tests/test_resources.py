@@ -296,7 +296,7 @@ def test_absent_features_take_no_memory():
 
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_absent_contact_leaves_no_code(solver, monkeypatch):
-    """The ground's force is looked up while a step compiles if, and only if, the scene has a ground."""
+    """The ground's distance is looked up while a step compiles if, and only if, the scene has a ground."""
     looked_up = []
 
     class Spy:
@@ -305,15 +305,15 @@ def test_absent_contact_leaves_no_code(solver, monkeypatch):
                 looked_up.append(instance)
             return original.__get__(instance, owner)
 
-    original = GroundForce.__dict__["force"]
-    monkeypatch.setattr(GroundForce, "force", Spy())
+    original = GroundForce.__dict__["distance_and_normal"]
+    monkeypatch.setattr(GroundForce, "distance_and_normal", Spy())
     # J_floor is a compile-time number of the law: a new J_floor means that everything compiles here
     material = ds.StableNeoHookean(1e5, 0.3, J_floor=0.0123 + 1e-4 * SOLVERS.index(solver))
     mesh = ds.TetrahedralMesh.create_box(2)
     ds.Simulator(solver(ds.Scene(mesh, material, terms=[ds.Gravity()]), dt=1e-3)).run(2)
     assert looked_up == []
     ds.Simulator(solver(ds.Scene(mesh, material, terms=[ds.Ground(-1.0)]), dt=1e-3)).run(2)
-    assert len(looked_up) == 1
+    assert looked_up
 
 
 def test_torch_is_not_needed():
