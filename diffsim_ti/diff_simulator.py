@@ -144,6 +144,7 @@ class DifferentiableSimulator:
         """Back to the start, or to given positions [m] and velocities [m/s], tensors of shape (num_vertices, 3)."""
         self._follow_dtype()
         self._displacements, self._velocities = torch.zeros_like(self._rest), torch.zeros_like(self._rest)
+        self._steps = 0  # done since
         if positions is not None:
             self._displacements = self._checked("positions", positions, self._rest.shape) - self._rest
         if velocities is not None:
@@ -225,7 +226,9 @@ class DifferentiableSimulator:
             shape = tuple(self._rest.shape)
             tensors["external_forces"] = self._checked("external_forces", external_forces, shape, (steps, *shape))
         rollout = self._rollout(steps, external_forces is not None, checkpoint_every, save_every)
+        rollout.sweep.first_step = self._steps
         frames, self._last = rollout_frames(rollout, **tensors), rollout
+        self._steps += steps
         self._displacements, self._velocities = frames.displacements[-1], frames.velocities[-1]
         return frames
 

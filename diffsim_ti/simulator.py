@@ -46,7 +46,7 @@ class Simulator:
         self.step_count = 0
         self.workspace.load(self._start)
         if self._start.forces is not None and len(self._start.forces) == 1:
-            runtime.fill(self.workspace.arrays.forces, self._start.forces)  # set_forces may have changed them
+            self.workspace.arrays.load_rows(forces=self._start.forces)  # set_forces may have changed them
 
     @property
     def time(self) -> float:
@@ -56,7 +56,7 @@ class Simulator:
     def step(self) -> None:
         """Advance by solver.dt."""
         self._load_step()
-        self._guard.offset = self.step_count * self.solver.substeps
+        self._guard.offset, self.workspace.first_step = self.step_count * self.solver.substeps, self.step_count
         passes = self.solver.num_passes(1)
         self.workspace.save(self._before, 0)
         try:
@@ -82,15 +82,15 @@ class Simulator:
         """Bring what depends on the step to the device: motion of fixed vertices, forces per step."""
         arrays, values = self.workspace.arrays, self._start
         if values.motion is not None:
-            runtime.fill(arrays.motion, self.scene.motion_rows([self.time, self.time + self.solver.dt]))
+            arrays.load_rows(motion=self.scene.motion_rows([self.time, self.time + self.solver.dt]))
         if values.path is not None:
             rows = self.scene.path_rows([self.time, self.time + self.solver.dt])
-            runtime.fill(arrays.path, np.stack(list(rows.values()), 1))
+            arrays.load_rows(path=np.stack(list(rows.values()), 1))
         if values.forces is not None and len(values.forces) > 1:
             rows = values.forces
             if self.step_count >= len(rows):
                 raise ValueError(f"external_forces are given for {len(rows)} steps, this is step {self.step_count}")
-            runtime.fill(arrays.forces, rows[self.step_count][None])
+            arrays.load_rows(forces=rows[self.step_count][None])
 
     @property
     def displacements(self) -> np.ndarray:
@@ -141,7 +141,7 @@ class Simulator:
             )
         if forces.shape != given.shape or not np.all(np.isfinite(forces)):
             raise ValueError(f"forces: expected finite numbers of shape {given.shape}, got shape {forces.shape}")
-        runtime.fill(self.workspace.arrays.forces, forces[None])
+        self.workspace.arrays.load_rows(forces=forces[None])
 
     @property
     def contact_resolution(self) -> ContactResolution:

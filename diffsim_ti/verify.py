@@ -61,9 +61,18 @@ def taylor_test(
 
 
 def central_difference(f: Callable[[float], float], scale: float = 1.0) -> tuple[float, float]:
-    """(f'(0), error estimate): central differences extrapolated once, at the step where two neighbours agree best."""
-    steps = scale * 10.0 ** -np.arange(2.0, 6.5, 0.5)
-    raw = np.array([(f(s) - f(-s)) / (2 * s) for s in np.append(steps, steps[-1] / np.sqrt(10))])
+    """(f'(0), error estimate): central differences extrapolated once, at the step where two neighbours agree best.
+
+    Steps so large that f refuses its argument (ValueError: a body that starts in an obstacle) are left out.
+    """
+    raw = []
+    for s in scale * 10.0 ** -np.arange(2.0, 7.0, 0.5):
+        try:
+            raw.append((f(s) - f(-s)) / (2 * s))
+        except ValueError:
+            if raw or s < 1e-4 * scale:
+                raise
+    raw = np.array(raw)
     better = (10 * raw[1:] - raw[:-1]) / 9  # steps fall by sqrt(10): the error of second order by 10
     change = np.abs(np.diff(better))
     best = int(np.argmin(change))
@@ -201,7 +210,12 @@ def check_gradients(
             exact = float((pull_back(double, double.forward(), loss)[name] * direction).sum())
         differences, uncertainty = central_difference(along)
         for epsilon in (0.1, 0.01, 0.001):  # where the loss is strongly curved only a closer look sees the order
-            taylor = taylor_test(along, 0.0, exact, 1.0, epsilon)
+            try:
+                taylor = taylor_test(along, 0.0, exact, 1.0, epsilon)
+            except ValueError:  # so far the body starts in an obstacle
+                if epsilon == 0.001:
+                    raise
+                continue
             if taylor.rate >= 1.9:
                 break
         scale = max(abs(differences), abs(analytic))

@@ -407,6 +407,28 @@ def test_steps_by_a_simulator_are_those_of_a_rollout():
             simulator.reset()
 
 
+@pytest.mark.parametrize("solver", [ds.ImplicitEulerSolver, ds.BDF2Solver, ds.ImplicitMidpointSolver, ds.StaticSolver])
+def test_a_simulator_moves_what_is_prescribed_in_every_step(solver):
+    """Held vertices, obstacles and forces of each step, not those of the first."""
+    mesh, steps = ds.TetrahedralMesh.create_box(2, size=0.1), 5
+    floor = ds.Ground(height=-0.02, stiffness=1e3, width=0.015, path=lambda t: [0, 200 * t * t, 0])
+    push = np.linspace(0, 1, steps)[:, None, None] * np.ones((2, 3))
+    scene = ds.Scene(
+        mesh,
+        ds.StableNeoHookean(1e5, 0.3),
+        terms=[floor, ds.ExternalForce(push, vertices=[6, 7])],
+        fixed=[2, 3, 6],
+        motion=lambda t: [100 * t * t, 0.2 * np.sin(50 * t), 0],
+        precision="f64",
+    )
+    simulator, frames = ds.Simulator(solver(scene, dt=2e-3)), ds.Rollout(solver(scene, dt=2e-3), steps).forward()
+    for _ in range(2):
+        simulator.run(steps)
+        np.testing.assert_allclose(simulator.positions, frames.positions[-1], atol=1e-9)
+        assert np.abs(simulator.displacements).max() > 5e-3
+        simulator.reset()
+
+
 @pytest.mark.parametrize(
     "option, message",
     [

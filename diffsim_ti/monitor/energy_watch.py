@@ -15,7 +15,9 @@ class EnergyWatch:
 
         E(u') - E(u) + f(u*) . (u' - u)
 
-    which is of third order in u' - u, and none for a quadratic E. Loads, drag and prescribed motion do not enter it.
+    which is of third order in u' - u, and none for a quadratic E. Loads, drag and prescribed motion do not enter it. Where
+    obstacles go from w by w* to w', E(u) and E(u') are taken with them at w and w', and what they do on the body in the
+    middle, dE/dw (w' - w), is none of the step's.
     Simo, Tarnow 1992, The discrete energy-momentum method, doi:10.1007/BF00913408.
     """
 
@@ -27,17 +29,31 @@ class EnergyWatch:
         """Forget what was seen."""
         self.gained, self.moving = 0.0, 0.0  # [J]
 
-    def note(self, u: np.ndarray, u_star: np.ndarray, u_next: np.ndarray, v_next: np.ndarray) -> None:
-        """A step went from u by u_star to u_next; contacts are as in its pass."""
-        potential, energies = self.ws.potential, []
-        for place in (u, u_next):
-            potential.place(place)
+    def note(self, u: np.ndarray, u_star: np.ndarray, u_next: np.ndarray, v_next: np.ndarray, places: tuple) -> None:
+        """A step went from u by u_star to u_next, obstacles from places[0] by places[1] to places[2] (displacements [m],
+        shape (num_obstacles, 3)); contacts are as in its pass."""
+        potential, energies, drift = self.ws.potential, [], places[2] - places[0]
+        for displacement, place in ((u, places[0]), (u_next, places[2])):
+            self.ws.put_obstacles(place)
+            potential.place(displacement)
             energies.append(potential.energy()[0])
+        self.ws.put_obstacles(places[1])
         potential.place(u_star)
-        work = float((potential.forces()[0] * (u_next - u)).sum())
+        work = float((potential.forces()[0] * (u_next - u)).sum()) - self._work_of_obstacles(places[1], drift)
         self.gained += energies[1] - energies[0] + work
         kinetic = 0.5 * float((self.ws.mass * v_next**2).sum())
         self.moving = max(self.moving, kinetic + energies[1])
+
+    def _work_of_obstacles(self, places: np.ndarray, drift: np.ndarray) -> float:
+        """dE/dw (w' - w) [J], by differences over a hundredth of the width."""
+        if not drift.any():
+            return 0.0
+        share, energies = min(0.5, 0.01 * self.ws.way.narrowest / np.abs(drift).max()), []
+        for sign in (1, -1):
+            self.ws.put_obstacles(places + sign * share * drift)
+            energies.append(self.ws.potential.energy()[0])
+        self.ws.put_obstacles(places)
+        return (energies[0] - energies[1]) / (2 * share)
 
     @property
     def share(self) -> float:

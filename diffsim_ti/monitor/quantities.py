@@ -119,6 +119,8 @@ def energy(workspace: Workspace) -> Energy:
         parts["gravity"] = float(-(values.mass * ((values.rest + u) @ g)).sum())
     if features.groups:
         parts["contact"] = float(barrier_energies(workspace).sum())
+        if workspace.potential is not None and workspace.potential.faces:
+            parts["contact"] += float(workspace.potential.faces.energies_at(workspace.state.u, a.offsets).sum())
     if workspace.pairs:
         parts["contact"] = parts.get("contact", 0.0) + workspace.pairs.look(workspace.state.u)[0]
     return Energy(parts)

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from diffsim_ti import runtime
+from diffsim_ti.potential.face_contact import FaceContact
 from diffsim_ti.potential.kernels import potential_kernels
 from diffsim_ti.potential.patch_coupling import PatchCoupling
 from diffsim_ti.state.arrays import copy_slot
@@ -31,6 +32,7 @@ class Potential:
         self.elastic, self.J = runtime.array(a.fp, m), runtime.array(a.fp, m)
         self._launches, self._coupling, self._barrier_blocks = {}, None, None  # made when first needed
         self.z = arrays.law_states(1)  # the state of the law, held during a pass
+        self.faces = FaceContact(self, parallel) if FaceContact.is_felt(arrays) else None
 
     def launch(self, name: str, lanes: bool = True, **records) -> None:
         """Run a kernel at the present displacement; records: more arrays than the potential's own."""
@@ -87,6 +89,8 @@ class Potential:
         elastic, contact, J = (runtime.fetch(x).astype(np.float64) for x in (self.elastic, self.contact, self.J))
         if self.pairs:
             contact = np.concatenate([contact, self.pairs.energies()])
+        if self.faces:
+            contact = np.concatenate([contact, self.faces.energies()])
         return elastic.sum() + contact.sum(), np.abs(elastic).sum() + np.abs(contact).sum(), J
 
     def forces(self) -> tuple[np.ndarray, np.ndarray]:
@@ -94,7 +98,11 @@ class Potential:
         if self.pairs:
             self.pairs.forces(self.u, 0, self.arrays.corner)
         self.launch("forces")
-        return runtime.fetch(self.y)[0].astype(np.float64), runtime.fetch(self.size).astype(np.float64)
+        forces, sizes = (runtime.fetch(x).astype(np.float64) for x in (self.y, self.size))
+        if self.faces:
+            pushed = self.faces.forces()
+            return forces[0] + pushed, sizes + np.linalg.norm(pushed, axis=1)
+        return forces[0], sizes
 
     def product(self, w: np.ndarray, convex: bool = False) -> np.ndarray:
         """d2E/du2 w [N]; `convex`: of contact between surfaces, only its convex part."""
@@ -103,7 +111,8 @@ class Potential:
         if self.pairs:
             self.pairs.hessian_product(self.u, self.w, convex)
         self.launch("product")
-        return runtime.fetch(self.y)[0].astype(np.float64) * -scale
+        y = runtime.fetch(self.y)[0].astype(np.float64)
+        return (y + self.faces.product() if self.faces else y) * -scale
 
     def blocks(self) -> np.ndarray:
         """3x3 diagonal blocks of d2E/du2 [N/m], shape (num_vertices, 3, 3)."""
@@ -112,6 +121,8 @@ class Potential:
         if self.pairs:
             self.pairs.add_blocks(self.u, self._block_arrays.blocks)
         blocks = np.swapaxes(runtime.fetch(self._block_arrays.blocks).astype(np.float64), 0, 1)
+        if self.faces:
+            blocks = blocks + self.faces.blocks()
         return blocks if a.patches is None else blocks + self.coupling.diagonal(self.patch_gradients())
 
     @cached_property
@@ -150,4 +161,5 @@ class Potential:
         self.launch("contact_blocks", lanes=False, out=self._barrier_blocks)
         if self.pairs:
             self.pairs.add_blocks(self.u, self._barrier_blocks.blocks)
-        return np.swapaxes(runtime.fetch(self._barrier_blocks.blocks).astype(np.float64), 0, 1)
+        blocks = np.swapaxes(runtime.fetch(self._barrier_blocks.blocks).astype(np.float64), 0, 1)
+        return blocks + self.faces.blocks() if self.faces else blocks

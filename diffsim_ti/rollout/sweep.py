@@ -46,6 +46,7 @@ class Sweep:
         self.wanted = self._check_names(gradients)
         self.clip, self.truncate, self.careful = clip, truncate, health or clip is not None
         self.health: list[dict] = []
+        self.first_step = 0  # steps that came before those of a run, for reports
         self.num_passes = solver.num_passes(self.steps)
         self.passes_per_frame = self.save_every * solver.substeps
         every = None if checkpoint_every is None else max(1, int(checkpoint_every)) * solver.substeps
@@ -129,6 +130,7 @@ class Sweep:
         self._load(run)
         ws, checkpoints = self.workspace, self.checkpoints
         self._guard.restart()
+        self._guard.offset, self.workspace.first_step = self.first_step * self.solver.substeps, self.first_step
         self._recorded = checkpoints.num_segments == 1 and self._adjoint is not None  # a gradient was asked for before
         if self._recorded:
             ws.make_record(checkpoints.segment + 1)

@@ -66,6 +66,7 @@ class SceneArrays:
             self.vector, 3 * len(self.contacts)
         )  # walls (potential/) as one looks between passes
         self.values: Derived | None = None
+        self.rows: dict[str, np.ndarray | None] = {}  # of steps, as the device has them: motion, path, forces
 
     def _order_tetrahedra(self, scene) -> None:
         """`order`: the tetrahedron in each lane; `place`: the lane of each; `num_places`: lanes to go through."""
@@ -134,6 +135,7 @@ class SceneArrays:
         """Bring values to the device; True if array shapes or kernels changed, so that launches must be bound anew."""
         old, before = self.values, None if self.values is None else self.features()
         self.values = values
+        self.rows = {name: getattr(values, name) for name in ("motion", "path", "forces")}
         moved = before != self.features()
         sources = {name: on_device(self, name, values) for name in TANGENT if name != "mass"}
         sources["parameters"] = np.concatenate([values.parameters, self.tables]), self.fp
@@ -149,6 +151,12 @@ class SceneArrays:
                 runtime.fill(current, data)
         return moved
 
+    def load_rows(self, **rows: np.ndarray) -> None:
+        """Other rows of motion, path or forces, by name: those of the steps to come."""
+        for name, data in rows.items():
+            runtime.fill(getattr(self, name), data)
+            self.rows[name] = data
+
     def _inverse_mass(self, mass: np.ndarray) -> np.ndarray:
         """1 / m of the vertices that move freely, 0 of the others."""
         out = np.divide(1.0, mass, out=np.zeros_like(mass), where=mass > 0)
@@ -157,8 +165,8 @@ class SceneArrays:
 
     def place_obstacles(self, schedule: Schedule, j: int) -> None:
         """Put what looks at a state between passes where the obstacles are when pass j begins."""
-        if self.values.path is not None:
-            now = schedule.place(self.values.path, j, schedule.begin(j))
+        if self.rows["path"] is not None:
+            now = schedule.place(self.rows["path"], j, schedule.begin(j))
             walls = np.zeros((3 * len(self.obstacles), 3))
             walls[::3] = [now[c] if c >= 0 else np.zeros(3) for _, _, c in self.obstacles]
             runtime.fill(self.offsets, walls)

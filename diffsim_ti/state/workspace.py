@@ -28,6 +28,8 @@ class Workspace:
     """What every solver's run needs; `advance` is the solver's own."""
 
     pairs_kind = SurfacePairs
+    first_step = 0  # steps that were done before this run, for reports
+    potential = None  # of implicit steps
     energy_watch = None  # counts energy that long steps add, for solvers that neither damp nor limit it
 
     def __init__(self, solver, derived: Derived):

@@ -10,6 +10,7 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.inputs import Derived
+from diffsim_ti.potential.faces import face_points
 from diffsim_ti.potential.kernels import potential_kernels
 from diffsim_ti.solvers.implicit.linear import Operator, solve_symmetric
 from diffsim_ti.solvers.implicit.threads import one_blas_thread
@@ -84,6 +85,9 @@ class ImplicitAdjoint(_Passes):
             runtime.fill(corner, 0)  # also where surfaces in contact have theirs
             self._law = SimpleNamespace(z=self.z, corner=corner, y=y)
         self._vjp = self.kernels.vjp.bind(a.in_lanes, **own)
+        if p.faces:
+            faces = face_points(self.features, a.precision, workspace.parallel)
+            self._vjp_of_faces = p.faces.bind(faces.vjp, adjoint=(self, self.numbers))
 
     def fits(self, workspace) -> bool:
         """Whether kernels and arrays are still those of the run."""
@@ -144,6 +148,8 @@ class ImplicitAdjoint(_Passes):
             ws.pairs.vjp(ws.potential.u, 0, ws.potential.w, ws.arrays.corner)
         self._vjp(**ws.potential.sizes())
         reaction = runtime.fetch(ws.potential.y)[0].astype(np.float64)
+        if ws.potential.faces:
+            reaction = reaction + self._vjp_of_faces()
         share = ws.load_share(j, s)
         self.gravity += share * (ws.mass * by_star).sum(0)
         self.mass_adj += (by_star * self.weight(share)).sum(1)
@@ -241,6 +247,8 @@ class ImplicitTangent(_Passes):
             runtime.fill(self.z, 0)
             self._law = SimpleNamespace(z=self.z, w=p.w)
         self._jvp = kernels.jvp.bind(a.in_lanes, **own)
+        if p.faces:
+            self._jvp_of_faces = p.faces.bind(p.faces.kernels.jvp, tangent=(self, self.numbers))
         self.rate_dot = float(tangent.parameters[a.features().drag]) if a.features().drag >= 0 else 0.0
         self.frames = [], []
 
@@ -284,6 +292,8 @@ class ImplicitTangent(_Passes):
         self._jvp(**ws.potential.sizes())
         share = ws.load_share(j, s)
         dR = runtime.fetch(ws.potential.y)[0].astype(np.float64) + tangent.mass[:, None] * self.weight(share)
+        if ws.potential.faces:
+            dR += self._jvp_of_faces()
         if a.features().gravity >= 0:
             dR += share * ws.mass * tangent.parameters[a.features().gravity :][:3]
         if tangent.forces is not None:

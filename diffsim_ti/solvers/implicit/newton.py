@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from diffsim_ti.potential.way import Met
 from diffsim_ti.solvers.implicit.linear import NotConverged, Operator, conjugate_gradients
 from diffsim_ti.solvers.implicit.projection import Projection
 
@@ -22,20 +23,24 @@ LONGER = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # steps along an indefinite direction
 @dataclass
 class NewtonReport:
     """What a solve took: relative residual before each round, products of the Hessian, rounds with an indefinite
-    Hessian, saddles that were left, evaluations of the energy."""
+    Hessian, saddles that were left, evaluations of the energy; directions that an obstacle cut short, and what cut the
+    last one (potential/way.py)."""
 
     residuals: list = field(default_factory=list)
     products: int = 0
     indefinite: int = 0
     saddles: int = 0
     trials: int = 0
+    met: Met | None = None
+    cuts: int = 0
+    place: np.ndarray | None = None  # where a solve that failed ended
 
 
 class Newton:
-    """Minimises Phi from a start. Every iterate keeps gaps > 0 where they were, and surfaces never pass through each other
-    on the way. If the start has no J <= 0, J falls by a
-    factor of ten at most, so that the energy's own resistance is felt in time; only where no share of a direction down to
-    `insist` lowers Phi so (a law that is finite at J = 0, pressed beyond it) may it fall further.
+    """Minimises Phi from a start. From iterate to iterate the surface meets no obstacle (potential/way.py) and does not pass
+    through itself. If the start has no J <= 0, J falls by a factor of ten at most, so that the energy's own resistance is
+    felt in time; only where no share of a direction down to `insist` lowers Phi so (a law that is finite at J = 0, pressed
+    beyond it) may it fall further.
 
     tolerance: |R| over the size of the forces that meet at the vertices (corner by corner, so that it does not vanish
     at equilibrium), loads and inertia, the largest of the rounds. Beyond it goes only what rounding allows.
@@ -43,20 +48,30 @@ class Newton:
 
     insist = 2.0**-10
     trusted = 10  # iterations after which the direction before an indefinite one is good enough
+    roughly = 0.03
+    patience = 6  # times as many rounds as asked for, at most, where obstacles cut directions short
     shortest = 2.0**-40  # fraction of a direction below which a line search gives up
 
     def __init__(
-        self, potential, free: np.ndarray, gaps, preconditioners, tolerance: float, max_iterations: int, eps: float
+        self, potential, free: np.ndarray, way, preconditioners, tolerance: float, max_iterations: int, eps: float
     ):
-        self.potential, self.free, self.gaps, self.preconditioners = potential, free, gaps, preconditioners
+        self.potential, self.free, self.way, self.preconditioners = potential, free, way, preconditioners
         self.tolerance, self.max_iterations, self.eps = tolerance, max_iterations, eps
         self.reach = 0.01 * float(np.ptp(potential.arrays.values.rest, 0).max())  # of the first step away from a saddle
         self.report = NewtonReport()
 
     def solve(
-        self, start: np.ndarray, mass: np.ndarray, inertial: np.ndarray, loads: np.ndarray, leave_saddles: bool = False
+        self,
+        start: np.ndarray,
+        mass: np.ndarray,
+        inertial: np.ndarray,
+        loads: np.ndarray,
+        leave_saddles: bool = False,
+        rounds: int | None = None,
     ) -> np.ndarray:
         """The minimiser; mass = c m, shape (num_vertices, 1). The potential stays placed there.
+
+        rounds: stop after so many, wherever that is, or once it is `roughly` there.
 
         leave_saddles: where Phi is stationary but falls in some direction (a column beyond its buckling load), go on
         that way; `report.saddles` counts it.
@@ -69,12 +84,15 @@ class Newton:
         self.preconditioner, self.stiffness = self.preconditioners(mass)
         E, size = self._evaluate(u), 0.0
         self.upright = bool(np.all(E[2] > 0))
-        for _ in range(self.max_iterations):
+        most = self.max_iterations if rounds is None else rounds
+        while len(report.residuals) < min(most + report.cuts, self.patience * most):
             R, now = self._residual(u)
             size = max(size, now)
             floor = 4 * self.eps * np.linalg.norm(self._rigidity() * np.abs(u).max(1, keepdims=True) * self.free)
             norm = np.linalg.norm(R)
             report.residuals.append(norm / size if size > 0 else 0.0)
+            if rounds is not None and norm <= self.roughly * size:
+                return u
             if norm <= self.tolerance * size + floor:
                 downhill = self._downhill() if leave_saddles else None
                 if downhill is None:
@@ -94,15 +112,21 @@ class Newton:
             if moved is None:
                 break
             u, E = moved
-        if norm <= 100 * floor:  # rounding has the last word
+        if norm <= 100 * floor or (rounds is not None and np.isfinite(norm)):  # rounding has the last word
             return u
         history = ", ".join(f"{r:.2g}" for r in report.residuals[-8:])
+        report.place = u
         raise NotConverged(
             f"Newton's method stopped after {len(report.residuals)} rounds at a relative residual of "
             f"{report.residuals[-1]:.2g} (asked for {self.tolerance:g}; the last ones: {history}): take smaller steps, more "
             "load steps, or a looser tolerance",
             report.residuals,
         )
+
+    def residual_at(self, u: np.ndarray) -> np.ndarray:
+        """-dPhi/du of the last solve [N]."""
+        self.potential.place(u)
+        return self._residual(u)[0]
 
     def _rigidity(self) -> np.ndarray:
         """How much force a small displacement makes at each vertex [N/m], contact and friction included."""
@@ -147,7 +171,7 @@ class Newton:
     def _evaluate(self, u):
         E, parts, J = self.potential.energy()
         self.report.trials += 1
-        return E, parts, J, self.gaps(u)
+        return E, parts, J
 
     def _search(self, u, d, R, before):
         """(u + t d, what was evaluated there) for the first t of 1, 1/2, ... that is admissible and lower; None if there is
@@ -160,6 +184,7 @@ class Newton:
             drowned = abs(slope) * fraction <= noise >= change
             if change <= -1e-4 * fraction * slope or (drowned and self._falls(trial, d, slope)):
                 best = trial, after, change
+                self.upright = self.upright and fraction > self.insist
                 break
             fraction *= 0.5
         while best is not None and self._indefinite and fraction in LONGER and 2 * fraction <= longest:
@@ -172,9 +197,11 @@ class Newton:
         return None if best is None else best[:2]
 
     def _safe_share(self, u, d) -> float:
-        """The longest step along d in which surfaces stay apart."""
+        """The longest step along d in which surfaces stay apart, from obstacles and from each other."""
         pairs, most = self.potential.pairs, 2 * LONGER[-1] if self._indefinite else 1.0
-        return pairs.safe_share(u, d, most) if pairs else most
+        free, self.report.met = self.way(u, d, most)
+        self.report.cuts += free < 1
+        return min(free, pairs.safe_share(u, d, free)) if pairs else free
 
     def _falls(self, u, d, slope) -> bool:
         """Whether Phi does not rise again at u as steeply as it fell before: what is left to ask where its change drowns in
@@ -185,10 +212,10 @@ class Newton:
     def _try(self, u, step, before, upright):
         """(displacement, what is there, change of Phi, rounding of that change); infinite change if not admissible."""
         trial = self.potential.place(u + step)
-        E, parts, J, gaps = before
+        E, parts, J = before
         after, step = self._evaluate(trial), trial - u
         change = after[0] - E + float((step * (self.mass * (u + 0.5 * step - self.inertial) - self.loads)).sum())
-        if np.any((gaps > 0) & ~(after[3] > 0)) or (upright and np.any(~(after[2] > 0.1 * J))):
+        if upright and np.any(~(after[2] > 0.1 * J)):
             change = np.inf
         rounding = parts + after[1] + float((self.stiffness * trial**2).sum())  # of strains that come from large u
         return trial, after, change, 10 * self.eps * rounding

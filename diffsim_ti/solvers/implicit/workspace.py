@@ -6,12 +6,16 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.contact.implicit_pairs import ImplicitPairs
+from diffsim_ti.contact.surface_pairs import Tunnelling
 from diffsim_ti.inputs import Derived
 from diffsim_ti.monitor.energy_watch import EnergyWatch
 from diffsim_ti.potential.potential import Potential
+from diffsim_ti.potential.way import Way
+from diffsim_ti.solvers.implicit.approach import Approach
 from diffsim_ti.solvers.implicit.law_state import law_state_kernels
 from diffsim_ti.solvers.implicit.linear import NotConverged
 from diffsim_ti.solvers.implicit.newton import Newton
+from diffsim_ti.solvers.implicit.obstacle_ways import ObstacleWays
 from diffsim_ti.solvers.implicit.preconditioners import BlockJacobi, Multigrid
 from diffsim_ti.solvers.implicit.stage import Stage
 from diffsim_ti.solvers.implicit.threads import one_blas_thread
@@ -28,7 +32,7 @@ class TwoStepHistory(History):
         self.fresh = [True] * num_slots
 
 
-class ImplicitWorkspace(Workspace):
+class ImplicitWorkspace(ObstacleWays, Workspace):
     """A run of an implicit solver. Vectors of vertices are worked on in float64 on the host, tetrahedra on the device."""
 
     pairs_kind = ImplicitPairs
@@ -54,9 +58,11 @@ class ImplicitWorkspace(Workspace):
         eps = np.finfo(runtime.NUMPY[self.scene.precision]).eps
         tolerance, rounds = self.solver.tolerance, self.solver.max_iterations
         me = weakref.proxy(self)  # no circle: a dropped run gives its memory back at once
-        gaps, preconditioner = (lambda u: me._gaps(u)), (lambda mass: me.preconditioner(mass))
-        self.newton = Newton(self.potential, self.free, gaps, preconditioner, tolerance, rounds, eps)
+        way, preconditioner = (lambda *step: me.way_past_obstacles(*step)), (lambda mass: me.preconditioner(mass))
+        self.newton = Newton(self.potential, self.free, way, preconditioner, tolerance, rounds, eps)
         self._preconditioners = {}
+        self.way, self.approach = Way(self.arrays, self.parallel), Approach(self)
+        self.check_apart()
 
     def restart(self) -> None:
         super().restart()
@@ -68,6 +74,7 @@ class ImplicitWorkspace(Workspace):
         """The state was set from outside: there is none before it."""
         super().forget()
         self._begin_anew()
+        self.check_apart()
 
     def _begin_anew(self) -> None:
         if self.solver.multistep:
@@ -111,11 +118,8 @@ class ImplicitWorkspace(Workspace):
             self.potential.hold(self.state, 0)
             try:
                 u_next, v_next = self._pass(j, u, v, before)
-            except NotConverged as error:
-                step = j // self.solver.substeps
-                raise NotConverged(
-                    f"step {step}, t = {step * self.solver.dt:.6g} s: {error}", error.residuals
-                ) from None
+            except (NotConverged, Tunnelling) as error:
+                raise self._dated(error, j) from None
             if self.solver.multistep:
                 copy_slot(self.state.u, 0, self.state.before.u, 0)
                 copy_slot(self.state.v, 0, self.state.before.v, 0)
@@ -135,6 +139,13 @@ class ImplicitWorkspace(Workspace):
         kernel = getattr(law_state_kernels(a.law, features, self.parallel, a.in_lanes), name)
         sizes = dict(num_items=a.num_items, num_vertices=a.num_vertices, slot=slot, end=end)
         self.bound(kernel, **records)(**sizes, h=float(self.solver.schedule.length(j)))
+
+    def _dated(self, error: Exception, j: int) -> Exception:
+        """The same error, which says when: `first_step` steps were done before this run."""
+        step = self.first_step + j // self.solver.substeps
+        error.step = step
+        error.args = (f"step {step}, t = {step * self.solver.dt:.6g} s: {error}",)
+        return error
 
     def preconditioner(self, mass: np.ndarray) -> tuple:
         """(preconditioner for c M + K with mass = c m, size of the diagonal of that at rest [N/m])."""
@@ -189,56 +200,61 @@ class ImplicitWorkspace(Workspace):
             start = start.copy()
             start[fixed] = middle
         self.begin(j, stage, u, x)
-        start = self._admissible(start, u)
-        u_star = self.newton.solve(start, mass, inertial, loads, leave_saddles=stage.static)
+        try:
+            u_star = self._solve(u, start, (mass, inertial, loads), stage)
+        except NotConverged as error:
+            raise self._explained(error, u) from None
         v_star = (u_star - x) / stage.gamma
         u_next = stage.c0 * u_star + (1 - stage.c0) * u
-        if self.pairs and stage.c0 != 1:
-            self.pairs.check_end(u_star, u_next)
         v_next = stage.e0 * v_star + stage.e1 * y
         if len(fixed):
             u_next[fixed], v_next[fixed] = (u[fixed], v[fixed]) if place is None else (place, speed)
+        if stage.c0 != 1:
+            self._check_end(j, u_star, u_next)
         if self.energy_watch:
-            self.energy_watch.note(u, u_star, u_next, v_next)
+            places = self.walls_before, self.walls_at_stage, self._walls_at_end(j)
+            self.energy_watch.note(u, u_star, u_next, v_next, places)
         return u_next, np.zeros_like(v) if stage.static else v_next
 
+    def _solve(self, u, start, problem: tuple, stage: Stage) -> np.ndarray:
+        """The minimum of the pass; problem: mass, inertial, loads of `Newton.solve`."""
+        held = self.approach(u, start, problem)
+        return self.newton.solve(self._admissible(start, held), *problem, leave_saddles=stage.static)
+
     def _admissible(self, start, u):
-        """The start of Newton's method: where inertia leads, or less far where that would turn something inside out."""
+        """The start of Newton's method: where inertia leads, or less far where something would turn inside out or meet an
+        obstacle."""
         held = start * (1 - self.free) + u * self.free
-        longest = self._safe_share(u, held, start)
-        _, _, J0 = self._looked_at(held)
-        gaps0 = self._gaps(held)
+        longest = min(self.way_past_obstacles(held, start - held)[0], self.pairs_share(held, start - held))
+        J0 = self.volume_ratios(held)
         for fraction in (longest, 0.5 * longest, 0.25 * longest):
             at = held + fraction * (start - held)
-            _, _, J = self._looked_at(at)
-            if not (np.any((J0 > 0) & ~(J > 0)) or np.any((gaps0 > 0) & ~(self._gaps(at) > 0))):
+            if not np.any((J0 > 0) & ~(self.volume_ratios(at) > 0)):
                 return at
         return held
 
-    def _safe_share(self, u, held, start) -> float:
-        """How far from `held` towards `start` no surfaces meet; prescribed vertices have to get where they are held."""
-        if not self.pairs:
-            return 1.0
-        if not self.pairs.way_is_free(u, held - u):
-            raise NotConverged("prescribed motion drives surfaces through each other: take smaller steps", [])
-        return self.pairs.safe_share(held, start - held)
-
-    def _looked_at(self, u):
+    def volume_ratios(self, u: np.ndarray) -> np.ndarray:
+        """J of each tetrahedron at a displacement."""
         self.potential.place(u)
-        return self.potential.energy()
+        return self.potential.energy()[2]
 
-    def _gaps(self, u: np.ndarray) -> np.ndarray:
-        """Distance of the surface vertices to each obstacle [m], one after the other."""
-        a = self.arrays
-        if not a.contacts:
-            return np.zeros(0)
-        surface = self.scene.mesh.surface_vertices
-        at = a.values.rest[surface] + u[surface]
-        return np.concatenate([term.gap(at, self._walls[3 * k]) for k, term in enumerate(a.contacts)])
+    # ---- what stands in the way --------------------------------------------------------------------------------------
+
+    def check_pairs(self, u, step) -> None:
+        """Prescribed vertices have to get where they are held."""
+        if self.pairs and not self.pairs.way_is_free(u, step):
+            raise NotConverged("prescribed motion drives surfaces through each other: take smaller steps", [])
+
+    def pairs_share(self, u, step) -> float:
+        """How far along a step no surfaces meet."""
+        return self.pairs.safe_share(u, step) if self.pairs else 1.0
+
+    # ---- what a pass is told -----------------------------------------------------------------------------------------
 
     def begin(self, j: int, stage: Stage, u: np.ndarray, x: np.ndarray) -> None:
         """Tell the potential where obstacles are in pass j and where friction is measured from."""
-        self._walls = self.walls(self.arrays.values.path, j, stage)
+        self._walls = self.walls(self.arrays.rows["path"], j, stage)
+        self.walls_at_stage, self.walls_before = self._walls[::3].copy(), self._walls[1::3].copy()
         self.potential.begin(u, x, 1 / stage.gamma, self._walls)
 
     def walls(self, path: np.ndarray | None, j: int, stage: Stage) -> np.ndarray:
@@ -275,10 +291,11 @@ class ImplicitWorkspace(Workspace):
 
         of: the values of the run, or their tangent: what is prescribed is linear in them.
         """
-        if of.motion is None:
+        motion = self.arrays.rows["motion"] if of is self.arrays.values else of.motion
+        if motion is None:
             return None, None
         schedule, anchor = self.solver.schedule, of.displacement[self.arrays.fixed]
-        return anchor + schedule.place(of.motion, j, schedule.end(j)), schedule.rate(of.motion, j)
+        return anchor + schedule.place(motion, j, schedule.end(j)), schedule.rate(motion, j)
 
     def loads(self, j: int, stage: Stage) -> np.ndarray:
         """Dead loads on each vertex [N]: weight and external forces; statics lay them on in substeps."""
@@ -286,9 +303,10 @@ class ImplicitWorkspace(Workspace):
         out = np.zeros_like(values.displacement)
         if features.gravity >= 0:
             out += self.mass * values.parameters[features.gravity :][:3]
-        if values.forces is not None:
-            row = self.solver.schedule.row(j) if len(values.forces) > 1 else 0
-            out[self.force_vertices()] += values.forces[row]
+        forces = self.arrays.rows["forces"]
+        if forces is not None:
+            row = self.solver.schedule.row(j) if len(forces) > 1 else 0
+            out[self.force_vertices()] += forces[row]
         return out * self.load_share(j, stage)
 
     def load_share(self, j: int, stage: Stage) -> float:

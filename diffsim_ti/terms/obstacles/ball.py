@@ -25,6 +25,14 @@ class SphereForce(ObstacleForce):
 
     count = 4
 
+    @property
+    def hollow(self):
+        return self.inside
+
+    @property
+    def convex(self):
+        return not self.inside
+
     @traced
     def distance_and_normal(self, g, p, X, u):
         length, n = radial(g, [(x - c) + y for x, c, y in zip(X, p, u)])
@@ -67,6 +75,7 @@ class CapsuleForce(ObstacleForce):
     """d = |x - nearest point of the segment a b| - radius."""
 
     count = 7
+    convex = True
 
     @traced
     def distance_and_normal(self, g, p, X, u):

@@ -59,6 +59,13 @@ def beta(s) -> np.ndarray:
     return np.where(s < CROSSOVER, _VALUE + t * (_SLOPE + t * _CURVATURE / 2), -((inside - 1) ** 2) * np.log(inside))
 
 
+def slope_at(s: float) -> float:
+    """beta'(s) on the host, for s < 1."""
+    if s < CROSSOVER:
+        return _SLOPE + (s - CROSSOVER) * _CURVATURE
+    return -(s - 1) * (2 * math.log(s) + (s - 1) / s)
+
+
 def reference_curvature() -> float:
     """beta'' at a tenth of the width: the stiffness to expect of a firm contact, in units of the barrier's stiffness."""
     s = 0.1

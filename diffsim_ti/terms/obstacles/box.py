@@ -39,6 +39,7 @@ class BoxForce(ObstacleForce):
     """Of y = R^T (x - center): d of |y| - half sizes (see `corner`); R the rotation of a quaternion (w, x, y, z)."""
 
     count = 10
+    convex = True
 
     @traced
     def distance_and_normal(self, g, p, X, u):
@@ -108,6 +109,7 @@ class CylinderForce(ObstacleForce):
     """d of (distance to the axis - radius, distance along it to the nearer end), see `corner`."""
 
     count = 7
+    convex = True
 
     @traced
     def distance_and_normal(self, g, p, X, u):

@@ -46,6 +46,7 @@ class GroundForce(ObstacleForce):
     """Compile-time twin of Ground; the force is written out, since only one component of it is not zero."""
 
     count = 1
+    hollow = True
 
     @traced
     def distance_and_normal(self, g, p, X, u):

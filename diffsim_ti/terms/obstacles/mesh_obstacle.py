@@ -101,6 +101,10 @@ class MeshForce(ObstacleForce):
 
     count = 3
 
+    @property
+    def grain(self):
+        return 0.25 * self.cell
+
     @traced
     def distance_and_normal(self, g, p, X, u):
         local = [(x - c) + y for x, c, y in zip(X, p, u)]
@@ -111,6 +115,25 @@ class MeshForce(ObstacleForce):
         d = g.function(at(found, 0), *((x, lambda k=k: n[k]) for k, x in enumerate(local)))
         rows = [g.function(n[a], *((x, lambda a=a, b=b: H[a][b]) for b, x in enumerate(local))) for a in range(3)]
         return d, rows
+
+    @ti.func
+    def clearance(self, parameters: ti.template(), first, X, u):
+        """Outside the grid the distance to it and a cell; within, with a margin for splines steeper than distances."""
+        point, outside, out = ti.Vector.zero(self.fp, 3), ti.cast(0, self.fp), 0 * X
+        for d in ti.static(range(3)):
+            point[d] = (X[d] - parameters[first + d]) + u[d]
+            low = ti.cast(self.origin[d] + self.cell, self.fp)
+            high = ti.cast(self.origin[d] + (self.counts[d] - 3) * self.cell, self.fp)
+            beyond = ti.max(low - point[d], point[d] - high, ti.cast(0, self.fp))
+            outside += beyond * beyond
+        if outside > 0:
+            out[3] = ti.sqrt(outside) + ti.cast(0.5 * self.cell, self.fp)
+        else:
+            found = self.sample(parameters, point)
+            for d in ti.static(range(3)):
+                out[d] = found[1 + d]
+            out[3] = ti.cast(0.8, self.fp) * ti.min(found[0], ti.cast(1e3 * self.cell, self.fp))
+        return out
 
     @ti.func
     def sample(self, parameters: ti.template(), point):

@@ -1,0 +1,45 @@
+"""Where the points within a face lie that feel an obstacle, and how their part in it fades in (faces.py)."""
+
+import numpy as np
+import taichi as ti
+
+FLAT, BENT = 0.02, 0.12
+PER_WIDTH, MOST_PARTS = 4, 64  # lattice points along a width; along the side of a face
+REACH = 0.65  # of the distance of lattice points: from what lies between them to the nearest, faces being stretched a little
+
+
+@ti.func
+def fade(t, fp: ti.template()):
+    """phi(t)"""
+    r = ti.min(ti.max((t - ti.cast(FLAT, fp)) * ti.cast(1 / (BENT - FLAT), fp), ti.cast(0, fp)), ti.cast(1, fp))
+    return r * r * r * (10 + r * (6 * r - 15))
+
+
+@ti.func
+def fade_slope(t, fp: ti.template()):
+    per = ti.cast(1 / (BENT - FLAT), fp)
+    r = ti.min(ti.max((t - ti.cast(FLAT, fp)) * per, ti.cast(0, fp)), ti.cast(1, fp))
+    return 30 * per * r * r * (1 - r) * (1 - r)
+
+
+@ti.func
+def fade_curvature(t, fp: ti.template()):
+    per = ti.cast(1 / (BENT - FLAT), fp)
+    r = ti.min(ti.max((t - ti.cast(FLAT, fp)) * per, ti.cast(0, fp)), ti.cast(1, fp))
+    return 60 * per * per * r * (1 - r) * (1 - 2 * r)
+
+
+def face_rows(mesh, terms) -> tuple[np.ndarray, ...]:
+    """(start, next, parts, reach, weight): the faces around vertex i are start[i] .. start[i + 1]; of each, its two other
+    corners and, for each obstacle, in how many parts the lattice cuts its sides, r [m] and c (faces.py)."""
+    faces, n = mesh.surface_triangles, mesh.num_vertices
+    corner, own = np.argsort(faces.ravel(), kind="stable"), np.sort(faces.ravel(), kind="stable")
+    f, a = corner // 3, corner % 3
+    x = mesh.vertices[faces]
+    longest = np.linalg.norm(x - np.roll(x, 1, axis=1), axis=2).max(1)
+    widths = np.array([float(t.values["barrier_width"]) for t in terms])
+    parts = np.clip(np.ceil(PER_WIDTH * longest[:, None] / widths), 2, MOST_PARTS).astype(int)
+    start = np.searchsorted(own, np.arange(n + 1))
+    apart = longest[:, None] / parts
+    reach, weight = REACH * apart, (apart / widths) ** 2
+    return start, np.stack([faces[f, (a + 1) % 3], faces[f, (a + 2) % 3]], 1), parts[f], reach[f], weight[f]

@@ -1,0 +1,219 @@
+"""How far the surface may move before a point of it meets an obstacle, and how far from one it is.
+
+A distance d to a solid changes by no more than the way that is gone. So from a place where it is d a point may go on by d,
+and again from there: conservative advancement (Mirtich 1996, Impulse-based Dynamic Simulation of Rigid Body Systems, 2.3).
+A face is as near as its nearest point, which lies between bounds: the distance d of its middle, and d - r, where r is how
+far its corners lie from there; for a convex obstacle, which lies on one side of each tangent plane, also d plus the least
+way of a corner along the normal. Faces are cut in four, and their parts again, until the bounds are near each other.
+To a hollow obstacle (the ground is one) a face is as near as its corners. Vertices are faces whose corners are one.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+import taichi as ti
+
+from diffsim_ti.runtime import Kernel
+from diffsim_ti.state.features import Features
+from diffsim_ti.state.numbers import SCENE
+from diffsim_ti.state.obstacle_functions import ObstacleFunctions
+
+A = ti.template()
+MARCHES = 200  # halts on a way
+LEVELS = 9  # a side of a face is cut in 2^9 parts at most
+TINY, KEPT = (
+    1e-3,
+    0.1,
+)  # shares of the distance, or of the width if that is less: what counts as met, where one halts then
+
+WAY = dict(places="vectors", drifts="vectors", step="vectors2", corners="ints")
+FOUND = dict(found="scalars", blocker="ints")
+
+
+@dataclass(frozen=True)
+class SweptKernels(ObstacleFunctions):
+    """Of each vertex and face: the free `shares` of a step, and `distances`; with the obstacle that they come from."""
+
+    parallel: bool
+
+    @property
+    def rows(self):
+        return ti.types.matrix(3, 4, self.fp)
+
+    def _kernel(self, name: str, body) -> Kernel:
+        own = dict(scene=SCENE, way=WAY, at=dict(u="vectors2"), out=FOUND)
+        return Kernel(
+            name, body, self.precision, own, dict(num_vertices="int", count="int", most="float", kept="float")
+        )
+
+    @ti.func
+    def length(self, v):
+        return ti.sqrt(v.norm_sqr())
+
+    @ti.func
+    def clearance(self, g: A, first, X, u, scene: A):
+        """(normal, distance) of a point to the obstacle whose numbers start at `first`."""
+        return g.force.clearance(scene.parameters, first, X, u)
+
+    # ---- a face ------------------------------------------------------------------------------------------------------
+
+    @ti.func
+    def part_of_face(self, code, level):
+        """Corners of a part of a face, a row of three shares each: the digits of `code` in base 4 say which quarter of
+        which quarter; quarter 0 is the middle one, which lies the other way round."""
+        i, j, up = 0, 0, 1
+        for m in range(level):
+            quarter = (code >> (2 * (level - 1 - m))) & 3
+            a, b = ti.select(quarter == 1, 1, 0), ti.select(quarter == 2, 1, 0)
+            if quarter == 0:
+                i = 2 * i + 1 - up
+                j = 2 * j + 1 - up
+                up = 1 - up
+            elif up == 1:
+                i = 2 * i + a
+                j = 2 * j + b
+            else:
+                i = 2 * i + 1 - b
+                j = 2 * j + 1 - a
+        out, per = ti.Matrix.zero(self.fp, 3, 3), 1 / ti.cast(1 << level, self.fp)
+        for c in ti.static(range(3)):
+            x = ti.select(up == 1, i + ti.static(int(c == 1)), i + ti.static(int(c != 1)))
+            y = ti.select(up == 1, j + ti.static(int(c == 2)), j + ti.static(int(c != 0)))
+            out[c, 1], out[c, 2] = x * per, y * per
+            out[c, 0] = 1 - (x + y) * per
+        return out
+
+    @ti.func
+    def face_clearance(self, g: A, first, X, u, scene: A, wanted):
+        """A distance [m] that a face keeps: `wanted` or more if it is that far away, else half of its own or more; not
+        positive if a point of it was found to be in the obstacle. X, u: rows of its corners."""
+        code, level, far, half = 0, 0, ti.cast(1e30, self.fp), ti.cast(0.5, self.fp)
+        nearest, least = far, far
+        while level >= 0 and nearest > 0:
+            part = self.part_of_face(code, level)
+            Xs, us, third = part @ X, part @ u, ti.cast(1 / 3, self.fp)
+            X0, u0 = self.vector(0), self.vector(0)
+            for n in ti.static(range(4)):
+                X0[n] = third * (Xs[0, n] + Xs[1, n] + Xs[2, n])
+                u0[n] = third * (us[0, n] + us[1, n] + us[2, n])
+            seen = self.clearance(g, first, X0, u0, scene)
+            d, r, along = seen[3], ti.cast(0, self.fp), far
+            for c in ti.static(range(3)):
+                edge = self.vector(0)
+                for n in ti.static(range(3)):
+                    edge[n] = (Xs[c, n] - X0[n]) + (us[c, n] - u0[n])
+                r = ti.max(r, self.length(edge))
+                along = ti.min(along, seen.dot(edge))
+            nearest, low = ti.min(nearest, d), d - r
+            if ti.static(g.force.convex):
+                low = ti.max(low, d + along)
+            last = level == LEVELS or r <= ti.cast(ti.static(g.force.grain), self.fp)
+            if last:  # by the plane there; what lies between is nearer than its middle by little
+                low = ti.max(low, d + along, ti.cast(0.05, self.fp) * d)
+            if last or low >= wanted or low >= half * nearest:
+                least = ti.min(least, low)
+                while level > 0 and (code & 3) == 3:
+                    code = code >> 2
+                    level -= 1
+                code += 1
+                if level == 0:
+                    level = -1
+            else:
+                code = code << 2
+                level += 1
+        return ti.select(nearest <= 0, nearest, least)
+
+    @ti.func
+    def corners_at(self, j, n, t, scene: A, way: A, at: A):
+        """(X, u) of a face, relative to obstacle n, when the share t of the step is done: rows of its corners."""
+        X, u = self.rows(0), self.rows(0)
+        for a in ti.static(range(3)):
+            i = way.corners[3 * j + a]
+            x, y = scene.rest[i] - way.places[n], at.u[0, i] + t * (way.step[0, i] - way.drifts[n])
+            for c in ti.static(range(3)):
+                X[a, c], u[a, c] = x[c], y[c]
+        return X, u
+
+    @ti.func
+    def share_of_one(self, g: A, k, j, scene: A, way: A, at: A, most, kept):
+        """The free share of the step of vertex or face j before obstacle k of group g; all of it from within. Where the
+        obstacle is met, the share `kept` of the distance, or of the width if that is less, is kept."""
+        first, n = g.first + k * g.size, g.number + k
+        speed, width, none = ti.cast(0, self.fp), g.force.width(scene.parameters, first), ti.cast(0, self.fp)
+        for a in ti.static(range(3)):
+            speed = ti.max(speed, self.length(way.step[0, way.corners[3 * j + a]] - way.drifts[n]))
+        t, free, near, halt, share = none, none, none, none, most
+        for m in range(MARCHES):
+            left = speed * (most - t)
+            X, u = self.corners_at(j, n, t, scene, way, at)
+            d = self.face_clearance(g, first, X, u, scene, left)
+            if m == 0:
+                near = ti.min(d, width)
+                halt = ti.cast(TINY, self.fp) * near
+                if d <= 0:
+                    break
+            if d <= 0:  # by rounding
+                share = free
+                break
+            if d > left:
+                break
+            free = t
+            if d <= halt:
+                if halt > ti.cast(0.5, self.fp) * kept * near:
+                    share = t
+                    break
+                halt, t, d = kept * near, none, near  # met: go there again, and halt sooner
+            t += (d - ti.cast(0.5, self.fp) * halt) / speed
+            if t >= most:
+                break
+            if m == MARCHES - 1:
+                share = t
+        return share
+
+    @ti.func
+    def all_shares(self, scene: A, way: A, at: A, out: A, plan: A):
+        ti.loop_config(serialize=not self.parallel)
+        for j in range(plan.count):
+            share, blocker = plan.most, -1
+            for g in ti.static(self.features.groups):
+                if ti.static(not g.force.hollow) or j < plan.num_vertices:
+                    for k in range(g.count):
+                        s = self.share_of_one(g, k, j, scene, way, at, plan.most, plan.kept)
+                        if s < share:
+                            share = s
+                            blocker = g.number + k
+            out.found[j] = share
+            out.blocker[j] = blocker
+
+    @cached_property
+    def shares(self) -> Kernel:
+        return self._kernel("shares", self.all_shares)
+
+    # ---- distances ---------------------------------------------------------------------------------------------------
+
+    @ti.func
+    def all_distances(self, scene: A, way: A, at: A, out: A, plan: A):
+        ti.loop_config(serialize=not self.parallel)
+        for j in range(plan.count):
+            least, blocker, none = plan.most, -1, ti.cast(0, self.fp)
+            for g in ti.static(self.features.groups):
+                if ti.static(not g.force.hollow) or j < plan.num_vertices:
+                    for k in range(g.count):
+                        X, u = self.corners_at(j, g.number + k, none, scene, way, at)
+                        d = self.face_clearance(g, g.first + k * g.size, X, u, scene, plan.most)
+                        if d < least:
+                            least = d
+                            blocker = g.number + k
+            out.found[j] = least
+            out.blocker[j] = blocker
+
+    @cached_property
+    def distances(self) -> Kernel:
+        """Distances below `most`, at the places and displacements given; those of faces by half too small at most."""
+        return self._kernel("distances", self.all_distances)
+
+
+@lru_cache(maxsize=None)
+def swept_kernels(features: Features, precision: str, parallel: bool) -> SweptKernels:
+    """Kernels for a scene's features."""
+    return SweptKernels(features, precision, parallel)

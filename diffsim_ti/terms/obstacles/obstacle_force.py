@@ -1,0 +1,254 @@
+"""The compile-time class of an obstacle: everything that kernels need of it, from its distance alone."""
+
+from dataclasses import dataclass
+
+import taichi as ti
+
+from diffsim_ti.differentiation import Graph
+from diffsim_ti.materials.calculus.tensor import sum_of
+from diffsim_ti.runtime import assign, at, let, traced
+from diffsim_ti.terms.obstacles import barrier, friction
+from diffsim_ti.terms.term import VertexForce
+
+
+@dataclass(frozen=True)
+class ObstacleForce(VertexForce):
+    """Compile-time twin of an obstacle: `count` numbers of its shape, then stiffness, width [, friction, friction_speed].
+
+    A shape writes one function, `distance_and_normal`, in numbers of a graph; everything else follows from it. Positions
+    are relative to the obstacle: callers take its displacement from X.
+    """
+
+    friction: bool = False
+
+    count = 0
+    watched = True
+    # what its distance says of a face between the face's corners: at least the least of theirs (hollow), that it lies on
+    # one side of each tangent plane (convex), or neither
+    hollow, convex = False, False
+    grain = 0.0  # parts of a face that are smaller [m] need not be told apart
+
+    @property
+    def size(self) -> int:
+        return self.count + (4 if self.friction else 2)
+
+    @traced
+    def distance_and_normal(self, g, p, X, u) -> tuple:
+        """(d, n) of the point X + u; p are the shape's numbers; n is the gradient of d, a list of three."""
+
+    # ---- recording --------------------------------------------------------------------------------------------------
+
+    @traced
+    def record(self, parameters, first, X, u):
+        """(graph, all numbers, components of u, d, n) at a point."""
+        g = Graph(self.fp, parameters)
+        p = [g.leaf(at(parameters, first + k)) for k in range(self.size)]
+        rest, moved = ([g.leaf(at(vector, d)) for d in range(3)] for vector in (X, u))
+        d, n = self.distance_and_normal(g, p[: self.count], rest, moved)
+        return g, p, moved, d, n
+
+    @traced
+    def _push(self, g, p, d):
+        """Size N of the barrier's force."""
+        stiffness, width = p[self.count], p[self.count + 1]
+        s, fp = d / width, self.fp
+        slope = g.function(barrier.slope(s.value, fp), (s, lambda: barrier.curvature(s.value, fp)))
+        return g.number(0) - stiffness * width * slope
+
+    @traced
+    def _record_force(self, parameters, first, X, u):
+        g, p, moved, d, n = self.record(parameters, first, X, u)
+        push = self._push(g, p, d)
+        return g, p, moved, [push * k for k in n]
+
+    @traced
+    def _vector(self, numbers):
+        return let(ti.types.vector(4, self.fp)(*numbers, ti.cast(0, self.fp)))
+
+    # ---- distance ---------------------------------------------------------------------------------------------------
+
+    @traced
+    def gap(self, parameters, first, X, u):
+        """Distance d [m]."""
+        return self.record(parameters, first, X, u)[3].value
+
+    @traced
+    def outlook(self, parameters, first, X, u):
+        """(n, d): normal and distance [m]."""
+        _, _, _, d, n = self.record(parameters, first, X, u)
+        return let(ti.types.vector(4, self.fp)(*(k.value for k in n), d.value))
+
+    @traced
+    def outlook_jvp(self, parameters, first, X, u, du, parameters_dot=None):
+        """Its change for changes of the place and, where given, of the obstacle's numbers."""
+        g, p, moved, d, n = self.record(parameters, first, X, u)
+        dots = [(x, at(du, k)) for k, x in enumerate(moved)]
+        if parameters_dot is not None:
+            dots += [(q, at(parameters_dot, first + k)) for k, q in enumerate(p)]
+        return let(ti.types.vector(4, self.fp)(*g.forward(dots, [*n, d])))
+
+    @traced
+    def outlook_vjp(self, parameters, first, X, u, adjoint, sums, i):
+        """Add to sums[first.., i] what an adjoint of (n, d) says of the obstacle's numbers."""
+        g, p, _, d, n = self.record(parameters, first, X, u)
+        adjoints = g.reverse([(x, let(at(adjoint, k))) for k, x in enumerate([*n, d])], p[: self.count])
+        for k, by in enumerate(adjoints):
+            assign(at(sums, first + k, i), at(sums, first + k, i) + by)
+
+    @traced
+    def clearance(self, parameters, first, X, u):
+        """(n, d) with a distance d [m] within which the obstacle is surely not met."""
+        return self.outlook(parameters, first, X, u)
+
+    @ti.func
+    def width(self, parameters: ti.template(), first):
+        """How far the obstacle is felt [m]."""
+        return parameters[first + self.count + 1]
+
+    @ti.func
+    def touches(self, parameters: ti.template(), first, X, u):
+        """Whether the barrier is felt."""
+        return self.gap(parameters, first, X, u) < self.width(parameters, first)
+
+    @traced
+    def approach(self, parameters, first, X, u, move):
+        """Change of the distance for a small move, n . move [m]."""
+        n = self.record(parameters, first, X, u)[4]
+        return let(sum_of(n[d].value * at(move, d) for d in range(3)))
+
+    @ti.func
+    def rigidity(self, parameters: ti.template(), first, X, u):
+        """b''(d) [N/m]"""
+        s = self.gap(parameters, first, X, u) / self.width(parameters, first)
+        return parameters[first + self.count] * barrier.curvature(s, self.fp)
+
+    # ---- the barrier's force ----------------------------------------------------------------------------------------
+
+    @ti.func
+    def energy(self, parameters: ti.template(), first, X, u):
+        width = self.width(parameters, first)
+        s = self.gap(parameters, first, X, u) / width
+        return parameters[first + self.count] * width * width * barrier.value(s, self.fp)
+
+    @ti.func
+    def force(self, parameters: ti.template(), first, X, u, v):
+        f = 0 * u
+        if self.touches(parameters, first, X, u):
+            f = self._force(parameters, first, X, u)
+        return f
+
+    @ti.func
+    def force_jvp(self, parameters: ti.template(), first, X, u, v, du, dv):
+        df = 0 * u
+        if self.touches(parameters, first, X, u):
+            df = self._force_jvp(parameters, first, X, u, du)
+        return df
+
+    @ti.func
+    def force_vjp(self, parameters: ti.template(), first, X, u, v, w):
+        return self.force_jvp(parameters, first, X, u, v, w, w), 0 * w  # a force with a potential
+
+    @ti.func
+    def parameter_derivatives(self, parameters: ti.template(), first, X, u, v):
+        by = self._zeros(u)
+        if self.touches(parameters, first, X, u):
+            self._parameter_derivatives(parameters, first, X, u, by)
+        return by
+
+    @traced
+    def _force(self, parameters, first, X, u):
+        return self._vector([k.value for k in self._record_force(parameters, first, X, u)[3]])
+
+    @traced
+    def _force_jvp(self, parameters, first, X, u, du):
+        g, _, moved, f = self._record_force(parameters, first, X, u)
+        return self._vector(g.forward([(x, at(du, d)) for d, x in enumerate(moved)], f))
+
+    @traced
+    def _zeros(self, u):
+        return [let(u * ti.cast(0, self.fp)) for _ in range(self.size)]
+
+    @traced
+    def _parameter_derivatives(self, parameters, first, X, u, by):
+        g, p, _, f = self._record_force(parameters, first, X, u)
+        rows = [g.reverse([(f[d], g.one())], p) for d in range(3)]
+        for m, target in enumerate(by):
+            assign(target, self._vector([row[m] for row in rows]))
+
+    # ---- friction as a stage of explicit passes ----------------------------------------------------------------------
+
+    @traced
+    def _record_slide(self, parameters, first, X, u, v, wall, h_over_m):
+        g, p, moved, d, n = self.record(parameters, first, X, u)
+        before, mu, eps = [g.leaf(at(v, d)) for d in range(3)], p[self.count + 2], p[self.count + 3]
+        ratio, wall = g.leaf(h_over_m), [g.leaf(at(wall, d)) for d in range(3)]
+        after = friction.slide(g, n, self._push(g, p, d), before, wall, mu, ratio, eps)
+        return g, p, moved, before, wall, ratio, after
+
+    @traced
+    def slide(self, parameters, first, X, u, v, wall, h_over_m):
+        """Velocity after friction in the time h on a vertex of mass m that touches; `wall`: the obstacle's velocity."""
+        return self._vector([k.value for k in self._record_slide(parameters, first, X, u, v, wall, h_over_m)[-1]])
+
+    @traced
+    def slide_jvp(self, parameters, first, X, u, v, wall, h_over_m, parameters_dot, du, dv, dwall, dh_over_m):
+        """Its change."""
+        g, p, moved, before, walls, ratio, after = self._record_slide(parameters, first, X, u, v, wall, h_over_m)
+        dots = [(ratio, dh_over_m)] + [(q, at(parameters_dot, first + k)) for k, q in enumerate(p)]
+        for leaves, change in ((moved, du), (before, dv), (walls, dwall)):
+            dots += [(leaf, at(change, d)) for d, leaf in enumerate(leaves)]
+        return self._vector(g.forward(dots, after))
+
+    @traced
+    def slide_vjp(self, parameters, first, X, u, v, wall, h_over_m, w):
+        """(adjoints of u, v, wall as vectors, of h_over_m, and of the obstacle's numbers, a tuple) for the adjoint w."""
+        g, p, moved, before, walls, ratio, after = self._record_slide(parameters, first, X, u, v, wall, h_over_m)
+        adjoints = g.reverse([(k, let(at(w, d))) for d, k in enumerate(after)], [*moved, *before, *walls, ratio, *p])
+        vectors = [self._vector(adjoints[k : k + 3]) for k in (0, 3, 6)]
+        return (*vectors, adjoints[9], tuple(adjoints[10:]))
+
+    # ---- friction as a force of implicit passes, at the velocity v, with N and n at the displacement u ----------------
+
+    @traced
+    def _record_rub(self, parameters, first, X, u, v, wall):
+        g, p, moved, d, n = self.record(parameters, first, X, u)
+        speed, wall = ([g.leaf(at(vector, d)) for d in range(3)] for vector in (v, wall))
+        return g, p, moved, speed, wall, n, self._push(g, p, d)
+
+    @traced
+    def dissipation(self, parameters, first, X, u, v, wall):
+        """Potential of friction by the velocity [W]."""
+        g, p, _, speed, wall, n, push = self._record_rub(parameters, first, X, u, v, wall)
+        return friction.dissipation(g, n, push, speed, wall, p[self.count + 2], p[self.count + 3]).value
+
+    @traced
+    def _rubbed(self, parameters, first, X, u, v, wall):
+        g, p, moved, speed, wall, n, push = self._record_rub(parameters, first, X, u, v, wall)
+        return g, p, moved, speed, wall, friction.rub(g, n, push, speed, wall, p[self.count + 2], p[self.count + 3])
+
+    @traced
+    def rub(self, parameters, first, X, u, v, wall):
+        """Force of friction [N]; `wall`: the obstacle's velocity."""
+        return self._vector([k.value for k in self._rubbed(parameters, first, X, u, v, wall)[-1]])
+
+    @traced
+    def rub_product(self, parameters, first, X, u, v, wall, dv):
+        """Its change for a change of the velocity alone."""
+        g, _, _, speed, _, f = self._rubbed(parameters, first, X, u, v, wall)
+        return self._vector(g.forward([(x, at(dv, d)) for d, x in enumerate(speed)], f))
+
+    @traced
+    def rub_jvp(self, parameters, first, X, u, v, wall, parameters_dot, du, dv, dwall):
+        """Its change for changes of everything."""
+        g, p, moved, speed, walls, f = self._rubbed(parameters, first, X, u, v, wall)
+        dots = [(q, at(parameters_dot, first + k)) for k, q in enumerate(p)]
+        for leaves, change in ((moved, du), (speed, dv), (walls, dwall)):
+            dots += [(leaf, at(change, d)) for d, leaf in enumerate(leaves)]
+        return self._vector(g.forward(dots, f))
+
+    @traced
+    def rub_vjp(self, parameters, first, X, u, v, wall, w):
+        """(adjoints of u, v, wall as vectors, and of the obstacle's numbers, a tuple) for the adjoint w of the force."""
+        g, p, moved, speed, walls, f = self._rubbed(parameters, first, X, u, v, wall)
+        adjoints = g.reverse([(k, let(at(w, d))) for d, k in enumerate(f)], [*moved, *speed, *walls, *p])
+        return (*(self._vector(adjoints[k : k + 3]) for k in (0, 3, 6)), tuple(adjoints[9:]))

@@ -1,0 +1,251 @@
+"""Random impacts of small bodies on thin walls, needles, plates and balls, at rest and moving, judged by geometry alone.
+
+    python tests/battery_of_impacts.py --cases 200 --seed 0 [--solver BDF2Solver] [--only 17 31]
+
+Each case runs once; where it raises, what the error advises is done and the case runs again, three times at most.
+"""
+
+import argparse
+import re
+import sys
+import time
+import warnings
+from collections import Counter
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from impact_judge import Judge
+
+import diffsim_ti as ds
+
+SOLVERS = {  # dealt in turn; `stable`: whether the step is what stability allows, and not drawn
+    "ImplicitEulerSolver": ds.ImplicitEulerSolver,
+    "BDF2Solver": ds.BDF2Solver,
+    "ImplicitMidpointSolver": ds.ImplicitMidpointSolver,
+    "StaticSolver": ds.StaticSolver,
+}
+DENSITY = 1000.0
+
+
+@dataclass
+class Case:
+    """One impact; the body comes along -x' of its own frame towards an obstacle about the origin."""
+
+    number: int
+    seed: int
+    solver: str
+    kind: str
+    precision: str
+    speed: float
+    dt: float
+    youngs_modulus: float
+    size: float
+    resolution: int
+    thickness: float
+    moving: bool
+    stiffness: float | None = None
+    substeps: int = 1
+    advice: list = field(default_factory=list)
+
+    @property
+    def wave_speed(self) -> float:
+        return float(np.sqrt(self.youngs_modulus / DENSITY))
+
+    @property
+    def slow(self) -> bool:
+        return self.speed < self.wave_speed
+
+    def __str__(self) -> str:
+        return (
+            f"{self.number}: {self.solver} {self.kind} {self.precision} {self.speed:.3g} m/s dt {self.dt:.3g} s E "
+            f"{self.youngs_modulus:.2g} size {self.size:.3g} m, {self.resolution} vertices a side, thickness "
+            f"{self.thickness:.3g} m{', moving' if self.moving else ''}"
+        )
+
+
+def draw(number: int, seed: int, solvers) -> Case:
+    rng, names = np.random.default_rng([seed, number]), list(solvers)
+    log = lambda low, high: float(np.exp(rng.uniform(np.log(low), np.log(high))))  # noqa: E731
+    return Case(
+        number=number,
+        seed=seed,
+        solver=names[number % len(names)],
+        kind=("wall", "needle", "plate", "ball")[int(rng.integers(4))],
+        precision="f32" if number % 5 == 4 else "f64",
+        speed=log(0.1, 50),
+        dt=log(1e-4, 3e-2),
+        youngs_modulus=log(1e4, 1e6),
+        size=log(0.04, 0.15),
+        resolution=int(rng.integers(2, 5)),
+        thickness=log(2e-3, 2e-2),
+        moving=bool(rng.integers(2)),
+    )
+
+
+def build(case: Case):
+    """(solver, steps, Judge's solid, displacement of the obstacle over time) of a case."""
+    rng = np.random.default_rng([case.seed, case.number, 1])
+    static, width = case.solver == "StaticSolver", 0.25 * float(np.clip(case.thickness, 4e-3, 1.2e-2)) + 1e-3
+    mesh = ds.TetrahedralMesh.create_box(case.resolution, size=case.size).translated([-0.5 * case.size] * 3)
+    turn = turned(rng) if rng.random() < 0.5 and not static else np.eye(3)
+    x = mesh.vertices @ turn.T
+    off = rng.uniform(-0.3, 0.3, 2) * case.size
+    obstacle, solid = make_obstacle(case, rng, width)
+    gap = width * rng.uniform(0.3, 2.0) + case.speed * case.dt * rng.uniform(0, 2) * (not static)
+    x = x + [-(x[:, 0].max() + half_depth(solid) + gap), *off]
+    mesh = ds.TetrahedralMesh(x, mesh.tetrahedra)
+    steps = int(np.clip(np.ceil((gap + 2 * case.size) / (case.speed * case.dt)), 6, 14))
+    own = case.speed * (0.0 if case.moving else 1.0)
+    speed = case.speed - own
+    if static:  # pressed on by a third of its size, either by its own held side or by the obstacle
+        way = gap + 0.3 * case.size
+        steps, total = 4, way
+        path, motion = (lambda t: [-total * t * case.moving, 0, 0]), (lambda t: [total * t * (not case.moving), 0, 0])
+        case = replace(case, dt=1 / steps)
+        fixed = x[:, 0] < x[:, 0].min() + 1e-6
+        more = dict(fixed=fixed, motion=motion)
+    else:
+        path, more = (lambda t: [-speed * t, 0, 0]), dict(initial_velocities=(own, 0, 0))
+    stiffness = case.stiffness or natural_stiffness(case, mesh, width)
+    obstacle = obstacle(width=width, stiffness=stiffness, path=path)
+    scene = ds.Scene(
+        mesh, ds.StableNeoHookean(case.youngs_modulus, 0.3), DENSITY, [obstacle], precision=case.precision, **more
+    )
+    options = dict(load_steps=case.substeps) if static else dict(substeps=case.substeps)
+    return SOLVERS[case.solver](scene, dt=case.dt, **options), steps, solid, path
+
+
+def natural_stiffness(case: Case, mesh, width: float) -> float:
+    """What the scene chooses where it knows the speed: that of its own velocity."""
+    still = ds.Scene(
+        mesh,
+        ds.StableNeoHookean(case.youngs_modulus, 0.3),
+        DENSITY,
+        [ds.HalfSpace(point=(1e3, 0, 0), normal=(-1, 0, 0), width=width)],
+        initial_velocities=(case.speed if case.solver != "StaticSolver" else case.wave_speed, 0, 0),
+    )
+    return float(still.terms[0].values["barrier_stiffness"])
+
+
+def make_obstacle(case: Case, rng, width: float):
+    """(obstacle as a function of its barrier, solid) about the origin."""
+    t, s = case.thickness, case.size
+    if case.kind in ("wall", "plate"):
+        wide = 20 * s if case.kind == "wall" else s * rng.uniform(0.3, 0.8)
+        size, angle = np.array([t, wide, wide]), np.zeros(3)
+        if case.kind == "plate" and rng.random() < 0.5:  # edge on, or askew
+            angle = rng.uniform(-1, 1, 3) * np.pi / 2
+        solid = dict(kind="box", center=np.zeros(3), axes=rotation(angle).T, half=size / 2)
+        return (lambda **o: ds.Box((0, 0, 0), size, angle, **o)), solid
+    if case.kind == "ball":
+        solid = dict(kind="capsule", start=np.zeros(3), end=np.zeros(3), radius=t)
+        return (lambda **o: ds.Sphere((0, 0, 0), t, **o)), solid
+    along = np.array([1.0, 0, 0]) if rng.random() < 0.5 else np.array([0, *unit(rng.standard_normal(2))])
+    start, end = -s * along, s * along
+    solid = dict(kind="capsule", start=start, end=end, radius=t / 2)
+    return (lambda **o: ds.Capsule(start, end, t / 2, **o)), solid
+
+
+def half_depth(solid: dict) -> float:
+    """How far a solid about the origin reaches along x."""
+    if solid["kind"] == "box":
+        return float(np.abs(solid["axes"][:, 0]) @ solid["half"])
+    return float(abs(solid["start"][0]) + solid["radius"])
+
+
+def unit(v):
+    return v / np.linalg.norm(v)
+
+
+def rotation(turn) -> np.ndarray:
+    """Rodrigues' formula."""
+    angle = np.linalg.norm(turn)
+    x, y, z = turn / angle if angle > 0 else np.zeros(3)
+    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
+
+
+def turned(rng) -> np.ndarray:
+    return rotation(unit(rng.standard_normal(3)) * rng.uniform(0, np.pi))
+
+
+def run(case: Case) -> str:
+    """ "in front", "impaled", "passed" (in silence), or what the error says."""
+    solver, steps, solid, path = build(case)
+    try:
+        simulator = ds.Simulator(solver)
+        judge = Judge(simulator.scene.mesh.surface_triangles, solid, simulator.positions)
+        for _ in range(steps):
+            simulator.step()
+            wrong = judge.after_step(simulator.positions, path(simulator.time))
+            if wrong:
+                return f"{wrong} in step {simulator.step_count}"
+    except (FloatingPointError, ValueError) as error:
+        return f"{type(error).__name__}: {error}"
+    return "in front"
+
+
+NUMBER = r"([-+.\deE]*\d)"
+
+
+def follow(case: Case, said: str) -> Case | None:
+    """The case changed as an error advises, or None."""
+    stiffness, substep = re.search(f"stiffness to {NUMBER} N/m", said), re.search(f"steps of {NUMBER} s", said)
+    advice = [*case.advice, said]
+    if stiffness:
+        return replace(case, stiffness=float(stiffness[1]), advice=advice)
+    if "BDF2Solver" in said and case.solver == "ImplicitMidpointSolver":
+        return replace(case, solver="BDF2Solver", advice=advice)
+    if substep and case.solver != "StaticSolver":
+        more = int(np.ceil(case.dt / float(substep[1])))
+        return replace(case, substeps=max(more, 2 * case.substeps), advice=advice)
+    if "smaller steps" in said or "load steps" in said:
+        return replace(case, substeps=4 * case.substeps, advice=advice)
+    return None
+
+
+def finish(case: Case) -> tuple[str, str]:
+    """(what the first run said, what the last one said)."""
+    first = last = run(case)
+    while ":" in last and len(case.advice) < 3:
+        case = follow(case, last)
+        if case is None:
+            break
+        last = run(case)
+    return first, last
+
+
+def battery(cases, show=print) -> dict[str, Counter]:
+    """Counts for each solver: cases, slow ones (below the body's wave speed) and how they ended."""
+    table: dict[str, Counter] = {}
+    for case in cases:
+        begin = time.perf_counter()
+        first, last = finish(case)
+        row = table.setdefault(case.solver, Counter())
+        silent = "step" in last and ":" not in last or "step" in first and ":" not in first
+        raised, in_front = ":" in first, first == "in front"
+        row.update(cases=1, silent=int(silent), raised=int(raised), finished_then=int(raised and last == "in front"))
+        row.update(slow=int(case.slow), slow_in_front=int(case.slow and in_front))
+        if first != "in front":
+            show(f"{case}\n    first: {first[:400]}\n    then: {last[:300]}  ({time.perf_counter() - begin:.1f} s)")
+    return table
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--cases", type=int, default=200)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--solver", choices=list(SOLVERS), action="append")
+    parser.add_argument("--only", type=int, nargs="*", help="numbers of cases")
+    given = parser.parse_args()
+    warnings.simplefilter("ignore", UserWarning)
+    ds.init("cpu", precision="f64")
+    cases = (draw(n, given.seed, SOLVERS) for n in given.only or range(given.cases))
+    table = battery(c for c in cases if not given.solver or c.solver in given.solver)
+    for name, row in table.items():
+        print(f"{name:24s} " + ", ".join(f"{key} {row[key]}" for key in row))
+    return int(any(row["silent"] for row in table.values()))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
