@@ -15,7 +15,7 @@ AREAS = {
     "implicit steps and equilibria": "implicit implicit_gradients implicit_contact",
     "patches against locking": "locking",
     "obstacles and friction": "contact contact_stage contact_crossing contact_friction contact_gradients own_obstacle",
-    "self-contact": "self_contact self_contact_implicit self_contact_pairs",
+    "self-contact": "self_contact self_contact_implicit self_contact_near self_contact_pairs",
     "PyTorch, optimisations": "torch torch_physics torch_solvers seed_snippets optimization",
     "charts, maps, advice": "study study_stability peers",
     "pictures, films, the window": "picture_drawing picture_film optimization_picture writers viewer viewer_window gallery",
