@@ -299,10 +299,12 @@ def test_bodies_that_start_in_each_other_are_refused():
         simulator.set_state(positions=start)
 
 
-def test_a_width_beyond_the_elements_is_refused():
-    scene = two_blocks().scene.replace(terms=[ds.SelfContact(STIFFNESS, 0.04)])
-    with pytest.raises(ValueError, match=r"of one body are only 0\.0\d+ m apart at rest.*width below"):
+def test_a_width_beyond_many_elements_is_refused():
+    scene = two_blocks().scene.replace(terms=[ds.SelfContact(STIFFNESS, 0.5)])
+    with pytest.raises(ValueError, match=r"more than 4 times the mean edge.*take a width below 0\.\d+ m") as refusal:
         ds.Simulator(ds.SemiImplicitSolver(scene, dt=DT))
+    width = float(str(refusal.value).split()[-2])
+    assert 0.1 < width < 0.5
 
 
 def test_tunnelling_is_an_error_that_names_the_pair_and_keeps_the_state():
@@ -317,6 +319,18 @@ def test_tunnelling_is_an_error_that_names_the_pair_and_keeps_the_state():
     with pytest.raises(ds.Tunnelling, match=r"(edges|vertex).*may have gone through each other: their gap was .* m/s"):
         weak.run(100)
     weak.check_surfaces()
+
+
+def test_contact_too_stiff_for_its_step_says_so_and_its_advice_works():
+    scene = crossed_edges().scene
+    stiff = ds.Simulator(ds.SemiImplicitSolver(scene.replace(terms=[ds.SelfContact(1e9, WIDTH)]), dt=DT))
+    with pytest.raises(ds.Tunnelling, match=r"at .* rad/s is too stiff for it: take a shorter step") as error:
+        stiff.run(200)
+    step = 0.2 / float(str(error.value).split(" rad/s")[0].split()[-1])
+    shorter = ds.SemiImplicitSolver(stiff.solver.scene, dt=step)
+    simulator = ds.Simulator(shorter)
+    simulator.run(round(3e-3 / step))
+    simulator.check_surfaces()
 
 
 def test_one_per_scene_and_gap_needs_it():

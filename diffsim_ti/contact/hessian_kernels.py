@@ -24,12 +24,12 @@ class HessianKernels(ListedPair):
     @ti.func
     def stiffness_along(self, kind: A, p, y1, y2, y3, scene: A, plan: A):
         """(weights of the corners, n, m phi''): the convex part of a pair's Hessian is m phi'' (w n)(w n)^T."""
-        width = self.width(scene)
+        stiffness, width = self.numbers(p, scene)
         w, r, _ = self.nearest(kind, y1, y2, y3)
         d = ti.sqrt(r.norm_sqr())
         k = ti.cast(0, self.fp)
         if d < width:
-            k = self.stiffness(scene) * barrier.curvature(d / width, self.fp)
+            k = stiffness * barrier.curvature(d / width, self.fp)
             if ti.static(kind == EDGE_EDGE):
                 m, _, _ = self.mollifier((self.scale_of(kind, p, scene, plan) * y1.cross(y3 - y2)).norm_sqr())
                 k *= m

@@ -18,6 +18,7 @@ SAFE = 0.9  # share of its gap by which a pair may close in one pass
 OPPOSITE = (((0, 1), (0, 2), (0, 3)), ((0, 2), (0, 3), (1, 2), (1, 3)))
 LIST = dict(pairs="ints", scale="scalars", surface="ints", place="ints", row="ints", corner_of="ints")  # broad_phase.py
 SCENE = LIST | dict(rest="vectors", parameters="scalars", corner="vectors", plane="vectors")
+SCENE |= dict(rest_plane="vectors", rest_weights="vectors")  # motion_kernels.py
 NUMBERS = dict.fromkeys(("slot", "num_vt", "num_ee", "num_surface", "first_out"), "int")
 
 
@@ -54,17 +55,45 @@ class ListedPair(Pair):
         return Kernel(name, body, self.precision, dict(scene=SCENE | (scene or {}), at=at), NUMBERS | numbers)
 
     @ti.func
-    def stiffness(self, scene: A):
-        return scene.parameters[self.first]
+    def own_share(self, p, scene: A):
+        """What pair p has of the scene's width: all, but no more than half of its distance at rest."""
+        return ti.min(
+            ti.cast(1, self.fp), ti.cast(0.5, self.fp) * scene.rest_plane[p][3] / scene.parameters[self.first + 1]
+        )
 
     @ti.func
-    def width(self, scene: A):
-        return scene.parameters[self.first + 1]
+    def numbers(self, p, scene: A):
+        """Stiffness and width of pair p (docstring of SelfContact)."""
+        share = self.own_share(p, scene)
+        return scene.parameters[self.first] / share, share * scene.parameters[self.first + 1]
+
+    @ti.func
+    def width(self, p, scene: A):
+        _, width = self.numbers(p, scene)
+        return width
+
+    @ti.func
+    def numbers_jvp(self, p, scene: A, d_stiffness, d_width, d_rest):
+        """Changes of stiffness and width of pair p for those of the scene's and of the pair's distance at rest."""
+        share, d_share = self.own_share(p, scene), ti.cast(0, self.fp)
+        k, W = scene.parameters[self.first], scene.parameters[self.first + 1]
+        if share < 1:
+            d_share = (ti.cast(0.5, self.fp) * d_rest - share * d_width) / W
+        return (d_stiffness - k / share * d_share) / share, share * d_width + W * d_share
+
+    @ti.func
+    def numbers_vjp(self, p, scene: A, by_stiffness, by_width):
+        """Adjoints of the scene's stiffness and width and of the pair's distance at rest."""
+        share, by_share = self.own_share(p, scene), ti.cast(0, self.fp)
+        k, W = scene.parameters[self.first], scene.parameters[self.first + 1]
+        if share < 1:
+            by_share = W * by_width - k / (share * share) * by_stiffness
+        return by_stiffness / share, share * (by_width - by_share / W), ti.cast(0.5, self.fp) * by_share / W
 
     @ti.func
     def is_felt(self, p, scene: A):
         """Whether pair p is nearer than the width, by the plane that `forces` left here."""
-        return not scene.plane[p][3] > self.width(scene)
+        return not scene.plane[p][3] > self.width(p, scene)
 
     @ti.func
     def scale_of(self, kind: A, p, scene: A, plan: A):

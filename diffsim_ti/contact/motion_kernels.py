@@ -108,13 +108,30 @@ class MotionKernels(ListedPair):
         return self.kernel("check", self.check_all, dict(u="vectors2"), own, **numbers)
 
     @ti.func
+    def measure(self, kind: A, p, scene: A):
+        """Distance at rest of pair p, D, its unit normal and the weights of the corners; far for two bodies."""
+        one, two = scene.place[scene.pairs[4 * p]], scene.place[scene.pairs[4 * p + 2]]
+        plane, weights = self.vec4(0, 0, 0, ti.cast(1e30, self.fp)), self.vec4(0)
+        if scene.body[one] == scene.body[two]:
+            y1, y2, y3 = self.changes_at_rest(p, scene, scene.rest)
+            w, r, _ = self.nearest(kind, y1, y2, y3)
+            D = ti.sqrt(r.norm_sqr())
+            n = r / ti.max(D, ti.cast(self.tiny, self.fp))
+            plane, weights = self.vec4(n[0], n[1], n[2], D), w
+        scene.rest_plane[p], scene.rest_weights[p] = plane, weights
+
+    @ti.func
     def begin_all(self, scene: A, at: A, plan: A):
-        for p in range(plan.num_vt + plan.num_ee):
-            scene.plane[p] = self.vec4(0)
+        for kind in ti.static((VERTEX_TRIANGLE, EDGE_EDGE)):
+            ti.loop_config(serialize=not self.parallel)
+            for p in range(kind * plan.num_vt, plan.num_vt + kind * plan.num_ee):
+                scene.plane[p] = self.vec4(0)
+                self.measure(kind, p, scene)
+        ti.loop_config(serialize=not self.parallel)
         for s in range(plan.num_surface):
             scene.built[s] = at.u[plan.slot, scene.surface[s]]
 
     @cached_property
     def begin(self) -> Kernel:
-        """A new list: where the surface is, and no planes yet."""
-        return self.kernel("begin", self.begin_all, dict(u="vectors2"), dict(built="vectors"))
+        """A new list: where the surface is, how far apart pairs are at rest, and no planes yet."""
+        return self.kernel("begin", self.begin_all, dict(u="vectors2"), dict(built="vectors", body="ints"))

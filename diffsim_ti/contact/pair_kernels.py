@@ -50,7 +50,7 @@ class PairKernels(ListedPair):
 
     @ti.func
     def force(self, kind: A, p, scene: A, at: A, plan: A):
-        width = self.width(scene)
+        stiffness, width = self.numbers(p, scene)
         y1, y2, y3 = self.corners(p, scene, at.u, plan.slot)
         last = scene.plane[p]
         n, energy, g1, g2, g3 = three(last), ti.cast(0, self.fp), self.vec3(0), self.vec3(0), self.vec3(0)
@@ -60,7 +60,7 @@ class PairKernels(ListedPair):
         # the plane of the pass before spares most pairs the search; the margin is for rounding
         if not d > ti.cast(MARGIN, self.fp) * width or plan.exact > 0:
             scale = self.scale_of(kind, p, scene, plan)
-            energy, n, d, g1, g2, g3 = self.gradient(kind, y1, y2, y3, scale, self.stiffness(scene), width)
+            energy, n, d, g1, g2, g3 = self.gradient(kind, y1, y2, y3, scale, stiffness, width)
         scene.plane[p] = self.vec4(n[0], n[1], n[2], d)
         scene.energy[p] = energy
         if not d > width:
@@ -80,7 +80,7 @@ class PairKernels(ListedPair):
             if scene.touched[s] > 0:
                 scene.touched[s] = 0
                 for k in range(scene.row[s], scene.row[s + 1]):
-                    if not scene.plane[scene.corner_of[k] >> 2][3] > self.width(scene):
+                    if self.is_felt(scene.corner_of[k] >> 2, scene):
                         total += scene.corner[scene.corner_of[k]]
             at.out[plan.first_out + s] = total
             scene.before[s] = at.u[plan.slot, scene.surface[s]]
@@ -102,14 +102,20 @@ class PairKernels(ListedPair):
         if plan.has_planes == 0 or self.is_felt(p, scene):
             y1, y2, y3 = self.corners(p, scene, at.u, plan.slot)
             dy1, dy2, dy3 = self.changes(p, scene, at.w, 0)
+            d_rest = ti.cast(0, self.fp)
             if plan.by_rest > 0:
                 r1, r2, r3 = self.changes_at_rest(p, scene, at.rest_dot)
                 dy1, dy2, dy3 = dy1 + r1, dy2 + r2, dy3 + r3
-            scale, stiffness, width = self.scale_of(kind, p, scene, plan), self.stiffness(scene), self.width(scene)
+                w = scene.rest_weights[p]
+                d_rest = three(scene.rest_plane[p]).dot(w[1] * r1 + w[2] * r2 + w[3] * r3)
+            scale = self.scale_of(kind, p, scene, plan)
+            stiffness, width = self.numbers(p, scene)
+            dk, dw = self.numbers_jvp(p, scene, plan.d_stiffness, plan.d_width, d_rest)
             h1, h2, h3, by_stiffness, by_width = self.gradient_jvp(
-                kind, y1, y2, y3, dy1, dy2, dy3, scale, stiffness, width, plan.d_stiffness, plan.d_width
+                kind, y1, y2, y3, dy1, dy2, dy3, scale, stiffness, width, dk, dw
             )
-            numbers[0], numbers[1] = 0 - by_stiffness, 0 - by_width  # minus, as the force is minus the gradient
+            by_k, by_W, by_D = self.numbers_vjp(p, scene, by_stiffness, by_width)
+            numbers = self.vec4(0 - by_k, 0 - by_W, 0 - by_D, ti.cast(0, self.fp))  # the force is minus the gradient
         self.store(p, scene, h1, h2, h3)
         scene.numbers[p] = numbers
 
@@ -135,15 +141,25 @@ class PairKernels(ListedPair):
     def add_all_sums(self, scene: A, at: A, plan: A):
         ti.loop_config(serialize=not self.parallel)
         for s in range(plan.num_surface):
-            total = self.vec4(0)
+            total, by_rest = self.vec4(0), at.out[plan.first_out + s]
             for k in range(scene.row[s], scene.row[s + 1]):
-                if scene.corner_of[k] & 3 == 0:
-                    total += scene.numbers[scene.corner_of[k] >> 2]
+                p, corner = scene.corner_of[k] >> 2, scene.corner_of[k] & 3
+                numbers = scene.numbers[p]
+                if corner == 0:
+                    total += numbers
+                if numbers[2] != 0:
+                    n = three(scene.rest_plane[p])
+                    for a in ti.static(range(4)):
+                        if corner == a:
+                            by_rest += self.four(numbers[2] * scene.rest_weights[p][a] * n)
             scene.sums[s] = scene.sums[s] + total
-            scene.rest_adj[s] = scene.rest_adj[s] + at.out[plan.first_out + s]
+            scene.rest_adj[s] = scene.rest_adj[s] + by_rest
 
     @cached_property
     def add_sums(self) -> Kernel:
-        """Adjoints of stiffness and width, each pair at its corner 0, and of the rest shape, after `products`."""
+        """Adjoints of stiffness and width, each pair at its corner 0, and of the rest shape, after `products`.
+
+        The rest shape moves the corners, and makes the widths of pairs that are near in it.
+        """
         own = dict.fromkeys(("numbers", "sums", "rest_adj"), "vectors")
         return self.kernel("add_sums", self.add_all_sums, dict(out="vectors"), own)

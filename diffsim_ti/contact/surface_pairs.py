@@ -13,6 +13,7 @@ from diffsim_ti.contact.motion_kernels import BLOCK, MotionKernels
 from diffsim_ti.contact.pair_kernels import PairKernels
 from diffsim_ti.mesh.sets import pieces
 from diffsim_ti.runtime import kernels_of
+from diffsim_ti.terms.obstacles.barrier import CROSSOVER
 
 
 class Tunnelling(FloatingPointError):
@@ -32,10 +33,9 @@ class SurfacePairs:
     typical_slack = 0.5  # share of the width that half of the vertices get at most, so that lists stay short
     fewest_passes, most_passes = 3, 30  # that a list should last, by its slacks, but
     least_slack = 0.1  # they are at least this share of the width, and
-    largest_reach = (
-        1.0,
-        2.0,
-    )  # width + 2 slack at most this share of an edge, of one body (with many neighbours) and of two
+    # width + 2 slack at most this share of an edge, of one body (with many neighbours) and of two
+    largest_reach = (1.0, 2.0)
+    most_edges = 4.0  # mean edges that the width may have
     markers = 16  # vertices whose mean motion is that of a body
 
     def __init__(self, arrays, parallel: bool):
@@ -66,7 +66,7 @@ class SurfacePairs:
         return float(self.a.values.parameters[self.first + 1])
 
     def load(self, u) -> None:
-        """New values, the start at u: raise ValueError if the surface passes through itself, or the width does not fit."""
+        """New values, the start at u: raise ValueError if surfaces touch or cross, or if the width is too large."""
         self.fresh = False
         checked = (self.a.values.rest, self.width)
         if self._checked_rest is None or self._checked_rest[0] is not checked[0] or self._checked_rest[1] != checked[1]:
@@ -78,14 +78,19 @@ class SurfacePairs:
         self.check_apart(u)
 
     def _check_rest(self, u) -> None:
-        self._build(u, 0)
-        gaps, pairs = self._distances(u)
-        near = np.nonzero((gaps < self.width) & (self.body[pairs[:, 0]] == self.body[pairs[:, 2]]))[0]
-        if near.size:
-            worst = near[gaps[near].argmin()]
+        largest = self.most_edges * self.list.typical
+        if self.width > largest:
             raise ValueError(
-                f"self-contact of width {self.width:.3g} m: {self._name(worst, pairs)} of one body are only "
-                f"{gaps[worst]:.3g} m apart at rest and would press on each other; take a width below that"
+                f"self-contact of width {self.width:.3g} m: more than {self.most_edges:g} times the mean edge of the "
+                f"surface, so that most of its pairs would be near at rest; take a width below {largest:.3g} m"
+            )
+        self._build(u, 0)
+        plane = whole(self.rest_plane)[: self.list.count]
+        if plane.size and not plane[:, 3].min() > 0:
+            worst, pairs = plane[:, 3].argmin(), runtime.fetch(self.list.pairs)[: 4 * self.list.count].reshape(-1, 4)
+            raise ValueError(
+                f"self-contact: {self._name(worst, pairs)} of one body touch at rest, so that no width is left to them; "
+                "move them apart in the mesh, or join their vertices"
             )
 
     def check_apart(self, u) -> None:
@@ -130,6 +135,7 @@ class SurfacePairs:
         vector, fp = self.kernels.vec4, self.kernels.fp
         self.corner, self.plane = take("forces", vector, 4 * count), take("planes", vector, count)
         self.energy, self.numbers = take("energies", fp, count), take("numbers", vector, count)
+        self.rest_plane, self.rest_weights = take("planes at rest", vector, count), take("weights", vector, count)
         self._run(self.motion.begin, dict(u=u), slot=slot)
         self.fresh, self.age = True, 0
         self.builds += 1
@@ -188,7 +194,12 @@ class SurfacePairs:
         moved = np.zeros((self.mesh.num_vertices, 3))
         moved[surface] = u[surface] - runtime.fetch(self.before)
         self.fresh = False
+        pairs = runtime.fetch(self.list.pairs)[: 4 * self.list.count].reshape(-1, 4)
+        plane = whole(self.plane)[: self.list.count].astype(np.float64)
+        fastest = self._fastest(plane[:, 3], pairs)
         remedy = "take a shorter step, raise the contact's stiffness or width, or lower the speed"
+        if fastest * h > 1:
+            remedy = f"contact at {fastest:.3g} rad/s is too stiff for it: take a shorter step, or lower its stiffness"
         if not crossed:
             i = surface[np.linalg.norm(moved[surface], axis=1).argmax()]
             speed = np.linalg.norm(moved[i]) / h
@@ -196,8 +207,6 @@ class SurfacePairs:
                 f"vertex {i} moves at {speed:.3g} m/s, {np.linalg.norm(moved[i]):.3g} m in one substep of {h:.3g} s: "
                 f"too far for a contact of width {self.width:.3g} m to see what it passes; {remedy}"
             )
-        pairs = runtime.fetch(self.list.pairs)[: 4 * self.list.count].reshape(-1, 4)
-        plane = whole(self.plane)[: self.list.count].astype(np.float64)
         closing = np.full(len(pairs), -np.inf)
         for kind, part in enumerate((slice(0, self.list.num_vt), slice(self.list.num_vt, None))):
             for a, b in OPPOSITE[kind]:
@@ -208,6 +217,15 @@ class SurfacePairs:
             f"{self._name(worst, pairs)} may have gone through each other: their gap was {plane[worst, 3]:.3g} m, and they "
             f"closed by {closing[worst]:.3g} m ({closing[worst] / h:.3g} m/s) in one substep of {h:.3g} s; {remedy}"
         )
+
+    def _fastest(self, gaps: np.ndarray, pairs: np.ndarray) -> float:
+        """A frequency [rad/s] of pairs that press, of the lightest vertex against the stiffest pair."""
+        at_rest = whole(self.rest_plane)[: self.list.count, 3].astype(np.float64)
+        share = np.minimum(1, at_rest / (2 * self.width))  # listed_pair.py
+        t = 1 - 1 / np.clip(gaps / (share * self.width), CROSSOVER, 1)  # beta'' = t^2 - 4 t - 2 log s, s = 1 / (1 - t)
+        stiffness = self.a.values.parameters[self.first] / share * (t * t - 4 * t + 2 * np.log1p(-t))
+        lightness = runtime.fetch(self.a.inverse_mass).astype(np.float64)[pairs].max(1)
+        return float(np.sqrt((stiffness * lightness).max(initial=0)))
 
     def _name(self, pair: int, pairs: np.ndarray) -> str:
         c = pairs[pair]
