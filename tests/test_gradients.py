@@ -166,7 +166,8 @@ def test_f32_gradients_agree_with_f64(solver, material):
     w, z = verify.linear_loss(double)(frames)[1:]
     exact, rough = double.vjp(frames, w, z), single.vjp(single.forward(), w, z)
     for name in INPUTS:
-        assert error(rough[name], exact[name]) <= 1e-3, name
+        # by the drag rate little is left of much: what contacts push cancels in it
+        assert error(rough[name], exact[name]) <= (2e-3 if name == "drag_rate" else 1e-3), name
 
 
 # ---- identities that hold on any mesh (I1 to I9) ------------------------------------------------------------------------

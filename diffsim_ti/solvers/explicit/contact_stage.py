@@ -153,8 +153,8 @@ class ContactStage(ObstacleStages):
             if self.look(i, u, free, now, scene, state):
                 _, total, _, _ = self.solve(i, free, now.alpha * self.blend(plan) * ratio, now, state, plan)
                 delta, v = ratio * total, self.slide_all(i, v_plus, ratio, state)
-        w = v + self.blend(plan) * delta
-        return u + now.alpha * w, v + delta - (1 - now.decay) * w
+        pressed = self.blend(plan) * delta
+        return u + now.alpha * (v + pressed), now.decay * v + delta - (1 - now.decay) * pressed
 
     # ---- its tangent ---------------------------------------------------------------------------------------------------
 
@@ -177,7 +177,8 @@ class ContactStage(ObstacleStages):
                 v, dv = self.slide_all_jvp(i, v, dv, ratio, dratio, now, scene, state, tangent)
         w, dw = v + blend * delta, dv + blend * ddelta
         du_next = du + dalpha * w + now.alpha * dw
-        return du_next, dv + ddelta - (1 - now.decay) * dw + now.decay_by_rate * plan.rate_dot * w
+        dv_next = now.decay * dv + ddelta - (1 - now.decay) * blend * ddelta
+        return du_next, dv_next + now.decay_by_rate * plan.rate_dot * w
 
     @ti.func
     def note_changes(self, i, u, du, z, now: A, scene: A, state: A, tangent: A, plan: A):
@@ -239,7 +240,7 @@ class ContactStage(ObstacleStages):
         free, w, u_adj = now.alpha * v_plus, v_plus, self.vector(0)
         inverse, blend = scene.inverse_mass[i], self.blend(plan)
         ratio, w_adj = now.h * inverse, now.alpha * p - (1 - now.decay) * q
-        v_adj, by_alpha = q + w_adj, p.dot(v_plus)
+        v_adj, by_alpha = now.alpha * p + now.decay * q, p.dot(v_plus)
         if self.acts(i, ratio, now, scene):
             if self.look(i, u, free, now, scene, state):
                 a = now.alpha * blend * ratio

@@ -79,7 +79,8 @@ class ObstacleStages(ObstacleFunctions):
         moved = self.place_at(g, k, now.end, now, scene.path) - place
         X, move = scene.rest[i] - place, u_next - u - moved
         d, width = g.force.gap(scene.parameters, first, X, u), g.force.width(scene.parameters, first)
-        if d < width or move.dot(move) >= d * d:
+        far = d - width if ti.static(self.features.stages) else d  # a stage feels where a pass leads to
+        if d < width or move.dot(move) >= far * far:
             approach = g.force.approach(scene.parameters, first, X, u, move)
             reached = ti.min(d, d + approach)
             if reached < width:
