@@ -129,7 +129,7 @@ class FacePoints(ObstacleFunctions):
     @ti.func
     def points_of_face(self, what: A, g: A, first, X, u, w, reach, weight, parts, i, scene: A, more: A):
         """The sum over the points of a face whose first corner is vertex i; X, u, w: rows of its corners."""
-        out, per, third = self.vector(0), 1 / ti.cast(parts, self.fp), ti.cast(1 / 3, self.fp)
+        out, per, third = self.vector(0), ti.cast(1, self.fp) / ti.cast(parts, self.fp), ti.cast(1 / 3, self.fp)
         stiffness, width = scene.parameters[first + g.force.count], g.force.width(scene.parameters, first)
         corners, turns, middle = self.rows(0), self.rows(0), self.vector(0)  # (normal, distance) there, and its change
         for a in range(4):

@@ -75,7 +75,7 @@ class SweptKernels(ObstacleFunctions):
             else:
                 i = 2 * i + 1 - b
                 j = 2 * j + 1 - a
-        out, per = ti.Matrix.zero(self.fp, 3, 3), 1 / ti.cast(1 << level, self.fp)
+        out, per = ti.Matrix.zero(self.fp, 3, 3), ti.cast(1, self.fp) / ti.cast(1 << level, self.fp)
         for c in ti.static(range(3)):
             x = ti.select(up == 1, i + ti.static(int(c == 1)), i + ti.static(int(c != 1)))
             y = ti.select(up == 1, j + ti.static(int(c == 2)), j + ti.static(int(c != 0)))

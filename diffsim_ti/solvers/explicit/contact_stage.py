@@ -97,6 +97,7 @@ class ContactStage(ObstacleStages):
         z, step, trial = self.vector(0), self.vector(0), self.vector(0)
         total, xyz, mixed = self.vector(0), self.vector(0), self.vector(0)
         before, share, half = ti.cast(0, self.fp), ti.cast(1, self.fp), ti.cast(0.5, self.fp)
+        tiny = ti.cast((4 * self.epsilon) ** 2, self.fp)
         for turn in range(MOST_ROUNDS):
             total, xyz, mixed = self.vector(0), self.vector(0), self.vector(0)
             for o in range(ti.static(self.features.num_staged)):
@@ -111,7 +112,7 @@ class ContactStage(ObstacleStages):
                 z, share = trial, ti.cast(1, self.fp)
                 step = self.vector(0) - stage.solve_linear(a, xyz, mixed, r)
                 before = -r.dot(step)
-                if step.norm() <= ti.cast(4 * self.epsilon, self.fp) * z.norm():
+                if step.dot(step) <= tiny * z.dot(z):  # norm() would compute in f64
                     break
             trial = z + share * step
         return z, total, xyz, mixed

@@ -25,7 +25,7 @@ def log1p_ratio(x, fp: ti.template()):
             value = ti.cast((-1) ** (k - 1) / k, fp) + x * value
     else:
         value = ti.log(1 + x) / x
-        derivative = (1 / (1 + x) - value) / x
+        derivative = (ti.cast(1, fp) / (1 + x) - value) / x
     return value, derivative
 
 
@@ -41,12 +41,12 @@ def _inside(s, t, fp: ti.template()):
 @ti.func
 def secant(s, t, fp: ti.template()):
     """(sigma, its derivative by s, its derivative by t)"""
-    corner = ti.cast(CROSSOVER, fp)
+    corner, half = ti.cast(CROSSOVER, fp), ti.cast(0.5, fp)  # dividing by 2 would compute in f64
     low, high = ti.min(s, t), ti.max(s, t)
     value, by_s, by_t = 0 * s, 0 * s, 0 * s
     if high <= corner:  # a straight slope
-        value = (barrier.slope(s, fp) + barrier.slope(t, fp)) / 2
-        by_s = barrier.curvature(s, fp) / 2
+        value = half * (barrier.slope(s, fp) + barrier.slope(t, fp))
+        by_s = half * barrier.curvature(s, fp)
         by_t = by_s
     elif low >= corner and high <= 1:
         value, by_t = _inside(s, t, fp)
@@ -56,7 +56,7 @@ def secant(s, t, fp: ti.template()):
         part, _ = _inside(a, b, fp)
         rise = part * (b - a)
         if low < corner:
-            rise += (barrier.slope(low, fp) + barrier.slope(corner, fp)) / 2 * (corner - low)
+            rise += half * (barrier.slope(low, fp) + barrier.slope(corner, fp)) * (corner - low)
         value = rise / (high - low)
         by_t = (barrier.slope(t, fp) - value) / (t - s)
         by_s = (value - barrier.slope(s, fp)) / (t - s)
