@@ -3,10 +3,13 @@
 import subprocess
 import sys
 
+import battery_of_falls
 import meshio
 import numpy as np
 import pytest
 import saved_series as series
+from open_laws.relaxing import RelaxingRubber
+from open_laws.viscous import ViscousRubber
 
 from diffsim_ti import adaptive_run as forward
 from diffsim_ti import picture
@@ -15,8 +18,9 @@ from diffsim_ti.materials import StableNeoHookean
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.monitor.quantities import TetrahedronFields
 from diffsim_ti.scene import Scene
-from diffsim_ti.solvers import SemiImplicitSolver, VelocityVerletSolver
-from diffsim_ti.terms import Gravity
+from diffsim_ti.simulator import Simulator
+from diffsim_ti.solvers import ImplicitEulerSolver, SemiImplicitSolver, VelocityVerletSolver
+from diffsim_ti.terms import Gravity, Ground
 
 
 def command(*arguments):
@@ -152,6 +156,42 @@ def test_where_explicit_steps_collapse_implicit_euler_goes_on(cube):
     assert run.simulator.time == reference.simulator.time and run.seen.gap > 0
     heights = [r.simulator.positions[:, 1].mean() for r in (run, reference)]
     assert heights[0] == pytest.approx(heights[1], abs=2e-2)  # it damps the bounce
+
+
+def test_a_part_by_implicit_euler_hands_on_what_a_law_remembers(cube):
+    """Bit by bit, there and back, in float32 too: no position is rounded on the way."""
+    body, law = cube.translated([0, 0.02, 0]), RelaxingRubber(mu=4e4, lam=6e4, g=2e4, tau=0.01)
+    for precision in ("f64", "f32"):
+        scene = Scene(body, law, 1000.0, [Gravity(), Ground(stiffness=1e3, width=0.01)], precision=precision)
+        run = forward.ForwardRun(scene, VelocityVerletSolver, 1 / 30)
+        run.advance()
+        run.advance()
+        sim, other = run.simulator, Simulator(ImplicitEulerSolver(scene, dt=run.simulator.solver.dt))
+        assert np.abs(sim.law_state).max() > 0
+        forward.hand_on(sim, other)
+        for name in ("positions", "velocities", "law_state"):
+            assert np.array_equal(getattr(other, name), getattr(sim, name)), name
+        before = sim.law_state
+        assert run._advance_part_implicitly("asked for") and not np.array_equal(sim.law_state, before)
+
+
+def test_a_law_that_implicit_solvers_do_not_know_ends_in_the_error(cube):
+    scene = Scene(
+        cube.translated([0, 0.02, 0]), ViscousRubber(2e4, 0.3, 10.0), 1000.0, [Gravity(), Ground(stiffness=1e3)]
+    )
+    run = Careless(scene, SemiImplicitSolver, 1 / 30)
+    assert not run._advance_part_implicitly("asked for")
+
+
+@pytest.mark.parametrize("solver", ["verlet", "bdf2"])
+def test_a_fall_of_the_battery(solver):
+    """One of those that `python tests/battery_of_falls.py` draws; and its judge notices what is wrong."""
+    beam = next(path for path in battery_of_falls.ASSETS if path.stem == "beam")
+    case = dict(mesh=str(beam), size=0.05, youngs_modulus=1e4, height=0.1, solver=solver)
+    fallen = battery_of_falls.fall(case)
+    assert battery_of_falls.judge(fallen) == "good", fallen
+    for wrong in (dict(gap=-1e-6), dict(rise=0.02), dict(ended=False, said="so")):
+        assert battery_of_falls.judge(fallen | wrong) != "good"
 
 
 def test_given_dt_is_used_as_it_is(cube):

@@ -12,6 +12,15 @@ def test_incline(capsys):
     assert "Coulomb's law" in capsys.readouterr().out
 
 
+def test_bounce_gradients(capsys, tmp_path):
+    """Soft balls: the stage's gradients are good at the longest steps of the body, and get better with shorter ones."""
+    errors = example("contact/bounce_gradients").main(tmp_path, starts=3, finest=1 / 16)
+    default = errors["stage, default"]
+    assert default[0] < 0.02 and default[-1] < 0.25 * default[0]
+    assert errors["stage, damping 1"][-1] > 4 * errors["stage, damping 0"][-1]  # what damping costs
+    assert (tmp_path / "bounce_gradients.png").stat().st_size > 10_000 and "median error" in capsys.readouterr().out
+
+
 @pytest.mark.filterwarnings("error:gradients through contacts")
 def test_wall_shot(capsys):
     numbers = example("control/wall_shot").main()

@@ -48,14 +48,6 @@ class HessianKernels(ListedPair):
             h1, h2, h3 = w[1] * pull, w[2] * pull, w[3] * pull
         self.store(p, scene, h1, h2, h3)
 
-    @ti.func
-    def all_products(self, scene: A, at: A, plan: A):
-        for kind in ti.static((VERTEX_TRIANGLE, EDGE_EDGE)):
-            ti.loop_config(serialize=not self.parallel)
-            for p in range(kind * plan.num_vt, plan.num_vt + kind * plan.num_ee):
-                self.product(kind, p, scene, at, plan)
-        self.sum_corners(scene, at.out, plan)
-
     @cached_property
     def products(self) -> Kernel:
         """Change of the forces for changes w of the positions, of the convex part of the energy alone."""

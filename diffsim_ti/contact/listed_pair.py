@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import taichi as ti
 
-from diffsim_ti.contact.proximity import EDGE_EDGE, Pair
+from diffsim_ti.contact.proximity import EDGE_EDGE, VERTEX_TRIANGLE, Pair
 from diffsim_ti.runtime import Kernel
 
 A = ti.template()
@@ -144,3 +144,12 @@ class ListedPair(Pair):
             for k in range(scene.row[s], scene.row[s + 1]):
                 total += scene.corner[scene.corner_of[k]]
             out[plan.first_out + s] = total
+
+    @ti.func
+    def all_products(self, scene: A, at: A, plan: A):
+        """`product` of every pair, which a subclass has, and their sums by vertex."""
+        for kind in ti.static((VERTEX_TRIANGLE, EDGE_EDGE)):
+            ti.loop_config(serialize=not self.parallel)
+            for p in range(kind * plan.num_vt, plan.num_vt + kind * plan.num_ee):
+                self.product(kind, p, scene, at, plan)
+        self.sum_corners(scene, at.out, plan)

@@ -119,14 +119,6 @@ class PairKernels(ListedPair):
         self.store(p, scene, h1, h2, h3)
         scene.numbers[p] = numbers
 
-    @ti.func
-    def all_products(self, scene: A, at: A, plan: A):
-        for kind in ti.static((VERTEX_TRIANGLE, EDGE_EDGE)):
-            ti.loop_config(serialize=not self.parallel)
-            for p in range(kind * plan.num_vt, plan.num_vt + kind * plan.num_ee):
-                self.product(kind, p, scene, at, plan)
-        self.sum_corners(scene, at.out, plan)
-
     @cached_property
     def products(self) -> Kernel:
         """Change of the forces for changes w of the positions (and of rest shape, stiffness and width).

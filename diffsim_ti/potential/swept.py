@@ -21,10 +21,7 @@ from diffsim_ti.state.obstacle_functions import ObstacleFunctions
 A = ti.template()
 MARCHES = 200  # halts on a way
 LEVELS = 9  # a side of a face is cut in 2^9 parts at most
-TINY, KEPT = (
-    1e-3,
-    0.1,
-)  # shares of the distance, or of the width if that is less: what counts as met, where one halts then
+TINY = 1e-3  # share of the distance, or of the width if that is less: what counts as met
 
 WAY = dict(places="vectors", drifts="vectors", step="vectors2", corners="ints")
 FOUND = dict(found="scalars", blocker="ints")

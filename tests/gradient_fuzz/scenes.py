@@ -200,5 +200,6 @@ def _solver(kind, scene, dt, substeps):
     if kind.static:
         return ds.StaticSolver(scene, load_steps=substeps, tolerance=tolerance, parallel=kind.parallel)
     if kind.explicit:
-        return kind.solver(scene, dt=dt, substeps=substeps, parallel=kind.parallel)
+        how = dict(contact=kind.contact, contact_damping=kind.contact_damping)
+        return kind.solver(scene, dt=dt, substeps=substeps, parallel=kind.parallel, **how)
     return kind.solver(scene, dt=dt, substeps=substeps, tolerance=tolerance, parallel=kind.parallel)

@@ -45,6 +45,8 @@ class Structure:
     motion: bool
     uniform: bool  # moduli
     torch: bool  # whether its torch simulator is tried
+    contact: str  # of explicit solvers
+    contact_damping: float
 
     @property
     def explicit(self) -> bool:
@@ -58,10 +60,11 @@ class Structure:
         kinds = [k.name + " rough" * k.friction + " moving" * k.path for k in self.obstacles]
         flags = ("self_contact", "gravity", "drag", "fixed", "motion", "uniform")
         words = [name for name in flags if getattr(self, name)]
+        how = f"{self.contact} {self.contact_damping:g}" if self.explicit else "potential"
         return (
             f"structure {self.number}: {self.law.__name__}, {self.solver.__name__}, {self.precision}, {self.volume}"
-            f"{', parallel' if self.parallel else ''}; obstacles: {', '.join(kinds) or 'none'}; forces {self.forces}; "
-            f"{', '.join(words)}"
+            f"{', parallel' if self.parallel else ''}; obstacles: {', '.join(kinds) or 'none'}, {how}; "
+            f"forces {self.forces}; {', '.join(words)}"
         )
 
 
@@ -101,4 +104,6 @@ def structure(number: int) -> Structure:
         fixed and rng.random() < 0.5,
         rng.random() < 0.4,
         number % 3 == 0,
+        turn(("stage", "stage", "force"), number, 6),
+        turn((0.0, 0.005, 0.005, 0.2, 1.0), number, 7),
     )

@@ -62,7 +62,7 @@ class ContactStage(ObstacleStages):
                         first, wall = g.first + k * g.size, self.speed(g, k, now, scene.path)
                         X = scene.rest[i] - self.place(g, k, now, scene.path)
                         plane, width = (
-                            stage.plane(g.force, scene.parameters, first, X, u),
+                            g.force.outlook(scene.parameters, first, X, u),
                             g.force.width(scene.parameters, first),
                         )
                         if turn == 0:

@@ -10,10 +10,8 @@ class Blocked(NotConverged):
     """A vertex or face stands before an obstacle, and no step helps. Carries its `vertices`, the obstacle (a term), the
     gap [m], the speed [m/s] at which they meet, and the stiffness [N/m] that the barrier needs, None where its own does."""
 
-    firm, near = (
-        0.02,
-        0.05,
-    )  # shares of the width: where a barrier that is stiff enough stops things; what counts as there
+    # shares of the width: where a barrier that is stiff enough stops things; what counts as there
+    firm, near = 0.02, 0.05
 
     def __init__(self, message: str, residuals, vertices, obstacle, gap: float, speed: float, stiffness: float | None):
         super().__init__(message, residuals)

@@ -1,7 +1,7 @@
 """An obstacle at a vertex as a stage of explicit passes: Taichi functions of one obstacle, with tangents and adjoints.
 
-`force` is the obstacle's compile-time class (obstacle.py), of which only the distance is used. A plane is the vector
-(n, d): normal and distance where the pass begins. The push P is that of secant.py, for a distance that goes from d to
+`force` is the obstacle's compile-time class (obstacle_force.py), of which only the distance is used. A plane is the vector
+(n, d) that its `outlook` gives where the pass begins. The push P is that of secant.py, for a distance that goes from d to
 y = d + n . move, `move` being the vertex's displacement in the pass relative to the obstacle. Friction is that of
 friction.py, with P as the normal force.
 """
@@ -16,13 +16,6 @@ from diffsim_ti.terms.obstacles import friction, secant
 @traced
 def _vector(fp, numbers, last=0):
     return let(ti.types.vector(4, fp)(*numbers, ti.cast(last, fp)))
-
-
-@traced
-def plane(force, parameters, first, X, u):
-    """(n, d)"""
-    _, _, _, d, n = force.record(parameters, first, X, u)
-    return _vector(force.fp, [k.value for k in n], d.value)
 
 
 @ti.func
