@@ -14,13 +14,14 @@ from open_laws.viscous import ViscousRubber
 from diffsim_ti import adaptive_run as forward
 from diffsim_ti import picture
 from diffsim_ti.cli import app as cli
+from diffsim_ti.cli import options
 from diffsim_ti.materials import StableNeoHookean
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.monitor.quantities import TetrahedronFields
 from diffsim_ti.scene import Scene
 from diffsim_ti.simulator import Simulator
 from diffsim_ti.solvers import ImplicitEulerSolver, SemiImplicitSolver, VelocityVerletSolver
-from diffsim_ti.terms import Gravity, Ground
+from diffsim_ti.terms import Gravity, Ground, Sphere
 
 
 def command(*arguments):
@@ -192,6 +193,21 @@ def test_a_fall_of_the_battery(solver):
     assert battery_of_falls.judge(fallen) == "good", fallen
     for wrong in (dict(gap=-1e-6), dict(rise=0.02), dict(ended=False, said="so")):
         assert battery_of_falls.judge(fallen | wrong) != "good"
+
+
+def test_the_summary_names_its_lines(cube, capsys):
+    """Each line of `describe` under its own name; what stands in brackets is printed."""
+    ball = Sphere((0, -1, 0), 1.0, width=0.01)
+    scene = Scene(cube.translated([0, 0.02, 0]), StableNeoHookean(2e4, 0.3), 1000.0, [Gravity(), ball])
+    run = forward.ForwardRun(scene, SemiImplicitSolver, 1 / 30)
+    run.advance()
+    run.seen.retries.append("t = 1 s: behind HalfSpace(half_space_point=[m])")
+    options.print_summary(run, 0.0, 0.0, ["a[s].npz"])
+    lines = capsys.readouterr().out.splitlines()
+    assert any(line.startswith("solver ") and "SemiImplicitSolver: dt" in line for line in lines)
+    assert any(line.startswith("inputs ") and "initial_velocities [m/s], youngs_modulus [Pa]" in line for line in lines)
+    assert any(line.startswith("chosen from weight and speed ") and "N/m of Sphere" in line for line in lines)
+    assert any("half_space_point=[m])" in line for line in lines) and any("a[s].npz" in line for line in lines)
 
 
 def test_given_dt_is_used_as_it_is(cube):

@@ -154,37 +154,42 @@ def print_summary(run: "ForwardRun", setup: float, writing: float, files: list[s
     """A table of what was simulated, how fast, how well, and where it was written."""
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
     sim, seen = run.simulator, run.seen
     substeps, m = sum(seen.substeps), run.scene.mesh.num_tetrahedra
     table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
+
+    def row(name: str, line: str) -> None:
+        table.add_row(name, Text(line))  # in which [m] is a unit, not markup
+
     names = iter(("mesh", "material", "", "solver"))
     for line in sim.describe().splitlines():
-        table.add_row(*line.split(": ", 1) if line.startswith(("terms", "fixed", "built")) else (next(names, ""), line))
-    table.add_row("simulated", f"{sim.time:.4g} s in {len(seen.substeps)} frames")
+        name, _, rest = line.partition(": ")
+        own = name in ("terms", "fixed vertices", "chosen from weight and speed", "inputs", "built")
+        row(*(name, rest) if own else (next(names, ""), line))
+    row("simulated", f"{sim.time:.4g} s in {len(seen.substeps)} frames")
     counts = f"{substeps}, from {min(seen.substeps)} to {max(seen.substeps)} a frame"
-    table.add_row("substeps", f"{counts}, {seen.shortest:.3g} to {seen.longest:.3g} s each")
+    row("substeps", f"{counts}, {seen.shortest:.3g} to {seen.longest:.3g} s each")
     parts = f"{len(seen.retries)}, of parts of {sim.solver.dt:.3g} s, again with half the substep; the last:"
-    table.add_row("retries", parts if seen.retries else "none")
+    row("retries", parts if seen.retries else "none")
     for retry in seen.retries[-3:]:
-        table.add_row("", retry if len(retry) < 130 else retry[:127] + "...")
-    table.add_row(
-        "wall time", f"compile and setup {setup:.2f} s, stepping {seen.seconds:.2f} s, writing {writing:.2f} s"
-    )
+        row("", retry if len(retry) < 130 else retry[:127] + "...")
+    row("wall time", f"compile and setup {setup:.2f} s, stepping {seen.seconds:.2f} s, writing {writing:.2f} s")
     each = seen.seconds / substeps
-    table.add_row("speed", f"{1 / each:.0f} substeps/s, {each / m * 1e9:.1f} ns per tetrahedron and substep")
+    row("speed", f"{1 / each:.0f} substeps/s, {each / m * 1e9:.1f} ns per tetrahedron and substep")
     for name, energy in (("energy at start", run.energies[0]), ("energy at end", run.energies[-1])):
-        table.add_row(name, f"{energy:.6g} J: " + ", ".join(f"{k} {v:.4g}" for k, v in energy.parts.items()))
+        row(name, f"{energy:.6g} J: " + ", ".join(f"{k} {v:.4g}" for k, v in energy.parts.items()))
     drift = run.energies[-1] - run.energies[0]
     share = drift / max(run.largest_energy, 1e-300)
-    table.add_row("energy drift", f"{drift:+.3g} J, {share:+.2%} of the largest kinetic + elastic + contact energy")
+    row("energy drift", f"{drift:+.3g} J, {share:+.2%} of the largest kinetic + elastic + contact energy")
     inverted = f", {seen.inverted} tetrahedra inside-out at once" if seen.inverted else ""
-    table.add_row("smallest J", f"{seen.J:.4g}{inverted}")
+    row("smallest J", f"{seen.J:.4g}{inverted}")
     if run.obstacles:
         width = min(float(t.values["barrier_width"]) for t in run.obstacles)
         crossed = f"{seen.crossed} vertices crossed, by up to {-seen.gap:.3g} m" if seen.crossed else "none crossed"
-        table.add_row("smallest gap", f"{seen.gap:.4g} m, barrier {width:.3g} m wide; {crossed}")
+        row("smallest gap", f"{seen.gap:.4g} m, barrier {width:.3g} m wide; {crossed}")
     for k, name in enumerate(files):
-        table.add_row("" if k else "files", name)
+        row("" if k else "files", name)
     console = Console()
     Console(width=console.width if console.is_terminal else 400).print(table)
