@@ -199,6 +199,16 @@ def test_cache_folder_that_cannot_be_made(tmp_path):
     assert out.splitlines()[-1] == "done"
 
 
+def test_the_next_process_finds_the_compiled_kernels(tmp_path):
+    """Taichi writes its cache when its program ends, which it must do whatever still refers to it."""
+    code = textwrap.dedent("import diffsim_ti as ds\nds.init()\n") + textwrap.dedent(STEP)
+    python(code, TI_OFFLINE_CACHE_FILE_PATH=str(tmp_path))
+    kept = {path: path.stat().st_mtime_ns for path in tmp_path.glob("*.tic")}
+    assert kept
+    python(code, TI_OFFLINE_CACHE_FILE_PATH=str(tmp_path))
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.glob("*.tic")} == kept  # none compiled again
+
+
 # ---- memory and kernels -------------------------------------------------------------------------------------------------
 
 

@@ -34,7 +34,7 @@ class Derived:
 
     def zeros(self) -> "Derived":
         """The same shapes, all zero."""
-        return Derived(*(None if part is None else np.zeros_like(part) for part in self.parts().values()))
+        return Derived(*(None if part is None else np.zeros(part.shape) for part in self.parts().values()))
 
     def parts(self) -> dict[str, np.ndarray | None]:
         """{name: array}"""

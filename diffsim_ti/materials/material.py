@@ -1,6 +1,7 @@
 """A material: a law with its numbers."""
 
 from abc import ABC, abstractmethod
+from math import prod
 
 import numpy as np
 
@@ -160,13 +161,14 @@ class Material(ABC):
         """
         adj = np.asarray(coefficients_adj, np.float64)
         v, matrix = self._columns(values), self._matrix()
-        parts = list(np.moveaxis(adj if matrix is None else adj @ matrix, -1, 0))
+        adj = adj if matrix is None else adj @ matrix
+        parts = [adj[..., k] for k in range(adj.shape[-1])]
         if self._begins_with_E_and_nu():
             parts[:2] = moduli.lame_vjp(*v[:2], *parts[:2])
         out, at = {}, 0
         for name in self.inputs:
             shape, value = self.shape_of(name), np.asarray(values[name])
-            own = [np.sum(x) if value.shape == shape else x for x in parts[at : at + int(np.prod(shape))]]
+            own = [np.sum(x) if value.shape == shape else x for x in parts[at : at + prod(shape)]]
             out[name], at = np.stack(own, -1).reshape(value.shape) if shape else own[0], at + len(own)
         return out
 

@@ -84,8 +84,9 @@ def full_shape(target) -> tuple:
 
 def _check_owner(target) -> None:
     """The memory of an array of a dead program is gone, and so is what describes it."""
-    if hasattr(target, "owner"):
-        check_alive(target.owner)
+    owner = getattr(target, "owner", None)
+    if owner is not None:
+        check_alive(owner)
 
 
 def view(target) -> "np.ndarray | None":
@@ -101,9 +102,9 @@ def view(target) -> "np.ndarray | None":
 
 def fill(target, data) -> None:
     """Copy numbers into a Taichi array; `data` broadcasts to its shape, and three components fit into four."""
-    data, shape = np.asarray(data), full_shape(target)
+    data, host = np.asarray(data), view(target)
+    shape = full_shape(target) if host is None else host.shape
     three = shape[-1] == 4 and data.ndim and data.shape[-1] == 3
-    host = view(target)
     if host is not None:
         (host[..., :3] if three else host)[...] = data
         return
@@ -123,7 +124,7 @@ def fetch(source) -> np.ndarray:
     """A NumPy copy of a Taichi array; of four components the first three."""
     host = view(source)
     host = _copied(source) if host is None else host
-    is_vector = len(getattr(source, "element_shape", ()) or ()) == 1 and host.shape[-1] == 4
+    is_vector = host.shape[-1] == 4 and host.ndim == len(source.shape) + 1
     return host[..., :3].copy() if is_vector else host.copy()
 
 

@@ -1,5 +1,6 @@
 """Start-up of Taichi, its backends and precisions, and whether the program that gave something still lives."""
 
+import atexit
 import contextlib
 import io
 import multiprocessing
@@ -103,6 +104,14 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_after_fork)
 
 
+@atexit.register
+def _end_program() -> None:
+    """Taichi writes the kernels that it compiled to its cache when its program ends, and an interpreter that exits does not
+    end it where anything, such as the callback above, still leads to it."""
+    if impl.get_runtime().prog is not None and not _settings.get("forked"):
+        ti.reset()
+
+
 def refuse_fork() -> None:
     if _settings.get("forked"):
         raise RuntimeError(
@@ -140,7 +149,8 @@ def _arch_of_parent() -> str:
 
 def is_alive(owner: weakref.ref) -> bool:
     """Whether the program `owner` is the one that runs."""
-    return owner() is not None and owner() is impl.get_runtime().prog
+    running = owner()
+    return running is not None and running is impl.get_runtime().prog
 
 
 def check_host_init() -> None:
@@ -158,6 +168,9 @@ def check_host_init() -> None:
 
 def check_alive(owner: weakref.ref) -> None:
     """Raise if `ti.init` was called after the program `owner`, or if this process was forked since."""
+    running = owner()  # looked up here, without calls: every look at an array comes by
+    if running is not None and running is impl.get_runtime().prog and not _settings.get("forked"):
+        return
     refuse_fork()
     if not is_alive(owner):
         raise RuntimeError("ti.init was called again, which destroys all Taichi data: build the scene and solver anew")

@@ -66,6 +66,7 @@ class SceneArrays:
             self.vector, 3 * len(self.contacts)
         )  # walls (potential/) as one looks between passes
         self.values: Derived | None = None
+        self._known_features: dict[tuple[bool, bool], Features] = {}  # for these values
         self.rows: dict[str, np.ndarray | None] = {}  # of steps, as the device has them: motion, path, forces
 
     def _order_tetrahedra(self, scene) -> None:
@@ -122,6 +123,11 @@ class SceneArrays:
 
     def features(self, density: bool = False, shape: bool = False) -> Features:
         """What kernels must contain for the values that are loaded."""
+        if (density, shape) not in self._known_features:
+            self._known_features[density, shape] = self._make_features(density, shape)
+        return self._known_features[density, shape]
+
+    def _make_features(self, density: bool, shape: bool) -> Features:
         forces = self.values.forces
         return Features(
             **self._features,
@@ -134,7 +140,7 @@ class SceneArrays:
     def load(self, values: Derived) -> bool:
         """Bring values to the device; True if array shapes or kernels changed, so that launches must be bound anew."""
         old, before = self.values, None if self.values is None else self.features()
-        self.values = values
+        self.values, self._known_features = values, {}
         self.rows = {name: getattr(values, name) for name in ("motion", "path", "forces")}
         moved = before != self.features()
         sources = {name: on_device(self, name, values) for name in TANGENT if name != "mass"}

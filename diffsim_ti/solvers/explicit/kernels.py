@@ -161,7 +161,8 @@ class ExplicitKernels:
     @cached_property
     def finish_vjp(self) -> Kernel:
         """Add the gather that the first pass of the run has left."""
-        own = dict(scene=SCENE, adjoint=dict(u="vectors2", v="vectors2") | CORNERS)
+        corners = {name: SCENE[name] for name in ("start", "corner_of")}
+        own = dict(scene=corners, adjoint=dict(u="vectors2", v="vectors2") | CORNERS)
         return Kernel("finish_vjp", self.gather_rest, self.vertex.law.precision, own, dict(num_vertices="int"))
 
     def _kernel(self, name: str, body, arrays: dict, **numbers) -> Kernel:
