@@ -81,7 +81,7 @@ class ContactStage(ObstacleStages):
         plane, felt = state.stage[ROWS * o + PLANE, i], state.stage[ROWS * o + FELT, i]
         n, width = self.normal(plane), felt.y
         y = plane.w + n.dot(z - now.h * state.stage[ROWS * o + WALL, i])
-        p, _, by_t = secant.push(plane.w / width, y / width, plan.contact_damping, self.fp)
+        p, by_t = secant.push_by_end(plane.w / width, y / width, plan.contact_damping, self.fp)
         P, K, zero = felt.x * width * p, felt.x * by_t, ti.cast(0, self.fp)
         state.stage[ROWS * o + PUSH, i] = self.vector(P, K, zero, zero)
         return n, P, K
@@ -89,12 +89,12 @@ class ContactStage(ObstacleStages):
     # ---- the move that all obstacles of a vertex agree on -------------------------------------------------------------
 
     @ti.func
-    def solve(self, i, free, a, now: A, state: A, plan: A):
-        """z = free + a sum P n by Newton's method, shorter where the slope along its step changes sign.
+    def solve(self, i, start, free, a, now: A, state: A, plan: A):
+        """z = free + a sum P n by Newton's method from `start`, shorter where the slope along its step changes sign.
 
         Returns z, sum P n, and the entries of sum K n (x) n there.
         """
-        z, step, trial = self.vector(0), self.vector(0), self.vector(0)
+        z, step, trial = start, self.vector(0), start
         total, xyz, mixed = self.vector(0), self.vector(0), self.vector(0)
         before, share, half = ti.cast(0, self.fp), ti.cast(1, self.fp), ti.cast(0.5, self.fp)
         tiny = ti.cast((4 * self.epsilon) ** 2, self.fp)
@@ -152,7 +152,8 @@ class ContactStage(ObstacleStages):
         v, delta, free, ratio = v_plus, self.vector(0), now.alpha * v_plus, now.h * scene.inverse_mass[i]
         if self.acts(i, ratio, now, scene):
             if self.look(i, u, free, now, scene, state):
-                _, total, _, _ = self.solve(i, free, now.alpha * self.blend(plan) * ratio, now, state, plan)
+                a = now.alpha * self.blend(plan) * ratio
+                _, total, _, _ = self.solve(i, self.vector(0), free, a, now, state, plan)
                 delta, v = ratio * total, self.slide_all(i, v_plus, ratio, state)
         pressed = self.blend(plan) * delta
         return u + now.alpha * (v + pressed), now.decay * v + delta - (1 - now.decay) * pressed
@@ -160,8 +161,8 @@ class ContactStage(ObstacleStages):
     # ---- its tangent ---------------------------------------------------------------------------------------------------
 
     @ti.func
-    def advance_jvp(self, i, u, v_plus, du, dv_plus, now: A, scene: A, state: A, tangent: A, plan: A):
-        """Changes of u' and v'."""
+    def advance_jvp(self, i, u, moved, v_plus, du, dv_plus, now: A, scene: A, state: A, tangent: A, plan: A):
+        """Changes of u' and v'; moved: u' - u, where the move is looked for."""
         v, dv, delta, ddelta = v_plus, dv_plus, self.vector(0), self.vector(0)
         inverse = scene.inverse_mass[i]
         ratio, blend, free = now.h * inverse, self.blend(plan), now.alpha * v_plus
@@ -169,7 +170,7 @@ class ContactStage(ObstacleStages):
         if self.acts(i, ratio, now, scene):
             if self.look(i, u, free, now, scene, state):
                 a, dratio = now.alpha * blend * ratio, -ratio * inverse * tangent.mass[i]
-                z, total, xyz, mixed = self.solve(i, free, a, now, state, plan)
+                z, total, xyz, mixed = self.solve(i, moved, free, a, now, state, plan)
                 dtotal = self.note_changes(i, u, du, z, now, scene, state, tangent, plan)
                 b = dalpha * v_plus + now.alpha * dv_plus + blend * (dalpha * ratio + now.alpha * dratio) * total
                 dz = stage.solve_linear(a, xyz, mixed, b + a * dtotal)
@@ -236,8 +237,11 @@ class ContactStage(ObstacleStages):
     # ---- its adjoint ---------------------------------------------------------------------------------------------------
 
     @ti.func
-    def advance_vjp(self, i, u, v_plus, p, q, now: A, scene: A, state: A, adjoint: A, plan: A):
-        """(adjoint of u besides p, adjoint of v+) for adjoints p and q of u' and v'; adds those of all else."""
+    def advance_vjp(self, i, u, moved, v_plus, p, q, now: A, scene: A, state: A, adjoint: A, plan: A):
+        """(adjoint of u besides p, adjoint of v+) for adjoints p and q of u' and v'; adds those of all else.
+
+        moved: u' - u, where the move is looked for.
+        """
         free, w, u_adj = now.alpha * v_plus, v_plus, self.vector(0)
         inverse, blend = scene.inverse_mass[i], self.blend(plan)
         ratio, w_adj = now.h * inverse, now.alpha * p - (1 - now.decay) * q
@@ -245,7 +249,7 @@ class ContactStage(ObstacleStages):
         if self.acts(i, ratio, now, scene):
             if self.look(i, u, free, now, scene, state):
                 a = now.alpha * blend * ratio
-                z, total, xyz, mixed = self.solve(i, free, a, now, state, plan)
+                z, total, xyz, mixed = self.solve(i, moved, free, a, now, state, plan)
                 w = self.slide_all(i, v_plus, ratio, state) + blend * ratio * total
                 delta_adj = q + blend * w_adj
                 by_alpha, by_ratio = p.dot(w), delta_adj.dot(total)

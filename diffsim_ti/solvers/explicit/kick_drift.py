@@ -170,7 +170,9 @@ class KickDrift:
         dv_next = now.decay * dv_plus + now.decay_by_rate * plan.rate_dot * v_plus
         if ti.static(self.features.num_staged > 0):
             _, before = self.kicked(i, v, state.f[s, i], now, scene)
-            du_next, dv_next = self.contact.advance_jvp(i, u, before, du, dv_plus, now, scene, state, tangent, plan)
+            du_next, dv_next = self.contact.advance_jvp(
+                i, u, state.u[t, i] - u, before, du, dv_plus, now, scene, state, tangent, plan
+            )
         # prescribed motion
         if ti.static(self.features.motion):
             k = self.prescribed(i, scene)
@@ -210,7 +212,8 @@ class KickDrift:
             v_plus_adj = q
         if ti.static(self.features.num_staged > 0):
             _, before = self.kicked(i, v, state.f[s, i], now, scene)
-            by_u, v_plus_adj = self.contact.advance_vjp(i, u, before, p, q, now, scene, state, adjoint, plan)
+            moved = state.u[t, i] - u
+            by_u, v_plus_adj = self.contact.advance_vjp(i, u, moved, before, p, q, now, scene, state, adjoint, plan)
             p += by_u
             if k >= 0:
                 v_plus_adj = q

@@ -52,6 +52,18 @@ def curvature(s, fp: ti.template()):
     return b
 
 
+@ti.func
+def slope_and_curvature(s, fp: ti.template()):
+    """(beta'(s), beta''(s)) with one logarithm, the dearest part of either"""
+    b, c = 0 * s, 0 * s
+    if s < ti.cast(CROSSOVER, fp):
+        b, c = slope(s, fp), curvature(s, fp)
+    elif s < 1:
+        log, share = ti.log(s), (s - 1) / s
+        b, c = -(s - 1) * (2 * log + share), -2 * log - 4 * (s - 1) / s + (s - 1) * (s - 1) / (s * s)
+    return b, c
+
+
 def beta(s) -> np.ndarray:
     """beta(s) on the host, for numbers or arrays, in float64."""
     s = np.asarray(s, np.float64)

@@ -18,9 +18,9 @@ def log1p_ratio(x, fp: ti.template()):
     """log(1 + x) / x for x > -1, and its derivative"""
     value, derivative = 1 + 0 * x, 0 * x
     if ti.abs(x) * 8 < 1:
-        # 1 - x/2 + x^2/3 - ..., by Horner's rule with its derivative: eighteen terms leave 1e-17 at |x| = 1/8
+        # 1 - x/2 + x^2/3 - ..., by Horner's rule with its derivative; at |x| = 1/8 a double needs 18 terms, a single 9
         value, derivative = 0 * x, 0 * x
-        for k in ti.static(range(18, 0, -1)):
+        for k in ti.static(range(18 if fp == ti.f64 else 9, 0, -1)):
             derivative = value + x * derivative
             value = ti.cast((-1) ** (k - 1) / k, fp) + x * value
     else:
@@ -39,18 +39,16 @@ def _inside(s, t, fp: ti.template()):
 
 
 @ti.func
-def secant(s, t, fp: ti.template()):
-    """(sigma, its derivative by s, its derivative by t)"""
+def secant_by_end(s, t, fp: ti.template()):
+    """(sigma, its derivative by t)"""
     corner, half = ti.cast(CROSSOVER, fp), ti.cast(0.5, fp)  # dividing by 2 would compute in f64
     low, high = ti.min(s, t), ti.max(s, t)
-    value, by_s, by_t = 0 * s, 0 * s, 0 * s
+    value, by_t = 0 * s, 0 * s
     if high <= corner:  # a straight slope
         value = half * (barrier.slope(s, fp) + barrier.slope(t, fp))
-        by_s = half * barrier.curvature(s, fp)
-        by_t = by_s
+        by_t = half * barrier.curvature(t, fp)
     elif low >= corner and high <= 1:
         value, by_t = _inside(s, t, fp)
-        _, by_s = _inside(t, s, fp)
     elif low < 1:
         a, b = ti.max(low, corner), ti.min(high, 1 + 0 * s)
         part, _ = _inside(a, b, fp)
@@ -59,17 +57,32 @@ def secant(s, t, fp: ti.template()):
             rise += half * (barrier.slope(low, fp) + barrier.slope(corner, fp)) * (corner - low)
         value = rise / (high - low)
         by_t = (barrier.slope(t, fp) - value) / (t - s)
-        by_s = (value - barrier.slope(s, fp)) / (t - s)
+    return value, by_t
+
+
+@ti.func
+def secant(s, t, fp: ti.template()):
+    """(sigma, its derivative by s, its derivative by t)"""
+    value, by_t = secant_by_end(s, t, fp)
+    _, by_s = secant_by_end(t, s, fp)  # it is symmetric
     return value, by_s, by_t
+
+
+@ti.func
+def push_by_end(s, t, c, fp: ti.template()):
+    """(p, -dp/dt): all that looking for the end of a pass needs"""
+    slope, curvature = barrier.slope_and_curvature(t, fp)
+    value, by_t = -slope, curvature
+    if c < 1:
+        sigma, sigma_t = secant_by_end(s, t, fp)
+        value = c * value - (1 - c) * sigma
+        by_t = c * by_t + (1 - c) * sigma_t
+    return value, by_t
 
 
 @ti.func
 def push(s, t, c, fp: ti.template()):
     """(p, -dp/ds, -dp/dt): none is negative."""
-    value, by_s, by_t = -barrier.slope(t, fp), 0 * s, barrier.curvature(t, fp)
-    if c < 1:
-        sigma, sigma_s, sigma_t = secant(s, t, fp)
-        value = c * value - (1 - c) * sigma
-        by_s = (1 - c) * sigma_s
-        by_t = c * by_t + (1 - c) * sigma_t
-    return value, by_s, by_t
+    value, by_t = push_by_end(s, t, c, fp)
+    _, sigma_s = secant_by_end(t, s, fp)
+    return value, (1 - c) * sigma_s, by_t
