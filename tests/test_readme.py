@@ -133,6 +133,24 @@ def test_links_and_pictures_are_there(page):
             assert not part or part in headings[file.resolve()], target
 
 
+def prose(text: str) -> list[str]:
+    """The sentences of a page; a link or code counts as the words that are read."""
+    lines = [line for line in without_blocks(text).splitlines() if not line.startswith(("|", "#", "!", "[", "    "))]
+    out = []
+    for block in re.split(r"\n\s*\n|\n(?=- |\d+\. )", "\n".join(lines)):
+        block = re.sub(r"`[^`]*`", "code", re.sub(r"\]\([^)]*\)", "]", block)).replace("\n", " ")
+        out += re.split(r"(?<=[.!?:;])\s+", block.strip("- "))
+    return out
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_sentences_are_short_and_no_line_stands_twice(page):
+    long = [s for s in prose(PAGES[page]) if len(re.findall(r"[\w'’./-]+", s)) > 25 and " = " not in s]
+    assert not long
+    lines = [x for x in without_blocks(PAGES[page]).splitlines() if len(x) > 60 and not x.startswith("|")]
+    assert len(lines) == len(set(lines))
+
+
 def test_every_picture_is_shown():
     shown = {Path(target).name for text in PAGES.values() for target in re.findall(r"\]\(([^)]+\.(?:png|gif))\)", text)}
     assert {path.name for path in (ROOT / "assets" / "pictures").iterdir()} == shown
