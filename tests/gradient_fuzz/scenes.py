@@ -8,7 +8,8 @@ import diffsim_ti as ds
 
 from . import bodies
 from .obstacles import MESH_WIDTH, Placed, place, push_direction
-from .structures import CELL, PER_STRUCTURE, Structure, structure
+from .open_materials import open_material
+from .structures import CELL, LAWS, PER_STRUCTURE, Structure, structure
 
 
 @dataclass
@@ -63,6 +64,8 @@ def material(kind: Structure, rng, mesh):
         return x * (1 + share * rng.random(m))
 
     mu, lam = E / (2 * (1 + nu)), E * nu / ((1 + nu) * (1 - 2 * nu))
+    if kind.law not in LAWS:
+        return open_material(kind.law, rng, mesh, E, nu, spread), E
     if kind.law is ds.MooneyRivlin and rng.random() < 0.5:
         own = next(names for names in kind.law.spellings if names[0] not in ("youngs_modulus", "mu"))
         numbers = dict(zip(own, (0.3 * mu, 0.2 * mu, lam + 2 / 3 * mu)))

@@ -6,6 +6,8 @@ import numpy as np
 
 import diffsim_ti as ds
 
+from .open_materials import open_laws
+
 PER_STRUCTURE = 8  # configurations of numbers on each
 CELL = 0.1  # edge of a grid cell [m]
 
@@ -88,12 +90,16 @@ def structure(number: int) -> Structure:
         names[1] = names[0]  # two of a kind
     obstacles = tuple(ObstacleKind(name, rng.random() < 0.65, rng.random() < 0.45) for name in names)
     fixed = static or rng.random() < 0.5
+    precision = "f32" if rng.random() < 0.2 else "f64"
+    volume = "patches" if rng.random() < 0.2 else "tetrahedra"
+    of_users = number % 8 == 1  # a law that is not the package's
+    laws = open_laws(solver in EXPLICIT, static, volume == "patches") if of_users else LAWS
     return Structure(
         number,
-        turn(LAWS, number, 5),
+        turn(laws, number // 8 if of_users else number, 5),
         solver,
-        "f32" if rng.random() < 0.2 else "f64",
-        "patches" if rng.random() < 0.2 else "tetrahedra",
+        precision,
+        volume,
         True if solver in EXPLICIT and rng.random() < 0.2 else None,
         obstacles,
         self_contact,
@@ -103,7 +109,7 @@ def structure(number: int) -> Structure:
         fixed,
         fixed and rng.random() < 0.5,
         rng.random() < 0.4,
-        number % 3 == 0,
+        number % 3 == 0 and not of_users,
         turn(("stage", "stage", "force"), number, 6),
         turn((0.0, 0.005, 0.005, 0.2, 1.0), number, 7),
     )
