@@ -26,19 +26,24 @@ def areas_of(mesh, X=None) -> np.ndarray:
 
 
 @pytest.mark.parametrize("pattern", ["kuhn", "five"])
-def test_areas_of_a_box_are_those_of_each_of_its_faces(pattern):
+def test_areas_of_a_cube_are_those_of_each_of_its_faces(pattern):
     """However its squares are cut in two, and whichever face it lies on; inner vertices have none."""
-    mesh = ds.TetrahedralMesh.create_box((3, 4, 5), size=(0.2, 0.3, 0.2), pattern=pattern)
-    areas, x = areas_of(mesh), mesh.vertices
-    assert areas[np.setdiff1d(np.arange(mesh.num_vertices), mesh.surface_vertices)].max() == 0
-    whole = [0.3 * 0.2, 0.2 * 0.2, 0.2 * 0.3]
-    for d in range(3):
-        for end in (x[:, d].min(), x[:, d].max()):
-            face = np.isclose(x[:, d], end)
-            assert areas[face].sum() == pytest.approx(whole[d], rel=0.03)  # edges between unequal cells
     cube = ds.TetrahedralMesh.create_cube(resolution=4, size=0.2, pattern=pattern)
+    areas, x = areas_of(cube), cube.vertices
+    assert areas[np.setdiff1d(np.arange(cube.num_vertices), cube.surface_vertices)].max() == 0
     for d in range(3):
-        assert areas_of(cube)[np.isclose(cube.vertices[:, d], 0)].sum() == pytest.approx(0.04, rel=1e-12)
+        for end in (0.0, 0.2):
+            assert areas[np.isclose(x[:, d], end)].sum() == pytest.approx(0.04, rel=1e-12)
+
+
+def test_areas_of_a_box_converge_to_those_of_its_faces():
+    """At edges between unequal cells the larger one counts more."""
+    errors = []
+    for cells in (2, 4, 8):
+        box = ds.TetrahedralMesh.create_box((cells + 1, cells + 1, 2 * cells + 1), size=(0.2, 0.3, 0.3))
+        bottom = np.isclose(box.vertices[:, 1], 0)
+        errors.append(abs(areas_of(box)[bottom].sum() / 0.06 - 1))
+    assert errors[0] < 0.2 and errors[1] < 0.6 * errors[0] and errors[2] < 0.6 * errors[1]
 
 
 def test_areas_of_a_smooth_surface_add_up_to_it():
