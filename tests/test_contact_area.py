@@ -43,7 +43,7 @@ def test_areas_of_a_box_converge_to_those_of_its_faces():
         box = ds.TetrahedralMesh.create_box((cells + 1, cells + 1, 2 * cells + 1), size=(0.2, 0.3, 0.3))
         bottom = np.isclose(box.vertices[:, 1], 0)
         errors.append(abs(areas_of(box)[bottom].sum() / 0.06 - 1))
-    assert errors[0] < 0.2 and errors[1] < 0.6 * errors[0] and errors[2] < 0.6 * errors[1]
+    assert errors[0] < 0.3 and errors[1] < 0.6 * errors[0] and errors[2] < 0.6 * errors[1]
 
 
 def test_areas_of_a_smooth_surface_add_up_to_it():
@@ -114,12 +114,12 @@ def sliding(precision="f64", **options) -> ds.Scene:
     """A skewed cube that slides over a floor and a ball that moves, pushed by a wall whose stiffness is of each vertex."""
     mesh = ds.TetrahedralMesh.create_cube(2, size=0.2)
     rng = np.random.default_rng(2)
-    mesh = ds.TetrahedralMesh(mesh.vertices + 0.01 * rng.standard_normal(mesh.vertices.shape), mesh.tetrahedra)
+    mesh = ds.TetrahedralMesh(mesh.vertices + 0.005 * rng.standard_normal(mesh.vertices.shape), mesh.tetrahedra)
     terms = [
         ds.Gravity(),
         ds.Ground(-0.03, width=0.05, stiffness_per_area=3e3, **ROUGH),
         ds.Sphere((0.1, -0.13, 0.1), 0.1, width=0.04, stiffness_per_area=2e4, path=lambda t: [0.2 * t, 0.5 * t, 0]),
-        ds.HalfSpace((-0.02, 0, 0), (1, 0, 0), width=0.05, stiffness=50.0),
+        ds.HalfSpace((-0.03, 0, 0), (1, 0, 0), width=0.05, stiffness=50.0),
     ]
     speed = dict(initial_velocities=[-0.3, -0.4, 0.5])
     return ds.Scene(mesh, ds.StableNeoHookean(2e4, 0.3), 500.0, terms, precision=precision, **speed, **options)
@@ -155,7 +155,7 @@ def test_gradients_are_slopes(solver):
 
 def on_a_needle(**options) -> ds.Rollout:
     """A cube whose bottom face, not its vertices, meets a needle."""
-    mesh = ds.TetrahedralMesh.create_box(2, size=0.1).translated((0, -0.0095, 0))
+    mesh = ds.TetrahedralMesh.create_box(2, size=0.1).translated((0, -0.006, 0))
     scene = ds.Scene(mesh, SOFT, terms=[needle(**options)], initial_velocities=(0.1, -0.2, 0), precision="f64")
     return ds.Rollout(ds.ImplicitEulerSolver(scene, dt=2e-3, tolerance=1e-12), 2, 1, gradients="all")
 
