@@ -15,6 +15,7 @@ from diffsim_ti.materials.patch_law import PatchLaw
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.terms import Drag, ExternalForce, Gravity, Obstacle, SelfContact, Term
 from diffsim_ti.terms.motion import Motion, sampled
+from diffsim_ti.terms.obstacles.obstacle import PER_AREA
 
 
 def _kind(term) -> tuple:
@@ -170,7 +171,7 @@ class Scene:
         mass = self.inputs.derive(self.inputs.values).mass.sum()
         terms = ", ".join(map(repr, self.terms)) or "none"
         chosen = [
-            f"chosen from weight and speed: stiffness {float(t.values['barrier_stiffness']):.4g} N/m of {type(t).__name__}"
+            f"chosen from weight and speed: stiffness per area {float(t.values[PER_AREA]):.4g} N/m^3 of {type(t).__name__}"
             for t in self.terms
             if isinstance(t, Obstacle) and t.chooses_stiffness
         ]

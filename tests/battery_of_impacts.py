@@ -106,8 +106,9 @@ def build(case: Case):
         more = dict(fixed=fixed, motion=motion)
     else:
         path, more = (lambda t: [-speed * t, 0, 0]), dict(initial_velocities=(own, 0, 0))
-    stiffness = case.stiffness or natural_stiffness(case, mesh, width)
-    obstacle = obstacle(width=width, stiffness=stiffness, path=path)
+    advised = dict(stiffness=case.stiffness)  # [N/m]
+    stiff = advised if case.stiffness else dict(stiffness_per_area=natural_stiffness(case, mesh, width))
+    obstacle = obstacle(width=width, path=path, **stiff)
     scene = ds.Scene(
         mesh, ds.StableNeoHookean(case.youngs_modulus, 0.3), DENSITY, [obstacle], precision=case.precision, **more
     )
@@ -116,7 +117,7 @@ def build(case: Case):
 
 
 def natural_stiffness(case: Case, mesh, width: float) -> float:
-    """What the scene chooses where it knows the speed: that of its own velocity."""
+    """What the scene chooses per area where it knows the speed: that of its own velocity."""
     still = ds.Scene(
         mesh,
         ds.StableNeoHookean(case.youngs_modulus, 0.3),
@@ -124,7 +125,7 @@ def natural_stiffness(case: Case, mesh, width: float) -> float:
         [ds.HalfSpace(point=(1e3, 0, 0), normal=(-1, 0, 0), width=width)],
         initial_velocities=(case.speed if case.solver != "StaticSolver" else case.wave_speed, 0, 0),
     )
-    return float(still.terms[0].values["barrier_stiffness"])
+    return float(still.terms[0].values["barrier_stiffness_per_area"])
 
 
 def make_obstacle(case: Case, rng, width: float):

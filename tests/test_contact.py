@@ -143,8 +143,8 @@ def test_a_body_in_an_obstacle_is_refused(name):
 
 def test_touching_exactly_is_refused_and_a_path_counts():
     with pytest.raises(ValueError, match="starts below or on the ground"):
-        points(tetrahedron(0.0), ds.Ground())
-    rising = ds.Ground(path=lambda t: [0, 0.3, 0])
+        points(tetrahedron(0.0), ds.Ground(stiffness=1e4))
+    rising = ds.Ground(stiffness=1e4, path=lambda t: [0, 0.3, 0])
     with pytest.raises(ValueError, match="starts below or on the ground"):
         points(tetrahedron(0.15), rising)
     points(tetrahedron(0.35), rising)
@@ -155,8 +155,9 @@ def test_stiffness_is_chosen_and_said():
     mesh, material = tetrahedron(0.1), ds.StableNeoHookean(1e5, 0.3)
     scene = ds.Scene(mesh, material, terms=[ds.Gravity(), ds.HalfSpace()])
     faster = ds.Scene(mesh, material, terms=[ds.Gravity(), ds.HalfSpace()], initial_velocities=[0, -5, 0])
-    k, more = (float(s.inputs.values["barrier_stiffness"]) for s in (scene, faster))
-    assert more > 3 * k > 0 and f"stiffness {k:.4g} N/m of HalfSpace" in scene.describe()
+    k, more = (float(s.inputs.values["barrier_stiffness_per_area"]) for s in (scene, faster))
+    assert more > 3 * k > 0 and f"stiffness per area {k:.4g} N/m^3 of HalfSpace" in scene.describe()
+    assert "barrier_stiffness_per_area [N/m^3]" in scene.describe()
     solver = ds.VelocityVerletSolver(scene, dt=2e-4)
     simulator = ds.Simulator(solver)
     simulator.run(2000)
@@ -186,7 +187,7 @@ def test_absent_obstacles_compile_nothing():
     arrays = bare.workspace.arrays
     assert arrays.features().groups == () and np.prod(bare.workspace.watch.seen.shape) == 1
     assert np.prod(arrays.path.shape) == 1 and str(bare.contact_resolution) == "contact: none"
-    plain = ds.Simulator(ds.SemiImplicitSolver(points(tetrahedron(0.5), ds.Ground()), dt=1e-4))
+    plain = ds.Simulator(ds.SemiImplicitSolver(points(tetrahedron(0.5), ds.Ground(stiffness=1e4)), dt=1e-4))
     (group,) = plain.workspace.arrays.features().groups
     assert not group.force.friction and group.path < 0 and group.size == 3
 
@@ -223,7 +224,7 @@ def test_symmetric_contact_stays_symmetric(solver):
     x = np.array([[1.0, 0, 0], [-1, 0, 0], [0, 0, 1], [0, 0, -1], [0, 1, 0], [0, 0, 0]]) * 0.2
     tets = [[0, 2, 4, 5], [2, 1, 4, 5], [1, 3, 4, 5], [3, 0, 4, 5]]
     mesh = ds.TetrahedralMesh(x + [0, 0.01, 0], tets, fix_orientation=True)
-    scene = ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3), terms=[ds.Gravity(), ds.Ground(friction=0.3)])
+    scene = ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3), terms=[ds.Gravity(), ds.Ground(stiffness=1e4, friction=0.3)])
     end = ds.Rollout(solver(scene, dt=2e-4), 2000).forward()
     p = end.positions[-1]
     mirrored, turned = p[[1, 0, 2, 3, 4, 5]] * [-1, 1, 1], p[[2, 3, 0, 1, 4, 5]][:, [2, 1, 0]]

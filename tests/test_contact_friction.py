@@ -42,7 +42,7 @@ def test_stopping_distance(solver, friction, distance, precision):
     """R21, from 2 m/s; it also stops, and does not come back."""
     scene = points(
         tetrahedron(resting_gap(G)),
-        ds.Ground(friction=friction),
+        ds.Ground(stiffness=1e4, friction=friction),
         terms=[ds.Gravity(-G)],
         initial_velocities=[2, 0, 0],
         precision=precision,
@@ -58,7 +58,7 @@ def test_stopping_distance(solver, friction, distance, precision):
 @solvers
 def test_moving_floor_drags_and_carries(solver):
     """A conveyor's speed is reached after v / (mu g), and then kept."""
-    floor = ds.Ground(friction=0.3, friction_speed=1e-3, path=lambda t: [1.5 * t, 0, 0])
+    floor = ds.Ground(stiffness=1e4, friction=0.3, friction_speed=1e-3, path=lambda t: [1.5 * t, 0, 0])
     scene = points(tetrahedron(resting_gap(G)), floor, terms=[ds.Gravity(-G)])
     frames = ds.Rollout(solver(scene, dt=1e-3), 1000, save_every=50).forward()
     expected = np.minimum(0.3 * G * frames.times, 1.5)
@@ -73,7 +73,7 @@ def test_friction_never_adds_energy(solver, speed):
     for sign in (1, -1):
         scene = points(
             tetrahedron(resting_gap(G)),
-            ds.Ground(friction=0.8, friction_speed=1e-3),
+            ds.Ground(stiffness=1e4, friction=0.8, friction_speed=1e-3),
             terms=[ds.Gravity(-G)],
             initial_velocities=[sign * speed, 0, 0.3 * speed],
         )
@@ -90,7 +90,7 @@ def test_friction_work_is_what_the_energy_loses(solver):
     """mu N times the way that was slid, while kinetic energy falls by as much."""
     scene = points(
         tetrahedron(resting_gap(G)),
-        ds.Ground(friction=0.25, friction_speed=1e-4),
+        ds.Ground(stiffness=1e4, friction=0.25, friction_speed=1e-4),
         terms=[ds.Gravity(-G)],
         initial_velocities=[1.2, 0, -0.5],
     )
@@ -103,7 +103,9 @@ def test_friction_work_is_what_the_energy_loses(solver):
 @solvers
 def test_static_and_sliding_are_one_continuous_law(solver):
     """Row 46: the velocity after friction is C1 in the velocity before: no jump in gradients where sticking ends."""
-    scene = points(tetrahedron(resting_gap(G)), ds.Ground(friction=0.5, friction_speed=0.05), terms=[ds.Gravity(-G)])
+    scene = points(
+        tetrahedron(resting_gap(G)), ds.Ground(stiffness=1e4, friction=0.5, friction_speed=0.05), terms=[ds.Gravity(-G)]
+    )
     rollout = ds.Rollout(solver(scene, dt=2e-3), 1 if solver.order == 1 else 2, gradients=["initial_velocities"])
     found, ends = [], []
     for speed in np.linspace(0.03, 0.09, 61):  # sticking ends at 0.05 + 0.5 g dt
@@ -126,7 +128,7 @@ def test_two_rough_walls_act_one_after_the_other(solver):
     wall = ds.HalfSpace([-resting_gap(5.0), 0, 0], [1, 0, 0], stiffness=1e4, friction=0.6)
     scene = points(
         tetrahedron(resting_gap(G)),
-        [ds.Ground(friction=0.6), wall],
+        [ds.Ground(stiffness=1e4, friction=0.6), wall],
         terms=[ds.Gravity([-5.0, -G, 2.0])],
         fixed=[1, 2, 3],
     )

@@ -121,7 +121,9 @@ def test_energy_never_grows(solver, damping):
 def test_no_speed_is_too_large(solver, dt):
     """The table of speeds that a force cannot hold beyond 3.7 m/s, and at long steps not at all: the damped stage can."""
     for speed in (1.0, 4.0, 16.0):
-        scene = points(tetrahedron(0.3 * speed * dt + 0.03), ds.Ground(), initial_velocities=[0.1, -speed, 0])
+        scene = points(
+            tetrahedron(0.3 * speed * dt + 0.03), ds.Ground(stiffness=1e4), initial_velocities=[0.1, -speed, 0]
+        )
         own = solver(scene, dt=dt, contact_damping=1.0, allow_unstable=True)
         frames = ds.Rollout(own, max(3, int(0.1 / speed / dt)), save_every=1).forward()
         assert frames.positions[:, :3, 1].min() > 0 and frames.contact_resolution.smallest_gap > 0
@@ -277,14 +279,16 @@ def test_every_shape(name):
     ],
 )
 def test_refused(options, message):
-    scene = points(tetrahedron(0.1), ds.Ground())
+    scene = points(tetrahedron(0.1), ds.Ground(stiffness=1e4))
     with pytest.raises(ValueError, match=message):
         ds.SemiImplicitSolver(scene, dt=1e-3, **options)
 
 
 def test_options_go_along():
     """A solver made anew for another scene keeps how it treats contact."""
-    force = with_options(ds.VelocityVerletSolver, contact="force")(points(tetrahedron(0.1), ds.Ground()), dt=1e-3)
+    force = with_options(ds.VelocityVerletSolver, contact="force")(
+        points(tetrahedron(0.1), ds.Ground(stiffness=1e4)), dt=1e-3
+    )
     assert ds.VelocityVerletSolver(force.scene, dt=1e-3).stages_contact and not force.stages_contact
     rollout = ds.Rollout(ds.SemiImplicitSolver(force.scene, dt=1e-3, contact_damping=0.7), 2).with_scene(
         precision="f32"

@@ -538,18 +538,24 @@ def test_terms_can_be_copied_and_pickled():
 
 def test_names_that_are_refused():
     with pytest.raises(ValueError, match=r"two terms have the name 'it': Ground\(name='it', .*Gravity\(name='it'"):
-        scene(terms=[ds.Ground(-1.0, name="it"), ds.Gravity(name="it")])
-    ground = ds.Ground(-1.0, name="floor")
+        scene(terms=[ds.Ground(-1.0, stiffness=1e4, name="it"), ds.Gravity(name="it")])
+    ground = ds.Ground(-1.0, stiffness=1e4, name="floor")
     with pytest.raises(ValueError, match="two terms have the name 'floor'"):
         scene(terms=[ground, ground])
     for name in ("", "left wall", "a.b", 3):
         with pytest.raises(ValueError, match=r"Ground: name must be a word such as 'floor', got "):
-            ds.Ground(-1.0, name=name)
+            ds.Ground(-1.0, stiffness=1e4, name=name)
 
 
 def test_names_without_and_with():
     """A term with a name does not count among those that are numbered."""
-    of = scene(terms=[ds.Ground(-1.0, name="low"), ds.Ground(-2.0), ds.Ground(-3.0)])
+    of = scene(
+        terms=[
+            ds.Ground(-1.0, stiffness=1e4, name="low"),
+            ds.Ground(-2.0, stiffness=1e4),
+            ds.Ground(-3.0, stiffness=1e4),
+        ]
+    )
     found = [list(of.input_names(term).values())[0] for term in of.terms]
     assert found == ["low.height", "ground_height", "ground_height_2"]
 

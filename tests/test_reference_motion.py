@@ -608,7 +608,11 @@ def test_ground_beyond_its_width_is_not_felt(solver, precision):
     for gap, felt in ((0.01 * (1 + 1e-6), False), (0.05, False), (0.0099, True)):
         mesh = standing_tetrahedron(0.0)
         scene = ds.Scene(
-            mesh, ds.StableNeoHookean(E, 0.3), RHO, terms=[ds.Ground(height=-gap, width=0.01)], precision=precision
+            mesh,
+            ds.StableNeoHookean(E, 0.3),
+            RHO,
+            terms=[ds.Ground(stiffness=1e4, height=-gap, width=0.01)],
+            precision=precision,
         )
         simulator = ds.Simulator(solver(scene, dt=1e-3))
         simulator.run(3)
@@ -624,7 +628,10 @@ def test_weight_at_rest_on_the_ground(solver, mass, gap):
     """R22: each of three vertices carries m g; the body settles with drag."""
     mesh = standing_tetrahedron(0.009)
     scene = ds.Scene(
-        mesh, ds.StableNeoHookean(E, 0.3), 3 * mass / mesh.volume, terms=[ds.Gravity(-G), ds.Drag(20.0), ds.Ground()]
+        mesh,
+        ds.StableNeoHookean(E, 0.3),
+        3 * mass / mesh.volume,
+        terms=[ds.Gravity(-G), ds.Drag(20.0), ds.Ground(stiffness=1e4)],
     )
     dt = 0.3 * solver(scene, dt=1e-9).stable_dt().dt
     end = ds.Rollout(solver(scene, dt=dt, allow_unstable=True), int(4 / dt)).forward()
@@ -638,7 +645,11 @@ def test_barrier_bounce(solver, v, d_min, omega):
     """R23: vertices of 1 kg, nearly free of each other, fly into the barrier and come back as fast."""
     mesh = standing_tetrahedron(0.02)
     scene = ds.Scene(
-        mesh, ds.LinearElastic(1e-6, 0.0), 4 / mesh.volume, terms=[ds.Ground()], initial_velocities=[0, -v, 0]
+        mesh,
+        ds.LinearElastic(1e-6, 0.0),
+        4 / mesh.volume,
+        terms=[ds.Ground(stiffness=1e4)],
+        initial_velocities=[0, -v, 0],
     )
     dt = 0.05 / omega
     frames = run(scene, solver, dt, int(0.04 / v / dt))
@@ -650,7 +661,9 @@ def test_barrier_bounce(solver, v, d_min, omega):
 @pytest.mark.parametrize("solver", FORCE + KEEPING)
 def test_block_bounces_without_losing_energy(solver):
     mesh = ds.TetrahedralMesh.create_box(2).translated([0, 0.1, 0])
-    scene = ds.Scene(mesh, ds.StableNeoHookean(E, 0.3), 100.0, terms=[ds.Gravity(), ds.Ground(width=0.05)])
+    scene = ds.Scene(
+        mesh, ds.StableNeoHookean(E, 0.3), 100.0, terms=[ds.Gravity(), ds.Ground(stiffness=1e4, width=0.05)]
+    )
     simulator = ds.Simulator(solver(scene, dt=1e-4))
     start, energies, heights = simulator.compute_energy(), [], []
     for _ in range(100):
@@ -664,7 +677,7 @@ def test_block_bounces_without_losing_energy(solver):
 
 
 def test_energy_adds_up():
-    scene = oscillator(0.3, terms=[ds.Gravity(), ds.Ground(height=-1.0)], initial_velocities=[0.5, 0, 0])
+    scene = oscillator(0.3, terms=[ds.Gravity(), ds.Ground(stiffness=1e4, height=-1.0)], initial_velocities=[0.5, 0, 0])
     energy = ds.Simulator(ds.SemiImplicitSolver(scene, dt=1e-3)).compute_energy()
     m, mu, volume = masses(scene)[3], E / 2.6, scene.mesh.volume
     assert energy.parts["kinetic"] == pytest.approx(0.5 * m * 0.25, rel=1e-14)

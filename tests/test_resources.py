@@ -297,7 +297,9 @@ def test_absent_features_take_no_memory():
     assert not (features.forces or features.motion) and features.uniform
     assert np.prod(bare.coefficients.shape) == len(bare.law.coefficient_names)  # one block for all tetrahedra
     full = workspace(
-        small(terms=[ds.Ground(-1), ds.ExternalForce([0, 0, 0])], fixed="xmin", motion=lambda t: [0, 0, 0])
+        small(
+            terms=[ds.Ground(-1, stiffness=1e4), ds.ExternalForce([0, 0, 0])], fixed="xmin", motion=lambda t: [0, 0, 0]
+        )
     ).arrays
     n = full.num_vertices
     assert full.surface.shape == full.rest.shape == full.force_slot.shape == full.motion_slot.shape == (n,)
@@ -322,7 +324,7 @@ def test_absent_contact_leaves_no_code(solver, monkeypatch):
     mesh = ds.TetrahedralMesh.create_box(2)
     ds.Simulator(solver(ds.Scene(mesh, material, terms=[ds.Gravity()]), dt=1e-3)).run(2)
     assert looked_up == []
-    ds.Simulator(solver(ds.Scene(mesh, material, terms=[ds.Ground(-1.0)]), dt=1e-3)).run(2)
+    ds.Simulator(solver(ds.Scene(mesh, material, terms=[ds.Ground(-1.0, stiffness=1e4)]), dt=1e-3)).run(2)
     assert looked_up
 
 

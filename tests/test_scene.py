@@ -100,18 +100,26 @@ REFUSED = {
     "drag per vertex": (lambda: ds.Drag([1.0, 2.0]), "Drag: rate must be one number"),
     "ground kappa": (lambda: ds.Ground(stiffness=0.0), r"Ground: stiffness \[N/m\] must be > 0, got 0"),
     "ground kappa negative": (lambda: ds.Ground(stiffness=-1.0), r"Ground: stiffness \[N/m\] must be > 0, got -1"),
+    "ground per area": (
+        lambda: ds.Ground(stiffness_per_area=0.0),
+        r"Ground: stiffness_per_area \[N/m\^3\] must be > 0, got 0",
+    ),
+    "ground twice": (
+        lambda: ds.Ground(stiffness=1e4, stiffness_per_area=1e6),
+        r"stiffness \[N/m\] of each vertex and stiffness_per_area \[N/m\^3\] exclude each other, got 10000.0 and 1000000.0",
+    ),
     "ground width": (lambda: ds.Ground(width=0.0), r"Ground: width \[m\] must be > 0, got 0"),
     "ground nan": (lambda: ds.Ground(height=np.nan), "Ground: ground_height must be finite"),
     "starts below the ground": (
-        lambda: scene(terms=[ds.Ground(height=0.25)]),
+        lambda: scene(terms=[ds.Ground(height=0.25, stiffness=1e4)]),
         r"vertex \d+ is at -0.25 m above y = 0.25 \(9 vertices\); lift the body",
     ),
     "starts on the ground": (
-        lambda: scene(terms=[ds.Ground(height=0.0)]),
+        lambda: scene(terms=[ds.Ground(height=0.0, stiffness=1e4)]),
         r"starts below or on the ground: vertex \d+ is at 0 m",
     ),
     "moved below the ground": (
-        lambda: scene(terms=[ds.Ground(height=-0.5)], initial_positions=MESH.vertices - [0, 1, 0]),
+        lambda: scene(terms=[ds.Ground(height=-0.5, stiffness=1e4)], initial_positions=MESH.vertices - [0, 1, 0]),
         "at -0.5 m above y = -0.5",
     ),
     "forces' shape": (
@@ -188,8 +196,10 @@ def test_refused(case):
         lambda: scene(initial_velocities=[1.0, 2.0, 3.0]),
         lambda: scene(terms=ds.Gravity()),
         lambda: scene(density=np.full(M, 2.0)),
-        lambda: scene(terms=[ds.Ground(height=-0.005)]),  # within the barrier's width: allowed
-        lambda: scene(terms=[ds.Ground(height=-1.0), ds.Ground(height=-2.0)]),  # contacts may be several
+        lambda: scene(terms=[ds.Ground(stiffness=1e4, height=-0.005)]),  # within the barrier's width: allowed
+        lambda: scene(
+            terms=[ds.Ground(stiffness=1e4, height=-1.0), ds.Ground(stiffness=1e4, height=-2.0)]
+        ),  # contacts may be several
         lambda: scene(fixed=[]),
         lambda: scene(fixed="xmin", motion=lambda t: np.zeros((9, 3))),
         lambda: scene(material=ds.StableNeoHookean(np.linspace(1e4, 1e5, 2 * M)[::2], 0.3)),  # not contiguous
@@ -290,7 +300,7 @@ def test_describe():
 
 
 def test_inputs_are_named_after_the_scene():
-    of = scene(terms=[ds.Gravity(), ds.Ground(height=-1), ds.Ground(height=-2)])
+    of = scene(terms=[ds.Gravity(), ds.Ground(stiffness=1e4, height=-1), ds.Ground(stiffness=1e4, height=-2)])
     assert of.inputs.names[:5] == (
         "initial_positions",
         "initial_velocities",

@@ -192,7 +192,9 @@ def test_a_state_from_outside_is_looked_at_between_its_vertices():
 
 
 def test_errors_name_the_step_of_the_simulator():
-    scene = ds.Scene(cube(2), SOFT, terms=[ds.Ground(-0.03)], initial_velocities=(0, -1, 0), precision="f64")
+    scene = ds.Scene(
+        cube(2), SOFT, terms=[ds.Ground(-0.03, stiffness=1e4)], initial_velocities=(0, -1, 0), precision="f64"
+    )
     simulator = ds.Simulator(ds.ImplicitEulerSolver(scene, dt=1e-2, substeps=2, max_iterations=1))
     with pytest.raises(ds.NotConverged, match=r"^step 2, t = 0.02 s"):
         simulator.run(9)

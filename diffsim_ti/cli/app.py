@@ -116,7 +116,12 @@ def simulate(
     ] = None,
     ground: Annotated[bool, typer.Option(help="a floor at y = 0, the body above it")] = True,
     height: Annotated[float | None, typer.Option(help="of the lowest point [m]; default a tenth of the size")] = None,
-    ground_stiffness: Annotated[float | None, typer.Option(help="[N/m]; default from the impact's pressure")] = None,
+    ground_stiffness_per_area: Annotated[
+        float | None, typer.Option(help="[N/m^3]; default from the impact's pressure")
+    ] = None,
+    ground_stiffness: Annotated[
+        float | None, typer.Option(help="of each vertex [N/m], instead of that per area")
+    ] = None,
     ground_width: Annotated[float | None, typer.Option(help="[m]; default 1 % of the size")] = None,
     azimuth: Annotated[float, typer.Option(help="where pictures are taken from, about y [degrees]")] = 32.0,
     backend: Backend = "cpu",
@@ -152,6 +157,7 @@ def simulate(
         ground_stiffness,
         ground_width,
         volume=volume,
+        stiffness_per_area=ground_stiffness_per_area,
     )
     frames = max(1, round(duration * fps))
     run = ForwardRun(scene, kind, duration / frames, dt)

@@ -103,15 +103,17 @@ def make_ground(
     speed: float,
     stiffness: float | None = None,
     width: float | None = None,
+    stiffness_per_area: float | None = None,
 ) -> Ground:
-    """The floor y = 0 for a body that meets it at `speed` [m/s]: width 1 % of the size, stiffness from the impact."""
+    """The floor y = 0 for a body that meets it at `speed` [m/s]: width 1 % of the size, stiffness per area [N/m^3] from the
+    impact, unless that of each vertex is given [N/m]."""
     from diffsim_ti.terms import Ground
-    from diffsim_ti.terms.obstacles.stiffness import barrier_stiffness
+    from diffsim_ti.terms.obstacles.stiffness import stiffness_of_impact
 
     width = 0.01 * np.ptp(mesh.bounding_box, 0).max() if width is None else width
-    if stiffness is None:
-        stiffness = barrier_stiffness(mesh, material, density, gravity, speed, width)
-    return Ground(0.0, stiffness, width)
+    if stiffness is None and stiffness_per_area is None:
+        stiffness_per_area = stiffness_of_impact(mesh, material, density, gravity, speed, width)
+    return Ground(0.0, stiffness, width, stiffness_per_area=stiffness_per_area)
 
 
 def fall_scene(
@@ -128,11 +130,12 @@ def fall_scene(
     width: float | None = None,
     extra: Sequence[Term] = (),
     volume: str = "tetrahedra",
+    stiffness_per_area: float | None = None,
 ) -> tuple[Scene, TetrahedralMesh]:
     """(scene, body): a body let go above the floor y = 0, its lowest point at `height` [m], default a tenth of its size.
 
-    fixed: as `fixed_vertices` takes them; stiffness, width: the floor's barrier, see `make_ground`; extra: more terms;
-    volume: as `Scene` takes it.
+    fixed: as `fixed_vertices` takes them; stiffness, stiffness_per_area, width: the floor's barrier, see `make_ground`;
+    extra: more terms; volume: as `Scene` takes it.
     """
     from diffsim_ti.scene import Scene
     from diffsim_ti.terms import Drag, Gravity
@@ -142,7 +145,7 @@ def fall_scene(
         low, height = body.bounding_box[0, 1], 0.1 * np.ptp(body.bounding_box, 0).max() if height is None else height
         body = body.translated([0, height - low, 0])
         speed = np.sqrt(min(velocity[1], 0) ** 2 + 2 * abs(gravity) * max(height, 0))
-        terms.append(make_ground(body, law, density, gravity, speed, stiffness, width))
+        terms.append(make_ground(body, law, density, gravity, speed, stiffness, width, stiffness_per_area))
     fixed = fixed_vertices(body, list(fixed or []))
     return Scene(body, law, density, terms + list(extra), fixed, initial_velocities=velocity, volume=volume), body
 

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from diffsim_ti.inputs import links
 from diffsim_ti.inputs.chain import Chain, Link
 from diffsim_ti.inputs.description import POSITIVE, Input, frozen, length, speed
+from diffsim_ti.inputs.surface_areas import SurfaceAreas
 from diffsim_ti.rows import Rows
 
 if TYPE_CHECKING:
@@ -28,6 +29,7 @@ class Derived:
     rest: np.ndarray  # (num_vertices, 3) [m]
     gradients: np.ndarray  # (num_tetrahedra, 3, 3), rows grad N_1..3 [1/m]
     volumes: np.ndarray  # (num_tetrahedra,) [m^3]
+    surface: np.ndarray | None = None  # (num_vertices,) of the surface, 0 within [m^2]
     forces: np.ndarray | None = None  # (1 or steps, k, 3) [N]
     motion: np.ndarray | None = None  # (steps + 1, num_fixed, 3) [m]
     path: np.ndarray | None = None  # displacements of obstacles, (steps + 1, num_moving, 3) [m]
@@ -109,6 +111,8 @@ class Inputs:
             links.LumpedMass(mesh.tetrahedra, mesh.num_vertices),
             *scene.material.links(),
         ]
+        if any(term.acts_on_surface for term in scene.terms):
+            out.append(SurfaceAreas(mesh.surface_triangles, mesh.num_vertices))
         for k, term in enumerate(scene.ordered_terms):
             own, rows = f"numbers of term {k}", self.parameters.of(term)
             links_of = term.links(named[term], own)

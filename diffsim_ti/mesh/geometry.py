@@ -39,6 +39,22 @@ def shape_gradients(inverse_D: np.ndarray) -> np.ndarray:
     return np.concatenate([-inverse_D.sum(1, keepdims=True), inverse_D], 1)
 
 
+def triangle_normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Normals of triangles, as long as the area [m^2], shape (num_triangles, 3)."""
+    a, b, c = (vertices[triangles[:, k]] for k in range(3))
+    return np.cross(b - a, c - a) / 2
+
+
+def triangle_areas_vjp(vertices: np.ndarray, triangles: np.ndarray, areas_adj: np.ndarray) -> np.ndarray:
+    """Adjoints of vertices, shape (num_vertices, 3), for those of areas."""
+    x, normals = vertices[triangles], triangle_normals(vertices, triangles)
+    unit = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    slopes = np.cross(unit[:, None], np.roll(x, -2, 1) - np.roll(x, -1, 1)) / 2  # dA/dx_a = N x (x_c - x_b) / 2
+    out = np.zeros_like(vertices)
+    np.add.at(out, triangles, areas_adj[:, None, None] * slopes)
+    return out
+
+
 def rotation_matrix(rotation, angle: float | None) -> np.ndarray:
     """The matrix of a turn about the axis `rotation` by angle [rad], or `rotation` itself; ValueError if it is none.
 

@@ -176,11 +176,10 @@ class Guard:
         speed = float(np.linalg.norm(ws.velocity_of(vertex)))
         enough = min(0.1 * float(term.values["barrier_width"]) / max(speed, 1e-300), 0.5 * solver.substep)
         stiffness = self._stiffness_needed(k, vertex, speed)
-        remedy = (
-            f"reduce the substep to {enough:.3g} s (a tenth of the barrier's width)"
-            if stiffness is None
-            else f"the barrier cannot stop it at any step: raise its stiffness to {stiffness:.3g} N/m, or its width"
-        )
+        remedy = f"reduce the substep to {enough:.3g} s (a tenth of the barrier's width)"
+        if stiffness is not None:
+            stiffer = ws.arrays.stiffer(k, [vertex], stiffness)
+            remedy = f"the barrier cannot stop it at any step: raise its {stiffer}, or its width"
         raise Crossing(
             f"step {step}, t = {step * solver.dt:.6g} s: vertex {vertex} gets {depth:.3g} m behind {term!r} within a "
             f"substep of {solver.substep:.4g} s, at {speed:.4g} m/s: {remedy}; the state before is kept",
@@ -199,7 +198,7 @@ class Guard:
         """
         arrays = self.ws.arrays
         force, first, _ = arrays.obstacles[k]
-        stiffness, width = (float(arrays.values.parameters[first + force.count + m]) for m in (0, 1))
+        stiffness, width = arrays.stiffness_of(k, [vertex]), float(arrays.values.parameters[first + force.count + 1])
         self.ws.place_obstacles(self.good_pass)
         offset = runtime.fetch(arrays.offsets)[3 * k].astype(np.float64)
         position = arrays.values.rest[vertex] + runtime.fetch(self.ws.state.u)[0, vertex]

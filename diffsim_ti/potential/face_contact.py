@@ -7,8 +7,8 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
+from diffsim_ti.potential.face_kernels import face_kernels
 from diffsim_ti.potential.face_lattice import face_rows
-from diffsim_ti.potential.faces import face_points
 
 
 class FaceContact:
@@ -24,7 +24,7 @@ class FaceContact:
         a, (*rows, reach, weight) = self.a, face_rows(self.a.mesh, self.a.contacts)
         self.face_start, self.face_next, self.face_parts = (runtime.upload(x.ravel(), ti.i32) for x in rows)
         self.face_reach, self.face_weight = (runtime.upload(x.ravel(), a.fp) for x in (reach, weight))
-        self.kernels, self.parallel = face_points(a.features(), a.precision, parallel), parallel
+        self.kernels, self.parallel = face_kernels(a.features(), a.precision, parallel), parallel
         self._out = SimpleNamespace(
             contact=runtime.array(a.fp, a.num_vertices),
             y=runtime.array(a.vector, 1, a.num_vertices),

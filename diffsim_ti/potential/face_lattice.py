@@ -3,6 +3,9 @@
 import numpy as np
 import taichi as ti
 
+from diffsim_ti.mesh import geometry
+from diffsim_ti.terms.obstacles import barrier
+
 FLAT, BENT = 0.02, 0.12
 PER_WIDTH, MOST_PARTS = 4, 64  # lattice points along a width; along the side of a face
 REACH = 0.65  # of the distance of lattice points: from what lies between them to the nearest, faces being stretched a little
@@ -29,6 +32,41 @@ def fade_curvature(t, fp: ti.template()):
     return 60 * per * per * r * (1 - r) * (1 - 2 * r)
 
 
+# F = beta(s) phi(t), or per area (beta(s) - beta(s + t)) phi(t), and its derivatives
+
+
+@ti.func
+def point_energy(s, t, per_area: ti.template(), fp: ti.template()):
+    """F"""
+    b = barrier.value(s, fp)
+    if ti.static(per_area):
+        b -= barrier.value(s + t, fp)
+    return b * fade(t, fp)
+
+
+@ti.func
+def point_slopes(s, t, per_area: ti.template(), fp: ti.template()):
+    """dF/ds, dF/dt"""
+    b, b1, p, p1 = barrier.value(s, fp), barrier.slope(s, fp), fade(t, fp), fade_slope(t, fp)
+    by_s, by_t = b1 * p, b * p1
+    if ti.static(per_area):
+        c, c1 = barrier.value(s + t, fp), barrier.slope(s + t, fp)
+        by_s, by_t = (b1 - c1) * p, (b - c) * p1 - c1 * p
+    return by_s, by_t
+
+
+@ti.func
+def point_curvatures(s, t, per_area: ti.template(), fp: ti.template()):
+    """d2F/ds2, d2F/dsdt, d2F/dt2"""
+    b, b1, b2 = barrier.value(s, fp), barrier.slope(s, fp), barrier.curvature(s, fp)
+    p, p1, p2 = fade(t, fp), fade_slope(t, fp), fade_curvature(t, fp)
+    ss, st, tt = b2 * p, b1 * p1, b * p2
+    if ti.static(per_area):
+        c, c1, c2 = barrier.value(s + t, fp), barrier.slope(s + t, fp), barrier.curvature(s + t, fp)
+        ss, st, tt = (b2 - c2) * p, (b1 - c1) * p1 - c2 * p, (b - c) * p2 - (c1 + c1) * p1 - c2 * p
+    return ss, st, tt
+
+
 def face_rows(mesh, terms) -> tuple[np.ndarray, ...]:
     """(start, next, parts, reach, weight): the faces around vertex i are start[i] .. start[i + 1]; of each, its two other
     corners and, for each obstacle, in how many parts the lattice cuts its sides, r [m] and c (faces.py)."""
@@ -43,3 +81,10 @@ def face_rows(mesh, terms) -> tuple[np.ndarray, ...]:
     apart = longest[:, None] / parts
     reach, weight = REACH * apart, (apart / widths) ** 2
     return start, np.stack([faces[f, (a + 1) % 3], faces[f, (a + 2) % 3]], 1), parts[f], reach[f], weight[f]
+
+
+def rest_of_areas(mesh, rest, by_rows) -> np.ndarray:
+    """Adjoint of the rest positions, shape (num_vertices, 3), for adjoints of the faces' areas by the rows above."""
+    faces = mesh.surface_triangles
+    by_faces = np.bincount(np.argsort(faces.ravel(), kind="stable") // 3, by_rows, len(faces))
+    return geometry.triangle_areas_vjp(rest, faces, by_faces)

@@ -1,40 +1,39 @@
 """What points within a face feel of an obstacle that its corners do not speak for.
 
-    E = c k w^2 beta((d - r) / w) phi(e / w),    e = sum_a s_a d_a - d
+    E = k c w^2 beta(s) phi(t),    s = (d - r) / w,    t = (sum_a s_a d_a - d) / w
 
 d [m]: distance of the point, whose shares of the corners are s_a; d_a: those of the corners; k, w, beta: the obstacle's
 stiffness, width and barrier (terms/obstacles/barrier.py); r: how far what lies between the points is from them; c: the
-square of their distance in widths, so that the points in a square of one width are together as stiff as a vertex. e is how
+square of their distance in widths, so that the points in a square of one width are together as stiff as a vertex. t is how
 much nearer the point is than its corners let expect: nothing before what is flat, hollow or far larger than the face, so
 that it costs nothing there; before a needle, an edge or a corner the point feels the obstacle as a vertex does. phi rises
-from 0 to 1 between e / w = FLAT and BENT and is C2.
+from 0 to 1 between t = FLAT and BENT and is C2.
+
+With a stiffness per area k, vertices and points are one integral over the surface. A vertex stands for a third of the
+faces around it, as if distances were linear within them; a point says how much more there is, on its area c at rest,
+
+    E = k c w^2 (beta(s) - beta(s + t)) phi(t)
+
+s + t being the distance that the corners let expect. The areas of a face's lattice points sum up to the face's, those of
+the corners included, and give each corner its third of it, so that nothing counts twice: where phi = 1 what the corners
+said of a point is taken back, and its own energy stands. The sum does not grow with the number of points.
 The points of a face lie on a lattice, a quarter of a width apart or closer, but for its largest number; corners are none of
 them.
 """
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
 
 import taichi as ti
 
-from diffsim_ti.potential.face_lattice import FLAT, fade, fade_curvature, fade_slope
-from diffsim_ti.runtime import Kernel
-from diffsim_ti.state.features import Features
-from diffsim_ti.state.numbers import ADJOINT, SCENE, TANGENT
+from diffsim_ti.potential.face_lattice import FLAT, point_curvatures, point_energy, point_slopes
 from diffsim_ti.state.obstacle_functions import ObstacleFunctions
-from diffsim_ti.terms.obstacles import barrier
 
 A = ti.template()
-PASS = dict(
-    walls="vectors", face_start="ints", face_next="ints", face_parts="ints", face_reach="scalars", face_weight="scalars"
-)
 
 
 @dataclass(frozen=True)
 class FacePoints(ObstacleFunctions):
     """Sums over the points of the faces around vertex i, each with what it says of that vertex."""
-
-    parallel: bool
 
     @property
     def rows(self):
@@ -97,10 +96,31 @@ class FacePoints(ObstacleFunctions):
                 for m in ti.static(range(4)):
                     X[a, m], u[a, m], w[a, m] = x[m], y[m], z[m]
             if own - ti.sqrt(size) < width + reach:
-                out += self.points_of_face(
-                    what, g, first, X, u, w, reach, pass_.face_weight[row], pass_.face_parts[row], i, scene, more
-                )
+                parts, weight, grown = pass_.face_parts[row], pass_.face_weight[row], ti.cast(0, self.fp)
+                if ti.static(g.force.per_area):
+                    normal, area = self.normal_of(scene.rest[i3[0]], scene.rest[i3[1]], scene.rest[i3[2]])
+                    weight = area / ti.cast(parts * parts, self.fp)  # of one of the small triangles
+                    if ti.static(what == "jvp"):
+                        for a in ti.static(range(3)):
+                            across = scene.rest[i3[(a + 2) % 3]] - scene.rest[i3[(a + 1) % 3]]
+                            slope = ti.cast(0.5, self.fp) / area * normal.cross(self.short(across))
+                            grown += slope.dot(self.short(more.rest[i3[a]]))
+                found = self.points_of_face(what, g, first, X, u, w, reach, weight, grown, parts, i, scene, more)
+                if ti.static(what == "numbers" and g.force.per_area and self.features.shape):
+                    more.face_areas[c] = more.face_areas[c] + found[0] / weight / ti.cast(parts * parts, self.fp)
+                out += found
         return out
+
+    @ti.func
+    def short(self, v):
+        return ti.Vector([v[0], v[1], v[2]])
+
+    @ti.func
+    def normal_of(self, a, b, c):
+        """(unit normal, area) of a triangle."""
+        n = self.short(b - a).cross(self.short(c - a))
+        size = ti.sqrt(n.norm_sqr())
+        return n / size, ti.cast(0.5, self.fp) * size
 
     @ti.func
     def unit(self, d, a: A):
@@ -127,8 +147,9 @@ class FacePoints(ObstacleFunctions):
         return out
 
     @ti.func
-    def points_of_face(self, what: A, g: A, first, X, u, w, reach, weight, parts, i, scene: A, more: A):
-        """The sum over the points of a face whose first corner is vertex i; X, u, w: rows of its corners."""
+    def points_of_face(self, what: A, g: A, first, X, u, w, reach, weight, grown, parts, i, scene: A, more: A):
+        """The sum over the points of a face whose first corner is vertex i; X, u, w: rows of its corners; grown: share by
+        which the weight changes. Of "numbers" the sum of force . at.w."""
         out, per, third = self.vector(0), ti.cast(1, self.fp) / ti.cast(parts, self.fp), ti.cast(1 / 3, self.fp)
         stiffness, width = scene.parameters[first + g.force.count], g.force.width(scene.parameters, first)
         corners, turns, middle = self.rows(0), self.rows(0), self.vector(0)  # (normal, distance) there, and its change
@@ -160,7 +181,24 @@ class FacePoints(ObstacleFunctions):
                         for b in ti.static(range(3)):
                             turns[b, m] = ti.select(a == b, t[m], turns[b, m])
             out = self.points_that_feel(
-                what, g, first, X, u, w, corners, turns, stiffness, weight, width, reach, parts, per, i, scene, more
+                what,
+                g,
+                first,
+                X,
+                u,
+                w,
+                corners,
+                turns,
+                stiffness,
+                weight,
+                grown,
+                width,
+                reach,
+                parts,
+                per,
+                i,
+                scene,
+                more,
             )
         return out
 
@@ -176,7 +214,8 @@ class FacePoints(ObstacleFunctions):
         corners,
         turns,
         stiffness,
-        weight,
+        one,
+        thicker,
         width,
         reach,
         parts,
@@ -196,32 +235,38 @@ class FacePoints(ObstacleFunctions):
                 s = (now[3] - reach) / width
                 t = (s0 * corners[0, 3] + s1 * corners[1, 3] + s2 * corners[2, 3] - now[3]) / width
                 if x + y > 0 and s < 1 and t > ti.cast(FLAT, self.fp):
-                    b = barrier.value(s, self.fp)
-                    b1 = barrier.slope(s, self.fp)
-                    b2 = barrier.curvature(s, self.fp)
-                    p, p1, p2 = fade(t, self.fp), fade_slope(t, self.fp), fade_curvature(t, self.fp)
+                    weight = one
+                    if ti.static(g.force.per_area):
+                        weight = ti.select(x > 0 and y > 0, one + one, one)  # the face beyond an edge has its own half
                     scale = 0 - s0 * weight * stiffness * width
                     if ti.static(what == "energy"):
-                        out[0] += s0 * weight * stiffness * width * width * b * p
+                        F = point_energy(s, t, g.force.per_area, self.fp)
+                        out[0] += s0 * weight * stiffness * width * width * F
                     elif ti.static(what == "force"):
-                        out += scale * (b1 * p * now + b * p1 * (c0 - now))
+                        Fs, Ft = point_slopes(s, t, g.force.per_area, self.fp)
+                        out += scale * (Fs * now + Ft * (c0 - now))
                     elif ti.static(what == "numbers"):
+                        Fs, Ft = point_slopes(s, t, g.force.per_area, self.fp)
+                        Fss, Fst, Ftt = point_curvatures(s, t, g.force.per_area, self.fp)
                         along, across = now.dot(w0), (c0 - now).dot(w0)  # w0 has no fourth component
-                        by_s = scale * (b2 * p * along + b1 * p1 * across)
-                        by_t = scale * (b1 * p1 * along + b * p2 * across)
-                        f = scale * (b1 * p * along + b * p1 * across)
-                        by_now = scale * (b1 * p - b * p1) * w0
+                        by_s = scale * (Fss * along + Fst * across)
+                        by_t = scale * (Fst * along + Ftt * across)
+                        f = scale * (Fs * along + Ft * across)
+                        by_now = scale * (Fs - Ft) * w0
                         by_now[3] = (by_s - by_t) / width
                         g.force.outlook_vjp(scene.parameters, first, Xs, us, by_now, more.sums, i)
                         for m in ti.static(range(3)):
-                            by[0, m] += scale * b * p1 * w0[m]
+                            by[0, m] += scale * Ft * w0[m]
                         by[0, 3] += s0 * by_t / width
                         by[1, 3] += s1 * by_t / width
                         by[2, 3] += s2 * by_t / width
                         at_k, at_w = first + g.force.count, first + g.force.count + 1
                         more.sums[at_k, i] = more.sums[at_k, i] + f / stiffness
                         more.sums[at_w, i] = more.sums[at_w, i] + (f - s * by_s - t * by_t) / width
+                        out[0] += f
                     else:
+                        Fs, Ft = point_slopes(s, t, g.force.per_area, self.fp)
+                        Fss, Fst, Ftt = point_curvatures(s, t, g.force.per_area, self.fp)
                         dn = self.turn(what, g, first, Xs, us, self.mix(s0, s1, s2, w), scene, more)
                         ds = dn[3] / width
                         dt = (s0 * turns[0, 3] + s1 * turns[1, 3] + s2 * turns[2, 3] - dn[3]) / width
@@ -229,13 +274,13 @@ class FacePoints(ObstacleFunctions):
                         if ti.static(what == "jvp"):
                             dwidth = more.parameters[first + g.force.count + 1] / width
                             ds, dt = ds - s * dwidth, dt - t * dwidth
-                            grown = more.parameters[first + g.force.count] / stiffness + dwidth
+                            grown = thicker + more.parameters[first + g.force.count] / stiffness + dwidth
                         out += scale * (
-                            (b2 * p * ds + b1 * p1 * dt) * now
-                            + b1 * p * dn
-                            + (b1 * p1 * ds + b * p2 * dt) * (c0 - now)
-                            + b * p1 * (t0 - dn)
-                            + grown * (b1 * p * now + b * p1 * (c0 - now))
+                            (Fss * ds + Fst * dt) * now
+                            + Fs * dn
+                            + (Fst * ds + Ftt * dt) * (c0 - now)
+                            + Ft * (t0 - dn)
+                            + grown * (Fs * now + Ft * (c0 - now))
                         )
         if ti.static(what == "numbers"):
             for a in range(3):
@@ -245,91 +290,3 @@ class FacePoints(ObstacleFunctions):
         if ti.static(what != "energy"):
             out[3] = 0
         return out
-
-    # ---- kernels -----------------------------------------------------------------------------------------------------
-
-    def _kernel(self, name: str, body, **arrays) -> Kernel:
-        own = dict(scene=SCENE, pass_=PASS, at=dict(u="vectors2", w="vectors2")) | arrays
-        return Kernel(name, body, self.precision, own, dict(num_vertices="int"))
-
-    @ti.func
-    def all_energies(self, scene: A, pass_: A, at: A, out: A, plan: A):
-        ti.loop_config(serialize=not self.parallel)
-        for i in range(plan.num_vertices):
-            out.contact[i] = self.around("energy", i, scene, pass_, at, at)[0]
-
-    @cached_property
-    def energy(self) -> Kernel:
-        """Energy [J], each vertex with its share of the points around."""
-        return self._kernel("face_energy", self.all_energies, out=dict(contact="scalars"))
-
-    @ti.func
-    def all_forces(self, scene: A, pass_: A, at: A, out: A, plan: A):
-        ti.loop_config(serialize=not self.parallel)
-        for i in range(plan.num_vertices):
-            out.y[0, i] = self.around("force", i, scene, pass_, at, at)
-
-    @cached_property
-    def forces(self) -> Kernel:
-        return self._kernel("face_forces", self.all_forces, out=dict(y="vectors2"))
-
-    @ti.func
-    def all_products(self, scene: A, pass_: A, at: A, out: A, plan: A):
-        ti.loop_config(serialize=not self.parallel)
-        for i in range(plan.num_vertices):
-            out.y[0, i] = self.around("product", i, scene, pass_, at, at)
-
-    @cached_property
-    def product(self) -> Kernel:
-        """y = df/du w"""
-        return self._kernel("face_product", self.all_products, out=dict(y="vectors2"))
-
-    @ti.func
-    def all_blocks(self, scene: A, pass_: A, at: A, out: A, plan: A):
-        ti.loop_config(serialize=not self.parallel)
-        for i in range(plan.num_vertices):
-            for d in range(3):
-                out.blocks[d, i] = 0 - self.around("column", i, scene, pass_, at, d)
-
-    @cached_property
-    def blocks(self) -> Kernel:
-        """The 3x3 diagonal blocks of -df/du, by columns."""
-        return self._kernel("face_blocks", self.all_blocks, out=dict(blocks="vectors2"))
-
-    @ti.func
-    def all_jvp(self, scene: A, pass_: A, at: A, out: A, tangent: A, plan: A):
-        ti.loop_config(serialize=not self.parallel)
-        for i in range(plan.num_vertices):
-            out.y[0, i] = self.around("jvp", i, scene, pass_, at, tangent)
-
-    @cached_property
-    def jvp(self) -> Kernel:
-        """Change y of the forces for changes w of the displacement and of everything else that they depend on."""
-        own = dict(out=dict(y="vectors2"), tangent=TANGENT | dict(walls="vectors"))
-        return self._kernel("face_jvp", self.all_jvp, **own)
-
-    @ti.func
-    def all_vjp(self, scene: A, pass_: A, at: A, out: A, adjoint: A, plan: A):
-        ti.loop_config(serialize=not self.parallel)
-        for i in range(plan.num_vertices):
-            out.y[0, i] = self.vector(0)
-            for g in ti.static(self.features.groups):
-                if ti.static(not g.force.hollow):
-                    for k in range(g.count):
-                        by_u, n = self.around_one("product", g, k, i, scene, pass_, at, at), 3 * (g.number + k)
-                        self.around_one("numbers", g, k, i, scene, pass_, at, adjoint)
-                        adjoint.walls[n, i] = adjoint.walls[n, i] - by_u
-                        self.add_to_rest(i, by_u, adjoint)
-                        out.y[0, i] = out.y[0, i] + by_u
-
-    @cached_property
-    def vjp(self) -> Kernel:
-        """y = df/du w; adds the adjoints of all else that forces depend on."""
-        own = dict(out=dict(y="vectors2"), adjoint=ADJOINT | dict(walls="vectors2"))
-        return self._kernel("face_vjp", self.all_vjp, **own)
-
-
-@lru_cache(maxsize=None)
-def face_points(features: Features, precision: str, parallel: bool) -> FacePoints:
-    """Kernels for a scene's features."""
-    return FacePoints(features, precision, parallel)

@@ -32,7 +32,7 @@ class ObstaclePotential(ObstacleFunctions):
         for g in ti.static(self.features.groups):
             for k in range(g.count):
                 X = self.rest_now(g, k, i, scene, pass_)
-                value += g.force.energy(scene.parameters, g.first + k * g.size, X, u)
+                value += self.on_area(g, i, g.force.energy(scene.parameters, g.first + k * g.size, X, u), scene)
         return value
 
     @ti.func
@@ -42,7 +42,8 @@ class ObstaclePotential(ObstacleFunctions):
         for g in ti.static(self.features.groups):
             for k in range(g.count):
                 X = self.rest_now(g, k, i, scene, pass_)
-                f += g.force.force_jvp(scene.parameters, g.first + k * g.size, X, u, zero, w, zero)
+                change = g.force.force_jvp(scene.parameters, g.first + k * g.size, X, u, zero, w, zero)
+                f += self.on_area(g, i, change, scene)
         return f
 
     # ---- with friction -----------------------------------------------------------------------------------------------
@@ -69,27 +70,33 @@ class ObstaclePotential(ObstacleFunctions):
         for g in ti.static(self.features.groups):
             for k in range(g.count):
                 first = g.first + k * g.size
-                value += g.force.energy(scene.parameters, first, self.rest_now(g, k, i, scene, pass_), u)
+                held = g.force.energy(scene.parameters, first, self.rest_now(g, k, i, scene, pass_), u)
+                value += self.on_area(g, i, held, scene)
                 if ti.static(g.force.friction):
                     if self.is_rubbed(g, k, i, scene, pass_):
                         v, wall = self.velocity(i, u, pass_, plan), pass_.walls[3 * (g.number + k) + 2]
                         X = self.rest_before(g, k, i, scene, pass_)
                         lost = g.force.dissipation(scene.parameters, first, X, pass_.lag[0, i], v, wall)
-                        value += lost / plan.per_gamma
+                        value += self.on_area(g, i, lost, scene) / plan.per_gamma
         return value
 
     @ti.func
     def whole_force(self, i, u, scene: A, pass_: A, plan: A):
-        f, zero = self.vector(0), self.vector(0)
+        f = self.vector(0)
         for g in ti.static(self.features.groups):
             for k in range(g.count):
-                first = g.first + k * g.size
-                f += g.force.force(scene.parameters, first, self.rest_now(g, k, i, scene, pass_), u, zero)
-                if ti.static(g.force.friction):
-                    if self.is_rubbed(g, k, i, scene, pass_):
-                        v, wall = self.velocity(i, u, pass_, plan), pass_.walls[3 * (g.number + k) + 2]
-                        X = self.rest_before(g, k, i, scene, pass_)
-                        f += g.force.rub(scene.parameters, first, X, pass_.lag[0, i], v, wall)
+                f += self.on_area(g, i, self.force_of_one(g, k, i, u, scene, pass_, plan), scene)
+        return f
+
+    @ti.func
+    def force_of_one(self, g: A, k, i, u, scene: A, pass_: A, plan: A):
+        first, zero = g.first + k * g.size, self.vector(0)
+        f = g.force.force(scene.parameters, first, self.rest_now(g, k, i, scene, pass_), u, zero)
+        if ti.static(g.force.friction):
+            if self.is_rubbed(g, k, i, scene, pass_):
+                v, wall = self.velocity(i, u, pass_, plan), pass_.walls[3 * (g.number + k) + 2]
+                X = self.rest_before(g, k, i, scene, pass_)
+                f += g.force.rub(scene.parameters, first, X, pass_.lag[0, i], v, wall)
         return f
 
     @ti.func
@@ -100,12 +107,13 @@ class ObstaclePotential(ObstacleFunctions):
             for k in range(g.count):
                 first = g.first + k * g.size
                 X = self.rest_now(g, k, i, scene, pass_)
-                f += g.force.force_jvp(scene.parameters, first, X, u, zero, w, zero)
+                change = g.force.force_jvp(scene.parameters, first, X, u, zero, w, zero)
                 if ti.static(g.force.friction):
                     if self.is_rubbed(g, k, i, scene, pass_):
                         v, wall = self.velocity(i, u, pass_, plan), pass_.walls[3 * (g.number + k) + 2]
                         before, dv = self.rest_before(g, k, i, scene, pass_), plan.per_gamma * w
-                        f += g.force.rub_product(scene.parameters, first, before, pass_.lag[0, i], v, wall, dv)
+                        change += g.force.rub_product(scene.parameters, first, before, pass_.lag[0, i], v, wall, dv)
+                f += self.on_area(g, i, change, scene)
         return f
 
     # ---- derivatives by everything -----------------------------------------------------------------------------------
@@ -135,6 +143,9 @@ class ObstaclePotential(ObstacleFunctions):
                 f += g.force.rub_jvp(
                     scene.parameters, first, before, pass_.lag[0, i], v, wall, tangent.parameters, du_before, dv, dwall
                 )
+        f = self.on_area(g, i, f, scene)
+        if ti.static(g.force.per_area):
+            f += tangent.surface[i] * self.force_of_one(g, k, i, u, scene, pass_, plan)
         return f
 
     @ti.func
@@ -148,6 +159,9 @@ class ObstaclePotential(ObstacleFunctions):
     @ti.func
     def vjp_of_one(self, g: A, k, i, u, w, scene: A, pass_: A, adjoint: A, plan: A):
         n, first, zero = 3 * (g.number + k), g.first + k * g.size, self.vector(0)
+        if ti.static(g.force.per_area and self.features.shape):
+            self.add_to_area(g, i, self.force_of_one(g, k, i, u, scene, pass_, plan).dot(w), adjoint)
+        w = self.on_area(g, i, w, scene)
         X = self.rest_now(g, k, i, scene, pass_)
         by_u, _ = g.force.force_vjp(scene.parameters, first, X, u, zero, w)
         by = g.force.parameter_derivatives(scene.parameters, first, X, u, zero)

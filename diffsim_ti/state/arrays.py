@@ -1,5 +1,7 @@
 """The numbers of one scene on the device, and the states of one run."""
 
+from dataclasses import replace
+
 import numpy as np
 import taichi as ti
 
@@ -10,7 +12,7 @@ from diffsim_ti.runtime import LANES
 from diffsim_ti.state.features import Features, grouped
 from diffsim_ti.state.numbers import TANGENT, on_device
 from diffsim_ti.state.schedule import Schedule
-from diffsim_ti.terms import Drag, ExternalForce, Gravity, SelfContact
+from diffsim_ti.terms import Drag, ExternalForce, Gravity, Obstacle, SelfContact
 
 
 def vertex_corners(tetrahedra: np.ndarray, num_vertices: int) -> tuple[np.ndarray, np.ndarray]:
@@ -96,9 +98,7 @@ class SceneArrays:
             num_corners += len(mesh.surface_vertices)
         self.start, self.corner_of = runtime.upload(start, ti.i32), runtime.upload(corner_of, ti.i32)
         self.corner = runtime.array(self.vector, num_corners)
-        self.surface = self.force_slot = self.motion_slot = runtime.array(ti.i32, 1)
-        if self.contacts:
-            self.surface = runtime.upload(np.isin(np.arange(n), mesh.surface_vertices), ti.i32)
+        self.force_slot = self.motion_slot = runtime.array(ti.i32, 1)
         if scene.term(ExternalForce):
             self.force_slot = runtime.upload(slots(scene.term(ExternalForce).indices(mesh), n), ti.i32)
         if scene.motion is not None:
@@ -113,6 +113,8 @@ class SceneArrays:
         for term in self.contacts:
             rows = scene.inputs.parameters.of(term)
             twin = term.kernel(scene.precision, **(dict(table=at) if term.table.size else {}))
+            if isinstance(term, Obstacle):
+                twin = replace(twin, per_area=term.per_area)
             if twin.size != rows.stop - rows.start:  # it would read, and add to, another term's rows
                 raise AssertionError(
                     f"the kernel of {term!r} has {twin.size} numbers, its term {rows.stop - rows.start}"
@@ -162,6 +164,23 @@ class SceneArrays:
         for name, data in rows.items():
             runtime.fill(getattr(self, name), data)
             self.rows[name] = data
+
+    # ---- the stiffness of obstacles ----------------------------------------------------------------------------------
+
+    def area_of(self, obstacle: int, vertices) -> float:
+        """What the stiffness of an obstacle is multiplied by: the vertices' mean area [m^2], or 1 where it is theirs."""
+        per_area = self.obstacles[obstacle][0].per_area
+        return float(self.values.surface[list(vertices)].mean()) if per_area else 1.0
+
+    def stiffness_of(self, obstacle: int, vertices) -> float:
+        """Stiffness [N/m] of an obstacle's barrier at vertices, on average."""
+        twin, first, _ = self.obstacles[obstacle]
+        return float(self.values.parameters[first + twin.count]) * self.area_of(obstacle, vertices)
+
+    def stiffer(self, obstacle: int, vertices, stiffness: float) -> str:
+        """In words, the number of an obstacle that gives its barrier a stiffness [N/m] at vertices."""
+        value, per_area = stiffness / self.area_of(obstacle, vertices), self.obstacles[obstacle][0].per_area
+        return f"stiffness_per_area to {value:.3g} N/m^3" if per_area else f"stiffness to {value:.3g} N/m"
 
     def _inverse_mass(self, mass: np.ndarray) -> np.ndarray:
         """1 / m of the vertices that move freely, 0 of the others."""

@@ -87,6 +87,12 @@ class Features:
     def rough_backwards(self) -> tuple[ObstacleGroup, ...]:
         return self.rough[::-1]
 
+    @property
+    def areas(self) -> bool:
+        """Whether adjoints of the surface's areas are wanted: the rest shape decides about them."""
+        return self.shape and any(group.force.per_area for group in self.groups)
+
     def sums(self) -> Rows:
         """Rows of the per-vertex adjoint sums: those of the parameters stand as the parameters do."""
-        return Rows({"parameters": self.num_parameters, "mass": int(self.density), "rest": 3 * self.shape})
+        sizes = {"mass": int(self.density), "rest": 3 * self.shape, "surface": int(self.areas)}
+        return Rows({"parameters": self.num_parameters} | sizes)

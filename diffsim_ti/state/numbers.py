@@ -47,12 +47,13 @@ PARTS = {
     "mass": Part("scalars", _given("mass")),
     "parameters": Part("scalars", _given("parameters")),
     "rest": Part("vectors", _given("rest")),
+    "surface": Part("scalars", _given("surface")),
     "forces": Part("vectors2", _given("forces"), _whole),
     "motion": Part("vectors2", _given("motion"), _whole),
     "anchor": Part("vectors", _anchor, _whole),
     "path": Part("vectors2", _given("path"), _whole),
 }
-TOPOLOGY = dict.fromkeys(("tets", "start", "corner_of", "surface", "force_slot", "motion_slot"), "ints")
+TOPOLOGY = dict.fromkeys(("tets", "start", "corner_of", "force_slot", "motion_slot"), "ints")
 TANGENT = {name: part.kind for name, part in PARTS.items()}
 SCENE = TOPOLOGY | TANGENT | dict(inverse_mass="scalars", corner="vectors")  # all that a kernel may read of a scene
 del SCENE["mass"]
@@ -71,7 +72,9 @@ def on_device(arrays, name: str, derived: Derived):
     kind = PARTS[name].kind
     element = {"blocks": arrays.lanes, "scalars": arrays.fp}.get(kind, arrays.vector)
     data = PARTS[name].pack(arrays, derived)
-    return np.zeros((1, 1, 3) if kind == "vectors2" else (1, 3)) if data is None else data, element
+    if data is None:
+        data = np.zeros({"vectors2": (1, 1, 3), "scalars": (1,)}.get(kind, (1, 3)))
+    return data, element
 
 
 class Tangent:
@@ -118,6 +121,8 @@ class Adjoint:
             out.mass = sums[rows.first("mass")]
         if features.shape:
             out.rest = sums[rows.of("rest")].T
+        if features.areas:
+            out.surface = sums[rows.first("surface")]
         for name in self._names:
             missing = getattr(out, name, None) is None or (name in ("gradients", "volumes") and not features.shape)
             if name in PARTS and not missing:

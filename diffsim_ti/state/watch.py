@@ -148,8 +148,11 @@ class ContactWatch:
 
     def _depths(self, travel: np.ndarray, values: Derived, h: float) -> np.ndarray:
         """Depths in the barriers, in widths, that stop vertices with these speeds: m v^2 / 2 = k w^2 beta(1 - depth)."""
+        area = np.where(values.surface > 0, values.surface, 1.0)
         stiffness = [
-            values.parameters[first + twin.count] if twin.watched else 1.0 for twin, first, _ in self._obstacles
+            (values.parameters[first + twin.count] if twin.watched else 1.0)
+            * (area if twin.per_area else np.ones_like(area))
+            for twin, first, _ in self._obstacles
         ]
-        energy = values.mass * travel**2 / (2 * h * h * np.array(stiffness)[:, None])
+        energy = values.mass * travel**2 / (2 * h * h * np.array(stiffness))
         return np.interp(energy, STOPPED, DEPTHS) + 1e-12

@@ -14,7 +14,7 @@ from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.study.charts import COLORS, new_figure, save, write_csv, write_json
 from diffsim_ti.study.problems import beam_scene, lame_scene
 from diffsim_ti.terms import Gravity, Ground
-from diffsim_ti.terms.obstacles.stiffness import barrier_stiffness
+from diffsim_ti.terms.obstacles.stiffness import stiffness_of_impact
 
 
 @dataclass
@@ -67,7 +67,7 @@ def bouncing_block(precision: str) -> Scene:
     mesh = TetrahedralMesh.create_cube(4, 0.2, "five").rotated((0.3, 0.2, 1.0), 0.6)
     mesh = mesh.translated((0, 0.05 - mesh.vertices[:, 1].min(), 0))
     law = SmithNeoHookean(1e5, 0.3)
-    floor = Ground(0.0, barrier_stiffness(mesh, law, 1000.0, 9.81, 1.0, 0.01), 0.01)
+    floor = Ground(0.0, width=0.01, stiffness_per_area=stiffness_of_impact(mesh, law, 1000.0, 9.81, 1.0, 0.01))
     return Scene(mesh, law, 1000.0, [Gravity(), floor], precision=precision)
 
 

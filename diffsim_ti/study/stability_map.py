@@ -16,7 +16,7 @@ from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.solvers.stable_step import start_workspace
 from diffsim_ti.terms import Ground, Term
 from diffsim_ti.terms.obstacles.obstacle import Obstacle
-from diffsim_ti.terms.obstacles.stiffness import barrier_stiffness
+from diffsim_ti.terms.obstacles.stiffness import stiffness_of_impact
 
 OUTCOMES = ("accurate", "bounded", "loses energy", "raises", "wrong silently")  # "raises": or warns
 ACCURATE = 0.01  # change of the total energy, over the energy that moves
@@ -68,8 +68,8 @@ def body(
 def impact(speed: float) -> Scene:
     """The cube 2 mm above a barrier 5 mm wide that is as stiff as the impact asks for, moving down."""
     still = body()
-    stiffness = barrier_stiffness(still.mesh, still.material, 1000.0, 0.0, speed, 0.005)
-    return body(lift=0.007, speed=speed, terms=[Ground(0.0, stiffness, 0.005)])
+    stiffness = stiffness_of_impact(still.mesh, still.material, 1000.0, 0.0, speed, 0.005)
+    return body(lift=0.007, speed=speed, terms=[Ground(0.0, width=0.005, stiffness_per_area=stiffness)])
 
 
 AXES = {

@@ -107,8 +107,8 @@ class VertexForce(ABC):
 
     precision: str
     size = 0
-    # of obstacles only (obstacle.py): is there friction, are nearness and crossing noted?
-    friction, watched = False, False
+    # of obstacles only (obstacle.py): is there friction, is stiffness per area, are nearness and crossing noted?
+    friction, per_area, watched = False, False, False
 
     @property
     def fp(self):

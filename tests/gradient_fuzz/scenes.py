@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 import diffsim_ti as ds
+from diffsim_ti.inputs.surface_areas import SurfaceAreas
 
 from . import bodies
 from .obstacles import MESH_WIDTH, Placed, place, push_direction
@@ -106,7 +107,7 @@ def build(seed: int, precision: str | None = None) -> Configuration:
     mass = np.bincount(mesh.tetrahedra.ravel(), np.repeat(density * mesh.volumes / 4 * np.ones(mesh.num_tetrahedra), 4))
     beat = 2e-3 if kind.static else dt / substeps if kind.explicit else duration / 25
     stiff = mass.min() * (rng.uniform(0.15, 0.4) / beat) ** 2 / 35  # omega dt at a fifth of the width
-    placed, paths, push = _obstacles(kind, rng, start, fixed, stiff, duration)
+    placed, paths, push = _obstacles(kind, rng, mesh, start, fixed, stiff, duration)
 
     terms = [p.term for p in placed]
     if kind.gravity:
@@ -169,7 +170,7 @@ def _schedule(kind, rng, mesh, E, density, bent) -> tuple[int, int, float]:
     return steps, substeps, float(5 * substep * substeps)
 
 
-def _obstacles(kind, rng, start, fixed, stiff, duration) -> tuple[list, list, np.ndarray]:
+def _obstacles(kind, rng, mesh, start, fixed, stiff, duration) -> tuple[list, list, np.ndarray]:
     """(obstacles, their paths, the direction in which the first of them pushes)."""
     free = np.setdiff1d(np.arange(len(start)), [] if fixed is None else fixed)
     placed, paths, push = [], [], None
@@ -181,6 +182,9 @@ def _obstacles(kind, rng, start, fixed, stiff, duration) -> tuple[list, list, np
         push = n if push is None else push
         width = MESH_WIDTH if o.name == "MeshObstacle" else CELL * rng.uniform(0.25, 0.5)
         options = dict(stiffness=stiff * rng.uniform(0.3, 1.0))
+        if o.per_area:  # no vertex's barrier is stiffer
+            largest = SurfaceAreas(mesh.surface_triangles, mesh.num_vertices).value(mesh.vertices)[0].max()
+            options = dict(stiffness_per_area=options["stiffness"] / largest)
         if o.friction:
             typical = 0.05 * CELL / duration
             options |= dict(friction=rng.uniform(0.1, 0.8), friction_speed=typical * 10 ** rng.uniform(-1.0, 0.8))

@@ -26,6 +26,7 @@ class ObstacleKind:
     name: str
     friction: bool
     path: bool
+    per_area: bool  # its stiffness
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,7 @@ class Structure:
         return self.solver is ds.StaticSolver
 
     def __str__(self) -> str:
-        kinds = [k.name + " rough" * k.friction + " moving" * k.path for k in self.obstacles]
+        kinds = [k.name + " rough" * k.friction + " moving" * k.path + " per area" * k.per_area for k in self.obstacles]
         flags = ("self_contact", "gravity", "drag", "fixed", "motion", "uniform")
         words = [name for name in flags if getattr(self, name)]
         how = f"{self.contact} {self.contact_damping:g}" if self.explicit else "potential"
@@ -88,7 +89,10 @@ def structure(number: int) -> Structure:
     names = [turn(OBSTACLES, 4 * number + k, 4) for k in range(max(count, int(static)))]
     if len(names) > 1 and rng.random() < 0.25:
         names[1] = names[0]  # two of a kind
-    obstacles = tuple(ObstacleKind(name, rng.random() < 0.65, rng.random() < 0.45) for name in names)
+    obstacles = tuple(
+        ObstacleKind(name, rng.random() < 0.65, rng.random() < 0.45, turn((True, True, False), 4 * number + k, 8))
+        for k, name in enumerate(names)
+    )
     fixed = static or rng.random() < 0.5
     precision = "f32" if rng.random() < 0.2 else "f64"
     volume = "patches" if rng.random() < 0.2 else "tetrahedra"

@@ -71,7 +71,9 @@ class ContactStage(ObstacleStages):
                         else:
                             row = ROWS * (g.number + k)
                             state.stage[row + PLANE, i] = plane
-                            state.stage[row + FELT, i] = stage.numbers(g.force, scene.parameters, first)
+                            felt = stage.numbers(g.force, scene.parameters, first)
+                            felt.x = self.on_area(g, i, felt.x, scene)
+                            state.stage[row + FELT, i] = felt
                             state.stage[row + WALL, i] = wall
         return near
 
@@ -195,8 +197,11 @@ class ContactStage(ObstacleStages):
                 change = stage.push_jvp(
                     g.force, scene.parameters, first, X, u, own, plan.contact_damping, tangent.parameters, moved, dmove
                 )
-                state.stage[row + SEED, i] = change
                 pushed = state.stage[row + PUSH, i]
+                change.w = self.on_area(g, i, change.w, scene)
+                if ti.static(g.force.per_area):
+                    change.w = change.w + pushed.x / scene.surface[i] * tangent.surface[i]
+                state.stage[row + SEED, i] = change
                 total += pushed.x * self.normal(change) + change.w * self.normal(state.stage[row + PLANE, i])
         return total
 
@@ -328,6 +333,9 @@ class ContactStage(ObstacleStages):
                 own = z - now.h * self.speed(g, k, now, scene.path)
                 by_n = self.normal(seed) + pushed.x * total_adj
                 by_push = seed.w + self.normal(state.stage[row + PLANE, i]).dot(total_adj)
+                if ti.static(g.force.per_area):
+                    self.add_to_area(g, i, by_push * pushed.x / scene.surface[i], adjoint)
+                by_push = self.on_area(g, i, by_push, scene)
                 by_u, by_own, by = stage.push_vjp(
                     g.force, scene.parameters, first, X, u, own, plan.contact_damping, by_n, by_push
                 )

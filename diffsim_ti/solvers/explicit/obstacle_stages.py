@@ -84,7 +84,8 @@ class ObstacleStages(ObstacleFunctions):
             approach = g.force.approach(scene.parameters, first, X, u, move)
             reached = ti.min(d, d + approach)
             if reached < width:
-                omega2 = scene.inverse_mass[i] * g.force.rigidity(scene.parameters, first, X, u)
+                rigidity = self.on_area(g, i, g.force.rigidity(scene.parameters, first, X, u), scene)
+                omega2 = scene.inverse_mass[i] * rigidity
                 state.seen[at, i] = ti.min(state.seen[at, i], reached)
                 state.seen[at + 1, i] = ti.max(state.seen[at + 1, i], now.h * now.h * omega2)
                 state.seen[at + 2, i] = ti.max(state.seen[at + 2, i], ti.abs(approach) / width)
@@ -97,7 +98,7 @@ class ObstacleStages(ObstacleFunctions):
         for g in ti.static(self.features.pressing):
             for k in range(g.count):
                 X = scene.rest[i] - self.place(g, k, now, scene.path)
-                f += g.force.force(scene.parameters, g.first + k * g.size, X, u, v)
+                f += self.on_area(g, i, g.force.force(scene.parameters, g.first + k * g.size, X, u, v), scene)
         return f
 
     @ti.func
@@ -108,10 +109,12 @@ class ObstacleStages(ObstacleFunctions):
                 first = g.first + k * g.size
                 X = scene.rest[i] - self.place(g, k, now, scene.path)
                 dX = tangent.rest[i] - self.place(g, k, now, tangent.path)
-                df += g.force.force_jvp(scene.parameters, first, X, u, v, du + dX, dv)
+                df += self.on_area(g, i, g.force.force_jvp(scene.parameters, first, X, u, v, du + dX, dv), scene)
                 by = g.force.parameter_derivatives(scene.parameters, first, X, u, v)
                 for m in ti.static(range(g.size)):
-                    df += by[m] * tangent.parameters[first + m]
+                    df += self.on_area(g, i, by[m], scene) * tangent.parameters[first + m]
+                if ti.static(g.force.per_area):
+                    df += tangent.surface[i] * g.force.force(scene.parameters, first, X, u, v)
         return df
 
     @ti.func
@@ -121,13 +124,17 @@ class ObstacleStages(ObstacleFunctions):
             for k in range(g.count):
                 first = g.first + k * g.size
                 X = scene.rest[i] - self.place(g, k, now, scene.path)
-                by_u, by_v = g.force.force_vjp(scene.parameters, first, X, u, v, f_adj)
+                w = self.on_area(g, i, f_adj, scene)
+                by_u, by_v = g.force.force_vjp(scene.parameters, first, X, u, v, w)
                 u_adj += by_u
                 v_adj += by_v
                 self.add_to_path(g, k, i, now, by_u, self.vector(0), adjoint)
                 by = g.force.parameter_derivatives(scene.parameters, first, X, u, v)
                 for m in ti.static(range(g.size)):
-                    adjoint.sums[first + m, i] = adjoint.sums[first + m, i] + by[m].dot(f_adj)
+                    adjoint.sums[first + m, i] = adjoint.sums[first + m, i] + by[m].dot(w)
+                if ti.static(g.force.per_area and self.features.shape):
+                    pushed = g.force.force(scene.parameters, first, X, u, v)
+                    self.add_to_area(g, i, pushed.dot(f_adj), adjoint)
                 self.add_to_rest(i, by_u, adjoint)
         return u_adj, v_adj
 
@@ -140,7 +147,8 @@ class ObstacleStages(ObstacleFunctions):
         X = scene.rest[i] - self.place(g, k, now, scene.path)
         if g.force.touches(scene.parameters, first, X, u):
             wall = self.speed(g, k, now, scene.path)
-            after = g.force.slide(scene.parameters, first, X, u, v, wall, now.h * scene.inverse_mass[i])
+            h_over_m = self.on_area(g, i, now.h * scene.inverse_mass[i], scene)
+            after = g.force.slide(scene.parameters, first, X, u, v, wall, h_over_m)
         return after
 
     @ti.func
@@ -163,8 +171,8 @@ class ObstacleStages(ObstacleFunctions):
     def slide_jvp(self, i, u, v, du, dv, now: A, scene: A, tangent: A):
         """Change of the velocity after friction, v and dv being those before it."""
         inverse = scene.inverse_mass[i]
-        h_over_m = now.h * inverse
         for g in ti.static(self.features.rough):
+            h_over_m = self.on_area(g, i, now.h * inverse, scene)
             for k in range(g.count):
                 first = g.first + k * g.size
                 X = scene.rest[i] - self.place(g, k, now, scene.path)
@@ -172,6 +180,8 @@ class ObstacleStages(ObstacleFunctions):
                     moved = du + tangent.rest[i] - self.place(g, k, now, tangent.path)
                     wall, dwall = self.speed(g, k, now, scene.path), self.speed(g, k, now, tangent.path)
                     lighter = -h_over_m * inverse * tangent.mass[i]
+                    if ti.static(g.force.per_area):
+                        lighter += now.h * inverse * tangent.surface[i]
                     dv = g.force.slide_jvp(
                         scene.parameters, first, X, u, v, wall, h_over_m, tangent.parameters, moved, dv, dwall, lighter
                     )
@@ -182,8 +192,8 @@ class ObstacleStages(ObstacleFunctions):
     def slide_vjp(self, i, u, v, v_adj, now: A, scene: A, adjoint: A):
         """Adjoints of u and of the velocity v before friction, for the adjoint of that after it; adds those of all else."""
         inverse, u_adj = scene.inverse_mass[i], self.vector(0)
-        h_over_m = now.h * inverse
         for g in ti.static(self.features.rough_backwards):
+            h_over_m = self.on_area(g, i, now.h * inverse, scene)
             for back in range(g.count):
                 k = g.count - 1 - back
                 first = g.first + k * g.size
@@ -200,6 +210,7 @@ class ObstacleStages(ObstacleFunctions):
                     if ti.static(self.features.density):
                         row = ti.static(self.features.sums().first("mass"))
                         adjoint.sums[row, i] = adjoint.sums[row, i] - h_over_m * inverse * by_ratio
+                    self.add_to_area(g, i, now.h * inverse * by_ratio, adjoint)
                     self.add_to_rest(i, by_u, adjoint)
                     self.add_to_path(g, k, i, now, by_u, by_wall, adjoint)
         return u_adj, v_adj

@@ -10,7 +10,8 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.inputs import Derived
-from diffsim_ti.potential.faces import face_points
+from diffsim_ti.potential.face_kernels import face_kernels
+from diffsim_ti.potential.face_lattice import rest_of_areas
 from diffsim_ti.potential.kernels import potential_kernels
 from diffsim_ti.solvers.implicit.linear import Operator, solve_symmetric
 from diffsim_ti.solvers.implicit.threads import one_blas_thread
@@ -86,7 +87,8 @@ class ImplicitAdjoint(_Passes):
             self._law = SimpleNamespace(z=self.z, corner=corner, y=y)
         self._vjp = self.kernels.vjp.bind(a.in_lanes, **own)
         if p.faces:
-            faces = face_points(self.features, a.precision, workspace.parallel)
+            faces = face_kernels(self.features, a.precision, workspace.parallel)
+            self.face_areas = runtime.array(a.fp, 3 * len(a.mesh.surface_triangles) if self.features.areas else 1)
             self._vjp_of_faces = p.faces.bind(faces.vjp, adjoint=(self, self.numbers))
 
     def fits(self, workspace) -> bool:
@@ -101,6 +103,8 @@ class ImplicitAdjoint(_Passes):
             runtime.fill(self.z, 0)
         if self.ws.pairs:
             self.ws.pairs.clear_sums()
+        if self.ws.potential.faces:
+            runtime.fill(self.face_areas, 0)
         a = self.ws.arrays
         self.frames = tuple(np.asarray(x, np.float64) for x in (positions_adj, velocities_adj))
         self.p, self.q = self.frames[0][-1].copy(), self.frames[1][-1].copy()
@@ -223,6 +227,9 @@ class ImplicitAdjoint(_Passes):
         if self.ws.pairs:
             out.parameters[a.parameters_of_self_contact], by_pairs = self.ws.pairs.collect()
             rest = rest + by_pairs
+        if self.ws.potential.faces and features.areas:
+            by_areas = runtime.fetch(self.face_areas).astype(np.float64)
+            rest = rest + rest_of_areas(a.mesh, a.values.rest, by_areas)
         out.rest = rest + out.rest
         out.forces, out.motion, out.path = self.forces, self.motion, self.path
         if self.motion is not None:

@@ -35,7 +35,7 @@ class Blocked(NotConverged):
         if met is None or met.obstacle >= len(ws.way.terms):
             return error
         term, gap = ws.way.terms[met.obstacle], ws.gap_of(met, u)
-        width, stiffness = (float(ws.number_of(met.obstacle, name)) for name in ("width", "stiffness"))
+        width, stiffness = ws.width_of(met.obstacle), ws.arrays.stiffness_of(met.obstacle, met.vertices)
         if gap > cls.near * width:
             return error
         R = ws.newton.residual_at(u)[list(met.vertices)]
@@ -43,7 +43,7 @@ class Blocked(NotConverged):
         needed = -force / (width * slope_at(cls.firm))
         weak = needed > stiffness
         remedy = (
-            f"the barrier cannot stop it: raise its stiffness to {needed:.3g} N/m, or its width"
+            f"the barrier cannot stop it: raise its {ws.arrays.stiffer(met.obstacle, met.vertices, needed)}, or its width"
             if weak
             else f"take substeps of {ws.solver.substep / 4:.3g} s"
         )

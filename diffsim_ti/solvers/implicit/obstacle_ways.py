@@ -71,7 +71,6 @@ class ObstacleWays:
         near = self.way.nearest(u, self._walls[::3], self.way.widest)
         return near.value if near is not None else self.way.widest
 
-    def number_of(self, obstacle: int, name: str) -> float:
-        """The barrier's "stiffness" [N/m] or "width" [m] of an obstacle, as loaded."""
-        twin, first, _ = self.arrays.obstacles[obstacle]
-        return self.arrays.values.parameters[first + twin.count + (name == "width")]
+    def width_of(self, obstacle: int) -> float:
+        """The width [m] of an obstacle's barrier, as loaded."""
+        return self.way.widths[obstacle]

@@ -14,15 +14,14 @@ from diffsim_ti.terms.obstacles.obstacle import Obstacle, ObstacleForce
 class Ground(Obstacle):
     """Floor y = height [m], felt by surface vertices through the barrier of their distance d = y - height.
 
-    Energy per vertex b(d) = -stiffness (d - width)^2 log(d / width) for d < width, exactly zero beyond, and its
-    second-order Taylor polynomial below width / 1000 (see barrier.py), so that a vertex that got past still is
-    pushed out. stiffness [N/m], width [m]; friction and path as for every `Obstacle`.
-    Inputs with gradient: "ground_height", "barrier_stiffness", "barrier_width", and with friction and path theirs.
-    Raises ValueError for stiffness <= 0, width <= 0, or a body that starts on or below the floor.
+    Stiffness per area [N/m^3] (default: the scene chooses it) or stiffness of every vertex [N/m], width [m], friction and
+    path as for every `Obstacle`.
+    Inputs with gradient: "ground_height", and those of every `Obstacle`.
+    Raises ValueError for numbers out of range, or a body that starts on or below the floor.
     Li et al. 2020, Incremental Potential Contact, doi:10.1145/3386569.3392425.
     """
 
-    def __init__(self, height: float = 0.0, stiffness: float | None = 1e4, width: float = 0.01, **options):
+    def __init__(self, height: float = 0.0, stiffness: float | None = None, width: float = 0.01, **options):
         super().__init__([Input("height", height, ((),), "m", plain="ground_height")], stiffness, width, **options)
 
     def distance(self, positions: np.ndarray) -> np.ndarray:

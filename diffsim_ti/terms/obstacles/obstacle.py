@@ -11,31 +11,37 @@ from diffsim_ti.terms.gravity import Gravity
 from diffsim_ti.terms.motion import Motion, sampled
 from diffsim_ti.terms.obstacles.obstacle_force import ObstacleForce
 from diffsim_ti.terms.obstacles.shapes import Triangles
-from diffsim_ti.terms.obstacles.stiffness import barrier_stiffness
+from diffsim_ti.terms.obstacles.stiffness import stiffness_of_impact
 from diffsim_ti.terms.term import Term
+
+PER_AREA = "barrier_stiffness_per_area"  # plain name of the input
 
 
 class Obstacle(Term):
     """A body that does not deform, felt by surface vertices through the barrier of their distance d [m] to it.
 
-    Energy per vertex b(d) = -stiffness (d - width)^2 log(d / width) for d < width, exactly zero beyond, and its
+    Energy of a vertex b(d) = -k (d - width)^2 log(d / width) for d < width, exactly zero beyond, and its
     second-order Taylor polynomial below width / 1000 (barrier.py), so that a vertex that got past is pushed out.
 
-    stiffness [N/m]: None lets the scene choose it from mass, wave speed, weight and impact (stiffness.py).
+    stiffness_per_area [N/m^3]: k is that times the vertex's area, a third of its surface triangles' at rest, so that gaps,
+    forces and friction are those of a surface and converge as it is refined. None lets the scene choose it from density,
+    wave speed, weight and impact (stiffness.py). Or
+    stiffness [N/m]: k of every vertex alike, however many there are.
     width [m]: how far the obstacle is felt.
     friction [-]: Coulomb's coefficient (friction.py); 0 compiles none. friction_speed [m/s]: the speed below which
     friction is smoothed, and with which a vertex that is held may creep.
     path: the obstacle's displacement over time [m], a function of time [s] that returns 3 numbers, or keyframes
     (times, displacements) between which it is linear. It is sampled at the steps and linear within each.
 
-    Inputs with gradient: the shape's own numbers, "barrier_stiffness", "barrier_width", with friction also "friction" and
-    "friction_speed", with a path "<shape>_path", shape (steps + 1, 3). A second obstacle's names end in _2; those of one
-    with a name begin with it and go on as the argument: "floor.stiffness", "floor.path".
+    Inputs with gradient: the shape's own numbers, "barrier_stiffness_per_area" or "barrier_stiffness", "barrier_width",
+    with friction also "friction" and "friction_speed", with a path "<shape>_path", shape (steps + 1, 3). A second
+    obstacle's names end in _2; those of one with a name begin with it and go on as the argument: "floor.stiffness",
+    "floor.path".
     In explicit steps frictions on one vertex act one after the other: kinds in a fixed order, obstacles of one kind as the
     scene lists them. Swapping two there, at 90 degrees to each other, moved a body by 7e-4 of the way that it went in 32 ms
     with substeps of 2 ms, and a gradient by up to 12 % (that of friction_speed); half of both with 1 ms. Elsewhere, and in
     implicit steps, swapping changes round-off alone.
-    Raises ValueError for numbers out of range, or a body that starts on or in the obstacle.
+    Raises ValueError for numbers out of range, both stiffnesses at once, or a body that starts on or in the obstacle.
     Li et al. 2020, Incremental Potential Contact, doi:10.1145/3386569.3392425.
     """
 
@@ -51,18 +57,31 @@ class Obstacle(Term):
         friction_speed: float = 1e-3,
         path: Motion | None = None,
         name: str | None = None,
+        stiffness_per_area: float | None = None,
     ):
         if isinstance(shape, dict):  # {name: value}, with nothing more to say of them
             shape = [Input(plain, value) for plain, value in shape.items()]
-        k, speed = 1.0 if stiffness is None else stiffness, positive("friction_speed", friction_speed, "m/s")
-        felt = positive("stiffness", k, "N/m", "barrier_stiffness"), positive("width", width, "m", "barrier_width")
+        stiff = self._stiffness(stiffness, stiffness_per_area)
+        speed, felt = positive("friction_speed", friction_speed, "m/s"), positive("width", width, "m", "barrier_width")
         friction_of = Input("friction", friction, ((),), range=NOT_NEGATIVE), speed
         for described in friction_of:  # also of what is smooth
             described.check_given(type(self).__name__)
         rough = friction_of if friction_of[0].value > 0 else ()
         rows = [Input("path", None, (("steps + 1", 3),), "m", change=length_per_step, plain=self.path_name)]
-        super().__init__(*shape, *felt, *rough, *(rows if path is not None else []), name=name)
-        self.chooses_stiffness, self.path = stiffness is None, path
+        super().__init__(*shape, stiff, felt, *rough, *(rows if path is not None else []), name=name)
+        self.path = path
+
+    def _stiffness(self, of_vertex: float | None, per_area: float | None) -> Input:
+        """How stiff the barrier is: per area, or of each vertex."""
+        self.per_area, self.chooses_stiffness = of_vertex is None, of_vertex is None and per_area is None
+        if not self.per_area:
+            if per_area is not None:
+                raise ValueError(
+                    f"{type(self).__name__}: stiffness [N/m] of each vertex and stiffness_per_area [N/m^3] exclude each "
+                    f"other, got {of_vertex} and {per_area}; pass one of them"
+                )
+            return positive("stiffness", of_vertex, "N/m", "barrier_stiffness")
+        return positive("stiffness_per_area", 1.0 if per_area is None else per_area, "N/m^3", PER_AREA)
 
     @property
     def path_name(self) -> str:
@@ -75,7 +94,7 @@ class Obstacle(Term):
         return "friction" in self.values
 
     def settled(self, scene, density, initial_positions, initial_velocities) -> "Obstacle":
-        """With the stiffness that the fall from the start, or the start's velocity, asks for."""
+        """With the stiffness per area that the fall from the start, or the start's velocity, asks for."""
         if not self.chooses_stiffness:
             return self
         gravity = scene.term(Gravity)
@@ -85,13 +104,13 @@ class Obstacle(Term):
         fall = max(float(self.gap(positions, place).min()), 0.0)
         start = 0.0 if initial_velocities is None else np.linalg.norm(np.atleast_2d(initial_velocities), axis=1).max()
         speed, width = float(np.sqrt(start**2 + 2 * g * fall)), float(self.values["barrier_width"])
-        stiffness = barrier_stiffness(scene.mesh, scene.material, float(np.mean(density)), g, speed, width)
+        stiffness = stiffness_of_impact(scene.mesh, scene.material, float(np.mean(density)), g, speed, width)
         if not stiffness > 0:
             raise ValueError(
                 f"{type(self).__name__}: without gravity and velocity nothing says how stiff the barrier must be; pass "
-                "stiffness [N/m]"
+                "stiffness_per_area [N/m^3]"
             )
-        return self.with_input("barrier_stiffness", value=stiffness)
+        return self.with_input(PER_AREA, value=stiffness)
 
     def distance(self, positions: np.ndarray) -> np.ndarray:
         """Distance [m] of each position, shape (k, 3), to the obstacle as it was made; negative inside."""
@@ -127,7 +146,7 @@ class Obstacle(Term):
 
     @property
     def variant(self) -> tuple:
-        return self.has_friction, self.path is not None
+        return self.has_friction, self.path is not None, self.per_area
 
     def kernel(self, precision: str) -> ObstacleForce:
         return self.twin(precision, self.has_friction)

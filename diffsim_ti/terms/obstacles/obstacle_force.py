@@ -1,6 +1,6 @@
 """The compile-time class of an obstacle: everything that kernels need of it, from its distance alone."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import taichi as ti
 
@@ -15,11 +15,13 @@ from diffsim_ti.terms.term import VertexForce
 class ObstacleForce(VertexForce):
     """Compile-time twin of an obstacle: `count` numbers of its shape, then stiffness, width [, friction, friction_speed].
 
+    per_area: whether stiffness is per area [N/m^3]; what is said here of a vertex is then said of one square metre.
     A shape writes one function, `distance_and_normal`, in numbers of a graph; everything else follows from it. Positions
     are relative to the obstacle: callers take its displacement from X.
     """
 
     friction: bool = False
+    per_area: bool = field(default=False, kw_only=True)
 
     count = 0
     watched = True

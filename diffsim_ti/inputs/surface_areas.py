@@ -1,0 +1,87 @@
+"""How much of a body's surface each of its vertices stands for, where it lies on something."""
+
+import numpy as np
+
+from diffsim_ti.inputs.chain import Link
+from diffsim_ti.mesh.geometry import triangle_normals
+
+
+class SurfaceAreas(Link):
+    """Of rest positions the area [m^2] of each vertex, 0 within the body.
+
+        a = tr(M^2) / tr(M),    M = sum over the triangles around of (theta / pi) A N (x) N
+
+    A, N: a triangle's area and unit normal; theta: its angle at the vertex, so that it is dealt out among its corners, by
+    the same shares however a square is cut in two. Where the surface is flat or bends little, a is the sum of these shares.
+    What counts at an edge is what faces one way: where a cube lies on its bottom, its sides carry nothing, and sides of
+    any height are not felt. a is the mean, over the surface around, of what faces the same way, by the square of the cosine.
+    """
+
+    reads, writes = ("rest",), ("surface",)
+
+    def __init__(self, triangles: np.ndarray, num_vertices: int):
+        self.triangles, self.num_vertices = triangles, num_vertices
+
+    def value(self, X):
+        return (self._areas(self._moments(*self._shapes(X)[:2])),)
+
+    def _shapes(self, X):
+        """(area times normal, angles, edges to the next corner, to the one after) of the triangles, by corners."""
+        x = X[self.triangles]
+        e, f = np.roll(x, -1, 1) - x, np.roll(x, -2, 1) - x
+        angles = np.arctan2(np.linalg.norm(np.cross(e, f), axis=2), (e * f).sum(2))
+        return triangle_normals(X, self.triangles), angles, e, f
+
+    def _moments(self, n, angles):
+        """M of each vertex."""
+        outer = n[:, :, None] * n[:, None, :] / np.linalg.norm(n, axis=1)[:, None, None]
+        return self._to_vertices(angles[:, :, None, None] / np.pi * outer[:, None])
+
+    def _areas(self, M):
+        total = np.trace(M, axis1=1, axis2=2)
+        return np.divide((M**2).sum((1, 2)), total, out=np.zeros_like(total), where=total > 0)
+
+    def _slopes(self, M):
+        """da/dM of each vertex."""
+        total = np.trace(M, axis1=1, axis2=2)[:, None, None]
+        rise = 2 * M - self._areas(M)[:, None, None] * np.eye(3)
+        return np.divide(rise, total, out=np.zeros_like(M), where=total > 0)
+
+    def _parts(self, X):
+        """What of da/dx comes by the corners of triangles: (da/d angle, da/d n, unit normals, edges e, f)."""
+        n, angles, e, f = self._shapes(X)
+        size = np.linalg.norm(n, axis=1)[:, None]
+        N, slopes = n / size, self._slopes(self._moments(n, angles))[self.triangles]
+        turned = np.einsum("tcij,tj->tci", slopes, N)
+        along = np.einsum("tci,ti->tc", turned, N)
+        by_n = angles[:, :, None] / np.pi * (2 * turned - along[:, :, None] * N[:, None])
+        return along * size / np.pi, by_n, N, e, f
+
+    def jvp(self, x, dx):
+        by_angle, by_n, N, e, f = self._parts(*x)
+        moved = dx[0][self.triangles]
+        de, df = np.roll(moved, -1, 1) - moved, np.roll(moved, -2, 1) - moved
+        by_e, by_f = _turn(N, e, f)
+        change = by_angle * ((by_e * de).sum(2) + (by_f * df).sum(2))
+        dn = (np.cross(de[:, 0], f[:, 0]) + np.cross(e[:, 0], df[:, 0])) / 2
+        return (self._to_vertices(change + np.einsum("tci,ti->tc", by_n, dn)),)
+
+    def vjp(self, x, y_adj):
+        by_angle, by_n, N, e, f = self._parts(*x)
+        own = y_adj[0][self.triangles]
+        by_e, by_f = ((own * by_angle)[:, :, None] * by for by in _turn(N, e, f))
+        by_corner = np.roll(by_e, 1, 1) + np.roll(by_f, 2, 1) - by_e - by_f
+        n_adj = np.einsum("tc,tci->ti", own, by_n)
+        by_corner += np.cross(np.roll(e, -1, 1) / -2, n_adj[:, None])
+        return (self._to_vertices(by_corner),)
+
+    def _to_vertices(self, by_corner: np.ndarray) -> np.ndarray:
+        out = np.zeros((self.num_vertices, *by_corner.shape[2:]))
+        np.add.at(out, self.triangles, by_corner)
+        return out
+
+
+def _turn(N, e, f):
+    """Derivatives of the angles between e and f by these."""
+    normal = N[:, None]
+    return -np.cross(normal, e) / (e**2).sum(2, keepdims=True), np.cross(normal, f) / (f**2).sum(2, keepdims=True)
