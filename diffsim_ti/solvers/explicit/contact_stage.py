@@ -211,11 +211,8 @@ class ContactStage(ObstacleStages):
         total = self.vector(0)
         for c in range(ti.static(self.features.num_staged)):
             row = ROWS * (ti.static(self.features.first_staged) + c)
-            n, pushed, change = (
-                self.normal(state.stage[row + PLANE, i]),
-                state.stage[row + PUSH, i],
-                state.stage[row + SEED, i],
-            )
+            n = self.normal(state.stage[row + PLANE, i])
+            pushed, change = state.stage[row + PUSH, i], state.stage[row + SEED, i]
             more = -pushed.y * n.dot(dz)
             change.w = change.w + more
             state.stage[row + SEED, i] = change
@@ -295,11 +292,8 @@ class ContactStage(ObstacleStages):
             row = ROWS * (ti.static(self.features.first_staged) + before)
             pushed, felt, by_wall = state.stage[row + PUSH, i], state.stage[row + FELT, i], self.vector(0)
             if pushed.x > 0 and felt.z > 0:
-                start, plane, wall = (
-                    self.slide_by(before, i, v, ratio, state),
-                    state.stage[row + PLANE, i],
-                    state.stage[row + WALL, i],
-                )
+                start = self.slide_by(before, i, v, ratio, state)
+                plane, wall = state.stage[row + PLANE, i], state.stage[row + WALL, i]
                 by_plane, by_v, of_wall, more, by_mu, by_eps = stage.slide_vjp(
                     self.fp, plane, pushed.x, start, wall, ratio, felt.z, felt.w, v_adj
                 )

@@ -24,8 +24,8 @@ class Obstacle(Term):
     second-order Taylor polynomial below width / 1000 (barrier.py), so that a vertex that got past is pushed out.
 
     stiffness_per_area [N/m^3]: k is that times the share of the surface at rest that the vertex stands for
-    (inputs/surface_areas.py), so that gaps, forces and friction are those of a surface and converge as it is refined. None lets the scene choose it from density,
-    wave speed, weight and impact (stiffness.py). Or
+    (inputs/surface_areas.py): gaps, forces and friction are those of a surface and converge as it is refined. None lets the
+    scene choose it from density, wave speed, weight and impact (stiffness.py). Or
     stiffness [N/m]: k of every vertex alike, however many there are.
     width [m]: how far the obstacle is felt.
     friction [-]: Coulomb's coefficient (friction.py); 0 compiles none. friction_speed [m/s]: the speed below which
