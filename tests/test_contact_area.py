@@ -14,7 +14,7 @@ from diffsim_ti.inputs.surface_areas import SurfaceAreas
 
 SOFT = ds.StableNeoHookean(1e5, 0.3)
 CORNERS = 0.1 * np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])  # of a regular tetrahedron
-ROUGH = dict(friction=0.3, friction_speed=0.5)
+ROUGH = dict(friction=0.3, friction_speed=5.0)
 
 
 def areas_of(mesh, X=None) -> np.ndarray:
@@ -162,7 +162,7 @@ def on_a_needle(**options) -> ds.Rollout:
 
 def test_points_within_faces_have_areas_too():
     rollout = on_a_needle(stiffness_per_area=1e7)
-    assert_transposed(rollout, 1e-7)
+    assert_transposed(rollout, 1e-7, ("capsule_start",))  # its other end is felt
     report = ds.check_gradients(rollout, inputs=["rest_positions", "barrier_stiffness_per_area", "barrier_width"])
     assert report.passed, report
 

@@ -84,7 +84,7 @@ def drop(gradient: bool = False, duration: float = 0.05) -> Problem:
         mesh,
         ds.SmithNeoHookean(1e5, 0.4),
         1000.0,
-        [ds.Gravity(), ds.Ground(0.0, 113.5, 0.005)],
+        [ds.Gravity(), ds.Ground(0.0, 225.6, 0.005)],
         initial_velocities=(0, -1.0, 0),
         precision="f32",
     )
