@@ -118,7 +118,7 @@ def sliding(precision="f64", **options) -> ds.Scene:
     terms = [
         ds.Gravity(),
         ds.Ground(-0.03, width=0.05, stiffness_per_area=3e3, **ROUGH),
-        ds.Sphere((0.1, -0.13, 0.1), 0.1, width=0.04, stiffness_per_area=2e4, path=lambda t: [0.2 * t, 0.5 * t, 0]),
+        ds.Sphere((0, -0.13, 0), 0.1, width=0.04, stiffness_per_area=2e4, path=lambda t: [0.01 * t, 0.01 * t, 0]),
         ds.HalfSpace((-0.03, 0, 0), (1, 0, 0), width=0.05, stiffness=50.0),
     ]
     speed = dict(initial_velocities=[-0.3, -0.4, 0.5])
