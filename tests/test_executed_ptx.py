@@ -129,7 +129,7 @@ def test_every_kernel_is_launched_again_and_again(driver, cube):
 
 
 def solvers_in_single_precision(cube):
-    friction = Ground(cube.vertices[:, 1].min() - 1e-3, 1e3, 0.01, friction=0.5)
+    friction = Ground(cube.vertices[:, 1].min() - 1e-3, width=0.01, friction=0.5, stiffness_per_area=1e5)
     yield explicit(Scene(cube, SmithNeoHookean(1e5, 0.4), 1000.0, [Gravity(-9.8), friction], precision="f32"))
     yield explicit(scene(cube, law=Corotated(1e5, 0.3), precision="f32"), VelocityVerletSolver)
     yield explicit(scene(two_boxes(), SelfContact(2e4, 2e-2), precision="f32"))

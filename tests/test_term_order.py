@@ -27,8 +27,9 @@ MESH = ds.TetrahedralMesh.joined([tetrahedron(0.15), tetrahedron(0.7)])  # an ap
 
 @cache
 def crowd() -> dict[str, Term]:
-    """Eight terms that all act: two rough obstacles on the same vertices, two half spaces, one obstacle that moves."""
-    rng, own = np.random.default_rng(0), dict(stiffness=300.0, width=0.2)
+    """Eight terms that all act: two rough obstacles on the same vertices, two half spaces, one obstacle that moves and is
+    stiff per area."""
+    rng, own, area = np.random.default_rng(0), dict(stiffness=300.0, width=0.2), dict(stiffness_per_area=2e3, width=0.2)
     return {
         "gravity": ds.Gravity(),
         "drag": ds.Drag(0.5),
@@ -37,7 +38,7 @@ def crowd() -> dict[str, Term]:
         "ground": SHAPES["ground"](**own, **ROUGH),
         "slope": SHAPES["half_space"](**own, **ROUGH),
         "wall": ds.HalfSpace([-0.1, 0, 0], [1, 0, 0], **own),
-        "sphere": ds.Sphere([0.25, -0.8, 0.2], 0.85, **own, path=lambda t: [0.3 * t, 0.1 * np.sin(5 * t), -0.2 * t]),
+        "sphere": ds.Sphere([0.25, -0.8, 0.2], 0.85, **area, path=lambda t: [0.3 * t, 0.1 * np.sin(5 * t), -0.2 * t]),
     }
 
 
@@ -138,8 +139,8 @@ def test_names_follow_the_list_as_written():
             term = crowd()[name]
             if isinstance(term, Obstacle):
                 count += 1
-                expected = "barrier_stiffness" + (f"_{count}" if count > 1 else "")
-                assert scene.input_names(term)["barrier_stiffness"] == expected
+                expected = "barrier_width" + (f"_{count}" if count > 1 else "")
+                assert scene.input_names(term)["barrier_width"] == expected
             for own, here in scene.input_names(term).items():
                 if own in term.values:
                     np.testing.assert_array_equal(scene.inputs.values[here], term.values[own])
