@@ -7,6 +7,15 @@ import numpy as np
 from diffsim_ti.state.workspace import Workspace
 
 
+class EnergyGained(UserWarning):
+    """Steps have added energy to the motion. Carries `gained` [J], `share` of the energy that moves, `step`, `time` [s] and
+    the `substep` [s] that is advised."""
+
+    def __init__(self, message: str, gained: float, share: float, step: int, time: float, substep: float):
+        super().__init__(message)
+        self.gained, self.share, self.step, self.time, self.substep = gained, share, step, time, substep
+
+
 class EnergyWatch:
     """Sums what implicit midpoint steps add to the energy, against the largest energy that moved so far.
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.monitor import quantities, stability
+from diffsim_ti.monitor.energy_watch import EnergyGained
 from diffsim_ti.state.workspace import Workspace
 from diffsim_ti.terms.obstacles.barrier import beta
 
@@ -58,6 +59,8 @@ class Guard:
     def restart(self) -> None:
         """A new run: looks come at the same passes whatever ran before, and sooner where it starts deformed."""
         solver = self.ws.solver
+        if solver.explicit and self.ws.energy_watch:
+            self.ws.energy_watch.clear()
         self._passes, self.every = 0, self.first if solver.explicit and solver.starts_deformed() else self.usual
 
     def mark(self, now: int) -> None:
@@ -68,8 +71,11 @@ class Guard:
 
     def advance(self, first: int, last: int, num_passes: int, save_every: int = 0, recording: bool = False) -> None:
         """Passes first .. last - 1, looked after; recording, slot j of the record holds the state before pass j."""
+        balance = self.ws.energy_watch if self.ws.solver.explicit else None
         while first < last:
             stop = min(last, first + self.every)
+            if balance:
+                balance.before(first, num_passes)
             self.mark(first)
             if recording:
                 self.ws.save(self.ws.record, first)
@@ -81,7 +87,9 @@ class Guard:
             if self.ws.first_bad_vertex() is not None:
                 self._diagnose(stop, num_passes)
             self._warn_of_stiff_contact()
-            self._warn_of_gained_energy()
+            if balance:
+                balance.after(stop, num_passes, stop - first)
+            self._warn_of_gained_energy(stop, num_passes)
             self._passes += stop - first
             if self._passes >= self.every:
                 self._passes = 0
@@ -103,18 +111,20 @@ class Guard:
                 stacklevel=5,
             )
 
-    def _warn_of_gained_energy(self) -> None:
-        """Once, where an implicit method's steps have added a tenth of the energy that moves."""
-        watch, h = self.ws.energy_watch, self.ws.solver.substep
+    def _warn_of_gained_energy(self, now: int, num_passes: int) -> None:
+        """Once, where steps have added a tenth of the energy that moves."""
+        watch, solver = self.ws.energy_watch, self.ws.solver
         if self._warned_of_gain or watch is None or watch.share <= 0.1:
             return
-        self._warned_of_gain = True
-        warnings.warn(
-            f"{type(self.ws.solver).__name__} has gained {watch.gained:.3g} J, {watch.share:.0%} of the energy that moves, "
-            f"from nonlinear motion or contact within its substeps of {h:.3g} s: take substeps of {h / 4:.3g} s, or "
-            "BDF2Solver or ImplicitEulerSolver, which damp",
-            stacklevel=5,
+        self._warned_of_gain, step = True, self._step_of(now - 1, num_passes)
+        enough = solver.substep / (2 if solver.explicit else 4)
+        said = (
+            f"step {step}, t = {step * solver.dt:.6g} s: {type(solver).__name__} has gained {watch.gained:.3g} J, "
+            f"{watch.share:.0%} of the energy that moves, from nonlinear motion or contact within its substeps of "
+            f"{solver.substep:.3g} s: take substeps of {enough:.3g} s, or BDF2Solver or ImplicitEulerSolver, which damp"
         )
+        about = watch.gained, watch.share, step, step * solver.dt, enough
+        warnings.warn(EnergyGained(said, *about), stacklevel=5)
 
     def _step_of(self, j: int, num_passes: int) -> int:
         """The step that pass j belongs to; velocity Verlet's closing half kick belongs to the last one."""

@@ -31,6 +31,7 @@ class Workspace:
     first_step = 0  # steps that were done before this run, for reports
     potential = None  # of implicit steps
     energy_watch = None  # counts energy that long steps add, for solvers that neither damp nor limit it
+    changes = 0  # of the state from outside its passes
 
     def __init__(self, solver, derived: Derived):
         self.solver, self.scene = solver, solver.scene
@@ -60,6 +61,7 @@ class Workspace:
 
     def restart(self) -> None:
         """Set the state to the start."""
+        self.changes += 1
         runtime.fill(self.state.u, self.arrays.values.displacement[None])
         runtime.fill(self.state.v, self.arrays.values.velocity[None])
         if self.state.z is not None:
@@ -85,6 +87,7 @@ class Workspace:
 
     def forget(self) -> None:
         """The state was set from outside: forget what came before it."""
+        self.changes += 1
         if self.pairs:
             self.pairs.forget(self.state.u)
 
@@ -126,6 +129,7 @@ class Workspace:
 
     def restore(self, source: History, slot: int) -> None:
         """Copy a slot to the current state."""
+        self.changes += 1
         source.copy(slot, self.state, 0)
 
     def save_frame(self, frame: int) -> None:
