@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import taichi as ti
 
 from diffsim_ti.solvers.explicit.obstacle_stages import FELT, PLANE, PUSH, ROWS, SEED, WALL, ObstacleStages
+from diffsim_ti.solvers.explicit.wall_work import work_of_stage
 from diffsim_ti.terms.obstacles import secant, stage
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
@@ -127,20 +128,6 @@ class ContactStage(ObstacleStages):
         return after
 
     @ti.func
-    def work_of_stage(self, i, v, now: A, scene: A, state: A):
-        """Work [J] that moving obstacles do on vertex i: what each pushes and rubs, times its velocity."""
-        work, h, mass = ti.cast(0, self.fp), now.h, ti.cast(1, self.fp) / scene.inverse_mass[i]
-        for c in range(ti.static(self.features.num_staged)):
-            row = ROWS * (ti.static(self.features.first_staged) + c)
-            wall, after = state.stage[row + WALL, i], v
-            if ti.static(len(self.features.staged_rough) > 0):
-                after = self.slide(ti.static(self.features.first_staged) + c, i, v, h * scene.inverse_mass[i], state)
-            pushed = h * state.stage[row + PUSH, i].x * self.normal(state.stage[row + PLANE, i])
-            work += (pushed + mass * (after - v)).dot(wall)
-            v = after
-        return work
-
-    @ti.func
     def slide_by(self, count, i, v, ratio, state: A):
         """Velocity after the friction of the first `count` obstacles, one after the other."""
         for o in range(count):
@@ -168,7 +155,7 @@ class ContactStage(ObstacleStages):
                 _, total, _, _ = self.solve(i, self.vector(0), free, a, now, state, plan)
                 delta, v = ratio * total, self.slide_all(i, v_plus, ratio, state)
                 if ti.static(self.features.moving > 0):
-                    state.work[i] = state.work[i] + self.work_of_stage(i, v_plus, now, scene, state)
+                    state.work[i] = state.work[i] + work_of_stage(self, i, v_plus, now, scene, state)
         pressed = self.blend(plan) * delta
         return u + now.alpha * (v + pressed), now.decay * v + delta - (1 - now.decay) * pressed
 
