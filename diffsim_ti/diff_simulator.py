@@ -17,7 +17,7 @@ from diffsim_ti.monitor import stability
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.scene import Scene
 from diffsim_ti.solvers import SemiImplicitSolver, Solver, StaticSolver
-from diffsim_ti.terms import Drag, ExternalForce, Gravity, Term
+from diffsim_ti.terms import Drag, ExternalForce, Gravity, Obstacle, SelfContact, Term
 from diffsim_ti.terms.obstacles import barrier
 from diffsim_ti.torch_bridge.autograd import torch
 from diffsim_ti.torch_bridge.rollout_node import TorchFrames, rollout_frames
@@ -79,7 +79,7 @@ class DifferentiableSimulator:
     material: DifferentiableMaterial, SpatiallyVaryingMaterial or another TorchMaterial (diff_physics); density [kg/m^3]:
     a number or a tensor, scalar or per tetrahedron; fixed_vertices: set name, indices or mask; contact: None for the seeds'
     ground, False for none, or a DifferentiableBarrierContact, whose numbers may be tensors with gradient; terms: further
-    core terms.
+    core terms, whose numbers may be tensors with gradient, too, as in `Sphere(radius=tensor)`.
 
     The seeds' ground is a barrier (stiffness 1e4, width 0.01) at y = 0 where the body starts at least one width above it,
     otherwise one width below its lowest vertex; it is fixed at the start. `describe()` says which.
@@ -266,21 +266,29 @@ class DifferentiableSimulator:
             options["check_start"] = False  # the count is chosen at reset; a run that outgrows it raises
         return self.solver.method(scene, **options)
 
+    def _contact_stiffness(self, scene: Scene, values: dict) -> float:
+        """Stiffness [N/m] of the barriers that a vertex may feel: the stiffest, or, where they are forces, all."""
+        names = [scene.input_names(t) for t in scene.terms if isinstance(t, Obstacle | SelfContact)]
+        plain = "barrier_stiffness", "self_contact_stiffness"
+        felt = [float(values[own[name]]) for own in names for name in plain if name in own]
+        together = sum if self.solver.options.get("contact") == "force" else max
+        return together(felt) if felt else 0.0
+
     def _choose_substeps(self) -> None:
         """What stability and contact ask for at the present numbers; the count only grows, so that losses stay smooth."""
         if not self.solver.method.explicit:
             return
         scene = self._scene(False)
-        numbers = {name: x.detach().double().cpu().numpy() for name, x in self._inputs().items()}
+        tensors = self._inputs() | {name: torch.as_tensor(x) for name, x in scene.given_tensors().items()}
+        numbers = {name: x.detach().double().cpu().numpy() for name, x in tensors.items()}
         values = scene.inputs.values | scene.inputs.check(numbers)
         bound = stability.element_limit(scene, values).dt
         if self._ratio is None:
             solver = self._core_solver(scene, 1)
             self._ratio = solver.stable_dt(tight=True).dt / stability.element_limit(scene).dt
         omega2 = (2 / (self._ratio * bound)) ** 2
-        if self._contact:
-            mass = scene.inputs.derive(values).mass
-            omega2 += float(values["barrier_stiffness"]) * barrier.reference_curvature() / mass[mass > 0].min()
+        mass = scene.inputs.derive(values).mass
+        omega2 += self._contact_stiffness(scene, values) * barrier.reference_curvature() / mass[mass > 0].min()
         needed = math.ceil(self.solver.dt * math.sqrt(omega2) / 2 / 0.8)
         if needed > self._substeps:
             warnings.warn(

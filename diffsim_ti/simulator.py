@@ -56,7 +56,7 @@ class Simulator:
     def step(self) -> None:
         """Advance by solver.dt."""
         self._load_step()
-        self._guard.offset, self.workspace.first_step = self.step_count * self.solver.substeps, self.step_count
+        self.workspace.first_step = self.step_count
         passes = self.solver.num_passes(1)
         self.workspace.save(self._before, 0)
         try:

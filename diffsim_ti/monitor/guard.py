@@ -52,7 +52,7 @@ class Guard:
     def __init__(self, workspace: Workspace):
         self.ws = workspace
         self.good = workspace.history(1)
-        self.good_pass, self.offset = 0, 0  # offset: passes before this run, for reports
+        self.good_pass = 0
         self._stiffness, self._warned, self._warned_of_gain = None, False, False
         self.restart()
 
@@ -86,7 +86,7 @@ class Guard:
                 self._diagnose_crossing(stop, num_passes)
             if self.ws.first_bad_vertex() is not None:
                 self._diagnose(stop, num_passes)
-            self._warn_of_stiff_contact()
+            self._warn_of_stiff_contact(stop, num_passes)
             if balance:
                 balance.after(stop, num_passes, stop - first)
             self._warn_of_gained_energy(stop, num_passes)
@@ -96,17 +96,18 @@ class Guard:
                 self._look_at_step(stop, num_passes)
             first = stop
 
-    def _warn_of_stiff_contact(self) -> None:
+    def _warn_of_stiff_contact(self, now: int, num_passes: int) -> None:
         """Once, where a barrier was stiffer than a step can follow: energy may then come from nowhere."""
         solver = self.ws.solver
         if self._warned or not solver.explicit or solver.stages_contact or not self.ws.watch.contacts:
             return
         omega_dt = self.ws.watch.largest_omega_dt()
         if omega_dt > 2:
-            self._warned = True
+            self._warned, step = True, self.ws.step_of(now - 1, num_passes)
             h = solver.substep
             warnings.warn(
-                f"a contact was stiffer than the substep {h:.3g} s can follow (omega dt = {omega_dt:.3g} > 2), so that "
+                f"step {step}, t = {step * solver.dt:.6g} s: a contact was stiffer than the substep {h:.3g} s can follow "
+                f"(omega dt = {omega_dt:.3g} > 2), so that "
                 f"energy may be gained in it: take substeps of {1.8 * h / omega_dt:.3g} s, or a softer or wider barrier",
                 stacklevel=5,
             )
@@ -116,7 +117,7 @@ class Guard:
         watch, solver = self.ws.energy_watch, self.ws.solver
         if self._warned_of_gain or watch is None or watch.share <= 0.1:
             return
-        self._warned_of_gain, step = True, self._step_of(now - 1, num_passes)
+        self._warned_of_gain, step = True, self.ws.step_of(now - 1, num_passes)
         enough = solver.substep / (2 if solver.explicit else 4)
         said = (
             f"step {step}, t = {step * solver.dt:.6g} s: {type(solver).__name__} has gained {watch.gained:.3g} J, "
@@ -125,11 +126,6 @@ class Guard:
         )
         about = watch.gained, watch.share, step, step * solver.dt, enough
         warnings.warn(EnergyGained(said, *about), stacklevel=5)
-
-    def _step_of(self, j: int, num_passes: int) -> int:
-        """The step that pass j belongs to; velocity Verlet's closing half kick belongs to the last one."""
-        solver = self.ws.solver
-        return (self.offset + min(j, num_passes - solver.num_passes(0) - 1)) // solver.substeps
 
     def _look_at_step(self, now: int, num_passes: int) -> None:
         solver = self.ws.solver
@@ -144,7 +140,7 @@ class Guard:
             near = omega2 * solver.substep**2 > 0.9**2 * 4
             self.every = min(2 * self.every, self.close if near else self.usual)
             return
-        step, limit = self._step_of(now - 1, num_passes), 2 / np.sqrt(omega2)
+        step, limit = self.ws.step_of(now - 1, num_passes), 2 / np.sqrt(omega2)
         tet = self._stiffness.worst_tetrahedron()
         self.ws.restore(self.good, 0)
         why = (
@@ -182,7 +178,7 @@ class Guard:
         ws.restore(self.good, 0)
         ws.watch.put(self._seen)
         k, vertex, depth = crossing
-        term, step = ws.watch.contacts[k], self._step_of(j, num_passes)
+        term, step = ws.watch.contacts[k], self.ws.step_of(j, num_passes)
         speed = float(np.linalg.norm(ws.velocity_of(vertex)))
         enough = min(0.1 * float(term.values["barrier_width"]) / max(speed, 1e-300), 0.5 * solver.substep)
         stiffness = self._stiffness_needed(k, vertex, speed)
@@ -234,7 +230,7 @@ class Guard:
         J_around = np.where(np.isfinite(J[around]), J[around], -np.inf)
         tet = int(around[J_around.argmin()]) if around.size else 0
         stable, state = self._stable_step()
-        step = self._step_of(j, num_passes)
+        step = self.ws.step_of(j, num_passes)
         why = (
             f"the substep {solver.substep:.4g} s exceeds the stable step {stable:.4g} s {state}: reduce dt, "
             "raise substeps, or use an implicit solver"

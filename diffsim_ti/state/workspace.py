@@ -91,6 +91,17 @@ class Workspace:
         if self.pairs:
             self.pairs.forget(self.state.u)
 
+    def step_of(self, j: int, num_passes: int) -> int:
+        """The step that pass j belongs to; velocity Verlet's closing half kick belongs to the last one."""
+        solver = self.solver
+        return self.first_step + min(j, num_passes - solver.num_passes(0) - 1) // solver.substeps
+
+    def dated(self, error: Exception, j: int, num_passes: int) -> Exception:
+        """The same error, which says when: in pass j of a run, before which `first_step` steps were done."""
+        error.step = self.step_of(j, num_passes)
+        error.args = (f"step {error.step}, t = {error.step * self.solver.dt:.6g} s: {error}",)
+        return error
+
     @property
     def rate(self) -> float:
         """The drag rate [1/s]."""

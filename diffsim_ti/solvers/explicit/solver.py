@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from diffsim_ti import runtime
+from diffsim_ti.contact.surface_pairs import Tunnelling
 from diffsim_ti.inputs import Derived
 from diffsim_ti.monitor.energy_balance import EnergyBalance
 from diffsim_ti.solvers.explicit.adjoint import ExplicitAdjoint, ExplicitTangent
@@ -173,4 +174,7 @@ class ExplicitWorkspace(Workspace):
                 pairs.forces(history.u, slot, self.arrays.corner)
             launch(**numbers, base=base, stride=stride)
             if pairs:
-                pairs.check_pass(history.u, slot + stride, self.solver.substep)
+                try:
+                    pairs.check_pass(history.u, slot + stride, self.solver.substep)
+                except Tunnelling as error:
+                    raise self.dated(error, numbers["first"], num_passes) from None

@@ -119,7 +119,7 @@ class ImplicitWorkspace(ObstacleWays, Workspace):
             try:
                 u_next, v_next = self._pass(j, u, v, before)
             except (NotConverged, Tunnelling) as error:
-                raise self._dated(error, j) from None
+                raise self.dated(error, j, num_passes) from None
             if self.solver.multistep:
                 copy_slot(self.state.u, 0, self.state.before.u, 0)
                 copy_slot(self.state.v, 0, self.state.before.v, 0)
@@ -139,13 +139,6 @@ class ImplicitWorkspace(ObstacleWays, Workspace):
         kernel = getattr(law_state_kernels(a.law, features, self.parallel, a.in_lanes), name)
         sizes = dict(num_items=a.num_items, num_vertices=a.num_vertices, slot=slot, end=end)
         self.bound(kernel, **records)(**sizes, h=float(self.solver.schedule.length(j)))
-
-    def _dated(self, error: Exception, j: int) -> Exception:
-        """The same error, which says when: `first_step` steps were done before this run."""
-        step = self.first_step + j // self.solver.substeps
-        error.step = step
-        error.args = (f"step {step}, t = {step * self.solver.dt:.6g} s: {error}",)
-        return error
 
     def preconditioner(self, mass: np.ndarray) -> tuple:
         """(preconditioner for c M + K with mass = c m, size of the diagonal of that at rest [N/m])."""
