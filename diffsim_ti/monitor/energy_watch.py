@@ -48,16 +48,18 @@ class EnergyWatch:
             energies.append(potential.energy()[0])
         self.ws.put_obstacles(places[1])
         potential.place(u_star)
-        work = float((potential.forces()[0] * (u_next - u)).sum()) - self._work_of_obstacles(places[1], drift)
+        work = float((potential.forces()[0] * (u_next - u)).sum()) - self._work_of_obstacles(u_star, places[1], drift)
         self.gained += energies[1] - energies[0] + work
         kinetic = 0.5 * float((self.ws.mass * v_next**2).sum())
         self.moving = max(self.moving, kinetic + energies[1])
 
-    def _work_of_obstacles(self, places: np.ndarray, drift: np.ndarray) -> float:
-        """dE/dw (w' - w) [J], by differences over a hundredth of the width."""
+    def _work_of_obstacles(self, u_star: np.ndarray, places: np.ndarray, drift: np.ndarray) -> float:
+        """dE/dw (w' - w) [J], by differences over a hundredth of the smallest gap."""
         if not drift.any():
             return 0.0
-        share, energies = min(0.5, 0.01 * self.ws.way.narrowest / np.abs(drift).max()), []
+        near = self.ws.way.nearest(u_star, places, self.ws.way.widest)
+        gap = self.ws.way.narrowest if near is None else min(near.value, self.ws.way.narrowest)
+        share, energies = min(0.5, 0.01 * gap / np.abs(drift).max()), []
         for sign in (1, -1):
             self.ws.put_obstacles(places + sign * share * drift)
             energies.append(self.ws.potential.energy()[0])
