@@ -147,3 +147,22 @@ def test_looks_change_no_bit():
         ends.append((run.positions, run.velocities, run.contact_resolution))
     assert np.array_equal(ends[0][0], ends[1][0]) and np.array_equal(ends[0][1], ends[1][1])
     assert ends[0][2] == ends[1][2]
+
+
+@pytest.mark.parametrize("work", [name for name in WORK if name != "loads of steps"])
+def test_bdf2_is_not_blamed_for_work_from_outside(work):
+    run = ds.Simulator(ds.BDF2Solver(WORK[work](), dt=2e-3))
+    seen = [float(run.compute_energy())]
+    for _ in range(40):
+        run.step()
+        seen.append(float(run.compute_energy()))
+    watch = run.workspace.energy_watch
+    assert np.ptp(seen) > 0.3 * watch.moving and watch.share < 0.01
+
+
+def test_what_bdf2_adds_is_the_change_of_the_energy():
+    run = ds.Simulator(ds.BDF2Solver(body(initial_velocities=0.3 * NOISE, fixed="xmin"), dt=2e-3, tolerance=1e-9))
+    start = run.compute_energy()
+    run.run(20)
+    watch = run.workspace.energy_watch
+    assert watch.gained == pytest.approx(run.compute_energy() - start, rel=1e-5) and watch.gained < -0.3 * watch.moving

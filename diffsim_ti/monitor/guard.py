@@ -119,10 +119,12 @@ class Guard:
             return
         self._warned_of_gain, step = True, self.ws.step_of(now - 1, num_passes)
         enough = solver.substep / (2 if solver.explicit else 4)
+        others = "ImplicitEulerSolver, which damps most"
+        others = others if getattr(solver, "multistep", False) else f"BDF2Solver or {others}"
         said = (
             f"step {step}, t = {step * solver.dt:.6g} s: {type(solver).__name__} has gained {watch.gained:.3g} J, "
             f"{watch.share:.0%} of the energy that moves, from nonlinear motion or contact within its substeps of "
-            f"{solver.substep:.3g} s: take substeps of {enough:.3g} s, or BDF2Solver or ImplicitEulerSolver, which damp"
+            f"{solver.substep:.3g} s: take substeps of {enough:.3g} s, or {others}"
         )
         about = watch.gained, watch.share, step, step * solver.dt, enough
         warnings.warn(EnergyGained(said, *about), stacklevel=5)

@@ -206,8 +206,14 @@ class ImplicitWorkspace(ObstacleWays, Workspace):
             self._check_end(j, u_star, u_next)
         if self.energy_watch:
             places = self.walls_before, self.walls_at_stage, self._walls_at_end(j)
-            self.energy_watch.note(u, u_star, u_next, v_next, places)
+            added = self._kinetic_added(u, v, u_next, v_star, y, stage) if self.solver.multistep else 0.0
+            self.energy_watch.note(u, u_star, u_next, v_next, places, added)
         return u_next, np.zeros_like(v) if stage.static else v_next
+
+    def _kinetic_added(self, u, v, u_next, v_star, y, stage: Stage) -> float:
+        """Kinetic energy [J] that a pass has added beyond the work of what accelerates the free vertices, before drag."""
+        work = (v_star - y) / stage.gamma * (u_next - u)
+        return float((self.mass * self.free * (0.5 * (v_star**2 - v**2) - work)).sum())
 
     def _solve(self, u, start, problem: tuple, stage: Stage) -> np.ndarray:
         """The minimum of the pass; problem: mass, inertial, loads of `Newton.solve`."""
