@@ -19,6 +19,7 @@ from diffsim_ti.scene import Scene
 from diffsim_ti.solvers import SemiImplicitSolver, Solver, StaticSolver
 from diffsim_ti.terms import Drag, ExternalForce, Gravity, Obstacle, SelfContact, Term
 from diffsim_ti.terms.obstacles import barrier
+from diffsim_ti.terms.obstacles.obstacle import PER_AREA
 from diffsim_ti.torch_bridge.autograd import torch
 from diffsim_ti.torch_bridge.rollout_node import TorchFrames, rollout_frames
 from diffsim_ti.torch_bridge.tensors import DTYPES, checked_device
@@ -266,11 +267,17 @@ class DifferentiableSimulator:
             options["check_start"] = False  # the count is chosen at reset; a run that outgrows it raises
         return self.solver.method(scene, **options)
 
-    def _contact_stiffness(self, scene: Scene, values: dict) -> float:
-        """Stiffness [N/m] of the barriers that a vertex may feel: the stiffest, or, where they are forces, all."""
-        names = [scene.input_names(t) for t in scene.terms if isinstance(t, Obstacle | SelfContact)]
-        plain = "barrier_stiffness", "self_contact_stiffness"
-        felt = [float(values[own[name]]) for own in names for name in plain if name in own]
+    def _contact_rigidity(self, scene: Scene, values: dict) -> float:
+        """Stiffness over mass [1/s^2] of barriers that a vertex may feel: the stiffest, or, where they are forces, all."""
+        derived, felt = scene.inputs.derive(values), []
+        mass = np.where(derived.mass > 0, derived.mass, np.inf)
+        for term in scene.terms:
+            if isinstance(term, Obstacle | SelfContact):
+                for plain, name in scene.input_names(term).items():
+                    if plain in ("barrier_stiffness", "self_contact_stiffness"):
+                        felt.append(float(values[name]) / mass.min())
+                    elif plain == PER_AREA:
+                        felt.append(float((values[name] * derived.surface / mass).max()))
         together = sum if self.solver.options.get("contact") == "force" else max
         return together(felt) if felt else 0.0
 
@@ -287,8 +294,7 @@ class DifferentiableSimulator:
             solver = self._core_solver(scene, 1)
             self._ratio = solver.stable_dt(tight=True).dt / stability.element_limit(scene).dt
         omega2 = (2 / (self._ratio * bound)) ** 2
-        mass = scene.inputs.derive(values).mass
-        omega2 += self._contact_stiffness(scene, values) * barrier.reference_curvature() / mass[mass > 0].min()
+        omega2 += self._contact_rigidity(scene, values) * barrier.reference_curvature()
         needed = math.ceil(self.solver.dt * math.sqrt(omega2) / 2 / 0.8)
         if needed > self._substeps:
             warnings.warn(

@@ -46,7 +46,7 @@ class Case:
     resolution: int
     thickness: float
     moving: bool
-    stiffness: float | None = None
+    stiffness: float | None = None  # per area [N/m^3]
     substeps: int = 1  # of explicit solvers: times what stability asks for
     substep: float = float("inf")  # what explicit ones were advised [s]
     advice: list = field(default_factory=list)
@@ -116,9 +116,8 @@ def build(case: Case):
         more = dict(fixed=fixed, motion=motion)
     else:
         path, more = (lambda t: [-speed * t, 0, 0]), dict(initial_velocities=(own, 0, 0))
-    advised = dict(stiffness=case.stiffness)  # [N/m]
-    stiff = advised if case.stiffness else dict(stiffness_per_area=natural_stiffness(case, mesh, width))
-    obstacle = obstacle(width=width, path=path, **stiff)
+    stiffness = case.stiffness or natural_stiffness(case, mesh, width)
+    obstacle = obstacle(width=width, stiffness_per_area=stiffness, path=path)
     scene = ds.Scene(
         mesh, ds.StableNeoHookean(case.youngs_modulus, 0.3), DENSITY, [obstacle], precision=case.precision, **more
     )
@@ -204,7 +203,7 @@ NUMBER = r"([-+.\deE]*\d)"
 
 def follow(case: Case, said: str) -> Case | None:
     """The case changed as an error advises, or None."""
-    stiffness, substep = re.search(f"stiffness to {NUMBER} N/m", said), re.search(f"steps of {NUMBER} s", said)
+    stiffness, substep = re.search(f"per_area to {NUMBER} N/m\\^3", said), re.search(f"steps of {NUMBER} s", said)
     advice = [*case.advice, said]
     if stiffness:
         return replace(case, stiffness=float(stiffness[1]), advice=advice)

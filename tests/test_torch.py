@@ -188,11 +188,12 @@ def test_substeps_count_barriers_of_terms_as_those_of_contact(contact):
         dict(contact=False, terms=[ds.Ground(-0.2, 1e6, 0.1)]),
         dict(contact=False, terms=[ds.Ground(-0.2, torch.tensor(1e6), 0.1, name="floor")]),
         dict(contact=False),
+        dict(contact=False, terms=[ds.Ground(-0.2, width=0.1, stiffness_per_area=torch.tensor(1e8))]),
     ):
         solver = DifferentiableSolver(0.01, contact=contact)
         sim = DifferentiableSimulator(MESH, DifferentiableMaterial(1e5, 0.3), solver, **options)
         counts.append(sim._substeps)
-    assert counts[0] == counts[1] == counts[2] > counts[3]
+    assert counts[0] == counts[1] == counts[2] > counts[3] < counts[4]
 
 
 @pytest.mark.parametrize(

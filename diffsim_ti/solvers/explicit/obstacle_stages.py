@@ -151,7 +151,8 @@ class ObstacleStages(ObstacleFunctions):
                 first, wall = g.first + k * g.size, self.speed(g, k, now, scene.path)
                 X = scene.rest[i] - self.place(g, k, now, scene.path)
                 if ti.static(g.path >= 0):
-                    work += now.h * g.force.force(scene.parameters, first, X, u, v_plus).dot(wall)
+                    force = self.on_area(g, i, g.force.force(scene.parameters, first, X, u, v_plus), scene)
+                    work += now.h * force.dot(wall)
                 if ti.static(g.force.friction):
                     if scene.inverse_mass[i] > 0:
                         after = self.slide(g, k, i, u, v, now, scene)
