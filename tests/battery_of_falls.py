@@ -4,16 +4,19 @@ Each draw takes a mesh, a size, a modulus, a height and a solver, all else as `d
 half a second after the first contact. A fall is good where it ends, nothing is ever below the floor, and the energy never
 rises above that of the start by more than 1 % of weight times height. What is refused before the first frame falls with the
 modulus that the error advises. A draw that takes longer than `--patience`
-seconds is named and replaced. Prints a line for each, and what all of them come to; exit code 1 if one is bad.
+seconds of processors is named and replaced. Prints a line for each, and what all of them come to; exit code 1 if one is bad.
 """
 
 import argparse
 import json
 import multiprocessing
 import re
+import resource
+import signal
 import sys
 import time
 from pathlib import Path
+from queue import Empty
 
 import numpy as np
 
@@ -85,23 +88,29 @@ def judge(result: dict) -> str:
     return "good" if result["rise"] < 0.01 else f"gained {result['rise']:.2%} of weight times height"
 
 
-def _work(case, queue):
-    queue.put(fall(case))
+def _work(case, patience, queue):
+    resource.setrlimit(resource.RLIMIT_CPU, (int(patience), int(patience) + 9))
+    queue.put(fall(case) | dict(cpu=time.process_time()))
 
 
 def within(case: dict, patience: float) -> dict | None:
-    """The fall, in a process of its own; None if it takes too long."""
+    """The fall, in a process of its own; None if it takes more than so many seconds of processors, whoever else runs."""
     context = multiprocessing.get_context("spawn")
     queue = context.Queue()
-    process = context.Process(target=_work, args=(case, queue))
+    process = context.Process(target=_work, args=(case, patience, queue))
     process.start()
-    try:
-        return queue.get(timeout=patience)
-    except Exception:  # queue.Empty
-        return None
-    finally:
-        process.kill()
-        process.join()
+    while True:
+        running = process.is_alive()
+        try:
+            result = queue.get(timeout=1)
+            process.join()
+            return result
+        except Empty:
+            if running:
+                continue
+        if -process.exitcode in (signal.SIGXCPU, signal.SIGKILL):
+            return None
+        return dict(case, ended=False, said=f"exit code {process.exitcode}")
 
 
 def main() -> None:
@@ -109,7 +118,7 @@ def main() -> None:
     parser.add_argument("meshes", nargs="*", type=Path, default=ASSETS)
     parser.add_argument("--cases", type=int, default=60)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--patience", type=float, default=120.0, help="seconds for one")
+    parser.add_argument("--patience", type=float, default=120.0, help="seconds of processors for one")
     options = parser.parse_args()
     rng, results, slow, draws = np.random.default_rng(options.seed), [], [], 0
     while len(results) < options.cases:
