@@ -15,6 +15,7 @@ from diffsim_ti.materials import (
     StVenantKirchhoff,
 )
 from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.monitor.energy_watch import EnergyGained
 from diffsim_ti.monitor.guard import Crossing, Divergence
 from diffsim_ti.outputs import MaterialPoints
 from diffsim_ti.rollout import Frames, Rollout
@@ -80,6 +81,7 @@ __all__ = [
     "Crossing",
     "Tunnelling",
     "NotConverged",
+    "EnergyGained",
     "Rollout",
     "Frames",
     "MaterialPoints",

@@ -16,6 +16,7 @@ from diffsim_ti.scene import Scene
 from diffsim_ti.simulator import Simulator
 from diffsim_ti.solvers import ImplicitEulerSolver
 from diffsim_ti.solvers.solver import Solver
+from diffsim_ti.strength import check_strength
 from diffsim_ti.terms import ExternalForce, Gravity, Obstacle
 from diffsim_ti.visual.frame import Frame, Setting
 from diffsim_ti.writers import Writer, writer_for
@@ -50,6 +51,8 @@ class ForwardRun:
     parts, whose steps are halved only where one does not converge or gains energy. With dt nothing is chosen and nothing
     repeated: what goes wrong is an error.
 
+    Raises ValueError for a body that no step saves (strength.py), naming what would.
+
     driven: whether something outside may add energy, which is then no sign of a bad step. before_part: called before each
     part, for instance to change forces.
     """
@@ -61,6 +64,7 @@ class ForwardRun:
     allowed = {1: (0.01, 0.001, 0.03), 2: (0.002, 0.0002, 0.006)}
 
     def __init__(self, scene: Scene, solver_class: type[Solver], frame_time: float, dt: float | None = None, **options):
+        check_strength(scene)
         self.scene, self.seen, self.adapts = scene, Seen(), dt is None
         self.driven = scene.motion is not None or bool(scene.moving)
         self.before_part: Callable[[], object] | None = None

@@ -7,9 +7,8 @@ import numpy as np
 
 from diffsim_ti.materials import StableNeoHookean, moduli
 from diffsim_ti.materials.evaluate import evaluate
-from diffsim_ti.terms import Ground
-from diffsim_ti.terms.obstacles.barrier import CROSSOVER
 from diffsim_ti.torch_bridge.autograd import first_order_only, torch
+from diffsim_ti.torch_bridge.barrier_contact import DifferentiableBarrierContact
 from diffsim_ti.torch_bridge.implicit_differentiation import ImplicitDifferentiation, conjugate_gradient
 
 __all__ = [
@@ -223,57 +222,6 @@ def _trilinear(mesh, resolution: tuple) -> tuple[np.ndarray, np.ndarray]:
         weights.append(np.prod(np.where(corner, part, 1 - part), 1))
         corners.append(np.ravel_multi_index((cell + corner).T, resolution))
     return np.stack(weights, 1), np.stack(corners, 1)
-
-
-class DifferentiableBarrierContact:
-    """Smooth ground contact by a barrier; a plain torch formula, differentiable as often as wanted.
-
-    b(d) = -kappa (d - d_hat)^2 log(d / d_hat) for d < d_hat [J], zero beyond, C2; below d_hat / 1000 its Taylor polynomial.
-    `DifferentiableBarrierContact(barrier_stiffness=1e4, barrier_width=0.01)`, or the seeds' second spelling
-    `(ground_height=..., barrier_stiffness=..., barrier_distance=...)`. Attributes kappa, d_hat, ground_height; each may be a
-    tensor with gradient.
-    """
-
-    def __init__(self, barrier_stiffness=1e4, barrier_width=None, *, ground_height: float = 0.0, barrier_distance=None):
-        given = [w for w in (barrier_width, barrier_distance) if w is not None]
-        if len(given) > 1:
-            raise ValueError("barrier_width and barrier_distance are two spellings of one number: give one")
-        self.kappa, self.d_hat, self.ground_height = barrier_stiffness, given[0] if given else 0.01, ground_height
-        self.term()  # checks the numbers
-
-    def term(self) -> Ground:
-        """The core's term with the same numbers."""
-        return Ground(*(float(torch.as_tensor(x).detach()) for x in (self.ground_height, self.kappa, self.d_hat)))
-
-    def tensors(self, like: torch.Tensor) -> dict[str, torch.Tensor]:
-        """The term's inputs, in the graph."""
-        numbers = dict(ground_height=self.ground_height, barrier_stiffness=self.kappa, barrier_width=self.d_hat)
-        return {name: torch.as_tensor(x, dtype=like.dtype, device=like.device) for name, x in numbers.items()}
-
-    def barrier_potential(self, d: torch.Tensor) -> torch.Tensor:
-        """Energy [J] at distances d [m], elementwise."""
-        s = d / self.d_hat
-        safe = s.clamp(CROSSOVER, 1.0)
-        t = torch.minimum(s - CROSSOVER, torch.zeros_like(s))
-        log = math.log(CROSSOVER)
-        slope = -2 * (CROSSOVER - 1) * log - (CROSSOVER - 1) ** 2 / CROSSOVER
-        curvature = -2 * log - 4 * (CROSSOVER - 1) / CROSSOVER + ((CROSSOVER - 1) / CROSSOVER) ** 2
-        beta = -((safe - 1) ** 2) * torch.log(safe) + t * (slope + t * curvature / 2)
-        return self.kappa * self.d_hat**2 * beta
-
-    def ground_contact_force(self, positions: torch.Tensor, velocities: torch.Tensor | None = None) -> torch.Tensor:
-        """Forces [N], shape (n, 3): along y, minus the slope of the barrier. velocities are not used (no friction)."""
-        inputs = (positions, self.ground_height, self.kappa, self.d_hat)
-        wanted = torch.is_grad_enabled() and any(isinstance(x, torch.Tensor) and x.requires_grad for x in inputs)
-        with torch.enable_grad():
-            d = positions[:, 1] - self.ground_height
-            d = d if d.requires_grad else d.detach().requires_grad_()
-            (slope,) = torch.autograd.grad(self.barrier_potential(d).sum(), d, create_graph=wanted)
-        slope = slope if wanted else slope.detach()
-        zero = torch.zeros_like(slope)
-        return torch.stack([zero, -slope, zero], 1)
-
-    compute_forces = ground_contact_force
 
 
 class CheckpointedRollout:

@@ -17,8 +17,9 @@ from diffsim_ti.monitor import stability
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.scene import Scene
 from diffsim_ti.solvers import SemiImplicitSolver, Solver, StaticSolver
-from diffsim_ti.terms import Drag, ExternalForce, Gravity, Term
+from diffsim_ti.terms import Drag, ExternalForce, Gravity, Obstacle, SelfContact, Term
 from diffsim_ti.terms.obstacles import barrier
+from diffsim_ti.terms.obstacles.obstacle import PER_AREA
 from diffsim_ti.torch_bridge.autograd import torch
 from diffsim_ti.torch_bridge.rollout_node import TorchFrames, rollout_frames
 from diffsim_ti.torch_bridge.tensors import DTYPES, checked_device
@@ -79,7 +80,7 @@ class DifferentiableSimulator:
     material: DifferentiableMaterial, SpatiallyVaryingMaterial or another TorchMaterial (diff_physics); density [kg/m^3]:
     a number or a tensor, scalar or per tetrahedron; fixed_vertices: set name, indices or mask; contact: None for the seeds'
     ground, False for none, or a DifferentiableBarrierContact, whose numbers may be tensors with gradient; terms: further
-    core terms.
+    core terms, whose numbers may be tensors with gradient, too, as in `Sphere(radius=tensor)`.
 
     The seeds' ground is a barrier (stiffness 1e4, width 0.01) at y = 0 where the body starts at least one width above it,
     otherwise one width below its lowest vertex; it is fixed at the start. `describe()` says which.
@@ -266,21 +267,34 @@ class DifferentiableSimulator:
             options["check_start"] = False  # the count is chosen at reset; a run that outgrows it raises
         return self.solver.method(scene, **options)
 
+    def _contact_rigidity(self, scene: Scene, values: dict) -> float:
+        """Stiffness over mass [1/s^2] of barriers that a vertex may feel: the stiffest, or, where they are forces, all."""
+        derived, felt = scene.inputs.derive(values), []
+        mass = np.where(derived.mass > 0, derived.mass, np.inf)
+        for term in scene.terms:
+            if isinstance(term, Obstacle | SelfContact):
+                for plain, name in scene.input_names(term).items():
+                    if plain in ("barrier_stiffness", "self_contact_stiffness"):
+                        felt.append(float(values[name]) / mass.min())
+                    elif plain == PER_AREA:
+                        felt.append(float((values[name] * derived.surface / mass).max()))
+        together = sum if self.solver.options.get("contact") == "force" else max
+        return together(felt) if felt else 0.0
+
     def _choose_substeps(self) -> None:
         """What stability and contact ask for at the present numbers; the count only grows, so that losses stay smooth."""
         if not self.solver.method.explicit:
             return
         scene = self._scene(False)
-        numbers = {name: x.detach().double().cpu().numpy() for name, x in self._inputs().items()}
+        tensors = self._inputs() | {name: torch.as_tensor(x) for name, x in scene.given_tensors().items()}
+        numbers = {name: x.detach().double().cpu().numpy() for name, x in tensors.items()}
         values = scene.inputs.values | scene.inputs.check(numbers)
         bound = stability.element_limit(scene, values).dt
         if self._ratio is None:
             solver = self._core_solver(scene, 1)
             self._ratio = solver.stable_dt(tight=True).dt / stability.element_limit(scene).dt
         omega2 = (2 / (self._ratio * bound)) ** 2
-        if self._contact:
-            mass = scene.inputs.derive(values).mass
-            omega2 += float(values["barrier_stiffness"]) * barrier.reference_curvature() / mass[mass > 0].min()
+        omega2 += self._contact_rigidity(scene, values) * barrier.reference_curvature()
         needed = math.ceil(self.solver.dt * math.sqrt(omega2) / 2 / 0.8)
         if needed > self._substeps:
             warnings.warn(

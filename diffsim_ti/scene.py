@@ -153,6 +153,14 @@ class Scene:
                 return self.inputs.names_of(terms.index(term))
         raise ValueError(f"this scene does not list {term!r}; it has {', '.join(map(repr, self.terms)) or 'no terms'}")
 
+    def given_tensors(self) -> dict[str, object]:
+        """{name of an input: tensor} of the terms' numbers that were given as tensors; their graphs stay with them."""
+        return {
+            self.inputs.names_of(k)[plain]: tensor
+            for k, term in enumerate(self._given)
+            for plain, tensor in term.tensors.items()
+        }
+
     def motion_rows(self, times: ArrayLike) -> np.ndarray:
         """Displacement of the fixed vertices from their start at each time [s], shape (len(times), num_fixed, 3) [m]."""
         return sampled("motion", self.motion, times, len(self.fixed))

@@ -56,7 +56,7 @@ class Simulator:
     def step(self) -> None:
         """Advance by solver.dt."""
         self._load_step()
-        self._guard.offset, self.workspace.first_step = self.step_count * self.solver.substeps, self.step_count
+        self.workspace.first_step = self.step_count
         passes = self.solver.num_passes(1)
         self.workspace.save(self._before, 0)
         try:
@@ -117,7 +117,7 @@ class Simulator:
     def set_state(self, positions: ArrayLike | None = None, velocities: ArrayLike | None = None) -> None:
         """Put the body elsewhere: positions [m], velocities [m/s], shape (num_vertices, 3); None leaves a part as it is.
 
-        What the law remembers stays; `reset` clears it.
+        Fixed vertices keep no velocity. What the law remembers stays; `reset` clears it.
         """
         state, shape = self.workspace.state, (self.scene.mesh.num_vertices, 3)
         for name, value, target, origin in (
@@ -128,7 +128,10 @@ class Simulator:
                 value = np.asarray(value, np.float64)
                 if value.shape != shape:
                     raise ValueError(f"{name}: expected shape {shape}, got {value.shape}")
-                runtime.fill(target, (value - origin)[None])
+                value = value - origin
+                if name == "velocities":
+                    value[self.scene.fixed] = 0
+                runtime.fill(target, value[None])
         self.workspace.forget()
 
     def set_forces(self, forces: ArrayLike) -> None:

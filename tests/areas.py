@@ -9,7 +9,7 @@ HEAD = "| area | files test_*.py | minutes |\n| --- | --- | ---: |\n"
 # area -> files, without test_ and .py
 AREAS = {
     "meshes, scenes, materials": "mesh locate scene inputs materials open_laws laws_with_state",
-    "motion against closed forms": "reference_motion step_limit hertz torture",
+    "motion against closed forms": "reference_motion step_limit energy_watch hertz torture",
     "every adjoint, order, fuzz": "every_adjoint term_order gradient_fuzz",
     "gradients": "gradients gradient_clip gradient_faults checkpoints tape outputs identification",
     "implicit steps and equilibria": "implicit implicit_gradients implicit_contact swept",
@@ -21,7 +21,7 @@ AREAS = {
     "charts, maps, advice": "study study_stability peers",
     "pictures, films, the window": "picture_drawing picture_film optimization_picture writers viewer viewer_window gallery",
     "examples and pages": "examples contact_examples static_examples torch_examples readme",
-    "command line, resources, backends": "cli layout resources devices launch executed_ptx vulkan",
+    "command line, resources, backends": "cli strength layout resources devices launch executed_ptx vulkan",
 }
 AREA_OF = {name: area for area, names in AREAS.items() for name in names.split()}
 

@@ -18,13 +18,16 @@ from impact_judge import Judge
 
 import diffsim_ti as ds
 
-SOLVERS = {  # dealt in turn; `stable`: whether the step is what stability allows, and not drawn
+SOLVERS = {  # dealt in turn
+    "VelocityVerletSolver": ds.VelocityVerletSolver,
+    "SemiImplicitSolver": ds.SemiImplicitSolver,
     "ImplicitEulerSolver": ds.ImplicitEulerSolver,
     "BDF2Solver": ds.BDF2Solver,
     "ImplicitMidpointSolver": ds.ImplicitMidpointSolver,
     "StaticSolver": ds.StaticSolver,
 }
 DENSITY = 1000.0
+SHARE = 0.7  # of the stable step at the start, which explicit solvers take
 
 
 @dataclass
@@ -43,13 +46,18 @@ class Case:
     resolution: int
     thickness: float
     moving: bool
-    stiffness: float | None = None
-    substeps: int = 1
+    stiffness: float | None = None  # per area [N/m^3]
+    substeps: int = 1  # of explicit solvers: times what stability asks for
+    substep: float = float("inf")  # what explicit ones were advised [s]
     advice: list = field(default_factory=list)
 
     @property
     def wave_speed(self) -> float:
         return float(np.sqrt(self.youngs_modulus / DENSITY))
+
+    @property
+    def explicit(self) -> bool:
+        return SOLVERS[self.solver].explicit
 
     @property
     def slow(self) -> bool:
@@ -73,7 +81,7 @@ def draw(number: int, seed: int, solvers) -> Case:
         kind=("wall", "needle", "plate", "ball")[int(rng.integers(4))],
         precision="f32" if number % 5 == 4 else "f64",
         speed=log(0.1, 50),
-        dt=log(1e-4, 3e-2),
+        dt=log(1e-4, 3e-2),  # of explicit solvers: how often one looks
         youngs_modulus=log(1e4, 1e6),
         size=log(0.04, 0.15),
         resolution=int(rng.integers(2, 5)),
@@ -86,6 +94,8 @@ def build(case: Case):
     """(solver, steps, Judge's solid, displacement of the obstacle over time) of a case."""
     rng = np.random.default_rng([case.seed, case.number, 1])
     static, width = case.solver == "StaticSolver", 0.25 * float(np.clip(case.thickness, 4e-3, 1.2e-2)) + 1e-3
+    if case.explicit:
+        case = replace(case, dt=min(case.dt, 0.25 * case.size / case.speed))
     mesh = ds.TetrahedralMesh.create_box(case.resolution, size=case.size).translated([-0.5 * case.size] * 3)
     turn = turned(rng) if rng.random() < 0.5 and not static else np.eye(3)
     x = mesh.vertices @ turn.T
@@ -94,7 +104,7 @@ def build(case: Case):
     gap = width * rng.uniform(0.3, 2.0) + case.speed * case.dt * rng.uniform(0, 2) * (not static)
     x = x + [-(x[:, 0].max() + half_depth(solid) + gap), *off]
     mesh = ds.TetrahedralMesh(x, mesh.tetrahedra)
-    steps = int(np.clip(np.ceil((gap + 2 * case.size) / (case.speed * case.dt)), 6, 14))
+    steps = int(np.clip(np.ceil((gap + 2 * case.size) / (case.speed * case.dt)), 6, 60 if case.explicit else 14))
     own = case.speed * (0.0 if case.moving else 1.0)
     speed = case.speed - own
     if static:  # pressed on by a third of its size, either by its own held side or by the obstacle
@@ -106,13 +116,15 @@ def build(case: Case):
         more = dict(fixed=fixed, motion=motion)
     else:
         path, more = (lambda t: [-speed * t, 0, 0]), dict(initial_velocities=(own, 0, 0))
-    advised = dict(stiffness=case.stiffness)  # [N/m]
-    stiff = advised if case.stiffness else dict(stiffness_per_area=natural_stiffness(case, mesh, width))
-    obstacle = obstacle(width=width, path=path, **stiff)
+    stiffness = case.stiffness or natural_stiffness(case, mesh, width)
+    obstacle = obstacle(width=width, stiffness_per_area=stiffness, path=path)
     scene = ds.Scene(
         mesh, ds.StableNeoHookean(case.youngs_modulus, 0.3), DENSITY, [obstacle], precision=case.precision, **more
     )
     options = dict(load_steps=case.substeps) if static else dict(substeps=case.substeps)
+    if case.explicit:
+        longest = min(SHARE * ds.stable_dt(scene).dt / case.substeps, case.substep)
+        options["substeps"] = int(np.ceil(case.dt / longest))
     return SOLVERS[case.solver](scene, dt=case.dt, **options), steps, solid, path
 
 
@@ -191,12 +203,17 @@ NUMBER = r"([-+.\deE]*\d)"
 
 def follow(case: Case, said: str) -> Case | None:
     """The case changed as an error advises, or None."""
-    stiffness, substep = re.search(f"stiffness to {NUMBER} N/m", said), re.search(f"steps of {NUMBER} s", said)
+    stiffness, substep = re.search(f"per_area to {NUMBER} N/m\\^3", said), re.search(f"steps of {NUMBER} s", said)
     advice = [*case.advice, said]
     if stiffness:
         return replace(case, stiffness=float(stiffness[1]), advice=advice)
     if "BDF2Solver" in said and case.solver == "ImplicitMidpointSolver":
         return replace(case, solver="BDF2Solver", advice=advice)
+    shorter = re.search(f"substep to {NUMBER} s", said)
+    if case.explicit and shorter:
+        return replace(case, substep=float(shorter[1]), advice=advice)
+    if case.explicit and "raise substeps" in said:
+        return replace(case, substeps=2 * case.substeps, advice=advice)
     if substep and case.solver != "StaticSolver":
         more = int(np.ceil(case.dt / float(substep[1])))
         return replace(case, substeps=max(more, 2 * case.substeps), advice=advice)

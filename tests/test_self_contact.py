@@ -316,8 +316,11 @@ def test_tunnelling_is_an_error_that_names_the_pair_and_keeps_the_state():
     weak = ds.Simulator(
         ds.SemiImplicitSolver(crossed_edges().scene.replace(terms=[ds.SelfContact(1e-3, WIDTH)]), dt=DT)
     )
-    with pytest.raises(ds.Tunnelling, match=r"(edges|vertex).*may have gone through each other: their gap was .* m/s"):
+    with pytest.raises(
+        ds.Tunnelling, match=r"^step \d+, t = .*(edges|vertex).*may have gone through each other: their gap was .* m/s"
+    ) as error:
         weak.run(100)
+    assert error.value.step == weak.step_count > 0 and f"t = {weak.time:.6g} s" in str(error.value)
     weak.check_surfaces()
 
 

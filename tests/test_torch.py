@@ -119,6 +119,83 @@ def test_gradcheck_of_contact_numbers():
     assert gradcheck(lambda *c: moved(contact=c), tuple(variable(x) for x in (1.0, 0.1, -0.05)), **GATE)
 
 
+def test_gradcheck_of_contact_with_friction():
+    def run(friction, speed, stiffness):
+        contact = DifferentiableBarrierContact(
+            1e4 * stiffness, 0.1, ground_height=-0.05, friction=friction, friction_speed=speed
+        )
+        sim = simulator(contact=contact)
+        sim.reset(*start())
+        sim.rollout(5)
+        return sim.positions, sim.velocities
+
+    assert gradcheck(run, tuple(variable(x) for x in (0.4, 0.3, 1.0)), **GATE)
+    moved, unmoved = run(0.4, 0.3, 1.0)[0], run(0.0, 0.3, 1.0)[0]
+    assert (moved - unmoved).abs().max() > 1e-4
+
+
+def test_gradcheck_of_numbers_of_terms():
+    """Tensors that terms are made of get gradients, in simulators and in the functional face, under any name."""
+
+    def terms(radius, center, stiffness, friction):
+        ball = ds.Sphere(center, radius, stiffness=1e4 * stiffness, width=0.2, friction=friction, friction_speed=0.3)
+        return [ball, ds.HalfSpace((-0.1, 0, 0), (1, 0, 0), stiffness=2e4 * stiffness, width=0.2, name="wall")]
+
+    def simulated(*numbers):
+        sim = simulator(contact=False, terms=terms(*numbers))
+        sim.reset(*start())
+        sim.rollout(2)
+        sim.step()
+        return sim.positions, sim.velocities
+
+    def rolled(*numbers):
+        scene = Scene(MESH, StableNeoHookean(1e5, 0.3), terms=terms(*numbers), precision="f64")
+        return tuple(
+            rollout_frames(Rollout(SemiImplicitSolver(scene, dt=0.002), 6), initial_displacements=0.01 * NOISE[0])
+        )
+
+    inputs = tuple(variable(x) for x in (0.3, [0.25, -0.4, 0.25], 1.0, 0.4))
+    assert gradcheck(simulated, inputs, **GATE)
+    assert gradcheck(rolled, inputs, **GATE)
+    grads = torch.autograd.grad(simulated(*inputs)[0].pow(2).sum(), inputs)
+    assert all(g.abs().max() > 0 for g in grads)
+
+
+def test_numbers_of_terms_follow_an_optimiser():
+    """Changed in place between runs, as optimisers do; one simulator, one scene."""
+    radius = torch.nn.Parameter(torch.tensor(0.3))
+    sim = simulator(contact=False, terms=[ds.Sphere((0.25, -0.4, 0.25), radius, stiffness=1e4, width=0.2)])
+    ends = []
+    for value in (0.3, 0.32):
+        with torch.no_grad():
+            radius.fill_(value)
+        sim.reset(*start())
+        sim.rollout(3)
+        fresh = simulator(contact=False, terms=[ds.Sphere((0.25, -0.4, 0.25), value, stiffness=1e4, width=0.2)])
+        fresh.reset(*start())
+        fresh.rollout(3)
+        assert torch.equal(sim.positions, fresh.positions)
+        ends.append(sim.positions)
+    assert not torch.equal(*ends)
+
+
+@pytest.mark.filterwarnings("default:dt = .* is divided")
+@pytest.mark.parametrize("contact", ["stage", "force"])
+def test_substeps_count_barriers_of_terms_as_those_of_contact(contact):
+    counts = []
+    for options in (
+        dict(contact=DifferentiableBarrierContact(1e6, 0.1, ground_height=-0.2)),
+        dict(contact=False, terms=[ds.Ground(-0.2, 1e6, 0.1)]),
+        dict(contact=False, terms=[ds.Ground(-0.2, torch.tensor(1e6), 0.1, name="floor")]),
+        dict(contact=False),
+        dict(contact=False, terms=[ds.Ground(-0.2, width=0.1, stiffness_per_area=torch.tensor(1e8))]),
+    ):
+        solver = DifferentiableSolver(0.01, contact=contact)
+        sim = DifferentiableSimulator(MESH, DifferentiableMaterial(1e5, 0.3), solver, **options)
+        counts.append(sim._substeps)
+    assert counts[0] == counts[1] == counts[2] > counts[3] < counts[4]
+
+
 @pytest.mark.parametrize(
     "inputs",
     [dict(E=1.0, nu=0.3, density=1.0, gravity=[0.5, -9.8, 1.0]), dict(velocities=NOISE[1]), dict(forces=NOISE)],
@@ -366,6 +443,22 @@ def test_a_run_that_outgrows_its_substeps_raises_and_keeps_its_state():
     fresh = simulator(contact=False)
     fresh.step()
     assert torch.equal(sim.positions, fresh.positions)
+
+
+def test_errors_of_steps_name_the_step_of_the_simulator():
+    """After three steps at rest one that diverges, and one that Newton's method gives up on."""
+    for method, options, size, error in (
+        (SemiImplicitSolver, {}, 1e200, ds.Divergence),
+        (ds.ImplicitEulerSolver, dict(max_iterations=2), 0.4, ds.NotConverged),
+    ):
+        solver = DifferentiableSolver(gravity=0.0, method=method, **options)
+        sim = DifferentiableSimulator(MESH, DifferentiableMaterial(1e5, 0.3), solver, contact=False)
+        for _ in range(3):
+            sim.step()
+        sim._displacements = size * NOISE[0]
+        with pytest.raises(error, match=r"^step 3, t = 0\.03 s: ") as raised:
+            sim.step()
+        assert raised.value.step == 3
 
 
 def test_truncated_backpropagation():

@@ -148,6 +148,27 @@ def test_barrier_derivatives_and_continuity():
     assert contact.barrier_potential(torch.tensor(0.03)).item() == pytest.approx(exact, rel=1e-14)
 
 
+def test_friction_of_the_formula():
+    """Coulomb's law beyond the friction speed, a smooth way there, nothing at rest; derivatives by everything."""
+    floor = dict(ground_height=0.0, barrier_stiffness=1e3, barrier_distance=0.1)
+    x = torch.full((4, 3), 0.05)
+    v = torch.tensor([[0.0, 1.0, 0.0], [3.0, -5.0, 4.0], [0.005, 0.0, 0.0], [-1.0, 0.0, 0.0]])
+    contact = DifferentiableBarrierContact(**floor, friction=0.5, friction_speed=0.01)
+    force = contact.compute_forces(x, v)
+    push = force[0, 1].item()
+    assert force[:, 1].allclose(force[0, 1]) and push > 0 and not force[0, [0, 2]].any()
+    assert force[1, [0, 2]].allclose(-0.5 * push * torch.tensor([0.6, 0.8])) and force[3, 0].item() == 0.5 * push
+    assert force[2, 0].item() == pytest.approx(-0.5 * push * 0.75)
+    assert torch.equal(contact.compute_forces(x), DifferentiableBarrierContact(**floor).compute_forces(x, v))
+
+    def by_numbers(x, v, mu, eps, kappa):
+        numbers = dict(barrier_stiffness=kappa, barrier_distance=0.1, friction=mu, friction_speed=eps)
+        return DifferentiableBarrierContact(**numbers).compute_forces(x, v)
+
+    at = (x, v[1:].repeat(2, 1)[:4], 0.5, 0.01, 1e3)
+    assert gradcheck(by_numbers, tuple(variable(a) for a in at), **GATE)
+
+
 def test_contact_forces():
     contact = DifferentiableBarrierContact(ground_height=-1.0, barrier_stiffness=1e3, barrier_distance=0.1)
     x = torch.tensor([[0.0, -0.95, 0.0], [1.0, -0.5, 2.0], [0.0, -1.01, 0.0]])

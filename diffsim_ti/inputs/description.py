@@ -1,7 +1,7 @@
 """What an input is, said once: its value, the shapes it may have, unit, range, and how large a change of it matters."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -72,6 +72,7 @@ class Input:
     change: (value, RunSize) -> how large a change of it matters, for `verify`.
     unit: "-" of a number without dimension, "" where it is not said.
     label: how errors of a constructor call it; default `plain`. The unit stands behind if not in it.
+    given: what the value was given as, if that is a tensor with a graph; the face to its library takes it from here.
     """
 
     name: str
@@ -82,8 +83,12 @@ class Input:
     change: Callable[[np.ndarray, RunSize], float] = own_size
     plain: str = ""
     label: str = ""
+    given: object = field(default=None, init=False)
 
     def __post_init__(self):
+        if hasattr(self.value, "detach"):
+            object.__setattr__(self, "given", self.value)
+            object.__setattr__(self, "value", self.value.detach().cpu().numpy())
         if self.value is not None:
             object.__setattr__(self, "value", frozen(np.array(self.value, np.float64)))
             object.__setattr__(self, "shapes", self.shapes or (self.value.shape,))

@@ -1,4 +1,4 @@
-"""Energy that comes from a step's being too long, counted where a method does not damp it."""
+"""Energy that comes from a step's being too long, counted where a method does not surely damp it."""
 
 import weakref
 
@@ -7,8 +7,17 @@ import numpy as np
 from diffsim_ti.state.workspace import Workspace
 
 
+class EnergyGained(UserWarning):
+    """Steps have added energy to the motion. Carries `gained` [J], `share` of the energy that moves, `step`, `time` [s] and
+    the `substep` [s] that is advised."""
+
+    def __init__(self, message: str, gained: float, share: float, step: int, time: float, substep: float):
+        super().__init__(message)
+        self.gained, self.share, self.step, self.time, self.substep = gained, share, step, time, substep
+
+
 class EnergyWatch:
-    """Sums what implicit midpoint steps add to the energy, against the largest energy that moved so far.
+    """Sums what implicit midpoint and BDF2 steps add to the energy, against the largest energy that moved so far.
 
     Between u and u' = 2 u* - u the forces f(u*) = -dE/du do the work f(u*) . (u' - u), and kinetic energy changes by just
     that; the energy of strains and contacts changes by E(u') - E(u). The step has added
@@ -18,6 +27,9 @@ class EnergyWatch:
     which is of third order in u' - u, and none for a quadratic E. Loads, drag and prescribed motion do not enter it. Where
     obstacles go from w by w* to w', E(u) and E(u') are taken with them at w and w', and what they do on the body in the
     middle, dE/dw (w' - w), is none of the step's.
+    BDF2 does not keep kinetic energy either, so that of free vertices is added, less the work m (v* - y) / gamma . (u' - u)
+    of what accelerates them (solvers/implicit/solver.py). It gives back within a bounce a part of what it has just taken,
+    and loses on the whole: only a net gain counts.
     Simo, Tarnow 1992, The discrete energy-momentum method, doi:10.1007/BF00913408.
     """
 
@@ -29,9 +41,17 @@ class EnergyWatch:
         """Forget what was seen."""
         self.gained, self.moving = 0.0, 0.0  # [J]
 
-    def note(self, u: np.ndarray, u_star: np.ndarray, u_next: np.ndarray, v_next: np.ndarray, places: tuple) -> None:
+    def note(
+        self,
+        u: np.ndarray,
+        u_star: np.ndarray,
+        u_next: np.ndarray,
+        v_next: np.ndarray,
+        places: tuple,
+        kinetic: float = 0.0,
+    ) -> None:
         """A step went from u by u_star to u_next, obstacles from places[0] by places[1] to places[2] (displacements [m],
-        shape (num_obstacles, 3)); contacts are as in its pass."""
+        shape (num_obstacles, 3)); contacts are as in its pass. kinetic: what it has added to that energy [J]."""
         potential, energies, drift = self.ws.potential, [], places[2] - places[0]
         for displacement, place in ((u, places[0]), (u_next, places[2])):
             self.ws.put_obstacles(place)
@@ -39,16 +59,17 @@ class EnergyWatch:
             energies.append(potential.energy()[0])
         self.ws.put_obstacles(places[1])
         potential.place(u_star)
-        work = float((potential.forces()[0] * (u_next - u)).sum()) - self._work_of_obstacles(places[1], drift)
-        self.gained += energies[1] - energies[0] + work
-        kinetic = 0.5 * float((self.ws.mass * v_next**2).sum())
-        self.moving = max(self.moving, kinetic + energies[1])
+        work = float((potential.forces()[0] * (u_next - u)).sum()) - self._work_of_obstacles(u_star, places[1], drift)
+        self.gained += energies[1] - energies[0] + work + kinetic
+        self.moving = max(self.moving, 0.5 * float((self.ws.mass * v_next**2).sum()) + energies[1])
 
-    def _work_of_obstacles(self, places: np.ndarray, drift: np.ndarray) -> float:
-        """dE/dw (w' - w) [J], by differences over a hundredth of the width."""
+    def _work_of_obstacles(self, u_star: np.ndarray, places: np.ndarray, drift: np.ndarray) -> float:
+        """dE/dw (w' - w) [J], by differences over a hundredth of the smallest gap."""
         if not drift.any():
             return 0.0
-        share, energies = min(0.5, 0.01 * self.ws.way.narrowest / np.abs(drift).max()), []
+        near = self.ws.way.nearest(u_star, places, self.ws.way.widest)
+        gap = self.ws.way.narrowest if near is None else min(near.value, self.ws.way.narrowest)
+        share, energies = min(0.5, 0.01 * gap / np.abs(drift).max()), []
         for sign in (1, -1):
             self.ws.put_obstacles(places + sign * share * drift)
             energies.append(self.ws.potential.energy()[0])

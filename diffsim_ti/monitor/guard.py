@@ -6,6 +6,7 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.monitor import quantities, stability
+from diffsim_ti.monitor.energy_watch import EnergyGained
 from diffsim_ti.state.workspace import Workspace
 from diffsim_ti.terms.obstacles.barrier import beta
 
@@ -51,13 +52,15 @@ class Guard:
     def __init__(self, workspace: Workspace):
         self.ws = workspace
         self.good = workspace.history(1)
-        self.good_pass, self.offset = 0, 0  # offset: passes before this run, for reports
+        self.good_pass = 0
         self._stiffness, self._warned, self._warned_of_gain = None, False, False
         self.restart()
 
     def restart(self) -> None:
         """A new run: looks come at the same passes whatever ran before, and sooner where it starts deformed."""
         solver = self.ws.solver
+        if solver.explicit and self.ws.energy_watch:
+            self.ws.energy_watch.clear()
         self._passes, self.every = 0, self.first if solver.explicit and solver.starts_deformed() else self.usual
 
     def mark(self, now: int) -> None:
@@ -68,8 +71,11 @@ class Guard:
 
     def advance(self, first: int, last: int, num_passes: int, save_every: int = 0, recording: bool = False) -> None:
         """Passes first .. last - 1, looked after; recording, slot j of the record holds the state before pass j."""
+        balance = self.ws.energy_watch if self.ws.solver.explicit else None
         while first < last:
             stop = min(last, first + self.every)
+            if balance:
+                balance.before(first, num_passes)
             self.mark(first)
             if recording:
                 self.ws.save(self.ws.record, first)
@@ -80,46 +86,48 @@ class Guard:
                 self._diagnose_crossing(stop, num_passes)
             if self.ws.first_bad_vertex() is not None:
                 self._diagnose(stop, num_passes)
-            self._warn_of_stiff_contact()
-            self._warn_of_gained_energy()
+            self._warn_of_stiff_contact(stop, num_passes)
+            if balance:
+                balance.after(stop, num_passes, stop - first)
+            self._warn_of_gained_energy(stop, num_passes)
             self._passes += stop - first
             if self._passes >= self.every:
                 self._passes = 0
                 self._look_at_step(stop, num_passes)
             first = stop
 
-    def _warn_of_stiff_contact(self) -> None:
+    def _warn_of_stiff_contact(self, now: int, num_passes: int) -> None:
         """Once, where a barrier was stiffer than a step can follow: energy may then come from nowhere."""
         solver = self.ws.solver
         if self._warned or not solver.explicit or solver.stages_contact or not self.ws.watch.contacts:
             return
         omega_dt = self.ws.watch.largest_omega_dt()
         if omega_dt > 2:
-            self._warned = True
+            self._warned, step = True, self.ws.step_of(now - 1, num_passes)
             h = solver.substep
             warnings.warn(
-                f"a contact was stiffer than the substep {h:.3g} s can follow (omega dt = {omega_dt:.3g} > 2), so that "
+                f"step {step}, t = {step * solver.dt:.6g} s: a contact was stiffer than the substep {h:.3g} s can follow "
+                f"(omega dt = {omega_dt:.3g} > 2), so that "
                 f"energy may be gained in it: take substeps of {1.8 * h / omega_dt:.3g} s, or a softer or wider barrier",
                 stacklevel=5,
             )
 
-    def _warn_of_gained_energy(self) -> None:
-        """Once, where an implicit method's steps have added a tenth of the energy that moves."""
-        watch, h = self.ws.energy_watch, self.ws.solver.substep
+    def _warn_of_gained_energy(self, now: int, num_passes: int) -> None:
+        """Once, where steps have added a tenth of the energy that moves."""
+        watch, solver = self.ws.energy_watch, self.ws.solver
         if self._warned_of_gain or watch is None or watch.share <= 0.1:
             return
-        self._warned_of_gain = True
-        warnings.warn(
-            f"{type(self.ws.solver).__name__} has gained {watch.gained:.3g} J, {watch.share:.0%} of the energy that moves, "
-            f"from nonlinear motion or contact within its substeps of {h:.3g} s: take substeps of {h / 4:.3g} s, or "
-            "BDF2Solver or ImplicitEulerSolver, which damp",
-            stacklevel=5,
+        self._warned_of_gain, step = True, self.ws.step_of(now - 1, num_passes)
+        enough = solver.substep / (2 if solver.explicit else 4)
+        others = "ImplicitEulerSolver, which damps most"
+        others = others if getattr(solver, "multistep", False) else f"BDF2Solver or {others}"
+        said = (
+            f"step {step}, t = {step * solver.dt:.6g} s: {type(solver).__name__} has gained {watch.gained:.3g} J, "
+            f"{watch.share:.0%} of the energy that moves, from nonlinear motion or contact within its substeps of "
+            f"{solver.substep:.3g} s: take substeps of {enough:.3g} s, or {others}"
         )
-
-    def _step_of(self, j: int, num_passes: int) -> int:
-        """The step that pass j belongs to; velocity Verlet's closing half kick belongs to the last one."""
-        solver = self.ws.solver
-        return (self.offset + min(j, num_passes - solver.num_passes(0) - 1)) // solver.substeps
+        about = watch.gained, watch.share, step, step * solver.dt, enough
+        warnings.warn(EnergyGained(said, *about), stacklevel=5)
 
     def _look_at_step(self, now: int, num_passes: int) -> None:
         solver = self.ws.solver
@@ -134,7 +142,7 @@ class Guard:
             near = omega2 * solver.substep**2 > 0.9**2 * 4
             self.every = min(2 * self.every, self.close if near else self.usual)
             return
-        step, limit = self._step_of(now - 1, num_passes), 2 / np.sqrt(omega2)
+        step, limit = self.ws.step_of(now - 1, num_passes), 2 / np.sqrt(omega2)
         tet = self._stiffness.worst_tetrahedron()
         self.ws.restore(self.good, 0)
         why = (
@@ -172,7 +180,7 @@ class Guard:
         ws.restore(self.good, 0)
         ws.watch.put(self._seen)
         k, vertex, depth = crossing
-        term, step = ws.watch.contacts[k], self._step_of(j, num_passes)
+        term, step = ws.watch.contacts[k], self.ws.step_of(j, num_passes)
         speed = float(np.linalg.norm(ws.velocity_of(vertex)))
         enough = min(0.1 * float(term.values["barrier_width"]) / max(speed, 1e-300), 0.5 * solver.substep)
         stiffness = self._stiffness_needed(k, vertex, speed)
@@ -224,7 +232,7 @@ class Guard:
         J_around = np.where(np.isfinite(J[around]), J[around], -np.inf)
         tet = int(around[J_around.argmin()]) if around.size else 0
         stable, state = self._stable_step()
-        step = self._step_of(j, num_passes)
+        step = self.ws.step_of(j, num_passes)
         why = (
             f"the substep {solver.substep:.4g} s exceeds the stable step {stable:.4g} s {state}: reduce dt, "
             "raise substeps, or use an implicit solver"

@@ -43,6 +43,18 @@ class ObserverKernels:
             shear = S[0, 1] * S[0, 1] + S[1, 2] * S[1, 2] + S[2, 0] * S[2, 0]
             out.von_mises[e] = ti.sqrt(ti.cast(0.5, self.element.types.fp) * (a * a + b * b + c * c) + 3 * shear)
 
+    @ti.func
+    def store(self, scene: A, at: A, out: A, plan: A):
+        for e in range(plan.num_places):
+            H = self.element.edges(e, scene, at.u, 0).dot(self.element.gradients_of(e, scene.gradients))
+            out.energy[e] = self.law.energy_density(H, self.element.numbers_at(e, scene, at, 0))
+
+    @cached_property
+    def stored(self) -> Kernel:
+        """Energy density [J/m^3] of each tetrahedron alone, for what looks often."""
+        own = dict(scene=SCENE, at=with_state(dict(u="vectors2"), self.law), out=dict(energy="scalars"))
+        return Kernel("stored", self.store, self.law.precision, own, dict(num_places="int"))
+
     @cached_property
     def fields(self) -> Kernel:
         """Energy density [J/m^3], von Mises stress [Pa], J of each tetrahedron."""
@@ -90,6 +102,19 @@ def tetrahedron_fields(workspace: Workspace) -> TetrahedronFields:
     return TetrahedronFields(
         *(runtime.fetch(x)[a.place].astype(np.float64) for x in (out.energy, out.von_mises, out.J))
     )
+
+
+def elastic_energy(workspace: Workspace) -> float:
+    """Energy of strains [J] in the current state."""
+    a = workspace.arrays
+
+    def bind():
+        out = SimpleNamespace(energy=runtime.array(a.fp, a.num_places))
+        return out, observer_kernels(a.law, a.features()).stored.bind(scene=a, at=workspace.state, out=out)
+
+    out, launch = workspace.kept("stored", bind)
+    launch(num_places=a.num_places)
+    return float(runtime.fetch(out.energy)[a.place].astype(np.float64) @ a.values.volumes)
 
 
 def barrier_energies(workspace: Workspace) -> np.ndarray:

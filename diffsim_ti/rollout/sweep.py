@@ -78,7 +78,7 @@ class Sweep:
 
     def run(self, values: dict, start: Callable | None = None) -> Run:
         """Run from the scene's inputs with some values replaced; see `Run` for `start`."""
-        run = Run(self._checked(values), start)
+        run = Run(self._checked(values), start, self.first_step)
         self._forward(run)
         run.contacts = self.workspace.watch.seen_so_far()
         return run
@@ -130,7 +130,7 @@ class Sweep:
         self._load(run)
         ws, checkpoints = self.workspace, self.checkpoints
         self._guard.restart()
-        self._guard.offset, self.workspace.first_step = self.first_step * self.solver.substeps, self.first_step
+        self.workspace.first_step = run.first_step
         self._recorded = checkpoints.num_segments == 1 and self._adjoint is not None  # a gradient was asked for before
         if self._recorded:
             ws.make_record(checkpoints.segment + 1)
@@ -245,8 +245,9 @@ class Sweep:
         """Between steps: report the running adjoint, and scale it back to `clip`."""
         by_position, by_velocity = self._adjoint.norm()
         if not np.isfinite(by_position + by_velocity):
+            now = self.workspace.first_step + step
             raise FloatingPointError(
-                f"the adjoint became not finite in step {step} (t = {step * self.solver.dt:g} s): "
+                f"the adjoint became not finite in step {now} (t = {now * self.solver.dt:g} s): "
                 "look at the loss and at how long the rollout stays smooth; parameters are unchanged"
             )
         scaled = 1.0

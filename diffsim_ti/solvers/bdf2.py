@@ -16,6 +16,7 @@ class BDF2Solver(ImplicitSolver):
 
     order = 2
     multistep = True
+    may_gain_energy = True
 
     def stage(self, rate, fresh):
         h = self.substep

@@ -93,6 +93,9 @@ class SemiImplicitSolver(ExplicitSolver):
     def num_passes(self, steps: int) -> int:
         return steps * self.substeps
 
+    def lags(self, j, num_passes):
+        return True
+
     def weights(self, j, num_passes, rate):
         h = self.dt / self.substeps
         decay = math.exp(-rate * h)

@@ -21,6 +21,9 @@ class VelocityVerletSolver(ExplicitSolver):
     def num_passes(self, steps: int) -> int:
         return steps * self.substeps + 1
 
+    def lags(self, j, num_passes):
+        return 0 < j < num_passes
+
     def weights(self, j, num_passes, rate):
         h = self.dt / self.substeps
         decay = math.exp(-rate * h)

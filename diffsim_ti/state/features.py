@@ -70,6 +70,11 @@ class Features:
         return self.staged[0].number if self.staged else 0
 
     @property
+    def driven(self) -> bool:
+        """Whether something does work on the body that its energy does not tell, or takes some."""
+        return self.forces or self.motion or self.moving > 0 or self.drag >= 0
+
+    @property
     def pressing(self) -> tuple[ObstacleGroup, ...]:
         """Groups that act by a force of their own."""
         return tuple(group for group in self.groups if group not in self.staged)

@@ -31,6 +31,7 @@ class Workspace:
     first_step = 0  # steps that were done before this run, for reports
     potential = None  # of implicit steps
     energy_watch = None  # counts energy that long steps add, for solvers that neither damp nor limit it
+    changes = 0  # of the state from outside its passes
 
     def __init__(self, solver, derived: Derived):
         self.solver, self.scene = solver, solver.scene
@@ -60,6 +61,7 @@ class Workspace:
 
     def restart(self) -> None:
         """Set the state to the start."""
+        self.changes += 1
         runtime.fill(self.state.u, self.arrays.values.displacement[None])
         runtime.fill(self.state.v, self.arrays.values.velocity[None])
         if self.state.z is not None:
@@ -85,8 +87,20 @@ class Workspace:
 
     def forget(self) -> None:
         """The state was set from outside: forget what came before it."""
+        self.changes += 1
         if self.pairs:
             self.pairs.forget(self.state.u)
+
+    def step_of(self, j: int, num_passes: int) -> int:
+        """The step that pass j belongs to; velocity Verlet's closing half kick belongs to the last one."""
+        solver = self.solver
+        return self.first_step + min(j, num_passes - solver.num_passes(0) - 1) // solver.substeps
+
+    def dated(self, error: Exception, j: int, num_passes: int) -> Exception:
+        """The same error, which says when: in pass j of a run, before which `first_step` steps were done."""
+        error.step = self.step_of(j, num_passes)
+        error.args = (f"step {error.step}, t = {error.step * self.solver.dt:.6g} s: {error}",)
+        return error
 
     @property
     def rate(self) -> float:
@@ -126,6 +140,7 @@ class Workspace:
 
     def restore(self, source: History, slot: int) -> None:
         """Copy a slot to the current state."""
+        self.changes += 1
         source.copy(slot, self.state, 0)
 
     def save_frame(self, frame: int) -> None:

@@ -49,6 +49,11 @@ class Term(ABC):
         """{plain name of an input: its value}, without those that are sampled per run."""
         return {i.plain: i.value for i in self.described if i.value is not None}
 
+    @property
+    def tensors(self) -> dict[str, object]:
+        """{plain name of an input: the tensor that it was given as}"""
+        return {i.plain: i.given for i in self.described if i.given is not None}
+
     def with_input(self, plain: str, **changes) -> "Term":
         """A copy in which the input of a plain name has another value, shapes ..."""
         out = copy(self)

@@ -87,7 +87,9 @@ def rollout_frames(rollout: Rollout, **tensors: torch.Tensor) -> TorchFrames:
     """Functional face: run a Rollout with some inputs given as tensors; one autograd node, gradients to all of them.
 
     Names are those of `rollout.inputs`, or "initial_displacements" instead of "initial_positions" (which keeps its digits
-    in float32). Two runs before one backward are right. Second derivatives are refused (see `verify.hessian_product`).
+    in float32). Numbers of the scene's terms that were given as tensors, as in `Sphere(radius=tensor)`, are among the
+    inputs by themselves. Two runs before one backward are right. Second derivatives are refused (see
+    `verify.hessian_product`).
 
     Frames are copied between tensors and the device by one kernel, and so are, with explicit solvers, initial displacements
     and velocities and the gradients by all of these (tensors.py); all other inputs are small and go through the host, as do
@@ -100,6 +102,8 @@ def rollout_frames(rollout: Rollout, **tensors: torch.Tensor) -> TorchFrames:
         raise ValueError("initial_positions and initial_displacements are two spellings of one input: give one")
     if "rest_positions" in tensors and "initial_displacements" in tensors:
         raise ValueError("with rest_positions, give initial_positions: initial_displacements are those from the mesh")
+    for name, value in rollout.scene.given_tensors().items():
+        tensors.setdefault(name, value.expand(rollout.values[name].shape))
     for name, value in tensors.items():
         tensors[name] = value if isinstance(value, torch.Tensor) else torch.as_tensor(value, dtype=torch.float64)
         if not tensors[name].is_floating_point():

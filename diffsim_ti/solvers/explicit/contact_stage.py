@@ -17,15 +17,12 @@ from dataclasses import dataclass
 
 import taichi as ti
 
-from diffsim_ti.solvers.explicit.obstacle_stages import ObstacleStages
+from diffsim_ti.solvers.explicit.obstacle_stages import FELT, PLANE, PUSH, ROWS, SEED, WALL, ObstacleStages
+from diffsim_ti.solvers.explicit.wall_work import work_of_stage
 from diffsim_ti.terms.obstacles import secant, stage
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
 MOST_ROUNDS = 60
-# what is noted of obstacle o at vertex i, in state.stage[ROWS o + row, i]: (n, d); (stiffness, width, mu, friction speed);
-# its velocity; (P, -dP/dy, adjoint of mu, of the friction speed); change or adjoint of (n, P)
-PLANE, FELT, WALL, PUSH, SEED = range(5)
-ROWS = 5
 
 
 @dataclass(frozen=True)
@@ -157,6 +154,8 @@ class ContactStage(ObstacleStages):
                 a = now.alpha * self.blend(plan) * ratio
                 _, total, _, _ = self.solve(i, self.vector(0), free, a, now, state, plan)
                 delta, v = ratio * total, self.slide_all(i, v_plus, ratio, state)
+                if ti.static(self.features.moving > 0):
+                    state.work[i] = state.work[i] + work_of_stage(self, i, v_plus, now, scene, state)
         pressed = self.blend(plan) * delta
         return u + now.alpha * (v + pressed), now.decay * v + delta - (1 - now.decay) * pressed
 

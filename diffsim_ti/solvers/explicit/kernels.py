@@ -20,6 +20,7 @@ STATE = dict(
     frames_v="vectors2",
     seen="scalars2",
     stage="vectors2",
+    work="scalars",
 )
 CHANGE = dict(u="vectors2", v="vectors2", frames_u="vectors2", frames_v="vectors2")  # of a state, or its adjoint
 CORNERS = dict(corner="vectors", rate_corner="vectors")  # adjoints of u and v, still to be gathered

@@ -11,6 +11,10 @@ import taichi as ti
 from diffsim_ti.state.obstacle_functions import ObstacleFunctions
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
+# what a contact stage notes of obstacle o at vertex i, in state.stage[ROWS o + row, i]: (n, d); (stiffness, width, mu,
+# friction speed); its velocity; (P, -dP/dy, adjoint of mu, of the friction speed); change or adjoint of (n, P)
+PLANE, FELT, WALL, PUSH, SEED = range(5)
+ROWS = 5
 
 
 @dataclass(frozen=True)
@@ -137,6 +141,24 @@ class ObstacleStages(ObstacleFunctions):
                     self.add_to_area(g, i, pushed.dot(f_adj), adjoint)
                 self.add_to_rest(i, by_u, adjoint)
         return u_adj, v_adj
+
+    @ti.func
+    def work_of_forces(self, i, u, v_plus, now: A, scene: A):
+        """Work [J] that moving obstacles do on vertex i by their forces and their friction, v_plus being before that."""
+        work, v = ti.cast(0, self.fp), v_plus
+        for g in ti.static(self.features.pressing):
+            for k in range(g.count):
+                first, wall = g.first + k * g.size, self.speed(g, k, now, scene.path)
+                X = scene.rest[i] - self.place(g, k, now, scene.path)
+                if ti.static(g.path >= 0):
+                    force = self.on_area(g, i, g.force.force(scene.parameters, first, X, u, v_plus), scene)
+                    work += now.h * force.dot(wall)
+                if ti.static(g.force.friction):
+                    if scene.inverse_mass[i] > 0:
+                        after = self.slide(g, k, i, u, v, now, scene)
+                        work += (after - v).dot(wall) / scene.inverse_mass[i]
+                        v = after
+        return work
 
     # ---- friction, its tangent and its adjoint -----------------------------------------------------------------------
 

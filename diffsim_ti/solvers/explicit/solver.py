@@ -8,13 +8,16 @@ from types import SimpleNamespace
 import numpy as np
 
 from diffsim_ti import runtime
+from diffsim_ti.contact.surface_pairs import Tunnelling
 from diffsim_ti.inputs import Derived
+from diffsim_ti.monitor.energy_balance import EnergyBalance
 from diffsim_ti.solvers.explicit.adjoint import ExplicitAdjoint, ExplicitTangent
 from diffsim_ti.solvers.explicit.contact_stage import ROWS
 from diffsim_ti.solvers.explicit.kernels import ExplicitKernels, explicit_kernels
 from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.state.schedule import PassTable
 from diffsim_ti.state.workspace import Workspace
+from diffsim_ti.terms import ExternalForce
 
 
 @dataclass(frozen=True)
@@ -74,6 +77,10 @@ class ExplicitSolver(Solver):
         return self.schedule.table(first, last, num_rows, save_every, weights)
 
     @abstractmethod
+    def lags(self, j: int, num_passes: int) -> bool:
+        """Whether before pass j the velocity is that of half a substep ago."""
+
+    @abstractmethod
     def num_passes(self, steps: int) -> int:
         """Passes that `steps` steps take."""
 
@@ -100,7 +107,37 @@ class ExplicitWorkspace(Workspace):
         super().__init__(solver, derived)
         features, a = self.arrays.features(), self.arrays
         noted = ROWS * len(a.obstacles), a.num_vertices
-        self.contact = SimpleNamespace(stage=runtime.array(a.vector, *(noted if features.staged else (1, 1))))
+        self.contact = SimpleNamespace(
+            stage=runtime.array(a.vector, *(noted if features.staged else (1, 1))),
+            work=runtime.array(a.fp, a.num_vertices if features.driven else 1),  # done on each vertex from outside [J]
+        )
+        self.probe = None  # room for a pass that is not taken
+        self.energy_watch = EnergyBalance(self) if EnergyBalance.knows(a.law) else None
+
+    def forces_at(self, j: int, num_passes: int) -> np.ndarray:
+        """Forces [N] on each vertex in the current state, gravity and stages left out, as pass j of a run takes them."""
+        if self.probe is None:
+            self.probe = self.history(2, record=True)
+        self.state.copy(0, self.probe, 0)
+        if self.pairs:
+            self.pairs.ensure(self.probe.u, 0)
+            self.pairs.forces(self.probe.u, 0, self.arrays.corner)
+        seen, step = self.watch.rows(), self.kernels(self.arrays.features()).step
+        launch = self.bound(step, state=(self.probe, self.frames, self.watch, self.contact), table=self.table)
+        for numbers in self.launches(j, j + 1, num_passes, 0, self.arrays.num_tetrahedra):
+            launch(**numbers, base=j, stride=1)
+        self.watch.put(seen)
+        return runtime.fetch(self.probe.f)[0].astype(np.float64)
+
+    def loads_at(self, j: int, num_passes: int) -> np.ndarray:
+        """External forces [N] on each vertex, as pass j of a run takes them."""
+        rows, out = self.arrays.rows["forces"], np.zeros((self.arrays.num_vertices, 3))
+        if rows is not None:
+            weights = self.solver.weights(np.array([j]), num_passes, self.rate)
+            at = [int(np.ravel(self.solver.schedule.row(j - lag))[0]) for lag in (weights.lag0, weights.lag1)]
+            force = 0.5 * sum(rows[min(row, len(rows) - 1)] for row in at)
+            out[self.scene.term(ExternalForce).indices(self.scene.mesh)] = force
+        return out
 
     def kernels(self, features) -> ExplicitKernels:
         """The kernels for some features of the scene."""
@@ -137,4 +174,7 @@ class ExplicitWorkspace(Workspace):
                 pairs.forces(history.u, slot, self.arrays.corner)
             launch(**numbers, base=base, stride=stride)
             if pairs:
-                pairs.check_pass(history.u, slot + stride, self.solver.substep)
+                try:
+                    pairs.check_pass(history.u, slot + stride, self.solver.substep)
+                except Tunnelling as error:
+                    raise self.dated(error, numbers["first"], num_passes) from None

@@ -119,7 +119,7 @@ class ImplicitWorkspace(ObstacleWays, Workspace):
             try:
                 u_next, v_next = self._pass(j, u, v, before)
             except (NotConverged, Tunnelling) as error:
-                raise self._dated(error, j) from None
+                raise self.dated(error, j, num_passes) from None
             if self.solver.multistep:
                 copy_slot(self.state.u, 0, self.state.before.u, 0)
                 copy_slot(self.state.v, 0, self.state.before.v, 0)
@@ -139,13 +139,6 @@ class ImplicitWorkspace(ObstacleWays, Workspace):
         kernel = getattr(law_state_kernels(a.law, features, self.parallel, a.in_lanes), name)
         sizes = dict(num_items=a.num_items, num_vertices=a.num_vertices, slot=slot, end=end)
         self.bound(kernel, **records)(**sizes, h=float(self.solver.schedule.length(j)))
-
-    def _dated(self, error: Exception, j: int) -> Exception:
-        """The same error, which says when: `first_step` steps were done before this run."""
-        step = self.first_step + j // self.solver.substeps
-        error.step = step
-        error.args = (f"step {step}, t = {step * self.solver.dt:.6g} s: {error}",)
-        return error
 
     def preconditioner(self, mass: np.ndarray) -> tuple:
         """(preconditioner for c M + K with mass = c m, size of the diagonal of that at rest [N/m])."""
@@ -213,8 +206,14 @@ class ImplicitWorkspace(ObstacleWays, Workspace):
             self._check_end(j, u_star, u_next)
         if self.energy_watch:
             places = self.walls_before, self.walls_at_stage, self._walls_at_end(j)
-            self.energy_watch.note(u, u_star, u_next, v_next, places)
+            added = self._kinetic_added(u, v, u_next, v_star, y, stage) if self.solver.multistep else 0.0
+            self.energy_watch.note(u, u_star, u_next, v_next, places, added)
         return u_next, np.zeros_like(v) if stage.static else v_next
+
+    def _kinetic_added(self, u, v, u_next, v_star, y, stage: Stage) -> float:
+        """Kinetic energy [J] that a pass has added beyond the work of what accelerates the free vertices, before drag."""
+        work = (v_star - y) / stage.gamma * (u_next - u)
+        return float((self.mass * self.free * (0.5 * (v_star**2 - v**2) - work)).sum())
 
     def _solve(self, u, start, problem: tuple, stage: Stage) -> np.ndarray:
         """The minimum of the pass; problem: mass, inertial, loads of `Newton.solve`."""

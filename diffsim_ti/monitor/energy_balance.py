@@ -1,0 +1,146 @@
+"""Energy that explicit steps add, against what is done on the body from outside."""
+
+import weakref
+from dataclasses import dataclass
+
+import numpy as np
+
+from diffsim_ti import runtime
+from diffsim_ti.monitor import quantities
+from diffsim_ti.state.arrays import History
+from diffsim_ti.state.workspace import Workspace
+
+
+@dataclass
+class Window:
+    """Where a balance began: the pass, the changes from outside and the substep [s] of then, the level [J] there (None:
+    not looked at yet, the state is kept), where obstacles were, and the passes since."""
+
+    first: int
+    num_passes: int
+    changes: int
+    substep: float
+    level: float | None
+    walls: np.ndarray | None = None
+    passes: int = 0
+
+
+class EnergyBalance:
+    """Follows T + V less the work of what is outside, as it is at looks, every few hundred passes.
+
+    T is the kinetic energy of free vertices, V that of strains, weight and contacts. Both swap within an oscillation, by a
+    quarter of (omega h)^2, which is no gain. So the velocity v- of half a substep before u is taken together with u:
+
+        T(v-) + V(u) + h/2 v- . f(u)         or, with v of the same time as u,    T(v) + V(u) - h^2/8 f(u)^2 / m
+
+    stays the same, to round-off, of every linear motion below omega h = 2, and falls by what friction and a contact stage
+    take. Passes note the work of loads, of prescribed motion and of moving obstacles, and what drag takes
+    (solvers/explicit/kick_drift.py). So whatever rises beyond the lowest level is the steps' own.
+    Laws that read a rate or remember may take or do work of their own: they are not watched.
+    Hairer, Lubich, Wanner 2003, Geometric numerical integration illustrated by the Stoermer-Verlet method,
+    doi:10.1017/S0962492902000144, 4.1 and 5.
+    """
+
+    usual = 800  # passes from look to look at least; a look costs about as much as six of them
+    small, seldom = 1000, 2.5  # tetrahedra below which a look costs more than that, and comes up to so much more seldom
+
+    def __init__(self, workspace: Workspace):
+        self.ws = weakref.proxy(workspace)  # which holds this: no circle
+        self._start: History | None = None
+        share = self.small / max(workspace.arrays.num_tetrahedra, 1)
+        self.every = int(self.usual * min(max(share, 1), self.seldom))
+        self.clear()
+
+    @staticmethod
+    def knows(law) -> bool:
+        """Whether the forces of a law are those of its energy alone."""
+        return law.reads == ("H",) and not law.state_names
+
+    def clear(self) -> None:
+        """Forget what was seen."""
+        self.window: Window | None = None
+        self.gained, self.moving = 0.0, 0.0  # [J]
+        self._risen, self._lowest = 0.0, 0.0  # the level against that of the first look
+
+    @property
+    def share(self) -> float:
+        """Energy gained, over the largest that moved: kinetic, of strains and of contacts."""
+        return self.gained / self.moving if self.moving > 0 else 0.0
+
+    def before(self, first: int, num_passes: int) -> None:
+        """Passes from `first` on come next; whatever was done to the state since the last ones is outside the balance."""
+        ws, window = self.ws, self.window
+        if window and (window.changes, window.substep) == (ws.changes, ws.solver.substep):
+            return
+        if self._start is None:
+            self._start = ws.history(1)
+        ws.save(self._start, 0)
+        self._begin(first, num_passes, None)
+
+    def _begin(self, first: int, num_passes: int, level: float | None) -> None:
+        if self.ws.arrays.features().driven:
+            runtime.fill(self.ws.contact.work, 0)
+        self.window = Window(first, num_passes, self.ws.changes, self.ws.solver.substep, level)
+        if level is None and self.ws.arrays.features().moving:
+            self.ws.place_obstacles(first)
+            self.window.walls = runtime.fetch(self.ws.arrays.offsets)
+
+    def after(self, now: int, num_passes: int, count: int) -> None:
+        """`count` passes are done, up to pass `now`, by the run alone."""
+        window = self.window
+        window.passes, window.changes = window.passes + count, self.ws.changes
+        if window.passes >= self.every:
+            self._look(now, num_passes)
+            window.changes = self.ws.changes
+
+    def _look(self, now: int, num_passes: int) -> None:
+        window, features = self.window, self.ws.arrays.features()
+        work = float(runtime.fetch(self.ws.contact.work).astype(np.float64).sum()) if features.driven else 0.0
+        if window.level is None:
+            window.level = self._level_at_start(window)
+        level = self._level(now, num_passes)
+        if window.level is not None and np.isfinite(level):
+            self._risen += level - work - window.level
+            self._lowest = min(self._lowest, self._risen)
+            self.gained = max(self.gained, self._risen - self._lowest)
+        self._begin(now, num_passes, level)
+
+    def _level_at_start(self, window: Window) -> float | None:
+        """The level of the state that was kept; None where forces there cannot be had any more."""
+        ws, features = self.ws, self.ws.arrays.features()
+        if ws.pairs or (features.moving and features.pressing):
+            return None
+        here = ws.history(1)
+        ws.save(here, 0)
+        ws.restore(self._start, 0)
+        level = self._level(window.first, window.num_passes, window.walls)
+        ws.restore(here, 0)
+        return level
+
+    def _level(self, now: int, num_passes: int, walls: np.ndarray | None = None) -> float:
+        """The level [J] of the current state, which is that before pass `now`."""
+        ws, a = self.ws, self.ws.arrays
+        values, h = a.values, ws.solver.substep
+        if walls is None:
+            ws.place_obstacles(now)
+        else:
+            runtime.fill(a.offsets, walls)
+        u, v = (runtime.fetch(x)[0].astype(np.float64) for x in (ws.state.u, ws.state.v))
+        free = runtime.fetch(a.inverse_mass) > 0
+        mass, features = values.mass[:, None] * free[:, None], a.features()
+        weight = mass * values.parameters[features.gravity :][:3] if features.gravity >= 0 else 0 * mass
+        kinetic = 0.5 * float((mass * v**2).sum())
+        stored = quantities.elastic_energy(ws)
+        if features.groups:  # a stage does not act on vertices that are held
+            stored += float((quantities.barrier_energies(ws) * (free if features.num_staged else 1)).sum())
+        if ws.pairs:
+            stored += ws.pairs.look(ws.state.u)[0]
+        self.moving = max(self.moving, kinetic + stored)
+        j = min(now, num_passes - 1)
+        forces = ws.forces_at(j, num_passes) - ws.loads_at(j, num_passes) + weight
+        if ws.solver.lags(now, num_passes):
+            swapped = 0.5 * h * float((v * forces).sum())
+        else:
+            inverse = np.divide(1.0, mass, out=np.zeros_like(mass), where=mass > 0)
+            swapped = -0.125 * h * h * float((inverse * forces**2).sum())
+        return kinetic + stored + swapped - float((weight * (values.rest + u)).sum())

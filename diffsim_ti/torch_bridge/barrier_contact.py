@@ -1,0 +1,84 @@
+"""PyTorch face: contact with a floor as a torch formula, and as the core's term with the same numbers."""
+
+import math
+
+from diffsim_ti.terms import Ground
+from diffsim_ti.terms.obstacles.barrier import CROSSOVER
+from diffsim_ti.torch_bridge.autograd import torch
+
+
+class DifferentiableBarrierContact:
+    """Smooth ground contact by a barrier; a plain torch formula, differentiable as often as wanted.
+
+    b(d) = -kappa (d - d_hat)^2 log(d / d_hat) for d < d_hat [J], zero beyond, C2; below d_hat / 1000 its Taylor polynomial.
+    friction: Coulomb's coefficient mu; a vertex pressed with N and sliding with velocity t is held back by
+    mu N f(|t| / eps) t / |t|, f(y) = 2 y - y^2 for y < 1, 1 beyond, eps = friction_speed [m/s]; 0 compiles none.
+    `DifferentiableBarrierContact(barrier_stiffness=1e4, barrier_width=0.01)`, or the seeds' second spelling
+    `(ground_height=..., barrier_stiffness=..., barrier_distance=...)`. Attributes kappa, d_hat, ground_height, friction,
+    friction_speed; each may be a tensor with gradient.
+    """
+
+    def __init__(
+        self,
+        barrier_stiffness=1e4,
+        barrier_width=None,
+        *,
+        ground_height: float = 0.0,
+        barrier_distance=None,
+        friction=0.0,
+        friction_speed=1e-3,
+    ):
+        given = [w for w in (barrier_width, barrier_distance) if w is not None]
+        if len(given) > 1:
+            raise ValueError("barrier_width and barrier_distance are two spellings of one number: give one")
+        self.kappa, self.d_hat, self.ground_height = barrier_stiffness, given[0] if given else 0.01, ground_height
+        self.friction, self.friction_speed = friction, friction_speed
+        self.term()  # checks the numbers
+
+    def term(self) -> Ground:
+        """The core's term with the same numbers."""
+        numbers = self.ground_height, self.kappa, self.d_hat, self.friction, self.friction_speed
+        height, kappa, width, friction, speed = (float(torch.as_tensor(x).detach()) for x in numbers)
+        return Ground(height, kappa, width, friction=friction, friction_speed=speed)
+
+    def tensors(self, like: torch.Tensor) -> dict[str, torch.Tensor]:
+        """The term's inputs, in the graph."""
+        numbers = dict(ground_height=self.ground_height, barrier_stiffness=self.kappa, barrier_width=self.d_hat)
+        if self.term().has_friction:
+            numbers |= dict(friction=self.friction, friction_speed=self.friction_speed)
+        return {name: torch.as_tensor(x, dtype=like.dtype, device=like.device) for name, x in numbers.items()}
+
+    def barrier_potential(self, d: torch.Tensor) -> torch.Tensor:
+        """Energy [J] at distances d [m], elementwise."""
+        s = d / self.d_hat
+        safe = s.clamp(CROSSOVER, 1.0)
+        t = torch.minimum(s - CROSSOVER, torch.zeros_like(s))
+        log = math.log(CROSSOVER)
+        slope = -2 * (CROSSOVER - 1) * log - (CROSSOVER - 1) ** 2 / CROSSOVER
+        curvature = -2 * log - 4 * (CROSSOVER - 1) / CROSSOVER + ((CROSSOVER - 1) / CROSSOVER) ** 2
+        beta = -((safe - 1) ** 2) * torch.log(safe) + t * (slope + t * curvature / 2)
+        return self.kappa * self.d_hat**2 * beta
+
+    def ground_contact_force(self, positions: torch.Tensor, velocities: torch.Tensor | None = None) -> torch.Tensor:
+        """Forces [N], shape (n, 3): along y, minus the slope of the barrier; with velocities [m/s] also friction."""
+        inputs = (positions, velocities, self.ground_height, self.kappa, self.d_hat, self.friction, self.friction_speed)
+        wanted = torch.is_grad_enabled() and any(isinstance(x, torch.Tensor) and x.requires_grad for x in inputs)
+        with torch.enable_grad():
+            d = positions[:, 1] - self.ground_height
+            d = d if d.requires_grad else d.detach().requires_grad_()
+            (slope,) = torch.autograd.grad(self.barrier_potential(d).sum(), d, create_graph=wanted)
+        slope = slope if wanted else slope.detach()
+        zero = torch.zeros_like(slope)
+        pushed = torch.stack([zero, -slope, zero], 1)
+        return pushed if velocities is None or not self.term().has_friction else pushed + self._rub(-slope, velocities)
+
+    def _rub(self, push: torch.Tensor, velocities: torch.Tensor) -> torch.Tensor:
+        """Friction [N] for normal forces [N], shape (n,)."""
+        t = velocities * velocities.new_tensor([1.0, 0.0, 1.0])
+        moves = (t**2).sum(1) > 0
+        speed = torch.where(moves[:, None], t, torch.ones_like(t)).norm(dim=1)  # whose slope at 0 is not finite
+        slow = torch.where(moves, speed, torch.zeros_like(speed)).clamp(max=self.friction_speed) / self.friction_speed
+        share = torch.where(slow < 1, (2 - slow) / self.friction_speed, 1 / speed)
+        return -(self.friction * push.clamp(min=0) * share)[:, None] * t
+
+    compute_forces = ground_contact_force

@@ -1,0 +1,168 @@
+"""Steps that add energy say so; what is done on a body from outside is not blamed on them."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+import diffsim_ti as ds
+from diffsim_ti.monitor.energy_watch import EnergyGained
+from diffsim_ti.monitor.stability import lanczos_limit
+
+MESH = ds.TetrahedralMesh.create_box(4, size=0.1)
+ABOVE = MESH.translated([0, 0.02 - MESH.bounding_box[0, 1], 0])
+SOFT = ds.StableNeoHookean(1e5, 0.3)
+NOISE = np.random.default_rng(0).standard_normal(MESH.vertices.shape)
+EXPLICIT = (ds.VelocityVerletSolver, ds.SemiImplicitSolver)
+
+
+def body(terms=(), mesh=MESH, **options) -> ds.Scene:
+    return ds.Scene(mesh, SOFT, 1000.0, terms, precision=options.pop("precision", "f64"), **options)
+
+
+def simulator(scene, share, kind=ds.VelocityVerletSolver, every=50, **options) -> ds.Simulator:
+    """Steps of ten substeps, each a share of the stable one; the balance is looked at every so many passes."""
+    out = ds.Simulator(kind(scene, dt=10 * share * ds.stable_dt(scene).dt, substeps=10, **options))
+    out.workspace.energy_watch.every = every
+    return out
+
+
+@pytest.mark.parametrize("kind", EXPLICIT)
+def test_a_gain_below_the_stable_step_is_said_and_the_advice_helps(kind):
+    """Hot cubes at nine tenths of the limit gain a third of their energy and more, though omega dt < 2 everywhere."""
+    scene = body(initial_velocities=0.3 * NOISE)
+    hot = simulator(scene, 0.9, kind)
+    with pytest.warns(EnergyGained, match=r"step \d+, t = .* has gained .* J, 1\d% of the energy that moves") as said:
+        while hot.time < 0.85 or not said.list:
+            hot.step()
+    first = said.list[0].message
+    assert len(said.list) == 1 and first.time == pytest.approx(first.step * hot.solver.dt) and 40 <= first.step < 60
+    start = 0.5 * float((scene.inputs.derive(scene.inputs.values).mass[:, None] * (0.3 * NOISE) ** 2).sum())
+    while hot.workspace.energy_watch.gained < start / 3:
+        assert hot.solver.substep < lanczos_limit(hot.workspace).dt
+        hot.step()
+    # as advised
+    calm = ds.Simulator(kind(scene, dt=hot.solver.dt, substeps=int(np.ceil(hot.solver.dt / first.substep))))
+    calm.workspace.energy_watch.every = 50
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        calm.run(3 * hot.step_count)
+    watch = calm.workspace.energy_watch
+    assert watch.gained < 0.01 * watch.moving and watch.moving > 0.5 * start
+
+
+def test_rollouts_say_it_once_a_run_and_name_the_step():
+    h = 0.9 * ds.stable_dt(body()).dt
+    rollout = ds.Rollout(ds.VelocityVerletSolver(body(initial_velocities=0.3 * NOISE), dt=h), 700)
+    rollout.forward(initial_velocities=0 * NOISE)
+    rollout.sweep.workspace.energy_watch.every = 200
+    with pytest.warns(EnergyGained) as said:
+        rollout.forward()
+    (first,) = (warning.message for warning in said.list)
+    assert (
+        400 <= first.step < 700 and first.time == pytest.approx(first.step * h) and f"step {first.step}, " in str(first)
+    )
+
+
+LOADS = np.zeros(MESH.vertices.shape)
+LOADS[-1] = 0, 0.3, 0.2
+SHAKEN = dict(fixed="xmin", motion=lambda t: [0.01 * np.sin(40 * t), 0.01 * np.sin(55 * t), 0])
+PLATE = lambda t: [0.3 * np.sin(20 * t), 0.01 * np.sin(60 * t), 0]  # noqa: E731
+WORK = {
+    "loads": lambda: body([ds.ExternalForce(LOADS)], fixed="xmin"),
+    "loads of steps": lambda: body(
+        [ds.ExternalForce(np.array([LOADS * np.sin(0.3 * k) for k in range(80)]))], fixed="xmin"
+    ),
+    "drag": lambda: body([ds.Drag(30.0), ds.Gravity()], initial_velocities=0.1 * NOISE, fixed="xmin"),
+    "motion": lambda: body([ds.Gravity()], **SHAKEN),
+    "motion, drag": lambda: body([ds.Drag(10.0)], **SHAKEN),
+    "a ball": lambda: body(
+        [ds.Sphere([0.05, -0.04, 0.05], 0.05, stiffness=2e3, path=lambda t: [0, 0.05 * np.sin(30 * t), 0])], ABOVE
+    ),
+    "a belt": lambda: body([ds.Gravity(), ds.Ground(0.0, 2e3, friction=0.5, path=PLATE)], ABOVE),
+}
+
+
+@pytest.mark.parametrize("kind", EXPLICIT)
+@pytest.mark.parametrize("work", WORK)
+def test_work_from_outside_is_counted(kind, work):
+    """The energy changes by most of what moves, or more; but for that work it rises by less than half a per cent."""
+    run = simulator(WORK[work](), 0.5, kind)
+    seen = [float(run.compute_energy())]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for _ in range(80):
+            run.step()
+            seen.append(float(run.compute_energy()))
+    watch = run.workspace.energy_watch
+    assert np.ptp(seen) > 0.5 * watch.moving and watch.share < 5e-3, (np.ptp(seen), watch.moving, watch.share)
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.5])
+def test_obstacles_as_a_force_count_too(friction):
+    run = simulator(
+        body([ds.Gravity(), ds.Ground(0.0, 2e3, friction=friction, path=PLATE)], ABOVE), 0.15, contact="force"
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        run.run(200)
+    watch = run.workspace.energy_watch
+    assert watch.moving > 0.1 and watch.share < 0.02
+
+
+@pytest.mark.parametrize("precision", ["f32", "f64"])
+def test_a_bounce_at_the_usual_step_is_not_blamed(precision):
+    scene = body([ds.Gravity(), ds.Ground(0.0, None)], ABOVE, precision=precision, initial_velocities=[0.5, -2, 0])
+    run = simulator(scene, 0.7)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        run.run(150)
+    assert run.workspace.energy_watch.share < 0.05
+
+
+def test_what_is_done_between_steps_is_outside_the_balance():
+    """Another state, another substep, another force, a reset."""
+    run = simulator(body([ds.Gravity(), ds.ExternalForce(LOADS)], fixed="xmin"), 0.5)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for k in range(30):
+            run.run(3)
+            if k % 4 == 0:
+                run.set_state(velocities=0.1 * (1 + k) * NOISE)
+            elif k % 4 == 1:
+                run.set_substeps(10 + k)
+            elif k % 4 == 2:
+                run.set_forces(LOADS * k)
+            else:
+                run.reset()
+    assert run.workspace.energy_watch.share < 0.01
+
+
+def test_looks_change_no_bit():
+    scene = body([ds.Gravity(), ds.Ground(0.0, None, friction=0.3), ds.Drag(1.0)], ABOVE, precision="f32")
+    ends = []
+    for every in (20, 10**9):
+        run = simulator(scene, 0.7, every=every)
+        run.run(60)
+        ends.append((run.positions, run.velocities, run.contact_resolution))
+    assert np.array_equal(ends[0][0], ends[1][0]) and np.array_equal(ends[0][1], ends[1][1])
+    assert ends[0][2] == ends[1][2]
+
+
+@pytest.mark.parametrize("work", [name for name in WORK if name != "loads of steps"])
+def test_bdf2_is_not_blamed_for_work_from_outside(work):
+    run = ds.Simulator(ds.BDF2Solver(WORK[work](), dt=2e-3))
+    seen = [float(run.compute_energy())]
+    for _ in range(40):
+        run.step()
+        seen.append(float(run.compute_energy()))
+    watch = run.workspace.energy_watch
+    assert np.ptp(seen) > 0.2 * watch.moving and watch.share < 0.01
+
+
+def test_what_bdf2_adds_is_the_change_of_the_energy():
+    run = ds.Simulator(ds.BDF2Solver(body(initial_velocities=0.3 * NOISE, fixed="xmin"), dt=2e-3, tolerance=1e-9))
+    start = run.compute_energy()
+    run.run(20)
+    watch = run.workspace.energy_watch
+    assert watch.gained == pytest.approx(run.compute_energy() - start, rel=1e-5) and watch.gained < -0.3 * watch.moving
