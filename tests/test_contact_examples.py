@@ -21,6 +21,16 @@ def test_bounce_gradients(capsys, tmp_path):
     assert (tmp_path / "bounce_gradients.png").stat().st_size > 10_000 and "median error" in capsys.readouterr().out
 
 
+def test_refinement():
+    """The force of a press is that of the surface, not of its vertices."""
+    press = example("contact/refinement").force_of_a_press
+    ours, theirs = (
+        [press(r, {name: k}) for r in (2, 3)] for name, k in (("stiffness_per_area", 1e6), ("stiffness", 1.6e3))
+    )
+    assert ours[1] == pytest.approx(ours[0], rel=0.01) and ours[0] == pytest.approx(141.6, rel=0.01)
+    assert theirs[1] > 1.2 * theirs[0]
+
+
 @pytest.mark.filterwarnings("error:gradients through contacts")
 def test_wall_shot(capsys):
     numbers = example("control/wall_shot").main()
