@@ -166,3 +166,40 @@ def test_what_bdf2_adds_is_the_change_of_the_energy():
     run.run(20)
     watch = run.workspace.energy_watch
     assert watch.gained == pytest.approx(run.compute_energy() - start, rel=1e-5) and watch.gained < -0.3 * watch.moving
+
+
+def test_self_contact_is_counted():
+    """Two blocks fall on each other and on the floor: their pairs' energy and forces are in the balance."""
+    blocks = [ds.TetrahedralMesh.create_box(3, size=0.05).translated([0, y, 0]) for y in (0.02, 0.09)]
+    scene = ds.Scene(
+        ds.TetrahedralMesh.joined(blocks),
+        SOFT,
+        1000.0,
+        [ds.Gravity(), ds.Ground(0.0, 200.0), ds.SelfContact(200.0, 0.01)],
+        initial_velocities=[0, -1, 0],
+        precision="f64",
+    )
+    run = simulator(scene, 0.2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        least = min(run.step() or run.smallest_gap() for _ in range(140))
+    assert least < 0.008 and run.workspace.energy_watch.share < 0.02
+
+
+def test_the_midpoints_advice_helps():
+    """A cube squeezed to .6, in steps that it cannot follow."""
+    mesh = ds.TetrahedralMesh.create_box(3, size=0.1)
+    squeezed = (mesh.vertices - 0.05) * [1, 0.6, 1] + 0.05
+    scene = ds.Scene(mesh, SOFT, 1000.0, initial_positions=squeezed, precision="f64")
+    with pytest.warns(EnergyGained, match="^step .* or BDF2Solver or ImplicitEulerSolver") as said:
+        ds.Simulator(ds.ImplicitMidpointSolver(scene, dt=1e-2)).run(30)
+    advised = round(1e-2 / said.list[0].message.substep)
+    for solver in (ds.ImplicitMidpointSolver(scene, 1e-2, advised), ds.BDF2Solver(scene, 1e-2)):
+        run = ds.Simulator(solver)
+        start, seen = run.compute_energy(), []
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            for _ in range(30):
+                run.step()
+                seen.append(run.compute_energy())
+        assert max(seen) < 1.1 * start

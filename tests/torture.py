@@ -41,6 +41,8 @@ ROWS = {
         "study_stability:boundary_is_the_theoretical_limit",
         "ten times the limit is refused with the substeps it takes": "step_limit:ten_times_the_limit_says_how_many_substeps",
         "squeezing is noticed before anything is NaN": "step_limit:compression_outgrows_the_step_before_any_nan",
+        "what gains energy below the limit says so, work from outside is not blamed on it": "energy_watch:a_gain_below_the_stable_step_is_said_and_the_advice_helps "
+        "energy_watch:work_from_outside_is_counted",
         "free fall is exact, damping is none unless asked for": "reference_motion:free_fall_is_exact reference_motion:default_is_undamped_and_unloaded",
         "a tumbling block keeps momentum and energy over 100 000 steps": "reference_motion:momentum_of_a_tumbling_block_over_1e5_steps "
         "reference_motion:energy_of_a_tumbling_block_stays_in_its_band",

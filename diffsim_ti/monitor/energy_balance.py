@@ -93,6 +93,7 @@ class EnergyBalance:
             self._look(now, num_passes)
             window.changes = self.ws.changes
 
+    @np.errstate(all="ignore")  # of a run that blows up
     def _look(self, now: int, num_passes: int) -> None:
         window, features = self.window, self.ws.arrays.features()
         work = float(runtime.fetch(self.ws.contact.work).astype(np.float64).sum()) if features.driven else 0.0
