@@ -215,6 +215,18 @@ def test_many_threads_or_another_device_do_the_same():
         np.testing.assert_allclose(gradient, gradients[1][name], rtol=2e-4, atol=1e-5 * np.abs(gradient).max())
 
 
+def test_a_capsule_that_swings_adds_no_energy_of_the_steps():
+    """Its work on faces is counted: what the steps themselves add is little beside it."""
+    scene = pressed("capsule", 400.0, path=lambda t: (0, 0.004 * np.sin(60 * t), 0))
+    simulator = ds.Simulator(ds.VelocityVerletSolver(scene, dt=1e-3, substeps=10))
+    simulator.workspace.energy_watch.every = 50
+    start = simulator.compute_energy()
+    simulator.run(80)
+    watch = simulator.workspace.energy_watch
+    assert abs(simulator.compute_energy() - start) > 0.05 * watch.moving
+    assert watch.gained < 0.005 * watch.moving
+
+
 # ---- what it costs, and what it says -------------------------------------------------------------------------------------
 
 

@@ -24,7 +24,7 @@ A = ti.template()
 FACES = dict.fromkeys(("corners", "own", "parts", "start", "entries", "vertices"), "ints") | dict.fromkeys(
     ("share", "whole", "seed", "before", "offsets"), "vectors"
 )
-FACES |= dict.fromkeys(("reach", "weight", "least", "energy"), "scalars")
+FACES |= dict.fromkeys(("reach", "weight", "least", "energy", "done", "work"), "scalars")
 NUMBERS = dict.fromkeys(
     ("slot", "first", "window", "num_vertices", "num_faces", "num_surface", "first_out", "between"), "int"
 )
@@ -82,13 +82,17 @@ class FaceKernels(FaceForces):
     @ti.func
     def force_of(self, f, now: A, scene: A, faces: A, state: A, plan: A):
         """Forces of a face's corners to `share`, its energy, and to `least` how near it is to each obstacle."""
-        faces.energy[f] = ti.cast(0, self.fp)
+        faces.energy[f], faces.done[f] = ti.cast(0, self.fp), ti.cast(0, self.fp)
         total, u = self.rows(0), self.rows_at(f, state.u, plan.slot, faces)
         for g in ti.static(self.groups):
             for k in range(g.count):
                 X = self.rest_rows(f, scene.rest, self.where(g, k, now, scene, faces, plan), faces)
                 rows, least = self.face("force", g, k, f, X, u, u, scene, faces, scene)
                 total += rows
+                if ti.static(g.path >= 0):
+                    speed = self.speed(g, k, now, scene.path)
+                    for a in ti.static(range(3)):
+                        faces.done[f] = faces.done[f] + plan.h * self.dot3(self.row_of(rows, a), speed)
                 faces.least[f * ti.static(self.num_obstacles) + g.number + k] = least
         self.store(f, total, faces)
         for a in ti.static(range(3)):
@@ -123,6 +127,9 @@ class FaceKernels(FaceForces):
             load = ti.max(load, self.load(i, whole[3], scene, plan))
             for m in ti.static(range(3)):
                 moved[a, m] = u[a, m] - before[m]
+        if ti.static(self.features.moving > 0):  # of moving obstacles, where the pass takes their force
+            share, _ = self.taken(load)
+            faces.work[f] = faces.work[f] + share * faces.done[f]
         for g in ti.static(self.groups):
             for k in range(g.count):
                 n, place = g.number + k, self.place(g, k, now, scene.path)

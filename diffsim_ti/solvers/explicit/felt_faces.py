@@ -47,6 +47,10 @@ class FeltFaces:
         self.share, self.before = (runtime.array(a.vector, 3 * len(faces)) for _ in range(2))
         self.whole, self.seed = (runtime.array(a.vector, len(surface)) for _ in range(2))
         self.least, self.offsets = runtime.array(fp, len(faces) * len(a.contacts)), a.offsets
+        self.done, self.work = (
+            runtime.array(fp, len(faces)) for _ in range(2)
+        )  # by moving obstacles, see EnergyBalance
+        runtime.fill(self.work, 0)
         self.energy, self.w = runtime.array(fp, len(faces)), runtime.array(a.vector, 1, a.num_vertices)
 
     def _run(self, name: str, plan: dict, slot: int, features=None, between=False, u=None, **records) -> None:

@@ -130,6 +130,8 @@ class ExplicitWorkspace(Workspace):
         seen, step = self.watch.rows(), self.kernels(self.arrays.features()).step
         launch = self.bound(step, state=(self.probe, self.frames, self.watch, self.contact), table=self.table)
         for numbers in self.launches(j, j + 1, num_passes, 0, self.arrays.num_tetrahedra):
+            if self.faces:
+                self.faces.forces(self.probe.u, 0, numbers)
             launch(**numbers, base=j, stride=1)
         self.watch.put(seen)
         return runtime.fetch(self.probe.f)[0].astype(np.float64)
