@@ -14,8 +14,8 @@ AREAS = {
     "gradients": "gradients gradient_clip gradient_faults checkpoints tape outputs identification",
     "implicit steps and equilibria": "implicit implicit_gradients implicit_contact swept",
     "patches against locking": "locking",
-    "obstacles and friction": "contact contact_area contact_stage contact_crossing contact_friction contact_gradients "
-    "own_obstacle",
+    "obstacles and friction": "contact contact_area contact_faces contact_stage contact_crossing contact_friction "
+    "contact_gradients own_obstacle",
     "self-contact": "self_contact self_contact_implicit self_contact_near self_contact_pairs",
     "PyTorch, optimisations": "torch torch_physics torch_solvers seed_snippets optimization",
     "charts, maps, advice": "study study_stability peers",

@@ -35,3 +35,10 @@ def pytest_terminal_summary(terminalreporter, config):
         terminalreporter.write_line("minutes: " + ", ".join(f"{area} {spent:.1f}" for area, spent in minutes.items()))
     if earlier := os.environ.get("EXECUTED_PTX"):  # what a call of pytest on CUDA's kernels came to, from .ci/run
         terminalreporter.write_line(earlier)
+
+
+@pytest.fixture
+def vertices_alone(monkeypatch):
+    """Explicit steps in which nothing but vertices feels obstacles, as for points that happen to have faces between them."""
+    kind = "diffsim_ti.solvers.explicit.solver.ExplicitWorkspace"
+    monkeypatch.setattr(f"{kind}.feels_faces", staticmethod(lambda scene: False))

@@ -129,6 +129,7 @@ def test_no_speed_is_too_large(solver, dt):
         assert frames.positions[:, :3, 1].min() > 0 and frames.contact_resolution.smallest_gap > 0
 
 
+@pytest.mark.usefixtures("vertices_alone")
 @solvers
 @dampings
 @pytest.mark.parametrize("name", THIN)
@@ -151,6 +152,7 @@ def test_a_fast_wall_pushes(solver):
     assert gap.min() > 0 and frames.velocities[-1, :, 0].min() > 29
 
 
+@pytest.mark.usefixtures("vertices_alone")
 @solvers
 def test_a_vertex_between_two_walls(solver):
     """Pressed from both sides by stiff walls, one of which moves, with other obstacles near: it stays between them."""

@@ -80,6 +80,8 @@ class EnergyBalance:
     def _begin(self, first: int, num_passes: int, level: float | None) -> None:
         if self.ws.arrays.features().driven:
             runtime.fill(self.ws.contact.work, 0)
+            if self.ws.faces:
+                runtime.fill(self.ws.faces.work, 0)
         self.window = Window(first, num_passes, self.ws.changes, self.ws.solver.substep, level)
         if level is None and self.ws.arrays.features().moving:
             self.ws.place_obstacles(first)
@@ -97,6 +99,8 @@ class EnergyBalance:
     def _look(self, now: int, num_passes: int) -> None:
         window, features = self.window, self.ws.arrays.features()
         work = float(runtime.fetch(self.ws.contact.work).astype(np.float64).sum()) if features.driven else 0.0
+        if features.moving and self.ws.faces:
+            work += float(runtime.fetch(self.ws.faces.work).astype(np.float64).sum())
         if window.level is None:
             window.level = self._level_at_start(window)
         level = self._level(now, num_passes)
@@ -109,7 +113,7 @@ class EnergyBalance:
     def _level_at_start(self, window: Window) -> float | None:
         """The level of the state that was kept; None where forces there cannot be had any more."""
         ws, features = self.ws, self.ws.arrays.features()
-        if ws.pairs or (features.moving and features.pressing):
+        if ws.pairs or (features.moving and (features.pressing or ws.faces)):
             return None
         here = ws.history(1)
         ws.save(here, 0)
@@ -134,6 +138,8 @@ class EnergyBalance:
         stored = quantities.elastic_energy(ws)
         if features.groups:  # a stage does not act on vertices that are held
             stored += float((quantities.barrier_energies(ws) * (free if features.num_staged else 1)).sum())
+        if ws.faces:
+            stored += float(ws.faces.energies().sum())
         if ws.pairs:
             stored += ws.pairs.look(ws.state.u)[0]
         self.moving = max(self.moving, kinetic + stored)

@@ -7,6 +7,7 @@ import numpy as np
 from diffsim_ti import runtime
 from diffsim_ti.monitor import quantities, stability
 from diffsim_ti.monitor.energy_watch import EnergyGained
+from diffsim_ti.state.watch import place_name
 from diffsim_ti.state.workspace import Workspace
 from diffsim_ti.terms.obstacles.barrier import beta
 
@@ -20,10 +21,11 @@ class Divergence(FloatingPointError):
 
 
 class Crossing(Divergence):
-    """A vertex got onto or behind an obstacle. Carries also depth [m], speed [m/s], and stiffness [N/m].
+    """A vertex or face got onto or behind an obstacle. Carries also depth [m], speed [m/s] against the obstacle's, and
+    stiffness [N/m].
 
-    stable_dt [s] is a substep that resolves the barrier at this speed; stiffness is what stops the vertex, or None where
-    the barrier's own would do.
+    vertex: that of a face is its fastest corner; all three are named. stable_dt [s] is a substep that resolves the barrier
+    at this speed; stiffness is what stops the vertex, or None where the barrier's own would do.
     """
 
     def __init__(
@@ -98,17 +100,21 @@ class Guard:
 
     def _warn_of_stiff_contact(self, now: int, num_passes: int) -> None:
         """Once, where a barrier was stiffer than a step can follow: energy may then come from nowhere."""
-        solver = self.ws.solver
-        if self._warned or not solver.explicit or solver.stages_contact or not self.ws.watch.contacts:
+        solver, watch = self.ws.solver, self.ws.watch
+        if self._warned or not solver.explicit or not watch.contacts:
             return
-        omega_dt = self.ws.watch.largest_omega_dt()
-        if omega_dt > 2:
+        by_faces, limit, enough = watch.faces_omega_dt(), 1, 0.7
+        omega_dt = by_faces
+        if not solver.stages_contact and not by_faces > 1:
+            omega_dt, limit, enough = watch.largest_omega_dt(), 2, 1.8
+        if omega_dt > limit:
             self._warned, step = True, self.ws.step_of(now - 1, num_passes)
-            h = solver.substep
+            h, what = solver.substep, "of faces " if limit == 1 else ""
             warnings.warn(
-                f"step {step}, t = {step * solver.dt:.6g} s: a contact was stiffer than the substep {h:.3g} s can follow "
-                f"(omega dt = {omega_dt:.3g} > 2), so that "
-                f"energy may be gained in it: take substeps of {1.8 * h / omega_dt:.3g} s, or a softer or wider barrier",
+                f"step {step}, t = {step * solver.dt:.6g} s: a contact {what}was stiffer than the substep {h:.3g} s can "
+                f"follow (omega dt = {omega_dt:.3g} > {limit}), "
+                f"so that energy may be gained in it: take substeps of {enough * h / omega_dt:.3g} s, or a softer or wider "
+                "barrier",
                 stacklevel=5,
             )
 
@@ -179,17 +185,30 @@ class Guard:
                 break
         ws.restore(self.good, 0)
         ws.watch.put(self._seen)
-        k, vertex, depth = crossing
-        term, step = ws.watch.contacts[k], self.ws.step_of(j, num_passes)
-        speed = float(np.linalg.norm(ws.velocity_of(vertex)))
-        enough = min(0.1 * float(term.values["barrier_width"]) / max(speed, 1e-300), 0.5 * solver.substep)
+        k, place, depth = crossing
+        term, step, vertices = ws.watch.contacts[k], self.ws.step_of(j, num_passes), ws.watch.vertices_of(place)
+        drift = self._velocity_of_obstacle(k, j)
+        speeds = [float(np.linalg.norm(ws.velocity_of(i) - drift)) for i in vertices]
+        speed, vertex = max(speeds), vertices[int(np.argmax(speeds))]
+        width, of_face = float(term.values["barrier_width"]), len(vertices) == 3
+        enough = min(0.1 * width / max(speed, 1e-300), (0.25 if of_face else 0.5) * solver.substep)
         stiffness = self._stiffness_needed(k, vertex, speed)
-        remedy = f"reduce the substep to {enough:.3g} s (a tenth of the barrier's width)"
+        ws.place_obstacles(j)
+        load = ws.faces.load_of(vertices) if of_face else 0.0
+        if of_face and max(speed * solver.substep / width, load) > 0.2:  # their force has to be resolved first
+            stiffness, enough = None, min(enough, solver.substep * np.sqrt(0.1 / max(load, 1e-300)))
+        elif of_face:
+            more = ws.faces.stiffening(vertices, k, np.array(speeds))
+            stiffness, enough = more * ws.arrays.stiffness_of(k, vertices), solver.substep / np.sqrt(more)
+        remedy = f"reduce the substep to {enough:.3g} s"
+        if not of_face:
+            remedy += " (a tenth of the barrier's width)"
         if stiffness is not None:
-            stiffer = ws.arrays.stiffer(k, [vertex], stiffness)
+            stiffer = ws.arrays.stiffer(k, vertices, stiffness)
             remedy = f"the barrier cannot stop it at any step: raise its {stiffer}, or its width"
+            remedy += f", with substeps of {enough:.3g} s" * of_face
         raise Crossing(
-            f"step {step}, t = {step * solver.dt:.6g} s: vertex {vertex} gets {depth:.3g} m behind {term!r} within a "
+            f"step {step}, t = {step * solver.dt:.6g} s: {place_name(vertices)} gets {depth:.3g} m behind {term!r} within a "
             f"substep of {solver.substep:.4g} s, at {speed:.4g} m/s: {remedy}; the state before is kept",
             step,
             vertex,
@@ -198,6 +217,11 @@ class Guard:
             speed,
             stiffness,
         )
+
+    def _velocity_of_obstacle(self, k: int, j: int) -> np.ndarray:
+        """In pass j [m/s]."""
+        path, column = self.ws.arrays.rows["path"], self.ws.arrays.obstacles[k][2]
+        return np.zeros(3) if column < 0 else self.ws.solver.schedule.rate(path, j)[column]
 
     def _stiffness_needed(self, k: int, vertex: int, speed: float) -> float | None:
         """Stiffness [N/m] whose barrier, alone, stops the vertex at a fiftieth of the width; None if the present one can.

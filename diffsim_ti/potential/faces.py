@@ -81,7 +81,7 @@ class FacePoints(ObstacleFunctions):
         force go to `more`."""
         out, first, n = self.vector(0), g.first + k * g.size, g.number + k
         wall, width = pass_.walls[3 * n], g.force.width(scene.parameters, first)
-        own = g.force.gap(scene.parameters, first, scene.rest[i] - wall, at.u[0, i])
+        own = g.force.clearance(scene.parameters, first, scene.rest[i] - wall, at.u[0, i])[3]
         for c in range(pass_.face_start[i], pass_.face_start[i + 1]):
             row = c * ti.static(self.num_obstacles) + n
             reach, size, i3 = pass_.face_reach[row], ti.cast(0, self.fp), ti.Vector([i, 0, 0])

@@ -38,7 +38,7 @@ def slots(indices: np.ndarray, num_vertices: int) -> np.ndarray:
 class SceneArrays:
     """What the kernels read of a scene: its topology, once, and its numbers (state/numbers.py), per load."""
 
-    def __init__(self, scene, stages_contact: bool = False):
+    def __init__(self, scene, stages_contact: bool = False, feels_faces: bool = False):
         mesh, precision = scene.mesh, scene.precision
         fp = runtime.PRECISIONS[precision]
         self.fp, self.vector, self.lanes = fp, ti.types.vector(4, fp), ti.types.vector(LANES, fp)
@@ -49,7 +49,7 @@ class SceneArrays:
         self.num_items = self.num_blocks if self.in_lanes else self.num_places
         self.num_vertices, self.num_tetrahedra = mesh.num_vertices, mesh.num_tetrahedra
         self.contacts = tuple(t for t in scene.ordered_terms if t.acts_on_surface)
-        self.fixed = scene.fixed
+        self.fixed, self.feels_faces = scene.fixed, feels_faces
         self.mesh, self.precision, self.self_contact = mesh, precision, scene.term(SelfContact)
         self._upload_topology(scene)
         rows = scene.inputs.parameters
@@ -94,6 +94,10 @@ class SceneArrays:
             corner_of = 4 * self.place[corner_of // 4] + corner_of % 4
         if self.self_contact:  # each surface vertex gathers one corner more, after those of its tetrahedra
             self.parameters_of_self_contact = scene.inputs.parameters.of(self.self_contact)
+            start, corner_of = with_own_corner(start, corner_of, mesh.surface_vertices, num_corners)
+            num_corners += len(mesh.surface_vertices)
+        self.first_face_corner = num_corners
+        if self.feels_faces:  # and one for what its faces feel
             start, corner_of = with_own_corner(start, corner_of, mesh.surface_vertices, num_corners)
             num_corners += len(mesh.surface_vertices)
         self.start, self.corner_of = runtime.upload(start, ti.i32), runtime.upload(corner_of, ti.i32)

@@ -34,11 +34,13 @@ def limits(solver) -> tuple[float, float]:
 class ContactResolution:
     """How well a run's substeps resolve its contacts, over all of its passes.
 
-    omega_dt: largest h sqrt(b''(d) / m), the barrier's stiffness against the vertex's mass.
+    omega_dt: largest h sqrt(b''(d) / m), the barrier's stiffness against the vertex's mass. Points within faces act by
+    a force; theirs counts times what a stage may exceed a force by.
     travel: largest approach to an obstacle in one substep, as a share of its width.
     share: the same as a share of the depth at which the barrier alone would stop the vertex.
     The last two are the largest of these at which gradients of a bounce stay within 10 %, with these solver's contacts.
-    smallest_gap [m], with the vertex and obstacle that reached it; infinite if no barrier was felt.
+    smallest_gap [m], with the vertex (or the corners of the face) and obstacle that reached it; infinite if no barrier was
+    felt.
     substep [s]: the substep h; advised_substep [s]: one at which gradients of a bounce stay within 10 %.
     """
 
@@ -46,7 +48,7 @@ class ContactResolution:
     travel: float
     share: float
     smallest_gap: float
-    vertex: int | None
+    vertex: int | tuple[int, ...] | None
     obstacle: str | None
     substep: float
     largest_omega_dt: float = LARGEST_OMEGA_DT
@@ -69,11 +71,17 @@ class ContactResolution:
     def __str__(self) -> str:
         if self.obstacle is None:
             return "contact: none"
+        place = place_name(np.atleast_1d(self.vertex))
         return (
-            f"contact: smallest gap {self.smallest_gap:.4g} m, of vertex {self.vertex} to {self.obstacle}; "
+            f"contact: smallest gap {self.smallest_gap:.4g} m, of {place} to {self.obstacle}; "
             f"omega dt {self.omega_dt:.3g} (advised {self.largest_omega_dt:.3g}), |v| dt {self.travel:.3g} of the width and "
             f"{self.share:.3g} of the depth (advised {self.largest_share:.3g})"
         )
+
+
+def place_name(vertices: tuple[int, ...]) -> str:
+    """A vertex, or a face by its corners, in words."""
+    return f"vertex {vertices[0]}" if len(vertices) == 1 else f"face ({', '.join(map(str, vertices))})"
 
 
 class ContactWatch:
@@ -83,7 +91,8 @@ class ContactWatch:
         self.ws, arrays = weakref.proxy(workspace), workspace.arrays  # which holds this: no circle
         self.contacts, self._obstacles = arrays.contacts, arrays.obstacles
         self._shown = [repr(term) for term in self.contacts]
-        n = arrays.num_vertices if self.contacts else 1
+        self._corners = arrays.mesh.surface_triangles if arrays.feels_faces else np.zeros((0, 3), int)
+        n = arrays.num_vertices + len(self._corners) if self.contacts else 1  # faces after vertices
         self.seen = runtime.array(arrays.fp, 3 * len(self.contacts), n)
         self.clear()
 
@@ -102,7 +111,7 @@ class ContactWatch:
         runtime.fill(self.seen, rows)
 
     def crossing(self) -> tuple[int, int, float] | None:
-        """(contact, vertex, depth [m]) of the deepest place on or behind an obstacle, or None."""
+        """(contact, place, depth [m]) of the deepest place on or behind an obstacle, or None; places: `vertices_of`."""
         if not self.contacts:
             return None
         host = runtime.view(self.seen)
@@ -110,11 +119,22 @@ class ContactWatch:
         k, i = np.unravel_index(np.argmin(gaps), gaps.shape)
         return (int(k), int(i), -float(gaps[k, i])) if gaps[k, i] <= 0 else None
 
+    def vertices_of(self, place: int) -> tuple[int, ...]:
+        """The vertex, or the corners of the face, that a column of `seen` is about."""
+        n = self.ws.arrays.num_vertices
+        return (int(place),) if place < n else tuple(int(i) for i in self._corners[place - n])
+
     def largest_omega_dt(self) -> float:
-        """Largest h sqrt(b''(d) / m) since the run's start."""
+        """Largest h sqrt(b''(d) / m) of vertices since the run's start."""
+        return float(np.sqrt(self._squares()[:, : self.ws.arrays.num_vertices].max()))
+
+    def faces_omega_dt(self) -> float:
+        """The same of points within faces, by a bound of all that a corner feels of them."""
+        return float(np.sqrt(self._squares()[:, self.ws.arrays.num_vertices :].max(initial=0)))
+
+    def _squares(self) -> np.ndarray:
         host = runtime.view(self.seen)
-        rows = runtime.fetch(self.seen) if host is None else host
-        return float(np.sqrt(rows[1::3].max()))
+        return (runtime.fetch(self.seen) if host is None else host)[1::3]
 
     def resolution(self) -> ContactResolution:
         """What was seen since the run's start."""
@@ -135,16 +155,22 @@ class ContactWatch:
         gaps, travel = rows[::3], rows[2::3]
         k, i = (int(x) for x in np.unravel_index(np.argmin(gaps), gaps.shape))
         seen = np.isfinite(gaps[k, i])
+        n = self.ws.arrays.num_vertices
+        squares, stricter = rows[1::3], largest[0] / LARGEST_OMEGA_DT
         return ContactResolution(
-            float(np.sqrt(rows[1::3].max())),
+            float(np.sqrt(max(squares[:, :n].max(), stricter**2 * squares[:, n:].max(initial=0)))),
             float(travel.max()),
             float((travel / self._depths(travel, values, h)).max()),
             float(gaps[k, i]),
-            i if seen else None,
+            self._named(i) if seen else None,
             self._shown[k] if seen else None,
             h,
             *largest,
         )
+
+    def _named(self, place: int) -> int | tuple[int, ...]:
+        vertices = self.vertices_of(place)
+        return vertices[0] if len(vertices) == 1 else vertices
 
     def _depths(self, travel: np.ndarray, values: Derived, h: float) -> np.ndarray:
         """Depths in the barriers, in widths, that stop vertices with these speeds: m v^2 / 2 = k w^2 beta(1 - depth)."""
@@ -154,5 +180,8 @@ class ContactWatch:
             * (area if twin.per_area else np.ones_like(area))
             for twin, first, _ in self._obstacles
         ]
-        energy = values.mass * travel**2 / (2 * h * h * np.array(stiffness))
+        faces = self._corners
+        mass = np.concatenate([values.mass, values.mass[faces].min(1, initial=np.inf)])
+        stiffness = [np.concatenate([row, np.ones(len(faces))]) for row in stiffness]
+        energy = mass * travel**2 / (2 * h * h * np.array(stiffness))
         return np.interp(energy, STOPPED, DEPTHS) + 1e-12

@@ -30,13 +30,14 @@ class Workspace:
     pairs_kind = SurfacePairs
     first_step = 0  # steps that were done before this run, for reports
     potential = None  # of implicit steps
+    faces = None  # of explicit steps, that feel obstacles between their corners
     energy_watch = None  # counts energy that long steps add, for solvers that neither damp nor limit it
     changes = 0  # of the state from outside its passes
 
     def __init__(self, solver, derived: Derived):
         self.solver, self.scene = solver, solver.scene
         self.owner = runtime.program()
-        self.arrays = SceneArrays(self.scene, solver.stages_contact)
+        self.arrays = SceneArrays(self.scene, solver.stages_contact, self.feels_faces(self.scene))
         self.parallel = solver.runs_parallel()
         self.pairs = self.pairs_kind(self.arrays, self.parallel) if self.arrays.self_contact else None
         self.state = self.history(1)
@@ -45,6 +46,11 @@ class Workspace:
         self.watch = ContactWatch(self)
         self._launches = {}
         self.load(derived)
+
+    @staticmethod
+    def feels_faces(scene) -> bool:
+        """Whether passes take forces at points within faces."""
+        return False
 
     def history(self, num_slots: int, record: bool = False) -> History:
         """Room for states of this run."""

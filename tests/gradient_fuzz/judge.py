@@ -187,6 +187,14 @@ class Judge:
         else:
             row.verdict = FAILED if resolved else UNRESOLVED
 
+    def faces_felt(self) -> bool:
+        """Whether points within faces were pushed in explicit steps."""
+        if not self.configuration.structure.explicit or not self.configuration.placed:
+            return False
+        rollout = self.configuration.rollout()
+        rollout.forward()
+        return rollout.sweep.workspace.watch.faces_omega_dt() > 0
+
     def seen(self) -> dict[str, bool]:
         """What contacts do in this configuration."""
         configuration = self.configuration
@@ -210,6 +218,7 @@ class Judge:
             sticks=bool(sticks),
             slides=bool(slides),
             self_contact=presses,
+            faces=self.faces_felt(),
             static_contact=bool(felt) and configuration.structure.static,
         )
 

@@ -64,13 +64,13 @@ def push_direction(name: str, rng) -> np.ndarray:
     return v / np.linalg.norm(v)
 
 
-def place(kind: ObstacleKind, rng, x: np.ndarray, n: np.ndarray, width: float, options: dict) -> Placed:
-    """An obstacle that pushes the points x along n and begins a part of its width below the lowest of them."""
-    p, gap = x[np.argmin(x @ n)], width * rng.uniform(0.3, 0.8)
+def place(kind: ObstacleKind, rng, x: np.ndarray, n: np.ndarray, width: float, options: dict, p=None) -> Placed:
+    """An obstacle that pushes the points x along n and begins a part of its width below the lowest of them, or below p."""
+    p, gap = x[np.argmin(x @ n)] if p is None else p, width * rng.uniform(0.3, 0.8)
     foot, turned = p - gap * n, frame(n, rng)
     aside = turned[:, 0] * rng.uniform(-1, 1) + turned[:, 2] * rng.uniform(-1, 1)
     options = options | dict(width=width)
-    radius = rng.uniform(1.0, 4.0) * CELL
+    radius = rng.uniform(1.0, 4.0) * CELL * (0.05 if kind.narrow else 1.0)
     if kind.name == "Ground":
         term, distance = ds.Ground(height=foot[1], **options), lambda y: y[:, 1] - foot[1]
     elif kind.name == "HalfSpace":
@@ -87,7 +87,7 @@ def place(kind: ObstacleKind, rng, x: np.ndarray, n: np.ndarray, width: float, o
         term = ds.Sphere(center=center, radius=around, inside=True, **options)
         distance = lambda y: around - np.linalg.norm(y - center, axis=1)  # noqa: E731
     elif kind.name == "Box":
-        size = CELL * rng.uniform(2.0, 6.0, 3)
+        size = CELL * rng.uniform(2.0, 6.0, 3) * ([0.05, 1.0, 1.0] if kind.narrow else 1.0)
         center = foot - size[1] / 2 * n + 0.5 * aside * size[[0, 2]].min() * 0.9
         turn = Rotation.from_matrix(turned)
         term = ds.Box(center=center, size=size, rotation=turn.as_rotvec(), **options)
@@ -110,7 +110,7 @@ def _round(name: str, rng, foot, n, turned, radius, options):
         a, b = middle - rng.uniform(1, 4) * CELL * axis, middle + rng.uniform(1, 4) * CELL * axis
     else:
         end = foot + CELL * rng.uniform(-0.5, 0.5) * turned[:, 0] if name == "Cylinder" else foot - radius * n
-        radius = radius + 2 * CELL * (name == "Cylinder")
+        radius = radius + 2 * CELL * (name == "Cylinder" and radius > 0.5 * CELL)
         a, b = end - rng.uniform(1, 4) * CELL * n, end
     kind = ds.Capsule if name == "Capsule" else ds.Cylinder
     axis, length = (b - a) / np.linalg.norm(b - a), np.linalg.norm(b - a)

@@ -5,13 +5,14 @@ from collections import Counter, defaultdict
 from .judge import CLASSES, FAILED, INACCURATE, PASSED, REFUSED, UNRESOLVED, ZERO, Result
 
 ENOUGH = 10  # non-zero derivatives that passed, of every law, solver and input
-SHARES = {"obstacle": 0.5, "sticks": 0.2, "slides": 0.2, "self_contact": 0.2, "static_contact": 0.1}
+SHARES = {"obstacle": 0.5, "sticks": 0.2, "slides": 0.2, "self_contact": 0.2, "static_contact": 0.1, "faces": 0.05}
 SAID = {
     "obstacle": "an obstacle is felt",
     "sticks": "friction sticks",
     "slides": "friction slides",
     "self_contact": "pairs of self-contact press",
     "static_contact": "statics press on an obstacle",
+    "faces": "points within faces are pushed in explicit steps",
 }
 LARGEST_EXPLAINED, LARGEST_ZERO = 0.05, 0.10
 

@@ -179,9 +179,16 @@ def _obstacles(kind, rng, mesh, start, fixed, stiff, duration) -> tuple[list, li
             n = push_direction(o.name, rng)
             if np.argmin(start @ n) in free:
                 break
+        below = None
+        if o.narrow:  # a face of free corners, if there is one
+            faces = mesh.surface_triangles
+            loose = faces[np.isin(faces, free).all(1)] if np.isin(faces, free).all(1).any() else faces
+            corners = start[loose[rng.integers(0, len(loose))]]
+            across = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+            below, n = corners.mean(0), -across / np.linalg.norm(across)
         push = n if push is None else push
         width = MESH_WIDTH if o.name == "MeshObstacle" else CELL * rng.uniform(0.25, 0.5)
-        options = dict(stiffness=stiff * rng.uniform(0.3, 1.0))
+        options = dict(stiffness=stiff * rng.uniform(0.3, 1.0) * (10 if o.narrow else 1))  # of few points
         if o.per_area:  # no vertex's barrier is stiffer
             largest = SurfaceAreas(mesh.surface_triangles, mesh.num_vertices).value(mesh.vertices)[0].max()
             options = dict(stiffness_per_area=options["stiffness"] / largest)
@@ -189,7 +196,7 @@ def _obstacles(kind, rng, mesh, start, fixed, stiff, duration) -> tuple[list, li
             typical = 0.05 * CELL / duration
             options |= dict(friction=rng.uniform(0.1, 0.8), friction_speed=typical * 10 ** rng.uniform(-1.0, 0.8))
         path = smooth_path(rng, 0.05 * CELL, duration) if o.path else None
-        placed.append(place(o, rng, start, n, width, options | dict(path=path)))
+        placed.append(place(o, rng, start, n, width, options | dict(path=path), below))
         paths.append(path)
     return placed, paths, rng.standard_normal(3) if push is None else push
 

@@ -1,6 +1,6 @@
 """What kernels are compiled for, drawn from a number: law, solver, precision, kinds of terms, friction, paths, motion."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,6 +18,8 @@ SOLVERS = (*EXPLICIT, *IMPLICIT, ds.StaticSolver)
 WHEEL = (*EXPLICIT * 3, *IMPLICIT * 2, *(ds.StaticSolver,) * 3, ds.SemiImplicitSolver)  # how often each is drawn
 OBSTACLES = ("Ground", "HalfSpace", "Sphere", "Bowl", "Box", "Capsule", "Cylinder", "MeshObstacle")
 
+NARROW = ("Sphere", "Box", "Capsule", "Cylinder")  # of which some are
+
 
 @dataclass(frozen=True)
 class ObstacleKind:
@@ -27,6 +29,7 @@ class ObstacleKind:
     friction: bool
     path: bool
     per_area: bool  # its stiffness
+    narrow: bool = False  # narrower than a triangle, before whose middle it lies
 
 
 @dataclass(frozen=True)
@@ -60,7 +63,10 @@ class Structure:
         return self.solver is ds.StaticSolver
 
     def __str__(self) -> str:
-        kinds = [k.name + " rough" * k.friction + " moving" * k.path + " per area" * k.per_area for k in self.obstacles]
+        kinds = [
+            k.name + " rough" * k.friction + " moving" * k.path + " per area" * k.per_area + " narrow" * k.narrow
+            for k in self.obstacles
+        ]
         flags = ("self_contact", "gravity", "drag", "fixed", "motion", "uniform")
         words = [name for name in flags if getattr(self, name)]
         how = f"{self.contact} {self.contact_damping:g}" if self.explicit else "potential"
@@ -93,6 +99,8 @@ def structure(number: int) -> Structure:
         ObstacleKind(name, rng.random() < 0.65, rng.random() < 0.45, turn((True, True, False), 4 * number + k, 8))
         for k, name in enumerate(names)
     )
+    if solver in EXPLICIT and obstacles and obstacles[0].name in NARROW and turn((True, True, False), number, 11):
+        obstacles = (replace(obstacles[0], narrow=True), *obstacles[1:])
     fixed = static or rng.random() < 0.5
     precision = "f32" if rng.random() < 0.2 else "f64"
     volume = "patches" if rng.random() < 0.2 else "tetrahedra"

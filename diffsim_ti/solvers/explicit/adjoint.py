@@ -7,6 +7,7 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.inputs import Derived
+from diffsim_ti.solvers.explicit.felt_faces import FeltAdjoint
 from diffsim_ti.state.arrays import copy_slot
 from diffsim_ti.state.numbers import OF_STEPS, Adjoint, Tangent
 from diffsim_ti.state.workspace import FrameArrays
@@ -33,6 +34,7 @@ class ExplicitAdjoint:
         self.felt = runtime.array(a.vector, 2 * moving, a.num_vertices if moving else 1)  # of paths, by each vertex
         self.frames = FrameArrays.of(a, *workspace.frames.frames_u.shape)
         self.z = a.law_states(1)  # of the state of the law
+        self.faces = FeltAdjoint(self, workspace.faces) if workspace.faces else None
 
     def fits(self, workspace) -> bool:
         """Whether kernels and shapes are still those of the run."""
@@ -60,6 +62,8 @@ class ExplicitAdjoint:
                 runtime.fill(target, 0)
         if self.ws.pairs:
             self.ws.pairs.clear_sums()
+        if self.faces:
+            self.faces.clear()
 
     def reverse(
         self, base: int, last: int, num_passes: int, save_every: int, stop: int, to_state: bool = False
@@ -92,6 +96,8 @@ class ExplicitAdjoint:
             slot = numbers["first"] - base
             ws.pairs.ensure(history.u, slot)
             ws.pairs.vjp(history.u, slot, self.w, self.corner)
+        if self.faces:
+            self.faces.reverse(history.u, numbers["first"] - base, numbers)
 
     def finish(self) -> None:
         """Complete the adjoint of the start."""
@@ -133,6 +139,8 @@ class ExplicitAdjoint:
         if self.features.shape:
             rest = rest + runtime.fetch(self.frames.frames_u).astype(np.float64).sum(0)
         out.rest = rest + out.rest
+        if self.faces:
+            self.faces.collect(out)
         return out
 
 
@@ -147,6 +155,7 @@ class ExplicitTangent:
         self.v = runtime.upload(tangent.velocity[None], a.vector)
         self.frames = FrameArrays.of(a, *workspace.frames.frames_u.shape)
         self.numbers, self.z = Tangent(a, tangent), a.law_states(1)
+        self.of_faces = self, self.numbers
         if self.z is not None:
             runtime.fill(self.z, 0)
         self._rate_dot = float(tangent.parameters[self.features.drag]) if self.features.drag >= 0 else 0.0
@@ -162,6 +171,8 @@ class ExplicitTangent:
                 ws.pairs.ensure(history.u, slot)
                 of_contact = self.tangent.parameters[a.parameters_of_self_contact]
                 ws.pairs.product(history.u, slot, self.u, a.corner, self.numbers.rest, of_contact)
+            if ws.faces:
+                ws.faces.jvp(history.u, slot, numbers, self.features, self.of_faces)
             launch(**numbers, base=first, rate_dot=self._rate_dot)
 
     def save_frame(self, frame: int) -> None:

@@ -13,6 +13,7 @@ from diffsim_ti.inputs import Derived
 from diffsim_ti.monitor.energy_balance import EnergyBalance
 from diffsim_ti.solvers.explicit.adjoint import ExplicitAdjoint, ExplicitTangent
 from diffsim_ti.solvers.explicit.contact_stage import ROWS
+from diffsim_ti.solvers.explicit.felt_faces import FeltFaces, feels_faces
 from diffsim_ti.solvers.explicit.kernels import ExplicitKernels, explicit_kernels
 from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.state.schedule import PassTable
@@ -46,6 +47,8 @@ class ExplicitSolver(Solver):
     contact: "stage", the default: obstacles act in a stage of each pass (contact_stage.py), which no step is too large
         for; or "force": their barriers are one more force, which the step has to follow. A vertex that is driven with more
         than a barrier holds, 7 stiffness width^2, crosses in either and raises Crossing, unless much is damped.
+        Points within faces feel what is narrower than they are by a force in either, of which a pass takes what it can
+        follow (face_kernels.py); where that is not all, a warning says so. No friction acts there.
     contact_damping: of the stage, from 0, which keeps the energy of a contact, to 1, which damps what the step does not
         resolve and is the smoothest. A vertex that is pressed with N rests at velocity (1 - c) h N / 2 m in the
         semi-implicit solver, whose rest is exact with 1, and at -c h N / 2 m in velocity Verlet, exact with 0.
@@ -100,12 +103,14 @@ class ExplicitSolver(Solver):
 class ExplicitWorkspace(Workspace):
     """A run of an explicit solver: one launch for many passes, or one per pass on all threads."""
 
+    feels_faces = staticmethod(feels_faces)
     work_per_launch = 4_000_000  # tetrahedra x passes in one launch: a tenth of a second, so that Ctrl-C is heard
 
     def __init__(self, solver, derived: Derived):
         self.table = PassTable(runtime.PRECISIONS[solver.scene.precision])
         super().__init__(solver, derived)
         features, a = self.arrays.features(), self.arrays
+        self.faces = FeltFaces(self) if a.feels_faces else None
         noted = ROWS * len(a.obstacles), a.num_vertices
         self.contact = SimpleNamespace(
             stage=runtime.array(a.vector, *(noted if features.staged else (1, 1))),
@@ -125,6 +130,8 @@ class ExplicitWorkspace(Workspace):
         seen, step = self.watch.rows(), self.kernels(self.arrays.features()).step
         launch = self.bound(step, state=(self.probe, self.frames, self.watch, self.contact), table=self.table)
         for numbers in self.launches(j, j + 1, num_passes, 0, self.arrays.num_tetrahedra):
+            if self.faces:
+                self.faces.forces(self.probe.u, 0, numbers)
             launch(**numbers, base=j, stride=1)
         self.watch.put(seen)
         return runtime.fetch(self.probe.f)[0].astype(np.float64)
@@ -149,7 +156,7 @@ class ExplicitWorkspace(Workspace):
         work: of a pass, against `work_per_launch`. backwards: from the last passes to the first.
         """
         a, solver = self.arrays, self.solver
-        chunk = 1 if self.parallel or self.pairs else max(1, self.work_per_launch // work)
+        chunk = 1 if self.parallel or self.pairs or self.faces else max(1, self.work_per_launch // work)
         num_rows = max((len(x) for x in (a.values.path, a.values.motion) if x is not None), default=1)
         run = num_passes, num_rows, save_every, self.rate, solver.schedule
         turn, sizes = -1 if backwards else 1, dict(num_items=a.num_items, num_vertices=a.num_vertices)
@@ -172,7 +179,11 @@ class ExplicitWorkspace(Workspace):
             slot = (numbers["first"] - base) * stride
             if pairs:
                 pairs.forces(history.u, slot, self.arrays.corner)
+            if self.faces:
+                self.faces.forces(history.u, slot, numbers)
             launch(**numbers, base=base, stride=stride)
+            if self.faces:
+                self.faces.look(history.u, slot + stride, numbers)
             if pairs:
                 try:
                     pairs.check_pass(history.u, slot + stride, self.solver.substep)

@@ -62,6 +62,9 @@ class Sphere(Obstacle):
         shape = shapes.bowl if self.inside else shapes.ball
         return shape(self.values["sphere_center"], float(self.values["sphere_radius"]))
 
+    def least_radius(self):
+        return np.inf if self.inside else float(self.values["sphere_radius"])
+
     @property
     def variant(self):
         return (*super().variant, self.inside)
@@ -104,6 +107,9 @@ class Capsule(Obstacle):
         a, b = self.values["capsule_start"], self.values["capsule_end"]
         share = np.clip((positions - a) @ (b - a) / ((b - a) @ (b - a)), 0, 1)
         return np.linalg.norm(positions - a - share[:, None] * (b - a), axis=1) - self.values["capsule_radius"]
+
+    def least_radius(self):
+        return float(self.values["capsule_radius"])
 
     def surface(self, size):
         values = self.values

@@ -64,6 +64,15 @@ def slope_and_curvature(s, fp: ti.template()):
     return b, c
 
 
+@ti.func
+def third(s, fp: ti.template()):
+    """beta'''(s)"""
+    b = 0 * s
+    if s >= ti.cast(CROSSOVER, fp) and s < 1:
+        b = (-2 * s * s - 4 * s + 2 * (s - 1)) / (s * s * s)
+    return b
+
+
 def beta(s) -> np.ndarray:
     """beta(s) on the host, for numbers or arrays, in float64."""
     s = np.asarray(s, np.float64)

@@ -27,6 +27,9 @@ class Ground(Obstacle):
     def distance(self, positions: np.ndarray) -> np.ndarray:
         return positions[:, 1] - float(self.values["ground_height"])
 
+    def least_radius(self):
+        return np.inf
+
     def floor_height(self):
         return float(self.values["ground_height"])
 

@@ -120,6 +120,10 @@ class Obstacle(Term):
         """Distance [m] of each position, the obstacle being displaced by `offset` [m]."""
         return self.distance(np.asarray(positions, np.float64) - offset)
 
+    def least_radius(self) -> float:
+        """How round the obstacle is at least [m]: 0 where it has edges, infinite where it is flat or hollow."""
+        return np.inf if getattr(getattr(self, "twin", None), "hollow", False) is True else 0.0
+
     def check_start(self, positions: np.ndarray, surface: np.ndarray, offset=(0.0, 0.0, 0.0)) -> None:
         gap = self.gap(positions[surface], offset)
         if gap.size and gap.min() <= 0:

@@ -1,0 +1,266 @@
+"""What obstacles do to points within a face in an explicit pass: forces of the energy of potential/faces.py, and more.
+
+The forces are taken where the pass begins. Of a face and an obstacle, corner a feels
+
+    f_a = -c k w sum_q s_a ((F_s - F_t) n + F_t n_a)
+
+q: points of the lattice, s_a: their shares of the corners; n, n_a: normals at the point and at the corner; F(s, t):
+potential/face_lattice.py. Beside it stands
+
+    D_a = c k sum_q s_a beta''(s) phi(t)    [N/m]
+
+whose sum over the faces around a vertex is no less than the stiffness that they have there, for s (x) s <= diag(s) where
+shares s sum up to 1. It says how much of the force a pass can take (face_kernels.py).
+"""
+
+from dataclasses import dataclass
+
+import taichi as ti
+
+from diffsim_ti.potential.face_lattice import FLAT, fade, fade_slope, point_curvatures, point_energy, point_slopes
+from diffsim_ti.solvers.explicit.face_rows import FaceRows
+from diffsim_ti.terms.obstacles import barrier
+
+A = ti.template()  # an array or Bundle handed to a Taichi function
+
+
+@dataclass(frozen=True)
+class FaceForces(FaceRows):
+    """Taichi functions of one face f and its forces."""
+
+    # ---- a face and an obstacle ----------------------------------------------------------------------------------------
+
+    @ti.func
+    def face(self, what: A, g: A, k, f, X, u, w, scene: A, faces: A, out: A):
+        """(rows, least) of face f, whose corners have the rows X of rest positions relative to the obstacle and u; least:
+        of d - r of all its points, or less.
+
+        Of "force" rows (f_a, D_a), the energy going to `faces`; of "product" change of f_a for changes w; "jvp": change of
+        both, those of the obstacle's numbers being in `out`; "vjp": adjoints of u for adjoints w of both, those of the
+        obstacle's numbers going to `out`.
+        """
+        found, first, row = self.rows(0), g.first + k * g.size, f * ti.static(self.num_obstacles) + g.number + k
+        reach, width = faces.reach[row], g.force.width(scene.parameters, first)
+        one = ti.cast(1 / 3, self.fp)
+        third = ti.Vector([one, one, one])
+        Xm, um, around = self.mix(third, X), self.mix(third, u), self.rows(0)
+        for a in ti.static(range(3)):
+            for m in ti.static(range(3)):
+                around[a, m] = (X[a, m] - Xm[m]) + (u[a, m] - um[m])
+        middle, size = g.force.clearance(scene.parameters, first, Xm, um), self.size_of_rows(around)
+        least = middle[3] - size - reach
+        if least < width:
+            least = ti.cast(1e30, self.fp)  # unless points are told apart, corners speak for them
+            corners, turns = self.rows(0), self.rows(0)  # (normal, distance) there, and its change
+            bent = ti.cast(1e30, self.fp)
+            for a in range(3):
+                seen = g.force.outlook(scene.parameters, first, self.row_of(X, a), self.row_of(u, a))
+                for m in ti.static(range(4)):
+                    for b in ti.static(range(3)):
+                        corners[b, m] = ti.select(a == b, seen[m], corners[b, m])
+            # a convex obstacle is never nearer than the tangent plane at the middle says
+            if ti.static(g.force.convex):
+                bent = ti.cast(0, self.fp)
+                for a in ti.static(range(3)):
+                    along = self.dot3(middle, self.row_of(around, a))
+                    bent = ti.max(bent, corners[a, 3] - middle[3] - along)
+            if bent > ti.cast(FLAT, self.fp) * width:
+                if ti.static(what in ("product", "jvp", "vjp")):
+                    for a in range(3):
+                        t = self.turn(
+                            what, g, first, self.row_of(X, a), self.row_of(u, a), self.row_of(w, a), scene, out
+                        )
+                        for m in ti.static(range(4)):
+                            for b in ti.static(range(3)):
+                                turns[b, m] = ti.select(a == b, t[m], turns[b, m])
+                found, least = self.points(
+                    what, g, first, f, row, X, u, w, corners, turns, reach, width, scene, faces, out
+                )
+        return found, least
+
+    @ti.func
+    def turn(self, what: A, g: A, first, X, u, w, scene: A, out: A):
+        """Change of (normal, distance) at a point that moves by w."""
+        t = self.vector(0)
+        if ti.static(what == "jvp"):
+            t = g.force.outlook_jvp(scene.parameters, first, X, u, w, out.parameters)
+        else:
+            t = g.force.outlook_jvp(scene.parameters, first, X, u, w)
+        return t
+
+    @ti.func
+    def points(self, what: A, g: A, first, f, row, X, u, w, corners, turns, reach, width, scene: A, faces: A, out: A):
+        found, by, least = self.rows(0), self.rows(0), ti.cast(1e30, self.fp)
+        parts = faces.parts[row]
+        one, thicker = self.one_point(what, g, f, row, X, parts, faces, out)
+        per, edge = ti.cast(1, self.fp) / ti.cast(parts, self.fp), self.rows(0)
+        for m in ti.static(range(3)):
+            edge[0, m] = per * ((X[2, m] - X[0, m]) + (u[2, m] - u[0, m]))
+        # distances change by no more than the way: where a point is far away, the next ones are not looked at
+        step = ti.max(ti.cast(1.01, self.fp) * self.size_of_rows(edge), ti.cast(1e-30, self.fp))
+        for x in range(parts + 1):
+            onwards = 0
+            for y in range(parts + 1 - x):
+                if y >= onwards:
+                    s1, s2 = x * per, y * per
+                    s = ti.Vector([1 - s1 - s2, s1, s2])
+                    Xs, us = self.mix(s, X), self.mix(s, u)
+                    now = g.force.outlook(scene.parameters, first, Xs, us)
+                    far = now[3]
+                    if ti.static(g.force.grain > 0):  # splines are steeper than distances, and end with their grid
+                        inside = now[3] < ti.cast(1e6 * g.force.grain, self.fp)
+                        far = ti.select(inside, ti.cast(0.8, self.fp) * now[3], width + reach)
+                    least = ti.min(least, ti.min(far, now[3]) - reach)
+                    ahead = ti.min((far - reach - width) / step, ti.cast(parts, self.fp))
+                    onwards = y + 1 + ti.cast(ti.max(ahead, ti.cast(0, self.fp)), ti.i32)
+                    sigma = (now[3] - reach) / width
+                    t = (s[0] * corners[0, 3] + s[1] * corners[1, 3] + s[2] * corners[2, 3] - now[3]) / width
+                    inner = x < parts and y < parts and x + y > 0
+                    weight = one
+                    if ti.static(g.force.per_area):
+                        weight = ti.select(x > 0 and y > 0 and x + y < parts, one + one, one)  # edges have two faces
+                    if inner and sigma < 1 and t > ti.cast(FLAT, self.fp):
+                        turned, mixed = self.vector(0), self.vector(0)
+                        if ti.static(what in ("product", "jvp", "vjp")):
+                            mixed = self.mix(s, w)
+                            turned = self.turn(what, g, first, Xs, us, mixed, scene, out)
+                        if ti.static(what == "force"):
+                            value = point_energy(sigma, t, g.force.per_area, self.fp)
+                            stiff = weight * scene.parameters[first + g.force.count]
+                            faces.energy[f] = faces.energy[f] + stiff * width * width * value
+                        found += self.point(
+                            what,
+                            g,
+                            first,
+                            s,
+                            sigma,
+                            t,
+                            now,
+                            turned,
+                            mixed,
+                            corners,
+                            turns,
+                            weight,
+                            thicker,
+                            width,
+                            scene,
+                            out,
+                        )
+                        if ti.static(what == "vjp"):
+                            by += self.numbers(
+                                g, first, f, s, sigma, t, now, Xs, us, mixed, w, corners, weight, width, scene, out
+                            )
+        if ti.static(what == "vjp"):
+            for a in range(3):
+                g.force.outlook_vjp(
+                    scene.parameters, first, self.row_of(X, a), self.row_of(u, a), self.row_of(by, a), out.sums, f
+                )
+        return found, least
+
+    @ti.func
+    def one_point(self, what: A, g: A, f, row, X, parts, faces: A, out: A):
+        """(c of a point on an edge, and the share by which it changes)."""
+        c, share = faces.weight[row], ti.cast(0, self.fp)
+        if ti.static(g.force.per_area):
+            a, b = ti.Vector.zero(self.fp, 3), ti.Vector.zero(self.fp, 3)
+            for m in ti.static(range(3)):
+                a[m], b[m] = X[1, m] - X[0, m], X[2, m] - X[0, m]
+            n = a.cross(b)
+            twice = ti.sqrt(n.norm_sqr())
+            c = ti.cast(0.5, self.fp) * twice / ti.cast(parts * parts, self.fp)  # that of one of the small triangles
+            if ti.static(what == "jvp"):
+                da, db = ti.Vector.zero(self.fp, 3), ti.Vector.zero(self.fp, 3)
+                moved = self.rest_rows(f, out.rest, self.vector(0), faces)
+                for m in ti.static(range(3)):
+                    da[m], db[m] = moved[1, m] - moved[0, m], moved[2, m] - moved[0, m]
+                share = n.dot(da.cross(b) + a.cross(db)) / (twice * twice)
+        return c, share
+
+    @ti.func
+    def rigid(self, s, t):
+        """G = beta''(s) phi(t) and its derivatives: (G, Gs, Gt)."""
+        b2, b3 = barrier.curvature(s, self.fp), barrier.third(s, self.fp)
+        p, p1 = fade(t, self.fp), fade_slope(t, self.fp)
+        G, Gs, Gt = b2 * p, b3 * p, b2 * p1
+        return G, Gs, Gt
+
+    @ti.func
+    def point(
+        self,
+        what: A,
+        g: A,
+        first,
+        s,
+        sigma,
+        t,
+        now,
+        dn,
+        mixed,
+        corners,
+        turns,
+        weight,
+        thicker,
+        width,
+        scene: A,
+        out: A,
+    ):
+        """What a point adds to the rows of the corners; dn: change of (normal, distance) there."""
+        found, stiffness = self.rows(0), scene.parameters[first + g.force.count]
+        scale, stiff = 0 - weight * stiffness * width, weight * stiffness
+        Fs, Ft = point_slopes(sigma, t, g.force.per_area, self.fp)
+        if ti.static(what == "force"):
+            G = barrier.curvature(sigma, self.fp) * fade(t, self.fp)
+            for a in ti.static(range(3)):
+                for m in ti.static(range(3)):
+                    found[a, m] = scale * s[a] * ((Fs - Ft) * now[m] + Ft * corners[a, m])
+                found[a, 3] = stiff * s[a] * G
+        else:
+            Fss, Fst, Ftt = point_curvatures(sigma, t, g.force.per_area, self.fp)
+            G, Gs, Gt = self.rigid(sigma, t)
+            ds, zero = dn[3] / width, ti.cast(0, self.fp)
+            dt = (s[0] * turns[0, 3] + s[1] * turns[1, 3] + s[2] * turns[2, 3] - dn[3]) / width
+            dk, dw = zero, zero
+            if ti.static(what == "jvp"):
+                dk = thicker + out.parameters[first + g.force.count] / stiffness
+                dw = out.parameters[first + g.force.count + 1] / width
+                ds, dt = ds - sigma * dw, dt - t * dw
+            dFs, dFt = Fss * ds + Fst * dt, Fst * ds + Ftt * dt
+            for a in ti.static(range(3)):
+                for m in ti.static(range(3)):
+                    found[a, m] = scale * s[a] * ((dFs - dFt) * now[m] + (Fs - Ft) * dn[m])
+                    found[a, m] += scale * s[a] * (dFt * corners[a, m] + Ft * turns[a, m])
+                    if ti.static(what == "jvp"):
+                        found[a, m] += (dk + dw) * scale * s[a] * ((Fs - Ft) * now[m] + Ft * corners[a, m])
+                    if ti.static(what == "vjp"):
+                        by_D = stiff * mixed[3] / width * s[a]
+                        found[a, m] += by_D * ((Gs - Gt) * now[m] + Gt * corners[a, m])
+                if ti.static(what == "jvp"):
+                    found[a, 3] = stiff * s[a] * (Gs * ds + Gt * dt + dk * G)
+        return found
+
+    @ti.func
+    def numbers(self, g: A, first, f, s, sigma, t, now, Xs, us, mixed, w, corners, weight, width, scene: A, out: A):
+        """Adjoints of (normal, distance) at the corners; adds those of the obstacle's numbers."""
+        by, stiffness = self.rows(0), scene.parameters[first + g.force.count]
+        scale, stiff = 0 - weight * stiffness * width, weight * stiffness * mixed[3]
+        Fs, Ft = point_slopes(sigma, t, g.force.per_area, self.fp)
+        Fss, Fst, Ftt = point_curvatures(sigma, t, g.force.per_area, self.fp)
+        G, Gs, Gt = self.rigid(sigma, t)
+        along, across = self.dot3(now, mixed), ti.cast(0, self.fp)
+        for a in ti.static(range(3)):
+            across += s[a] * (corners[a, 0] * w[a, 0] + corners[a, 1] * w[a, 1] + corners[a, 2] * w[a, 2])
+        by_s = scale * ((Fss - Fst) * along + Fst * across) + stiff * Gs
+        by_t = scale * ((Fst - Ftt) * along + Ftt * across) + stiff * Gt
+        of_force, by_now = scale * ((Fs - Ft) * along + Ft * across), scale * (Fs - Ft) * mixed
+        by_now[3] = (by_s - by_t) / width
+        g.force.outlook_vjp(scene.parameters, first, Xs, us, by_now, out.sums, f)
+        for a in ti.static(range(3)):
+            for m in ti.static(range(3)):
+                by[a, m] = scale * Ft * s[a] * w[a, m]
+            by[a, 3] = s[a] * by_t / width
+        at = first + g.force.count
+        out.sums[at, f] = out.sums[at, f] + (of_force + stiff * G) / stiffness
+        if ti.static(g.force.per_area):
+            out.by_areas[f] = out.by_areas[f] + of_force + stiff * G
+        out.sums[at + 1, f] = out.sums[at + 1, f] + (of_force - sigma * by_s - t * by_t) / width
+        return by

@@ -1,0 +1,119 @@
+"""Faces against obstacles in an explicit pass: their corners as rows of a matrix, and how near they are."""
+
+from dataclasses import dataclass
+
+import taichi as ti
+
+from diffsim_ti.potential.face_lattice import BENT
+from diffsim_ti.solvers.explicit.obstacle_stages import ObstacleStages
+
+A = ti.template()  # an array or Bundle handed to a Taichi function
+
+
+@dataclass(frozen=True)
+class FaceRows(ObstacleStages):
+    """Taichi functions of one face f; g is a group of obstacles, k a place in it (state/features.py).
+
+    Where plan.between, obstacles are where one looks at the state between passes, not where pass `now` begins.
+    """
+
+    @property
+    def rows(self):
+        return ti.types.matrix(3, 4, self.fp)
+
+    @property
+    def groups(self):
+        """Obstacles that can reach into a face between its corners."""
+        return tuple(group for group in self.features.groups if group.force.watched and not group.force.hollow)
+
+    @property
+    def num_obstacles(self) -> int:
+        return sum(group.count for group in self.features.groups)
+
+    @ti.func
+    def where(self, g: A, k, now: A, scene: A, faces: A, plan: A):
+        """Displacement of an obstacle."""
+        place = faces.offsets[3 * (g.number + k)]
+        if plan.between == 0:
+            place = self.place(g, k, now, scene.path)
+        return place
+
+    @ti.func
+    def row_of(self, M, a):
+        """Row a of a matrix of three."""
+        out = self.vector(0)
+        for m in ti.static(range(4)):
+            out[m] = ti.select(a == 0, M[0, m], ti.select(a == 1, M[1, m], M[2, m]))
+        return out
+
+    @ti.func
+    def mix(self, s, M):
+        """Rows of a matrix of three, weighted."""
+        out = self.vector(0)
+        for m in ti.static(range(4)):
+            out[m] = s[0] * M[0, m] + s[1] * M[1, m] + s[2] * M[2, m]
+        return out
+
+    @ti.func
+    def dot3(self, a, b):
+        """Of vectors whose fourth component says something else."""
+        return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+    @ti.func
+    def size_of_rows(self, M):
+        """Length of the longest row."""
+        most = ti.cast(0, self.fp)
+        for a in ti.static(range(3)):
+            most = ti.max(most, M[a, 0] * M[a, 0] + M[a, 1] * M[a, 1] + M[a, 2] * M[a, 2])
+        return ti.sqrt(most)
+
+    @ti.func
+    def rows_at(self, f, array: A, slot, faces: A):
+        """array[slot, i] at the corners of a face."""
+        out = self.rows(0)
+        for a in ti.static(range(3)):
+            x = array[slot, faces.corners[3 * f + a]]
+            for m in ti.static(range(4)):
+                out[a, m] = x[m]
+        return out
+
+    @ti.func
+    def rest_rows(self, f, rest: A, place, faces: A):
+        """rest[i] - place at the corners of a face."""
+        out = self.rows(0)
+        for a in ti.static(range(3)):
+            x = rest[faces.corners[3 * f + a]] - place
+            for m in ti.static(range(3)):
+                out[a, m] = x[m]
+        return out
+
+    # ---- what is noted -------------------------------------------------------------------------------------------------
+
+    @ti.func
+    def nearest(self, g: A, k, f, X, u, move, scene: A, faces: A):
+        """The least distance d of the points of face f, now or, along the normal, on the way `move` that led here.
+
+        Where a point is nearer than r, so that what lies between points may be in the obstacle, d - r.
+        """
+        first, row = g.first + k * g.size, f * ti.static(self.num_obstacles) + g.number + k
+        parts, reach, least = faces.parts[row], faces.reach[row], ti.cast(1e30, self.fp)
+        per, gaps = ti.cast(1, self.fp) / ti.cast(parts, self.fp), ti.Vector.zero(self.fp, 3)
+        width = g.force.width(scene.parameters, first)
+        for a in range(3):
+            d = g.force.gap(scene.parameters, first, self.row_of(X, a), self.row_of(u, a))
+            for b in ti.static(range(3)):
+                gaps[b] = ti.select(a == b, d, gaps[b])
+        for x in range(parts + 1):
+            for y in range(parts + 1 - x):
+                s1, s2 = x * per, y * per
+                s = ti.Vector([1 - s1 - s2, s1, s2])
+                now = g.force.outlook(scene.parameters, first, self.mix(s, X), self.mix(s, u))
+                d, before = now[3], now[3] - self.dot3(now, self.mix(s, move))
+                bent = s.dot(gaps) - d > ti.cast(BENT, self.fp) * width
+                if bent and d <= reach:
+                    d -= reach
+                if before <= 0 and (bent or d <= 0):
+                    d = ti.min(d, before)
+                if bent or d <= 0:
+                    least = ti.min(least, d)
+        return least
