@@ -80,7 +80,7 @@ def test_arrays_hold_what_is_copied_to_them(dtype):
             assert np.array_equal(runtime.fetch_row(array, row), numbers[row, :, :3])
 
 
-# ---- loops that are gone through many times in a launch --------------------------------------------------------------------
+# ---- loops that are gone through many times in a launch ----------------------------------------------------------------
 
 
 @ti.func

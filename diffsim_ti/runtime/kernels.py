@@ -9,7 +9,7 @@ import taichi as ti
 
 from diffsim_ti.runtime.language import Bundle
 from diffsim_ti.runtime.launch import Launch
-from diffsim_ti.runtime.start import PRECISIONS
+from diffsim_ti.runtime.start import PRECISIONS, runs_on_cpu
 
 LANES = 8  # tetrahedra in a block
 _serial = count()
@@ -55,9 +55,12 @@ class Kernel:
         arguments = [(f"{b}_{a}", types[kind]) for b, own in arrays.items() for a, kind in own.items()]
         arguments += [(n, types[kind]) for n, kind in numbers.items()]
         bundles = [f"Bundle({', '.join(f'{a}={b}_{a}' for a in own)})" for b, own in arrays.items()]
-        bundles.append(f"Bundle({', '.join(f'{n}={n}' for n in numbers)})")
+        # a GPU takes one task more, of one thread, for the bounds of each loop, but one for all that are read before them
+        first = [] if runs_on_cpu() else [n for n, kind in numbers.items() if kind == "int"]
+        bundles.append(f"Bundle({', '.join(f'{n}={n}_' if n in first else f'{n}={n}' for n in numbers)})")
         signature = ", ".join(f"{argument}: types[{k}]" for k, (argument, _) in enumerate(arguments))
-        source = f"def {name}({signature}):\n    body({', '.join(bundles)})\n"
+        lines = [*(f"{n}_ = {n}" for n in first), f"body({', '.join(bundles)})"]
+        source = f"def {name}({signature}):\n" + "".join(f"    {line}\n" for line in lines)
         file = f"<{name} {next(_serial)}>"
         linecache.cache[file] = (len(source), None, source.splitlines(True), file)  # Taichi reads a kernel's source
         scope = dict(body=body, Bundle=Bundle, types=[kind for _, kind in arguments])

@@ -11,7 +11,6 @@ from diffsim_ti.state.arrays import copy_slot
 from diffsim_ti.state.numbers import OF_STEPS, Adjoint, Tangent
 from diffsim_ti.state.workspace import FrameArrays
 
-
 STEPS = [name for name in OF_STEPS if name != "path"]
 PARTS = 64  # sums over vertices that a GPU's threads make side by side
 
