@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import diffsim_ti as ds
+from diffsim_ti.solvers.explicit import solver as explicit
 
 pytestmark = pytest.mark.backends
 # relative size of the step by which a gradient is compared with the motion's slope
@@ -47,3 +48,17 @@ def test_gradients_are_the_slopes_of_runs_and_checkpoints_change_no_bit(solver):
     parts = {name: (gradients[name] * ways[name]).sum() for name in INPUTS}
     assert min(parts.values()) > 0.005 * sum(parts.values())  # each counts
     assert sum(parts.values()) == pytest.approx((w * (ends[0] - ends[1])).sum() / 2, rel=5e-3)
+
+
+def test_substeps_of_a_launch_have_the_same_bits_however_many_they_are(monkeypatch):
+    """Kernels for a GPU do up to 16 of them in a launch; here two, and with a change of steps within a launch."""
+    found = []
+    for most in (2, 16):
+        monkeypatch.setattr(explicit, "MOST_PASSES", most)
+        rollout = rollout_of(ds.VelocityVerletSolver)
+        assert rollout.solver.passes_per_launch() in (1, most)
+        frames = rollout.forward()
+        gradients = rollout.vjp(frames, frames.displacements, frames.velocities)
+        found.append([frames.positions, frames.velocities, *gradients.values()])
+    for two, sixteen in zip(*found):
+        np.testing.assert_array_equal(two, sixteen)
