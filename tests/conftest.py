@@ -1,5 +1,6 @@
 """One Taichi runtime for the whole session; DIFFSIM_TI_ARCH names another backend (test_vulkan.py and cuda_on_cpu use it).
 
+DIFFSIM_TI_FORM=gpu: arrays, kernels and launches take the form for a GPU, on the CPU.
 DIFFSIM_TI_DEBUG=1: kernels check the bounds of every array; slow, in one process: `DIFFSIM_TI_DEBUG=1 python -m pytest`.
 """
 
@@ -33,8 +34,9 @@ def pytest_terminal_summary(terminalreporter, config):
         minutes = areas.minutes_of(reports)
         areas.write(minutes)
         terminalreporter.write_line("minutes: " + ", ".join(f"{area} {spent:.1f}" for area, spent in minutes.items()))
-    if earlier := os.environ.get("EXECUTED_PTX"):  # what a call of pytest on CUDA's kernels came to, from .ci/run
-        terminalreporter.write_line(earlier)
+    for name in ("EXECUTED_PTX", "GPU_FORM"):  # what earlier calls of pytest came to, from .ci/run
+        if earlier := os.environ.get(name):
+            terminalreporter.write_line(earlier)
 
 
 @pytest.fixture

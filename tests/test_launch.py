@@ -1,11 +1,14 @@
 """Prepared launches: the same kernel with the same arrays again and again, other numbers and other tensors each time."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import taichi as ti
 import torch
 
 from diffsim_ti import runtime
+from diffsim_ti.runtime import repeated_loops
 
 pytestmark = pytest.mark.backends
 
@@ -75,3 +78,72 @@ def test_arrays_hold_what_is_copied_to_them(dtype):
         runtime.fill(array, numbers[..., :3])
         for row in (2, -1):
             assert np.array_equal(runtime.fetch_row(array, row), numbers[row, :, :3])
+
+
+# ---- loops that are gone through many times in a launch ----------------------------------------------------------------
+
+
+@ti.func
+def note_turns(data: ti.template(), plan: ti.template()):
+    """Two loops that count themselves as those of explicit passes do, and one that comes once, at the end."""
+    first, second = plan.first, plan.second
+    for i in range(first):
+        turn = data.turns[0]
+        if i == 0:
+            data.turns[1] = turn
+        data.sums[i] += turn + plan.more
+    for i in range(second):
+        turn = data.turns[1]
+        if i == 0:
+            data.turns[0] = ti.select(turn + 1 < plan.times, turn + 1, 0)
+        data.sums[i] += 100 * data.sums[i + first]
+    for i in range(first):
+        data.sums[i + first] += 1
+
+
+def expected_sums(sums: np.ndarray, first: int, second: int, more: int, times: int) -> None:
+    for turn in range(times):
+        sums[:first] += turn + more
+        sums[:second] += 100 * sums[first : first + second]
+    sums[first : 2 * first] += 1
+
+
+@pytest.fixture
+def repeated():
+    """Launches of the kernel, each with arrays of its own, and those arrays."""
+    if not runtime.can_repeat():
+        pytest.skip(f"loops cannot be repeated on {runtime.arch_name()}, and are not")
+    numbers = dict.fromkeys(("first", "second", "more", "times"), "int")
+    kernel = runtime.Kernel(
+        "note_turns", note_turns, "f64", dict(data=dict(turns="ints", sums="ints")), numbers, loops=2
+    )
+
+    def bind():
+        data = SimpleNamespace(turns=runtime.upload(np.zeros(2), ti.i32), sums=runtime.upload(np.arange(20), ti.i32))
+        return kernel.bind(data=data), data
+
+    return bind
+
+
+def test_loops_are_gone_through_as_often_as_a_launch_says(repeated):
+    (launch, data), sums = repeated(), np.arange(20)
+    for k, times in enumerate((1, 3, 2, 3, 1, 5, 2)):
+        launch(first=8, second=4 + k % 2, more=k, times=times)
+        expected_sums(sums, 8, 4 + k % 2, k, times)
+        assert runtime.fetch(data.sums).tolist() == sums.tolist()
+
+
+def test_launches_of_one_kernel_repeat_their_own_number_of_times(repeated):
+    bound, sums = [repeated() for _ in range(2)], [np.arange(20) for _ in range(2)]
+    for k in range(6):
+        for (launch, data), expected, times in zip(bound, sums, (2, 3 + k % 2)):
+            launch(first=6, second=3, more=k, times=times)
+            expected_sums(expected, 6, 3, k, times)
+            assert runtime.fetch(data.sums).tolist() == expected.tolist()
+
+
+def test_another_build_of_taichi_is_not_taken_for_this_one(repeated, monkeypatch):
+    launch, _ = repeated()
+    monkeypatch.setattr(repeated_loops, "_TASK", 40)  # as if tasks were of another size
+    with pytest.raises(RuntimeError, match="install taichi==1.7.4"):
+        launch(first=8, second=4, more=0, times=2)

@@ -1,16 +1,19 @@
 """Distances, energies and candidates of pairs of surface primitives, against IPC Toolkit, differences and brute force."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import taichi as ti
 
 import diffsim_ti as ds
 from diffsim_ti import runtime
-from diffsim_ti.contact.box_tree import beyond
+from diffsim_ti.contact.box_tree import BoxTree, beyond
 from diffsim_ti.contact.broad_phase import CandidatePairs
 from diffsim_ti.contact.broad_phase_kernels import bits_from, lowest, sort
 from diffsim_ti.contact.buffers import BLOCK, Buffers, Launches
 from diffsim_ti.contact.evaluate import evaluate_pairs
+from diffsim_ti.contact.listed_pair import MARGIN
 from diffsim_ti.contact.proximity import EDGE_EDGE, VERTEX_TRIANGLE
 from diffsim_ti.contact.surface_pairs import surface_edges
 from diffsim_ti.mesh.sets import pieces
@@ -185,14 +188,61 @@ def test_broad_phase_finds_what_brute_force_finds(precision):
     assert (edges[edge][0] < box.num_vertices) != (triangles[triangle][0] < box.num_vertices)
 
 
+@pytest.mark.backends
 @pytest.mark.parametrize("parallel", [False, True])
-@pytest.mark.parametrize("count", [0, 1, BLOCK, 3 * BLOCK + 7])
+@pytest.mark.parametrize("count", [0, 1, BLOCK, 3 * BLOCK + 7, 301 * BLOCK + 11])
 def test_scan_sums_what_lies_before(parallel, count):
-    runtime.program()
+    if runtime.arch_name() == "vulkan" and not parallel and count > 2**16:
+        pytest.skip("Mesa's lavapipe leaves a loop after 65 535 turns; a GPU has none so long")
     numbers = np.random.default_rng(count).integers(0, 9, count + 1)
     values = runtime.upload(numbers, ti.i32)
     Buffers(Launches(), parallel).scan(values, count)
     np.testing.assert_array_equal(runtime.fetch(values), np.cumsum(numbers) - numbers)
+
+
+@pytest.mark.backends
+@pytest.mark.parametrize("count", [2, 70, 70_000])  # of the last, threads of a GPU gather up three levels of subtrees
+def test_boxes_hold_those_below_them(count):
+    runtime.program()
+    points, vector = np.random.default_rng(count).random((count, 3)).astype(np.float32), ti.types.vector(4, ti.f32)
+    tree = BoxTree(np.arange(count)[:, None], "f32", True, Launches())
+    rest, u = runtime.upload(points, vector), runtime.upload(np.zeros((1, count, 3)), vector)
+    names = dict(place=np.arange(count), body=np.zeros(count, int))
+    vertices = SimpleNamespace(**{name: runtime.upload(data, ti.i32) for name, data in names.items()})
+    vertices.slack = runtime.upload(np.zeros((count, 3)), vector)
+    tree.refit((SimpleNamespace(rest=rest, u=u), vertices), 0, 0.1)
+    boxes = runtime.fetch(tree.boxes)
+    lowest, highest = (
+        boxes[2 : 2 * tree.leaves : 2],
+        boxes[3 : 2 * tree.leaves : 2],
+    )  # of nodes 1, 2 .. above the leaves
+    below = boxes[4:].reshape(-1, 4, 3)  # of the two children of each: lowest, highest, lowest, highest
+    np.testing.assert_array_equal(lowest, np.minimum(below[:, 0], below[:, 2]))
+    np.testing.assert_array_equal(highest, np.maximum(below[:, 1], below[:, 3]))
+    np.testing.assert_allclose(lowest[0], points.min(0) - 0.0505, atol=1e-5)
+    np.testing.assert_allclose(highest[0], points.max(0) + 0.0505, atol=1e-5)
+
+
+@pytest.mark.backends
+def test_motion_since_the_last_forces_is_that_of_all_vertices():
+    """`frame` and `farthest` (motion_kernels.py), which come together block by block."""
+    box, small = ds.TetrahedralMesh.create_box(14, 1.0), ds.TetrahedralMesh.create_box(2, 0.1)
+    mesh = ds.TetrahedralMesh.joined([box, *(small.translated([0.3 * k, 2.0, 0]) for k in range(29))])
+    precision = "f32" if runtime.arch_name() == "vulkan" else "f64"
+    scene = ds.Scene(mesh, ds.Corotated(1e5, 0.3), 1000.0, [ds.SelfContact(1e3, 1e-2)], precision=precision)
+    solver = ds.SemiImplicitSolver(scene, dt=1e-5)
+    workspace = solver.workspace(solver.start_values())
+    pairs, surface = workspace.pairs, mesh.surface_vertices
+    move = np.random.default_rng(0).normal(size=mesh.vertices.shape) * 1e-4
+    runtime.fill(workspace.state.u, move[None])
+    pairs.ensure(workspace.state.u, 0)
+    assert pairs.builds == 2  # the list still holds: no new one was made after those of the rest shape and the start
+    marked = move[surface][runtime.fetch(pairs.marked)].reshape(30, -1, 3)
+    found, latest = runtime.fetch(pairs.frame), marked[:, 0].mean(0)
+    np.testing.assert_allclose(found[:30], marked.mean(1), atol=1e-10)
+    np.testing.assert_allclose(found[30:32], [marked.mean((0, 1)), latest], atol=1e-10)
+    farthest = np.linalg.norm(move[surface] - latest, axis=1).max()
+    assert runtime.fetch(pairs.farthest)[0] == pytest.approx(2 * MARGIN * farthest, rel=1e-5)
 
 
 def test_walk_that_skips_children_meets_every_other_node_once():

@@ -18,7 +18,7 @@ from diffsim_ti.runtime import LANES, NUMPY, PRECISIONS, Kernel, kernels_of
 
 A = ti.template()
 GROUP = LANES  # primitives in a leaf
-SUBTREES = 64  # that threads gather up, each by itself
+SUBTREES = 64  # that a CPU's threads gather up, each by itself; a GPU has so many leaves in each
 MARGIN = 1.01  # of the widening; a hundredth more than the exact distances of the pairs take
 TREE = dict(corners="ints", order="ints", slacks="vectors", items="vectors", lanes="blocks", boxes="vectors")
 
@@ -66,6 +66,16 @@ def merge(node, boxes: A):
     """The box of a node from those of its children."""
     boxes[2 * node] = ti.min(boxes[4 * node], boxes[4 * node + 2])
     boxes[2 * node + 1] = ti.max(boxes[4 * node + 1], boxes[4 * node + 3])
+
+
+@ti.func
+def gather_up(node, number, boxes: A):
+    """The boxes of a node and of all below it, down to above the `number` that are there."""
+    first = node * number
+    while number > 1:
+        first, number = first >> 1, number >> 1
+        for k in range(first, first + number):
+            merge(k, boxes)
 
 
 @dataclass(frozen=True)
@@ -133,20 +143,19 @@ class BoxKernels:
             tree.boxes[2 * (plan.leaves + k)], tree.boxes[2 * (plan.leaves + k) + 1] = low, high
         ti.loop_config(serialize=not self.parallel)
         for r in range(plan.subtrees):
-            first, number = plan.leaves + r * (plan.leaves // plan.subtrees), plan.leaves // plan.subtrees
-            while number > 1:
-                first, number = first >> 1, number >> 1
-                for node in range(first, first + number):
-                    merge(node, tree.boxes)
+            gather_up(plan.subtrees + r, plan.leaves // plan.subtrees, tree.boxes)
+        ti.loop_config(serialize=ti.static(runtime.runs_on_cpu()))
+        for r in range(plan.roots):
+            gather_up(plan.roots + r, plan.subtrees // plan.roots, tree.boxes)
         ti.loop_config(serialize=True)
-        for k in range(1, plan.subtrees):
-            merge(plan.subtrees - k, tree.boxes)
+        for _ in range(1):
+            gather_up(1, plan.roots, tree.boxes)
 
     @cached_property
     def refit(self) -> Kernel:
         """Slacks of primitives from those of vertices, and boxes of all nodes where the vertices are now."""
         scene = dict(rest="vectors", u="vectors2", place="ints", body="ints", slack="vectors")
-        numbers = dict.fromkeys(("slot", "count", "leaves", "subtrees"), "int") | dict(reach="float")
+        numbers = dict.fromkeys(("slot", "count", "leaves", "subtrees", "roots"), "int") | dict(reach="float")
         return Kernel("refit", self.fit_boxes, self.precision, dict(scene=scene, tree=TREE), numbers)
 
 
@@ -178,13 +187,18 @@ class BoxTree:
         scene: (record of rest and u, record of place, body and slack).
         """
         if self.refits % self.sort_every == 0:
-            rest, u = scene[0].rest, scene[0].u
-            host = runtime.view(u)
-            x = runtime.fetch(rest) + (runtime.fetch(u) if host is None else host)[slot, :, :3]
+            x = runtime.fetch(scene[0].rest) + runtime.fetch(scene[0].u, slot)
             runtime.fill(self.order, curve_order(x[self._host].mean(1)))
         self.refits += 1
-        counts = dict(count=self.count, leaves=self.leaves, subtrees=min(SUBTREES, self.leaves))
-        self.launch(self.kernels.refit, scene=scene, tree=self)(slot=slot, reach=reach, **counts)
+        self.launch(self.kernels.refit, scene=scene, tree=self)(slot=slot, reach=reach, **self._counts())
+
+    def _counts(self) -> dict[str, int]:
+        """Sizes of the tree, and of its parts: subtrees of leaves, and those of which they are the leaves."""
+        subtrees, roots = min(SUBTREES, self.leaves), 1
+        if not runtime.runs_on_cpu():
+            subtrees = max(1, self.leaves // SUBTREES)
+            roots = max(1, subtrees // SUBTREES)
+        return dict(count=self.count, leaves=self.leaves, subtrees=subtrees, roots=roots)
 
 
 def curve_order(points: np.ndarray) -> np.ndarray:

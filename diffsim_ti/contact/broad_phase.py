@@ -14,7 +14,7 @@ import taichi as ti
 from diffsim_ti import runtime
 from diffsim_ti.contact.box_tree import BoxTree
 from diffsim_ti.contact.broad_phase_kernels import Piercing, Search
-from diffsim_ti.contact.buffers import Buffers, Launches, whole
+from diffsim_ti.contact.buffers import Buffers, Launches
 from diffsim_ti.contact.list_kernels import ListKernels
 from diffsim_ti.contact.proximity import EDGE_EDGE, PARALLEL, VERTEX_TRIANGLE
 from diffsim_ti.runtime import kernels_of
@@ -91,7 +91,7 @@ class CandidatePairs:
             tree.refit((scene, self), slot, reach)
         partner_t = self._find(VERTEX_TRIANGLE, v, t, self.row_t, scene, slot, reach)
         partner_e = self._find(EDGE_EDGE, e, e, self.row_e, scene, slot, reach)
-        self.num_vt, self.num_ee = int(whole(self.row_t)[-1]), int(whole(self.row_e)[-1])
+        self.num_vt, self.num_ee = (int(runtime.fetch(row, -1)) for row in (self.row_t, self.row_e))
         self._take()
         found = SimpleNamespace(partner_t=partner_t, partner_e=partner_e), self
         write = self.launch(self.lists.write, list=self, found=found, vertices=v, triangles=t, edges=e)

@@ -1,5 +1,6 @@
 """Arrays that grow and kernels bound to them, for lists whose length changes from build to build."""
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from types import SimpleNamespace
@@ -14,9 +15,18 @@ A = ti.template()
 BLOCK = 256  # numbers that one thread sums
 
 
+def branches(count: int) -> dict[str, int]:
+    """How `count` sums come together: `size` of them by each of `number` threads, and those on one.
+
+    On a GPU both are about the root of `count`; a CPU's thread is quicker alone.
+    """
+    size = max(1, count if runtime.runs_on_cpu() else math.isqrt(count))
+    return dict(size=size, number=-(-count // size))
+
+
 @dataclass(frozen=True)
 class Scan:
-    """Sums of the numbers before each."""
+    """Sums of the numbers before each: up a tree of three levels and down again."""
 
     parallel: bool
 
@@ -28,14 +38,27 @@ class Scan:
             for k in range(b * BLOCK, ti.min((b + 1) * BLOCK, plan.count)):
                 total += of.values[k]
             of.sums[b] = total
+        ti.loop_config(serialize=ti.static(runtime.runs_on_cpu()))
+        for c in range(plan.number):
+            total = 0
+            for b in range(c * plan.size, ti.min((c + 1) * plan.size, plan.blocks)):
+                total += of.sums[b]
+            of.sums[plan.blocks + c] = total
         ti.loop_config(serialize=True)
         for _ in range(1):
             total = 0
-            for b in range(plan.blocks):
+            for c in range(plan.blocks, plan.blocks + plan.number):
+                part = of.sums[c]
+                of.sums[c] = total
+                total += part
+            of.values[plan.count] = total
+        ti.loop_config(serialize=ti.static(runtime.runs_on_cpu()))
+        for c in range(plan.number):
+            total = of.sums[plan.blocks + c]
+            for b in range(c * plan.size, ti.min((c + 1) * plan.size, plan.blocks)):
                 part = of.sums[b]
                 of.sums[b] = total
                 total += part
-            of.values[plan.count] = total
         ti.loop_config(serialize=not self.parallel)
         for b in range(plan.blocks):
             total = of.sums[b]
@@ -48,7 +71,8 @@ class Scan:
     def kernel(self) -> Kernel:
         """values[k] becomes the sum of those before k; values[count], which must be there, the sum of all."""
         arrays = dict(of=dict(values="ints", sums="ints"))
-        return Kernel("scan", self.scan, "f64", arrays, dict(count="int", blocks="int"))  # whatever the precision
+        numbers = dict.fromkeys(("count", "blocks", "size", "number"), "int")
+        return Kernel("scan", self.scan, "f64", arrays, numbers)  # whatever the precision
 
 
 class Launches:
@@ -98,5 +122,6 @@ class Buffers:
     def scan(self, values, count: int) -> None:
         """Exclusive sums in place, over count + 1 numbers, the last of them the sum of all."""
         blocks = -(-count // BLOCK)
-        of = SimpleNamespace(values=values, sums=self.take(f"sums of {count}", ti.i32, blocks))
-        self._launch(self._scan, of=of)(count=count, blocks=blocks)
+        upper = branches(blocks)
+        of = SimpleNamespace(values=values, sums=self.take(f"sums of {count}", ti.i32, blocks + upper["number"]))
+        self._launch(self._scan, of=of)(count=count, blocks=blocks, **upper)

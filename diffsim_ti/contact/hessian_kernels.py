@@ -9,7 +9,7 @@ from functools import cached_property
 
 import taichi as ti
 
-from diffsim_ti.contact.listed_pair import OPPOSITE, ListedPair, between, three
+from diffsim_ti.contact.listed_pair import OPPOSITE, ListedPair, behind, between, first_of, three
 from diffsim_ti.contact.proximity import EDGE_EDGE, VERTEX_TRIANGLE
 from diffsim_ti.runtime import Kernel
 from diffsim_ti.terms.obstacles import barrier
@@ -72,7 +72,7 @@ class HessianKernels(ListedPair):
     def add_blocks(self, scene: A, at: A, plan: A):
         for kind in ti.static((VERTEX_TRIANGLE, EDGE_EDGE)):
             ti.loop_config(serialize=not self.parallel)
-            for p in range(kind * plan.num_vt, plan.num_vt + kind * plan.num_ee):
+            for p in range(first_of(kind, plan), behind(kind, plan)):
                 self.root(kind, p, scene, at, plan)
         ti.loop_config(serialize=not self.parallel)
         for s in range(plan.num_surface):
@@ -105,7 +105,7 @@ class HessianKernels(ListedPair):
     def all_shares(self, scene: A, at: A, plan: A):
         for kind in ti.static((VERTEX_TRIANGLE, EDGE_EDGE)):
             ti.loop_config(serialize=not self.parallel)
-            for p in range(kind * plan.num_vt, plan.num_vt + kind * plan.num_ee):
+            for p in range(first_of(kind, plan), behind(kind, plan)):
                 at.out[p] = self.share(kind, p, scene, at, plan)
 
     @cached_property

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import taichi as ti
 
 from diffsim_ti.contact.proximity import EDGE_EDGE, VERTEX_TRIANGLE, Pair
-from diffsim_ti.runtime import Kernel
+from diffsim_ti.runtime import Kernel, traced
 
 A = ti.template()
 MARGIN = 1.001
@@ -19,7 +19,18 @@ OPPOSITE = (((0, 1), (0, 2), (0, 3)), ((0, 2), (0, 3), (1, 2), (1, 3)))
 LIST = dict(pairs="ints", scale="scalars", surface="ints", place="ints", row="ints", corner_of="ints")  # broad_phase.py
 SCENE = LIST | dict(rest="vectors", parameters="scalars", corner="vectors", plane="vectors")
 SCENE |= dict(rest_plane="vectors", rest_weights="vectors")  # motion_kernels.py
-NUMBERS = dict.fromkeys(("slot", "num_vt", "num_ee", "num_surface", "first_out"), "int")
+NUMBERS = dict.fromkeys(("slot", "num_vt", "num_pairs", "num_surface", "first_out"), "int")
+
+
+@traced
+def first_of(kind, plan):
+    """The first pair of a kind, and below the one behind its last: no sums, for which a GPU would take a task each."""
+    return 0 if kind == VERTEX_TRIANGLE else plan.num_vt
+
+
+@traced
+def behind(kind, plan):
+    return plan.num_vt if kind == VERTEX_TRIANGLE else plan.num_pairs
 
 
 @ti.func
@@ -150,6 +161,6 @@ class ListedPair(Pair):
         """`product` of every pair, which a subclass has, and their sums by vertex."""
         for kind in ti.static((VERTEX_TRIANGLE, EDGE_EDGE)):
             ti.loop_config(serialize=not self.parallel)
-            for p in range(kind * plan.num_vt, plan.num_vt + kind * plan.num_ee):
+            for p in range(first_of(kind, plan), behind(kind, plan)):
                 self.product(kind, p, scene, at, plan)
         self.sum_corners(scene, at.out, plan)

@@ -9,7 +9,8 @@ from functools import cached_property
 
 import taichi as ti
 
-from diffsim_ti.contact.listed_pair import MARGIN, OPPOSITE, SAFE, ListedPair, between, three
+from diffsim_ti import runtime
+from diffsim_ti.contact.listed_pair import MARGIN, OPPOSITE, SAFE, ListedPair, behind, between, first_of, three
 from diffsim_ti.contact.proximity import EDGE_EDGE, VERTEX_TRIANGLE
 from diffsim_ti.runtime import Kernel
 
@@ -29,13 +30,20 @@ class MotionKernels(ListedPair):
             for k in range(b * plan.markers, (b + 1) * plan.markers):
                 total += at.u[plan.slot, scene.surface[scene.marked[k]]] - scene.built[scene.marked[k]]
             scene.frame[b] = (ti.cast(1, self.fp) / ti.cast(plan.markers, self.fp)) * total
-        ti.loop_config(serialize=True)
-        for _ in range(1):
-            total, latest, n = self.vec4(0), self.vec4(0), plan.num_bodies
-            for b in range(n):
+        ti.loop_config(serialize=ti.static(runtime.runs_on_cpu()))
+        for c in range(plan.body_blocks):
+            total, latest = self.vec4(0), self.vec4(0)
+            for b in range(c * plan.body_block, ti.min((c + 1) * plan.body_block, plan.num_bodies)):
                 s = scene.marked[b * plan.markers]
                 total += scene.frame[b]
                 latest += at.u[plan.slot, scene.surface[s]] - scene.before[s]
+            scene.frame[plan.num_bodies + 2 + 2 * c], scene.frame[plan.num_bodies + 3 + 2 * c] = total, latest
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            total, latest, n = self.vec4(0), self.vec4(0), plan.num_bodies
+            for c in range(plan.body_blocks):
+                total += scene.frame[n + 2 + 2 * c]
+                latest += scene.frame[n + 3 + 2 * c]
             scene.frame[n] = (ti.cast(1, self.fp) / ti.cast(n, self.fp)) * total
             scene.frame[n + 1] = (ti.cast(1, self.fp) / ti.cast(n, self.fp)) * latest
 
@@ -56,22 +64,27 @@ class MotionKernels(ListedPair):
 
     @ti.func
     def find_farthest(self, scene: A, at: A, plan: A):
-        """`farthest`: of each BLOCK of vertices the square of the longest way since `forces`, relative to the mean; then
-        twice the longest of all, by which no pair closes more: that spares most pairs the look at their corners."""
-        blocks = (plan.num_surface + BLOCK - 1) // BLOCK
+        """`farthest`: twice the longest way of all vertices since `forces`, relative to the mean, by which no pair closes
+        more: that spares most pairs the look at their corners; then squares of it, of each BLOCK of vertices and above."""
         ti.loop_config(serialize=not self.parallel)
-        for b in range(blocks):
+        for b in range(plan.blocks):
             most = ti.cast(0, self.fp)
             for s in range(b * BLOCK, ti.min((b + 1) * BLOCK, plan.num_surface)):
                 move = at.u[plan.slot, scene.surface[s]] - scene.before[s] - scene.frame[plan.num_bodies + 1]
                 most = ti.max(most, move.norm_sqr())
-            scene.farthest[b] = most
+            scene.farthest[1 + b] = most
+        ti.loop_config(serialize=ti.static(runtime.runs_on_cpu()))
+        for c in range(plan.number):
+            most = ti.cast(0, self.fp)
+            for b in range(c * plan.size, ti.min((c + 1) * plan.size, plan.blocks)):
+                most = ti.max(most, scene.farthest[1 + b])
+            scene.farthest[1 + plan.blocks + c] = most
         ti.loop_config(serialize=True)
         for _ in range(1):
             most = ti.cast(0, self.fp)
-            for b in range(blocks):
-                most = ti.max(most, scene.farthest[b])
-            scene.farthest[blocks] = ti.cast(2 * MARGIN, self.fp) * ti.sqrt(most)
+            for c in range(plan.number):
+                most = ti.max(most, scene.farthest[1 + plan.blocks + c])
+            scene.farthest[0] = ti.cast(2 * MARGIN, self.fp) * ti.sqrt(most)
 
     @ti.func
     def closing(self, kind: A, p, scene: A, at: A, plan: A):
@@ -85,17 +98,16 @@ class MotionKernels(ListedPair):
 
     @ti.func
     def check_all(self, scene: A, at: A, plan: A):
-        ti.loop_config(serialize=True)
-        for k in range(3):
+        for k in ti.static(range(3)):
             scene.flags[k] = 0
         self.follow_frames(scene, at, plan)
         self.compare_slacks(scene, at, plan)
         self.find_farthest(scene, at, plan)
         for kind in ti.static((VERTEX_TRIANGLE, EDGE_EDGE)):
             ti.loop_config(serialize=not self.parallel)
-            for p in range(kind * plan.num_vt, plan.num_vt + kind * plan.num_ee):
+            for p in range(first_of(kind, plan), behind(kind, plan)):
                 room = ti.cast(SAFE, self.fp) * scene.plane[p][3]
-                if not scene.farthest[(plan.num_surface + BLOCK - 1) // BLOCK] <= room:
+                if not scene.farthest[0] <= room:
                     if not self.closing(kind, p, scene, at, plan) <= room:
                         scene.flags[2] = 1
 
@@ -104,7 +116,10 @@ class MotionKernels(ListedPair):
         """flags: a vertex has used up its slack (0), or that and `lost` (1); a pair may have crossed (2)."""
         own = dict(body="ints", marked="ints", flags="ints", slack="vectors", frame="vectors", farthest="scalars")
         own |= dict(before="vectors", built="vectors")
-        numbers = dict(num_bodies="int", markers="int", lost="float")
+        numbers = dict.fromkeys(
+            ("num_bodies", "markers", "body_block", "body_blocks", "blocks", "size", "number"), "int"
+        )
+        numbers |= dict(lost="float")
         return self.kernel("check", self.check_all, dict(u="vectors2"), own, **numbers)
 
     @ti.func
@@ -124,7 +139,7 @@ class MotionKernels(ListedPair):
     def begin_all(self, scene: A, at: A, plan: A):
         for kind in ti.static((VERTEX_TRIANGLE, EDGE_EDGE)):
             ti.loop_config(serialize=not self.parallel)
-            for p in range(kind * plan.num_vt, plan.num_vt + kind * plan.num_ee):
+            for p in range(first_of(kind, plan), behind(kind, plan)):
                 scene.plane[p] = self.vec4(0)
                 self.measure(kind, p, scene)
         ti.loop_config(serialize=not self.parallel)

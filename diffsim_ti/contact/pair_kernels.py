@@ -8,7 +8,7 @@ from functools import cached_property
 
 import taichi as ti
 
-from diffsim_ti.contact.listed_pair import MARGIN, OPPOSITE, ListedPair, three
+from diffsim_ti.contact.listed_pair import MARGIN, OPPOSITE, ListedPair, behind, first_of, three
 from diffsim_ti.contact.proximity import EDGE_EDGE, VERTEX_TRIANGLE
 from diffsim_ti.runtime import Kernel
 
@@ -72,7 +72,7 @@ class PairKernels(ListedPair):
     def all_forces(self, scene: A, at: A, plan: A):
         for kind in ti.static((VERTEX_TRIANGLE, EDGE_EDGE)):
             ti.loop_config(serialize=not self.parallel)
-            for p in range(kind * plan.num_vt, plan.num_vt + kind * plan.num_ee):
+            for p in range(first_of(kind, plan), behind(kind, plan)):
                 self.force(kind, p, scene, at, plan)
         ti.loop_config(serialize=not self.parallel)
         for s in range(plan.num_surface):

@@ -7,7 +7,7 @@ import taichi as ti
 
 from diffsim_ti import runtime
 from diffsim_ti.contact.broad_phase import CandidatePairs
-from diffsim_ti.contact.buffers import whole
+from diffsim_ti.contact.buffers import branches, whole
 from diffsim_ti.contact.listed_pair import OPPOSITE
 from diffsim_ti.contact.motion_kernels import BLOCK, MotionKernels
 from diffsim_ti.contact.pair_kernels import PairKernels
@@ -56,8 +56,12 @@ class SurfacePairs:
         self.none, self.flags = runtime.array(vector, 1), runtime.array(ti.i32, 3)
         marked = spread(self.body[mesh.surface_vertices], self.markers)
         self.num_bodies, self.marked = len(marked), runtime.upload(marked.ravel(), ti.i32)
-        self.frame = runtime.array(vector, self.num_bodies + 2)
-        self.farthest, self.touched = runtime.array(self.kernels.fp, n // BLOCK + 2), runtime.array(ti.i32, n)
+        bodies, blocks = branches(self.num_bodies), -(-n // BLOCK)
+        upper = branches(blocks)
+        self._sums = dict(body_block=bodies["size"], body_blocks=bodies["number"], blocks=blocks, **upper)
+        self.frame = runtime.array(vector, self.num_bodies + 2 + 2 * bodies["number"])
+        self.farthest = runtime.array(self.kernels.fp, 1 + blocks + upper["number"])
+        self.touched = runtime.array(ti.i32, n)
         self.fresh, self.age, self.builds = False, 0, 0
         self._checked_rest = self._scratch = None
 
@@ -120,13 +124,15 @@ class SurfacePairs:
         k, a = self.list, self.a
         numbers |= dict(num_surface=k.num_surface, first_out=a.first_contact_corner)
         scene = k, self, SimpleNamespace(rest=a.rest, parameters=a.parameters)
-        self._launch(kernel, scene=scene, at=SimpleNamespace(**at))(**dict(num_vt=k.num_vt, num_ee=k.num_ee) | numbers)
+        self._launch(kernel, scene=scene, at=SimpleNamespace(**at))(
+            **dict(num_vt=k.num_vt, num_pairs=k.count) | numbers
+        )
 
     # ---- the list ---------------------------------------------------------------------------------------------------
 
     def _build(self, u, slot: int, wanted=0.0) -> None:
         """The list at u[slot]; slacks follow the motion, or cover `wanted`, shape (n, 2) [m]."""
-        x = runtime.fetch(u)[slot][self.mesh.surface_vertices]
+        x = runtime.fetch(u, slot)[self.mesh.surface_vertices]
         if not np.all(np.isfinite(x)):  # the guard of the run will say so
             return
         runtime.fill(self.list.slack, self._slacks(x, wanted))
@@ -166,10 +172,10 @@ class SurfacePairs:
         """Let go of the arrays that forces were computed from."""
         self._launch.clear()
 
-    def _check(self, u, slot: int, num_vt: int, num_ee: int) -> tuple[bool, bool, bool]:
+    def _check(self, u, slot: int, num_vt: int, num_pairs: int) -> tuple[bool, bool, bool]:
         """Whether the list is stale, whether pairs beyond it may have crossed, and whether pairs of it may have."""
-        bodies = dict(num_bodies=self.num_bodies, markers=self.markers, lost=0.5 * self.width)
-        self._run(self.motion.check, dict(u=u), slot=slot, num_vt=num_vt, num_ee=num_ee, **bodies)
+        bodies = dict(num_bodies=self.num_bodies, markers=self.markers, lost=0.5 * self.width, **self._sums)
+        self._run(self.motion.check, dict(u=u), slot=slot, num_vt=num_vt, num_pairs=num_pairs, **bodies)
         flags = runtime.view(self.flags)
         stale, lost, crossed = runtime.fetch(self.flags) if flags is None else flags
         return bool(stale), bool(lost), bool(crossed)
@@ -183,9 +189,9 @@ class SurfacePairs:
     def check_pass(self, u, slot: int, h: float) -> None:
         """After a pass of length h [s] to u[slot]: raise Tunnelling if a pair may have crossed."""
         self.age += 1
-        stale, lost, crossed = self._check(u, slot, self.list.num_vt, self.list.num_ee)
-        if (lost or crossed) and np.all(np.isfinite(runtime.fetch(u)[slot])):
-            self._refuse(runtime.fetch(u)[slot].astype(np.float64), h, crossed)
+        stale, lost, crossed = self._check(u, slot, self.list.num_vt, self.list.count)
+        if (lost or crossed) and np.all(np.isfinite(runtime.fetch(u, slot))):
+            self._refuse(runtime.fetch_row(u, slot), h, crossed)
         if stale:
             self._build(u, slot)
 

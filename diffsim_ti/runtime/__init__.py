@@ -19,6 +19,7 @@ from diffsim_ti.runtime.field_pool import FieldPool, current_tape, fields
 from diffsim_ti.runtime.kernels import LANES, Kernel, array_types, kernels_of
 from diffsim_ti.runtime.language import Bundle, assign, at, each_lane, let, spread, traced
 from diffsim_ti.runtime.launch import Launch, TensorLaunch
+from diffsim_ti.runtime.repeated_loops import can_repeat
 from diffsim_ti.runtime.start import (
     NUMPY,
     PRECISIONS,

@@ -120,11 +120,11 @@ def fill(target, data) -> None:
         target.from_numpy(whole)
 
 
-def fetch(source) -> np.ndarray:
-    """A NumPy copy of a Taichi array; of four components the first three."""
+def fetch(source, row: int | None = None) -> np.ndarray:
+    """A NumPy copy of a Taichi array, or of a row of it; of four components the first three."""
     host = view(source)
-    host = _copied(source) if host is None else host
-    is_vector = host.shape[-1] == 4 and host.ndim == len(source.shape) + 1
+    host = _copied(source, row) if host is None else host if row is None else host[row]
+    is_vector = host.ndim > 0 and host.shape[-1] == 4 and host.ndim == len(source.shape) + (row is None)
     return host[..., :3].copy() if is_vector else host.copy()
 
 
@@ -145,8 +145,7 @@ def _address(target) -> int:
 
 def fetch_row(source, k: int) -> np.ndarray:
     """Row k of a Taichi array of vectors in float64; of four components the first three."""
-    host = view(source)
-    return (_copied(source, k) if host is None else host[k])[..., :3].astype(np.float64)
+    return fetch(source, k).astype(np.float64)
 
 
 def to_numpy_dtype(dtype):

@@ -9,7 +9,7 @@ import taichi as ti
 
 from diffsim_ti.runtime.language import Bundle
 from diffsim_ti.runtime.launch import Launch
-from diffsim_ti.runtime.start import PRECISIONS
+from diffsim_ti.runtime.start import PRECISIONS, runs_on_cpu
 
 LANES = 8  # tetrahedra in a block
 _serial = count()
@@ -38,17 +38,29 @@ class Kernel:
 
     arrays: {bundle: {array: kind}}, kinds as in `array_types`; each bundle reaches the body as a `Bundle` of its arrays,
     and `numbers`, {name: "int" or "float"}, as one more.
+    loops: so many of its first loops are gone through as often as the last number says (repeated_loops.py); 0: once.
     """
 
-    def __init__(self, name: str, body: Callable, precision: str, arrays: dict[str, dict], numbers: dict[str, str]):
-        self.arrays, self.numbers = arrays, tuple(numbers)
+    def __init__(
+        self,
+        name: str,
+        body: Callable,
+        precision: str,
+        arrays: dict[str, dict],
+        numbers: dict[str, str],
+        loops: int = 0,
+    ):
+        self.arrays, self.numbers, self.loops = arrays, tuple(numbers), loops
         types = array_types(precision)
         arguments = [(f"{b}_{a}", types[kind]) for b, own in arrays.items() for a, kind in own.items()]
         arguments += [(n, types[kind]) for n, kind in numbers.items()]
         bundles = [f"Bundle({', '.join(f'{a}={b}_{a}' for a in own)})" for b, own in arrays.items()]
-        bundles.append(f"Bundle({', '.join(f'{n}={n}' for n in numbers)})")
+        # a GPU takes one task more, of one thread, for the bounds of each loop, but one for all that are read before them
+        first = [] if runs_on_cpu() else [n for n, kind in numbers.items() if kind == "int"]
+        bundles.append(f"Bundle({', '.join(f'{n}={n}_' if n in first else f'{n}={n}' for n in numbers)})")
         signature = ", ".join(f"{argument}: types[{k}]" for k, (argument, _) in enumerate(arguments))
-        source = f"def {name}({signature}):\n    body({', '.join(bundles)})\n"
+        lines = [*(f"{n}_ = {n}" for n in first), f"body({', '.join(bundles)})"]
+        source = f"def {name}({signature}):\n" + "".join(f"    {line}\n" for line in lines)
         file = f"<{name} {next(_serial)}>"
         linecache.cache[file] = (len(source), None, source.splitlines(True), file)  # Taichi reads a kernel's source
         scope = dict(body=body, Bundle=Bundle, types=[kind for _, kind in arguments])
@@ -61,7 +73,7 @@ class Kernel:
         records: for each bundle the object whose attributes its arrays are, or a tuple of objects that share them.
         """
         arrays = [_found(records[bundle], name) for bundle, own in self.arrays.items() for name in own]
-        launch, names = Launch(self.kernel, *arrays, vectorized=vectorized), self.numbers
+        launch, names = Launch(self.kernel, *arrays, vectorized=vectorized, loops=self.loops), self.numbers
         return lambda **numbers: launch(*(numbers[name] for name in names))
 
 

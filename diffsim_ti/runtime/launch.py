@@ -7,6 +7,7 @@ from taichi.types import primitive_types
 
 from diffsim_ti.runtime.argument_buffer import ArgumentBuffer
 from diffsim_ti.runtime.arrays import full_shape
+from diffsim_ti.runtime.repeated_loops import RepeatedLoops
 from diffsim_ti.runtime.start import arch_name, check_alive, program
 
 
@@ -15,11 +16,12 @@ class Launch:
 
     A plain call looks at every argument anew: 5 us for each array, 130 us for the kernels of a step; this takes 12 us.
     vectorized: compile vectors as they are, to vector instructions, instead of number by number (CPU only).
+    loops: so many of its first loops are gone through as often as the last number says (repeated_loops.py); 0: once.
     """
 
-    def __init__(self, kernel, *arrays, vectorized: bool = False):
-        self._kernel, self._arrays, self._vectorized = kernel._primal, arrays, vectorized
-        self._setters, self._buffer, self._owner = None, None, program()
+    def __init__(self, kernel, *arrays, vectorized: bool = False, loops: int = 0):
+        self._kernel, self._arrays, self._vectorized, self._loops = kernel._primal, arrays, vectorized, loops
+        self._setters, self._buffer, self._repeated, self._owner = None, None, None, program()
 
     def _prepare(self, numbers: tuple) -> None:
         prog = impl.get_runtime().prog
@@ -31,6 +33,8 @@ class Launch:
             self._code = prog.compile_kernel(config, prog.get_device_caps(), compiled)
         finally:
             config.real_matrix_scalarize = scalarize
+        if self._loops:
+            self._repeated = RepeatedLoops(self._code, self._owner, self._loops)
         self._context, arch = compiled.make_launch_context(), arch_name()
         if arch == "cuda":
             self._buffer = ArgumentBuffer(self._context)
@@ -59,7 +63,11 @@ class Launch:
             self._buffer.restore()
         for (setter, index), number in zip(self._setters, numbers):
             setter(index, number)
-        self._owner().launch_kernel(self._code, self._context)
+        if self._repeated:
+            with self._repeated.times(numbers[-1]):
+                self._owner().launch_kernel(self._code, self._context)
+        else:
+            self._owner().launch_kernel(self._code, self._context)
 
 
 class TensorLaunch(Launch):

@@ -20,6 +20,7 @@ PRECISIONS = {"f32": ti.f32, "f64": ti.f64}
 NUMPY = {"f32": np.float32, "f64": np.float64}
 _ARCHS = {"cpu": ti.cpu, "cuda": ti.cuda, "vulkan": ti.vulkan}
 _PARENT = "DIFFSIM_TI_PARENT"  # process and backend that its spawned workers start on
+_FORM = "DIFFSIM_TI_FORM"
 _settings = {"precision": "f32"}
 
 
@@ -190,7 +191,14 @@ def arch_name() -> str:
 
 
 def runs_on_cpu() -> bool:
-    return arch_name() == "cpu"
+    """Whether kernels and arrays take the form for a CPU: lanes, serial loops, memory that NumPy sees.
+
+    DIFFSIM_TI_FORM=gpu in the environment gives them the form for a GPU all the same, to test it.
+    """
+    form = os.environ.get(_FORM, "cpu")
+    if form not in ("cpu", "gpu"):
+        raise ValueError(f"{_FORM} must be cpu or gpu, got {form!r}")
+    return arch_name() == "cpu" and form == "cpu"
 
 
 def check_backend(precision: str) -> None:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 class Solver(ABC):
     """Advances a scene by steps of dt [s], each divided into `substeps` equal substeps.
 
-    parallel: one launch per substep on all threads, or one serial launch for many substeps; None chooses by size.
+    parallel: each substep on all threads, or many of them in a row on one; None chooses by size.
     allow_unstable: take a step beyond the stable one all the same: neither the start nor the run is checked.
     check_start: whether the constructor refuses a step beyond the stable one; False where `substeps` is chosen later, before
         each step or by `choose_substeps`. The run is checked all the same.
@@ -83,6 +83,10 @@ class Solver(ABC):
         limit = self.serial_limit_in_lanes if in_lanes else self.serial_limit
         return not runtime.runs_on_cpu() or self.scene.mesh.num_tetrahedra > limit
 
+    def passes_per_launch(self) -> int:
+        """How many passes one launch does at most where they run in parallel."""
+        return 1
+
     def stable_dt(self, tight: bool = False) -> stability.StepLimit:
         """Largest stable substep at the start: the safe element bound or, `tight`, the Lanczos value."""
         if not tight:
@@ -128,7 +132,9 @@ class Solver(ABC):
 
     def describe(self) -> str:
         """How the scene advances, in a line."""
-        how = "parallel, one launch per substep" if self.runs_parallel() else "serial, many substeps per launch"
+        number = self.passes_per_launch()
+        each = "one launch per substep" if number == 1 else f"up to {number} substeps per launch"
+        how = f"parallel, {each}" if self.runs_parallel() else "serial, many substeps per launch"
         return f"{type(self).__name__}: dt {self.dt:g} s, {self.substeps} substeps of {self.substep:.4g} s; {how}"
 
     def __repr__(self) -> str:

@@ -121,6 +121,8 @@ class PassTable:
     def __init__(self, fp):
         self.ints = runtime.array(ti.i32, self.size * len(INTS))
         self.floats = runtime.array(fp, self.size * len(FLOATS))
+        self.turns = runtime.array(ti.i32, 2)  # of the loops of a launch
+        runtime.fill(self.turns, 0)
         self._made, self._shown = {}, None
 
     def windows(self, first: int, last: int) -> list[tuple[int, int, int]]:

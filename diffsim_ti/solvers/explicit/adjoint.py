@@ -12,6 +12,9 @@ from diffsim_ti.state.arrays import copy_slot
 from diffsim_ti.state.numbers import OF_STEPS, Adjoint, Tangent
 from diffsim_ti.state.workspace import FrameArrays
 
+STEPS = [name for name in OF_STEPS if name != "path"]
+PARTS = 64  # sums over vertices that a GPU's threads make side by side
+
 
 class ExplicitAdjoint:
     """Adjoint arrays of one run and the sweep that fills them.
@@ -23,7 +26,7 @@ class ExplicitAdjoint:
         self.ws = weakref.proxy(workspace)  # which keeps launches with these arrays: no circle
         a = workspace.arrays
         self.features = a.features(density, shape)
-        self.numbers = Adjoint(a, self.features, more=OF_STEPS)
+        self.numbers = Adjoint(a, self.features, more=STEPS)
         self.u, self.v, self.w = (runtime.array(a.vector, 1, a.num_vertices) for _ in range(3))
         self.corner = runtime.array(a.vector, *a.corner.shape)  # products with the stiffness, still to be gathered
         rates = "H_dot" in a.law.reads
@@ -31,7 +34,10 @@ class ExplicitAdjoint:
         whole = [runtime.array(a.vector, 1, a.num_vertices) for _ in range(1 + rates)]
         self.whole = SimpleNamespace(u=whole[0], v=whole[-1] if rates else self.v)  # with what is still to be gathered
         moving = self.features.moving
-        self.felt = runtime.array(a.vector, 2 * moving, a.num_vertices if moving else 1)  # of paths, by each vertex
+        self.num_parts = 1 if runtime.runs_on_cpu() else PARTS
+        # of paths: what each vertex felt in the steps that a launch goes through, and the sums of that
+        self.felt = runtime.array(a.vector, 2 * moving * self._steps, a.num_vertices if moving else 1)
+        self.path = runtime.array(a.vector, a.path.shape[0], moving * self.num_parts)
         self.frames = FrameArrays.of(a, *workspace.frames.frames_u.shape)
         self.z = a.law_states(1)  # of the state of the law
         self.faces = FeltAdjoint(self, workspace.faces) if workspace.faces else None
@@ -40,6 +46,8 @@ class ExplicitAdjoint:
         """Whether kernels and shapes are still those of the run."""
         a = workspace.arrays
         same = self.numbers.fits(a, a.features(self.features.density, self.features.shape))
+        same = same and self.felt.shape[0] == max(1, 2 * self.features.moving * self._steps)
+        same = same and self.path.shape[0] == a.path.shape[0]
         return same and self.frames.frames_u.shape == workspace.frames.frames_u.shape
 
     def start(self, positions_adj: np.ndarray, velocities_adj: np.ndarray, last_frame_is_input: bool) -> None:
@@ -57,13 +65,19 @@ class ExplicitAdjoint:
     def clear(self) -> None:
         """All adjoints zero, but those of the frames."""
         self.numbers.clear()
-        for target in (self.felt, self.u, self.v, self.w, self.z):
+        for target in (self.felt, self.path, self.u, self.v, self.w, self.z):
             if target is not None:
                 runtime.fill(target, 0)
         if self.ws.pairs:
             self.ws.pairs.clear_sums()
         if self.faces:
             self.faces.clear()
+
+    @property
+    def _steps(self) -> int:
+        """The most steps that the passes of a launch lie in; 1 where sums are made after each pass."""
+        substeps = self.ws.solver.substeps
+        return 1 + -(-(self.ws.in_parallel - 1) // substeps) if self.ws.repeated else 1
 
     def reverse(
         self, base: int, last: int, num_passes: int, save_every: int, stop: int, to_state: bool = False
@@ -73,25 +87,22 @@ class ExplicitAdjoint:
         to_state: stop at the state that pass `stop` shows, and leave the half kick that leads to it to `reverse_kick`.
         """
         halt = stop if to_state else -1
-        for numbers in self.ws.launches(stop, last, num_passes, save_every, self._work, backwards=True):
+        most = self.ws.most_passes(2 * self.ws.arrays.num_tetrahedra)  # a pass costs twice as much as forward
+        for numbers in self.ws.launches(stop, last, num_passes, save_every, most, backwards=True):
             self._launch(numbers, base, num_passes, halt, kick=0)
 
     def reverse_kick(self, j: int, base: int, num_passes: int) -> None:
         """Go back through the half kick that leads to the state which pass j shows."""
         if np.any(self.ws.solver.weights(np.array([j]), num_passes, self.ws.rate).pre):
-            for numbers in self.ws.launches(j, j + 1, num_passes, 0, self._work):
+            for numbers in self.ws.launches(j, j + 1, num_passes, 0, 1):
                 self._launch(numbers, base, num_passes, halt=-1, kick=1)
-
-    @property
-    def _work(self) -> int:
-        """Of a pass, in those of tetrahedra forward."""
-        return 2 * self.ws.arrays.num_tetrahedra
 
     def _launch(self, numbers: dict, base: int, num_passes: int, halt: int, kick: int) -> None:
         ws, history, own = self.ws, self.ws.record, (self, self.numbers, self.frames)
         states = (history, ws.frames, ws.watch, ws.contact)
         launch = ws.bound(ws.kernels(self.features).step_vjp, state=states, adjoint=own, table=ws.table)
-        launch(**numbers, base=base, num_passes=num_passes, halt=halt, kick=kick)
+        run = dict(num_passes=num_passes, steps=self._steps, num_parts=self.num_parts)
+        launch(**numbers, **run, base=base, halt=halt, kick=kick)
         if ws.pairs:
             slot = numbers["first"] - base
             ws.pairs.ensure(history.u, slot)
@@ -136,6 +147,9 @@ class ExplicitAdjoint:
             out.velocity += runtime.fetch(self.v)[0]
         if self.ws.pairs:
             out.parameters[self.ws.arrays.parameters_of_self_contact], rest = self.ws.pairs.collect()
+        if self.features.moving:
+            path = runtime.fetch(self.path).astype(np.float64)
+            out.path += path.reshape(len(path), self.features.moving, self.num_parts, 3).sum(2)
         if self.features.shape:
             rest = rest + runtime.fetch(self.frames.frames_u).astype(np.float64).sum(0)
         out.rest = rest + out.rest
@@ -165,7 +179,7 @@ class ExplicitTangent:
         ws, a, history = self.ws, self.ws.arrays, self.ws.record
         states, own = (history, ws.frames, ws.watch, ws.contact), (self, self.numbers, self.frames)
         launch = ws.bound(ws.kernels(self.features).step_jvp, state=states, tangent=own, table=ws.table)
-        for numbers in ws.launches(first, last, num_passes, save_every, ws.work_per_launch):  # pass by pass
+        for numbers in ws.launches(first, last, num_passes, save_every, 1):
             slot = numbers["first"] - first
             if ws.pairs:
                 ws.pairs.ensure(history.u, slot)

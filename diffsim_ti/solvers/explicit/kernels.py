@@ -6,7 +6,7 @@ from functools import cached_property, lru_cache
 import taichi as ti
 
 from diffsim_ti.elements.tetrahedron import Onwards
-from diffsim_ti.runtime import Kernel, let, traced
+from diffsim_ti.runtime import Bundle, Kernel, let, traced
 from diffsim_ti.solvers.explicit.kick_drift import KickDrift
 from diffsim_ti.state.numbers import ADJOINT, OF_STEPS, SCENE, TANGENT, with_state
 from diffsim_ti.state.schedule import pass_at, reversed_pass
@@ -25,6 +25,7 @@ STATE = dict(
 CHANGE = dict(u="vectors2", v="vectors2", frames_u="vectors2", frames_v="vectors2")  # of a state, or its adjoint
 CORNERS = dict(corner="vectors", rate_corner="vectors")  # adjoints of u and v, still to be gathered
 PLAN = dict(ints="ints", floats="scalars")  # the tables of the passes, from pass `window` on
+TURNS = dict(turns="ints")  # of the loops of a launch for many passes
 NUMBERS = dict.fromkeys(("num_items", "num_vertices", "window", "first", "count", "base"), "int") | dict(
     contact_damping="float"
 )
@@ -32,10 +33,16 @@ NUMBERS = dict.fromkeys(("num_items", "num_vertices", "window", "first", "count"
 
 @dataclass(frozen=True)
 class ExplicitKernels:
-    """parallel: one pass per launch on all threads; else one serial launch for `count` passes."""
+    """parallel: passes on all threads, one after the other, else a single loop over `count` passes on one.
+
+    repeated: `count` passes per launch in parallel too. Its two loops are gone through `times` times (Kernel), and count
+    themselves: the first reads in turns[0] which time it is and notes it in turns[1], the second reads that and notes the
+    next in turns[0], so that no thread reads what another may be writing. After the last time it is 0 again.
+    """
 
     vertex: KickDrift
     parallel: bool
+    repeated: bool = False
 
     @property
     def element(self):
@@ -48,6 +55,26 @@ class ExplicitKernels:
 
     def with_state(self, arrays: dict) -> dict:
         return with_state(arrays, self.vertex.law)
+
+    @ti.func
+    def turn_of_first(self, item, table: A):
+        """Which time this is that the first loop is gone through."""
+        turn = 0
+        if ti.static(self.repeated):
+            turn = table.turns[0]
+            if item == 0:
+                table.turns[1] = turn
+        return turn
+
+    @ti.func
+    def turn_of_second(self, item, table: A, plan: A):
+        """The same of the second loop."""
+        turn = 0
+        if ti.static(self.repeated):
+            turn = table.turns[1]
+            if item == 0:
+                table.turns[0] = ti.select(turn + 1 < plan.times, turn + 1, 0)
+        return turn
 
     # ---- forward -----------------------------------------------------------------------------------------------------
 
@@ -63,10 +90,16 @@ class ExplicitKernels:
     def passes(self, scene: A, state: A, table: A, plan: A):
         """Slot 0 holds the state before pass `base`; with stride 1 each pass writes the next slot, and its forces."""
         if ti.static(self.parallel):
-            for e in range(plan.num_items):
-                self.elements(e, plan.first, scene, state, table, plan)
-            for i in range(plan.num_vertices):
-                self.vertex.step(i, plan.first, pass_at(table, plan.first - plan.window), scene, state, plan)
+            num_items, num_vertices = plan.num_items, plan.num_vertices  # both bounds are read by one task
+            for e in range(num_items):
+                turn = self.turn_of_first(e, table)
+                if turn < plan.count:
+                    self.elements(e, plan.first + turn, scene, state, table, plan)
+            for i in range(num_vertices):
+                turn = self.turn_of_second(i, table, plan)
+                if turn < plan.count:
+                    j = plan.first + turn
+                    self.vertex.step(i, j, pass_at(table, j - plan.window), scene, state, plan)
         else:
             ti.loop_config(serialize=True)
             for j in range(plan.first, plan.first + plan.count):
@@ -79,7 +112,7 @@ class ExplicitKernels:
     @cached_property
     def step(self) -> Kernel:
         """`count` passes from pass `first` on."""
-        return self._kernel("step", self.passes, dict(state=self.with_state(STATE)), stride="int")
+        return self._kernel("step", self.passes, dict(state=self.with_state(STATE)), self.repeated, stride="int")
 
     # ---- tangent -----------------------------------------------------------------------------------------------------
 
@@ -101,7 +134,7 @@ class ExplicitKernels:
     def step_jvp(self) -> Kernel:
         """The tangent of pass `first` along recorded slots; the change of the state is advanced in place."""
         own = dict(state=self.with_state(STATE), tangent=self.with_state(CHANGE) | TANGENT)
-        return self._kernel("step_jvp", self.passes_jvp, own, rate_dot="float")
+        return self._kernel("step_jvp", self.passes_jvp, own, False, rate_dot="float")
 
     # ---- adjoint -----------------------------------------------------------------------------------------------------
 
@@ -116,40 +149,73 @@ class ExplicitKernels:
             e, scene, state, s, adjoint.w, adjoint.corner, adjoint, self.vertex.features.shape, self.element.has_state
         )
 
+    @traced
+    def pass_back(self, j, table, plan):
+        """Pass j on the way back; `felt`: where vertices note what they feel of paths in its step."""
+        now, moving = reversed_pass(pass_at(table, j - plan.window), j, plan), self.vertex.features.moving
+        return Bundle(**vars(now), felt=let(2 * moving * (now.row % plan.steps)) if moving else 0)
+
+    @ti.func
+    def fold_part(self, p, first, last, adjoint: A, table: A, plan: A):
+        """Sum what every num_parts-th vertex felt of a path in the steps that passes last .. first complete, in order."""
+        low, high = pass_at(table, first - plan.window), pass_at(table, last - plan.window)
+        c, part, moving = p // plan.num_parts, p % plan.num_parts, ti.static(self.vertex.features.moving)
+        for back in range(high.row - low.row + low.opens):
+            row = high.row - back
+            at, after = 2 * (moving * (row % plan.steps) + c), ti.min(row + 1, high.next)
+            to_row, to_next = self.vertex.vector(0), self.vertex.vector(0)
+            for m in range((plan.num_vertices - part + plan.num_parts - 1) // plan.num_parts):
+                i = part + m * plan.num_parts
+                to_row += adjoint.felt[at, i]
+                to_next += adjoint.felt[at + 1, i]
+                adjoint.felt[at, i] = self.vertex.vector(0)
+                adjoint.felt[at + 1, i] = self.vertex.vector(0)
+            adjoint.path[row, p] = adjoint.path[row, p] + to_row
+            adjoint.path[after, p] = adjoint.path[after, p] + to_next
+
     @ti.func
     def passes_vjp(self, scene: A, state: A, adjoint: A, table: A, plan: A):
         """The gather of K w is left to the next call (or to `finish_vjp`), so that each pass has two loops, as forward."""
         moving = ti.static(self.vertex.features.moving)
         if ti.static(self.parallel):
-            for i in range(plan.num_vertices):
-                now = reversed_pass(pass_at(table, plan.first - plan.window), plan.first, plan)
-                self.vertex.step_vjp(i, plan.first, now, scene, state, adjoint, plan)
-            for e in range(plan.num_items):
-                self.elements_vjp(e, plan.first, scene, state, adjoint, table, plan)
-            for c in range(moving):
-                now = pass_at(table, plan.first - plan.window)
-                self.vertex.obstacles.fold_path(c, now, plan.num_vertices, adjoint)
+            num_items, num_vertices, parts = plan.num_items, plan.num_vertices, moving * plan.num_parts
+            for i in range(num_vertices):
+                turn = self.turn_of_first(i, table)
+                if turn < plan.count:
+                    j = plan.first + plan.count - 1 - turn
+                    now = self.pass_back(j, table, plan)
+                    self.vertex.step_vjp(i, j, now, scene, state, adjoint, plan)
+            for e in range(num_items):
+                turn = self.turn_of_second(e, table, plan)
+                if turn < plan.count:
+                    self.elements_vjp(e, plan.first + plan.count - 1 - turn, scene, state, adjoint, table, plan)
+            if ti.static(moving > 0):
+                for p in range(parts):
+                    self.fold_part(p, plan.first, plan.first + plan.count - 1, adjoint, table, plan)
         else:
             ti.loop_config(serialize=True)
             for back in range(plan.count):
                 j = plan.first + plan.count - 1 - back
-                now = reversed_pass(pass_at(table, j - plan.window), j, plan)
+                now = self.pass_back(j, table, plan)
                 for i in range(plan.num_vertices):
                     self.vertex.step_vjp(i, j, now, scene, state, adjoint, plan)
                 for e in range(plan.num_items):
                     self.elements_vjp(e, j, scene, state, adjoint, table, plan)
-                for c in range(moving):
-                    self.vertex.obstacles.fold_path(c, now, plan.num_vertices, adjoint)
+                for p in range(moving * plan.num_parts):
+                    self.fold_part(p, j, j, adjoint, table, plan)
 
     @cached_property
     def step_vjp(self) -> Kernel:
         """The adjoint of passes first + count - 1 .. first; `num_passes` is that of the run.
 
         halt: the pass at whose state the sweep stops, between its two kicks; kick: only the kick before the state.
+        steps: those for which there is room in `felt`; num_parts: sums over vertices that are made for each path.
         """
-        numbers = dict.fromkeys(("num_passes", "halt", "kick"), "int")
-        own = self.with_state(CHANGE) | ADJOINT | OF_STEPS | dict(w="vectors2", felt="vectors2") | CORNERS
-        return self._kernel("step_vjp", self.passes_vjp, dict(state=self.with_state(STATE), adjoint=own), **numbers)
+        numbers = dict.fromkeys(("num_passes", "halt", "kick", "steps", "num_parts"), "int")
+        own = self.with_state(CHANGE) | ADJOINT | OF_STEPS | CORNERS
+        own |= dict(w="vectors2", felt="vectors2")
+        arrays = dict(state=self.with_state(STATE), adjoint=own)
+        return self._kernel("step_vjp", self.passes_vjp, arrays, self.repeated, **numbers)
 
     @ti.func
     def gather_rest(self, scene: A, adjoint: A, plan: A):
@@ -166,12 +232,14 @@ class ExplicitKernels:
         own = dict(scene=corners, adjoint=dict(u="vectors2", v="vectors2") | CORNERS)
         return Kernel("finish_vjp", self.gather_rest, self.vertex.law.precision, own, dict(num_vertices="int"))
 
-    def _kernel(self, name: str, body, arrays: dict, **numbers) -> Kernel:
-        arrays = dict(scene=SCENE) | arrays | dict(table=PLAN)
-        return Kernel(name, body, self.vertex.law.precision, arrays, NUMBERS | numbers)
+    def _kernel(self, name: str, body, arrays: dict, repeated: bool, **numbers) -> Kernel:
+        arrays, numbers = dict(scene=SCENE) | arrays | dict(table=PLAN), NUMBERS | numbers
+        if repeated:
+            arrays["table"], numbers = PLAN | TURNS, numbers | dict(times="int")
+        return Kernel(name, body, self.vertex.law.precision, arrays, numbers, loops=2 * repeated)
 
 
 @lru_cache(maxsize=None)
-def explicit_kernels(law, features, parallel: bool, lanes: bool) -> ExplicitKernels:
+def explicit_kernels(law, features, parallel: bool, lanes: bool, repeated: bool) -> ExplicitKernels:
     """Kernels for a law and a scene's features."""
-    return ExplicitKernels(KickDrift(law, features, lanes), parallel)
+    return ExplicitKernels(KickDrift(law, features, lanes), parallel, repeated)

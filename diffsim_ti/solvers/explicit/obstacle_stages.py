@@ -47,24 +47,11 @@ class ObstacleStages(ObstacleFunctions):
 
     @ti.func
     def add_to_path(self, g: A, k, i, now: A, by_X, by_wall, adjoint: A):
-        """Adjoints of the rows of the path that vertex i felt; `fold_path` sums them over the vertices."""
+        """Adjoints of the rows of the path that vertex i felt; summed over the vertices where a step begins."""
         if ti.static(g.path >= 0):
-            c, rate = 2 * (g.path + k), now.per_step * by_wall
+            c, rate = now.felt + 2 * (g.path + k), now.per_step * by_wall
             adjoint.felt[c, i] = adjoint.felt[c, i] - ((1 - now.begin) * by_X + rate)
             adjoint.felt[c + 1, i] = adjoint.felt[c + 1, i] - (now.begin * by_X - rate)
-
-    @ti.func
-    def fold_path(self, c, now: A, num_vertices, adjoint: A):
-        """At the first pass of a step, the last to be gone back through: sum what all vertices felt, in a fixed order."""
-        if now.opens > 0:
-            to_row, to_next = self.vector(0), self.vector(0)
-            for i in range(num_vertices):
-                to_row += adjoint.felt[2 * c, i]
-                to_next += adjoint.felt[2 * c + 1, i]
-                adjoint.felt[2 * c, i] = self.vector(0)
-                adjoint.felt[2 * c + 1, i] = self.vector(0)
-            adjoint.path[now.row, c] = adjoint.path[now.row, c] + to_row
-            adjoint.path[now.next, c] = adjoint.path[now.next, c] + to_next
 
     # ---- what is noted -----------------------------------------------------------------------------------------------
 

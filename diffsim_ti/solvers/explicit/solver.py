@@ -18,7 +18,7 @@ from diffsim_ti.solvers.explicit.kernels import ExplicitKernels, explicit_kernel
 from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.state.schedule import PassTable
 from diffsim_ti.state.workspace import Workspace
-from diffsim_ti.terms import ExternalForce
+from diffsim_ti.terms import ExternalForce, SelfContact
 
 
 @dataclass(frozen=True)
@@ -39,6 +39,7 @@ class Weights:
 
 
 CONTACT_DAMPING = 0.005  # measured: tests/README.md
+MOST_PASSES = 16  # in a launch on all threads of a GPU, whose cost for the host is spread over them
 
 
 class ExplicitSolver(Solver):
@@ -69,6 +70,11 @@ class ExplicitSolver(Solver):
     @property
     def stages_contact(self) -> bool:
         return self.contact == "stage"
+
+    def passes_per_launch(self) -> int:
+        """How many passes one launch does at most where they run in parallel (runtime/repeated_loops.py)."""
+        alone = self.scene.term(SelfContact) or feels_faces(self.scene)  # which act between passes
+        return 1 if alone or runtime.runs_on_cpu() or not runtime.can_repeat() else MOST_PASSES
 
     @abstractmethod
     def weights(self, j: np.ndarray, num_passes: int, rate: float) -> Weights:
@@ -109,6 +115,8 @@ class ExplicitWorkspace(Workspace):
     def __init__(self, solver, derived: Derived):
         self.table = PassTable(runtime.PRECISIONS[solver.scene.precision])
         super().__init__(solver, derived)
+        self.in_parallel = solver.passes_per_launch()
+        self.repeated = self.parallel and self.in_parallel > 1
         features, a = self.arrays.features(), self.arrays
         self.faces = FeltFaces(self) if a.feels_faces else None
         noted = ROWS * len(a.obstacles), a.num_vertices
@@ -129,7 +137,7 @@ class ExplicitWorkspace(Workspace):
             self.pairs.forces(self.probe.u, 0, self.arrays.corner)
         seen, step = self.watch.rows(), self.kernels(self.arrays.features()).step
         launch = self.bound(step, state=(self.probe, self.frames, self.watch, self.contact), table=self.table)
-        for numbers in self.launches(j, j + 1, num_passes, 0, self.arrays.num_tetrahedra):
+        for numbers in self.launches(j, j + 1, num_passes, 0, 1):
             if self.faces:
                 self.faces.forces(self.probe.u, 0, numbers)
             launch(**numbers, base=j, stride=1)
@@ -148,24 +156,31 @@ class ExplicitWorkspace(Workspace):
 
     def kernels(self, features) -> ExplicitKernels:
         """The kernels for some features of the scene."""
-        return explicit_kernels(self.arrays.law, features, self.parallel, self.arrays.in_lanes)
+        return explicit_kernels(self.arrays.law, features, self.parallel, self.arrays.in_lanes, self.repeated)
 
-    def launches(self, first: int, last: int, num_passes: int, save_every: int, work: int, backwards=False) -> Iterator:
+    def most_passes(self, work: int) -> int:
+        """How many passes a launch may take; work: of a pass, in those of tetrahedra."""
+        if self.parallel or self.pairs or self.faces:
+            return self.in_parallel
+        return max(1, self.work_per_launch // work)
+
+    def launches(self, first: int, last: int, num_passes: int, save_every: int, most: int, backwards=False) -> Iterator:
         """Numbers of the launches that passes first .. last - 1 take, for each of which their table is shown.
 
-        work: of a pass, against `work_per_launch`. backwards: from the last passes to the first.
+        most: passes that a launch takes. backwards: from the last passes to the first.
         """
         a, solver = self.arrays, self.solver
-        chunk = 1 if self.parallel or self.pairs or self.faces else max(1, self.work_per_launch // work)
         num_rows = max((len(x) for x in (a.values.path, a.values.motion) if x is not None), default=1)
         run = num_passes, num_rows, save_every, self.rate, solver.schedule
         turn, sizes = -1 if backwards else 1, dict(num_items=a.num_items, num_vertices=a.num_vertices)
         sizes["contact_damping"] = solver.contact_damping
         for window, begin, end in self.table.windows(first, last)[::turn]:
             self.table.show(window, run, lambda first, last: solver.pass_table(first, last, *run[:4]))
+            number = -(-(end - begin) // most)
+            chunk = -(-(end - begin) // number)  # launches of one size
             stops = [*range(end, begin, -chunk), begin][::-1] if backwards else [*range(begin, end, chunk), end]
             for start, stop in list(zip(stops, stops[1:]))[::turn]:
-                yield sizes | dict(window=window, first=start, count=stop - start)
+                yield sizes | dict(window=window, first=start, count=stop - start, times=chunk)
 
     def advance(self, first: int, last: int, num_passes: int, save_every: int = 0, base: int | None = None) -> None:
         """Passes first .. last - 1 from the current state; or recorded: slot j - base holds the state before pass j."""
@@ -175,7 +190,8 @@ class ExplicitWorkspace(Workspace):
         launch = self.bound(step, state=states, table=self.table)
         if pairs:
             pairs.ensure(history.u, (first - base) * stride)
-        for numbers in self.launches(first, last, num_passes, save_every, self.arrays.num_tetrahedra):
+        most = self.most_passes(self.arrays.num_tetrahedra)
+        for numbers in self.launches(first, last, num_passes, save_every, most):
             slot = (numbers["first"] - base) * stride
             if pairs:
                 pairs.forces(history.u, slot, self.arrays.corner)
