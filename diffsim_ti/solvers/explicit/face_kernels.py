@@ -39,7 +39,8 @@ class FaceKernels(FaceForces):
 
     def _kernel(self, name: str, body, **arrays) -> Kernel:
         own = dict(scene=SCENE, faces=FACES, state=dict(u="vectors2"), table=dict(ints="ints", floats="scalars"))
-        return Kernel("face_" + name, body, self.precision, own | arrays, NUMBERS | dict(h="float"))
+        numbers = NUMBERS | dict(h="float") | (dict(steps="int", num_parts="int") if "own" in arrays else {})
+        return Kernel("face_" + name, body, self.precision, own | arrays, numbers)
 
     @ti.func
     def taken(self, x):
@@ -252,7 +253,7 @@ class FaceKernels(FaceForces):
             self.seed_vertex(s, scene, faces, adjoint, plan)
         ti.loop_config(serialize=not self.parallel)
         for f in range(plan.num_faces):
-            now, total = pass_at(table, plan.first - plan.window), self.rows(0)
+            now, total = self.noting(pass_at(table, plan.first - plan.window), plan), self.rows(0)
             u, w = self.rows_at(f, state.u, plan.slot, faces), self.seed_rows(f, faces)
             for g in ti.static(self.groups):
                 for k in range(g.count):
@@ -267,8 +268,9 @@ class FaceKernels(FaceForces):
             by_u = self.gathered(s, faces)
             adjoint.corner[plan.first_out + s] = by_u
             own.rest_adj[s] = own.rest_adj[s] + by_u
-        for c in range(ti.static(self.features.moving)):
-            self.fold_path(c, pass_at(table, plan.first - plan.window), plan.num_faces, own)
+        if ti.static(self.features.moving > 0):
+            for p in range(ti.static(self.features.moving) * plan.num_parts):
+                self.fold_part(p, plan.num_faces, plan.first, plan.first, own, table, plan)
 
     @cached_property
     def vjp(self) -> Kernel:

@@ -65,7 +65,7 @@ class FeltFaces:
 
         sizes = dict(num_vertices=a.num_vertices, num_faces=self.num_faces, num_surface=self.num_surface)
         own = sizes | dict(first_out=a.first_face_corner, slot=slot, between=int(between), h=ws.solver.substep)
-        ws.kept(key, bind)[0](**own | {name: plan.get(name, 0) for name in ("first", "window")})
+        ws.kept(key, bind)[0](**own | {name: plan.get(name, 0) for name in ("first", "window", "steps", "num_parts")})
 
     # ---- in passes ---------------------------------------------------------------------------------------------------
 
@@ -122,12 +122,8 @@ class FeltAdjoint:
 
     def __init__(self, adjoint, faces: FeltFaces):
         a, features = faces.a, adjoint.features
-        self.faces, self.adjoint, self.features, self.path = (
-            faces,
-            (adjoint, adjoint.numbers),
-            features,
-            adjoint.numbers.path,
-        )
+        self.faces, self.adjoint, self.features = faces, (adjoint, adjoint.numbers), features
+        self.path, self.num_parts = adjoint.path, adjoint.num_parts
         self.sums = runtime.array(a.fp, features.num_parameters, faces.num_faces)
         self.felt = runtime.array(a.vector, 2 * features.moving, faces.num_faces if features.moving else 1)
         self.rest_adj, self.by_areas = runtime.array(a.vector, faces.num_surface), runtime.array(a.fp, faces.num_faces)
@@ -139,6 +135,7 @@ class FeltAdjoint:
     def reverse(self, u, slot: int, plan: dict) -> None:
         """Go back through the forces at u[slot] of pass plan["first"]."""
         self.faces.forces(u, slot, plan)
+        plan = plan | dict(steps=1, num_parts=self.num_parts)
         self.faces._run("vjp", plan, slot, self.features, u=u, adjoint=self.adjoint, own=self)
 
     def collect(self, out) -> None:

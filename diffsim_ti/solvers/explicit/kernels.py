@@ -6,7 +6,7 @@ from functools import cached_property, lru_cache
 import taichi as ti
 
 from diffsim_ti.elements.tetrahedron import Onwards
-from diffsim_ti.runtime import Bundle, Kernel, let, traced
+from diffsim_ti.runtime import Kernel, let, traced
 from diffsim_ti.solvers.explicit.kick_drift import KickDrift
 from diffsim_ti.state.numbers import ADJOINT, OF_STEPS, SCENE, TANGENT, with_state
 from diffsim_ti.state.schedule import pass_at, reversed_pass
@@ -151,27 +151,8 @@ class ExplicitKernels:
 
     @traced
     def pass_back(self, j, table, plan):
-        """Pass j on the way back; `felt`: where vertices note what they feel of paths in its step."""
-        now, moving = reversed_pass(pass_at(table, j - plan.window), j, plan), self.vertex.features.moving
-        return Bundle(**vars(now), felt=let(2 * moving * (now.row % plan.steps)) if moving else 0)
-
-    @ti.func
-    def fold_part(self, p, first, last, adjoint: A, table: A, plan: A):
-        """Sum what every num_parts-th vertex felt of a path in the steps that passes last .. first complete, in order."""
-        low, high = pass_at(table, first - plan.window), pass_at(table, last - plan.window)
-        c, part, moving = p // plan.num_parts, p % plan.num_parts, ti.static(self.vertex.features.moving)
-        for back in range(high.row - low.row + low.opens):
-            row = high.row - back
-            at, after = 2 * (moving * (row % plan.steps) + c), ti.min(row + 1, high.next)
-            to_row, to_next = self.vertex.vector(0), self.vertex.vector(0)
-            for m in range((plan.num_vertices - part + plan.num_parts - 1) // plan.num_parts):
-                i = part + m * plan.num_parts
-                to_row += adjoint.felt[at, i]
-                to_next += adjoint.felt[at + 1, i]
-                adjoint.felt[at, i] = self.vertex.vector(0)
-                adjoint.felt[at + 1, i] = self.vertex.vector(0)
-            adjoint.path[row, p] = adjoint.path[row, p] + to_row
-            adjoint.path[after, p] = adjoint.path[after, p] + to_next
+        """Pass j on the way back."""
+        return self.vertex.obstacles.noting(reversed_pass(pass_at(table, j - plan.window), j, plan), plan)
 
     @ti.func
     def passes_vjp(self, scene: A, state: A, adjoint: A, table: A, plan: A):
@@ -191,7 +172,8 @@ class ExplicitKernels:
                     self.elements_vjp(e, plan.first + plan.count - 1 - turn, scene, state, adjoint, table, plan)
             if ti.static(moving > 0):
                 for p in range(parts):
-                    self.fold_part(p, plan.first, plan.first + plan.count - 1, adjoint, table, plan)
+                    last = plan.first + plan.count - 1
+                    self.vertex.obstacles.fold_part(p, plan.num_vertices, plan.first, last, adjoint, table, plan)
         else:
             ti.loop_config(serialize=True)
             for back in range(plan.count):
@@ -202,7 +184,7 @@ class ExplicitKernels:
                 for e in range(plan.num_items):
                     self.elements_vjp(e, j, scene, state, adjoint, table, plan)
                 for p in range(moving * plan.num_parts):
-                    self.fold_part(p, j, j, adjoint, table, plan)
+                    self.vertex.obstacles.fold_part(p, plan.num_vertices, j, j, adjoint, table, plan)
 
     @cached_property
     def step_vjp(self) -> Kernel:

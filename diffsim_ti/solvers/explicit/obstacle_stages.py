@@ -8,7 +8,9 @@ from dataclasses import dataclass
 
 import taichi as ti
 
+from diffsim_ti.runtime import Bundle, let, traced
 from diffsim_ti.state.obstacle_functions import ObstacleFunctions
+from diffsim_ti.state.schedule import pass_at
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
 # what a contact stage notes of obstacle o at vertex i, in state.stage[ROWS o + row, i]: (n, d); (stiffness, width, mu,
@@ -52,6 +54,31 @@ class ObstacleStages(ObstacleFunctions):
             c, rate = now.felt + 2 * (g.path + k), now.per_step * by_wall
             adjoint.felt[c, i] = adjoint.felt[c, i] - ((1 - now.begin) * by_X + rate)
             adjoint.felt[c + 1, i] = adjoint.felt[c + 1, i] - (now.begin * by_X - rate)
+
+    @traced
+    def noting(self, now, plan):
+        """A pass on the way back with `felt`: where vertices note what they feel of paths in its step."""
+        moving = self.features.moving
+        return Bundle(**vars(now), felt=let(2 * moving * (now.row % plan.steps)) if moving else 0)
+
+    @ti.func
+    def fold_part(self, p, count, first, last, adjoint: A, table: A, plan: A):
+        """Sum what every num_parts-th of `count` vertices (or faces) felt of a path in the steps that passes last .. first
+        complete, in order."""
+        low, high = pass_at(table, first - plan.window), pass_at(table, last - plan.window)
+        c, part, moving = p // plan.num_parts, p % plan.num_parts, ti.static(self.features.moving)
+        for back in range(high.row - low.row + low.opens):
+            row = high.row - back
+            at, after = 2 * (moving * (row % plan.steps) + c), ti.min(row + 1, high.next)
+            to_row, to_next = self.vector(0), self.vector(0)
+            for m in range((count - part + plan.num_parts - 1) // plan.num_parts):
+                i = part + m * plan.num_parts
+                to_row += adjoint.felt[at, i]
+                to_next += adjoint.felt[at + 1, i]
+                adjoint.felt[at, i] = self.vector(0)
+                adjoint.felt[at + 1, i] = self.vector(0)
+            adjoint.path[row, p] = adjoint.path[row, p] + to_row
+            adjoint.path[after, p] = adjoint.path[after, p] + to_next
 
     # ---- what is noted -----------------------------------------------------------------------------------------------
 
