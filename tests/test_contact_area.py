@@ -153,11 +153,12 @@ def test_gradients_are_slopes(solver):
     assert report.passed, report
 
 
-def on_a_needle(**options) -> ds.Rollout:
+def on_a_needle(precision="f64", **options) -> ds.Rollout:
     """A cube whose bottom face, not its vertices, meets a needle."""
     mesh = ds.TetrahedralMesh.create_box(2, size=0.1).translated((0, -0.006, 0))
-    scene = ds.Scene(mesh, SOFT, terms=[needle(**options)], initial_velocities=(0.1, -0.2, 0), precision="f64")
-    return ds.Rollout(ds.ImplicitEulerSolver(scene, dt=2e-3, tolerance=1e-12), 2, 1, gradients="all")
+    scene = ds.Scene(mesh, SOFT, terms=[needle(**options)], initial_velocities=(0.1, -0.2, 0), precision=precision)
+    tolerance = 1e-12 if precision == "f64" else 1e-6
+    return ds.Rollout(ds.ImplicitEulerSolver(scene, dt=2e-3, tolerance=tolerance), 2, 1, gradients="all")
 
 
 def test_points_within_faces_have_areas_too():
@@ -228,7 +229,6 @@ def test_backend_transpose_of_areas(solver):
 
 @pytest.mark.backends
 def test_backend_of_areas_in_implicit_steps():
-    rollout = sliding_rollout(ds.ImplicitEulerSolver, "f32")
-    single, double = rollout.forward().positions, sliding_rollout(ds.ImplicitEulerSolver).forward().positions
-    assert ds.dot_product_test(rollout) <= 2e-3
-    np.testing.assert_allclose(single, double, atol=2e-6)
+    """A face on a needle moves as in float64 on a processor; without the needle it would go .8 mm."""
+    positions = on_a_needle("f32", stiffness_per_area=1e7).forward().positions
+    assert (positions[-1] - positions[0])[:, 1].mean() == pytest.approx(-6.4209e-4, rel=1e-3)
