@@ -48,6 +48,7 @@ class ExplicitAdjoint:
         same = self.numbers.fits(a, a.features(self.features.density, self.features.shape))
         same = same and self.felt.shape[0] == max(1, 2 * self.features.moving * self._steps)
         same = same and self.path.shape[0] == a.path.shape[0]
+        same = same and (not self.faces or self.faces.path.shape[0] == a.path.shape[0])
         return same and self.frames.frames_u.shape == workspace.frames.frames_u.shape
 
     def start(self, positions_adj: np.ndarray, velocities_adj: np.ndarray, last_frame_is_input: bool) -> None:

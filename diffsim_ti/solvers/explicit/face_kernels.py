@@ -260,7 +260,10 @@ class FaceKernels(FaceForces):
                     rows, _ = self.face("vjp", g, k, f, X, u, w, scene, faces, own)
                     total += rows
                     by_X = self.row_of(rows, 0) + self.row_of(rows, 1) + self.row_of(rows, 2)
-                    self.add_to_path(g, k, f, now, by_X, self.vector(0), own)
+                    if ti.static(g.path >= 0):
+                        c = 2 * (g.path + k)
+                        own.felt[c, f] = own.felt[c, f] - (1 - now.begin) * by_X
+                        own.felt[c + 1, f] = own.felt[c + 1, f] - now.begin * by_X
             self.store(f, total, faces)
         ti.loop_config(serialize=not self.parallel)
         for s in range(plan.num_surface):
@@ -269,6 +272,18 @@ class FaceKernels(FaceForces):
             own.rest_adj[s] = own.rest_adj[s] + by_u
         for c in range(ti.static(self.features.moving)):
             self.fold_path(c, pass_at(table, plan.first - plan.window), plan.num_faces, own)
+
+    @ti.func
+    def fold_path(self, c, now: A, num_faces, own: A):
+        """At the first pass of a step, the last to be gone back through: sum what all faces felt, in a fixed order."""
+        if now.opens > 0:
+            to_row, to_next = self.vector(0), self.vector(0)
+            for f in range(num_faces):
+                to_row += own.felt[2 * c, f]
+                to_next += own.felt[2 * c + 1, f]
+                own.felt[2 * c, f], own.felt[2 * c + 1, f] = self.vector(0), self.vector(0)
+            own.path[now.row, c] = own.path[now.row, c] + to_row
+            own.path[now.next, c] = own.path[now.next, c] + to_next
 
     @cached_property
     def vjp(self) -> Kernel:

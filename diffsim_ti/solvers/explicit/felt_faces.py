@@ -122,18 +122,14 @@ class FeltAdjoint:
 
     def __init__(self, adjoint, faces: FeltFaces):
         a, features = faces.a, adjoint.features
-        self.faces, self.adjoint, self.features, self.path = (
-            faces,
-            (adjoint, adjoint.numbers),
-            features,
-            adjoint.numbers.path,
-        )
+        self.faces, self.adjoint, self.features = faces, (adjoint, adjoint.numbers), features
+        self.path = runtime.array(a.vector, a.path.shape[0], features.moving)
         self.sums = runtime.array(a.fp, features.num_parameters, faces.num_faces)
         self.felt = runtime.array(a.vector, 2 * features.moving, faces.num_faces if features.moving else 1)
         self.rest_adj, self.by_areas = runtime.array(a.vector, faces.num_surface), runtime.array(a.fp, faces.num_faces)
 
     def clear(self) -> None:
-        for x in (self.sums, self.felt, self.rest_adj, self.by_areas):
+        for x in (self.sums, self.felt, self.path, self.rest_adj, self.by_areas):
             runtime.fill(x, 0)
 
     def reverse(self, u, slot: int, plan: dict) -> None:
@@ -146,6 +142,8 @@ class FeltAdjoint:
         count = self.features.num_parameters
         out.parameters[:count] += runtime.fetch(self.sums).astype(np.float64).sum(1)[:count]
         out.rest[self.faces.mesh.surface_vertices] += runtime.fetch(self.rest_adj)
+        if self.features.moving:
+            out.path += runtime.fetch(self.path)
         rest, faces = self.faces.a.values.rest, self.faces.mesh.surface_triangles
         by_areas = runtime.fetch(self.by_areas).astype(np.float64)
         by_areas /= np.linalg.norm(geometry.triangle_normals(rest, faces), axis=1)
