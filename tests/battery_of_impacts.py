@@ -206,7 +206,9 @@ def follow(case: Case, said: str) -> Case | None:
     stiffness, substep = re.search(f"per_area to {NUMBER} N/m\\^3", said), re.search(f"steps of {NUMBER} s", said)
     advice = [*case.advice, said]
     if stiffness:
-        return replace(case, stiffness=float(stiffness[1]), advice=advice)
+        with_it = re.search(f"with substeps of {NUMBER} s", said)
+        shorter = dict(substep=float(with_it[1])) if with_it else {}
+        return replace(case, stiffness=float(stiffness[1]), advice=advice, **shorter)
     if "BDF2Solver" in said and case.solver == "ImplicitMidpointSolver":
         return replace(case, solver="BDF2Solver", advice=advice)
     shorter = re.search(f"substep to {NUMBER} s", said)
