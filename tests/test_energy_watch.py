@@ -77,7 +77,12 @@ WORK = {
     "motion": lambda: body([ds.Gravity()], **SHAKEN),
     "motion, drag": lambda: body([ds.Drag(10.0)], **SHAKEN),
     "a ball": lambda: body(
-        [ds.Sphere([0.05, -0.04, 0.05], 0.05, stiffness=2e3, path=lambda t: [0, 0.05 * np.sin(30 * t), 0])], ABOVE
+        [
+            ds.Sphere(
+                [0.05, -0.04, 0.05], 0.05, stiffness=400.0, width=0.02, path=lambda t: [0, 0.05 * np.sin(30 * t), 0]
+            )
+        ],
+        ABOVE,
     ),
     "a belt": lambda: body([ds.Gravity(), ds.Ground(0.0, 2e3, friction=0.5, path=PLATE)], ABOVE),
 }
