@@ -288,8 +288,8 @@ def test_the_left_button_pulls_a_live_body(live, make_viewer):
     velocity = live.run.simulator.velocities[:, 1].mean()
     view.go(len(live))
     assert live.run.simulator.velocities[:, 1].mean() - velocity == pytest.approx(
-        -9.81 / 60, rel=0.1
-    )  # a corner touches
+        -9.81 / 60, rel=0.15
+    )  # a corner touches, and the floor has a stiffness per area
 
 
 def test_a_click_on_the_panel_or_beside_the_body_grabs_nothing(live, make_viewer):
