@@ -34,9 +34,8 @@ def pytest_terminal_summary(terminalreporter, config):
         minutes = areas.minutes_of(reports)
         areas.write(minutes)
         terminalreporter.write_line("minutes: " + ", ".join(f"{area} {spent:.1f}" for area, spent in minutes.items()))
-    for name in ("EXECUTED_PTX", "GPU_FORM"):  # what earlier calls of pytest came to, from .ci/run
-        if earlier := os.environ.get(name):
-            terminalreporter.write_line(earlier)
+    if earlier := os.environ.get("EXECUTED_PTX"):  # what a call of pytest on CUDA's kernels came to, from .ci/run
+        terminalreporter.write_line(earlier)
 
 
 @pytest.fixture
