@@ -35,7 +35,8 @@ class EnergyBalance:
 
     stays the same, to round-off, of every linear motion below omega h = 2, and falls by what friction and a contact stage
     take. Passes note the work of loads, of prescribed motion and of moving obstacles, and what drag takes
-    (solvers/explicit/kick_drift.py). So whatever rises beyond the lowest level is the steps' own.
+    (solvers/explicit/kick_drift.py), but for drag that acts alone, which can hide a gain. So whatever rises beyond the
+    lowest level is the steps' own.
     Laws that read a rate or remember may take or do work of their own: they are not watched.
     Hairer, Lubich, Wanner 2003, Geometric numerical integration illustrated by the Stoermer-Verlet method,
     doi:10.1017/S0962492902000144, 4.1 and 5.

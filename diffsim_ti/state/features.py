@@ -71,8 +71,9 @@ class Features:
 
     @property
     def driven(self) -> bool:
-        """Whether something does work on the body that its energy does not tell, or takes some."""
-        return self.forces or self.motion or self.moving > 0 or self.drag >= 0
+        """Whether something may do work on the body that its energy does not tell. Drag alone only takes some, and
+        counting that would cost small scenes a fifth."""
+        return self.forces or self.motion or self.moving > 0
 
     @property
     def pressing(self) -> tuple[ObstacleGroup, ...]:
