@@ -194,19 +194,17 @@ class Guard:
         enough = min(0.1 * width / max(speed, 1e-300), (0.25 if of_face else 0.5) * solver.substep)
         stiffness = self._stiffness_needed(k, vertex, speed)
         ws.place_obstacles(j)
-        load = ws.faces.load_of(vertices) if of_face else 0.0
-        if of_face and max(speed * solver.substep / width, load) > 0.2:  # their force has to be resolved first
-            stiffness, enough = None, min(enough, solver.substep * np.sqrt(0.1 / max(load, 1e-300)))
+        if of_face and ws.faces.saturated:  # their force has to be resolved first
+            stiffness = None
         elif of_face:
             more = ws.faces.stiffening(vertices, k, np.array(speeds))
-            stiffness, enough = more * ws.arrays.stiffness_of(k, vertices), solver.substep / np.sqrt(more)
+            stiffness = more * ws.arrays.stiffness_of(k, vertices)
         remedy = f"reduce the substep to {enough:.3g} s"
         if not of_face:
             remedy += " (a tenth of the barrier's width)"
         if stiffness is not None:
             stiffer = ws.arrays.stiffer(k, vertices, stiffness)
             remedy = f"the barrier cannot stop it at any step: raise its {stiffer}, or its width"
-            remedy += f", with substeps of {enough:.3g} s" * of_face
         raise Crossing(
             f"step {step}, t = {step * solver.dt:.6g} s: {place_name(vertices)} gets {depth:.3g} m behind {term!r} within a "
             f"substep of {solver.substep:.4g} s, at {speed:.4g} m/s: {remedy}; the state before is kept",

@@ -80,8 +80,6 @@ class Stiffness:
         if self.ws.pairs:
             self.ws.pairs.ensure(self.ws.state.u, 0)
             self.ws.pairs.product(self.ws.state.u, 0, self.w, self.ws.arrays.corner)
-        if self.ws.faces:
-            self.ws.faces.product(self.w)
         a = self.ws.arrays
         self._multiply(num_items=a.num_items, num_tetrahedra=a.num_places, num_vertices=a.num_vertices, per_gamma=0.0)
         return -root * runtime.fetch(self.y)[0].astype(np.float64) * scale

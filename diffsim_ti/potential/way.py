@@ -75,6 +75,15 @@ class Way:
         self._look("distances", u, places, max(within, 1e-30))
         return self.met
 
+    def check_apart(self, u: np.ndarray, places: np.ndarray) -> None:
+        """Raise ValueError if a vertex or a face is in an obstacle. A state that is not finite is looked at elsewhere."""
+        met = self.nearest(u, places) if np.all(np.isfinite(u)) else None
+        if met is not None:
+            raise ValueError(
+                f"{self.terms[met.obstacle]!r} reaches {-met.value:.3g} m into {met} of the body: move the body or the "
+                "obstacle"
+            )
+
     def _look(self, name: str, u, places, most: float, kept: float = 0.0) -> None:
         if name not in self._launches:
             own = dict(scene=self.a, way=self._way, at=self._at, out=self._out)

@@ -96,10 +96,6 @@ class SceneArrays:
             self.parameters_of_self_contact = scene.inputs.parameters.of(self.self_contact)
             start, corner_of = with_own_corner(start, corner_of, mesh.surface_vertices, num_corners)
             num_corners += len(mesh.surface_vertices)
-        self.first_face_corner = num_corners
-        if self.feels_faces:  # and one for what its faces feel
-            start, corner_of = with_own_corner(start, corner_of, mesh.surface_vertices, num_corners)
-            num_corners += len(mesh.surface_vertices)
         self.start, self.corner_of = runtime.upload(start, ti.i32), runtime.upload(corner_of, ti.i32)
         self.corner = runtime.array(self.vector, num_corners)
         self.force_slot = self.motion_slot = runtime.array(ti.i32, 1)

@@ -1,13 +1,14 @@
 """The reverse sweep and the tangent of a chain of kick-drift passes, along recorded states."""
 
 import weakref
+from contextlib import nullcontext
 from types import SimpleNamespace
 
 import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.inputs import Derived
-from diffsim_ti.solvers.explicit.felt_faces import FeltAdjoint
+from diffsim_ti.solvers.explicit.felt_faces import FeltAdjoint, FeltTangent
 from diffsim_ti.state.arrays import copy_slot
 from diffsim_ti.state.numbers import OF_STEPS, Adjoint, Tangent
 from diffsim_ti.state.workspace import FrameArrays
@@ -102,13 +103,25 @@ class ExplicitAdjoint:
         states = (history, ws.frames, ws.watch, ws.contact)
         launch = ws.bound(ws.kernels(self.features).step_vjp, state=states, adjoint=own, table=ws.table)
         run = dict(num_passes=num_passes, steps=self._steps, num_parts=self.num_parts)
-        launch(**numbers, **run, base=base, halt=halt, kick=kick)
+        slot = numbers["first"] - base
+        with self._faces_of(slot + 1, kick) as alone:
+            if alone:
+                if numbers["first"] < num_passes - 1:  # what comes first in the pass has to be there
+                    self._gather(self)
+                    runtime.fill(self.corner, 0)
+                    runtime.fill(self.rate_corner, 0)
+                self.faces.start(alone, numbers)
+            launch(**numbers, **run, base=base, halt=halt, kick=kick)
+            if alone:
+                self.faces.end(alone, numbers)
         if ws.pairs:
-            slot = numbers["first"] - base
             ws.pairs.ensure(history.u, slot)
             ws.pairs.vjp(history.u, slot, self.w, self.corner)
-        if self.faces:
-            self.faces.reverse(history.u, numbers["first"] - base, numbers)
+
+    def _faces_of(self, slot: int, kick: int):
+        """The pass to a slot without contact within faces; nothing where there was none, or in a kick alone."""
+        alone = self.faces.faces.alone(self.ws.record, slot) if self.faces and not kick else None
+        return nullcontext() if alone is None else alone
 
     def finish(self) -> None:
         """Complete the adjoint of the start."""
@@ -169,7 +182,7 @@ class ExplicitTangent:
         self.v = runtime.upload(tangent.velocity[None], a.vector)
         self.frames = FrameArrays.of(a, *workspace.frames.frames_u.shape)
         self.numbers, self.z = Tangent(a, tangent), a.law_states(1)
-        self.of_faces = self, self.numbers
+        self.faces = FeltTangent(self, workspace.faces) if workspace.faces else None
         if self.z is not None:
             runtime.fill(self.z, 0)
         self._rate_dot = float(tangent.parameters[self.features.drag]) if self.features.drag >= 0 else 0.0
@@ -185,9 +198,13 @@ class ExplicitTangent:
                 ws.pairs.ensure(history.u, slot)
                 of_contact = self.tangent.parameters[a.parameters_of_self_contact]
                 ws.pairs.product(history.u, slot, self.u, a.corner, self.numbers.rest, of_contact)
-            if ws.faces:
-                ws.faces.jvp(history.u, slot, numbers, self.features, self.of_faces)
-            launch(**numbers, base=first, rate_dot=self._rate_dot)
+            alone = ws.faces.alone(history, slot + 1) if ws.faces else None
+            with nullcontext() if alone is None else alone:
+                if alone:
+                    self.faces.start(alone, numbers)
+                launch(**numbers, base=first, rate_dot=self._rate_dot)
+                if alone:
+                    self.faces.end(alone, numbers)
 
     def save_frame(self, frame: int) -> None:
         """Copy the current tangent to a frame."""

@@ -1,12 +1,15 @@
-"""Kernels over the faces of a surface before an explicit pass, whose forces surface vertices gather as one more corner.
+"""Contact of points within faces as a stage of explicit passes: what they feel on the way that a pass has found.
 
-Barriers are stiffer than a pass of length h can follow, and the pass takes of a vertex's force f what it can:
+A pass leads a surface vertex of mass m from u0 to u1. Barriers of points are stiffer than it can follow, and narrower than
+it is long, so that the way is gone again in n equal parts of length d = h / n, with their forces f (face_forces.py):
 
-    f g(x),    x = h^2 D / m,    g(x) = (1 + x^4)^(-1/4)
+    u  = u0 + (k + 1/2) / n (u1 - u0) + e + d v / 2        where forces of part k are taken
+    v' = v + d f(u) / m,    e' = e + d (v + v') / 2,       from v = e = 0; at the end u1 + e and v are added to the state
 
-D (face_forces.py) is no less than the stiffness of the points around the vertex, so that h^2 times the stiffness over the
-mass that is left is at most 1: where the body alone may take 4, that lets it have 3. Where a pass resolves the contact
-(x < 1/2) it feels the whole force to 2 %. Where it does not, the force is less, and what passes the barrier is noticed.
+It is leapfrog in the moving frame of the pass, and keeps the energy as that does. n is a power of two (felt_faces.py): in a
+part no face goes farther than a share of the width, and d^2 D / m is at most LOAD at each vertex. D, which comes with f, is
+no less than the stiffness of the points around it. The step of the body need not know of this stiffness.
+Tuckerman, Berne, Martyna 1992, Reversible multiple time scale molecular dynamics, doi:10.1063/1.463137.
 """
 
 from dataclasses import dataclass
@@ -14,46 +17,32 @@ from functools import cached_property, lru_cache
 
 import taichi as ti
 
-from diffsim_ti.runtime import Kernel
+from diffsim_ti.potential.face_lattice import FLAT
+from diffsim_ti.runtime import Bundle, Kernel, let, traced
 from diffsim_ti.solvers.explicit.face_forces import FaceForces
 from diffsim_ti.state.features import Features
-from diffsim_ti.state.numbers import ADJOINT, SCENE, TANGENT
+from diffsim_ti.state.numbers import SCENE
 from diffsim_ti.state.schedule import pass_at
 
 A = ti.template()
-FACES = dict.fromkeys(("corners", "own", "parts", "start", "entries", "vertices"), "ints") | dict.fromkeys(
-    ("share", "whole", "seed", "before", "offsets"), "vectors"
+FACES = dict.fromkeys(("corners", "own", "parts", "start", "entries", "vertices", "near"), "ints")
+FACES |= dict.fromkeys(("share", "whole", "shift", "offsets"), "vectors") | dict.fromkeys(
+    ("begin", "place", "speed"), "vectors2"
 )
-FACES |= dict.fromkeys(("reach", "weight", "least", "energy", "done", "work"), "scalars")
-NUMBERS = dict.fromkeys(
-    ("slot", "first", "window", "num_vertices", "num_faces", "num_surface", "first_out", "between"), "int"
-)
-OF_FACES = dict(sums="scalars2", felt="vectors2", path="vectors2", rest_adj="vectors", by_areas="scalars")
+FACES |= dict.fromkeys(("reach", "weight", "least", "energy", "done", "work", "need", "load"), "scalars")
+NUMBERS = dict.fromkeys(("slot", "first", "window", "num_vertices", "num_faces", "num_surface", "between"), "int")
+NUMBERS |= dict(n="int", k="int", h="float")
 
 
 @dataclass(frozen=True)
 class FaceKernels(FaceForces):
-    """Of all faces, at u[slot] of a state."""
+    """Of all faces; u[slot] of a state is where the pass ends, faces.begin[0] where it begins."""
 
     parallel: bool
 
-    def _kernel(self, name: str, body, **arrays) -> Kernel:
-        own = dict(scene=SCENE, faces=FACES, state=dict(u="vectors2"), table=dict(ints="ints", floats="scalars"))
-        numbers = NUMBERS | dict(h="float") | (dict(steps="int", num_parts="int") if "own" in arrays else {})
-        return Kernel("face_" + name, body, self.precision, own | arrays, numbers)
-
-    @ti.func
-    def taken(self, x):
-        """(g, g')"""
-        y = x * x * x * x
-        root = ti.sqrt(ti.sqrt(1 + y))
-        g = ti.cast(1, self.fp) / root
-        return g, 0 - x * x * x * g / (1 + y)
-
-    @ti.func
-    def load(self, i, D, scene: A, plan: A):
-        """x of a vertex."""
-        return plan.h * plan.h * D * scene.inverse_mass[i]
+    def _kernel(self, name: str, body, more=(), **arrays) -> Kernel:
+        own = dict(scene=SCENE, faces=FACES, state=dict(u="vectors2", v="vectors2"), table=dict(ints="ints", floats="scalars"))
+        return Kernel("face_" + name, body, self.precision, own | arrays, NUMBERS | dict.fromkeys(more, "int"))
 
     @ti.func
     def direct(self, f):
@@ -78,13 +67,100 @@ class FaceKernels(FaceForces):
                 x[m] = rows[a, m]
             faces.share[3 * f + a] = x
 
+    @ti.func
+    def share_of(self, k, plan: A):
+        """Share of the pass at which forces of part k are taken."""
+        return (ti.cast(k, self.fp) + ti.cast(0.5, self.fp)) / ti.cast(plan.n, self.fp)
+
+    @traced
+    def when(self, now, share):
+        """The pass, as if it began at a share of it: obstacles are there then."""
+        return Bundle(**(dict(vars(now)) | dict(begin=let(now.begin + share * (now.end - now.begin)))))
+
+    @ti.func
+    def part_length(self, now: A, plan: A):
+        return now.h / ti.cast(plan.n, self.fp)
+
+    # ---- which faces come near ---------------------------------------------------------------------------------------
+
+    @ti.func
+    def bent(self, g: A, first, X, u, scene: A):
+        """How much nearer than its corners a point of the face may be [m]."""
+        out = ti.cast(1e30, self.fp)
+        if ti.static(g.force.convex):
+            one = ti.cast(1 / 3, self.fp)
+            third = ti.Vector([one, one, one])
+            Xm, um = self.mix(third, X), self.mix(third, u)
+            middle, out = g.force.outlook(scene.parameters, first, Xm, um), ti.cast(0, self.fp)
+            for a in range(3):
+                Xa, ua = self.row_of(X, a), self.row_of(u, a)
+                edge = (Xa - Xm) + (ua - um)
+                out = ti.max(out, g.force.gap(scene.parameters, first, Xa, ua) - middle[3] - self.dot3(middle, edge))
+        return out
+
+    @ti.func
+    def bound(self, g: A, k, f, X, u, travel, scene: A, faces: A):
+        """What the distance of a face's points less r is not below, before they have moved by `travel` or after."""
+        one, around = ti.cast(1 / 3, self.fp), self.rows(0)
+        third = ti.Vector([one, one, one])
+        Xm, um = self.mix(third, X), self.mix(third, u)
+        for a in ti.static(range(3)):
+            for m in ti.static(range(3)):
+                around[a, m] = (X[a, m] - Xm[m]) + (u[a, m] - um[m])
+        middle = g.force.clearance(scene.parameters, g.first + k * g.size, Xm, um)
+        reach = faces.reach[f * ti.static(self.num_obstacles) + g.number + k]
+        return middle[3] - self.size_of_rows(around) - reach - travel
+
+    @ti.func
+    def way_of(self, g: A, k, f, now: A, u0, u1, scene: A):
+        """(rows of the corners' moves in the pass as the obstacle sees them, where the obstacle begins)"""
+        place = self.place(g, k, now, scene.path)
+        drift, move = self.place_at(g, k, now.end, now, scene.path) - place, u1 - u0
+        for a in ti.static(range(3)):
+            for m in ti.static(range(3)):
+                move[a, m] -= drift[m]
+        return move, place
+
+    @ti.func
+    def comes_near(self, f, now: A, scene: A, faces: A, state: A, plan: A):
+        near, need = 0, ti.cast(0, self.fp)
+        u0, u1 = self.rows_at(f, faces.begin, 0, faces), self.rows_at(f, state.u, plan.slot, faces)
+        for g in ti.static(self.groups):
+            for k in range(g.count):
+                first = g.first + k * g.size
+                move, place = self.way_of(g, k, f, now, u0, u1, scene)
+                X, width = self.rest_rows(f, scene.rest, place, faces), g.force.width(scene.parameters, first)
+                travel = self.size_of_rows(move)
+                if self.bound(g, k, f, X, u0, travel, scene, faces) < width:
+                    bent = ti.cast(0, self.fp)
+                    for c in range(3):
+                        bent = ti.max(bent, self.bent(g, first, X, u0 + ti.cast(0.5, self.fp) * c * move, scene))
+                    if bent > ti.cast(FLAT, self.fp) * width:
+                        near, need = 1, ti.max(need, travel / width)
+        if now.alpha <= 0:
+            near = 0
+        faces.near[f], faces.need[f] = near, need
+        faces.energy[f], faces.done[f] = ti.cast(0, self.fp), ti.cast(0, self.fp)
+        self.store(f, self.rows(0), faces)
+
+    @ti.func
+    def all_approaches(self, scene: A, faces: A, state: A, table: A, plan: A):
+        ti.loop_config(serialize=not self.parallel)
+        for f in range(plan.num_faces):
+            self.comes_near(f, pass_at(table, plan.first - plan.window), scene, faces, state, plan)
+
+    @cached_property
+    def approaches(self) -> Kernel:
+        """Notes faces that come near an obstacle in the pass, and their ways in widths."""
+        return self._kernel("approaches", self.all_approaches)
+
     # ---- forces ------------------------------------------------------------------------------------------------------
 
     @ti.func
-    def force_of(self, f, now: A, scene: A, faces: A, state: A, plan: A):
+    def force_of(self, f, u, length, now: A, scene: A, faces: A, plan: A):
         """Forces of a face's corners to `share`, its energy, and to `least` how near it is to each obstacle."""
-        faces.energy[f], faces.done[f] = ti.cast(0, self.fp), ti.cast(0, self.fp)
-        total, u = self.rows(0), self.rows_at(f, state.u, plan.slot, faces)
+        faces.energy[f] = ti.cast(0, self.fp)
+        total = self.rows(0)
         for g in ti.static(self.groups):
             for k in range(g.count):
                 X = self.rest_rows(f, scene.rest, self.where(g, k, now, scene, faces, plan), faces)
@@ -93,190 +169,135 @@ class FaceKernels(FaceForces):
                 if ti.static(g.path >= 0):
                     speed = self.speed(g, k, now, scene.path)
                     for a in ti.static(range(3)):
-                        faces.done[f] = faces.done[f] + plan.h * self.dot3(self.row_of(rows, a), speed)
+                        faces.done[f] = faces.done[f] + length * self.dot3(self.row_of(rows, a), speed)
                 faces.least[f * ti.static(self.num_obstacles) + g.number + k] = least
         self.store(f, total, faces)
-        for a in ti.static(range(3)):
-            faces.before[3 * f + a] = state.u[plan.slot, faces.corners[3 * f + a]]
 
     @ti.func
     def all_forces(self, scene: A, faces: A, state: A, table: A, plan: A):
         ti.loop_config(serialize=not self.parallel)
         for f in range(plan.num_faces):
-            self.force_of(f, pass_at(table, plan.first - plan.window), scene, faces, state, plan)
+            now, u = pass_at(table, plan.first - plan.window), self.rows_at(f, state.u, plan.slot, faces)
+            self.force_of(f, u, ti.cast(0, self.fp), now, scene, faces, plan)
         ti.loop_config(serialize=not self.parallel)
         for s in range(plan.num_surface):
-            whole = self.gathered(s, faces)
-            faces.whole[s] = whole
-            g, _ = self.taken(self.load(faces.vertices[s], whole[3], scene, plan))
-            scene.corner[plan.first_out + s] = g * self.direct(whole)
+            faces.whole[s] = self.gathered(s, faces)
 
     @cached_property
     def forces(self) -> Kernel:
+        """What faces feel at u[slot], between passes."""
         return self._kernel("forces", self.all_forces)
 
-    # ---- what happened in the pass -----------------------------------------------------------------------------------
+    # ---- the parts of a pass -----------------------------------------------------------------------------------------
+
+    @ti.func
+    def put(self, s, k, scene: A, faces: A, state: A, now: A, plan: A):
+        """Where part k takes its forces."""
+        i, half = faces.vertices[s], ti.cast(0.5, self.fp)
+        u0 = faces.begin[0, i]
+        moved = self.share_of(k, plan) * (state.u[plan.slot, i] - u0)
+        faces.place[k, s] = u0 + moved + faces.shift[s] + half * self.part_length(now, plan) * faces.speed[k, s]
+
+    @ti.func
+    def all_begins(self, scene: A, faces: A, state: A, table: A, plan: A):
+        ti.loop_config(serialize=not self.parallel)
+        for s in range(plan.num_surface):
+            faces.shift[s], faces.speed[0, s], faces.load[s] = self.vector(0), self.vector(0), ti.cast(0, self.fp)
+            self.put(s, 0, scene, faces, state, pass_at(table, plan.first - plan.window), plan)
+        ti.loop_config(serialize=not self.parallel)
+        for f in range(plan.num_faces):
+            faces.done[f] = ti.cast(0, self.fp)
+
+    @cached_property
+    def begins(self) -> Kernel:
+        return self._kernel("begins", self.all_begins)
+
+    @ti.func
+    def push(self, f, k, now: A, scene: A, faces: A, plan: A):
+        if faces.near[f] > 0:
+            then = self.when(now, self.share_of(k, plan))
+            self.force_of(f, self.rows_of(f, faces.place, k, faces), self.part_length(now, plan), then, scene, faces, plan)
+
+    @ti.func
+    def go_on(self, s, k, now: A, scene: A, faces: A, state: A, plan: A):
+        length, inverse, whole = self.part_length(now, plan), scene.inverse_mass[faces.vertices[s]], self.gathered(s, faces)
+        before = faces.speed[k, s]
+        after = before + length * inverse * self.direct(whole)
+        faces.shift[s] = faces.shift[s] + ti.cast(0.5, self.fp) * length * (before + after)
+        faces.speed[k + 1, s] = after
+        faces.load[s] = ti.max(faces.load[s], length * length * whole[3] * inverse)
+        if k + 1 < plan.n:
+            self.put(s, k + 1, scene, faces, state, now, plan)
+
+    @ti.func
+    def all_parts(self, scene: A, faces: A, state: A, table: A, plan: A):
+        if ti.static(self.parallel):
+            for f in range(plan.num_faces):
+                self.push(f, plan.k, pass_at(table, plan.first - plan.window), scene, faces, plan)
+            for s in range(plan.num_surface):
+                self.go_on(s, plan.k, pass_at(table, plan.first - plan.window), scene, faces, state, plan)
+        else:
+            ti.loop_config(serialize=True)
+            for k in range(plan.n):
+                now = pass_at(table, plan.first - plan.window)
+                for f in range(plan.num_faces):
+                    self.push(f, k, now, scene, faces, plan)
+                for s in range(plan.num_surface):
+                    self.go_on(s, k, now, scene, faces, state, plan)
+
+    @cached_property
+    def parts_of_pass(self) -> Kernel:
+        """All parts, or on all threads part k alone."""
+        return self._kernel("parts", self.all_parts)
+
+    # ---- the end, and what happened ----------------------------------------------------------------------------------
 
     @ti.func
     def look_at(self, f, now: A, scene: A, faces: A, state: A, plan: A, watch: A):
-        """Note how near a face in a barrier is, or one that went farther than it was away, and x (state/watch.py)."""
-        u, load, column = self.rows_at(f, state.u, plan.slot, faces), ti.cast(0, self.fp), plan.num_vertices + f
-        moved = self.rows(0)
+        """Note how near a face came in each part, and d^2 D / m (state/watch.py)."""
+        load, column, before = ti.cast(0, self.fp), plan.num_vertices + f, self.rows_at(f, faces.begin, 0, faces)
         for a in ti.static(range(3)):
-            i, before = faces.corners[3 * f + a], faces.before[3 * f + a]
-            whole = faces.whole[faces.own[3 * f + a]]
-            load = ti.max(load, self.load(i, whole[3], scene, plan))
-            for m in ti.static(range(3)):
-                moved[a, m] = u[a, m] - before[m]
-        if ti.static(self.features.moving > 0):  # of moving obstacles, where the pass takes their force
-            share, _ = self.taken(load)
-            faces.work[f] = faces.work[f] + share * faces.done[f]
-        for g in ti.static(self.groups):
-            for k in range(g.count):
-                n, place = g.number + k, self.place(g, k, now, scene.path)
-                drift, move = self.place_at(g, k, now.end, now, scene.path) - place, moved
-                for a in ti.static(range(3)):
-                    for m in ti.static(range(3)):
-                        move[a, m] -= drift[m]
-                least, width = (
-                    faces.least[f * ti.static(self.num_obstacles) + n],
-                    g.force.width(scene.parameters, g.first + k * g.size),
-                )
-                felt = least < width
-                if least < self.size_of_rows(move):
-                    X = self.rest_rows(f, scene.rest, place + drift, faces)
-                    least = self.nearest(g, k, f, X, u, move, scene, faces)
-                elif felt:
-                    least += faces.reach[f * ti.static(self.num_obstacles) + n]
-                if felt or least < width:
-                    watch.seen[3 * n, column] = ti.min(watch.seen[3 * n, column], least)
-                    watch.seen[3 * n + 1, column] = ti.max(watch.seen[3 * n + 1, column], load)
+            load = ti.max(load, faces.load[faces.own[3 * f + a]])
+        began = now.begin + ti.cast(0, self.fp)
+        for k in range(plan.n + 1):
+            end, u = now.end + ti.cast(0, self.fp), self.rows_at(f, state.u, plan.slot, faces)
+            if k < plan.n:
+                end, u = now.begin + self.share_of(k, plan) * (now.end - now.begin), self.rows_of(f, faces.place, k, faces)
+            for g in ti.static(self.groups):
+                for o in range(g.count):
+                    n, place = g.number + o, self.place_at(g, o, end, now, scene.path)
+                    drift, move = place - self.place_at(g, o, began, now, scene.path), u - before
+                    for a in ti.static(range(3)):
+                        for m in ti.static(range(3)):
+                            move[a, m] -= drift[m]
+                    X, width = (
+                        self.rest_rows(f, scene.rest, place, faces),
+                        g.force.width(scene.parameters, g.first + o * g.size),
+                    )
+                    if self.bound(g, o, f, X, u, self.size_of_rows(move), scene, faces) < width:
+                        least = self.nearest(g, o, f, X, u, move, scene, faces)
+                        if least < width:
+                            watch.seen[3 * n, column] = ti.min(watch.seen[3 * n, column], least)
+                            watch.seen[3 * n + 1, column] = ti.max(watch.seen[3 * n + 1, column], load)
+            before, began = u, end
 
     @ti.func
-    def all_looks(self, scene: A, faces: A, state: A, table: A, watch: A, plan: A):
-        ti.loop_config(serialize=not self.parallel)
-        for f in range(plan.num_faces):
-            self.look_at(f, pass_at(table, plan.first - plan.window), scene, faces, state, plan, watch)
-
-    @cached_property
-    def looks(self) -> Kernel:
-        """After a pass that led to u[slot]."""
-        return self._kernel("looks", self.all_looks, watch=dict(seen="scalars2"))
-
-    # ---- stiffness, between passes ---------------------------------------------------------------------------------------
-
-    @ti.func
-    def seed_rows(self, f, faces: A):
-        out = self.rows(0)
-        for a in ti.static(range(3)):
-            x = faces.seed[faces.own[3 * f + a]]
-            for m in ti.static(range(4)):
-                out[a, m] = x[m]
-        return out
-
-    @ti.func
-    def all_products(self, scene: A, faces: A, state: A, table: A, at: A, plan: A):
+    def all_ends(self, scene: A, faces: A, state: A, table: A, watch: A, plan: A):
         ti.loop_config(serialize=not self.parallel)
         for s in range(plan.num_surface):
             i = faces.vertices[s]
-            g, _ = self.taken(self.load(i, faces.whole[s][3], scene, plan))
-            faces.seed[s] = ti.sqrt(g) * self.direct(at.w[0, i])
+            state.u[plan.slot, i] = state.u[plan.slot, i] + faces.shift[s]
+            state.v[plan.slot, i] = state.v[plan.slot, i] + faces.speed[plan.n, s]
         ti.loop_config(serialize=not self.parallel)
         for f in range(plan.num_faces):
-            total, u, w = self.rows(0), self.rows_at(f, state.u, plan.slot, faces), self.seed_rows(f, faces)
-            now = pass_at(table, plan.first - plan.window)
-            for g in ti.static(self.groups):
-                for k in range(g.count):
-                    X = self.rest_rows(f, scene.rest, self.where(g, k, now, scene, faces, plan), faces)
-                    rows, _ = self.face("product", g, k, f, X, u, w, scene, faces, scene)
-                    total += rows
-            self.store(f, total, faces)
-        ti.loop_config(serialize=not self.parallel)
-        for s in range(plan.num_surface):
-            i = faces.vertices[s]
-            g, _ = self.taken(self.load(i, faces.whole[s][3], scene, plan))
-            scene.corner[plan.first_out + s] = ti.sqrt(g) * self.gathered(s, faces)
+            faces.work[f] = faces.work[f] + faces.done[f]
+            if faces.near[f] > 0:
+                self.look_at(f, pass_at(table, plan.first - plan.window), scene, faces, state, plan, watch)
 
     @cached_property
-    def products(self) -> Kernel:
-        """sqrt(g) df/du sqrt(g) w: what a pass takes of the stiffness, made symmetric; its eigenvalues are the same. As all
-        below after `forces` at the same place."""
-        return self._kernel("products", self.all_products, at=dict(w="vectors2"))
-
-    # ---- tangent -----------------------------------------------------------------------------------------------------
-
-    @ti.func
-    def all_jvp(self, scene: A, faces: A, state: A, table: A, tangent: A, plan: A):
-        ti.loop_config(serialize=not self.parallel)
-        for f in range(plan.num_faces):
-            now, total = pass_at(table, plan.first - plan.window), self.rows(0)
-            u, du = self.rows_at(f, state.u, plan.slot, faces), self.rows_at(f, tangent.u, 0, faces)
-            for g in ti.static(self.groups):
-                for k in range(g.count):
-                    X = self.rest_rows(f, scene.rest, self.where(g, k, now, scene, faces, plan), faces)
-                    w = du + self.rest_rows(f, tangent.rest, self.place(g, k, now, tangent.path), faces)
-                    rows, _ = self.face("jvp", g, k, f, X, u, w, scene, faces, tangent)
-                    total += rows
-            self.store(f, total, faces)
-        ti.loop_config(serialize=not self.parallel)
-        for s in range(plan.num_surface):
-            i, whole, change = faces.vertices[s], faces.whole[s], self.gathered(s, faces)
-            x, inverse = self.load(i, whole[3], scene, plan), scene.inverse_mass[i]
-            g, slope = self.taken(x)
-            dx = self.load(i, change[3], scene, plan) - x * inverse * tangent.mass[i]
-            scene.corner[plan.first_out + s] = g * self.direct(change) + slope * dx * self.direct(whole)
-
-    @cached_property
-    def jvp(self) -> Kernel:
-        """Change of the forces for changes of everything that they depend on."""
-        return self._kernel("jvp", self.all_jvp, tangent=dict(u="vectors2") | TANGENT)
-
-    # ---- adjoint -----------------------------------------------------------------------------------------------------
-
-    @ti.func
-    def seed_vertex(self, s, scene: A, faces: A, adjoint: A, plan: A):
-        """Adjoints of (f, D) at a surface vertex; adds that of its mass."""
-        i, whole = faces.vertices[s], faces.whole[s]
-        w, x, inverse = adjoint.w[0, i], self.load(i, whole[3], scene, plan), scene.inverse_mass[i]
-        g, slope = self.taken(x)
-        by_x, seed = slope * self.dot3(whole, w), g * self.direct(w)
-        seed[3] = by_x * plan.h * plan.h * inverse
-        faces.seed[s] = seed
-        if ti.static(self.features.density):
-            row = ti.static(self.features.sums().first("mass"))
-            adjoint.sums[row, i] = adjoint.sums[row, i] - by_x * x * inverse
-
-    @ti.func
-    def all_vjp(self, scene: A, faces: A, state: A, table: A, adjoint: A, own: A, plan: A):
-        ti.loop_config(serialize=not self.parallel)
-        for s in range(plan.num_surface):
-            self.seed_vertex(s, scene, faces, adjoint, plan)
-        ti.loop_config(serialize=not self.parallel)
-        for f in range(plan.num_faces):
-            now, total = self.noting(pass_at(table, plan.first - plan.window), plan), self.rows(0)
-            u, w = self.rows_at(f, state.u, plan.slot, faces), self.seed_rows(f, faces)
-            for g in ti.static(self.groups):
-                for k in range(g.count):
-                    X = self.rest_rows(f, scene.rest, self.where(g, k, now, scene, faces, plan), faces)
-                    rows, _ = self.face("vjp", g, k, f, X, u, w, scene, faces, own)
-                    total += rows
-                    by_X = self.row_of(rows, 0) + self.row_of(rows, 1) + self.row_of(rows, 2)
-                    self.add_to_path(g, k, f, now, by_X, self.vector(0), own)
-            self.store(f, total, faces)
-        ti.loop_config(serialize=not self.parallel)
-        for s in range(plan.num_surface):
-            by_u = self.gathered(s, faces)
-            adjoint.corner[plan.first_out + s] = by_u
-            own.rest_adj[s] = own.rest_adj[s] + by_u
-        if ti.static(self.features.moving > 0):
-            for p in range(ti.static(self.features.moving) * plan.num_parts):
-                self.fold_part(p, plan.num_faces, plan.first, plan.first, own, table, plan)
-
-    @cached_property
-    def vjp(self) -> Kernel:
-        """Adjoints of u to the corners that vertices gather, for the adjoint w of the forces; adds those of all else."""
-        adjoint = dict(w="vectors2", corner="vectors", sums=ADJOINT["sums"])
-        return self._kernel("vjp", self.all_vjp, adjoint=adjoint, own=OF_FACES)
+    def ends(self) -> Kernel:
+        """Add to the state what the parts did, and note how near faces came."""
+        return self._kernel("ends", self.all_ends, watch=dict(seen="scalars2"))
 
 
 @lru_cache(maxsize=None)

@@ -78,6 +78,16 @@ class FaceRows(ObstacleStages):
         return out
 
     @ti.func
+    def rows_of(self, f, array: A, k, faces: A):
+        """array[k, s] of the surface vertices that are the corners of a face."""
+        out = self.rows(0)
+        for a in ti.static(range(3)):
+            x = array[k, faces.own[3 * f + a]]
+            for m in ti.static(range(4)):
+                out[a, m] = x[m]
+        return out
+
+    @ti.func
     def rest_rows(self, f, rest: A, place, faces: A):
         """rest[i] - place at the corners of a face."""
         out = self.rows(0)

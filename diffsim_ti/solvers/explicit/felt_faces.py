@@ -1,18 +1,17 @@
 """Faces of a run of an explicit solver that feel obstacles between their corners."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
-from diffsim_ti.contact.buffers import whole
 from diffsim_ti.mesh import geometry
 from diffsim_ti.potential.face_lattice import BENT, face_rows
+from diffsim_ti.solvers.explicit.face_derivatives import face_derivatives
 from diffsim_ti.solvers.explicit.face_kernels import face_kernels
 from diffsim_ti.state.arrays import copy_slot
 from diffsim_ti.terms.obstacles.barrier import beta
 
+TRAVEL, LOAD = 0.2, 0.2
 
 def feels_faces(scene) -> bool:
     """Whether a scene has an obstacle that could reach into a face of the body between its corners.
@@ -28,7 +27,13 @@ def feels_faces(scene) -> bool:
 
 
 class FeltFaces:
-    """Their arrays, and what kernels (face_kernels.py) do with them, at a slot of a run's states."""
+    """Their arrays, and what kernels (face_kernels.py) do with them, at a slot of a run's states.
+
+    A pass is gone in a power of two of parts, `most_parts` at most: in each no face goes farther than TRAVEL widths, and
+    d^2 D / m is LOAD at most.
+    """
+
+    most_parts = 1024
 
     def __init__(self, workspace):
         self.ws, a = workspace, workspace.arrays
@@ -44,64 +49,102 @@ class FeltFaces:
         for name, data in ints.items():
             setattr(self, name, runtime.upload(data.ravel(), ti.i32))
         self.reach, self.weight = (runtime.upload(x[first].ravel(), fp) for x in (reach, weight))
-        self.share, self.before = (runtime.array(a.vector, 3 * len(faces)) for _ in range(2))
-        self.whole, self.seed = (runtime.array(a.vector, len(surface)) for _ in range(2))
+        self.share, self.begin = runtime.array(a.vector, 3 * len(faces)), runtime.array(a.vector, 1, a.num_vertices)
+        self.whole, self.shift = (runtime.array(a.vector, len(surface)) for _ in range(2))
         self.least, self.offsets = runtime.array(fp, len(faces) * len(a.contacts)), a.offsets
-        self.done, self.work = (
-            runtime.array(fp, len(faces)) for _ in range(2)
-        )  # by moving obstacles, see EnergyBalance
+        self.near, self.load = runtime.array(ti.i32, len(faces)), runtime.array(fp, len(surface))
+        # of each face: energy; work of moving obstacles in a pass, and in all (EnergyBalance); its way in widths
+        self.energy, self.done, self.work, self.need = (runtime.array(fp, len(faces)) for _ in range(4))
         runtime.fill(self.work, 0)
-        self.energy, self.w = runtime.array(fp, len(faces)), runtime.array(a.vector, 1, a.num_vertices)
+        self.row, self.place = runtime.array(a.vector, 1, a.num_vertices), None
+        self._make_room(1)
+        self.kept = {}  # of recorded passes in which faces came near, by slots: (parts, state without their contact)
+        self.saturated = False  # whether the last pass would have taken more parts than there may be
 
-    def _run(self, name: str, plan: dict, slot: int, features=None, between=False, u=None, **records) -> None:
+    def _make_room(self, n: int) -> None:
+        """For n parts of a pass."""
+        if self.place is None or self.place.shape[0] < n:
+            self.place = runtime.array(self.a.vector, n, self.num_surface)
+            self.speed = runtime.array(self.a.vector, n + 1, self.num_surface)
+
+    def _run(self, name: str, plan: dict, state, slot: int, n=1, k=0, features=None, between=False, **records) -> None:
         a, ws = self.a, self.ws
+        kernels = face_kernels if features is None else face_derivatives
         features = a.features() if features is None else features
-        kernel = getattr(face_kernels(features, a.precision, ws.parallel), name)
-        state = SimpleNamespace(u=ws.state.u) if u is None else SimpleNamespace(u=u)
-        key = ("faces", kernel, id(state.u), *(id(x) for x in records.values()))
-
-        def bind():
-            return kernel.bind(scene=a, faces=self, state=state, table=ws.table, **records), records
-
+        kernel = getattr(kernels(features, a.precision, ws.parallel), name)
+        # bound anew with the scene's, or with more room for parts
+        launches = ws.kept(("faces", id(self.place)), lambda: (self.place, {}))[1]
+        key = (kernel, id(state.u), *(id(x) for x in records.values()))
+        if key not in launches:
+            own = dict(scene=a, faces=self, state=state, table=ws.table)
+            launches[key] = kernel.bind(**own, **records), state, records
         sizes = dict(num_vertices=a.num_vertices, num_faces=self.num_faces, num_surface=self.num_surface)
-        own = sizes | dict(first_out=a.first_face_corner, slot=slot, between=int(between), h=ws.solver.substep)
-        ws.kept(key, bind)[0](**own | {name: plan.get(name, 0) for name in ("first", "window", "steps", "num_parts")})
+        own = sizes | dict(slot=slot, between=int(between), h=ws.solver.substep, n=n, k=k)
+        numbers = ("first", "window", "steps", "num_parts")
+        launches[key][0](**own | {name: plan.get(name, 0) for name in numbers if name in kernel.numbers})
+
+    def _run_parts(self, name: str, plan: dict, state, slot: int, n: int, back=False, **records) -> None:
+        """All parts: in one launch, or on all threads one after the other."""
+        order = (range(n)[::-1] if back else range(n)) if self.ws.parallel else [0]
+        for k in order:
+            self._run(name, plan, state, slot, n, k, **records)
 
     # ---- in passes ---------------------------------------------------------------------------------------------------
 
-    def forces(self, u, slot: int, plan: dict, **where) -> None:
-        """Forces at u[slot], where pass plan["first"] begins, to the last corners of the scene."""
-        self._run("forces", plan, slot, u=u, **where)
+    def before_pass(self, history, slot: int) -> None:
+        """A pass begins at a slot."""
+        copy_slot(history.u, slot, self.begin, 0)
 
-    def look(self, u, slot: int, plan: dict) -> None:
-        """After the pass, which led to u[slot]: note what faces did in it."""
-        self._run("looks", plan, slot, u=u, watch=self.ws.watch)
+    def after_pass(self, history, slot: int, plan: dict, recording: bool) -> None:
+        """The pass led to a slot: go its way again where faces come near, and note what they did."""
+        self.kept.pop(slot, None)
+        self._run("approaches", plan, history, slot)
+        n = self._fewest_parts()
+        while n:
+            self._go(history, slot, plan, n)
+            load = float(_seen(self.load).max())
+            if not load > LOAD or n >= self.most_parts:
+                break
+            more = np.sqrt(load / LOAD) if np.isfinite(load) else 2.0
+            n = min(self.most_parts, n * _power_of_two(max(min(more, 64.0), 1.01)))
+        if n:
+            self.saturated = n >= self.most_parts
+            if recording:
+                self.kept[slot] = n, runtime.fetch_row(history.u, slot), runtime.fetch_row(history.v, slot)
+            self._run("ends", plan, history, slot, n, watch=self.ws.watch)
 
-    def jvp(self, u, slot: int, plan: dict, features, tangent) -> None:
-        """Change of the forces for the change of the state, and of all else, to the same corners."""
-        self.forces(u, slot, plan)
-        self._run("jvp", plan, slot, features, u=u, tangent=tangent)
+    def _fewest_parts(self) -> int:
+        """How many parts the ways of faces ask for; 0 if none comes near."""
+        if not _seen(self.near).any():
+            return 0
+        need = float(_seen(self.need).max())
+        return min(self.most_parts, _power_of_two(need / TRAVEL)) if np.isfinite(need) else 1
+
+    def _go(self, history, slot: int, plan: dict, n: int) -> None:
+        self._make_room(n)
+        self._run("begins", plan, history, slot, n)
+        self._run_parts("parts_of_pass", plan, history, slot, n)
+
+    def alone(self, history, slot: int) -> "Alone | None":
+        """The recorded pass to a slot without contact within faces, if there was some."""
+        return Alone(self, history, slot) if slot in self.kept else None
 
     # ---- between passes ----------------------------------------------------------------------------------------------
 
+    def _forces(self) -> None:
+        self._run("forces", {}, self.ws.state, 0, between=True)
+
     def energies(self) -> np.ndarray:
         """Energy [J] of points within each face, in the current state."""
-        self.forces(self.ws.state.u, 0, {}, between=True)
+        self._forces()
         return runtime.fetch(self.energy).astype(np.float64)
-
-    def load_of(self, vertices) -> float:
-        """The largest x = h^2 D / m (face_kernels.py) of vertices in the current state."""
-        self.forces(self.ws.state.u, 0, {}, between=True)
-        i = np.array(vertices)
-        D = whole(self.whole)[np.searchsorted(self.mesh.surface_vertices, i), 3]
-        return float((D * runtime.fetch(self.a.inverse_mass)[i]).max()) * self.ws.solver.substep**2
 
     def stiffening(self, vertices, contact: int, speeds: np.ndarray) -> float:
         """How many times stiffer a barrier must be to stop a face of that speed [m/s] at a fiftieth of the width.
 
         Twice what takes up the kinetic energy of its corners and what it holds in the current state; at least 4.
         """
-        self.forces(self.ws.state.u, 0, {}, between=True)
+        self._forces()
         f = int(np.flatnonzero((self.mesh.surface_triangles == np.array(vertices)).all(1))[0])
         width = float(self.a.contacts[contact].values["barrier_width"])
         near = runtime.fetch(self.least)[f * len(self.a.contacts) + contact] / width
@@ -110,19 +153,73 @@ class FeltFaces:
         most = held * float(beta(0.02) / max(beta(np.clip(near, 1e-3, 1)), 1e-9))
         return float(np.clip(2 * (held + moving) / max(most, 1e-300), 4.0, 1e4))
 
-    def product(self, w) -> None:
-        """Products with the stiffness that passes take, for w[0] (face_kernels.py), to the last corners of the scene."""
-        copy_slot(w, 0, self.w, 0)
-        self.forces(self.ws.state.u, 0, {}, between=True)
-        self._run("products", {}, 0, between=True, at=self)
+
+class Alone:
+    """A recorded pass, gone again without contact within faces and then with it; `with` leaves the record as it was."""
+
+    def __init__(self, faces: FeltFaces, history, slot: int):
+        self.faces, self.history, self.slot = faces, history, slot
+        self.n, *self._state = faces.kept[slot]
+
+    def __enter__(self) -> "Alone":
+        self._whole = [runtime.fetch_row(x, self.slot) for x in (self.history.u, self.history.v)]
+        self._put(self._state)
+        return self
+
+    def __exit__(self, *_) -> None:
+        self._put(self._whole)
+
+    def _put(self, state) -> None:
+        for target, data in zip((self.history.u, self.history.v), state):
+            runtime.fill(self.faces.row, data[None])
+            copy_slot(self.faces.row, 0, target, self.slot)
+
+    def go(self, plan: dict) -> None:
+        """Its parts again, from where the pass begins, the slot before."""
+        faces = self.faces
+        faces.before_pass(self.history, self.slot - 1)
+        faces._run("approaches", plan, self.history, self.slot)
+        faces._go(self.history, self.slot, plan, self.n)
 
 
-class FeltAdjoint:
-    """What adjoints of a run have of faces: sums over the passes, by faces and surface vertices."""
+class FaceChanges:
+    """Changes, or adjoints, of what faces do in recorded passes."""
+
+    def __init__(self, faces: FeltFaces, features):
+        a, self.faces, self.features = faces.a, faces, features
+        self.shift_dot, self.speed_dot, self.seed, self.begin_dot = (
+            runtime.array(a.vector, faces.num_surface) for _ in range(4)
+        )
+
+    def _run(self, name: str, alone: Alone, plan: dict, in_parts=False, **records) -> None:
+        run = self.faces._run_parts if in_parts else self.faces._run
+        run(name, plan, alone.history, alone.slot, alone.n, features=self.features, own=self, **records)
+
+
+class FeltTangent(FaceChanges):
+    """The tangent of passes; at: what holds the changes u and v of the state, numbers: those of all else."""
+
+    def __init__(self, tangent, faces: FeltFaces):
+        super().__init__(faces, tangent.features)
+        self.at, self.of_all = tangent, (tangent, tangent.numbers)
+
+    def start(self, alone: Alone, plan: dict) -> None:
+        """Before the rest of the pass."""
+        self._run("begin_jvp", alone, plan, tangent=self.at)
+
+    def end(self, alone: Alone, plan: dict) -> None:
+        """After it."""
+        alone.go(plan)
+        self._run("jvp", alone, plan, in_parts=True, tangent=self.of_all)
+
+
+class FeltAdjoint(FaceChanges):
+    """The adjoint of passes: sums over them, by faces and surface vertices."""
 
     def __init__(self, adjoint, faces: FeltFaces):
+        super().__init__(faces, adjoint.features)
         a, features = faces.a, adjoint.features
-        self.faces, self.adjoint, self.features = faces, (adjoint, adjoint.numbers), features
+        self.at, self.of_all = adjoint, (adjoint, adjoint.numbers)
         self.path, self.num_parts = adjoint.path, adjoint.num_parts
         self.sums = runtime.array(a.fp, features.num_parameters, faces.num_faces)
         self.felt = runtime.array(a.vector, 2 * features.moving, faces.num_faces if features.moving else 1)
@@ -132,11 +229,15 @@ class FeltAdjoint:
         for x in (self.sums, self.felt, self.rest_adj, self.by_areas):
             runtime.fill(x, 0)
 
-    def reverse(self, u, slot: int, plan: dict) -> None:
-        """Go back through the forces at u[slot] of pass plan["first"]."""
-        self.faces.forces(u, slot, plan)
+    def start(self, alone: Alone, plan: dict) -> None:
+        """Go back through the contact of faces, the last thing that the pass did."""
+        alone.go(plan)
         plan = plan | dict(steps=1, num_parts=self.num_parts)
-        self.faces._run("vjp", plan, slot, self.features, u=u, adjoint=self.adjoint, own=self)
+        self._run("vjp", alone, plan, in_parts=True, adjoint=self.of_all, out=self)
+
+    def end(self, alone: Alone, plan: dict) -> None:
+        """The rest of the pass is reversed."""
+        self._run("begin_vjp", alone, plan, adjoint=self.at)
 
     def collect(self, out) -> None:
         """Add the adjoints of parameters and rest positions to a `Derived`."""
@@ -147,3 +248,13 @@ class FeltAdjoint:
         by_areas = runtime.fetch(self.by_areas).astype(np.float64)
         by_areas /= np.linalg.norm(geometry.triangle_normals(rest, faces), axis=1)
         out.rest += geometry.triangle_areas_vjp(rest, faces, by_areas)
+
+
+def _seen(array) -> np.ndarray:
+    host = runtime.view(array)
+    return runtime.fetch(array) if host is None else host
+
+
+def _power_of_two(x: float) -> int:
+    """The least that is not below x >= 0."""
+    return 1 << max(0, int(np.ceil(np.log2(max(x, 1.0)))))

@@ -11,6 +11,7 @@ from diffsim_ti import runtime
 from diffsim_ti.contact.surface_pairs import Tunnelling
 from diffsim_ti.inputs import Derived
 from diffsim_ti.monitor.energy_balance import EnergyBalance
+from diffsim_ti.potential.way import Way
 from diffsim_ti.solvers.explicit.adjoint import ExplicitAdjoint, ExplicitTangent
 from diffsim_ti.solvers.explicit.contact_stage import ROWS
 from diffsim_ti.solvers.explicit.felt_faces import FeltFaces, feels_faces
@@ -127,6 +128,21 @@ class ExplicitWorkspace(Workspace):
         self.probe = None  # room for a pass that is not taken
         self.energy_watch = EnergyBalance(self) if EnergyBalance.knows(a.law) else None
 
+    def load(self, derived: Derived) -> None:
+        super().load(derived)
+        self.check_apart()
+
+    def forget(self) -> None:
+        super().forget()
+        self.check_apart()
+
+    def check_apart(self) -> None:
+        """Raise ValueError if a face is in an obstacle that faces feel."""
+        a = self.arrays
+        if a.feels_faces:
+            way = self.kept("way", lambda: Way(a, self.parallel))
+            way.check_apart(runtime.fetch_row(self.state.u, 0), runtime.fetch(a.offsets)[::3].astype(np.float64))
+
     def forces_at(self, j: int, num_passes: int) -> np.ndarray:
         """Forces [N] on each vertex in the current state, gravity and stages left out, as pass j of a run takes them."""
         if self.probe is None:
@@ -138,8 +154,6 @@ class ExplicitWorkspace(Workspace):
         seen, step = self.watch.rows(), self.kernels(self.arrays.features()).step
         launch = self.bound(step, state=(self.probe, self.frames, self.watch, self.contact), table=self.table)
         for numbers in self.launches(j, j + 1, num_passes, 0, 1):
-            if self.faces:
-                self.faces.forces(self.probe.u, 0, numbers)
             launch(**numbers, base=j, stride=1)
         self.watch.put(seen)
         return runtime.fetch(self.probe.f)[0].astype(np.float64)
@@ -196,10 +210,10 @@ class ExplicitWorkspace(Workspace):
             if pairs:
                 pairs.forces(history.u, slot, self.arrays.corner)
             if self.faces:
-                self.faces.forces(history.u, slot, numbers)
+                self.faces.before_pass(history, slot)
             launch(**numbers, base=base, stride=stride)
             if self.faces:
-                self.faces.look(history.u, slot + stride, numbers)
+                self.faces.after_pass(history, slot + stride, numbers, recording)
             if pairs:
                 try:
                     pairs.check_pass(history.u, slot + stride, self.solver.substep)

@@ -26,12 +26,7 @@ class ObstacleWays:
     def check_apart(self) -> None:
         """Raise ValueError if a face is in an obstacle, which vertices alone do not show."""
         u, walls = runtime.fetch_row(self.state.u, 0), runtime.fetch(self.arrays.offsets)[::3].astype(np.float64)
-        met = self.way.nearest(u, walls[: len(self.way.terms)]) if np.all(np.isfinite(u)) else None
-        if met is not None:
-            raise ValueError(
-                f"{self.way.terms[met.obstacle]!r} reaches {-met.value:.3g} m into {met} of the body: move the body or the "
-                "obstacle"
-            )
+        self.way.check_apart(u, walls[: len(self.way.terms)])
 
     def _walls_at_end(self, j: int) -> np.ndarray:
         """Displacements of the obstacles at the end of pass j."""

@@ -1,0 +1,192 @@
+"""Tangent and adjoint of contact within faces in an explicit pass (face_kernels.py), along the parts that it was gone in."""
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+import taichi as ti
+
+from diffsim_ti.runtime import Kernel
+from diffsim_ti.solvers.explicit.face_kernels import FaceKernels
+from diffsim_ti.state.features import Features
+from diffsim_ti.state.numbers import ADJOINT, TANGENT
+from diffsim_ti.state.schedule import pass_at
+
+A = ti.template()
+# of surface vertices: changes, or adjoints, of e and v; what a part is given; those of u0
+OWN = dict.fromkeys(("shift_dot", "speed_dot", "seed", "begin_dot"), "vectors")
+OF_FACES = dict(sums="scalars2", felt="vectors2", path="vectors2", rest_adj="vectors", by_areas="scalars")
+
+
+@dataclass(frozen=True)
+class FaceDerivatives(FaceKernels):
+    """After `begins` and `parts_of_pass` with the same number of parts."""
+
+    # ---- tangent -----------------------------------------------------------------------------------------------------
+
+    @ti.func
+    def put_change(self, s, k, now: A, faces: A, tangent: A, own: A, plan: A):
+        """Change of where part k takes its forces."""
+        i, half = faces.vertices[s], ti.cast(0.5, self.fp)
+        if k == 0:
+            own.shift_dot[s], own.speed_dot[s] = self.vector(0), self.vector(0)
+        change = own.begin_dot[s] + self.share_of(k, plan) * (tangent.u[0, i] - own.begin_dot[s])
+        own.seed[s] = change + own.shift_dot[s] + half * self.part_length(now, plan) * own.speed_dot[s]
+
+    @ti.func
+    def push_jvp(self, f, k, now: A, scene: A, faces: A, tangent: A, own: A, plan: A):
+        if faces.near[f] > 0:
+            then, total = self.when(now, self.share_of(k, plan)), self.rows(0)
+            u, du = self.rows_of(f, faces.place, k, faces), self.seed_rows(f, own, faces)
+            for g in ti.static(self.groups):
+                for o in range(g.count):
+                    X = self.rest_rows(f, scene.rest, self.place(g, o, then, scene.path), faces)
+                    w = du + self.rest_rows(f, tangent.rest, self.place(g, o, then, tangent.path), faces)
+                    rows, _ = self.face("jvp", g, o, f, X, u, w, scene, faces, tangent)
+                    total += rows
+            self.store(f, total, faces)
+
+    @ti.func
+    def go_on_jvp(self, s, k, now: A, scene: A, faces: A, tangent: A, own: A, plan: A):
+        i, length, half = faces.vertices[s], self.part_length(now, plan), ti.cast(0.5, self.fp)
+        inverse, before = scene.inverse_mass[i], own.speed_dot[s]
+        gained = faces.speed[k + 1, s] - faces.speed[k, s]
+        after = before + length * inverse * self.direct(self.gathered(s, faces)) - inverse * tangent.mass[i] * gained
+        own.shift_dot[s] = own.shift_dot[s] + half * length * (before + after)
+        own.speed_dot[s] = after
+        if k == plan.n - 1:
+            tangent.u[0, i] = tangent.u[0, i] + own.shift_dot[s]
+            tangent.v[0, i] = tangent.v[0, i] + after
+
+    @ti.func
+    def all_jvp(self, scene: A, faces: A, state: A, table: A, tangent: A, own: A, plan: A):
+        if ti.static(self.parallel):
+            for s in range(plan.num_surface):
+                self.put_change(s, plan.k, pass_at(table, plan.first - plan.window), faces, tangent, own, plan)
+            for f in range(plan.num_faces):
+                self.push_jvp(f, plan.k, pass_at(table, plan.first - plan.window), scene, faces, tangent, own, plan)
+            for s in range(plan.num_surface):
+                self.go_on_jvp(s, plan.k, pass_at(table, plan.first - plan.window), scene, faces, tangent, own, plan)
+        else:
+            ti.loop_config(serialize=True)
+            for k in range(plan.n):
+                now = pass_at(table, plan.first - plan.window)
+                for s in range(plan.num_surface):
+                    self.put_change(s, k, now, faces, tangent, own, plan)
+                for f in range(plan.num_faces):
+                    self.push_jvp(f, k, now, scene, faces, tangent, own, plan)
+                for s in range(plan.num_surface):
+                    self.go_on_jvp(s, k, now, scene, faces, tangent, own, plan)
+
+    @cached_property
+    def jvp(self) -> Kernel:
+        """Change of the state at the end of a pass, where that without contact within faces stands in `tangent`."""
+        arrays = dict(tangent=dict(u="vectors2", v="vectors2") | TANGENT, own=OWN)
+        return self._kernel("jvp", self.all_jvp, **arrays)
+
+    # ---- adjoint -----------------------------------------------------------------------------------------------------
+
+    @ti.func
+    def seed_rows(self, f, own: A, faces: A):
+        out = self.rows(0)
+        for a in ti.static(range(3)):
+            x = own.seed[faces.own[3 * f + a]]
+            for m in ti.static(range(4)):
+                out[a, m] = x[m]
+        return out
+
+    @ti.func
+    def seed_force(self, s, k, now: A, scene: A, faces: A, adjoint: A, own: A, plan: A):
+        """Adjoint of the force of part k at a surface vertex; adds that of its mass."""
+        i, half, length = faces.vertices[s], ti.cast(0.5, self.fp), self.part_length(now, plan)
+        if k == plan.n - 1:
+            own.shift_dot[s], own.speed_dot[s] = self.direct(adjoint.u[0, i]), self.direct(adjoint.v[0, i])
+            own.begin_dot[s] = self.vector(0)
+        q, inverse = own.speed_dot[s] + half * length * own.shift_dot[s], scene.inverse_mass[i]
+        own.speed_dot[s] = q
+        own.seed[s] = length * inverse * q
+        if ti.static(self.features.density):
+            row, gained = ti.static(self.features.sums().first("mass")), faces.speed[k + 1, s] - faces.speed[k, s]
+            adjoint.sums[row, i] = adjoint.sums[row, i] - inverse * self.dot3(q, gained)
+
+    @ti.func
+    def push_vjp(self, f, k, now: A, scene: A, faces: A, out: A, own: A, plan: A):
+        if faces.near[f] > 0:
+            then, total = self.noting(self.when(now, self.share_of(k, plan)), plan), self.rows(0)
+            u, w = self.rows_of(f, faces.place, k, faces), self.seed_rows(f, own, faces)
+            for g in ti.static(self.groups):
+                for o in range(g.count):
+                    X = self.rest_rows(f, scene.rest, self.place(g, o, then, scene.path), faces)
+                    rows, _ = self.face("vjp", g, o, f, X, u, w, scene, faces, out)
+                    total += rows
+                    by_X = self.row_of(rows, 0) + self.row_of(rows, 1) + self.row_of(rows, 2)
+                    self.add_to_path(g, o, f, then, by_X, self.vector(0), out)
+            self.store(f, total, faces)
+
+    @ti.func
+    def go_back(self, s, k, now: A, faces: A, adjoint: A, out: A, own: A, plan: A):
+        i, share, by_u = faces.vertices[s], self.share_of(k, plan), self.direct(self.gathered(s, faces))
+        half = ti.cast(0.5, self.fp) * self.part_length(now, plan)
+        own.speed_dot[s] = own.speed_dot[s] + half * (own.shift_dot[s] + by_u)
+        own.shift_dot[s] = own.shift_dot[s] + by_u
+        own.begin_dot[s] = own.begin_dot[s] + (1 - share) * by_u
+        out.rest_adj[s] = out.rest_adj[s] + by_u
+        adjoint.u[0, i] = adjoint.u[0, i] + share * by_u
+
+    @ti.func
+    def all_vjp(self, scene: A, faces: A, state: A, table: A, adjoint: A, out: A, own: A, plan: A):
+        if ti.static(self.parallel):
+            for s in range(plan.num_surface):
+                self.seed_force(s, plan.k, pass_at(table, plan.first - plan.window), scene, faces, adjoint, own, plan)
+            for f in range(plan.num_faces):
+                self.push_vjp(f, plan.k, pass_at(table, plan.first - plan.window), scene, faces, out, own, plan)
+            for s in range(plan.num_surface):
+                self.go_back(s, plan.k, pass_at(table, plan.first - plan.window), faces, adjoint, out, own, plan)
+        else:
+            ti.loop_config(serialize=True)
+            for back in range(plan.n):
+                k, now = plan.n - 1 - back, pass_at(table, plan.first - plan.window)
+                for s in range(plan.num_surface):
+                    self.seed_force(s, k, now, scene, faces, adjoint, own, plan)
+                for f in range(plan.num_faces):
+                    self.push_vjp(f, k, now, scene, faces, out, own, plan)
+                for s in range(plan.num_surface):
+                    self.go_back(s, k, now, faces, adjoint, out, own, plan)
+        if ti.static(self.features.moving > 0):
+            for p in range(ti.static(self.features.moving) * plan.num_parts):
+                self.fold_part(p, plan.num_faces, plan.first, plan.first, out, table, plan)
+
+    @cached_property
+    def vjp(self) -> Kernel:
+        """Adjoint of the state at the end of a pass without contact within faces, in place, and of u0; adds those of all
+        else."""
+        arrays = dict(adjoint=dict(u="vectors2", v="vectors2", sums=ADJOINT["sums"]), out=OF_FACES, own=OWN)
+        return self._kernel("vjp", self.all_vjp, ("steps", "num_parts"), **arrays)
+
+    @ti.func
+    def all_begin_vjp(self, scene: A, faces: A, state: A, table: A, adjoint: A, own: A, plan: A):
+        ti.loop_config(serialize=not self.parallel)
+        for s in range(plan.num_surface):
+            i = faces.vertices[s]
+            adjoint.u[0, i] = adjoint.u[0, i] + own.begin_dot[s]
+
+    @cached_property
+    def begin_vjp(self) -> Kernel:
+        """Add the adjoint of u0, once the rest of the pass is reversed."""
+        return self._kernel("begin_vjp", self.all_begin_vjp, adjoint=dict(u="vectors2"), own=OWN)
+
+    @ti.func
+    def all_begin_jvp(self, scene: A, faces: A, state: A, table: A, tangent: A, own: A, plan: A):
+        ti.loop_config(serialize=not self.parallel)
+        for s in range(plan.num_surface):
+            own.begin_dot[s] = tangent.u[0, faces.vertices[s]]
+
+    @cached_property
+    def begin_jvp(self) -> Kernel:
+        """Keep the change of u0."""
+        return self._kernel("begin_jvp", self.all_begin_jvp, tangent=dict(u="vectors2"), own=OWN)
+
+
+@lru_cache(maxsize=None)
+def face_derivatives(features: Features, precision: str, parallel: bool) -> FaceDerivatives:
+    """Kernels for a scene's features."""
+    return FaceDerivatives(features, precision, parallel)
