@@ -12,56 +12,63 @@ REACH = 0.65  # of the distance of lattice points: from what lies between them t
 
 
 @ti.func
-def fade(t, fp: ti.template()):
-    """phi(t)"""
-    r = ti.min(ti.max((t - ti.cast(FLAT, fp)) * ti.cast(1 / (BENT - FLAT), fp), ti.cast(0, fp)), ti.cast(1, fp))
-    return r * r * r * (10 + r * (6 * r - 15))
+def rise(t, fp: ti.template()):
+    """The step from 0 to 1 between FLAT and BENT, and its two derivatives."""
+    per = ti.cast(1 / (BENT - FLAT), fp)
+    r = ti.min(ti.max((t - ti.cast(FLAT, fp)) * per, ti.cast(0, fp)), ti.cast(1, fp))
+    value, slope = r * r * r * (10 + r * (6 * r - 15)), 30 * per * r * r * (1 - r) * (1 - r)
+    curvature = 60 * per * per * r * (1 - r) * (1 - 2 * r)
+    return value, slope, curvature
+
+
+def firmer(force) -> bool:
+    """Whether points are the firmer, the narrower their obstacle is; a spline's t ends with its grid."""
+    return force.per_area and not force.grain
 
 
 @ti.func
-def fade_slope(t, fp: ti.template()):
-    per = ti.cast(1 / (BENT - FLAT), fp)
-    r = ti.min(ti.max((t - ti.cast(FLAT, fp)) * per, ti.cast(0, fp)), ti.cast(1, fp))
-    return 30 * per * r * r * (1 - r) * (1 - r)
-
-
-@ti.func
-def fade_curvature(t, fp: ti.template()):
-    per = ti.cast(1 / (BENT - FLAT), fp)
-    r = ti.min(ti.max((t - ti.cast(FLAT, fp)) * per, ti.cast(0, fp)), ti.cast(1, fp))
-    return 60 * per * per * r * (1 - r) * (1 - 2 * r)
+def fade(t, force: ti.template(), fp: ti.template()):
+    """phi(t) and its two derivatives"""
+    value, slope, curvature = rise(t, fp)
+    if ti.static(firmer(force)):
+        curvature = curvature * (1 + t * t) + 4 * t * slope + 2 * value
+        slope = slope * (1 + t * t) + 2 * t * value
+        value = value * (1 + t * t)
+    return value, slope, curvature
 
 
 # F = beta(s) phi(t), or per area (beta(s) - beta(s + t)) phi(t), and its derivatives
 
 
 @ti.func
-def point_energy(s, t, per_area: ti.template(), fp: ti.template()):
+def point_energy(s, t, force: ti.template(), fp: ti.template()):
     """F"""
     b = barrier.value(s, fp)
-    if ti.static(per_area):
+    if ti.static(force.per_area):
         b -= barrier.value(s + t, fp)
-    return b * fade(t, fp)
+    p, _, _ = fade(t, force, fp)
+    return b * p
 
 
 @ti.func
-def point_slopes(s, t, per_area: ti.template(), fp: ti.template()):
+def point_slopes(s, t, force: ti.template(), fp: ti.template()):
     """dF/ds, dF/dt"""
-    b, b1, p, p1 = barrier.value(s, fp), barrier.slope(s, fp), fade(t, fp), fade_slope(t, fp)
+    b, b1 = barrier.value(s, fp), barrier.slope(s, fp)
+    p, p1, _ = fade(t, force, fp)
     by_s, by_t = b1 * p, b * p1
-    if ti.static(per_area):
+    if ti.static(force.per_area):
         c, c1 = barrier.value(s + t, fp), barrier.slope(s + t, fp)
         by_s, by_t = (b1 - c1) * p, (b - c) * p1 - c1 * p
     return by_s, by_t
 
 
 @ti.func
-def point_curvatures(s, t, per_area: ti.template(), fp: ti.template()):
+def point_curvatures(s, t, force: ti.template(), fp: ti.template()):
     """d2F/ds2, d2F/dsdt, d2F/dt2"""
     b, b1, b2 = barrier.value(s, fp), barrier.slope(s, fp), barrier.curvature(s, fp)
-    p, p1, p2 = fade(t, fp), fade_slope(t, fp), fade_curvature(t, fp)
+    p, p1, p2 = fade(t, force, fp)
     ss, st, tt = b2 * p, b1 * p1, b * p2
-    if ti.static(per_area):
+    if ti.static(force.per_area):
         c, c1, c2 = barrier.value(s + t, fp), barrier.slope(s + t, fp), barrier.curvature(s + t, fp)
         ss, st, tt = (b2 - c2) * p, (b1 - c1) * p1 - c2 * p, (b - c) * p2 - (c1 + c1) * p1 - c2 * p
     return ss, st, tt

@@ -16,7 +16,9 @@ faces around it, as if distances were linear within them; a point says how much 
 
 s + t being the distance that the corners let expect. The areas of a face's lattice points sum up to the face's, those of
 the corners included, and give each corner its third of it, so that nothing counts twice: where phi = 1 what the corners
-said of a point is taken back, and its own energy stands. The sum does not grow with the number of points, but for r,
+said of a point is taken back, and its own energy stands. What is much narrower than a face touches little of it, and has
+to stop as much of the body as a vertex carries: phi grows on as 1 + t^2, which refinement takes back. (Not so before a mesh,
+whose distances end with its grid.) The sum does not grow with the number of points, but for r,
 which is .16 w at most and lets a point feel what lies between it and the next.
 The points of a face lie on a lattice, a quarter of a width apart or closer, but for its largest number; corners are none of
 them.
@@ -241,14 +243,14 @@ class FacePoints(ObstacleFunctions):
                         weight = ti.select(x > 0 and y > 0, one + one, one)  # the face beyond an edge has its own half
                     scale = 0 - s0 * weight * stiffness * width
                     if ti.static(what == "energy"):
-                        F = point_energy(s, t, g.force.per_area, self.fp)
+                        F = point_energy(s, t, g.force, self.fp)
                         out[0] += s0 * weight * stiffness * width * width * F
                     elif ti.static(what == "force"):
-                        Fs, Ft = point_slopes(s, t, g.force.per_area, self.fp)
+                        Fs, Ft = point_slopes(s, t, g.force, self.fp)
                         out += scale * (Fs * now + Ft * (c0 - now))
                     elif ti.static(what == "numbers"):
-                        Fs, Ft = point_slopes(s, t, g.force.per_area, self.fp)
-                        Fss, Fst, Ftt = point_curvatures(s, t, g.force.per_area, self.fp)
+                        Fs, Ft = point_slopes(s, t, g.force, self.fp)
+                        Fss, Fst, Ftt = point_curvatures(s, t, g.force, self.fp)
                         along, across = now.dot(w0), (c0 - now).dot(w0)  # w0 has no fourth component
                         by_s = scale * (Fss * along + Fst * across)
                         by_t = scale * (Fst * along + Ftt * across)
@@ -266,8 +268,8 @@ class FacePoints(ObstacleFunctions):
                         more.sums[at_w, i] = more.sums[at_w, i] + (f - s * by_s - t * by_t) / width
                         out[0] += f
                     else:
-                        Fs, Ft = point_slopes(s, t, g.force.per_area, self.fp)
-                        Fss, Fst, Ftt = point_curvatures(s, t, g.force.per_area, self.fp)
+                        Fs, Ft = point_slopes(s, t, g.force, self.fp)
+                        Fss, Fst, Ftt = point_curvatures(s, t, g.force, self.fp)
                         dn = self.turn(what, g, first, Xs, us, self.mix(s0, s1, s2, w), scene, more)
                         ds = dn[3] / width
                         dt = (s0 * turns[0, 3] + s1 * turns[1, 3] + s2 * turns[2, 3] - dn[3]) / width

@@ -1,6 +1,6 @@
 """What obstacles do to points within a face in an explicit pass: forces of the energy of potential/faces.py, and more.
 
-The forces are taken where the pass begins. Of a face and an obstacle, corner a feels
+Of a face and an obstacle, corner a feels
 
     f_a = -c k w sum_q s_a ((F_s - F_t) n + F_t n_a)
 
@@ -10,14 +10,14 @@ potential/face_lattice.py. Beside it stands
     D_a = c k sum_q s_a beta''(s) phi(t)    [N/m]
 
 whose sum over the faces around a vertex is no less than the stiffness that they have there, for s (x) s <= diag(s) where
-shares s sum up to 1. It says how much of the force a pass can take (face_kernels.py).
+shares s sum up to 1. It says in how many parts a pass is to be gone (face_kernels.py).
 """
 
 from dataclasses import dataclass
 
 import taichi as ti
 
-from diffsim_ti.potential.face_lattice import FLAT, fade, fade_slope, point_curvatures, point_energy, point_slopes
+from diffsim_ti.potential.face_lattice import FLAT, fade, point_curvatures, point_energy, point_slopes
 from diffsim_ti.solvers.explicit.face_rows import FaceRows
 from diffsim_ti.terms.obstacles import barrier
 
@@ -35,9 +35,8 @@ class FaceForces(FaceRows):
         """(rows, least) of face f, whose corners have the rows X of rest positions relative to the obstacle and u; least:
         of d - r of all its points, or less.
 
-        Of "force" rows (f_a, D_a), the energy going to `faces`; of "product" change of f_a for changes w; "jvp": change of
-        both, those of the obstacle's numbers being in `out`; "vjp": adjoints of u for adjoints w of both, those of the
-        obstacle's numbers going to `out`.
+        Of "force" rows (f_a, D_a), the energy going to `faces`; of "jvp" change of f_a for changes w, those of the obstacle's
+        numbers being in `out`; "vjp": adjoints of u for adjoints w of f_a, those of the obstacle's numbers going to `out`.
         """
         found, first, row = self.rows(0), g.first + k * g.size, f * ti.static(self.num_obstacles) + g.number + k
         reach, width = faces.reach[row], g.force.width(scene.parameters, first)
@@ -65,7 +64,7 @@ class FaceForces(FaceRows):
                     along = self.dot3(middle, self.row_of(around, a))
                     bent = ti.max(bent, corners[a, 3] - middle[3] - along)
             if bent > ti.cast(FLAT, self.fp) * width:
-                if ti.static(what in ("product", "jvp", "vjp")):
+                if ti.static(what in ("jvp", "vjp")):
                     for a in range(3):
                         t = self.turn(
                             what, g, first, self.row_of(X, a), self.row_of(u, a), self.row_of(w, a), scene, out
@@ -121,11 +120,11 @@ class FaceForces(FaceRows):
                         weight = ti.select(x > 0 and y > 0 and x + y < parts, one + one, one)  # edges have two faces
                     if inner and sigma < 1 and t > ti.cast(FLAT, self.fp):
                         turned, mixed = self.vector(0), self.vector(0)
-                        if ti.static(what in ("product", "jvp", "vjp")):
+                        if ti.static(what in ("jvp", "vjp")):
                             mixed = self.mix(s, w)
                             turned = self.turn(what, g, first, Xs, us, mixed, scene, out)
                         if ti.static(what == "force"):
-                            value = point_energy(sigma, t, g.force.per_area, self.fp)
+                            value = point_energy(sigma, t, g.force, self.fp)
                             stiff = weight * scene.parameters[first + g.force.count]
                             faces.energy[f] = faces.energy[f] + stiff * width * width * value
                         found += self.point(
@@ -177,14 +176,6 @@ class FaceForces(FaceRows):
         return c, share
 
     @ti.func
-    def rigid(self, s, t):
-        """G = beta''(s) phi(t) and its derivatives: (G, Gs, Gt)."""
-        b2, b3 = barrier.curvature(s, self.fp), barrier.third(s, self.fp)
-        p, p1 = fade(t, self.fp), fade_slope(t, self.fp)
-        G, Gs, Gt = b2 * p, b3 * p, b2 * p1
-        return G, Gs, Gt
-
-    @ti.func
     def point(
         self,
         what: A,
@@ -207,16 +198,16 @@ class FaceForces(FaceRows):
         """What a point adds to the rows of the corners; dn: change of (normal, distance) there."""
         found, stiffness = self.rows(0), scene.parameters[first + g.force.count]
         scale, stiff = 0 - weight * stiffness * width, weight * stiffness
-        Fs, Ft = point_slopes(sigma, t, g.force.per_area, self.fp)
+        Fs, Ft = point_slopes(sigma, t, g.force, self.fp)
         if ti.static(what == "force"):
-            G = barrier.curvature(sigma, self.fp) * fade(t, self.fp)
+            phi, _, _ = fade(t, g.force, self.fp)
+            G = barrier.curvature(sigma, self.fp) * phi
             for a in ti.static(range(3)):
                 for m in ti.static(range(3)):
                     found[a, m] = scale * s[a] * ((Fs - Ft) * now[m] + Ft * corners[a, m])
                 found[a, 3] = stiff * s[a] * G
         else:
-            Fss, Fst, Ftt = point_curvatures(sigma, t, g.force.per_area, self.fp)
-            G, Gs, Gt = self.rigid(sigma, t)
+            Fss, Fst, Ftt = point_curvatures(sigma, t, g.force, self.fp)
             ds, zero = dn[3] / width, ti.cast(0, self.fp)
             dt = (s[0] * turns[0, 3] + s[1] * turns[1, 3] + s[2] * turns[2, 3] - dn[3]) / width
             dk, dw = zero, zero
@@ -231,26 +222,20 @@ class FaceForces(FaceRows):
                     found[a, m] += scale * s[a] * (dFt * corners[a, m] + Ft * turns[a, m])
                     if ti.static(what == "jvp"):
                         found[a, m] += (dk + dw) * scale * s[a] * ((Fs - Ft) * now[m] + Ft * corners[a, m])
-                    if ti.static(what == "vjp"):
-                        by_D = stiff * mixed[3] / width * s[a]
-                        found[a, m] += by_D * ((Gs - Gt) * now[m] + Gt * corners[a, m])
-                if ti.static(what == "jvp"):
-                    found[a, 3] = stiff * s[a] * (Gs * ds + Gt * dt + dk * G)
         return found
 
     @ti.func
     def numbers(self, g: A, first, f, s, sigma, t, now, Xs, us, mixed, w, corners, weight, width, scene: A, out: A):
         """Adjoints of (normal, distance) at the corners; adds those of the obstacle's numbers."""
         by, stiffness = self.rows(0), scene.parameters[first + g.force.count]
-        scale, stiff = 0 - weight * stiffness * width, weight * stiffness * mixed[3]
-        Fs, Ft = point_slopes(sigma, t, g.force.per_area, self.fp)
-        Fss, Fst, Ftt = point_curvatures(sigma, t, g.force.per_area, self.fp)
-        G, Gs, Gt = self.rigid(sigma, t)
+        scale = 0 - weight * stiffness * width
+        Fs, Ft = point_slopes(sigma, t, g.force, self.fp)
+        Fss, Fst, Ftt = point_curvatures(sigma, t, g.force, self.fp)
         along, across = self.dot3(now, mixed), ti.cast(0, self.fp)
         for a in ti.static(range(3)):
             across += s[a] * (corners[a, 0] * w[a, 0] + corners[a, 1] * w[a, 1] + corners[a, 2] * w[a, 2])
-        by_s = scale * ((Fss - Fst) * along + Fst * across) + stiff * Gs
-        by_t = scale * ((Fst - Ftt) * along + Ftt * across) + stiff * Gt
+        by_s = scale * ((Fss - Fst) * along + Fst * across)
+        by_t = scale * ((Fst - Ftt) * along + Ftt * across)
         of_force, by_now = scale * ((Fs - Ft) * along + Ft * across), scale * (Fs - Ft) * mixed
         by_now[3] = (by_s - by_t) / width
         g.force.outlook_vjp(scene.parameters, first, Xs, us, by_now, out.sums, f)
@@ -259,8 +244,8 @@ class FaceForces(FaceRows):
                 by[a, m] = scale * Ft * s[a] * w[a, m]
             by[a, 3] = s[a] * by_t / width
         at = first + g.force.count
-        out.sums[at, f] = out.sums[at, f] + (of_force + stiff * G) / stiffness
+        out.sums[at, f] = out.sums[at, f] + of_force / stiffness
         if ti.static(g.force.per_area):
-            out.by_areas[f] = out.by_areas[f] + of_force + stiff * G
+            out.by_areas[f] = out.by_areas[f] + of_force
         out.sums[at + 1, f] = out.sums[at + 1, f] + (of_force - sigma * by_s - t * by_t) / width
         return by
