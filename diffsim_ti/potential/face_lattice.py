@@ -6,7 +6,7 @@ import taichi as ti
 from diffsim_ti.mesh import geometry
 from diffsim_ti.terms.obstacles import barrier
 
-FLAT, BENT = 0.02, 0.12
+FLAT, BENT, GROWTH = 0.02, 0.12, 8
 PER_WIDTH, MOST_PARTS = 4, 64  # lattice points along a width; along the side of a face
 REACH = 0.65  # of the distance of lattice points: from what lies between them to the nearest, faces being stretched a little
 
@@ -31,9 +31,10 @@ def fade(t, force: ti.template(), fp: ti.template()):
     """phi(t) and its two derivatives"""
     value, slope, curvature = rise(t, fp)
     if ti.static(firmer(force)):
-        curvature = curvature * (1 + t * t) + 4 * t * slope + 2 * value
-        slope = slope * (1 + t * t) + 2 * t * value
-        value = value * (1 + t * t)
+        grown, by_t, twice = 1 + ti.cast(GROWTH, fp) * t * t, ti.cast(2 * GROWTH, fp) * t, ti.cast(2 * GROWTH, fp)
+        curvature = curvature * grown + 2 * by_t * slope + twice * value
+        slope = slope * grown + by_t * value
+        value = value * grown
     return value, slope, curvature
 
 
