@@ -41,7 +41,9 @@ class FaceKernels(FaceForces):
     parallel: bool
 
     def _kernel(self, name: str, body, more=(), **arrays) -> Kernel:
-        own = dict(scene=SCENE, faces=FACES, state=dict(u="vectors2", v="vectors2"), table=dict(ints="ints", floats="scalars"))
+        own = dict(
+            scene=SCENE, faces=FACES, state=dict(u="vectors2", v="vectors2"), table=dict(ints="ints", floats="scalars")
+        )
         return Kernel("face_" + name, body, self.precision, own | arrays, NUMBERS | dict.fromkeys(more, "int"))
 
     @ti.func
@@ -216,11 +218,17 @@ class FaceKernels(FaceForces):
     def push(self, f, k, now: A, scene: A, faces: A, plan: A):
         if faces.near[f] > 0:
             then = self.when(now, self.share_of(k, plan))
-            self.force_of(f, self.rows_of(f, faces.place, k, faces), self.part_length(now, plan), then, scene, faces, plan)
+            self.force_of(
+                f, self.rows_of(f, faces.place, k, faces), self.part_length(now, plan), then, scene, faces, plan
+            )
 
     @ti.func
     def go_on(self, s, k, now: A, scene: A, faces: A, state: A, plan: A):
-        length, inverse, whole = self.part_length(now, plan), scene.inverse_mass[faces.vertices[s]], self.gathered(s, faces)
+        length, inverse, whole = (
+            self.part_length(now, plan),
+            scene.inverse_mass[faces.vertices[s]],
+            self.gathered(s, faces),
+        )
         before = faces.speed[k, s]
         after = before + length * inverse * self.direct(whole)
         faces.shift[s] = faces.shift[s] + ti.cast(0.5, self.fp) * length * (before + after)
@@ -258,11 +266,14 @@ class FaceKernels(FaceForces):
         load, column, before = ti.cast(0, self.fp), plan.num_vertices + f, self.rows_at(f, faces.begin, 0, faces)
         for a in ti.static(range(3)):
             load = ti.max(load, faces.load[faces.own[3 * f + a]])
-        began = now.begin + ti.cast(0, self.fp)
+        began, count = now.begin + ti.cast(0, self.fp), ti.static(self.num_obstacles)
         for k in range(plan.n + 1):
             end, u = now.end + ti.cast(0, self.fp), self.rows_at(f, state.u, plan.slot, faces)
             if k < plan.n:
-                end, u = now.begin + self.share_of(k, plan) * (now.end - now.begin), self.rows_of(f, faces.place, k, faces)
+                end, u = (
+                    now.begin + self.share_of(k, plan) * (now.end - now.begin),
+                    self.rows_of(f, faces.place, k, faces),
+                )
             for g in ti.static(self.groups):
                 for o in range(g.count):
                     n, place = g.number + o, self.place_at(g, o, end, now, scene.path)
@@ -275,8 +286,8 @@ class FaceKernels(FaceForces):
                         g.force.width(scene.parameters, g.first + o * g.size),
                     )
                     if self.bound(g, o, f, X, u, self.size_of_rows(move), scene, faces) < width:
-                        least = self.nearest(g, o, f, X, u, move, scene, faces)
-                        if least < width:
+                        least, reach = self.nearest(g, o, f, X, u, move, scene, faces), faces.reach[f * count + n]
+                        if least < width + reach:
                             watch.seen[3 * n, column] = ti.min(watch.seen[3 * n, column], least)
                             watch.seen[3 * n + 1, column] = ti.max(watch.seen[3 * n + 1, column], load)
             before, began = u, end

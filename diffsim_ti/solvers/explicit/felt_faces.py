@@ -13,6 +13,7 @@ from diffsim_ti.terms.obstacles.barrier import beta
 
 TRAVEL, LOAD = 0.2, 0.2
 
+
 def feels_faces(scene) -> bool:
     """Whether a scene has an obstacle that could reach into a face of the body between its corners.
 
