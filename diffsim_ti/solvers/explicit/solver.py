@@ -49,8 +49,8 @@ class ExplicitSolver(Solver):
     contact: "stage", the default: obstacles act in a stage of each pass (contact_stage.py), which no step is too large
         for; or "force": their barriers are one more force, which the step has to follow. A vertex that is driven with more
         than a barrier holds, 7 stiffness width^2, crosses in either and raises Crossing, unless much is damped.
-        Points within faces feel what is narrower than they are by a force in either, of which a pass takes what it can
-        follow (face_kernels.py); where that is not all, a warning says so. No friction acts there.
+        Points within faces feel what is narrower than they are in either by a stage of its own, which goes the way of the
+        pass again in as many parts as barrier and speed ask for (face_kernels.py). No friction acts there.
     contact_damping: of the stage, from 0, which keeps the energy of a contact, to 1, which damps what the step does not
         resolve and is the smoothest. A vertex that is pressed with N rests at velocity (1 - c) h N / 2 m in the
         semi-implicit solver, whose rest is exact with 1, and at -c h N / 2 m in velocity Verlet, exact with 0.
