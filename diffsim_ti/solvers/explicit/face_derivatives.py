@@ -19,7 +19,7 @@ OF_FACES = dict(sums="scalars2", felt="vectors2", path="vectors2", rest_adj="vec
 
 @dataclass(frozen=True)
 class FaceDerivatives(FaceKernels):
-    """After `begins` and `parts_of_pass` with the same number of parts."""
+    """After `begins` and `parts_of_pass` with the same number of parts; what a part takes of forces is held."""
 
     # ---- tangent -----------------------------------------------------------------------------------------------------
 
@@ -50,7 +50,8 @@ class FaceDerivatives(FaceKernels):
         i, length, half = faces.vertices[s], self.part_length(now, plan), ti.cast(0.5, self.fp)
         inverse, before = scene.inverse_mass[i], own.speed_dot[s]
         gained = faces.speed[k + 1, s] - faces.speed[k, s]
-        after = before + length * inverse * self.direct(self.gathered(s, faces)) - inverse * tangent.mass[i] * gained
+        change = faces.taken[k, s] * length * inverse * self.direct(self.gathered(s, faces))
+        after = before + change - inverse * tangent.mass[i] * gained
         own.shift_dot[s] = own.shift_dot[s] + half * length * (before + after)
         own.speed_dot[s] = after
         if k == plan.n - 1:
@@ -103,7 +104,7 @@ class FaceDerivatives(FaceKernels):
             own.begin_dot[s] = self.vector(0)
         q, inverse = own.speed_dot[s] + half * length * own.shift_dot[s], scene.inverse_mass[i]
         own.speed_dot[s] = q
-        own.seed[s] = length * inverse * q
+        own.seed[s] = faces.taken[k, s] * length * inverse * q
         if ti.static(self.features.density):
             row, gained = ti.static(self.features.sums().first("mass")), faces.speed[k + 1, s] - faces.speed[k, s]
             adjoint.sums[row, i] = adjoint.sums[row, i] - inverse * self.dot3(q, gained)

@@ -8,7 +8,8 @@ it is long, so that the way is gone again in n equal parts of length d = h / n, 
 
 It is leapfrog in the moving frame of the pass, and keeps the energy as that does. n is a power of two (felt_faces.py): in a
 part no face goes farther than a share of the width, and d^2 D / m is at most LOAD at each vertex. D, which comes with f, is
-no less than the stiffness of the points around it. The step of the body need not know of this stiffness.
+no less than the stiffness of the points around it. The step of the body need not know of this stiffness. Where more parts
+would be needed than there may be, a part takes of f what it can follow, f / max(1, d^2 D / m), and a warning says so.
 Tuckerman, Berne, Martyna 1992, Reversible multiple time scale molecular dynamics, doi:10.1063/1.463137.
 """
 
@@ -29,7 +30,9 @@ FACES = dict.fromkeys(("corners", "own", "parts", "start", "entries", "vertices"
 FACES |= dict.fromkeys(("share", "whole", "shift", "offsets"), "vectors") | dict.fromkeys(
     ("begin", "place", "speed"), "vectors2"
 )
-FACES |= dict.fromkeys(("reach", "weight", "least", "energy", "done", "work", "need", "load"), "scalars")
+FACES |= dict(taken="scalars2") | dict.fromkeys(
+    ("reach", "weight", "least", "energy", "done", "work", "need", "load"), "scalars"
+)
 NUMBERS = dict.fromkeys(("slot", "first", "window", "num_vertices", "num_faces", "num_surface", "between"), "int")
 NUMBERS |= dict(n="int", k="int", h="float")
 
@@ -229,11 +232,13 @@ class FaceKernels(FaceForces):
             scene.inverse_mass[faces.vertices[s]],
             self.gathered(s, faces),
         )
-        before = faces.speed[k, s]
-        after = before + length * inverse * self.direct(whole)
+        before, load = faces.speed[k, s], length * length * whole[3] * inverse
+        taken = ti.cast(1, self.fp) / ti.max(load, ti.cast(1, self.fp))
+        after = before + taken * length * inverse * self.direct(whole)
+        faces.taken[k, s] = taken
         faces.shift[s] = faces.shift[s] + ti.cast(0.5, self.fp) * length * (before + after)
         faces.speed[k + 1, s] = after
-        faces.load[s] = ti.max(faces.load[s], length * length * whole[3] * inverse)
+        faces.load[s] = ti.max(faces.load[s], load)
         if k + 1 < plan.n:
             self.put(s, k + 1, scene, faces, state, now, plan)
 

@@ -67,6 +67,7 @@ class FeltFaces:
         if self.place is None or self.place.shape[0] < n:
             self.place = runtime.array(self.a.vector, n, self.num_surface)
             self.speed = runtime.array(self.a.vector, n + 1, self.num_surface)
+            self.taken = runtime.array(self.a.fp, n, self.num_surface)
 
     def _run(self, name: str, plan: dict, state, slot: int, n=1, k=0, features=None, between=False, **records) -> None:
         a, ws = self.a, self.ws
