@@ -79,16 +79,6 @@ class FaceForces(FaceRows):
         return found, least
 
     @ti.func
-    def turn(self, what: A, g: A, first, X, u, w, scene: A, out: A):
-        """Change of (normal, distance) at a point that moves by w."""
-        t = self.vector(0)
-        if ti.static(what == "jvp"):
-            t = g.force.outlook_jvp(scene.parameters, first, X, u, w, out.parameters)
-        else:
-            t = g.force.outlook_jvp(scene.parameters, first, X, u, w)
-        return t
-
-    @ti.func
     def points(self, what: A, g: A, first, f, row, X, u, w, corners, turns, reach, width, scene: A, faces: A, out: A):
         found, by, least = self.rows(0), self.rows(0), ti.cast(1e30, self.fp)
         parts = faces.parts[row]
@@ -151,10 +141,7 @@ class FaceForces(FaceRows):
                                 g, first, f, s, sigma, t, now, Xs, us, mixed, w, corners, weight, width, scene, out
                             )
         if ti.static(what == "vjp"):
-            for a in range(3):
-                g.force.outlook_vjp(
-                    scene.parameters, first, self.row_of(X, a), self.row_of(u, a), self.row_of(by, a), out.sums, f
-                )
+            self.corners_vjp(g, first, X, u, by, scene, out, f)
         return found, least
 
     @ti.func
@@ -177,12 +164,14 @@ class FaceForces(FaceRows):
         return c, share
 
     @ti.func
-    def rigid(self, s, t):
-        """G = beta''(s) phi(t) and its derivatives: (G, Gs, Gt)."""
-        b2, b3 = barrier.curvature(s, self.fp), barrier.third(s, self.fp)
+    def second(self, sigma, t, per_area: A):
+        """(Fs, Ft, Fss, Fst, Ftt), and of G = beta''(s) phi(t) (G, Gs, Gt)"""
+        Fs, Ft = point_slopes(sigma, t, per_area, self.fp)
+        Fss, Fst, Ftt = point_curvatures(sigma, t, per_area, self.fp)
+        b2, b3 = barrier.curvature(sigma, self.fp), barrier.third(sigma, self.fp)
         p, p1 = fade(t, self.fp), fade_slope(t, self.fp)
         G, Gs, Gt = b2 * p, b3 * p, b2 * p1
-        return G, Gs, Gt
+        return Fs, Ft, Fss, Fst, Ftt, G, Gs, Gt
 
     @ti.func
     def point(
@@ -207,16 +196,15 @@ class FaceForces(FaceRows):
         """What a point adds to the rows of the corners; dn: change of (normal, distance) there."""
         found, stiffness = self.rows(0), scene.parameters[first + g.force.count]
         scale, stiff = 0 - weight * stiffness * width, weight * stiffness
-        Fs, Ft = point_slopes(sigma, t, g.force.per_area, self.fp)
         if ti.static(what == "force"):
+            Fs, Ft = point_slopes(sigma, t, g.force.per_area, self.fp)
             G = barrier.curvature(sigma, self.fp) * fade(t, self.fp)
             for a in ti.static(range(3)):
                 for m in ti.static(range(3)):
                     found[a, m] = scale * s[a] * ((Fs - Ft) * now[m] + Ft * corners[a, m])
                 found[a, 3] = stiff * s[a] * G
         else:
-            Fss, Fst, Ftt = point_curvatures(sigma, t, g.force.per_area, self.fp)
-            G, Gs, Gt = self.rigid(sigma, t)
+            Fs, Ft, Fss, Fst, Ftt, G, Gs, Gt = self.second(sigma, t, g.force.per_area)
             ds, zero = dn[3] / width, ti.cast(0, self.fp)
             dt = (s[0] * turns[0, 3] + s[1] * turns[1, 3] + s[2] * turns[2, 3] - dn[3]) / width
             dk, dw = zero, zero
@@ -243,9 +231,7 @@ class FaceForces(FaceRows):
         """Adjoints of (normal, distance) at the corners; adds those of the obstacle's numbers."""
         by, stiffness = self.rows(0), scene.parameters[first + g.force.count]
         scale, stiff = 0 - weight * stiffness * width, weight * stiffness * mixed[3]
-        Fs, Ft = point_slopes(sigma, t, g.force.per_area, self.fp)
-        Fss, Fst, Ftt = point_curvatures(sigma, t, g.force.per_area, self.fp)
-        G, Gs, Gt = self.rigid(sigma, t)
+        Fs, Ft, Fss, Fst, Ftt, G, Gs, Gt = self.second(sigma, t, g.force.per_area)
         along, across = self.dot3(now, mixed), ti.cast(0, self.fp)
         for a in ti.static(range(3)):
             across += s[a] * (corners[a, 0] * w[a, 0] + corners[a, 1] * w[a, 1] + corners[a, 2] * w[a, 2])
