@@ -21,7 +21,7 @@ AREAS = {
     "charts, maps, advice": "study study_stability peers",
     "pictures, films, the window": "picture_drawing picture_film optimization_picture writers viewer viewer_window gallery",
     "examples and pages": "examples contact_examples static_examples torch_examples readme",
-    "command line, resources, backends": "cli strength layout resources devices launch executed_ptx vulkan single_precision",
+    "command line, resources, backends": "cli strength layout resources devices launch executed_ptx single_precision",
 }
 AREA_OF = {name: area for area, names in AREAS.items() for name in names.split()}
 

@@ -1,4 +1,4 @@
-"""One Taichi runtime for the whole session; DIFFSIM_TI_ARCH names another backend (test_vulkan.py and cuda_on_cpu use it).
+"""One Taichi runtime for the whole session; DIFFSIM_TI_ARCH names another backend (cuda_on_cpu uses it).
 
 DIFFSIM_TI_FORM=gpu: arrays, kernels and launches take the form for a GPU, on the CPU.
 DIFFSIM_TI_DEBUG=1: kernels check the bounds of every array; slow, in one process: `DIFFSIM_TI_DEBUG=1 python -m pytest`.
@@ -34,8 +34,8 @@ def pytest_terminal_summary(terminalreporter, config):
         minutes = areas.minutes_of(reports)
         areas.write(minutes)
         terminalreporter.write_line("minutes: " + ", ".join(f"{area} {spent:.1f}" for area, spent in minutes.items()))
-    if earlier := os.environ.get("EXECUTED_PTX"):  # what a call of pytest on CUDA's kernels came to, from .ci/run
-        terminalreporter.write_line(earlier)
+    if earlier := os.environ.get("OTHER_FORMS"):  # what calls of pytest on other backends came to, from .ci/run
+        terminalreporter.write_line(earlier.rstrip())
 
 
 @pytest.fixture

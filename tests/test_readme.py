@@ -135,7 +135,8 @@ def test_links_and_pictures_are_there(page):
 
 def prose(text: str) -> list[str]:
     """The sentences of a page; a link or code counts as the words that are read."""
-    lines = [line for line in without_blocks(text).splitlines() if not line.startswith(("|", "#", "!", "[", "    "))]
+    lines = [line for line in without_blocks(text).splitlines() if not line.startswith(("|", "#", "!", "    "))]
+    lines = [line for line in lines if " · " not in line]  # a list of links
     out = []
     for block in re.split(r"\n\s*\n|\n(?=- |\d+\. )", "\n".join(lines)):
         block = re.sub(r"`[^`]*`", "code", re.sub(r"\]\([^)]*\)", "]", block)).replace("\n", " ")

@@ -38,14 +38,6 @@ A = ti.template()
 class FacePoints(ObstacleFunctions):
     """Sums over the points of the faces around vertex i, each with what it says of that vertex."""
 
-    @property
-    def rows(self):
-        return ti.types.matrix(3, 4, self.fp)
-
-    @property
-    def num_obstacles(self) -> int:
-        return sum(group.count for group in self.features.groups)
-
     @ti.func
     def change_at(self, what: A, i, n, at: A, more: A):
         """How vertex i moves, relative to obstacle n."""
@@ -55,16 +47,6 @@ class FacePoints(ObstacleFunctions):
         if ti.static(what == "jvp"):
             w = at.w[0, i] + more.rest[i] - more.walls[3 * n]
         return w
-
-    @ti.func
-    def turn(self, what: A, g: A, first, X, u, w, scene: A, more: A):
-        """Change of (normal, distance) at a point that moves by w."""
-        out = self.vector(0)
-        if ti.static(what == "jvp"):
-            out = g.force.outlook_jvp(scene.parameters, first, X, u, w, more.parameters)
-        elif ti.static(what in ("product", "column")):
-            out = g.force.outlook_jvp(scene.parameters, first, X, u, w)
-        return out
 
     @ti.func
     def around(self, what: A, i, scene: A, pass_: A, at: A, more: A):
@@ -134,33 +116,18 @@ class FacePoints(ObstacleFunctions):
         return out
 
     @ti.func
-    def row_of(self, M, a):
-        """Row a of a matrix of three."""
-        out = self.vector(0)
-        for m in ti.static(range(4)):
-            out[m] = ti.select(a == 0, M[0, m], ti.select(a == 1, M[1, m], M[2, m]))
-        return out
-
-    @ti.func
-    def mix(self, s0, s1, s2, M):
-        """Rows of a matrix of three, weighted."""
-        out = self.vector(0)
-        for m in ti.static(range(4)):
-            out[m] = s0 * M[0, m] + s1 * M[1, m] + s2 * M[2, m]
-        return out
-
-    @ti.func
     def points_of_face(self, what: A, g: A, first, X, u, w, reach, weight, grown, parts, i, scene: A, more: A):
         """The sum over the points of a face whose first corner is vertex i; X, u, w: rows of its corners; grown: share by
         which the weight changes. Of "numbers" the sum of force . at.w."""
         out, per, third = self.vector(0), ti.cast(1, self.fp) / ti.cast(parts, self.fp), ti.cast(1 / 3, self.fp)
         stiffness, width = scene.parameters[first + g.force.count], g.force.width(scene.parameters, first)
+        thirds = ti.Vector([third, third, third])
         corners, turns, middle = self.rows(0), self.rows(0), self.vector(0)  # (normal, distance) there, and its change
         for a in range(4):
             x, y = self.row_of(X, a), self.row_of(u, a)
             if a == 3:
-                x = self.mix(third, third, third, X)
-                y = self.mix(third, third, third, u)
+                x = self.mix(thirds, X)
+                y = self.mix(thirds, u)
             seen = g.force.outlook(scene.parameters, first, x, y)
             for m in ti.static(range(4)):
                 middle[m] = seen[m]
@@ -233,7 +200,8 @@ class FacePoints(ObstacleFunctions):
             for y in range(parts - x):
                 s1, s2 = x * per, y * per
                 s0 = 1 - s1 - s2
-                Xs, us = self.mix(s0, s1, s2, X), self.mix(s0, s1, s2, u)
+                shares = ti.Vector([s0, s1, s2])
+                Xs, us = self.mix(shares, X), self.mix(shares, u)
                 now = g.force.outlook(scene.parameters, first, Xs, us)
                 s = (now[3] - reach) / width
                 t = (s0 * corners[0, 3] + s1 * corners[1, 3] + s2 * corners[2, 3] - now[3]) / width
@@ -270,7 +238,7 @@ class FacePoints(ObstacleFunctions):
                     else:
                         Fs, Ft = point_slopes(s, t, g.force, self.fp)
                         Fss, Fst, Ftt = point_curvatures(s, t, g.force, self.fp)
-                        dn = self.turn(what, g, first, Xs, us, self.mix(s0, s1, s2, w), scene, more)
+                        dn = self.turn(what, g, first, Xs, us, self.mix(shares, w), scene, more)
                         ds = dn[3] / width
                         dt = (s0 * turns[0, 3] + s1 * turns[1, 3] + s2 * turns[2, 3] - dn[3]) / width
                         grown = ti.cast(0, self.fp)
@@ -286,10 +254,7 @@ class FacePoints(ObstacleFunctions):
                             + grown * (Fs * now + Ft * (c0 - now))
                         )
         if ti.static(what == "numbers"):
-            for a in range(3):
-                g.force.outlook_vjp(
-                    scene.parameters, first, self.row_of(X, a), self.row_of(u, a), self.row_of(by, a), more.sums, i
-                )
+            self.corners_vjp(g, first, X, u, by, scene, more, i)
         if ti.static(what != "energy"):
             out[3] = 0
         return out

@@ -7,6 +7,8 @@ import taichi as ti
 from diffsim_ti.runtime import PRECISIONS
 from diffsim_ti.state.features import Features
 
+A = ti.template()  # an array or Bundle handed to a Taichi function
+
 
 @dataclass(frozen=True)
 class ObstacleFunctions:
@@ -22,6 +24,14 @@ class ObstacleFunctions:
     @property
     def vector(self):
         return ti.types.vector(4, self.fp)
+
+    @property
+    def rows(self):
+        return ti.types.matrix(3, 4, self.fp)
+
+    @property
+    def num_obstacles(self) -> int:
+        return sum(group.count for group in self.features.groups)
 
     # An obstacle with a stiffness per area pushes vertex i with that times the vertex's area: energy, forces and friction
     # are linear in it. What kernels of a shape compute is that of one square metre.
@@ -48,3 +58,43 @@ class ObstacleFunctions:
         if ti.static(self.features.shape):
             for d in ti.static(range(3)):
                 adjoint.sums[row + d, i] = adjoint.sums[row + d, i] + by_X[d]
+
+    # ---- points within a face, whose corners are the rows of a matrix -----------------------------------------------------
+
+    @ti.func
+    def row_of(self, M, a):
+        """Row a of a matrix of three."""
+        out = self.vector(0)
+        for m in ti.static(range(4)):
+            out[m] = ti.select(a == 0, M[0, m], ti.select(a == 1, M[1, m], M[2, m]))
+        return out
+
+    @ti.func
+    def mix(self, s, M):
+        """Rows of a matrix of three, weighted."""
+        out = self.vector(0)
+        for m in ti.static(range(4)):
+            out[m] = s[0] * M[0, m] + s[1] * M[1, m] + s[2] * M[2, m]
+        return out
+
+    @ti.func
+    def dot3(self, a, b):
+        """Of vectors whose fourth component says something else."""
+        return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+    @ti.func
+    def turn(self, what: A, g: A, first, X, u, w, scene: A, more: A):
+        """Change of (normal, distance) at a point that moves by w, of "jvp" for that of the obstacle's numbers too."""
+        t = self.vector(0)
+        if ti.static(what == "jvp"):
+            t = g.force.outlook_jvp(scene.parameters, first, X, u, w, more.parameters)
+        else:
+            t = g.force.outlook_jvp(scene.parameters, first, X, u, w)
+        return t
+
+    @ti.func
+    def corners_vjp(self, g: A, first, X, u, by, scene: A, adjoint: A, i):
+        """Add to column i of the sums what adjoints `by` of (normal, distance) at three corners say of an obstacle."""
+        for a in range(3):
+            x, y, w = self.row_of(X, a), self.row_of(u, a), self.row_of(by, a)
+            g.force.outlook_vjp(scene.parameters, first, x, y, w, adjoint.sums, i)

@@ -23,7 +23,7 @@ COLORS = {
     "BDF2": "#CC79A7",
     "Static": "#56B4E9",
 }
-PEER_COLORS = {"torch-diffsim": "#555555", "Warp (CPU)": "#999999", "JAX": "#BBBBBB"}
+PEER_COLORS = {"torch-diffsim": "#555555", "Warp": "#999999", "JAX": "#BBBBBB"}
 MARKERS = {
     "SemiImplicit": "o",
     "VelocityVerlet": "s",

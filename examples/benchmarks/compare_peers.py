@@ -49,15 +49,20 @@ def common(python: str, sizes, rounds: int) -> dict:
             note("diffsim_ti", row["tets"], 1, row["forward_backward_ns"])
         for who in work.installed(python):
             for n in sizes:
-                scene = common_rollout(n, "f32", per_tetrahedron=False).scene
-                rest, tets = scene.mesh.vertices, scene.mesh.num_tetrahedra
-                end = np.array([0.0, 1.0])
-                job = work.scene_numbers(scene, H) | dict(E=1e5, nu=0.4, frames=1, substeps=SUBSTEPS, repeats=5)
-                both = job | dict(weights=2 * rest, linear=end, square=0 * end, target=0 * end)
-                for k, answer in enumerate(work.ask(who, python, [job, both])):
+                jobs, tets = common_jobs(n)
+                for k, answer in enumerate(work.ask(who, python, jobs)):
                     if answer is not None:
                         note(who, tets, k, float(answer["seconds"]) / SUBSTEPS / tets * 1e9)
     return best
+
+
+def common_jobs(vertices_a_side: int, repeats: int = 5, **more) -> tuple[list[dict], int]:
+    """(the common work forward, the same with gradients; tetrahedra)"""
+    scene = common_rollout(vertices_a_side, "f32", per_tetrahedron=False).scene
+    end = np.array([0.0, 1.0])
+    job = work.scene_numbers(scene, H) | dict(E=1e5, nu=0.4, frames=1, substeps=SUBSTEPS, repeats=repeats) | more
+    both = job | dict(weights=2 * scene.mesh.vertices, linear=end, square=0 * end, target=0 * end)
+    return [job, both], scene.mesh.num_tetrahedra
 
 
 def common_table(best: dict) -> str:
@@ -153,7 +158,7 @@ def accuracy_table(found: dict) -> str:
 STYLES = {
     "diffsim_ti": ("#0072B2", "o"),
     "torch-diffsim": ("#D55E00", "s"),
-    "Warp (CPU)": ("#009E73", "^"),
+    "Warp": ("#009E73", "^"),
     "JAX": ("#CC79A7", "D"),
 }
 

@@ -4,7 +4,8 @@
 
 Each part runs in a process of its own with a time limit, prints one JSON line, and is a row of the table at the end: the
 device; copies and launches; correctness against the CPU, in float64 and float32; time per substep by size beside what
-copying the same bytes takes. What does not fit the time or the memory is left out, and said so.
+copying the same bytes takes; the same work by peers that are installed (compare_peers.py), on the same device. What does
+not fit the time or the memory is left out, and said so.
 """
 
 import argparse
@@ -17,6 +18,8 @@ from pathlib import Path
 
 import numpy as np
 import taichi as ti
+from compare_peers import common_jobs
+from peers import work
 from speed import SUBSTEPS, common_rollout
 
 import diffsim_ti as ds
@@ -176,12 +179,29 @@ def speed(options, tetrahedra: int) -> dict:
     )
 
 
+def peers(options, who: str) -> dict:
+    """The work of 48 000 tetrahedra by another code: time of a substep, forward and with its reverse."""
+    if who not in work.installed(sys.executable):
+        return dict(left_out="not installed")
+    if options.arch == "vulkan" or options.largest < 48_000:
+        return dict(left_out="it has no Vulkan" if options.arch == "vulkan" else "beyond --largest")
+    jobs, _ = common_jobs(SIZES[48_000], repeats=3, device=options.arch)
+    answers = work.ask(who, sys.executable, jobs)
+    if None in answers:
+        return dict(passed=False, error="it failed; see what it printed")
+    return {
+        name: round(1e6 * float(answer["seconds"]) / SUBSTEPS, 1)
+        for name, answer in zip(("forward_us", "with_reverse_us"), answers)
+    }
+
+
 PARTS = {"device": device, "bandwidth": bandwidth, "reference": reference}
 for _kind in ("explicit", "implicit", "self-contact"):
     for _precision in ("f64", "f32"):
         PARTS[f"{_kind} {_precision}"] = lambda options, k=_kind, p=_precision: correctness(options, k, p)
 PARTS |= {"divergence": divergence, "torch": torch_streams}
 PARTS |= {f"{n:,} tetrahedra": lambda options, n=n: speed(options, n) for n in SIZES}
+PARTS |= {f"{who}, 48,000": lambda options, who=who: peers(options, who) for who in work.PEERS}
 
 
 def run_part(options, name: str) -> dict:
@@ -216,6 +236,7 @@ def main() -> int:
     parser.add_argument("--arch", default="cuda", choices=["cpu", "cuda", "vulkan"])
     parser.add_argument("--minutes", type=float, default=10.0, help="for all parts together")
     parser.add_argument("--largest", type=int, default=5_000_000, help="tetrahedra of the largest mesh")
+    parser.add_argument("--only", nargs="+", choices=PARTS, metavar="PART", help="these parts alone")
     parser.add_argument("--part", help=argparse.SUPPRESS)
     parser.add_argument("--folder", help=argparse.SUPPRESS)
     options = parser.parse_args()
@@ -224,7 +245,7 @@ def main() -> int:
         return 0
     end, rows = time.monotonic() + 60 * options.minutes, {}
     with tempfile.TemporaryDirectory() as folder:
-        for name in PARTS:
+        for name in options.only or PARTS:
             left = end - time.monotonic()
             start = time.monotonic()
             rows[name] = ask(options, name, min(left, 120), folder) if left > 5 else dict(left_out="no time left")

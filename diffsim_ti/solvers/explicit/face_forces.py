@@ -79,16 +79,6 @@ class FaceForces(FaceRows):
         return found, least
 
     @ti.func
-    def turn(self, what: A, g: A, first, X, u, w, scene: A, out: A):
-        """Change of (normal, distance) at a point that moves by w."""
-        t = self.vector(0)
-        if ti.static(what == "jvp"):
-            t = g.force.outlook_jvp(scene.parameters, first, X, u, w, out.parameters)
-        else:
-            t = g.force.outlook_jvp(scene.parameters, first, X, u, w)
-        return t
-
-    @ti.func
     def points(self, what: A, g: A, first, f, row, X, u, w, corners, turns, reach, width, scene: A, faces: A, out: A):
         found, by, least = self.rows(0), self.rows(0), ti.cast(1e30, self.fp)
         parts = faces.parts[row]
@@ -151,10 +141,7 @@ class FaceForces(FaceRows):
                                 g, first, f, s, sigma, t, now, Xs, us, mixed, w, corners, weight, width, scene, out
                             )
         if ti.static(what == "vjp"):
-            for a in range(3):
-                g.force.outlook_vjp(
-                    scene.parameters, first, self.row_of(X, a), self.row_of(u, a), self.row_of(by, a), out.sums, f
-                )
+            self.corners_vjp(g, first, X, u, by, scene, out, f)
         return found, least
 
     @ti.func

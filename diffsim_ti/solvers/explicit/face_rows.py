@@ -18,17 +18,9 @@ class FaceRows(ObstacleStages):
     """
 
     @property
-    def rows(self):
-        return ti.types.matrix(3, 4, self.fp)
-
-    @property
     def groups(self):
         """Obstacles that can reach into a face between its corners."""
         return tuple(group for group in self.features.groups if group.force.watched and not group.force.hollow)
-
-    @property
-    def num_obstacles(self) -> int:
-        return sum(group.count for group in self.features.groups)
 
     @ti.func
     def where(self, g: A, k, now: A, scene: A, faces: A, plan: A):
@@ -37,27 +29,6 @@ class FaceRows(ObstacleStages):
         if plan.between == 0:
             place = self.place(g, k, now, scene.path)
         return place
-
-    @ti.func
-    def row_of(self, M, a):
-        """Row a of a matrix of three."""
-        out = self.vector(0)
-        for m in ti.static(range(4)):
-            out[m] = ti.select(a == 0, M[0, m], ti.select(a == 1, M[1, m], M[2, m]))
-        return out
-
-    @ti.func
-    def mix(self, s, M):
-        """Rows of a matrix of three, weighted."""
-        out = self.vector(0)
-        for m in ti.static(range(4)):
-            out[m] = s[0] * M[0, m] + s[1] * M[1, m] + s[2] * M[2, m]
-        return out
-
-    @ti.func
-    def dot3(self, a, b):
-        """Of vectors whose fourth component says something else."""
-        return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
     @ti.func
     def size_of_rows(self, M):

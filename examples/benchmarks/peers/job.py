@@ -13,7 +13,7 @@ import numpy as np
 class Job:
     """vertices (n, 3) [m], tetrahedra (m, 4); start, velocities (n, 3); fixed: indices; E [Pa], nu, density,
     gravity [m/s^2]; h [s], substeps per frame, frames; keep: what is left of the velocity after a substep;
-    ground: (stiffness [N/m], width [m]) of the barrier of y = 0, or nothing; repeats: timed runs.
+    ground: (stiffness [N/m], width [m]) of the barrier of y = 0, or nothing; repeats: timed runs; device: "cpu" or "cuda".
 
     With `weights` (n, 3) a gradient is wanted, of the loss sum_f [linear_f q_f + square_f (q_f - target_f)^2 / 2],
     q_f = sum(weights * displacements_f); the three are of length frames + 1.
@@ -22,7 +22,8 @@ class Job:
     def __init__(self, path: str):
         self.path = path
         with np.load(path) as file:
-            self.__dict__.update({name: value[()] for name, value in file.items()})
+            self.__dict__.update(dict(device="cpu") | {name: value[()] for name, value in file.items()})
+        self.device = str(self.device)
         self.frames, self.substeps, self.repeats = int(self.frames), int(self.substeps), int(self.repeats)
         self.rest_edges = np.moveaxis(self.edges(self.vertices), 1, 2)
         self.volumes = np.linalg.det(self.rest_edges) / 6

@@ -55,6 +55,7 @@ def checkpointed(job) -> bool:
 
 
 def work(job):
+    torch.set_default_device(job.device)
     simulator, lift, steps = simulator_of(job)
     dtype = simulator.positions.dtype
     start, speed = (torch.tensor(a, dtype=dtype) for a in (job.start, job.velocities))
@@ -71,13 +72,13 @@ def work(job):
             for _ in range(job.frames):
                 simulator.step()
                 seen.append(simulator.positions)
-        positions = np.stack([(x.detach() - lift).numpy() for x in seen])
+        positions = np.stack([(x.detach() - lift).cpu().numpy() for x in seen])
         if not job.differentiates:
             return positions, {}
         adjoints = [torch.tensor(a, dtype=dtype) for a in job.adjoints(positions)]
         torch.autograd.backward(seen[1:], adjoints[1:])
         return positions, dict(
-            youngs_modulus=float(simulator.material.E.grad), initial_positions=first.grad.double().numpy()
+            youngs_modulus=float(simulator.material.E.grad), initial_positions=first.grad.double().cpu().numpy()
         )
 
     seconds, (positions, gradients) = timed(run, job.repeats, compiles=False)

@@ -78,10 +78,10 @@ def work(job):
 
     def array(a, dtype, **options):
         host = np.ascontiguousarray(a, np.int32 if dtype is int else np.float32)
-        return wp.array(host, dtype=dtype, device="cpu", **options)
+        return wp.array(host, dtype=dtype, device=job.device, **options)
 
     def states(count):
-        return [wp.zeros(n, dtype=wp.vec3, device="cpu", requires_grad=job.differentiates) for _ in range(count)]
+        return [wp.zeros(n, dtype=wp.vec3, device=job.device, requires_grad=job.differentiates) for _ in range(count)]
 
     tet, B = array(job.tetrahedra, int), array(np.linalg.inv(job.rest_edges), wp.mat33)
     W, masses, free = array(job.volumes, float), array(job.masses, float), array(free, float)
@@ -102,9 +102,13 @@ def work(job):
             f = fs[s if job.differentiates else 0]
             if s and not job.differentiates:
                 f.zero_()
-            wp.launch(elastic, m, inputs=[xs[a], tet, B, W, mu, lam], outputs=[f], device="cpu")
+            wp.launch(elastic, m, inputs=[xs[a], tet, B, W, mu, lam], outputs=[f], device=job.device)
             wp.launch(
-                advance, n, inputs=[xs[a], vs[a], f, masses, free, *constants], outputs=[xs[b], vs[b]], device="cpu"
+                advance,
+                n,
+                inputs=[xs[a], vs[a], f, masses, free, *constants],
+                outputs=[xs[b], vs[b]],
+                device=job.device,
             )
             if (s + 1) % job.substeps == 0:
                 seen.append(xs[b].numpy().copy())
@@ -116,7 +120,8 @@ def work(job):
             positions = forward()
         adjoints = job.adjoints(positions).astype(np.float32)
         seeds = {
-            xs[j * job.substeps]: wp.array(adjoints[j], dtype=wp.vec3, device="cpu") for j in range(1, job.frames + 1)
+            xs[j * job.substeps]: wp.array(adjoints[j], dtype=wp.vec3, device=job.device)
+            for j in range(1, job.frames + 1)
         }
         tape.backward(grads=seeds)
         by_mu, by_lam = (float(a.grad.numpy().astype(float).sum()) for a in (mu, lam))

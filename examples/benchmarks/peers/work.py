@@ -15,7 +15,7 @@ from diffsim_ti.terms import Drag, Gravity, Obstacle
 HERE = Path(__file__).parent
 PEERS = {
     "torch-diffsim": ("run_torch_diffsim.py", "diffsim"),
-    "Warp (CPU)": ("run_warp.py", "warp"),
+    "Warp": ("run_warp.py", "warp"),
     "JAX": ("run_jax.py", "jax"),
 }
 
