@@ -105,7 +105,7 @@ class Newton:
                 continue
             if not np.isfinite(norm):
                 break
-            forcing = min(0.1, np.sqrt(norm / size), max(1e-3, 0.5 * self.tolerance * size / norm))
+            forcing = max(min(0.1, np.sqrt(norm / size)), min(0.1, 0.5 * self.tolerance * size / norm))
             self.preconditioner.update(u)
             direction = self._direction(R, max(forcing, 10 * self.eps))
             moved = self._search(u, direction, R, E)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from diffsim_ti import runtime
-from diffsim_ti.contact.surface_pairs import Tunnelling
+from diffsim_ti.contact.surface_pairs import Overlap, Tunnelling
 from diffsim_ti.solvers.implicit.blocked import Blocked
 from diffsim_ti.solvers.implicit.linear import NotConverged
 from diffsim_ti.solvers.implicit.stage import Stage
@@ -24,11 +24,11 @@ class ObstacleWays:
             runtime.fill(self.potential.walls, self._walls)
 
     def check_apart(self) -> None:
-        """Raise ValueError if a face is in an obstacle, which vertices alone do not show."""
+        """Raise Overlap if a face is in an obstacle, which vertices alone do not show."""
         u, walls = runtime.fetch_row(self.state.u, 0), runtime.fetch(self.arrays.offsets)[::3].astype(np.float64)
         met = self.way.nearest(u, walls[: len(self.way.terms)]) if np.all(np.isfinite(u)) else None
         if met is not None:
-            raise ValueError(
+            raise Overlap(
                 f"{self.way.terms[met.obstacle]!r} reaches {-met.value:.3g} m into {met} of the body: move the body or the "
                 "obstacle"
             )
