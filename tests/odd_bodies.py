@@ -43,7 +43,9 @@ def spring() -> TetrahedralMesh:
     bar = TetrahedralMesh.create_box((3, 91, 3), (0.12, 1, 0.12), origin=(-0.06, 0, -0.06))
     x, s, z = bar.vertices.T
     turn, r = 6 * np.pi * s, 0.5 + x
-    return TetrahedralMesh(np.stack([r * np.cos(turn), s + z, r * np.sin(turn)], 1), bar.tetrahedra, fix_orientation=True)
+    return TetrahedralMesh(
+        np.stack([r * np.cos(turn), s + z, r * np.sin(turn)], 1), bar.tetrahedra, fix_orientation=True
+    )
 
 
 def dumb_bell() -> TetrahedralMesh:

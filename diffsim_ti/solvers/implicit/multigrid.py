@@ -133,8 +133,8 @@ def vertex_rotations(potential, u: np.ndarray) -> np.ndarray | None:
 
 
 def rotations_of(F: np.ndarray) -> np.ndarray:
-    """The rotation next to each F, shape (k, 3, 3): by Newton's iteration R <- (R + R^-T) / 2, which takes a tenth of the time
-    of singular values; by those where F is nearly singular or mirrored.
+    """The rotation next to each F, shape (k, 3, 3): by Newton's iteration R <- (R + R^-T) / 2, which takes a fourth of the
+    time of singular values; by those where F is nearly singular or mirrored.
 
     Higham 1986, Computing the Polar Decomposition, doi:10.1137/0907079.
     """

@@ -48,6 +48,8 @@ class Newton:
 
     insist = 2.0**-10
     trusted = 10  # iterations after which the direction before an indefinite one is good enough
+    slight = 0.01, 0.0  # which negative eigenvalues of tetrahedra may stay (projection.py), the second where that fails
+    inexact, exact = 0.1, 1e-3  # relative residuals of linear solves
     roughly = 0.03
     patience = 6  # times as many rounds as asked for, at most, where obstacles cut directions short
     shortest = 2.0**-40  # fraction of a direction below which a line search gives up
@@ -84,7 +86,7 @@ class Newton:
         self.preconditioner, self.stiffness = self.preconditioners(mass)
         E, size = self._evaluate(u), 0.0
         self.upright = bool(np.all(E[2] > 0))
-        most = self.max_iterations if rounds is None else rounds
+        most, exactly = self.max_iterations if rounds is None else rounds, False
         while len(report.residuals) < min(most + report.cuts, self.patience * most):
             R, now = self._residual(u)
             size = max(size, now)
@@ -105,10 +107,10 @@ class Newton:
                 continue
             if not np.isfinite(norm):
                 break
-            forcing = max(min(0.1, np.sqrt(norm / size)), min(0.1, 0.5 * self.tolerance * size / norm))
             self.preconditioner.update(u)
-            direction = self._direction(R, max(forcing, 10 * self.eps))
+            direction, cuts = self._direction(R, self._forcing(exactly)), report.cuts
             moved = self._search(u, direction, R, E)
+            exactly = report.cuts > cuts
             if moved is None:
                 break
             u, E = moved
@@ -143,6 +145,16 @@ class Newton:
         size = np.sqrt((sizes**2).sum() + (self.loads**2).sum() + (inertia**2 * self.free).sum())
         return (f + self.loads - inertia) * self.free, size
 
+    def _forcing(self, exactly: bool) -> float:
+        """The relative residual to which a round solves its linear system: as its own is now; but exactly where the last one
+        brought little, or an obstacle cut it short. Eisenstat, Walker 1996, Choosing the Forcing Terms in an Inexact Newton
+        Method, doi:10.1137/0917003."""
+        before, now = (
+            self.report.residuals[-2:] if len(self.report.residuals) > 1 else (np.inf, self.report.residuals[-1])
+        )
+        most = self.exact if exactly or now > 0.5 * before else self.inexact
+        return max(min(most, np.sqrt(now)), 10 * self.eps)
+
     def _direction(self, R, forcing):
         A = self.operator()
         limit = 10 * len(R)
@@ -151,8 +163,11 @@ class Newton:
         if negative is not None:
             self.report.indefinite += 1
             if count <= self.trusted:
-                A.correction = Projection(self.potential)
-                d, *_ = conjugate_gradients(A, R, self.preconditioner, forcing, limit, self.eps)
+                for slight in self.slight:
+                    A.correction = Projection(self.potential, slight)
+                    d, *_, negative = conjugate_gradients(A, R, self.preconditioner, forcing, limit, self.eps)
+                    if negative is None:
+                        break
         self.report.products += A.products
         return d
 
