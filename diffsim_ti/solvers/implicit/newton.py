@@ -49,7 +49,7 @@ class Newton:
     insist = 2.0**-10
     trusted = 10  # iterations after which the direction before an indefinite one is good enough
     slight = 0.01, 0.0  # which negative eigenvalues of tetrahedra may stay (projection.py), the second where that fails
-    inexact, exact = 0.1, 1e-3  # relative residuals of linear solves
+    inexact = 0.1  # relative residual of a linear solve, or the root of the round's own if that is less
     roughly = 0.03
     patience = 6  # times as many rounds as asked for, at most, where obstacles cut directions short
     shortest = 2.0**-40  # fraction of a direction below which a line search gives up
@@ -86,7 +86,7 @@ class Newton:
         self.preconditioner, self.stiffness = self.preconditioners(mass)
         E, size = self._evaluate(u), 0.0
         self.upright = bool(np.all(E[2] > 0))
-        most, exactly = self.max_iterations if rounds is None else rounds, False
+        most = self.max_iterations if rounds is None else rounds
         while len(report.residuals) < min(most + report.cuts, self.patience * most):
             R, now = self._residual(u)
             size = max(size, now)
@@ -108,9 +108,8 @@ class Newton:
             if not np.isfinite(norm):
                 break
             self.preconditioner.update(u)
-            direction, cuts = self._direction(R, self._forcing(exactly)), report.cuts
+            direction = self._direction(R, max(min(self.inexact, np.sqrt(norm / size)), 10 * self.eps))
             moved = self._search(u, direction, R, E)
-            exactly = report.cuts > cuts
             if moved is None:
                 break
             u, E = moved
@@ -144,16 +143,6 @@ class Newton:
         inertia = self.mass * (u - self.inertial)
         size = np.sqrt((sizes**2).sum() + (self.loads**2).sum() + (inertia**2 * self.free).sum())
         return (f + self.loads - inertia) * self.free, size
-
-    def _forcing(self, exactly: bool) -> float:
-        """The relative residual to which a round solves its linear system: as its own is now; but exactly where the last one
-        brought little, or an obstacle cut it short. Eisenstat, Walker 1996, Choosing the Forcing Terms in an Inexact Newton
-        Method, doi:10.1137/0917003."""
-        before, now = (
-            self.report.residuals[-2:] if len(self.report.residuals) > 1 else (np.inf, self.report.residuals[-1])
-        )
-        most = self.exact if exactly or now > 0.5 * before else self.inexact
-        return max(min(most, np.sqrt(now)), 10 * self.eps)
 
     def _direction(self, R, forcing):
         A = self.operator()
