@@ -21,7 +21,7 @@ from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.monitor.quantities import Energy, TetrahedronFields
 from diffsim_ti.scene import Scene
 from diffsim_ti.simulator import Simulator
-from diffsim_ti.solvers import ImplicitEulerSolver, SemiImplicitSolver, VelocityVerletSolver
+from diffsim_ti.solvers import BDF2Solver, ImplicitEulerSolver, SemiImplicitSolver, VelocityVerletSolver
 from diffsim_ti.terms import Gravity, Ground, Sphere
 
 
@@ -210,6 +210,21 @@ def test_energy_that_only_ever_rises_is_refused_once_it_has_drifted(cube, solver
         run._look()
     assert 0 < gained <= (rule.drift + rule.part) * scale
     assert "the energy rose by" in run._complaint(look_up=False)
+
+
+def test_what_no_implicit_step_lowers_is_rounding_while_nothing_is_gained_on_the_whole(cube, monkeypatch):
+    run = falling(cube, solver=BDF2Solver)
+    run.advance()
+    told, sim = run._energy, run.simulator
+    monkeypatch.setattr(sim, "compute_energy", lambda: Energy(told.parts | dict(other=1.0)))
+    begin = sim.step_count
+    run._begun = told + 2.0  # of which half has gone
+    run._advance_part(last=False)
+    assert sim.step_count == begin + 1 and len(run.seen.retries) == 3
+    assert "the energy rose by 1 J; shorter ones do not lower that" in run.seen.retries[-1]
+    run._begun = told
+    with pytest.raises(FloatingPointError, match="unstable even with a substep.*the energy rose by 1 J"):
+        run._advance_part(last=False)
 
 
 def test_a_law_that_implicit_solvers_do_not_know_ends_in_the_error(cube):
