@@ -45,7 +45,7 @@ class EnergyRise:
 
 
 STEPS = StepRule()
-ENERGY_RISE = {1: EnergyRise(0.01, 0.001, 0.03), 2: EnergyRise(0.002, 2e-5, 0.002)}  # by the order of the method
+ENERGY_RISE = {1: EnergyRise(0.01, 0.001, 0.03), 2: EnergyRise(0.002, 5e-5, 0.004)}  # by the order of the method
 
 
 class Interrupted(Exception):
