@@ -125,6 +125,7 @@ class ForwardRun:
         """Measure the rise and drift of energy from the present state on, which something outside has changed."""
         self._energy = self._lowest = self._begun = self.simulator.compute_energy()
         self.largest_energy = max(self.largest_energy, self._moving(self._energy))
+        self._fastest = max(self._fastest, self._moving(self._energy))
 
     def advance(self) -> None:
         """One frame. Raises FloatingPointError if no number of substeps tried keeps it stable."""

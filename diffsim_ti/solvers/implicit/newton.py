@@ -49,7 +49,9 @@ class Newton:
     insist = 2.0**-10
     trusted = 10  # iterations after which the direction before an indefinite one is good enough
     slight = 0.01, 0.0  # which negative eigenvalues of tetrahedra may stay (projection.py), the second where that fails
-    inexact = 0.1  # relative residual of a linear solve, or the root of the round's own if that is less
+    # relative residual of a linear solve, or the root of the round's own if that is less: Eisenstat, Walker 1996, Choosing
+    # the Forcing Terms in an Inexact Newton Method, doi:10.1137/0917003
+    inexact = 0.1
     roughly = 0.03
     patience = 6  # times as many rounds as asked for, at most, where obstacles cut directions short
     shortest = 2.0**-40  # fraction of a direction below which a line search gives up
