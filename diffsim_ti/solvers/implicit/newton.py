@@ -23,8 +23,8 @@ LONGER = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # steps along an indefinite direction
 @dataclass
 class NewtonReport:
     """What a solve took: relative residual before each round, products of the Hessian, rounds with an indefinite
-    Hessian, saddles that were left, evaluations of the energy; directions that an obstacle cut short, and what cut the
-    last one (potential/way.py)."""
+    Hessian, saddles that were left, evaluations of the energy; directions that an obstacle, or the surface itself, cut
+    short, and which obstacle cut the last one (potential/way.py)."""
 
     residuals: list = field(default_factory=list)
     products: int = 0
@@ -206,8 +206,9 @@ class Newton:
         """The longest step along d in which surfaces stay apart, from obstacles and from each other."""
         pairs, most = self.potential.pairs, 2 * LONGER[-1] if self._indefinite else 1.0
         free, self.report.met = self.way(u, d, most)
+        free = min(free, pairs.safe_share(u, d, free)) if pairs else free
         self.report.cuts += free < 1
-        return min(free, pairs.safe_share(u, d, free)) if pairs else free
+        return free
 
     def _falls(self, u, d, slope) -> bool:
         """Whether Phi does not rise again at u as steeply as it fell before: what is left to ask where its change drowns in
