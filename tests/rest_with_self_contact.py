@@ -27,7 +27,7 @@ def fall(mesh: Path, solver: str, drag: float, E: float, width: float = 1e-3) ->
 
 
 def speed(run: ForwardRun) -> float:
-    """Root mean square of vertical velocities [m/s]: the floor has no friction, on which a body slides and turns for ever."""
+    """Root mean square of vertical velocities [m/s]: a body slides for ever on a floor without friction."""
     return float(np.sqrt((run.simulator.velocities[:, 1].astype(np.float64) ** 2).mean()))
 
 
