@@ -15,12 +15,13 @@ from diffsim_ti import adaptive_run as forward
 from diffsim_ti import picture
 from diffsim_ti.cli import app as cli
 from diffsim_ti.cli import options
+from diffsim_ti.contact.surface_pairs import Overlap
 from diffsim_ti.materials import StableNeoHookean
 from diffsim_ti.mesh import TetrahedralMesh
-from diffsim_ti.monitor.quantities import TetrahedronFields
+from diffsim_ti.monitor.quantities import Energy, TetrahedronFields
 from diffsim_ti.scene import Scene
 from diffsim_ti.simulator import Simulator
-from diffsim_ti.solvers import ImplicitEulerSolver, SemiImplicitSolver, VelocityVerletSolver
+from diffsim_ti.solvers import BDF2Solver, ImplicitEulerSolver, SemiImplicitSolver, VelocityVerletSolver
 from diffsim_ti.terms import Gravity, Ground, Sphere
 
 
@@ -174,6 +175,56 @@ def test_a_part_by_implicit_euler_hands_on_what_a_law_remembers(cube):
             assert np.array_equal(getattr(other, name), getattr(sim, name)), name
         before = sim.law_state
         assert run._advance_part_implicitly("asked for") and not np.array_equal(sim.law_state, before)
+
+
+def test_only_overlaps_let_implicit_parts_try_again(cube, monkeypatch):
+    """A face that explicit steps brought into an obstacle; any other error is one."""
+    run = falling(cube)
+
+    def refuse(error):
+        def hand_on(source, target):
+            raise error
+
+        monkeypatch.setattr(forward, "hand_on", hand_on)
+
+    refuse(Overlap("a face is in the floor"))
+    assert not run._advance_part_implicitly("asked for") and run.seen.implicit_parts == 0
+    refuse(ValueError("something else"))
+    with pytest.raises(ValueError, match="something else"):
+        run._advance_part_implicitly("asked for")
+
+
+@pytest.mark.parametrize("solver", [SemiImplicitSolver, VelocityVerletSolver])
+def test_energy_that_only_ever_rises_is_refused_once_it_has_drifted(cube, solver, monkeypatch):
+    """A passing error is let through part by part, but the parts together may not gain more than its size."""
+    run = falling(cube, solver=solver)
+    for _ in range(3):
+        run.advance()
+    rule, scale = forward.ENERGY_RISE[run.simulator.solver.order], run._fastest
+    before, gained = run.simulator.compute_energy(), 0.0
+    for _ in range(200):
+        gained += 0.4 * rule.part * scale
+        monkeypatch.setattr(run.simulator, "compute_energy", lambda: Energy(before.parts | dict(other=gained)))
+        if run._complaint(look_up=False):
+            break
+        run._look()
+    assert 0 < gained <= (rule.drift + rule.part) * scale
+    assert "the energy rose by" in run._complaint(look_up=False)
+
+
+def test_what_no_implicit_step_lowers_is_rounding_while_nothing_is_gained_on_the_whole(cube, monkeypatch):
+    run = falling(cube, solver=BDF2Solver)
+    run.advance()
+    told, sim = run._energy, run.simulator
+    monkeypatch.setattr(sim, "compute_energy", lambda: Energy(told.parts | dict(other=1.0)))
+    begin = sim.step_count
+    run._begun = told + 2.0  # of which half has gone
+    run._advance_part(last=False)
+    assert sim.step_count == begin + 1 and len(run.seen.retries) == 3
+    assert "the energy rose by 1 J; shorter ones do not lower that" in run.seen.retries[-1]
+    run._begun = told
+    with pytest.raises(FloatingPointError, match="unstable even with a substep.*the energy rose by 1 J"):
+        run._advance_part(last=False)
 
 
 def test_a_law_that_implicit_solvers_do_not_know_ends_in_the_error(cube):

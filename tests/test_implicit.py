@@ -7,6 +7,9 @@ import numpy as np
 import pytest
 
 import diffsim_ti as ds
+from diffsim_ti.solvers.implicit.multigrid import rotations_of
+from diffsim_ti.solvers.implicit.newton import Newton
+from diffsim_ti.solvers.implicit.projection import has_eigenvalue_below
 
 SOLVERS = (ds.ImplicitEulerSolver, ds.ImplicitMidpointSolver, ds.BDF2Solver)
 by_name = pytest.mark.parametrize("solver", SOLVERS, ids=lambda s: s.__name__)
@@ -393,6 +396,49 @@ def test_multigrid_and_block_jacobi_find_the_same_motion():
         ends.append((workspace.read(workspace.state, 0)[0], products))
     np.testing.assert_allclose(ends[0][0], ends[1][0], atol=1e-8)
     assert ends[0][1] < 0.5 * ends[1][1]
+
+
+def test_linear_solves_are_no_more_exact_than_rounds_need(monkeypatch):
+    """A beam that bends far: fewer products, the same motion."""
+    mesh = ds.TetrahedralMesh.create_box((9, 4, 4), (0.8, 0.3, 0.3))
+    scene = ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.4), terms=[ds.Gravity(-60)], fixed="xmin", precision="f64")
+    found = []
+    for inexact in (Newton.inexact, 1e-3):
+        monkeypatch.setattr(Newton, "inexact", inexact)
+        workspace, products = ds.ImplicitEulerSolver(scene, dt=2e-2, tolerance=1e-6), 0
+        workspace = workspace.workspace(workspace.start_values())
+        for j in range(10):
+            workspace.advance(j, j + 1, 10)
+            products += workspace.newton.report.products
+        found.append((workspace.read(workspace.state, 0)[0], products))
+    np.testing.assert_allclose(found[0][0], found[1][0], atol=1e-5)
+    assert found[0][1] < 0.8 * found[1][1], found
+
+
+def test_rotations_are_those_of_singular_values():
+    """Near rotations, stretched, nearly singular and mirrored."""
+    rng = np.random.default_rng(0)
+    F = np.concatenate([np.eye(3) + s * rng.standard_normal((200, 3, 3)) for s in (0.1, 0.5, 2.0)])
+    F[::7, 2] *= 1e-3
+    U, S, V = np.linalg.svd(F)
+    U[:, :, 2] *= np.linalg.det(U @ V)[:, None]
+    clear = S[:, 1] - np.abs(S[:, 2]) > 1e-3  # else many rotations are as near
+    R = rotations_of(F)
+    np.testing.assert_allclose(R[clear], (U @ V)[clear], atol=1e-5)
+    np.testing.assert_allclose(R @ np.swapaxes(R, 1, 2), np.tile(np.eye(3), (len(R), 1, 1)), atol=1e-6)
+
+
+def test_elimination_knows_which_matrices_have_an_eigenvalue_below_a_bound():
+    rng = np.random.default_rng(0)
+    C = rng.standard_normal((300, 9, 9))
+    C = C + np.swapaxes(C, 1, 2) + 8 * rng.random((300, 1, 1)) * np.eye(9)
+    bound = rng.uniform(-8, 4, 300)
+    lowest = np.linalg.eigvalsh(C)[:, 0]
+    assert 50 < (lowest < bound).sum() < 250
+    for count in (300, 1):
+        given = C[:count].copy()
+        np.testing.assert_array_equal(has_eigenvalue_below(given, bound[:count], chunk=128), (lowest < bound)[:count])
+        np.testing.assert_array_equal(given, C[:count])
 
 
 def test_steps_by_a_simulator_are_those_of_a_rollout():

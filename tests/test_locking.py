@@ -11,7 +11,7 @@ from diffsim_ti.materials import MATERIALS
 from diffsim_ti.mesh.patches import SIZE, in_eights, volume_patches
 from diffsim_ti.monitor import quantities
 from diffsim_ti.monitor.stability import element_limit, lanczos_limit
-from diffsim_ti.solvers.implicit.preconditioners import _assemble
+from diffsim_ti.solvers.implicit.preconditioners import assemble
 
 locking = example("benchmarks/locking")
 
@@ -181,7 +181,7 @@ def test_preconditioners_are_made_of_the_exact_matrix():
     p.place(state())
     blocks = p.blocks()
     largest = np.abs(exact).max()
-    assert np.abs(_assemble(p, np.zeros((n, 1)), np.ones((n, 1)))[0].toarray() - exact).max() < 1e-13 * largest
+    assert np.abs(assemble(p, np.zeros((n, 1)), np.ones((n, 1)))[0].toarray() - exact).max() < 1e-13 * largest
     assert (
         max(np.abs(blocks[i] - exact[3 * i : 3 * i + 3, 3 * i : 3 * i + 3]).max() for i in range(n)) < 1e-13 * largest
     )

@@ -20,6 +20,10 @@ class Tunnelling(FloatingPointError):
     """In one pass, surfaces moved so far that they may have gone through each other."""
 
 
+class Overlap(ValueError):
+    """A state in which surfaces touch or pass through each other, or an obstacle reaches into a face."""
+
+
 class SurfacePairs:
     """Pairs of surface primitives of a scene with a SelfContact term (terms/self_contact.py).
 
@@ -98,20 +102,20 @@ class SurfacePairs:
             )
 
     def check_apart(self, u) -> None:
-        """Raise ValueError if surfaces touch or pass through each other at u[0]."""
+        """Raise Overlap if surfaces touch or pass through each other at u[0]."""
         if not self.fresh or self.age:
             self._build(u, 0)
         found = self.list.first_piercing(self.a.rest, u, 0)
         if found:
             edge, triangle = self.edges[found[0]], self.mesh.surface_triangles[found[1]]
-            raise ValueError(
+            raise Overlap(
                 f"surfaces pass through each other: edge {_numbers(edge)} and triangle {_numbers(triangle)}; "
                 "move the bodies apart"
             )
         gaps, pairs = self._distances(u)
         if gaps.size and not gaps.min() > 0:
             worst = int(gaps.argmin())
-            raise ValueError(f"surfaces touch: {self._name(worst, pairs)}; move the bodies apart")
+            raise Overlap(f"surfaces touch: {self._name(worst, pairs)}; move the bodies apart")
 
     def forget(self, u) -> None:
         """The state was set from outside."""

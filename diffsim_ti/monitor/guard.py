@@ -103,20 +103,18 @@ class Guard:
         solver, watch = self.ws.solver, self.ws.watch
         if self._warned or not solver.explicit or not watch.contacts:
             return
-        by_faces, limit, enough = watch.faces_omega_dt(), 1, 0.7
-        omega_dt = by_faces
-        if not solver.stages_contact and not by_faces > 1:
-            omega_dt, limit, enough = watch.largest_omega_dt(), 2, 1.8
-        if omega_dt > limit:
-            self._warned, step = True, self.ws.step_of(now - 1, num_passes)
-            h, what = solver.substep, "of faces " if limit == 1 else ""
-            warnings.warn(
-                f"step {step}, t = {step * solver.dt:.6g} s: a contact {what}was stiffer than the substep {h:.3g} s can "
-                f"follow (omega dt = {omega_dt:.3g} > {limit}), "
-                f"so that energy may be gained in it: take substeps of {enough * h / omega_dt:.3g} s, or a softer or wider "
-                "barrier",
-                stacklevel=5,
-            )
+        looks = [("of faces ", watch.faces_omega_dt(), 1, 0.7)]  # what, how stiff, what a step follows, what is advised
+        if not solver.stages_contact:
+            looks.append(("", watch.largest_omega_dt(), 2, 1.8))
+        for what, omega_dt, limit, enough in looks:
+            if omega_dt > limit and not self._warned:
+                self._warned, step, h = True, self.ws.step_of(now - 1, num_passes), solver.substep
+                warnings.warn(
+                    f"step {step}, t = {step * solver.dt:.6g} s: a contact {what}was stiffer than the substep {h:.3g} s "
+                    f"can follow (omega dt = {omega_dt:.3g} > {limit}), so that energy may be gained in it: take substeps "
+                    f"of {enough * h / omega_dt:.3g} s, or a softer or wider barrier",
+                    stacklevel=5,
+                )
 
     def _warn_of_gained_energy(self, now: int, num_passes: int) -> None:
         """Once, where steps have added a tenth of the energy that moves."""

@@ -7,6 +7,7 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
+from diffsim_ti.contact.surface_pairs import Overlap
 from diffsim_ti.potential.swept import swept_kernels
 
 
@@ -76,10 +77,10 @@ class Way:
         return self.met
 
     def check_apart(self, u: np.ndarray, places: np.ndarray) -> None:
-        """Raise ValueError if a vertex or a face is in an obstacle. A state that is not finite is looked at elsewhere."""
+        """Raise Overlap if a vertex or a face is in an obstacle. A state that is not finite is looked at elsewhere."""
         met = self.nearest(u, places) if np.all(np.isfinite(u)) else None
         if met is not None:
-            raise ValueError(
+            raise Overlap(
                 f"{self.terms[met.obstacle]!r} reaches {-met.value:.3g} m into {met} of the body: move the body or the "
                 "obstacle"
             )

@@ -23,8 +23,8 @@ LONGER = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # steps along an indefinite direction
 @dataclass
 class NewtonReport:
     """What a solve took: relative residual before each round, products of the Hessian, rounds with an indefinite
-    Hessian, saddles that were left, evaluations of the energy; directions that an obstacle cut short, and what cut the
-    last one (potential/way.py)."""
+    Hessian, saddles that were left, evaluations of the energy; directions that an obstacle, or the surface itself, cut
+    short, and which obstacle cut the last one (potential/way.py)."""
 
     residuals: list = field(default_factory=list)
     products: int = 0
@@ -48,6 +48,10 @@ class Newton:
 
     insist = 2.0**-10
     trusted = 10  # iterations after which the direction before an indefinite one is good enough
+    slight = 0.01, 0.0  # which negative eigenvalues of tetrahedra may stay (projection.py), the second where that fails
+    # relative residual of a linear solve, or the root of the round's own if that is less: Eisenstat, Walker 1996, Choosing
+    # the Forcing Terms in an Inexact Newton Method, doi:10.1137/0917003
+    inexact = 0.1
     roughly = 0.03
     patience = 6  # times as many rounds as asked for, at most, where obstacles cut directions short
     shortest = 2.0**-40  # fraction of a direction below which a line search gives up
@@ -105,9 +109,8 @@ class Newton:
                 continue
             if not np.isfinite(norm):
                 break
-            forcing = min(0.1, np.sqrt(norm / size), max(1e-3, 0.5 * self.tolerance * size / norm))
             self.preconditioner.update(u)
-            direction = self._direction(R, max(forcing, 10 * self.eps))
+            direction = self._direction(R, max(min(self.inexact, np.sqrt(norm / size)), 10 * self.eps))
             moved = self._search(u, direction, R, E)
             if moved is None:
                 break
@@ -151,8 +154,11 @@ class Newton:
         if negative is not None:
             self.report.indefinite += 1
             if count <= self.trusted:
-                A.correction = Projection(self.potential)
-                d, *_ = conjugate_gradients(A, R, self.preconditioner, forcing, limit, self.eps)
+                for slight in self.slight:
+                    A.correction = Projection(self.potential, slight)
+                    d, *_, negative = conjugate_gradients(A, R, self.preconditioner, forcing, limit, self.eps)
+                    if negative is None:
+                        break
         self.report.products += A.products
         return d
 
@@ -200,8 +206,9 @@ class Newton:
         """The longest step along d in which surfaces stay apart, from obstacles and from each other."""
         pairs, most = self.potential.pairs, 2 * LONGER[-1] if self._indefinite else 1.0
         free, self.report.met = self.way(u, d, most)
+        free = min(free, pairs.safe_share(u, d, free)) if pairs else free
         self.report.cuts += free < 1
-        return min(free, pairs.safe_share(u, d, free)) if pairs else free
+        return free
 
     def _falls(self, u, d, slope) -> bool:
         """Whether Phi does not rise again at u as steeply as it fell before: what is left to ask where its change drowns in

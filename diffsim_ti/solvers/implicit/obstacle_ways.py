@@ -24,7 +24,7 @@ class ObstacleWays:
             runtime.fill(self.potential.walls, self._walls)
 
     def check_apart(self) -> None:
-        """Raise ValueError if a face is in an obstacle, which vertices alone do not show."""
+        """Raise Overlap if a face is in an obstacle, which vertices alone do not show."""
         u, walls = runtime.fetch_row(self.state.u, 0), runtime.fetch(self.arrays.offsets)[::3].astype(np.float64)
         self.way.check_apart(u, walls[: len(self.way.terms)])
 

@@ -1,4 +1,4 @@
-"""Preconditioners for c M + d2E/du2: block Jacobi, and algebraic multigrid of the body at rest, turned with it.
+"""Preconditioners for c M + d2E/du2: block Jacobi here, multigrid in multigrid.py; and its assembled matrix.
 
 Both are functions of the present state alone, so that a run that is started again from a checkpoint takes the same steps.
 """
@@ -27,94 +27,6 @@ class BlockJacobi:
         return np.matmul(self._inverse, r[:, :, None])[:, :, 0]
 
 
-class Multigrid:
-    """Smoothed aggregation on the assembled matrix of the rest state, with rigid motions as near kernel.
-
-    Isotropic laws: turning a body turns its stiffness, K(R u) = R K(u) R^T. So residuals are turned back by each vertex's
-    mean rotation, and corrections forth. Contact stiffness joins the finest level.
-    Vanek, Mandel, Brezina 1996, doi:10.1007/BF02238511; Bell, Olson, Schroder, PyAMG, doi:10.21105/joss.04142.
-    """
-
-    def __init__(self, potential, mass: np.ndarray, free: np.ndarray, size: np.ndarray):
-        import pyamg
-
-        self.potential, self.free = potential, free
-        with potential.at_rest():
-            potential.blocks()
-            self._matrix, self._diagonal = _assemble(potential, mass, free)
-        sweep = ("block_gauss_seidel", {"sweep": "symmetric", "iterations": 1})
-        state = np.random.get_state()
-        np.random.seed(0)  # pyamg estimates a spectral radius from a random vector
-        try:
-            self._levels = pyamg.smoothed_aggregation_solver(
-                self._matrix,
-                B=_rigid_motions(potential.arrays.values.rest) * np.repeat(free, 3, 0),
-                strength=("symmetric", {"theta": 0.08}),
-                presmoother=sweep,
-                postsmoother=sweep,
-                max_coarse=300,
-                coarse_solver="splu",
-            )
-        finally:
-            np.random.set_state(state)
-        self._rotations, self._contact = None, None
-
-    def update(self, u: np.ndarray) -> None:
-        """Adapt to the displacement at which the potential is placed."""
-        self._rotations = vertex_rotations(self.potential, u)
-        contact = self.potential.contact_blocks()
-        if contact is None:
-            return
-        if self._rotations is not None:
-            contact = np.swapaxes(self._rotations, 1, 2) @ contact @ self._rotations
-        if self._contact is not None and np.array_equal(contact, self._contact):
-            return
-        from pyamg.relaxation.smoothing import change_smoothers
-
-        finest = self._levels.levels[0].A
-        finest.data[self._diagonal] += contact - (0 if self._contact is None else self._contact)
-        self._contact = contact
-        for kept in ("block_D", "block_D_inv"):  # pyamg keeps the diagonal that it found first
-            if hasattr(finest, kept):
-                delattr(finest, kept)
-        sweep = ("block_gauss_seidel", {"sweep": "symmetric", "iterations": 1})
-        change_smoothers(self._levels, sweep, sweep)
-
-    def __call__(self, r: np.ndarray) -> np.ndarray:
-        R = self._rotations
-        if R is not None:
-            r = np.matmul(np.swapaxes(R, 1, 2), r[:, :, None])[:, :, 0]
-        z = self._levels.solve(r.ravel(), x0=np.zeros(r.size), maxiter=1, tol=1e-300, cycle="V").reshape(-1, 3)
-        if R is not None:
-            z = np.matmul(R, z[:, :, None])[:, :, 0]
-        return z * self.free
-
-
-def vertex_rotations(potential, u: np.ndarray) -> np.ndarray | None:
-    """Mean rotation at each vertex, shape (num_vertices, 3, 3); None where everything is nearly unturned."""
-    a, tets = potential.arrays, potential.tetrahedra
-    D = u[tets[:, 1:]] - u[tets[:, :1]]
-    H = np.matmul(np.swapaxes(D, 1, 2), a.values.gradients)
-    if np.abs(H).max(initial=0.0) < 0.02:
-        return None
-    H *= a.values.volumes[:, None, None]
-    F = np.stack([np.bincount(tets.ravel(), np.repeat(H.reshape(-1, 9)[:, k], 4), a.num_vertices) for k in range(9)], 1)
-    F /= np.bincount(tets.ravel(), np.repeat(a.values.volumes, 4), a.num_vertices)[:, None] + 1e-300
-    U, _, V = np.linalg.svd(F.reshape(-1, 3, 3) + np.eye(3))
-    U[:, :, 2] *= np.linalg.det(U @ V)[:, None]
-    return U @ V
-
-
-def _rigid_motions(X: np.ndarray) -> np.ndarray:
-    x, y, z = (X - X.mean(0)).T
-    out = np.zeros((len(X), 3, 6))
-    out[:, 0, 0] = out[:, 1, 1] = out[:, 2, 2] = 1
-    out[:, 0, 3], out[:, 1, 3] = -y, x
-    out[:, 1, 4], out[:, 2, 4] = -z, y
-    out[:, 0, 5], out[:, 2, 5] = z, -x
-    return out.reshape(-1, 6)
-
-
 def element_matrices(potential) -> np.ndarray:
     """12x12 stiffness of each tetrahedron where `potential.blocks` was last called, as (m, 4, 4, 3, 3) blocks [N/m]; a
     patch's pressure is held.
@@ -127,7 +39,7 @@ def element_matrices(potential) -> np.ndarray:
     return np.einsum("eaj,eijkb->eabik", N, right, optimize=True)
 
 
-def _assemble(potential, mass, free):
+def assemble(potential, mass, free):
     """(c M + K as a block matrix, places of its diagonal blocks); fixed vertices keep a diagonal."""
     from scipy.sparse import bsr_matrix
 

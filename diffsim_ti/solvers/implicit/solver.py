@@ -26,7 +26,7 @@ class ImplicitSolver(Solver):
 
     tolerance: relative residual of the equation of motion; gradients are as exact as the solve.
     max_iterations: Newton rounds per substep, after which NotConverged is raised and the state stays as it was. Rounds whose
-        direction an obstacle cuts short do not count, up to five times as many.
+        direction an obstacle, or the surface itself, cuts short do not count, up to five times as many.
 
     On the way from one state to the next no vertex or face meets an obstacle; what comes to the body, obstacles on their
     paths and held vertices, makes room for itself. Where there is none, Blocked (a NotConverged) says what stands there.

@@ -14,9 +14,10 @@ from diffsim_ti.potential.way import Way
 from diffsim_ti.solvers.implicit.approach import Approach
 from diffsim_ti.solvers.implicit.law_state import law_state_kernels
 from diffsim_ti.solvers.implicit.linear import NotConverged
+from diffsim_ti.solvers.implicit.multigrid import Multigrid
 from diffsim_ti.solvers.implicit.newton import Newton
 from diffsim_ti.solvers.implicit.obstacle_ways import ObstacleWays
-from diffsim_ti.solvers.implicit.preconditioners import BlockJacobi, Multigrid
+from diffsim_ti.solvers.implicit.preconditioners import BlockJacobi
 from diffsim_ti.solvers.implicit.stage import Stage
 from diffsim_ti.solvers.implicit.threads import one_blas_thread
 from diffsim_ti.state.arrays import History, copy_slot
