@@ -111,7 +111,7 @@ class ContactStage(ObstacleStages):
                 share = half * share
             else:
                 z, share = trial, ti.cast(1, self.fp)
-                step = self.vector(0) - stage.solve_linear(a, xyz, mixed, r)
+                step = self.vector(0) - stage.solve_linear(self.features.num_staged, a, xyz, mixed, r)
                 before = -r.dot(step)
                 if step.dot(step) <= tiny * ti.max(z.dot(z), least * least):  # norm() would compute in f64
                     break
@@ -176,7 +176,7 @@ class ContactStage(ObstacleStages):
                 z, total, xyz, mixed = self.solve(i, moved, free, a, now, state, plan)
                 dtotal = self.note_changes(i, u, du, z, now, scene, state, tangent, plan)
                 b = dalpha * v_plus + now.alpha * dv_plus + blend * (dalpha * ratio + now.alpha * dratio) * total
-                dz = stage.solve_linear(a, xyz, mixed, b + a * dtotal)
+                dz = stage.solve_linear(self.features.num_staged, a, xyz, mixed, b + a * dtotal)
                 dtotal += self.add_change(i, dz, state)
                 delta, ddelta = ratio * total, dratio * total + ratio * dtotal
                 v, dv = self.slide_all_jvp(i, v, dv, ratio, dratio, now, scene, state, tangent)
@@ -260,7 +260,7 @@ class ContactStage(ObstacleStages):
                 if ti.static(len(self.features.staged_rough) > 0):
                     v_adj, more = self.slide_all_vjp(i, v_plus, v_adj, ratio, state)
                     by_ratio += more
-                z_adj = stage.solve_linear(a, xyz, mixed, self.by_move(i, state))
+                z_adj = stage.solve_linear(self.features.num_staged, a, xyz, mixed, self.by_move(i, state))
                 v_adj += now.alpha * z_adj
                 by_alpha += z_adj.dot(v_plus + blend * ratio * total)
                 by_ratio += blend * now.alpha * z_adj.dot(total)
