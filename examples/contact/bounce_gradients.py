@@ -132,17 +132,19 @@ def save_chart(path: Path, results: dict) -> None:
     """Median errors against the substep, a panel for each body and width."""
     from matplotlib.figure import Figure
 
-    figure = Figure((4.2 * len(results), 3.6), layout="constrained")
+    figure = Figure((3.2 * len(results), 3.6), layout="constrained")
     panels = figure.subplots(1, len(results), sharey=True, squeeze=False)[0]
     for axes, ((body, width), errors) in zip(panels, results.items()):
         for kind, values in errors.items():
             seen = np.isfinite(values)
             axes.loglog(np.array(SHARES)[seen], 100 * values[seen], "o-", label=kind, lw=1.2, ms=4)
         axes.axhline(2, color="0.7", lw=1)
-        axes.set_title(f"{body}, barrier {1e3 * width:g} mm wide", loc="left", fontsize=10)
+        axes.set_title(f"{body}, a barrier of {1e3 * width:g} mm", loc="left", fontsize=10)
         axes.set_xlabel("substep over the body's limit")
+        axes.set_xticks(SHARES, [f"{x:g}" for x in SHARES])
+        axes.minorticks_off()
     panels[0].set_ylabel("median error of the gradient [%]")
-    panels[-1].legend(frameon=False, fontsize=8)
+    panels[-1].legend(frameon=False, fontsize=8, loc="lower right")
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=100)
     print(f"chart: {path}")
