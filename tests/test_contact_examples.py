@@ -1,7 +1,8 @@
 """The examples of contact run and find what they look for."""
 
+import numpy as np
 import pytest
-from example_files import example
+from example_files import EXAMPLES, example
 
 
 def test_incline(capsys):
@@ -14,8 +15,11 @@ def test_incline(capsys):
 
 def test_bounce_gradients(capsys, tmp_path):
     """Soft balls: the stage's gradients are good at the longest steps of the body, and get better with shorter ones."""
-    errors = example("contact/bounce_gradients").main(tmp_path, starts=3, finest=1 / 16)
+    cases = [("balls", 2e-3), ("blocks", 0.01)]
+    found = example("contact/bounce_gradients").main(tmp_path, starts=3, finest=1 / 16, cases=cases)
+    errors, edges = found.values()
     default = errors["stage, default"]
+    assert edges["stage, default"].max() < 0.01  # sharp edges, and the width that obstacles have by default
     assert default[0] < 0.02 and default[-1] < 0.25 * default[0]
     assert errors["stage, damping 1"][-1] > 4 * errors["stage, damping 0"][-1]  # what damping costs
     assert (tmp_path / "bounce_gradients.png").stat().st_size > 10_000 and "median error" in capsys.readouterr().out
@@ -29,6 +33,34 @@ def test_refinement():
     )
     assert ours[1] == pytest.approx(ours[0], rel=0.01) and ours[0] == pytest.approx(141.6, rel=0.01)
     assert theirs[1] > 1.2 * theirs[0]
+
+
+def test_damping_map(monkeypatch, capsys):
+    """Damping takes energy, the more of it the more, and costs the gradients of resolved contacts."""
+    monkeypatch.syspath_prepend(str(EXAMPLES / "contact"))
+    (found,) = example("contact/damping_map").main(starts=2, finest=1 / 8, barriers=((0.01, 1),)).values()
+    errors, growths, lost = np.array([found[damping] for damping in (0.0, 0.1, 0.3, 1.0)]).T
+    assert np.all(np.diff(lost) > 0) and abs(lost[0]) < 0.01 and lost[-1] > 0.03
+    assert errors[-1] > 4 * errors[0] and np.all(growths < 1) and "contact_damping" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("damping", [0.0, 0.005, 1.0])
+def test_a_slab_slides_as_far_as_coulomb_says(damping):
+    """v^2 / (2 mu g), whatever the mesh, the kind of stiffness and the damping; and then it stays."""
+    refinement = example("contact/refinement")
+    exact = 0.7**2 / (2 * 0.3 * 9.81)
+    for resolution in (2, 5):
+        for kind in refinement.KINDS.items():
+            way = refinement.way_of_sliding(resolution, dict([kind]), contact_damping=damping)
+            assert way[-1] == pytest.approx(exact, rel=2e-3) and way[-1] == pytest.approx(way[250], abs=1e-4)
+
+
+def test_a_cube_rocks_when_it_has_slid():
+    """As far as a slab within half a per cent; then friction tips it no longer, and it swings back on its barrier."""
+    refinement = example("contact/refinement")
+    way = refinement.way_of_sliding(3, {"stiffness_per_area": 1e6}, refinement.block(3, 0.0))
+    exact = 0.7**2 / (2 * 0.3 * 9.81)
+    assert way.max() == pytest.approx(exact, rel=5e-3) and way[way.argmax() :].min() < 0.985 * exact
 
 
 @pytest.mark.filterwarnings("error:gradients through contacts")

@@ -32,7 +32,9 @@ def test_incline(solver, precision):
         if slides:
             assert way == pytest.approx(np.full(3, 0.274198), rel=1e-2)
         else:
-            assert np.all(way > 0) and np.all(way <= 1.02 * eps * T)
+            # f32's grain of the gap, 7e-8 m, changes N by 8e-5; what is just held creeps faster by the root of that
+            most = 1.02 if precision == "f64" else 1.02 + 8e-5**0.5
+            assert np.all(way > 0) and np.all(way <= most * eps * T) and way.mean() <= 1.02 * eps * T
 
 
 @solvers

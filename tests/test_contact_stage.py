@@ -11,6 +11,8 @@ from test_contact_crossing import THIN
 
 import diffsim_ti as ds
 from diffsim_ti import runtime
+from diffsim_ti.solvers.explicit import contact_stage
+from diffsim_ti.solvers.explicit.kernels import explicit_kernels
 from diffsim_ti.terms.obstacles import barrier, secant
 
 DAMPINGS = [0.0, 0.02, 0.4, 1.0]
@@ -114,6 +116,23 @@ def test_energy_never_grows(solver, damping):
         assert rise.max() < 1e-9 * energies[0]
         if damping == 0:
             assert np.abs(rise).max() < 1e-9 * energies[0]
+
+
+@solvers
+@pytest.mark.parametrize("precision", ["f32", "f64"])
+def test_a_few_rounds_find_the_root(solver, precision, monkeypatch):
+    """At rest, where a move is round-off of a gap, and in impacts: eight rounds of Newton's method are as good as sixty."""
+    ends = []
+    for rounds in (60, 8):
+        monkeypatch.setattr(contact_stage, "MOST_ROUNDS", rounds)
+        explicit_kernels.cache_clear()
+        for gap, speed, damping in ((0.0088, 0.0, 1.0), (0.0088, 0.0, 0.005), (0.02, 1.0, 0.005), (0.02, 4.0, 1.0)):
+            mesh = ds.TetrahedralMesh.create_box(3, size=0.2, origin=(0, gap, 0))
+            law, terms = ds.StableNeoHookean(1e5, 0.3), [ds.Gravity(), ds.Drag(5.0), ds.Ground()]
+            scene = ds.Scene(mesh, law, terms=terms, initial_velocities=(0, -speed, 0), precision=precision)
+            ends.append(ds.Rollout(solver(scene, dt=1e-3, contact_damping=damping), 150).forward().positions[-1])
+    explicit_kernels.cache_clear()
+    assert all(np.array_equal(few, many) for few, many in zip(ends[4:], ends[:4]))
 
 
 @solvers

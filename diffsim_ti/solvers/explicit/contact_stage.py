@@ -76,14 +76,14 @@ class ContactStage(ObstacleStages):
 
     @ti.func
     def push(self, o, i, z, now: A, state: A, plan: A):
-        """Note the push of an obstacle for the move z; returns (n, P, -dP/dy)."""
+        """Note the push of an obstacle for the move z; returns (n, P, -dP/dy, the smaller one of d and y)."""
         plane, felt = state.stage[ROWS * o + PLANE, i], state.stage[ROWS * o + FELT, i]
         n, width = self.normal(plane), felt.y
         y = plane.w + n.dot(z - now.h * state.stage[ROWS * o + WALL, i])
         p, by_t = secant.push_by_end(plane.w / width, y / width, plan.contact_damping, self.fp)
         P, K, zero = felt.x * width * p, felt.x * by_t, ti.cast(0, self.fp)
         state.stage[ROWS * o + PUSH, i] = self.vector(P, K, zero, zero)
-        return n, P, K
+        return n, P, K, ti.min(plane.w, y)
 
     # ---- the move that all obstacles of a vertex agree on -------------------------------------------------------------
 
@@ -91,17 +91,19 @@ class ContactStage(ObstacleStages):
     def solve(self, i, start, free, a, now: A, state: A, plan: A):
         """z = free + a sum P n by Newton's method from `start`, shorter where the slope along its step changes sign.
 
-        Returns z, sum P n, and the entries of sum K n (x) n there.
+        Returns z, sum P n, and the entries of sum K n (x) n there. It ends where z changes by no more than the round-off of
+        itself or of a distance, which no push can see.
         """
         z, step, trial = start, self.vector(0), start
         total, xyz, mixed = self.vector(0), self.vector(0), self.vector(0)
         before, share, half = ti.cast(0, self.fp), ti.cast(1, self.fp), ti.cast(0.5, self.fp)
         tiny = ti.cast((4 * self.epsilon) ** 2, self.fp)
         for turn in range(MOST_ROUNDS):
-            total, xyz, mixed = self.vector(0), self.vector(0), self.vector(0)
+            total, xyz, mixed, least = self.vector(0), self.vector(0), self.vector(0), ti.cast(1e30, self.fp)
             for o in range(ti.static(self.features.num_staged)):
-                n, P, K = self.push(ti.static(self.features.first_staged) + o, i, trial, now, state, plan)
+                n, P, K, gap = self.push(ti.static(self.features.first_staged) + o, i, trial, now, state, plan)
                 total += P * n
+                least = ti.min(least, gap)
                 xyz += K * n * n
                 mixed += K * self.vector(n.y * n.z, n.z * n.x, n.x * n.y, ti.cast(0, self.fp))
             r = trial - free - a * total
@@ -109,9 +111,9 @@ class ContactStage(ObstacleStages):
                 share = half * share
             else:
                 z, share = trial, ti.cast(1, self.fp)
-                step = self.vector(0) - stage.solve_linear(a, xyz, mixed, r)
+                step = self.vector(0) - stage.solve_linear(self.features.num_staged, a, xyz, mixed, r)
                 before = -r.dot(step)
-                if step.dot(step) <= tiny * z.dot(z):  # norm() would compute in f64
+                if step.dot(step) <= tiny * ti.max(z.dot(z), least * least):  # norm() would compute in f64
                     break
             trial = z + share * step
         return z, total, xyz, mixed
@@ -174,7 +176,7 @@ class ContactStage(ObstacleStages):
                 z, total, xyz, mixed = self.solve(i, moved, free, a, now, state, plan)
                 dtotal = self.note_changes(i, u, du, z, now, scene, state, tangent, plan)
                 b = dalpha * v_plus + now.alpha * dv_plus + blend * (dalpha * ratio + now.alpha * dratio) * total
-                dz = stage.solve_linear(a, xyz, mixed, b + a * dtotal)
+                dz = stage.solve_linear(self.features.num_staged, a, xyz, mixed, b + a * dtotal)
                 dtotal += self.add_change(i, dz, state)
                 delta, ddelta = ratio * total, dratio * total + ratio * dtotal
                 v, dv = self.slide_all_jvp(i, v, dv, ratio, dratio, now, scene, state, tangent)
@@ -258,7 +260,7 @@ class ContactStage(ObstacleStages):
                 if ti.static(len(self.features.staged_rough) > 0):
                     v_adj, more = self.slide_all_vjp(i, v_plus, v_adj, ratio, state)
                     by_ratio += more
-                z_adj = stage.solve_linear(a, xyz, mixed, self.by_move(i, state))
+                z_adj = stage.solve_linear(self.features.num_staged, a, xyz, mixed, self.by_move(i, state))
                 v_adj += now.alpha * z_adj
                 by_alpha += z_adj.dot(v_plus + blend * ratio * total)
                 by_ratio += blend * now.alpha * z_adj.dot(total)

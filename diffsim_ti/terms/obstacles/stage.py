@@ -28,8 +28,24 @@ def numbers(force: ti.template(), parameters: ti.template(), first):
 
 
 @ti.func
-def solve_linear(a, xyz, mixed, b):
-    """(I + a sum K n (x) n)^-1 b, by L D L^T; xyz and mixed are the entries of the sum, xx, yy, zz and yz, zx, xy."""
+def solve_linear(count: ti.template(), a, xyz, mixed, b):
+    """(I + a sum K n (x) n)^-1 b; xyz and mixed are the entries of the sum of `count`, xx, yy, zz and yz, zx, xy.
+
+    By L D L^T, or of one by Sherman and Morrison's formula.
+    """
+    x = 0 * b
+    if ti.static(count == 1):
+        x.x = xyz.x * b.x + mixed.z * b.y + mixed.y * b.z
+        x.y = mixed.z * b.x + xyz.y * b.y + mixed.x * b.z
+        x.z = mixed.y * b.x + mixed.x * b.y + xyz.z * b.z
+        x = b - a / (1 + a * (xyz.x + xyz.y + xyz.z)) * x
+    else:
+        x = _solve_many(a, xyz, mixed, b)
+    return x
+
+
+@ti.func
+def _solve_many(a, xyz, mixed, b):
     d0 = 1 + a * xyz.x
     l1, l2 = a * mixed.z / d0, a * mixed.y / d0
     d1 = 1 + a * xyz.y - l1 * a * mixed.z
