@@ -173,6 +173,7 @@ def rollout(solver, kind, precision="f64", stiffness=50.0, dt=4e-4, steps=6, **o
     "kind, solver, precision, options",
     [
         ("capsule", ds.SemiImplicitSolver, "f64", dict()),
+        ("capsule", ds.SemiImplicitSolver, "f64", dict(stiffness=2000.0, dt=3.2e-3, parallel=True)),  # in many parts
         ("needle", ds.VelocityVerletSolver, "f64", dict(contact="force", per_area=True)),
         ("thin box", ds.SemiImplicitSolver, "f32", dict(per_area=True)),
     ],

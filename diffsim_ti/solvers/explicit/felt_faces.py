@@ -193,9 +193,12 @@ class FaceChanges:
             runtime.array(a.vector, faces.num_surface) for _ in range(4)
         )
 
-    def _run(self, name: str, alone: Alone, plan: dict, in_parts=False, **records) -> None:
-        run = self.faces._run_parts if in_parts else self.faces._run
-        run(name, plan, alone.history, alone.slot, alone.n, features=self.features, own=self, **records)
+    def _run(self, name: str, alone: Alone, plan: dict, **records) -> None:
+        self.faces._run(name, plan, alone.history, alone.slot, alone.n, features=self.features, own=self, **records)
+
+    def _run_parts(self, name: str, alone: Alone, plan: dict, back=False, **records) -> None:
+        own = dict(features=self.features, own=self) | records
+        self.faces._run_parts(name, plan, alone.history, alone.slot, alone.n, back, **own)
 
 
 class FeltTangent(FaceChanges):
@@ -212,7 +215,7 @@ class FeltTangent(FaceChanges):
     def end(self, alone: Alone, plan: dict) -> None:
         """After it."""
         alone.go(plan)
-        self._run("jvp", alone, plan, in_parts=True, tangent=self.of_all)
+        self._run_parts("jvp", alone, plan, tangent=self.of_all)
 
 
 class FeltAdjoint(FaceChanges):
@@ -235,7 +238,7 @@ class FeltAdjoint(FaceChanges):
         """Go back through the contact of faces, the last thing that the pass did."""
         alone.go(plan)
         plan = plan | dict(steps=1, num_parts=self.num_parts)
-        self._run("vjp", alone, plan, in_parts=True, adjoint=self.of_all, out=self)
+        self._run_parts("vjp", alone, plan, back=True, adjoint=self.of_all, out=self)
 
     def end(self, alone: Alone, plan: dict) -> None:
         """The rest of the pass is reversed."""
