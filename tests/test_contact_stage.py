@@ -242,7 +242,6 @@ def crowded(kind, damping: float, precision: str = "f64", **options):
     return ds.Rollout(kind(scene, dt=1e-3, contact_damping=damping), 12, save_every=3, gradients="all", **options)
 
 
-@pytest.mark.usefixtures("vertices_alone")
 @solvers
 @dampings
 def test_every_input_in_a_crowd(solver, damping):
