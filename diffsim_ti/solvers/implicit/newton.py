@@ -86,7 +86,7 @@ class Newton:
         self.mass, self.inertial, self.loads = mass, inertial, loads
         u = self.potential.place(start)
         self.preconditioner, self.stiffness = self.preconditioners(mass)
-        E, size, norm, forcing = self._evaluate(u), 0.0, np.inf, 0.0
+        E, size, norm, rough = self._evaluate(u), 0.0, np.inf, False
         self.upright = bool(np.all(E[2] > 0))
         most = self.max_iterations if rounds is None else rounds
         while len(report.residuals) < min(most + report.cuts, self.patience * most):
@@ -98,7 +98,7 @@ class Newton:
             if rounds is not None and norm <= self.roughly * size:
                 return u
             solved = norm <= self.tolerance * size + floor
-            if solved and (forcing <= self.inexact or norm <= floor):
+            if solved and (not rough or norm <= floor):
                 downhill = self._downhill() if leave_saddles else None
                 if downhill is None:
                     return u
@@ -111,7 +111,8 @@ class Newton:
             if not np.isfinite(norm):
                 break
             self.preconditioner.update(u)
-            forcing = self._forcing(norm, before, solved, size)
+            forcing = self._forcing(norm, before, solved, size, floor)
+            rough = forcing > max(self.inexact, 0.3 * floor / norm)
             direction = self._direction(R, max(forcing, 10 * self.eps))
             moved = self._search(u, direction, R, E)
             if moved is None:
@@ -148,11 +149,11 @@ class Newton:
         size = np.sqrt((sizes**2).sum() + (self.loads**2).sum() + (inertia**2 * self.free).sum())
         return (f + self.loads - inertia) * self.free, size
 
-    def _forcing(self, norm, before, solved, size) -> float:
+    def _forcing(self, norm, before, solved, size, floor) -> float:
         """Relative residual of a round's linear solve: rough while rounds gain little, but not of the last one, whose error
         slow motions of stiff bodies would show. Eisenstat, Walker 1996, Choosing the Forcing Terms in an Inexact Newton
         Method, choice 2, doi:10.1137/0917003."""
-        exact = min(self.inexact, np.sqrt(norm / size))
+        exact = max(min(self.inexact, np.sqrt(norm / size)), 0.3 * floor / norm)  # rounding would hide more
         gained = min(norm / before, 1.0) if np.isfinite(before) else 1.0
         return exact if solved else max(exact, min(self.rough, 0.9 * gained**2))
 
