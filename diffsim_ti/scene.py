@@ -141,6 +141,24 @@ class Scene:
                 stacklevel=3,
             )
 
+    @property
+    def obstacles(self) -> tuple[Term, ...]:
+        """What the surface feels by distance, in the order of frames' contact forces."""
+        return tuple(t for t in self.ordered_terms if t.acts_on_surface)
+
+    def place_of(self, obstacle: Term | str) -> int:
+        """Place in `obstacles` of one that is given by its name, or as the scene lists it."""
+        names = [t.name for t in self.obstacles]
+        if isinstance(obstacle, str) and obstacle in names:
+            return names.index(obstacle)
+        for terms in (self.terms, self._given):
+            if obstacle in terms:
+                found = self.terms[terms.index(obstacle)]
+                if found in self.obstacles:
+                    return self.obstacles.index(found)
+        known = ", ".join(repr(t.name or t) for t in self.obstacles) or "none"
+        raise ValueError(f"this scene has no obstacle {obstacle!r}; it has {known}: give obstacles a name=")
+
     def term(self, kind: type) -> Term | None:
         """The scene's first term of a kind, or None."""
         return next((t for t in self.terms if isinstance(t, kind)), None)

@@ -33,6 +33,7 @@ class Workspace:
     faces = None  # of explicit steps, that feel obstacles between their corners
     energy_watch = None  # counts energy that long steps add, for solvers that neither damp nor limit it
     changes = 0  # of the state from outside its passes
+    impulses = None  # of obstacles on vertices in each frame, where a loss names them
 
     def __init__(self, solver, derived: Derived):
         self.solver, self.scene = solver, solver.scene
@@ -118,6 +119,19 @@ class Workspace:
         """Room for `count` saved states."""
         self.frames = FrameArrays.of(self.arrays, count, self.arrays.num_vertices)
         self._launches.clear()
+
+    def record_contacts(self) -> None:
+        """From now on note, for each frame, what obstacles do to each vertex; the frames are made."""
+        raise NotImplementedError
+
+    def forget_contacts(self) -> None:
+        """Note them anew."""
+        raise NotImplementedError
+
+    def contact_forces(self, frame_time: float):
+        """Mean forces [N] of frames that take `frame_time` [s], shape (frames, obstacles, 2: by push and by friction,
+        num_vertices, 3)."""
+        raise NotImplementedError
 
     def make_record(self, num_slots: int) -> History:
         """Room for `num_slots` recorded states."""
