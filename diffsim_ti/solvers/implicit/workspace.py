@@ -12,6 +12,7 @@ from diffsim_ti.monitor.energy_watch import EnergyWatch
 from diffsim_ti.potential.potential import Potential
 from diffsim_ti.potential.way import Way
 from diffsim_ti.solvers.implicit.approach import Approach
+from diffsim_ti.solvers.implicit.contact_record import ContactRecord, Shares
 from diffsim_ti.solvers.implicit.law_state import law_state_kernels
 from diffsim_ti.solvers.implicit.linear import NotConverged
 from diffsim_ti.solvers.implicit.multigrid import Multigrid
@@ -119,6 +120,7 @@ class ImplicitWorkspace(ObstacleWays, Workspace):
             self.potential.hold(self.state, 0)
             try:
                 u_next, v_next = self._pass(j, u, v, before)
+                self._note_contacts(j, save_every)
             except (NotConverged, Tunnelling) as error:
                 raise self.dated(error, j, num_passes) from None
             if self.solver.multistep:
@@ -133,6 +135,26 @@ class ImplicitWorkspace(ObstacleWays, Workspace):
                 self.state.copy(0, self.record, j + 1 - base)
                 if self.solver.multistep:
                     self.record.fresh[j + 1 - base] = False
+
+    def record_contacts(self) -> None:
+        self.impulses = ContactRecord(self)
+
+    def forget_contacts(self) -> None:
+        self.record_contacts()
+
+    def contact_forces(self, frame_time: float) -> np.ndarray:
+        return self.impulses.forces
+
+    def _note_contacts(self, j: int, per_frame: int) -> None:
+        """What obstacles did in pass j, where it is asked for."""
+        if self.impulses and per_frame:
+            self.potential.place(self._u_star)
+            shares = self.kept("shares", lambda: Shares(self))
+            self.impulses.add(j, per_frame, self.is_static, shares.forces)
+
+    @property
+    def is_static(self) -> bool:
+        return self.solver.stage(self.rate, True).static
 
     def launch_law_state(self, name: str, features, j: int, slot: int, end: int, **records) -> None:
         """Launch one of the LawStateKernels for pass j, from z in `slot` and u in slot `end`."""
@@ -198,6 +220,7 @@ class ImplicitWorkspace(ObstacleWays, Workspace):
             u_star = self._solve(u, start, (mass, inertial, loads), stage)
         except NotConverged as error:
             raise self._explained(error, u) from None
+        self._u_star = u_star
         v_star = (u_star - x) / stage.gamma
         u_next = stage.c0 * u_star + (1 - stage.c0) * u
         v_next = stage.e0 * v_star + stage.e1 * y
