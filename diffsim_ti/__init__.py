@@ -17,7 +17,7 @@ from diffsim_ti.materials import (
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.monitor.energy_watch import EnergyGained
 from diffsim_ti.monitor.guard import Crossing, Divergence
-from diffsim_ti.outputs import ContactForce, MaterialPoints
+from diffsim_ti.outputs import ContactForce, MaterialPoints, Reaction
 from diffsim_ti.rollout import Frames, Rollout
 from diffsim_ti.runtime import init
 from diffsim_ti.scene import Scene
@@ -86,6 +86,7 @@ __all__ = [
     "Frames",
     "MaterialPoints",
     "ContactForce",
+    "Reaction",
     "taylor_test",
     "dot_product_test",
     "check_gradients",

@@ -33,6 +33,7 @@ class Frames:
     contact_resolution: ContactResolution | None = None
     outputs: dict[str, np.ndarray] = field(default_factory=dict)
     contact_forces: np.ndarray | None = field(default=None, repr=False)
+    steps: np.ndarray | None = field(default=None, repr=False)  # of the run that are done in each frame
     run: Run | None = field(default=None, repr=False)
 
     def __getitem__(self, name: str) -> np.ndarray:
