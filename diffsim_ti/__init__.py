@@ -15,6 +15,7 @@ from diffsim_ti.materials import (
     StVenantKirchhoff,
 )
 from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.modes import Modes, modes
 from diffsim_ti.monitor.energy_watch import EnergyGained
 from diffsim_ti.monitor.guard import Crossing, Divergence
 from diffsim_ti.outputs import ContactForce, MaterialPoints, Reaction
@@ -87,6 +88,8 @@ __all__ = [
     "MaterialPoints",
     "ContactForce",
     "Reaction",
+    "modes",
+    "Modes",
     "taylor_test",
     "dot_product_test",
     "check_gradients",
