@@ -33,6 +33,7 @@ from diffsim_ti.solvers import (
     VelocityVerletSolver,
     stable_dt,
 )
+from diffsim_ti.state.solve_report import Buckled, SolveReport
 from diffsim_ti.terms import (
     Box,
     Capsule,
@@ -83,6 +84,8 @@ __all__ = [
     "Tunnelling",
     "NotConverged",
     "EnergyGained",
+    "Buckled",
+    "SolveReport",
     "Rollout",
     "Frames",
     "MaterialPoints",

@@ -14,6 +14,7 @@ from diffsim_ti.rollout.run import Run
 from diffsim_ti.rollout.sweep import Sweep
 from diffsim_ti.rollout.taped import TapeFace
 from diffsim_ti.solvers.solver import Solver
+from diffsim_ti.state.solve_report import SolveReport
 
 
 class Rollout:
@@ -107,6 +108,11 @@ class Rollout:
     def memory(self) -> float:
         """What the reverse sweep keeps [MB]: snapshots, recorded states."""
         return self.checkpoints.states() * self.sweep.state_bytes / 1e6
+
+    @property
+    def report(self) -> SolveReport:
+        """What the solves of the last forward run took: iterations, residuals, cuts, saddles, time, by step."""
+        return SolveReport() if self.sweep.workspace is None else self.sweep.workspace.report
 
     @property
     def health(self) -> list[dict]:

@@ -150,12 +150,14 @@ class Sweep:
         self._recorded = checkpoints.num_segments == 1 and self._adjoint is not None  # a gradient was asked for before
         if self._recorded:
             ws.make_record(checkpoints.segment + 1)
+        ws.report.clear()
         path = [0, *checkpoints.path(0, checkpoints.num_segments, checkpoints.snapshots - 1)]
         for k, segment in enumerate(path):
             ws.save(self._snapshots, k)
             first = checkpoints.bounds(segment)[0]
             last = checkpoints.bounds(path[k + 1])[0] if k + 1 < len(path) else self.num_passes
-            self._guard.advance(first, last, self.num_passes, self.passes_per_frame, self._recorded)
+            with ws.report.of_passes(last - first):
+                self._guard.advance(first, last, self.num_passes, self.passes_per_frame, self._recorded)
         if self.solver.last_frame_is_state:
             ws.save_frame(self.num_frames - 1)
         self._kept, self._current = path, run  # segments whose starts are in the snapshots

@@ -10,6 +10,7 @@ from diffsim_ti.contact.surface_pairs import SurfacePairs
 from diffsim_ti.inputs import Derived
 from diffsim_ti.runtime import Kernel
 from diffsim_ti.state.arrays import History, SceneArrays, copy_slot, first_bad_vertex
+from diffsim_ti.state.solve_report import SolveReport
 from diffsim_ti.state.watch import ContactWatch
 
 
@@ -36,7 +37,7 @@ class Workspace:
     impulses = None  # of obstacles on vertices in each frame, where a loss names them
 
     def __init__(self, solver, derived: Derived):
-        self.solver, self.scene = solver, solver.scene
+        self.solver, self.scene, self.report = solver, solver.scene, SolveReport()
         self.owner = runtime.program()
         self.arrays = SceneArrays(self.scene, solver.stages_contact, self.feels_faces(self.scene))
         self.parallel = solver.runs_parallel()

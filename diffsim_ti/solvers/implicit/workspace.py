@@ -1,5 +1,6 @@
 """A run of an implicit solver: its passes, what they are told of obstacles, motion and loads."""
 
+import time
 import weakref
 
 import numpy as np
@@ -12,11 +13,11 @@ from diffsim_ti.monitor.energy_watch import EnergyWatch
 from diffsim_ti.potential.potential import Potential
 from diffsim_ti.potential.way import Way
 from diffsim_ti.solvers.implicit.approach import Approach
-from diffsim_ti.solvers.implicit.contact_record import ContactRecord, Shares
 from diffsim_ti.solvers.implicit.law_state import law_state_kernels
 from diffsim_ti.solvers.implicit.linear import NotConverged
 from diffsim_ti.solvers.implicit.multigrid import Multigrid
 from diffsim_ti.solvers.implicit.newton import Newton
+from diffsim_ti.solvers.implicit.noted import Noted
 from diffsim_ti.solvers.implicit.obstacle_ways import ObstacleWays
 from diffsim_ti.solvers.implicit.preconditioners import BlockJacobi
 from diffsim_ti.solvers.implicit.stage import Stage
@@ -34,7 +35,7 @@ class TwoStepHistory(History):
         self.fresh = [True] * num_slots
 
 
-class ImplicitWorkspace(ObstacleWays, Workspace):
+class ImplicitWorkspace(ObstacleWays, Noted, Workspace):
     """A run of an implicit solver. Vectors of vertices are worked on in float64 on the host, tetrahedra on the device."""
 
     pairs_kind = ImplicitPairs
@@ -118,9 +119,11 @@ class ImplicitWorkspace(ObstacleWays, Workspace):
                 self.save_frame(j // save_every)
             u, v, before = self.read(self.state, 0)
             self.potential.hold(self.state, 0)
+            begin, self.newton.reports = time.perf_counter(), []
             try:
                 u_next, v_next = self._pass(j, u, v, before)
-                self._note_contacts(j, save_every)
+                self.note_contacts(j, save_every)
+                self.note_solves(j, num_passes, time.perf_counter() - begin)
             except (NotConverged, Tunnelling) as error:
                 raise self.dated(error, j, num_passes) from None
             if self.solver.multistep:
@@ -135,26 +138,6 @@ class ImplicitWorkspace(ObstacleWays, Workspace):
                 self.state.copy(0, self.record, j + 1 - base)
                 if self.solver.multistep:
                     self.record.fresh[j + 1 - base] = False
-
-    def record_contacts(self) -> None:
-        self.impulses = ContactRecord(self)
-
-    def forget_contacts(self) -> None:
-        self.record_contacts()
-
-    def contact_forces(self, frame_time: float) -> np.ndarray:
-        return self.impulses.forces
-
-    def _note_contacts(self, j: int, per_frame: int) -> None:
-        """What obstacles did in pass j, where it is asked for."""
-        if self.impulses and per_frame:
-            self.potential.place(self._u_star)
-            shares = self.kept("shares", lambda: Shares(self))
-            self.impulses.add(j, per_frame, self.is_static, shares.forces)
-
-    @property
-    def is_static(self) -> bool:
-        return self.solver.stage(self.rate, True).static
 
     def launch_law_state(self, name: str, features, j: int, slot: int, end: int, **records) -> None:
         """Launch one of the LawStateKernels for pass j, from z in `slot` and u in slot `end`."""
@@ -220,7 +203,7 @@ class ImplicitWorkspace(ObstacleWays, Workspace):
             u_star = self._solve(u, start, (mass, inertial, loads), stage)
         except NotConverged as error:
             raise self._explained(error, u) from None
-        self._u_star = u_star
+        self.u_star = u_star
         v_star = (u_star - x) / stage.gamma
         u_next = stage.c0 * u_star + (1 - stage.c0) * u
         v_next = stage.e0 * v_star + stage.e1 * y
