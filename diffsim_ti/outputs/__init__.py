@@ -1,9 +1,23 @@
 """What a loss may name besides a run's inputs: functions of its frames, one file each, and their interface for others."""
 
 from diffsim_ti.outputs.contact_force import ContactForce
+from diffsim_ti.outputs.enclosed_volume import EnclosedVolume
 from diffsim_ti.outputs.material_points import MaterialPoints
 from diffsim_ti.outputs.output import Change, Output
 from diffsim_ti.outputs.reaction import Reaction
 from diffsim_ti.outputs.states import Displacements, Positions, Velocities
+from diffsim_ti.outputs.tensors import Strain, Stress
 
-__all__ = ["Change", "ContactForce", "Displacements", "MaterialPoints", "Output", "Positions", "Reaction", "Velocities"]
+__all__ = [
+    "Change",
+    "ContactForce",
+    "Displacements",
+    "EnclosedVolume",
+    "MaterialPoints",
+    "Output",
+    "Positions",
+    "Reaction",
+    "Strain",
+    "Stress",
+    "Velocities",
+]

@@ -18,7 +18,12 @@ def _kernel(law, what: str):
     @ti.kernel
     def law_on_arrays(H: matrices, W: matrices, p: vectors, dp: vectors, P: matrices, by_p: vectors):
         for i in range(H.shape[0]):
-            h, w, q, dq = tensor(H[i]), tensor(W[i]), [p[i][c] for c in ti.static(range(K))], [dp[i][c] for c in ti.static(range(K))]
+            h, w, q, dq = (
+                tensor(H[i]),
+                tensor(W[i]),
+                [p[i][c] for c in ti.static(range(K))],
+                [dp[i][c] for c in ti.static(range(K))],
+            )
             if ti.static(what == "value"):
                 P[i] = law.stress(h, q).matrix()
             elif ti.static(what == "jvp"):
