@@ -33,8 +33,8 @@ class Modes:
             d lambda_i = phi_i . (dK - lambda_i dM) phi_i,        df = d lambda / (8 pi^2 f)
 
         Where frequencies coincide each mode takes the mean of its group, which is the one of them that is differentiable:
-        the loss must weigh the modes of a group alike, and a group must not be cut by k. "displacements" is the gradient by the
-        state, besides. Initial positions and loads have none: chain those that move the state through its own rollout.
+        the loss must weigh the modes of a group alike, and a group must not be cut by k. "displacements" is the gradient
+        by the state, besides. Initial positions and loads have none: chain those that move the state through its own rollout.
         phi . dK phi is the slope of the exact derivatives of phi . forces along phi, by differences of fourth order whose
         error is 1e-10 of it.
 

@@ -212,7 +212,9 @@ class Scene:
         Zienkiewicz, Taylor, The Finite Element Method, vol. 2, 5th ed., 2000, sec. 10.3.
         """
         if self.law.reads != ("H",) or self.law.state_names:
-            raise ValueError(f"{type(self.law).__name__} is more than an energy of the displacement gradient: it has no K")
+            raise ValueError(
+                f"{type(self.law).__name__} is more than an energy of the displacement gradient: it has no K"
+            )
         scene = self if self.precision == "f64" else self.replace(precision="f64")
         return body_stiffness(scene, self.checked_displacements(displacements))
 

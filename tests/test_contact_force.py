@@ -24,7 +24,9 @@ def pressed(precision="f64", round_one=False, **options) -> ds.Scene:
     rough = dict(stiffness_per_area=3e5, width=0.01, friction=0.4, friction_speed=0.3, name="floor")
     floor = ds.Sphere((0.05, -0.06, 0.05), 0.06, **rough) if round_one else ds.Ground(0, **rough)
     wall = ds.HalfSpace([-0.006, 0, 0], [1, 0.1, 0], stiffness_per_area=3e5, width=0.01, friction=0.2, name="wall")
-    given = dict(initial_velocities=(0.1, -0.3, 0.2), precision=precision, terms=[ds.Gravity(), floor, wall, ds.Drag(0.5)])
+    given = dict(
+        initial_velocities=(0.1, -0.3, 0.2), precision=precision, terms=[ds.Gravity(), floor, wall, ds.Drag(0.5)]
+    )
     return ds.Scene(cube(), ds.StableNeoHookean(youngs_modulus=2e5, poissons_ratio=0.3), **given | options)
 
 
@@ -45,7 +47,12 @@ def path(t):
 def rollout_of(case: str) -> ds.Rollout:
     kind, *more = case.split()
     tight = dict(tolerance=1e-12)
-    moved = dict(terms=[ds.Gravity(), ds.Ground(0, stiffness_per_area=3e5, friction=0.4, friction_speed=0.3, path=path, name="floor")])
+    moved = dict(
+        terms=[
+            ds.Gravity(),
+            ds.Ground(0, stiffness_per_area=3e5, friction=0.4, friction_speed=0.3, path=path, name="floor"),
+        ]
+    )
     held = dict(fixed="ymax", motion=lambda t: (0.001 * t, -0.001 * t, 0.0), initial_velocities=None)
     alone = dict(terms=pressed(round_one=True).terms[:2]) if "round" in more else {}
     options = (moved if "moved" in more else {}) | alone | (held if kind == "static" else {})
@@ -104,7 +111,10 @@ def test_gradients_agree_with_differences(case):
         direction = rng.normal(size=base.shape) * verify.input_scale(rollout, key)
         slope = (gradients[key] * direction).sum()
         step = 1e-4
-        coarse, fine = ((loss(**{key: base + s * direction}) - loss(**{key: base - s * direction})) / (2 * s) for s in (step, step / 2))
+        coarse, fine = (
+            (loss(**{key: base + s * direction}) - loss(**{key: base - s * direction})) / (2 * s)
+            for s in (step, step / 2)
+        )
         assert slope == pytest.approx((4 * fine - coarse) / 3, rel=1e-6, abs=1e-7 * abs(loss())), key
 
 
@@ -114,11 +124,7 @@ def momentum(scene, frames) -> np.ndarray:
 
 @pytest.mark.parametrize(
     "kind, gate",
-    [
-        *((kind, 1e-12) for kind in EXPLICIT),
-        (ds.ImplicitEulerSolver, 1e-7),
-        (ds.ImplicitMidpointSolver, 1e-7),
-    ],
+    [*((kind, 1e-12) for kind in EXPLICIT), (ds.ImplicitEulerSolver, 1e-7), (ds.ImplicitMidpointSolver, 1e-7)],
 )
 def test_the_impulse_of_a_bounce_is_the_change_of_momentum(kind, gate):
     """With weight and friction, frame by frame."""
@@ -138,7 +144,11 @@ def test_the_impulse_of_a_bounce_is_the_change_of_momentum(kind, gate):
 def test_what_faces_feel_counts(round_one):
     """Of a ball that is smaller than a face, which is felt between corners."""
     scene = pressed(round_one=round_one, terms=pressed(round_one=round_one).terms[:2])
-    rollout = ds.Rollout(ds.VelocityVerletSolver(scene, dt=1e-3), 4, outputs=outputs()[:1] + [ds.ContactForce("floor", name="each", per_vertex=True)])
+    rollout = ds.Rollout(
+        ds.VelocityVerletSolver(scene, dt=1e-3),
+        4,
+        outputs=outputs()[:1] + [ds.ContactForce("floor", name="each", per_vertex=True)],
+    )
     frames = rollout.forward()
     p, mass = momentum(scene, frames), scene.inputs.derive(scene.inputs.values).mass.sum()
     gained = 4e-3 * (frames["held"][1] + mass * np.array([0, -G, 0]))
@@ -153,7 +163,12 @@ def test_a_block_at_rest_on_a_slope(kind):
     g = G * np.array([np.sin(slope), -np.cos(slope), 0])
     floor = ds.Ground(0, stiffness_per_area=1e6, width=0.01, friction=0.5, friction_speed=creep, name="floor")
     scene = ds.Scene(
-        cube(0.006), ds.StableNeoHookean(2e5, 0.3), 1000.0, [ds.Gravity(g), floor], initial_velocities=(0, 0, 0), precision="f64"
+        cube(0.006),
+        ds.StableNeoHookean(2e5, 0.3),
+        1000.0,
+        [ds.Gravity(g), floor],
+        initial_velocities=(0, 0, 0),
+        precision="f64",
     )
     explicit = kind is ds.SemiImplicitSolver
     options = dict(dt=5e-4, contact_damping=1.0) if explicit else dict(dt=0.02, tolerance=1e-8)
@@ -163,7 +178,11 @@ def test_a_block_at_rest_on_a_slope(kind):
     named = [ds.ContactForce("floor", part, name=part) for part in ("normal", "friction")]
     frames = ds.Rollout(kind(scene, **options), steps, save_every=steps // 2, outputs=named).forward()
     frames = ds.Rollout(
-        kind(scene.replace(initial_positions=frames.positions[-1], initial_velocities=frames.velocities[-1]), **options), 4, outputs=named
+        kind(
+            scene.replace(initial_positions=frames.positions[-1], initial_velocities=frames.velocities[-1]), **options
+        ),
+        4,
+        outputs=named,
     ).forward()
     mass = scene.inputs.derive(scene.inputs.values).mass.sum()
     assert frames["normal"][1] == pytest.approx([0, mass * G * np.cos(slope), 0], rel=1e-4, abs=1e-9)
@@ -232,7 +251,9 @@ def test_segments_and_a_second_run_change_nothing():
     """Replayed passes are not counted twice."""
     scene = pressed()
     whole, parts = (
-        ds.Rollout(ds.VelocityVerletSolver(scene, dt=1e-3), 6, save_every=2, checkpoint_every=every, outputs=outputs()[:1])
+        ds.Rollout(
+            ds.VelocityVerletSolver(scene, dt=1e-3), 6, save_every=2, checkpoint_every=every, outputs=outputs()[:1]
+        )
         for every in (None, 1)
     )
     seed = np.random.default_rng(6).normal(size=(4, 3))
@@ -252,7 +273,9 @@ def test_a_scene_whose_loss_does_not_name_it_pays_nothing():
         rollout.forward()
         ws = rollout.sweep.workspace
         kernels = ws.kernels(ws.arrays.features())
-        assert [("impulse" in k.arrays["state"]) for k in (kernels.step, kernels.step_vjp, kernels.step_jvp)] == [there] * 3
+        assert [("impulse" in k.arrays["state"]) for k in (kernels.step, kernels.step_vjp, kernels.step_jvp)] == [
+            there
+        ] * 3
         assert ("per_frame" in kernels.step.numbers) == there and hasattr(ws.contact, "impulse") == there
 
 
@@ -267,7 +290,9 @@ def test_what_does_not_fit_is_refused():
     as_force = ds.Rollout(ds.SemiImplicitSolver(scene, dt=1e-4, contact="force"), 1, outputs=ds.ContactForce("floor"))
     with pytest.raises(ValueError, match='pass contact="stage"'):
         as_force.forward()
-    balls = [ds.Sphere((x, -0.06, 0.05), 0.06, stiffness_per_area=3e5, name=f"ball{k}") for k, x in enumerate((0.02, 0.08))]
+    balls = [
+        ds.Sphere((x, -0.06, 0.05), 0.06, stiffness_per_area=3e5, name=f"ball{k}") for k, x in enumerate((0.02, 0.08))
+    ]
     several = ds.Rollout(ds.SemiImplicitSolver(pressed(terms=balls), dt=1e-4), 1, outputs=ds.ContactForce(balls[1]))
     with pytest.raises(ValueError, match="2 obstacles reach between the corners of faces"):
         several.forward()

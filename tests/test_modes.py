@@ -18,7 +18,15 @@ def strain_displacement(mesh):
     for a in range(4):
         x, y, z = N[:, 0, a], N[:, 1, a], N[:, 2, a]
         for row, column, value in (
-            (0, 0, x), (1, 1, y), (2, 2, z), (3, 1, z), (3, 2, y), (4, 0, z), (4, 2, x), (5, 0, y), (5, 1, x)
+            (0, 0, x),
+            (1, 1, y),
+            (2, 2, z),
+            (3, 1, z),
+            (3, 2, y),
+            (4, 0, z),
+            (4, 2, x),
+            (5, 0, y),
+            (5, 1, x),
         ):
             B[:, row, 3 * a + column] = value
     return B, np.linalg.det(X[:, 1:] - X[:, :1]) / 6
@@ -115,7 +123,9 @@ def test_stiffness_is_the_slope_of_forces(volume):
         return body.forces()
 
     slope = (forces(-h) - forces(h)) / (2 * h)
-    assert (scene.stiffness_matrix(u) @ w.ravel()).reshape(-1, 3) == pytest.approx(slope, abs=1e-7 * np.abs(slope).max())
+    assert (scene.stiffness_matrix(u) @ w.ravel()).reshape(-1, 3) == pytest.approx(
+        slope, abs=1e-7 * np.abs(slope).max()
+    )
 
 
 @pytest.mark.parametrize("state", ["rest", "bent"])
@@ -146,7 +156,9 @@ def test_gradients_of_frequencies_agree_with_differences(state):
         if key == "displacements":
             direction[scene.fixed] = 0
         slope, s = (gradients[key] * direction).sum(), 1e-3 if key == "displacements" else 1e-2
-        coarse, fine = ((loss(key, base + t * direction) - loss(key, base - t * direction)) / (2 * t) for t in (s, s / 2))
+        coarse, fine = (
+            (loss(key, base + t * direction) - loss(key, base - t * direction)) / (2 * t) for t in (s, s / 2)
+        )
         assert slope == pytest.approx((4 * fine - coarse) / 3, rel=2e-6), key
 
 

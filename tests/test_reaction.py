@@ -14,7 +14,9 @@ FORCES = RNG.normal(size=(4, 8, 3))
 
 def scene_of(precision="f64", **options):
     mesh = ds.TetrahedralMesh.create_box((3, 2, 2), size=(0.2, 0.1, 0.1))
-    load = ds.ExternalForce(FORCES if "per_step" in options else FORCES[0, :4], vertices="xmax" if "per_step" not in options else None)
+    load = ds.ExternalForce(
+        FORCES if "per_step" in options else FORCES[0, :4], vertices="xmax" if "per_step" not in options else None
+    )
     options.pop("per_step", None)
     given = dict(density=900.0, terms=[ds.Gravity((1.0, -9.81, 2.0)), load], fixed=["xmin"], precision=precision)
     return ds.Scene(mesh, ds.StableNeoHookean(youngs_modulus=5e4, poissons_ratio=0.3), **given | options)
@@ -70,11 +72,21 @@ def test_gradients_agree_with_differences(kind):
         got = rollout.forward(**values)
         return sum((got[name] * seed).sum() for name, seed in seeds.items())
 
-    for key in ("youngs_modulus", "poissons_ratio", "density", "rest_positions", "gravity", "external_forces", "prescribed_motion"):
+    for key in (
+        "youngs_modulus",
+        "poissons_ratio",
+        "density",
+        "rest_positions",
+        "gravity",
+        "external_forces",
+        "prescribed_motion",
+    ):
         base = rollout.values[key]
         direction = rng.normal(size=base.shape) * verify.input_scale(rollout, key)
         slope, s = (gradients[key] * direction).sum(), 1e-3
-        coarse, fine = ((loss(**{key: base + t * direction}) - loss(**{key: base - t * direction})) / (2 * t) for t in (s, s / 2))
+        coarse, fine = (
+            (loss(**{key: base + t * direction}) - loss(**{key: base - t * direction})) / (2 * t) for t in (s, s / 2)
+        )
         assert slope == pytest.approx((4 * fine - coarse) / 3, rel=1e-6, abs=1e-8 * abs(loss())), key
 
 

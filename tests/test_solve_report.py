@@ -47,7 +47,9 @@ def test_statics_say_which_saddles_they_left():
     mesh = ds.TetrahedralMesh.create_box((2, 9, 2), (0.1, 1.0, 0.1), pattern="five")
     top, euler = mesh.vertex_indices("ymax"), np.pi**2 * 1e6 * 0.1**4 / 48
     down = np.tile([0, -8 * euler / len(top), 0], (len(top), 1))
-    scene = ds.Scene(mesh, ds.StableNeoHookean(1e6, 0.0), terms=[ds.ExternalForce(down, top)], fixed="ymin", precision="f64")
+    scene = ds.Scene(
+        mesh, ds.StableNeoHookean(1e6, 0.0), terms=[ds.ExternalForce(down, top)], fixed="ymin", precision="f64"
+    )
     rollout = ds.Rollout(ds.StaticSolver(scene, load_steps=2, max_iterations=400), 1)
     with pytest.warns(ds.Buckled, match="saddles? left: the body was in balance and not stable") as said:
         rollout.forward()

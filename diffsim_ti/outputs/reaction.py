@@ -27,7 +27,7 @@ class Reaction(Output):
     inertia of vertices that a prescribed motion accelerates.
 
     support: which of the fixed vertices, by a vertex set's name, indices, a mask or a list of names; None: all.
-    about: the moment [N m] about this point [m] instead: sum (x_i - about) x R_i. per_vertex: of each vertex, in the order of
+    about: the moment [N m] about this point [m] instead: sum (x_i - about) x R_i. per_vertex: of each vertex, ordered as
         `mesh.vertex_indices(support)`. name: how a loss calls it.
     The gradient is exact by all inputs. In single precision a reaction is the small sum of large forces of stress: it has an
     error of some 1e-6 of these.

@@ -86,8 +86,8 @@ class Strain(_Tensors):
     """Green's strain E = (F^T F - I) / 2 [-], F = I + sum_a u_a (x) grad N_a, in each frame; symmetric 3x3 tensors.
 
     at: "tetrahedra", (frames, num_tetrahedra, 3, 3); "vertices", means over the tetrahedra around, by their volumes; or
-    points X [m] of the rest shape, shape (k, 3). principal: its eigenvalues instead, ascending, shape (frames, ..., 3); where
-    two coincide only their sum has a gradient. name: how a loss calls it.
+    points X [m] of the rest shape, shape (k, 3). principal: its eigenvalues instead, ascending, shape (frames, ..., 3);
+    where two coincide only their sum has a gradient. name: how a loss calls it.
     The gradient is exact by all inputs. Raises ValueError for another `at`, or points outside the mesh.
     Holzapfel, Nonlinear Solid Mechanics, 2000, sec. 2.5.
     """
@@ -112,7 +112,7 @@ class Stress(_Tensors):
     """Stress [Pa] in each frame: Cauchy's sigma = P F^T / J, or the first Piola-Kirchhoff stress P = dpsi/dF.
 
     kind: "cauchy" or "first_piola". at: "tetrahedra", (frames, num_tetrahedra, 3, 3); "vertices", means over the tetrahedra
-    around, by their volumes; or points X [m] of the rest shape, shape (k, 3). principal: the eigenvalues of Cauchy's instead,
+    around, by their volumes; or points X [m] of the rest shape, shape (k, 3). principal: Cauchy's eigenvalues instead,
     ascending, shape (frames, ..., 3); where two coincide only their sum has a gradient. name: how a loss calls it.
     The gradient is exact by all inputs; in single precision the stress has an error of some 1e-6 of the modulus.
 

@@ -34,8 +34,8 @@ class Noted:
         saddles = sum(solve.saddles for solve in solves)
         if saddles and self.is_static:
             said = (
-                f"step {step}: {saddles} saddle{'s' * (saddles > 1)} left: the body was in balance and not stable, as beyond a "
-                "buckling load, and went to a lower equilibrium; to which of several is chance, and gradients are of that one"
+                f"step {step}: {saddles} saddle{'s' * (saddles > 1)} left: the body was in balance and not stable, as "
+                "beyond a buckling load, and went to a lower equilibrium; to which of several is chance, and gradients are of it"
             )
             warnings.warn(Buckled(said, step, saddles), stacklevel=2)
 
