@@ -34,7 +34,7 @@ class Modes:
 
         Where frequencies coincide each mode takes the mean of its group, which is the one of them that is differentiable:
         the loss must weigh the modes of a group alike, and a group must not be cut by k. "displacements" is the gradient
-        by the state, besides. Initial positions and loads have none: chain those that move the state through its own rollout.
+        by the state, besides. Initial positions and loads have none: chain what moves the state through its own rollout.
         phi . dK phi is the slope of the exact derivatives of phi . forces along phi, by differences of fourth order whose
         error is 1e-10 of it.
 

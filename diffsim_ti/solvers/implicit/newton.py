@@ -23,9 +23,8 @@ LONGER = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # steps along an indefinite direction
 @dataclass
 class NewtonReport:
     """What a solve took: relative residual before each round, products of the Hessian, rounds with an indefinite
-    Hessian, saddles that were left, evaluations of the energy, halvings in line searches;
-    directions that an obstacle, or the surface itself, cut
-    short, and which obstacle cut the last one (potential/way.py)."""
+    Hessian, saddles that were left, evaluations of the energy, halvings in line searches; directions that an obstacle, or
+    the surface itself, cut short, and which obstacle cut the last one (potential/way.py)."""
 
     residuals: list = field(default_factory=list)
     products: int = 0

@@ -33,9 +33,10 @@ class Noted:
         self.report.note(step, seconds, solves)
         saddles = sum(solve.saddles for solve in solves)
         if saddles and self.is_static:
+            left = f"{saddles} saddle{'s' * (saddles > 1)} left"
             said = (
-                f"step {step}: {saddles} saddle{'s' * (saddles > 1)} left: the body was in balance and not stable, as "
-                "beyond a buckling load, and went to a lower equilibrium; to which of several is chance, and gradients are of it"
+                f"step {step}: {left}: the body was in balance and not stable, as beyond a buckling load, and went to a lower "
+                "equilibrium; to which of several is chance, and gradients are of it"
             )
             warnings.warn(Buckled(said, step, saddles), stacklevel=2)
 
