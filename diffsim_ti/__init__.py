@@ -18,7 +18,16 @@ from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.modes import Modes, modes
 from diffsim_ti.monitor.energy_watch import EnergyGained
 from diffsim_ti.monitor.guard import Crossing, Divergence
-from diffsim_ti.outputs import ContactForce, EnclosedVolume, MaterialPoints, Reaction, Strain, Stress
+from diffsim_ti.outputs import (
+    ContactForce,
+    ElasticEnergy,
+    EnclosedVolume,
+    KineticEnergy,
+    MaterialPoints,
+    Reaction,
+    Strain,
+    Stress,
+)
 from diffsim_ti.rollout import Frames, Rollout
 from diffsim_ti.runtime import init
 from diffsim_ti.scene import Scene
@@ -94,6 +103,8 @@ __all__ = [
     "Stress",
     "Strain",
     "EnclosedVolume",
+    "ElasticEnergy",
+    "KineticEnergy",
     "modes",
     "Modes",
     "taylor_test",

@@ -27,6 +27,9 @@ def outputs():
         ds.Strain("nodal_strain", at="vertices"),
         ds.Strain("marked", at=POINTS, principal=True),
         ds.EnclosedVolume(),
+        ds.ElasticEnergy(),
+        ds.ElasticEnergy([[0, 3, 4], [1, 2]], name="parts"),
+        ds.KineticEnergy(["xmax", "ymin"]),
     ]
 
 
@@ -99,6 +102,8 @@ def test_a_homogeneous_stretch_has_its_closed_form():
     green = 0.5 * (np.array([a, b, c]) ** 2 - 1)
     assert frames["nodal_strain"][0] == pytest.approx(np.tile(np.diag(green), (body.num_vertices, 1, 1)), abs=1e-12)
     assert frames["marked"][0] == pytest.approx(np.tile(np.sort(green), (2, 1)), abs=1e-12)
+    psi = 0.5 * mu * (a**2 + b**2 + c**2 - 3) - mu * np.log(J) + 0.5 * lam * (J - 1) ** 2
+    assert frames["elastic_energy"][0] == pytest.approx(psi * body.volumes.sum(), rel=1e-9)
     assert frames["volume"][0] == pytest.approx(J * body.volumes.sum(), rel=1e-12)
 
 

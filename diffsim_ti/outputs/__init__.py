@@ -2,6 +2,7 @@
 
 from diffsim_ti.outputs.contact_force import ContactForce
 from diffsim_ti.outputs.enclosed_volume import EnclosedVolume
+from diffsim_ti.outputs.energies import ElasticEnergy, KineticEnergy
 from diffsim_ti.outputs.material_points import MaterialPoints
 from diffsim_ti.outputs.output import Change, Output
 from diffsim_ti.outputs.reaction import Reaction
@@ -12,7 +13,9 @@ __all__ = [
     "Change",
     "ContactForce",
     "Displacements",
+    "ElasticEnergy",
     "EnclosedVolume",
+    "KineticEnergy",
     "MaterialPoints",
     "Output",
     "Positions",

@@ -35,8 +35,8 @@ class Noted:
         if saddles and self.is_static:
             left = f"{saddles} saddle{'s' * (saddles > 1)} left"
             said = (
-                f"step {step}: {left}: the body was in balance and not stable, as beyond a buckling load, and went to a lower "
-                "equilibrium; to which of several is chance, and gradients are of it"
+                f"step {step}: {left}: the body was in balance and not stable, as beyond a buckling load, and went to a "
+                "lower equilibrium; to which of several is chance, and gradients are of it"
             )
             warnings.warn(Buckled(said, step, saddles), stacklevel=2)
 
