@@ -42,19 +42,33 @@ def test_a_simulator_reports_since_its_start():
     assert explicit.report.substeps == 6 and "nothing to solve" in str(explicit.report)
 
 
-def test_statics_say_which_saddles_they_left():
-    """A column twice as heavy laden as Euler's load is in balance upright."""
+def laden_column(sideways: float) -> ds.Rollout:
+    """A column with eight times Euler's load on it, and a small part of that sideways."""
     mesh = ds.TetrahedralMesh.create_box((2, 9, 2), (0.1, 1.0, 0.1), pattern="five")
-    top, euler = mesh.vertex_indices("ymax"), np.pi**2 * 1e6 * 0.1**4 / 48
-    down = np.tile([0, -8 * euler / len(top), 0], (len(top), 1))
-    scene = ds.Scene(
-        mesh, ds.StableNeoHookean(1e6, 0.0), terms=[ds.ExternalForce(down, top)], fixed="ymin", precision="f64"
-    )
-    rollout = ds.Rollout(ds.StaticSolver(scene, load_steps=2, max_iterations=400), 1)
+    top, load = mesh.vertex_indices("ymax"), 8 * np.pi**2 * 1e6 * 0.1**4 / 48
+    forces = np.tile([sideways * load, -load, 0], (len(top), 1)) / len(top)
+    terms = [ds.ExternalForce(forces, top)]
+    scene = ds.Scene(mesh, ds.StableNeoHookean(1e6, 0.0), terms=terms, fixed="ymin", precision="f64")
+    return ds.Rollout(ds.StaticSolver(scene, load_steps=2, max_iterations=400), 1)
+
+
+def test_statics_say_which_saddles_they_left():
+    """Straight up it is in balance, and not stable."""
+    rollout = laden_column(0.0)
     with pytest.warns(ds.Buckled, match="saddles? left: the body was in balance and not stable") as said:
         rollout.forward()
     assert rollout.report.saddles >= 1 and "left" in str(rollout.report)
     assert sum(w.message.saddles for w in said if isinstance(w.message, ds.Buckled)) == rollout.report.saddles
+
+
+def test_statics_say_that_a_body_may_have_buckled_on_the_way():
+    """What is not quite straight passes no saddle."""
+    rollout = laden_column(1e-3)
+    with pytest.warns(ds.Buckled, match="rounds of Newton's method met states that are not stable") as said:
+        frames = rollout.forward()
+    assert rollout.report.saddles == 0 < rollout.report.indefinite
+    assert sum(w.message.unstable for w in said) == rollout.report.indefinite
+    assert frames.displacements[-1][:, 0].max() > 0.5
 
 
 def test_a_step_limit_is_a_float():

@@ -7,11 +7,13 @@ from dataclasses import dataclass
 
 
 class Buckled(UserWarning):
-    """Statics left stationary states that were no minima; `saddles` of them in step `step`."""
+    """Statics left stationary states that were no minima, `saddles` of them in step `step`, or, where that is 0, met states
+    with an indefinite Hessian in `unstable` rounds on the way to the equilibrium, which is how a body buckles whose mesh is
+    not quite symmetric."""
 
-    def __init__(self, message: str = "", step: int = 0, saddles: int = 0):
+    def __init__(self, message: str = "", step: int = 0, saddles: int = 0, unstable: int = 0):
         super().__init__(message)
-        self.step, self.saddles = step, saddles
+        self.step, self.saddles, self.unstable = step, saddles, unstable
 
 
 @dataclass
@@ -107,6 +109,7 @@ class SolveReport:
             f"residual {self.residual:.2g} at most",
             f"{self.cuts} line-search cuts, {self.blocked} by contact",
         ]
+        parts += [f"{self.indefinite} rounds met unstable states"] if self.indefinite else []
         return ", ".join(parts + ([f"{self.saddles} saddles left"] if self.saddles else []))
 
     def __repr__(self) -> str:

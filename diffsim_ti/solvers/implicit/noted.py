@@ -31,14 +31,18 @@ class Noted:
         """What pass j took; saddles that statics left are said."""
         step, solves = self.step_of(j, num_passes), self.newton.reports
         self.report.note(step, seconds, solves)
-        saddles = sum(solve.saddles for solve in solves)
-        if saddles and self.is_static:
-            left = f"{saddles} saddle{'s' * (saddles > 1)} left"
-            said = (
-                f"step {step}: {left}: the body was in balance and not stable, as beyond a buckling load, and went to a "
-                "lower equilibrium; to which of several is chance, and gradients are of it"
-            )
-            warnings.warn(Buckled(said, step, saddles), stacklevel=2)
+        saddles, unstable = (sum(getattr(solve, name) for solve in solves) for name in ("saddles", "indefinite"))
+        if self.is_static and (saddles or unstable):
+            rounds = sum(max(len(solve.residuals) - 1, 0) for solve in solves)
+            left = f"{saddles} saddle{'s' * (saddles > 1)} left: the body was in balance and not stable, as when it buckles"
+            if not saddles:
+                left = (
+                    f"{unstable} of {rounds} rounds of Newton's method met states that are not stable: the body may have "
+                    "buckled on the way (follow it by more load_steps)"
+                )
+            went = "it went to a lower equilibrium, which may be one of several, and gradients are of it"
+            said = f"step {step}: {left}; {went}"
+            warnings.warn(Buckled(said, step, saddles, unstable), stacklevel=2)
 
     @property
     def is_static(self) -> bool:
