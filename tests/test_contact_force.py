@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import taichi as ti
 import torch
+from contact_scenes import points, tetrahedron
 
 import diffsim_ti as ds
 from diffsim_ti import verify
@@ -39,6 +40,16 @@ def outputs():
     ]
 
 
+def belt(kind) -> ds.Rollout:
+    """A vertex that a rough belt drives towards a wall, and that takes a share of all friction only."""
+    rough = dict(stiffness=1e6, width=0.01)
+    moving = ds.Ground(-0.011, friction=1.5, path=lambda t: [-20 * t, 0, 0], name="floor", **rough)
+    wall = ds.HalfSpace([-0.011, 0, 0], [1, 0.2, 0.1], friction=0.3, name="wall", **rough)
+    body = points(tetrahedron(), [moving, wall], fixed=[1, 2, 3], initial_velocities=[-1.0, -6.0, 0.3], precision="f64")
+    named = [*outputs()[:2], outputs()[3], ds.ContactForce("wall", "friction", name="rubbed")]
+    return ds.Rollout(kind(body, dt=1e-3, contact_damping=0.02), 3, save_every=1, outputs=named, gradients="all")
+
+
 def path(t):
     return 0.0, 0.2 * t, 0.1 * t
 
@@ -46,6 +57,8 @@ def path(t):
 @lru_cache(maxsize=None)
 def rollout_of(case: str) -> ds.Rollout:
     kind, *more = case.split()
+    if "belt" in more:
+        return belt(dict(semi=ds.SemiImplicitSolver, verlet=ds.VelocityVerletSolver)[kind])
     tight = dict(tolerance=1e-12)
     moved = dict(
         terms=[
@@ -69,7 +82,19 @@ def rollout_of(case: str) -> ds.Rollout:
     return ds.Rollout(solver, 4, save_every=2, outputs=named, gradients="all")
 
 
-CASES = ["semi", "verlet", "euler", "middle moved", "bdf", "static", "semi moved", "semi round", "euler round"]
+CASES = [
+    "semi",
+    "verlet",
+    "euler",
+    "middle moved",
+    "bdf",
+    "static",
+    "semi moved",
+    "semi belt",
+    "verlet belt",
+    "semi round",
+    "euler round",
+]
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -106,7 +131,8 @@ def test_gradients_agree_with_differences(case):
         got = rollout.forward(**values)
         return sum((got[name] * seed).sum() for name, seed in seeds.items())
 
-    for key in KEYS + ("floor.path",) * ("moved" in case):
+    keys = [key for key in (*KEYS, "floor.path", "wall.normal") if key in rollout.inputs]
+    for key in keys:
         base = rollout.values[key]
         direction = rng.normal(size=base.shape) * verify.input_scale(rollout, key)
         slope = (gradients[key] * direction).sum()
@@ -138,6 +164,16 @@ def test_the_impulse_of_a_bounce_is_the_change_of_momentum(kind, gate):
     assert np.abs(p[-1] - p[0]).max() > 0.5 * np.abs(p).max()
     assert np.diff(p, axis=0) == pytest.approx(gained, abs=gate * np.abs(p).max())
     assert not frames["held"][0].any()
+
+
+def test_friction_that_a_vertex_takes_a_share_of_counts():
+    """Of a free vertex that feels no other force."""
+    rollout = belt(ds.SemiImplicitSolver)
+    frames, mass = rollout.forward(), rollout.scene.inputs.derive(rollout.scene.inputs.values).mass[0]
+    forces = frames["held"] + frames["each"].sum(1)
+    gained = mass * np.diff(frames.velocities[:, 0], axis=0)
+    assert gained == pytest.approx(1e-3 * forces[1:], abs=1e-9 * np.abs(gained).max())  # the law's modulus is 1e-6 Pa
+    assert np.abs(frames["rubbed"]).max() > 0 and np.abs(frames["dragged"]).max() > 0
 
 
 @pytest.mark.parametrize("round_one", [False, True])

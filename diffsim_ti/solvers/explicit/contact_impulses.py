@@ -1,8 +1,9 @@
 """Impulses of obstacles in the contact stage of explicit passes, summed over the passes of a frame where a loss names them.
 
-In a pass obstacle o gives vertex i h P_o n_o by its push and m (v_o - v_(o-1)) by its friction, v_o being the velocity after
-the frictions of obstacles 1 .. o: what the stage adds to the vertex's momentum, to round-off. They are added to rows
-now.into + 2 o and now.into + 2 o + 1 of `impulse`; now.into is negative in passes that no frame counts.
+In a pass obstacle o gives vertex i h P_o n_o by its push and c m (v_o - v_(o-1)) by its friction, v_o being the velocity
+after the frictions of obstacles 1 .. o, and c the share of them that the vertex takes (contact_friction.py): what the stage
+adds to the vertex's momentum, to round-off. They are added to rows now.into + 2 o and now.into + 2 o + 1 of `impulse`;
+now.into is negative in passes that no frame counts.
 """
 
 import taichi as ti
@@ -13,9 +14,11 @@ A = ti.template()
 
 
 @ti.func
-def note_impulses(self: A, i, v_plus, ratio, now: A, scene: A, state: A):
+def note_impulses(self: A, i, v_plus, z, ratio, now: A, scene: A, state: A):
     """Add what the noted pushes, and the frictions on v+, are."""
     if now.into >= 0:
+        x, _ = self.crowding(i, v_plus, self.slide_all(i, v_plus, ratio, state), z, now, state)
+        share, _ = self.share_and_slope(x)
         v = v_plus
         for c in range(ti.static(self.features.num_staged)):
             o = ti.static(self.features.first_staged) + c
@@ -23,7 +26,7 @@ def note_impulses(self: A, i, v_plus, ratio, now: A, scene: A, state: A):
             pushed, after = state.stage[row + PUSH, i], self.slide(o, i, v, ratio, state)
             n = self.normal(state.stage[row + PLANE, i])
             state.impulse[at, i] = state.impulse[at, i] + now.h * pushed.x * n
-            state.impulse[at + 1, i] = state.impulse[at + 1, i] + (after - v) / scene.inverse_mass[i]
+            state.impulse[at + 1, i] = state.impulse[at + 1, i] + share * (after - v) / scene.inverse_mass[i]
             v = after
 
 
@@ -40,11 +43,19 @@ def note_pushes_jvp(self: A, i, now: A, state: A, tangent: A):
 
 
 @ti.func
-def note_friction_jvp(self: A, o, i, gained, dgained, now: A, scene: A, tangent: A):
-    """The change of that of friction, whose obstacle has added `gained` to the velocity."""
+def note_friction_jvp(self: A, i, v, dv, share, dshare, ratio, dratio, now: A, scene: A, state: A, tangent: A):
+    """The change of those of friction, v being the velocity before it."""
     if now.into >= 0:
-        at, change = now.into + 2 * o + 1, dgained / scene.inverse_mass[i] + tangent.mass[i] * gained
-        tangent.impulse[at, i] = tangent.impulse[at, i] + change
+        inverse = scene.inverse_mass[i]
+        for g in ti.static(self.features.staged_rough):
+            for k in range(g.count):
+                at = now.into + 2 * (g.number + k) + 1
+                after, dafter = self.slide_jvp_of(g, k, i, v, dv, ratio, dratio, now, state, tangent)
+                gained = (share * (dafter - dv) + dshare * (after - v)) / inverse + share * tangent.mass[i] * (
+                    after - v
+                )
+                tangent.impulse[at, i] = tangent.impulse[at, i] + gained
+                v, dv = after, dafter
 
 
 @ti.func
@@ -70,11 +81,22 @@ def seed_of_friction(self: A, c, i, now: A, scene: A, adjoint: A):
 
 
 @ti.func
-def friction_by_mass(self: A, c, i, before, ratio, now: A, state: A, adjoint: A):
+def friction_by_mass(self: A, c, i, before, share, ratio, now: A, state: A, adjoint: A):
     """Add the adjoint of the mass by the impulse of friction, `before` being the velocity before it."""
     if ti.static(self.features.density):
         if now.into >= 0:
             o, row = ti.static(self.features.first_staged) + c, ti.static(self.features.sums().first("mass"))
-            gained = self.slide(o, i, before, ratio, state) - before
+            gained = share * (self.slide(o, i, before, ratio, state) - before)
             by = gained.dot(adjoint.impulse[now.into + 2 * o + 1, i])
             adjoint.sums[row, i] = adjoint.sums[row, i] + by
+
+
+@ti.func
+def friction_by_share(self: A, i, v, ratio, now: A, scene: A, state: A, adjoint: A):
+    """Adjoint of the share of friction that the vertex takes, by the impulses."""
+    out = ti.cast(0, self.fp)
+    for c in range(ti.static(self.features.num_staged)):
+        after = self.slide(ti.static(self.features.first_staged) + c, i, v, ratio, state)
+        out += (after - v).dot(seed_of_friction(self, c, i, now, scene, adjoint))
+        v = after
+    return out

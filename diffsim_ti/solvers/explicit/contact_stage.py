@@ -17,8 +17,8 @@ from dataclasses import dataclass
 
 import taichi as ti
 
+from diffsim_ti.solvers.explicit.contact_friction import ContactFriction
 from diffsim_ti.solvers.explicit.contact_impulses import note_impulses, note_pushes_jvp, seed_impulses
-from diffsim_ti.solvers.explicit.contact_slides import ContactSlides
 from diffsim_ti.solvers.explicit.obstacle_stages import FELT, PLANE, PUSH, ROWS, SEED, WALL
 from diffsim_ti.solvers.explicit.wall_work import work_of_stage
 from diffsim_ti.terms.obstacles import secant, stage
@@ -28,7 +28,7 @@ MOST_ROUNDS = 60
 
 
 @dataclass(frozen=True)
-class ContactStage(ContactSlides):
+class ContactStage(ContactFriction):
     """Taichi functions of one vertex; `now` is the pass (state/schedule.py), g a group of obstacles, k a place in it.
 
     Obstacles of all kinds are gone through in one loop, over what `look` notes of them.
@@ -129,10 +129,10 @@ class ContactStage(ContactSlides):
         if self.acts(i, ratio, now, scene):
             if self.look(i, u, free, now, scene, state):
                 a = now.alpha * self.blend(plan) * ratio
-                _, total, _, _ = self.solve(i, self.vector(0), free, a, now, state, plan)
-                delta, v = ratio * total, self.slide_all(i, v_plus, ratio, state)
+                z, total, _, _ = self.solve(i, self.vector(0), free, a, now, state, plan)
+                delta, v = ratio * total, self.rubbed(i, v_plus, z, ratio, now, state)
                 if ti.static(self.features.recorded):
-                    note_impulses(self, i, v_plus, ratio, now, scene, state)
+                    note_impulses(self, i, v_plus, z, ratio, now, scene, state)
                 if ti.static(self.features.moving > 0):
                     state.work[i] = state.work[i] + work_of_stage(self, i, v_plus, now, scene, state)
         pressed = self.blend(plan) * delta
@@ -158,7 +158,7 @@ class ContactStage(ContactSlides):
                 delta, ddelta = ratio * total, dratio * total + ratio * dtotal
                 if ti.static(self.features.recorded):
                     note_pushes_jvp(self, i, now, state, tangent)
-                v, dv = self.slide_all_jvp(i, v, dv, ratio, dratio, now, scene, state, tangent)
+                v, dv = self.rubbed_jvp(i, u, du, v, dv, z, dz, ratio, dratio, dalpha, now, scene, state, tangent)
         w, dw = v + blend * delta, dv + blend * ddelta
         du_next = du + dalpha * w + now.alpha * dw
         dv_next = now.decay * dv + ddelta - (1 - now.decay) * blend * ddelta
@@ -215,20 +215,26 @@ class ContactStage(ContactSlides):
             if self.look(i, u, free, now, scene, state):
                 a = now.alpha * blend * ratio
                 z, total, xyz, mixed = self.solve(i, moved, free, a, now, state, plan)
-                w = self.slide_all(i, v_plus, ratio, state) + blend * ratio * total
+                w = self.rubbed(i, v_plus, z, ratio, now, state) + blend * ratio * total
                 delta_adj = q + blend * w_adj
                 by_alpha, by_ratio = p.dot(w), delta_adj.dot(total)
                 self.seed_all(i, ratio * delta_adj, state)
                 if ti.static(self.features.recorded):
                     seed_impulses(self, i, now, state, adjoint)
+                by_z = self.vector(0)
                 if ti.static(len(self.features.staged_rough) > 0):
-                    v_adj, more = self.slide_all_vjp(i, v_plus, v_adj, ratio, now, scene, state, adjoint)
+                    v_adj, more, of_z, of_alpha, of_u = self.rubbed_vjp(
+                        i, u, v_plus, v_adj, z, ratio, now, scene, state, adjoint
+                    )
                     by_ratio += more
-                z_adj = stage.solve_linear(self.features.num_staged, a, xyz, mixed, self.by_move(i, state))
+                    by_alpha += of_alpha
+                    by_z += of_z
+                    u_adj += of_u
+                z_adj = stage.solve_linear(self.features.num_staged, a, xyz, mixed, self.by_move(i, state) + by_z)
                 v_adj += now.alpha * z_adj
                 by_alpha += z_adj.dot(v_plus + blend * ratio * total)
                 by_ratio += blend * now.alpha * z_adj.dot(total)
-                u_adj = self.push_all_vjp(i, u, z, a * z_adj, now, scene, state, adjoint, plan)
+                u_adj += self.push_all_vjp(i, u, z, a * z_adj, now, scene, state, adjoint, plan)
                 if ti.static(self.features.density):
                     row = ti.static(self.features.sums().first("mass"))
                     adjoint.sums[row, i] = adjoint.sums[row, i] - ratio * inverse * by_ratio
