@@ -49,8 +49,8 @@ class Frame:
 
     @classmethod
     def of_run(cls, scene: Scene, frames: "Frames", k: int) -> "Frame":
-        """Frame k of a Rollout's run of a scene; its fields are the outputs that each vertex or each tetrahedron has: vectors
-        such as ContactForce(per_vertex=True), tensors and principal values such as Stress(at="vertices").
+        """Frame k of a Rollout's run of a scene; its fields are the outputs that each vertex or each tetrahedron has:
+        vectors such as ContactForce(per_vertex=True), tensors and principal values such as Stress(at="vertices").
 
         Raises IndexError for a frame that there is not.
         """
