@@ -15,9 +15,19 @@ from diffsim_ti.materials import (
     StVenantKirchhoff,
 )
 from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.modes import Modes, modes
 from diffsim_ti.monitor.energy_watch import EnergyGained
 from diffsim_ti.monitor.guard import Crossing, Divergence
-from diffsim_ti.outputs import MaterialPoints
+from diffsim_ti.outputs import (
+    ContactForce,
+    ElasticEnergy,
+    EnclosedVolume,
+    KineticEnergy,
+    MaterialPoints,
+    Reaction,
+    Strain,
+    Stress,
+)
 from diffsim_ti.rollout import Frames, Rollout
 from diffsim_ti.runtime import init
 from diffsim_ti.scene import Scene
@@ -32,6 +42,7 @@ from diffsim_ti.solvers import (
     VelocityVerletSolver,
     stable_dt,
 )
+from diffsim_ti.state.solve_report import Buckled, SolveReport
 from diffsim_ti.terms import (
     Box,
     Capsule,
@@ -82,9 +93,20 @@ __all__ = [
     "Tunnelling",
     "NotConverged",
     "EnergyGained",
+    "Buckled",
+    "SolveReport",
     "Rollout",
     "Frames",
     "MaterialPoints",
+    "ContactForce",
+    "Reaction",
+    "Stress",
+    "Strain",
+    "EnclosedVolume",
+    "ElasticEnergy",
+    "KineticEnergy",
+    "modes",
+    "Modes",
     "taylor_test",
     "dot_product_test",
     "check_gradients",

@@ -13,6 +13,7 @@ from diffsim_ti.materials.material import Material
 from diffsim_ti.materials.moduli import youngs_poisson
 from diffsim_ti.materials.patch_law import PatchLaw
 from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.potential.assembled import body_stiffness
 from diffsim_ti.terms import Drag, ExternalForce, Gravity, Obstacle, SelfContact, Term
 from diffsim_ti.terms.motion import Motion, sampled
 from diffsim_ti.terms.obstacles.obstacle import PER_AREA
@@ -141,6 +142,24 @@ class Scene:
                 stacklevel=3,
             )
 
+    @property
+    def obstacles(self) -> tuple[Term, ...]:
+        """What the surface feels by distance, in the order of frames' contact forces."""
+        return tuple(t for t in self.ordered_terms if t.acts_on_surface)
+
+    def place_of(self, obstacle: Term | str) -> int:
+        """Place in `obstacles` of one that is given by its name, or as the scene lists it."""
+        names = [t.name for t in self.obstacles]
+        if isinstance(obstacle, str) and obstacle in names:
+            return names.index(obstacle)
+        for terms in (self.terms, self._given):
+            if obstacle in terms:
+                found = self.terms[terms.index(obstacle)]
+                if found in self.obstacles:
+                    return self.obstacles.index(found)
+        known = ", ".join(repr(t.name or t) for t in self.obstacles) or "none"
+        raise ValueError(f"this scene has no obstacle {obstacle!r}; it has {known}: give obstacles a name=")
+
     def term(self, kind: type) -> Term | None:
         """The scene's first term of a kind, or None."""
         return next((t for t in self.terms if isinstance(t, kind)), None)
@@ -173,6 +192,37 @@ class Scene:
     def places(self, time: float) -> dict[Term, np.ndarray]:
         """Displacement of each moving obstacle at a time [s], shape (3,) [m]."""
         return {term: rows[0] for term, rows in zip(self.moving, self.path_rows([time]).values())}
+
+    # ---- matrices ----------------------------------------------------------------------------------------------------
+
+    def checked_displacements(self, displacements: ArrayLike | None) -> np.ndarray:
+        """Displacements from the rest shape [m], shape (num_vertices, 3); None: zero."""
+        shape = self.mesh.vertices.shape
+        u = np.zeros(shape) if displacements is None else np.asarray(displacements, np.float64)
+        if u.shape != shape or not np.all(np.isfinite(u)):
+            raise ValueError(f"displacements: expected finite numbers [m] of shape {shape}, got shape {u.shape}")
+        return u
+
+    def stiffness_matrix(self, displacements: ArrayLike | None = None):
+        """K = d2E/du2 [N/m] of the body's stress at displacements [m] from the rest shape, default none, shape
+        (num_vertices, 3), as a SciPy CSR matrix of all 3 num_vertices unknowns, x, y, z of vertex 0 first, in float64.
+
+        Fixed vertices have their rows: strike them out. What obstacles, self-contact and loads add is not in it.
+        Raises ValueError for shapes that do not fit, or a law that reads more than the displacement gradient.
+        Zienkiewicz, Taylor, The Finite Element Method, vol. 2, 5th ed., 2000, sec. 10.3.
+        """
+        if self.law.reads != ("H",) or self.law.state_names:
+            raise ValueError(
+                f"{type(self.law).__name__} is more than an energy of the displacement gradient: it has no K"
+            )
+        scene = self if self.precision == "f64" else self.replace(precision="f64")
+        return body_stiffness(scene, self.checked_displacements(displacements))
+
+    def mass_matrix(self):
+        """M [kg], lumped, as a diagonal SciPy CSR matrix of all 3 num_vertices unknowns, in float64."""
+        from scipy.sparse import diags
+
+        return diags(np.repeat(self.inputs.derive(self.inputs.values).mass, 3)).tocsr()
 
     def describe(self) -> str:
         """What is simulated, in a few lines."""

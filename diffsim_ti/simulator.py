@@ -9,6 +9,7 @@ from diffsim_ti import runtime
 from diffsim_ti.monitor import quantities
 from diffsim_ti.monitor.guard import Guard
 from diffsim_ti.monitor.quantities import Energy, TetrahedronFields
+from diffsim_ti.state.solve_report import SolveReport
 from diffsim_ti.state.watch import ContactResolution
 from diffsim_ti.terms import ExternalForce
 
@@ -45,6 +46,7 @@ class Simulator:
         """Back to the start of the scene."""
         self.step_count = 0
         self.workspace.load(self._start)
+        self.workspace.report.clear()
         if self._start.forces is not None and len(self._start.forces) == 1:
             self.workspace.arrays.load_rows(forces=self._start.forces)  # set_forces may have changed them
 
@@ -60,7 +62,8 @@ class Simulator:
         passes = self.solver.num_passes(1)
         self.workspace.save(self._before, 0)
         try:
-            self._guard.advance(0, passes, passes)
+            with self.workspace.report.of_passes(passes):
+                self._guard.advance(0, passes, passes)
         except FloatingPointError:
             self.workspace.restore(self._before, 0)
             raise
@@ -150,6 +153,11 @@ class Simulator:
     def contact_resolution(self) -> ContactResolution:
         """Smallest gap [m] since the start and how finely the substeps resolve contacts; obstacles only."""
         return self.workspace.watch.resolution()
+
+    @property
+    def report(self) -> SolveReport:
+        """What the solves took since the start: iterations, residuals, cuts, saddles, time (state.solve_report.py)."""
+        return self.workspace.report
 
     def compute_energy(self) -> Energy:
         """Total energy [J], a float with `.parts`: kinetic, elastic, gravity, contact."""

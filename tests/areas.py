@@ -11,8 +11,9 @@ AREAS = {
     "meshes, scenes, materials": "mesh locate scene inputs materials open_laws laws_with_state",
     "motion against closed forms": "reference_motion step_limit energy_watch hertz torture",
     "every adjoint, order, fuzz": "every_adjoint term_order gradient_fuzz",
-    "gradients": "gradients gradient_clip gradient_faults checkpoints tape outputs identification",
-    "implicit steps and equilibria": "implicit implicit_gradients implicit_contact swept",
+    "gradients": "gradients gradient_clip gradient_faults checkpoints tape outputs "
+    "contact_force reaction tensor_outputs modes identification",
+    "implicit steps and equilibria": "implicit implicit_gradients implicit_contact swept solve_report",
     "patches against locking": "locking",
     "obstacles and friction": "contact contact_area contact_faces contact_stage contact_crossing contact_friction "
     "contact_gradients own_obstacle",

@@ -190,3 +190,24 @@ def test_folders_have_no_suffix_or_are_there(tmp_path):
     assert file_in(tmp_path / "out", "a.pvd") == tmp_path / "out" / "a.pvd"
     assert file_in(tmp_path / "v1.5", "a.pvd") == tmp_path / "v1.5" / "a.pvd"
     assert file_in(tmp_path / "a.gif", "a.pvd") == tmp_path / "a.gif"
+
+
+def test_results_of_a_rollout_are_written(tmp_path):
+    """Each output that every vertex or tetrahedron has, tensors row by row; others are not."""
+    scene = ds.Scene(
+        TetrahedralMesh.create_cube(3),
+        ds.StableNeoHookean(1e5, 0.3),
+        terms=[ds.Gravity(), ds.Ground(-0.005, 1e4)],
+        precision="f64",
+    )
+    named = [ds.ContactForce(scene.terms[1], per_vertex=True), ds.ContactForce(scene.terms[1], name="sum"), ds.Stress()]
+    named += [ds.Stress("principal", at="vertices", principal=True)]
+    frames = ds.Rollout(ds.SemiImplicitSolver(scene, dt=1e-3), 4, save_every=2, outputs=named).forward()
+    with open_writer(tmp_path / "run.pvd", scene) as out:
+        for k in range(3):
+            out.write(Frame.of_run(scene, frames, k))
+    last = meshio.read(tmp_path / "run_0002.vtu")
+    assert np.array_equal(last.point_data["contact_force"], frames["contact_force"][2]) and frames["sum"][2, 1] > 0
+    assert np.array_equal(last.point_data["principal"], frames["principal"][2]) and "sum" not in last.point_data
+    assert np.array_equal(last.cell_data["stress"][0].reshape(-1, 3, 3), frames["stress"][2])
+    assert len(SavedSeries(tmp_path / "run.pvd").frame(2).positions) == scene.mesh.num_vertices

@@ -1,6 +1,6 @@
 """How large a step may be: a bound by elements, the tight limit by Lanczos, and a bound during the run."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,13 +15,24 @@ if TYPE_CHECKING:
     from diffsim_ti.scene import Scene
 
 
-@dataclass(frozen=True)
-class StepLimit:
-    """Largest stable explicit step [s], the tetrahedron that sets it, and how it was found."""
+class StepLimit(float):
+    """Largest stable explicit step [s], a float; with `tetrahedron`, which sets it, and `method`, how it was found."""
 
-    dt: float
     tetrahedron: int
     method: str
+
+    def __new__(cls, dt: float, tetrahedron: int, method: str):
+        out = super().__new__(cls, dt)
+        out.tetrahedron, out.method = tetrahedron, method
+        return out
+
+    def __getnewargs__(self) -> tuple:
+        return self.dt, self.tetrahedron, self.method
+
+    @property
+    def dt(self) -> float:
+        """The step alone."""
+        return float.__add__(self, 0.0)
 
     def __str__(self) -> str:
         return f"{self.dt:.4g} s ({self.method}, set by tetrahedron {self.tetrahedron})"

@@ -1,7 +1,26 @@
 """What a loss may name besides a run's inputs: functions of its frames, one file each, and their interface for others."""
 
+from diffsim_ti.outputs.contact_force import ContactForce
+from diffsim_ti.outputs.enclosed_volume import EnclosedVolume
+from diffsim_ti.outputs.energies import ElasticEnergy, KineticEnergy
 from diffsim_ti.outputs.material_points import MaterialPoints
 from diffsim_ti.outputs.output import Change, Output
+from diffsim_ti.outputs.reaction import Reaction
 from diffsim_ti.outputs.states import Displacements, Positions, Velocities
+from diffsim_ti.outputs.tensors import Strain, Stress
 
-__all__ = ["Change", "Displacements", "MaterialPoints", "Output", "Positions", "Velocities"]
+__all__ = [
+    "Change",
+    "ContactForce",
+    "Displacements",
+    "ElasticEnergy",
+    "EnclosedVolume",
+    "KineticEnergy",
+    "MaterialPoints",
+    "Output",
+    "Positions",
+    "Reaction",
+    "Strain",
+    "Stress",
+    "Velocities",
+]

@@ -16,17 +16,17 @@ def field_seed(face, k: int | None, change: Change) -> HostSeed:
     if face.rollout.solver.explicit:
         return FieldSeed(face, k, change)
     by_frames = Change(face.row(k, "positions") + face.row(k, "displacements"), face.row(k, "velocities"))
-    by_frames.add(Change(change.positions, change.velocities))
+    by_frames.add(Change(change.positions, change.velocities, contact_forces=change.contact_forces))
     for name in ("positions", "velocities"):
         check_finite(name, getattr(by_frames, name), face.rollout.save_every)
-    return HostSeed(by_frames.positions, by_frames.velocities)
+    return HostSeed(by_frames.positions, by_frames.velocities, by_frames.contact_forces)
 
 
 class FieldSeed(HostSeed):
     """Gradients by the frames in the fields, copied on the device, with those that came by further outputs."""
 
     def __init__(self, face, k: int | None, change: Change):
-        self.face, self.k, self.change = face, k, change
+        self.face, self.k, self.change, self.contact_forces = face, k, change, change.contact_forces
 
     def put(self, adjoint, last_frame_is_state: bool) -> tuple[float, float]:
         face = self.face

@@ -18,6 +18,10 @@ class Frames:
 
     `contact_resolution` says how near the body came to obstacles and how finely the steps resolve that (state/watch.py).
 
+    `contact_forces` [N], where an output reads them: what each obstacle did to each vertex, on average since the frame
+    before, by its barrier and by friction; shape (frames, obstacles, 2, num_vertices, 3), obstacles as in
+    `scene.obstacles`. The first frame has none.
+
     `inputs` are the values that the run started from, so that its gradient can be taken whenever it is wanted.
     """
 
@@ -28,6 +32,8 @@ class Frames:
     inputs: dict = field(repr=False)
     contact_resolution: ContactResolution | None = None
     outputs: dict[str, np.ndarray] = field(default_factory=dict)
+    contact_forces: np.ndarray | None = field(default=None, repr=False)
+    steps: np.ndarray | None = field(default=None, repr=False)  # of the run that are done in each frame
     run: Run | None = field(default=None, repr=False)
 
     def __getitem__(self, name: str) -> np.ndarray:
@@ -65,6 +71,7 @@ class HostSeed:
 
     positions: np.ndarray
     velocities: np.ndarray
+    contact_forces: np.ndarray | None = None
 
     def put(self, adjoint, last_frame_is_state: bool) -> tuple[float, float]:
         adjoint.start(self.positions, self.velocities, last_frame_is_state)

@@ -14,6 +14,7 @@ from diffsim_ti.rollout.run import Run
 from diffsim_ti.rollout.sweep import Sweep
 from diffsim_ti.rollout.taped import TapeFace
 from diffsim_ti.solvers.solver import Solver
+from diffsim_ti.state.solve_report import SolveReport
 
 
 class Rollout:
@@ -64,10 +65,11 @@ class Rollout:
             truncate=truncate,
             health=health,
         )
-        self.sweep = sweep = Sweep(solver, steps, **options)
+        given = (outputs,) if isinstance(outputs, Output) else tuple(outputs)
+        contacts = any(getattr(output, "reads_contact_forces", False) for output in given)
+        self.sweep = sweep = Sweep(solver, steps, **options, contacts=contacts)
         self.steps, self.save_every, self.num_frames = sweep.steps, sweep.save_every, sweep.num_frames
         self.values, self.inputs, self.wanted = sweep.values, sweep.inputs, sweep.wanted
-        given = (outputs,) if isinstance(outputs, Output) else tuple(outputs)
         self.outputs = self._check_outputs((Positions(), Velocities(), Displacements(), *given))
         self.computed = {output.name: self.outputs[output.name] for output in given}  # besides the states themselves
         self._options = options | dict(outputs=given, runs=runs)
@@ -108,6 +110,11 @@ class Rollout:
         return self.checkpoints.states() * self.sweep.state_bytes / 1e6
 
     @property
+    def report(self) -> SolveReport:
+        """What the solves of the last forward run took: iterations, residuals, cuts, saddles, time, by step."""
+        return SolveReport() if self.sweep.workspace is None else self.sweep.workspace.report
+
+    @property
     def health(self) -> list[dict]:
         """Norms of the adjoint in the steps of the last reverse sweep, last step first, if asked for."""
         return self.sweep.health
@@ -127,6 +134,8 @@ class Rollout:
             start = dict(initial_positions=positions[0], initial_velocities=v[0])
             inputs = inputs | {name: x.astype(np.float64) for name, x in start.items()}
         frames = Frames(positions, v, u, self.times, inputs, run.contact_resolution, run=run)
+        frames.steps = np.arange(self.num_frames) * self.save_every
+        frames.contact_forces = self.sweep.contact_forces()
         for name, output in self.computed.items():
             value, shape = np.asarray(output.value(frames)), tuple(output.shape(self.num_frames))
             if value.shape != shape:
@@ -145,7 +154,8 @@ class Rollout:
         change = self.pulled_to_frames(frames, dict(positions=positions, velocities=velocities) | seeds)
         zero = np.zeros(frames.positions.shape)
         at_frames = [zero if x is None else x for x in (change.positions, change.velocities)]
-        self.gradients = self.gradients_of(frames.run, self.sweep.pull_back(frames.run, HostSeed(*at_frames)), change)
+        seed = HostSeed(*at_frames, change.contact_forces)
+        self.gradients = self.gradients_of(frames.run, self.sweep.pull_back(frames.run, seed), change)
         return self.gradients
 
     def pulled_to_frames(self, frames: Frames, seeds: dict) -> Change:
@@ -189,7 +199,8 @@ class Rollout:
         values = frames.inputs
         tangents = {k: np.broadcast_to(np.asarray(x, np.float64), values[k].shape) for k, x in tangents.items()}
         derived = self.scene.inputs.derive_jvp(values, tangents)
-        return Change(*self.sweep.push_forward(frames.run, derived), tangents)
+        moved = self.sweep.push_forward(frames.run, derived)
+        return Change(*moved, tangents, self.sweep.contact_change)
 
     # ---- under ti.ad.Tape -------------------------------------------------------------------------------------------
 

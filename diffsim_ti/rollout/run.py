@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
 
+import numpy as np
+
 from diffsim_ti.inputs import Derived
 from diffsim_ti.state.watch import ContactResolution
 
@@ -30,7 +32,9 @@ class Run:
 
 
 class Seed(Protocol):
-    """Gradients of a loss by the frames' positions and velocities, wherever they lie."""
+    """Gradients of a loss by the frames' positions and velocities, wherever they lie; of contact forces on the host."""
+
+    contact_forces: np.ndarray | None
 
     def put(self, adjoint, last_frame_is_state: bool) -> tuple[float, float]:
         """Set a solver's adjoint to them and everything else in it to zero; their norms, or FloatingPointError."""

@@ -33,7 +33,9 @@ class Sweep:
         clip: float | None = None,
         truncate: int | None = None,
         health: bool = False,
+        contacts: bool = False,
     ):
+        self.contacts = contacts  # whether runs note what obstacles do to each vertex in each frame
         self.solver, self.scene, self.steps = solver, solver.scene, int(steps)
         if self.steps != steps or steps < 0:
             raise ValueError(f"steps must be a whole number >= 0, got {steps}")
@@ -58,6 +60,7 @@ class Sweep:
         self._loaded = None  # the values that are on the device
         self._current = None  # the run whose frames and snapshots the workspace holds
         self._adjoint = None  # the solver's, made by the first pull-back
+        self.contact_change = None  # of the contact forces, by the last tangent
         self._recorded, self._warned = False, False  # whether the record holds all passes; whether of coarse contacts
 
     def _check_names(self, names) -> tuple[str, ...]:
@@ -68,6 +71,15 @@ class Sweep:
         if unknown:
             raise ValueError(f"gradients: no input named {unknown[0]!r}; this rollout has {', '.join(self.inputs)}")
         return names
+
+    @property
+    def frame_time(self) -> float:
+        """Time between two frames [s]."""
+        return self.save_every * self.solver.dt
+
+    def contact_forces(self) -> np.ndarray | None:
+        """Mean forces [N] of obstacles on vertices in the frames of the last run (state/workspace.py), if they are noted."""
+        return self.workspace.contact_forces(self.frame_time) if self.contacts else None
 
     @property
     def truncates(self) -> bool:
@@ -116,6 +128,8 @@ class Sweep:
             if self.workspace is None:
                 self.workspace = self.solver.workspace(derived)
                 self.workspace.make_frames(self.num_frames)
+                if self.contacts:
+                    self.workspace.record_contacts()
                 self._snapshots = self.workspace.history(self.checkpoints.snapshots)
                 self._guard = Guard(self.workspace)
             else:
@@ -130,16 +144,20 @@ class Sweep:
         self._load(run)
         ws, checkpoints = self.workspace, self.checkpoints
         self._guard.restart()
+        if self.contacts:
+            ws.forget_contacts()
         self.workspace.first_step = run.first_step
         self._recorded = checkpoints.num_segments == 1 and self._adjoint is not None  # a gradient was asked for before
         if self._recorded:
             ws.make_record(checkpoints.segment + 1)
+        ws.report.clear()
         path = [0, *checkpoints.path(0, checkpoints.num_segments, checkpoints.snapshots - 1)]
         for k, segment in enumerate(path):
             ws.save(self._snapshots, k)
             first = checkpoints.bounds(segment)[0]
             last = checkpoints.bounds(path[k + 1])[0] if k + 1 < len(path) else self.num_passes
-            self._guard.advance(first, last, self.num_passes, self.passes_per_frame, self._recorded)
+            with ws.report.of_passes(last - first):
+                self._guard.advance(first, last, self.num_passes, self.passes_per_frame, self._recorded)
         if self.solver.last_frame_is_state:
             ws.save_frame(self.num_frames - 1)
         self._kept, self._current = path, run  # segments whose starts are in the snapshots
@@ -168,6 +186,7 @@ class Sweep:
         if self.solver.last_frame_is_state:
             tangent.save_frame(self.num_frames - 1)
         self._current = run if current is run else None  # its frames and snapshots are untouched
+        self.contact_change = tangent.contact_forces(self.frame_time) if self.contacts else None
         return tangent.collect()
 
     # ---- adjoints ---------------------------------------------------------------------------------------------------
@@ -197,6 +216,8 @@ class Sweep:
             density = shape or "density" in self.wanted  # the rest shape makes masses
             self._adjoint = self.solver.adjoint(ws, density, shape)
         norms = seed.put(self._adjoint, self.solver.last_frame_is_state)
+        if self.contacts:
+            self._adjoint.seed_contacts(seed.contact_forces, self.frame_time)
         self.health = []
         stop = 0 if self.truncate is None else max(0, self.steps - self.truncate) * self.solver.substeps
         kept, end = self._kept, checkpoints.num_segments

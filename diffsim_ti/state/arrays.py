@@ -123,6 +123,10 @@ class SceneArrays:
             at += term.table.size
         return out
 
+    def record_contacts(self) -> None:
+        """Kernels are to note what contact stages do."""
+        self._features["recorded"], self._known_features = True, {}
+
     def features(self, density: bool = False, shape: bool = False) -> Features:
         """What kernels must contain for the values that are loaded."""
         if (density, shape) not in self._known_features:

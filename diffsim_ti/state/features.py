@@ -52,6 +52,7 @@ class Features:
     moving: int = 0  # obstacles that follow a path
     num_parameters: int = 0  # numbers of all terms
     uniform: bool = True  # one set of coefficients for all tetrahedra
+    recorded: bool = False  # whether a loss names what a contact stage does
     density: bool = False  # the last two: adjoints that cost extra, only if asked for
     shape: bool = False
 

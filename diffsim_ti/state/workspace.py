@@ -10,6 +10,7 @@ from diffsim_ti.contact.surface_pairs import SurfacePairs
 from diffsim_ti.inputs import Derived
 from diffsim_ti.runtime import Kernel
 from diffsim_ti.state.arrays import History, SceneArrays, copy_slot, first_bad_vertex
+from diffsim_ti.state.solve_report import SolveReport
 from diffsim_ti.state.watch import ContactWatch
 
 
@@ -33,9 +34,10 @@ class Workspace:
     faces = None  # of explicit steps, that feel obstacles between their corners
     energy_watch = None  # counts energy that long steps add, for solvers that neither damp nor limit it
     changes = 0  # of the state from outside its passes
+    impulses = None  # of obstacles on vertices in each frame, where a loss names them
 
     def __init__(self, solver, derived: Derived):
-        self.solver, self.scene = solver, solver.scene
+        self.solver, self.scene, self.report = solver, solver.scene, SolveReport()
         self.owner = runtime.program()
         self.arrays = SceneArrays(self.scene, solver.stages_contact, self.feels_faces(self.scene))
         self.parallel = solver.runs_parallel()
@@ -118,6 +120,19 @@ class Workspace:
         """Room for `count` saved states."""
         self.frames = FrameArrays.of(self.arrays, count, self.arrays.num_vertices)
         self._launches.clear()
+
+    def record_contacts(self) -> None:
+        """From now on note, for each frame, what obstacles do to each vertex; the frames are made."""
+        raise NotImplementedError
+
+    def forget_contacts(self) -> None:
+        """Note them anew."""
+        raise NotImplementedError
+
+    def contact_forces(self, frame_time: float):
+        """Mean forces [N] of frames that take `frame_time` [s], shape (frames, obstacles, 2: by push and by friction,
+        num_vertices, 3)."""
+        raise NotImplementedError
 
     def make_record(self, num_slots: int) -> History:
         """Room for `num_slots` recorded states."""

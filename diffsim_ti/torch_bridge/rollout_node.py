@@ -37,13 +37,16 @@ class TorchFrames(_States):
 
 
 class _RolloutNode(torch.autograd.Function):
-    """Inputs of a rollout -> displacements and velocities of its frames; the gradient by the first is that by positions."""
+    """Inputs of a rollout -> displacements and velocities of its frames, and contact forces where its runs note them; the
+    gradient by the first is that by positions."""
 
     @staticmethod
     def forward(ctx, rollout: Rollout, names: tuple, kept: list, *tensors):
         run, *frames = rollout.torch_face.forward(dict(zip(names, tensors)))
         if rollout.computed:
             kept.append(rollout.frames_of(run))
+            if rollout.sweep.contacts:
+                frames.append(torch.from_numpy(kept[0].contact_forces).to(frames[0]))
         ctx.run, ctx.rollout, ctx.names, ctx.tensors = run, rollout, names, tensors
         return tuple(x.to(tensors[0].device) if tensors else x for x in frames)
 
@@ -51,7 +54,8 @@ class _RolloutNode(torch.autograd.Function):
     @first_order_only(REMEDY)
     def backward(ctx, *adjoints):
         needed = ctx.needs_input_grad[3:]
-        gradients = ctx.rollout.torch_face.vjp(ctx.run, *adjoints, [n for n, need in zip(ctx.names, needed) if need])
+        wanted = [n for n, need in zip(ctx.names, needed) if need]
+        gradients = ctx.rollout.torch_face.vjp(ctx.run, *adjoints, wanted=wanted)
         return None, None, None, *_as_tensors(gradients, ctx.names, ctx.tensors, needed)
 
 
@@ -68,7 +72,8 @@ class _OutputNode(torch.autograd.Function):
     def backward(ctx, seed):
         seeds = {ctx.name: seed.detach().to("cpu", torch.float64).numpy()}
         change = ctx.rollout.pulled_to_frames(ctx.frames, seeds)
-        gradients = dict(positions=change.positions, velocities=change.velocities) | change.inputs
+        states = ("positions", "velocities", "contact_forces")
+        gradients = {name: getattr(change, name) for name in states} | change.inputs
         if "initial_positions" in gradients:
             gradients["initial_displacements"] = gradients["initial_positions"]
         return None, None, None, None, *_as_tensors(gradients, ctx.names, ctx.tensors, ctx.needs_input_grad[4:])
@@ -117,10 +122,10 @@ def rollout_frames(rollout: Rollout, **tensors: torch.Tensor) -> TorchFrames:
     if rollout.torch_face is None:
         rollout.torch_face = TensorRollout(rollout)
     names, kept = tuple(tensors), []
-    displacements, velocities = _RolloutNode.apply(rollout, names, kept, *tensors.values())
-    states, outputs = (displacements, velocities), {}
+    states, outputs = _RolloutNode.apply(rollout, names, kept, *tensors.values()), {}
+    displacements, velocities = states[:2]
     for name in rollout.computed:
-        around = ("positions", "velocities", *names)
+        around = (*("positions", "velocities", "contact_forces")[: len(states)], *names)
         outputs[name] = _OutputNode.apply(rollout, name, kept[0], around, *states, *tensors.values())
     if "rest_positions" not in tensors:
         rest = torch.from_numpy(np.array(rollout.values["rest_positions"])).to(displacements)

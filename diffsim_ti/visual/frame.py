@@ -1,6 +1,7 @@
 """A moment of a run, and what all of its moments share: what writers, films and windows are given."""
 
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -9,6 +10,9 @@ from diffsim_ti.obstacles import floor_of, obstacle_surfaces
 from diffsim_ti.scene import Scene
 from diffsim_ti.simulator import Simulator
 from diffsim_ti.terms.obstacles.shapes import Triangles
+
+if TYPE_CHECKING:
+    from diffsim_ti.rollout.frames import Frames
 
 
 @dataclass
@@ -42,6 +46,19 @@ class Frame:
     velocities: np.ndarray
     fields: dict[str, np.ndarray]
     obstacles: list[np.ndarray] | None = None
+
+    @classmethod
+    def of_run(cls, scene: Scene, frames: "Frames", k: int) -> "Frame":
+        """Frame k of a Rollout's run of a scene; its fields are the outputs that each vertex or each tetrahedron has:
+        vectors such as ContactForce(per_vertex=True), tensors and principal values such as Stress(at="vertices").
+
+        Raises IndexError for a frame that there is not.
+        """
+        u, v = frames.displacements[k], frames.velocities[k]
+        fields = dict(displacement=np.linalg.norm(u, axis=1), speed=np.linalg.norm(v, axis=1))
+        sizes = scene.mesh.num_vertices, scene.mesh.num_tetrahedra
+        shown = {name: y[k] for name, y in frames.outputs.items() if y.ndim > 2 and y.shape[1] in sizes}
+        return cls(float(frames.times[k]), frames.positions[k], u, v, fields | shown)
 
     @classmethod
     def of(cls, simulator: Simulator, **more) -> "Frame":

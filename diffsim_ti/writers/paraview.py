@@ -9,11 +9,18 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from diffsim_ti.visual.fields import FIELDS
 from diffsim_ti.visual.frame import Frame, Setting
 from diffsim_ti.visual.series import listed
 from diffsim_ti.writers.writer import Writer, register
 
 PER_TETRAHEDRON = ("von_mises", "energy_density", "J")
+
+
+def _rows(value) -> np.ndarray:
+    """Numbers, vectors, or tensors row by row, of each vertex or tetrahedron."""
+    value = np.asarray(value)
+    return value.reshape(len(value), -1) if value.ndim > 2 else value
 
 
 @register
@@ -23,7 +30,9 @@ class ParaViewWriter(Writer):
     Each frame can be read once it is written: the .pvd is replaced as a whole after each, so an interrupted run leaves a
     valid series. Frames that an earlier series of that name left in the folder are removed first. Frames hold
     displacement [m], velocity [m/s] and what is fixed per vertex, and von_mises [Pa], energy_density [J/m^3] and J [-] per
-    tetrahedron, in the precision of the displacements. Raises OSError if the folder cannot be written.
+    tetrahedron, in the precision of the displacements; besides, what else a frame's fields have for every vertex or
+    every tetrahedron, such as forces and stresses (`Frame.of_run`), tensors row by row. Raises OSError if the folder
+    cannot be written.
     """
 
     suffixes = (".pvd",)
@@ -46,12 +55,20 @@ class ParaViewWriter(Writer):
         dtype = np.float32 if np.asarray(frame.displacements).dtype == np.float32 else np.float64
         path = self.folder / f"{self.name}_{self.count:04d}.vtu"
         held = np.isin(np.arange(len(frame.positions)), self.setting.fixed).astype("u1")
-        point_data = {"displacement": frame.displacements, "velocity": frame.velocities}
+        point_data, cell_data = {"displacement": frame.displacements, "velocity": frame.velocities}, {}
+        for name, value in frame.fields.items():
+            if name in PER_TETRAHEDRON or (name not in FIELDS and len(value) == self.setting.mesh.num_tetrahedra):
+                cell_data[name] = value
+            elif name not in FIELDS:
+                point_data[name] = value
+        point_data, cell_data = (
+            {name: _rows(value).astype(dtype) for name, value in data.items()} for data in (point_data, cell_data)
+        )
         saved = meshio.Mesh(
             np.asarray(frame.positions, np.float64),
             [("tetra", self.setting.mesh.tetrahedra)],
-            point_data={name: np.asarray(value, dtype) for name, value in point_data.items()} | {"fixed": held},
-            cell_data={name: [np.asarray(frame.fields[name], dtype)] for name in PER_TETRAHEDRON},
+            point_data=point_data | {"fixed": held},
+            cell_data={name: [value] for name, value in cell_data.items()},
         )
         saved.write(path, file_format="vtu", binary=True)
         self._write_obstacles(frame)

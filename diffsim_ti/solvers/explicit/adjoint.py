@@ -9,6 +9,7 @@ import numpy as np
 from diffsim_ti import runtime
 from diffsim_ti.inputs import Derived
 from diffsim_ti.solvers.explicit.felt_faces import FeltAdjoint, FeltTangent
+from diffsim_ti.solvers.explicit.impulse_record import ImpulseRecord
 from diffsim_ti.state.arrays import copy_slot
 from diffsim_ti.state.numbers import OF_STEPS, Adjoint, Tangent
 from diffsim_ti.state.workspace import FrameArrays
@@ -42,6 +43,9 @@ class ExplicitAdjoint:
         self.frames = FrameArrays.of(a, *workspace.frames.frames_u.shape)
         self.z = a.law_states(1)  # of the state of the law
         self.faces = FeltAdjoint(self, workspace.faces) if workspace.faces else None
+        if workspace.impulses:
+            self.impulses = ImpulseRecord(workspace)
+            self.impulse, self.mass_adj = self.impulses.impulse, np.zeros(a.num_vertices)
 
     def fits(self, workspace) -> bool:
         """Whether kernels and shapes are still those of the run."""
@@ -63,8 +67,16 @@ class ExplicitAdjoint:
             runtime.fill(self.u, positions_adj[-1:])
             runtime.fill(self.v, velocities_adj[-1:])
 
+    def seed_contacts(self, forces_adj: np.ndarray | None, frame_time: float) -> None:
+        """Set the adjoints of the frames' contact forces (None: zero)."""
+        if forces_adj is not None:
+            self.impulses.put(forces_adj / frame_time)
+
     def clear(self) -> None:
         """All adjoints zero, but those of the frames."""
+        if self.ws.impulses:
+            self.impulses.clear()
+            self.mass_adj[:] = 0
         self.numbers.clear()
         for target in (self.felt, self.path, self.u, self.v, self.w, self.z):
             if target is not None:
@@ -110,13 +122,24 @@ class ExplicitAdjoint:
                     self._gather(self)
                     runtime.fill(self.corner, 0)
                     runtime.fill(self.rate_corner, 0)
-                self.faces.start(alone, numbers)
+                self._start_faces(alone, numbers)
             launch(**numbers, **run, base=base, halt=halt, kick=kick)
             if alone:
                 self.faces.end(alone, numbers)
         if ws.pairs:
             ws.pairs.ensure(history.u, slot)
             ws.pairs.vjp(history.u, slot, self.w, self.corner)
+
+    def _start_faces(self, alone, numbers: dict) -> None:
+        """Go back through the contact of faces, whose impulse may be asked for."""
+        by_speed = self.impulses.seed(numbers) if self.ws.impulses else None
+        if by_speed is None:
+            self.faces.start(alone, numbers)
+            return
+        runtime.fill(self.v, runtime.fetch(self.v) + by_speed)
+        self.faces.start(alone, numbers)
+        runtime.fill(self.v, runtime.fetch(self.v) - by_speed)
+        self.mass_adj += self.impulses.by_mass(numbers, alone.speed)
 
     def _faces_of(self, slot: int, kick: int):
         """The pass to a slot without contact within faces; nothing where there was none, or in a kick alone."""
@@ -168,6 +191,8 @@ class ExplicitAdjoint:
         out.rest = rest + out.rest
         if self.faces:
             self.faces.collect(out)
+        if self.ws.impulses:
+            out.mass = out.mass + self.mass_adj
         return out
 
 
@@ -183,6 +208,9 @@ class ExplicitTangent:
         self.frames = FrameArrays.of(a, *workspace.frames.frames_u.shape)
         self.numbers, self.z = Tangent(a, tangent), a.law_states(1)
         self.faces = FeltTangent(self, workspace.faces) if workspace.faces else None
+        if workspace.impulses:
+            self.impulses = ImpulseRecord(workspace)
+            self.impulse = self.impulses.impulse
         if self.z is not None:
             runtime.fill(self.z, 0)
         self._rate_dot = float(tangent.parameters[self.features.drag]) if self.features.drag >= 0 else 0.0
@@ -204,7 +232,19 @@ class ExplicitTangent:
                     self.faces.start(alone, numbers)
                 launch(**numbers, base=first, rate_dot=self._rate_dot)
                 if alone:
-                    self.faces.end(alone, numbers)
+                    self._end_faces(alone, numbers)
+
+    def _end_faces(self, alone, numbers: dict) -> None:
+        """What faces do, whose impulse may be asked for."""
+        before = runtime.fetch_row(self.v, 0) if self.ws.impulses else None
+        self.faces.end(alone, numbers)
+        if before is not None:
+            change = runtime.fetch_row(self.v, 0) - before
+            self.impulses.add_jvp(numbers, alone.speed, change, self.tangent.mass)
+
+    def contact_forces(self, frame_time: float) -> np.ndarray:
+        """Changes of the frames' contact forces."""
+        return self.impulses.collect() / frame_time
 
     def save_frame(self, frame: int) -> None:
         """Copy the current tangent to a frame."""

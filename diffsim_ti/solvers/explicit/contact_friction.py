@@ -8,6 +8,12 @@ from dataclasses import dataclass
 
 import taichi as ti
 
+from diffsim_ti.solvers.explicit.contact_impulses import (
+    friction_by_mass,
+    friction_by_share,
+    note_friction_jvp,
+    seed_of_friction,
+)
 from diffsim_ti.solvers.explicit.held_back import HeldBack
 from diffsim_ti.solvers.explicit.obstacle_stages import FELT, PLANE, PUSH, ROWS, SEED, WALL
 from diffsim_ti.terms.obstacles import stage
@@ -76,20 +82,26 @@ class ContactFriction(HeldBack):
     # ---- tangent -------------------------------------------------------------------------------------------------------
 
     @ti.func
+    def slide_jvp_of(self, g: A, k, i, v, dv, ratio, dratio, now: A, state: A, tangent: A):
+        """Velocity after the friction of one obstacle, and its change."""
+        row, numbers = ROWS * (g.number + k), g.first + k * g.size + g.force.count
+        pushed, felt = state.stage[row + PUSH, i], state.stage[row + FELT, i]
+        if pushed.x > 0:
+            plane, wall = state.stage[row + PLANE, i], state.stage[row + WALL, i]
+            dwall, change = self.speed(g, k, now, tangent.path), state.stage[row + SEED, i]
+            dmu, deps = tangent.parameters[numbers + 2], tangent.parameters[numbers + 3]
+            dv = stage.slide_jvp(
+                self.fp, plane, pushed.x, v, wall, ratio, felt.z, felt.w, change, dv, dwall, dratio, dmu, deps
+            )
+            v = stage.slide(self.fp, plane, pushed.x, v, wall, ratio, felt.z, felt.w)
+        return v, dv
+
+    @ti.func
     def slide_all_jvp(self, i, v, dv, ratio, dratio, now: A, scene: A, state: A, tangent: A):
         """Velocity after friction, and its change."""
         for g in ti.static(self.features.staged_rough):
             for k in range(g.count):
-                row, numbers = ROWS * (g.number + k), g.first + k * g.size + g.force.count
-                pushed, felt = state.stage[row + PUSH, i], state.stage[row + FELT, i]
-                if pushed.x > 0:
-                    plane, wall = state.stage[row + PLANE, i], state.stage[row + WALL, i]
-                    dwall, change = self.speed(g, k, now, tangent.path), state.stage[row + SEED, i]
-                    dmu, deps = tangent.parameters[numbers + 2], tangent.parameters[numbers + 3]
-                    dv = stage.slide_jvp(
-                        self.fp, plane, pushed.x, v, wall, ratio, felt.z, felt.w, change, dv, dwall, dratio, dmu, deps
-                    )
-                    v = stage.slide(self.fp, plane, pushed.x, v, wall, ratio, felt.z, felt.w)
+                v, dv = self.slide_jvp_of(g, k, i, v, dv, ratio, dratio, now, state, tangent)
         return v, dv
 
     @ti.func
@@ -98,6 +110,7 @@ class ContactFriction(HeldBack):
         after, change = self.slide_all_jvp(i, v, dv, ratio, dratio, now, scene, state, tangent)
         x, number = self.crowding(i, v, after, z, now, state)
         c, slope = self.share_and_slope(x)
+        dc, start, dstart = ti.cast(0, self.fp), v, dv
         if slope < 0:
             way, dway, dx = after - v, change - dv, ti.cast(0, self.fp)
             for g in ti.static(self.features.staged):
@@ -110,14 +123,20 @@ class ContactFriction(HeldBack):
                     move, dmove = z - now.h * wall, dz - now.h * self.speed(g, k, now, tangent.path)
                     y, dy = plane.w + n.dot(move), turned.w + dn.dot(move) + n.dot(dmove)
                     dx = -(dalpha * n.dot(way) + now.alpha * (dn.dot(way) + n.dot(dway)) + x * dy) / y
+            dc = slope * dx
             after, change = v + c * way, dv + c * dway + slope * dx * way
+        if ti.static(self.features.recorded):
+            note_friction_jvp(self, i, start, dstart, c, dc, ratio, dratio, now, scene, state, tangent)
         return after, change
 
     # ---- adjoint -------------------------------------------------------------------------------------------------------
 
     @ti.func
-    def slide_all_vjp(self, i, v, v_adj, ratio, state: A):
-        """(adjoint of the velocity v before friction, of h / m); notes those of all else, of the wall in its place."""
+    def slide_all_vjp(self, i, v, v_adj, ratio, share, now: A, scene: A, state: A, adjoint: A):
+        """(adjoint of the velocity v before friction, of h / m); notes those of all else, of the wall in its place.
+
+        share: what of it the vertex takes, for impulses that are asked for.
+        """
         by_ratio = ti.cast(0, self.fp)
         for back in range(ti.static(self.features.num_staged)):
             before = ti.static(self.features.num_staged) - 1 - back
@@ -126,10 +145,15 @@ class ContactFriction(HeldBack):
             if pushed.x > 0 and felt.z > 0:
                 start = self.slide_by(before, i, v, ratio, state)
                 plane, wall = state.stage[row + PLANE, i], state.stage[row + WALL, i]
+                if ti.static(self.features.recorded):
+                    v_adj += share * seed_of_friction(self, before, i, now, scene, adjoint)
                 by_plane, by_v, of_wall, more, by_mu, by_eps = stage.slide_vjp(
                     self.fp, plane, pushed.x, start, wall, ratio, felt.z, felt.w, v_adj
                 )
                 v_adj, by_wall = by_v, of_wall
+                if ti.static(self.features.recorded):
+                    v_adj += -share * seed_of_friction(self, before, i, now, scene, adjoint)
+                    friction_by_mass(self, before, i, start, share, ratio, now, state, adjoint)
                 by_ratio += more
                 state.stage[row + SEED, i] = state.stage[row + SEED, i] + by_plane
                 pushed.z, pushed.w = by_mu, by_eps
@@ -147,6 +171,8 @@ class ContactFriction(HeldBack):
         if slope < 0:
             way = after - v
             by_x = slope * v_adj.dot(way)
+            if ti.static(self.features.recorded):
+                by_x += slope * friction_by_share(self, i, v, ratio, now, scene, state, adjoint)
             way_adj, own, by_alpha = c * v_adj, v_adj, by_x * x / now.alpha
             for g in ti.static(self.features.staged):
                 k = number - g.number
@@ -163,5 +189,5 @@ class ContactFriction(HeldBack):
                     self.add_to_rest(i, by_u, adjoint)
                     self.add_to_path(g, k, i, now, by_u, -now.h * by_z, adjoint)
             own = v_adj - way_adj
-        by_v, by_ratio = self.slide_all_vjp(i, v, way_adj, ratio, state)
+        by_v, by_ratio = self.slide_all_vjp(i, v, way_adj, ratio, c, now, scene, state, adjoint)
         return by_v + own, by_ratio, by_z, by_alpha, by_u

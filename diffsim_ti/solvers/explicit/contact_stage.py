@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import taichi as ti
 
 from diffsim_ti.solvers.explicit.contact_friction import ContactFriction
+from diffsim_ti.solvers.explicit.contact_impulses import note_impulses, note_pushes_jvp, seed_impulses
 from diffsim_ti.solvers.explicit.obstacle_stages import FELT, PLANE, PUSH, ROWS, SEED, WALL
 from diffsim_ti.solvers.explicit.wall_work import work_of_stage
 from diffsim_ti.terms.obstacles import secant, stage
@@ -130,6 +131,8 @@ class ContactStage(ContactFriction):
                 a = now.alpha * self.blend(plan) * ratio
                 z, total, _, _ = self.solve(i, self.vector(0), free, a, now, state, plan)
                 delta, v = ratio * total, self.rubbed(i, v_plus, z, ratio, now, state)
+                if ti.static(self.features.recorded):
+                    note_impulses(self, i, v_plus, z, ratio, now, scene, state)
                 if ti.static(self.features.moving > 0):
                     state.work[i] = state.work[i] + work_of_stage(self, i, v_plus, now, scene, state)
         pressed = self.blend(plan) * delta
@@ -153,6 +156,8 @@ class ContactStage(ContactFriction):
                 dz = stage.solve_linear(self.features.num_staged, a, xyz, mixed, b + a * dtotal)
                 dtotal += self.add_change(i, dz, state)
                 delta, ddelta = ratio * total, dratio * total + ratio * dtotal
+                if ti.static(self.features.recorded):
+                    note_pushes_jvp(self, i, now, state, tangent)
                 v, dv = self.rubbed_jvp(i, u, du, v, dv, z, dz, ratio, dratio, dalpha, now, scene, state, tangent)
         w, dw = v + blend * delta, dv + blend * ddelta
         du_next = du + dalpha * w + now.alpha * dw
@@ -214,6 +219,8 @@ class ContactStage(ContactFriction):
                 delta_adj = q + blend * w_adj
                 by_alpha, by_ratio = p.dot(w), delta_adj.dot(total)
                 self.seed_all(i, ratio * delta_adj, state)
+                if ti.static(self.features.recorded):
+                    seed_impulses(self, i, now, state, adjoint)
                 by_z = self.vector(0)
                 if ti.static(len(self.features.staged_rough) > 0):
                     v_adj, more, of_z, of_alpha, of_u = self.rubbed_vjp(

@@ -97,8 +97,9 @@ class FeltFaces:
         """A pass begins at a slot."""
         copy_slot(history.u, slot, self.begin, 0)
 
-    def after_pass(self, history, slot: int, plan: dict, recording: bool) -> None:
-        """The pass led to a slot: go its way again where faces come near, and note what they did."""
+    def after_pass(self, history, slot: int, plan: dict, recording: bool, asked: bool = False) -> np.ndarray | None:
+        """The pass led to a slot: go its way again where faces come near, and note what they did; where it is `asked`,
+        the velocity that they have added."""
         self.kept.pop(slot, None)
         self._run("approaches", plan, history, slot)
         n = self._fewest_parts()
@@ -113,7 +114,10 @@ class FeltFaces:
             self.saturated = n >= self.most_parts
             if recording:
                 self.kept[slot] = n, runtime.fetch_row(history.u, slot), runtime.fetch_row(history.v, slot)
+            before = runtime.fetch_row(history.v, slot) if asked else None
             self._run("ends", plan, history, slot, n, watch=self.ws.watch)
+            return runtime.fetch_row(history.v, slot) - before if asked else None
+        return None
 
     def _fewest_parts(self) -> int:
         """How many parts the ways of faces ask for; 0 if none comes near."""
@@ -175,6 +179,11 @@ class Alone:
         for target, data in zip((self.history.u, self.history.v), state):
             runtime.fill(self.faces.row, data[None])
             copy_slot(self.faces.row, 0, target, self.slot)
+
+    @property
+    def speed(self) -> np.ndarray:
+        """The velocity that faces have added in the pass."""
+        return self._whole[1] - self._state[1]
 
     def go(self, plan: dict) -> None:
         """Its parts again, from where the pass begins, the slot before."""

@@ -6,7 +6,7 @@ from functools import cached_property, lru_cache
 import taichi as ti
 
 from diffsim_ti.elements.tetrahedron import Onwards
-from diffsim_ti.runtime import Kernel, let, traced
+from diffsim_ti.runtime import Bundle, Kernel, let, traced
 from diffsim_ti.solvers.explicit.kick_drift import KickDrift
 from diffsim_ti.state.numbers import ADJOINT, OF_STEPS, SCENE, TANGENT, with_state
 from diffsim_ti.state.schedule import pass_at, reversed_pass
@@ -56,6 +56,30 @@ class ExplicitKernels:
     def with_state(self, arrays: dict) -> dict:
         return with_state(arrays, self.vertex.law)
 
+    def with_record(self, arrays: dict) -> dict:
+        """The same, with the impulses of obstacles where they are recorded."""
+        return self.with_state(arrays) | (dict(impulse="vectors2") if self.recorded else {})
+
+    def state(self) -> dict:
+        return self.with_record(STATE)
+
+    @property
+    def recorded(self) -> bool:
+        return self.vertex.features.recorded
+
+    @traced
+    def counted(self, now, j, plan):
+        """A pass with `into`: the first row of `impulse` of the frame that pass j leads to, -1 if none counts it."""
+        if not self.recorded:
+            return now
+        rows, each = 2 * self.vertex.obstacles.num_obstacles, plan.per_frame
+        return Bundle(**vars(now), into=let(ti.select(each > 0, (j // ti.max(each, 1) + 1) * rows, -1)))
+
+    @traced
+    def pass_of(self, j, table, plan):
+        """Pass j."""
+        return self.counted(pass_at(table, j - plan.window), j, plan)
+
     @ti.func
     def turn_of_first(self, item, table: A):
         """Which time this is that the first loop is gone through."""
@@ -99,20 +123,20 @@ class ExplicitKernels:
                 turn = self.turn_of_second(i, table, plan)
                 if turn < plan.count:
                     j = plan.first + turn
-                    self.vertex.step(i, j, pass_at(table, j - plan.window), scene, state, plan)
+                    self.vertex.step(i, j, self.pass_of(j, table, plan), scene, state, plan)
         else:
             ti.loop_config(serialize=True)
             for j in range(plan.first, plan.first + plan.count):
                 for e in range(plan.num_items):
                     self.elements(e, j, scene, state, table, plan)
-                now = pass_at(table, j - plan.window)
+                now = self.pass_of(j, table, plan)
                 for i in range(plan.num_vertices):
                     self.vertex.step(i, j, now, scene, state, plan)
 
     @cached_property
     def step(self) -> Kernel:
         """`count` passes from pass `first` on."""
-        return self._kernel("step", self.passes, dict(state=self.with_state(STATE)), self.repeated, stride="int")
+        return self._kernel("step", self.passes, dict(state=self.state()), self.repeated, stride="int")
 
     # ---- tangent -----------------------------------------------------------------------------------------------------
 
@@ -127,13 +151,13 @@ class ExplicitKernels:
                 self.element.move_on_jvp(e, scene, state, s, tangent, tangent, self.onwards(now))
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.num_vertices):
-            now = pass_at(table, plan.first - plan.window)
+            now = self.pass_of(plan.first, table, plan)
             self.vertex.step_jvp(i, plan.first, now, scene, state, tangent, plan)
 
     @cached_property
     def step_jvp(self) -> Kernel:
         """The tangent of pass `first` along recorded slots; the change of the state is advanced in place."""
-        own = dict(state=self.with_state(STATE), tangent=self.with_state(CHANGE) | TANGENT)
+        own = dict(state=self.state(), tangent=self.with_record(CHANGE) | TANGENT)
         return self._kernel("step_jvp", self.passes_jvp, own, False, rate_dot="float")
 
     # ---- adjoint -----------------------------------------------------------------------------------------------------
@@ -152,7 +176,8 @@ class ExplicitKernels:
     @traced
     def pass_back(self, j, table, plan):
         """Pass j on the way back."""
-        return self.vertex.obstacles.noting(reversed_pass(pass_at(table, j - plan.window), j, plan), plan)
+        now = reversed_pass(pass_at(table, j - plan.window), j, plan)
+        return self.counted(self.vertex.obstacles.noting(now, plan), j, plan)
 
     @ti.func
     def passes_vjp(self, scene: A, state: A, adjoint: A, table: A, plan: A):
@@ -194,9 +219,9 @@ class ExplicitKernels:
         steps: those for which there is room in `felt`; num_parts: sums over vertices that are made for each path.
         """
         numbers = dict.fromkeys(("num_passes", "halt", "kick", "steps", "num_parts"), "int")
-        own = self.with_state(CHANGE) | ADJOINT | OF_STEPS | CORNERS
+        own = self.with_record(CHANGE) | ADJOINT | OF_STEPS | CORNERS
         own |= dict(w="vectors2", felt="vectors2")
-        arrays = dict(state=self.with_state(STATE), adjoint=own)
+        arrays = dict(state=self.state(), adjoint=own)
         return self._kernel("step_vjp", self.passes_vjp, arrays, self.repeated, **numbers)
 
     @ti.func
@@ -216,6 +241,7 @@ class ExplicitKernels:
 
     def _kernel(self, name: str, body, arrays: dict, repeated: bool, **numbers) -> Kernel:
         arrays, numbers = dict(scene=SCENE) | arrays | dict(table=PLAN), NUMBERS | numbers
+        numbers |= dict(per_frame="int") if self.recorded else {}
         if repeated:
             arrays["table"], numbers = PLAN | TURNS, numbers | dict(times="int")
         return Kernel(name, body, self.vertex.law.precision, arrays, numbers, loops=2 * repeated)

@@ -15,6 +15,7 @@ from diffsim_ti.potential.way import Way
 from diffsim_ti.solvers.explicit.adjoint import ExplicitAdjoint, ExplicitTangent
 from diffsim_ti.solvers.explicit.contact_stage import ROWS
 from diffsim_ti.solvers.explicit.felt_faces import FeltFaces, feels_faces
+from diffsim_ti.solvers.explicit.impulse_record import ImpulseRecord
 from diffsim_ti.solvers.explicit.kernels import ExplicitKernels, explicit_kernels
 from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.state.schedule import PassTable
@@ -132,6 +133,18 @@ class ExplicitWorkspace(Workspace):
         super().load(derived)
         self.check_apart()
 
+    def record_contacts(self) -> None:
+        self.arrays.record_contacts()
+        self._launches.clear()
+        self.impulses = ImpulseRecord(self)
+        self.contact.impulse = self.impulses.impulse
+
+    def forget_contacts(self) -> None:
+        self.impulses.clear()
+
+    def contact_forces(self, frame_time: float) -> np.ndarray:
+        return self.impulses.collect() / frame_time
+
     def forget(self) -> None:
         super().forget()
         self.check_apart()
@@ -194,7 +207,7 @@ class ExplicitWorkspace(Workspace):
             chunk = -(-(end - begin) // number)  # launches of one size
             stops = [*range(end, begin, -chunk), begin][::-1] if backwards else [*range(begin, end, chunk), end]
             for start, stop in list(zip(stops, stops[1:]))[::turn]:
-                yield sizes | dict(window=window, first=start, count=stop - start, times=chunk)
+                yield sizes | dict(per_frame=save_every, window=window, first=start, count=stop - start, times=chunk)
 
     def advance(self, first: int, last: int, num_passes: int, save_every: int = 0, base: int | None = None) -> None:
         """Passes first .. last - 1 from the current state; or recorded: slot j - base holds the state before pass j."""
@@ -213,7 +226,9 @@ class ExplicitWorkspace(Workspace):
                 self.faces.before_pass(history, slot)
             launch(**numbers, base=base, stride=stride)
             if self.faces:
-                self.faces.after_pass(history, slot + stride, numbers, recording)
+                change = self.faces.after_pass(history, slot + stride, numbers, recording, self.impulses is not None)
+                if change is not None:
+                    self.impulses.add(numbers, change)
             if pairs:
                 try:
                     pairs.check_pass(history.u, slot + stride, self.solver.substep)

@@ -13,58 +13,13 @@ from diffsim_ti.inputs import Derived
 from diffsim_ti.potential.face_kernels import face_kernels
 from diffsim_ti.potential.face_lattice import rest_of_areas
 from diffsim_ti.potential.kernels import potential_kernels
-from diffsim_ti.solvers.implicit.linear import Operator, solve_symmetric
+from diffsim_ti.solvers.implicit.contact_record import ContactRecord, Shares, SharesAdjoint
+from diffsim_ti.solvers.implicit.recorded_passes import RecordedPasses
 from diffsim_ti.solvers.implicit.threads import one_blas_thread
 from diffsim_ti.state.numbers import Adjoint, Tangent
 
 
-class _Passes:
-    """What tangent and reverse sweep share: a recorded pass with everything that its equation names."""
-
-    def __init__(self, workspace):
-        self.ws = workspace
-        self.eps = np.finfo(runtime.NUMPY[workspace.scene.precision]).eps
-        self.tolerance = max(workspace.solver.tolerance, 20 * self.eps)
-
-    def open(self, j: int, base: int) -> None:
-        """Take pass j from the record, its first slot being the state before pass `base`."""
-        ws = self.ws
-        self.u, self.v, self.before = ws.read(ws.record, j - base)
-        self.u_next = ws.read(ws.record, j - base + 1)[0]
-        self.stage = stage = ws.solver.stage(ws.rate, self.before is None)
-        self.x, self.y = ws.inertial(stage, self.u, self.v, self.before)
-        self.u_star = (self.u_next - (1 - stage.c0) * self.u) / stage.c0
-        self.mass = stage.inertia * ws.mass
-        ws.begin(j, stage, self.u, self.x)
-        ws.potential.hold(ws.record, j - base)
-        ws.potential.place(self.u_star)
-        self.operator = Operator(ws.potential, self.mass, ws.free)
-        self._preconditioner = None
-
-    def solve(self, b: np.ndarray) -> np.ndarray:
-        """A^-1 b on the free vertices, zero elsewhere."""
-        b = b * self.ws.free
-        if not b.any():
-            return b
-        if self._preconditioner is None:
-            self._preconditioner, _ = self.ws.preconditioner(self.mass)
-            self._preconditioner.update(self.u_star)
-        return solve_symmetric(self.operator, b, self._preconditioner, self.tolerance, self.eps, 20 * len(b))
-
-    def weight(self, share: float) -> np.ndarray:
-        """dR/dm of each vertex [m/s^2]: gravity less the acceleration."""
-        features, values = self.ws.arrays.features(), self.ws.arrays.values
-        out = -self.stage.inertia * (self.u_star - self.x - self.stage.gamma * self.y)
-        if features.gravity >= 0:
-            out = out + share * values.parameters[features.gravity :][:3]
-        return out
-
-    @property
-    def v_star(self) -> np.ndarray:
-        return (self.u_star - self.x) / self.stage.gamma
-
-
-class ImplicitAdjoint(_Passes):
+class ImplicitAdjoint(RecordedPasses):
     """Adjoints of one run, in float64 on the host, except those of tetrahedra.
 
     density, shape: also the adjoints by vertex masses and by the rest shape, which cost extra.
@@ -90,6 +45,10 @@ class ImplicitAdjoint(_Passes):
             faces = face_kernels(self.features, a.precision, workspace.parallel)
             self.face_areas = runtime.array(a.fp, 3 * len(a.mesh.surface_triangles) if self.features.areas else 1)
             self._vjp_of_faces = p.faces.bind(faces.vjp, adjoint=(self, self.numbers))
+        self.contacts, areas = None, self.face_areas if p.faces else runtime.array(a.fp, 1)
+        if workspace.impulses:
+            self.contacts = ContactRecord(workspace)
+            self._shares = SharesAdjoint(workspace, self.features, self.numbers, areas)
 
     def fits(self, workspace) -> bool:
         """Whether kernels and arrays are still those of the run."""
@@ -115,6 +74,10 @@ class ImplicitAdjoint(_Passes):
         self.path = None if a.values.path is None else np.zeros_like(a.values.path)
         self.anchor = np.zeros((len(a.fixed), 3))
 
+    def seed_contacts(self, forces_adj: np.ndarray | None, frame_time: float) -> None:
+        """Set the adjoints of the frames' contact forces (None: zero)."""
+        self.contacts.forces = np.zeros_like(self.contacts.forces) if forces_adj is None else forces_adj
+
     @one_blas_thread
     def reverse(
         self, base: int, last: int, num_passes: int, save_every: int, stop: int, to_state: bool = False
@@ -127,7 +90,7 @@ class ImplicitAdjoint(_Passes):
             self.open(j, base)
             if self.z is not None:
                 self._pull_back_law(j, j - base)
-            self._pull_back(j)
+            self._pull_back(j, save_every)
             if save_every and j % save_every == 0 and j // save_every < len(self.frames[0]) - 1:
                 self.p += self.frames[0][j // save_every]
                 self.q += self.frames[1][j // save_every]
@@ -138,13 +101,20 @@ class ImplicitAdjoint(_Passes):
         self.ws.launch_law_state("vjp", self.features, j, slot, slot + 1, **own)
         self.p = self.p + runtime.fetch_row(self._law.y, 0)
 
-    def _pull_back(self, j: int) -> None:
+    def _pull_back_contacts(self, j: int, per_frame: int) -> tuple | None:
+        """Adjoints of what the forces of obstacles in pass j depend on, where a loss names them (SharesAdjoint)."""
+        seed = self.contacts.seed(j, per_frame, self.stage.static) if self.contacts else None
+        return None if seed is None else self._shares.pull_back(seed)
+
+    def _pull_back(self, j: int, per_frame: int) -> None:
         ws, s, p, q, fixed = self.ws, self.stage, self.p, self.q, self.ws.arrays.fixed
+        seen = self._pull_back_contacts(j, per_frame)
+        by_contacts = 0.0 if seen is None else seen[0]
         if s.static:
             q = np.zeros_like(q)
         p_free, q_free = p * ws.free, q * ws.free
         # the equation
-        by_star = self.solve(s.c0 * p_free + s.e0 / s.gamma * q_free)
+        by_star = self.solve(s.c0 * p_free + s.e0 / s.gamma * q_free + by_contacts * ws.free)
         runtime.fill(ws.potential.w, by_star[None])
         for target in (self.lag, self.walls):
             runtime.fill(target, 0)
@@ -154,6 +124,7 @@ class ImplicitAdjoint(_Passes):
         reaction = runtime.fetch(ws.potential.y)[0].astype(np.float64)
         if ws.potential.faces:
             reaction = reaction + self._vjp_of_faces()
+        reaction = reaction + by_contacts
         share = ws.load_share(j, s)
         self.gravity += share * (ws.mass * by_star).sum(0)
         self.mass_adj += (by_star * self.weight(share)).sum(1)
@@ -165,10 +136,11 @@ class ImplicitAdjoint(_Passes):
         x_adj = inertial - s.e0 / s.gamma * q_free
         by_lag = np.zeros_like(p)
         if ws.potential.has_friction:
-            by_lag, by_x = runtime.fetch(self.lag).astype(np.float64)
+            by_lag, by_x = runtime.fetch(self.lag).astype(np.float64) + (0.0 if seen is None else seen[1])
             x_adj = x_adj + by_x
         if self.path is not None:
-            ws.walls_vjp(runtime.fetch(self.walls).astype(np.float64).sum(1), j, s, self.path)
+            by_walls = runtime.fetch(self.walls).astype(np.float64).sum(1)
+            ws.walls_vjp(by_walls + (0.0 if seen is None else seen[2]), j, s, self.path)
         y_adj = s.gamma * inertial + s.e1 * q_free
         db0, db1, de0, de1 = s.by_rate
         self.rate += db0 * (y_adj * self.v).sum() + de0 * (q_free * self.v_star).sum() + de1 * (q_free * self.y).sum()
@@ -237,7 +209,7 @@ class ImplicitAdjoint(_Passes):
         return out
 
 
-class ImplicitTangent(_Passes):
+class ImplicitTangent(RecordedPasses):
     """The tangent of a run: changes of the state for changes of everything that the equation names."""
 
     def __init__(self, workspace, tangent: Derived):
@@ -256,6 +228,8 @@ class ImplicitTangent(_Passes):
         self._jvp = kernels.jvp.bind(a.in_lanes, **own)
         if p.faces:
             self._jvp_of_faces = p.faces.bind(p.faces.kernels.jvp, tangent=(self, self.numbers))
+        self.contacts = ContactRecord(workspace) if workspace.impulses else None
+        self._shares = Shares(workspace) if workspace.impulses else None
         self.rate_dot = float(tangent.parameters[a.features().drag]) if a.features().drag >= 0 else 0.0
         self.frames = [], []
 
@@ -266,13 +240,13 @@ class ImplicitTangent(_Passes):
             if j % save_every == 0:
                 self.save_frame(j // save_every)
             self.open(j, first)
-            self._pass(j)
+            self._pass(j, save_every)
             if self.z is not None:
                 runtime.fill(self.ws.potential.w, self.du[None])
                 own = dict(at=self.ws.record, tangent=(self._law, self.numbers))
                 self.ws.launch_law_state("jvp", self.features, j, j - first, j - first + 1, **own)
 
-    def _pass(self, j: int) -> None:
+    def _pass(self, j: int, per_frame: int) -> None:
         ws, s, tangent, a = self.ws, self.stage, self.tangent, self.ws.arrays
         db0, db1, de0, de1 = (x * self.rate_dot for x in s.by_rate)
         dx, dy = s.a0 * self.du, s.b0 * self.dv + db0 * self.v
@@ -307,6 +281,8 @@ class ImplicitTangent(_Passes):
             row = ws.solver.schedule.row(j) if len(tangent.forces) > 1 else 0
             dR[ws.force_vertices()] += share * tangent.forces[row]
         d_star = held + self.solve(dR + self.mass * (dx + s.gamma * dy))
+        if self.contacts:
+            self._note_contacts(j, per_frame, d_star)
         before = self.du, self.dv
         self.du = s.c0 * d_star + (1 - s.c0) * self.du
         self.dv = s.e0 * (d_star - dx) / s.gamma + s.e1 * dy + de0 * self.v_star + de1 * self.y
@@ -314,6 +290,16 @@ class ImplicitTangent(_Passes):
         if s.static:
             self.dv = np.zeros_like(self.dv)
         self.tangent_before = before
+
+    def _note_contacts(self, j: int, per_frame: int, d_star: np.ndarray) -> None:
+        """Change of the forces of obstacles in pass j, u* changing by d_star."""
+        runtime.fill(self.ws.potential.w, d_star[None])
+        record = dict(tangent=(SimpleNamespace(lag=self.lag, walls=self.walls), self.numbers))
+        self.contacts.add(j, per_frame, self.stage.static, lambda: self._shares.forces("jvp", **record))
+
+    def contact_forces(self, frame_time: float) -> np.ndarray:
+        """Changes of the frames' contact forces."""
+        return self.contacts.forces
 
     def save_frame(self, frame: int) -> None:
         """Copy the current tangent to a frame."""

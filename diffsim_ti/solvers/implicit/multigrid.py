@@ -3,7 +3,7 @@
 import numpy as np
 
 from diffsim_ti import runtime
-from diffsim_ti.solvers.implicit.preconditioners import assemble
+from diffsim_ti.potential.assembled import assemble
 
 
 class Multigrid:

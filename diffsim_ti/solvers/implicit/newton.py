@@ -23,14 +23,15 @@ LONGER = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # steps along an indefinite direction
 @dataclass
 class NewtonReport:
     """What a solve took: relative residual before each round, products of the Hessian, rounds with an indefinite
-    Hessian, saddles that were left, evaluations of the energy; directions that an obstacle, or the surface itself, cut
-    short, and which obstacle cut the last one (potential/way.py)."""
+    Hessian, saddles that were left, evaluations of the energy, halvings in line searches; directions that an obstacle, or
+    the surface itself, cut short, and which obstacle cut the last one (potential/way.py)."""
 
     residuals: list = field(default_factory=list)
     products: int = 0
     indefinite: int = 0
     saddles: int = 0
     trials: int = 0
+    halvings: int = 0
     met: Met | None = None
     cuts: int = 0
     place: np.ndarray | None = None  # where a solve that failed ended
@@ -62,7 +63,7 @@ class Newton:
         self.potential, self.free, self.way, self.preconditioners = potential, free, way, preconditioners
         self.tolerance, self.max_iterations, self.eps = tolerance, max_iterations, eps
         self.reach = 0.01 * float(np.ptp(potential.arrays.values.rest, 0).max())  # of the first step away from a saddle
-        self.report = NewtonReport()
+        self.report, self.reports = NewtonReport(), []  # of the last solve, of all since somebody looked
 
     def solve(
         self,
@@ -83,6 +84,7 @@ class Newton:
         Raises NotConverged.
         """
         self.report = report = NewtonReport()
+        self.reports.append(report)
         self.mass, self.inertial, self.loads = mass, inertial, loads
         u = self.potential.place(start)
         self.preconditioner, self.stiffness = self.preconditioners(mass)
@@ -204,6 +206,7 @@ class Newton:
                 self.upright = self.upright and fraction > self.insist
                 break
             fraction *= 0.5
+            self.report.halvings += 1
         while best is not None and self._indefinite and fraction in LONGER and 2 * fraction <= longest:
             fraction *= 2
             trial, after, change, _ = self._try(u, fraction * d, before, self.upright)

@@ -1,4 +1,4 @@
-"""Preconditioners for c M + d2E/du2: block Jacobi here, multigrid in multigrid.py; and its assembled matrix.
+"""Preconditioners for c M + d2E/du2: block Jacobi here, multigrid in multigrid.py.
 
 Both are functions of the present state alone, so that a run that is started again from a checkpoint takes the same steps.
 """
@@ -25,37 +25,3 @@ class BlockJacobi:
 
     def __call__(self, r: np.ndarray) -> np.ndarray:
         return np.matmul(self._inverse, r[:, :, None])[:, :, 0]
-
-
-def element_matrices(potential) -> np.ndarray:
-    """12x12 stiffness of each tetrahedron where `potential.blocks` was last called, as (m, 4, 4, 3, 3) blocks [N/m]; a
-    patch's pressure is held.
-    """
-    a = potential.arrays
-    m, B = a.num_tetrahedra, a.values.gradients
-    N = np.concatenate([-B.sum(1, keepdims=True), B], 1)
-    C = potential.tangents().reshape(m, 3, 3, 3, 3) * a.values.volumes[:, None, None, None, None]
-    right = np.matmul(C.reshape(m, 27, 3), np.swapaxes(N, 1, 2)).reshape(m, 3, 3, 3, 4)
-    return np.einsum("eaj,eijkb->eabik", N, right, optimize=True)
-
-
-def assemble(potential, mass, free):
-    """(c M + K as a block matrix, places of its diagonal blocks); fixed vertices keep a diagonal."""
-    from scipy.sparse import bsr_matrix
-
-    n, tets = potential.arrays.num_vertices, potential.tetrahedra.astype(np.int64)
-    places = (tets[:, :, None] * n + tets[:, None, :]).ravel()
-    entries = element_matrices(potential).reshape(-1, 9)
-    if potential.arrays.patches is not None:
-        rows, columns, blocks = potential.coupling.entries(potential.patch_gradients())
-        places, entries = np.concatenate([places, rows * n + columns]), np.concatenate([entries, blocks.reshape(-1, 9)])
-    places, inverse = np.unique(places, return_inverse=True)
-    data = np.stack([np.bincount(inverse, entries[:, k], len(places)) for k in range(9)], 1).reshape(-1, 3, 3)
-    rows, columns = places // n, places % n
-    is_free = free[:, 0] > 0
-    data[~(is_free[rows] & is_free[columns])] = 0
-    diagonal = np.searchsorted(places, np.arange(n, dtype=np.int64) * (n + 1))
-    data[diagonal] += mass[:, :, None] * np.eye(3)
-    data[diagonal[~is_free]] = np.eye(3) * (np.abs(data).max() or 1.0)
-    start = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=n))])
-    return bsr_matrix((data, columns, start), shape=(3 * n, 3 * n)), diagonal

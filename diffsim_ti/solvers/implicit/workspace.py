@@ -1,5 +1,6 @@
 """A run of an implicit solver: its passes, what they are told of obstacles, motion and loads."""
 
+import time
 import weakref
 
 import numpy as np
@@ -16,6 +17,7 @@ from diffsim_ti.solvers.implicit.law_state import law_state_kernels
 from diffsim_ti.solvers.implicit.linear import NotConverged
 from diffsim_ti.solvers.implicit.multigrid import Multigrid
 from diffsim_ti.solvers.implicit.newton import Newton
+from diffsim_ti.solvers.implicit.noted import Noted
 from diffsim_ti.solvers.implicit.obstacle_ways import ObstacleWays
 from diffsim_ti.solvers.implicit.preconditioners import BlockJacobi
 from diffsim_ti.solvers.implicit.stage import Stage
@@ -33,7 +35,7 @@ class TwoStepHistory(History):
         self.fresh = [True] * num_slots
 
 
-class ImplicitWorkspace(ObstacleWays, Workspace):
+class ImplicitWorkspace(ObstacleWays, Noted, Workspace):
     """A run of an implicit solver. Vectors of vertices are worked on in float64 on the host, tetrahedra on the device."""
 
     pairs_kind = ImplicitPairs
@@ -117,8 +119,11 @@ class ImplicitWorkspace(ObstacleWays, Workspace):
                 self.save_frame(j // save_every)
             u, v, before = self.read(self.state, 0)
             self.potential.hold(self.state, 0)
+            begin, self.newton.reports = time.perf_counter(), []
             try:
                 u_next, v_next = self._pass(j, u, v, before)
+                self.note_contacts(j, save_every)
+                self.note_solves(j, num_passes, time.perf_counter() - begin)
             except (NotConverged, Tunnelling) as error:
                 raise self.dated(error, j, num_passes) from None
             if self.solver.multistep:
@@ -198,6 +203,7 @@ class ImplicitWorkspace(ObstacleWays, Workspace):
             u_star = self._solve(u, start, (mass, inertial, loads), stage)
         except NotConverged as error:
             raise self._explained(error, u) from None
+        self.u_star = u_star
         v_star = (u_star - x) / stage.gamma
         u_next = stage.c0 * u_star + (1 - stage.c0) * u
         v_next = stage.e0 * v_star + stage.e1 * y

@@ -1,0 +1,135 @@
+"""Vibrations of a body about a state: frequencies and shapes, with the gradients of frequencies."""
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from diffsim_ti.outputs.body_forces import BodyForces
+
+if TYPE_CHECKING:
+    from diffsim_ti.scene import Scene
+
+SMALL, DENSE = 1e-8, 600  # of the largest eigenvalue: zero; unknowns up to which all of them are computed
+
+
+@dataclass(eq=False)
+class Modes:
+    """frequencies [Hz], ascending, shape (k,), negative where the state is unstable (lambda < 0: -sqrt(-lambda) / 2 pi);
+    eigenvalues lambda = (2 pi f)^2 [1/s^2]; shapes [1/sqrt(kg)], (k, num_vertices, 3), with shapes_i . M shapes_j = 1 where
+    i = j, else 0; groups: lists of modes whose frequencies coincide, whose mean alone has a gradient."""
+
+    frequencies: np.ndarray
+    eigenvalues: np.ndarray
+    shapes: np.ndarray
+    groups: list[list[int]]
+    scene: "Scene" = field(repr=False)
+    displacements: np.ndarray = field(repr=False)
+
+    def gradients(self, by_frequency: ArrayLike) -> dict[str, np.ndarray]:
+        """Gradients of a loss by every input of the scene, for its gradient by the frequencies, shape (k,).
+
+            d lambda_i = phi_i . (dK - lambda_i dM) phi_i,        df = d lambda / (8 pi^2 f)
+
+        Where frequencies coincide each mode takes the mean of its group, which is the one of them that is differentiable:
+        the loss must weigh the modes of a group alike, and a group must not be cut by k. "displacements" is the gradient
+        by the state, besides. Initial positions and loads have none: chain what moves the state through its own rollout.
+        phi . dK phi is the slope of the exact derivatives of phi . forces along phi, by differences of fourth order whose
+        error is 1e-10 of it.
+
+        Raises ValueError for another shape, for weights that differ within a group, and for frequencies of zero.
+        Magnus 1985, On differentiating eigenvalues and eigenvectors, doi:10.1017/S0266466600011129.
+        """
+        by = np.asarray(by_frequency, np.float64)
+        if by.shape != self.frequencies.shape:
+            raise ValueError(f"by_frequency: expected shape {self.frequencies.shape}, got {by.shape}")
+        size = np.abs(by).max(initial=0.0)
+        for group in self.groups:
+            if np.ptp(by[group]) > 1e-9 * size:
+                raise ValueError(
+                    f"modes {group} have one frequency, {self.frequencies[group[0]]:.6g} Hz, of which only the mean has a "
+                    f"gradient: weigh them alike, not {by[group]}"
+                )
+            if by[group[0]] and not abs(self.frequencies[group[0]]) > 0:
+                raise ValueError(f"modes {group} are motions without stiffness: their frequency 0 has no gradient")
+        body = BodyForces(self.scene)
+        values = self.scene.inputs.values
+        derived = body.load(values)
+        total, by_state = derived.zeros(), np.zeros_like(self.displacements)
+        for group in self.groups:
+            if not by[group[0]]:
+                continue
+            weight = by[group[0]] / (8 * np.pi**2 * abs(self.frequencies[group[0]]))
+            for i in group:
+                slope, by_u = _slope(body, self.displacements, self.shapes[i], derived)
+                for name, part in slope.parts().items():
+                    if part is not None:
+                        setattr(total, name, getattr(total, name) + weight * part)
+                by_state += weight * by_u
+                total.mass = total.mass - weight * self.eigenvalues[i] * (self.shapes[i] ** 2).sum(1)
+        return self.scene.inputs.derive_vjp(values, total, tuple(values)) | {"displacements": by_state}
+
+
+def _slope(body: BodyForces, u: np.ndarray, phi: np.ndarray, derived):
+    """Derivatives of phi . K phi, of what kernels read and of u."""
+    X, tets = derived.rest, body.scene.mesh.tetrahedra
+    edges = phi[tets[:, 1:]] - phi[tets[:, :1]]
+    H = np.einsum("eai,eaj->eij", edges, derived.gradients)
+    step = 2e-3 / max(np.abs(H).max(), 1e-300)  # a strain that a law's third derivatives resolve
+    total, by_u, v = derived.zeros(), np.zeros_like(X), np.zeros_like(X)
+    for shift, weight in ((-2, 1), (-1, -8), (1, 8), (2, -1)):
+        body.place(u + shift * step * phi, v)
+        adjoint = body.adjoint()
+        own, _ = body.vjp(phi, adjoint)
+        found, weight = adjoint.collect(), -weight / (12 * step)
+        by_u += weight * own
+        for name in ("coefficients", "gradients", "volumes"):
+            setattr(total, name, getattr(total, name) + weight * getattr(found, name))
+    return total, by_u
+
+
+def modes(scene: "Scene", k: int, displacements: ArrayLike | None = None) -> Modes:
+    """The k lowest modes of small vibrations of a body about a state: K phi = lambda M phi, f = sqrt(lambda) / 2 pi.
+
+    K: `scene.stiffness_matrix(displacements)`, of the body's stress at displacements [m] from the rest shape, default none;
+    M: `scene.mass_matrix()`, lumped; fixed vertices do not move, and what presses or loads the body is not in K.
+    A body that is not fixed has six frequencies of 0, its rigid motions, with k counting them. Everything is in float64.
+
+    Raises ValueError for k outside 1 .. the number of free unknowns, shapes that do not fit, or a law with rates or a state.
+    Bathe, Finite Element Procedures, 2nd ed., 2014, ch. 10.
+    """
+    from scipy.linalg import eigh
+    from scipy.sparse import diags
+    from scipy.sparse.linalg import eigsh
+
+    if scene.precision != "f64":
+        scene = scene.replace(precision="f64")
+    u = scene.checked_displacements(displacements)
+    free = np.ones((scene.mesh.num_vertices, 3), bool)
+    free[scene.fixed] = False
+    keep = np.flatnonzero(free.ravel())
+    if int(k) != k or not 1 <= k <= len(keep):
+        raise ValueError(f"modes: k must be a whole number of 1 .. {len(keep)}, the free unknowns, got {k}")
+    k = int(k)
+    mass = scene.mass_matrix().diagonal()[keep]
+    scale = 1 / np.sqrt(mass)
+    K = scene.stiffness_matrix(u)[keep][:, keep]
+    A = diags(scale) @ (0.5 * (K + K.T)) @ diags(scale)
+    if len(keep) <= DENSE or 3 * k >= len(keep):
+        values, vectors = eigh(A.toarray(), subset_by_index=[0, k - 1])
+        size = float(abs(A).sum(1).max())
+    else:
+        size = float(abs(A).sum(1).max())
+        values, vectors = eigsh(A.tocsc(), k, sigma=-1e-6 * size, which="LM", tol=1e-13)
+        order = np.argsort(values)
+        values, vectors = values[order], vectors[:, order]
+    values = np.where(np.abs(values) < 1e-13 * size, 0.0, values)
+    shapes = np.zeros((k, free.size))
+    shapes[:, keep] = (vectors * scale[:, None]).T
+    frequencies = np.sign(values) * np.sqrt(np.abs(values)) / (2 * np.pi)
+    groups = [[0]]
+    for i in range(1, k):
+        near = abs(values[i] - values[i - 1]) <= SMALL * max(abs(values[i]), 1e-6 * size * SMALL)
+        groups[-1].append(i) if near else groups.append([i])
+    return Modes(frequencies, values, shapes.reshape(k, -1, 3), groups, scene, u)

@@ -1,0 +1,144 @@
+"""Forces of the body's own stress on its vertices in the frames of a run, with derivatives, for outputs."""
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from types import SimpleNamespace
+
+import numpy as np
+import taichi as ti
+
+from diffsim_ti import runtime
+from diffsim_ti.elements.patched_tetrahedron import functions_of
+from diffsim_ti.inputs import Derived
+from diffsim_ti.runtime import Kernel
+from diffsim_ti.state.arrays import SceneArrays
+from diffsim_ti.state.features import Features
+from diffsim_ti.state.numbers import ADJOINT, SCENE, TANGENT, Adjoint, Tangent
+
+A = ti.template()
+STATE = dict(u="vectors2", v="vectors2")
+CORNERS = dict(corner="vectors", rate_corner="vectors")
+
+
+@dataclass(frozen=True)
+class BodyForceKernels:
+    """At the displacement and velocity in slot 0 of `at`."""
+
+    law: object
+    features: Features
+    lanes: bool
+
+    @cached_property
+    def element(self):
+        return functions_of(self.law, self.features.uniform, self.lanes)
+
+    def _kernel(self, name: str, body, **arrays) -> Kernel:
+        own = dict(scene=SCENE, at=STATE, out=CORNERS | dict(y="vectors2", y_rate="vectors2")) | arrays
+        return Kernel(name, body, self.law.precision, own, dict(num_items="int", num_vertices="int"))
+
+    @ti.func
+    def all_forces(self, scene: A, at: A, out: A, plan: A):
+        for e in range(plan.num_items):
+            self.element.forces(e, scene, at, 0, out.corner)
+        for i in range(plan.num_vertices):
+            out.y[0, i] = self.element.gather(i, scene, out.corner)
+
+    @cached_property
+    def forces(self) -> Kernel:
+        return self._kernel("body_forces", self.all_forces)
+
+    @ti.func
+    def all_jvp(self, scene: A, at: A, out: A, change: A, tangent: A, plan: A):
+        for e in range(plan.num_items):
+            self.element.forces_jvp(e, scene, at, 0, change, out.corner, tangent)
+        for i in range(plan.num_vertices):
+            out.y[0, i] = self.element.gather(i, scene, out.corner)
+
+    @cached_property
+    def jvp(self) -> Kernel:
+        return self._kernel("body_forces_jvp", self.all_jvp, change=STATE, tangent=TANGENT)
+
+    @ti.func
+    def all_vjp(self, scene: A, at: A, out: A, seed: A, adjoint: A, plan: A):
+        for e in range(plan.num_items):
+            self.element.forces_vjp(e, scene, at, 0, seed.w, out.corner, adjoint, True)
+        for i in range(plan.num_vertices):
+            out.y[0, i] = self.element.gather(i, scene, out.corner)
+            if ti.static(self.element.reads_rates):
+                out.y_rate[0, i] = self.element.gather(i, scene, out.rate_corner)
+
+    @cached_property
+    def vjp(self) -> Kernel:
+        own = ADJOINT | dict(rate_corner="vectors")
+        return self._kernel("body_forces_vjp", self.all_vjp, seed=dict(w="vectors2"), adjoint=own)
+
+
+@lru_cache(maxsize=None)
+def _kernels(law, features: Features, lanes: bool) -> BodyForceKernels:
+    return BodyForceKernels(law, features, lanes)
+
+
+class BodyForces:
+    """Forces -dE/du [N] of stress, shape (num_vertices, 3), at the states that frames show.
+
+    Raises ValueError for a law with a state of its own, which frames do not have.
+    """
+
+    def __init__(self, scene):
+        if scene.law.state_names:
+            raise ValueError(
+                f"{type(scene.law).__name__} has a state ({', '.join(scene.law.state_names)}) that frames do not keep: this "
+                "output knows laws of the displacement and velocity gradients only"
+            )
+        self.scene, self.arrays = scene, SceneArrays(scene)
+        a = self.arrays
+        self.at, self.change, self.out = (
+            SimpleNamespace(**{name: runtime.array(a.vector, 1, a.num_vertices) for name in names})
+            for names in (("u", "v", "w"), ("u", "v"), ("y", "y_rate"))
+        )
+        self.out.corner, self.out.rate_corner = (runtime.array(a.vector, *a.corner.shape) for _ in range(2))
+
+    def load(self, values: dict) -> Derived:
+        """The numbers of a run; what kernels read of them."""
+        derived = self.scene.inputs.derive(values)
+        self.arrays.load(derived)
+        self.kernels = _kernels(self.arrays.law, self.arrays.features(True, True), self.arrays.in_lanes)
+        return derived
+
+    def _run(self, name: str, **records) -> np.ndarray:
+        a = self.arrays
+        launch = getattr(self.kernels, name).bind(a.in_lanes, scene=a, at=self.at, out=self.out, **records)
+        launch(num_items=a.num_items, num_vertices=a.num_vertices)
+        return runtime.fetch_row(self.out.y, 0)
+
+    def place(self, u: np.ndarray, v: np.ndarray) -> None:
+        """Go to a displacement [m] and a velocity [m/s]."""
+        runtime.fill(self.at.u, u[None])
+        runtime.fill(self.at.v, v[None])
+
+    def forces(self) -> np.ndarray:
+        """f."""
+        return self._run("forces")
+
+    def jvp(self, du: np.ndarray, dv: np.ndarray, tangent: Tangent) -> np.ndarray:
+        """Its change."""
+        runtime.fill(self.change.u, du[None])
+        runtime.fill(self.change.v, dv[None])
+        return self._run("jvp", change=self.change, tangent=tangent)
+
+    def tangent(self, change: Derived) -> Tangent:
+        """Changes of the scene's numbers, for `jvp`."""
+        return Tangent(self.arrays, change)
+
+    def adjoint(self) -> Adjoint:
+        """Room for the adjoints of the scene's numbers, for `vjp`; `collect()` gives them."""
+        out = Adjoint(self.arrays, self.arrays.features(True, True))
+        out.clear()
+        return out
+
+    def vjp(self, w: np.ndarray, adjoint: Adjoint) -> tuple[np.ndarray, np.ndarray]:
+        """(adjoint of u, of v) for that of f; adds those of coefficients, grad N and V."""
+        runtime.fill(self.at.w, w[None])
+        runtime.fill(self.out.y_rate, 0)
+        by_u = self._run("vjp", seed=self.at, adjoint=(adjoint, self.out))
+        return by_u, runtime.fetch_row(self.out.y_rate, 0)

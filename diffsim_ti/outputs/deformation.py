@@ -1,0 +1,98 @@
+"""Displacement gradients of tetrahedra in the frames of a run, with derivatives, and averages of what they make."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from diffsim_ti.mesh.geometry import edge_matrices
+
+
+@dataclass
+class Deformation:
+    """H = D B of some tetrahedra, D the edges of the displacement, rows of B grad N_1..3; arrays (frames, m, 3, 3)."""
+
+    D: np.ndarray
+    B: np.ndarray
+    tetrahedra: np.ndarray
+
+    @classmethod
+    def of(cls, frames, derived, tetrahedra: np.ndarray, chosen) -> "Deformation":
+        """chosen: which of all tetrahedra."""
+        u = frames.displacements.astype(np.float64)
+        return cls(np.stack([edge_matrices(x, tetrahedra) for x in u]), derived.gradients[chosen], tetrahedra)
+
+    @property
+    def H(self) -> np.ndarray:
+        return self.D @ self.B
+
+    @property
+    def F(self) -> np.ndarray:
+        return np.eye(3) + self.H
+
+    def jvp(self, du: np.ndarray, dB: np.ndarray) -> np.ndarray:
+        """dH for changes of the displacements, shape (frames, num_vertices, 3), and of B."""
+        dD = np.stack([edge_matrices(x, self.tetrahedra) for x in du])
+        return dD @ self.B + self.D @ dB
+
+    def vjp(self, H_adj: np.ndarray, num_vertices: int) -> tuple[np.ndarray, np.ndarray]:
+        """(adjoint of the displacements, of B) for that of H."""
+        by_edge = np.swapaxes(H_adj @ np.swapaxes(self.B, -1, -2), -1, -2)  # a row for each edge
+        out = np.zeros((len(H_adj), num_vertices, 3))
+        for u_adj, rows in zip(out, by_edge):
+            np.add.at(u_adj, self.tetrahedra[:, 1:].ravel(), rows.reshape(-1, 3))
+            np.add.at(u_adj, self.tetrahedra[:, 0], -rows.sum(1))
+        return out, (np.swapaxes(self.D, -1, -2) @ H_adj).sum(0)
+
+
+class VertexMeans:
+    """Means over the tetrahedra around each vertex, by their volumes V: T_i = sum V_e T_e / sum V_e."""
+
+    def __init__(self, tetrahedra: np.ndarray, num_vertices: int):
+        from scipy.sparse import csr_matrix
+
+        m = len(tetrahedra)
+        ones, columns = np.ones(4 * m), np.repeat(np.arange(m), 4)
+        self._around = csr_matrix((ones, (tetrahedra.ravel(), columns)), shape=(num_vertices, m))
+
+    def value(self, T: np.ndarray, V: np.ndarray) -> np.ndarray:
+        """T: (frames, m, ...) -> (frames, num_vertices, ...)."""
+        rows = (T * _like(V, T)).reshape(*T.shape[:2], -1)
+        out = np.stack([self._around @ frame for frame in rows])
+        return out.reshape(len(T), -1, *T.shape[2:]) / _like(self._around @ V, T)
+
+    def jvp(self, T, dT, V, dV) -> np.ndarray:
+        """Its change."""
+        mean, total = self.value(T, V), self._around @ V
+        share = _like(self._around @ dV / total, T)
+        return self.value(dT, V) + self.value(T * _like(dV / V, T), V) - mean * share
+
+    def vjp(self, T, V, seed) -> tuple[np.ndarray, np.ndarray]:
+        """(adjoint of T, of V)."""
+        mean, total = self.value(T, V), self._around @ V
+        scaled = seed / _like(total, T)
+        back = self._around.T @ scaled.reshape(*seed.shape[:2], -1).swapaxes(0, 1).reshape(len(total), -1)
+        back = back.reshape(len(V), len(T), -1).swapaxes(0, 1).reshape(T.shape)
+        kept = self._around.T @ (scaled * mean).reshape(len(T), len(total), -1).sum((0, 2))
+        return back * _like(V, T), (back * T).reshape(len(T), len(V), -1).sum((0, 2)) - kept
+
+
+def _like(per_item: np.ndarray, T: np.ndarray) -> np.ndarray:
+    """Numbers of items, to multiply arrays (frames, items, ...)."""
+    return per_item.reshape(1, -1, *[1] * (T.ndim - 2))
+
+
+def principal(T: np.ndarray) -> np.ndarray:
+    """Eigenvalues of symmetric tensors, ascending."""
+    return np.linalg.eigvalsh(T)
+
+
+def principal_jvp(T: np.ndarray, dT: np.ndarray) -> np.ndarray:
+    """Their change, n . dT n for each; where some coincide, in the directions that the eigenvectors happen to have."""
+    n = np.linalg.eigh(T)[1]
+    return np.einsum("...ia,...ij,...ja->...a", n, dT, n)
+
+
+def principal_vjp(T: np.ndarray, seed: np.ndarray) -> np.ndarray:
+    """Adjoint of T."""
+    n = np.linalg.eigh(T)[1]
+    return np.einsum("...ia,...a,...ja->...ij", n, seed, n)

@@ -1,0 +1,150 @@
+"""What holds the fixed vertices of a body: force and moment of a support."""
+
+from copy import copy
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from diffsim_ti.outputs.body_forces import BodyForces
+from diffsim_ti.outputs.moments import moments, moments_jvp, moments_vjp
+from diffsim_ti.outputs.output import Change, Output
+from diffsim_ti.terms import ExternalForce, Gravity
+
+if TYPE_CHECKING:
+    from diffsim_ti.rollout.frames import Frames
+    from diffsim_ti.scene import Scene
+
+
+class Reaction(Output):
+    """Force [N] with which fixed vertices are held, shape (frames, 3), or of each, (frames, k, 3), at each frame's state.
+
+        R = -sum over the support of (f_i + m_i g + F_i)
+
+    f: force of the body's stress on a vertex, m_i g its weight, F its external force (of the step that ends in the frame).
+    So in equilibrium the reactions of all supports, the weight, the loads and the forces of obstacles add up to zero.
+    What obstacles and self-contact do to fixed vertices themselves is not in it (ContactForce has the first), nor is the
+    inertia of vertices that a prescribed motion accelerates.
+
+    support: which of the fixed vertices, by a vertex set's name, indices, a mask or a list of names; None: all.
+    about: the moment [N m] about this point [m] instead: sum (x_i - about) x R_i. per_vertex: of each vertex, ordered as
+        `mesh.vertex_indices(support)`. name: how a loss calls it.
+    The gradient is exact by all inputs. In single precision a reaction is the small sum of large forces of stress: it has an
+    error of some 1e-6 of these.
+
+    Raises ValueError for a support that is not fixed, for a law with a state, or for about= and per_vertex=True together.
+    Belytschko, Liu, Moran, Nonlinear Finite Elements for Continua and Structures, 2000, sec. 4.4.
+    """
+
+    def __init__(
+        self,
+        support: str | ArrayLike | None = None,
+        name: str = "reaction",
+        about: ArrayLike | None = None,
+        per_vertex: bool = False,
+    ):
+        if about is not None and per_vertex:
+            raise ValueError("Reaction: a moment is of all vertices: give about= or per_vertex=True, not both")
+        self.support, self.name, self.per_vertex = support, name, bool(per_vertex)
+        self.about = None if about is None else np.array(about, np.float64)
+        if self.about is not None and (self.about.shape != (3,) or not np.all(np.isfinite(self.about))):
+            raise ValueError(f"Reaction: about must be 3 finite numbers [m], got {about!r}")
+
+    def __repr__(self) -> str:
+        return f"Reaction({self.support!r}, name={self.name!r})"
+
+    def settled(self, scene: "Scene") -> "Reaction":
+        out = copy(self)
+        out.vertices = scene.fixed if self.support is None else scene.mesh.vertex_indices(self.support)
+        loose = np.setdiff1d(out.vertices, scene.fixed)
+        if len(out.vertices) == 0 or len(loose):
+            raise ValueError(
+                f"Reaction: the support must be among the fixed vertices, but {len(loose) or 'all'} of its "
+                f"{len(out.vertices)} vertices are free: fix them (Scene(..., fixed=...)) or name others"
+            )
+        out.scene, out.body = scene, BodyForces(scene)
+        load = scene.term(ExternalForce)
+        out.loaded = None if load is None else load.indices(scene.mesh)
+        gravity = scene.term(Gravity)
+        out.gravity = None if gravity is None else scene.inputs.parameters.of(gravity)
+        return out
+
+    def shape(self, num_frames: int) -> tuple[int, ...]:
+        return (num_frames, len(self.vertices), 3) if self.per_vertex else (num_frames, 3)
+
+    # ---- forces on all vertices, shape (frames, num_vertices, 3) -----------------------------------------------------
+
+    def _state(self, frames, k: int) -> tuple[np.ndarray, np.ndarray]:
+        return frames.displacements[k].astype(np.float64), frames.velocities[k].astype(np.float64)
+
+    def _row(self, frames, k: int, forces: np.ndarray) -> int:
+        """The row of external forces that frame k ends."""
+        return min(max(int(frames.steps[k]) - 1, 0), len(forces) - 1)
+
+    def _held(self, frames) -> np.ndarray:
+        """Minus all forces."""
+        derived, out = self.body.load(frames.inputs), []
+        for k in range(len(frames.positions)):
+            self.body.place(*self._state(frames, k))
+            f = self.body.forces()
+            if self.gravity is not None:
+                f = f + derived.mass[:, None] * derived.parameters[self.gravity][:3]
+            if self.loaded is not None:
+                f[self.loaded] += derived.forces[self._row(frames, k, derived.forces)]
+            out.append(-f)
+        return np.stack(out)
+
+    def value(self, frames: "Frames") -> np.ndarray:
+        return self._of(frames, self._held(frames)[:, self.vertices])
+
+    def _of(self, frames, held: np.ndarray) -> np.ndarray:
+        if self.about is not None:
+            return moments(frames.positions[:, self.vertices], self.about, held)
+        return held if self.per_vertex else held.sum(1)
+
+    def jvp(self, frames: "Frames", change: Change) -> np.ndarray:
+        derived = self.body.load(frames.inputs)
+        moved = self.scene.inputs.derive_jvp(frames.inputs, change.inputs)
+        tangent, zero, out = self.body.tangent(moved), np.zeros(frames.positions.shape), []
+        dx = zero if change.positions is None else change.positions
+        dv = zero if change.velocities is None else change.velocities
+        for k in range(len(zero)):
+            self.body.place(*self._state(frames, k))
+            df = self.body.jvp(dx[k] - moved.rest, dv[k], tangent)
+            if self.gravity is not None:
+                g, dg = (x.parameters[self.gravity][:3] for x in (derived, moved))
+                df = df + moved.mass[:, None] * g + derived.mass[:, None] * dg
+            if self.loaded is not None:
+                df[self.loaded] += moved.forces[self._row(frames, k, derived.forces)]
+            out.append(-df[self.vertices])
+        if self.about is None:
+            return self._of(frames, np.stack(out))
+        held, x = self._held(frames)[:, self.vertices], frames.positions[:, self.vertices]
+        return moments_jvp(x, self.about, held, dx[:, self.vertices], np.stack(out))
+
+    def vjp(self, frames: "Frames", seed: np.ndarray) -> Change:
+        positions, velocities, w = np.zeros((3, *frames.positions.shape))
+        if self.about is not None:
+            held, x = self._held(frames)[:, self.vertices], frames.positions[:, self.vertices]
+            positions[:, self.vertices], w[:, self.vertices] = moments_vjp(x, self.about, held, seed)
+        else:
+            w[:, self.vertices] = seed if self.per_vertex else seed[:, None]
+        w, derived = -w, self.body.load(frames.inputs)
+        adjoint, loads = self.body.adjoint(), None if derived.forces is None else np.zeros_like(derived.forces)
+        rest = np.zeros(positions.shape[1:])
+        for k in range(len(w)):
+            self.body.place(*self._state(frames, k))
+            by_u, by_v = self.body.vjp(w[k], adjoint)
+            positions[k] += by_u
+            velocities[k] += by_v
+            rest -= by_u
+            if loads is not None:
+                loads[self._row(frames, k, loads)] += w[k, self.loaded]
+        adj = adjoint.collect()
+        if self.gravity is not None:
+            g = derived.parameters[self.gravity][:3]
+            adj.mass = adj.mass + (w @ g).sum(0)
+            adj.parameters[self.gravity.start : self.gravity.start + 3] += np.einsum("i,fid->d", derived.mass, w)
+        adj.forces, adj.rest = loads, adj.rest + rest
+        inputs = self.scene.inputs.derive_vjp(frames.inputs, adj, tuple(frames.inputs))
+        return Change(positions, velocities, inputs)

@@ -1,0 +1,245 @@
+"""What each obstacle does to each vertex in an implicit pass, by its barrier and by friction, with all derivatives.
+
+Rows 2 o and 2 o + 1 of `force`, and of its adjoint `seed`, are those of obstacle o. What they depend on is what the
+potential's forces do (obstacles.py).
+"""
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+import taichi as ti
+
+from diffsim_ti.potential.face_kernels import PASS as FACES
+from diffsim_ti.potential.faces import FacePoints
+from diffsim_ti.potential.obstacles import ObstaclePotential
+from diffsim_ti.runtime import Kernel
+from diffsim_ti.state.features import Features
+from diffsim_ti.state.numbers import ADJOINT, SCENE, TANGENT
+
+A = ti.template()
+PASS = dict(walls="vectors", lag="vectors2")
+NUMBERS = dict(num_vertices="int", per_gamma="float")
+
+
+@dataclass(frozen=True)
+class ObstacleShares(ObstaclePotential):
+    """parallel: loops run on all threads."""
+
+    parallel: bool
+
+    def _kernel(self, name: str, body, **arrays) -> Kernel:
+        return Kernel(name, body, self.precision, dict(scene=SCENE, pass_=PASS) | arrays, NUMBERS)
+
+    @ti.func
+    def dragged(self, g: A, k, i, scene: A, pass_: A):
+        rubbed = False
+        if ti.static(g.force.friction):
+            rubbed = self.is_rubbed(g, k, i, scene, pass_)
+        return rubbed
+
+    @ti.func
+    def push(self, g: A, k, i, u, scene: A, pass_: A):
+        X = self.rest_now(g, k, i, scene, pass_)
+        return g.force.force(scene.parameters, g.first + k * g.size, X, u, self.vector(0))
+
+    @ti.func
+    def drag(self, g: A, k, i, u, scene: A, pass_: A, plan: A):
+        v, wall = self.velocity(i, u, pass_, plan), pass_.walls[3 * (g.number + k) + 2]
+        X = self.rest_before(g, k, i, scene, pass_)
+        return g.force.rub(scene.parameters, g.first + k * g.size, X, pass_.lag[0, i], v, wall)
+
+    @ti.func
+    def all_forces(self, scene: A, pass_: A, at: A, out: A, plan: A):
+        ti.loop_config(serialize=not self.parallel)
+        for i in range(plan.num_vertices):
+            for g in ti.static(self.features.groups):
+                for k in range(g.count):
+                    row, f, drag = 2 * (g.number + k), self.vector(0), self.vector(0)
+                    if scene.surface[i] > 0:
+                        f = self.on_area(g, i, self.push(g, k, i, at.u[0, i], scene, pass_), scene)
+                        if ti.static(g.force.friction):
+                            if self.dragged(g, k, i, scene, pass_):
+                                drag = self.on_area(g, i, self.drag(g, k, i, at.u[0, i], scene, pass_, plan), scene)
+                    out.force[row, i] = f
+                    out.force[row + 1, i] = drag
+
+    @cached_property
+    def forces(self) -> Kernel:
+        """Forces at `at.u`."""
+        return self._kernel("obstacle_forces", self.all_forces, at=dict(u="vectors2"), out=dict(force="vectors2"))
+
+    @ti.func
+    def push_jvp(self, g: A, k, i, u, du, scene: A, pass_: A, tangent: A):
+        n, first, zero = 3 * (g.number + k), g.first + k * g.size, self.vector(0)
+        X, moved = self.rest_now(g, k, i, scene, pass_), du + tangent.rest[i] - tangent.walls[n]
+        f = g.force.force_jvp(scene.parameters, first, X, u, zero, moved, zero)
+        by = g.force.parameter_derivatives(scene.parameters, first, X, u, zero)
+        for m in ti.static(range(g.size)):
+            f += by[m] * tangent.parameters[first + m]
+        f = self.on_area(g, i, f, scene)
+        if ti.static(g.force.per_area):
+            f += tangent.surface[i] * self.push(g, k, i, u, scene, pass_)
+        return f
+
+    @ti.func
+    def drag_jvp(self, g: A, k, i, u, du, scene: A, pass_: A, tangent: A, plan: A):
+        n, first = 3 * (g.number + k), g.first + k * g.size
+        v, wall, dwall = self.velocity(i, u, pass_, plan), pass_.walls[n + 2], tangent.walls[n + 2]
+        du_before = tangent.lag[0, i] + tangent.rest[i] - tangent.walls[n + 1]
+        dv, before = plan.per_gamma * (du - tangent.lag[1, i]), self.rest_before(g, k, i, scene, pass_)
+        f = g.force.rub_jvp(
+            scene.parameters, first, before, pass_.lag[0, i], v, wall, tangent.parameters, du_before, dv, dwall
+        )
+        f = self.on_area(g, i, f, scene)
+        if ti.static(g.force.per_area):
+            f += tangent.surface[i] * self.drag(g, k, i, u, scene, pass_, plan)
+        return f
+
+    @ti.func
+    def all_jvp(self, scene: A, pass_: A, at: A, out: A, tangent: A, plan: A):
+        ti.loop_config(serialize=not self.parallel)
+        for i in range(plan.num_vertices):
+            for g in ti.static(self.features.groups):
+                for k in range(g.count):
+                    row, f, drag, u, du = 2 * (g.number + k), self.vector(0), self.vector(0), at.u[0, i], at.w[0, i]
+                    if scene.surface[i] > 0:
+                        f = self.push_jvp(g, k, i, u, du, scene, pass_, tangent)
+                        if ti.static(g.force.friction):
+                            if self.dragged(g, k, i, scene, pass_):
+                                drag = self.drag_jvp(g, k, i, u, du, scene, pass_, tangent, plan)
+                    out.force[row, i] = f
+                    out.force[row + 1, i] = drag
+
+    @cached_property
+    def jvp(self) -> Kernel:
+        """Their change for changes `at.w` of the displacement and of everything else that they depend on."""
+        own = dict(at=dict(u="vectors2", w="vectors2"), out=dict(force="vectors2"), tangent=TANGENT | PASS)
+        return self._kernel("obstacle_forces_jvp", self.all_jvp, **own)
+
+    @ti.func
+    def push_vjp(self, g: A, k, i, u, w, scene: A, pass_: A, adjoint: A):
+        n, first, zero = 3 * (g.number + k), g.first + k * g.size, self.vector(0)
+        if ti.static(g.force.per_area and self.features.shape):
+            self.add_to_area(g, i, self.push(g, k, i, u, scene, pass_).dot(w), adjoint)
+        w = self.on_area(g, i, w, scene)
+        X = self.rest_now(g, k, i, scene, pass_)
+        by_u, _ = g.force.force_vjp(scene.parameters, first, X, u, zero, w)
+        by = g.force.parameter_derivatives(scene.parameters, first, X, u, zero)
+        for m in ti.static(range(g.size)):
+            adjoint.sums[first + m, i] = adjoint.sums[first + m, i] + by[m].dot(w)
+        self.add_to_rest(i, by_u, adjoint)
+        adjoint.walls[n, i] = zero - by_u
+        return by_u
+
+    @ti.func
+    def drag_vjp(self, g: A, k, i, u, w, scene: A, pass_: A, adjoint: A, plan: A):
+        n, first, zero = 3 * (g.number + k), g.first + k * g.size, self.vector(0)
+        if ti.static(g.force.per_area and self.features.shape):
+            self.add_to_area(g, i, self.drag(g, k, i, u, scene, pass_, plan).dot(w), adjoint)
+        w = self.on_area(g, i, w, scene)
+        v, wall, before = self.velocity(i, u, pass_, plan), pass_.walls[n + 2], self.rest_before(g, k, i, scene, pass_)
+        by_lag, by_v, by_wall, by = g.force.rub_vjp(scene.parameters, first, before, pass_.lag[0, i], v, wall, w)
+        for m in ti.static(range(g.size)):
+            adjoint.sums[first + m, i] = adjoint.sums[first + m, i] + by[m]
+        self.add_to_rest(i, by_lag, adjoint)
+        adjoint.lag[0, i] = adjoint.lag[0, i] + by_lag
+        adjoint.lag[1, i] = adjoint.lag[1, i] - plan.per_gamma * by_v
+        adjoint.walls[n + 1, i] = zero - by_lag
+        adjoint.walls[n + 2, i] = by_wall
+        return plan.per_gamma * by_v
+
+    @ti.func
+    def all_vjp(self, scene: A, pass_: A, at: A, out: A, adjoint: A, plan: A):
+        ti.loop_config(serialize=not self.parallel)
+        for i in range(plan.num_vertices):
+            y = self.vector(0)
+            for g in ti.static(self.features.groups):
+                for k in range(g.count):
+                    row = 2 * (g.number + k)
+                    if scene.surface[i] > 0:
+                        y += self.push_vjp(g, k, i, at.u[0, i], at.seed[row, i], scene, pass_, adjoint)
+                        if ti.static(g.force.friction):
+                            if self.dragged(g, k, i, scene, pass_):
+                                y += self.drag_vjp(
+                                    g, k, i, at.u[0, i], at.seed[row + 1, i], scene, pass_, adjoint, plan
+                                )
+            out.y[0, i] = y
+
+    @cached_property
+    def vjp(self) -> Kernel:
+        """Adjoint y of the displacement; adds those of all else."""
+        own = dict(at=dict(u="vectors2", seed="vectors2"), out=dict(y="vectors2"))
+        return self._kernel(
+            "obstacle_forces_vjp", self.all_vjp, **own, adjoint=ADJOINT | dict(lag="vectors2", walls="vectors2")
+        )
+
+
+@dataclass(frozen=True)
+class FaceShares(FacePoints):
+    """The same of points within faces, where there is no friction, of one obstacle at a time: number `which`."""
+
+    parallel: bool
+
+    def _kernel(self, name: str, body, **arrays) -> Kernel:
+        own = dict(scene=SCENE, pass_=FACES, at=dict(u="vectors2", w="vectors2"), out=dict(y="vectors2")) | arrays
+        return Kernel(name, body, self.precision, own, dict(num_vertices="int", which="int"))
+
+    @ti.func
+    def all_forces(self, scene: A, pass_: A, at: A, out: A, plan: A):
+        ti.loop_config(serialize=not self.parallel)
+        for i in range(plan.num_vertices):
+            f = self.vector(0)
+            for g in ti.static(self.features.groups):
+                if ti.static(not g.force.hollow):
+                    k = plan.which - g.number
+                    if 0 <= k and k < g.count:
+                        f = self.around_one("force", g, k, i, scene, pass_, at, at)
+            out.y[0, i] = f
+
+    @cached_property
+    def forces(self) -> Kernel:
+        return self._kernel("face_share", self.all_forces)
+
+    @ti.func
+    def all_jvp(self, scene: A, pass_: A, at: A, out: A, tangent: A, plan: A):
+        ti.loop_config(serialize=not self.parallel)
+        for i in range(plan.num_vertices):
+            f = self.vector(0)
+            for g in ti.static(self.features.groups):
+                if ti.static(not g.force.hollow):
+                    k = plan.which - g.number
+                    if 0 <= k and k < g.count:
+                        f = self.around_one("jvp", g, k, i, scene, pass_, at, tangent)
+            out.y[0, i] = f
+
+    @cached_property
+    def jvp(self) -> Kernel:
+        return self._kernel("face_share_jvp", self.all_jvp, tangent=TANGENT | dict(walls="vectors"))
+
+    @ti.func
+    def all_vjp(self, scene: A, pass_: A, at: A, out: A, adjoint: A, plan: A):
+        ti.loop_config(serialize=not self.parallel)
+        for i in range(plan.num_vertices):
+            by_u = self.vector(0)
+            for g in ti.static(self.features.groups):
+                if ti.static(not g.force.hollow):
+                    k = plan.which - g.number
+                    if 0 <= k and k < g.count:
+                        by_u = self.around_one("product", g, k, i, scene, pass_, at, at)
+                        self.around_one("numbers", g, k, i, scene, pass_, at, adjoint)
+                        n = 3 * plan.which
+                        adjoint.walls[n, i] = adjoint.walls[n, i] - by_u
+                        self.add_to_rest(i, by_u, adjoint)
+            out.y[0, i] = by_u
+
+    @cached_property
+    def vjp(self) -> Kernel:
+        return self._kernel(
+            "face_share_vjp", self.all_vjp, adjoint=ADJOINT | dict(walls="vectors2", face_areas="scalars")
+        )
+
+
+@lru_cache(maxsize=None)
+def share_kernels(features: Features, precision: str, parallel: bool) -> tuple[ObstacleShares, FaceShares]:
+    """Kernels for a scene's features."""
+    return ObstacleShares(features, precision, parallel), FaceShares(features, precision, parallel)

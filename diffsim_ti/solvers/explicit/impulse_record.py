@@ -1,0 +1,80 @@
+"""What obstacles did in each frame of an explicit run, per vertex, on the device; also its changes and its adjoints."""
+
+import numpy as np
+
+from diffsim_ti import runtime
+
+
+class ImpulseRecord:
+    """Impulses [N s] of obstacles on vertices: those of the contact stage in `impulse` (contact_impulses.py), those of
+    points within faces, which are one obstacle's, in `of_faces`, shape (frames, num_vertices, 3).
+
+    Raises ValueError where obstacles act as forces, or where faces could feel several of them.
+    """
+
+    def __init__(self, workspace):
+        self.arrays, a, features = workspace.arrays, workspace.arrays, workspace.arrays.features()
+        if len(features.staged) < len(features.groups):
+            solver = type(workspace.solver).__name__
+            raise ValueError(
+                f"explicit solvers know the forces of obstacles that act as a stage of their passes, and {solver} was told "
+                'to take some as forces: pass contact="stage", and obstacles with a distance'
+            )
+        reaching = [g.number + k for g in features.groups if not g.force.hollow for k in range(g.count)]
+        self.felt = reaching[0] if workspace.faces and reaching else None
+        if workspace.faces and len(reaching) > 1:
+            raise ValueError(
+                f"{len(reaching)} obstacles reach between the corners of faces, where explicit steps know only what they do "
+                "together: take an implicit solver, wider barriers, or a finer surface, for the force of each"
+            )
+        self.num_frames, self.num_obstacles = workspace.frames.frames_u.shape[0], len(a.obstacles)
+        self.impulse = runtime.array(a.vector, 2 * self.num_frames * self.num_obstacles, a.num_vertices)
+        self.clear()
+
+    @property
+    def _shape(self) -> tuple:
+        return self.num_frames, self.num_obstacles, 2, self.arrays.num_vertices, 3
+
+    def clear(self) -> None:
+        runtime.fill(self.impulse, 0)
+        self.of_faces = np.zeros((self.num_frames, self.arrays.num_vertices, 3))
+
+    def put(self, impulses: np.ndarray) -> None:
+        """Set them; shape as `collect` gives."""
+        runtime.fill(self.impulse, impulses.reshape(-1, *self._shape[3:]))
+        self.of_faces = np.zeros_like(self.of_faces) if self.felt is None else impulses[:, self.felt, 0].copy()
+
+    def collect(self) -> np.ndarray:
+        """Shape (frames, obstacles, 2: by push and by friction, num_vertices, 3), float64; the first frame has none."""
+        out = runtime.fetch(self.impulse).astype(np.float64).reshape(self._shape)
+        if self.felt is not None:
+            out[:, self.felt, 0] += self.of_faces
+        return out
+
+    # ---- of faces ----------------------------------------------------------------------------------------------------
+
+    def frame_of(self, numbers: dict) -> int | None:
+        """The frame that counts the pass of a launch, if one does."""
+        return numbers["first"] // numbers["per_frame"] + 1 if numbers["per_frame"] else None
+
+    def add(self, numbers: dict, change: np.ndarray) -> None:
+        """Add what faces did in a pass; change: of the velocity by them [m/s]."""
+        frame = self.frame_of(numbers)
+        if frame is not None:
+            self.of_faces[frame] += self.arrays.values.mass[:, None] * change
+
+    def add_jvp(self, numbers: dict, speed: np.ndarray, change: np.ndarray, mass_dot: np.ndarray) -> None:
+        """Its change; speed: the change of velocity by faces, change: that of it."""
+        self.add(numbers, change)
+        frame = self.frame_of(numbers)
+        if frame is not None:
+            self.of_faces[frame] += mass_dot[:, None] * speed
+
+    def seed(self, numbers: dict) -> np.ndarray | None:
+        """Adjoint of the velocity after faces, by their impulse; that before them has the opposite."""
+        frame = self.frame_of(numbers)
+        return None if frame is None else self.arrays.values.mass[:, None] * self.of_faces[frame]
+
+    def by_mass(self, numbers: dict, speed: np.ndarray) -> np.ndarray:
+        """Adjoint of the masses."""
+        return (self.of_faces[self.frame_of(numbers)] * speed).sum(1)

@@ -1,0 +1,105 @@
+"""What obstacles do in each frame of an implicit run, per vertex, with tangent and adjoint; on the host, in float64.
+
+Forces are those where passes take them, averaged over the passes since the frame before; of statics those of the last pass.
+"""
+
+from types import SimpleNamespace
+
+import numpy as np
+
+from diffsim_ti import runtime
+from diffsim_ti.potential.obstacle_shares import share_kernels
+
+
+class Shares:
+    """Forces of each obstacle on each vertex in the pass that a potential is told of, shape (obstacles, 2, n, 3)."""
+
+    def __init__(self, workspace, features=None):
+        self.p, self.a = workspace.potential, workspace.arrays
+        a, features = self.a, workspace.arrays.features() if features is None else features
+        self.at_vertices, self.of_faces = share_kernels(features, a.precision, workspace.parallel)
+        self.num_obstacles = len(a.obstacles)
+        self.force = runtime.array(a.vector, 2 * self.num_obstacles, a.num_vertices)
+        self.y = runtime.array(a.vector, 1, a.num_vertices)
+        self.reaching = [g.number + k for g in features.groups if not g.force.hollow for k in range(g.count)]
+        self._launches = {}
+
+    def _sizes(self, **more) -> dict:
+        return dict(num_vertices=self.a.num_vertices, per_gamma=self.p.per_gamma) | more
+
+    def run(self, name: str, **records) -> None:
+        """A kernel of obstacles at vertices."""
+        if name not in self._launches:
+            own = dict(scene=self.a, pass_=self.p, at=(self.p, self), out=self) | records
+            self._launches[name] = getattr(self.at_vertices, name).bind(**own)
+        self._launches[name](**self._sizes())
+
+    def run_face(self, name: str, which: int, **records) -> np.ndarray:
+        """A kernel of one obstacle at points within faces; its result on vertices."""
+        if ("face", name) not in self._launches:
+            place = SimpleNamespace(walls=self.p.walls), self.p.faces
+            own = dict(scene=self.a, pass_=place, at=self.p, out=self) | records
+            self._launches["face", name] = getattr(self.of_faces, name).bind(**own)
+        self._launches["face", name](**self._sizes(which=which))
+        return runtime.fetch_row(self.y, 0)
+
+    def forces(self, name: str = "forces", **records) -> np.ndarray:
+        """Forces, or "jvp": their change for w of the potential and `tangent`."""
+        self.run(name, **records)
+        n = self.a.num_vertices
+        out = runtime.fetch(self.force).astype(np.float64).reshape(self.num_obstacles, 2, n, 3)
+        if self.p.faces:
+            for k in self.reaching:
+                out[k, 0] += self.run_face(name, k, **records)
+        return out
+
+
+class ContactRecord:
+    """Forces of all frames, shape (frames, obstacles, 2, num_vertices, 3)."""
+
+    def __init__(self, workspace):
+        frames, a = workspace.frames.frames_u.shape[0], workspace.arrays
+        self.forces = np.zeros((frames, len(a.obstacles), 2, a.num_vertices, 3))
+
+    @staticmethod
+    def weight(j: int, per_frame: int, static: bool) -> float:
+        """How much pass j counts in its frame."""
+        return float((j + 1) % per_frame == 0) if static else 1 / per_frame
+
+    def add(self, j: int, per_frame: int, static: bool, make) -> None:
+        """Add make(), forces in pass j, to the frame that the pass leads to."""
+        weight = self.weight(j, per_frame, static) if per_frame else 0.0
+        if weight:
+            self.forces[j // per_frame + 1] += weight * make()
+
+    def seed(self, j: int, per_frame: int, static: bool) -> np.ndarray | None:
+        """Adjoint of the forces in pass j, `forces` being those of the frames; None where it is zero."""
+        weight = self.weight(j, per_frame, static) if per_frame else 0.0
+        out = weight * self.forces[j // per_frame + 1] if weight else None
+        return out if weight and out.any() else None
+
+
+class SharesAdjoint(Shares):
+    """Adjoints by those of the forces."""
+
+    def __init__(self, workspace, features, numbers, face_areas):
+        super().__init__(workspace, features)
+        p, a = self.p, self.a
+        self.seed = runtime.array(a.vector, 2 * self.num_obstacles, a.num_vertices)
+        self.lag = runtime.array(a.vector, *p.lag.shape)
+        self.walls = runtime.array(a.vector, 3 * self.num_obstacles, a.num_vertices)
+        self.w = runtime.array(a.vector, 1, a.num_vertices)
+        self.numbers = (SimpleNamespace(lag=self.lag, walls=self.walls, face_areas=face_areas), numbers)
+
+    def pull_back(self, seed: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(adjoint of u*, of the two rows of lag, of the rows of walls) in float64; adds those of the scene's numbers."""
+        runtime.fill(self.seed, seed.reshape(-1, *seed.shape[2:]))
+        for target in (self.lag, self.walls):
+            runtime.fill(target, 0)
+        self.run("vjp", adjoint=self.numbers)
+        by_u = runtime.fetch_row(self.y, 0)
+        if self.p.faces:
+            for k in self.reaching:
+                runtime.fill(self.p.w, seed[k, :1])
+                by_u = by_u + self.run_face("vjp", k, adjoint=self.numbers)
+        return by_u, runtime.fetch(self.lag).astype(np.float64), runtime.fetch(self.walls).astype(np.float64).sum(1)

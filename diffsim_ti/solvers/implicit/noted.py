@@ -1,0 +1,50 @@
+"""What is noted of the passes of an implicit run: what solves took and, where it is asked for, what obstacles did."""
+
+import warnings
+
+import numpy as np
+
+from diffsim_ti.solvers.implicit.contact_record import ContactRecord, Shares
+from diffsim_ti.state.solve_report import Buckled
+
+
+class Noted:
+    """A part of ImplicitWorkspace."""
+
+    def record_contacts(self) -> None:
+        self.impulses = ContactRecord(self)
+
+    def forget_contacts(self) -> None:
+        self.record_contacts()
+
+    def contact_forces(self, frame_time: float) -> np.ndarray:
+        return self.impulses.forces
+
+    def note_contacts(self, j: int, per_frame: int) -> None:
+        """What obstacles did in pass j, where it is asked for."""
+        if self.impulses and per_frame:
+            self.potential.place(self.u_star)
+            shares = self.kept("shares", lambda: Shares(self))
+            self.impulses.add(j, per_frame, self.is_static, shares.forces)
+
+    def note_solves(self, j: int, num_passes: int, seconds: float) -> None:
+        """What pass j took; saddles that statics left are said."""
+        step, solves = self.step_of(j, num_passes), self.newton.reports
+        self.report.note(step, seconds, solves)
+        saddles, unstable = (sum(getattr(solve, name) for solve in solves) for name in ("saddles", "indefinite"))
+        if self.is_static and (saddles or unstable):
+            rounds = sum(max(len(solve.residuals) - 1, 0) for solve in solves)
+            left = f"{saddles} saddle{'s' * (saddles > 1)} left: the body was in balance and not stable, as when it buckles"
+            if not saddles:
+                left = (
+                    f"{unstable} of {rounds} rounds of Newton's method met states that are not stable: the body may have "
+                    "buckled on the way (follow it by more load_steps)"
+                )
+            went = "it went to a lower equilibrium, which may be one of several, and gradients are of it"
+            said = f"step {step}: {left}; {went}"
+            warnings.warn(Buckled(said, step, saddles, unstable), stacklevel=2)
+
+    @property
+    def is_static(self) -> bool:
+        """Whether passes look for equilibria."""
+        return self.solver.stage(self.rate, True).static

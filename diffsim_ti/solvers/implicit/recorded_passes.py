@@ -1,0 +1,52 @@
+"""A recorded pass of an implicit run, with everything that its equation names."""
+
+import numpy as np
+
+from diffsim_ti import runtime
+from diffsim_ti.solvers.implicit.linear import Operator, solve_symmetric
+
+
+class RecordedPasses:
+    """What tangent and reverse sweep share: a recorded pass with everything that its equation names."""
+
+    def __init__(self, workspace):
+        self.ws = workspace
+        self.eps = np.finfo(runtime.NUMPY[workspace.scene.precision]).eps
+        self.tolerance = max(workspace.solver.tolerance, 20 * self.eps)
+
+    def open(self, j: int, base: int) -> None:
+        """Take pass j from the record, its first slot being the state before pass `base`."""
+        ws = self.ws
+        self.u, self.v, self.before = ws.read(ws.record, j - base)
+        self.u_next = ws.read(ws.record, j - base + 1)[0]
+        self.stage = stage = ws.solver.stage(ws.rate, self.before is None)
+        self.x, self.y = ws.inertial(stage, self.u, self.v, self.before)
+        self.u_star = (self.u_next - (1 - stage.c0) * self.u) / stage.c0
+        self.mass = stage.inertia * ws.mass
+        ws.begin(j, stage, self.u, self.x)
+        ws.potential.hold(ws.record, j - base)
+        ws.potential.place(self.u_star)
+        self.operator = Operator(ws.potential, self.mass, ws.free)
+        self._preconditioner = None
+
+    def solve(self, b: np.ndarray) -> np.ndarray:
+        """A^-1 b on the free vertices, zero elsewhere."""
+        b = b * self.ws.free
+        if not b.any():
+            return b
+        if self._preconditioner is None:
+            self._preconditioner, _ = self.ws.preconditioner(self.mass)
+            self._preconditioner.update(self.u_star)
+        return solve_symmetric(self.operator, b, self._preconditioner, self.tolerance, self.eps, 20 * len(b))
+
+    def weight(self, share: float) -> np.ndarray:
+        """dR/dm of each vertex [m/s^2]: gravity less the acceleration."""
+        features, values = self.ws.arrays.features(), self.ws.arrays.values
+        out = -self.stage.inertia * (self.u_star - self.x - self.stage.gamma * self.y)
+        if features.gravity >= 0:
+            out = out + share * values.parameters[features.gravity :][:3]
+        return out
+
+    @property
+    def v_star(self) -> np.ndarray:
+        return (self.u_star - self.x) / self.stage.gamma

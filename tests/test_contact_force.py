@@ -1,0 +1,334 @@
+"""Forces of obstacles on the body, as a loss names them: balances, and derivatives in every solver."""
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+import taichi as ti
+import torch
+from contact_scenes import points, tetrahedron
+
+import diffsim_ti as ds
+from diffsim_ti import verify
+from diffsim_ti.diff_simulator import rollout_frames
+
+G = 9.81
+EXPLICIT = [ds.SemiImplicitSolver, ds.VelocityVerletSolver]
+
+
+def cube(height=0.004):
+    return ds.TetrahedralMesh.create_box(2, size=0.1, origin=(0, height, 0))
+
+
+def pressed(precision="f64", round_one=False, **options) -> ds.Scene:
+    """A cube within the barriers of a floor, or of a ball that reaches into its lowest faces, and of a wall."""
+    rough = dict(stiffness_per_area=3e5, width=0.01, friction=0.4, friction_speed=0.3, name="floor")
+    floor = ds.Sphere((0.05, -0.06, 0.05), 0.06, **rough) if round_one else ds.Ground(0, **rough)
+    wall = ds.HalfSpace([-0.006, 0, 0], [1, 0.1, 0], stiffness_per_area=3e5, width=0.01, friction=0.2, name="wall")
+    given = dict(
+        initial_velocities=(0.1, -0.3, 0.2), precision=precision, terms=[ds.Gravity(), floor, wall, ds.Drag(0.5)]
+    )
+    return ds.Scene(cube(), ds.StableNeoHookean(youngs_modulus=2e5, poissons_ratio=0.3), **given | options)
+
+
+def outputs():
+    return [
+        ds.ContactForce("floor", name="held"),
+        ds.ContactForce("floor", "friction", name="dragged"),
+        ds.ContactForce("wall", "normal", name="turned", about=(0, 0.1, 0)),
+        ds.ContactForce("wall", name="each", per_vertex=True),
+    ]
+
+
+def belt(kind) -> ds.Rollout:
+    """A vertex that a rough belt drives towards a wall, and that takes a share of all friction only."""
+    rough = dict(stiffness=1e6, width=0.01)
+    moving = ds.Ground(-0.011, friction=1.5, path=lambda t: [-20 * t, 0, 0], name="floor", **rough)
+    wall = ds.HalfSpace([-0.011, 0, 0], [1, 0.2, 0.1], friction=0.3, name="wall", **rough)
+    body = points(tetrahedron(), [moving, wall], fixed=[1, 2, 3], initial_velocities=[-1.0, -6.0, 0.3], precision="f64")
+    named = [*outputs()[:2], outputs()[3], ds.ContactForce("wall", "friction", name="rubbed")]
+    return ds.Rollout(kind(body, dt=1e-3, contact_damping=0.02), 3, save_every=1, outputs=named, gradients="all")
+
+
+def path(t):
+    return 0.0, 0.2 * t, 0.1 * t
+
+
+@lru_cache(maxsize=None)
+def rollout_of(case: str) -> ds.Rollout:
+    kind, *more = case.split()
+    if "belt" in more:
+        return belt(dict(semi=ds.SemiImplicitSolver, verlet=ds.VelocityVerletSolver)[kind])
+    tight = dict(tolerance=1e-12)
+    moved = dict(
+        terms=[
+            ds.Gravity(),
+            ds.Ground(0, stiffness_per_area=3e5, friction=0.4, friction_speed=0.3, path=path, name="floor"),
+        ]
+    )
+    held = dict(fixed="ymax", motion=lambda t: (0.001 * t, -0.001 * t, 0.0), initial_velocities=None)
+    alone = dict(terms=pressed(round_one=True).terms[:2]) if "round" in more else {}
+    options = (moved if "moved" in more else {}) | alone | (held if kind == "static" else {})
+    scene = pressed("f32" if "f32" in more else "f64", **options)
+    solver = {
+        "euler": lambda: ds.ImplicitEulerSolver(scene, dt=2e-3, **tight),
+        "middle": lambda: ds.ImplicitMidpointSolver(scene, dt=2e-3, **tight),
+        "bdf": lambda: ds.BDF2Solver(scene, dt=2e-3, substeps=2, **tight),
+        "static": lambda: ds.StaticSolver(scene, load_steps=2, tolerance=1e-12),
+        "semi": lambda: ds.SemiImplicitSolver(scene, dt=2e-3, substeps=3),
+        "verlet": lambda: ds.VelocityVerletSolver(scene, dt=2e-3, substeps=2),
+    }[kind]()
+    named = outputs() if len(scene.obstacles) > 1 else outputs()[:2]
+    return ds.Rollout(solver, 4, save_every=2, outputs=named, gradients="all")
+
+
+CASES = [
+    "semi",
+    "verlet",
+    "euler",
+    "middle moved",
+    "bdf",
+    "static",
+    "semi moved",
+    "semi belt",
+    "verlet belt",
+    "semi round",
+    "euler round",
+]
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_seeds_are_the_transpose_of_tangents(case):
+    """For every input by itself, and every output."""
+    rollout, rng = rollout_of(case), np.random.default_rng(1)
+    frames, gate = rollout.forward(), 1e-11 if rollout.solver.explicit else 1e-8
+    assert np.abs(frames["held"]).max(0).min() > 0.1  # all components
+    seeds = {name: rng.normal(size=frames[name].shape) for name in rollout.computed}
+    gradients = {name: rollout.vjp(frames, **{name: seed}) for name, seed in seeds.items()}
+    for key in rollout.inputs:
+        direction = rng.normal(size=rollout.values[key].shape) * verify.input_scale(rollout, key)
+        if key == "initial_velocities":
+            direction[rollout.scene.fixed] = 0
+        tangents = rollout.tangents(frames, **{key: direction})
+        for name, seed in seeds.items():
+            terms = tangents[name] * seed
+            pushed, pulled = terms.sum(), (gradients[name][key] * direction).sum()
+            assert abs(pushed - pulled) <= gate * max(abs(pushed), np.linalg.norm(terms), 1e-12), (key, name)
+
+
+KEYS = ("youngs_modulus", "poissons_ratio", "floor.friction", "floor.stiffness_per_area", "rest_positions", "density")
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_gradients_agree_with_differences(case):
+    """All outputs at once: what they are seeded with is random."""
+    rollout, rng = rollout_of(case), np.random.default_rng(2)
+    frames = rollout.forward()
+    seeds = {name: rng.normal(size=frames[name].shape) for name in rollout.computed}
+    gradients = rollout.vjp(frames, **seeds)
+
+    def loss(**values):
+        got = rollout.forward(**values)
+        return sum((got[name] * seed).sum() for name, seed in seeds.items())
+
+    keys = [key for key in (*KEYS, "floor.path", "wall.normal") if key in rollout.inputs]
+    for key in keys:
+        base = rollout.values[key]
+        direction = rng.normal(size=base.shape) * verify.input_scale(rollout, key)
+        slope = (gradients[key] * direction).sum()
+        step = 1e-4
+        coarse, fine = (
+            (loss(**{key: base + s * direction}) - loss(**{key: base - s * direction})) / (2 * s)
+            for s in (step, step / 2)
+        )
+        assert slope == pytest.approx((4 * fine - coarse) / 3, rel=1e-6, abs=1e-7 * abs(loss())), key
+
+
+def momentum(scene, frames) -> np.ndarray:
+    return np.einsum("i,fid->fd", scene.inputs.derive(scene.inputs.values).mass, frames.velocities.astype(np.float64))
+
+
+@pytest.mark.parametrize(
+    "kind, gate",
+    [*((kind, 1e-12) for kind in EXPLICIT), (ds.ImplicitEulerSolver, 1e-7), (ds.ImplicitMidpointSolver, 1e-7)],
+)
+def test_the_impulse_of_a_bounce_is_the_change_of_momentum(kind, gate):
+    """With weight and friction, frame by frame."""
+    scene = pressed(initial_velocities=(0.4, -1.0, 0.2), terms=pressed().terms[:3])
+    tight = {} if kind in EXPLICIT else dict(tolerance=1e-10)
+    rollout = ds.Rollout(kind(scene, dt=1e-3, **tight), 24, save_every=2, outputs=outputs()[:1] + [outputs()[3]])
+    frames = rollout.forward()
+    mass, p = scene.inputs.derive(scene.inputs.values).mass.sum(), momentum(scene, frames)
+    forces = frames["held"] + frames["each"].sum(1)
+    gained = 2e-3 * (forces[1:] + mass * np.array([0, -G, 0]))
+    assert np.abs(p[-1] - p[0]).max() > 0.5 * np.abs(p).max()
+    assert np.diff(p, axis=0) == pytest.approx(gained, abs=gate * np.abs(p).max())
+    assert not frames["held"][0].any()
+
+
+def test_friction_that_a_vertex_takes_a_share_of_counts():
+    """Of a free vertex that feels no other force."""
+    rollout = belt(ds.SemiImplicitSolver)
+    frames, mass = rollout.forward(), rollout.scene.inputs.derive(rollout.scene.inputs.values).mass[0]
+    forces = frames["held"] + frames["each"].sum(1)
+    gained = mass * np.diff(frames.velocities[:, 0], axis=0)
+    assert gained == pytest.approx(1e-3 * forces[1:], abs=1e-9 * np.abs(gained).max())  # the law's modulus is 1e-6 Pa
+    assert np.abs(frames["rubbed"]).max() > 0 and np.abs(frames["dragged"]).max() > 0
+
+
+@pytest.mark.parametrize("round_one", [False, True])
+def test_what_faces_feel_counts(round_one):
+    """Of a ball that is smaller than a face, which is felt between corners."""
+    scene = pressed(round_one=round_one, terms=pressed(round_one=round_one).terms[:2])
+    rollout = ds.Rollout(
+        ds.VelocityVerletSolver(scene, dt=1e-3),
+        4,
+        outputs=outputs()[:1] + [ds.ContactForce("floor", name="each", per_vertex=True)],
+    )
+    frames = rollout.forward()
+    p, mass = momentum(scene, frames), scene.inputs.derive(scene.inputs.values).mass.sum()
+    gained = 4e-3 * (frames["held"][1] + mass * np.array([0, -G, 0]))
+    assert p[1] - p[0] == pytest.approx(gained, abs=1e-12 * np.abs(p).max()) and frames["held"][1, 1] > 1
+    assert frames["each"].sum(1) == pytest.approx(frames["held"])
+
+
+@pytest.mark.parametrize("kind", [ds.SemiImplicitSolver, ds.ImplicitEulerSolver])
+def test_a_block_at_rest_on_a_slope(kind):
+    """It presses with m g cos and is held with m g sin, but for what the explicit one's drag takes of its creep."""
+    slope, creep = np.radians(15), 1e-5 if kind is ds.SemiImplicitSolver else 1e-3
+    g = G * np.array([np.sin(slope), -np.cos(slope), 0])
+    floor = ds.Ground(0, stiffness_per_area=1e6, width=0.01, friction=0.5, friction_speed=creep, name="floor")
+    scene = ds.Scene(
+        cube(0.006),
+        ds.StableNeoHookean(2e5, 0.3),
+        1000.0,
+        [ds.Gravity(g), floor],
+        initial_velocities=(0, 0, 0),
+        precision="f64",
+    )
+    explicit = kind is ds.SemiImplicitSolver
+    options = dict(dt=5e-4, contact_damping=1.0) if explicit else dict(dt=0.02, tolerance=1e-8)
+    if explicit:
+        scene = scene.replace(terms=[*scene.terms, ds.Drag(20.0)])
+    steps = 2000 if explicit else 60
+    named = [ds.ContactForce("floor", part, name=part) for part in ("normal", "friction")]
+    frames = ds.Rollout(kind(scene, **options), steps, save_every=steps // 2, outputs=named).forward()
+    frames = ds.Rollout(
+        kind(
+            scene.replace(initial_positions=frames.positions[-1], initial_velocities=frames.velocities[-1]), **options
+        ),
+        4,
+        outputs=named,
+    ).forward()
+    mass = scene.inputs.derive(scene.inputs.values).mass.sum()
+    assert frames["normal"][1] == pytest.approx([0, mass * G * np.cos(slope), 0], rel=1e-4, abs=1e-9)
+    assert frames["friction"][1] == pytest.approx([-mass * G * np.sin(slope), 0, 0], rel=1e-4, abs=1e-4)
+
+
+@pytest.mark.parametrize("case", ["semi f32", "euler f32"])
+def test_single_precision(case):
+    """Of the barrier's force single precision sees gaps of 4 mm to 1e-7 of the body's size, 0.1 m: some 1e-5 of the force,
+    and Newton's method stops there. Gradients agree with those of double precision to 1e-3."""
+    single, double = (rollout_of(name) for name in (case, case.split()[0]))
+    rng, found = np.random.default_rng(4), []
+    for rollout in (single, double):
+        frames = rollout.forward()
+        found.append(frames)
+    assert found[0]["held"] == pytest.approx(found[1]["held"], abs=1e-3 * np.abs(found[1]["held"]).max())
+    seed = rng.normal(size=found[0]["held"].shape)
+    one, two = (rollout.vjp(frames, held=seed) for rollout, frames in zip((single, double), found))
+    for key in KEYS:
+        size = np.abs(two[key]).max()
+        assert np.abs(one[key] - two[key]).max() <= 2e-3 * size, key
+
+
+@lru_cache(maxsize=None)
+def scalar_field():
+    return ti.field(ti.f64, (), needs_grad=True)
+
+
+@pytest.mark.parametrize("case", ["semi", "euler"])
+def test_tape_and_torch_give_the_same_gradients(case):
+    rollout, names = rollout_of(case), ("youngs_modulus", "floor.friction", "floor.stiffness_per_area")
+    frames = rollout.forward()
+    weight = np.random.default_rng(5).normal(size=frames["held"].shape)
+    expected = rollout.vjp(frames, held=weight, positions=np.ones(frames.positions.shape))
+
+    held, x, total = rollout.field("held"), rollout.positions, scalar_field()
+    weights = ti.field(ti.f64, weight.shape)
+    weights.from_numpy(weight)
+
+    @ti.kernel
+    def loss():
+        for f in range(held.shape[0]):
+            for d in ti.static(range(3)):
+                total[None] += weights[f, d] * held[f][d]
+        for f, i in x:
+            for d in ti.static(range(3)):
+                total[None] += x[f, i][d]
+
+    total[None] = 0
+    with ti.ad.Tape(total):
+        rollout.run()
+        loss()
+    tensors = {name: torch.tensor(rollout.values[name], requires_grad=True) for name in names}
+    seen = rollout_frames(rollout, **tensors)
+    ((seen["held"] * torch.from_numpy(weight)).sum() + seen.positions.sum()).backward()
+    for name in names:
+        assert tensors[name].grad.numpy() == pytest.approx(expected[name], rel=1e-8), name
+    with ti.ad.Tape(total):
+        rollout.run()
+        loss()
+    for name in names:
+        assert rollout.gradients[name] == pytest.approx(expected[name], rel=1e-8), name
+
+
+def test_segments_and_a_second_run_change_nothing():
+    """Replayed passes are not counted twice."""
+    scene = pressed()
+    whole, parts = (
+        ds.Rollout(
+            ds.VelocityVerletSolver(scene, dt=1e-3), 6, save_every=2, checkpoint_every=every, outputs=outputs()[:1]
+        )
+        for every in (None, 1)
+    )
+    seed = np.random.default_rng(6).normal(size=(4, 3))
+    first, second = whole.forward(), parts.forward()
+    gradients = [r.vjp(f, held=seed) for r, f in ((whole, first), (parts, second), (parts, second))]
+    again = parts.forward()
+    assert np.array_equal(first["held"], second["held"]) and np.array_equal(again["held"], second["held"])
+    for name in gradients[0]:
+        assert np.array_equal(gradients[0][name], gradients[1][name]), name
+        assert np.array_equal(gradients[1][name], gradients[2][name]), name
+
+
+def test_a_scene_whose_loss_does_not_name_it_pays_nothing():
+    """Its kernels are those of before: none of their arguments is an impulse."""
+    plain, asked = (ds.Rollout(ds.SemiImplicitSolver(pressed(), dt=1e-3), 1, outputs=o) for o in ((), outputs()[0]))
+    for rollout, there in ((plain, False), (asked, True)):
+        rollout.forward()
+        ws = rollout.sweep.workspace
+        kernels = ws.kernels(ws.arrays.features())
+        assert [("impulse" in k.arrays["state"]) for k in (kernels.step, kernels.step_vjp, kernels.step_jvp)] == [
+            there
+        ] * 3
+        assert ("per_frame" in kernels.step.numbers) == there and hasattr(ws.contact, "impulse") == there
+
+
+def test_what_does_not_fit_is_refused():
+    scene = pressed()
+    with pytest.raises(ValueError, match="no obstacle 'roof'; it has 'floor', 'wall'"):
+        ds.Rollout(ds.SemiImplicitSolver(scene, dt=1e-3), 1, outputs=ds.ContactForce("roof"))
+    with pytest.raises(ValueError, match="part must be total, normal or friction, got 'shear'"):
+        ds.ContactForce("floor", "shear")
+    with pytest.raises(ValueError, match="about= or per_vertex=True"):
+        ds.ContactForce("floor", about=(0, 0, 0), per_vertex=True)
+    as_force = ds.Rollout(ds.SemiImplicitSolver(scene, dt=1e-4, contact="force"), 1, outputs=ds.ContactForce("floor"))
+    with pytest.raises(ValueError, match='pass contact="stage"'):
+        as_force.forward()
+    balls = [
+        ds.Sphere((x, -0.06, 0.05), 0.06, stiffness_per_area=3e5, name=f"ball{k}") for k, x in enumerate((0.02, 0.08))
+    ]
+    several = ds.Rollout(ds.SemiImplicitSolver(pressed(terms=balls), dt=1e-4), 1, outputs=ds.ContactForce(balls[1]))
+    with pytest.raises(ValueError, match="2 obstacles reach between the corners of faces"):
+        several.forward()

@@ -1,0 +1,197 @@
+"""Matrices of a scene and its modes, against the same elements assembled in another way, and against closed forms."""
+
+import numpy as np
+import pytest
+from scipy.linalg import eigh
+
+import diffsim_ti as ds
+from diffsim_ti import verify
+
+E, NU, RHO = 3e6, 0.3, 1200.0
+
+
+def strain_displacement(mesh):
+    """(B, V): the textbook's 6 x 12 matrices in Voigt's notation, from the coefficients of N_a = a + b x + c y + d z."""
+    X = mesh.vertices[mesh.tetrahedra]
+    N = np.linalg.inv(np.concatenate([np.ones((len(X), 4, 1)), X], 2))[:, 1:]  # columns: grad N_a
+    B = np.zeros((len(X), 6, 12))
+    for a in range(4):
+        x, y, z = N[:, 0, a], N[:, 1, a], N[:, 2, a]
+        for row, column, value in (
+            (0, 0, x),
+            (1, 1, y),
+            (2, 2, z),
+            (3, 1, z),
+            (3, 2, y),
+            (4, 0, z),
+            (4, 2, x),
+            (5, 0, y),
+            (5, 1, x),
+        ):
+            B[:, row, 3 * a + column] = value
+    return B, np.linalg.det(X[:, 1:] - X[:, :1]) / 6
+
+
+def dense(mesh):
+    """(K, M) of linear elasticity."""
+    B, V = strain_displacement(mesh)
+    mu, lam = E / (2 * (1 + NU)), E * NU / ((1 + NU) * (1 - 2 * NU))
+    C = np.diag([2 * mu] * 3 + [mu] * 3)
+    C[:3, :3] += lam
+    K, m = np.zeros((3 * mesh.num_vertices,) * 2), np.zeros(mesh.num_vertices)
+    for e, tet in enumerate(mesh.tetrahedra):
+        rows = (3 * tet[:, None] + np.arange(3)).ravel()
+        K[np.ix_(rows, rows)] += V[e] * B[e].T @ C @ B[e]
+        m[tet] += RHO * V[e] / 4
+    return K, np.diag(np.repeat(m, 3))
+
+
+def scene_of(mesh, law=ds.StableNeoHookean, **options):
+    return ds.Scene(mesh, law(youngs_modulus=E, poissons_ratio=NU), RHO, **dict(precision="f64") | options)
+
+
+@pytest.mark.parametrize("law", [ds.StableNeoHookean, ds.Corotated, ds.LinearElastic])
+def test_matrices_are_the_textbooks(law):
+    mesh = ds.TetrahedralMesh.create_box(3, size=0.2)
+    scene, (K, M) = scene_of(mesh, law), dense(mesh)
+    assert np.abs(scene.stiffness_matrix().toarray() - K).max() <= 1e-12 * np.abs(K).max()
+    assert np.abs(scene.mass_matrix().toarray() - M).max() <= 1e-14 * M.max()
+
+
+def test_a_free_cube():
+    """Six rigid motions, then the eigenvalues of the dense pencil."""
+    mesh = ds.TetrahedralMesh.create_box(4, size=0.2)
+    found, (K, M) = ds.modes(scene_of(mesh), 14), dense(mesh)
+    values, _ = eigh(K, M)
+    assert np.abs(found.eigenvalues[:6]).max() <= 1e-10 * values[-1]
+    assert found.frequencies[6:] == pytest.approx(np.sqrt(values[6:14]) / (2 * np.pi), rel=1e-8)
+    flat = found.shapes.reshape(14, -1)
+    assert flat @ M @ flat.T == pytest.approx(np.eye(14), abs=1e-9)
+    assert np.abs(K @ flat.T - M @ flat.T * found.eigenvalues).max() <= 1e-9 * np.abs(K).max() * np.abs(flat).max()
+
+
+def test_a_clamped_beam_by_both_eigensolvers():
+    """Of 600 and more unknowns the lowest modes alone are computed."""
+    mesh = ds.TetrahedralMesh.create_box((12, 5, 5), size=(0.4, 0.1, 0.08))
+    scene, (K, M) = scene_of(mesh, fixed="xmin"), dense(mesh)
+    keep = np.setdiff1d(np.arange(mesh.num_vertices), scene.fixed)
+    rows = (3 * keep[:, None] + np.arange(3)).ravel()
+    assert len(rows) > 600
+    values = eigh(K[np.ix_(rows, rows)], M[np.ix_(rows, rows)], eigvals_only=True, subset_by_index=[0, 5])
+    found = ds.modes(scene, 6)
+    assert found.frequencies == pytest.approx(np.sqrt(values) / (2 * np.pi), rel=1e-8)
+    assert not found.shapes[:, scene.fixed].any()
+
+
+def test_scikit_fem_has_the_same_elements():
+    """Its stiffness by its own quadrature; its mass lumped by row sums."""
+    skfem = pytest.importorskip("skfem")
+    from skfem.models.elasticity import lame_parameters, linear_elasticity
+
+    mesh = ds.TetrahedralMesh.create_box(4, size=(0.2, 0.1, 0.15))
+    theirs = skfem.MeshTet(mesh.vertices.T.copy(), mesh.tetrahedra.T.copy())
+    basis = skfem.Basis(theirs, skfem.ElementVector(skfem.ElementTetP1()))
+    K = linear_elasticity(*lame_parameters(E, NU)).assemble(basis).toarray()
+    place = basis.nodal_dofs.T.ravel()  # of unknown 3 i + d
+    K = K[np.ix_(place, place)]
+    assert np.abs(scene_of(mesh).stiffness_matrix().toarray() - K).max() <= 1e-11 * np.abs(K).max()
+    found = ds.modes(scene_of(mesh, fixed="xmin"), 5)
+    keep = np.setdiff1d(np.arange(mesh.num_vertices), mesh.vertex_indices("xmin"))
+    rows = (3 * keep[:, None] + np.arange(3)).ravel()
+    values = eigh(K[np.ix_(rows, rows)], dense(mesh)[1][np.ix_(rows, rows)], eigvals_only=True, subset_by_index=[0, 4])
+    assert found.frequencies == pytest.approx(np.sqrt(values) / (2 * np.pi), rel=1e-8)
+
+
+def bent(mesh):
+    x = mesh.vertices
+    return 0.02 * np.sin(9 * x[:, [1, 2, 0]] + 1) * np.array([1.0, 0.7, -0.8])
+
+
+@pytest.mark.parametrize("volume", ["tetrahedra", "patches"])
+def test_stiffness_is_the_slope_of_forces(volume):
+    """At a bent state; that of patches reaches beyond their tetrahedra."""
+    mesh = ds.TetrahedralMesh.create_box(3, size=0.2)
+    scene = scene_of(mesh, volume=volume)
+    from diffsim_ti.outputs.body_forces import BodyForces
+
+    body, u = BodyForces(scene), bent(mesh)
+    body.load(scene.inputs.values)
+    w, h = np.random.default_rng(0).normal(size=u.shape), 1e-6
+
+    def forces(t):
+        body.place(u + t * w, 0 * u)
+        return body.forces()
+
+    slope = (forces(-h) - forces(h)) / (2 * h)
+    assert (scene.stiffness_matrix(u) @ w.ravel()).reshape(-1, 3) == pytest.approx(
+        slope, abs=1e-7 * np.abs(slope).max()
+    )
+
+
+@pytest.mark.parametrize("state", ["rest", "bent"])
+def test_gradients_of_frequencies_agree_with_differences(state):
+    mesh = ds.TetrahedralMesh.create_box(3, size=(0.3, 0.11, 0.08))
+    scene = scene_of(mesh, fixed="xmin")
+    u = bent(mesh) * (mesh.vertices[:, :1] > 0) if state == "bent" else np.zeros_like(mesh.vertices)
+    found, by, rng = ds.modes(scene, 4, u), np.array([1.0, -0.5, 0.3, 0.2]), np.random.default_rng(3)
+    assert found.groups == [[0], [1], [2], [3]]
+    gradients = found.gradients(by)
+
+    def loss(key, value):
+        if key == "displacements":
+            return by @ ds.modes(scene, 4, value).frequencies
+        if key == "rest_positions":
+            moved = ds.TetrahedralMesh(value, mesh.tetrahedra)
+            fixed = scene.fixed
+            return by @ ds.modes(ds.Scene(moved, scene.material, RHO, fixed=fixed, precision="f64"), 4, u).frequencies
+        if key == "density":
+            return by @ ds.modes(scene.replace(density=value), 4, u).frequencies
+        numbers = dict(youngs_modulus=E, poissons_ratio=NU) | {key: float(value)}
+        return by @ ds.modes(scene.replace(material=ds.StableNeoHookean(**numbers)), 4, u).frequencies
+
+    for key in ("youngs_modulus", "poissons_ratio", "density", "rest_positions", "displacements"):
+        base = u if key == "displacements" else scene.inputs.values[key]
+        scale = 0.01 if base.ndim else 0.1 * float(base)
+        direction = scale * rng.normal(size=base.shape)
+        if key == "displacements":
+            direction[scene.fixed] = 0
+        slope, s = (gradients[key] * direction).sum(), 1e-3 if key == "displacements" else 1e-2
+        coarse, fine = (
+            (loss(key, base + t * direction) - loss(key, base - t * direction)) / (2 * t) for t in (s, s / 2)
+        )
+        assert slope == pytest.approx((4 * fine - coarse) / 3, rel=2e-6), key
+
+
+def test_coinciding_frequencies_have_the_gradient_of_their_mean():
+    """A free cube, whose cells are cut alike about a diagonal of space, has pairs; moduli that differ part them."""
+    mesh = ds.TetrahedralMesh.create_box(3, size=0.1)
+    material = ds.StableNeoHookean(youngs_modulus=np.full(mesh.num_tetrahedra, E), poissons_ratio=NU)
+    scene = ds.Scene(mesh, material, RHO, precision="f64")
+    found = ds.modes(scene, 12)
+    assert found.groups[0] == [0, 1, 2, 3, 4, 5]
+    pairs = [group for group in found.groups if len(group) == 2]
+    assert pairs, found.frequencies
+    by = np.zeros(12)
+    by[pairs[0]] = 0.5
+    direction = E * np.random.default_rng(0).uniform(-1, 1, mesh.num_tetrahedra)
+    slope = (found.gradients(by)["youngs_modulus"] * direction).sum()
+
+    def mean(t):
+        moved = ds.StableNeoHookean(youngs_modulus=E + t * direction, poissons_ratio=NU)
+        return by @ ds.modes(scene.replace(material=moved), 12).frequencies
+
+    differences, _ = verify.central_difference(lambda t: mean(0.1 * t) / 0.1)
+    assert slope == pytest.approx(differences, rel=1e-6)
+    with pytest.raises(ValueError, match="of which only the mean has a gradient"):
+        found.gradients(np.eye(12)[pairs[0][0]])
+
+
+def test_what_does_not_fit_is_refused():
+    scene = scene_of(ds.TetrahedralMesh.create_box(2))
+    for k in (0, 25, 1.5):
+        with pytest.raises(ValueError, match="k must be a whole number of 1 .. 24"):
+            ds.modes(scene, k)
+    with pytest.raises(ValueError, match="of shape"):
+        scene.stiffness_matrix(np.zeros((3, 3)))
+    with pytest.raises(ValueError, match="frequency 0 has no gradient"):
+        ds.modes(scene, 8).gradients(np.ones(8))

@@ -1,0 +1,123 @@
+"""Stress, strain and enclosed volume, as a loss names them."""
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+import diffsim_ti as ds
+from diffsim_ti import verify
+
+POINTS = np.array([[0.02, 0.03, 0.05], [0.15, 0.07, 0.03]])
+
+
+def mesh():
+    return ds.TetrahedralMesh.create_box((3, 2, 2), size=(0.2, 0.1, 0.1))
+
+
+def bent(X):
+    return X + 0.02 * np.sin(11 * X[:, [1, 2, 0]] + 1) * np.array([1.0, 0.7, -0.8])
+
+
+def outputs():
+    return [
+        ds.Stress(),
+        ds.Stress("nodal", at="vertices", principal=True),
+        ds.Stress("piola", at=POINTS, kind="first_piola"),
+        ds.Strain("nodal_strain", at="vertices"),
+        ds.Strain("marked", at=POINTS, principal=True),
+        ds.EnclosedVolume(),
+        ds.ElasticEnergy(),
+        ds.ElasticEnergy([[0, 3, 4], [1, 2]], name="parts"),
+        ds.KineticEnergy(["xmax", "ymin"]),
+    ]
+
+
+@lru_cache(maxsize=None)
+def rollout_of(kind):
+    body = mesh()
+    E = np.linspace(4e4, 8e4, body.num_tetrahedra) if kind == "verlet" else 5e4
+    law = ds.Corotated if kind == "verlet" else ds.StableNeoHookean
+    start = dict(initial_positions=bent(body.vertices)) if kind == "verlet" else {}
+    scene = ds.Scene(body, law(E, 0.3), 900.0, ds.Gravity((3.0, -9.81, 2.0)), "xmin", precision="f64", **start)
+    solver = ds.VelocityVerletSolver(scene, dt=5e-4) if kind == "verlet" else ds.StaticSolver(scene, tolerance=1e-12)
+    return ds.Rollout(solver, 2, save_every=1, outputs=outputs(), gradients="all")
+
+
+def symmetric(seed):
+    return 0.5 * (seed + np.swapaxes(seed, -1, -2))
+
+
+@pytest.mark.parametrize("kind", ["verlet", "static"])
+def test_derivatives(kind):
+    """Seeds are the transpose of tangents, and gradients agree with differences, for each output and input by itself."""
+    rollout, rng = rollout_of(kind), np.random.default_rng(1)
+    frames, gate = rollout.forward(), 1e-11 if kind == "verlet" else 1e-8
+    seeds = {name: rng.normal(size=frames[name].shape) for name in rollout.computed}
+    for seed in seeds.values():
+        seed[0] *= kind == "verlet"  # at rest principal values coincide
+    gradients = {name: rollout.vjp(frames, **{name: seed}) for name, seed in seeds.items()}
+    tangents, directions = {}, {}
+    for key in rollout.inputs:
+        directions[key] = rng.normal(size=rollout.values[key].shape) * verify.input_scale(rollout, key)
+        if key in ("initial_velocities", "initial_positions"):
+            directions[key][rollout.scene.fixed] = 0
+        tangents[key] = rollout.tangents(frames, **{key: directions[key]})
+        for name, seed in seeds.items():
+            terms = tangents[key][name] * seed
+            pushed, pulled = terms.sum(), (gradients[name][key] * directions[key]).sum()
+            assert abs(pushed - pulled) <= gate * max(
+                abs(pushed), np.linalg.norm(terms), 1e-9 * np.abs(frames[name]).max()
+            ), (key, name)
+    keys = ("youngs_modulus", "poissons_ratio", "density", "rest_positions")
+    for key in keys:
+        base, s = rollout.values[key], 1e-4
+        got = [rollout.forward(**{key: base + t * directions[key]}) for t in (s, -s, s / 2, -s / 2)]
+        for name, seed in seeds.items():
+            d = [(got[k][name] * seed).sum() for k in range(4)]
+            difference = (4 * (d[2] - d[3]) / s - (d[0] - d[1]) / (2 * s)) / 3
+            size = np.abs(frames[name]).max()
+            assert (tangents[key][name] * seed).sum() == pytest.approx(difference, rel=1e-6, abs=1e-7 * size), (
+                key,
+                name,
+            )
+
+
+def test_a_homogeneous_stretch_has_its_closed_form():
+    """F = diag(a, b, c), turned: sigma by the law's formula in the turned frame, E = (F^T F - I) / 2, V as det F."""
+    body, (a, b, c), E, nu = mesh(), (1.3, 0.9, 1.1), 5e4, 0.3
+    turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    turn *= np.sign(np.linalg.det(turn))
+    F = turn @ np.diag([a, b, c])
+    scene = ds.Scene(body, ds.StableNeoHookean(E, nu), initial_positions=body.vertices @ F.T, precision="f64")
+    frames = ds.Rollout(ds.VelocityVerletSolver(scene, dt=1e-5), 1, outputs=outputs()).forward()
+    mu, lam, J = E / (2 * (1 + nu)), E * nu / ((1 + nu) * (1 - 2 * nu)), a * b * c
+    own = (
+        mu * (np.array([a, b, c]) ** 2 - 1) + lam * (J - 1) * J
+    ) / J  # psi = mu/2 (I_C - 3) - mu log J + lam/2 (J-1)^2
+    sigma = turn @ np.diag(own) @ turn.T
+    assert frames["stress"][0] == pytest.approx(np.tile(sigma, (body.num_tetrahedra, 1, 1)), rel=1e-9, abs=1e-9 * E)
+    assert frames["nodal"][0] == pytest.approx(np.tile(np.sort(own), (body.num_vertices, 1)), rel=1e-9)
+    assert frames["piola"][0] == pytest.approx(np.tile(J * sigma @ np.linalg.inv(F).T, (2, 1, 1)), abs=1e-9 * E)
+    green = 0.5 * (np.array([a, b, c]) ** 2 - 1)
+    assert frames["nodal_strain"][0] == pytest.approx(np.tile(np.diag(green), (body.num_vertices, 1, 1)), abs=1e-12)
+    assert frames["marked"][0] == pytest.approx(np.tile(np.sort(green), (2, 1)), abs=1e-12)
+    psi = 0.5 * mu * (a**2 + b**2 + c**2 - 3) - mu * np.log(J) + 0.5 * lam * (J - 1) ** 2
+    assert frames["elastic_energy"][0] == pytest.approx(psi * body.volumes.sum(), rel=1e-9)
+    assert frames["volume"][0] == pytest.approx(J * body.volumes.sum(), rel=1e-12)
+
+
+def test_what_does_not_fit_is_refused():
+    scene = ds.Scene(mesh(), ds.StableNeoHookean(5e4, 0.3), volume="patches")
+    solver = ds.SemiImplicitSolver(scene, dt=1e-4)
+    with pytest.raises(ValueError, match='take volume="tetrahedra"'):
+        ds.Rollout(solver, 1, outputs=ds.Stress())
+    ds.Rollout(solver, 1, outputs=ds.Strain())
+    with pytest.raises(ValueError, match="open, or turned two ways, at the edge"):
+        ds.Rollout(solver, 1, outputs=ds.EnclosedVolume(scene.mesh.surface_triangles[1:]))
+    with pytest.raises(ValueError, match='kind must be "cauchy"'):
+        ds.Stress(kind="second")
+    with pytest.raises(ValueError, match="P is not symmetric"):
+        ds.Stress(kind="first_piola", principal=True)
+    with pytest.raises(ValueError, match='at must be "tetrahedra"'):
+        ds.Strain(at="nodes")
