@@ -33,6 +33,7 @@ from diffsim_ti.solvers import (
     stable_dt,
 )
 from diffsim_ti.terms import (
+    BodyForce,
     Box,
     Capsule,
     Cylinder,
@@ -42,8 +43,10 @@ from diffsim_ti.terms import (
     Ground,
     HalfSpace,
     MeshObstacle,
+    Pressure,
     SelfContact,
     Sphere,
+    Traction,
 )
 from diffsim_ti.verify import check_gradients, dot_product_test, taylor_test
 
@@ -60,6 +63,9 @@ __all__ = [
     "Gravity",
     "Drag",
     "ExternalForce",
+    "Traction",
+    "Pressure",
+    "BodyForce",
     "Ground",
     "HalfSpace",
     "Sphere",

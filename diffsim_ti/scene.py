@@ -13,7 +13,7 @@ from diffsim_ti.materials.material import Material
 from diffsim_ti.materials.moduli import youngs_poisson
 from diffsim_ti.materials.patch_law import PatchLaw
 from diffsim_ti.mesh import TetrahedralMesh
-from diffsim_ti.terms import Drag, ExternalForce, Gravity, Obstacle, SelfContact, Term
+from diffsim_ti.terms import Drag, Gravity, Obstacle, Pressure, SelfContact, Term
 from diffsim_ti.terms.motion import Motion, sampled
 from diffsim_ti.terms.obstacles.obstacle import PER_AREA
 
@@ -32,9 +32,9 @@ class Scene:
     mesh: TetrahedralMesh, the rest shape.
     material: a law with its numbers (materials/).
     density [kg/m^3]: one number or one per tetrahedron; vertices carry the lumped mass sum rho V / 4.
-    terms: loads, contacts, damping (terms/), each at most once except contacts. What is not listed costs nothing. Their
-        order means nothing but that of obstacles of one kind, whose forces and frictions act one after the other. Names
-        of terms, each another (Ground(name="floor")), begin the names of their inputs: "floor.stiffness".
+    terms: loads, contacts, damping (terms/); gravity, drag and self-contact at most once. What is not listed costs
+        nothing. Their order means nothing but that of obstacles of one kind, whose forces and frictions act one after
+        the other. Names of terms, each another (Ground(name="floor")), begin the names of their inputs: "floor.stiffness".
     fixed: vertices that do not move freely: a vertex set's name, indices, a Boolean mask or a list of set names.
     motion: displacement of the fixed vertices from where they start: a function of time [s] that returns 3 numbers or
         shape (num_fixed, 3) [m], or keyframes (times, displacements) between which it is linear. Default: held still.
@@ -86,6 +86,8 @@ class Scene:
         self.terms = tuple(copy(t) for t in settled)  # one that is listed twice is two
         self.ordered_terms = tuple(sorted(self.terms, key=_kind))
         self.moving = tuple(t for t in self.ordered_terms if t.path is not None)
+        self.dead_loads = tuple(t for t in self.ordered_terms if t.dead)
+        self.pressures = tuple(t for t in self.ordered_terms if isinstance(t, Pressure))
         self.inputs = Inputs(self, density, initial_positions, initial_velocities)
         self._check_start()
         if volume == "tetrahedra":
@@ -106,7 +108,7 @@ class Scene:
             if not isinstance(term, Term):
                 raise ValueError(f"terms must be diffsim_ti terms such as Gravity(), got {term!r}")
             term.check(self.mesh)
-        for kind in (Gravity, Drag, ExternalForce, SelfContact):
+        for kind in (Gravity, Drag, SelfContact):
             if sum(isinstance(t, kind) for t in self.terms) > 1:
                 raise ValueError(f"a scene takes one {kind.__name__}, got several; add their numbers instead")
         named = [t for t in self.terms if t.name is not None]
@@ -169,6 +171,11 @@ class Scene:
         """Displacement of each moving obstacle at each time [s], by input name, shape (len(times), 3) [m]."""
         names = self.inputs.paths
         return {name: sampled(name, t.path, times, 1)[:, 0] for name, t in zip(names, self.moving)}
+
+    @property
+    def loaded_vertices(self) -> np.ndarray:
+        """Sorted indices of the vertices that dead loads act on."""
+        return np.unique(np.concatenate([np.zeros(0, np.int64), *(t.indices(self.mesh) for t in self.dead_loads)]))
 
     def places(self, time: float) -> dict[Term, np.ndarray]:
         """Displacement of each moving obstacle at a time [s], shape (3,) [m]."""

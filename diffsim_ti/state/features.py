@@ -48,6 +48,9 @@ class Features:
     drag: int = -1
     forces: bool = False
     forces_per_step: bool = False
+    forces_keyed: bool = False  # whether they change within steps
+    pressed: bool = False  # whether passes take follower pressures on triangles
+    pressure_per_step: bool = False
     motion: bool = False
     moving: int = 0  # obstacles that follow a path
     num_parameters: int = 0  # numbers of all terms
@@ -73,7 +76,7 @@ class Features:
     def driven(self) -> bool:
         """Whether something may do work on the body that its energy does not tell. Drag alone only takes some, and
         counting that would cost small scenes a fifth."""
-        return self.forces or self.motion or self.moving > 0
+        return self.forces or self.motion or self.moving > 0 or self.pressed
 
     @property
     def pressing(self) -> tuple[ObstacleGroup, ...]:

@@ -52,9 +52,10 @@ PARTS = {
     "motion": Part("vectors2", _given("motion"), _whole),
     "anchor": Part("vectors", _anchor, _whole),
     "path": Part("vectors2", _given("path"), _whole),
+    "follower": Part("vectors2", _given("follower")),
 }
 TOPOLOGY = dict.fromkeys(("tets", "start", "corner_of", "force_slot", "motion_slot"), "ints")
-TANGENT = {name: part.kind for name, part in PARTS.items()}
+TANGENT = {name: part.kind for name, part in PARTS.items() if name != "follower"}  # which only what is pressed has
 SCENE = TOPOLOGY | TANGENT | dict(inverse_mass="scalars", corner="vectors")  # all that a kernel may read of a scene
 del SCENE["mass"]
 OF_TETRAHEDRA = {name: PARTS[name].kind for name in ("gradients", "volumes", "coefficients")}

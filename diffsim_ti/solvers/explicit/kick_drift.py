@@ -72,9 +72,42 @@ class KickDrift:
         f = self.vector(0)
         k = scene.force_slot[i]
         if k >= 0:
-            f = forces[0, k]
-            if ti.static(self.features.forces_per_step):
-                f = self.half() * (forces[now.force0, k] + forces[now.force1, k])
+            if ti.static(self.features.forces_keyed):
+                f = self.half() * (
+                    self.keyed_force(now.force0, k, now, forces) + self.keyed_force(now.force1, k, now, forces)
+                )
+            else:
+                f = forces[0, k]
+                if ti.static(self.features.forces_per_step):
+                    f = self.half() * (forces[now.force0, k] + forces[now.force1, k])
+        return f
+
+    @ti.func
+    def row_of_step(self, step):
+        """The row of forces that holds in a step."""
+        r = 0
+        if ti.static(self.features.forces_per_step):
+            r = step
+        return r
+
+    @ti.func
+    def share_of_step(self, step, now: A):
+        """How far in a step the pass lies: it ends a step before its own."""
+        return ti.select(step == now.row, now.begin, ti.cast(1, self.fp))
+
+    @ti.func
+    def keyed_force(self, step, k, now: A, forces: A):
+        """The force of a step that changes from its beginning to its end."""
+        begin, end = forces[self.row_of_step(step), 2 * k], forces[self.row_of_step(step), 2 * k + 1]
+        return begin + self.share_of_step(step, now) * (end - begin)
+
+    @ti.func
+    def pressed_force(self, i, scene: A, plan: A):
+        """What pressures do at vertex i, of what it gathers."""
+        f = self.vector(0)
+        for c in range(scene.start[i], scene.start[i + 1]):
+            if scene.corner_of[c] >= plan.first_pressed:
+                f = f + scene.corner[scene.corner_of[c]]
         return f
 
     @ti.func
@@ -133,14 +166,14 @@ class KickDrift:
             if scene.surface[i] > 0:
                 self.obstacles.note(i, u, u_next, now, scene, state)
         if ti.static(self.features.driven):
-            state.work[i] = state.work[i] + self.work(i, u, v, f, u_next, v_next, now, scene)
+            state.work[i] = state.work[i] + self.work(i, u, v, f, u_next, v_next, now, scene, plan)
         if plan.stride > 0:
             state.f[s, i] = f
         state.u[t, i] = u_next
         state.v[t, i] = v_next
 
     @ti.func
-    def work(self, i, u, v, f, u_next, v_next, now: A, scene: A):
+    def work(self, i, u, v, f, u_next, v_next, now: A, scene: A, plan: A):
         """Work [J] done on vertex i in the pass, less what drag takes, for the energy that monitor/energy_balance.py
         follows. What a contact stage does is not in it (contact_stage.py)."""
         done, inverse, load = ti.cast(0, self.fp), scene.inverse_mass[i], self.vector(0)
@@ -150,11 +183,13 @@ class KickDrift:
         _, v_plus = self.kicked(i, v, f, now, scene)
         if ti.static(self.features.forces):
             load = self.force_at(i, now, scene, scene.forces)
+        if ti.static(self.features.pressed):
+            load += self.pressed_force(i, scene, plan)
         own = f - load  # the body's
         if inverse > 0:
             if ti.static(self.features.gravity >= 0):
                 own += self.gravity(scene.parameters) / inverse
-            if ti.static(self.features.forces):
+            if ti.static(self.features.forces or self.features.pressed):
                 done += half * load.dot((pre + post) * (v + v_plus) + (pre * pre - post * post) * inverse * own)
             if ti.static(self.features.drag >= 0):
                 kept = ti.exp(-now.h * scene.parameters[ti.static(self.features.drag)])
@@ -288,7 +323,12 @@ class KickDrift:
     def force_at_vjp(self, i, f_adj, now: A, scene: A, adjoint: A):
         k = scene.force_slot[i]
         if k >= 0:
-            if ti.static(self.features.forces_per_step):
+            if ti.static(self.features.forces_keyed):
+                for step in ti.static((now.force0, now.force1)):
+                    r, share, half = self.row_of_step(step), self.share_of_step(step, now), self.half()
+                    adjoint.forces[r, 2 * k] = adjoint.forces[r, 2 * k] + half * (1 - share) * f_adj
+                    adjoint.forces[r, 2 * k + 1] = adjoint.forces[r, 2 * k + 1] + half * share * f_adj
+            elif ti.static(self.features.forces_per_step):
                 adjoint.forces[now.force0, k] = adjoint.forces[now.force0, k] + self.half() * f_adj
                 adjoint.forces[now.force1, k] = adjoint.forces[now.force1, k] + self.half() * f_adj
             else:

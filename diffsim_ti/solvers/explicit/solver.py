@@ -11,6 +11,7 @@ from diffsim_ti import runtime
 from diffsim_ti.contact.surface_pairs import Tunnelling
 from diffsim_ti.inputs import Derived
 from diffsim_ti.monitor.energy_balance import EnergyBalance
+from diffsim_ti.potential.follower_pressure import FollowerPressure
 from diffsim_ti.potential.way import Way
 from diffsim_ti.solvers.explicit.adjoint import ExplicitAdjoint, ExplicitTangent
 from diffsim_ti.solvers.explicit.contact_stage import ROWS
@@ -19,7 +20,7 @@ from diffsim_ti.solvers.explicit.kernels import ExplicitKernels, explicit_kernel
 from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.state.schedule import PassTable
 from diffsim_ti.state.workspace import Workspace
-from diffsim_ti.terms import ExternalForce, SelfContact
+from diffsim_ti.terms import SelfContact
 
 
 @dataclass(frozen=True)
@@ -160,12 +161,17 @@ class ExplicitWorkspace(Workspace):
 
     def loads_at(self, j: int, num_passes: int) -> np.ndarray:
         """External forces [N] on each vertex, as pass j of a run takes them."""
-        rows, out = self.arrays.rows["forces"], np.zeros((self.arrays.num_vertices, 3))
-        if rows is not None:
-            weights = self.solver.weights(np.array([j]), num_passes, self.rate)
-            at = [int(np.ravel(self.solver.schedule.row(j - lag))[0]) for lag in (weights.lag0, weights.lag1)]
-            force = 0.5 * sum(rows[min(row, len(rows) - 1)] for row in at)
-            out[self.scene.term(ExternalForce).indices(self.scene.mesh)] = force
+        a, schedule, out = self.arrays, self.solver.schedule, np.zeros((self.arrays.num_vertices, 3))
+        weights = self.solver.weights(np.array([j]), num_passes, self.rate)
+        lags = [int(np.ravel(lag)[0]) for lag in (weights.lag0, weights.lag1)]
+        kicks = [(j - lag, schedule.end(j - lag) if lag else schedule.begin(j)) for lag in lags]
+        if a.rows["forces"] is not None:
+            keyed = a.features().forces_keyed
+            out[self.scene.loaded_vertices] = 0.5 * sum(schedule.load(a.rows["forces"], *k, keyed) for k in kicks)
+        if a.pressures:
+            p = 0.5 * sum(schedule.pressure(a.rows["follower"], *k) for k in kicks)
+            x = a.values.rest + runtime.fetch_row(self.state.u, 0)
+            out += FollowerPressure(a.pressed_triangles, a.load_of, a.num_vertices).at(p).forces(x)
         return out
 
     def kernels(self, features) -> ExplicitKernels:
@@ -185,9 +191,11 @@ class ExplicitWorkspace(Workspace):
         """
         a, solver = self.arrays, self.solver
         num_rows = max((len(x) for x in (a.values.path, a.values.motion) if x is not None), default=1)
+        if num_rows == 1 and (a.pressures or a.features().forces_keyed):  # they ask in which step a pass lies
+            num_rows = max(1 + len(x) for x in (a.values.forces, a.values.follower) if x is not None)
         run = num_passes, num_rows, save_every, self.rate, solver.schedule
         turn, sizes = -1 if backwards else 1, dict(num_items=a.num_items, num_vertices=a.num_vertices)
-        sizes["contact_damping"] = solver.contact_damping
+        sizes |= dict(contact_damping=solver.contact_damping, num_pressed=a.num_pressed, first_pressed=a.first_pressed)
         for window, begin, end in self.table.windows(first, last)[::turn]:
             self.table.show(window, run, lambda first, last: solver.pass_table(first, last, *run[:4]))
             number = -(-(end - begin) // most)

@@ -13,13 +13,15 @@ from diffsim_ti.inputs import Derived
 from diffsim_ti.potential.face_kernels import face_kernels
 from diffsim_ti.potential.face_lattice import rest_of_areas
 from diffsim_ti.potential.kernels import potential_kernels
-from diffsim_ti.solvers.implicit.linear import Operator, solve_symmetric
+from diffsim_ti.solvers.implicit.linear import Operator, solve
 from diffsim_ti.solvers.implicit.threads import one_blas_thread
 from diffsim_ti.state.numbers import Adjoint, Tangent
 
 
 class _Passes:
     """What tangent and reverse sweep share: a recorded pass with everything that its equation names."""
+
+    transposed = False  # whether equations are solved with the transposed operator
 
     def __init__(self, workspace):
         self.ws = workspace
@@ -38,18 +40,19 @@ class _Passes:
         ws.begin(j, stage, self.u, self.x)
         ws.potential.hold(ws.record, j - base)
         ws.potential.place(self.u_star)
-        self.operator = Operator(ws.potential, self.mass, ws.free)
+        self.operator = Operator(ws.potential, self.mass, ws.free, ws.follower, self.transposed)
+        self.places = ws.arrays.values.rest + ws.potential.held_at
         self._preconditioner = None
 
     def solve(self, b: np.ndarray) -> np.ndarray:
-        """A^-1 b on the free vertices, zero elsewhere."""
+        """A^-1 b, or A^-T b, on the free vertices, zero elsewhere."""
         b = b * self.ws.free
         if not b.any():
             return b
         if self._preconditioner is None:
             self._preconditioner, _ = self.ws.preconditioner(self.mass)
             self._preconditioner.update(self.u_star)
-        return solve_symmetric(self.operator, b, self._preconditioner, self.tolerance, self.eps, 20 * len(b))
+        return solve(self.operator, b, self._preconditioner, self.tolerance, self.eps, 20 * len(b))
 
     def weight(self, share: float) -> np.ndarray:
         """dR/dm of each vertex [m/s^2]: gravity less the acceleration."""
@@ -69,6 +72,8 @@ class ImplicitAdjoint(_Passes):
 
     density, shape: also the adjoints by vertex masses and by the rest shape, which cost extra.
     """
+
+    transposed = True
 
     def __init__(self, workspace, density: bool, shape: bool):
         super().__init__(workspace)
@@ -110,6 +115,8 @@ class ImplicitAdjoint(_Passes):
         self.p, self.q = self.frames[0][-1].copy(), self.frames[1][-1].copy()
         self.pending = [np.zeros_like(self.p), np.zeros_like(self.p)]
         self.mass_adj, self.gravity, self.rate = np.zeros(len(self.p)), np.zeros(3), 0.0
+        self.pressure = None if a.values.follower is None else np.zeros_like(a.values.follower)
+        self.rest_by_pressure = np.zeros_like(self.p)
         self.forces = None if a.values.forces is None else np.zeros_like(a.values.forces)
         self.motion = None if a.values.motion is None else np.zeros_like(a.values.motion)
         self.path = None if a.values.path is None else np.zeros_like(a.values.path)
@@ -155,11 +162,16 @@ class ImplicitAdjoint(_Passes):
         if ws.potential.faces:
             reaction = reaction + self._vjp_of_faces()
         share = ws.load_share(j, s)
+        if self.pressure is not None:
+            by_place = ws.follower.vjp(self.places, by_star)
+            reaction, self.rest_by_pressure = reaction + by_place, self.rest_by_pressure + by_place
+            felt = share * ws.follower.pressures_vjp(self.places, by_star)
+            ws.solver.schedule.add_pressure(self.pressure, j, ws.share_at_stage(j, s), felt)
         self.gravity += share * (ws.mass * by_star).sum(0)
         self.mass_adj += (by_star * self.weight(share)).sum(1)
         if self.forces is not None:
-            row = ws.solver.schedule.row(j) if len(self.forces) > 1 else 0
-            self.forces[row] += share * by_star[ws.force_vertices()]
+            felt, keyed = share * by_star[ws.force_vertices], ws.scene.inputs.keyed_forces
+            ws.solver.schedule.add_load(self.forces, j, ws.share_at_stage(j, s), keyed, felt)
         # where inertia starts from
         inertial = self.mass * by_star
         x_adj = inertial - s.e0 / s.gamma * q_free
@@ -230,8 +242,8 @@ class ImplicitAdjoint(_Passes):
         if self.ws.potential.faces and features.areas:
             by_areas = runtime.fetch(self.face_areas).astype(np.float64)
             rest = rest + rest_of_areas(a.mesh, a.values.rest, by_areas)
-        out.rest = rest + out.rest
-        out.forces, out.motion, out.path = self.forces, self.motion, self.path
+        out.rest = rest + self.rest_by_pressure + out.rest
+        out.forces, out.motion, out.path, out.follower = self.forces, self.motion, self.path, self.pressure
         if self.motion is not None:
             out.displacement[a.fixed] += self.anchor
         return out
@@ -303,9 +315,10 @@ class ImplicitTangent(_Passes):
             dR += self._jvp_of_faces()
         if a.features().gravity >= 0:
             dR += share * ws.mass * tangent.parameters[a.features().gravity :][:3]
-        if tangent.forces is not None:
-            row = ws.solver.schedule.row(j) if len(tangent.forces) > 1 else 0
-            dR[ws.force_vertices()] += share * tangent.forces[row]
+        dR += ws.given_forces(tangent.forces, j, s)
+        if tangent.follower is not None:
+            dp = share * ws.solver.schedule.pressure(tangent.follower, j, ws.share_at_stage(j, s))
+            dR += ws.follower.jvp(self.places, held + tangent.rest, dp)
         d_star = held + self.solve(dR + self.mass * (dx + s.gamma * dy))
         before = self.du, self.dv
         self.du = s.c0 * d_star + (1 - s.c0) * self.du

@@ -1,6 +1,7 @@
 """A run of an implicit solver: its passes, what they are told of obstacles, motion and loads."""
 
 import weakref
+from functools import cached_property
 
 import numpy as np
 
@@ -9,6 +10,7 @@ from diffsim_ti.contact.implicit_pairs import ImplicitPairs
 from diffsim_ti.contact.surface_pairs import Tunnelling
 from diffsim_ti.inputs import Derived
 from diffsim_ti.monitor.energy_watch import EnergyWatch
+from diffsim_ti.potential.follower_pressure import FollowerPressure, is_symmetric
 from diffsim_ti.potential.potential import Potential
 from diffsim_ti.potential.way import Way
 from diffsim_ti.solvers.implicit.approach import Approach
@@ -60,10 +62,22 @@ class ImplicitWorkspace(ObstacleWays, Workspace):
         tolerance, rounds = self.solver.tolerance, self.solver.max_iterations
         me = weakref.proxy(self)  # no circle: a dropped run gives its memory back at once
         way, preconditioner = (lambda *step: me.way_past_obstacles(*step)), (lambda mass: me.preconditioner(mass))
-        self.newton = Newton(self.potential, self.free, way, preconditioner, tolerance, rounds, eps)
+        self.follower = self._follower()
+        self.newton = Newton(self.potential, self.free, way, preconditioner, tolerance, rounds, eps, self.follower)
         self._preconditioners = {}
         self.way, self.approach = Way(self.arrays, self.parallel), Approach(self)
         self.check_apart()
+
+    def _follower(self) -> FollowerPressure | None:
+        """The scene's pressures."""
+        scene = self.scene
+        if not scene.pressures:
+            return None
+        triangles = [term.triangles(scene.mesh) for term in scene.pressures]
+        load_of = np.repeat(np.arange(len(triangles)), [len(rows) for rows in triangles])
+        triangles, free = np.concatenate(triangles), self.free[:, :, None] * np.eye(3)
+        symmetric = is_symmetric(triangles, load_of, free, self.arrays.values.rest)
+        return FollowerPressure(triangles, load_of, scene.mesh.num_vertices, symmetric)
 
     def restart(self) -> None:
         super().restart()
@@ -256,6 +270,10 @@ class ImplicitWorkspace(ObstacleWays, Workspace):
         self._walls = self.walls(self.arrays.rows["path"], j, stage)
         self.walls_at_stage, self.walls_before = self._walls[::3].copy(), self._walls[1::3].copy()
         self.potential.begin(u, x, 1 / stage.gamma, self._walls)
+        if self.follower is not None:
+            share = self.share_at_stage(j, stage)
+            p = self.solver.schedule.pressure(self.arrays.rows["follower"], j, share)
+            self.follower.at(self.load_share(j, stage) * p)
 
     def walls(self, path: np.ndarray | None, j: int, stage: Stage) -> np.ndarray:
         """Three rows for each obstacle: displacement where forces are taken, displacement before, velocity."""
@@ -263,14 +281,14 @@ class ImplicitWorkspace(ObstacleWays, Workspace):
         out = np.zeros((3 * len(obstacles), 3))
         if path is not None:
             before = schedule.place(path, j, schedule.begin(j))
-            at_stage = schedule.place(path, j, self._share_at_stage(j, stage))
+            at_stage = schedule.place(path, j, self.share_at_stage(j, stage))
             speed = schedule.rate(path, j)
             for k, (_, _, column) in enumerate(obstacles):
                 if column >= 0:
                     out[3 * k : 3 * k + 3] = at_stage[column], before[column], speed[column]
         return out
 
-    def _share_at_stage(self, j: int, stage: Stage) -> float:
+    def share_at_stage(self, j: int, stage: Stage) -> float:
         """Share of the step at which pass j takes its forces."""
         schedule = self.solver.schedule
         return schedule.begin(j) + (schedule.end(j) - schedule.begin(j)) / stage.c0
@@ -282,7 +300,7 @@ class ImplicitWorkspace(ObstacleWays, Workspace):
             if column >= 0:
                 by_stage, by_before, by_speed = walls_adj[3 * k : 3 * k + 3]
                 rows = path_adj[:, column]
-                schedule.add_place(rows, j, self._share_at_stage(j, stage), by_stage)
+                schedule.add_place(rows, j, self.share_at_stage(j, stage), by_stage)
                 schedule.add_place(rows, j, schedule.begin(j), by_before)
                 schedule.add_rate(rows, j, by_speed)
 
@@ -303,11 +321,19 @@ class ImplicitWorkspace(ObstacleWays, Workspace):
         out = np.zeros_like(values.displacement)
         if features.gravity >= 0:
             out += self.mass * values.parameters[features.gravity :][:3]
-        forces = self.arrays.rows["forces"]
-        if forces is not None:
-            row = self.solver.schedule.row(j) if len(forces) > 1 else 0
-            out[self.force_vertices()] += forces[row]
+        out = self._add_forces(self.arrays.rows["forces"], out, j, stage)
         return out * self.load_share(j, stage)
+
+    def _add_forces(self, rows: np.ndarray | None, out: np.ndarray, j: int, stage: Stage) -> np.ndarray:
+        if rows is not None:
+            share, keyed = self.share_at_stage(j, stage), self.scene.inputs.keyed_forces
+            out[self.force_vertices] += self.solver.schedule.load(rows, j, share, keyed)
+        return out
+
+    def given_forces(self, rows: np.ndarray | None, j: int, stage: Stage) -> np.ndarray:
+        """Given forces on each vertex in pass j [N], from rows of them or of their tangent, without weight."""
+        out = np.zeros_like(self.arrays.values.displacement)
+        return self._add_forces(rows, out, j, stage) * self.load_share(j, stage)
 
     def load_share(self, j: int, stage: Stage) -> float:
         """Share of the loads in pass j."""
@@ -315,8 +341,7 @@ class ImplicitWorkspace(ObstacleWays, Workspace):
             return 1.0
         return min(1.0, (j + 1) / self.solver.substeps)
 
+    @cached_property
     def force_vertices(self) -> np.ndarray:
-        """Vertices that external forces act on."""
-        from diffsim_ti.terms import ExternalForce
-
-        return self.scene.term(ExternalForce).indices(self.scene.mesh)
+        """Vertices that given forces act on."""
+        return self.scene.loaded_vertices
