@@ -2,8 +2,8 @@
 
     Phi(u) = c/2 sum_i m_i |u_i - a_i|^2 + E(u) - sum_i b_i . u_i - W(u),    R = -dPhi/du
 
-W: work of follower pressures. Where an open surface leaves them without a potential, only R is there: then |R| takes the
-place of Phi in the search, and directions come from GMRES.
+W: work of follower pressures. Where an open surface leaves them without a potential there is no Phi, but R: directions come
+from GMRES, and a step is taken that lowers |R| or, in the first rounds, along which -R does negative work.
 a: where inertia alone would lead [m]; b: dead loads [N]; c = 1 / gamma^2 [1/s^2], zero for statics. Directions come from
 conjugate gradients on the exact Hessian. Where that is met to be indefinite they stop with what they have (buckling needs
 that), or, if that is early, each tetrahedron's d2psi/dF2 is made positive definite and the direction computed anew (crushed
@@ -57,6 +57,7 @@ class Newton:
     inexact = 1e-3
     roughly = 0.03
     patience = 6  # times as many rounds as asked for, at most, where obstacles cut directions short
+    by_work = 30  # rounds in which work may stand for a potential that is not there: beyond them it might lead in circles
     shortest = 2.0**-40  # fraction of a direction below which a line search gives up
 
     def __init__(
@@ -210,7 +211,9 @@ class Newton:
         while fraction > self.shortest:
             trial, after, change, noise = self._try(u, fraction * d, before, self.upright and fraction > self.insist)
             if self.by_residual:
-                lower = np.isfinite(change) and self._residual_falls(trial, R, fraction)
+                early = len(self.report.residuals) <= self.by_work and slope > 0
+                lower = early and change <= -1e-4 * fraction * slope
+                lower = lower or (np.isfinite(change) and self._residual_falls(trial, R, fraction))
             else:
                 drowned = abs(slope) * fraction <= noise >= change
                 lower = change <= -1e-4 * fraction * slope or (drowned and self._falls(trial, d, slope))
