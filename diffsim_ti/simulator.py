@@ -136,7 +136,7 @@ class Simulator:
                     raise ValueError(f"{name}: expected shape {shape}, got {value.shape}")
                 value = value - origin
                 if name == "velocities":
-                    value[self.scene.fixed] = 0
+                    value = self.scene.supports.free(value)
                 runtime.fill(target, value[None])
         self.workspace.forget()
 

@@ -32,9 +32,11 @@ class Derived:
     volumes: np.ndarray  # (num_tetrahedra,) [m^3]
     surface: np.ndarray | None = None  # (num_vertices,) of the surface, 0 within [m^2]
     forces: np.ndarray | None = None  # (1 or steps, k, 3), or (1 or steps, 2 k, 3) as each step begins and ends [N]
-    motion: np.ndarray | None = None  # (steps + 1, num_fixed, 3) [m]
+    motion: np.ndarray | None = None  # (steps + 1, num_held, 3) [m]
     path: np.ndarray | None = None  # displacements of obstacles, (steps + 1, num_moving, 3) [m]
-    follower: np.ndarray | None = None  # pressures of loads as each step begins and ends, and 0, (1 or steps, loads, 3) [Pa]
+    follower: np.ndarray | None = (
+        None  # pressures of loads as each step begins and ends, and 0, (1 or steps, loads, 3) [Pa]
+    )
 
     def zeros(self) -> "Derived":
         """The same shapes, all zero."""
@@ -102,7 +104,7 @@ class Inputs:
         """What stands at the end of the list: the rest shape, whose gradient costs extra, and the prescribed motion."""
         out = [Input("rest_positions", self.mesh.vertices, (("vertices", 3),), "m", change=length)]
         if self.scene.motion is not None:
-            shape = ("steps + 1", len(self.scene.fixed), 3)
+            shape = ("steps + 1", len(self.scene.held), 3)
             out.append(Input("prescribed_motion", None, (shape,), "m", change=length))
         return out
 
@@ -112,7 +114,7 @@ class Inputs:
         out = [
             links.RestShape(mesh.tetrahedra),
             links.Displacement(),
-            links.FreeVelocity(scene.fixed),
+            links.FreeVelocity(scene.supports.free),
             links.LumpedMass(mesh.tetrahedra, mesh.num_vertices),
             *scene.material.links(),
         ]

@@ -56,7 +56,8 @@ class SceneArrays:
         self.num_items = self.num_blocks if self.in_lanes else self.num_places
         self.num_vertices, self.num_tetrahedra = mesh.num_vertices, mesh.num_tetrahedra
         self.contacts = tuple(t for t in scene.ordered_terms if t.acts_on_surface)
-        self.fixed, self.feels_faces = scene.fixed, feels_faces
+        self.fixed, self.held, self.feels_faces = scene.fixed, scene.held, feels_faces
+        self.supports = scene.supports
         self.pressures = scene.pressures if presses else ()  # that gather with the tetrahedra's corners
         self.mesh, self.precision, self.self_contact = mesh, precision, scene.term(SelfContact)
         self._upload_topology(scene)
@@ -72,6 +73,7 @@ class SceneArrays:
             forces_keyed=scene.inputs.keyed_forces,
             pressed=bool(self.pressures),
             motion=scene.motion is not None,
+            guided=bool(len(scene.supports.guided)),
             num_parameters=rows.total,
         )
         self.offsets = runtime.array(
@@ -122,7 +124,10 @@ class SceneArrays:
         if scene.dead_loads:
             self.force_slot = runtime.upload(slots(scene.loaded_vertices, n), ti.i32)
         if scene.motion is not None:
-            self.motion_slot = runtime.upload(slots(scene.fixed, n), ti.i32)
+            self.motion_slot = runtime.upload(slots(scene.held, n), ti.i32)
+        if len(scene.supports.guided):
+            self.guide_slot = runtime.upload(slots(scene.supports.guided, n), ti.i32)
+            self.guides = runtime.upload(scene.supports.guides.reshape(-1, 3), self.vector)
 
     def _twins(self, scene) -> list[tuple]:
         """(compile-time twin, first parameter, column of the path or -1) of the obstacles; their tables stand behind the

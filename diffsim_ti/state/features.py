@@ -52,6 +52,7 @@ class Features:
     pressed: bool = False  # whether passes take follower pressures on triangles
     pressure_per_step: bool = False
     motion: bool = False
+    guided: bool = False  # whether vertices are held in some directions alone
     moving: int = 0  # obstacles that follow a path
     num_parameters: int = 0  # numbers of all terms
     uniform: bool = True  # one set of coefficients for all tetrahedra

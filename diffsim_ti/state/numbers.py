@@ -29,7 +29,7 @@ def _given(name: str) -> Callable:
 
 
 def _anchor(arrays, derived):
-    return None if derived.motion is None else derived.displacement[arrays.fixed]
+    return None if derived.motion is None else derived.displacement[arrays.held]
 
 
 def _whole(arrays, x):
@@ -129,5 +129,5 @@ class Adjoint:
             if name in PARTS and not missing:
                 setattr(out, name, PARTS[name].unpack(a, runtime.fetch(getattr(self, name))))
         if "anchor" in self._names and out.motion is not None:
-            out.displacement[a.fixed] += runtime.fetch(self.anchor)
+            out.displacement[a.held] += runtime.fetch(self.anchor)
         return out

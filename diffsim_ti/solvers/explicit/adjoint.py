@@ -148,7 +148,7 @@ class ExplicitAdjoint:
             copy_slot(self.v, 0, self.whole.v, 0)
         self._gather(self.whole)
         u, v = (runtime.fetch(x)[0].astype(np.float64) for x in (self.whole.u, self.whole.v))
-        v[self.ws.arrays.fixed] = 0
+        v = self.ws.arrays.supports.free(v)
         return float(np.linalg.norm(u)), float(np.linalg.norm(v))
 
     def scale(self, factor: float) -> None:

@@ -8,6 +8,7 @@ import taichi as ti
 from diffsim_ti.elements.pressed_triangle import PRESSED, PressedTriangle
 from diffsim_ti.elements.tetrahedron import Onwards
 from diffsim_ti.runtime import Kernel, let, traced
+from diffsim_ti.solvers.explicit.guides import GUIDED
 from diffsim_ti.solvers.explicit.kick_drift import KickDrift
 from diffsim_ti.state.numbers import ADJOINT, OF_STEPS, SCENE, TANGENT, with_state
 from diffsim_ti.state.schedule import pass_at, reversed_pass
@@ -271,6 +272,7 @@ class ExplicitKernels:
 
     def _kernel(self, name: str, body, arrays: dict, repeated: bool, **numbers) -> Kernel:
         scene, counted = (SCENE | PRESSED, ("num_pressed", "first_pressed")) if self.pressed else (SCENE, ())
+        scene = scene | GUIDED if self.vertex.features.guided else scene
         arrays, numbers = (
             dict(scene=scene) | arrays | dict(table=PLAN),
             NUMBERS | dict.fromkeys(counted, "int") | numbers,

@@ -57,7 +57,9 @@ class Newton:
     inexact = 1e-3
     roughly = 0.03
     patience = 6  # times as many rounds as asked for, at most, where obstacles cut directions short
-    by_work = 30  # rounds in which work may stand for a potential that is not there: beyond them it might lead in circles
+    by_work = (
+        30  # rounds in which work may stand for a potential that is not there: beyond them it might lead in circles
+    )
     shortest = 2.0**-40  # fraction of a direction below which a line search gives up
 
     def __init__(
