@@ -131,3 +131,39 @@ def _normal(mesh: TetrahedralMesh, name: str) -> np.ndarray:
             "directions, or name flat parts of it"
         )
     return mean
+
+
+def rigid_motions_left(places: np.ndarray, held: np.ndarray) -> str:
+    """The rigid motions that supports at places [m], shape (k, 3), with projectors onto what is held leave, in words; ""
+    if none. Motions are t + w x (x - middle): those that no held direction feels.
+    """
+    middle = places.mean(0) if len(places) else np.zeros(3)
+    arms = places - middle
+    size = float(np.abs(arms).max(initial=0.0)) or 1.0
+    across = np.cross(np.eye(3)[None], arms[:, None] / size)  # rows e_d x arm
+    motions = np.concatenate([np.tile(np.eye(3), (len(places), 1, 1)), across], 1)  # (k, 6, 3)
+    felt = np.concatenate([np.zeros((6, 6)), np.einsum("kij,kmj->kim", held, motions).reshape(-1, 6)])
+    _, sizes, V = np.linalg.svd(felt, full_matrices=False)
+    left = V[sizes <= 1e-8 * max(sizes.max(), 1.0)]
+    turning = np.linalg.matrix_rank(left[:, 3:], tol=1e-6) if len(left) else 0
+    shifting = len(left) - turning
+    if not len(left):
+        return ""
+    counts = [(shifting, "translation"), (turning, "rotation")]
+    words = ", ".join(f"{n} {word}{'s' * int(n > 1)}" for n, word in counts if n)
+    shifts, turns = _spanned(left[:, :3][np.linalg.norm(left[:, 3:], axis=1) < 1e-6]), _spanned(left[:, 3:])
+    along = [f"along {shifts}"] * (0 < shifting < 3 and bool(shifts)) + [f"about {turns}"] * (0 < turning < 3)
+    if len(left) == 6:
+        return "6 rigid modes: 3 translations, 3 rotations"
+    return f"{words}{': ' * bool(along)}{', '.join(along)}"
+
+
+def _spanned(vectors: np.ndarray) -> str:
+    """A basis of what vectors span, in words."""
+    _, sizes, V = np.linalg.svd(vectors.reshape(-1, 3), full_matrices=False)
+    basis = V[sizes > 1e-6]
+    projector = basis.T @ basis
+    axes = [axis for axis, d in AXES.items() if abs(projector[d, d] - 1) < 1e-9]
+    if len(axes) == len(basis):
+        return " and ".join(axes)
+    return " and ".join("(" + ", ".join(f"{c:.3g}" for c in row) + ")" for row in basis)

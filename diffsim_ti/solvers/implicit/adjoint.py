@@ -120,7 +120,7 @@ class ImplicitAdjoint(_Passes):
         self.forces = None if a.values.forces is None else np.zeros_like(a.values.forces)
         self.motion = None if a.values.motion is None else np.zeros_like(a.values.motion)
         self.path = None if a.values.path is None else np.zeros_like(a.values.path)
-        self.anchor = np.zeros((len(a.fixed), 3))
+        self.anchor = np.zeros((len(a.held), 3))
 
     @one_blas_thread
     def reverse(
@@ -146,7 +146,7 @@ class ImplicitAdjoint(_Passes):
         self.p = self.p + runtime.fetch_row(self._law.y, 0)
 
     def _pull_back(self, j: int) -> None:
-        ws, s, p, q, fixed = self.ws, self.stage, self.p, self.q, self.ws.arrays.fixed
+        ws, s, p, q, held = self.ws, self.stage, self.p, self.q, self.ws.arrays.held
         if s.static:
             q = np.zeros_like(q)
         p_free, q_free = p * ws.free, q * ws.free
@@ -189,22 +189,24 @@ class ImplicitAdjoint(_Passes):
         u_adj = s.a0 * x_adj + (1 - s.c0) * p_free + by_lag
         v_adj = s.b0 * y_adj
         # prescribed places
-        if len(fixed):
-            self._pull_back_fixed(j, p, q, reaction, u_adj, v_adj)
+        if len(held):
+            self._pull_back_held(j, p, q, reaction, u_adj, v_adj)
         self.p, self.q = u_adj + self.pending[0], v_adj + self.pending[1]
         self.pending = [s.a1 * x_adj, s.b1 * y_adj] if self.before is not None else [0 * x_adj, 0 * y_adj]
 
-    def _pull_back_fixed(self, j, p, q, reaction, u_adj, v_adj) -> None:
-        fixed, s = self.ws.arrays.fixed, self.stage
-        pull = reaction[fixed]
+    def _pull_back_held(self, j, p, q, reaction, u_adj, v_adj) -> None:
+        """Adds what comes by the held parts, of which nothing is in u_adj and v_adj of the equation."""
+        ws, held, s = self.ws, self.ws.arrays.held, self.stage
+        pull, p, q = (ws.of_held(x[held]) for x in (reaction, p, q))
         if self.motion is None:
-            u_adj[fixed], v_adj[fixed] = p[fixed] + pull, q[fixed]
+            u_adj[held] += p + pull
+            v_adj[held] += q
             return
-        schedule = self.ws.solver.schedule
-        place = p[fixed] + pull / s.c0
-        u_adj[fixed], v_adj[fixed] = (1 - 1 / s.c0) * pull, 0.0
+        schedule = ws.solver.schedule
+        place = p + pull / s.c0
+        u_adj[held] += (1 - 1 / s.c0) * pull
         schedule.add_place(self.motion, j, schedule.end(j), place)
-        schedule.add_rate(self.motion, j, q[fixed])
+        schedule.add_rate(self.motion, j, q)
         self.anchor += place
 
     def reverse_kick(self, j: int, base: int, num_passes: int) -> None:
@@ -218,7 +220,7 @@ class ImplicitAdjoint(_Passes):
 
         Held vertices have no velocity.
         """
-        q = np.delete(self.q, self.ws.arrays.fixed, axis=0)
+        q = self.ws.arrays.supports.free(self.q)
         return float(np.linalg.norm(self.p)), float(np.linalg.norm(q))
 
     def scale(self, factor: float) -> None:
@@ -245,7 +247,7 @@ class ImplicitAdjoint(_Passes):
         out.rest = rest + self.rest_by_pressure + out.rest
         out.forces, out.motion, out.path, out.follower = self.forces, self.motion, self.path, self.pressure
         if self.motion is not None:
-            out.displacement[a.fixed] += self.anchor
+            out.displacement[a.held] += self.anchor
         return out
 
 
@@ -292,8 +294,8 @@ class ImplicitTangent(_Passes):
             dx = dx + s.a1 * self.tangent_before[0]
             dy = dy + s.b1 * self.tangent_before[1] + db1 * self.before[1]
         place, speed = ws.prescribed(j, tangent)
-        held = np.zeros_like(self.du)
-        held[a.fixed] = self.du[a.fixed] if place is None else self.du[a.fixed] + (place - self.du[a.fixed]) / s.c0
+        now = self.du[a.held]
+        held = ws.with_held(np.zeros_like(self.du), now if place is None else now + (place - now) / s.c0)
         runtime.fill(ws.potential.w, held[None])
         if ws.potential.has_friction:
             runtime.fill(self.lag, np.stack([self.du, dx]))
@@ -323,7 +325,8 @@ class ImplicitTangent(_Passes):
         before = self.du, self.dv
         self.du = s.c0 * d_star + (1 - s.c0) * self.du
         self.dv = s.e0 * (d_star - dx) / s.gamma + s.e1 * dy + de0 * self.v_star + de1 * self.y
-        self.du[a.fixed], self.dv[a.fixed] = (x[a.fixed] for x in before) if place is None else (place, speed)
+        place, speed = (x[a.held] for x in before) if place is None else (place, speed)
+        self.du, self.dv = ws.with_held(self.du, place), ws.with_held(self.dv, speed)
         if s.static:
             self.dv = np.zeros_like(self.dv)
         self.tangent_before = before

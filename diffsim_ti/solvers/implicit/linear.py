@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from diffsim_ti.solvers.implicit.free import Free
+
 
 class NotConverged(FloatingPointError):
     """An iteration did not reach its tolerance. Carries `residuals`, the relative residual after each round."""
@@ -15,10 +17,10 @@ class Operator:
     """w -> c m w + d2E/du2 w at the potential's displacement, less what follower pressures change; rows of fixed vertices
     are zero.
 
-    mass: c m, shape (num_vertices, 1) [N/m]; free: (num_vertices, 1), 1 or 0; transposed: what follower pressures change.
+    mass: c m, shape (num_vertices, 1) [N/m]; free: what vertices may do (free.py); transposed: of pressures.
     """
 
-    def __init__(self, potential, mass: np.ndarray, free: np.ndarray, follower=None, transposed: bool = False):
+    def __init__(self, potential, mass: np.ndarray, free: Free, follower=None, transposed: bool = False):
         self.potential, self.mass, self.free = potential, mass, free
         self.products, self.correction = 0, None
         self.follower, self.transposed = follower, transposed

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from diffsim_ti.solvers.implicit.free import Free, projectors_of
 from diffsim_ti.solvers.implicit.preconditioners import assemble
 
 
@@ -14,7 +15,7 @@ class Multigrid:
     Vanek, Mandel, Brezina 1996, doi:10.1007/BF02238511; Bell, Olson, Schroder, PyAMG, doi:10.21105/joss.04142.
     """
 
-    def __init__(self, potential, mass: np.ndarray, free: np.ndarray, size: np.ndarray):
+    def __init__(self, potential, mass: np.ndarray, free: Free, size: np.ndarray):
         import pyamg
 
         self.potential, self.free = potential, free
@@ -26,7 +27,7 @@ class Multigrid:
         try:
             levels = pyamg.smoothed_aggregation_solver(
                 matrix,
-                B=_rigid_motions(potential.arrays.values.rest) * np.repeat(free, 3, 0),
+                B=_allowed(_rigid_motions(potential.arrays.values.rest), free),
                 strength=("symmetric", {"theta": 0.08}),
                 max_coarse=300,
             ).levels
@@ -159,6 +160,11 @@ def _cofactors(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     out = [e * i - f * h, f * g - d * i, d * h - e * g, c * h - b * i, a * i - c * g, b * g - a * h]
     out += [b * f - c * e, c * d - a * f, a * e - b * d]
     return np.stack(out), a * out[0] + b * out[1] + c * out[2]
+
+
+def _allowed(motions: np.ndarray, free: Free) -> np.ndarray:
+    """What may be done of motions, shape (3 num_vertices, k)."""
+    return (projectors_of(free) @ motions.reshape(-1, 3, motions.shape[1])).reshape(motions.shape)
 
 
 def _rigid_motions(X: np.ndarray) -> np.ndarray:

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from diffsim_ti.potential.way import Met
+from diffsim_ti.solvers.implicit.free import Free, mask_of
 from diffsim_ti.solvers.implicit.linear import NotConverged, Operator, conjugate_gradients, gmres
 from diffsim_ti.solvers.implicit.projection import Projection
 
@@ -65,7 +66,7 @@ class Newton:
     def __init__(
         self,
         potential,
-        free: np.ndarray,
+        free: Free,
         way,
         preconditioners,
         tolerance: float,
@@ -75,6 +76,7 @@ class Newton:
     ):
         self.follower = follower  # pressures (potential/follower_pressure.py), or None
         self.by_residual = follower is not None and not follower.symmetric
+        self.moves = mask_of(free)  # in some direction
         self.potential, self.free, self.way, self.preconditioners = potential, free, way, preconditioners
         self.tolerance, self.max_iterations, self.eps = tolerance, max_iterations, eps
         self.reach = 0.01 * float(np.ptp(potential.arrays.values.rest, 0).max())  # of the first step away from a saddle
@@ -108,7 +110,7 @@ class Newton:
         while len(report.residuals) < min(most + report.cuts, self.patience * most):
             R, now = self._residual(u)
             size = max(size, now)
-            floor = 4 * self.eps * np.linalg.norm(self._rigidity() * np.abs(u).max(1, keepdims=True) * self.free)
+            floor = 4 * self.eps * np.linalg.norm(self._rigidity() * np.abs(u).max(1, keepdims=True) * self.moves)
             norm = np.linalg.norm(R)
             report.residuals.append(norm / size if size > 0 else 0.0)
             if rounds is not None and norm <= self.roughly * size:
@@ -163,7 +165,7 @@ class Newton:
         if self.follower is not None:
             x = self.potential.arrays.values.rest + u
             f, sizes = f + self.follower.forces(x), sizes + self.follower.sizes(x)
-        size = np.sqrt((sizes**2).sum() + (self.loads**2).sum() + (inertia**2 * self.free).sum())
+        size = np.sqrt((sizes**2).sum() + (self.loads**2).sum() + (inertia**2 * self.moves).sum())
         return (f + self.loads - inertia) * self.free, size
 
     def _direction(self, R, forcing):
@@ -189,7 +191,7 @@ class Newton:
 
     def _downhill(self):
         """A direction of negative curvature, found by solving for something random, and a slope for its search."""
-        probe = np.random.default_rng(0).standard_normal(self.free.shape[:1] + (3,)) * self.free
+        probe = np.random.default_rng(0).standard_normal((len(self.moves), 3)) * self.free
         A = self.operator()
         self.preconditioner.update(self.potential.held_at)
         _, _, _, p = conjugate_gradients(A, probe, self.preconditioner, 1e-3, 10 * len(probe), self.eps)

@@ -5,6 +5,8 @@ Both are functions of the present state alone, so that a run that is started aga
 
 import numpy as np
 
+from diffsim_ti.solvers.implicit.free import Free, FreeDirections, mask_of, projectors_of
+
 
 class BlockJacobi:
     """The inverse 3x3 diagonal blocks; blocks that are not positive definite take |eigenvalues|.
@@ -12,16 +14,20 @@ class BlockJacobi:
     size: of the diagonal at rest [N/m], to which what is all but zero is raised.
     """
 
-    def __init__(self, potential, mass: np.ndarray, free: np.ndarray, size: np.ndarray):
+    def __init__(self, potential, mass: np.ndarray, free: Free, size: np.ndarray):
         self.potential, self.mass, self.free, self.least = potential, mass, free, 1e-6 * (size + mass)
 
     def update(self, u: np.ndarray) -> None:
         """Adapt to the displacement at which the potential is placed."""
         D = self.potential.blocks() + self.mass[:, :, None] * np.eye(3)
+        if isinstance(self.free, FreeDirections):
+            D = self.free.around(D)
         values, vectors = np.linalg.eigh(0.5 * (D + np.swapaxes(D, 1, 2)))
         values = np.maximum(np.abs(values), self.least)
-        inverse = np.divide(self.free, values, out=np.zeros_like(values), where=values > 0)
+        inverse = np.divide(mask_of(self.free), values, out=np.zeros_like(values), where=values > 0)
         self._inverse = np.matmul(vectors * inverse[:, None, :], np.swapaxes(vectors, 1, 2))
+        if isinstance(self.free, FreeDirections):
+            self._inverse = self.free.around(self._inverse)
 
     def __call__(self, r: np.ndarray) -> np.ndarray:
         return np.matmul(self._inverse, r[:, :, None])[:, :, 0]
@@ -40,7 +46,7 @@ def element_matrices(potential) -> np.ndarray:
 
 
 def assemble(potential, mass, free):
-    """(c M + K as a block matrix, places of its diagonal blocks); fixed vertices keep a diagonal."""
+    """(c M + K as a block matrix, places of its diagonal blocks); what is held keeps a diagonal."""
     from scipy.sparse import bsr_matrix
 
     n, tets = potential.arrays.num_vertices, potential.tetrahedra.astype(np.int64)
@@ -52,10 +58,15 @@ def assemble(potential, mass, free):
     places, inverse = np.unique(places, return_inverse=True)
     data = np.stack([np.bincount(inverse, entries[:, k], len(places)) for k in range(9)], 1).reshape(-1, 3, 3)
     rows, columns = places // n, places % n
-    is_free = free[:, 0] > 0
+    is_free, P = mask_of(free)[:, 0] > 0, projectors_of(free)
     data[~(is_free[rows] & is_free[columns])] = 0
+    if isinstance(free, FreeDirections):
+        data = P[rows] @ data @ P[columns]
     diagonal = np.searchsorted(places, np.arange(n, dtype=np.int64) * (n + 1))
     data[diagonal] += mass[:, :, None] * np.eye(3)
     data[diagonal[~is_free]] = np.eye(3) * (np.abs(data).max() or 1.0)
+    if isinstance(free, FreeDirections):
+        at = diagonal[free.guided]
+        data[at] = P[free.guided] @ data[at] @ P[free.guided] + free.guides * np.abs(data).max()
     start = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=n))])
     return bsr_matrix((data, columns, start), shape=(3 * n, 3 * n)), diagonal
