@@ -145,17 +145,18 @@ def rigid_motions_left(places: np.ndarray, held: np.ndarray) -> str:
     felt = np.concatenate([np.zeros((6, 6)), np.einsum("kij,kmj->kim", held, motions).reshape(-1, 6)])
     _, sizes, V = np.linalg.svd(felt, full_matrices=False)
     left = V[sizes <= 1e-8 * max(sizes.max(), 1.0)]
-    turning = np.linalg.matrix_rank(left[:, 3:], tol=1e-6) if len(left) else 0
-    shifting = len(left) - turning
-    if not len(left):
-        return ""
-    counts = [(shifting, "translation"), (turning, "rotation")]
-    words = ", ".join(f"{n} {word}{'s' * int(n > 1)}" for n, word in counts if n)
-    shifts, turns = _spanned(left[:, :3][np.linalg.norm(left[:, 3:], axis=1) < 1e-6]), _spanned(left[:, 3:])
-    along = [f"along {shifts}"] * (0 < shifting < 3 and bool(shifts)) + [f"about {turns}"] * (0 < turning < 3)
     if len(left) == 6:
         return "6 rigid modes: 3 translations, 3 rotations"
-    return f"{words}{': ' * bool(along)}{', '.join(along)}"
+    if not len(left):
+        return ""
+    U, sizes, _ = np.linalg.svd(left[:, 3:])
+    turning = int((sizes > 1e-6).sum())
+    shifting = len(left) - turning
+    shifts, turns = U[:, turning:].T @ left[:, :3], left[:, 3:]  # combinations that do not turn; what all turn about
+    parts = [(shifting, "translation", "along", shifts), (turning, "rotation", "about", turns)]
+    words = ", ".join(f"{n} {word}{'s' if n > 1 else ''}" for n, word, _, _ in parts if n)
+    along = ", ".join(f"{how} {_spanned(rows)}" for n, _, how, rows in parts if 0 < n < 3)
+    return f"{words}: {along}" if along else words
 
 
 def _spanned(vectors: np.ndarray) -> str:
@@ -166,4 +167,4 @@ def _spanned(vectors: np.ndarray) -> str:
     axes = [axis for axis, d in AXES.items() if abs(projector[d, d] - 1) < 1e-9]
     if len(axes) == len(basis):
         return " and ".join(axes)
-    return " and ".join("(" + ", ".join(f"{c:.3g}" for c in row) + ")" for row in basis)
+    return " and ".join("(" + ", ".join(f"{c:.3g}" for c in np.round(row, 6) + 0.0) + ")" for row in basis)

@@ -28,7 +28,7 @@ every = pytest.mark.parametrize("kind", SOLVERS, ids=lambda s: s.__name__)
 
 def supported(motion=None, terms=(), **options) -> ds.Scene:
     """A distorted body on three rollers at right angles, and one askew, from a deformed start that moves."""
-    mesh = random_mesh(2).with_surface_set("lid", lambda x, n: x[:, 0] > 0.6)
+    mesh = random_mesh(2).with_surface_set("lid", lambda x, n: x[:, 0] > 0.8)
     rng, shape = np.random.default_rng(1), mesh.vertices.shape
     start = dict(
         initial_positions=mesh.vertices + 0.01 * rng.normal(size=shape), initial_velocities=0.3 * rng.normal(size=shape)
@@ -86,15 +86,15 @@ def test_what_is_held_is_held_and_the_rest_is_free(kind):
     "kind", [ds.VelocityVerletSolver, ds.ImplicitEulerSolver, ds.StaticSolver], ids=lambda s: s.__name__
 )
 def test_a_turned_scene_moves_as_one_along_axes(kind):
-    """Directions of supports mean nothing: rollers along axes, and the same scene turned, with rollers along any direction."""
-    mesh = random_mesh(2).with_surface_set("lid", lambda x, n: x[:, 0] > 0.6)
+    """Directions of supports mean nothing: rollers along axes, and the same turned, with rollers along any direction."""
+    mesh = random_mesh(2).with_surface_set("lid", lambda x, n: x[:, 0] > 0.8)
     R = ds.TetrahedralMesh.create_cube(2).rotated([1.0, 2.0, -0.5], 0.7).vertices[[4, 2, 1]].T
     turned = mesh.rotated(R)
-    axes = {"xmin": "x", "ymin": "y", "zmin": "z", "lid": "xy"}
+    axes = {"xmin": "x", "ymin": "y", "zmin": "z", "lid": "x"}
     along = {name: R[:, ["xyz".index(a) for a in how]].T for name, how in axes.items()}
     g, ends = np.array([0, -9.81, 3.0]), []
     for body, fixed, Q in ((mesh, axes, np.eye(3)), (turned, along, R)):
-        motion = {"lid": lambda t, Q=Q: Q @ [0.5 * t, -0.2 * t, 0]}
+        motion = {"lid": lambda t, Q=Q: Q @ [0.5 * t, 0, 0]}
         terms = [ds.Gravity(Q @ g), ds.Pressure(200.0, "ymax")] if "ymax" in body.surface_sets else [ds.Gravity(Q @ g)]
         scene = ds.Scene(body, ds.StableNeoHookean(1e4, 0.3), 1000.0, terms, fixed, motion, precision="f64")
         ends.append(ds.Rollout(made(kind, scene), STEPS).forward().positions[-1])
@@ -174,11 +174,11 @@ def test_uniaxial_traction_finds_the_stretch_back():
 
 
 def test_cooks_membrane_in_plane_strain():
-    """u_z = 0 is one line. 16 x 16 cells and one across: linear elasticity, E 1, nu 1/3, a shear force of 1 on the right edge:
-    in plane strain the corner rises as a plate of the same cells, twice as thick, does: nothing depends on z."""
+    """u_z = 0 is one line. Linear elasticity, E 1, nu 1/3, a shear force of 1 per thickness on the right edge: in plane
+    strain the corner rises alike in one and in two layers of cells, for nothing depends on z."""
     tips = []
-    for layers in (2, 3):
-        mesh = ds.TetrahedralMesh.create_box((13, 13, layers), (1.0, 1.0, 0.1 * (layers - 1)), pattern="five")
+    for layers in (2, 3):  # of vertices
+        mesh = ds.TetrahedralMesh.create_box((13, 13, layers), (1.0, 1.0, 4.0 * (layers - 1)), pattern="five")
         X, Y, Z = mesh.vertices.T
         moved = np.stack([48 * X, 44 * X + Y * (44 + (16 - 44) * X), Z], 1)
         mesh = ds.TetrahedralMesh(moved, mesh.tetrahedra, vertex_sets=dict(mesh.vertex_sets)).with_surface_set(

@@ -13,6 +13,7 @@ from diffsim_ti.inputs import Derived
 from diffsim_ti.potential.face_kernels import face_kernels
 from diffsim_ti.potential.face_lattice import rest_of_areas
 from diffsim_ti.potential.kernels import potential_kernels
+from diffsim_ti.solvers.implicit.free import cleaned
 from diffsim_ti.solvers.implicit.linear import Operator, solve
 from diffsim_ti.solvers.implicit.threads import one_blas_thread
 from diffsim_ti.state.numbers import Adjoint, Tangent
@@ -52,7 +53,8 @@ class _Passes:
         if self._preconditioner is None:
             self._preconditioner, _ = self.ws.preconditioner(self.mass)
             self._preconditioner.update(self.u_star)
-        return solve(self.operator, b, self._preconditioner, self.tolerance, self.eps, 20 * len(b))
+        x = solve(self.operator, b, self._preconditioner, self.tolerance, self.eps, 20 * len(b))
+        return cleaned(self.ws.free, x)
 
     def weight(self, share: float) -> np.ndarray:
         """dR/dm of each vertex [m/s^2]: gravity less the acceleration."""

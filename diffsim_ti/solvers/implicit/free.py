@@ -48,6 +48,11 @@ def projectors_of(free: Free) -> np.ndarray:
     return free.projectors() if isinstance(free, FreeDirections) else free[:, :, None] * np.eye(3)
 
 
+def cleaned(free: Free, x: np.ndarray) -> np.ndarray:
+    """A solution without the rounding that is left of it in what is held."""
+    return x * free if isinstance(free, FreeDirections) else x
+
+
 def held_as(free: Free, held: np.ndarray, moving: np.ndarray) -> np.ndarray:
     """Displacements that are `held` where vertices are held, and `moving` in what they may do."""
     return held + (moving - held) * free if isinstance(free, FreeDirections) else held * (1 - free) + moving * free

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from diffsim_ti.potential.way import Met
-from diffsim_ti.solvers.implicit.free import Free, mask_of
+from diffsim_ti.solvers.implicit.free import Free, cleaned, mask_of
 from diffsim_ti.solvers.implicit.linear import NotConverged, Operator, conjugate_gradients, gmres
 from diffsim_ti.solvers.implicit.projection import Projection
 
@@ -129,7 +129,7 @@ class Newton:
                 break
             self.preconditioner.update(u)
             forcing = min(self.inexact, np.sqrt(norm / size))
-            direction = self._direction(R, max(forcing, 10 * self.eps))
+            direction = cleaned(self.free, self._direction(R, max(forcing, 10 * self.eps)))
             moved = self._search(u, direction, R, E)
             if moved is None:
                 break

@@ -22,6 +22,7 @@ class BlockJacobi:
         D = self.potential.blocks() + self.mass[:, :, None] * np.eye(3)
         if isinstance(self.free, FreeDirections):
             D = self.free.around(D)
+            D[self.free.guided] += self.free.guides * (size_of(D[self.free.guided]) / 3)[:, None, None]
         values, vectors = np.linalg.eigh(0.5 * (D + np.swapaxes(D, 1, 2)))
         values = np.maximum(np.abs(values), self.least)
         inverse = np.divide(mask_of(self.free), values, out=np.zeros_like(values), where=values > 0)
@@ -31,6 +32,11 @@ class BlockJacobi:
 
     def __call__(self, r: np.ndarray) -> np.ndarray:
         return np.matmul(self._inverse, r[:, :, None])[:, :, 0]
+
+
+def size_of(blocks: np.ndarray) -> np.ndarray:
+    """Sum of the sizes of the diagonal of each block."""
+    return np.abs(np.diagonal(blocks, axis1=1, axis2=2)).sum(1)
 
 
 def element_matrices(potential) -> np.ndarray:
