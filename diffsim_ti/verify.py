@@ -63,20 +63,24 @@ def taylor_test(
 def central_difference(f: Callable[[float], float], scale: float = 1.0) -> tuple[float, float]:
     """(f'(0), error estimate): central differences extrapolated once, at the step where two neighbours agree best.
 
-    Steps so large that f refuses its argument (ValueError: a body that starts in an obstacle) are left out.
+    Steps so large that f refuses its argument (ValueError: a body that starts in an obstacle) are left out, and smaller ones
+    where two neighbours agree to 1e-9.
     """
-    raw = []
+    raw, better, best, error = [], [], 0.0, np.inf
     for s in scale * 10.0 ** -np.arange(2.0, 7.0, 0.5):
         try:
             raw.append((f(s) - f(-s)) / (2 * s))
         except ValueError:
             if raw or s < 1e-4 * scale:
                 raise
-    raw = np.array(raw)
-    better = (10 * raw[1:] - raw[:-1]) / 9  # steps fall by sqrt(10): the error of second order by 10
-    change = np.abs(np.diff(better))
-    best = int(np.argmin(change))
-    return float(better[best + 1]), float(change[best])
+            continue
+        if len(raw) > 1:  # steps fall by sqrt(10): the error of second order by 10
+            better.append((10 * raw[-1] - raw[-2]) / 9)
+        if len(better) > 1 and abs(better[-1] - better[-2]) < error:
+            best, error = better[-1], abs(better[-1] - better[-2])
+        if error <= 1e-9 * abs(best):
+            break
+    return float(best), float(error)
 
 
 def input_scale(rollout: Rollout, name: str) -> float:

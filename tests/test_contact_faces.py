@@ -283,3 +283,18 @@ def test_the_stable_step_does_not_know_contact_within_faces():
         watch.every = 5
         simulator.run(50)
         assert watch.gained < 0.35 * watch.moving and 0 < simulator.contact_resolution.smallest_gap < 1.2 * WIDTH
+
+
+@both
+def test_faces_push_no_vertex_through_a_wall(solver):
+    """A face that a ball pushes takes its corners along, to a wall that they feel themselves (held_back.py)."""
+    wall = ds.HalfSpace((-0.002, 0, 0), (1, 0.3, 0), width=0.004, stiffness=400.0, friction=0.2)
+    ball = ds.Sphere(
+        (0.05, -0.1, 0.05), 0.1, width=0.004, stiffness=300.0, path=lambda t: [0, 0.2 * t, 0], friction=0.4
+    )
+    mesh, law = ds.TetrahedralMesh.create_box(3, size=0.1, origin=(0, 0.002, 0)), ds.StableNeoHookean(3e4, 0.3)
+    terms, v = [ds.Gravity(), ds.Drag(2.0), wall, ball], (-1.8, -1.5, 0.3)
+    scene = ds.Scene(mesh, law, terms=terms, initial_velocities=v, precision="f64")
+    rollout = ds.Rollout(solver(scene, dt=1e-3, contact_damping=0.02), 22, save_every=1, gradients="all")
+    assert min(wall.gap(x).min() for x in rollout.forward().positions) > 0
+    assert ds.dot_product_test(rollout) < 1e-11

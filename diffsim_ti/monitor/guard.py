@@ -25,7 +25,8 @@ class Crossing(Divergence):
     stiffness [N/m].
 
     vertex: that of a face is its fastest corner; all three are named. stable_dt [s] is a substep that resolves the barrier
-    at this speed; stiffness is what stops the vertex, or None where the barrier's own would do.
+    at this speed, or that is stable in this state where the present one is not: the speed is of its own making then.
+    stiffness is what stops the vertex, or None where the barrier's own would do.
     """
 
     def __init__(
@@ -203,6 +204,13 @@ class Guard:
         if stiffness is not None:
             stiffer = ws.arrays.stiffer(k, vertices, stiffness)
             remedy = f"the barrier cannot stop it at any step: raise its {stiffer}, or its width"
+        stable, _ = self._stable_step()
+        if not solver.substep <= stable:  # the speed is of the steps' own making
+            stiffness, enough = None, min(0.5 * solver.substep, 0.7 * stable)
+            remedy = (
+                f"the substep has outgrown the stable step {stable:.3g} s of this state, whose elements are squeezed: "
+                f"reduce the substep to {enough:.3g} s"
+            )
         raise Crossing(
             f"step {step}, t = {step * solver.dt:.6g} s: {place_name(vertices)} gets {depth:.3g} m behind {term!r} within a "
             f"substep of {solver.substep:.4g} s, at {speed:.4g} m/s: {remedy}; the state before is kept",

@@ -17,7 +17,8 @@ from dataclasses import dataclass
 
 import taichi as ti
 
-from diffsim_ti.solvers.explicit.obstacle_stages import FELT, PLANE, PUSH, ROWS, SEED, WALL, ObstacleStages
+from diffsim_ti.solvers.explicit.contact_friction import ContactFriction
+from diffsim_ti.solvers.explicit.obstacle_stages import FELT, PLANE, PUSH, ROWS, SEED, WALL
 from diffsim_ti.solvers.explicit.wall_work import work_of_stage
 from diffsim_ti.terms.obstacles import secant, stage
 
@@ -26,7 +27,7 @@ MOST_ROUNDS = 60
 
 
 @dataclass(frozen=True)
-class ContactStage(ObstacleStages):
+class ContactStage(ContactFriction):
     """Taichi functions of one vertex; `now` is the pass (state/schedule.py), g a group of obstacles, k a place in it.
 
     Obstacles of all kinds are gone through in one loop, over what `look` notes of them.
@@ -35,10 +36,6 @@ class ContactStage(ObstacleStages):
     @property
     def epsilon(self) -> float:
         return 2.0**-52 if self.precision == "f64" else 2.0**-23
-
-    @ti.func
-    def normal(self, plane):
-        return self.vector(plane.x, plane.y, plane.z, ti.cast(0, self.fp))
 
     @ti.func
     def blend(self, plan: A):
@@ -121,29 +118,6 @@ class ContactStage(ObstacleStages):
     # ---- the stage -----------------------------------------------------------------------------------------------------
 
     @ti.func
-    def slide(self, o, i, v, ratio, state: A):
-        """Velocity after the friction of an obstacle, whose push is noted."""
-        pushed, felt, after = state.stage[ROWS * o + PUSH, i], state.stage[ROWS * o + FELT, i], v
-        if pushed.x > 0 and felt.z > 0:
-            plane, wall = state.stage[ROWS * o + PLANE, i], state.stage[ROWS * o + WALL, i]
-            after = stage.slide(self.fp, plane, pushed.x, v, wall, ratio, felt.z, felt.w)
-        return after
-
-    @ti.func
-    def slide_by(self, count, i, v, ratio, state: A):
-        """Velocity after the friction of the first `count` obstacles, one after the other."""
-        for o in range(count):
-            v = self.slide(ti.static(self.features.first_staged) + o, i, v, ratio, state)
-        return v
-
-    @ti.func
-    def slide_all(self, i, v, ratio, state: A):
-        """Velocity after the friction of all obstacles."""
-        if ti.static(len(self.features.staged_rough) > 0):
-            v = self.slide_by(ti.static(self.features.num_staged), i, v, ratio, state)
-        return v
-
-    @ti.func
     def acts(self, i, ratio, now: A, scene: A):
         return now.alpha > 0 and scene.surface[i] > 0 and ratio > 0
 
@@ -154,8 +128,8 @@ class ContactStage(ObstacleStages):
         if self.acts(i, ratio, now, scene):
             if self.look(i, u, free, now, scene, state):
                 a = now.alpha * self.blend(plan) * ratio
-                _, total, _, _ = self.solve(i, self.vector(0), free, a, now, state, plan)
-                delta, v = ratio * total, self.slide_all(i, v_plus, ratio, state)
+                z, total, _, _ = self.solve(i, self.vector(0), free, a, now, state, plan)
+                delta, v = ratio * total, self.rubbed(i, v_plus, z, ratio, now, state)
                 if ti.static(self.features.moving > 0):
                     state.work[i] = state.work[i] + work_of_stage(self, i, v_plus, now, scene, state)
         pressed = self.blend(plan) * delta
@@ -179,7 +153,7 @@ class ContactStage(ObstacleStages):
                 dz = stage.solve_linear(self.features.num_staged, a, xyz, mixed, b + a * dtotal)
                 dtotal += self.add_change(i, dz, state)
                 delta, ddelta = ratio * total, dratio * total + ratio * dtotal
-                v, dv = self.slide_all_jvp(i, v, dv, ratio, dratio, now, scene, state, tangent)
+                v, dv = self.rubbed_jvp(i, u, du, v, dv, z, dz, ratio, dratio, dalpha, now, scene, state, tangent)
         w, dw = v + blend * delta, dv + blend * ddelta
         du_next = du + dalpha * w + now.alpha * dw
         dv_next = now.decay * dv + ddelta - (1 - now.decay) * blend * ddelta
@@ -220,23 +194,6 @@ class ContactStage(ObstacleStages):
             total += more * n
         return total
 
-    @ti.func
-    def slide_all_jvp(self, i, v, dv, ratio, dratio, now: A, scene: A, state: A, tangent: A):
-        """Velocity after friction, and its change."""
-        for g in ti.static(self.features.staged_rough):
-            for k in range(g.count):
-                row, numbers = ROWS * (g.number + k), g.first + k * g.size + g.force.count
-                pushed, felt = state.stage[row + PUSH, i], state.stage[row + FELT, i]
-                if pushed.x > 0:
-                    plane, wall = state.stage[row + PLANE, i], state.stage[row + WALL, i]
-                    dwall, change = self.speed(g, k, now, tangent.path), state.stage[row + SEED, i]
-                    dmu, deps = tangent.parameters[numbers + 2], tangent.parameters[numbers + 3]
-                    dv = stage.slide_jvp(
-                        self.fp, plane, pushed.x, v, wall, ratio, felt.z, felt.w, change, dv, dwall, dratio, dmu, deps
-                    )
-                    v = stage.slide(self.fp, plane, pushed.x, v, wall, ratio, felt.z, felt.w)
-        return v, dv
-
     # ---- its adjoint ---------------------------------------------------------------------------------------------------
 
     @ti.func
@@ -253,18 +210,24 @@ class ContactStage(ObstacleStages):
             if self.look(i, u, free, now, scene, state):
                 a = now.alpha * blend * ratio
                 z, total, xyz, mixed = self.solve(i, moved, free, a, now, state, plan)
-                w = self.slide_all(i, v_plus, ratio, state) + blend * ratio * total
+                w = self.rubbed(i, v_plus, z, ratio, now, state) + blend * ratio * total
                 delta_adj = q + blend * w_adj
                 by_alpha, by_ratio = p.dot(w), delta_adj.dot(total)
                 self.seed_all(i, ratio * delta_adj, state)
+                by_z = self.vector(0)
                 if ti.static(len(self.features.staged_rough) > 0):
-                    v_adj, more = self.slide_all_vjp(i, v_plus, v_adj, ratio, state)
+                    v_adj, more, of_z, of_alpha, of_u = self.rubbed_vjp(
+                        i, u, v_plus, v_adj, z, ratio, now, scene, state, adjoint
+                    )
                     by_ratio += more
-                z_adj = stage.solve_linear(self.features.num_staged, a, xyz, mixed, self.by_move(i, state))
+                    by_alpha += of_alpha
+                    by_z += of_z
+                    u_adj += of_u
+                z_adj = stage.solve_linear(self.features.num_staged, a, xyz, mixed, self.by_move(i, state) + by_z)
                 v_adj += now.alpha * z_adj
                 by_alpha += z_adj.dot(v_plus + blend * ratio * total)
                 by_ratio += blend * now.alpha * z_adj.dot(total)
-                u_adj = self.push_all_vjp(i, u, z, a * z_adj, now, scene, state, adjoint, plan)
+                u_adj += self.push_all_vjp(i, u, z, a * z_adj, now, scene, state, adjoint, plan)
                 if ti.static(self.features.density):
                     row = ti.static(self.features.sums().first("mass"))
                     adjoint.sums[row, i] = adjoint.sums[row, i] - ratio * inverse * by_ratio
@@ -283,28 +246,6 @@ class ContactStage(ObstacleStages):
             seed = pushed.x * total_adj
             seed.w = self.normal(state.stage[row + PLANE, i]).dot(total_adj)
             state.stage[row + SEED, i] = seed
-
-    @ti.func
-    def slide_all_vjp(self, i, v, v_adj, ratio, state: A):
-        """(adjoint of the velocity v before friction, of h / m); notes those of all else, of the wall in its place."""
-        by_ratio = ti.cast(0, self.fp)
-        for back in range(ti.static(self.features.num_staged)):
-            before = ti.static(self.features.num_staged) - 1 - back
-            row = ROWS * (ti.static(self.features.first_staged) + before)
-            pushed, felt, by_wall = state.stage[row + PUSH, i], state.stage[row + FELT, i], self.vector(0)
-            if pushed.x > 0 and felt.z > 0:
-                start = self.slide_by(before, i, v, ratio, state)
-                plane, wall = state.stage[row + PLANE, i], state.stage[row + WALL, i]
-                by_plane, by_v, of_wall, more, by_mu, by_eps = stage.slide_vjp(
-                    self.fp, plane, pushed.x, start, wall, ratio, felt.z, felt.w, v_adj
-                )
-                v_adj, by_wall = by_v, of_wall
-                by_ratio += more
-                state.stage[row + SEED, i] = state.stage[row + SEED, i] + by_plane
-                pushed.z, pushed.w = by_mu, by_eps
-                state.stage[row + PUSH, i] = pushed
-            state.stage[row + WALL, i] = by_wall
-        return v_adj, by_ratio
 
     @ti.func
     def by_move(self, i, state: A):

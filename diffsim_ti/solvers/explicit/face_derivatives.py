@@ -46,7 +46,7 @@ class FaceDerivatives(FaceKernels):
             self.store(f, total, faces)
 
     @ti.func
-    def go_on_jvp(self, s, k, now: A, scene: A, faces: A, tangent: A, own: A, plan: A):
+    def go_on_jvp(self, s, k, now: A, scene: A, faces: A, state: A, tangent: A, own: A, plan: A):
         i, length, half = faces.vertices[s], self.part_length(now, plan), ti.cast(0.5, self.fp)
         inverse, before = scene.inverse_mass[i], own.speed_dot[s]
         gained = faces.speed[k + 1, s] - faces.speed[k, s]
@@ -55,7 +55,9 @@ class FaceDerivatives(FaceKernels):
         own.shift_dot[s] = own.shift_dot[s] + half * length * (before + after)
         own.speed_dot[s] = after
         if k == plan.n - 1:
-            tangent.u[0, i] = tangent.u[0, i] + own.shift_dot[s]
+            du, shift = tangent.u[0, i], faces.shift[s]
+            moved = self.taken_jvp(i, shift, own.shift_dot[s], state.u[plan.slot, i], du, now, scene, tangent)
+            tangent.u[0, i] = du + moved
             tangent.v[0, i] = tangent.v[0, i] + after
 
     @ti.func
@@ -66,7 +68,8 @@ class FaceDerivatives(FaceKernels):
             for f in range(plan.num_faces):
                 self.push_jvp(f, plan.k, pass_at(table, plan.first - plan.window), scene, faces, tangent, own, plan)
             for s in range(plan.num_surface):
-                self.go_on_jvp(s, plan.k, pass_at(table, plan.first - plan.window), scene, faces, tangent, own, plan)
+                now = pass_at(table, plan.first - plan.window)
+                self.go_on_jvp(s, plan.k, now, scene, faces, state, tangent, own, plan)
         else:
             ti.loop_config(serialize=True)
             for k in range(plan.n):
@@ -76,7 +79,7 @@ class FaceDerivatives(FaceKernels):
                 for f in range(plan.num_faces):
                     self.push_jvp(f, k, now, scene, faces, tangent, own, plan)
                 for s in range(plan.num_surface):
-                    self.go_on_jvp(s, k, now, scene, faces, tangent, own, plan)
+                    self.go_on_jvp(s, k, now, scene, faces, state, tangent, own, plan)
 
     @cached_property
     def jvp(self) -> Kernel:
@@ -96,11 +99,15 @@ class FaceDerivatives(FaceKernels):
         return out
 
     @ti.func
-    def seed_force(self, s, k, now: A, scene: A, faces: A, adjoint: A, own: A, plan: A):
+    def seed_force(self, s, k, now: A, scene: A, faces: A, state: A, adjoint: A, out: A, own: A, plan: A):
         """Adjoint of the force of part k at a surface vertex; adds that of its mass."""
         i, half, length = faces.vertices[s], ti.cast(0.5, self.fp), self.part_length(now, plan)
         if k == plan.n - 1:
-            own.shift_dot[s], own.speed_dot[s] = self.direct(adjoint.u[0, i]), self.direct(adjoint.v[0, i])
+            p, then = self.direct(adjoint.u[0, i]), self.noting(self.when(now, ti.cast(1, self.fp)), plan)
+            u, shift = state.u[plan.slot, i], faces.shift[s]
+            by_shift, by_u = self.taken_vjp(i, s, shift, p, u, now, then, scene, adjoint, out)
+            adjoint.u[0, i] = adjoint.u[0, i] + by_u
+            own.shift_dot[s], own.speed_dot[s] = by_shift, self.direct(adjoint.v[0, i])
             own.begin_dot[s] = self.vector(0)
         q, inverse = own.speed_dot[s] + half * length * own.shift_dot[s], scene.inverse_mass[i]
         own.speed_dot[s] = q
@@ -137,7 +144,8 @@ class FaceDerivatives(FaceKernels):
     def all_vjp(self, scene: A, faces: A, state: A, table: A, adjoint: A, out: A, own: A, plan: A):
         if ti.static(self.parallel):
             for s in range(plan.num_surface):
-                self.seed_force(s, plan.k, pass_at(table, plan.first - plan.window), scene, faces, adjoint, own, plan)
+                now = pass_at(table, plan.first - plan.window)
+                self.seed_force(s, plan.k, now, scene, faces, state, adjoint, out, own, plan)
             for f in range(plan.num_faces):
                 self.push_vjp(f, plan.k, pass_at(table, plan.first - plan.window), scene, faces, out, own, plan)
             for s in range(plan.num_surface):
@@ -147,7 +155,7 @@ class FaceDerivatives(FaceKernels):
             for back in range(plan.n):
                 k, now = plan.n - 1 - back, pass_at(table, plan.first - plan.window)
                 for s in range(plan.num_surface):
-                    self.seed_force(s, k, now, scene, faces, adjoint, own, plan)
+                    self.seed_force(s, k, now, scene, faces, state, adjoint, out, own, plan)
                 for f in range(plan.num_faces):
                     self.push_vjp(f, k, now, scene, faces, out, own, plan)
                 for s in range(plan.num_surface):

@@ -4,7 +4,7 @@ A pass leads a surface vertex of mass m from u0 to u1. Barriers of points are st
 it is long, so that the way is gone again in n equal parts of length d = h / n, with their forces f (face_forces.py):
 
     u  = u0 + (k + 1/2) / n (u1 - u0) + e + d v / 2        where forces of part k are taken
-    v' = v + d f(u) / m,    e' = e + d (v + v') / 2,       from v = e = 0; at the end u1 + e and v are added to the state
+    v' = v + d f(u) / m,    e' = e + d (v + v') / 2,       from v = e = 0; at the end e (face_walls.py) and v are added
 
 It is leapfrog in the moving frame of the pass, and keeps the energy as that does. n is a power of two (felt_faces.py): in a
 part no face goes farther than a share of the width, and d^2 D / m is at most LOAD at each vertex. D, which comes with f, is
@@ -20,7 +20,7 @@ import taichi as ti
 
 from diffsim_ti.potential.face_lattice import FLAT
 from diffsim_ti.runtime import Bundle, Kernel, let, traced
-from diffsim_ti.solvers.explicit.face_forces import FaceForces
+from diffsim_ti.solvers.explicit.face_walls import FaceWalls
 from diffsim_ti.state.features import Features
 from diffsim_ti.state.numbers import SCENE
 from diffsim_ti.state.schedule import pass_at
@@ -38,7 +38,7 @@ NUMBERS |= dict(n="int", k="int", h="float")
 
 
 @dataclass(frozen=True)
-class FaceKernels(FaceForces):
+class FaceKernels(FaceWalls):
     """Of all faces; u[slot] of a state is where the pass ends, faces.begin[0] where it begins."""
 
     parallel: bool
@@ -301,8 +301,9 @@ class FaceKernels(FaceForces):
     def all_ends(self, scene: A, faces: A, state: A, table: A, watch: A, plan: A):
         ti.loop_config(serialize=not self.parallel)
         for s in range(plan.num_surface):
-            i = faces.vertices[s]
-            state.u[plan.slot, i] = state.u[plan.slot, i] + faces.shift[s]
+            i, now = faces.vertices[s], pass_at(table, plan.first - plan.window)
+            before = state.u[plan.slot, i]
+            state.u[plan.slot, i] = before + self.taken(i, faces.shift[s], before, now, scene)
             state.v[plan.slot, i] = state.v[plan.slot, i] + faces.speed[plan.n, s]
         ti.loop_config(serialize=not self.parallel)
         for f in range(plan.num_faces):

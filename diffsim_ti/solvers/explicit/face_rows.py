@@ -5,13 +5,13 @@ from dataclasses import dataclass
 import taichi as ti
 
 from diffsim_ti.potential.face_lattice import BENT
-from diffsim_ti.solvers.explicit.obstacle_stages import ObstacleStages
+from diffsim_ti.solvers.explicit.held_back import HeldBack
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
 
 
 @dataclass(frozen=True)
-class FaceRows(ObstacleStages):
+class FaceRows(HeldBack):
     """Taichi functions of one face f; g is a group of obstacles, k a place in it (state/features.py).
 
     Where plan.between, obstacles are where one looks at the state between passes, not where pass `now` begins.

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from diffsim_ti.solvers.implicit.free import Free, projectors_of
+from diffsim_ti import runtime
+from diffsim_ti.solvers.implicit.free import Free, FreeDirections, projectors_of
 from diffsim_ti.solvers.implicit.preconditioners import assemble
 
 
@@ -37,8 +38,11 @@ class Multigrid:
         tags.data = np.arange(matrix.data.size, dtype=float).reshape(matrix.data.shape)
         order = tags.tocsr().data.astype(np.int64)  # where numbers of the finest level lie in blocks
         self._diagonal = np.argsort(order).reshape(-1, 3, 3)[diagonal]
-        matrices = [matrix.tocsr(), *(level.A.tocsr() for level in levels[1:])]
-        self._levels = [Level(A, level.P.tocsr(), level.R.tocsr()) for A, level in zip(matrices, levels[:-1])]
+        self._fp = runtime.NUMPY[potential.arrays.precision]  # of the cycle, which memory's speed limits
+        self._at_rest = matrix.tocsr().data[self._diagonal]
+        matrices = [matrix, *(level.A for level in levels[1:])]
+        rows = [[M.tocsr().astype(self._fp) for M in (A, level.P, level.R)] for A, level in zip(matrices, levels[:-1])]
+        self._levels = [Level(*matrices) for matrices in rows]
         self._coarsest = _factorised(levels[-1].A)
         self._rotations, self._contact = None, None
 
@@ -48,19 +52,22 @@ class Multigrid:
         contact = self.potential.contact_blocks()
         if contact is None:
             return
+        if isinstance(self.free, FreeDirections):
+            contact = self.free.around(contact)
         if self._rotations is not None:
             contact = np.swapaxes(self._rotations, 1, 2) @ contact @ self._rotations
         if self._contact is not None and np.array_equal(contact, self._contact):
             return
         if self._levels:
-            self._levels[0].add(self._diagonal, contact - (0 if self._contact is None else self._contact))
+            self._levels[0].put(self._diagonal, self._at_rest + contact)
         self._contact = contact
 
     def __call__(self, r: np.ndarray) -> np.ndarray:
         R = self._rotations
         if R is not None:
             r = np.einsum("nji,nj->ni", R, r)
-        z = self._cycle(0, r.ravel()).reshape(-1, 3)
+        size = np.abs(r).max(initial=0.0) + 1e-300  # no number may be too small for the cycle
+        z = size * self._cycle(0, (r / size).ravel().astype(self._fp)).astype(np.float64).reshape(-1, 3)
         if R is not None:
             z = np.einsum("nij,nj->ni", R, z)
         return z * self.free
@@ -68,7 +75,7 @@ class Multigrid:
     def _cycle(self, k: int, b: np.ndarray) -> np.ndarray:
         """A V-cycle for level k."""
         if k == len(self._levels):
-            return self._coarsest(b)
+            return self._coarsest(b.astype(np.float64)).astype(self._fp)
         level = self._levels[k]
         x, left = level.smooth(b)
         x += level.P @ self._cycle(k + 1, level.R @ left)
@@ -92,9 +99,9 @@ class Level:
     def _split(self) -> None:
         self.L.data, self.U.data = self.A.data[self._of_L], self.A.data[self._of_U]
 
-    def add(self, places: np.ndarray, change: np.ndarray) -> None:
+    def put(self, places: np.ndarray, numbers: np.ndarray) -> None:
         """Change numbers of A, which lie at `places`."""
-        self.A.data[places] += change
+        self.A.data[places] = numbers
         self._split()
 
     def smooth(self, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

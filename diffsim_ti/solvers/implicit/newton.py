@@ -52,15 +52,12 @@ class Newton:
     insist = 2.0**-10
     trusted = 10  # iterations after which the direction before an indefinite one is good enough
     slight = 0.01, 0.0  # which negative eigenvalues of tetrahedra may stay (projection.py), the second where that fails
-    # relative residual of a linear solve, or the root of the round's own if that is less (Eisenstat, Walker 1996, Choosing
-    # the Forcing Terms in an Inexact Newton Method, doi:10.1137/0917003). With 0.1 a bent beam took .75 of the products,
-    # and the slow pull of a stiff body was off by 4.6 % instead of 1.4 % (the scene "pull" of tests/test_study.py).
-    inexact = 1e-3
+    # relative residual of the linear solves of the last rounds, or the root of the round's own if that is less; of those
+    # before at most (`_forcing`)
+    inexact, rough = 1e-3, 0.1
     roughly = 0.03
     patience = 6  # times as many rounds as asked for, at most, where obstacles cut directions short
-    by_work = (
-        30  # rounds in which work may stand for a potential that is not there: beyond them it might lead in circles
-    )
+    by_work = 30  # rounds in which work may stand for a potential that is not there; later it might lead in circles
     shortest = 2.0**-40  # fraction of a direction below which a line search gives up
 
     def __init__(
@@ -104,18 +101,19 @@ class Newton:
         self.mass, self.inertial, self.loads = mass, inertial, loads
         u = self.potential.place(start)
         self.preconditioner, self.stiffness = self.preconditioners(mass)
-        E, size = self._evaluate(u), 0.0
+        E, size, norm, rough = self._evaluate(u), 0.0, np.inf, False
         self.upright = bool(np.all(E[2] > 0))
         most = self.max_iterations if rounds is None else rounds
         while len(report.residuals) < min(most + report.cuts, self.patience * most):
             R, now = self._residual(u)
-            size = max(size, now)
+            size, before = max(size, now), norm
             floor = 4 * self.eps * np.linalg.norm(self._rigidity() * np.abs(u).max(1, keepdims=True) * self.moves)
             norm = np.linalg.norm(R)
             report.residuals.append(norm / size if size > 0 else 0.0)
             if rounds is not None and norm <= self.roughly * size:
                 return u
-            if norm <= self.tolerance * size + floor:
+            solved = norm <= self.tolerance * size + floor
+            if solved and (not rough or norm <= floor):
                 downhill = self._downhill() if leave_saddles and not self.by_residual else None
                 if downhill is None:
                     return u
@@ -128,10 +126,13 @@ class Newton:
             if not np.isfinite(norm):
                 break
             self.preconditioner.update(u)
-            forcing = min(self.inexact, np.sqrt(norm / size))
+            forcing = self._forcing(norm, before, solved, size, floor)
+            rough = forcing > max(self.inexact, 0.3 * floor / norm)
             direction = cleaned(self.free, self._direction(R, max(forcing, 10 * self.eps)))
             moved = self._search(u, direction, R, E)
             if moved is None:
+                if solved and self.by_residual:  # |R| is as small as rounding lets it be
+                    return self.potential.place(u)
                 break
             u, E = moved
         if norm <= 100 * floor or (rounds is not None and np.isfinite(norm)):  # rounding has the last word
@@ -167,6 +168,14 @@ class Newton:
             f, sizes = f + self.follower.forces(x), sizes + self.follower.sizes(x)
         size = np.sqrt((sizes**2).sum() + (self.loads**2).sum() + (inertia**2 * self.moves).sum())
         return (f + self.loads - inertia) * self.free, size
+
+    def _forcing(self, norm, before, solved, size, floor) -> float:
+        """Relative residual of a round's linear solve: rough while rounds gain little, but not of the last one, whose error
+        slow motions of stiff bodies would show. Eisenstat, Walker 1996, Choosing the Forcing Terms in an Inexact Newton
+        Method, choice 2, doi:10.1137/0917003."""
+        exact = max(min(self.inexact, np.sqrt(norm / size)), 0.3 * floor / norm)  # rounding would hide more
+        gained = min(norm / before, 1.0) if np.isfinite(before) else 1.0
+        return exact if solved else max(exact, min(self.rough, 0.9 * gained**2))
 
     def _direction(self, R, forcing):
         A = self.operator()

@@ -12,7 +12,10 @@ from threadpoolctl import ThreadpoolController
 
 @lru_cache(maxsize=1)
 def _controller() -> ThreadpoolController:
-    """Finding the libraries takes milliseconds; limiting them afterwards does not."""
+    """Finding the libraries takes milliseconds; limiting them afterwards does not. Only those that are loaded are found,
+    and scipy brings a BLAS of its own."""
+    import scipy.linalg  # noqa: F401
+
     return ThreadpoolController()
 
 

@@ -1,0 +1,167 @@
+"""Friction of the contact stage: that of each obstacle, one after the other, with the pushes that the stage has noted.
+
+Friction with one obstacle may lead a vertex towards another one, which the stage has not asked. With e the way that friction
+adds and y_o > 0 the distances to which the stage leads, the vertex takes the share c(x) of all friction (held_back.py).
+"""
+
+from dataclasses import dataclass
+
+import taichi as ti
+
+from diffsim_ti.solvers.explicit.held_back import HeldBack
+from diffsim_ti.solvers.explicit.obstacle_stages import FELT, PLANE, PUSH, ROWS, SEED, WALL
+from diffsim_ti.terms.obstacles import stage
+
+A = ti.template()  # an array or Bundle handed to a Taichi function
+
+
+@dataclass(frozen=True)
+class ContactFriction(HeldBack):
+    """Taichi functions of one vertex; `now` is the pass (state/schedule.py), g a group of obstacles, k a place in it."""
+
+    @ti.func
+    def normal(self, plane):
+        return self.vector(plane.x, plane.y, plane.z, ti.cast(0, self.fp))
+
+    @ti.func
+    def slide(self, o, i, v, ratio, state: A):
+        """Velocity after the friction of an obstacle, whose push is noted."""
+        pushed, felt, after = state.stage[ROWS * o + PUSH, i], state.stage[ROWS * o + FELT, i], v
+        if pushed.x > 0 and felt.z > 0:
+            plane, wall = state.stage[ROWS * o + PLANE, i], state.stage[ROWS * o + WALL, i]
+            after = stage.slide(self.fp, plane, pushed.x, v, wall, ratio, felt.z, felt.w)
+        return after
+
+    @ti.func
+    def slide_by(self, count, i, v, ratio, state: A):
+        """Velocity after the friction of the first `count` obstacles, one after the other."""
+        for o in range(count):
+            v = self.slide(ti.static(self.features.first_staged) + o, i, v, ratio, state)
+        return v
+
+    @ti.func
+    def slide_all(self, i, v, ratio, state: A):
+        """Velocity after the friction of all obstacles."""
+        if ti.static(len(self.features.staged_rough) > 0):
+            v = self.slide_by(ti.static(self.features.num_staged), i, v, ratio, state)
+        return v
+
+    # ---- what of it a vertex takes -------------------------------------------------------------------------------------
+
+    @ti.func
+    def crowding(self, i, v, after, z, now: A, state: A):
+        """(x, number of the obstacle that has it, or -1) for the velocities before and after friction and the move z."""
+        most, number, e = ti.cast(0, self.fp), -1, now.alpha * (after - v)
+        if ti.static(self.features.num_staged > 1 and len(self.features.staged_rough) > 0):
+            for c in range(ti.static(self.features.num_staged)):
+                row = ROWS * (ti.static(self.features.first_staged) + c)
+                plane = state.stage[row + PLANE, i]
+                n = self.normal(plane)
+                y = plane.w + n.dot(z - now.h * state.stage[row + WALL, i])
+                x = -n.dot(e) / y
+                if y > 0 and x > most:
+                    most, number = x, ti.static(self.features.first_staged) + c
+        return most, number
+
+    @ti.func
+    def rubbed(self, i, v, z, ratio, now: A, state: A):
+        """Velocity after friction."""
+        after = self.slide_all(i, v, ratio, state)
+        x, _ = self.crowding(i, v, after, z, now, state)
+        c, slope = self.share_and_slope(x)
+        if slope < 0:
+            after = v + c * (after - v)
+        return after
+
+    # ---- tangent -------------------------------------------------------------------------------------------------------
+
+    @ti.func
+    def slide_all_jvp(self, i, v, dv, ratio, dratio, now: A, scene: A, state: A, tangent: A):
+        """Velocity after friction, and its change."""
+        for g in ti.static(self.features.staged_rough):
+            for k in range(g.count):
+                row, numbers = ROWS * (g.number + k), g.first + k * g.size + g.force.count
+                pushed, felt = state.stage[row + PUSH, i], state.stage[row + FELT, i]
+                if pushed.x > 0:
+                    plane, wall = state.stage[row + PLANE, i], state.stage[row + WALL, i]
+                    dwall, change = self.speed(g, k, now, tangent.path), state.stage[row + SEED, i]
+                    dmu, deps = tangent.parameters[numbers + 2], tangent.parameters[numbers + 3]
+                    dv = stage.slide_jvp(
+                        self.fp, plane, pushed.x, v, wall, ratio, felt.z, felt.w, change, dv, dwall, dratio, dmu, deps
+                    )
+                    v = stage.slide(self.fp, plane, pushed.x, v, wall, ratio, felt.z, felt.w)
+        return v, dv
+
+    @ti.func
+    def rubbed_jvp(self, i, u, du, v, dv, z, dz, ratio, dratio, dalpha, now: A, scene: A, state: A, tangent: A):
+        """Velocity after friction, and its change."""
+        after, change = self.slide_all_jvp(i, v, dv, ratio, dratio, now, scene, state, tangent)
+        x, number = self.crowding(i, v, after, z, now, state)
+        c, slope = self.share_and_slope(x)
+        if slope < 0:
+            way, dway, dx = after - v, change - dv, ti.cast(0, self.fp)
+            for g in ti.static(self.features.staged):
+                k = number - g.number
+                if k >= 0 and k < g.count:
+                    row, wall = ROWS * number, self.speed(g, k, now, scene.path)
+                    plane = state.stage[row + PLANE, i]
+                    turned = self.plane_jvp(g, k, i, u, du, now.begin, now, scene, tangent)
+                    n, dn = self.normal(plane), self.normal(turned)
+                    move, dmove = z - now.h * wall, dz - now.h * self.speed(g, k, now, tangent.path)
+                    y, dy = plane.w + n.dot(move), turned.w + dn.dot(move) + n.dot(dmove)
+                    dx = -(dalpha * n.dot(way) + now.alpha * (dn.dot(way) + n.dot(dway)) + x * dy) / y
+            after, change = v + c * way, dv + c * dway + slope * dx * way
+        return after, change
+
+    # ---- adjoint -------------------------------------------------------------------------------------------------------
+
+    @ti.func
+    def slide_all_vjp(self, i, v, v_adj, ratio, state: A):
+        """(adjoint of the velocity v before friction, of h / m); notes those of all else, of the wall in its place."""
+        by_ratio = ti.cast(0, self.fp)
+        for back in range(ti.static(self.features.num_staged)):
+            before = ti.static(self.features.num_staged) - 1 - back
+            row = ROWS * (ti.static(self.features.first_staged) + before)
+            pushed, felt, by_wall = state.stage[row + PUSH, i], state.stage[row + FELT, i], self.vector(0)
+            if pushed.x > 0 and felt.z > 0:
+                start = self.slide_by(before, i, v, ratio, state)
+                plane, wall = state.stage[row + PLANE, i], state.stage[row + WALL, i]
+                by_plane, by_v, of_wall, more, by_mu, by_eps = stage.slide_vjp(
+                    self.fp, plane, pushed.x, start, wall, ratio, felt.z, felt.w, v_adj
+                )
+                v_adj, by_wall = by_v, of_wall
+                by_ratio += more
+                state.stage[row + SEED, i] = state.stage[row + SEED, i] + by_plane
+                pushed.z, pushed.w = by_mu, by_eps
+                state.stage[row + PUSH, i] = pushed
+            state.stage[row + WALL, i] = by_wall
+        return v_adj, by_ratio
+
+    @ti.func
+    def rubbed_vjp(self, i, u, v, v_adj, z, ratio, now: A, scene: A, state: A, adjoint: A):
+        """(adjoints of v before friction, of h / m, of the move z, of alpha, of u); notes or adds those of all else."""
+        after, by_z, by_u = self.slide_all(i, v, ratio, state), self.vector(0), self.vector(0)
+        x, number = self.crowding(i, v, after, z, now, state)
+        c, slope = self.share_and_slope(x)
+        way_adj, own, by_alpha = v_adj, self.vector(0), ti.cast(0, self.fp)
+        if slope < 0:
+            way = after - v
+            by_x = slope * v_adj.dot(way)
+            way_adj, own, by_alpha = c * v_adj, v_adj, by_x * x / now.alpha
+            for g in ti.static(self.features.staged):
+                k = number - g.number
+                if k >= 0 and k < g.count:
+                    wall, plane = self.speed(g, k, now, scene.path), state.stage[ROWS * number + PLANE, i]
+                    n, move = self.normal(plane), z - now.h * wall
+                    ratio_x = by_x / (plane.w + n.dot(move))
+                    way_adj += -(ratio_x * now.alpha) * n
+                    by_y = -ratio_x * x
+                    by_plane = -(ratio_x * now.alpha) * way + by_y * move
+                    by_plane.w = by_y
+                    by_z = by_y * n
+                    by_u = self.plane_vjp(g, k, i, u, by_plane, now.begin, now, scene, adjoint)
+                    self.add_to_rest(i, by_u, adjoint)
+                    self.add_to_path(g, k, i, now, by_u, -now.h * by_z, adjoint)
+            own = v_adj - way_adj
+        by_v, by_ratio = self.slide_all_vjp(i, v, way_adj, ratio, state)
+        return by_v + own, by_ratio, by_z, by_alpha, by_u
