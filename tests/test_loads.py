@@ -46,7 +46,9 @@ def scene(terms, precision="f64", mesh=None, **options) -> ds.Scene:
 
 def solver_of(kind, of: ds.Scene):
     exact = {} if kind.explicit else dict(tolerance=1e-12 if of.precision == "f64" else 1e-6)
-    return kind(of, load_steps=2, **exact) if kind is ds.StaticSolver else kind(of, dt=2e-3, substeps=2, **exact)
+    return (
+        kind(of, load_steps=2, dt=2e-3, **exact) if kind is ds.StaticSolver else kind(of, dt=2e-3, substeps=2, **exact)
+    )
 
 
 def rollout_of(kind, terms, precision="f64", steps=STEPS, **options) -> ds.Rollout:
