@@ -44,6 +44,7 @@ from diffsim_ti.solvers import (
 )
 from diffsim_ti.state.solve_report import Buckled, SolveReport
 from diffsim_ti.terms import (
+    BodyForce,
     Box,
     Capsule,
     Cylinder,
@@ -53,8 +54,10 @@ from diffsim_ti.terms import (
     Ground,
     HalfSpace,
     MeshObstacle,
+    Pressure,
     SelfContact,
     Sphere,
+    Traction,
 )
 from diffsim_ti.verify import check_gradients, dot_product_test, taylor_test
 
@@ -71,6 +74,9 @@ __all__ = [
     "Gravity",
     "Drag",
     "ExternalForce",
+    "Traction",
+    "Pressure",
+    "BodyForce",
     "Ground",
     "HalfSpace",
     "Sphere",

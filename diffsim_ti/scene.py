@@ -1,7 +1,7 @@
 """Scene: what is simulated, and nothing about how."""
 
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from copy import copy
 
 import numpy as np
@@ -14,7 +14,8 @@ from diffsim_ti.materials.moduli import youngs_poisson
 from diffsim_ti.materials.patch_law import PatchLaw
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.potential.assembled import body_stiffness
-from diffsim_ti.terms import Drag, ExternalForce, Gravity, Obstacle, SelfContact, Term
+from diffsim_ti.supports import Fixed, Supports
+from diffsim_ti.terms import Drag, Gravity, Obstacle, Pressure, SelfContact, Term
 from diffsim_ti.terms.motion import Motion, sampled
 from diffsim_ti.terms.obstacles.obstacle import PER_AREA
 
@@ -33,12 +34,15 @@ class Scene:
     mesh: TetrahedralMesh, the rest shape.
     material: a law with its numbers (materials/).
     density [kg/m^3]: one number or one per tetrahedron; vertices carry the lumped mass sum rho V / 4.
-    terms: loads, contacts, damping (terms/), each at most once except contacts. What is not listed costs nothing. Their
-        order means nothing but that of obstacles of one kind, whose forces and frictions act one after the other. Names
-        of terms, each another (Ground(name="floor")), begin the names of their inputs: "floor.stiffness".
-    fixed: vertices that do not move freely: a vertex set's name, indices, a Boolean mask or a list of set names.
-    motion: displacement of the fixed vertices from where they start: a function of time [s] that returns 3 numbers or
-        shape (num_fixed, 3) [m], or keyframes (times, displacements) between which it is linear. Default: held still.
+    terms: loads, contacts, damping (terms/); gravity, drag and self-contact at most once. What is not listed costs
+        nothing. Their order means nothing but that of obstacles of one kind, whose forces and frictions act one after
+        the other. Names of terms, each another (Ground(name="floor")), begin the names of their inputs: "floor.stiffness".
+    fixed: vertices that do not move freely: a vertex set's name, indices, a Boolean mask or a list of set names. Or
+        {name of a vertex or surface set: in which directions it is held}: axes such as "x" or "xyz", a direction (3
+        numbers) or several, or "normal" of a flat surface set; so are rollers and symmetry planes made.
+    motion: displacement of the held vertices from where they start: a function of time [s] that returns 3 numbers or
+        shape (num_held, 3) [m], or keyframes (times, displacements) between which it is linear; of what is held in some
+        directions, only those count. Or, where `fixed` names sets, {name: such a motion}. Default: held still.
     initial_positions [m], initial_velocities [m/s]: shape (num_vertices, 3) or 3 numbers (velocities); default at rest.
     precision: "f32", "f64" or None for the default that `diffsim_ti.init` set.
     volume: where a change of volume is resisted: in each of the "tetrahedra", which lock as Poisson's ratio nears 0.5, or
@@ -54,8 +58,8 @@ class Scene:
         material: Material,
         density: ArrayLike = 1000.0,
         terms: Term | Iterable[Term] = (),
-        fixed: str | ArrayLike | None = None,
-        motion: Motion | None = None,
+        fixed: Fixed | None = None,
+        motion: Motion | Mapping[str, Motion] | None = None,
         initial_positions: ArrayLike | None = None,
         initial_velocities: ArrayLike | None = None,
         precision: str | None = None,
@@ -79,7 +83,8 @@ class Scene:
             raise ValueError(f'volume must be "tetrahedra" or, against locking, "patches", got {volume!r}')
         self.volume = volume
         self.terms = tuple([terms] if isinstance(terms, Term) else terms)
-        self.fixed = np.zeros(0, np.int64) if fixed is None else mesh.vertex_indices(fixed)
+        self.supports = Supports(mesh, fixed)
+        self.fixed, self.held = self.supports.fixed, self.supports.vertices  # in all directions; in some
         self.motion = motion
         self._check_terms()
         self._given = self.terms
@@ -87,6 +92,8 @@ class Scene:
         self.terms = tuple(copy(t) for t in settled)  # one that is listed twice is two
         self.ordered_terms = tuple(sorted(self.terms, key=_kind))
         self.moving = tuple(t for t in self.ordered_terms if t.path is not None)
+        self.dead_loads = tuple(t for t in self.ordered_terms if t.dead)
+        self.pressures = tuple(t for t in self.ordered_terms if isinstance(t, Pressure))
         self.inputs = Inputs(self, density, initial_positions, initial_velocities)
         self._check_start()
         if volume == "tetrahedra":
@@ -107,7 +114,7 @@ class Scene:
             if not isinstance(term, Term):
                 raise ValueError(f"terms must be diffsim_ti terms such as Gravity(), got {term!r}")
             term.check(self.mesh)
-        for kind in (Gravity, Drag, ExternalForce, SelfContact):
+        for kind in (Gravity, Drag, SelfContact):
             if sum(isinstance(t, kind) for t in self.terms) > 1:
                 raise ValueError(f"a scene takes one {kind.__name__}, got several; add their numbers instead")
         named = [t for t in self.terms if t.name is not None]
@@ -115,7 +122,7 @@ class Scene:
             other = next((t for t in named[:k] if t.name == term.name), None)
             if other is not None:
                 raise ValueError(f"two terms have the name {term.name!r}: {other!r} and {term!r}; give each its own")
-        if self.motion is not None and len(self.fixed) == 0:
+        if self.motion is not None and len(self.held) == 0:
             raise ValueError("motion moves the fixed vertices, but none is fixed; pass fixed=...")
         if self.motion is not None:
             self.motion_rows([0.0])
@@ -181,13 +188,18 @@ class Scene:
         }
 
     def motion_rows(self, times: ArrayLike) -> np.ndarray:
-        """Displacement of the fixed vertices from their start at each time [s], shape (len(times), num_fixed, 3) [m]."""
-        return sampled("motion", self.motion, times, len(self.fixed))
+        """Displacement of the held vertices from their start at each time [s], shape (len(times), num_held, 3) [m]."""
+        return self.supports.rows(self.motion, times)
 
     def path_rows(self, times: ArrayLike) -> dict[str, np.ndarray]:
         """Displacement of each moving obstacle at each time [s], by input name, shape (len(times), 3) [m]."""
         names = self.inputs.paths
         return {name: sampled(name, t.path, times, 1)[:, 0] for name, t in zip(names, self.moving)}
+
+    @property
+    def loaded_vertices(self) -> np.ndarray:
+        """Sorted indices of the vertices that dead loads act on."""
+        return np.unique(np.concatenate([np.zeros(0, np.int64), *(t.indices(self.mesh) for t in self.dead_loads)]))
 
     def places(self, time: float) -> dict[Term, np.ndarray]:
         """Displacement of each moving obstacle at a time [s], shape (3,) [m]."""
@@ -239,7 +251,9 @@ class Scene:
                 f"{self.material!r}" + (", volume averaged over patches" if self.volume == "patches" else ""),
                 f"mass {mass:.6g} kg, precision {self.precision}",
                 f"terms: {terms}",
-                f"fixed vertices: {len(self.fixed)}" + (", moving" if self.motion is not None else ""),
+                f"fixed vertices: {len(self.fixed)}"
+                + (f", in some directions {len(self.supports.guided)}" if len(self.supports.guided) else "")
+                + (", moving" if self.motion is not None else ""),
                 *chosen,
                 "inputs: " + ", ".join(f"{name}{i.in_brackets}" for name, i in self.inputs.described.items()),
             ]

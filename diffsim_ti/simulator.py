@@ -45,6 +45,7 @@ class Simulator:
     def reset(self) -> None:
         """Back to the start of the scene."""
         self.step_count = 0
+        self._set: dict[str, np.ndarray] = {}  # inputs that were set since
         self.workspace.load(self._start)
         self.workspace.report.clear()
         if self._start.forces is not None and len(self._start.forces) == 1:
@@ -89,7 +90,12 @@ class Simulator:
         if values.path is not None:
             rows = self.scene.path_rows([self.time, self.time + self.solver.dt])
             arrays.load_rows(path=np.stack(list(rows.values()), 1))
-        if values.forces is not None and len(values.forces) > 1:
+        inputs = self.scene.inputs
+        if inputs.sums_loads or self.scene.pressures:
+            now = inputs.derive(inputs.at_step(self.step_count, self.solver.dt, self._set))
+            made = dict(forces=now.forces if inputs.sums_loads else None, follower=now.follower)
+            arrays.load_rows(**{name: rows for name, rows in made.items() if rows is not None})
+        if not inputs.sums_loads and values.forces is not None and len(values.forces) > 1:
             rows = values.forces
             if self.step_count >= len(rows):
                 raise ValueError(f"external_forces are given for {len(rows)} steps, this is step {self.step_count}")
@@ -133,7 +139,7 @@ class Simulator:
                     raise ValueError(f"{name}: expected shape {shape}, got {value.shape}")
                 value = value - origin
                 if name == "velocities":
-                    value[self.scene.fixed] = 0
+                    value = self.scene.supports.free(value)
                 runtime.fill(target, value[None])
         self.workspace.forget()
 
@@ -147,7 +153,10 @@ class Simulator:
             )
         if forces.shape != given.shape or not np.all(np.isfinite(forces)):
             raise ValueError(f"forces: expected finite numbers of shape {given.shape}, got shape {forces.shape}")
-        self.workspace.arrays.load_rows(forces=forces[None])
+        if self.scene.inputs.sums_loads:  # with others, when a step is loaded
+            self._set[self.scene.input_names(term)["external_forces"]] = forces
+        else:
+            self.workspace.arrays.load_rows(forces=forces[None])
 
     @property
     def contact_resolution(self) -> ContactResolution:

@@ -24,7 +24,7 @@ def check_strength(scene: Scene) -> None:
     floors = [t for t in scene.terms if isinstance(t, Obstacle) and t.path is None and t.floor_height() is not None]
     if not E > 0:
         return
-    held = bool(floors) or len(scene.fixed) > 0
+    held = bool(floors) or len(scene.held) > 0
     H = float(np.ptp(scene.mesh.vertices[:, 1])) if gravity and held else 0.0
     weight = rho * abs(pull) * H
     start = values["initial_positions"]

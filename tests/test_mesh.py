@@ -480,6 +480,68 @@ def test_physical_groups_become_sets(tmp_path, file_format):
     assert np.array_equal(mesh.tetrahedron_sets["hard"], [0, 1])
     assert np.array_equal(mesh.tetrahedron_sets["tag_4"], [2, 3, 4, 5])
     assert (len(mesh.vertex_sets), len(mesh.tetrahedron_sets)) == (2, 2)
+    assert np.array_equal(mesh.surface_sets["floor"], cube.surface_sets["zmin"])
+    assert len(mesh.surface_sets) == 2 and len(mesh.surface_sets["tag_9"]) == 10
+
+
+def lidded() -> TetrahedralMesh:
+    """A box of which two overlapping parts of the surface have names, one of them also a vertex set of other vertices."""
+    mesh = TetrahedralMesh.create_box((3, 4, 3), pattern="five")
+    mesh = mesh.with_surface_set("lid", lambda x, n: n[:, 1] > 0.9).with_vertex_set("tip", [3])
+    return mesh.with_surface_set("half", lambda x, n: x[:, 0] < 0.4)
+
+
+def test_surface_sets_by_predicate_triangles_and_names():
+    mesh = lidded()
+    assert np.array_equal(mesh.surface_sets["lid"], mesh.surface_sets["ymax"])
+    triangles, rng = mesh.surface_triangles, np.random.default_rng(0)
+    shuffled = rng.permuted(triangles[mesh.surface_sets["half"]], axis=1)[::-1]
+    assert np.array_equal(mesh.surface_indices(shuffled), mesh.surface_sets["half"])
+    both = np.union1d(mesh.surface_sets["half"], mesh.surface_sets["lid"])
+    assert np.array_equal(mesh.surface_indices(["half", "lid"]), both)
+    assert len(mesh.surface_indices(None)) == len(triangles)
+    assert np.array_equal(mesh.vertex_indices("lid"), mesh.vertex_sets["ymax"])  # a surface set stands for its vertices
+    assert "surface sets: xmin (12)" in mesh.describe()
+    with pytest.raises(ValueError, match="no surface set is called 'roof'; there are: xmin"):
+        mesh.surface_indices("roof")
+    inner = next(f for t in mesh.tetrahedra for f in [t[:3]] if not (np.sort(triangles, 1) == np.sort(f)).all(1).any())
+    with pytest.raises(ValueError, match=r"triangle .* is not on the surface \(1 of 1 are not\)"):
+        mesh.surface_indices([inner])
+    with pytest.raises(ValueError, match="the predicate must return .* Booleans"):
+        mesh.surface_where(lambda x, n: n[:, 1])
+    with pytest.raises(ValueError, match=r"surface set 'a': triangles must be vertex indices of shape \(k, 3\)"):
+        TetrahedralMesh(CORNERS, TET, surface_sets={"a": [0, 1]})
+
+
+def test_surface_sets_follow_the_mesh():
+    mesh = lidded()
+    for moved in (
+        mesh.scaled((2, 1, 3)),
+        mesh.translated((1, 2, 3)),
+        mesh.rotated((0, 1, 0), 0.3),
+        pickle.loads(pickle.dumps(mesh)),
+    ):
+        assert {k: v.tolist() for k, v in moved.surface_sets.items()} == {
+            k: v.tolist() for k, v in mesh.surface_sets.items()
+        }
+        assert not moved.surface_sets["lid"].flags.writeable
+    other = TetrahedralMesh.create_cube(3).translated((3, 0, 0))
+    both = TetrahedralMesh.joined([other, mesh])
+    expected = mesh.surface_triangles[mesh.surface_sets["lid"]] + other.num_vertices
+    assert set(map(tuple, both.surface_triangles[both.surface_sets["lid"]])) == set(map(tuple, expected))
+    assert len(both.surface_sets["ymin"]) == len(other.surface_sets["ymin"]) + len(mesh.surface_sets["ymin"])
+    assert len(both.surface_sets["body_1"]) == len(mesh.surface_triangles)
+
+
+@pytest.mark.parametrize("suffix", [".msh", ".vtu", ".vtk"])
+def test_files_keep_surface_sets(tmp_path, suffix):
+    mesh = lidded()
+    mesh.save(tmp_path / f"a{suffix}")
+    again = TetrahedralMesh.from_file(tmp_path / f"a{suffix}")
+    assert set(again.surface_sets) == set(mesh.surface_sets)
+    assert all(np.array_equal(again.surface_sets[name], rows) for name, rows in mesh.surface_sets.items())
+    assert np.array_equal(again.vertex_sets["tip"], [3])
+    assert np.array_equal(again.vertex_sets["ymax"], mesh.vertex_sets["ymax"])
 
 
 def gmsh41(points, cells, tags, names) -> str:

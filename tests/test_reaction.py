@@ -106,7 +106,7 @@ def test_reactions_balance_weight_and_loads():
 
 def test_what_does_not_fit_is_refused():
     solver = ds.StaticSolver(scene_of())
-    with pytest.raises(ValueError, match="among the fixed vertices, but 4 of its 4 vertices are free"):
+    with pytest.raises(ValueError, match="among the held vertices, but 4 of its 4 vertices are free"):
         ds.Rollout(solver, 1, outputs=ds.Reaction("xmax"))
     with pytest.raises(ValueError, match="about= or per_vertex=True"):
         ds.Reaction(about=(0, 0, 0), per_vertex=True)

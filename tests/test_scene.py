@@ -90,7 +90,7 @@ REFUSED = {
         "a scene takes one Gravity, got several; add their numbers",
     ),
     "two drags": (lambda: scene(terms=[ds.Drag(1), ds.Drag(2)]), "a scene takes one Drag"),
-    "two forces": (lambda: scene(terms=[ds.ExternalForce([0, 0, 1])] * 2), "a scene takes one ExternalForce"),
+    "two self-contacts": (lambda: scene(terms=[ds.SelfContact()] * 2), "a scene takes one SelfContact"),
     "gravity's shape": (
         lambda: ds.Gravity([1, 2]),
         r"acceleration must be a number \(along y\) or 3 numbers, got shape \(2,\)",

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from diffsim_ti.inputs import links
 from diffsim_ti.inputs.chain import Chain, Link
 from diffsim_ti.inputs.description import POSITIVE, Input, frozen, length, speed
+from diffsim_ti.inputs.loads import PressureRows, SumOfForces
 from diffsim_ti.inputs.surface_areas import SurfaceAreas
 from diffsim_ti.rows import Rows
 
@@ -30,9 +31,12 @@ class Derived:
     gradients: np.ndarray  # (num_tetrahedra, 3, 3), rows grad N_1..3 [1/m]
     volumes: np.ndarray  # (num_tetrahedra,) [m^3]
     surface: np.ndarray | None = None  # (num_vertices,) of the surface, 0 within [m^2]
-    forces: np.ndarray | None = None  # (1 or steps, k, 3) [N]
-    motion: np.ndarray | None = None  # (steps + 1, num_fixed, 3) [m]
+    forces: np.ndarray | None = None  # (1 or steps, k, 3), or (1 or steps, 2 k, 3) as each step begins and ends [N]
+    motion: np.ndarray | None = None  # (steps + 1, num_held, 3) [m]
     path: np.ndarray | None = None  # displacements of obstacles, (steps + 1, num_moving, 3) [m]
+    follower: np.ndarray | None = (
+        None  # pressures of loads as each step begins and ends, and 0, (1 or steps, loads, 3) [Pa]
+    )
 
     def zeros(self) -> "Derived":
         """The same shapes, all zero."""
@@ -78,6 +82,9 @@ class Inputs:
         self._per_step = [name for name, i in self.described.items() if i.is_per_step]
         self.parameters = Rows({term: term.num_numbers for term in scene.ordered_terms})
         self.paths = [named[term][term.path_name] for term in scene.moving]  # names, in the order of kernels' columns
+        self.keyed = [(named[term][term.plain], term) for term in scene.ordered_terms if term.keyed]
+        alone = len(scene.dead_loads) == 1 and scene.dead_loads[0].sums_itself
+        self.sums_loads = bool(scene.dead_loads) and not alone
         self.chain = Chain(self._links(named), self.described)
 
     def _of_body(self, density, positions, velocities) -> list[Input]:
@@ -97,7 +104,7 @@ class Inputs:
         """What stands at the end of the list: the rest shape, whose gradient costs extra, and the prescribed motion."""
         out = [Input("rest_positions", self.mesh.vertices, (("vertices", 3),), "m", change=length)]
         if self.scene.motion is not None:
-            shape = ("steps + 1", len(self.scene.fixed), 3)
+            shape = ("steps + 1", len(self.scene.held), 3)
             out.append(Input("prescribed_motion", None, (shape,), "m", change=length))
         return out
 
@@ -107,7 +114,7 @@ class Inputs:
         out = [
             links.RestShape(mesh.tetrahedra),
             links.Displacement(),
-            links.FreeVelocity(scene.fixed),
+            links.FreeVelocity(scene.supports.free),
             links.LumpedMass(mesh.tetrahedra, mesh.num_vertices),
             *scene.material.links(),
         ]
@@ -115,16 +122,35 @@ class Inputs:
             out.append(SurfaceAreas(mesh.surface_triangles, mesh.num_vertices))
         for k, term in enumerate(scene.ordered_terms):
             own, rows = f"numbers of term {k}", self.parameters.of(term)
-            links_of = term.links(named[term], own)
+            summed = term.dead and self.sums_loads
+            links_of = term.force_links(named[term], own) if summed else term.links(named[term], own)
             out += links_of
             as_they_are = not any(own in link.writes for link in links_of)
             places |= _placed(term, named[term], rows) if as_they_are else {own: rows}
+        out += self._sums_of_loads()
         out.append(links.Placed(places, "parameters", max(self.parameters.total, 1)))
         if self.paths:
             out.append(links.Columns(self.paths, "path"))
         if scene.motion is not None:
             out.append(links.Same("prescribed_motion", "motion"))
         return out
+
+    def _sums_of_loads(self) -> list[Link]:
+        """What adds the forces of dead loads, and what lists pressures."""
+        own = {term: f"numbers of term {k}" for k, term in enumerate(self.scene.ordered_terms)}
+        dead, pressures = self.scene.dead_loads, self.scene.pressures
+        out = []
+        if self.sums_loads:
+            indices = [term.indices(self.mesh) for term in dead]
+            out.append(SumOfForces([f"{own[t]} forces" for t in dead], indices, self.keyed_forces, "forces"))
+        if pressures:
+            out.append(PressureRows([f"{own[t]} in time" for t in pressures], "follower"))
+        return out
+
+    @property
+    def keyed_forces(self) -> bool:
+        """Whether some dead load changes within steps."""
+        return any(term.keyed for term in self.scene.dead_loads)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -138,7 +164,20 @@ class Inputs:
         """The values of a run, with those that are sampled at its times [s]."""
         scene = self.scene
         rows = {"prescribed_motion": scene.motion_rows(times)} if scene.motion is not None else {}
-        return self.values | {name: frozen(value) for name, value in (rows | scene.path_rows(times)).items()}
+        rows |= scene.path_rows(times) | {name: term.rows(times) for name, term in self.keyed}
+        return self.values | {name: frozen(value) for name, value in rows.items()}
+
+    def at_step(self, step: int, dt: float, values: dict | None = None) -> dict[str, np.ndarray]:
+        """The values of a run of one step of dt [s], that of number `step`, with some of them replaced; where loads are made
+        together, of what is given for each step that step's row."""
+        out = self.at_times([step * dt, (step + 1) * dt]) | (values or {})
+        for name in self._per_step:
+            rules = [rule for rule in self.described[name].shapes if len(rule) == out[name].ndim]
+            if any("steps" in rule for rule in rules) and (self.sums_loads or self.scene.pressures):
+                if step >= len(out[name]):
+                    raise ValueError(f"{name} is given for {len(out[name])} steps, this is step {step}")
+                out[name] = out[name][step : step + 1]
+        return out
 
     def check(self, values: dict) -> dict[str, np.ndarray]:
         """Float64 arrays of the right shapes, or ValueError naming expected and got."""

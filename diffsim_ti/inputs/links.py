@@ -1,6 +1,6 @@
 """Links of a body, its rest shape, mass and start, and what joins the numbers of terms and the paths of obstacles."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
@@ -72,17 +72,15 @@ class Displacement(Link):
 
 
 class FreeVelocity(Link):
-    """Velocities; fixed vertices have none."""
+    """Velocities without what is held of them: free(v), a projection."""
 
     reads, writes = ("initial_velocities",), ("velocity",)
 
-    def __init__(self, fixed: np.ndarray):
-        self.fixed = fixed
+    def __init__(self, free: Callable):
+        self.free = free
 
     def value(self, v):
-        out = np.array(v)
-        out[self.fixed] = 0
-        return (out,)
+        return (self.free(v),)
 
     def jvp(self, x, dx):
         return self.value(dx[0])

@@ -30,6 +30,7 @@ def describe(mesh: "TetrahedralMesh") -> str:
             f"smallest altitude: {mesh.altitudes[thin].min():.4g} m in tetrahedron {thin}",
             f"vertex sets: {sizes(mesh.vertex_sets)}",
             f"tetrahedron sets: {sizes(mesh.tetrahedron_sets)}",
+            f"surface sets: {sizes(mesh.surface_sets)}",
         ]
     )
 

@@ -8,12 +8,13 @@ import numpy as np
 
 DIMENSION = {"vertex": 0, "line": 1, "triangle": 2, "tetra": 3}  # the cells that a file may hold
 TAGS = ("gmsh:physical", "medit:ref", "cell_tags", "avsucd:material")  # integer cell data that group cells
-VERTEX_PREFIX, TETRAHEDRON_PREFIX = "vertex_set:", "tetrahedron_set:"  # 0/1 data arrays in VTU and VTK files
+VERTEX_PREFIX = "vertex_set:"  # 0/1 data arrays in VTU and VTK files
+CELL_PREFIXES = {"tetra": "tetrahedron_set:", "triangle": "surface_set:"}
 KEEPS_SETS = (".msh", ".vtu", ".vtk")
 
 
-def read_mesh(path) -> tuple[np.ndarray, np.ndarray, dict, dict]:
-    """Vertices, tetrahedra, vertex sets and tetrahedron sets of a file; see `TetrahedralMesh.from_file`."""
+def read_mesh(path) -> tuple[np.ndarray, np.ndarray, dict, dict, dict]:
+    """Vertices, tetrahedra, vertex sets, tetrahedron sets and named triangles of a file; see `TetrahedralMesh.from_file`."""
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"mesh file {path} does not exist (looked in {Path.cwd()})")
@@ -21,13 +22,15 @@ def read_mesh(path) -> tuple[np.ndarray, np.ndarray, dict, dict]:
     _check_cell_types(mesh)
     blocks = [k for k, block in enumerate(mesh.cells) if block.type == "tetra"]
     offset = dict(zip(blocks, np.cumsum([0] + [len(mesh.cells[k].data) for k in blocks])))
-    vertex_sets, tetrahedron_sets = {}, {}
+    vertex_sets, tetrahedron_sets, triangles = {}, {}, {}
 
     def add(name: str, k: int, rows: np.ndarray) -> None:
         if len(rows) and k in offset:
             tetrahedron_sets.setdefault(name, []).append(rows + offset[k])
         elif len(rows):
             vertex_sets.setdefault(name, []).append(mesh.cells[k].data[rows].ravel())
+            if mesh.cells[k].type == "triangle":
+                triangles.setdefault(name, []).append(mesh.cells[k].data[rows])
 
     for name, k, rows in _groups(mesh):
         add(name, k, rows)
@@ -41,7 +44,8 @@ def read_mesh(path) -> tuple[np.ndarray, np.ndarray, dict, dict]:
     if path.suffix == ".msh":
         tetrahedra, join = _merge_repeated(tetrahedra, join)
     sets = {name: np.unique(np.concatenate(parts)).astype(np.int64) for name, parts in vertex_sets.items()}
-    return mesh.points, tetrahedra, sets, join
+    triangles = {name: np.concatenate(parts).astype(np.int64) for name, parts in triangles.items()}
+    return mesh.points, tetrahedra, sets, join, triangles
 
 
 def _read(path: Path):
@@ -92,8 +96,9 @@ def _groups(mesh):
         if name != "gmsh:bounding_entities":
             yield from ((name, k, np.asarray(rows, np.int64)) for k, rows in enumerate(members) if rows is not None)
     for key, blocks in mesh.cell_data.items():
-        if key.startswith(TETRAHEDRON_PREFIX):
-            yield from ((key.removeprefix(TETRAHEDRON_PREFIX), k, np.nonzero(v)[0]) for k, v in enumerate(blocks))
+        for kind, prefix in CELL_PREFIXES.items():
+            own = [k for k, block in enumerate(mesh.cells) if block.type == kind and key.startswith(prefix)]
+            yield from ((key.removeprefix(prefix), k, np.nonzero(blocks[k])[0]) for k in own)
         if key not in TAGS:
             continue
         blocks = [np.asarray(values).astype(np.int64) for values in blocks]
@@ -122,20 +127,34 @@ def _merge_repeated(tetrahedra: np.ndarray, sets: dict) -> tuple[np.ndarray, dic
     return tetrahedra[keep], {name: np.unique(new[rows]) for name, rows in sets.items()}
 
 
-def write_mesh(path, vertices, tetrahedra, vertex_sets: dict, tetrahedron_sets: dict) -> list[str]:
-    """Write the mesh in the format that the suffix names; returns the names of the sets that the format cannot keep."""
+def write_mesh(path, vertices, tetrahedra, vertex_sets: dict, tetrahedron_sets: dict, triangles: dict) -> list[str]:
+    """Write the mesh in the format that the suffix names; returns the names of the sets that the format cannot keep.
+
+    triangles: name -> vertex indices of a surface set, shape (k, 3).
+    """
     import meshio
 
     path = Path(path)
+    vertex_sets = {n: rows for n, rows in vertex_sets.items() if not _same_vertices(rows, triangles.get(n))}
     if path.suffix == ".msh":
-        _write_gmsh(meshio, path, vertices, tetrahedra, vertex_sets, tetrahedron_sets)
+        _write_gmsh(meshio, path, vertices, tetrahedra, vertex_sets, tetrahedron_sets, triangles)
         return []
-    point_data, cell_data, lost = {}, {}, [*vertex_sets, *tetrahedron_sets]
+    cells, point_data, cell_data, lost = [("tetra", tetrahedra)], {}, {}, [*vertex_sets, *tetrahedron_sets, *triangles]
     if path.suffix in KEEPS_SETS:
+        m, surface = len(tetrahedra), np.zeros((0, 3), np.int64)
+        if triangles:
+            surface, inverse = np.unique(np.concatenate([*triangles.values()]), axis=0, return_inverse=True)
+            inverse = np.split(inverse.ravel(), np.cumsum([len(rows) for rows in triangles.values()])[:-1])
+            cells.append(("triangle", surface))
+        sizes = [m, len(surface)][: len(cells)]
+        members = {CELL_PREFIXES["tetra"] + name: (0, rows) for name, rows in tetrahedron_sets.items()}
+        if triangles:
+            members |= {CELL_PREFIXES["triangle"] + name: (1, rows) for name, rows in zip(triangles, inverse)}
+        for name, (block, rows) in members.items():
+            cell_data[name] = [_mask(rows if k == block else [], size) for k, size in enumerate(sizes)]
         point_data = {VERTEX_PREFIX + name: _mask(rows, len(vertices)) for name, rows in vertex_sets.items()}
-        cell_data = {TETRAHEDRON_PREFIX + name: [_mask(r, len(tetrahedra))] for name, r in tetrahedron_sets.items()}
         lost = []
-    mesh = meshio.Mesh(vertices, [("tetra", tetrahedra)], point_data=point_data, cell_data=cell_data)
+    mesh = meshio.Mesh(vertices, cells, point_data=point_data, cell_data=cell_data)
     try:
         mesh.write(path)
     except (meshio.WriteError, meshio.ReadError) as error:
@@ -143,14 +162,19 @@ def write_mesh(path, vertices, tetrahedra, vertex_sets: dict, tetrahedron_sets: 
     return lost
 
 
-def _mask(rows: np.ndarray, count: int) -> np.ndarray:
+def _same_vertices(rows: np.ndarray, triangles: np.ndarray | None) -> bool:
+    """Whether a vertex set is that of its triangles, which say so when they are read again."""
+    return triangles is not None and np.array_equal(rows, np.unique(triangles))
+
+
+def _mask(rows, count: int) -> np.ndarray:
     mask = np.zeros(count, np.int32)
     mask[rows] = 1
     return mask
 
 
-def _write_gmsh(meshio, path, vertices, tetrahedra, vertex_sets, tetrahedron_sets) -> None:
-    """Gmsh 2.2, binary: sets as named physical groups of points and of volumes; a member of several is listed again."""
+def _write_gmsh(meshio, path, vertices, tetrahedra, vertex_sets, tetrahedron_sets, triangles) -> None:
+    """Gmsh 2.2, binary: sets as named physical groups of points, surfaces, volumes; a member of several is listed again."""
     field_data, first, again = {}, np.zeros(len(tetrahedra), np.int64), []
     for tag, (name, rows) in enumerate(tetrahedron_sets.items(), start=1):
         field_data[name] = np.array([tag, 3])
@@ -162,13 +186,18 @@ def _write_gmsh(meshio, path, vertices, tetrahedra, vertex_sets, tetrahedron_set
         if len(rows):
             blocks.append(("tetra", tetrahedra[rows]))
             tags.append(np.full(len(rows), tag))
-    for tag, (name, rows) in enumerate(vertex_sets.items(), start=1):
-        if name in field_data:  # meshio knows one dimension per name
-            raise ValueError(f"cannot save {path}: {name!r} names a vertex set and a tetrahedron set; rename one")
-        field_data[name] = np.array([tag, 0])
-        if len(rows):
-            blocks.append(("vertex", rows[:, None]))
-            tags.append(np.full(len(rows), tag))
+    surfaces = [("triangle", name, cells) for name, cells in triangles.items()]
+    points = [("vertex", name, rows[:, None]) for name, rows in vertex_sets.items()]
+    for kind, group in (("triangle", surfaces), ("vertex", points)):
+        for tag, (_, name, cells) in enumerate(group, start=1):
+            if name in field_data:  # meshio knows one dimension per name
+                known = {3: "tetrahedron", 2: "surface"}[int(field_data[name][1])]
+                which = {"vertex": "vertex", "triangle": "surface"}[kind]
+                raise ValueError(f"cannot save {path}: {name!r} names a {which} set and a {known} set; rename one")
+            field_data[name] = np.array([tag, DIMENSION[kind]])
+            if len(cells):
+                blocks.append((kind, cells))
+                tags.append(np.full(len(cells), tag))
     cell_data = {"gmsh:physical": tags, "gmsh:geometrical": tags}
     mesh = meshio.Mesh(vertices, blocks, cell_data=cell_data, field_data=field_data)
     mesh.write(path, file_format="gmsh22", binary=True)

@@ -1,4 +1,4 @@
-"""Named sets of vertices and of tetrahedra, and the ways in which a user may choose some."""
+"""Named sets of vertices, of tetrahedra and of surface triangles: their numbers, checked, joined, renumbered."""
 
 import numpy as np
 
@@ -56,24 +56,59 @@ def join_sets(parts: list[dict], firsts: np.ndarray) -> dict[str, np.ndarray]:
     return out
 
 
-def join(meshes: list) -> tuple[np.ndarray, np.ndarray, dict, dict]:
-    """(vertices, tetrahedra, vertex sets, tetrahedron sets) of several bodies, one after the other."""
+def places_of_triangles(triangles: np.ndarray, among: np.ndarray) -> np.ndarray:
+    """The row of `among` that has the same three vertices, -1 where there is none."""
+    if not len(triangles) or not len(among):
+        return np.full(len(triangles), -1)
+    both = np.sort(np.concatenate([among, triangles]), 1)
+    _, first, inverse = np.unique(both, axis=0, return_index=True, return_inverse=True)
+    at = first[inverse.ravel()[len(among) :]]
+    return np.where(at < len(among), at, -1)
+
+
+def rows_on_surface(sets: dict | None, surface: np.ndarray) -> dict[str, np.ndarray]:
+    """name -> rows of the surface, from triangles as vertex indices; those within the body are left out, and sets that are
+    left with none."""
+    out = {}
+    for name, triangles in (sets or {}).items():
+        triangles = np.asarray(triangles)
+        if triangles.ndim != 2 or triangles.shape[1] != 3 or triangles.dtype.kind not in "iu":
+            raise ValueError(
+                f"surface set {name!r}: triangles must be vertex indices of shape (k, 3), got shape {triangles.shape}"
+            )
+        rows = places_of_triangles(triangles, surface)
+        if np.any(rows >= 0) or not len(triangles):
+            out[name] = rows[rows >= 0]
+    return out
+
+
+def join(meshes: list) -> tuple[np.ndarray, np.ndarray, dict]:
+    """(vertices, tetrahedra, sets by arguments of TetrahedralMesh) of several bodies, one after the other."""
     firsts = np.cumsum([0, *(mesh.num_vertices for mesh in meshes)])
     first_tets = np.cumsum([0, *(mesh.num_tetrahedra for mesh in meshes)])
-    return (
-        np.concatenate([mesh.vertices for mesh in meshes]),
-        np.concatenate([mesh.tetrahedra + first for mesh, first in zip(meshes, firsts)]),
-        join_sets([mesh.vertex_sets for mesh in meshes], firsts),
-        join_sets([mesh.tetrahedron_sets for mesh in meshes], first_tets),
+    triangles = [
+        {f"body_{k}": mesh.surface_triangles + first}
+        | {name: mesh.surface_triangles[rows] + first for name, rows in mesh.surface_sets.items()}
+        for k, (mesh, first) in enumerate(zip(meshes, firsts))
+    ]
+    names = dict.fromkeys(name for sets in triangles for name in sets)
+    sets = dict(
+        vertex_sets=join_sets([mesh.vertex_sets for mesh in meshes], firsts),
+        tetrahedron_sets=join_sets([mesh.tetrahedron_sets for mesh in meshes], first_tets),
+        surface_sets={name: np.concatenate([sets[name] for sets in triangles if name in sets]) for name in names},
     )
+    vertices = np.concatenate([mesh.vertices for mesh in meshes])
+    return vertices, np.concatenate([mesh.tetrahedra + first for mesh, first in zip(meshes, firsts)]), sets
 
 
-def without_unused(vertices: np.ndarray, tetrahedra: np.ndarray, sets: dict) -> tuple[np.ndarray, np.ndarray, dict]:
-    """The same without vertices that no tetrahedron uses, renumbered."""
+def without_unused(vertices: np.ndarray, tetrahedra: np.ndarray, sets: dict, triangles: dict) -> tuple:
+    """(vertices, tetrahedra, vertex sets, triangles by name) without vertices that no tetrahedron uses, renumbered."""
     used = np.unique(tetrahedra)
     new = np.full(len(vertices), -1)
     new[used] = np.arange(len(used))
-    return vertices[used], new[tetrahedra], {name: new[rows][new[rows] >= 0] for name, rows in sets.items()}
+    sets = {name: new[rows][new[rows] >= 0] for name, rows in sets.items()}
+    triangles = {name: new[rows][(new[rows] >= 0).all(1)] for name, rows in triangles.items()}
+    return vertices[used], new[tetrahedra], sets, triangles
 
 
 def pieces(mesh) -> np.ndarray:

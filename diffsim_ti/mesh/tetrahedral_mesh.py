@@ -3,10 +3,9 @@
 import copy
 import math
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from functools import cached_property
 from os import PathLike
-from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,16 +16,19 @@ from diffsim_ti.mesh.description import content_hash, describe
 from diffsim_ti.mesh.files import KEEPS_SETS, read_mesh, write_mesh
 from diffsim_ti.mesh.grid import box
 from diffsim_ti.mesh.locate import LocatedPoints, locate
-from diffsim_ti.mesh.sets import checked_sets, chosen_indices, join, pieces, without_unused
+from diffsim_ti.mesh.named_sets import NamedSets
+from diffsim_ti.mesh.sets import checked_sets, join, pieces, rows_on_surface, without_unused
 
 
-class TetrahedralMesh:
+class TetrahedralMesh(NamedSets):
     """Linear tetrahedra at rest. Immutable: arrays are read-only float64 or int64, changes return a new mesh.
 
     vertices: positions [m], shape (num_vertices, 3).
     tetrahedra: vertex indices from 0, integers, shape (num_tetrahedra, 4), positive volume
         det [x1 - x0, x2 - x0, x3 - x0] / 6 > 0.
     vertex_sets, tetrahedron_sets: name -> indices or Boolean mask; kept as sorted indices.
+    surface_sets: name -> triangles of the surface as vertex indices, shape (k, 3), in any order; kept as sorted indices of
+        rows of `surface_triangles`. Triangles within the body are left out.
     fix_orientation: swap two vertices of each inside-out tetrahedron instead of refusing it.
 
     Raises ValueError for wrong shapes or dtypes, indices out of range, non-finite coordinates, a repeated vertex in a
@@ -41,6 +43,7 @@ class TetrahedralMesh:
         *,
         vertex_sets: dict | None = None,
         tetrahedron_sets: dict | None = None,
+        surface_sets: dict | None = None,
         fix_orientation: bool = False,
     ):
         self._vertices = checks.checked_vertices(vertices)
@@ -51,6 +54,8 @@ class TetrahedralMesh:
         self._surface_triangles = checks.surface_of(self._tetrahedra, self.num_vertices)
         self._vertex_sets = checked_sets(vertex_sets, self.num_vertices, "vertex")
         self._tetrahedron_sets = checked_sets(tetrahedron_sets, self.num_tetrahedra, "tetrahedron")
+        on_surface = rows_on_surface(surface_sets, self._surface_triangles)
+        self._surface_sets = checked_sets(on_surface, len(self._surface_triangles), "surface")
         self._freeze()
         checks.warn_of_orphans(self.unused_vertices)
         checks.warn_of_slivers(self)
@@ -70,7 +75,7 @@ class TetrahedralMesh:
     def create_box(
         cls, resolution: ArrayLike = 5, size: ArrayLike = 1.0, pattern: str = "kuhn", origin: ArrayLike = (0, 0, 0)
     ) -> "TetrahedralMesh":
-        """A box on a regular grid, with vertex sets xmin, xmax, ymin, ymax, zmin, zmax.
+        """A box on a regular grid, with vertex sets and surface sets xmin, xmax, ymin, ymax, zmin, zmax.
 
         resolution: vertices per side, an integer of at least 2 or three of them.
         size: edge lengths [m], one number or three. origin: the lowest corner [m].
@@ -79,7 +84,10 @@ class TetrahedralMesh:
         Vertex (i, j, k) has index (i ny + j) nz + k.
         """
         vertices, tetrahedra, sides = box(resolution, size, pattern, origin)
-        return cls(vertices, tetrahedra, vertex_sets=sides)
+        mesh = cls(vertices, tetrahedra, vertex_sets=sides)
+        corners = mesh.surface_triangles
+        rows = {name: np.isin(corners, side).all(1) for name, side in sides.items()}
+        return mesh._changed(_surface_sets=checked_sets(rows, len(corners), "surface"))
 
     @classmethod
     def from_file(
@@ -88,22 +96,24 @@ class TetrahedralMesh:
         """Load tetrahedra from any format that meshio reads: Gmsh .msh (2.2 and 4.x), .vtu, .vtk, MEDIT .mesh, .inp ...
 
         Blocks of tetrahedra are joined. Named groups of tetrahedra become tetrahedron sets, groups of triangles, lines
-        or points the vertex sets of their vertices; integer tags without a name become "tag_<n>", except 0 and a tag
-        that all tetrahedra share. Triangles, lines and points are otherwise ignored.
+        or points the vertex sets of their vertices, and those triangles that lie on the surface a surface set too; integer
+        tags without a name become "tag_<n>", except 0 and a tag that all tetrahedra share. Other triangles, lines and
+        points are ignored.
         drop_orphans: leave out vertices that no tetrahedron uses (Gmsh writes some) and renumber; default: warn.
 
         Raises FileNotFoundError, and ValueError for an unreadable file, one without tetrahedra, 10-node tetrahedra,
         other cells beside tetrahedra (cell types are named), and whatever the constructor refuses.
         """
-        vertices, tetrahedra, vertex_sets, tetrahedron_sets = read_mesh(path)
+        vertices, tetrahedra, vertex_sets, tetrahedron_sets, triangles = read_mesh(path)
         if drop_orphans and tetrahedra.min() >= 0 and tetrahedra.max() < len(vertices):
-            vertices, tetrahedra, vertex_sets = without_unused(vertices, tetrahedra, vertex_sets)
+            vertices, tetrahedra, vertex_sets, triangles = without_unused(vertices, tetrahedra, vertex_sets, triangles)
         try:
             return cls(
                 vertices,
                 tetrahedra,
                 vertex_sets=vertex_sets,
                 tetrahedron_sets=tetrahedron_sets,
+                surface_sets=triangles,
                 fix_orientation=fix_orientation,
             )
         except ValueError as error:
@@ -118,11 +128,13 @@ class TetrahedralMesh:
     def save(self, path: str | PathLike) -> None:
         """Write the mesh through meshio, in the format that the suffix names.
 
-        Sets are kept in .msh (Gmsh 2.2 binary, as physical groups of points and volumes) and in .vtu and .vtk (as 0/1
-        data arrays "vertex_set:<name>", "tetrahedron_set:<name>"; .vtk turns blanks in names into underscores); other
-        formats lose them with a UserWarning. These three keep every digit. ValueError for an unknown suffix.
+        Sets are kept in .msh (Gmsh 2.2 binary, as physical groups of points, surfaces and volumes) and in .vtu and .vtk (as
+        0/1 data arrays "vertex_set:<name>", "tetrahedron_set:<name>", "surface_set:<name>", with triangles as cells; .vtk
+        turns blanks in names into underscores); other formats lose them with a UserWarning. These three keep every digit.
+        ValueError for an unknown suffix, and in .msh for a name of two sets (not a surface set and its own vertices).
         """
-        lost = write_mesh(path, self.vertices, self.tetrahedra, self.vertex_sets, self.tetrahedron_sets)
+        triangles = {name: self.surface_triangles[rows] for name, rows in self._surface_sets.items()}
+        lost = write_mesh(path, self.vertices, self.tetrahedra, self._vertex_sets, self._tetrahedron_sets, triangles)
         if lost:
             kept = ", ".join(KEEPS_SETS)
             warnings.warn(f"{path} cannot keep the sets {', '.join(lost)}; these formats can: {kept}", stacklevel=2)
@@ -131,14 +143,14 @@ class TetrahedralMesh:
     def joined(cls, meshes: Iterable["TetrahedralMesh"]) -> "TetrahedralMesh":
         """Several bodies as one mesh of several pieces, one after the other.
 
-        Sets of the same name become one; each body's vertices and tetrahedra also become sets "body_0", "body_1", ...
+        Sets of the same name become one; each body's vertices, tetrahedra and surface are sets "body_0", "body_1", ... too.
         ValueError for an empty list, and for meshes that have a set of such a name already.
         """
         meshes = list(meshes)
         if not meshes:
             raise ValueError("joined needs at least one mesh, got none")
-        vertices, tetrahedra, vertex_sets, tetrahedron_sets = join(meshes)
-        return cls(vertices, tetrahedra, vertex_sets=vertex_sets, tetrahedron_sets=tetrahedron_sets)
+        vertices, tetrahedra, sets = join(meshes)
+        return cls(vertices, tetrahedra, **sets)
 
     # What it consists of
 
@@ -151,16 +163,6 @@ class TetrahedralMesh:
     def tetrahedra(self) -> np.ndarray:
         """Vertex indices, shape (num_tetrahedra, 4), positively oriented."""
         return self._tetrahedra
-
-    @property
-    def vertex_sets(self) -> MappingProxyType:
-        """Name -> sorted vertex indices."""
-        return MappingProxyType(self._vertex_sets)
-
-    @property
-    def tetrahedron_sets(self) -> MappingProxyType:
-        """Name -> sorted tetrahedron indices."""
-        return MappingProxyType(self._tetrahedron_sets)
 
     @property
     def num_vertices(self) -> int:
@@ -239,32 +241,7 @@ class TetrahedralMesh:
         """Lowest and highest corner [m], shape (2, 3)."""
         return _frozen(np.stack([self.vertices.min(0), self.vertices.max(0)]))
 
-    # Choosing vertices and tetrahedra
-
-    def vertex_indices(self, chosen: str | ArrayLike | Iterable[str]) -> np.ndarray:
-        """Sorted indices from a set's name, several names, indices, or a Boolean mask over the vertices."""
-        return chosen_indices(chosen, self._vertex_sets, self.num_vertices, "vertex")
-
-    def tetrahedron_indices(self, chosen: str | ArrayLike | Iterable[str]) -> np.ndarray:
-        """Sorted indices from a set's name, several names, indices, or a Boolean mask over the tetrahedra."""
-        return chosen_indices(chosen, self._tetrahedron_sets, self.num_tetrahedra, "tetrahedron")
-
-    def vertices_where(self, predicate: Callable) -> np.ndarray:
-        """Sorted indices of the vertices where a function of all positions is true: `lambda x: x[:, 0] < 0.1`."""
-        mask = np.asarray(predicate(self.vertices))
-        if mask.dtype.kind != "b":
-            raise ValueError(f"the predicate must return {self.num_vertices} Booleans, got dtype {mask.dtype}")
-        return self.vertex_indices(mask)
-
-    def with_vertex_set(self, name: str, chosen: str | ArrayLike | Iterable[str]) -> "TetrahedralMesh":
-        """A mesh that has this vertex set too (or instead of one of that name); `chosen` as in `vertex_indices`."""
-        sets = {**self._vertex_sets, name: self.vertex_indices(chosen)}
-        return self._changed(_vertex_sets=checked_sets(sets, self.num_vertices, "vertex"))
-
-    def with_tetrahedron_set(self, name: str, chosen: str | ArrayLike | Iterable[str]) -> "TetrahedralMesh":
-        """A mesh that has this tetrahedron set too (or instead of one of that name)."""
-        sets = {**self._tetrahedron_sets, name: self.tetrahedron_indices(chosen)}
-        return self._changed(_tetrahedron_sets=checked_sets(sets, self.num_tetrahedra, "tetrahedron"))
+    # Points
 
     def locate(self, points: ArrayLike, nearest: bool = False) -> LocatedPoints:
         """Where points [m], shape (k, 3), lie: tetrahedra, corners, barycentric weights; `.matrix` is the sparse map.
@@ -330,6 +307,7 @@ class TetrahedralMesh:
         new._surface_triangles = self._surface_triangles
         checks.oriented(new._tetrahedra, new._volumes, fix_orientation=False)
         new._vertex_sets, new._tetrahedron_sets = self._vertex_sets, self._tetrahedron_sets
+        new._surface_sets = self._surface_sets
         new._freeze()
         return new
 
@@ -340,7 +318,8 @@ class TetrahedralMesh:
     def __setstate__(self, state: dict) -> None:
         """Copies and unpickled meshes are read-only too (NumPy forgets the flag)."""
         self.__dict__.update(state)
-        for value in (*state.values(), *self._vertex_sets.values(), *self._tetrahedron_sets.values()):
+        sets = (self._vertex_sets, self._tetrahedron_sets, self._surface_sets)
+        for value in (*state.values(), *(rows for named in sets for rows in named.values())):
             if isinstance(value, np.ndarray):
                 _frozen(value)
 

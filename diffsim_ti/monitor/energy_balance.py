@@ -134,6 +134,7 @@ class EnergyBalance:
         u, v = (runtime.fetch(x)[0].astype(np.float64) for x in (ws.state.u, ws.state.v))
         free = runtime.fetch(a.inverse_mass) > 0
         mass, features = values.mass[:, None] * free[:, None], a.features()
+        v = a.supports.free(v)
         weight = mass * values.parameters[features.gravity :][:3] if features.gravity >= 0 else 0 * mass
         kinetic = 0.5 * float((mass * v**2).sum())
         stored = quantities.elastic_energy(ws)
@@ -145,7 +146,7 @@ class EnergyBalance:
             stored += ws.pairs.look(ws.state.u)[0]
         self.moving = max(self.moving, kinetic + stored)
         j = min(now, num_passes - 1)
-        forces = ws.forces_at(j, num_passes) - ws.loads_at(j, num_passes) + weight
+        forces = a.supports.free(ws.forces_at(j, num_passes) - ws.loads_at(j, num_passes) + weight)
         if ws.solver.lags(now, num_passes):
             swapped = 0.5 * h * float((v * forces).sum())
         else:

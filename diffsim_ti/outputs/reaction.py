@@ -1,4 +1,4 @@
-"""What holds the fixed vertices of a body: force and moment of a support."""
+"""What holds a body: force and moment of a support."""
 
 from copy import copy
 from typing import TYPE_CHECKING
@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.outputs.body_forces import BodyForces
+from diffsim_ti.outputs.given_loads import GivenLoads
 from diffsim_ti.outputs.moments import moments, moments_jvp, moments_vjp
 from diffsim_ti.outputs.output import Change, Output
-from diffsim_ti.terms import ExternalForce, Gravity
 
 if TYPE_CHECKING:
     from diffsim_ti.rollout.frames import Frames
@@ -17,22 +17,24 @@ if TYPE_CHECKING:
 
 
 class Reaction(Output):
-    """Force [N] with which fixed vertices are held, shape (frames, 3), or of each, (frames, k, 3), at each frame's state.
+    """Force [N] with which vertices are held, shape (frames, 3), or of each, (frames, k, 3), at each frame's state.
 
-        R = -sum over the support of (f_i + m_i g + F_i)
+        R = -sum over the support of Q_i (f_i + m_i g + F_i)
 
-    f: force of the body's stress on a vertex, m_i g its weight, F its external force (of the step that ends in the frame).
-    So in equilibrium the reactions of all supports, the weight, the loads and the forces of obstacles add up to zero.
-    What obstacles and self-contact do to fixed vertices themselves is not in it (ContactForce has the first), nor is the
+    f: force of the body's stress on a vertex, m_i g its weight, F its loads (of the step that ends in the frame), Q_i: the
+    projector onto the directions in which the support holds it, or, if `support` is no name in the scene's `fixed`, all do.
+    So in equilibrium the reactions of all supports, the weight, the loads and the forces of obstacles add up to zero where
+    supports share no vertices, or hold them in directions perpendicular to each other.
+    What obstacles and self-contact do to held vertices themselves is not in it (ContactForce has the first), nor is the
     inertia of vertices that a prescribed motion accelerates.
 
-    support: which of the fixed vertices, by a vertex set's name, indices, a mask or a list of names; None: all.
+    support: which of the held vertices, by a vertex set's name, indices, a mask or a list of names; None: all.
     about: the moment [N m] about this point [m] instead: sum (x_i - about) x R_i. per_vertex: of each vertex, ordered as
         `mesh.vertex_indices(support)`. name: how a loss calls it.
     The gradient is exact by all inputs. In single precision a reaction is the small sum of large forces of stress: it has an
     error of some 1e-6 of these.
 
-    Raises ValueError for a support that is not fixed, for a law with a state, or for about= and per_vertex=True together.
+    Raises ValueError for a support that is not held, for a law with a state, or for about= and per_vertex=True together.
     Belytschko, Liu, Moran, Nonlinear Finite Elements for Continua and Structures, 2000, sec. 4.4.
     """
 
@@ -55,18 +57,15 @@ class Reaction(Output):
 
     def settled(self, scene: "Scene") -> "Reaction":
         out = copy(self)
-        out.vertices = scene.fixed if self.support is None else scene.mesh.vertex_indices(self.support)
-        loose = np.setdiff1d(out.vertices, scene.fixed)
+        out.vertices = scene.held if self.support is None else scene.mesh.vertex_indices(self.support)
+        loose = np.setdiff1d(out.vertices, scene.held)
         if len(out.vertices) == 0 or len(loose):
             raise ValueError(
-                f"Reaction: the support must be among the fixed vertices, but {len(loose) or 'all'} of its "
+                f"Reaction: the support must be among the held vertices, but {len(loose) or 'all'} of its "
                 f"{len(out.vertices)} vertices are free: fix them (Scene(..., fixed=...)) or name others"
             )
-        out.scene, out.body = scene, BodyForces(scene)
-        load = scene.term(ExternalForce)
-        out.loaded = None if load is None else load.indices(scene.mesh)
-        gravity = scene.term(Gravity)
-        out.gravity = None if gravity is None else scene.inputs.parameters.of(gravity)
+        out.scene, out.body, out.loads = scene, BodyForces(scene), GivenLoads(scene)
+        out.onto = scene.supports.projectors(out.vertices, self.support)
         return out
 
     def shape(self, num_frames: int) -> tuple[int, ...]:
@@ -77,25 +76,21 @@ class Reaction(Output):
     def _state(self, frames, k: int) -> tuple[np.ndarray, np.ndarray]:
         return frames.displacements[k].astype(np.float64), frames.velocities[k].astype(np.float64)
 
-    def _row(self, frames, k: int, forces: np.ndarray) -> int:
-        """The row of external forces that frame k ends."""
-        return min(max(int(frames.steps[k]) - 1, 0), len(forces) - 1)
-
     def _held(self, frames) -> np.ndarray:
-        """Minus all forces."""
+        """What holds the vertices, shape (frames, k, 3)."""
         derived, out = self.body.load(frames.inputs), []
-        for k in range(len(frames.positions)):
+        for k, x in enumerate(frames.positions.astype(np.float64)):
             self.body.place(*self._state(frames, k))
-            f = self.body.forces()
-            if self.gravity is not None:
-                f = f + derived.mass[:, None] * derived.parameters[self.gravity][:3]
-            if self.loaded is not None:
-                f[self.loaded] += derived.forces[self._row(frames, k, derived.forces)]
-            out.append(-f)
+            f = self.body.forces() + self.loads.forces(derived, x, int(frames.steps[k]))
+            out.append(-self._onto(f[self.vertices]))
         return np.stack(out)
 
+    def _onto(self, f: np.ndarray) -> np.ndarray:
+        """Of forces on the support's vertices, shape (..., k, 3), what it can hold."""
+        return np.einsum("kij,...kj->...ki", self.onto, f)
+
     def value(self, frames: "Frames") -> np.ndarray:
-        return self._of(frames, self._held(frames)[:, self.vertices])
+        return self._of(frames, self._held(frames))
 
     def _of(self, frames, held: np.ndarray) -> np.ndarray:
         if self.about is not None:
@@ -111,40 +106,33 @@ class Reaction(Output):
         for k in range(len(zero)):
             self.body.place(*self._state(frames, k))
             df = self.body.jvp(dx[k] - moved.rest, dv[k], tangent)
-            if self.gravity is not None:
-                g, dg = (x.parameters[self.gravity][:3] for x in (derived, moved))
-                df = df + moved.mass[:, None] * g + derived.mass[:, None] * dg
-            if self.loaded is not None:
-                df[self.loaded] += moved.forces[self._row(frames, k, derived.forces)]
-            out.append(-df[self.vertices])
+            x = frames.positions[k].astype(np.float64)
+            df = df + self.loads.jvp(derived, moved, x, dx[k], int(frames.steps[k]))
+            out.append(-self._onto(df[self.vertices]))
         if self.about is None:
             return self._of(frames, np.stack(out))
-        held, x = self._held(frames)[:, self.vertices], frames.positions[:, self.vertices]
+        held, x = self._held(frames), frames.positions[:, self.vertices]
         return moments_jvp(x, self.about, held, dx[:, self.vertices], np.stack(out))
 
     def vjp(self, frames: "Frames", seed: np.ndarray) -> Change:
         positions, velocities, w = np.zeros((3, *frames.positions.shape))
         if self.about is not None:
-            held, x = self._held(frames)[:, self.vertices], frames.positions[:, self.vertices]
+            held, x = self._held(frames), frames.positions[:, self.vertices]
             positions[:, self.vertices], w[:, self.vertices] = moments_vjp(x, self.about, held, seed)
         else:
             w[:, self.vertices] = seed if self.per_vertex else seed[:, None]
-        w, derived = -w, self.body.load(frames.inputs)
-        adjoint, loads = self.body.adjoint(), None if derived.forces is None else np.zeros_like(derived.forces)
-        rest = np.zeros(positions.shape[1:])
+        w[:, self.vertices] = -self._onto(w[:, self.vertices])
+        derived, adjoint = self.body.load(frames.inputs), self.body.adjoint()
+        rest, by_loads = np.zeros(positions.shape[1:]), derived.zeros()
         for k in range(len(w)):
             self.body.place(*self._state(frames, k))
             by_u, by_v = self.body.vjp(w[k], adjoint)
-            positions[k] += by_u
+            x = frames.positions[k].astype(np.float64)
+            positions[k] += by_u + self.loads.vjp(derived, x, w[k], int(frames.steps[k]), by_loads)
             velocities[k] += by_v
             rest -= by_u
-            if loads is not None:
-                loads[self._row(frames, k, loads)] += w[k, self.loaded]
         adj = adjoint.collect()
-        if self.gravity is not None:
-            g = derived.parameters[self.gravity][:3]
-            adj.mass = adj.mass + (w @ g).sum(0)
-            adj.parameters[self.gravity.start : self.gravity.start + 3] += np.einsum("i,fid->d", derived.mass, w)
-        adj.forces, adj.rest = loads, adj.rest + rest
+        adj.mass, adj.parameters = adj.mass + by_loads.mass, adj.parameters + by_loads.parameters
+        adj.forces, adj.follower, adj.rest = by_loads.forces, by_loads.follower, adj.rest + rest
         inputs = self.scene.inputs.derive_vjp(frames.inputs, adj, tuple(frames.inputs))
         return Change(positions, velocities, inputs)

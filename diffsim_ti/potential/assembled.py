@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from diffsim_ti.potential.free import FreeDirections, mask_of, projectors_of
 from diffsim_ti.potential.potential import Potential
 from diffsim_ti.state.arrays import SceneArrays
 
@@ -19,7 +20,7 @@ def element_matrices(potential) -> np.ndarray:
 
 
 def assemble(potential, mass, free):
-    """(c M + K as a block matrix, places of its diagonal blocks); fixed vertices keep a diagonal."""
+    """(c M + K as a block matrix, places of its diagonal blocks); what is held keeps a diagonal."""
     from scipy.sparse import bsr_matrix
 
     n, tets = potential.arrays.num_vertices, potential.tetrahedra.astype(np.int64)
@@ -31,11 +32,16 @@ def assemble(potential, mass, free):
     places, inverse = np.unique(places, return_inverse=True)
     data = np.stack([np.bincount(inverse, entries[:, k], len(places)) for k in range(9)], 1).reshape(-1, 3, 3)
     rows, columns = places // n, places % n
-    is_free = free[:, 0] > 0
+    is_free, P = mask_of(free)[:, 0] > 0, projectors_of(free)
     data[~(is_free[rows] & is_free[columns])] = 0
+    if isinstance(free, FreeDirections):
+        data = P[rows] @ data @ P[columns]
     diagonal = np.searchsorted(places, np.arange(n, dtype=np.int64) * (n + 1))
     data[diagonal] += mass[:, :, None] * np.eye(3)
     data[diagonal[~is_free]] = np.eye(3) * (np.abs(data).max() or 1.0)
+    if isinstance(free, FreeDirections):
+        at = diagonal[free.guided]
+        data[at] = P[free.guided] @ data[at] @ P[free.guided] + free.guides * np.abs(data).max()
     start = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=n))])
     return bsr_matrix((data, columns, start), shape=(3 * n, 3 * n)), diagonal
 

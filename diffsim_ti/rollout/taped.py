@@ -141,7 +141,8 @@ class TapeFace:
         if self._fields:
             runtime.check_alive(self._program)
         start = [name for name in (*START, *SPELLING) if name in self._fields]
-        direct = rollout.scene.motion is None and "rest_positions" not in self._fields
+        simple = rollout.scene.motion is None and not len(rollout.scene.supports.guided)
+        direct = simple and "rest_positions" not in self._fields
         out = {}
         for name, field in self._fields.items():
             if SPELLING.get(name, name) in rollout.inputs and not (direct and name in start):

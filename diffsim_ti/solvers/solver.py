@@ -97,7 +97,7 @@ class Solver(ABC):
 
     def start_values(self):
         """What kernels read at the start; a step of motion rows if fixed vertices move."""
-        return self.scene.inputs.derive(self.scene.inputs.at_times([0.0, self.dt]))
+        return self.scene.inputs.derive(self.scene.inputs.at_step(0, self.dt))
 
     def starts_deformed(self, strain: float = 0.05) -> bool:
         """Whether the start is strained so much that the bound at rest may not hold."""

@@ -4,7 +4,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from diffsim_ti.mesh.sets import pieces
 from diffsim_ti.solvers.implicit.solver import ImplicitSolver, Stage
+from diffsim_ti.supports import rigid_motions_left
 
 if TYPE_CHECKING:
     from diffsim_ti.scene import Scene
@@ -16,7 +18,8 @@ class StaticSolver(ImplicitSolver):
     saddle. Several steps follow prescribed motion and forces per step quasi-statically.
 
     load_steps: in the first step loads and prescribed motion are laid on in so many parts, each starting from the last.
-    Raises ValueError if the fixed vertices leave a piece of the body free to move rigidly, NotConverged otherwise.
+    Raises ValueError, which names the motions, if the supports leave a piece of the body free to move rigidly; NotConverged
+    otherwise.
     """
 
     order = 0
@@ -50,24 +53,16 @@ class StaticSolver(ImplicitSolver):
         return Stage(self.substep, b0=0.0, e0=0.0, static=True)
 
     def _refuse_rigid_modes(self) -> None:
-        from scipy.sparse import coo_matrix
-        from scipy.sparse.csgraph import connected_components
-
-        mesh, fixed = self.scene.mesh, np.zeros(self.scene.mesh.num_vertices, bool)
-        fixed[self.scene.fixed] = True
-        tets = mesh.tetrahedra
-        edges = tets[:, [0, 0, 0]].ravel(), tets[:, 1:].ravel()
-        graph = coo_matrix((np.ones(len(edges[0])), edges), shape=(len(fixed), len(fixed)))
-        count, piece = connected_components(graph, directed=False)
-        for k in range(count):
-            held = mesh.vertices[fixed & (piece == k)]
-            spread = np.linalg.matrix_rank(held - held[0], tol=1e-9 * np.ptp(mesh.vertices)) if len(held) else -1
-            if spread < 2:
-                free = {-1: "6 rigid modes: 3 translations, 3 rotations", 0: "3 rotations", 1: "1 rotation"}[
-                    int(spread)
-                ]
-                which = f"piece {k} of {count} of the body" if count > 1 else "the body"
+        """Raise ValueError, which names them, if the supports leave rigid motions of a piece of the body."""
+        mesh, supports = self.scene.mesh, self.scene.supports
+        piece = pieces(mesh)
+        used = [k for k in range(piece.max(initial=-1) + 1) if np.any(piece[mesh.tetrahedra[:, 0]] == k)]
+        for number, k in enumerate(used):
+            own = piece[supports.vertices] == k
+            free = rigid_motions_left(mesh.vertices[supports.vertices[own]], supports.held[own])
+            if free:
+                which = f"piece {number} of {len(used)} of the body" if len(used) > 1 else "the body"
                 raise ValueError(
-                    f"statics: {which} is free to move rigidly ({free}): fix at least three of its vertices that do not "
-                    "lie on a line, or use a solver with inertia"
+                    f"statics: {which} is free to move rigidly ({free}): hold it by fixed=..., at three vertices that do "
+                    "not lie on a line or in as many directions as that takes, or use a solver with inertia"
                 )

@@ -10,9 +10,9 @@ from diffsim_ti.inputs import Derived
 from diffsim_ti.mesh.patches import in_eights, volume_patches
 from diffsim_ti.runtime import LANES
 from diffsim_ti.state.features import Features, grouped
-from diffsim_ti.state.numbers import TANGENT, on_device
+from diffsim_ti.state.numbers import PARTS, on_device
 from diffsim_ti.state.schedule import Schedule
-from diffsim_ti.terms import Drag, ExternalForce, Gravity, Obstacle, SelfContact
+from diffsim_ti.terms import Drag, Gravity, Obstacle, SelfContact
 
 
 def vertex_corners(tetrahedra: np.ndarray, num_vertices: int) -> tuple[np.ndarray, np.ndarray]:
@@ -28,6 +28,13 @@ def with_own_corner(start: np.ndarray, corner_of: np.ndarray, vertices: np.ndarr
     return start + np.searchsorted(vertices, np.arange(len(start))), longer
 
 
+def with_more_corners(start: np.ndarray, corner_of: np.ndarray, vertices: np.ndarray, first: int) -> tuple:
+    """The same rows with corners more, first + k, at the end of those of vertices[k], which may repeat."""
+    order = np.argsort(vertices, kind="stable")
+    longer = np.insert(corner_of, start[vertices[order] + 1], first + order)
+    return start + np.searchsorted(vertices[order], np.arange(len(start))), longer
+
+
 def slots(indices: np.ndarray, num_vertices: int) -> np.ndarray:
     """Place of each vertex in a list of vertices, -1 where it is not listed."""
     out = np.full(num_vertices, -1)
@@ -38,7 +45,7 @@ def slots(indices: np.ndarray, num_vertices: int) -> np.ndarray:
 class SceneArrays:
     """What the kernels read of a scene: its topology, once, and its numbers (state/numbers.py), per load."""
 
-    def __init__(self, scene, stages_contact: bool = False, feels_faces: bool = False):
+    def __init__(self, scene, stages_contact: bool = False, feels_faces: bool = False, presses: bool = False):
         mesh, precision = scene.mesh, scene.precision
         fp = runtime.PRECISIONS[precision]
         self.fp, self.vector, self.lanes = fp, ti.types.vector(4, fp), ti.types.vector(LANES, fp)
@@ -49,7 +56,9 @@ class SceneArrays:
         self.num_items = self.num_blocks if self.in_lanes else self.num_places
         self.num_vertices, self.num_tetrahedra = mesh.num_vertices, mesh.num_tetrahedra
         self.contacts = tuple(t for t in scene.ordered_terms if t.acts_on_surface)
-        self.fixed, self.feels_faces = scene.fixed, feels_faces
+        self.fixed, self.held, self.feels_faces = scene.fixed, scene.held, feels_faces
+        self.supports = scene.supports
+        self.pressures = scene.pressures if presses else ()  # that gather with the tetrahedra's corners
         self.mesh, self.precision, self.self_contact = mesh, precision, scene.term(SelfContact)
         self._upload_topology(scene)
         rows = scene.inputs.parameters
@@ -60,8 +69,11 @@ class SceneArrays:
             moving=len(scene.moving),
             gravity=rows.first(scene.term(Gravity)),
             drag=rows.first(scene.term(Drag)),
-            forces=scene.term(ExternalForce) is not None,
+            forces=bool(scene.dead_loads),
+            forces_keyed=scene.inputs.keyed_forces,
+            pressed=bool(self.pressures),
             motion=scene.motion is not None,
+            guided=bool(len(scene.supports.guided)),
             num_parameters=rows.total,
         )
         self.offsets = runtime.array(
@@ -96,13 +108,26 @@ class SceneArrays:
             self.parameters_of_self_contact = scene.inputs.parameters.of(self.self_contact)
             start, corner_of = with_own_corner(start, corner_of, mesh.surface_vertices, num_corners)
             num_corners += len(mesh.surface_vertices)
+        self.first_pressed, self.num_pressed = num_corners, 0
+        if self.pressures:
+            triangles = [term.triangles(mesh) for term in self.pressures]
+            start, corner_of = with_more_corners(start, corner_of, np.concatenate(triangles).ravel(), num_corners)
+            self.num_pressed = sum(map(len, triangles))
+            num_corners += 3 * self.num_pressed
+            self.pressed_triangles = np.concatenate(triangles)
+            self.load_of = np.repeat(np.arange(len(triangles)), [len(rows) for rows in triangles])
+            self.pressed = runtime.upload(self.pressed_triangles.ravel(), ti.i32)
+            self.pressed_load = runtime.upload(self.load_of, ti.i32)
         self.start, self.corner_of = runtime.upload(start, ti.i32), runtime.upload(corner_of, ti.i32)
         self.corner = runtime.array(self.vector, num_corners)
         self.force_slot = self.motion_slot = runtime.array(ti.i32, 1)
-        if scene.term(ExternalForce):
-            self.force_slot = runtime.upload(slots(scene.term(ExternalForce).indices(mesh), n), ti.i32)
+        if scene.dead_loads:
+            self.force_slot = runtime.upload(slots(scene.loaded_vertices, n), ti.i32)
         if scene.motion is not None:
-            self.motion_slot = runtime.upload(slots(scene.fixed, n), ti.i32)
+            self.motion_slot = runtime.upload(slots(scene.held, n), ti.i32)
+        if len(scene.supports.guided):
+            self.guide_slot = runtime.upload(slots(scene.supports.guided, n), ti.i32)
+            self.guides = runtime.upload(scene.supports.guides.reshape(-1, 3), self.vector)
 
     def _twins(self, scene) -> list[tuple]:
         """(compile-time twin, first parameter, column of the path or -1) of the obstacles; their tables stand behind the
@@ -134,10 +159,11 @@ class SceneArrays:
         return self._known_features[density, shape]
 
     def _make_features(self, density: bool, shape: bool) -> Features:
-        forces = self.values.forces
+        forces, follower = self.values.forces, self.values.follower
         return Features(
             **self._features,
             forces_per_step=forces is not None and len(forces) > 1,
+            pressure_per_step=bool(self.pressures) and len(follower) > 1,
             uniform=self.values.coefficients.ndim == 1,
             density=density,
             shape=shape,
@@ -147,11 +173,11 @@ class SceneArrays:
         """Bring values to the device; True if array shapes or kernels changed, so that launches must be bound anew."""
         old, before = self.values, None if self.values is None else self.features()
         self.values, self._known_features = values, {}
-        self.rows = {name: getattr(values, name) for name in ("motion", "path", "forces")}
+        self.rows = {name: getattr(values, name) for name in ("motion", "path", "forces", "follower")}
         moved = before != self.features()
-        sources = {name: on_device(self, name, values) for name in TANGENT if name != "mass"}
+        sources = {name: on_device(self, name, values) for name in PARTS if name != "mass"}
         sources["parameters"] = np.concatenate([values.parameters, self.tables]), self.fp
-        if not (self.contacts or self.self_contact):
+        if not (self.contacts or self.self_contact or self.pressures):
             sources["rest"] = np.zeros((1, 3)), self.vector
         sources["inverse_mass"] = self._inverse_mass(values.mass), self.fp
         for name, (data, dtype) in sources.items():
@@ -164,7 +190,7 @@ class SceneArrays:
         return moved
 
     def load_rows(self, **rows: np.ndarray) -> None:
-        """Other rows of motion, path or forces, by name: those of the steps to come."""
+        """Other rows of motion, path, forces or pressure, by name: those of the steps to come."""
         for name, data in rows.items():
             runtime.fill(getattr(self, name), data)
             self.rows[name] = data

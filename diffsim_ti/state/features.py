@@ -48,7 +48,11 @@ class Features:
     drag: int = -1
     forces: bool = False
     forces_per_step: bool = False
+    forces_keyed: bool = False  # whether they change within steps
+    pressed: bool = False  # whether passes take follower pressures on triangles
+    pressure_per_step: bool = False
     motion: bool = False
+    guided: bool = False  # whether vertices are held in some directions alone
     moving: int = 0  # obstacles that follow a path
     num_parameters: int = 0  # numbers of all terms
     uniform: bool = True  # one set of coefficients for all tetrahedra
@@ -74,7 +78,7 @@ class Features:
     def driven(self) -> bool:
         """Whether something may do work on the body that its energy does not tell. Drag alone only takes some, and
         counting that would cost small scenes a fifth."""
-        return self.forces or self.motion or self.moving > 0
+        return self.forces or self.motion or self.moving > 0 or self.pressed
 
     @property
     def pressing(self) -> tuple[ObstacleGroup, ...]:

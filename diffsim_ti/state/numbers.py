@@ -29,7 +29,7 @@ def _given(name: str) -> Callable:
 
 
 def _anchor(arrays, derived):
-    return None if derived.motion is None else derived.displacement[arrays.fixed]
+    return None if derived.motion is None else derived.displacement[arrays.held]
 
 
 def _whole(arrays, x):
@@ -52,9 +52,10 @@ PARTS = {
     "motion": Part("vectors2", _given("motion"), _whole),
     "anchor": Part("vectors", _anchor, _whole),
     "path": Part("vectors2", _given("path"), _whole),
+    "follower": Part("vectors2", _given("follower")),
 }
 TOPOLOGY = dict.fromkeys(("tets", "start", "corner_of", "force_slot", "motion_slot"), "ints")
-TANGENT = {name: part.kind for name, part in PARTS.items()}
+TANGENT = {name: part.kind for name, part in PARTS.items() if name != "follower"}  # which only what is pressed has
 SCENE = TOPOLOGY | TANGENT | dict(inverse_mass="scalars", corner="vectors")  # all that a kernel may read of a scene
 del SCENE["mass"]
 OF_TETRAHEDRA = {name: PARTS[name].kind for name in ("gradients", "volumes", "coefficients")}
@@ -128,5 +129,5 @@ class Adjoint:
             if name in PARTS and not missing:
                 setattr(out, name, PARTS[name].unpack(a, runtime.fetch(getattr(self, name))))
         if "anchor" in self._names and out.motion is not None:
-            out.displacement[a.fixed] += runtime.fetch(self.anchor)
+            out.displacement[a.held] += runtime.fetch(self.anchor)
         return out

@@ -71,6 +71,37 @@ class Schedule:
         rows_adj[r] -= adjoint / self.step_length(j)
         rows_adj[after] += adjoint / self.step_length(j)
 
+    # ---- loads: rows of steps, with their values at the beginning and at the end -------------------------------------
+
+    def load_row(self, rows: np.ndarray, j: int) -> int:
+        """The row of pass j among those of loads, of which one may serve all steps."""
+        return min(int(self.row(j)), len(rows) - 1) if len(rows) > 1 else 0
+
+    def load(self, rows: np.ndarray, j: int, share: float, keyed: bool) -> np.ndarray:
+        """Forces at a share of the step of pass j; keyed: rows have those at the beginning and at the end in turn."""
+        row = rows[self.load_row(rows, j)]
+        return row[0::2] + share * (row[1::2] - row[0::2]) if keyed else row
+
+    def pressure(self, rows: np.ndarray, j: int, share: float) -> np.ndarray:
+        """Pressures of loads at a share of the step of pass j."""
+        begin, end, _ = rows[self.load_row(rows, j)].T
+        return begin + share * (end - begin)
+
+    def add_load(self, rows_adj: np.ndarray, j: int, share: float, keyed: bool, adjoint: np.ndarray) -> None:
+        """Adjoint of `load`."""
+        row = rows_adj[self.load_row(rows_adj, j)]
+        if keyed:
+            row[0::2] += (1 - share) * adjoint
+            row[1::2] += share * adjoint
+        else:
+            row += adjoint
+
+    def add_pressure(self, rows_adj: np.ndarray, j: int, share: float, adjoint: np.ndarray) -> None:
+        """Adjoint of `pressure`."""
+        row = rows_adj[self.load_row(rows_adj, j)]
+        row[:, 0] += (1 - share) * adjoint
+        row[:, 1] += share * adjoint
+
     def _rows(self, rows, j):
         r = min(self.row(j), len(rows) - 1)
         return r, min(r + 1, len(rows) - 1)

@@ -39,7 +39,7 @@ class Workspace:
     def __init__(self, solver, derived: Derived):
         self.solver, self.scene, self.report = solver, solver.scene, SolveReport()
         self.owner = runtime.program()
-        self.arrays = SceneArrays(self.scene, solver.stages_contact, self.feels_faces(self.scene))
+        self.arrays = SceneArrays(self.scene, solver.stages_contact, self.feels_faces(self.scene), solver.explicit)
         self.parallel = solver.runs_parallel()
         self.pairs = self.pairs_kind(self.arrays, self.parallel) if self.arrays.self_contact else None
         self.state = self.history(1)

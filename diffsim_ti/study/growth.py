@@ -50,7 +50,7 @@ def growth(
     start, rng, sizes = rollout.forward(), np.random.default_rng(seed), []
     for _ in range(directions):
         d = rng.standard_normal(start.positions.shape[1:])
-        d[solver.scene.fixed] = 0
+        d = solver.scene.supports.free(d)
         moved, _ = rollout.jvp(start, initial_positions=d / np.linalg.norm(d))
         sizes.append(np.linalg.norm(moved, axis=(1, 2)))
     sizes, times = np.array(sizes), rollout.times

@@ -11,7 +11,7 @@ from diffsim_ti.scene import LOCKING_RATIO, Scene
 from diffsim_ti.solvers import SOLVERS, BDF2Solver, VelocityVerletSolver, stable_dt
 from diffsim_ti.study.problem import Problem, distance
 from diffsim_ti.study.recommendation import Option, Recommendation
-from diffsim_ti.terms import Drag, ExternalForce
+from diffsim_ti.terms import Drag
 
 SAFETY = 0.7  # of the tolerance: what a trial run must keep, for the error of the whole run is predicted
 SHARE = 0.8  # of the stable step at the start, which may fall on the way
@@ -308,7 +308,7 @@ class Trials:
             out.append("damping: none in the scene")
         if not any(getattr(t, "acts_on_surface", False) for t in self.scene.terms):
             out.append("contact: none in the scene")
-        if self.scene.term(ExternalForce) is None and self.scene.motion is None:
+        if not self.scene.dead_loads and not self.scene.pressures and self.scene.motion is None:
             out.append("forces and motion per step")
         nu = self.scene.largest_poissons_ratio()
         if nu > LOCKING_RATIO + 1e-12:

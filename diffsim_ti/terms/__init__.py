@@ -3,6 +3,7 @@
 from diffsim_ti.terms.drag import Drag
 from diffsim_ti.terms.external_force import ExternalForce
 from diffsim_ti.terms.gravity import Gravity
+from diffsim_ti.terms.loads import BodyForce, Load, Pressure, Traction
 from diffsim_ti.terms.obstacles.ball import Capsule, Sphere
 from diffsim_ti.terms.obstacles.box import Box, Cylinder
 from diffsim_ti.terms.obstacles.ground import Ground
@@ -13,8 +14,9 @@ from diffsim_ti.terms.self_contact import SelfContact
 from diffsim_ti.terms.term import Term, VertexForce
 
 OBSTACLES = (Ground, HalfSpace, Sphere, Box, Capsule, Cylinder, MeshObstacle)
-TERMS = (Gravity, Drag, ExternalForce, *OBSTACLES, SelfContact)
+TERMS = (Gravity, Drag, ExternalForce, Traction, Pressure, BodyForce, *OBSTACLES, SelfContact)
 __all__ = [
+    "BodyForce",
     "Box",
     "Capsule",
     "Cylinder",
@@ -23,12 +25,15 @@ __all__ = [
     "Gravity",
     "Ground",
     "HalfSpace",
+    "Load",
     "MeshObstacle",
     "OBSTACLES",
     "Obstacle",
+    "Pressure",
     "SelfContact",
     "Sphere",
     "Term",
     "TERMS",
+    "Traction",
     "VertexForce",
 ]

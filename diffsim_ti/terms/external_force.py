@@ -5,6 +5,7 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti.inputs import Input
 from diffsim_ti.inputs.links import PerStep
+from diffsim_ti.inputs.loads import InTime
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.terms.term import Term
 
@@ -14,8 +15,10 @@ class ExternalForce(Term):
 
     vertices: which k vertices, as indices or the name of a vertex set; None means all. A single vector of 3 is laid
     on each of them. Per-step forces hold during one step dt; a run longer than the list is an error.
-    Input with gradient: "external_forces", of the shape given, or "<name>.forces". One per scene.
+    Input with gradient: "external_forces", of the shape given, or "<name>.forces". Several in a scene add up.
     """
+
+    dead = sums_itself = True
 
     def __init__(self, forces: ArrayLike, vertices: str | ArrayLike | None = None, name: str | None = None):
         shapes = (3,), ("k", 3), ("steps", "k", 3)
@@ -26,6 +29,10 @@ class ExternalForce(Term):
 
     def links(self, names, own):
         return [PerStep(names["external_forces"], "forces", 3)]
+
+    def force_links(self, names, own):
+        """Beside other loads, by the name `own` forces."""
+        return [InTime(names["external_forces"], f"{own} forces", 3, keyed=False)]
 
     def indices(self, mesh: TetrahedralMesh) -> np.ndarray:
         """Vertices that are acted upon, shape (k,)."""

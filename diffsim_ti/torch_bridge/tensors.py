@@ -51,7 +51,8 @@ def is_direct(rollout, names) -> bool:
     shape are measured from. The host then stands between, with the same numbers.
     """
     scene = rollout.scene
-    return shares_memory() and rollout.solver.explicit and scene.motion is None and "rest_positions" not in names
+    copies = shares_memory() and rollout.solver.explicit and not len(scene.supports.guided)
+    return copies and scene.motion is None and "rest_positions" not in names
 
 
 class TensorStart:

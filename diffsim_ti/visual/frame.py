@@ -27,7 +27,7 @@ class Setting:
     @classmethod
     def of(cls, scene: Scene) -> "Setting":
         """A scene's."""
-        return cls(scene.mesh, floor_of(scene), scene.fixed, obstacle_surfaces(scene))
+        return cls(scene.mesh, floor_of(scene), scene.held, obstacle_surfaces(scene))
 
 
 @dataclass

@@ -42,6 +42,9 @@ class ExplicitAdjoint:
         self.path = runtime.array(a.vector, a.path.shape[0], moving * self.num_parts)
         self.frames = FrameArrays.of(a, *workspace.frames.frames_u.shape)
         self.z = a.law_states(1)  # of the state of the law
+        # of pressures by each triangle and of the places of its corners
+        self.pressed_felt = runtime.array(a.vector, a.follower.shape[0], max(a.num_pressed, 1))
+        self.pressed_rest = runtime.array(a.vector, 3 * a.num_pressed * self.features.shape)
         self.faces = FeltAdjoint(self, workspace.faces) if workspace.faces else None
         if workspace.impulses:
             self.impulses = ImpulseRecord(workspace)
@@ -53,6 +56,7 @@ class ExplicitAdjoint:
         same = self.numbers.fits(a, a.features(self.features.density, self.features.shape))
         same = same and self.felt.shape[0] == max(1, 2 * self.features.moving * self._steps)
         same = same and self.path.shape[0] == a.path.shape[0]
+        same = same and self.pressed_felt.shape[0] == a.follower.shape[0]
         return same and self.frames.frames_u.shape == workspace.frames.frames_u.shape
 
     def start(self, positions_adj: np.ndarray, velocities_adj: np.ndarray, last_frame_is_input: bool) -> None:
@@ -78,7 +82,8 @@ class ExplicitAdjoint:
             self.impulses.clear()
             self.mass_adj[:] = 0
         self.numbers.clear()
-        for target in (self.felt, self.path, self.u, self.v, self.w, self.z):
+        pressed = self.pressed_felt, self.pressed_rest
+        for target in (self.felt, self.path, self.u, self.v, self.w, self.z, *pressed):
             if target is not None:
                 runtime.fill(target, 0)
         if self.ws.pairs:
@@ -166,7 +171,7 @@ class ExplicitAdjoint:
             copy_slot(self.v, 0, self.whole.v, 0)
         self._gather(self.whole)
         u, v = (runtime.fetch(x)[0].astype(np.float64) for x in (self.whole.u, self.whole.v))
-        v[self.ws.arrays.fixed] = 0
+        v = self.ws.arrays.supports.free(v)
         return float(np.linalg.norm(u)), float(np.linalg.norm(v))
 
     def scale(self, factor: float) -> None:
@@ -186,6 +191,8 @@ class ExplicitAdjoint:
         if self.features.moving:
             path = runtime.fetch(self.path).astype(np.float64)
             out.path += path.reshape(len(path), self.features.moving, self.num_parts, 3).sum(2)
+        if self.features.pressed:
+            rest = rest + self._collect_pressures(out)
         if self.features.shape:
             rest = rest + runtime.fetch(self.frames.frames_u).astype(np.float64).sum(0)
         out.rest = rest + out.rest
@@ -194,6 +201,14 @@ class ExplicitAdjoint:
         if self.ws.impulses:
             out.mass = out.mass + self.mass_adj
         return out
+
+    def _collect_pressures(self, out: Derived):
+        """Adds the adjoints of pressures; returns those of the rest shape."""
+        a, rest = self.ws.arrays, np.zeros((self.ws.arrays.num_vertices, 3))
+        np.add.at(out.follower, (slice(None), a.load_of), runtime.fetch(self.pressed_felt).astype(np.float64))
+        if self.features.shape:
+            np.add.at(rest, a.pressed_triangles.ravel(), runtime.fetch(self.pressed_rest).astype(np.float64))
+        return rest
 
 
 class ExplicitTangent:

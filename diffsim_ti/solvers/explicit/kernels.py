@@ -5,8 +5,10 @@ from functools import cached_property, lru_cache
 
 import taichi as ti
 
+from diffsim_ti.elements.pressed_triangle import PRESSED, PressedTriangle
 from diffsim_ti.elements.tetrahedron import Onwards
 from diffsim_ti.runtime import Bundle, Kernel, let, traced
+from diffsim_ti.solvers.explicit.guides import GUIDED
 from diffsim_ti.solvers.explicit.kick_drift import KickDrift
 from diffsim_ti.state.numbers import ADJOINT, OF_STEPS, SCENE, TANGENT, with_state
 from diffsim_ti.state.schedule import pass_at, reversed_pass
@@ -47,6 +49,20 @@ class ExplicitKernels:
     @property
     def element(self):
         return self.vertex.element
+
+    @property
+    def pressed(self) -> bool:
+        return self.vertex.features.pressed
+
+    @cached_property
+    def triangle(self) -> PressedTriangle:
+        features = self.vertex.features
+        return PressedTriangle(self.vertex.law.precision, features.pressure_per_step, features.shape)
+
+    @traced
+    def num_elements(self, plan):
+        """Items of tetrahedra, and after them pressed triangles."""
+        return let(plan.num_items + plan.num_pressed) if self.pressed else plan.num_items
 
     @traced
     def onwards(self, now) -> Onwards:
@@ -104,6 +120,17 @@ class ExplicitKernels:
 
     @ti.func
     def elements(self, e, j, scene: A, state: A, table: A, plan: A):
+        if ti.static(self.pressed):
+            if e < plan.num_items:
+                self.tetrahedra(e, j, scene, state, table, plan)
+            else:
+                now, s = pass_at(table, j - plan.window), (j - plan.base) * plan.stride
+                self.triangle.forces(e - plan.num_items, now, scene, state, s, plan.first_pressed)
+        else:
+            self.tetrahedra(e, j, scene, state, table, plan)
+
+    @ti.func
+    def tetrahedra(self, e, j, scene: A, state: A, table: A, plan: A):
         s = (j - plan.base) * plan.stride
         self.element.forces(e, scene, state, s, scene.corner)
         if ti.static(self.element.has_state):
@@ -114,7 +141,7 @@ class ExplicitKernels:
     def passes(self, scene: A, state: A, table: A, plan: A):
         """Slot 0 holds the state before pass `base`; with stride 1 each pass writes the next slot, and its forces."""
         if ti.static(self.parallel):
-            num_items, num_vertices = plan.num_items, plan.num_vertices  # both bounds are read by one task
+            num_items, num_vertices = self.num_elements(plan), plan.num_vertices  # both bounds are read by one task
             for e in range(num_items):
                 turn = self.turn_of_first(e, table)
                 if turn < plan.count:
@@ -127,7 +154,7 @@ class ExplicitKernels:
         else:
             ti.loop_config(serialize=True)
             for j in range(plan.first, plan.first + plan.count):
-                for e in range(plan.num_items):
+                for e in range(self.num_elements(plan)):
                     self.elements(e, j, scene, state, table, plan)
                 now = self.pass_of(j, table, plan)
                 for i in range(plan.num_vertices):
@@ -141,14 +168,29 @@ class ExplicitKernels:
     # ---- tangent -----------------------------------------------------------------------------------------------------
 
     @ti.func
+    def elements_jvp(self, e, scene: A, state: A, tangent: A, table: A, plan: A):
+        if ti.static(self.pressed):
+            if e < plan.num_items:
+                self.tetrahedra_jvp(e, scene, state, tangent, table, plan)
+            else:
+                now, s = pass_at(table, plan.first - plan.window), plan.first - plan.base
+                self.triangle.forces_jvp(e - plan.num_items, now, scene, state, s, tangent, plan.first_pressed)
+        else:
+            self.tetrahedra_jvp(e, scene, state, tangent, table, plan)
+
+    @ti.func
+    def tetrahedra_jvp(self, e, scene: A, state: A, tangent: A, table: A, plan: A):
+        s = plan.first - plan.base
+        self.element.forces_jvp(e, scene, state, s, tangent, scene.corner, tangent)
+        if ti.static(self.element.has_state):
+            now = pass_at(table, plan.first - plan.window)
+            self.element.move_on_jvp(e, scene, state, s, tangent, tangent, self.onwards(now))
+
+    @ti.func
     def passes_jvp(self, scene: A, state: A, tangent: A, table: A, plan: A):
         ti.loop_config(serialize=not self.parallel)
-        for e in range(plan.num_items):
-            s = plan.first - plan.base
-            self.element.forces_jvp(e, scene, state, s, tangent, scene.corner, tangent)
-            if ti.static(self.element.has_state):
-                now = pass_at(table, plan.first - plan.window)
-                self.element.move_on_jvp(e, scene, state, s, tangent, tangent, self.onwards(now))
+        for e in range(self.num_elements(plan)):
+            self.elements_jvp(e, scene, state, tangent, table, plan)
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.num_vertices):
             now = self.pass_of(plan.first, table, plan)
@@ -157,13 +199,25 @@ class ExplicitKernels:
     @cached_property
     def step_jvp(self) -> Kernel:
         """The tangent of pass `first` along recorded slots; the change of the state is advanced in place."""
-        own = dict(state=self.state(), tangent=self.with_record(CHANGE) | TANGENT)
+        tangent = TANGENT | dict(follower=PRESSED["follower"]) if self.pressed else TANGENT
+        own = dict(state=self.state(), tangent=self.with_record(CHANGE) | tangent)
         return self._kernel("step_jvp", self.passes_jvp, own, False, rate_dot="float")
 
     # ---- adjoint -----------------------------------------------------------------------------------------------------
 
     @ti.func
     def elements_vjp(self, e, j, scene: A, state: A, adjoint: A, table: A, plan: A):
+        if ti.static(self.pressed):
+            if e < plan.num_items:
+                self.tetrahedra_vjp(e, j, scene, state, adjoint, table, plan)
+            else:
+                now, s = pass_at(table, j - plan.window), j - plan.base
+                self.triangle.forces_vjp(e - plan.num_items, now, scene, state, s, adjoint, plan.first_pressed)
+        else:
+            self.tetrahedra_vjp(e, j, scene, state, adjoint, table, plan)
+
+    @ti.func
+    def tetrahedra_vjp(self, e, j, scene: A, state: A, adjoint: A, table: A, plan: A):
         s = j - plan.base
         if ti.static(self.element.has_state):
             now = reversed_pass(pass_at(table, j - plan.window), j, plan)
@@ -184,7 +238,7 @@ class ExplicitKernels:
         """The gather of K w is left to the next call (or to `finish_vjp`), so that each pass has two loops, as forward."""
         moving = ti.static(self.vertex.features.moving)
         if ti.static(self.parallel):
-            num_items, num_vertices, parts = plan.num_items, plan.num_vertices, moving * plan.num_parts
+            num_items, num_vertices, parts = self.num_elements(plan), plan.num_vertices, moving * plan.num_parts
             for i in range(num_vertices):
                 turn = self.turn_of_first(i, table)
                 if turn < plan.count:
@@ -206,7 +260,7 @@ class ExplicitKernels:
                 now = self.pass_back(j, table, plan)
                 for i in range(plan.num_vertices):
                     self.vertex.step_vjp(i, j, now, scene, state, adjoint, plan)
-                for e in range(plan.num_items):
+                for e in range(self.num_elements(plan)):
                     self.elements_vjp(e, j, scene, state, adjoint, table, plan)
                 for p in range(moving * plan.num_parts):
                     self.vertex.obstacles.fold_part(p, plan.num_vertices, j, j, adjoint, table, plan)
@@ -221,6 +275,8 @@ class ExplicitKernels:
         numbers = dict.fromkeys(("num_passes", "halt", "kick", "steps", "num_parts"), "int")
         own = self.with_record(CHANGE) | ADJOINT | OF_STEPS | CORNERS
         own |= dict(w="vectors2", felt="vectors2")
+        if self.pressed:
+            own |= dict(pressed_felt="vectors2", pressed_rest="vectors")
         arrays = dict(state=self.state(), adjoint=own)
         return self._kernel("step_vjp", self.passes_vjp, arrays, self.repeated, **numbers)
 
@@ -240,7 +296,10 @@ class ExplicitKernels:
         return Kernel("finish_vjp", self.gather_rest, self.vertex.law.precision, own, dict(num_vertices="int"))
 
     def _kernel(self, name: str, body, arrays: dict, repeated: bool, **numbers) -> Kernel:
-        arrays, numbers = dict(scene=SCENE) | arrays | dict(table=PLAN), NUMBERS | numbers
+        scene, counted = (SCENE | PRESSED, ("num_pressed", "first_pressed")) if self.pressed else (SCENE, ())
+        scene = scene | GUIDED if self.vertex.features.guided else scene
+        arrays = dict(scene=scene) | arrays | dict(table=PLAN)
+        numbers = NUMBERS | dict.fromkeys(counted, "int") | numbers
         numbers |= dict(per_frame="int") if self.recorded else {}
         if repeated:
             arrays["table"], numbers = PLAN | TURNS, numbers | dict(times="int")

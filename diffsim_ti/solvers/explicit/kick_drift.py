@@ -23,6 +23,8 @@ import taichi as ti
 from diffsim_ti.elements.patched_tetrahedron import functions_of
 from diffsim_ti.runtime import PRECISIONS
 from diffsim_ti.solvers.explicit.contact_stage import ContactStage
+from diffsim_ti.solvers.explicit.given_forces import GivenForces
+from diffsim_ti.solvers.explicit.guides import Guides
 from diffsim_ti.solvers.explicit.obstacle_stages import ObstacleStages
 from diffsim_ti.state.features import Features
 
@@ -57,6 +59,14 @@ class KickDrift:
     def contact(self) -> ContactStage:
         return ContactStage(self.features, self.law.precision)
 
+    @cached_property
+    def given(self) -> GivenForces:
+        return GivenForces(self.features, self.law.precision)
+
+    @cached_property
+    def guides(self) -> Guides:
+        return Guides(self.law.precision, self.features.motion)
+
     @ti.func
     def half(self):
         return ti.cast(0.5, self.fp)  # dividing by 2 would compute in f64
@@ -65,17 +75,6 @@ class KickDrift:
     def gravity(self, parameters: A):
         g = ti.static(self.features.gravity)
         return self.vector(parameters[g], parameters[g + 1], parameters[g + 2], ti.cast(0, self.fp))
-
-    @ti.func
-    def force_at(self, i, now: A, scene: A, forces: A):
-        """External force on vertex i: of the present step, or half of each of the two that share a kick."""
-        f = self.vector(0)
-        k = scene.force_slot[i]
-        if k >= 0:
-            f = forces[0, k]
-            if ti.static(self.features.forces_per_step):
-                f = self.half() * (forces[now.force0, k] + forces[now.force1, k])
-        return f
 
     @ti.func
     def prescribed(self, i, scene: A):
@@ -92,6 +91,8 @@ class KickDrift:
         if ti.static(self.features.gravity >= 0):
             if scene.inverse_mass[i] > 0:
                 a += self.gravity(scene.parameters)
+        if ti.static(self.features.guided):
+            a = self.guides.free(i, a, scene)
         v_mid = v + now.pre * a
         return v_mid, v_mid + now.post * a
 
@@ -107,7 +108,7 @@ class KickDrift:
             if scene.surface[i] > 0:
                 f = self.obstacles.add_force(i, f, u, v, now, scene)
         if ti.static(self.features.forces):
-            f += self.force_at(i, now, scene, scene.forces)
+            f += self.given.force(i, now, scene, scene.forces)
         # kick, frame, kick
         v_mid, v_plus = self.kicked(i, v, f, now, scene)
         if now.frame >= 0:
@@ -121,7 +122,11 @@ class KickDrift:
         if ti.static(self.features.num_staged > 0):
             u_next, v_next = self.contact.advance(i, u, v_plus, now, scene, state, plan)
         # prescribed motion
-        if ti.static(self.features.motion):
+        if ti.static(self.features.guided):
+            k = self.prescribed(i, scene)
+            u_held, v_held = self.guides.given(k, u, v, now, scene)
+            u_next, v_next = self.guides.end(i, k, u_next, u_held, scene), self.guides.end(i, k, v_next, v_held, scene)
+        elif ti.static(self.features.motion):
             k = self.prescribed(i, scene)
             if k >= 0:
                 u_next, v_next = u, v
@@ -133,14 +138,14 @@ class KickDrift:
             if scene.surface[i] > 0:
                 self.obstacles.note(i, u, u_next, now, scene, state)
         if ti.static(self.features.driven):
-            state.work[i] = state.work[i] + self.work(i, u, v, f, u_next, v_next, now, scene)
+            state.work[i] = state.work[i] + self.work(i, u, v, f, u_next, v_next, now, scene, plan)
         if plan.stride > 0:
             state.f[s, i] = f
         state.u[t, i] = u_next
         state.v[t, i] = v_next
 
     @ti.func
-    def work(self, i, u, v, f, u_next, v_next, now: A, scene: A):
+    def work(self, i, u, v, f, u_next, v_next, now: A, scene: A, plan: A):
         """Work [J] done on vertex i in the pass, less what drag takes, for the energy that monitor/energy_balance.py
         follows. What a contact stage does is not in it (contact_stage.py)."""
         done, inverse, load = ti.cast(0, self.fp), scene.inverse_mass[i], self.vector(0)
@@ -149,12 +154,22 @@ class KickDrift:
             pre, post = half * now.h, half * now.h
         _, v_plus = self.kicked(i, v, f, now, scene)
         if ti.static(self.features.forces):
-            load = self.force_at(i, now, scene, scene.forces)
+            load = self.given.force(i, now, scene, scene.forces)
+        if ti.static(self.features.pressed):
+            load += self.given.pressed(i, scene, plan)
         own = f - load  # the body's
         if inverse > 0:
             if ti.static(self.features.gravity >= 0):
                 own += self.gravity(scene.parameters) / inverse
-            if ti.static(self.features.forces):
+            if ti.static(self.features.guided):  # what holds it takes what the body does there
+                done += -own.dot(self.guides.held(i, pre * v + post * v_next, scene))
+                own, v, v_plus = (
+                    self.guides.free(i, own, scene),
+                    self.guides.free(i, v, scene),
+                    self.guides.free(i, v_plus, scene),
+                )
+                u_next, v_next = u + self.guides.free(i, u_next - u, scene), self.guides.free(i, v_next, scene)
+            if ti.static(self.features.forces or self.features.pressed):
                 done += half * load.dot((pre + post) * (v + v_plus) + (pre * pre - post * post) * inverse * own)
             if ti.static(self.features.drag >= 0):
                 kept = ti.exp(-now.h * scene.parameters[ti.static(self.features.drag)])
@@ -181,12 +196,14 @@ class KickDrift:
             if scene.surface[i] > 0:
                 df = self.obstacles.add_force_jvp(i, df, u, v, du, dv, now, scene, tangent)
         if ti.static(self.features.forces):
-            df += self.force_at(i, now, scene, tangent.forces)
+            df += self.given.force(i, now, scene, tangent.forces)
         inverse = scene.inverse_mass[i]
         da = inverse * (df - inverse * tangent.mass[i] * state.f[s, i])
         if ti.static(self.features.gravity >= 0):
             if inverse > 0:
                 da += self.gravity(tangent.parameters)
+        if ti.static(self.features.guided):
+            da = self.guides.free(i, da, scene)
         # kick, frame, kick
         dv_mid = dv + now.pre * da
         if now.frame >= 0:
@@ -206,7 +223,14 @@ class KickDrift:
                 i, u, state.u[t, i] - u, before, du, dv_plus, now, scene, state, tangent, plan
             )
         # prescribed motion
-        if ti.static(self.features.motion):
+        if ti.static(self.features.guided):
+            k = self.prescribed(i, scene)
+            u_held, v_held = self.guides.given(k, du, dv, now, tangent)
+            du_next, dv_next = (
+                self.guides.end(i, k, du_next, u_held, scene),
+                self.guides.end(i, k, dv_next, v_held, scene),
+            )
+        elif ti.static(self.features.motion):
             k = self.prescribed(i, scene)
             if k >= 0:
                 du_next, dv_next = du, dv
@@ -230,8 +254,10 @@ class KickDrift:
             if ti.static(self.element.reads_rates):
                 q += self.element.gather(i, scene, adjoint.rate_corner)
         # prescribed motion: the state after the pass comes from the motion alone
-        k = self.prescribed(i, scene)
-        if ti.static(self.features.motion):
+        k, by_u_held, by_v_held = self.prescribed(i, scene), self.vector(0), self.vector(0)
+        if ti.static(self.features.guided):
+            p, q, by_u_held, by_v_held = self.guides.end_vjp(i, k, p, q, now, scene, adjoint)
+        elif ti.static(self.features.motion):
             if k >= 0 and now.alpha > 0:
                 before, after = adjoint.motion[now.row, k], adjoint.motion[now.next, k]
                 adjoint.motion[now.row, k] = before + (1 - now.end) * p - now.per_step * q
@@ -240,8 +266,9 @@ class KickDrift:
                 p, q = self.vector(0), self.vector(0)
         # drift and damping
         v_plus_adj = now.alpha * p + now.decay * q
-        if k >= 0:
-            v_plus_adj = q
+        if ti.static(not self.features.guided):
+            if k >= 0:
+                v_plus_adj = q
         if ti.static(self.features.num_staged > 0):
             _, before = self.kicked(i, v, state.f[s, i], now, scene)
             moved = state.u[t, i] - u
@@ -264,6 +291,9 @@ class KickDrift:
             p += adjoint.frames_u[now.frame, i]
             v_mid_adj += adjoint.frames_v[now.frame, i]
         a_adj = now.post * v_plus_adj + now.pre_adj * v_mid_adj
+        if ti.static(self.features.guided):
+            a_adj = self.guides.free(i, a_adj, scene)
+            p, v_mid_adj = p + by_u_held, v_mid_adj + by_v_held
         # forces
         inverse = scene.inverse_mass[i]
         f_adj, q = inverse * a_adj, v_mid_adj
@@ -276,20 +306,10 @@ class KickDrift:
                     row = ti.static(self.features.gravity + d)
                     adjoint.sums[row, i] = adjoint.sums[row, i] + a_adj[d]
         if ti.static(self.features.forces):
-            self.force_at_vjp(i, f_adj, now, scene, adjoint)
+            self.given.add_vjp(i, f_adj, now, scene, adjoint)
         if ti.static(len(self.features.pressing) > 0):
             if scene.surface[i] > 0:
                 p, q = self.obstacles.add_force_vjp(i, p, q, u, v, f_adj, now, scene, adjoint)
         adjoint.u[0, i] = p
         adjoint.v[0, i] = q
         adjoint.w[0, i] = f_adj
-
-    @ti.func
-    def force_at_vjp(self, i, f_adj, now: A, scene: A, adjoint: A):
-        k = scene.force_slot[i]
-        if k >= 0:
-            if ti.static(self.features.forces_per_step):
-                adjoint.forces[now.force0, k] = adjoint.forces[now.force0, k] + self.half() * f_adj
-                adjoint.forces[now.force1, k] = adjoint.forces[now.force1, k] + self.half() * f_adj
-            else:
-                adjoint.forces[0, k] = adjoint.forces[0, k] + f_adj

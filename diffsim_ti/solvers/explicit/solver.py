@@ -11,6 +11,7 @@ from diffsim_ti import runtime
 from diffsim_ti.contact.surface_pairs import Tunnelling
 from diffsim_ti.inputs import Derived
 from diffsim_ti.monitor.energy_balance import EnergyBalance
+from diffsim_ti.potential.follower_pressure import FollowerPressure
 from diffsim_ti.potential.way import Way
 from diffsim_ti.solvers.explicit.adjoint import ExplicitAdjoint, ExplicitTangent
 from diffsim_ti.solvers.explicit.contact_stage import ROWS
@@ -20,7 +21,7 @@ from diffsim_ti.solvers.explicit.kernels import ExplicitKernels, explicit_kernel
 from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.state.schedule import PassTable
 from diffsim_ti.state.workspace import Workspace
-from diffsim_ti.terms import ExternalForce, SelfContact
+from diffsim_ti.terms import SelfContact
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,8 @@ class ExplicitSolver(Solver):
     contact_damping: of the stage, from 0, which keeps the energy of a contact, to 1, which damps what the step does not
         resolve and is the smoothest. A vertex that is pressed with N rests at velocity (1 - c) h N / 2 m in the
         semi-implicit solver, whose rest is exact with 1, and at -c h N / 2 m in velocity Verlet, exact with 0.
-    Raises ValueError for another `contact`, or damping outside [0, 1].
+    Raises ValueError for another `contact`, damping outside [0, 1], and obstacles in a stage where vertices are held in some
+    directions alone.
     """
 
     explicit = True
@@ -68,6 +70,17 @@ class ExplicitSolver(Solver):
             raise ValueError(f"contact_damping must lie between 0 and 1, got {contact_damping}")
         self.contact, self.contact_damping = contact, float(contact_damping)
         super().__init__(*arguments, **options)
+        self._refuse_guides_in_stages()
+
+    def _refuse_guides_in_stages(self) -> None:
+        """A stage moves vertices along the normals of obstacles, and knows nothing of what holds them."""
+        if len(self.scene.supports.guided) and any(term.acts_on_surface for term in self.scene.terms):
+            if self.stages_contact or feels_faces(self.scene):
+                raise ValueError(
+                    "explicit steps cannot treat obstacles in a stage of their own where vertices are held in some "
+                    'directions alone: pass contact="force" (with obstacles that are wider than faces), or take an implicit '
+                    "solver"
+                )
 
     @property
     def stages_contact(self) -> bool:
@@ -173,12 +186,17 @@ class ExplicitWorkspace(Workspace):
 
     def loads_at(self, j: int, num_passes: int) -> np.ndarray:
         """External forces [N] on each vertex, as pass j of a run takes them."""
-        rows, out = self.arrays.rows["forces"], np.zeros((self.arrays.num_vertices, 3))
-        if rows is not None:
-            weights = self.solver.weights(np.array([j]), num_passes, self.rate)
-            at = [int(np.ravel(self.solver.schedule.row(j - lag))[0]) for lag in (weights.lag0, weights.lag1)]
-            force = 0.5 * sum(rows[min(row, len(rows) - 1)] for row in at)
-            out[self.scene.term(ExternalForce).indices(self.scene.mesh)] = force
+        a, schedule, out = self.arrays, self.solver.schedule, np.zeros((self.arrays.num_vertices, 3))
+        weights = self.solver.weights(np.array([j]), num_passes, self.rate)
+        lags = [int(np.ravel(lag)[0]) for lag in (weights.lag0, weights.lag1)]
+        kicks = [(j - lag, schedule.end(j - lag) if lag else schedule.begin(j)) for lag in lags]
+        if a.rows["forces"] is not None:
+            keyed = a.features().forces_keyed
+            out[self.scene.loaded_vertices] = 0.5 * sum(schedule.load(a.rows["forces"], *k, keyed) for k in kicks)
+        if a.pressures:
+            p = 0.5 * sum(schedule.pressure(a.rows["follower"], *k) for k in kicks)
+            x = a.values.rest + runtime.fetch_row(self.state.u, 0)
+            out += FollowerPressure(a.pressed_triangles, a.load_of, a.num_vertices).at(p).forces(x)
         return out
 
     def kernels(self, features) -> ExplicitKernels:
@@ -198,9 +216,11 @@ class ExplicitWorkspace(Workspace):
         """
         a, solver = self.arrays, self.solver
         num_rows = max((len(x) for x in (a.values.path, a.values.motion) if x is not None), default=1)
+        if num_rows == 1 and (a.pressures or a.features().forces_keyed):  # they ask in which step a pass lies
+            num_rows = max(1 + len(x) for x in (a.values.forces, a.values.follower) if x is not None)
         run = num_passes, num_rows, save_every, self.rate, solver.schedule
         turn, sizes = -1 if backwards else 1, dict(num_items=a.num_items, num_vertices=a.num_vertices)
-        sizes["contact_damping"] = solver.contact_damping
+        sizes |= dict(contact_damping=solver.contact_damping, num_pressed=a.num_pressed, first_pressed=a.first_pressed)
         for window, begin, end in self.table.windows(first, last)[::turn]:
             self.table.show(window, run, lambda first, last: solver.pass_table(first, last, *run[:4]))
             number = -(-(end - begin) // most)

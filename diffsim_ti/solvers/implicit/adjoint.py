@@ -25,6 +25,8 @@ class ImplicitAdjoint(RecordedPasses):
     density, shape: also the adjoints by vertex masses and by the rest shape, which cost extra.
     """
 
+    transposed = True
+
     def __init__(self, workspace, density: bool, shape: bool):
         super().__init__(workspace)
         a = workspace.arrays
@@ -69,10 +71,12 @@ class ImplicitAdjoint(RecordedPasses):
         self.p, self.q = self.frames[0][-1].copy(), self.frames[1][-1].copy()
         self.pending = [np.zeros_like(self.p), np.zeros_like(self.p)]
         self.mass_adj, self.gravity, self.rate = np.zeros(len(self.p)), np.zeros(3), 0.0
+        self.pressure = None if a.values.follower is None else np.zeros_like(a.values.follower)
+        self.rest_by_pressure = np.zeros_like(self.p)
         self.forces = None if a.values.forces is None else np.zeros_like(a.values.forces)
         self.motion = None if a.values.motion is None else np.zeros_like(a.values.motion)
         self.path = None if a.values.path is None else np.zeros_like(a.values.path)
-        self.anchor = np.zeros((len(a.fixed), 3))
+        self.anchor = np.zeros((len(a.held), 3))
 
     def seed_contacts(self, forces_adj: np.ndarray | None, frame_time: float) -> None:
         """Set the adjoints of the frames' contact forces (None: zero)."""
@@ -107,9 +111,9 @@ class ImplicitAdjoint(RecordedPasses):
         return None if seed is None else self._shares.pull_back(seed)
 
     def _pull_back(self, j: int, per_frame: int) -> None:
-        ws, s, p, q, fixed = self.ws, self.stage, self.p, self.q, self.ws.arrays.fixed
+        ws, s, p, q, held = self.ws, self.stage, self.p, self.q, self.ws.arrays.held
         seen = self._pull_back_contacts(j, per_frame)
-        by_contacts = 0.0 if seen is None else seen[0]
+        by_contacts = np.zeros_like(p) if seen is None else seen[0]
         if s.static:
             q = np.zeros_like(q)
         p_free, q_free = p * ws.free, q * ws.free
@@ -126,11 +130,16 @@ class ImplicitAdjoint(RecordedPasses):
             reaction = reaction + self._vjp_of_faces()
         reaction = reaction + by_contacts
         share = ws.load_share(j, s)
+        if self.pressure is not None:
+            by_place = ws.follower.vjp(self.places, by_star)
+            reaction, self.rest_by_pressure = reaction + by_place, self.rest_by_pressure + by_place
+            felt = share * ws.follower.pressures_vjp(self.places, by_star)
+            ws.solver.schedule.add_pressure(self.pressure, j, ws.share_at_stage(j, s), felt)
         self.gravity += share * (ws.mass * by_star).sum(0)
         self.mass_adj += (by_star * self.weight(share)).sum(1)
         if self.forces is not None:
-            row = ws.solver.schedule.row(j) if len(self.forces) > 1 else 0
-            self.forces[row] += share * by_star[ws.force_vertices()]
+            felt, keyed = share * by_star[ws.force_vertices], ws.scene.inputs.keyed_forces
+            ws.solver.schedule.add_load(self.forces, j, ws.share_at_stage(j, s), keyed, felt)
         # where inertia starts from
         inertial = self.mass * by_star
         x_adj = inertial - s.e0 / s.gamma * q_free
@@ -149,22 +158,24 @@ class ImplicitAdjoint(RecordedPasses):
         u_adj = s.a0 * x_adj + (1 - s.c0) * p_free + by_lag
         v_adj = s.b0 * y_adj
         # prescribed places
-        if len(fixed):
-            self._pull_back_fixed(j, p, q, reaction, u_adj, v_adj)
+        if len(held):
+            self._pull_back_held(j, p, q, reaction, u_adj, v_adj)
         self.p, self.q = u_adj + self.pending[0], v_adj + self.pending[1]
         self.pending = [s.a1 * x_adj, s.b1 * y_adj] if self.before is not None else [0 * x_adj, 0 * y_adj]
 
-    def _pull_back_fixed(self, j, p, q, reaction, u_adj, v_adj) -> None:
-        fixed, s = self.ws.arrays.fixed, self.stage
-        pull = reaction[fixed]
+    def _pull_back_held(self, j, p, q, reaction, u_adj, v_adj) -> None:
+        """Adds what comes by the held parts, of which nothing is in u_adj and v_adj of the equation."""
+        ws, held, s = self.ws, self.ws.arrays.held, self.stage
+        pull, p, q = (ws.of_held(x[held]) for x in (reaction, p, q))
         if self.motion is None:
-            u_adj[fixed], v_adj[fixed] = p[fixed] + pull, q[fixed]
+            u_adj[held] += p + pull
+            v_adj[held] += q
             return
-        schedule = self.ws.solver.schedule
-        place = p[fixed] + pull / s.c0
-        u_adj[fixed], v_adj[fixed] = (1 - 1 / s.c0) * pull, 0.0
+        schedule = ws.solver.schedule
+        place = p + pull / s.c0
+        u_adj[held] += (1 - 1 / s.c0) * pull
         schedule.add_place(self.motion, j, schedule.end(j), place)
-        schedule.add_rate(self.motion, j, q[fixed])
+        schedule.add_rate(self.motion, j, q)
         self.anchor += place
 
     def reverse_kick(self, j: int, base: int, num_passes: int) -> None:
@@ -178,7 +189,7 @@ class ImplicitAdjoint(RecordedPasses):
 
         Held vertices have no velocity.
         """
-        q = np.delete(self.q, self.ws.arrays.fixed, axis=0)
+        q = self.ws.arrays.supports.free(self.q)
         return float(np.linalg.norm(self.p)), float(np.linalg.norm(q))
 
     def scale(self, factor: float) -> None:
@@ -202,10 +213,10 @@ class ImplicitAdjoint(RecordedPasses):
         if self.ws.potential.faces and features.areas:
             by_areas = runtime.fetch(self.face_areas).astype(np.float64)
             rest = rest + rest_of_areas(a.mesh, a.values.rest, by_areas)
-        out.rest = rest + out.rest
-        out.forces, out.motion, out.path = self.forces, self.motion, self.path
+        out.rest = rest + self.rest_by_pressure + out.rest
+        out.forces, out.motion, out.path, out.follower = self.forces, self.motion, self.path, self.pressure
         if self.motion is not None:
-            out.displacement[a.fixed] += self.anchor
+            out.displacement[a.held] += self.anchor
         return out
 
 
@@ -254,8 +265,8 @@ class ImplicitTangent(RecordedPasses):
             dx = dx + s.a1 * self.tangent_before[0]
             dy = dy + s.b1 * self.tangent_before[1] + db1 * self.before[1]
         place, speed = ws.prescribed(j, tangent)
-        held = np.zeros_like(self.du)
-        held[a.fixed] = self.du[a.fixed] if place is None else self.du[a.fixed] + (place - self.du[a.fixed]) / s.c0
+        now = self.du[a.held]
+        held = ws.with_held(np.zeros_like(self.du), now if place is None else now + (place - now) / s.c0)
         runtime.fill(ws.potential.w, held[None])
         if ws.potential.has_friction:
             runtime.fill(self.lag, np.stack([self.du, dx]))
@@ -277,16 +288,18 @@ class ImplicitTangent(RecordedPasses):
             dR += self._jvp_of_faces()
         if a.features().gravity >= 0:
             dR += share * ws.mass * tangent.parameters[a.features().gravity :][:3]
-        if tangent.forces is not None:
-            row = ws.solver.schedule.row(j) if len(tangent.forces) > 1 else 0
-            dR[ws.force_vertices()] += share * tangent.forces[row]
+        dR += ws.given_forces(tangent.forces, j, s)
+        if tangent.follower is not None:
+            dp = share * ws.solver.schedule.pressure(tangent.follower, j, ws.share_at_stage(j, s))
+            dR += ws.follower.jvp(self.places, held + tangent.rest, dp)
         d_star = held + self.solve(dR + self.mass * (dx + s.gamma * dy))
         if self.contacts:
             self._note_contacts(j, per_frame, d_star)
         before = self.du, self.dv
         self.du = s.c0 * d_star + (1 - s.c0) * self.du
         self.dv = s.e0 * (d_star - dx) / s.gamma + s.e1 * dy + de0 * self.v_star + de1 * self.y
-        self.du[a.fixed], self.dv[a.fixed] = (x[a.fixed] for x in before) if place is None else (place, speed)
+        place, speed = (x[a.held] for x in before) if place is None else (place, speed)
+        self.du, self.dv = ws.with_held(self.du, place), ws.with_held(self.dv, speed)
         if s.static:
             self.dv = np.zeros_like(self.dv)
         self.tangent_before = before

@@ -10,6 +10,7 @@ import weakref
 
 import numpy as np
 
+from diffsim_ti.potential.free import held_as
 from diffsim_ti.solvers.implicit.blocked import Blocked
 
 
@@ -29,7 +30,7 @@ class Approach:
         u: where the pass begins; start: where inertia leads; problem: mass, inertial, loads of `Newton.solve`.
         Raises Blocked where no room is left.
         """
-        ws, held = self.ws, start * (1 - self.ws.free) + u * self.ws.free
+        ws, held = self.ws, held_as(self.ws.free, start, u)
         way, before, after = ws.way, ws.walls_before, ws.walls_at_stage
         step, drift = held - u, after - before
         if not (step.any() or drift.any()):
@@ -67,7 +68,7 @@ class Approach:
 
     def _carried(self, place, step, walls, drift, obstacle: int):
         """All that moves freely goes along with an obstacle; None where that way is not free."""
-        along = step + self.ws.free * drift[obstacle]
+        along = step + np.tile(drift[obstacle], (len(step), 1)) * self.ws.free
         if not drift[obstacle].any() or self.ws.way.share(place, along, walls, drift) < 1:
             return None
         return place + along if self._is_sound(place, place + along) else None

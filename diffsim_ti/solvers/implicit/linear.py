@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from diffsim_ti.potential.free import Free
+
 
 class NotConverged(FloatingPointError):
     """An iteration did not reach its tolerance. Carries `residuals`, the relative residual after each round."""
@@ -12,20 +14,30 @@ class NotConverged(FloatingPointError):
 
 
 class Operator:
-    """w -> c m w + d2E/du2 w at the potential's displacement; rows of fixed vertices are zero.
+    """w -> c m w + d2E/du2 w at the potential's displacement, less what follower pressures change; rows of fixed vertices
+    are zero.
 
-    mass: c m, shape (num_vertices, 1) [N/m]; free: (num_vertices, 1), 1 or 0.
+    mass: c m, shape (num_vertices, 1) [N/m]; free: what vertices may do (free.py); transposed: of pressures.
     """
 
-    def __init__(self, potential, mass: np.ndarray, free: np.ndarray):
+    def __init__(self, potential, mass: np.ndarray, free: Free, follower=None, transposed: bool = False):
         self.potential, self.mass, self.free = potential, mass, free
         self.products, self.correction = 0, None
+        self.follower, self.transposed = follower, transposed
+
+    @property
+    def symmetric(self) -> bool:
+        return self.follower is None or self.follower.symmetric
 
     def __call__(self, w: np.ndarray) -> np.ndarray:
         self.products += 1
         y = self.mass * w + self.potential.product(w, convex=self.correction is not None)
         if self.correction is not None:
             y += self.correction(w)
+        if self.follower is not None:
+            x = self.potential.arrays.values.rest + self.potential.held_at
+            w = w * self.free
+            y -= self.follower.vjp(x, w) if self.transposed else self.follower.jvp(x, w)
         return y * self.free
 
 
@@ -59,6 +71,63 @@ def conjugate_gradients(operator, b, preconditioner, tolerance: float, max_itera
     return x, np.linalg.norm(r) / size, max_iterations, None
 
 
+def gmres(operator, b, preconditioner, tolerance: float, max_iterations: int, restart: int = 80):
+    """(x, relative residual, iterations) of A x = b for any A: GMRES, preconditioned from the right, started again every so
+    many products, and where rounding has left more than it knows of, until that helps no more.
+    Saad, Schultz 1986, doi:10.1137/0907058.
+    """
+    x, r, size, count = np.zeros_like(b), b, np.linalg.norm(b), 0
+    residual = 1.0 if size > 0 else 0.0
+    while residual > tolerance and count < max_iterations:
+        beta = np.linalg.norm(r)
+        V, Z, H = [r / beta], [], np.zeros((restart + 1, restart))
+        for k in range(restart):
+            Z.append(preconditioner(V[k]))
+            w, count = operator(Z[k]), count + 1
+            whole = np.linalg.norm(w)
+            for _ in range(2):  # twice is enough
+                for i, v in enumerate(V):
+                    h = float((v * w).sum())
+                    H[i, k] += h
+                    w = w - h * v
+            H[k + 1, k] = np.linalg.norm(w)
+            rhs = np.zeros(k + 2)
+            rhs[0] = beta
+            y, *_ = np.linalg.lstsq(H[: k + 2, : k + 1], rhs, rcond=None)
+            left = np.linalg.norm(H[: k + 2, : k + 1] @ y - rhs)
+            if not np.isfinite(left):
+                raise FloatingPointError("the stiffness of this state is not finite")
+            spanned = H[k + 1, k] <= 1e-12 * whole  # all that these directions lead to
+            if left <= tolerance * size or spanned or count >= max_iterations:
+                break
+            V.append(w / H[k + 1, k])
+        x = x + sum(c * z for c, z in zip(y, Z))
+        r = b - operator(x)
+        before, residual = residual, np.linalg.norm(r) / size
+        if residual > 0.9 * before:  # it stands
+            break
+    return x, residual, count
+
+
+def solve(operator, b, preconditioner, tolerance: float, eps: float, max_iterations: int) -> np.ndarray:
+    """x with |b - A x| <= tolerance |b|, whether A is symmetric or not. Raises NotConverged."""
+    if operator.symmetric:
+        return solve_symmetric(operator, b, preconditioner, tolerance, eps, max_iterations)
+    x, residual, count = gmres(operator, b, preconditioner, tolerance, max_iterations)
+    if residual > max(tolerance, 1000 * eps):  # products of A have rounding of their own
+        raise not_solved(residual, tolerance, count)
+    return x
+
+
+def not_solved(residual: float, tolerance: float, count: int) -> NotConverged:
+    """What a linear solve that stopped early says."""
+    return NotConverged(
+        f"a linear solve stopped at a relative residual of {residual:.2g} (asked for {tolerance:g}) after {count} "
+        "iterations: the state may be at a limit point; loosen the tolerance or take smaller steps",
+        [residual],
+    )
+
+
 def solve_symmetric(operator, b, preconditioner, tolerance: float, eps: float, max_iterations: int) -> np.ndarray:
     """x with |b - A x| <= tolerance |b| for a symmetric, possibly indefinite A: CG, and MINRES where CG cannot go on.
 
@@ -80,9 +149,5 @@ def solve_symmetric(operator, b, preconditioner, tolerance: float, eps: float, m
             step, _ = minres(A, r.ravel(), M=M, rtol=0.1 * tolerance, maxiter=max_iterations)
             x += step.reshape(b.shape)
     if residual > tolerance:
-        raise NotConverged(
-            f"a linear solve stopped at a relative residual of {residual:.2g} (asked for {tolerance:g}) after {count} "
-            "iterations: the state may be at a limit point; loosen the tolerance or take smaller steps",
-            [residual],
-        )
+        raise not_solved(residual, tolerance, count)
     return x

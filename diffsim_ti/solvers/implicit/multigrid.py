@@ -4,6 +4,7 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.potential.assembled import assemble
+from diffsim_ti.potential.free import Free, FreeDirections, projectors_of
 
 
 class Multigrid:
@@ -15,7 +16,7 @@ class Multigrid:
     Vanek, Mandel, Brezina 1996, doi:10.1007/BF02238511; Bell, Olson, Schroder, PyAMG, doi:10.21105/joss.04142.
     """
 
-    def __init__(self, potential, mass: np.ndarray, free: np.ndarray, size: np.ndarray):
+    def __init__(self, potential, mass: np.ndarray, free: Free, size: np.ndarray):
         import pyamg
 
         self.potential, self.free = potential, free
@@ -27,7 +28,7 @@ class Multigrid:
         try:
             levels = pyamg.smoothed_aggregation_solver(
                 matrix,
-                B=_rigid_motions(potential.arrays.values.rest) * np.repeat(free, 3, 0),
+                B=_allowed(_rigid_motions(potential.arrays.values.rest), free),
                 strength=("symmetric", {"theta": 0.08}),
                 max_coarse=300,
             ).levels
@@ -51,6 +52,8 @@ class Multigrid:
         contact = self.potential.contact_blocks()
         if contact is None:
             return
+        if isinstance(self.free, FreeDirections):
+            contact = self.free.around(contact)
         if self._rotations is not None:
             contact = np.swapaxes(self._rotations, 1, 2) @ contact @ self._rotations
         if self._contact is not None and np.array_equal(contact, self._contact):
@@ -164,6 +167,11 @@ def _cofactors(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     out = [e * i - f * h, f * g - d * i, d * h - e * g, c * h - b * i, a * i - c * g, b * g - a * h]
     out += [b * f - c * e, c * d - a * f, a * e - b * d]
     return np.stack(out), a * out[0] + b * out[1] + c * out[2]
+
+
+def _allowed(motions: np.ndarray, free: Free) -> np.ndarray:
+    """What may be done of motions, shape (3 num_vertices, k)."""
+    return (projectors_of(free) @ motions.reshape(-1, 3, motions.shape[1])).reshape(motions.shape)
 
 
 def _rigid_motions(X: np.ndarray) -> np.ndarray:

@@ -1,7 +1,9 @@
 """Newton's method on the incremental potential, of which an implicit step is a minimum.
 
-    Phi(u) = c/2 sum_i m_i |u_i - a_i|^2 + E(u) - sum_i b_i . u_i,    R = -dPhi/du
+    Phi(u) = c/2 sum_i m_i |u_i - a_i|^2 + E(u) - sum_i b_i . u_i - W(u),    R = -dPhi/du
 
+W: work of follower pressures. Where an open surface leaves them without a potential there is no Phi, but R: directions come
+from GMRES, and a step is taken that lowers |R| or, in the first rounds, along which -R does negative work.
 a: where inertia alone would lead [m]; b: dead loads [N]; c = 1 / gamma^2 [1/s^2], zero for statics. Directions come from
 conjugate gradients on the exact Hessian. Where that is met to be indefinite they stop with what they have (buckling needs
 that), or, if that is early, each tetrahedron's d2psi/dF2 is made positive definite and the direction computed anew (crushed
@@ -13,8 +15,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from diffsim_ti.potential.free import Free, cleaned, mask_of
 from diffsim_ti.potential.way import Met
-from diffsim_ti.solvers.implicit.linear import NotConverged, Operator, conjugate_gradients
+from diffsim_ti.solvers.implicit.linear import NotConverged, Operator, conjugate_gradients, gmres
 from diffsim_ti.solvers.implicit.projection import Projection
 
 LONGER = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # steps along an indefinite direction that are doubled while Phi falls
@@ -55,11 +58,23 @@ class Newton:
     inexact, rough = 1e-3, 0.1
     roughly = 0.03
     patience = 6  # times as many rounds as asked for, at most, where obstacles cut directions short
+    by_work = 30  # rounds in which work may stand for a potential that is not there; later it might lead in circles
     shortest = 2.0**-40  # fraction of a direction below which a line search gives up
 
     def __init__(
-        self, potential, free: np.ndarray, way, preconditioners, tolerance: float, max_iterations: int, eps: float
+        self,
+        potential,
+        free: Free,
+        way,
+        preconditioners,
+        tolerance: float,
+        max_iterations: int,
+        eps: float,
+        follower=None,
     ):
+        self.follower = follower  # pressures (potential/follower_pressure.py), or None
+        self.by_residual = follower is not None and not follower.symmetric
+        self.moves = mask_of(free)  # in some direction
         self.potential, self.free, self.way, self.preconditioners = potential, free, way, preconditioners
         self.tolerance, self.max_iterations, self.eps = tolerance, max_iterations, eps
         self.reach = 0.01 * float(np.ptp(potential.arrays.values.rest, 0).max())  # of the first step away from a saddle
@@ -94,14 +109,14 @@ class Newton:
         while len(report.residuals) < min(most + report.cuts, self.patience * most):
             R, now = self._residual(u)
             size, before = max(size, now), norm
-            floor = 4 * self.eps * np.linalg.norm(self._rigidity() * np.abs(u).max(1, keepdims=True) * self.free)
+            floor = 4 * self.eps * np.linalg.norm(self._rigidity() * np.abs(u).max(1, keepdims=True) * self.moves)
             norm = np.linalg.norm(R)
             report.residuals.append(norm / size if size > 0 else 0.0)
             if rounds is not None and norm <= self.roughly * size:
                 return u
             solved = norm <= self.tolerance * size + floor
             if solved and (not rough or norm <= floor):
-                downhill = self._downhill() if leave_saddles else None
+                downhill = self._downhill() if leave_saddles and not self.by_residual else None
                 if downhill is None:
                     return u
                 report.saddles += 1
@@ -115,9 +130,11 @@ class Newton:
             self.preconditioner.update(u)
             forcing = self._forcing(norm, before, solved, size, floor)
             rough = forcing > max(self.inexact, 0.3 * floor / norm)
-            direction = self._direction(R, max(forcing, 10 * self.eps))
+            direction = cleaned(self.free, self._direction(R, max(forcing, 10 * self.eps)))
             moved = self._search(u, direction, R, E)
             if moved is None:
+                if solved and self.by_residual:  # |R| is as small as rounding lets it be
+                    return self.potential.place(u)
                 break
             u, E = moved
         if norm <= 100 * floor or (rounds is not None and np.isfinite(norm)):  # rounding has the last word
@@ -143,12 +160,15 @@ class Newton:
 
     def operator(self) -> Operator:
         """The Hessian of Phi where the potential stands."""
-        return Operator(self.potential, self.mass, self.free)
+        return Operator(self.potential, self.mass, self.free, self.follower)
 
     def _residual(self, u):
         f, sizes = self.potential.forces()
         inertia = self.mass * (u - self.inertial)
-        size = np.sqrt((sizes**2).sum() + (self.loads**2).sum() + (inertia**2 * self.free).sum())
+        if self.follower is not None:
+            x = self.potential.arrays.values.rest + u
+            f, sizes = f + self.follower.forces(x), sizes + self.follower.sizes(x)
+        size = np.sqrt((sizes**2).sum() + (self.loads**2).sum() + (inertia**2 * self.moves).sum())
         return (f + self.loads - inertia) * self.free, size
 
     def _forcing(self, norm, before, solved, size, floor) -> float:
@@ -162,6 +182,11 @@ class Newton:
     def _direction(self, R, forcing):
         A = self.operator()
         limit = 10 * len(R)
+        if self.by_residual:
+            self._indefinite = False
+            d, *_ = gmres(A, R, self.preconditioner, forcing, limit)
+            self.report.products += A.products
+            return d
         d, _, count, negative = conjugate_gradients(A, R, self.preconditioner, forcing, limit, self.eps)
         self._indefinite = negative is not None
         if negative is not None:
@@ -177,7 +202,7 @@ class Newton:
 
     def _downhill(self):
         """A direction of negative curvature, found by solving for something random, and a slope for its search."""
-        probe = np.random.default_rng(0).standard_normal(self.free.shape[:1] + (3,)) * self.free
+        probe = np.random.default_rng(0).standard_normal((len(self.moves), 3)) * self.free
         A = self.operator()
         self.preconditioner.update(self.potential.held_at)
         _, _, _, p = conjugate_gradients(A, probe, self.preconditioner, 1e-3, 10 * len(probe), self.eps)
@@ -200,8 +225,14 @@ class Newton:
         fraction = min(1.0, longest)
         while fraction > self.shortest:
             trial, after, change, noise = self._try(u, fraction * d, before, self.upright and fraction > self.insist)
-            drowned = abs(slope) * fraction <= noise >= change
-            if change <= -1e-4 * fraction * slope or (drowned and self._falls(trial, d, slope)):
+            if self.by_residual:
+                early = len(self.report.residuals) <= self.by_work and slope > 0
+                lower = early and change <= -1e-4 * fraction * slope
+                lower = lower or (np.isfinite(change) and self._residual_falls(trial, R, fraction))
+            else:
+                drowned = abs(slope) * fraction <= noise >= change
+                lower = change <= -1e-4 * fraction * slope or (drowned and self._falls(trial, d, slope))
+            if lower:
                 best = trial, after, change
                 self.upright = self.upright and fraction > self.insist
                 break
@@ -230,12 +261,18 @@ class Newton:
         R, _ = self._residual(u)
         return float((R * d).sum()) >= -0.8 * slope
 
+    def _residual_falls(self, u, R, fraction) -> bool:
+        """Whether the residual at u is less than R, after a share of a step."""
+        return np.linalg.norm(self._residual(u)[0]) <= (1 - 1e-4 * fraction) * np.linalg.norm(R)
+
     def _try(self, u, step, before, upright):
         """(displacement, what is there, change of Phi, rounding of that change); infinite change if not admissible."""
         trial = self.potential.place(u + step)
         E, parts, J = before
         after, step = self._evaluate(trial), trial - u
         change = after[0] - E + float((step * (self.mass * (u + 0.5 * step - self.inertial) - self.loads)).sum())
+        if self.follower is not None:
+            change -= self.follower.work(self.potential.arrays.values.rest + u, step)
         if upright and np.any(~(after[2] > 0.1 * J)):
             change = np.inf
         rounding = parts + after[1] + float((self.stiffness * trial**2).sum())  # of strains that come from large u

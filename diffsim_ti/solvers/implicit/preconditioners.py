@@ -5,6 +5,8 @@ Both are functions of the present state alone, so that a run that is started aga
 
 import numpy as np
 
+from diffsim_ti.potential.free import Free, FreeDirections, mask_of
+
 
 class BlockJacobi:
     """The inverse 3x3 diagonal blocks; blocks that are not positive definite take |eigenvalues|.
@@ -12,16 +14,26 @@ class BlockJacobi:
     size: of the diagonal at rest [N/m], to which what is all but zero is raised.
     """
 
-    def __init__(self, potential, mass: np.ndarray, free: np.ndarray, size: np.ndarray):
+    def __init__(self, potential, mass: np.ndarray, free: Free, size: np.ndarray):
         self.potential, self.mass, self.free, self.least = potential, mass, free, 1e-6 * (size + mass)
 
     def update(self, u: np.ndarray) -> None:
         """Adapt to the displacement at which the potential is placed."""
         D = self.potential.blocks() + self.mass[:, :, None] * np.eye(3)
+        if isinstance(self.free, FreeDirections):
+            D = self.free.around(D)
+            D[self.free.guided] += self.free.guides * (size_of(D[self.free.guided]) / 3)[:, None, None]
         values, vectors = np.linalg.eigh(0.5 * (D + np.swapaxes(D, 1, 2)))
         values = np.maximum(np.abs(values), self.least)
-        inverse = np.divide(self.free, values, out=np.zeros_like(values), where=values > 0)
+        inverse = np.divide(mask_of(self.free), values, out=np.zeros_like(values), where=values > 0)
         self._inverse = np.matmul(vectors * inverse[:, None, :], np.swapaxes(vectors, 1, 2))
+        if isinstance(self.free, FreeDirections):
+            self._inverse = self.free.around(self._inverse)
 
     def __call__(self, r: np.ndarray) -> np.ndarray:
         return np.matmul(self._inverse, r[:, :, None])[:, :, 0]
+
+
+def size_of(blocks: np.ndarray) -> np.ndarray:
+    """Sum of the sizes of the diagonal of each block."""
+    return np.abs(np.diagonal(blocks, axis1=1, axis2=2)).sum(1)

@@ -3,11 +3,14 @@
 import numpy as np
 
 from diffsim_ti import runtime
-from diffsim_ti.solvers.implicit.linear import Operator, solve_symmetric
+from diffsim_ti.potential.free import cleaned
+from diffsim_ti.solvers.implicit.linear import Operator, solve
 
 
 class RecordedPasses:
     """What tangent and reverse sweep share: a recorded pass with everything that its equation names."""
+
+    transposed = False  # whether equations are solved with the transposed operator
 
     def __init__(self, workspace):
         self.ws = workspace
@@ -26,18 +29,20 @@ class RecordedPasses:
         ws.begin(j, stage, self.u, self.x)
         ws.potential.hold(ws.record, j - base)
         ws.potential.place(self.u_star)
-        self.operator = Operator(ws.potential, self.mass, ws.free)
+        self.operator = Operator(ws.potential, self.mass, ws.free, ws.follower, self.transposed)
+        self.places = ws.arrays.values.rest + ws.potential.held_at
         self._preconditioner = None
 
     def solve(self, b: np.ndarray) -> np.ndarray:
-        """A^-1 b on the free vertices, zero elsewhere."""
+        """A^-1 b, or A^-T b, on the free vertices, zero elsewhere."""
         b = b * self.ws.free
         if not b.any():
             return b
         if self._preconditioner is None:
             self._preconditioner, _ = self.ws.preconditioner(self.mass)
             self._preconditioner.update(self.u_star)
-        return solve_symmetric(self.operator, b, self._preconditioner, self.tolerance, self.eps, 20 * len(b))
+        x = solve(self.operator, b, self._preconditioner, self.tolerance, self.eps, 20 * len(b))
+        return cleaned(self.ws.free, x)
 
     def weight(self, share: float) -> np.ndarray:
         """dR/dm of each vertex [m/s^2]: gravity less the acceleration."""

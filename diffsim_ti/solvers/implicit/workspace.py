@@ -8,11 +8,12 @@ import numpy as np
 from diffsim_ti import runtime
 from diffsim_ti.contact.implicit_pairs import ImplicitPairs
 from diffsim_ti.contact.surface_pairs import Tunnelling
-from diffsim_ti.inputs import Derived
 from diffsim_ti.monitor.energy_watch import EnergyWatch
+from diffsim_ti.potential.free import FreeDirections, held_as, mask_of
 from diffsim_ti.potential.potential import Potential
 from diffsim_ti.potential.way import Way
 from diffsim_ti.solvers.implicit.approach import Approach
+from diffsim_ti.solvers.implicit.given import GivenInPasses
 from diffsim_ti.solvers.implicit.law_state import law_state_kernels
 from diffsim_ti.solvers.implicit.linear import NotConverged
 from diffsim_ti.solvers.implicit.multigrid import Multigrid
@@ -35,7 +36,7 @@ class TwoStepHistory(History):
         self.fresh = [True] * num_slots
 
 
-class ImplicitWorkspace(ObstacleWays, Noted, Workspace):
+class ImplicitWorkspace(ObstacleWays, Noted, GivenInPasses, Workspace):
     """A run of an implicit solver. Vectors of vertices are worked on in float64 on the host, tetrahedra on the device."""
 
     pairs_kind = ImplicitPairs
@@ -58,11 +59,14 @@ class ImplicitWorkspace(ObstacleWays, Noted, Workspace):
         a = self.arrays
         self.mass = derived.mass[:, None]
         self.free = (runtime.fetch(a.inverse_mass)[:, None] > 0).astype(np.float64)
+        if a.features().guided:
+            self.free = FreeDirections(self.free, a.supports.guided, a.supports.guides)
         eps = np.finfo(runtime.NUMPY[self.scene.precision]).eps
         tolerance, rounds = self.solver.tolerance, self.solver.max_iterations
         me = weakref.proxy(self)  # no circle: a dropped run gives its memory back at once
         way, preconditioner = (lambda *step: me.way_past_obstacles(*step)), (lambda mass: me.preconditioner(mass))
-        self.newton = Newton(self.potential, self.free, way, preconditioner, tolerance, rounds, eps)
+        self.follower = self.follower_pressure()
+        self.newton = Newton(self.potential, self.free, way, preconditioner, tolerance, rounds, eps, self.follower)
         self._preconditioners = {}
         self.way, self.approach = Way(self.arrays, self.parallel), Approach(self)
         self.check_apart()
@@ -187,17 +191,15 @@ class ImplicitWorkspace(ObstacleWays, Noted, Workspace):
         stage = self.solver.stage(self.rate, before is None)
         x, y = self.inertial(stage, u, v, before)
         place, speed = self.prescribed(j, self.arrays.values)
-        fixed = self.arrays.fixed
         mass, loads = stage.inertia * self.mass, self.loads(j, stage)
         inertial = x + stage.gamma * y
         if not stage.static:  # dead loads act like a shift of where inertia leads: free flight is then exact
             inertial = inertial + np.divide(loads, mass, out=np.zeros_like(loads), where=mass > 0)
             loads = np.zeros_like(loads)
         start = u if stage.static else u + self.free * (inertial - u)
-        if len(fixed) and place is not None:
-            middle = u[fixed] + (place - u[fixed]) / stage.c0
-            start = start.copy()
-            start[fixed] = middle
+        if place is not None:
+            held = self.arrays.held
+            start = self.with_held(start, u[held] + (place - u[held]) / stage.c0)
         self.begin(j, stage, u, x)
         try:
             u_star = self._solve(u, start, (mass, inertial, loads), stage)
@@ -207,8 +209,9 @@ class ImplicitWorkspace(ObstacleWays, Noted, Workspace):
         v_star = (u_star - x) / stage.gamma
         u_next = stage.c0 * u_star + (1 - stage.c0) * u
         v_next = stage.e0 * v_star + stage.e1 * y
-        if len(fixed):
-            u_next[fixed], v_next[fixed] = (u[fixed], v[fixed]) if place is None else (place, speed)
+        held = self.arrays.held
+        place, speed = (u[held], v[held]) if place is None else (place, speed)
+        u_next, v_next = self.with_held(u_next, place), self.with_held(v_next, speed)
         if stage.c0 != 1:
             self._check_end(j, u_star, u_next)
         if self.energy_watch:
@@ -220,7 +223,8 @@ class ImplicitWorkspace(ObstacleWays, Noted, Workspace):
     def _kinetic_added(self, u, v, u_next, v_star, y, stage: Stage) -> float:
         """Kinetic energy [J] that a pass has added beyond the work of what accelerates the free vertices, before drag."""
         work = (v_star - y) / stage.gamma * (u_next - u)
-        return float((self.mass * self.free * (0.5 * (v_star**2 - v**2) - work)).sum())
+        moves = mask_of(self.free)
+        return float((self.mass * moves * (0.5 * (v_star**2 - v**2) - work)).sum())
 
     def _solve(self, u, start, problem: tuple, stage: Stage) -> np.ndarray:
         """The minimum of the pass; problem: mass, inertial, loads of `Newton.solve`."""
@@ -230,7 +234,7 @@ class ImplicitWorkspace(ObstacleWays, Noted, Workspace):
     def _admissible(self, start, u):
         """The start of Newton's method: where inertia leads, or less far where something would turn inside out or meet an
         obstacle."""
-        held = start * (1 - self.free) + u * self.free
+        held = held_as(self.free, start, u)
         longest = min(self.way_past_obstacles(held, start - held)[0], self.pairs_share(held, start - held))
         J0 = self.volume_ratios(held)
         for fraction in (longest, 0.5 * longest, 0.25 * longest):
@@ -262,6 +266,7 @@ class ImplicitWorkspace(ObstacleWays, Noted, Workspace):
         self._walls = self.walls(self.arrays.rows["path"], j, stage)
         self.walls_at_stage, self.walls_before = self._walls[::3].copy(), self._walls[1::3].copy()
         self.potential.begin(u, x, 1 / stage.gamma, self._walls)
+        self.press(j, stage)
 
     def walls(self, path: np.ndarray | None, j: int, stage: Stage) -> np.ndarray:
         """Three rows for each obstacle: displacement where forces are taken, displacement before, velocity."""
@@ -269,14 +274,14 @@ class ImplicitWorkspace(ObstacleWays, Noted, Workspace):
         out = np.zeros((3 * len(obstacles), 3))
         if path is not None:
             before = schedule.place(path, j, schedule.begin(j))
-            at_stage = schedule.place(path, j, self._share_at_stage(j, stage))
+            at_stage = schedule.place(path, j, self.share_at_stage(j, stage))
             speed = schedule.rate(path, j)
             for k, (_, _, column) in enumerate(obstacles):
                 if column >= 0:
                     out[3 * k : 3 * k + 3] = at_stage[column], before[column], speed[column]
         return out
 
-    def _share_at_stage(self, j: int, stage: Stage) -> float:
+    def share_at_stage(self, j: int, stage: Stage) -> float:
         """Share of the step at which pass j takes its forces."""
         schedule = self.solver.schedule
         return schedule.begin(j) + (schedule.end(j) - schedule.begin(j)) / stage.c0
@@ -288,41 +293,6 @@ class ImplicitWorkspace(ObstacleWays, Noted, Workspace):
             if column >= 0:
                 by_stage, by_before, by_speed = walls_adj[3 * k : 3 * k + 3]
                 rows = path_adj[:, column]
-                schedule.add_place(rows, j, self._share_at_stage(j, stage), by_stage)
+                schedule.add_place(rows, j, self.share_at_stage(j, stage), by_stage)
                 schedule.add_place(rows, j, schedule.begin(j), by_before)
                 schedule.add_rate(rows, j, by_speed)
-
-    def prescribed(self, j: int, of: Derived) -> tuple:
-        """(displacement [m], velocity [m/s]) of the fixed vertices after pass j; None where they are held.
-
-        of: the values of the run, or their tangent: what is prescribed is linear in them.
-        """
-        motion = self.arrays.rows["motion"] if of is self.arrays.values else of.motion
-        if motion is None:
-            return None, None
-        schedule, anchor = self.solver.schedule, of.displacement[self.arrays.fixed]
-        return anchor + schedule.place(motion, j, schedule.end(j)), schedule.rate(motion, j)
-
-    def loads(self, j: int, stage: Stage) -> np.ndarray:
-        """Dead loads on each vertex [N]: weight and external forces; statics lay them on in substeps."""
-        values, features = self.arrays.values, self.arrays.features()
-        out = np.zeros_like(values.displacement)
-        if features.gravity >= 0:
-            out += self.mass * values.parameters[features.gravity :][:3]
-        forces = self.arrays.rows["forces"]
-        if forces is not None:
-            row = self.solver.schedule.row(j) if len(forces) > 1 else 0
-            out[self.force_vertices()] += forces[row]
-        return out * self.load_share(j, stage)
-
-    def load_share(self, j: int, stage: Stage) -> float:
-        """Share of the loads in pass j."""
-        if not stage.static:
-            return 1.0
-        return min(1.0, (j + 1) / self.solver.substeps)
-
-    def force_vertices(self) -> np.ndarray:
-        """Vertices that external forces act on."""
-        from diffsim_ti.terms import ExternalForce
-
-        return self.scene.term(ExternalForce).indices(self.scene.mesh)

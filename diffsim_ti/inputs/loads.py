@@ -1,0 +1,176 @@
+"""Links of loads: from numbers over time, areas and volumes to what kernels read.
+
+What is given over time comes as values at the beginning and at the end of each step, shape (2, rows, ...), between which a
+load goes linearly. One row serves all steps.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from diffsim_ti.inputs.chain import Link
+from diffsim_ti.mesh.geometry import triangle_areas_vjp, triangle_normals
+
+
+class InTime(Link):
+    """At the beginning and at the end of each step, shape (2, rows, ...), of an array that is the same all the time or, with
+    a leading axis of `ndim` in all, given for each step; `keyed`: for each step's ends instead, linear between."""
+
+    def __init__(self, reads: str, writes: str, ndim: int, keyed: bool):
+        self.reads, self.writes, self.ndim, self.keyed = (reads,), (writes,), ndim, keyed
+
+    def value(self, x):
+        if self.keyed:
+            return (np.stack([x[:-1], x[1:]] if len(x) > 1 else [x, x]),)
+        rows = x[None] if x.ndim < self.ndim else x
+        return (np.stack([rows, rows]),)
+
+    def jvp(self, x, dx):
+        return self.value(dx[0])
+
+    def vjp(self, x, y_adj):
+        begin, end = y_adj[0]
+        if not self.keyed:
+            both = begin + end
+            return (both[0] if x[0].ndim < self.ndim else both,)
+        if len(x[0]) == 1:
+            return (begin + end,)
+        out = np.zeros_like(x[0])
+        out[:-1] += begin
+        out[1:] += end
+        return (out,)
+
+
+class VertexAreas(Link):
+    """Of rest positions the area [m^2] of each of some vertices: a third of each of the given triangles around it, which is
+    what a constant traction on these asks for."""
+
+    reads = ("rest",)
+
+    def __init__(self, triangles: np.ndarray, vertices: np.ndarray, writes: str):
+        self.triangles, self.writes = triangles, (writes,)
+        self.corners, self.count = np.searchsorted(vertices, triangles), len(vertices)
+
+    def _to_vertices(self, areas):
+        return np.bincount(self.corners.ravel(), np.repeat(areas / 3, 3), self.count)
+
+    def value(self, X):
+        return (self._to_vertices(np.linalg.norm(triangle_normals(X, self.triangles), axis=1)),)
+
+    def jvp(self, x, dx):
+        (X,), moved = x, dx[0][self.triangles]
+        e, f = (X[self.triangles[:, k]] - X[self.triangles[:, 0]] for k in (1, 2))
+        de, df = (moved[:, k] - moved[:, 0] for k in (1, 2))
+        n, dn = np.cross(e, f) / 2, (np.cross(de, f) + np.cross(e, df)) / 2
+        return (self._to_vertices((n * dn).sum(1) / np.linalg.norm(n, axis=1)),)
+
+    def vjp(self, x, y_adj):
+        return (triangle_areas_vjp(x[0], self.triangles, y_adj[0][self.corners].sum(1) / 3),)
+
+
+class VertexShares(Link):
+    """What each of some vertices has of the volume [m^3] or, with density, of the mass [kg] of the given tetrahedra, a
+    fourth of each around it."""
+
+    def __init__(self, tetrahedra: np.ndarray, chosen: np.ndarray, vertices: np.ndarray, of_mass: bool, writes: str):
+        self.reads, self.writes = ("volumes", "density") if of_mass else ("volumes",), (writes,)
+        self.chosen, self.count = chosen, len(vertices)
+        self.corners = np.searchsorted(vertices, tetrahedra[chosen])
+
+    def _to_vertices(self, of_each):
+        return np.bincount(self.corners.ravel(), np.repeat(of_each[self.chosen] / 4, 4), self.count)
+
+    def value(self, volumes, *density):
+        return (self._to_vertices(density[0] * volumes if density else volumes),)
+
+    def jvp(self, x, dx):
+        if len(x) == 1:
+            return self.value(dx[0])
+        return (self._to_vertices(dx[1] * x[0] + x[1] * dx[0]),)
+
+    def vjp(self, x, y_adj):
+        by_each = np.zeros_like(x[0])
+        by_each[self.chosen] = y_adj[0][self.corners].sum(1) / 4
+        if len(x) == 1:
+            return (by_each,)
+        volumes, density = x
+        by_density = by_each * volumes
+        return by_each * density, by_density if density.ndim else by_density.sum()
+
+
+class Spread(Link):
+    """Forces of vertices, weight times vector, from vectors of shape (2, rows, 3) and one weight for each vertex."""
+
+    def __init__(self, reads: Sequence[str], writes: str):
+        self.reads, self.writes = tuple(reads), (writes,)
+
+    def value(self, vectors, weights):
+        return (vectors[:, :, None] * weights[:, None],)
+
+    def jvp(self, x, dx):
+        return (self.value(dx[0], x[1])[0] + self.value(x[0], dx[1])[0],)
+
+    def vjp(self, x, y_adj):
+        return np.einsum("brki,k->bri", y_adj[0], x[1]), np.einsum("brki,bri->k", y_adj[0], x[0])
+
+
+class _Together(Link):
+    """Several loads in time, each of shape (2, rows, ...); those of one row hold in all steps."""
+
+    def __init__(self, reads: Sequence[str], writes: str):
+        self.reads, self.writes = tuple(reads), (writes,)
+
+    @staticmethod
+    def rows(x) -> int:
+        """The steps that all are given for, 1 if all are constant."""
+        return min((part.shape[1] for part in x if part.shape[1] > 1), default=1)
+
+    def jvp(self, x, dx):
+        return self.value(*dx)
+
+    @staticmethod
+    def _pulled(part: np.ndarray, adjoint: np.ndarray) -> np.ndarray:
+        """The adjoint of one of them, from that of its share in all rows."""
+        if part.shape[1] == 1:
+            return adjoint.sum(1, keepdims=True)
+        out = np.zeros_like(part)
+        out[:, : adjoint.shape[1]] = adjoint
+        return out
+
+
+class SumOfForces(_Together):
+    """Forces [N] of all dead loads, shape (rows, k, 3) for the k vertices that any of them acts on; with `keyed`, where some
+    change within steps, (rows, 2 k, 3): at the beginning of each step in even columns, at its end in odd ones."""
+
+    def __init__(self, reads: Sequence[str], vertices: Sequence[np.ndarray], keyed: bool, writes: str):
+        super().__init__(reads, writes)
+        self.vertices = np.unique(np.concatenate(vertices))
+        self.columns, self.keyed = [np.searchsorted(self.vertices, own) for own in vertices], keyed
+
+    def value(self, *x):
+        rows, k = self.rows(x), len(self.vertices)
+        out = np.zeros((2, rows, k, 3))
+        for columns, part in zip(self.columns, x):
+            out[:, :, columns] += part[:, :rows]
+        return (np.moveaxis(out, 0, 2).reshape(rows, 2 * k, 3) if self.keyed else out[0],)
+
+    def vjp(self, x, y_adj):
+        if self.keyed:
+            adjoint = np.stack([y_adj[0][:, 0::2], y_adj[0][:, 1::2]])
+        else:
+            adjoint = np.stack([y_adj[0], np.zeros_like(y_adj[0])])
+        return [self._pulled(part, adjoint[:, :, columns]) for columns, part in zip(self.columns, x)]
+
+
+class PressureRows(_Together):
+    """Pressures [Pa] of all loads, shape (rows, loads, 3): at the beginning of each step, at its end, zero."""
+
+    def value(self, *x):
+        rows = self.rows(x)
+        out = np.zeros((rows, len(x), 3))
+        for k, part in enumerate(x):
+            out[:, k, :2] = part[:, :rows].T
+        return (out,)
+
+    def vjp(self, x, y_adj):
+        return [self._pulled(part, y_adj[0][:, k, :2].T) for k, part in enumerate(x)]

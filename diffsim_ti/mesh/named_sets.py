@@ -1,0 +1,111 @@
+"""The face of a mesh to its named sets: of vertices, of tetrahedra, and of triangles of the surface."""
+
+from collections.abc import Callable, Iterable
+from types import MappingProxyType
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from diffsim_ti.mesh.geometry import triangle_normals
+from diffsim_ti.mesh.sets import checked_sets, chosen_indices, places_of_triangles
+
+if TYPE_CHECKING:
+    from diffsim_ti.mesh.tetrahedral_mesh import TetrahedralMesh
+
+
+class NamedSets:
+    """A part of TetrahedralMesh: which sets it has, and the ways to choose and to name some."""
+
+    @property
+    def vertex_sets(self) -> MappingProxyType:
+        """Name -> sorted vertex indices."""
+        return MappingProxyType(self._vertex_sets)
+
+    @property
+    def tetrahedron_sets(self) -> MappingProxyType:
+        """Name -> sorted tetrahedron indices."""
+        return MappingProxyType(self._tetrahedron_sets)
+
+    @property
+    def surface_sets(self) -> MappingProxyType:
+        """Name -> sorted indices of rows of `surface_triangles`."""
+        return MappingProxyType(self._surface_sets)
+
+    # Choosing
+
+    def vertex_indices(self, chosen: str | ArrayLike | Iterable[str]) -> np.ndarray:
+        """Sorted indices from a set's name, several names, indices, or a Boolean mask over the vertices.
+
+        A surface set of a name that no vertex set has stands for its vertices.
+        """
+        of_surface = {name: np.unique(self.surface_triangles[rows]) for name, rows in self._surface_sets.items()}
+        return chosen_indices(chosen, of_surface | self._vertex_sets, self.num_vertices, "vertex")
+
+    def tetrahedron_indices(self, chosen: str | ArrayLike | Iterable[str]) -> np.ndarray:
+        """Sorted indices from a set's name, several names, indices, or a Boolean mask over the tetrahedra."""
+        return chosen_indices(chosen, self._tetrahedron_sets, self.num_tetrahedra, "tetrahedron")
+
+    def surface_indices(self, chosen: str | ArrayLike | Iterable[str] | None) -> np.ndarray:
+        """Sorted indices of rows of `surface_triangles` from a surface set's name, several names, indices, a Boolean mask
+        over the rows, or triangles as vertex indices in any order, shape (k, 3); None means the whole surface.
+
+        ValueError for an unknown name, and for a triangle that is not on the surface.
+        """
+        count = len(self.surface_triangles)
+        if chosen is None:
+            return np.arange(count)
+        if not isinstance(chosen, str) and np.ndim(chosen) == 2:
+            triangles = np.asarray(chosen)
+            if triangles.shape[1] != 3 or triangles.dtype.kind not in "iu":
+                raise ValueError(f"triangles must be vertex indices of shape (k, 3), got shape {triangles.shape}")
+            chosen = places_of_triangles(triangles, self.surface_triangles)
+            if len(chosen) and chosen.min() < 0:
+                first = triangles[np.argmin(chosen)]
+                raise ValueError(
+                    f"triangle {first.tolist()} is not on the surface ({(chosen < 0).sum()} of {len(chosen)} are not); "
+                    "take rows of surface_triangles"
+                )
+        return chosen_indices(chosen, self._surface_sets, count, "surface")
+
+    def vertices_where(self, predicate: Callable) -> np.ndarray:
+        """Sorted indices of the vertices where a function of all positions is true: `lambda x: x[:, 0] < 0.1`."""
+        return self.vertex_indices(_mask(predicate(self.vertices), self.num_vertices))
+
+    def surface_where(self, predicate: Callable) -> np.ndarray:
+        """Sorted indices of the surface triangles where a function of all centroids [m] and outward unit normals, both of
+        shape (k, 3), is true: `lambda x, n: n[:, 1] > 0.9`."""
+        triangles = self.surface_triangles
+        normals = triangle_normals(self.vertices, triangles)
+        unit = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+        return self.surface_indices(_mask(predicate(self.vertices[triangles].mean(1), unit), len(triangles)))
+
+    # Naming
+
+    def with_vertex_set(self, name: str, chosen: str | ArrayLike | Iterable[str]) -> "TetrahedralMesh":
+        """A mesh that has this vertex set too (or instead of one of that name); `chosen` as in `vertex_indices`."""
+        sets = {**self._vertex_sets, name: self.vertex_indices(chosen)}
+        return self._changed(_vertex_sets=checked_sets(sets, self.num_vertices, "vertex"))
+
+    def with_tetrahedron_set(self, name: str, chosen: str | ArrayLike | Iterable[str]) -> "TetrahedralMesh":
+        """A mesh that has this tetrahedron set too (or instead of one of that name)."""
+        sets = {**self._tetrahedron_sets, name: self.tetrahedron_indices(chosen)}
+        return self._changed(_tetrahedron_sets=checked_sets(sets, self.num_tetrahedra, "tetrahedron"))
+
+    def with_surface_set(self, name: str, chosen: str | ArrayLike | Iterable[str] | Callable) -> "TetrahedralMesh":
+        """A mesh that has this surface set too (or instead of one of that name), for loads and supports to name.
+
+        chosen: as in `surface_indices`, or a predicate as in `surface_where`:
+
+            mesh.with_surface_set("lid", lambda x, n: n[:, 1] > 0.9)
+        """
+        rows = self.surface_where(chosen) if callable(chosen) else self.surface_indices(chosen)
+        sets = {**self._surface_sets, name: rows}
+        return self._changed(_surface_sets=checked_sets(sets, len(self.surface_triangles), "surface"))
+
+
+def _mask(values, count: int) -> np.ndarray:
+    mask = np.asarray(values)
+    if mask.dtype.kind != "b":
+        raise ValueError(f"the predicate must return {count} Booleans, got dtype {mask.dtype}")
+    return mask

@@ -1,0 +1,59 @@
+"""What vertices may do where some are held in some directions alone."""
+
+import numpy as np
+
+
+class FreeDirections:
+    """Projectors of vertices: `x * free` takes from vectors, shape (num_vertices, 3), what is held of them.
+
+    mask: (num_vertices, 1), 0 where a vertex is held wholly, else 1; guided: the vertices that are held in some directions,
+    with projectors onto these, shape (k, 3, 3).
+    """
+
+    __array_ufunc__ = None  # so that NumPy leaves x * free to this class
+
+    def __init__(self, mask: np.ndarray, guided: np.ndarray, guides: np.ndarray):
+        self.mask, self.guided, self.guides = mask, guided, guides
+
+    def __rmul__(self, x: np.ndarray) -> np.ndarray:
+        out = x * self.mask
+        for _ in range(2):  # where next to nothing is free, once leaves as much rounding of what is held
+            out[self.guided] -= np.einsum("kij,kj->ki", self.guides, out[self.guided])
+        return out
+
+    __mul__ = __rmul__
+
+    def projectors(self) -> np.ndarray:
+        """Of all vertices, shape (num_vertices, 3, 3)."""
+        out = self.mask[:, :, None] * np.eye(3)
+        out[self.guided] -= self.guides
+        return out
+
+    def around(self, blocks: np.ndarray) -> np.ndarray:
+        """P B P for a block of each vertex, shape (num_vertices, 3, 3)."""
+        P, out = np.eye(3) - self.guides, np.array(blocks)
+        out[self.guided] = P @ blocks[self.guided] @ P
+        return out
+
+
+Free = np.ndarray | FreeDirections  # numbers (num_vertices, 1) where no vertex is held in some directions alone
+
+
+def mask_of(free: Free) -> np.ndarray:
+    """1 where a vertex moves in some direction, else 0, shape (num_vertices, 1)."""
+    return free.mask if isinstance(free, FreeDirections) else free
+
+
+def projectors_of(free: Free) -> np.ndarray:
+    """Projectors of all vertices on what they may do, shape (num_vertices, 3, 3)."""
+    return free.projectors() if isinstance(free, FreeDirections) else free[:, :, None] * np.eye(3)
+
+
+def cleaned(free: Free, x: np.ndarray) -> np.ndarray:
+    """A solution without the rounding that is left of it in what is held."""
+    return x * free if isinstance(free, FreeDirections) else x
+
+
+def held_as(free: Free, held: np.ndarray, moving: np.ndarray) -> np.ndarray:
+    """Displacements that are `held` where vertices are held, and `moving` in what they may do."""
+    return held + (moving - held) * free if isinstance(free, FreeDirections) else held * (1 - free) + moving * free

@@ -1,0 +1,89 @@
+"""Forces that are given on vertices, in explicit passes: constant, for each step, or linear within steps."""
+
+from dataclasses import dataclass
+
+import taichi as ti
+
+from diffsim_ti.runtime import PRECISIONS
+from diffsim_ti.state.features import Features
+
+A = ti.template()  # an array or Bundle handed to a Taichi function
+
+
+@dataclass(frozen=True)
+class GivenForces:
+    """Functions of one vertex i."""
+
+    features: Features
+    precision: str
+
+    @property
+    def fp(self):
+        return PRECISIONS[self.precision]
+
+    @property
+    def vector(self):
+        return ti.types.vector(4, self.fp)
+
+    @ti.func
+    def half(self):
+        return ti.cast(0.5, self.fp)  # dividing by 2 would compute in f64
+
+    @ti.func
+    def force(self, i, now: A, scene: A, forces: A):
+        """External force on vertex i: of the present step, or half of each of the two that share a kick."""
+        f = self.vector(0)
+        k = scene.force_slot[i]
+        if k >= 0:
+            if ti.static(self.features.forces_keyed):
+                f = self.half() * (
+                    self.keyed_force(now.force0, k, now, forces) + self.keyed_force(now.force1, k, now, forces)
+                )
+            else:
+                f = forces[0, k]
+                if ti.static(self.features.forces_per_step):
+                    f = self.half() * (forces[now.force0, k] + forces[now.force1, k])
+        return f
+
+    @ti.func
+    def row_of_step(self, step):
+        """The row of forces that holds in a step."""
+        r = 0
+        if ti.static(self.features.forces_per_step):
+            r = step
+        return r
+
+    @ti.func
+    def share_of_step(self, step, now: A):
+        """How far in a step the pass lies: it ends a step before its own."""
+        return ti.select(step == now.row, now.begin, ti.cast(1, self.fp))
+
+    @ti.func
+    def keyed_force(self, step, k, now: A, forces: A):
+        """The force of a step that changes from its beginning to its end."""
+        begin, end = forces[self.row_of_step(step), 2 * k], forces[self.row_of_step(step), 2 * k + 1]
+        return begin + self.share_of_step(step, now) * (end - begin)
+
+    @ti.func
+    def pressed(self, i, scene: A, plan: A):
+        """What pressures do at vertex i, of what it gathers."""
+        f = self.vector(0)
+        for c in range(scene.start[i], scene.start[i + 1]):
+            if scene.corner_of[c] >= plan.first_pressed:
+                f = f + scene.corner[scene.corner_of[c]]
+        return f
+
+    @ti.func
+    def add_vjp(self, i, f_adj, now: A, scene: A, adjoint: A):
+        k = scene.force_slot[i]
+        if k >= 0:
+            if ti.static(self.features.forces_keyed):
+                for step in ti.static((now.force0, now.force1)):
+                    r, share, half = self.row_of_step(step), self.share_of_step(step, now), self.half()
+                    adjoint.forces[r, 2 * k] = adjoint.forces[r, 2 * k] + half * (1 - share) * f_adj
+                    adjoint.forces[r, 2 * k + 1] = adjoint.forces[r, 2 * k + 1] + half * share * f_adj
+            elif ti.static(self.features.forces_per_step):
+                adjoint.forces[now.force0, k] = adjoint.forces[now.force0, k] + self.half() * f_adj
+                adjoint.forces[now.force1, k] = adjoint.forces[now.force1, k] + self.half() * f_adj
+            else:
+                adjoint.forces[0, k] = adjoint.forces[0, k] + f_adj

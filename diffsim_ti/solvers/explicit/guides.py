@@ -1,0 +1,82 @@
+"""Vertices that are held in some directions alone, in explicit passes: what they may do, and what holds them.
+
+`guide_slot` says which of them a vertex is, -1 none; `guides` has three rows each of the projector Q onto what is held.
+"""
+
+from dataclasses import dataclass
+
+import taichi as ti
+
+from diffsim_ti.runtime import PRECISIONS
+
+A = ti.template()  # an array or Bundle handed to a Taichi function
+GUIDED = dict(guide_slot="ints", guides="vectors")
+
+
+@dataclass(frozen=True)
+class Guides:
+    """Functions of one vertex i. Those that are held wholly have no mass (SceneArrays) and, if they move, a place k >= 0 in
+    the prescribed motion."""
+
+    precision: str
+    motion: bool
+
+    @property
+    def vector(self):
+        return ti.types.vector(4, PRECISIONS[self.precision])
+
+    @ti.func
+    def held(self, i, x, scene: A):
+        """What is held of a vector, none where a vertex is free, or held wholly."""
+        out, g = self.vector(0), scene.guide_slot[i]
+        if g >= 0:
+            for d in ti.static(range(3)):
+                out[d] = scene.guides[3 * g + d].dot(x)
+        return out
+
+    @ti.func
+    def free(self, i, x, scene: A):
+        """The rest of it."""
+        return x - self.held(i, x, scene)
+
+    @ti.func
+    def given(self, k, u, v, now: A, of: A):
+        """Displacement and velocity of what is held at the end of a pass; of: the scene, or its tangent."""
+        u_held, v_held = u, v
+        if ti.static(self.motion):
+            if k >= 0 and now.alpha > 0:
+                change = of.motion[now.next, k] - of.motion[now.row, k]
+                u_held = of.anchor[k] + of.motion[now.row, k] + now.end * change
+                v_held = now.per_step * change
+        return u_held, v_held
+
+    @ti.func
+    def end(self, i, k, x, x_held, scene: A):
+        """x in what vertex i may do, x_held in the rest."""
+        out = x + self.held(i, x_held - x, scene)
+        if k >= 0 and scene.guide_slot[i] < 0:
+            out = x_held
+        return out
+
+    @ti.func
+    def of_held(self, i, k, x, scene: A):
+        """What of an adjoint of the end belongs to x_held."""
+        out = self.held(i, x, scene)
+        if k >= 0 and scene.guide_slot[i] < 0:
+            out = x
+        return out
+
+    @ti.func
+    def end_vjp(self, i, k, p, q, now: A, scene: A, adjoint: A):
+        """(p, q, adjoints of u and v) from adjoints p, q of the end: what is left for the free parts, and what goes straight
+        to the state before, where the end is held there. Adds those of the motion."""
+        by_u, by_v = self.of_held(i, k, p, scene), self.of_held(i, k, q, scene)
+        p_free, q_free = p - by_u, q - by_v
+        if ti.static(self.motion):
+            if k >= 0 and now.alpha > 0:
+                before, after = adjoint.motion[now.row, k], adjoint.motion[now.next, k]
+                adjoint.motion[now.row, k] = before + (1 - now.end) * by_u - now.per_step * by_v
+                adjoint.motion[now.next, k] = after + now.end * by_u + now.per_step * by_v
+                adjoint.anchor[k] = adjoint.anchor[k] + by_u
+                by_u, by_v = self.vector(0), self.vector(0)
+        return p_free, q_free, by_u, by_v

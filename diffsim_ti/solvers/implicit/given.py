@@ -1,0 +1,92 @@
+"""What is given in the passes of an implicit run: prescribed places, dead loads, follower pressures."""
+
+from functools import cached_property
+
+import numpy as np
+
+from diffsim_ti.inputs import Derived
+from diffsim_ti.potential.follower_pressure import FollowerPressure, is_symmetric
+from diffsim_ti.potential.free import projectors_of
+from diffsim_ti.solvers.implicit.stage import Stage
+
+
+class GivenInPasses:
+    """A part of ImplicitWorkspace."""
+
+    # ---- supports ----------------------------------------------------------------------------------------------------
+
+    def with_held(self, x: np.ndarray, held: np.ndarray) -> np.ndarray:
+        """x with what is held of each held vertex replaced; held: shape (num_held, 3)."""
+        a, out = self.arrays, np.array(x)
+        if not a.features().guided:
+            out[a.held] = held
+            return out
+        out[a.held] += np.einsum("kij,kj->ki", a.supports.held, held - out[a.held])
+        return out
+
+    def of_held(self, x: np.ndarray) -> np.ndarray:
+        """What is held of vectors of the held vertices, shape (num_held, 3)."""
+        a = self.arrays
+        return np.einsum("kij,kj->ki", a.supports.held, x) if a.features().guided else x
+
+    def prescribed(self, j: int, of: Derived) -> tuple:
+        """(displacement [m], velocity [m/s]) of the held vertices after pass j; None where they are held.
+
+        of: the values of the run, or their tangent: what is prescribed is linear in them.
+        """
+        motion = self.arrays.rows["motion"] if of is self.arrays.values else of.motion
+        if motion is None:
+            return None, None
+        schedule, anchor = self.solver.schedule, of.displacement[self.arrays.held]
+        return anchor + schedule.place(motion, j, schedule.end(j)), schedule.rate(motion, j)
+
+    # ---- loads -------------------------------------------------------------------------------------------------------
+
+    def press(self, j: int, stage: Stage) -> None:
+        """Set the pressures of pass j."""
+        if self.follower is not None:
+            share = self.share_at_stage(j, stage)
+            p = self.solver.schedule.pressure(self.arrays.rows["follower"], j, share)
+            self.follower.at(self.load_share(j, stage) * p)
+
+    def follower_pressure(self) -> FollowerPressure | None:
+        """The scene's pressures."""
+        scene = self.scene
+        if not scene.pressures:
+            return None
+        triangles = [term.triangles(scene.mesh) for term in scene.pressures]
+        load_of = np.repeat(np.arange(len(triangles)), [len(rows) for rows in triangles])
+        triangles, free = np.concatenate(triangles), projectors_of(self.free)
+        symmetric = is_symmetric(triangles, load_of, free, self.arrays.values.rest)
+        return FollowerPressure(triangles, load_of, scene.mesh.num_vertices, symmetric)
+
+    def loads(self, j: int, stage: Stage) -> np.ndarray:
+        """Dead loads on each vertex [N]: weight and external forces; statics lay them on in substeps."""
+        values, features = self.arrays.values, self.arrays.features()
+        out = np.zeros_like(values.displacement)
+        if features.gravity >= 0:
+            out += self.mass * values.parameters[features.gravity :][:3]
+        out = self._add_forces(self.arrays.rows["forces"], out, j, stage)
+        return out * self.load_share(j, stage)
+
+    def _add_forces(self, rows: np.ndarray | None, out: np.ndarray, j: int, stage: Stage) -> np.ndarray:
+        if rows is not None:
+            share, keyed = self.share_at_stage(j, stage), self.scene.inputs.keyed_forces
+            out[self.force_vertices] += self.solver.schedule.load(rows, j, share, keyed)
+        return out
+
+    def given_forces(self, rows: np.ndarray | None, j: int, stage: Stage) -> np.ndarray:
+        """Given forces on each vertex in pass j [N], from rows of them or of their tangent, without weight."""
+        out = np.zeros_like(self.arrays.values.displacement)
+        return self._add_forces(rows, out, j, stage) * self.load_share(j, stage)
+
+    def load_share(self, j: int, stage: Stage) -> float:
+        """Share of the loads in pass j."""
+        if not stage.static:
+            return 1.0
+        return min(1.0, (j + 1) / self.solver.substeps)
+
+    @cached_property
+    def force_vertices(self) -> np.ndarray:
+        """Vertices that given forces act on."""
+        return self.scene.loaded_vertices

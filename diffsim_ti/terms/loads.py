@@ -1,0 +1,161 @@
+"""Loads on surfaces and volumes: traction, pressure, body force."""
+
+from copy import copy
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from diffsim_ti.inputs import Link
+from diffsim_ti.inputs.loads import InTime, Spread, VertexAreas, VertexShares
+from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.terms.over_time import OverTime, amount, is_keyed, rows_at
+from diffsim_ti.terms.term import Term
+
+
+class Load(Term):
+    """An amount per area or volume, over time. A scene may list several of a kind: they add up."""
+
+    num_numbers = 0  # what kernels read of it lies in arrays of its own
+    shape: tuple = ()  # of the amount
+
+    def __init__(self, argument: str, given: OverTime, unit: str, plain: str, name: str | None):
+        super().__init__(amount(argument, given, self.shape, unit, plain), name=name)
+        self._given, self.keyed = given, is_keyed(given)
+        if self.keyed:
+            self.rows([0.0])  # refuses what does not fit
+
+    @property
+    def plain(self) -> str:
+        """Plain name of its input."""
+        return self.described[0].plain
+
+    def rows(self, times: ArrayLike) -> np.ndarray:
+        """Its amount at each time [s], where it is keyed."""
+        return rows_at(f"{type(self).__name__}: {self.plain}", self._given, times, self.shape)
+
+    def settled(self, scene, density, initial_positions, initial_velocities) -> "Load":
+        """For a mesh, whose sets it names."""
+        out = copy(self)
+        out.mesh = scene.mesh
+        return out
+
+    def in_time(self, names: dict[str, str], own: str) -> Link:
+        """Its amount in time, as inputs/loads.py has it, by the name `own` in time."""
+        return InTime(names[self.plain], f"{own} in time", len(self.shape) + 1, self.keyed)
+
+
+class Traction(Load):
+    """Force per area of the surface at rest, t [N/m^2], whatever becomes of the surface: a dead load, f_i = t A_i.
+
+    A_i is a third of the area of each triangle around vertex i, exact for what is constant on linear triangles.
+
+    traction: 3 numbers [N/m^2]; or one set for each step, shape (steps, 3), each held during its step; or a function of time
+        [s] that returns 3 numbers, or keyframes (times, values), a tuple, sampled at the steps and linear within each.
+    surface: where it acts: a surface set's name, several, rows of `surface_triangles`; None: all of the surface.
+    Input with gradient: "traction" or "<name>.traction", of the shape given, (steps + 1, 3) of what is linear within steps.
+    Raises ValueError for other shapes, what is not finite, and unknown sets.
+    Bonet, Wood 2008, Nonlinear Continuum Mechanics for Finite Element Analysis, 2nd ed., 9.4,
+    doi:10.1017/CBO9780511755446.
+    """
+
+    shape = (3,)
+    dead = True
+
+    def __init__(self, traction: OverTime, surface: str | ArrayLike | None = None, name: str | None = None):
+        super().__init__("traction", traction, "N/m^2", "traction", name)
+        self.surface = surface
+
+    def check(self, mesh: TetrahedralMesh) -> None:
+        self.triangles(mesh)
+
+    def triangles(self, mesh: TetrahedralMesh) -> np.ndarray:
+        """Where it acts, as vertex indices, shape (k, 3)."""
+        return mesh.surface_triangles[_some(self, mesh.surface_indices(self.surface))]
+
+    def indices(self, mesh: TetrahedralMesh) -> np.ndarray:
+        """Vertices that are acted upon."""
+        return np.unique(self.triangles(mesh))
+
+    def force_links(self, names: dict[str, str], own: str) -> list[Link]:
+        """To forces of its vertices, by the name `own` forces."""
+        areas = VertexAreas(self.triangles(self.mesh), self.indices(self.mesh), f"{own} areas")
+        return [self.in_time(names, own), areas, Spread((f"{own} in time", f"{own} areas"), f"{own} forces")]
+
+
+class BodyForce(Load):
+    """Force per volume at rest b [N/m^3], or per mass [m/s^2], on some of a body: dead loads f_i = b V_i or b m_i.
+
+    V_i and m_i are a fourth of the volume and mass of each tetrahedron around vertex i. Uniform weight is `Gravity`.
+
+    force: 3 numbers, over time as in `Traction`; per: "volume" or "mass". tetrahedra: a tetrahedron set's name, several,
+        indices or a mask; None: all.
+    Input with gradient: "body_force" or "<name>.force", of the shape given, (steps + 1, 3) of what is linear within steps.
+    Raises ValueError for other shapes, what is not finite, unknown sets, and another `per`.
+    Bonet, Wood 2008, Nonlinear Continuum Mechanics for Finite Element Analysis, 2nd ed., 9.4,
+    doi:10.1017/CBO9780511755446.
+    """
+
+    shape = (3,)
+    dead = True
+
+    def __init__(
+        self, force: OverTime, tetrahedra: str | ArrayLike | None = None, per: str = "volume", name: str | None = None
+    ):
+        if per not in ("volume", "mass"):
+            raise ValueError(f'BodyForce: per must be "volume" [N/m^3] or "mass" [m/s^2], got {per!r}')
+        super().__init__("force", force, "N/m^3" if per == "volume" else "m/s^2", "body_force", name)
+        self.tetrahedra, self.per = tetrahedra, per
+
+    def check(self, mesh: TetrahedralMesh) -> None:
+        self.chosen(mesh)
+
+    def chosen(self, mesh: TetrahedralMesh) -> np.ndarray:
+        """Tetrahedra that are acted upon."""
+        every = np.arange(mesh.num_tetrahedra)
+        return _some(self, every if self.tetrahedra is None else mesh.tetrahedron_indices(self.tetrahedra))
+
+    def indices(self, mesh: TetrahedralMesh) -> np.ndarray:
+        """Vertices that are acted upon."""
+        return np.unique(mesh.tetrahedra[self.chosen(mesh)])
+
+    def force_links(self, names: dict[str, str], own: str) -> list[Link]:
+        """To forces of its vertices, by the name `own` forces."""
+        mesh, weights = self.mesh, f"{own} weights"
+        shares = VertexShares(mesh.tetrahedra, self.chosen(mesh), self.indices(mesh), self.per == "mass", weights)
+        return [self.in_time(names, own), shares, Spread((f"{own} in time", weights), f"{own} forces")]
+
+
+class Pressure(Load):
+    """Pressure p [Pa] on the surface as it is now: it follows area and normal, f_a = -p n / 3 at each corner of a triangle.
+
+    n = (x_1 - x_0) x (x_2 - x_0) / 2 points outwards, so that positive pressures push inwards; exact for what is constant on
+    linear triangles. On a closed surface it has the potential p V, V the volume inside, and its tangent is symmetric. On one
+    with an edge that moves freely it has neither: implicit and static solvers then search by the residual, solve with GMRES,
+    and transpose for gradients. Its stiffness does not enter the stable step of explicit solvers.
+
+    pressure: one number [Pa], over time as in `Traction`, shape (steps,) for each step. surface: as there.
+    Input with gradient: "pressure" or "<name>.pressure", of the shape given, (steps + 1,) of what is linear within steps.
+    Raises ValueError for other shapes, what is not finite, and unknown sets.
+    Bonet, Wood 2008, Nonlinear Continuum Mechanics for Finite Element Analysis, 2nd ed., 8.5.2 and 9.6.1,
+    doi:10.1017/CBO9780511755446.
+    """
+
+    def __init__(self, pressure: OverTime, surface: str | ArrayLike | None = None, name: str | None = None):
+        super().__init__("pressure", pressure, "Pa", "pressure", name)
+        self.surface = surface
+
+    def check(self, mesh: TetrahedralMesh) -> None:
+        self.triangles(mesh)
+
+    def triangles(self, mesh: TetrahedralMesh) -> np.ndarray:
+        """Where it acts, as vertex indices, normals outwards, shape (k, 3)."""
+        return mesh.surface_triangles[_some(self, mesh.surface_indices(self.surface))]
+
+    def links(self, names: dict[str, str], own: str) -> list[Link]:
+        return [self.in_time(names, own)]
+
+
+def _some(load: Load, rows: np.ndarray) -> np.ndarray:
+    if len(rows) == 0:
+        raise ValueError(f"{type(load).__name__} acts on nothing: the set is empty; name a set that has members")
+    return rows
