@@ -334,3 +334,17 @@ def test_what_does_not_fit_is_refused():
     several = ds.Rollout(ds.SemiImplicitSolver(pressed(terms=balls), dt=1e-4), 1, outputs=ds.ContactForce(balls[1]))
     with pytest.raises(ValueError, match="2 obstacles reach between the corners of faces"):
         several.forward()
+
+
+@pytest.mark.parametrize("kind", EXPLICIT)
+def test_all_threads_give_what_one_gives(kind):
+    serial, parallel = (
+        ds.Rollout(kind(pressed(), dt=1e-3, parallel=p), 4, save_every=2, outputs=outputs()) for p in (False, True)
+    )
+    one, many, rng = serial.forward(), parallel.forward(), np.random.default_rng(7)
+    seeds = {name: rng.normal(size=one[name].shape) for name in serial.computed}
+    for name in seeds:
+        assert many[name] == pytest.approx(one[name], rel=1e-12, abs=1e-12 * np.abs(one[name]).max())
+    first, second = serial.vjp(one, **seeds), parallel.vjp(many, **seeds)
+    for name in first:
+        assert second[name] == pytest.approx(first[name], rel=1e-9, abs=1e-11 * np.abs(first[name]).max()), name
