@@ -30,7 +30,8 @@ class Rollout:
     clip: largest norm of the running adjoint; it is scaled back when it exceeds that (the gradient is then no gradient).
     truncate: differentiate only the last so many steps.
     health: keep a report of the adjoint's norm per step (`rollout.health`).
-    outputs: what a loss may name besides positions, velocities and displacements, such as MaterialPoints (outputs/).
+    outputs: what a loss may name besides positions, velocities and displacements, such as ContactForce, Reaction, Stress,
+        MaterialPoints (outputs/).
     runs: how many runs one tape may hold, each with frames of its own; see `run`.
 
     Two ways to use it. With arrays: `frames = rollout.forward(youngs_modulus=...)`, then `rollout.vjp(frames, ...)`.
