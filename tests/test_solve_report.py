@@ -1,5 +1,7 @@
 """What can be learnt of the solves of a run."""
 
+import warnings
+
 import numpy as np
 import pytest
 from test_implicit import cube
@@ -69,6 +71,17 @@ def test_statics_say_that_a_body_may_have_buckled_on_the_way():
     assert rollout.report.saddles == 0 < rollout.report.indefinite
     assert sum(w.message.unstable for w in said) == rollout.report.indefinite
     assert frames.displacements[-1][:, 0].max() > 0.5
+
+
+def test_contact_alone_is_not_called_buckling():
+    """Barriers of what is curved make states with an indefinite Hessian."""
+    ball = ds.Sphere((0.5, 1.3, 0.5), 0.25, stiffness_per_area=1e7, width=0.02, path=lambda t: (0, -0.15 * t, 0))
+    scene = ds.Scene(cube(), ds.StableNeoHookean(1e5, 0.3), terms=[ball], fixed="ymin", precision="f64")
+    rollout = ds.Rollout(ds.StaticSolver(scene, load_steps=3), 1)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        rollout.forward()
+    assert rollout.report.indefinite > 0 and not [w for w in said if isinstance(w.message, ds.Buckled)]
 
 
 def test_a_step_limit_is_a_float():

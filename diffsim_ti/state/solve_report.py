@@ -9,7 +9,7 @@ from dataclasses import dataclass
 class Buckled(UserWarning):
     """Statics left stationary states that were no minima, `saddles` of them in step `step`, or, where that is 0, met states
     with an indefinite Hessian in `unstable` rounds on the way to the equilibrium, which is how a body buckles whose mesh is
-    not quite symmetric."""
+    not quite symmetric (not said where there is contact, whose barriers have such states anyway; the report counts all)."""
 
     def __init__(self, message: str = "", step: int = 0, saddles: int = 0, unstable: int = 0):
         super().__init__(message)

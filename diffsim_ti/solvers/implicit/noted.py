@@ -28,10 +28,12 @@ class Noted:
             self.impulses.add(j, per_frame, self.is_static, shares.forces)
 
     def note_solves(self, j: int, num_passes: int, seconds: float) -> None:
-        """What pass j took; saddles that statics left are said."""
+        """What pass j took; statics say which saddles they left and, without contact, where states were not stable."""
         step, solves = self.step_of(j, num_passes), self.newton.reports
         self.report.note(step, seconds, solves)
         saddles, unstable = (sum(getattr(solve, name) for solve in solves) for name in ("saddles", "indefinite"))
+        if self.arrays.contacts or self.pairs:  # whose curved barriers are indefinite where nothing buckles
+            unstable = 0
         if self.is_static and (saddles or unstable):
             rounds = sum(max(len(solve.residuals) - 1, 0) for solve in solves)
             left = f"{saddles} saddle{'s' * (saddles > 1)} left: the body was in balance and not stable, as when it buckles"
