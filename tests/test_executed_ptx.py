@@ -14,12 +14,14 @@ from diffsim_ti import (
     Gravity,
     Ground,
     ImplicitEulerSolver,
+    Pressure,
     Rollout,
     Scene,
     SelfContact,
     SemiImplicitSolver,
     SmithNeoHookean,
     TetrahedralMesh,
+    Traction,
     VelocityVerletSolver,
 )
 
@@ -178,6 +180,10 @@ def solvers_in_single_precision(cube):
     yield explicit(Scene(cube, SmithNeoHookean(1e5, 0.4), 1000.0, [Gravity(-9.8), friction], precision="f32"))
     yield explicit(scene(cube, law=Corotated(1e5, 0.3), precision="f32"), VelocityVerletSolver)
     yield explicit(scene(two_boxes(), SelfContact(2e4, 2e-2), precision="f32"))
+    loads = Pressure(lambda t: 10 * t, "ymax"), Traction(lambda t: [t, 0, 0], "ymax")
+    fixed = {"xmin": "x", "ymin": [0, 1, 1]}
+    guided = Scene(cube, SmithNeoHookean(1e5, 0.4), 1000.0, [Gravity(), *loads], fixed, precision="f32")
+    yield explicit(guided, VelocityVerletSolver)
     yield ImplicitEulerSolver(scene(cube, precision="f32"), dt=5e-3)
     yield BDF2Solver(scene(cube, precision="f32"), dt=5e-3)
 

@@ -101,7 +101,8 @@ def test_a_turned_scene_moves_as_one_along_axes(kind):
     np.testing.assert_allclose(ends[0] @ R.T, ends[1], rtol=0, atol=1e-9)
 
 
-def test_explicit_energy_is_followed_with_supports_that_move():
+@pytest.mark.parametrize("kind", [ds.SemiImplicitSolver, ds.VelocityVerletSolver], ids=lambda s: s.__name__)
+def test_explicit_energy_is_followed_with_supports_that_move(kind):
     """Nothing is gained by the steps: what rollers do on the body is work from outside."""
     mesh = ds.TetrahedralMesh.create_box((4, 3, 3), (1.0, 0.5, 0.5))
     fixed, motion = (
@@ -109,7 +110,7 @@ def test_explicit_energy_is_followed_with_supports_that_move():
         {"xmax": lambda t: [0.2 * np.sin(30 * t), 0, 0]},
     )
     scene = ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3), 1000.0, [ds.Gravity()], fixed, motion, precision="f64")
-    sim = ds.Simulator(ds.VelocityVerletSolver(scene, dt=2e-4))
+    sim = ds.Simulator(kind(scene, dt=2e-4))
     watch = sim.workspace.energy_watch
     watch.every = 20
     sim.run(400)

@@ -134,9 +134,8 @@ class EnergyBalance:
         u, v = (runtime.fetch(x)[0].astype(np.float64) for x in (ws.state.u, ws.state.v))
         free = runtime.fetch(a.inverse_mass) > 0
         mass, features = values.mass[:, None] * free[:, None], a.features()
-        v = a.supports.free(v)
         weight = mass * values.parameters[features.gravity :][:3] if features.gravity >= 0 else 0 * mass
-        kinetic = 0.5 * float((mass * v**2).sum())
+        kinetic = 0.5 * float((mass * a.supports.free(v) ** 2).sum())
         stored = quantities.elastic_energy(ws)
         if features.groups:  # a stage does not act on vertices that are held
             stored += float((quantities.barrier_energies(ws) * (free if features.num_staged else 1)).sum())
@@ -146,10 +145,10 @@ class EnergyBalance:
             stored += ws.pairs.look(ws.state.u)[0]
         self.moving = max(self.moving, kinetic + stored)
         j = min(now, num_passes - 1)
-        forces = a.supports.free(ws.forces_at(j, num_passes) - ws.loads_at(j, num_passes) + weight)
+        forces = ws.forces_at(j, num_passes) - ws.loads_at(j, num_passes) + weight
         if ws.solver.lags(now, num_passes):
             swapped = 0.5 * h * float((v * forces).sum())
         else:
             inverse = np.divide(1.0, mass, out=np.zeros_like(mass), where=mass > 0)
-            swapped = -0.125 * h * h * float((inverse * forces**2).sum())
+            swapped = -0.125 * h * h * float((inverse * a.supports.free(forces) ** 2).sum())
         return kinetic + stored + swapped - float((weight * (values.rest + u)).sum())
