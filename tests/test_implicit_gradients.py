@@ -7,7 +7,7 @@ import pytest
 import taichi as ti
 
 import diffsim_ti as ds
-from diffsim_ti.solvers.implicit import adjoint as implicit_adjoint
+from diffsim_ti.solvers.implicit import recorded_passes
 
 DYNAMIC = (ds.ImplicitEulerSolver, ds.ImplicitMidpointSolver, ds.BDF2Solver)
 ALL = (*DYNAMIC, ds.StaticSolver)
@@ -198,7 +198,7 @@ def test_errors_fall_with_the_tolerance():
 
 @pytest.mark.parametrize("mutation", ["scaled", "preconditioner only", "no inertia"])
 def test_a_wrong_adjoint_is_noticed(mutation, monkeypatch):
-    plain = implicit_adjoint._Passes.solve
+    plain = recorded_passes.RecordedPasses.solve
 
     def wrong(self, b):
         if mutation == "scaled":
@@ -209,7 +209,7 @@ def test_a_wrong_adjoint_is_noticed(mutation, monkeypatch):
         plain(self, b)
         return self._preconditioner(b * self.ws.free) if b.any() else b
 
-    monkeypatch.setattr(implicit_adjoint._Passes, "solve", wrong)
+    monkeypatch.setattr(recorded_passes.RecordedPasses, "solve", wrong)
     rollout = make(ds.ImplicitEulerSolver, steps=2, gradients=["youngs_modulus"])
     assert not ds.check_gradients(rollout, verbose=False).passed
 

@@ -4,6 +4,7 @@ import numpy as np
 
 import diffsim_ti as ds
 from diffsim_ti import verify
+from diffsim_ti.terms.loads import Load
 
 from . import faces
 from .structures import CELL
@@ -100,7 +101,18 @@ class Chain:
     def __init__(self, it):
         self.it, self.configuration = it, it.configuration
         self.states = it.configuration.rollout(save_every=1).forward()
-        self.values = it.rollout.values
+        self.values, scene = it.rollout.values, self.configuration.scene
+        self.keyed, self.per_step = (
+            set(),
+            {n for n in ("external_forces",) if n in self.values and self.values[n].ndim == 3},
+        )
+        for term in scene.terms:
+            if isinstance(term, Load):
+                (name,) = scene.input_names(term).values()
+                if term.keyed:
+                    self.keyed.add(name)
+                elif self.values[name].ndim > len(term.shape):
+                    self.per_step.add(name)
 
     def part(self, first: int, steps: int, save_every: int):
         """(rollout, frames) of some steps from the state before step `first`."""
@@ -116,10 +128,10 @@ class Chain:
     def rows(self, first: int, steps: int) -> dict[str, slice]:
         """Which rows of inputs that are given over time a part reads."""
         out = {}
-        for name, value in self.values.items():
-            if name == "external_forces" and value.ndim == 3:
+        for name in self.values:
+            if name in self.per_step:
                 out[name] = slice(first, first + steps)
-            elif name == "prescribed_motion" or name.rstrip("_0123456789").endswith("_path"):
+            elif name in self.keyed or name == "prescribed_motion" or name.rstrip("_0123456789").endswith("_path"):
                 out[name] = slice(first, first + steps + 1)
         return out
 
@@ -141,8 +153,7 @@ class Chain:
     def comparable(self) -> bool:
         """Whether a step depends on the state before it alone."""
         kind, solver = self.configuration.structure, self.configuration.solver
-        forces = self.values.get("external_forces")
-        shared = kind.solver is ds.VelocityVerletSolver and forces is not None and forces.ndim == 3
+        shared = kind.solver is ds.VelocityVerletSolver and self.per_step
         return kind.solver is not ds.BDF2Solver and not shared and not (kind.static and solver.substeps > 1)
 
 
@@ -165,7 +176,7 @@ def clip(it) -> str:
             p, q = part["initial_positions"], part["initial_velocities"]
             if k % save == 0:
                 p, q = p + it.w[k // save], q + it.z[k // save]
-                q[configuration.scene.fixed] = 0  # held vertices have no velocity
+                q = configuration.scene.supports.free(q)  # what is held has no velocity
             norms.append(float(np.hypot(np.linalg.norm(p), np.linalg.norm(q))))
             share = min(1.0, limit / norms[-1]) if norms[-1] > 0 else 1.0
             p, q = share * p, share * q
@@ -196,7 +207,7 @@ def truncate(it) -> str:
         return "gradients by the start are not zero"
     for name, rows in chain.rows(cut, steps - cut).items():
         # the kick at the cut takes half of the force of the step before it
-        shared = int(name == "external_forces" and configuration.structure.solver is ds.VelocityVerletSolver)
+        shared = int(name in chain.per_step and configuration.structure.solver is ds.VelocityVerletSolver)
         if np.any(found[name][: rows.start - shared]):
             return f"{name}: rows before the cut are not zero"
         if np.any(found[name][rows.start + 1 :] != it.gradients[name][rows.start + 1 :]):

@@ -91,7 +91,11 @@ def owners(configuration: Configuration, names) -> dict[str, tuple[str, str]]:
     """(class of the term, name without its number) of each input."""
     out, terms = {}, {}
     for term in configuration.terms:
-        for name in [*term.values, *([term.path_name] if getattr(term, "path", None) is not None else [])]:
+        for name in [
+            *term.values,
+            *([term.plain] if getattr(term, "keyed", False) else []),
+            *([term.path_name] if getattr(term, "path", None) is not None else []),
+        ]:
             terms.setdefault(name, []).append(type(term).__name__)
     known = ("initial_positions", "initial_velocities", "density", "rest_positions", "prescribed_motion")
     for name in names:

@@ -8,6 +8,7 @@ import diffsim_ti as ds
 from diffsim_ti.inputs.surface_areas import SurfaceAreas
 
 from . import bodies
+from .loads import load, rollers
 from .obstacles import MESH_WIDTH, Placed, place, push_direction
 from .open_materials import open_material
 from .structures import CELL, LAWS, PER_STRUCTURE, Structure, structure
@@ -99,6 +100,8 @@ def build(seed: int, precision: str | None = None) -> Configuration:
     law, E = material(kind, rng, mesh)
     density = rng.uniform(600, 1200) * (1 + 0.3 * rng.random(mesh.num_tetrahedra) if rng.random() < 0.4 else 1.0)
     fixed = _fixed(kind, rng, mesh) if kind.fixed else None
+    if kind.rollers:
+        mesh, supports = rollers(np.random.default_rng([20, seed]), mesh, fixed)
     steps, substeps, dt = _schedule(
         kind, rng, mesh, E, np.min(density), np.abs(start - mesh.vertices).max() > 0.1 * CELL
     )
@@ -119,6 +122,10 @@ def build(seed: int, precision: str | None = None) -> Configuration:
     if kind.self_contact:
         terms.append(ds.SelfContact(stiffness=stiff * rng.uniform(0.05, 0.3), width=bodies.SELF_WIDTH))
     terms = [terms[k] for k in rng.permutation(len(terms))]
+    more = np.random.default_rng([21, seed])
+    for name in kind.loads:
+        own = load(name, more, mesh, steps, duration, mass.sum())
+        terms.insert(int(more.integers(0, len(terms) + 1)), own)
 
     velocities = None
     if not kind.static and rng.random() < 0.9:
@@ -133,7 +140,7 @@ def build(seed: int, precision: str | None = None) -> Configuration:
         law,
         density,
         terms,
-        fixed=fixed,
+        fixed=supports if kind.rollers else fixed,
         motion=motion,
         initial_positions=deformed,
         initial_velocities=velocities,

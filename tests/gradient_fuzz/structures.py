@@ -18,6 +18,9 @@ SOLVERS = (*EXPLICIT, *IMPLICIT, ds.StaticSolver)
 WHEEL = (*EXPLICIT * 3, *IMPLICIT * 2, *(ds.StaticSolver,) * 3, ds.SemiImplicitSolver)  # how often each is drawn
 OBSTACLES = ("Ground", "HalfSpace", "Sphere", "Bowl", "Box", "Capsule", "Cylinder", "MeshObstacle")
 
+LOADS = tuple(
+    f"{kind} {how}" for kind in ("Traction", "Pressure", "BodyForce") for how in ("constant", "per step", "keyed")
+)
 NARROW = ("Sphere", "Box", "Capsule", "Cylinder")  # of which some are
 
 
@@ -53,6 +56,8 @@ class Structure:
     torch: bool  # whether its torch simulator is tried
     contact: str  # of explicit solvers
     contact_damping: float
+    loads: tuple[str, ...]  # on surfaces and volumes, each with how it is given
+    rollers: bool  # some of what is fixed is held in some directions alone
 
     @property
     def explicit(self) -> bool:
@@ -67,13 +72,13 @@ class Structure:
             k.name + " rough" * k.friction + " moving" * k.path + " per area" * k.per_area + " narrow" * k.narrow
             for k in self.obstacles
         ]
-        flags = ("self_contact", "gravity", "drag", "fixed", "motion", "uniform")
+        flags = ("self_contact", "gravity", "drag", "fixed", "motion", "uniform", "rollers")
         words = [name for name in flags if getattr(self, name)]
         how = f"{self.contact} {self.contact_damping:g}" if self.explicit else "potential"
         return (
             f"structure {self.number}: {self.law.__name__}, {self.solver.__name__}, {self.precision}, {self.volume}"
             f"{', parallel' if self.parallel else ''}; obstacles: {', '.join(kinds) or 'none'}, {how}; "
-            f"forces {self.forces}; {', '.join(words)}"
+            f"forces {', '.join([self.forces, *self.loads])}; {', '.join(words)}"
         )
 
 
@@ -104,6 +109,9 @@ def structure(number: int) -> Structure:
     fixed = static or rng.random() < 0.5
     precision = "f32" if rng.random() < 0.2 else "f64"
     volume = "patches" if rng.random() < 0.2 else "tetrahedra"
+    contact = turn(("stage", "stage", "force"), number, 6)
+    # which explicit steps refuse where vertices are held in some directions alone
+    staged = solver in EXPLICIT and bool(obstacles) and (contact == "stage" or obstacles[0].narrow)
     of_users = number % 8 == 1  # a law that is not the package's
     laws = open_laws(solver in EXPLICIT, static, volume == "patches") if of_users else LAWS
     return Structure(
@@ -122,6 +130,8 @@ def structure(number: int) -> Structure:
         fixed and rng.random() < 0.5,
         rng.random() < 0.4,
         number % 3 == 0 and not of_users,
-        turn(("stage", "stage", "force"), number, 6),
+        contact,
         turn((0.0, 0.005, 0.005, 0.2, 1.0), number, 7),
+        tuple(turn(LOADS, 3 * number + k, 12) for k in range(1 + number // 4 % 3)) if number % 4 == 3 else (),
+        fixed and not static and number % 5 in (0, 4) and not staged,
     )

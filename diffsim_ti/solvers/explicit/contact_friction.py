@@ -26,10 +26,6 @@ class ContactFriction(HeldBack):
     """Taichi functions of one vertex; `now` is the pass (state/schedule.py), g a group of obstacles, k a place in it."""
 
     @ti.func
-    def normal(self, plane):
-        return self.vector(plane.x, plane.y, plane.z, ti.cast(0, self.fp))
-
-    @ti.func
     def slide(self, o, i, v, ratio, state: A):
         """Velocity after the friction of an obstacle, whose push is noted."""
         pushed, felt, after = state.stage[ROWS * o + PUSH, i], state.stage[ROWS * o + FELT, i], v
@@ -113,18 +109,13 @@ class ContactFriction(HeldBack):
         dc, start, dstart = ti.cast(0, self.fp), v, dv
         if slope < 0:
             way, dway, dx = after - v, change - dv, ti.cast(0, self.fp)
+            e, de = now.alpha * way, dalpha * way + now.alpha * dway
             for g in ti.static(self.features.staged):
                 k = number - g.number
                 if k >= 0 and k < g.count:
-                    row, wall = ROWS * number, self.speed(g, k, now, scene.path)
-                    plane = state.stage[row + PLANE, i]
-                    turned = self.plane_jvp(g, k, i, u, du, now.begin, now, scene, tangent)
-                    n, dn = self.normal(plane), self.normal(turned)
-                    move, dmove = z - now.h * wall, dz - now.h * self.speed(g, k, now, tangent.path)
-                    y, dy = plane.w + n.dot(move), turned.w + dn.dot(move) + n.dot(dmove)
-                    dx = -(dalpha * n.dot(way) + now.alpha * (dn.dot(way) + n.dot(dway)) + x * dy) / y
+                    dx = self.change_of_x(g, k, i, u, du, z, dz, e, de, x, now, scene, tangent)
             dc = slope * dx
-            after, change = v + c * way, dv + c * dway + slope * dx * way
+            after, change = v + c * way, dv + c * dway + dc * way
         if ti.static(self.features.recorded):
             note_friction_jvp(self, i, start, dstart, c, dc, ratio, dratio, now, scene, state, tangent)
         return after, change
@@ -173,21 +164,18 @@ class ContactFriction(HeldBack):
             by_x = slope * v_adj.dot(way)
             if ti.static(self.features.recorded):
                 by_x += slope * friction_by_share(self, i, v, ratio, now, scene, state, adjoint)
-            way_adj, own, by_alpha = c * v_adj, v_adj, by_x * x / now.alpha
+            way_adj = c * v_adj
             for g in ti.static(self.features.staged):
                 k = number - g.number
                 if k >= 0 and k < g.count:
-                    wall, plane = self.speed(g, k, now, scene.path), state.stage[ROWS * number + PLANE, i]
-                    n, move = self.normal(plane), z - now.h * wall
-                    ratio_x = by_x / (plane.w + n.dot(move))
-                    way_adj += -(ratio_x * now.alpha) * n
-                    by_y = -ratio_x * x
-                    by_plane = -(ratio_x * now.alpha) * way + by_y * move
-                    by_plane.w = by_y
-                    by_z = by_y * n
-                    by_u = self.plane_vjp(g, k, i, u, by_plane, now.begin, now, scene, adjoint)
-                    self.add_to_rest(i, by_u, adjoint)
-                    self.add_to_path(g, k, i, now, by_u, -now.h * by_z, adjoint)
+                    of_e, of_z, of_u = self.adjoint_of_x(
+                        g, k, i, i, u, z, now.alpha * way, x, by_x, now, scene, adjoint, adjoint
+                    )
+                    way_adj += now.alpha * of_e
+                    by_alpha += of_e.dot(way)
+                    by_z += of_z
+                    by_u += of_u
+            self.add_to_rest(i, by_u, adjoint)
             own = v_adj - way_adj
         by_v, by_ratio = self.slide_all_vjp(i, v, way_adj, ratio, c, now, scene, state, adjoint)
         return by_v + own, by_ratio, by_z, by_alpha, by_u

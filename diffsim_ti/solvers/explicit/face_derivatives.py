@@ -55,9 +55,9 @@ class FaceDerivatives(FaceKernels):
         own.shift_dot[s] = own.shift_dot[s] + half * length * (before + after)
         own.speed_dot[s] = after
         if k == plan.n - 1:
-            du, shift = tangent.u[0, i], faces.shift[s]
-            moved = self.taken_jvp(i, shift, own.shift_dot[s], state.u[plan.slot, i], du, now, scene, tangent)
-            tangent.u[0, i] = du + moved
+            u, du, end = faces.begin[0, i], own.begin_dot[s], tangent.u[0, i]
+            z, dz, e, de = state.u[plan.slot, i] - u, end - du, faces.shift[s], own.shift_dot[s]
+            tangent.u[0, i] = end + self.taken_jvp(i, u, du, z, dz, e, de, now, scene, tangent)
             tangent.v[0, i] = tangent.v[0, i] + after
 
     @ti.func
@@ -103,12 +103,12 @@ class FaceDerivatives(FaceKernels):
         """Adjoint of the force of part k at a surface vertex; adds that of its mass."""
         i, half, length = faces.vertices[s], ti.cast(0.5, self.fp), self.part_length(now, plan)
         if k == plan.n - 1:
-            p, then = self.direct(adjoint.u[0, i]), self.noting(self.when(now, ti.cast(1, self.fp)), plan)
-            u, shift = state.u[plan.slot, i], faces.shift[s]
-            by_shift, by_u = self.taken_vjp(i, s, shift, p, u, now, then, scene, adjoint, out)
-            adjoint.u[0, i] = adjoint.u[0, i] + by_u
-            own.shift_dot[s], own.speed_dot[s] = by_shift, self.direct(adjoint.v[0, i])
-            own.begin_dot[s] = self.vector(0)
+            p, u, noted = self.direct(adjoint.u[0, i]), faces.begin[0, i], self.noting(now, plan)
+            z = state.u[plan.slot, i] - u
+            by_e, by_z, by_u = self.taken_vjp(i, s, u, z, faces.shift[s], p, noted, scene, adjoint, out)
+            adjoint.u[0, i] = adjoint.u[0, i] + by_z
+            own.shift_dot[s], own.speed_dot[s] = by_e, self.direct(adjoint.v[0, i])
+            own.begin_dot[s] = by_u - by_z
         q, inverse = own.speed_dot[s] + half * length * own.shift_dot[s], scene.inverse_mass[i]
         own.speed_dot[s] = q
         own.seed[s] = faces.taken[k, s] * length * inverse * q

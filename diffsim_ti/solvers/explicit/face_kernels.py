@@ -302,8 +302,8 @@ class FaceKernels(FaceWalls):
         ti.loop_config(serialize=not self.parallel)
         for s in range(plan.num_surface):
             i, now = faces.vertices[s], pass_at(table, plan.first - plan.window)
-            before = state.u[plan.slot, i]
-            state.u[plan.slot, i] = before + self.taken(i, faces.shift[s], before, now, scene)
+            u, end = faces.begin[0, i], state.u[plan.slot, i]
+            state.u[plan.slot, i] = end + self.taken(i, u, end - u, faces.shift[s], now, scene)
             state.v[plan.slot, i] = state.v[plan.slot, i] + faces.speed[plan.n, s]
         ti.loop_config(serialize=not self.parallel)
         for f in range(plan.num_faces):

@@ -1,11 +1,13 @@
 """Ways that would lead a vertex behind an obstacle, of which it takes a share.
 
-The stage leads a vertex to a distance d > 0 from each obstacle's tangent plane, normal n (contact_stage.py). What comes
-after that, friction and contact within faces, adds a way e to it, of which the vertex takes the share c(x):
+The stage moves a vertex by z to a distance y > 0 from the tangent plane, normal n, that each obstacle has where the pass
+begins (contact_stage.py). What comes after that, friction and contact within faces, adds a way e, of which the vertex takes
+the share c(x):
 
-    x = max_o -e . n_o / d_o,    c(x) = 1 for x <= 1/2,    c(x) = (1 - exp(1 - 2 x) / 2) / x beyond,
+    x = max_o -e . n_o / y_o,    c(x) = 1 for x <= 1/2,    c(x) = (1 - exp(1 - 2 x) / 2) / x beyond,
 
-which leaves it d_o exp(1 - 2 x) / 2 or more of each. The slope of c is continuous; where x <= 1/2 nothing is changed.
+which leaves it y_o exp(1 - 2 x) / 2 or more of each. The slope of c is continuous; where x <= 1/2 nothing is changed.
+Planes that a vertex is behind, since it went past an obstacle, do not count.
 """
 
 from dataclasses import dataclass
@@ -19,7 +21,7 @@ A = ti.template()  # an array or Bundle handed to a Taichi function
 
 @dataclass(frozen=True)
 class HeldBack(ObstacleStages):
-    """Taichi functions of vertex i; an obstacle stands where it is at a share of the step."""
+    """Taichi functions of vertex i; `now` is the pass (state/schedule.py), g a group of obstacles, k a place in it."""
 
     @ti.func
     def share_and_slope(self, x):
@@ -32,25 +34,46 @@ class HeldBack(ObstacleStages):
         return c, slope
 
     @ti.func
-    def plane(self, g: A, k, i, u, share, now: A, scene: A):
-        """(n, d) of an obstacle at u."""
-        X = scene.rest[i] - self.place_at(g, k, share, now, scene.path)
+    def normal(self, plane):
+        return self.vector(plane.x, plane.y, plane.z, ti.cast(0, self.fp))
+
+    @ti.func
+    def plane(self, g: A, k, i, u, now: A, scene: A):
+        """(n, d) of an obstacle at u, where it is when the pass begins."""
+        X = scene.rest[i] - self.place(g, k, now, scene.path)
         return g.force.outlook(scene.parameters, g.first + k * g.size, X, u)
 
     @ti.func
-    def plane_jvp(self, g: A, k, i, u, du, share, now: A, scene: A, tangent: A):
-        """Its change."""
-        X = scene.rest[i] - self.place_at(g, k, share, now, scene.path)
-        moved = du + tangent.rest[i] - self.place_at(g, k, share, now, tangent.path)
-        return g.force.outlook_jvp(scene.parameters, g.first + k * g.size, X, u, moved, tangent.parameters)
+    def way_to(self, g: A, k, z, now: A, path: A):
+        """A move z as the obstacle sees it, or the change of both."""
+        return z - now.h * self.speed(g, k, now, path)
 
     @ti.func
-    def plane_vjp(self, g: A, k, i, u, seed, share, now: A, scene: A, adjoint: A):
-        """Adjoint of u for that of (n, d); adds those of the obstacle's numbers. The change of n by u is symmetric."""
-        first, X = g.first + k * g.size, scene.rest[i] - self.place_at(g, k, share, now, scene.path)
-        plane, by_u = g.force.outlook(scene.parameters, first, X, u), self.vector(0)
+    def change_of_x(self, g: A, k, i, u, du, z, dz, e, de, x, now: A, scene: A, tangent: A):
+        """Change of x, which obstacle k has, for a vertex that the stage has moved by z from u."""
+        first, X = g.first + k * g.size, scene.rest[i] - self.place(g, k, now, scene.path)
+        moved = du + tangent.rest[i] - self.place(g, k, now, tangent.path)
+        plane = g.force.outlook(scene.parameters, first, X, u)
+        turned = g.force.outlook_jvp(scene.parameters, first, X, u, moved, tangent.parameters)
+        n, dn, way = self.normal(plane), self.normal(turned), self.way_to(g, k, z, now, scene.path)
+        dy = turned.w + dn.dot(way) + n.dot(self.way_to(g, k, dz, now, tangent.path))
+        return -(dn.dot(e) + n.dot(de) + x * dy) / (plane.w + n.dot(way))
+
+    @ti.func
+    def adjoint_of_x(self, g: A, k, i, column, u, z, e, x, by_x, now: A, scene: A, adjoint: A, out: A):
+        """(adjoints of e, z, u) for that of x; adds those of the obstacle's numbers, and of its path to out.felt.
+
+        The change of n by u is symmetric.
+        """
+        first, X = g.first + k * g.size, scene.rest[i] - self.place(g, k, now, scene.path)
+        plane = g.force.outlook(scene.parameters, first, X, u)
+        n, way = self.normal(plane), self.way_to(g, k, z, now, scene.path)
+        ratio = by_x / (plane.w + n.dot(way))
+        by_y = -ratio * x
+        by_e, by_z, seed = -ratio * n, by_y * n, by_y * way + -ratio * e
+        seed.w = by_y
         turned = g.force.outlook_jvp(scene.parameters, first, X, u, seed)
         g.force.outlook_vjp(scene.parameters, first, X, u, seed, adjoint.sums, i)
-        for m in ti.static(range(3)):
-            by_u[m] = turned[m] + seed[3] * plane[m]
-        return by_u
+        by_u = self.normal(turned) + by_y * n
+        self.add_to_path(g, k, column, now, by_u, -now.h * by_z, out)
+        return by_e, by_z, by_u
