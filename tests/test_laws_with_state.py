@@ -176,7 +176,8 @@ def test_gradients_beside_contact():
     two = ds.TetrahedralMesh.joined([MESH, MESH.translated([0.1, 1.04, 0.07])])
     terms = [ds.Ground(-0.05, stiffness=300.0, width=0.2, friction=0.3), ds.SelfContact(300.0, 0.1)]
     velocities = np.repeat([[0.3, -1, 0], [0, -2.0, 0.2]], MESH.num_vertices, 0)
-    body = ds.Scene(two, rubber(), 1000.0, terms, initial_velocities=velocities, precision="f64")
+    start = dict(initial_velocities=velocities, initial_positions=two.vertices * [1.1, 1, 1])  # stretched: it relaxes
+    body = ds.Scene(two, rubber(), 1000.0, terms, precision="f64", **start)
     r = rollout(body, ds.ImplicitMidpointSolver, steps=2)
     gates(r, 1e-10, "tau", "rest_positions")
     assert r.sweep.workspace.pairs.list.count > 0
