@@ -194,6 +194,7 @@ def test_what_faces_feel_counts(round_one):
     assert frames["each"].sum(1) == pytest.approx(frames["held"])
 
 
+@pytest.mark.executed_ptx
 @pytest.mark.parametrize("kind", [ds.SemiImplicitSolver, ds.ImplicitEulerSolver])
 def test_a_block_at_rest_on_a_slope(kind):
     """It presses with m g cos and is held with m g sin, but for what the explicit one's drag takes of its creep."""

@@ -59,6 +59,7 @@ def rollout_of(kind, terms, precision="f64", steps=STEPS, **options) -> ds.Rollo
 every = pytest.mark.parametrize("kind", SOLVERS, ids=lambda s: s.__name__)
 
 
+@pytest.mark.executed_ptx
 @every
 @pytest.mark.parametrize("precision", ["f64", "f32"])
 def test_every_number_of_a_load(kind, precision):

@@ -62,6 +62,7 @@ def test_gradients_against_differences(kind):
     assert all(row.relative_error < 1e-6 for row in table.rows), table
 
 
+@pytest.mark.executed_ptx
 @every
 def test_what_is_held_is_held_and_the_rest_is_free(kind):
     scene = supported(MOTIONS["by set"])
