@@ -201,6 +201,12 @@ class Scene:
         """Sorted indices of the vertices that dead loads act on."""
         return np.unique(np.concatenate([np.zeros(0, np.int64), *(t.indices(self.mesh) for t in self.dead_loads)]))
 
+    @property
+    def pressed_triangles(self) -> tuple[np.ndarray, np.ndarray]:
+        """(triangles that pressures act on, shape (k, 3), the number of the one of `pressures` that each belongs to)."""
+        triangles = [np.zeros((0, 3), np.int64), *(term.triangles(self.mesh) for term in self.pressures)]
+        return np.concatenate(triangles), np.repeat(np.arange(len(triangles)) - 1, [len(rows) for rows in triangles])
+
     def places(self, time: float) -> dict[Term, np.ndarray]:
         """Displacement of each moving obstacle at a time [s], shape (3,) [m]."""
         return {term: rows[0] for term, rows in zip(self.moving, self.path_rows([time]).values())}

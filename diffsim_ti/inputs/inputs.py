@@ -34,9 +34,7 @@ class Derived:
     forces: np.ndarray | None = None  # (1 or steps, k, 3), or (1 or steps, 2 k, 3) as each step begins and ends [N]
     motion: np.ndarray | None = None  # (steps + 1, num_held, 3) [m]
     path: np.ndarray | None = None  # displacements of obstacles, (steps + 1, num_moving, 3) [m]
-    follower: np.ndarray | None = (
-        None  # pressures of loads as each step begins and ends, and 0, (1 or steps, loads, 3) [Pa]
-    )
+    follower: np.ndarray | None = None  # pressures as each step begins and ends, and 0, (1 or steps, loads, 3) [Pa]
 
     def zeros(self) -> "Derived":
         """The same shapes, all zero."""

@@ -16,9 +16,7 @@ class GivenLoads:
         self.gravity = None if gravity is None else scene.inputs.parameters.of(gravity)
         self.loaded, self.keyed = scene.loaded_vertices if scene.dead_loads else None, scene.inputs.keyed_forces
         if scene.pressures:
-            triangles = [term.triangles(scene.mesh) for term in scene.pressures]
-            load_of = np.repeat(np.arange(len(triangles)), [len(rows) for rows in triangles])
-            self.follower = FollowerPressure(np.concatenate(triangles), load_of, scene.mesh.num_vertices)
+            self.follower = FollowerPressure(*scene.pressed_triangles, scene.mesh.num_vertices)
 
     @staticmethod
     def _row(step: int, rows: np.ndarray) -> np.ndarray:

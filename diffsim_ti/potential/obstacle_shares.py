@@ -185,16 +185,21 @@ class FaceShares(FacePoints):
         return Kernel(name, body, self.precision, own, dict(num_vertices="int", which="int"))
 
     @ti.func
+    def around_which(self, what: A, i, scene: A, pass_: A, at: A, more: A, plan: A):
+        """What `around_one` gives of that obstacle."""
+        f = self.vector(0)
+        for g in ti.static(self.features.groups):
+            if ti.static(not g.force.hollow):
+                k = plan.which - g.number
+                if 0 <= k and k < g.count:
+                    f = self.around_one(what, g, k, i, scene, pass_, at, more)
+        return f
+
+    @ti.func
     def all_forces(self, scene: A, pass_: A, at: A, out: A, plan: A):
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.num_vertices):
-            f = self.vector(0)
-            for g in ti.static(self.features.groups):
-                if ti.static(not g.force.hollow):
-                    k = plan.which - g.number
-                    if 0 <= k and k < g.count:
-                        f = self.around_one("force", g, k, i, scene, pass_, at, at)
-            out.y[0, i] = f
+            out.y[0, i] = self.around_which("force", i, scene, pass_, at, at, plan)
 
     @cached_property
     def forces(self) -> Kernel:
@@ -204,13 +209,7 @@ class FaceShares(FacePoints):
     def all_jvp(self, scene: A, pass_: A, at: A, out: A, tangent: A, plan: A):
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.num_vertices):
-            f = self.vector(0)
-            for g in ti.static(self.features.groups):
-                if ti.static(not g.force.hollow):
-                    k = plan.which - g.number
-                    if 0 <= k and k < g.count:
-                        f = self.around_one("jvp", g, k, i, scene, pass_, at, tangent)
-            out.y[0, i] = f
+            out.y[0, i] = self.around_which("jvp", i, scene, pass_, at, tangent, plan)
 
     @cached_property
     def jvp(self) -> Kernel:

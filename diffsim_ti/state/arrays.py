@@ -110,12 +110,10 @@ class SceneArrays:
             num_corners += len(mesh.surface_vertices)
         self.first_pressed, self.num_pressed = num_corners, 0
         if self.pressures:
-            triangles = [term.triangles(mesh) for term in self.pressures]
-            start, corner_of = with_more_corners(start, corner_of, np.concatenate(triangles).ravel(), num_corners)
-            self.num_pressed = sum(map(len, triangles))
+            self.pressed_triangles, self.load_of = scene.pressed_triangles
+            start, corner_of = with_more_corners(start, corner_of, self.pressed_triangles.ravel(), num_corners)
+            self.num_pressed = len(self.pressed_triangles)
             num_corners += 3 * self.num_pressed
-            self.pressed_triangles = np.concatenate(triangles)
-            self.load_of = np.repeat(np.arange(len(triangles)), [len(rows) for rows in triangles])
             self.pressed = runtime.upload(self.pressed_triangles.ravel(), ti.i32)
             self.pressed_load = runtime.upload(self.load_of, ti.i32)
         self.start, self.corner_of = runtime.upload(start, ti.i32), runtime.upload(corner_of, ti.i32)

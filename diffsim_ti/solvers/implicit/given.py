@@ -54,9 +54,7 @@ class GivenInPasses:
         scene = self.scene
         if not scene.pressures:
             return None
-        triangles = [term.triangles(scene.mesh) for term in scene.pressures]
-        load_of = np.repeat(np.arange(len(triangles)), [len(rows) for rows in triangles])
-        triangles, free = np.concatenate(triangles), projectors_of(self.free)
+        (triangles, load_of), free = scene.pressed_triangles, projectors_of(self.free)
         symmetric = is_symmetric(triangles, load_of, free, self.arrays.values.rest)
         return FollowerPressure(triangles, load_of, scene.mesh.num_vertices, symmetric)
 
