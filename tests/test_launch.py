@@ -147,3 +147,31 @@ def test_another_build_of_taichi_is_not_taken_for_this_one(repeated, monkeypatch
     monkeypatch.setattr(repeated_loops, "_TASK", 40)  # as if tasks were of another size
     with pytest.raises(RuntimeError, match="install taichi==1.7.4"):
         launch(first=8, second=4, more=0, times=2)
+
+
+@ti.func
+def larger(x):
+    return ti.max(
+        x,
+        name_that_nothing_has,  # noqa: F821
+    )
+
+
+@ti.kernel
+def not_to_be_compiled() -> float:
+    y = 2.0
+    return y + larger(y)
+
+
+def test_errors_in_kernels_say_where():
+    """Taichi asks the package where a node stands (runtime/sources.py), through functions and on several lines."""
+    with pytest.raises(ti.TaichiNameError) as error:
+        not_to_be_compiled()
+    called, source, mark, inlined, wrong, wrong_mark = [x for x in str(error.value).splitlines() if x.strip()][:6]
+    assert (
+        called.endswith(", in not_to_be_compiled:") and inlined.endswith(", in larger:") and "test_launch.py" in called
+    )
+    assert source.strip() == "return y + larger(y)" and mark == " " * source.index("larger") + "^" * len("larger(y)")
+    assert wrong_mark.count("^") == len("name_that_nothing_has")
+    number = int(inlined.split("line ")[1].split(",")[0])
+    assert wrong == open(__file__).read().splitlines()[number - 1]

@@ -20,6 +20,7 @@ from diffsim_ti.runtime.kernels import LANES, Kernel, array_types, kernels_of
 from diffsim_ti.runtime.language import Bundle, assign, at, each_lane, let, spread, traced
 from diffsim_ti.runtime.launch import Launch, TensorLaunch
 from diffsim_ti.runtime.repeated_loops import can_repeat
+from diffsim_ti.runtime.sources import trace_faster as _trace_faster
 from diffsim_ti.runtime.start import (
     NUMPY,
     PRECISIONS,
@@ -35,3 +36,5 @@ from diffsim_ti.runtime.start import (
     runs_on_cpu,
     set_precision,
 )
+
+_trace_faster()
