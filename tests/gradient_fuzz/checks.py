@@ -154,7 +154,8 @@ class Chain:
         """Whether a step depends on the state before it alone."""
         kind, solver = self.configuration.structure, self.configuration.solver
         shared = kind.solver is ds.VelocityVerletSolver and self.per_step
-        if kind.rollers and kind.motion:  # a start has no velocity in what is held, which friction would see
+        sees_held = kind.rollers or self.configuration.scene.law.reads != ("H",)
+        if kind.motion and sees_held:  # a start has no velocity in what is held: friction and viscosity would see it
             return False
         return kind.solver is not ds.BDF2Solver and not shared and not (kind.static and solver.substeps > 1)
 

@@ -11,16 +11,17 @@ import numpy as np
 
 import diffsim_ti as ds
 
-from .differences import derivative
+from .differences import closer, derivative
 from .scenes import Configuration, build, path_at
 from .structures import CELL
 
-PASSED, ZERO, REFUSED, UNRESOLVED, INACCURATE, FAILED = CLASSES = (
+PASSED, ZERO, REFUSED, UNRESOLVED, INACCURATE, KINK, FAILED = CLASSES = (
     "passed",
     "exactly zero",
     "refused as documented",
     "unresolved contact",
     "difference not accurate enough",
+    "that of one side, at a kink",
     "FAILED",
 )
 GATES = {("f64", True): (1e-10, 1e-6), ("f64", False): (1e-7, 1e-5)}  # (precision, explicit): (tangent, differences)
@@ -162,13 +163,16 @@ class Judge:
         dot_gate, gate = self.gates
         base, direction = exact.values[name], self.directions[name]
 
-        def change(h: float) -> float:
+        def at(h: float):
+            return exact.forward(**{name: base + h * direction})
+
+        def between(one, other, h: float) -> float:
             # of displacements, which keep their digits; a moved rest shape moves positions as well
-            one, other = (exact.forward(**{name: base + s * h * direction}) for s in (1, -1))
             dx = one.displacements - other.displacements
-            return self.along(
-                dx + 2 * h * direction if name == "rest_positions" else dx, one.velocities - other.velocities
-            )
+            return self.along(dx + h * direction if name == "rest_positions" else dx, one.velocities - other.velocities)
+
+        def change(h: float) -> float:
+            return between(at(h), at(-h), 2 * h)
 
         # rounding of positions, and what a solve leaves of the displacements
         rounding = 1e-16 * np.abs(self.frames.positions).max()
@@ -189,7 +193,18 @@ class Judge:
         elif off <= 3 * row.error:
             row.verdict = INACCURATE
         else:
-            row.verdict = FAILED if resolved else UNRESOLVED
+            here = at(0.0)
+            row.verdict = self._closer(row, lambda h: between(at(h), here, h), gate * row.size)
+            if row.verdict == FAILED and not resolved:
+                row.verdict = UNRESOLVED
+
+    def _closer(self, row: Row, f, gate: float) -> str:
+        """The verdict by smaller steps, where larger ones meet a kink."""
+        (row.difference, row.error), *sides = closer(f)
+        if max(row.error, abs(row.reverse - row.difference)) <= gate:
+            return PASSED
+        kink = abs(sides[0][0] - sides[1][0]) > gate
+        return KINK if kink and any(max(e, abs(row.reverse - side)) <= gate for side, e in sides) else FAILED
 
     def faces_felt(self) -> bool:
         """Whether points within faces were pushed in explicit steps."""
