@@ -157,6 +157,8 @@ class Chain:
         sees_held = kind.rollers or self.configuration.scene.law.reads != ("H",)
         if kind.motion and sees_held:  # a start has no velocity in what is held: friction and viscosity would see it
             return False
+        if self.configuration.scene.law.state_names:  # which a start has not
+            return False
         return kind.solver is not ds.BDF2Solver and not shared and not (kind.static and solver.substeps > 1)
 
 

@@ -1,0 +1,113 @@
+"""Find Young's modulus and the coefficient of friction of a soft block from the force on a ball that is pressed in and dragged.
+
+A laboratory records force against displacement. The ball goes down 8 mm, then 8 mm to the side; the force that it feels is
+`ContactForce`. Its derivatives by both numbers come from tangents, one run each, and SciPy's least squares does the rest,
+in logarithms. Data carry noise of 1 % of the largest force.
+
+    python examples/identify/indentation.py [folder for a picture]
+"""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+from scipy.optimize import least_squares
+
+import diffsim_ti as ds
+
+TRUTH = dict(youngs_modulus=6e4, friction=0.35)  # [Pa], [-]
+GUESS = dict(youngs_modulus=2e4, friction=0.1)
+DOWN, ASIDE, STEPS = 8e-3, 6e-3, 6  # [m], [m], steps of each
+NOISE = 0.01  # of the largest force
+
+
+def way(t: float) -> tuple[float, float, float]:
+    """Displacement of the ball [m] after t steps."""
+    return ASIDE * max(t - STEPS, 0) / STEPS, -DOWN * min(t, STEPS) / STEPS, 0.0
+
+
+def experiment() -> ds.Rollout:
+    mesh = ds.TetrahedralMesh.create_box((7, 4, 7), size=(0.08, 0.04, 0.08), pattern="five")
+    ball = ds.Sphere(
+        center=(0.04, 0.062, 0.04),
+        radius=0.02,
+        stiffness_per_area=5e7,
+        width=2e-3,
+        friction=GUESS["friction"],
+        friction_speed=1e-4,  # of a static run: the way in a step [m] below which it sticks
+        path=way,
+        name="ball",
+    )
+    scene = ds.Scene(mesh, ds.StableNeoHookean(GUESS["youngs_modulus"], 0.4), terms=[ball], fixed="ymin", precision="f64")
+    force = ds.ContactForce("ball", name="force")
+    return ds.Rollout(ds.StaticSolver(scene), 2 * STEPS, save_every=1, outputs=[force])
+
+
+def main(folder: str | None = None) -> dict:
+    """Returns the numbers found, their relative errors and standard errors, runs, and the forces [N]."""
+    rollout = experiment()
+    names = {"youngs_modulus": "youngs_modulus", "friction": "ball.friction"}  # of inputs
+
+    def run(log_numbers):
+        return rollout.forward(**{names[n]: np.exp(x) for n, x in zip(GUESS, log_numbers)})
+
+    exact = -run(np.log([*TRUTH.values()]))["force"]  # what the block does to the ball
+    noise = NOISE * np.abs(exact).max()
+    seen = exact + noise * np.random.default_rng(0).standard_normal(exact.shape)
+    runs = []
+
+    def residual(log_numbers):
+        runs.append(run(log_numbers))
+        return ((-runs[-1]["force"] - seen) / noise).ravel()
+
+    def jacobian(log_numbers):
+        frames = runs[-1]
+        columns = [
+            -rollout.tangents(frames, **{names[n]: np.exp(x)})["force"].ravel() / noise for n, x in zip(GUESS, log_numbers)
+        ]
+        return np.stack(columns, 1)
+
+    found = least_squares(residual, np.log([*GUESS.values()]), jacobian, x_scale=1.0, xtol=1e-6)
+    numbers = dict(zip(GUESS, np.exp(found.x)))
+    spread = np.sqrt(np.diag(np.linalg.inv(found.jac.T @ found.jac)))  # relative, for the unknowns are logarithms
+    errors = {name: abs(numbers[name] / TRUTH[name] - 1) for name in TRUTH}
+    print(
+        f"E = {numbers['youngs_modulus']:.5g} Pa ({100 * errors['youngs_modulus']:.2f} % off, standard error "
+        f"{100 * spread[0]:.2f} %), friction = {numbers['friction']:.4f} ({100 * errors['friction']:.2f} % off, standard "
+        f"error {100 * spread[1]:.2f} %), from {GUESS} in {len(runs)} runs"
+    )
+    force = -run(found.x)["force"]
+    if folder:
+        draw(Path(folder) / "indentation.png", rollout, seen, force, -run(np.log([*GUESS.values()]))["force"])
+    return dict(numbers=numbers, errors=errors, spread=spread, runs=len(runs), force=force, seen=seen)
+
+
+def draw(path: Path, rollout, seen, found, guess) -> None:
+    """The force curve, and the block at its end."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained", width_ratios=(3, 2))
+    steps, colours = np.arange(len(seen)), {0: "tab:orange", 1: "tab:blue"}
+    for axis, said in ((1, "up"), (0, "to the side")):
+        axes[0].plot(steps, seen[:, axis], "o", color=colours[axis], mfc="none", label=f"{said}, measured")
+        axes[0].plot(steps, found[:, axis], "-", color=colours[axis], label=f"{said}, found")
+        axes[0].plot(steps, guess[:, axis], ":", color=colours[axis], label=f"{said}, guessed")
+    axes[0].set(xlabel=f"step: {STEPS} of {DOWN * 1e3 / STEPS:g} mm down, {STEPS} aside", ylabel="force on the ball [N]")
+    axes[0].legend(fontsize=8)
+    image = path.with_name("indentation_body.png")
+    frames = rollout.forward(youngs_modulus=TRUTH["youngs_modulus"], **{"ball.friction": TRUTH["friction"]})
+    ds.picture.save_picture(image, rollout.scene, frames.positions[-1], time=2.0 * STEPS)
+    axes[1].imshow(plt.imread(image))
+    axes[1].axis("off")
+    image.unlink()
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
+
+
+if __name__ == "__main__":
+    ds.init(precision="f64")
+    main(*sys.argv[1:])
