@@ -123,7 +123,8 @@ def barrier_energies(workspace: Workspace) -> np.ndarray:
 
     def bind():
         out = SimpleNamespace(contact=runtime.array(a.fp, a.num_vertices))
-        walls = SimpleNamespace(walls=a.offsets, lag=runtime.array(a.vector, 2, 1))
+        no_friction = runtime.array(a.vector, 2, 1)
+        walls = SimpleNamespace(walls=a.offsets, lag=no_friction, pressed=no_friction)
         kernel = potential_kernels(a.law, a.features(), workspace.parallel, a.in_lanes).barrier_energy
         return out, kernel.bind(scene=a, pass_=walls, at=workspace.state, out=out)
 

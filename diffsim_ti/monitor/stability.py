@@ -70,6 +70,7 @@ class Stiffness:
         a = workspace.arrays
         self.w, self.y = runtime.array(a.vector, 1, a.num_vertices), runtime.array(a.vector, 1, a.num_vertices)
         self.walls, self.lag = a.offsets, runtime.array(a.vector, 2, 1)
+        self.pressed = self.lag  # no friction
         features = a.features()
         felt = replace(features, groups=features.pressing)  # a stage limits no step
         kernels = potential_kernels(a.law, felt, workspace.parallel, a.in_lanes)

@@ -17,7 +17,7 @@ from diffsim_ti.state.features import Features
 from diffsim_ti.state.numbers import ADJOINT, SCENE, TANGENT
 
 A = ti.template()
-PASS = dict(walls="vectors", lag="vectors2")
+PASS = dict(walls="vectors", lag="vectors2", pressed="vectors2")
 NUMBERS = dict(num_vertices="int", per_gamma="float")
 
 
@@ -38,17 +38,6 @@ class ObstacleShares(ObstaclePotential):
         return rubbed
 
     @ti.func
-    def push(self, g: A, k, i, u, scene: A, pass_: A):
-        X = self.rest_now(g, k, i, scene, pass_)
-        return g.force.force(scene.parameters, g.first + k * g.size, X, u, self.vector(0))
-
-    @ti.func
-    def drag(self, g: A, k, i, u, scene: A, pass_: A, plan: A):
-        v, wall = self.velocity(i, u, pass_, plan), pass_.walls[3 * (g.number + k) + 2]
-        X = self.rest_before(g, k, i, scene, pass_)
-        return g.force.rub(scene.parameters, g.first + k * g.size, X, pass_.lag[0, i], v, wall)
-
-    @ti.func
     def all_forces(self, scene: A, pass_: A, at: A, out: A, plan: A):
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.num_vertices):
@@ -59,7 +48,8 @@ class ObstacleShares(ObstaclePotential):
                         f = self.on_area(g, i, self.push(g, k, i, at.u[0, i], scene, pass_), scene)
                         if ti.static(g.force.friction):
                             if self.dragged(g, k, i, scene, pass_):
-                                drag = self.on_area(g, i, self.drag(g, k, i, at.u[0, i], scene, pass_, plan), scene)
+                                drag = self.drag(g, k, i, at.u[0, i], scene, pass_, plan)
+                                drag = self.on_rubbed_area(g, i, drag, scene)
                     out.force[row, i] = f
                     out.force[row + 1, i] = drag
 
@@ -67,33 +57,6 @@ class ObstacleShares(ObstaclePotential):
     def forces(self) -> Kernel:
         """Forces at `at.u`."""
         return self._kernel("obstacle_forces", self.all_forces, at=dict(u="vectors2"), out=dict(force="vectors2"))
-
-    @ti.func
-    def push_jvp(self, g: A, k, i, u, du, scene: A, pass_: A, tangent: A):
-        n, first, zero = 3 * (g.number + k), g.first + k * g.size, self.vector(0)
-        X, moved = self.rest_now(g, k, i, scene, pass_), du + tangent.rest[i] - tangent.walls[n]
-        f = g.force.force_jvp(scene.parameters, first, X, u, zero, moved, zero)
-        by = g.force.parameter_derivatives(scene.parameters, first, X, u, zero)
-        for m in ti.static(range(g.size)):
-            f += by[m] * tangent.parameters[first + m]
-        f = self.on_area(g, i, f, scene)
-        if ti.static(g.force.per_area):
-            f += tangent.surface[i] * self.push(g, k, i, u, scene, pass_)
-        return f
-
-    @ti.func
-    def drag_jvp(self, g: A, k, i, u, du, scene: A, pass_: A, tangent: A, plan: A):
-        n, first = 3 * (g.number + k), g.first + k * g.size
-        v, wall, dwall = self.velocity(i, u, pass_, plan), pass_.walls[n + 2], tangent.walls[n + 2]
-        du_before = tangent.lag[0, i] + tangent.rest[i] - tangent.walls[n + 1]
-        dv, before = plan.per_gamma * (du - tangent.lag[1, i]), self.rest_before(g, k, i, scene, pass_)
-        f = g.force.rub_jvp(
-            scene.parameters, first, before, pass_.lag[0, i], v, wall, tangent.parameters, du_before, dv, dwall
-        )
-        f = self.on_area(g, i, f, scene)
-        if ti.static(g.force.per_area):
-            f += tangent.surface[i] * self.drag(g, k, i, u, scene, pass_, plan)
-        return f
 
     @ti.func
     def all_jvp(self, scene: A, pass_: A, at: A, out: A, tangent: A, plan: A):
@@ -117,38 +80,6 @@ class ObstacleShares(ObstaclePotential):
         return self._kernel("obstacle_forces_jvp", self.all_jvp, **own)
 
     @ti.func
-    def push_vjp(self, g: A, k, i, u, w, scene: A, pass_: A, adjoint: A):
-        n, first, zero = 3 * (g.number + k), g.first + k * g.size, self.vector(0)
-        if ti.static(g.force.per_area and self.features.shape):
-            self.add_to_area(g, i, self.push(g, k, i, u, scene, pass_).dot(w), adjoint)
-        w = self.on_area(g, i, w, scene)
-        X = self.rest_now(g, k, i, scene, pass_)
-        by_u, _ = g.force.force_vjp(scene.parameters, first, X, u, zero, w)
-        by = g.force.parameter_derivatives(scene.parameters, first, X, u, zero)
-        for m in ti.static(range(g.size)):
-            adjoint.sums[first + m, i] = adjoint.sums[first + m, i] + by[m].dot(w)
-        self.add_to_rest(i, by_u, adjoint)
-        adjoint.walls[n, i] = zero - by_u
-        return by_u
-
-    @ti.func
-    def drag_vjp(self, g: A, k, i, u, w, scene: A, pass_: A, adjoint: A, plan: A):
-        n, first, zero = 3 * (g.number + k), g.first + k * g.size, self.vector(0)
-        if ti.static(g.force.per_area and self.features.shape):
-            self.add_to_area(g, i, self.drag(g, k, i, u, scene, pass_, plan).dot(w), adjoint)
-        w = self.on_area(g, i, w, scene)
-        v, wall, before = self.velocity(i, u, pass_, plan), pass_.walls[n + 2], self.rest_before(g, k, i, scene, pass_)
-        by_lag, by_v, by_wall, by = g.force.rub_vjp(scene.parameters, first, before, pass_.lag[0, i], v, wall, w)
-        for m in ti.static(range(g.size)):
-            adjoint.sums[first + m, i] = adjoint.sums[first + m, i] + by[m]
-        self.add_to_rest(i, by_lag, adjoint)
-        adjoint.lag[0, i] = adjoint.lag[0, i] + by_lag
-        adjoint.lag[1, i] = adjoint.lag[1, i] - plan.per_gamma * by_v
-        adjoint.walls[n + 1, i] = zero - by_lag
-        adjoint.walls[n + 2, i] = by_wall
-        return plan.per_gamma * by_v
-
-    @ti.func
     def all_vjp(self, scene: A, pass_: A, at: A, out: A, adjoint: A, plan: A):
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.num_vertices):
@@ -170,7 +101,10 @@ class ObstacleShares(ObstaclePotential):
         """Adjoint y of the displacement; adds those of all else."""
         own = dict(at=dict(u="vectors2", seed="vectors2"), out=dict(y="vectors2"))
         return self._kernel(
-            "obstacle_forces_vjp", self.all_vjp, **own, adjoint=ADJOINT | dict(lag="vectors2", walls="vectors2")
+            "obstacle_forces_vjp",
+            self.all_vjp,
+            **own,
+            adjoint=ADJOINT | dict(lag="vectors2", walls="vectors2", pressed="vectors2"),
         )
 
 

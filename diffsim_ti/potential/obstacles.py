@@ -3,6 +3,7 @@
 Obstacles are looked at where they are in the pass. `pass_.walls` holds three vectors for each: its displacement where forces
 are taken, its displacement where the pass begins, its velocity. `pass_.lag` holds two rows: the displacement of the body
 where the pass begins, from which friction takes its normal force, and x, so that (u - x) per_gamma is the velocity.
+`pass_.pressed` holds a row for each obstacle (`reaches`).
 """
 
 from dataclasses import dataclass
@@ -47,6 +48,12 @@ class ObstaclePotential(ObstacleFunctions):
         return f
 
     # ---- with friction -----------------------------------------------------------------------------------------------
+    # Of obstacles that reach into faces, points within them push as well: N and its direction are then the size and the
+    # direction of `pass_.pressed`, all that an obstacle pushes a vertex with where the pass begins.
+
+    def reaches(self, g) -> bool:
+        """Whether friction of a group takes its normal force from `pressed`."""
+        return g.force.friction and not g.force.hollow
 
     @ti.func
     def velocity(self, i, u, pass_: A, plan: A):
@@ -58,10 +65,63 @@ class ObstaclePotential(ObstacleFunctions):
         return scene.rest[i] - pass_.walls[3 * (g.number + k) + 1]
 
     @ti.func
+    def on_rubbed_area(self, g: A, i, x, scene: A):
+        """Friction on the area of vertex i; `pressed` is of the whole already."""
+        out = x
+        if ti.static(not self.reaches(g)):
+            out = self.on_area(g, i, x, scene)
+        return out
+
+    @ti.func
     def is_rubbed(self, g: A, k, i, scene: A, pass_: A):
         """Whether friction of an obstacle is felt."""
-        X = self.rest_before(g, k, i, scene, pass_)
-        return g.force.touches(scene.parameters, g.first + k * g.size, X, pass_.lag[0, i])
+        felt = False
+        if ti.static(self.reaches(g)):
+            felt = pass_.pressed[g.number + k, i].norm_sqr() > 0
+        else:
+            X = self.rest_before(g, k, i, scene, pass_)
+            felt = g.force.touches(scene.parameters, g.first + k * g.size, X, pass_.lag[0, i])
+        return felt
+
+    @ti.func
+    def lost(self, g: A, k, i, u, scene: A, pass_: A, plan: A):
+        """Potential of friction by the velocity [W]."""
+        v, wall, first = self.velocity(i, u, pass_, plan), pass_.walls[3 * (g.number + k) + 2], g.first + k * g.size
+        value = ti.cast(0, self.fp)
+        if ti.static(self.reaches(g)):
+            value = g.force.dissipation(scene.parameters, first, None, pass_.pressed[g.number + k, i], v, wall)
+        else:
+            X = self.rest_before(g, k, i, scene, pass_)
+            value = g.force.dissipation(scene.parameters, first, X, pass_.lag[0, i], v, wall)
+        return value
+
+    @ti.func
+    def push(self, g: A, k, i, u, scene: A, pass_: A):
+        X = self.rest_now(g, k, i, scene, pass_)
+        return g.force.force(scene.parameters, g.first + k * g.size, X, u, self.vector(0))
+
+    @ti.func
+    def drag(self, g: A, k, i, u, scene: A, pass_: A, plan: A):
+        v, wall, first = self.velocity(i, u, pass_, plan), pass_.walls[3 * (g.number + k) + 2], g.first + k * g.size
+        f = self.vector(0)
+        if ti.static(self.reaches(g)):
+            f = g.force.rub(scene.parameters, first, None, pass_.pressed[g.number + k, i], v, wall)
+        else:
+            X = self.rest_before(g, k, i, scene, pass_)
+            f = g.force.rub(scene.parameters, first, X, pass_.lag[0, i], v, wall)
+        return f
+
+    @ti.func
+    def drag_product(self, g: A, k, i, u, w, scene: A, pass_: A, plan: A):
+        """Change of `drag` for a change w of the displacement."""
+        v, wall, first = self.velocity(i, u, pass_, plan), pass_.walls[3 * (g.number + k) + 2], g.first + k * g.size
+        f, dv = self.vector(0), plan.per_gamma * w
+        if ti.static(self.reaches(g)):
+            f = g.force.rub_product(scene.parameters, first, None, pass_.pressed[g.number + k, i], v, wall, dv)
+        else:
+            X = self.rest_before(g, k, i, scene, pass_)
+            f = g.force.rub_product(scene.parameters, first, X, pass_.lag[0, i], v, wall, dv)
+        return f
 
     @ti.func
     def whole_energy(self, i, u, scene: A, pass_: A, plan: A):
@@ -69,15 +129,12 @@ class ObstaclePotential(ObstacleFunctions):
         value = ti.cast(0, self.fp)
         for g in ti.static(self.features.groups):
             for k in range(g.count):
-                first = g.first + k * g.size
-                held = g.force.energy(scene.parameters, first, self.rest_now(g, k, i, scene, pass_), u)
-                value += self.on_area(g, i, held, scene)
+                X = self.rest_now(g, k, i, scene, pass_)
+                value += self.on_area(g, i, g.force.energy(scene.parameters, g.first + k * g.size, X, u), scene)
                 if ti.static(g.force.friction):
                     if self.is_rubbed(g, k, i, scene, pass_):
-                        v, wall = self.velocity(i, u, pass_, plan), pass_.walls[3 * (g.number + k) + 2]
-                        X = self.rest_before(g, k, i, scene, pass_)
-                        lost = g.force.dissipation(scene.parameters, first, X, pass_.lag[0, i], v, wall)
-                        value += self.on_area(g, i, lost, scene) / plan.per_gamma
+                        lost = self.lost(g, k, i, u, scene, pass_, plan)
+                        value += self.on_rubbed_area(g, i, lost, scene) / plan.per_gamma
         return value
 
     @ti.func
@@ -85,18 +142,10 @@ class ObstaclePotential(ObstacleFunctions):
         f = self.vector(0)
         for g in ti.static(self.features.groups):
             for k in range(g.count):
-                f += self.on_area(g, i, self.force_of_one(g, k, i, u, scene, pass_, plan), scene)
-        return f
-
-    @ti.func
-    def force_of_one(self, g: A, k, i, u, scene: A, pass_: A, plan: A):
-        first, zero = g.first + k * g.size, self.vector(0)
-        f = g.force.force(scene.parameters, first, self.rest_now(g, k, i, scene, pass_), u, zero)
-        if ti.static(g.force.friction):
-            if self.is_rubbed(g, k, i, scene, pass_):
-                v, wall = self.velocity(i, u, pass_, plan), pass_.walls[3 * (g.number + k) + 2]
-                X = self.rest_before(g, k, i, scene, pass_)
-                f += g.force.rub(scene.parameters, first, X, pass_.lag[0, i], v, wall)
+                f += self.on_area(g, i, self.push(g, k, i, u, scene, pass_), scene)
+                if ti.static(g.force.friction):
+                    if self.is_rubbed(g, k, i, scene, pass_):
+                        f += self.on_rubbed_area(g, i, self.drag(g, k, i, u, scene, pass_, plan), scene)
         return f
 
     @ti.func
@@ -105,62 +154,62 @@ class ObstaclePotential(ObstacleFunctions):
         f, zero = self.vector(0), self.vector(0)
         for g in ti.static(self.features.groups):
             for k in range(g.count):
-                first = g.first + k * g.size
                 X = self.rest_now(g, k, i, scene, pass_)
-                change = g.force.force_jvp(scene.parameters, first, X, u, zero, w, zero)
+                change = g.force.force_jvp(scene.parameters, g.first + k * g.size, X, u, zero, w, zero)
+                f += self.on_area(g, i, change, scene)
                 if ti.static(g.force.friction):
                     if self.is_rubbed(g, k, i, scene, pass_):
-                        v, wall = self.velocity(i, u, pass_, plan), pass_.walls[3 * (g.number + k) + 2]
-                        before, dv = self.rest_before(g, k, i, scene, pass_), plan.per_gamma * w
-                        change += g.force.rub_product(scene.parameters, first, before, pass_.lag[0, i], v, wall, dv)
-                f += self.on_area(g, i, change, scene)
+                        f += self.on_rubbed_area(g, i, self.drag_product(g, k, i, u, w, scene, pass_, plan), scene)
         return f
 
     # ---- derivatives by everything -----------------------------------------------------------------------------------
 
     @ti.func
-    def add_jvp(self, i, f, u, du, scene: A, pass_: A, tangent: A, plan: A):
-        """f and the change of the force for changes of everything that it depends on."""
-        for g in ti.static(self.features.groups):
-            for k in range(g.count):
-                f += self.jvp_of_one(g, k, i, u, du, scene, pass_, tangent, plan)
-        return f
-
-    @ti.func
-    def jvp_of_one(self, g: A, k, i, u, du, scene: A, pass_: A, tangent: A, plan: A):
+    def push_jvp(self, g: A, k, i, u, du, scene: A, pass_: A, tangent: A):
         n, first, zero = 3 * (g.number + k), g.first + k * g.size, self.vector(0)
         X, moved = self.rest_now(g, k, i, scene, pass_), du + tangent.rest[i] - tangent.walls[n]
         f = g.force.force_jvp(scene.parameters, first, X, u, zero, moved, zero)
         by = g.force.parameter_derivatives(scene.parameters, first, X, u, zero)
         for m in ti.static(range(g.size)):
             f += by[m] * tangent.parameters[first + m]
-        if ti.static(g.force.friction):
-            if self.is_rubbed(g, k, i, scene, pass_):
-                v, wall, dwall = self.velocity(i, u, pass_, plan), pass_.walls[n + 2], tangent.walls[n + 2]
-                du_before = tangent.lag[0, i] + tangent.rest[i] - tangent.walls[n + 1]
-                dv = plan.per_gamma * (du - tangent.lag[1, i])
-                before = self.rest_before(g, k, i, scene, pass_)
-                f += g.force.rub_jvp(
-                    scene.parameters, first, before, pass_.lag[0, i], v, wall, tangent.parameters, du_before, dv, dwall
-                )
         f = self.on_area(g, i, f, scene)
         if ti.static(g.force.per_area):
-            f += tangent.surface[i] * self.force_of_one(g, k, i, u, scene, pass_, plan)
+            f += tangent.surface[i] * self.push(g, k, i, u, scene, pass_)
         return f
 
     @ti.func
-    def add_vjp(self, i, f, u, w, scene: A, pass_: A, adjoint: A, plan: A):
-        """f and the adjoint of u for the adjoint w of the force; adds those of all else."""
+    def drag_jvp(self, g: A, k, i, u, du, scene: A, pass_: A, tangent: A, plan: A):
+        n, first = 3 * (g.number + k), g.first + k * g.size
+        v, wall, dwall = self.velocity(i, u, pass_, plan), pass_.walls[n + 2], tangent.walls[n + 2]
+        f, dv = self.vector(0), plan.per_gamma * (du - tangent.lag[1, i])
+        if ti.static(self.reaches(g)):
+            P, dP = pass_.pressed[g.number + k, i], tangent.pressed[g.number + k, i]
+            f = g.force.rub_jvp(scene.parameters, first, None, P, v, wall, tangent.parameters, dP, dv, dwall)
+        else:
+            X, before = self.rest_before(g, k, i, scene, pass_), pass_.lag[0, i]
+            du_before = tangent.lag[0, i] + tangent.rest[i] - tangent.walls[n + 1]
+            f = g.force.rub_jvp(scene.parameters, first, X, before, v, wall, tangent.parameters, du_before, dv, dwall)
+            f = self.on_area(g, i, f, scene)
+            if ti.static(g.force.per_area):
+                f += tangent.surface[i] * self.drag(g, k, i, u, scene, pass_, plan)
+        return f
+
+    @ti.func
+    def add_jvp(self, i, f, u, du, scene: A, pass_: A, tangent: A, plan: A):
+        """f and the change of the force for changes of everything that it depends on."""
         for g in ti.static(self.features.groups):
             for k in range(g.count):
-                f += self.vjp_of_one(g, k, i, u, w, scene, pass_, adjoint, plan)
+                f += self.push_jvp(g, k, i, u, du, scene, pass_, tangent)
+                if ti.static(g.force.friction):
+                    if self.is_rubbed(g, k, i, scene, pass_):
+                        f += self.drag_jvp(g, k, i, u, du, scene, pass_, tangent, plan)
         return f
 
     @ti.func
-    def vjp_of_one(self, g: A, k, i, u, w, scene: A, pass_: A, adjoint: A, plan: A):
+    def push_vjp(self, g: A, k, i, u, w, scene: A, pass_: A, adjoint: A):
         n, first, zero = 3 * (g.number + k), g.first + k * g.size, self.vector(0)
         if ti.static(g.force.per_area and self.features.shape):
-            self.add_to_area(g, i, self.force_of_one(g, k, i, u, scene, pass_, plan).dot(w), adjoint)
+            self.add_to_area(g, i, self.push(g, k, i, u, scene, pass_).dot(w), adjoint)
         w = self.on_area(g, i, w, scene)
         X = self.rest_now(g, k, i, scene, pass_)
         by_u, _ = g.force.force_vjp(scene.parameters, first, X, u, zero, w)
@@ -171,19 +220,43 @@ class ObstaclePotential(ObstacleFunctions):
         adjoint.walls[n, i] = zero - by_u
         adjoint.walls[n + 1, i] = zero
         adjoint.walls[n + 2, i] = zero
-        if ti.static(g.force.friction):
-            if self.is_rubbed(g, k, i, scene, pass_):
-                v, wall = self.velocity(i, u, pass_, plan), pass_.walls[n + 2]
-                before = self.rest_before(g, k, i, scene, pass_)
-                by_lag, by_v, by_wall, by_numbers = g.force.rub_vjp(
-                    scene.parameters, first, before, pass_.lag[0, i], v, wall, w
-                )
-                for m in ti.static(range(g.size)):
-                    adjoint.sums[first + m, i] = adjoint.sums[first + m, i] + by_numbers[m]
-                self.add_to_rest(i, by_lag, adjoint)
-                by_u += plan.per_gamma * by_v
-                adjoint.lag[0, i] = adjoint.lag[0, i] + by_lag
-                adjoint.lag[1, i] = adjoint.lag[1, i] - plan.per_gamma * by_v
-                adjoint.walls[n + 1, i] = zero - by_lag
-                adjoint.walls[n + 2, i] = by_wall
         return by_u
+
+    @ti.func
+    def drag_vjp(self, g: A, k, i, u, w, scene: A, pass_: A, adjoint: A, plan: A):
+        n, first, zero = 3 * (g.number + k), g.first + k * g.size, self.vector(0)
+        if ti.static(g.force.per_area and self.features.shape and not self.reaches(g)):
+            self.add_to_area(g, i, self.drag(g, k, i, u, scene, pass_, plan).dot(w), adjoint)
+        w = self.on_rubbed_area(g, i, w, scene)
+        v, wall, by_v = self.velocity(i, u, pass_, plan), pass_.walls[n + 2], self.vector(0)
+        if ti.static(self.reaches(g)):
+            P = pass_.pressed[g.number + k, i]
+            by_P, by_speed, by_wall, by = g.force.rub_vjp(scene.parameters, first, None, P, v, wall, w)
+            for m in ti.static(range(g.size)):
+                adjoint.sums[first + m, i] = adjoint.sums[first + m, i] + by[m]
+            adjoint.pressed[g.number + k, i] = by_P
+            adjoint.walls[n + 2, i] = by_wall
+            by_v = by_speed
+        else:
+            X = self.rest_before(g, k, i, scene, pass_)
+            by_lag, by_speed, by_wall, by = g.force.rub_vjp(scene.parameters, first, X, pass_.lag[0, i], v, wall, w)
+            for m in ti.static(range(g.size)):
+                adjoint.sums[first + m, i] = adjoint.sums[first + m, i] + by[m]
+            self.add_to_rest(i, by_lag, adjoint)
+            adjoint.lag[0, i] = adjoint.lag[0, i] + by_lag
+            adjoint.walls[n + 1, i] = zero - by_lag
+            adjoint.walls[n + 2, i] = by_wall
+            by_v = by_speed
+        adjoint.lag[1, i] = adjoint.lag[1, i] - plan.per_gamma * by_v
+        return plan.per_gamma * by_v
+
+    @ti.func
+    def add_vjp(self, i, f, u, w, scene: A, pass_: A, adjoint: A, plan: A):
+        """f and the adjoint of u for the adjoint w of the force; adds those of all else."""
+        for g in ti.static(self.features.groups):
+            for k in range(g.count):
+                f += self.push_vjp(g, k, i, u, w, scene, pass_, adjoint)
+                if ti.static(g.force.friction):
+                    if self.is_rubbed(g, k, i, scene, pass_):
+                        f += self.drag_vjp(g, k, i, u, w, scene, pass_, adjoint, plan)
+        return f

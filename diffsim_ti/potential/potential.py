@@ -27,12 +27,14 @@ class Potential:
         self.has_friction = bool(a.features().rough)
         self.lag = runtime.array(a.vector, 2, n if self.has_friction else 1)  # as obstacles.py says, like the walls
         self.walls = runtime.array(a.vector, 3 * num_obstacles)
+        self.faces = FaceContact(self, parallel) if FaceContact.is_felt(arrays) else None
+        self.presses = any(g.force.friction and not g.force.hollow for g in a.features().groups)
+        self.pressed = runtime.array(a.vector, num_obstacles if self.presses else 1, n if self.presses else 1)
         self.per_gamma, self.held_at = 1.0, np.zeros((n, 3))
         self.size, self.contact = runtime.array(a.fp, n), runtime.array(a.fp, n)
         self.elastic, self.J = runtime.array(a.fp, m), runtime.array(a.fp, m)
         self._launches, self._coupling, self._barrier_blocks = {}, None, None  # made when first needed
         self.z = arrays.law_states(1)  # the state of the law, held during a pass
-        self.faces = FaceContact(self, parallel) if FaceContact.is_felt(arrays) else None
 
     def launch(self, name: str, lanes: bool = True, **records) -> None:
         """Run a kernel at the present displacement; records: more arrays than the potential's own."""

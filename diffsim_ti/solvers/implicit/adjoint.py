@@ -14,6 +14,7 @@ from diffsim_ti.potential.face_kernels import face_kernels
 from diffsim_ti.potential.face_lattice import rest_of_areas
 from diffsim_ti.potential.kernels import potential_kernels
 from diffsim_ti.solvers.implicit.contact_record import ContactRecord, Shares, SharesAdjoint
+from diffsim_ti.solvers.implicit.pressed import PressedAdjoint, PressedTangent
 from diffsim_ti.solvers.implicit.recorded_passes import RecordedPasses
 from diffsim_ti.solvers.implicit.threads import one_blas_thread
 from diffsim_ti.state.numbers import Adjoint, Tangent
@@ -37,6 +38,7 @@ class ImplicitAdjoint(RecordedPasses):
         self.potential = p
         self.lag = runtime.array(a.vector, 2, n if p.has_friction else 1)
         self.walls = runtime.array(a.vector, 3 * num_obstacles, n if num_obstacles else 1)
+        self.pressed = runtime.array(a.vector, *p.pressed.shape)
         self.z, own = a.law_states(1), dict(scene=a, pass_=p, at=p, out=p, adjoint=(self, self.numbers))
         if self.z is not None:  # the state of the law
             corner, y = runtime.array(a.vector, *a.corner.shape), runtime.array(a.vector, 1, n)
@@ -51,6 +53,7 @@ class ImplicitAdjoint(RecordedPasses):
         if workspace.impulses:
             self.contacts = ContactRecord(workspace)
             self._shares = SharesAdjoint(workspace, self.features, self.numbers, areas)
+        self._by_pressed = PressedAdjoint(workspace, self.features, self.numbers, areas) if p.presses else None
 
     def fits(self, workspace) -> bool:
         """Whether kernels and arrays are still those of the run."""
@@ -120,7 +123,7 @@ class ImplicitAdjoint(RecordedPasses):
         # the equation
         by_star = self.solve(s.c0 * p_free + s.e0 / s.gamma * q_free + by_contacts * ws.free)
         runtime.fill(ws.potential.w, by_star[None])
-        for target in (self.lag, self.walls):
+        for target in (self.lag, self.walls, self.pressed):
             runtime.fill(target, 0)
         if ws.pairs:
             ws.pairs.vjp(ws.potential.u, 0, ws.potential.w, ws.arrays.corner)
@@ -143,13 +146,17 @@ class ImplicitAdjoint(RecordedPasses):
         # where inertia starts from
         inertial = self.mass * by_star
         x_adj = inertial - s.e0 / s.gamma * q_free
-        by_lag = np.zeros_like(p)
+        by_lag, by_begin = np.zeros_like(p), 0.0
         if ws.potential.has_friction:
             by_lag, by_x = runtime.fetch(self.lag).astype(np.float64) + (0.0 if seen is None else seen[1])
             x_adj = x_adj + by_x
+        if self._by_pressed:
+            by_pressed = runtime.fetch(self.pressed).astype(np.float64) + (0.0 if seen is None else seen[2])
+            by_place, by_begin = self._by_pressed.pull_back(by_pressed)
+            by_lag = by_lag + by_place
         if self.path is not None:
             by_walls = runtime.fetch(self.walls).astype(np.float64).sum(1)
-            ws.walls_vjp(by_walls + (0.0 if seen is None else seen[2]), j, s, self.path)
+            ws.walls_vjp(by_walls + by_begin + (0.0 if seen is None else seen[3]), j, s, self.path)
         y_adj = s.gamma * inertial + s.e1 * q_free
         db0, db1, de0, de1 = s.by_rate
         self.rate += db0 * (y_adj * self.v).sum() + de0 * (q_free * self.v_star).sum() + de1 * (q_free * self.y).sum()
@@ -231,7 +238,8 @@ class ImplicitTangent(RecordedPasses):
         self.features = a.features()
         kernels = potential_kernels(a.law, self.features, workspace.parallel, a.in_lanes)
         self.numbers = Tangent(a, tangent)
-        self.lag, self.walls = runtime.array(a.vector, *p.lag.shape), runtime.array(a.vector, *p.walls.shape)
+        self.lag, self.walls, self.pressed = (runtime.array(a.vector, *x.shape) for x in (p.lag, p.walls, p.pressed))
+        self._presses = PressedTangent(workspace, self) if p.presses else None
         self.z, own = a.law_states(1), dict(scene=a, pass_=p, at=p, out=p, tangent=(self, self.numbers))
         if self.z is not None:
             runtime.fill(self.z, 0)
@@ -270,8 +278,11 @@ class ImplicitTangent(RecordedPasses):
         runtime.fill(ws.potential.w, held[None])
         if ws.potential.has_friction:
             runtime.fill(self.lag, np.stack([self.du, dx]))
-        if tangent.path is not None:
-            runtime.fill(self.walls, ws.walls(tangent.path, j, s))
+        walls = None if tangent.path is None else ws.walls(tangent.path, j, s)
+        if walls is not None:
+            runtime.fill(self.walls, walls)
+        if self._presses:
+            self._presses.begin(self.du, walls)
         if ws.pairs:
             ws.pairs.product(
                 ws.potential.u,
@@ -307,7 +318,7 @@ class ImplicitTangent(RecordedPasses):
     def _note_contacts(self, j: int, per_frame: int, d_star: np.ndarray) -> None:
         """Change of the forces of obstacles in pass j, u* changing by d_star."""
         runtime.fill(self.ws.potential.w, d_star[None])
-        record = dict(tangent=(SimpleNamespace(lag=self.lag, walls=self.walls), self.numbers))
+        record = dict(tangent=(SimpleNamespace(lag=self.lag, walls=self.walls, pressed=self.pressed), self.numbers))
         self.contacts.add(j, per_frame, self.stage.static, lambda: self._shares.forces("jvp", **record))
 
     def contact_forces(self, frame_time: float) -> np.ndarray:

@@ -14,8 +14,9 @@ from diffsim_ti.potential.obstacle_shares import share_kernels
 class Shares:
     """Forces of each obstacle on each vertex in the pass that a potential is told of, shape (obstacles, 2, n, 3)."""
 
-    def __init__(self, workspace, features=None):
-        self.p, self.a = workspace.potential, workspace.arrays
+    def __init__(self, workspace, features=None, at=None):
+        """at: what says where the forces are taken, instead of the potential (pressed.py)."""
+        self.p, self.a = workspace.potential if at is None else at, workspace.arrays
         a, features = self.a, workspace.arrays.features() if features is None else features
         self.at_vertices, self.of_faces = share_kernels(features, a.precision, workspace.parallel)
         self.num_obstacles = len(a.obstacles)
@@ -82,19 +83,21 @@ class ContactRecord:
 class SharesAdjoint(Shares):
     """Adjoints by those of the forces."""
 
-    def __init__(self, workspace, features, numbers, face_areas):
-        super().__init__(workspace, features)
+    def __init__(self, workspace, features, numbers, face_areas, at=None):
+        super().__init__(workspace, features, at)
         p, a = self.p, self.a
         self.seed = runtime.array(a.vector, 2 * self.num_obstacles, a.num_vertices)
         self.lag = runtime.array(a.vector, *p.lag.shape)
         self.walls = runtime.array(a.vector, 3 * self.num_obstacles, a.num_vertices)
-        self.w = runtime.array(a.vector, 1, a.num_vertices)
-        self.numbers = (SimpleNamespace(lag=self.lag, walls=self.walls, face_areas=face_areas), numbers)
+        self.pressed = runtime.array(a.vector, *p.pressed.shape)
+        own = SimpleNamespace(lag=self.lag, walls=self.walls, pressed=self.pressed, face_areas=face_areas)
+        self.numbers = (own, numbers)
 
-    def pull_back(self, seed: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(adjoint of u*, of the two rows of lag, of the rows of walls) in float64; adds those of the scene's numbers."""
+    def pull_back(self, seed: np.ndarray) -> tuple[np.ndarray, ...]:
+        """(adjoint of u*, of the two rows of lag, of `pressed`, of the rows of walls) in float64; adds those of the scene's
+        numbers."""
         runtime.fill(self.seed, seed.reshape(-1, *seed.shape[2:]))
-        for target in (self.lag, self.walls):
+        for target in (self.lag, self.walls, self.pressed):
             runtime.fill(target, 0)
         self.run("vjp", adjoint=self.numbers)
         by_u = runtime.fetch_row(self.y, 0)
@@ -102,4 +105,7 @@ class SharesAdjoint(Shares):
             for k in self.reaching:
                 runtime.fill(self.p.w, seed[k, :1])
                 by_u = by_u + self.run_face("vjp", k, adjoint=self.numbers)
-        return by_u, runtime.fetch(self.lag).astype(np.float64), runtime.fetch(self.walls).astype(np.float64).sum(1)
+        by_lag, by_pressed, by_walls = (
+            runtime.fetch(x).astype(np.float64) for x in (self.lag, self.pressed, self.walls)
+        )
+        return by_u, by_lag, by_pressed, by_walls.sum(1)

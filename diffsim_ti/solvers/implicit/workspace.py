@@ -21,6 +21,7 @@ from diffsim_ti.solvers.implicit.newton import Newton
 from diffsim_ti.solvers.implicit.noted import Noted
 from diffsim_ti.solvers.implicit.obstacle_ways import ObstacleWays
 from diffsim_ti.solvers.implicit.preconditioners import BlockJacobi
+from diffsim_ti.solvers.implicit.pressed import Pressed
 from diffsim_ti.solvers.implicit.stage import Stage
 from diffsim_ti.solvers.implicit.threads import one_blas_thread
 from diffsim_ti.state.arrays import History, copy_slot
@@ -56,6 +57,7 @@ class ImplicitWorkspace(ObstacleWays, Noted, GivenInPasses, Workspace):
         if not self._launches.get("potential"):
             self.potential = Potential(self.arrays, self.scene.mesh.tetrahedra, self.parallel, self.pairs)
             self._launches["potential"] = True
+            self.pressed = Pressed(self) if self.potential.presses else None
         a = self.arrays
         self.mass = derived.mass[:, None]
         self.free = (runtime.fetch(a.inverse_mass)[:, None] > 0).astype(np.float64)
@@ -266,6 +268,8 @@ class ImplicitWorkspace(ObstacleWays, Noted, GivenInPasses, Workspace):
         self._walls = self.walls(self.arrays.rows["path"], j, stage)
         self.walls_at_stage, self.walls_before = self._walls[::3].copy(), self._walls[1::3].copy()
         self.potential.begin(u, x, 1 / stage.gamma, self._walls)
+        if self.pressed:
+            self.pressed.begin(u, self._walls)
         self.press(j, stage)
 
     def walls(self, path: np.ndarray | None, j: int, stage: Stage) -> np.ndarray:

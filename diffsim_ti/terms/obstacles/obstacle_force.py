@@ -44,7 +44,7 @@ class ObstacleForce(VertexForce):
     def record(self, parameters, first, X, u):
         """(graph, all numbers, components of u, d, n) at a point."""
         g = Graph(self.fp, parameters)
-        p = [g.leaf(at(parameters, first + k)) for k in range(self.size)]
+        p = [g.leaf(x) for x in self._numbers(parameters, first)]
         rest, moved = ([g.leaf(at(vector, d)) for d in range(3)] for vector in (X, u))
         d, n = self.distance_and_normal(g, p[: self.count], rest, moved)
         return g, p, moved, d, n
@@ -209,13 +209,27 @@ class ObstacleForce(VertexForce):
         vectors = [self._vector(adjoints[k : k + 3]) for k in (0, 3, 6)]
         return (*vectors, adjoints[9], tuple(adjoints[10:]))
 
-    # ---- friction as a force of implicit passes, at the velocity v, with N and n at the displacement u ----------------
+    # ---- friction as a force of implicit passes, at the velocity v, with N and n at the displacement u; where X is None,
+    # u is the normal force N n itself [N] --------------------------------------------------------------------------------
 
     @traced
     def _record_rub(self, parameters, first, X, u, v, wall):
-        g, p, moved, d, n = self.record(parameters, first, X, u)
+        if X is None:
+            g = Graph(self.fp, parameters)
+            p, place = (
+                [g.leaf(x) for x in xs] for xs in (self._numbers(parameters, first), [at(u, d) for d in range(3)])
+            )
+            push = g.sqrt(g.dot(place, place))
+            n = [x / push for x in place]
+        else:
+            g, p, place, d, n = self.record(parameters, first, X, u)
+            push = self._push(g, p, d)
         speed, wall = ([g.leaf(at(vector, d)) for d in range(3)] for vector in (v, wall))
-        return g, p, moved, speed, wall, n, self._push(g, p, d)
+        return g, p, place, speed, wall, n, push
+
+    @traced
+    def _numbers(self, parameters, first):
+        return [at(parameters, first + k) for k in range(self.size)]
 
     @traced
     def dissipation(self, parameters, first, X, u, v, wall):
