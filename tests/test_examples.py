@@ -28,6 +28,13 @@ def test_identify_beam(capsys):
     assert "E = " in capsys.readouterr().out
 
 
+def test_indentation(capsys):
+    numbers = example("identify/indentation").main()
+    assert max(numbers["errors"].values()) < 0.01 and numbers["runs"] <= 10
+    assert max(numbers["spread"]) < 0.01  # standard errors, of numbers in logarithms
+    assert "friction = " in capsys.readouterr().out
+
+
 def test_inverse_rest_shape(capsys):
     numbers = example("design/inverse_rest_shape").main()
     assert numbers["ratio"] >= 100 and numbers["iterations"] <= 6

@@ -110,7 +110,7 @@ class ObstacleShares(ObstaclePotential):
 
 @dataclass(frozen=True)
 class FaceShares(FacePoints):
-    """The same of points within faces, where there is no friction, of one obstacle at a time: number `which`."""
+    """What points within faces push with, of one obstacle at a time: number `which`."""
 
     parallel: bool
 

@@ -1,8 +1,8 @@
 """Find Young's modulus and the coefficient of friction of a soft block from the force on a ball that is pressed in and dragged.
 
-A laboratory records force against displacement. The ball goes down 8 mm, then 8 mm to the side; the force that it feels is
+A laboratory records force against displacement. The ball goes down 8 mm, then 12 mm to the side; the force that it feels is
 `ContactForce`. Its derivatives by both numbers come from tangents, one run each, and SciPy's least squares does the rest,
-in logarithms. Data carry noise of 1 % of the largest force.
+in logarithms. Data carry noise of .2 % of the largest force.
 
     python examples/identify/indentation.py [folder for a picture]
 """
@@ -14,11 +14,13 @@ import numpy as np
 from scipy.optimize import least_squares
 
 import diffsim_ti as ds
+from diffsim_ti import picture
+from diffsim_ti.obstacles import obstacle_surfaces
 
 TRUTH = dict(youngs_modulus=6e4, friction=0.35)  # [Pa], [-]
 GUESS = dict(youngs_modulus=2e4, friction=0.1)
-DOWN, ASIDE, STEPS = 8e-3, 6e-3, 6  # [m], [m], steps of each
-NOISE = 0.01  # of the largest force
+DOWN, ASIDE, STEPS = 8e-3, 12e-3, 8  # [m], [m], steps of each
+NOISE = 0.002  # of the largest force
 
 
 def way(t: float) -> tuple[float, float, float]:
@@ -27,18 +29,20 @@ def way(t: float) -> tuple[float, float, float]:
 
 
 def experiment() -> ds.Rollout:
-    mesh = ds.TetrahedralMesh.create_box((7, 4, 7), size=(0.08, 0.04, 0.08), pattern="five")
+    mesh = ds.TetrahedralMesh.create_box((5, 4, 5), size=(0.08, 0.04, 0.08), pattern="five")
     ball = ds.Sphere(
-        center=(0.04, 0.062, 0.04),
+        center=(0.04, 0.064, 0.04),
         radius=0.02,
-        stiffness_per_area=5e7,
-        width=2e-3,
+        stiffness_per_area=1e7,
+        width=4e-3,
         friction=GUESS["friction"],
-        friction_speed=1e-4,  # of a static run: the way in a step [m] below which it sticks
+        friction_speed=2e-4,  # of a static run: the way in a step [m] below which it sticks
         path=way,
         name="ball",
     )
-    scene = ds.Scene(mesh, ds.StableNeoHookean(GUESS["youngs_modulus"], 0.4), terms=[ball], fixed="ymin", precision="f64")
+    scene = ds.Scene(
+        mesh, ds.StableNeoHookean(GUESS["youngs_modulus"], 0.4), terms=[ball], fixed="ymin", precision="f64"
+    )
     force = ds.ContactForce("ball", name="force")
     return ds.Rollout(ds.StaticSolver(scene), 2 * STEPS, save_every=1, outputs=[force])
 
@@ -63,7 +67,8 @@ def main(folder: str | None = None) -> dict:
     def jacobian(log_numbers):
         frames = runs[-1]
         columns = [
-            -rollout.tangents(frames, **{names[n]: np.exp(x)})["force"].ravel() / noise for n, x in zip(GUESS, log_numbers)
+            -rollout.tangents(frames, **{names[n]: np.exp(x)})["force"].ravel() / noise
+            for n, x in zip(GUESS, log_numbers)
         ]
         return np.stack(columns, 1)
 
@@ -96,14 +101,15 @@ def draw(path: Path, rollout, seen, found, guess) -> None:
         axes[0].plot(steps, seen[:, axis], "o", color=colours[axis], mfc="none", label=f"{said}, measured")
         axes[0].plot(steps, found[:, axis], "-", color=colours[axis], label=f"{said}, found")
         axes[0].plot(steps, guess[:, axis], ":", color=colours[axis], label=f"{said}, guessed")
-    axes[0].set(xlabel=f"step: {STEPS} of {DOWN * 1e3 / STEPS:g} mm down, {STEPS} aside", ylabel="force on the ball [N]")
+    axes[0].set(
+        xlabel=f"step: {STEPS} of {DOWN * 1e3 / STEPS:g} mm down, {STEPS} aside", ylabel="force on the ball [N]"
+    )
     axes[0].legend(fontsize=8)
-    image = path.with_name("indentation_body.png")
     frames = rollout.forward(youngs_modulus=TRUTH["youngs_modulus"], **{"ball.friction": TRUTH["friction"]})
-    ds.picture.save_picture(image, rollout.scene, frames.positions[-1], time=2.0 * STEPS)
-    axes[1].imshow(plt.imread(image))
+    mesh, scene = rollout.scene.mesh, rollout.scene
+    balls = obstacle_surfaces(scene, 2.0 * STEPS)
+    axes[1].imshow(picture.draw(mesh, frames.positions[-1], obstacles=balls, size=(640, 520), elevation=20))
     axes[1].axis("off")
-    image.unlink()
     figure.savefig(path, dpi=120)
     plt.close(figure)
 
