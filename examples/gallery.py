@@ -24,6 +24,7 @@ EXAMPLES = {
     "identify/stiffness_field": ("", "stiffness_field.png"),
     "identify/learned_material": ("", "learned_material.png"),
     "identify/identify_beam": ("output", "identify_beam.png"),
+    "identify/indentation": ("output", "indentation.png"),
     "identify/identify_torch": ("", "identify_both.png"),
     "identify/stiffness_from_picture": ("output", "stiffness_from_picture.png"),
     "identify/train_distributed": ("", "train_distributed.png"),

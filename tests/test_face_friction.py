@@ -47,7 +47,7 @@ def dragged() -> ds.Rollout:
 
 
 def test_gradients_of_forces_and_places():
-    """Reverse, tangent, and differences, where the ball drags the block along; tests/fuzz_gradients.py has the other solvers."""
+    """Reverse, tangent, and differences, where the ball drags the block along; the fuzz has other solvers."""
     rollout = dragged()
     frames, rng = rollout.forward(), np.random.default_rng(0)
     assert np.abs(frames["drag"]).sum() > 0.5

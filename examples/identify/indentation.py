@@ -1,4 +1,4 @@
-"""Find Young's modulus and the coefficient of friction of a soft block from the force on a ball that is pressed in and dragged.
+"""Find Young's modulus and friction of a soft block from the force on a ball that is pressed in and dragged.
 
 A laboratory records force against displacement. The ball goes down 8 mm, then 12 mm to the side; the force that it feels is
 `ContactForce`. Its derivatives by both numbers come from tangents, one run each, and SciPy's least squares does the rest,
