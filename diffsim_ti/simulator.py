@@ -123,6 +123,11 @@ class Simulator:
         arrays, z, S = self.workspace.arrays, self.workspace.state.z, len(self.scene.law.state_names)
         return np.zeros((arrays.num_tetrahedra, 0)) if z is None else arrays.from_blocks(runtime.fetch(z)[0], S)
 
+    @property
+    def values(self) -> dict[str, np.ndarray]:
+        """The values of the scene's inputs, with those that were set since, and of what is given over time, now."""
+        return self.scene.inputs.at_times([self.time]) | self._set
+
     def set_state(self, positions: ArrayLike | None = None, velocities: ArrayLike | None = None) -> None:
         """Put the body elsewhere: positions [m], velocities [m/s], shape (num_vertices, 3); None leaves a part as it is.
 
@@ -153,9 +158,8 @@ class Simulator:
             )
         if forces.shape != given.shape or not np.all(np.isfinite(forces)):
             raise ValueError(f"forces: expected finite numbers of shape {given.shape}, got shape {forces.shape}")
-        if self.scene.inputs.sums_loads:  # with others, when a step is loaded
-            self._set[self.scene.input_names(term)["external_forces"]] = forces
-        else:
+        self._set[self.scene.input_names(term)["external_forces"]] = forces
+        if not self.scene.inputs.sums_loads:  # else with others, when a step is loaded
             self.workspace.arrays.load_rows(forces=forces[None])
 
     @property

@@ -47,6 +47,7 @@ class Output(ABC):
     """
 
     name: str
+    unit = ""  # for pictures
     reads_contact_forces = False  # whether runs must note frames.contact_forces for it
 
     def settled(self, scene: "Scene") -> "Output":

@@ -9,7 +9,10 @@ from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.obstacles import floor_of, obstacle_surfaces
 from diffsim_ti.scene import Scene
 from diffsim_ti.simulator import Simulator
+from diffsim_ti.terms.marks import Mark
 from diffsim_ti.terms.obstacles.shapes import Triangles
+from diffsim_ti.visual.fields import FIELDS
+from diffsim_ti.visual.scene_marks import marks_of
 
 if TYPE_CHECKING:
     from diffsim_ti.rollout.frames import Frames
@@ -17,17 +20,23 @@ if TYPE_CHECKING:
 
 @dataclass
 class Setting:
-    """What all frames share: the mesh at rest, the floor's height [m], fixed vertices, obstacles as they first stand."""
+    """What all frames share: the mesh at rest, the floor's height [m], fixed vertices, obstacles as they first stand.
+
+    held: of fixed vertices the projectors onto the directions in which each is held, shape (len(fixed), 3, 3), where some
+    are held in some directions alone; else None.
+    """
 
     mesh: TetrahedralMesh
     ground: float | None = None
     fixed: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
     obstacles: list[Triangles] = field(default_factory=list)
+    held: np.ndarray | None = None
 
     @classmethod
     def of(cls, scene: Scene) -> "Setting":
         """A scene's."""
-        return cls(scene.mesh, floor_of(scene), scene.held, obstacle_surfaces(scene))
+        held = scene.supports.held if len(scene.supports.guided) else None
+        return cls(scene.mesh, floor_of(scene), scene.held, obstacle_surfaces(scene), held)
 
 
 @dataclass
@@ -37,7 +46,8 @@ class Frame:
     time [s]; positions, displacements [m], velocities [m/s]: shape (num_vertices, 3).
     fields: numbers to colour by, one per vertex or per tetrahedron, under the names in fields.py: "displacement" [m],
     "speed" [m/s], "von_mises" [Pa], "energy_density" [J/m^3], "J" [-] ...
-    obstacles: points of each obstacle [m], or None where the setting has them.
+    obstacles: points of each obstacle [m], or None where the setting has them. marks: arrows, lines and points that show
+    the scene's terms (scene_marks.py). units: {name of a field: its unit}, where known.
     """
 
     time: float
@@ -46,19 +56,39 @@ class Frame:
     velocities: np.ndarray
     fields: dict[str, np.ndarray]
     obstacles: list[np.ndarray] | None = None
+    marks: list[Mark] = field(default_factory=list)
+    units: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def colours(self) -> dict[str, np.ndarray]:
+        """The fields that pictures can be coloured by."""
+        return {name: values for name, values in self.fields.items() if name in FIELDS}
 
     @classmethod
     def of_run(cls, scene: Scene, frames: "Frames", k: int) -> "Frame":
         """Frame k of a Rollout's run of a scene; its fields are the outputs that each vertex or each tetrahedron has:
-        vectors such as ContactForce(per_vertex=True), tensors and principal values such as Stress(at="vertices").
+        vectors such as ContactForce(per_vertex=True), tensors and principal values such as Stress(at="vertices"). What some
+        vertices have, such as Reaction(per_vertex=True), is zero at the others.
 
         Raises IndexError for a frame that there is not.
         """
         u, v = frames.displacements[k], frames.velocities[k]
         fields = dict(displacement=np.linalg.norm(u, axis=1), speed=np.linalg.norm(v, axis=1))
         sizes = scene.mesh.num_vertices, scene.mesh.num_tetrahedra
-        shown = {name: y[k] for name, y in frames.outputs.items() if y.ndim > 2 and y.shape[1] in sizes}
-        return cls(float(frames.times[k]), frames.positions[k], u, v, fields | shown)
+        shown, units = {}, {}
+        for name, y in frames.outputs.items():
+            output = frames.computed.get(name)
+            places = getattr(output, "vertices", None)
+            if y.ndim > 2 and y.shape[1] in sizes:
+                shown[name] = y[k]
+            elif y.ndim > 1 and places is not None and y.shape[1] == len(places):
+                shown[name] = np.zeros((sizes[0], *y.shape[2:]), y.dtype)
+                shown[name][places] = y[k]
+            units[name] = getattr(output, "unit", "")
+        step = int(frames.steps[k])
+        drawn = marks_of(scene, frames.positions[k], float(frames.times[k]), step, frames.inputs)
+        moved = [points for points, _ in obstacle_surfaces(scene, float(frames.times[k]))] if scene.moving else None
+        return cls(float(frames.times[k]), frames.positions[k], u, v, fields | shown, moved, drawn, units)
 
     @classmethod
     def of(cls, simulator: Simulator, **more) -> "Frame":
@@ -68,4 +98,6 @@ class Frame:
         fields = dict(displacement=np.linalg.norm(u, axis=1), speed=np.linalg.norm(v, axis=1))
         fields |= {name: getattr(measured, name) for name in ("von_mises", "energy_density", "J")}
         moved = [points for points, _ in obstacle_surfaces(scene, simulator.time)] if scene.moving else None
-        return cls(simulator.time, simulator.positions, u, v, fields, moved, **more)
+        x, values = simulator.positions, simulator.values
+        drawn = marks_of(scene, x, simulator.time, simulator.step_count, values)
+        return cls(simulator.time, x, u, v, fields, moved, **dict(marks=drawn) | more)
