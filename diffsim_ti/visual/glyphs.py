@@ -59,7 +59,7 @@ def glyphs(
             out.append(marks(mark.points, camera, size, 0.006 * size[1], near, colour))
             continue
         both = ends(mark, scale, length)
-        radius = (0.03 if isinstance(mark, Arrows) else 0.035) * length
+        radius = (0.04 if isinstance(mark, Arrows) else 0.05) * length
         long = np.linalg.norm(both[:, 1] - both[:, 0], axis=1)
         both, long = both[long > 1e-3 * length], long[long > 1e-3 * length]
         if isinstance(mark, Arrows):
