@@ -20,7 +20,8 @@ AREAS = {
     "self-contact": "self_contact self_contact_implicit self_contact_near self_contact_pairs",
     "PyTorch, optimisations": "torch torch_physics torch_solvers seed_snippets optimization",
     "charts, maps, advice": "study study_stability peers",
-    "pictures, films, the window": "picture_drawing picture_film marks optimization_picture writers viewer viewer_window gallery",
+    "pictures, films, the window": "picture_drawing picture_film marks "
+    "optimization_picture writers viewer viewer_window gallery",
     "examples and pages": "examples contact_examples static_examples torch_examples readme",
     "command line, resources, backends": "cli strength layout resources devices launch executed_ptx single_precision",
 }
