@@ -12,7 +12,7 @@ AREAS = {
     "motion against closed forms": "reference_motion step_limit energy_watch hertz torture",
     "every adjoint, order, fuzz": "every_adjoint term_order gradient_fuzz",
     "gradients": "gradients gradient_clip gradient_faults checkpoints tape outputs "
-    "contact_force reaction tensor_outputs modes identification",
+    "contact_force reaction tensor_outputs work modes identification",
     "implicit steps and equilibria": "implicit implicit_gradients implicit_contact swept solve_report",
     "patches against locking": "locking",
     "obstacles and friction": "contact contact_area contact_faces contact_stage contact_crossing contact_friction "

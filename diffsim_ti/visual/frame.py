@@ -1,5 +1,6 @@
 """A moment of a run, and what all of its moments share: what writers, films and windows are given."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -7,6 +8,7 @@ import numpy as np
 
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.obstacles import floor_of, obstacle_surfaces
+from diffsim_ti.outputs import Output
 from diffsim_ti.scene import Scene
 from diffsim_ti.simulator import Simulator
 from diffsim_ti.terms.marks import Mark
@@ -74,25 +76,19 @@ class Frame:
         """
         u, v = frames.displacements[k], frames.velocities[k]
         fields = dict(displacement=np.linalg.norm(u, axis=1), speed=np.linalg.norm(v, axis=1))
-        sizes = scene.mesh.num_vertices, scene.mesh.num_tetrahedra
-        shown, units = {}, {}
-        for name, y in frames.outputs.items():
-            output = frames.computed.get(name)
-            places = getattr(output, "vertices", None)
-            if y.ndim > 2 and y.shape[1] in sizes:
-                shown[name] = y[k]
-            elif y.ndim > 1 and places is not None and y.shape[1] == len(places):
-                shown[name] = np.zeros((sizes[0], *y.shape[2:]), y.dtype)
-                shown[name][places] = y[k]
-            units[name] = getattr(output, "unit", "")
+        given = [(name, frames.computed.get(name), y[k]) for name, y in frames.outputs.items()]
+        shown, units = _of_items(given, scene)
         step = int(frames.steps[k])
         drawn = marks_of(scene, frames.positions[k], float(frames.times[k]), step, frames.inputs)
         moved = [points for points, _ in obstacle_surfaces(scene, float(frames.times[k]))] if scene.moving else None
         return cls(float(frames.times[k]), frames.positions[k], u, v, fields | shown, moved, drawn, units)
 
     @classmethod
-    def of(cls, simulator: Simulator, **more) -> "Frame":
-        """The present state of a simulator, in its scene's precision. more: further arguments of the class."""
+    def of(cls, simulator: Simulator, outputs: Iterable[Output] = (), last: Simulator | None = None, **more) -> "Frame":
+        """The present state of a simulator, in its scene's precision. more: further arguments of the class.
+
+        outputs: become fields as in `of_run`; last: the simulator that took the last step to this state, if another did.
+        """
         u, v, scene = simulator.displacements, simulator.velocities, simulator.scene
         measured = simulator.tetrahedron_fields()
         fields = dict(displacement=np.linalg.norm(u, axis=1), speed=np.linalg.norm(v, axis=1))
@@ -100,4 +96,21 @@ class Frame:
         moved = [points for points, _ in obstacle_surfaces(scene, simulator.time)] if scene.moving else None
         x, values = simulator.positions, simulator.values
         drawn = marks_of(scene, x, simulator.time, simulator.step_count, values)
-        return cls(simulator.time, x, u, v, fields, moved, **dict(marks=drawn) | more)
+        by = last or simulator
+        shown, units = _of_items([(output.name, by.settled(output), by.output(output)) for output in outputs], scene)
+        return cls(simulator.time, x, u, v, fields | shown, moved, **dict(marks=drawn, units=units) | more)
+
+
+def _of_items(values: Iterable[tuple], scene: Scene) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    """Of (name, settled output or None, its value at a moment) what each vertex or tetrahedron has, and units. What some
+    vertices have, those that the output names as its `vertices`, is zero at the others."""
+    shown, units, n = {}, {}, scene.mesh.num_vertices
+    for name, output, y in values:
+        units[name], places = getattr(output, "unit", ""), getattr(output, "vertices", None)
+        y = np.asarray(y)
+        if (y.ndim > 1 or getattr(output, "per_item", False)) and y.shape[0] in (n, scene.mesh.num_tetrahedra):
+            shown[name] = y
+        elif y.ndim and places is not None and getattr(output, "per_vertex", False):
+            shown[name] = np.zeros((n, *y.shape[1:]), y.dtype)
+            shown[name][places] = y
+    return shown, units
