@@ -141,6 +141,12 @@ class Simulator:
         """The values of the scene's inputs, with those that were set since, and of what is given over time, now."""
         return self.scene.inputs.at_times([self.time]) | self._set
 
+    @property
+    def values_of_step(self) -> dict[str, np.ndarray]:
+        """The values of the scene's inputs in the last step, or in the first before it is taken, as a run of one step has
+        them; those that were set since the start included."""
+        return self.scene.inputs.at_step(max(self.step_count - 1, 0), self.solver.dt, self._set)
+
     def output(self, output: Output) -> np.ndarray:
         """Value of an output such as `Reaction("left")` or `Stress()` at the present state, as a Rollout's frame has it.
 
@@ -154,7 +160,7 @@ class Simulator:
         frames = Frames(
             self.positions[None], self.velocities[None], self.displacements[None], np.array([self.time]), {}
         )
-        frames.inputs = self.scene.inputs.at_step(max(self.step_count - 1, 0), self.solver.dt, self._set)
+        frames.inputs = self.values_of_step
         frames.steps = np.array([self.step_count])
         if self._notes:
             frames.contact_forces = self.workspace.contact_forces(self.solver.dt)[1:]

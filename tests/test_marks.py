@@ -174,6 +174,18 @@ def test_a_series_keeps_supports_loads_and_results(loaded, tmp_path):
     assert not np.array_equal(imread(tmp_path / "run.png"), imread(tmp_path / "bare.png"))
 
 
+def test_forces_of_loads_are_a_field(loaded):
+    """What they sum up to: traction times area at rest, pressure on the top as it is."""
+    scene, frames = loaded
+    forces, x = Frame.of_run(scene, frames, 2).fields["loads"], frames.positions[2]
+    top = scene.mesh.surface_triangles[scene.mesh.surface_indices("ymax")]
+    pushed = -200.0 * np.cross(x[top[:, 1]] - x[top[:, 0]], x[top[:, 2]] - x[top[:, 0]]).sum(0) / 2
+    assert forces.sum(0) == pytest.approx(np.array([0, -300.0 * 0.2**2, 0]) + pushed, rel=1e-12, abs=1e-12)
+    simulator = ds.Simulator(ds.SemiImplicitSolver(scene, dt=1e-4))
+    simulator.run(4)
+    assert Frame.of(simulator).fields["loads"] == pytest.approx(forces, rel=1e-12)
+
+
 def test_the_command_draws_arrows(loaded, tmp_path, capsys):
     scene, frames = loaded
     with open_writer(tmp_path / "run.pvd", scene) as series:

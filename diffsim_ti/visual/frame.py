@@ -9,6 +9,7 @@ import numpy as np
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.obstacles import floor_of, obstacle_surfaces
 from diffsim_ti.outputs import Output
+from diffsim_ti.outputs.given_loads import GivenLoads
 from diffsim_ti.scene import Scene
 from diffsim_ti.simulator import Simulator
 from diffsim_ti.terms.marks import Mark
@@ -47,7 +48,8 @@ class Frame:
 
     time [s]; positions, displacements [m], velocities [m/s]: shape (num_vertices, 3).
     fields: numbers to colour by, one per vertex or per tetrahedron, under the names in fields.py: "displacement" [m],
-    "speed" [m/s], "von_mises" [Pa], "energy_density" [J/m^3], "J" [-] ...
+    "speed" [m/s], "von_mises" [Pa], "energy_density" [J/m^3], "J" [-] ...; where the scene has loads, "loads" [N]: what
+    tractions, pressures, body and external forces do to each vertex, shape (num_vertices, 3).
     obstacles: points of each obstacle [m], or None where the setting has them. marks: arrows, lines and points that show
     the scene's terms (scene_marks.py). units: {name of a field: its unit}, where known.
     """
@@ -79,6 +81,7 @@ class Frame:
         given = [(name, frames.computed.get(name), y[k]) for name, y in frames.outputs.items()]
         shown, units = _of_items(given, scene)
         step = int(frames.steps[k])
+        shown |= _loads(scene, frames.positions[k], step, frames.inputs)
         drawn = marks_of(scene, frames.positions[k], float(frames.times[k]), step, frames.inputs)
         moved = [points for points, _ in obstacle_surfaces(scene, float(frames.times[k]))] if scene.moving else None
         return cls(float(frames.times[k]), frames.positions[k], u, v, fields | shown, moved, drawn, units)
@@ -98,13 +101,14 @@ class Frame:
         drawn = marks_of(scene, x, simulator.time, simulator.step_count, values)
         by = last or simulator
         shown, units = _of_items([(output.name, by.settled(output), by.output(output)) for output in outputs], scene)
+        shown |= _loads(scene, x, simulator.step_count, simulator.values_of_step)
         return cls(simulator.time, x, u, v, fields | shown, moved, **dict(marks=drawn, units=units) | more)
 
 
 def _of_items(values: Iterable[tuple], scene: Scene) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     """Of (name, settled output or None, its value at a moment) what each vertex or tetrahedron has, and units. What some
     vertices have, those that the output names as its `vertices`, is zero at the others."""
-    shown, units, n = {}, {}, scene.mesh.num_vertices
+    shown, units, n = {}, {"loads": "N"}, scene.mesh.num_vertices
     for name, output, y in values:
         units[name], places = getattr(output, "unit", ""), getattr(output, "vertices", None)
         y = np.asarray(y)
@@ -114,3 +118,11 @@ def _of_items(values: Iterable[tuple], scene: Scene) -> tuple[dict[str, np.ndarr
             shown[name] = np.zeros((n, *y.shape[1:]), y.dtype)
             shown[name][places] = y
     return shown, units
+
+
+def _loads(scene: Scene, positions: np.ndarray, step: int, values: dict) -> dict[str, np.ndarray]:
+    """{"loads": forces of loads on each vertex}, of the step that ends there; nothing in a scene without."""
+    if not scene.dead_loads and not scene.pressures:
+        return {}
+    forces = GivenLoads(scene, weight=False).forces
+    return {"loads": forces(scene.inputs.derive(values), positions.astype(np.float64), step)}
