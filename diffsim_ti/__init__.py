@@ -20,6 +20,7 @@ from diffsim_ti.monitor.energy_watch import EnergyGained
 from diffsim_ti.monitor.guard import Crossing, Divergence
 from diffsim_ti.outputs import (
     ContactForce,
+    ContactTraction,
     ElasticEnergy,
     EnclosedVolume,
     KineticEnergy,
@@ -27,6 +28,7 @@ from diffsim_ti.outputs import (
     Reaction,
     Strain,
     Stress,
+    WorkOfLoads,
 )
 from diffsim_ti.rollout import Frames, Rollout
 from diffsim_ti.runtime import init
@@ -105,6 +107,7 @@ __all__ = [
     "Frames",
     "MaterialPoints",
     "ContactForce",
+    "ContactTraction",
     "Reaction",
     "Stress",
     "Strain",
@@ -116,4 +119,5 @@ __all__ = [
     "taylor_test",
     "dot_product_test",
     "check_gradients",
+    "WorkOfLoads",
 ]

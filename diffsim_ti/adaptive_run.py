@@ -12,6 +12,7 @@ from diffsim_ti import runtime
 from diffsim_ti.contact.surface_pairs import Overlap
 from diffsim_ti.monitor.quantities import Energy
 from diffsim_ti.monitor.stability import lanczos_limit
+from diffsim_ti.outputs import Output
 from diffsim_ti.progress import progress
 from diffsim_ti.scene import Scene
 from diffsim_ti.simulator import Simulator
@@ -79,13 +80,22 @@ class ForwardRun:
 
     Raises ValueError for a body that no step saves (strength.py), naming what would.
 
+    outputs: what frames shall have besides, such as Reaction(per_vertex=True); contact forces are those of the last part.
     driven: whether something outside may add energy, which is then no sign of a bad step. before_part: called before each
     part, for instance to change forces.
     """
 
     parts, attempts = 16, 7  # per frame; per part
 
-    def __init__(self, scene: Scene, solver_class: type[Solver], frame_time: float, dt: float | None = None, **options):
+    def __init__(
+        self,
+        scene: Scene,
+        solver_class: type[Solver],
+        frame_time: float,
+        dt: float | None = None,
+        outputs: Sequence[Output] = (),
+        **options,
+    ):
         check_strength(scene)
         self.scene, self.seen, self.adapts = scene, Seen(), dt is None
         self.driven = scene.motion is not None or bool(scene.moving) or bool(scene.pressures)
@@ -108,7 +118,9 @@ class ForwardRun:
             )  # dt and the time both stay as asked
             steps //= self.parts
             solver = solver_class(scene, dt=steps * dt, substeps=steps, **options)
-        self.simulator = Simulator(solver)
+        self.outputs = tuple(outputs)
+        self._noted = dict(contact_forces=any(output.reads_contact_forces for output in self.outputs))
+        self.simulator = self._last = Simulator(solver, **self._noted)
         self.frame_time = self.parts * solver.dt
         ws = self.simulator.workspace
         self._start = ws.history(1)
@@ -134,6 +146,7 @@ class ForwardRun:
         for part in range(self.parts):
             if self.before_part is not None:
                 self.before_part()
+            self._last = self.simulator
             if self.adapts:
                 self._advance_part(last=part == self.parts - 1)
             else:
@@ -141,6 +154,10 @@ class ForwardRun:
             self._look()
         self.energies.append(self._energy)
         self.seen.seconds += time.perf_counter() - begin
+
+    def frame(self) -> Frame:
+        """The present moment, with the outputs."""
+        return Frame.of(self.simulator, self.outputs, self._last)
 
     def _advance_part(self, last: bool) -> None:
         sim, first = self.simulator, self.simulator.step_count
@@ -176,7 +193,7 @@ class ForwardRun:
         if self.scene.law.reads != ("H",):  # what implicit solvers do not know
             return False
         if self._implicit is None:
-            self._implicit = Simulator(ImplicitEulerSolver(self.scene, dt=sim.solver.dt))
+            self._implicit = Simulator(ImplicitEulerSolver(self.scene, dt=sim.solver.dt), **self._noted)
         other = self._implicit
         if self.scene.term(ExternalForce) is not None:
             runtime.fill(other.workspace.arrays.forces, runtime.fetch(sim.workspace.arrays.forces))
@@ -192,6 +209,7 @@ class ForwardRun:
             self.seen.retries.append(f"t = {sim.time:.4g} s: {why}; this part by {substeps} steps of implicit Euler")
             hand_on(other, sim)
             sim.step_count += 1
+            self._last = other
             self._limit = self._stable_dt()
             return True
         return False
@@ -297,7 +315,7 @@ def run_and_write(
                 if k:
                     run.advance()
                 begin = time.perf_counter()
-                frame = Frame.of(run.simulator)
+                frame = run.frame()
                 for writer in writers:
                     writer.write(frame)
                 writing += time.perf_counter() - begin

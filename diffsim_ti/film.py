@@ -9,9 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.terms.marks import Mark
 from diffsim_ti.terms.obstacles.shapes import Triangles
 from diffsim_ti.visual.colouring import Colouring, to_vertices
 from diffsim_ti.visual.drawing import Drawing
+from diffsim_ti.visual.glyphs import arrow_length, ends, longest
 from diffsim_ti.visual.series import SavedSeries
 from diffsim_ti.writers import View, writer_for
 from diffsim_ti.writers.film import check_film, encoder
@@ -31,6 +33,7 @@ def render_series(
     backend: str = "auto",
     say: Callable[[str], object] | None = None,
     wireframe: bool = False,
+    arrows: Sequence[str] = (),
 ) -> int:
     """Write every frame of a .pvd series into `output`, in the format of its suffix (writers/); the number written.
 
@@ -38,7 +41,8 @@ def render_series(
     colour: a name in visual/fields.py; fps: frames per second of the film (a GIF keeps time in steps of 10 ms); size:
     pixels, even for .mp4; ground: height of a floor to draw [m], default the run's own, if it had one; azimuth, elevation
     of the eye [degrees]; backend: "auto", "vulkan" or "software"; say: told once which draws; wireframe: draw edges.
-    Obstacles and fixed vertices are those that the series holds.
+    arrows: point data of the series that are vectors, such as forces, to draw as arrows.
+    Obstacles, supports, loads and other marks are those that the series holds.
     Raises ValueError for bad arguments or an empty series, RuntimeError if MP4's encoder is not installed.
     """
     view = View(
@@ -51,6 +55,7 @@ def render_series(
         wireframe=wireframe,
         backend=backend,
         say=say,
+        arrows=tuple(arrows),
     )
     writer, saved = writer_for(output, view), SavedSeries(series)
     writer.open(saved.setting)
@@ -72,13 +77,15 @@ def save_film(
     label: str = "",
     limits: tuple[float, float] | None = None,
     box: np.ndarray | None = None,
+    marks: Sequence[Sequence[Mark]] | None = None,
     **look,
 ) -> int:
     """Draw states of a body into `path` (.mp4, .gif), or the last one (.png); the number drawn.
 
     positions: shape (n, num_vertices, 3) [m]; values: shape (n, m), per vertex or tetrahedron, coloured as in `save_picture`
     with one scale for all; obstacles: n lists of (points, triangles), which may move but not change; title: k -> text;
-    box, shape (2, 3) [m]: what to frame, default all positions; look: what else `Drawing` takes.
+    box, shape (2, 3) [m]: what to frame, default all positions;
+    marks: n lists, as `save_picture` takes them; look: what else `Drawing` takes.
     Raises ValueError for bad arguments, RuntimeError if MP4's encoder is not installed.
     """
     path, positions = Path(path), np.asarray(positions, np.float64)
@@ -86,22 +93,26 @@ def save_film(
         raise ValueError(f"output: must end in {', '.join(KINDS)}, got {path.name!r}; rename it")
     View(fps=fps, size=tuple(size))  # raises what does not fit
     check_film(path, size)
-    for name, rows in (("values", values), ("obstacles", obstacles)):
+    for name, rows in (("values", values), ("obstacles", obstacles), ("marks", marks)):
         if rows is not None and len(rows) != len(positions):
             raise ValueError(f"{name}: must be given for each of the {len(positions)} frames, got {len(rows)}")
     if values is not None:
         values = [to_vertices(mesh, row) for row in values]
         shown = np.stack(values)[:, mesh.surface_vertices]
         look["colouring"] = Colouring.of(shown, label, limits, look.pop("colours", None))
-    seen = positions[:, mesh.surface_vertices]
-    box = np.stack([seen.min((0, 1)), seen.max((0, 1))]) if box is None else box
+    drawn = [mark for row in marks or () for mark in row]
+    scale, length = longest(drawn), arrow_length(mesh)
+    around = [ends(mark, scale, length).reshape(-1, 3) for mark in drawn]
+    seen = np.concatenate([positions[:, mesh.surface_vertices].reshape(-1, 3), *around])
+    box = np.stack([seen.min(0), seen.max(0)]) if box is None else box
     drawing = Drawing(mesh, size, obstacles=obstacles[0] if obstacles else (), box=box, **look)
+    drawing.scale = scale
     frames = range(len(positions))[-1:] if path.suffix == ".png" else range(len(positions))
     path.parent.mkdir(parents=True, exist_ok=True)
     with drawing, encoder(path, fps) as writer:
         for k in frames:
             around = [points for points, _ in obstacles[k]] if obstacles else None
-            writer.append_data(
-                drawing.image(positions[k], None if values is None else values[k], title(k) if title else "", around)
-            )
+            own = None if values is None else values[k]
+            words = title(k) if title else ""
+            writer.append_data(drawing.image(positions[k], own, words, around, marks[k] if marks else ()))
     return len(frames)

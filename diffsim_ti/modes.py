@@ -89,11 +89,29 @@ def _slope(body: BodyForces, u: np.ndarray, phi: np.ndarray, derived):
     return total, by_u
 
 
+def free_directions(scene: "Scene"):
+    """An orthonormal basis of the motions that supports leave, as columns of a SciPy CSC matrix, (3 num_vertices, k); each
+    moves one vertex."""
+    from scipy.sparse import csc_matrix
+
+    held = np.zeros((scene.mesh.num_vertices, 3, 3))
+    held[scene.held] = scene.supports.held
+    values, vectors = np.linalg.eigh(held)  # of a vertex that is free or held wholly, the axes
+    vertex, which = np.nonzero(values < 0.5)
+    rows = 3 * vertex[:, None] + np.arange(3)
+    columns = np.repeat(np.arange(len(vertex)), 3)
+    shape = 3 * scene.mesh.num_vertices, len(vertex)
+    out = csc_matrix((vectors[vertex, :, which].ravel(), (rows.ravel(), columns)), shape=shape)
+    out.eliminate_zeros()
+    return out
+
+
 def modes(scene: "Scene", k: int, displacements: ArrayLike | None = None) -> Modes:
     """The k lowest modes of small vibrations of a body about a state: K phi = lambda M phi, f = sqrt(lambda) / 2 pi.
 
     K: `scene.stiffness_matrix(displacements)`, of the body's stress at displacements [m] from the rest shape, default none;
-    M: `scene.mass_matrix()`, lumped; fixed vertices do not move, and what presses or loads the body is not in K.
+    M: `scene.mass_matrix()`, lumped; vertices do not move where they are held, and what presses or loads the body is
+    not in K.
     A body that is not fixed has six frequencies of 0, its rigid motions, with k counting them. Everything is in float64.
 
     Raises ValueError for k outside 1 .. the number of free unknowns, shapes that do not fit, or a law with rates or a state.
@@ -106,17 +124,15 @@ def modes(scene: "Scene", k: int, displacements: ArrayLike | None = None) -> Mod
     if scene.precision != "f64":
         scene = scene.replace(precision="f64")
     u = scene.checked_displacements(displacements)
-    free = np.ones((scene.mesh.num_vertices, 3), bool)
-    free[scene.fixed] = False
-    keep = np.flatnonzero(free.ravel())
-    if int(k) != k or not 1 <= k <= len(keep):
-        raise ValueError(f"modes: k must be a whole number of 1 .. {len(keep)}, the free unknowns, got {k}")
+    free = free_directions(scene)
+    count = free.shape[1]
+    if int(k) != k or not 1 <= k <= count:
+        raise ValueError(f"modes: k must be a whole number of 1 .. {count}, the free unknowns, got {k}")
     k = int(k)
-    mass = scene.mass_matrix().diagonal()[keep]
-    scale = 1 / np.sqrt(mass)
-    K = scene.stiffness_matrix(u)[keep][:, keep]
+    scale = 1 / np.sqrt(abs(free).T.power(2) @ scene.mass_matrix().diagonal())
+    K = free.T @ scene.stiffness_matrix(u) @ free
     A = diags(scale) @ (0.5 * (K + K.T)) @ diags(scale)
-    if len(keep) <= DENSE or 3 * k >= len(keep):
+    if count <= DENSE or 3 * k >= count:
         values, vectors = eigh(A.toarray(), subset_by_index=[0, k - 1])
         size = float(abs(A).sum(1).max())
     else:
@@ -125,8 +141,7 @@ def modes(scene: "Scene", k: int, displacements: ArrayLike | None = None) -> Mod
         order = np.argsort(values)
         values, vectors = values[order], vectors[:, order]
     values = np.where(np.abs(values) < 1e-13 * size, 0.0, values)
-    shapes = np.zeros((k, free.size))
-    shapes[:, keep] = (vectors * scale[:, None]).T
+    shapes = (free @ (vectors * scale[:, None])).T
     frequencies = np.sign(values) * np.sqrt(np.abs(values)) / (2 * np.pi)
     groups = [[0]]
     for i in range(1, k):

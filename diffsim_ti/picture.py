@@ -1,13 +1,19 @@
 """A PNG of a body in one call; `drawing.Drawing` draws many."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.terms.marks import Arrows, Lines, Mark, Points, arrows
 from diffsim_ti.visual.colouring import Colouring, to_vertices
 from diffsim_ti.visual.drawing import Drawing
+from diffsim_ti.visual.glyphs import arrow_length, ends, longest
+from diffsim_ti.visual.scene_marks import marks_of
+
+__all__ = ["Arrows", "Lines", "Points", "arrows", "draw", "marks_of", "save_picture"]
 
 
 def draw(
@@ -24,6 +30,7 @@ def draw(
     label: str = "",
     title: str = "",
     backend: str = "software",
+    marks: Sequence[Mark] = (),
     **view,
 ) -> np.ndarray:
     """The picture as RGB in [0, 1], shape (height, width, 3); arguments as in `save_picture`."""
@@ -34,6 +41,8 @@ def draw(
     shown = np.asarray(positions, np.float64)
     if box is None and shown.shape == mesh.vertices.shape and np.all(np.isfinite(shown)):
         shown = shown[mesh.surface_vertices]
+        scale, length = longest(marks), arrow_length(mesh)
+        shown = np.concatenate([shown, *(ends(mark, scale, length).reshape(-1, 3) for mark in marks)])
         box = np.stack([shown.min(0), shown.max(0)])
     with Drawing(
         mesh,
@@ -46,7 +55,7 @@ def draw(
         backend=backend,
         **view,
     ) as drawing:
-        return drawing.image(positions, values, title) / 255
+        return drawing.image(positions, values, title, drawn=marks) / 255
 
 
 def save_picture(
@@ -65,7 +74,10 @@ def save_picture(
     values: per tetrahedron (averaged to vertices) or per vertex, shown in colour with a bar named `label`; limits: what
     the colours span, default zero (or the smallest value, if negative) to the 99.5th percentile of the surface.
     ground: height of a floor to draw [m]. view: what `Drawing` takes (box to fit, default the body's; size; azimuth,
-    elevation; obstacles, fixed, wireframe, backend, by default the one that needs no Vulkan), colours, a matplotlib map.
+    elevation; obstacles, fixed, held, wireframe, backend, by default the one that needs no Vulkan), colours, a matplotlib
+    map, and marks: arrows, lines and points, with a key: `marks_of(scene, positions)` are those of a scene's loads,
+    `arrows("reaction [N]", mesh, positions, vertices, forces)` those of a result. `fixed=scene.held` and
+    `held=scene.supports.held` show supports.
     The folder is made if there is none. Raises ValueError for shapes that do not fit.
     """
     from PIL import Image

@@ -9,6 +9,8 @@ from diffsim_ti import runtime
 from diffsim_ti.monitor import quantities
 from diffsim_ti.monitor.guard import Guard
 from diffsim_ti.monitor.quantities import Energy, TetrahedronFields
+from diffsim_ti.outputs import Output
+from diffsim_ti.rollout.frames import Frames
 from diffsim_ti.state.solve_report import SolveReport
 from diffsim_ti.state.watch import ContactResolution
 from diffsim_ti.terms import ExternalForce
@@ -17,14 +19,15 @@ from diffsim_ti.terms import ExternalForce
 class Simulator:
     """Advances a scene step by step and shows its state.
 
-    `Simulator(solver)`, or, for a solver made without a scene, `Simulator(mesh, material, solver)`.
+    `Simulator(solver)`, or, for a solver made without a scene, `Simulator(mesh, material, solver)`. contact_forces: note in
+    each step what obstacles do, for `output(ContactForce(...))`.
 
     positions, displacements [m] and velocities [m/s] are NumPy copies of shape (num_vertices, 3) in the scene's
     precision; time [s] and step_count say where it is. A run that goes wrong raises Divergence (a FloatingPointError)
     and leaves the state before the step that failed.
     """
 
-    def __init__(self, *arguments):
+    def __init__(self, *arguments, contact_forces: bool = False):
         solver = arguments[-1]
         if len(arguments) == 3:
             solver.bind(arguments[0], arguments[1])
@@ -38,6 +41,10 @@ class Simulator:
         solver.simulator = weakref.ref(self)
         self._start = solver.start_values()
         self.workspace = solver.workspace(self._start)
+        self._notes, self._settled = bool(contact_forces), {}
+        if contact_forces:
+            self.workspace.make_frames(2)
+            self.workspace.record_contacts()
         self._guard = Guard(self.workspace)
         self._before = self.workspace.history(1)
         self.reset()
@@ -48,6 +55,8 @@ class Simulator:
         self._set: dict[str, np.ndarray] = {}  # inputs that were set since
         self.workspace.load(self._start)
         self.workspace.report.clear()
+        if self._notes:
+            self.workspace.forget_contacts()
         if self._start.forces is not None and len(self._start.forces) == 1:
             self.workspace.arrays.load_rows(forces=self._start.forces)  # set_forces may have changed them
 
@@ -62,11 +71,15 @@ class Simulator:
         self.workspace.first_step = self.step_count
         passes = self.solver.num_passes(1)
         self.workspace.save(self._before, 0)
+        if self._notes:
+            self.workspace.forget_contacts()
         try:
             with self.workspace.report.of_passes(passes):
-                self._guard.advance(0, passes, passes)
+                self._guard.advance(0, passes, passes, self.solver.substeps if self._notes else 0)
         except FloatingPointError:
             self.workspace.restore(self._before, 0)
+            if self._notes:
+                self.workspace.forget_contacts()
             raise
         self.step_count += 1
         self.workspace.place_obstacles(self.solver.substeps)
@@ -123,6 +136,42 @@ class Simulator:
         arrays, z, S = self.workspace.arrays, self.workspace.state.z, len(self.scene.law.state_names)
         return np.zeros((arrays.num_tetrahedra, 0)) if z is None else arrays.from_blocks(runtime.fetch(z)[0], S)
 
+    @property
+    def values(self) -> dict[str, np.ndarray]:
+        """The values of the scene's inputs, with those that were set since, and of what is given over time, now."""
+        return self.scene.inputs.at_times([self.time]) | self._set
+
+    @property
+    def values_of_step(self) -> dict[str, np.ndarray]:
+        """The values of the scene's inputs in the last step, or in the first before it is taken, as a run of one step has
+        them; those that were set since the start included."""
+        return self.scene.inputs.at_step(max(self.step_count - 1, 0), self.solver.dt, self._set)
+
+    def output(self, output: Output) -> np.ndarray:
+        """Value of an output such as `Reaction("left")` or `Stress()` at the present state, as a Rollout's frame has it.
+
+        ContactForce and ContactTraction are the mean over the last step, zero before the first, and need
+        `Simulator(solver, contact_forces=True)`. Raises ValueError for one without, and as the output does.
+        """
+        if output.reads_contact_forces and not self._notes:
+            raise ValueError(f"{output!r} is of a step: make the simulator with Simulator(solver, contact_forces=True)")
+        if output.cumulative:
+            raise ValueError(f"{output!r} counts from the start of a run: pass it to Rollout(..., outputs=[...])")
+        frames = Frames(
+            self.positions[None], self.velocities[None], self.displacements[None], np.array([self.time]), {}
+        )
+        frames.inputs = self.values_of_step
+        frames.steps = np.array([self.step_count])
+        if self._notes:
+            frames.contact_forces = self.workspace.contact_forces(self.solver.dt)[1:]
+        return self.settled(output).value(frames)[0]
+
+    def settled(self, output: Output) -> Output:
+        """The output as it is for the scene, made once."""
+        if output not in self._settled:
+            self._settled[output] = output.settled(self.scene)
+        return self._settled[output]
+
     def set_state(self, positions: ArrayLike | None = None, velocities: ArrayLike | None = None) -> None:
         """Put the body elsewhere: positions [m], velocities [m/s], shape (num_vertices, 3); None leaves a part as it is.
 
@@ -153,9 +202,8 @@ class Simulator:
             )
         if forces.shape != given.shape or not np.all(np.isfinite(forces)):
             raise ValueError(f"forces: expected finite numbers of shape {given.shape}, got shape {forces.shape}")
-        if self.scene.inputs.sums_loads:  # with others, when a step is loaded
-            self._set[self.scene.input_names(term)["external_forces"]] = forces
-        else:
+        self._set[self.scene.input_names(term)["external_forces"]] = forces
+        if not self.scene.inputs.sums_loads:  # else with others, when a step is loaded
             self.workspace.arrays.load_rows(forces=forces[None])
 
     @property

@@ -1,5 +1,6 @@
 """SimulationVisualizer: a window that shows a moving body, or a picture file where there is no display."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -7,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.terms.marks import Mark
 from diffsim_ti.visual.backdrop import Backdrop
 from diffsim_ti.visual.viewer import open_window
 
@@ -18,7 +20,8 @@ class SimulationVisualizer:
     """Shows a mesh whose positions change: `update(positions)` while it runs, `show()` at the end.
 
     With a display and a Vulkan driver: a Taichi window (the right button turns, Escape closes). Otherwise
-    `show()` writes a PNG to `path` and prints where. `has_window` says which.
+    `show()` writes a PNG to `path` and prints where. `has_window` says which. look: what else `Drawing` takes: obstacles,
+    fixed, held, wireframe, azimuth ...; `update(positions, marks)` shows arrows and lines, as `save_picture` takes them.
     """
 
     def __init__(
@@ -27,25 +30,26 @@ class SimulationVisualizer:
         path: str | Path = "output/simulation.png",
         title: str = "diffsim_ti",
         ground: float | None = None,
+        **look,
     ):
-        self.mesh, self.path, self.ground = mesh, Path(path), ground
-        self.positions = np.array(mesh.vertices)
+        self.mesh, self.path, self.ground, self.look = mesh, Path(path), ground, look
+        self.positions, self.marks = np.array(mesh.vertices), ()
         self.window = open_window(title, (1024, 768))
         if self.window is not None:
-            self._scene = _Scene(self.window, mesh, ground)
+            self._scene = _Scene(self.window, mesh, ground, look)
 
     @property
     def has_window(self) -> bool:
         return self.window is not None
 
-    def update(self, positions: ArrayLike) -> None:
+    def update(self, positions: ArrayLike, marks: Sequence[Mark] = ()) -> None:
         """Show these positions [m], shape (num_vertices, 3), a NumPy array or what becomes one."""
         positions = np.asarray(positions, np.float64)
         if positions.shape != self.mesh.vertices.shape:
             raise ValueError(f"positions: expected shape {self.mesh.vertices.shape}, got {positions.shape}")
-        self.positions = positions.copy()
+        self.positions, self.marks = positions.copy(), marks
         if self.has_window and self.window.running:
-            self._scene.draw(self.positions)
+            self._scene.draw(self.positions, marks)
 
     def show(self) -> None:
         """Keep the window open until it is closed; without one, write the picture and print its path."""
@@ -53,26 +57,26 @@ class SimulationVisualizer:
             from diffsim_ti.picture import save_picture
 
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            save_picture(self.path, self.mesh, self.positions, ground=self.ground)
+            save_picture(self.path, self.mesh, self.positions, ground=self.ground, marks=self.marks, **self.look)
             print(f"no display: picture written to {self.path}")
             return
         while self.window.running:
-            self._scene.draw(self.positions)
+            self._scene.draw(self.positions, self.marks)
 
 
 class _Scene:
     """The window's picture, drawn as `Drawing` draws it."""
 
-    def __init__(self, window: "Window", mesh: TetrahedralMesh, ground: float):
+    def __init__(self, window: "Window", mesh: TetrahedralMesh, ground: float | None, look: dict):
         from diffsim_ti.visual.drawing import Drawing
         from diffsim_ti.visual.vulkan_painter import Canvas
 
         self.window, self.size = window, (1024, 768)
-        self.drawing = Drawing(mesh, self.size, ground=ground, backend="software")
+        self.drawing = Drawing(mesh, self.size, ground=ground, backend="software", **look)
         self.backdrop, self.canvas = Backdrop((512, 384), ground, self.drawing.box), Canvas(window)
         self._cursor = None
 
-    def draw(self, positions: np.ndarray) -> None:
+    def draw(self, positions: np.ndarray, marks: Sequence[Mark]) -> None:
         import taichi as ti
 
         if self.window.is_pressed(ti.ui.ESCAPE):
@@ -82,6 +86,6 @@ class _Scene:
             move = cursor - self._cursor
             self.drawing.camera = self.drawing.camera.orbited(-180 * move[0], -120 * move[1])
         self._cursor = cursor
-        soup, shapes = self.drawing.soup(positions)
+        soup, shapes = self.drawing.soup(positions, drawn=marks)
         self.canvas.draw(soup, self.backdrop.image(self.drawing.camera, shapes), self.size)
         self.window.show()

@@ -31,6 +31,7 @@ EXAMPLES = {
     "design/least_compliance": ("output", "least_compliance.png"),
     "design/sag_into_shape": ("output", "sag_into_shape.png"),
     "design/inverse_rest_shape": ("output", "inverse_rest_shape.png"),
+    "design/tuning_fork": ("output", "tuning_fork.png"),
     "control/gripper": ("output", "gripper.gif"),
     "control/train_controller": ("", "train_controller.gif"),
     "control/wall_shot": ("output", "wall_shot.png"),

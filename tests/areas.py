@@ -12,7 +12,7 @@ AREAS = {
     "motion against closed forms": "reference_motion step_limit energy_watch hertz torture",
     "every adjoint, order, fuzz": "every_adjoint term_order gradient_fuzz",
     "gradients": "gradients gradient_clip gradient_faults checkpoints tape outputs "
-    "contact_force reaction tensor_outputs modes identification",
+    "contact_force reaction tensor_outputs work modes identification",
     "implicit steps and equilibria": "implicit implicit_gradients implicit_contact swept solve_report",
     "patches against locking": "locking",
     "obstacles and friction": "contact contact_area contact_faces contact_stage contact_crossing contact_friction "
@@ -20,7 +20,8 @@ AREAS = {
     "self-contact": "self_contact self_contact_implicit self_contact_near self_contact_pairs",
     "PyTorch, optimisations": "torch torch_physics torch_solvers seed_snippets optimization",
     "charts, maps, advice": "study study_stability peers",
-    "pictures, films, the window": "picture_drawing picture_film optimization_picture writers viewer viewer_window gallery",
+    "pictures, films, the window": "picture_drawing picture_film marks "
+    "optimization_picture writers viewer viewer_window gallery",
     "examples and pages": "examples contact_examples static_examples torch_examples readme",
     "command line, resources, backends": "cli strength layout resources devices launch executed_ptx single_precision",
 }

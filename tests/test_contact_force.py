@@ -37,6 +37,7 @@ def outputs():
         ds.ContactForce("floor", "friction", name="dragged"),
         ds.ContactForce("wall", "normal", name="turned", about=(0, 0.1, 0)),
         ds.ContactForce("wall", name="each", per_vertex=True),
+        ds.ContactTraction("wall", name="traction"),
     ]
 
 
@@ -316,6 +317,21 @@ def test_a_scene_whose_loss_does_not_name_it_pays_nothing():
             there
         ] * 3
         assert ("per_frame" in kernels.step.numbers) == there and hasattr(ws.contact, "impulse") == there
+
+
+def test_traction_is_force_per_area():
+    """Of each part, on the bottom of a cube that lies in the floor's barrier; a_i t_i is the force on each vertex."""
+    scene = pressed()
+    named = [ds.ContactForce("floor", part, f"f_{part}", per_vertex=True) for part in ("normal", "friction")]
+    named += [ds.ContactTraction("floor", part, f"t_{part}") for part in ("normal", "friction")]
+    frames = ds.Rollout(ds.SemiImplicitSolver(scene, dt=1e-3), 3, outputs=named).forward()
+    areas, bottom = scene.inputs.derive(scene.inputs.values).surface, scene.mesh.vertex_indices("ymin")
+    assert areas[bottom].sum() == pytest.approx(0.1**2, rel=1e-9)
+    for part in ("normal", "friction"):
+        f, t = frames[f"f_{part}"], frames[f"t_{part}"]
+        assert areas[:, None] * t == pytest.approx(f, rel=1e-12) and np.abs(f[-1, bottom]).max() > 0
+    assert frames["t_normal"][-1, bottom, 1].min() > 0 and not frames["t_normal"][-1][:, [0, 2]].any()
+    assert not frames["t_friction"][-1][:, 1].any()
 
 
 def test_what_does_not_fit_is_refused():

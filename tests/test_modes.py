@@ -102,6 +102,93 @@ def test_scikit_fem_has_the_same_elements():
     assert found.frequencies == pytest.approx(np.sqrt(values) / (2 * np.pi), rel=1e-8)
 
 
+def timoshenko(L, h, n):
+    """First n frequencies [Hz] of a clamped beam of square section h, shear and rotary inertia counted, by nu = 0: the roots
+    of the determinant of four boundary conditions on exp(k x) solutions. Shear coefficient 5/6."""
+    from scipy.linalg import expm
+    from scipy.optimize import brentq
+
+    A, inertia, G = h**2, h**4 / 12, E / 2
+
+    def determinant(f):  # of (moment, shear) at the free end by those at the clamped one, states (w, phi, M, Q)
+        w2 = (2 * np.pi * f) ** 2
+        D = np.array(
+            [
+                [0, 1, 0, 1 / (5 / 6 * G * A)],
+                [0, 0, 1 / (E * inertia), 0],
+                [0, -RHO * inertia * w2, 0, -1],
+                [-RHO * A * w2, 0, 0, 0],
+            ]
+        )
+        return np.linalg.det(expm(D * L)[2:, 2:])
+
+    base, out, f = 0.16 * h / L**2 * np.sqrt(E / RHO), [], 0.0
+    while len(out) < n:
+        while determinant(f + 0.2 * base) * determinant(f) > 0:
+            f += 0.2 * base
+        out.append(brentq(determinant, f, f + 0.2 * base))
+        f = out[-1] * (1 + 1e-9)
+    return np.array(out)
+
+
+def test_a_clamped_beam_converges_to_the_beams_frequencies():
+    """Two pairs of bending modes of a square section, nu = 0: errors fall by h^2, and extrapolated to h = 0 they are 1 %."""
+    L, h, found = 1.0, 0.1, []
+    for n in (2, 4, 6):
+        mesh = ds.TetrahedralMesh.create_box((10 * n + 1, n + 1, n + 1), size=(L, h, h), pattern="five")
+        scene = ds.Scene(mesh, ds.LinearElastic(E, 0.0), RHO, fixed="xmin", precision="f64")
+        found.append(ds.modes(scene, 2).frequencies.mean())
+    exact = timoshenko(L, h, 1)[0]
+    assert exact == pytest.approx(
+        1.8751**2 / (2 * np.pi) * np.sqrt(E / RHO / 12) * h / L**2, rel=0.02
+    )  # Euler's, slender
+    errors = np.array(found) ** 2 / exact**2 - 1  # stiffness is what is too large
+    assert np.all(errors > 0) and errors[0] / errors[1] == pytest.approx(4, rel=0.15)
+    limit = errors[2] - (errors[1] - errors[2]) * (1 / 36) / (1 / 16 - 1 / 36)
+    assert abs(limit) < 0.02
+
+
+def test_a_bar_in_a_smooth_tube_has_the_exact_frequencies():
+    """Rollers on all sides leave motion along x alone: f = (2 i - 1) c / 4 L, c^2 = (lambda + 2 mu) / rho, by order 2."""
+    L, c = 0.6, np.sqrt(E * (1 - NU) / ((1 + NU) * (1 - 2 * NU)) / RHO)
+    exact, off = (2 * np.arange(3) + 1) * c / (4 * L), []
+    for n in (8, 16, 32):
+        box = ds.TetrahedralMesh.create_box((n + 1, 2, 2), size=(L, 0.05, 0.05))
+        sets = dict(box.vertex_sets) | {"all": np.arange(box.num_vertices)}
+        mesh = ds.TetrahedralMesh(box.vertices, box.tetrahedra, vertex_sets=sets)
+        scene = ds.Scene(mesh, ds.LinearElastic(E, NU), RHO, fixed={"all": "yz", "xmin": "x"}, precision="f64")
+        found = ds.modes(scene, 3)
+        assert np.abs(found.shapes[:, :, 1:]).max() == 0 and not found.shapes[:, scene.fixed].any()
+        off.append(np.abs(found.frequencies / exact - 1))
+    assert (
+        np.all(off[2] < 4e-3)
+        and off[0] / off[1] == pytest.approx(4, rel=0.1)
+        and off[1] / off[2] == pytest.approx(4, rel=0.1)
+    )
+
+
+def test_rollers_in_any_direction_leave_what_they_leave():
+    """Supports that are turned with the body change no frequency, and nothing moves as they hold it."""
+    mesh, turn = (
+        ds.TetrahedralMesh.create_box((4, 3, 3), size=(0.3, 0.11, 0.08)),
+        np.linalg.qr(np.random.default_rng(2).normal(size=(3, 3)))[0],
+    )
+    turn *= np.sign(np.linalg.det(turn))
+    straight = ds.modes(scene_of(mesh, fixed={"xmin": "x", "zmin": "yz"}), 5)
+    turned = ds.TetrahedralMesh(mesh.vertices @ turn.T, mesh.tetrahedra, vertex_sets=dict(mesh.vertex_sets))
+    found = ds.modes(scene_of(turned, fixed={"xmin": turn[:, 0], "zmin": turn[:, 1:].T}), 5)
+    assert found.frequencies == pytest.approx(straight.frequencies, rel=1e-9)
+    held = np.einsum(
+        "kij,mkj->mki",
+        scene_of(turned, fixed={"xmin": turn[:, 0], "zmin": turn[:, 1:].T}).supports.held,
+        found.shapes[:, np.union1d(mesh.vertex_indices("xmin"), mesh.vertex_indices("zmin"))],
+    )
+    assert np.abs(held).max() <= 1e-9 * np.abs(found.shapes).max()
+    by = np.array([1.0, 0, 0, 0, 0])
+    slope = float(found.gradients(by)["youngs_modulus"])
+    assert slope == pytest.approx(0.5 * found.frequencies[0] / E, rel=1e-8)
+
+
 def bent(mesh):
     x = mesh.vertices
     return 0.02 * np.sin(9 * x[:, [1, 2, 0]] + 1) * np.array([1.0, 0.7, -0.8])

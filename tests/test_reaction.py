@@ -104,6 +104,33 @@ def test_reactions_balance_weight_and_loads():
     assert frames["moment"][-1] == pytest.approx(-moment, rel=1e-9)
 
 
+def test_a_simulator_has_them_step_by_step():
+    """As a run's frames have them: reactions under loads that change within steps, contact forces of each step."""
+    keyed = ds.Traction(lambda t: (2e5 * t, 0.0, -100.0), "xmax")
+    floor = ds.Ground(-0.004, stiffness_per_area=3e5, width=0.01, friction=0.4, name="floor")
+    named = [ds.Reaction("xmin", per_vertex=True), ds.Reaction(name="all"), ds.Stress(von_mises=True)]
+    named += [ds.ContactForce("floor", per_vertex=True), ds.ContactTraction("floor", "friction", "rubbed")]
+    options = dict(terms=[ds.Gravity(), keyed, floor], initial_velocities=(0.3, -0.4, 0.0))
+    for kind in (ds.SemiImplicitSolver, ds.VelocityVerletSolver, ds.ImplicitEulerSolver):
+        solver = kind(scene_of(**options), dt=5e-4, substeps=2)
+        frames = ds.Rollout(solver, 6, save_every=1, outputs=named).forward()
+        simulator = ds.Simulator(solver, contact_forces=True)
+        for _ in range(2):
+            for k in range(7):
+                for output in named:
+                    assert np.array_equal(simulator.output(output), frames[output.name][k]), (kind, k, output)
+                if k < 6:
+                    simulator.step()
+            simulator.reset()
+        assert np.abs(frames["contact_force"][-1]).max() > 0 and np.abs(frames["rubbed"][-1]).max() > 0
+    plain = ds.Simulator(solver)
+    assert np.array_equal(plain.output(named[1]), frames["all"][0])
+    with pytest.raises(ValueError, match="contact_forces=True"):
+        plain.output(named[3])
+    with pytest.raises(ValueError, match="counts from the start of a run"):
+        plain.output(ds.WorkOfLoads())
+
+
 def test_what_does_not_fit_is_refused():
     solver = ds.StaticSolver(scene_of())
     with pytest.raises(ValueError, match="among the held vertices, but 4 of its 4 vertices are free"):

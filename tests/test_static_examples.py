@@ -37,6 +37,26 @@ def test_sag_into_shape(tmp_path, capsys):
     assert "times less" in capsys.readouterr().out
 
 
+def test_tuning_fork(tmp_path, capsys):
+    """Both frequencies are met; the Jacobian by the shape's gradient agrees with differences; lower modes are no fork's."""
+    fork = example("design/tuning_fork")
+    numbers = fork.main(tmp_path, quick=True)
+    assert numbers["after"] == pytest.approx([440, 2640], rel=1e-6) and numbers["iterations"] <= 5
+    assert numbers["before"][0] > 500 and 6.1 < numbers["before"][1] / numbers["before"][0] < 6.25
+    length, taper = numbers["p"]
+    assert 0.09 < length < 0.105 and 0.05 < taper < 0.12
+    assert np.all(numbers["finer"] < numbers["after"])  # linear tetrahedra are too stiff
+    assert (tmp_path / "tuning_fork.png").stat().st_size > 10_000
+    body, p = fork.Fork(16, 2), np.array([0.085, 0.05])
+    _, jacobian, modes, chosen = body.ring(p)
+    for k, s in enumerate((1e-5, 1e-3)):
+        step = s * np.eye(2)[k]
+        slope = (body.ring(p + step)[0] - body.ring(p - step)[0]) / (2 * s)
+        assert jacobian[:, k] == pytest.approx(slope, rel=1e-5)
+    assert chosen[0] > 0  # prongs that swing together are lower
+    assert "finer mesh" in capsys.readouterr().out
+
+
 def test_stiffness_from_picture(capsys):
     """Within 2 %, and within three times the spread that the noise of the picture leaves."""
     numbers = example("identify/stiffness_from_picture").main(quick=True)

@@ -26,6 +26,9 @@ def outputs():
         ds.Stress("piola", at=POINTS, kind="first_piola"),
         ds.Strain("nodal_strain", at="vertices"),
         ds.Strain("marked", at=POINTS, principal=True),
+        ds.Stress("mises", von_mises=True),
+        ds.Stress("nodal_mises", at="vertices", von_mises=True),
+        ds.Strain("stretches", stretches=True),
         ds.EnclosedVolume(),
         ds.ElasticEnergy(),
         ds.ElasticEnergy([[0, 3, 4], [1, 2]], name="parts"),
@@ -102,9 +105,30 @@ def test_a_homogeneous_stretch_has_its_closed_form():
     green = 0.5 * (np.array([a, b, c]) ** 2 - 1)
     assert frames["nodal_strain"][0] == pytest.approx(np.tile(np.diag(green), (body.num_vertices, 1, 1)), abs=1e-12)
     assert frames["marked"][0] == pytest.approx(np.tile(np.sort(green), (2, 1)), abs=1e-12)
+    mises = np.sqrt(0.5 * ((own[0] - own[1]) ** 2 + (own[1] - own[2]) ** 2 + (own[2] - own[0]) ** 2))
+    assert frames["mises"][0] == pytest.approx(np.full(body.num_tetrahedra, mises), rel=1e-9)
+    assert frames["nodal_mises"][0] == pytest.approx(np.full(body.num_vertices, mises), rel=1e-9)
+    assert frames["stretches"][0] == pytest.approx(np.tile(np.sort([a, b, c]), (body.num_tetrahedra, 1)), rel=1e-12)
     psi = 0.5 * mu * (a**2 + b**2 + c**2 - 3) - mu * np.log(J) + 0.5 * lam * (J - 1) ** 2
     assert frames["elastic_energy"][0] == pytest.approx(psi * body.volumes.sum(), rel=1e-9)
     assert frames["volume"][0] == pytest.approx(J * body.volumes.sum(), rel=1e-12)
+
+
+def test_where_principal_values_coincide():
+    """At rest von Mises stress is 0 and has the gradient 0; a sum of principal values has that of the trace."""
+    body = mesh()
+    scene = ds.Scene(body, ds.StableNeoHookean(5e4, 0.3), precision="f64")
+    named = [ds.Stress("mises", von_mises=True), ds.Stress("each", principal=True), ds.Strain("wide", stretches=True)]
+    rollout = ds.Rollout(ds.SemiImplicitSolver(scene, dt=1e-5), 1, outputs=named, gradients=["initial_positions"])
+    frames = rollout.forward()
+    assert not frames["mises"].any() and frames["wide"] == pytest.approx(np.ones_like(frames["wide"]))
+    by = rollout.vjp(frames, mises=np.ones_like(frames["mises"]))["initial_positions"]
+    assert not by.any()
+    seed = np.zeros_like(frames["each"])
+    seed[0] = body.volumes[:, None]
+    swollen = (rollout.vjp(frames, each=seed)["initial_positions"] * body.vertices).sum()
+    bulk = 3 * 5e4 / (3 * (1 - 2 * 0.3))  # d tr sigma / d scale of x = (1 + scale) X: 3 K times 3
+    assert swollen == pytest.approx(3 * bulk * body.volumes.sum(), rel=1e-9)
 
 
 def test_what_does_not_fit_is_refused():
@@ -119,5 +143,7 @@ def test_what_does_not_fit_is_refused():
         ds.Stress(kind="second")
     with pytest.raises(ValueError, match="P is not symmetric"):
         ds.Stress(kind="first_piola", principal=True)
+    with pytest.raises(ValueError, match="principal and von_mises exclude each other"):
+        ds.Stress(principal=True, von_mises=True)
     with pytest.raises(ValueError, match='at must be "tetrahedra"'):
         ds.Strain(at="nodes")

@@ -28,6 +28,7 @@ from diffsim_ti.cli.options import (
     Youngs,
     fall_scene,
     fixed_vertices,
+    forces_named,
     load_body,
     make_ground,
     make_material,
@@ -124,6 +125,12 @@ def simulate(
     ] = None,
     ground_width: Annotated[float | None, typer.Option(help="[m]; default 1 % of the size")] = None,
     azimuth: Annotated[float, typer.Option(help="where pictures are taken from, about y [degrees]")] = 32.0,
+    arrows: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="forces to draw as arrows and to write: reaction (of what is held), contact; may be repeated"
+        ),
+    ] = None,
     backend: Backend = "cpu",
     precision: Precision = "f32",
     threads: Threads = None,
@@ -137,7 +144,7 @@ def simulate(
     for name, value in (("duration", duration), ("fps", fps), ("density", density)):
         if not value > 0:
             raise ValueError(f"--{name} must be > 0, got {value:g}")
-    view = View(fps=fps, azimuth=azimuth, title=mesh.stem, fit="end")
+    view = View(fps=fps, azimuth=azimuth, title=mesh.stem, fit="end", arrows=tuple(arrows or ()))
     asked = [file_in(o, mesh.stem + suffix) for o in output or [Path("output/simulate")] for suffix in (".pvd", ".png")]
     writers = [writer_for(path, view) for path in dict.fromkeys(asked)]
     kind = solver_class(solver)
@@ -160,7 +167,7 @@ def simulate(
         stiffness_per_area=ground_stiffness_per_area,
     )
     frames = max(1, round(duration * fps))
-    run = ForwardRun(scene, kind, duration / frames, dt)
+    run = ForwardRun(scene, kind, duration / frames, dt, forces_named(arrows or (), scene))
     setup = time.perf_counter() - begin
     writing, files, _ = run_and_write(run, frames, writers)
     print_summary(run, setup, writing, files)

@@ -18,6 +18,7 @@ from diffsim_ti.writers import WRITERS
 
 if TYPE_CHECKING:
     from diffsim_ti.adaptive_run import ForwardRun
+    from diffsim_ti.outputs import Output
 
 
 Up = Enum("Up", {name: name for name in ("x", "y", "z", "-x", "-y", "-z")}, type=str)
@@ -148,6 +149,21 @@ def fall_scene(
         terms.append(make_ground(body, law, density, gravity, speed, stiffness, width, stiffness_per_area))
     fixed = fixed_vertices(body, list(fixed or []))
     return Scene(body, law, density, terms + list(extra), fixed, initial_velocities=velocity, volume=volume), body
+
+
+def forces_named(names: Sequence[str], scene: Scene) -> "list[Output]":
+    """Outputs of --arrows: what holds the body, what its obstacle does."""
+    from diffsim_ti.outputs import ContactForce, Reaction
+
+    out = []
+    for name in dict.fromkeys(names):
+        if name not in ("reaction", "contact"):
+            raise ValueError(f"--arrows: must be reaction or contact, got {name!r}")
+        if name == "contact" and not scene.obstacles:
+            raise ValueError("--arrows contact: there is no obstacle; leave --no-ground out")
+        own = dict(name=name, per_vertex=True)
+        out.append(Reaction(**own) if name == "reaction" else ContactForce(scene.obstacles[0], **own))
+    return out
 
 
 # ---- what is said at the end ------------------------------------------------------------------------------------------

@@ -41,12 +41,29 @@ def render(
     elevation: Annotated[float, typer.Option(help="of the eye, above the floor [degrees]")] = 14.0,
     wireframe: Annotated[bool, typer.Option("--wireframe", help="draw the edges of the triangles")] = False,
     backend: Annotated[str, typer.Option(help="vulkan, software, or auto: Vulkan where there is a driver")] = "auto",
+    arrows: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="vectors of vertices that the series holds, such as forces, to draw as arrows; may be repeated"
+        ),
+    ] = None,
 ) -> None:
     """Draw a saved series as a film, coloured by a field, without a display."""
     from diffsim_ti.film import render_series
 
     count = render_series(
-        series, output, colour, fps, size, ground, azimuth, elevation, backend, print, wireframe=wireframe
+        series,
+        output,
+        colour,
+        fps,
+        size,
+        ground,
+        azimuth,
+        elevation,
+        backend,
+        print,
+        wireframe=wireframe,
+        arrows=arrows or (),
     )
     print(f"{count} frame{'s' * (count != 1)}: {output}")
 

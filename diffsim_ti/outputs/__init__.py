@@ -1,6 +1,7 @@
 """What a loss may name besides a run's inputs: functions of its frames, one file each, and their interface for others."""
 
 from diffsim_ti.outputs.contact_force import ContactForce
+from diffsim_ti.outputs.contact_traction import ContactTraction
 from diffsim_ti.outputs.enclosed_volume import EnclosedVolume
 from diffsim_ti.outputs.energies import ElasticEnergy, KineticEnergy
 from diffsim_ti.outputs.material_points import MaterialPoints
@@ -8,10 +9,12 @@ from diffsim_ti.outputs.output import Change, Output
 from diffsim_ti.outputs.reaction import Reaction
 from diffsim_ti.outputs.states import Displacements, Positions, Velocities
 from diffsim_ti.outputs.tensors import Strain, Stress
+from diffsim_ti.outputs.work import WorkOfLoads
 
 __all__ = [
     "Change",
     "ContactForce",
+    "ContactTraction",
     "Displacements",
     "ElasticEnergy",
     "EnclosedVolume",
@@ -23,4 +26,5 @@ __all__ = [
     "Strain",
     "Stress",
     "Velocities",
+    "WorkOfLoads",
 ]

@@ -39,7 +39,7 @@ class ContactForce(Output):
     Wriggers, Computational Contact Mechanics, 2nd ed., 2006, sec. 5 and 8, doi:10.1007/978-3-540-32609-0.
     """
 
-    reads_contact_forces = True
+    reads_contact_forces, unit = True, "N"
 
     def __init__(
         self,

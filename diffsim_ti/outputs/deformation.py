@@ -81,6 +81,43 @@ def _like(per_item: np.ndarray, T: np.ndarray) -> np.ndarray:
     return per_item.reshape(1, -1, *[1] * (T.ndim - 2))
 
 
+def von_mises(T: np.ndarray) -> np.ndarray:
+    """sqrt(3/2 s : s), s = T - tr T / 3, of symmetric tensors; its gradient is 0 where it is 0."""
+    s = _deviator(T)
+    return np.sqrt(1.5 * (s**2).sum((-1, -2)))
+
+
+def von_mises_jvp(T: np.ndarray, dT: np.ndarray) -> np.ndarray:
+    """Its change, 3/2 s : dT / value."""
+    return (von_mises_vjp(T, np.ones(T.shape[:-2])) * dT).sum((-1, -2))
+
+
+def von_mises_vjp(T: np.ndarray, seed: np.ndarray) -> np.ndarray:
+    """Adjoint of T."""
+    value = von_mises(T)
+    by = np.divide(1.5 * seed, value, out=np.zeros_like(value), where=value > 0)
+    return by[..., None, None] * _deviator(T)
+
+
+def _deviator(T: np.ndarray) -> np.ndarray:
+    return T - np.trace(T, axis1=-2, axis2=-1)[..., None, None] / 3 * np.eye(3)
+
+
+def stretches(E: np.ndarray) -> np.ndarray:
+    """sqrt(1 + 2 E_i), ascending, E_i: eigenvalues of Green's strain."""
+    return np.sqrt(1 + 2 * principal(E))
+
+
+def stretches_jvp(E: np.ndarray, dE: np.ndarray) -> np.ndarray:
+    """Their change."""
+    return principal_jvp(E, dE) / stretches(E)
+
+
+def stretches_vjp(E: np.ndarray, seed: np.ndarray) -> np.ndarray:
+    """Adjoint of E."""
+    return principal_vjp(E, seed / stretches(E))
+
+
 def principal(T: np.ndarray) -> np.ndarray:
     """Eigenvalues of symmetric tensors, ascending."""
     return np.linalg.eigvalsh(T)
@@ -96,3 +133,11 @@ def principal_vjp(T: np.ndarray, seed: np.ndarray) -> np.ndarray:
     """Adjoint of T."""
     n = np.linalg.eigh(T)[1]
     return np.einsum("...ia,...a,...ja->...ij", n, seed, n)
+
+
+# what tensors are shown by: (number of components, value, jvp, vjp)
+NUMBERS = {
+    "principal": ((3,), principal, principal_jvp, principal_vjp),
+    "von_mises": ((), von_mises, von_mises_jvp, von_mises_vjp),
+    "stretches": ((3,), stretches, stretches_jvp, stretches_vjp),
+}

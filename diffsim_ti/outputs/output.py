@@ -47,6 +47,8 @@ class Output(ABC):
     """
 
     name: str
+    unit = ""  # for pictures
+    cumulative = False  # whether it counts from the first frame on, and so is of no state by itself
     reads_contact_forces = False  # whether runs must note frames.contact_forces for it
 
     def settled(self, scene: "Scene") -> "Output":

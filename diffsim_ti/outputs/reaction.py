@@ -38,6 +38,8 @@ class Reaction(Output):
     Belytschko, Liu, Moran, Nonlinear Finite Elements for Continua and Structures, 2000, sec. 4.4.
     """
 
+    unit = "N"
+
     def __init__(
         self,
         support: str | ArrayLike | None = None,

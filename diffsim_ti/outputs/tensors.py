@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffsim_ti.outputs.deformation import Deformation, VertexMeans, principal, principal_jvp, principal_vjp
+from diffsim_ti.outputs.deformation import NUMBERS, Deformation, VertexMeans
 from diffsim_ti.outputs.law_on_arrays import LawOnArrays
 from diffsim_ti.outputs.output import Change, Output
 
@@ -18,11 +18,18 @@ if TYPE_CHECKING:
 
 class _Tensors(Output):
     """at: "tetrahedra", (frames, num_tetrahedra, 3, 3); "vertices", the means over the tetrahedra around by their volumes;
-    or material points X [m], shape (k, 3), each with the tensor of its tetrahedron. principal: eigenvalues, ascending, of
-    shape (frames, ..., 3), instead; where two coincide only their sum has a gradient. name: how a loss calls it."""
+    or material points X [m], shape (k, 3), each with the tensor of its tetrahedron. numbers: what of them is given instead,
+    a name in deformation.NUMBERS, or None. name: how a loss calls it."""
 
-    def __init__(self, name: str, at: str | ArrayLike, principal: bool):
-        self.name, self.principal, self.at = name, bool(principal), at
+    per_item = True  # whether there is a value for each tetrahedron or vertex
+
+    def __init__(self, name: str, at: str | ArrayLike, **numbers: bool):
+        asked = [which for which, wanted in numbers.items() if wanted]
+        if len(asked) > 1:
+            raise ValueError(
+                f"{type(self).__name__}: {' and '.join(asked)} exclude each other; take one output for each"
+            )
+        self.name, self.at, self.numbers = name, at, asked[0] if asked else None
         if isinstance(at, str) and at not in ("tetrahedra", "vertices"):
             raise ValueError(f'{type(self).__name__}: at must be "tetrahedra", "vertices" or points, got {at!r}')
 
@@ -36,7 +43,7 @@ class _Tensors(Output):
         return out
 
     def shape(self, num_frames: int) -> tuple[int, ...]:
-        return (num_frames, self.count, 3) if self.principal else (num_frames, self.count, 3, 3)
+        return num_frames, self.count, *(NUMBERS[self.numbers][0] if self.numbers else (3, 3))
 
     @abstractmethod
     def _tensors(self, deformation: Deformation, derived) -> np.ndarray:
@@ -58,7 +65,7 @@ class _Tensors(Output):
 
     def value(self, frames: "Frames") -> np.ndarray:
         shown = self._start(frames)[3]
-        return principal(shown) if self.principal else shown
+        return NUMBERS[self.numbers][1](shown) if self.numbers else shown
 
     def jvp(self, frames: "Frames", change: Change) -> np.ndarray:
         derived, deformation, T, shown = self._start(frames)
@@ -67,11 +74,11 @@ class _Tensors(Output):
         dT = self._tensors_jvp(deformation, derived, deformation.jvp(du, moved.gradients[self.chosen]), moved)
         if self.means is not None:
             dT = self.means.jvp(T, dT, derived.volumes, moved.volumes)
-        return principal_jvp(shown, dT) if self.principal else dT
+        return NUMBERS[self.numbers][2](shown, dT) if self.numbers else dT
 
     def vjp(self, frames: "Frames", seed: np.ndarray) -> Change:
         derived, deformation, T, shown = self._start(frames)
-        adjoint, seed = derived.zeros(), principal_vjp(shown, seed) if self.principal else seed
+        adjoint, seed = derived.zeros(), NUMBERS[self.numbers][3](shown, seed) if self.numbers else seed
         if self.means is not None:
             seed, adjoint.volumes = self.means.vjp(T, derived.volumes, seed)
         H_adj = self._tensors_vjp(deformation, derived, seed, adjoint)
@@ -86,14 +93,18 @@ class Strain(_Tensors):
     """Green's strain E = (F^T F - I) / 2 [-], F = I + sum_a u_a (x) grad N_a, in each frame; symmetric 3x3 tensors.
 
     at: "tetrahedra", (frames, num_tetrahedra, 3, 3); "vertices", means over the tetrahedra around, by their volumes; or
-    points X [m] of the rest shape, shape (k, 3). principal: its eigenvalues instead, ascending, shape (frames, ..., 3);
-    where two coincide only their sum has a gradient. name: how a loss calls it.
-    The gradient is exact by all inputs. Raises ValueError for another `at`, or points outside the mesh.
-    Holzapfel, Nonlinear Solid Mechanics, 2000, sec. 2.5.
+    points X [m] of the rest shape, shape (k, 3). name: how a loss calls it.
+    principal: its eigenvalues E_i instead, ascending, shape (frames, ..., 3). stretches: the principal stretches
+    sqrt(1 + 2 E_i) [-], ascending; at vertices those of the mean strain. Where two of either coincide only their sum has a
+    gradient: each has the slope along an eigenvector that the solver happened to choose.
+    The gradient is exact by all inputs. Raises ValueError for another `at`, points outside the mesh, or both of these.
+    Holzapfel, Nonlinear Solid Mechanics, 2000, sec. 2.5 and 2.6.
     """
 
-    def __init__(self, name: str = "strain", at: str | ArrayLike = "tetrahedra", principal: bool = False):
-        super().__init__(name, at, principal)
+    def __init__(
+        self, name: str = "strain", at: str | ArrayLike = "tetrahedra", principal: bool = False, stretches: bool = False
+    ):
+        super().__init__(name, at, principal=principal, stretches=stretches)
 
     def _tensors(self, deformation, derived):
         H = deformation.H
@@ -112,23 +123,30 @@ class Stress(_Tensors):
     """Stress [Pa] in each frame: Cauchy's sigma = P F^T / J, or the first Piola-Kirchhoff stress P = dpsi/dF.
 
     kind: "cauchy" or "first_piola". at: "tetrahedra", (frames, num_tetrahedra, 3, 3); "vertices", means over the tetrahedra
-    around, by their volumes; or points X [m] of the rest shape, shape (k, 3). principal: Cauchy's eigenvalues instead,
-    ascending, shape (frames, ..., 3); where two coincide only their sum has a gradient. name: how a loss calls it.
+    around, by their volumes; or points X [m] of the rest shape, shape (k, 3). name: how a loss calls it.
+    principal: Cauchy's eigenvalues instead, ascending, shape (frames, ..., 3); where two coincide only their sum has a
+    gradient. von_mises: sqrt(3/2 s : s) of Cauchy's deviator s instead, shape (frames, ...), at vertices that of the mean
+    stress; where it is 0 it has a kink, and its gradient is given as 0.
     The gradient is exact by all inputs; in single precision the stress has an error of some 1e-6 of the modulus.
 
-    Raises ValueError for another kind or `at`, principal values of P, which is not symmetric, points outside the mesh,
-    volume="patches", whose pressure is the patch's, and laws that read more than the displacement gradient.
+    Raises ValueError for another kind or `at`, both of these, or one of them of P, which is not symmetric, points outside
+    the mesh, volume="patches", whose pressure is the patch's, and laws that read more than the displacement gradient.
     Holzapfel, Nonlinear Solid Mechanics, 2000, sec. 3.1.
     """
 
     def __init__(
-        self, name: str = "stress", at: str | ArrayLike = "tetrahedra", principal: bool = False, kind: str = "cauchy"
+        self,
+        name: str = "stress",
+        at: str | ArrayLike = "tetrahedra",
+        principal: bool = False,
+        kind: str = "cauchy",
+        von_mises: bool = False,
     ):
         if kind not in ("cauchy", "first_piola"):
             raise ValueError(f'Stress: kind must be "cauchy" or "first_piola", got {kind!r}')
-        if principal and kind != "cauchy":
-            raise ValueError("Stress: principal values are Cauchy's; P is not symmetric")
-        super().__init__(name, at, principal)
+        if (principal or von_mises) and kind != "cauchy":
+            raise ValueError("Stress: principal values and von Mises stress are Cauchy's; P is not symmetric")
+        super().__init__(name, at, principal=principal, von_mises=von_mises)
         self.kind = kind
 
     def settled(self, scene: "Scene") -> "Stress":

@@ -22,6 +22,8 @@ class Frames:
     before, by its barrier and by friction; shape (frames, obstacles, 2, num_vertices, 3), obstacles as in
     `scene.obstacles`. The first frame has none.
 
+    `computed` are these outputs themselves, as settled for the scene.
+
     `inputs` are the values that the run started from, so that its gradient can be taken whenever it is wanted.
     """
 
@@ -33,6 +35,7 @@ class Frames:
     contact_resolution: ContactResolution | None = None
     outputs: dict[str, np.ndarray] = field(default_factory=dict)
     contact_forces: np.ndarray | None = field(default=None, repr=False)
+    computed: dict = field(default_factory=dict, repr=False)
     steps: np.ndarray | None = field(default=None, repr=False)  # of the run that are done in each frame
     run: Run | None = field(default=None, repr=False)
 

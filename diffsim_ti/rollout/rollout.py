@@ -135,6 +135,7 @@ class Rollout:
             start = dict(initial_positions=positions[0], initial_velocities=v[0])
             inputs = inputs | {name: x.astype(np.float64) for name, x in start.items()}
         frames = Frames(positions, v, u, self.times, inputs, run.contact_resolution, run=run)
+        frames.computed = self.computed
         frames.steps = np.arange(self.num_frames) * self.save_every
         frames.contact_forces = self.sweep.contact_forces()
         for name, output in self.computed.items():

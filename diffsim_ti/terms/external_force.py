@@ -7,6 +7,7 @@ from diffsim_ti.inputs import Input
 from diffsim_ti.inputs.links import PerStep
 from diffsim_ti.inputs.loads import InTime
 from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.terms.marks import arrows
 from diffsim_ti.terms.term import Term
 
 
@@ -44,6 +45,10 @@ class ExternalForce(Term):
         k, shape = len(self.indices(mesh)), self.values["external_forces"].shape
         if len(shape) > 1 and shape[-2] != k:
             raise ValueError(f"ExternalForce: expected forces for {k} vertices, shape (..., {k}, 3), got {shape}")
+
+    def drawn(self, moment):
+        vertices, forces = self.indices(moment.mesh), moment.values["external_forces"]
+        return [arrows(f"{self.name or 'force'} [N]", moment.mesh, moment.positions, vertices, forces)]
 
     def settled(self, scene, density, initial_positions, initial_velocities) -> "ExternalForce":
         """With a force for each of the vertices acted upon."""

@@ -8,6 +8,8 @@ from numpy.typing import ArrayLike
 from diffsim_ti.inputs import Link
 from diffsim_ti.inputs.loads import InTime, Spread, VertexAreas, VertexShares
 from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.mesh.geometry import triangle_normals
+from diffsim_ti.terms.marks import MOST, Arrows, arrows, spread
 from diffsim_ti.terms.over_time import OverTime, amount, is_keyed, rows_at
 from diffsim_ti.terms.term import Term
 
@@ -76,6 +78,11 @@ class Traction(Load):
         """Vertices that are acted upon."""
         return np.unique(self.triangles(mesh))
 
+    def drawn(self, moment):
+        vertices = self.indices(moment.mesh)
+        label = f"{self.name or 'traction'} [N/m^2]"
+        return [arrows(label, moment.mesh, moment.positions, vertices, moment.values[self.plain])]
+
     def force_links(self, names: dict[str, str], own: str) -> list[Link]:
         """To forces of its vertices, by the name `own` forces."""
         areas = VertexAreas(self.triangles(self.mesh), self.indices(self.mesh), f"{own} areas")
@@ -118,6 +125,12 @@ class BodyForce(Load):
         """Vertices that are acted upon."""
         return np.unique(mesh.tetrahedra[self.chosen(mesh)])
 
+    def drawn(self, moment):
+        mesh, unit = moment.mesh, self.described[0].unit
+        vertices = np.intersect1d(self.indices(mesh), mesh.surface_vertices)  # those within would not be seen
+        label = f"{self.name or 'body force'} [{unit}]"
+        return [arrows(label, mesh, moment.positions, vertices, moment.values[self.plain], most=24)]
+
     def force_links(self, names: dict[str, str], own: str) -> list[Link]:
         """To forces of its vertices, by the name `own` forces."""
         mesh, weights = self.mesh, f"{own} weights"
@@ -153,6 +166,17 @@ class Pressure(Load):
 
     def links(self, names: dict[str, str], own: str) -> list[Link]:
         return [self.in_time(names, own)]
+
+    def drawn(self, moment):
+        triangles, pressure = self.triangles(moment.mesh), float(moment.values[self.plain])
+        if pressure == 0:
+            return []
+        middle = moment.mesh.vertices[triangles].mean(1)
+        triangles = triangles[spread(middle, MOST)]
+        n = triangle_normals(moment.positions, triangles)
+        vectors = -pressure * n / np.linalg.norm(n, axis=1, keepdims=True)
+        onto = np.full(len(n), pressure > 0)
+        return [Arrows(f"{self.name or 'pressure'} [Pa]", moment.positions[triangles].mean(1), vectors, onto)]
 
 
 def _some(load: Load, rows: np.ndarray) -> np.ndarray:

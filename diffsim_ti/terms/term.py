@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from diffsim_ti.inputs import Input, Link
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.runtime import PRECISIONS
+from diffsim_ti.terms.marks import Mark, Moment
 
 if TYPE_CHECKING:
     from diffsim_ti.scene import Scene
@@ -25,7 +26,8 @@ class Term(ABC):
     A term that the scene does not list leaves no code and no memory behind. What a subclass may write, each optional:
     `links`, where kernels read something else than its inputs as they are; `check`, `settled` and `check_start`, to refuse
     what does not fit and to choose what is left to the scene; `kernel`, the compile-time twin of a term that acts by a
-    force on each vertex (VertexForce). Gravity, drag and external forces are stages of the step itself.
+    force on each vertex (VertexForce); `drawn`, what pictures, films, the window and series show of it. Gravity, drag and
+    external forces are stages of the step itself.
     """
 
     acts_on_surface = False
@@ -92,6 +94,15 @@ class Term(ABC):
 
     def check_start(self, positions: np.ndarray, surface: np.ndarray) -> None:
         """Raise ValueError if the body may not start at `positions` [m], shape (num_vertices, 3)."""
+
+    def drawn(self, moment: Moment) -> list[Mark]:
+        """Arrows, lines and points (marks.py) that show the term at a moment, in space [m]; none: nothing is drawn.
+
+        A spring from one vertex to another: `x = moment.positions[[a, b]]; return [Lines("spring", x[None])]`; a load:
+        `[arrows("traction [N/m^2]", moment.mesh, moment.positions, vertices, moment.values["traction"])]`. The label stands
+        in the picture's key; arrows need their unit in it. An obstacle has a `surface` instead.
+        """
+        return []
 
     def kernel(self, precision: str) -> "VertexForce | None":
         """Compile-time twin; a term with a table is also given `table`, where it starts in the scene's parameter array."""

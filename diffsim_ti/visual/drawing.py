@@ -7,11 +7,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.terms.marks import Arrows, Mark, vertex_normals
 from diffsim_ti.terms.obstacles.shapes import Triangles
 from diffsim_ti.visual.backdrop import Backdrop
 from diffsim_ti.visual.camera import Camera
 from diffsim_ti.visual.colouring import Colouring, to_vertices
-from diffsim_ti.visual.legend import legend, write_text
+from diffsim_ti.visual.glyphs import COLOURS, arrow_length, cones, glyphs, key_lines, longest
+from diffsim_ti.visual.legend import legend, write_key, write_text
 from diffsim_ti.visual.surface import OBSTACLE, PLAIN, Soup, Surface, marks, with_edges
 
 if TYPE_CHECKING:
@@ -36,6 +38,24 @@ def painter(backend: str, size: tuple[int, int]) -> "SoftwarePainter | VulkanPai
     return SoftwarePainter(size) if backend == "software" or not has_vulkan() else VulkanPainter(size)
 
 
+def held_along(mesh: TetrahedralMesh, vertices: np.ndarray, held: np.ndarray) -> tuple[np.ndarray, ...] | None:
+    """Of vertices and the projectors onto the directions in which each is held: (those held in all, one vertex and unit
+    vector for each direction in which another is held); the vectors point out of the body. None if all are held wholly."""
+    rank = np.rint(np.trace(held, axis1=1, axis2=2)).astype(int)
+    if len(held) == 0 or rank.min() == 3:
+        return None
+    values, vectors = np.linalg.eigh(held)
+    which, column = np.nonzero((values > 0.5) & (rank < 3)[:, None])
+    axes = vectors[which, :, column]
+    out = mesh.vertices - mesh.bounding_box.mean(0)  # where the surface says nothing
+    normals = vertex_normals(mesh, mesh.vertices)
+    for away in (out, normals):
+        along = (axes * away[vertices[which]]).sum(1)
+        clear = np.abs(along) > 1e-6 * np.abs(away).max()
+        axes = np.where((clear & (along < 0))[:, None], -axes, axes)
+    return vertices[rank == 3], vertices[which], axes
+
+
 class Drawing:
     """Pictures of a body's surface, y upwards.
 
@@ -43,7 +63,8 @@ class Drawing:
     size: width and height in pixels. camera: default one that frames `box` [m], shape (2, 3) (default: the rest shape),
         from `azimuth` and `elevation` [degrees].
     ground: height of a floor [m], or None. obstacles: (points, triangles) of what stands around, see `obstacle_surfaces`.
-    fixed: vertices to mark. wireframe: draw the triangles' edges. colouring: how values are coloured.
+    fixed: vertices to mark; held: projectors onto the directions in which each is held, shape (len(fixed), 3, 3), None: all.
+        wireframe: draw the triangles' edges. colouring: how values are coloured.
     backend: "auto", "vulkan" or "software"; `describe()` says which it became.
     """
 
@@ -61,6 +82,7 @@ class Drawing:
         azimuth: float = 32.0,
         elevation: float = 14.0,
         backend: str = "auto",
+        held: ArrayLike | None = None,
     ):
         if len(size) != 2 or any(int(n) != n or not 16 <= n <= 8192 for n in size):
             raise ValueError(f"size must be two whole numbers of pixels between 16 and 8192, got {size}")
@@ -69,6 +91,9 @@ class Drawing:
         self.camera = camera or Camera.framing(fit, self.size, azimuth, elevation)
         self.box = np.stack([fit.min(0), fit.max(0)])
         self.fixed = np.zeros(0, np.int64) if fixed is None else mesh.vertex_indices(fixed)
+        self._cones = None if held is None else held_along(mesh, self.fixed, np.asarray(held, np.float64))
+        self.scale: dict[str, float] = {}  # the largest vector of each label of arrows so far
+        self.colours: dict[str, np.ndarray] = {}  # of marks, by label
         self.obstacles, self._around = tuple(obstacles), [Surface(*shape) for shape in obstacles]
         self._surface = Surface(mesh.vertices, mesh.surface_triangles)
         self._backdrop = Backdrop(self.size, ground, self.box)
@@ -85,6 +110,7 @@ class Drawing:
         values: ArrayLike | None = None,
         size: tuple[int, int] | None = None,
         obstacles: Sequence[np.ndarray] | None = None,
+        drawn: Sequence[Mark] = (),
     ) -> tuple[Soup, list]:
         """The triangles to paint, and (points, triangles) of what throws shadows."""
         points = np.asarray(positions, np.float64)
@@ -102,11 +128,33 @@ class Drawing:
         soups = [with_edges(body, 0.0006 * size[1]) if self.wireframe else body]
         placed = [s.points for s in self._around] if obstacles is None else obstacles
         soups += [s.lit(p, OBSTACLE, self.camera, size) for s, p in zip(self._around, placed)]
-        if len(self.fixed):
-            near = 0.01 * float(np.ptp(self.box, 0).max())
-            soups.append(marks(points[self.fixed], self.camera, size, 0.004 * size[1], near))
+        soups += self._supports(points, size) + self._glyphs(drawn, size)
         shapes = [(points, self.mesh.surface_triangles), *((p, s.triangles) for s, p in zip(self._around, placed))]
         return Soup.joined(soups), shapes
+
+    def _supports(self, points: np.ndarray, size: tuple[int, int]) -> list[Soup]:
+        wholly, extent = self.fixed, float(np.ptp(self.box, 0).max())
+        out = []
+        if self._cones is not None:
+            wholly, vertices, axes = self._cones
+            out.append(cones(points[vertices], axes, 0.035 * extent, self.camera, size))
+        if len(wholly):
+            out.append(marks(points[wholly], self.camera, size, 0.004 * size[1], 0.01 * extent))
+        return out
+
+    def _glyphs(self, drawn: Sequence[Mark], size: tuple[int, int]) -> list[Soup]:
+        if not drawn:
+            return []
+        self.scale = longest(drawn, self.scale)
+        for mark in drawn:
+            self.colours.setdefault(mark.label, COLOURS[len(self.colours) % len(COLOURS)])
+        return glyphs(drawn, self.scale, self.colours, arrow_length(self.mesh), self.camera, size)
+
+    def key(self, drawn: Sequence[Mark]) -> list[tuple[str, np.ndarray]]:
+        """(text, colour) of lines that say what cones, arrows and lines of a picture mean; none where there are none."""
+        wholly = self.fixed if self._cones is None else self._cones[0]
+        some = [mark for mark in drawn if not isinstance(mark, Arrows) or len(mark.points)]
+        return key_lines(some, self.scale, self.colours, len(wholly) > 0, self._cones is not None)
 
     def backdrop(self, shapes: Sequence[Triangles]) -> np.ndarray:
         """What lies behind, with the shadows of `shapes` from `soup`: RGB in [0, 1], float32 (height, width, 3)."""
@@ -118,18 +166,22 @@ class Drawing:
         values: ArrayLike | None = None,
         title: str = "",
         obstacles: Sequence[np.ndarray] | None = None,
+        drawn: Sequence[Mark] = (),
     ) -> np.ndarray:
         """A picture, RGB uint8 (height, width, 3), of the body at `positions` [m], shape (num_vertices, 3).
 
         values: one per vertex or per tetrahedron (averaged to vertices), shown in colours with the legend of the
         colouring; without a colouring the first frame's values set it. obstacles: points of each obstacle, if they moved.
+        drawn: arrows, lines and points (terms/marks.py), with a key; see `scene_marks.marks_of`.
         Raises ValueError for shapes that do not fit and for numbers that are not finite.
         """
-        soup, shapes = self.soup(positions, values, None, obstacles)
+        soup, shapes = self.soup(positions, values, None, obstacles, drawn)
         image = self._painter.paint(soup, self.backdrop(shapes))
         image = np.ascontiguousarray(np.clip(255 * image + 0.5, 0, 255).astype(np.uint8))
         if values is not None:
             self.add_legend(image)
+        key = self.key(drawn)
+        image = write_key(image, key) if key else image
         return write_text(image, title) if title else image
 
     def add_legend(self, image: np.ndarray) -> None:

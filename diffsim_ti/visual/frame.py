@@ -1,5 +1,6 @@
 """A moment of a run, and what all of its moments share: what writers, films and windows are given."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -7,9 +8,14 @@ import numpy as np
 
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.obstacles import floor_of, obstacle_surfaces
+from diffsim_ti.outputs import Output
+from diffsim_ti.outputs.given_loads import GivenLoads
 from diffsim_ti.scene import Scene
 from diffsim_ti.simulator import Simulator
+from diffsim_ti.terms.marks import Mark
 from diffsim_ti.terms.obstacles.shapes import Triangles
+from diffsim_ti.visual.fields import FIELDS
+from diffsim_ti.visual.scene_marks import marks_of
 
 if TYPE_CHECKING:
     from diffsim_ti.rollout.frames import Frames
@@ -17,17 +23,23 @@ if TYPE_CHECKING:
 
 @dataclass
 class Setting:
-    """What all frames share: the mesh at rest, the floor's height [m], fixed vertices, obstacles as they first stand."""
+    """What all frames share: the mesh at rest, the floor's height [m], fixed vertices, obstacles as they first stand.
+
+    held: of fixed vertices the projectors onto the directions in which each is held, shape (len(fixed), 3, 3), where some
+    are held in some directions alone; else None.
+    """
 
     mesh: TetrahedralMesh
     ground: float | None = None
     fixed: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
     obstacles: list[Triangles] = field(default_factory=list)
+    held: np.ndarray | None = None
 
     @classmethod
     def of(cls, scene: Scene) -> "Setting":
         """A scene's."""
-        return cls(scene.mesh, floor_of(scene), scene.held, obstacle_surfaces(scene))
+        held = scene.supports.held if len(scene.supports.guided) else None
+        return cls(scene.mesh, floor_of(scene), scene.held, obstacle_surfaces(scene), held)
 
 
 @dataclass
@@ -36,8 +48,10 @@ class Frame:
 
     time [s]; positions, displacements [m], velocities [m/s]: shape (num_vertices, 3).
     fields: numbers to colour by, one per vertex or per tetrahedron, under the names in fields.py: "displacement" [m],
-    "speed" [m/s], "von_mises" [Pa], "energy_density" [J/m^3], "J" [-] ...
-    obstacles: points of each obstacle [m], or None where the setting has them.
+    "speed" [m/s], "von_mises" [Pa], "energy_density" [J/m^3], "J" [-] ...; where the scene has loads, "loads" [N]: what
+    tractions, pressures, body and external forces do to each vertex, shape (num_vertices, 3).
+    obstacles: points of each obstacle [m], or None where the setting has them. marks: arrows, lines and points that show
+    the scene's terms (scene_marks.py). units: {name of a field: its unit}, where known.
     """
 
     time: float
@@ -46,26 +60,69 @@ class Frame:
     velocities: np.ndarray
     fields: dict[str, np.ndarray]
     obstacles: list[np.ndarray] | None = None
+    marks: list[Mark] = field(default_factory=list)
+    units: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def colours(self) -> dict[str, np.ndarray]:
+        """The fields that pictures can be coloured by."""
+        return {name: values for name, values in self.fields.items() if name in FIELDS}
 
     @classmethod
     def of_run(cls, scene: Scene, frames: "Frames", k: int) -> "Frame":
         """Frame k of a Rollout's run of a scene; its fields are the outputs that each vertex or each tetrahedron has:
-        vectors such as ContactForce(per_vertex=True), tensors and principal values such as Stress(at="vertices").
+        vectors such as ContactForce(per_vertex=True), tensors and principal values such as Stress(at="vertices"). What some
+        vertices have, such as Reaction(per_vertex=True), is zero at the others.
 
         Raises IndexError for a frame that there is not.
         """
         u, v = frames.displacements[k], frames.velocities[k]
         fields = dict(displacement=np.linalg.norm(u, axis=1), speed=np.linalg.norm(v, axis=1))
-        sizes = scene.mesh.num_vertices, scene.mesh.num_tetrahedra
-        shown = {name: y[k] for name, y in frames.outputs.items() if y.ndim > 2 and y.shape[1] in sizes}
-        return cls(float(frames.times[k]), frames.positions[k], u, v, fields | shown)
+        given = [(name, frames.computed.get(name), y[k]) for name, y in frames.outputs.items()]
+        shown, units = _of_items(given, scene)
+        step = int(frames.steps[k])
+        shown |= _loads(scene, frames.positions[k], step, frames.inputs)
+        drawn = marks_of(scene, frames.positions[k], float(frames.times[k]), step, frames.inputs)
+        moved = [points for points, _ in obstacle_surfaces(scene, float(frames.times[k]))] if scene.moving else None
+        return cls(float(frames.times[k]), frames.positions[k], u, v, fields | shown, moved, drawn, units)
 
     @classmethod
-    def of(cls, simulator: Simulator, **more) -> "Frame":
-        """The present state of a simulator, in its scene's precision. more: further arguments of the class."""
+    def of(cls, simulator: Simulator, outputs: Iterable[Output] = (), last: Simulator | None = None, **more) -> "Frame":
+        """The present state of a simulator, in its scene's precision. more: further arguments of the class.
+
+        outputs: become fields as in `of_run`; last: the simulator that took the last step to this state, if another did.
+        """
         u, v, scene = simulator.displacements, simulator.velocities, simulator.scene
         measured = simulator.tetrahedron_fields()
         fields = dict(displacement=np.linalg.norm(u, axis=1), speed=np.linalg.norm(v, axis=1))
         fields |= {name: getattr(measured, name) for name in ("von_mises", "energy_density", "J")}
         moved = [points for points, _ in obstacle_surfaces(scene, simulator.time)] if scene.moving else None
-        return cls(simulator.time, simulator.positions, u, v, fields, moved, **more)
+        x, values = simulator.positions, simulator.values
+        drawn = marks_of(scene, x, simulator.time, simulator.step_count, values)
+        by = last or simulator
+        shown, units = _of_items([(output.name, by.settled(output), by.output(output)) for output in outputs], scene)
+        shown |= _loads(scene, x, simulator.step_count, simulator.values_of_step)
+        return cls(simulator.time, x, u, v, fields | shown, moved, **dict(marks=drawn, units=units) | more)
+
+
+def _of_items(values: Iterable[tuple], scene: Scene) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    """Of (name, settled output or None, its value at a moment) what each vertex or tetrahedron has, and units. What some
+    vertices have, those that the output names as its `vertices`, is zero at the others."""
+    shown, units, n = {}, {"loads": "N"}, scene.mesh.num_vertices
+    for name, output, y in values:
+        units[name], places = getattr(output, "unit", ""), getattr(output, "vertices", None)
+        y = np.asarray(y)
+        if (y.ndim > 1 or getattr(output, "per_item", False)) and y.shape[0] in (n, scene.mesh.num_tetrahedra):
+            shown[name] = y
+        elif y.ndim and places is not None and getattr(output, "per_vertex", False):
+            shown[name] = np.zeros((n, *y.shape[1:]), y.dtype)
+            shown[name][places] = y
+    return shown, units
+
+
+def _loads(scene: Scene, positions: np.ndarray, step: int, values: dict) -> dict[str, np.ndarray]:
+    """{"loads": forces of loads on each vertex}, of the step that ends there; nothing in a scene without."""
+    if not scene.dead_loads and not scene.pressures:
+        return {}
+    forces = GivenLoads(scene, weight=False).forces
+    return {"loads": forces(scene.inputs.derive(values), positions.astype(np.float64), step)}

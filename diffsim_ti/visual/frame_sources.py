@@ -44,7 +44,9 @@ class FrameSource(ABC):
     def look(self) -> dict:
         """What `Drawing` takes: floor, obstacles, fixed vertices, box."""
         shared = self.setting
-        return dict(ground=shared.ground, obstacles=shared.obstacles, fixed=shared.fixed, box=self.box())
+        return dict(
+            ground=shared.ground, obstacles=shared.obstacles, fixed=shared.fixed, held=shared.held, box=self.box()
+        )
 
     @abstractmethod
     def box(self) -> np.ndarray:
@@ -86,7 +88,7 @@ class SavedFrames(FrameSource):
     def _extent(self, name: str) -> Extent:
         if not self._extents:
             for frame in map(self._series.frame, range(len(self))):
-                for known, values in frame.fields.items():
+                for known, values in frame.colours.items():
                     self._extents.setdefault(known, Extent(self.mesh, known)).add(frame.positions, values)
         return self._extents[name]
 
@@ -165,7 +167,7 @@ class LiveFrames(FrameSource):
         sim, seen = self.run.simulator, self.run.seen
         frame, energy = ShownFrame.of(sim), sim.compute_energy()
         frame.fields["stiffness"] = field_of(sim, "stiffness")
-        for name, values in frame.fields.items():
+        for name, values in frame.colours.items():
             shown = to_vertices(self.mesh, values)[self.mesh.surface_vertices]
             low, high = np.percentile(shown, [0.5, 99.5])
             least, most = self._limits.get(name, (low, high))

@@ -1,5 +1,6 @@
 """Words and the colour bar on a picture."""
 
+from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -44,6 +45,19 @@ def _font(pixels: int):
     from PIL import ImageFont
 
     return ImageFont.truetype(findfont("DejaVu Sans"), pixels)
+
+
+def write_key(image: np.ndarray, rows: Sequence[tuple[str, np.ndarray]]) -> np.ndarray:
+    """The picture with lines of words, each in its colour (RGB in [0, 1]), at its lower left."""
+    from PIL import Image, ImageDraw
+
+    out = Image.fromarray(image)
+    height, margin = max(10, round(0.024 * image.shape[0])), 0.025 * image.shape[1]
+    pen = ImageDraw.Draw(out)
+    for k, (text, colour) in enumerate(rows):
+        y = image.shape[0] - margin - 1.35 * height * (len(rows) - k)
+        pen.text((margin, y), text, tuple(int(255 * c) for c in 0.85 * colour), _font(height))
+    return np.array(out)
 
 
 def write_text(image: np.ndarray, text: str) -> np.ndarray:

@@ -1,8 +1,10 @@
 """Reading a run that was saved as a series: a .pvd that lists .vtu files with their times (writers/paraview.py).
 
-Part 0 of a moment is the body, part 1 the obstacles; the list's attribute `ground` is the floor's height [m].
+Part 0 of a moment is the body, part 1 the obstacles, part 2 marks (series_marks.py); the list's attribute `ground` is the
+floor's height [m], `marks` are labels, `units` those of fields.
 """
 
+import json
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -12,6 +14,7 @@ from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.terms.obstacles.shapes import Triangles
 from diffsim_ti.visual.fields import FIELDS
 from diffsim_ti.visual.frame import Frame, Setting
+from diffsim_ti.visual.series_marks import read_marks
 
 
 def listed(path: str | Path) -> list[tuple[float, str, Path]]:
@@ -39,7 +42,10 @@ class SavedSeries:
 
     def __init__(self, path: str | Path):
         self._frames = frames_of(path)
-        self._obstacles = [file for _, part, file in listed(path) if part == "1"]
+        self._parts: list[dict[str, Path]] = []  # of each frame
+        for _, part, file in listed(path):
+            self._parts += [{}] if part == "0" else []
+            self._parts[-1][part] = file
         self._read: tuple[Path | None, list[Triangles]] = (None, [])
         if not self._frames:
             raise ValueError(f"{path}: must list at least one frame, lists none; run the simulation first")
@@ -50,9 +56,13 @@ class SavedSeries:
                 "diffsim-ti"
             )
         rest = TetrahedralMesh(first.points - first.point_data["displacement"], first.cells_dict["tetra"])
-        ground = next(ElementTree.parse(path).getroot().iter("Collection")).get("ground")
+        own = next(ElementTree.parse(path).getroot().iter("Collection"))
+        ground, self._labels = own.get("ground"), json.loads(own.get("marks", "[]"))
+        self._units = json.loads(own.get("units", "{}"))
         fixed = np.flatnonzero(first.point_data.get("fixed", []))
         self.setting = Setting(rest, None if ground is None else float(ground), fixed, self._shapes(0))
+        if "held" in first.point_data:
+            self.setting.held = first.point_data["held"][fixed].reshape(-1, 3, 3)
 
     def __len__(self) -> int:
         return len(self._frames)
@@ -63,7 +73,11 @@ class SavedSeries:
         u, v = (saved.point_data[name] for name in ("displacement", "velocity"))
         fields = dict(displacement=np.linalg.norm(u, axis=1), speed=np.linalg.norm(v, axis=1))
         fields |= {name: np.asarray(saved.cell_data[name][0], np.float64) for name in FIELDS if name in saved.cell_data}
-        return Frame(self._frames[k][0], saved.points, u, v, fields, [points for points, _ in self._shapes(k)])
+        vectors = {name: y for name, y in saved.point_data.items() if np.shape(y) == (len(u), 3)}
+        fields |= {name: y for name, y in vectors.items() if name not in ("displacement", "velocity")}
+        marks = read_marks(self._parts[k]["2"], self._labels) if "2" in self._parts[k] else []
+        around = [points for points, _ in self._shapes(k)]
+        return Frame(self._frames[k][0], saved.points, u, v, fields, around, marks, self._units)
 
     def _mesh(self, k: int):
         import meshio
@@ -74,9 +88,9 @@ class SavedSeries:
         """(points [m], triangles) of each obstacle in frame k."""
         import meshio
 
-        if not self._obstacles:
+        if "1" not in self._parts[k]:
             return []
-        file = self._obstacles[k]
+        file = self._parts[k]["1"]
         if self._read[0] != file:
             surface = meshio.read(file)
             triangles, number = surface.cells_dict["triangle"], surface.cell_data["obstacle"][0]

@@ -86,7 +86,9 @@ def with_edges(soup: Soup, width: float) -> Soup:
     return Soup(corners.reshape(-1, 3, 3), colours.reshape(-1, 3, 3), np.repeat(soup.distance, 2))
 
 
-def marks(points: ArrayLike, camera: Camera, size: tuple[int, int], radius: float, nearer: float) -> Soup:
+def marks(
+    points: ArrayLike, camera: Camera, size: tuple[int, int], radius: float, nearer: float, colour: np.ndarray = MARK
+) -> Soup:
     """A disc of `radius` pixels at each point, drawn `nearer` [m] to the eye than it lies."""
     angle = np.linspace(0, 2 * np.pi, 9)
     rim = radius * np.stack([np.cos(angle), np.sin(angle)], 1)
@@ -96,7 +98,7 @@ def marks(points: ArrayLike, camera: Camera, size: tuple[int, int], radius: floa
     corners[:, :, 2, :2] += rim[1:]
     corners[..., 2] = np.maximum(corners[..., 2] - nearer, 1e-6)
     corners = corners.reshape(-1, 3, 3)
-    return Soup(corners, np.broadcast_to(MARK, corners.shape), corners[:, :, 2].mean(1))
+    return Soup(corners, np.broadcast_to(colour, corners.shape), corners[:, :, 2].mean(1))
 
 
 def _normalized(v: np.ndarray) -> np.ndarray:

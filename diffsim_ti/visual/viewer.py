@@ -71,10 +71,10 @@ class Viewer:
         self._mouse()
         self._play()
         frame, drawing = self.source.frame(self.at), self.drawing
-        values = frame.fields.get(self.colour)
+        values = frame.colours.get(self.colour)
         if values is not None:
             drawing.colouring = self.source.colouring(self.colour)
-        soup, shapes = drawing.soup(frame.positions, values, None, frame.obstacles)
+        soup, shapes = drawing.soup(frame.positions, values, None, frame.obstacles, frame.marks)
         if self.held is not None:
             ends = np.stack([frame.positions[self.held], self._under_cursor()])
             soup = Soup.joined([soup, marks(ends, drawing.camera, self.size, 0.008 * self.size[1], 0.5 * self._depth)])
@@ -107,7 +107,7 @@ class Viewer:
             elif event.key == "w":
                 self.drawing.wireframe = not self.drawing.wireframe
             elif event.key == "c":
-                names = list(self.source.frame(self.at).fields)
+                names = list(self.source.frame(self.at).colours)
                 self.colour = names[(names.index(self.colour) + 1) % len(names)] if self.colour in names else names[0]
             elif event.key == "s" and self.output is not None:
                 self.save()
@@ -194,8 +194,9 @@ class Viewer:
     def _panel(self, frame) -> None:
         left, top, width = PANEL
         saving = self.output is not None
-        notes = [*frame.notes, *filter(None, [self._saved])]
-        self._panel_height = 0.02 + 0.032 * (7 + saving + len(frame.fields)) + 0.024 * len(notes)
+        key = [text for text, _ in self.drawing.key(frame.marks)]
+        notes = [*frame.notes, *key, *filter(None, [self._saved])]
+        self._panel_height = 0.02 + 0.032 * (7 + saving + len(frame.colours)) + 0.024 * len(notes)
         with self.window.get_gui().sub_window("diffsim_ti", left, top, width, self._panel_height) as gui:
             gui.text(f"t = {frame.time:.4f} s, frame {self.at} of {len(self.source) - 1}, {self._rate:.0f} a second")
             if gui.button("pause" if self.playing else "play"):
@@ -205,7 +206,7 @@ class Viewer:
                 self.go(min(chosen, len(self.source) - 1))
             self.speed = gui.slider_float("speed", self.speed, 0.1, 4.0)
             self.drawing.wireframe = gui.checkbox("edges", self.drawing.wireframe)
-            for name in frame.fields:
+            for name in frame.colours:
                 if gui.button(("* " if name == self.colour else "  ") + field_named(name).label):
                     self.colour = name
             if self.colour in frame.fields:

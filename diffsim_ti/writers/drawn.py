@@ -1,5 +1,6 @@
 """What pictures and films share: frames wait in a temporary file until the camera and the colours that fit all are known."""
 
+import pickle
 import tempfile
 from collections.abc import Iterator
 
@@ -8,6 +9,7 @@ import numpy as np
 from diffsim_ti.visual.drawing import Drawing
 from diffsim_ti.visual.extent import Extent
 from diffsim_ti.visual.frame import Frame, Setting
+from diffsim_ti.visual.scene_marks import results_as_arrows
 from diffsim_ti.writers.writer import Writer
 
 
@@ -22,13 +24,15 @@ class DrawnWriter(Writer):
         self._waiting, self.count = tempfile.TemporaryFile(), 0
 
     def write(self, frame: Frame) -> None:
-        if self.view.colour not in frame.fields:
-            known = ", ".join(frame.fields)
+        if self.view.colour not in frame.colours:
+            known = ", ".join(frame.colours)
             raise ValueError(f"colour: the frame must hold {self.view.colour}, it holds {known}; choose one of these")
         values = np.asarray(frame.fields[self.view.colour])
-        self._extent.add(frame.positions, values)
+        marks = [*frame.marks, *results_as_arrows(frame, self.setting.mesh, self.view.arrows)]
+        self._extent.add(frame.positions, values, marks)
         for array in (frame.time, frame.positions, values, *self._points(frame)):
             np.save(self._waiting, array)
+        pickle.dump(marks, self._waiting)
         self.count += 1
 
     def _points(self, frame: Frame) -> list[np.ndarray]:
@@ -51,10 +55,13 @@ class DrawnWriter(Writer):
             azimuth=view.azimuth,
             elevation=view.elevation,
             backend=view.backend,
+            held=setting.held,
         ) as drawing:
+            drawing.scale = self._extent.scale
             if view.say:
                 view.say(drawing.describe())
             for _ in range(self.count):
                 time, positions, values, *points = (np.load(self._waiting) for _ in range(3 + len(setting.obstacles)))
+                marks = pickle.load(self._waiting)
                 title = f"{view.title}, " * bool(view.title) + f"t = {float(time):.3f} s"
-                yield drawing.image(positions, values, title, points)
+                yield drawing.image(positions, values, title, points, marks)

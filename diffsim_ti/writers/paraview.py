@@ -1,8 +1,10 @@
 """A series that ParaView opens: one .vtu per frame, and a .pvd that lists them with their times (visual/series.py reads it).
 
-Part 0 of a moment is the body, part 1 the obstacles; the list's attribute `ground` is the floor's height [m].
+Part 0 of a moment is the body, part 1 the obstacles, part 2 arrows and lines that show loads and the like
+(visual/series_marks.py); the list's attribute `ground` is the floor's height [m], `marks` are the labels of part 2.
 """
 
+import json
 import os
 from pathlib import Path
 from xml.etree import ElementTree
@@ -12,6 +14,7 @@ import numpy as np
 from diffsim_ti.visual.fields import FIELDS
 from diffsim_ti.visual.frame import Frame, Setting
 from diffsim_ti.visual.series import listed
+from diffsim_ti.visual.series_marks import write_marks
 from diffsim_ti.writers.writer import Writer, register
 
 PER_TETRAHEDRON = ("von_mises", "energy_density", "J")
@@ -40,7 +43,9 @@ class ParaViewWriter(Writer):
     def open(self, setting: Setting) -> None:
         self.setting, self.count = setting, 0
         self.folder, self.name = self.path.parent, self.path.stem
-        self._rows: list[tuple[float, list[Path]]] = []
+        self._rows: list[tuple[float, dict[int, Path]]] = []
+        self._labels: list[str] = []  # of marks
+        self._units: dict[str, str] = {}
         self._around: list[np.ndarray] | None = None  # obstacles as they were last written
         self._obstacles: list[Path] = []
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -67,14 +72,27 @@ class ParaViewWriter(Writer):
         saved = meshio.Mesh(
             np.asarray(frame.positions, np.float64),
             [("tetra", self.setting.mesh.tetrahedra)],
-            point_data=point_data | {"fixed": held},
+            point_data=point_data | {"fixed": held} | self._held(dtype),
             cell_data={name: [value] for name, value in cell_data.items()},
         )
         saved.write(path, file_format="vtu", binary=True)
         self._write_obstacles(frame)
-        self._rows.append((float(frame.time), [path, *self._obstacles[-1:]]))
+        parts = {0: path} | ({1: self._obstacles[-1]} if self._obstacles else {})
+        if frame.marks:
+            parts[2] = self.folder / f"{self.name}_marks_{self.count:04d}.vtu"
+            write_marks(parts[2], frame.marks, self._labels)
+        self._units |= {name: unit for name, unit in frame.units.items() if unit}
+        self._rows.append((float(frame.time), parts))
         self._write_list()
         self.count += 1
+
+    def _held(self, dtype) -> dict[str, np.ndarray]:
+        """Where some vertices are held in some directions alone: the projectors onto these, row by row."""
+        if self.setting.held is None:
+            return {}
+        rows = np.zeros((self.setting.mesh.num_vertices, 9), dtype)
+        rows[self.setting.fixed] = self.setting.held.reshape(-1, 9)
+        return {"held": rows}
 
     def _write_obstacles(self, frame: Frame) -> None:
         """The obstacles as triangles, numbered, where they are not as they were written last."""
@@ -95,9 +113,12 @@ class ParaViewWriter(Writer):
     def _write_list(self) -> None:
         root = ElementTree.Element("VTKFile", type="Collection", version="0.1", byte_order="LittleEndian")
         ground = self.setting.ground
-        rows = ElementTree.SubElement(root, "Collection", {} if ground is None else {"ground": f"{ground:.9g}"})
+        own = {} if ground is None else {"ground": f"{ground:.9g}"}
+        own |= {"marks": json.dumps(self._labels)} if self._labels else {}
+        own |= {"units": json.dumps(self._units)} if self._units else {}
+        rows = ElementTree.SubElement(root, "Collection", own)
         for at, parts in self._rows:
-            for part, file in enumerate(parts):
+            for part, file in parts.items():
                 row = dict(timestep=f"{at:.9g}", group="", part=str(part), file=file.name)
                 ElementTree.SubElement(rows, "DataSet", row)
         ElementTree.indent(root)

@@ -23,7 +23,8 @@ class View:
     colour: a name in visual/fields.py; fps: frames per second of a film; size: width and height [pixels], None for what
     suits the format. camera, or azimuth and elevation [degrees] of one that sees all; ground: height of a floor [m]
     instead of the setting's own; wireframe: draw edges; backend: "software", "vulkan" or "auto"; title: words before the
-    time. fit: what camera and colours of a picture of the end are chosen by: the whole "run", or the "end" alone.
+    time. arrows: names of fields that are vectors of vertices, such as forces, to draw as arrows.
+    fit: what camera and colours of a picture of the end are chosen by: the whole "run", or the "end" alone.
     say: told once what draws.
     Raises ValueError for what is out of range.
     """
@@ -38,6 +39,7 @@ class View:
     wireframe: bool = False
     backend: str = "software"
     title: str = ""
+    arrows: tuple[str, ...] = ()
     fit: str = "run"
     say: Callable[[str], object] | None = None
 

@@ -1,0 +1,102 @@
+"""Work of loads on a body, frame after frame."""
+
+from copy import copy
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from diffsim_ti.outputs.given_loads import GivenLoads
+from diffsim_ti.outputs.output import Change, Output
+
+if TYPE_CHECKING:
+    from diffsim_ti.rollout.frames import Frames
+    from diffsim_ti.scene import Scene
+
+
+class WorkOfLoads(Output):
+    """Work [J] that loads have done on the body since the first frame, shape (frames,): the sum over the frames before of
+
+        W_k - W_(k-1) = 1/6 [F_b(a) + 2 F_b(m) + 2 F_e(m) + F_e(b)] . (b - a),        m = (a + b) / 2
+
+    a, b: positions in the two frames; F_b(x), F_e(x): forces of all tractions, body forces, external forces and pressures
+    at x, as the first step between the frames begins and as the last one ends; with weight=True also those of gravity.
+    It is Simpson's rule along straight ways from frame to frame under loads that go linearly in time: exact, to round-off,
+    for such ways; for loads that are constant and dead (and weight), and for a constant pressure on a closed surface (minus
+    p times the change of volume), whatever the way. Else its error falls as the square of the time between frames; with
+    save_every=1 loads for each step are those of their step. Loads that change between frames further apart are not seen
+    there. What moves held vertices, obstacles and drag do no work of loads.
+
+    weight: whether gravity counts. name: how a loss calls it. The gradient is exact by all inputs.
+    Raises ValueError for a scene without such loads.
+    Belytschko, Liu, Moran, Nonlinear Finite Elements for Continua and Structures, 2000, sec. 6.2.3 (energy balance).
+    """
+
+    unit, cumulative = "J", True
+
+    def __init__(self, weight: bool = False, name: str = "work"):
+        self.weight, self.name = bool(weight), name
+
+    def settled(self, scene: "Scene") -> "WorkOfLoads":
+        out = copy(self)
+        out.scene, out.loads = scene, GivenLoads(scene, weight=self.weight)
+        if out.loads.gravity is None and out.loads.loaded is None and out.loads.follower is None:
+            raise ValueError(
+                "WorkOfLoads: the scene has no load: add a Traction, BodyForce, ExternalForce or Pressure, or count gravity "
+                "by weight=True"
+            )
+        return out
+
+    def shape(self, num_frames: int) -> tuple[int, ...]:
+        return (num_frames,)
+
+    def _points(self, frames, k: int):
+        """(weight, place, share of a, step, whether as that step begins) of each force between frames k - 1 and k."""
+        a, b = frames.positions[k - 1].astype(np.float64), frames.positions[k].astype(np.float64)
+        first, last = int(frames.steps[k - 1]) + 1, int(frames.steps[k])
+        middle = 0.5 * (a + b)
+        return [
+            (1 / 6, a, 1.0, first, True),
+            (1 / 3, middle, 0.5, first, True),
+            (1 / 3, middle, 0.5, last, False),
+            (1 / 6, b, 0.0, last, False),
+        ]
+
+    def _gone(self, frames, k: int) -> np.ndarray:
+        return frames.positions[k].astype(np.float64) - frames.positions[k - 1].astype(np.float64)
+
+    def value(self, frames: "Frames") -> np.ndarray:
+        derived, parts = self.scene.inputs.derive(frames.inputs), [0.0]
+        for k in range(1, len(frames.positions)):
+            mean = sum(w * self.loads.forces(derived, x, s, begins) for w, x, _, s, begins in self._points(frames, k))
+            parts.append(float((mean * self._gone(frames, k)).sum()))
+        return np.cumsum(parts)
+
+    def jvp(self, frames: "Frames", change: Change) -> np.ndarray:
+        derived = self.scene.inputs.derive(frames.inputs)
+        moved = self.scene.inputs.derive_jvp(frames.inputs, change.inputs)
+        dx = np.zeros(frames.positions.shape) if change.positions is None else change.positions
+        parts = [0.0]
+        for k in range(1, len(dx)):
+            mean, dmean = np.zeros((2, *dx.shape[1:]))
+            for w, x, share, s, begins in self._points(frames, k):
+                own = share * dx[k - 1] + (1 - share) * dx[k]
+                mean += w * self.loads.forces(derived, x, s, begins)
+                dmean += w * self.loads.jvp(derived, moved, x, own, s, begins)
+            parts.append(float((dmean * self._gone(frames, k) + mean * (dx[k] - dx[k - 1])).sum()))
+        return np.cumsum(parts)
+
+    def vjp(self, frames: "Frames", seed: np.ndarray) -> Change:
+        derived = self.scene.inputs.derive(frames.inputs)
+        positions, adjoint = np.zeros(frames.positions.shape), derived.zeros()
+        later = np.cumsum(seed[::-1])[::-1]  # a part counts in all frames after it
+        for k in range(1, len(positions)):
+            gone, mean = later[k] * self._gone(frames, k), np.zeros(positions.shape[1:])
+            for w, x, share, s, begins in self._points(frames, k):
+                mean += w * self.loads.forces(derived, x, s, begins)
+                by_x = self.loads.vjp(derived, x, w * gone, s, adjoint, begins)
+                positions[k - 1] += share * by_x
+                positions[k] += (1 - share) * by_x
+            positions[k] += later[k] * mean
+            positions[k - 1] -= later[k] * mean
+        inputs = self.scene.inputs.derive_vjp(frames.inputs, adjoint, tuple(frames.inputs))
+        return Change(positions=positions, inputs=inputs)

@@ -1,0 +1,65 @@
+"""Marks (terms/marks.py) in a series: part 2 of a moment, which ParaView shows as lines, and as arrows by its filter Glyph.
+
+A .vtu of lines and of vertices; point data "vector" and "onto" (of arrows; 0 elsewhere), cell data "mark": the number of the
+label in the list's attribute `marks`, and "kind": 0 arrow, 1 line, 2 point.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from diffsim_ti.terms.marks import Arrows, Lines, Mark, Points
+
+ARROW, LINE, POINT = range(3)
+
+
+def write_marks(path: Path, drawn: Sequence[Mark], labels: list[str]) -> None:
+    """Write marks, adding labels that are new to the list."""
+    import meshio
+
+    points, vectors, onto, cells = [], [], [], {"line": [], "vertex": []}
+    numbers, kinds, count = {"line": [], "vertex": []}, {"line": [], "vertex": []}, 0
+    for mark in drawn:
+        if mark.label not in labels:
+            labels.append(mark.label)
+        x = mark.ends.reshape(-1, 3) if isinstance(mark, Lines) else mark.points
+        form, kind = (
+            ("line", LINE) if isinstance(mark, Lines) else ("vertex", ARROW if isinstance(mark, Arrows) else POINT)
+        )
+        points.append(x)
+        vectors.append(mark.vectors if kind == ARROW else np.zeros_like(x))
+        onto.append(mark.onto if kind == ARROW else np.zeros(len(x), bool))
+        cells[form].append(np.arange(count, count + len(x)).reshape(-1, 2 if kind == LINE else 1))
+        numbers[form].append(np.full(len(cells[form][-1]), labels.index(mark.label)))
+        kinds[form].append(np.full(len(cells[form][-1]), kind))
+        count += len(x)
+    used = [form for form in cells if cells[form]]
+    meshio.Mesh(
+        np.concatenate(points),
+        [(form, np.concatenate(cells[form])) for form in used],
+        point_data=dict(vector=np.concatenate(vectors).astype(float), onto=np.concatenate(onto).astype(np.uint8)),
+        cell_data={
+            name: [np.concatenate(of[form]) for form in used] for name, of in (("mark", numbers), ("kind", kinds))
+        },
+    ).write(path, file_format="vtu", binary=True)
+
+
+def read_marks(path: Path, labels: Sequence[str]) -> list[Mark]:
+    """What `write_marks` wrote; those of one label and kind are one."""
+    import meshio
+
+    saved, out = meshio.read(path), []
+    for block, number, kind in zip(saved.cells, saved.cell_data["mark"], saved.cell_data["kind"]):
+        for which, how in np.unique(np.stack([number, kind], 1), axis=0):
+            own = block.data[(number == which) & (kind == how)]
+            label, x = labels[which], saved.points[own]
+            if how == LINE:
+                out.append(Lines(label, x))
+            elif how == POINT:
+                out.append(Points(label, x[:, 0]))
+            else:
+                own = own[:, 0]
+                onto = saved.point_data["onto"][own].astype(bool)
+                out.append(Arrows(label, x[:, 0], saved.point_data["vector"][own], onto))
+    return out
