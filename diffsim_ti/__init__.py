@@ -19,6 +19,7 @@ from diffsim_ti.modes import Modes, modes
 from diffsim_ti.monitor.energy_watch import EnergyGained
 from diffsim_ti.monitor.guard import Crossing, Divergence
 from diffsim_ti.outputs import (
+    ChamberPressure,
     ContactForce,
     ElasticEnergy,
     EnclosedVolume,
@@ -50,6 +51,8 @@ from diffsim_ti.terms import (
     Cylinder,
     Drag,
     ExternalForce,
+    FilledChamber,
+    GasChamber,
     Gravity,
     Ground,
     HalfSpace,
@@ -76,6 +79,8 @@ __all__ = [
     "ExternalForce",
     "Traction",
     "Pressure",
+    "GasChamber",
+    "FilledChamber",
     "BodyForce",
     "Ground",
     "HalfSpace",
@@ -109,6 +114,7 @@ __all__ = [
     "Stress",
     "Strain",
     "EnclosedVolume",
+    "ChamberPressure",
     "ElasticEnergy",
     "KineticEnergy",
     "modes",

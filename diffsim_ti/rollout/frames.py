@@ -22,6 +22,9 @@ class Frames:
     before, by its barrier and by friction; shape (frames, obstacles, 2, num_vertices, 3), obstacles as in
     `scene.obstacles`. The first frame has none.
 
+    `chamber_pressures` [Pa], where an output reads them: those in chambers whose volume is held, shape (frames, chambers),
+    of the substep that ends in the frame; others, and the first frame, have none (0).
+
     `inputs` are the values that the run started from, so that its gradient can be taken whenever it is wanted.
     """
 
@@ -33,6 +36,7 @@ class Frames:
     contact_resolution: ContactResolution | None = None
     outputs: dict[str, np.ndarray] = field(default_factory=dict)
     contact_forces: np.ndarray | None = field(default=None, repr=False)
+    chamber_pressures: np.ndarray | None = field(default=None, repr=False)
     steps: np.ndarray | None = field(default=None, repr=False)  # of the run that are done in each frame
     run: Run | None = field(default=None, repr=False)
 
@@ -72,6 +76,7 @@ class HostSeed:
     positions: np.ndarray
     velocities: np.ndarray
     contact_forces: np.ndarray | None = None
+    chamber_pressures: np.ndarray | None = None
 
     def put(self, adjoint, last_frame_is_state: bool) -> tuple[float, float]:
         adjoint.start(self.positions, self.velocities, last_frame_is_state)
