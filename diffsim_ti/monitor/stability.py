@@ -59,18 +59,18 @@ def element_limit(scene: "Scene", values: dict | None = None) -> StepLimit:
     largest = np.linalg.eigvalsh(np.einsum("eai,eaj->eij", N, N))[:, -1]
     omega2 = 4 / values["density"] * (np.maximum(lam, 0) * (N**2).sum((1, 2)) + 2 * mu * largest)
     worst = int(np.argmax(omega2))
-    gases = _gas_bound(scene, derived) if scene.chambers else 0.0
+    gases = _gas_bound(scene, values, derived) if scene.chambers else 0.0
     return StepLimit(float(2 / np.sqrt(omega2[worst] + gases)), worst, "element bound")
 
 
-def _gas_bound(scene: "Scene", derived) -> float:
+def _gas_bound(scene: "Scene", values: dict, derived) -> float:
     """What gases in chambers add to omega^2 at most, at rest: n p_0 / V_0 sum |dV/dx|^2 / m of the free vertices each."""
-    at, out = len(scene.pressures), 0.0
-    free = np.delete(np.arange(scene.mesh.num_vertices), scene.fixed)
+    free, out = np.delete(np.arange(scene.mesh.num_vertices), scene.fixed), 0.0
     for chamber in scene.chambers:
-        p, _, V, n = derived.follower[:, at : at + 4, :2].max((0, 2))
-        g, at = chamber.enclosure.gradient(derived.rest), at + 4
-        out += float(n * p / V * ((g[free] ** 2).sum(1) / derived.mass[free]).sum())
+        names = scene.input_names(chamber)
+        p = np.max(chamber.rows([0.0]) if chamber.keyed else values[names[chamber.plain]])
+        V, g = chamber.enclosure.volume(derived.rest), chamber.enclosure.gradient(derived.rest)
+        out += float(values[names["gas_exponent"]] * p / V * ((g[free] ** 2).sum(1) / derived.mass[free]).sum())
     return out
 
 

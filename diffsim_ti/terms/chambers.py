@@ -25,6 +25,7 @@ class Chamber(Term):
     inflates it. The forces are those of `Pressure`, p dV/dx, V the volume inside.
     """
 
+    shape = ()  # of what is given over time
     num_numbers = 0  # what is read of it lies in rows of its own
     row_names: tuple[str, ...] = ()  # of its numbers, each of which has a row in time
 
