@@ -62,6 +62,7 @@ GAS = [(kind, "f64") for kind in SOLVERS] + [
 ]
 
 
+@pytest.mark.executed_ptx
 @pytest.mark.parametrize("kind, precision", GAS)
 def test_every_number_of_a_gas(kind, precision):
     """By a dot product each; the pressure is given for each step, and the other gas by keyframes."""
@@ -258,3 +259,39 @@ def test_mistakes_are_refused(mistake):
     make, message = MISTAKES[mistake]
     with pytest.raises(ValueError, match=message):
         make()
+
+
+# ---- other faces -----------------------------------------------------------------------------------------------------
+
+
+def test_torch_and_tape_agree_with_arrays():
+    """Gradients of a held volume's pressure and of positions, in one loss."""
+    import taichi as ti
+    import torch
+
+    from diffsim_ti.diff_simulator import rollout_frames
+
+    rollout = rollout_of(ds.StaticSolver, filled(grown=(1.1,)), steps=1)
+    frames = rollout.forward()
+    weight = np.zeros(frames.positions.shape)
+    weight[-1, :, 2] = 1e3
+    expected = rollout.vjp(frames, weight, p_0=2 * frames["p_0"])["oil.volume"]
+    volume = torch.tensor(rollout.values["oil.volume"], requires_grad=True)
+    made = rollout_frames(rollout, **{"oil.volume": volume})
+    assert made["p_0"].detach().numpy() == pytest.approx(frames["p_0"])
+    ((made["p_0"] ** 2).sum() + 1e3 * made.positions[-1, :, 2].sum()).backward()
+    assert volume.grad.numpy() == pytest.approx(expected, rel=1e-7)
+    loss = ti.field(ti.f64, (), needs_grad=True)
+    p, x, own = rollout.field("p_0"), rollout.positions, rollout.field("oil.volume")
+
+    @ti.kernel
+    def measure():
+        for k in p:
+            loss[None] += p[k] ** 2
+        for i in range(x.shape[1]):
+            loss[None] += 1e3 * x[1, i][2]
+
+    with ti.ad.Tape(loss):
+        rollout.run()
+        measure()
+    assert own.grad.to_numpy() == pytest.approx(expected, rel=1e-7)
