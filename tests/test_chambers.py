@@ -261,6 +261,17 @@ def test_mistakes_are_refused(mistake):
         make()
 
 
+def test_a_simulator_takes_the_volumes_of_each_step():
+    """And keeps the pressure of the last pass alone, from which the next one starts."""
+    of = filled(grown=(1.02, 1.05, 1.1))
+    frames = ds.Rollout(solver_of(ds.ImplicitEulerSolver, of), 3, outputs=ds.ChamberPressure("oil")).forward()
+    sim = ds.Simulator(solver_of(ds.ImplicitEulerSolver, of))
+    sim.run(3)
+    assert sim.positions == pytest.approx(frames.positions[-1], rel=0, abs=1e-11)
+    kept = sim.workspace.multipliers
+    assert len(kept) == 3 and kept[5] == pytest.approx(frames["chamber_pressure"][-1:], rel=1e-9)
+
+
 # ---- other faces -----------------------------------------------------------------------------------------------------
 
 

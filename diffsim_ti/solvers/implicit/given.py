@@ -67,7 +67,10 @@ class GivenInPasses:
     def start_multipliers(self, j: int, u: np.ndarray) -> None:
         """Begin pass j with the pressures of held volumes that the pass before it ended with."""
         if self.volumes:
-            before = self.multipliers.get(self._pass_of_all(j) - 1)
+            now = self._pass_of_all(j)
+            if j == 0:  # steps that come one by one are not to fill the memory
+                self.multipliers = {k: kept for k, kept in self.multipliers.items() if k >= now - 1}
+            before = self.multipliers.get(now - 1)
             self.volumes.place(u, np.zeros(len(self.volumes.laws)) if before is None else before)
 
     def keep_multipliers(self, j: int) -> None:
