@@ -7,6 +7,7 @@ from test_every_adjoint import assert_transposed
 from test_term_order import IMPLICIT, SOLVERS
 
 import diffsim_ti as ds
+from diffsim_ti.monitor.stability import Stiffness
 from diffsim_ti.potential.chamber_pressure import ChamberPressure
 from diffsim_ti.solvers.implicit.held_volumes import HeldVolumes
 
@@ -270,6 +271,23 @@ def test_a_simulator_takes_the_volumes_of_each_step():
     assert sim.positions == pytest.approx(frames.positions[-1], rel=0, abs=1e-11)
     kept = sim.workspace.multipliers
     assert len(kept) == 3 and kept[5] == pytest.approx(frames["chamber_pressure"][-1:], rel=1e-9)
+
+
+def test_a_stiff_gas_counts_in_the_stable_step_and_forces_of_loads_do_not():
+    """By forces that passes left in corners, before and after a run; the bound lies below the exact limit."""
+    thin, stiff = (hollow([gas(pressure=p, outside=p)]) for p in (1.0, 3e7))
+    soft, hard = (ds.VelocityVerletSolver(of, dt=2e-5) for of in (thin, stiff))
+    assert hard.stable_dt(tight=True) < 0.6 * soft.stable_dt(tight=True)
+    for solver in (soft, hard):
+        assert solver.stable_dt() <= solver.stable_dt(tight=True)
+    solver = ds.VelocityVerletSolver(hollow([ds.Pressure(1e3, "cavity"), gas()]), dt=1e-4)
+    sim = ds.Simulator(solver)
+    sim.run(2)
+    stiffness = Stiffness(sim.workspace)
+    nothing = np.zeros((solver.scene.mesh.num_vertices, 3))
+    assert not stiffness.product(nothing).any()
+    v, w = np.random.default_rng(0).normal(size=(2, *nothing.shape))
+    assert (v * stiffness.product(w)).sum() == pytest.approx((w * stiffness.product(v)).sum(), rel=1e-9)
 
 
 # ---- other faces -----------------------------------------------------------------------------------------------------
