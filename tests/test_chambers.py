@@ -66,7 +66,7 @@ GAS = [(kind, "f64") for kind in SOLVERS] + [
 @pytest.mark.executed_ptx
 @pytest.mark.parametrize("kind, precision", GAS)
 def test_every_number_of_a_gas(kind, precision):
-    """By a dot product each; the pressure is given for each step, and the other gas by keyframes."""
+    """By a dot product each; the pressure is given for each step (the fuzz has keyframes)."""
     terms = [gas(pressure=1.1 * 101325 * np.array([1.0, 1.1]))]
     unfelt = ("drag_rate",) if kind is ds.StaticSolver else ()
     gate = (1e-12 if kind.explicit else 1e-8) if precision == "f64" else (3e-5 if kind.explicit else 2e-3)
@@ -194,7 +194,7 @@ def sphere(term, nu, start=1.0, layers=3, around=10, **options) -> ds.Scene:
 
 
 def test_lames_sphere():
-    """u(A) = p A^3 / (B^3 - A^3) (A / (3 lam + 2 mu) ... ) in the form of Lame: at E, nu and 1e-4 E."""
+    """u(r) = p A^3 / (E (B^3 - A^3)) [(1 - 2 nu) r + (1 + nu) B^3 / (2 r^2)], at a pressure of 1e-4 E."""
     nu, p, A, B = 0.3, 26.0, 1.0, 1.2
     frames = ds.Rollout(ds.StaticSolver(sphere(ds.Pressure(p, "inside"), nu, volume="tetrahedra")), 1).forward()
     E = 2e5 * (1 + nu)
