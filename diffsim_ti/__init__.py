@@ -19,6 +19,7 @@ from diffsim_ti.modes import Modes, modes
 from diffsim_ti.monitor.energy_watch import EnergyGained
 from diffsim_ti.monitor.guard import Crossing, Divergence
 from diffsim_ti.outputs import (
+    ChamberPressure,
     ContactForce,
     ContactTraction,
     ElasticEnergy,
@@ -52,6 +53,8 @@ from diffsim_ti.terms import (
     Cylinder,
     Drag,
     ExternalForce,
+    FilledChamber,
+    GasChamber,
     Gravity,
     Ground,
     HalfSpace,
@@ -78,6 +81,8 @@ __all__ = [
     "ExternalForce",
     "Traction",
     "Pressure",
+    "GasChamber",
+    "FilledChamber",
     "BodyForce",
     "Ground",
     "HalfSpace",
@@ -112,6 +117,7 @@ __all__ = [
     "Stress",
     "Strain",
     "EnclosedVolume",
+    "ChamberPressure",
     "ElasticEnergy",
     "KineticEnergy",
     "modes",

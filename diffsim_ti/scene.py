@@ -15,7 +15,7 @@ from diffsim_ti.materials.patch_law import PatchLaw
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.potential.assembled import body_stiffness
 from diffsim_ti.supports import Fixed, Supports
-from diffsim_ti.terms import Drag, Gravity, Obstacle, Pressure, SelfContact, Term
+from diffsim_ti.terms import Chamber, Drag, FilledChamber, Gravity, Obstacle, Pressure, SelfContact, Term
 from diffsim_ti.terms.motion import Motion, sampled
 from diffsim_ti.terms.obstacles.obstacle import PER_AREA
 
@@ -94,6 +94,8 @@ class Scene:
         self.moving = tuple(t for t in self.ordered_terms if t.path is not None)
         self.dead_loads = tuple(t for t in self.ordered_terms if t.dead)
         self.pressures = tuple(t for t in self.ordered_terms if isinstance(t, Pressure))
+        self.chambers = tuple(t for t in self.ordered_terms if isinstance(t, Chamber))
+        self.following = (*self.pressures, *self.chambers)  # what presses on the surface as it is
         self.inputs = Inputs(self, density, initial_positions, initial_velocities)
         self._check_start()
         if volume == "tetrahedra":
@@ -206,6 +208,26 @@ class Scene:
         """(triangles that pressures act on, shape (k, 3), the number of the one of `pressures` that each belongs to)."""
         triangles = [np.zeros((0, 3), np.int64), *(term.triangles(self.mesh) for term in self.pressures)]
         return np.concatenate(triangles), np.repeat(np.arange(len(triangles)) - 1, [len(rows) for rows in triangles])
+
+    @property
+    def holds_volumes(self) -> bool:
+        """Whether some chamber holds a given volume."""
+        return any(isinstance(term, FilledChamber) for term in self.chambers)
+
+    def place_of_chamber(self, chamber: Term | str) -> int:
+        """Place in `chambers` of one that is given by its name, or as the scene lists it."""
+        for k, own in enumerate(self.chambers):
+            given = self._given[self.terms.index(own)]
+            if chamber is own or chamber is given or (isinstance(chamber, str) and chamber == own.name):
+                return k
+        known = ", ".join(repr(t.name or t) for t in self.chambers) or "none"
+        raise ValueError(f"this scene has no chamber {chamber!r}; it has {known}: give chambers a name=")
+
+    def chamber_volume(self, chamber: Term | str, positions: ArrayLike | None = None) -> float:
+        """Volume [m^3] of a chamber, given by its name or as the scene lists it, at positions [m], default at rest."""
+        u = None if positions is None else np.asarray(positions, np.float64) - self.mesh.vertices
+        own = self.chambers[self.place_of_chamber(chamber)]
+        return own.enclosure.volume(self.mesh.vertices + self.checked_displacements(u))
 
     def places(self, time: float) -> dict[Term, np.ndarray]:
         """Displacement of each moving obstacle at a time [s], shape (3,) [m]."""

@@ -5,12 +5,14 @@ import re
 
 import numpy as np
 import pytest
+from chamber_meshes import hollow_cube
 from cuda_on_cpu.counters import Absent, Counters
 
 from diffsim_ti import (
     BDF2Solver,
     Capsule,
     Corotated,
+    GasChamber,
     Gravity,
     Ground,
     ImplicitEulerSolver,
@@ -184,6 +186,8 @@ def solvers_in_single_precision(cube):
     fixed = {"xmin": "x", "ymin": [0, 1, 1]}
     guided = Scene(cube, SmithNeoHookean(1e5, 0.4), 1000.0, [Gravity(), *loads], fixed, precision="f32")
     yield explicit(guided, VelocityVerletSolver)
+    gas = GasChamber(lambda t: 1.1e5 + t, "cavity")
+    yield explicit(Scene(hollow_cube(), SmithNeoHookean(1e5, 0.4), 1000.0, gas, "bottom", precision="f32"))
     yield ImplicitEulerSolver(scene(cube, precision="f32"), dt=5e-3)
     yield BDF2Solver(scene(cube, precision="f32"), dt=5e-3)
 

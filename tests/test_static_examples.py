@@ -76,6 +76,19 @@ def test_least_compliance(tmp_path, capsys):
     assert "times less" in capsys.readouterr().out
 
 
+def test_pneumatic_finger(tmp_path, capsys):
+    """Newton's method with derivatives of the equilibrium: few steps, the last of them quadratic."""
+    numbers = example("control/pneumatic_finger").main(tmp_path, quick=True)
+    history = numbers["history"]
+    assert history[-1] < 1e-6 < 2e-4 < history[0] and len(history) <= 7
+    assert numbers["moved"][1:] == pytest.approx([-0.002, 0.0003], abs=1e-6)
+    assert numbers["over"][0] > numbers["over"][1] > 1e3 and np.all(
+        numbers["gas"] > 101325 + numbers["over"]
+    )  # it grew
+    assert (tmp_path / "pneumatic_finger.png").stat().st_size > 10_000
+    assert "um from the target" in capsys.readouterr().out
+
+
 def test_derivatives_of_the_compliance():
     """By E they are -f . u shares: E dc/dE adds up to -c; and they equal differences."""
     module = example("design/least_compliance")

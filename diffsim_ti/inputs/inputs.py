@@ -34,7 +34,8 @@ class Derived:
     forces: np.ndarray | None = None  # (1 or steps, k, 3), or (1 or steps, 2 k, 3) as each step begins and ends [N]
     motion: np.ndarray | None = None  # (steps + 1, num_held, 3) [m]
     path: np.ndarray | None = None  # displacements of obstacles, (steps + 1, num_moving, 3) [m]
-    follower: np.ndarray | None = None  # pressures as each step begins and ends, and 0, (1 or steps, loads, 3) [Pa]
+    # pressures, then numbers of chambers, as each step begins and ends, and 0, (1 or steps, loads and numbers, 3)
+    follower: np.ndarray | None = None
 
     def zeros(self) -> "Derived":
         """The same shapes, all zero."""
@@ -134,15 +135,18 @@ class Inputs:
         return out
 
     def _sums_of_loads(self) -> list[Link]:
-        """What adds the forces of dead loads, and what lists pressures."""
+        """What adds the forces of dead loads, and what lists pressures and the numbers of chambers."""
         own = {term: f"numbers of term {k}" for k, term in enumerate(self.scene.ordered_terms)}
         dead, pressures = self.scene.dead_loads, self.scene.pressures
         out = []
         if self.sums_loads:
             indices = [term.indices(self.mesh) for term in dead]
             out.append(SumOfForces([f"{own[t]} forces" for t in dead], indices, self.keyed_forces, "forces"))
-        if pressures:
-            out.append(PressureRows([f"{own[t]} in time" for t in pressures], "follower"))
+        rows = [f"{own[t]} in time" for t in pressures] + [
+            row for t in self.scene.chambers for row in t.in_time(own[t])
+        ]
+        if rows:
+            out.append(PressureRows(rows, "follower"))
         return out
 
     @property
@@ -171,7 +175,7 @@ class Inputs:
         out = self.at_times([step * dt, (step + 1) * dt]) | (values or {})
         for name in self._per_step:
             rules = [rule for rule in self.described[name].shapes if len(rule) == out[name].ndim]
-            if any("steps" in rule for rule in rules) and (self.sums_loads or self.scene.pressures):
+            if any("steps" in rule for rule in rules) and (self.sums_loads or self.scene.following):
                 if step >= len(out[name]):
                     raise ValueError(f"{name} is given for {len(out[name])} steps, this is step {step}")
                 out[name] = out[name][step : step + 1]

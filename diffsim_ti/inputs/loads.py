@@ -163,7 +163,7 @@ class SumOfForces(_Together):
 
 
 class PressureRows(_Together):
-    """Pressures [Pa] of all loads, shape (rows, loads, 3): at the beginning of each step, at its end, zero."""
+    """Pressures [Pa] of all loads, then numbers of chambers, shape (rows, k, 3): as each step begins, as it ends, zero."""
 
     def value(self, *x):
         rows = self.rows(x)

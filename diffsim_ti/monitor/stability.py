@@ -59,7 +59,19 @@ def element_limit(scene: "Scene", values: dict | None = None) -> StepLimit:
     largest = np.linalg.eigvalsh(np.einsum("eai,eaj->eij", N, N))[:, -1]
     omega2 = 4 / values["density"] * (np.maximum(lam, 0) * (N**2).sum((1, 2)) + 2 * mu * largest)
     worst = int(np.argmax(omega2))
-    return StepLimit(float(2 / np.sqrt(omega2[worst])), worst, "element bound")
+    gases = _gas_bound(scene, values, derived) if scene.chambers else 0.0
+    return StepLimit(float(2 / np.sqrt(omega2[worst] + gases)), worst, "element bound")
+
+
+def _gas_bound(scene: "Scene", values: dict, derived) -> float:
+    """What gases in chambers add to omega^2 at most, at rest: n p_0 / V_0 sum |dV/dx|^2 / m of the free vertices each."""
+    free, out = np.delete(np.arange(scene.mesh.num_vertices), scene.fixed), 0.0
+    for chamber in scene.chambers:
+        names = scene.input_names(chamber)
+        p = np.max(chamber.rows([0.0]) if chamber.keyed else values[names[chamber.plain]])
+        V, g = chamber.enclosure.volume(derived.rest), chamber.enclosure.gradient(derived.rest)
+        out += float(values[names["gas_exponent"]] * p / V * ((g[free] ** 2).sum(1) / derived.mass[free]).sum())
+    return out
 
 
 class Stiffness:
@@ -93,8 +105,10 @@ class Stiffness:
             self.ws.pairs.ensure(self.ws.state.u, 0)
             self.ws.pairs.product(self.ws.state.u, 0, self.w, self.ws.arrays.corner)
         a = self.ws.arrays
+        a.clear_corners_of_loads()
         self._multiply(num_items=a.num_items, num_tetrahedra=a.num_places, num_vertices=a.num_vertices, per_gamma=0.0)
-        return -root * runtime.fetch(self.y)[0].astype(np.float64) * scale
+        y = runtime.fetch(self.y)[0].astype(np.float64) * scale
+        return -root * (y + self.ws.chambers.product(w) if self.ws.chambers else y)
 
     def largest(self, tolerance: float = 1e-3) -> tuple[float, float]:
         """(largest eigenvalue omega^2 [1/s^2], residual bound) by Lanczos; keeps the vector for `lower_bound`.

@@ -1,5 +1,6 @@
 """What a loss may name besides a run's inputs: functions of its frames, one file each, and their interface for others."""
 
+from diffsim_ti.outputs.chamber_pressure import ChamberPressure
 from diffsim_ti.outputs.contact_force import ContactForce
 from diffsim_ti.outputs.contact_traction import ContactTraction
 from diffsim_ti.outputs.enclosed_volume import EnclosedVolume
@@ -12,6 +13,7 @@ from diffsim_ti.outputs.tensors import Strain, Stress
 from diffsim_ti.outputs.work import WorkOfLoads
 
 __all__ = [
+    "ChamberPressure",
     "Change",
     "ContactForce",
     "ContactTraction",

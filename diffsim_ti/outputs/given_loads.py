@@ -3,7 +3,7 @@
 import numpy as np
 
 from diffsim_ti.inputs import Derived
-from diffsim_ti.potential.follower_pressure import FollowerPressure
+from diffsim_ti.potential.chamber_pressure import following
 from diffsim_ti.terms import Gravity
 
 
@@ -12,12 +12,15 @@ class GivenLoads:
     as it ends; with `begins`, as it begins."""
 
     def __init__(self, scene, weight: bool = True):
-        self.scene, self.follower = scene, None
+        if scene.holds_volumes:
+            raise ValueError(
+                "the pressure of a FilledChamber is no function of a frame's state, so that reactions in its scene are not "
+                "known: give it as a GasChamber or a Pressure of what ChamberPressure found"
+            )
+        self.scene, self.follower = scene, following(scene)
         gravity = scene.term(Gravity) if weight else None
         self.gravity = None if gravity is None else scene.inputs.parameters.of(gravity)
         self.loaded, self.keyed = scene.loaded_vertices if scene.dead_loads else None, scene.inputs.keyed_forces
-        if scene.pressures:
-            self.follower = FollowerPressure(*scene.pressed_triangles, scene.mesh.num_vertices)
 
     @staticmethod
     def _row(step: int, rows: np.ndarray) -> np.ndarray:

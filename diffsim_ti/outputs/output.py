@@ -16,7 +16,7 @@ class Change:
     """A change of frames and inputs, or the gradient of a loss by them; None, and inputs left out, are zero.
 
     positions [m], velocities [m/s]: shape (frames, num_vertices, 3); inputs: name -> array of the input's shape.
-    contact_forces [N]: of the frames' array of that name, where an output says that it reads them.
+    contact_forces [N], chamber_pressures [Pa]: of the frames' arrays of that name, where an output says that it reads them.
     positions are those of the frames, which move with rest_positions where displacements are kept, and the other way
     round: they are the variable of the chain rule, and displacements are positions less rest_positions.
     """
@@ -25,10 +25,11 @@ class Change:
     velocities: np.ndarray | None = None
     inputs: dict[str, np.ndarray] = field(default_factory=dict)
     contact_forces: np.ndarray | None = None
+    chamber_pressures: np.ndarray | None = None
 
     def add(self, other: "Change") -> None:
         """Add another one."""
-        for name in ("positions", "velocities", "contact_forces"):
+        for name in ("positions", "velocities", "contact_forces", "chamber_pressures"):
             mine, theirs = getattr(self, name), getattr(other, name)
             setattr(self, name, mine if theirs is None else theirs if mine is None else mine + theirs)
         for name, value in other.inputs.items():
@@ -50,6 +51,7 @@ class Output(ABC):
     unit = ""  # for pictures
     cumulative = False  # whether it counts from the first frame on, and so is of no state by itself
     reads_contact_forces = False  # whether runs must note frames.contact_forces for it
+    reads_chamber_pressures = False  # the same of frames.chamber_pressures
 
     def settled(self, scene: "Scene") -> "Output":
         """This output for a scene: checked, with what depends on the scene alone; raises ValueError if it does not fit."""

@@ -6,6 +6,8 @@ The force of a triangle on each of its corners is -p n / 3, n = (x_1 - x_0) x (x
 
 import numpy as np
 
+from diffsim_ti.mesh.enclosure import open_edges, spanned_by_edges
+
 
 class FollowerPressure:
     """Of triangles (m, 3), each of which belongs to a load; `at` says how large the pressures of loads are [Pa].
@@ -18,9 +20,9 @@ class FollowerPressure:
         self.symmetric = symmetric
         self.pressure = np.zeros(0)
 
-    def at(self, pressures: np.ndarray) -> "FollowerPressure":
-        """With pressures of the loads [Pa]."""
-        self.pressure = np.asarray(pressures, np.float64)
+    def at(self, pressures: np.ndarray, share: float = 1.0) -> "FollowerPressure":
+        """With a share of pressures of the loads [Pa]."""
+        self.share, self.pressure = share, share * np.asarray(pressures, np.float64)
         return self
 
     def _edges(self, x):
@@ -52,7 +54,7 @@ class FollowerPressure:
         (e, f), (de, df) = self._edges(x), self._edges(dx)
         part = self._factors(self.pressure) * (np.cross(de, f) + np.cross(e, df))
         if pressures_dot is not None:
-            part += self._factors(pressures_dot) * np.cross(e, f)
+            part += self._factors(self.share * pressures_dot) * np.cross(e, f)
         return self._to_vertices(part, part, part)
 
     def vjp(self, x: np.ndarray, w: np.ndarray) -> np.ndarray:
@@ -65,7 +67,7 @@ class FollowerPressure:
     def pressures_vjp(self, x: np.ndarray, w: np.ndarray) -> np.ndarray:
         """Adjoint of the pressures of loads for the adjoint w of the forces."""
         by_triangle = (np.cross(*self._edges(x)) * w[self.triangles].sum(1)).sum(1) / -6
-        return np.bincount(self.load_of, by_triangle, len(self.pressure))
+        return self.share * np.bincount(self.load_of, by_triangle, len(self.pressure))
 
     def work(self, x: np.ndarray, step: np.ndarray) -> float:
         """Work done along a straight step [J]: the forces are quadratic in it, so that Simpson's rule is exact."""
@@ -80,16 +82,8 @@ def is_symmetric(triangles: np.ndarray, load_of: np.ndarray, free: np.ndarray, x
     a plane at most, as on a symmetry plane. free: projectors on what each vertex may do, (num_vertices, 3, 3).
     """
     for load in np.unique(load_of):
-        own = triangles[load_of == load]
-        edges = own[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-        low, high = np.sort(edges, 1).T
-        key, sense = low * len(x) + high, np.where(edges[:, 0] == low, 1, -1)
-        keys, inverse = np.unique(key, return_inverse=True)
-        net = np.bincount(inverse.ravel(), sense, len(keys))
-        i, j = np.divmod(keys[net != 0], len(x))
-        along = x[j] - x[i]
-        along = along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-300)
-        spanned = np.concatenate([free[i], free[j], along[:, None]], 1)
+        rim = open_edges(triangles[load_of == load], len(x))
+        spanned = spanned_by_edges(rim, free, x)
         if np.any(np.linalg.matrix_rank(spanned, tol=1e-9) > 2):
             return False
     return True

@@ -16,10 +16,10 @@ def field_seed(face, k: int | None, change: Change) -> HostSeed:
     if face.rollout.solver.explicit:
         return FieldSeed(face, k, change)
     by_frames = Change(face.row(k, "positions") + face.row(k, "displacements"), face.row(k, "velocities"))
-    by_frames.add(Change(change.positions, change.velocities, contact_forces=change.contact_forces))
+    by_frames.add(Change(change.positions, change.velocities))
     for name in ("positions", "velocities"):
         check_finite(name, getattr(by_frames, name), face.rollout.save_every)
-    return HostSeed(by_frames.positions, by_frames.velocities, by_frames.contact_forces)
+    return HostSeed(by_frames.positions, by_frames.velocities, change.contact_forces, change.chamber_pressures)
 
 
 class FieldSeed(HostSeed):
@@ -27,6 +27,7 @@ class FieldSeed(HostSeed):
 
     def __init__(self, face, k: int | None, change: Change):
         self.face, self.k, self.change, self.contact_forces = face, k, change, change.contact_forces
+        self.chamber_pressures = None  # of implicit runs
 
     def put(self, adjoint, last_frame_is_state: bool) -> tuple[float, float]:
         face = self.face

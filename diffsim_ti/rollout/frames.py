@@ -24,6 +24,9 @@ class Frames:
 
     `computed` are these outputs themselves, as settled for the scene.
 
+    `chamber_pressures` [Pa], where an output reads them: those in chambers whose volume is held, shape (frames, chambers),
+    of the substep that ends in the frame; others, and the first frame, have none (0).
+
     `inputs` are the values that the run started from, so that its gradient can be taken whenever it is wanted.
     """
 
@@ -36,6 +39,7 @@ class Frames:
     outputs: dict[str, np.ndarray] = field(default_factory=dict)
     contact_forces: np.ndarray | None = field(default=None, repr=False)
     computed: dict = field(default_factory=dict, repr=False)
+    chamber_pressures: np.ndarray | None = field(default=None, repr=False)
     steps: np.ndarray | None = field(default=None, repr=False)  # of the run that are done in each frame
     run: Run | None = field(default=None, repr=False)
 
@@ -75,6 +79,7 @@ class HostSeed:
     positions: np.ndarray
     velocities: np.ndarray
     contact_forces: np.ndarray | None = None
+    chamber_pressures: np.ndarray | None = None
 
     def put(self, adjoint, last_frame_is_state: bool) -> tuple[float, float]:
         adjoint.start(self.positions, self.velocities, last_frame_is_state)

@@ -68,7 +68,8 @@ class Rollout:
         )
         given = (outputs,) if isinstance(outputs, Output) else tuple(outputs)
         contacts = any(getattr(output, "reads_contact_forces", False) for output in given)
-        self.sweep = sweep = Sweep(solver, steps, **options, contacts=contacts)
+        chambers = any(getattr(output, "reads_chamber_pressures", False) for output in given)
+        self.sweep = sweep = Sweep(solver, steps, **options, contacts=contacts, chambers=chambers)
         self.steps, self.save_every, self.num_frames = sweep.steps, sweep.save_every, sweep.num_frames
         self.values, self.inputs, self.wanted = sweep.values, sweep.inputs, sweep.wanted
         self.outputs = self._check_outputs((Positions(), Velocities(), Displacements(), *given))
@@ -137,7 +138,7 @@ class Rollout:
         frames = Frames(positions, v, u, self.times, inputs, run.contact_resolution, run=run)
         frames.computed = self.computed
         frames.steps = np.arange(self.num_frames) * self.save_every
-        frames.contact_forces = self.sweep.contact_forces()
+        frames.contact_forces, frames.chamber_pressures = self.sweep.contact_forces(), self.sweep.chamber_pressures()
         for name, output in self.computed.items():
             value, shape = np.asarray(output.value(frames)), tuple(output.shape(self.num_frames))
             if value.shape != shape:
@@ -156,7 +157,7 @@ class Rollout:
         change = self.pulled_to_frames(frames, dict(positions=positions, velocities=velocities) | seeds)
         zero = np.zeros(frames.positions.shape)
         at_frames = [zero if x is None else x for x in (change.positions, change.velocities)]
-        seed = HostSeed(*at_frames, change.contact_forces)
+        seed = HostSeed(*at_frames, change.contact_forces, change.chamber_pressures)
         self.gradients = self.gradients_of(frames.run, self.sweep.pull_back(frames.run, seed), change)
         return self.gradients
 
@@ -202,7 +203,7 @@ class Rollout:
         tangents = {k: np.broadcast_to(np.asarray(x, np.float64), values[k].shape) for k, x in tangents.items()}
         derived = self.scene.inputs.derive_jvp(values, tangents)
         moved = self.sweep.push_forward(frames.run, derived)
-        return Change(*moved, tangents, self.sweep.contact_change)
+        return Change(*moved, tangents, self.sweep.contact_change, self.sweep.chamber_change)
 
     # ---- under ti.ad.Tape -------------------------------------------------------------------------------------------
 

@@ -34,8 +34,10 @@ class Sweep:
         truncate: int | None = None,
         health: bool = False,
         contacts: bool = False,
+        chambers: bool = False,
     ):
         self.contacts = contacts  # whether runs note what obstacles do to each vertex in each frame
+        self.chambers = chambers and solver.scene.holds_volumes  # whether pressures in chambers are wanted of frames
         self.solver, self.scene, self.steps = solver, solver.scene, int(steps)
         if self.steps != steps or steps < 0:
             raise ValueError(f"steps must be a whole number >= 0, got {steps}")
@@ -60,7 +62,7 @@ class Sweep:
         self._loaded = None  # the values that are on the device
         self._current = None  # the run whose frames and snapshots the workspace holds
         self._adjoint = None  # the solver's, made by the first pull-back
-        self.contact_change = None  # of the contact forces, by the last tangent
+        self.contact_change = self.chamber_change = None  # of the contact forces and chambers, by the last tangent
         self._recorded, self._warned = False, False  # whether the record holds all passes; whether of coarse contacts
 
     def _check_names(self, names) -> tuple[str, ...]:
@@ -80,6 +82,15 @@ class Sweep:
     def contact_forces(self) -> np.ndarray | None:
         """Mean forces [N] of obstacles on vertices in the frames of the last run (state/workspace.py), if they are noted."""
         return self.workspace.contact_forces(self.frame_time) if self.contacts else None
+
+    def chamber_pressures(self) -> np.ndarray | None:
+        """Pressures [Pa] in chambers in the frames of the last run, if they are wanted."""
+        return self.workspace.chamber_pressures(self.num_frames, self.passes_per_frame) if self.chambers else None
+
+    @property
+    def noted(self) -> tuple[str, ...]:
+        """What frames hold besides states, by name."""
+        return ("contact_forces",) * self.contacts + ("chamber_pressures",) * self.chambers
 
     @property
     def truncates(self) -> bool:
@@ -187,6 +198,7 @@ class Sweep:
             tangent.save_frame(self.num_frames - 1)
         self._current = run if current is run else None  # its frames and snapshots are untouched
         self.contact_change = tangent.contact_forces(self.frame_time) if self.contacts else None
+        self.chamber_change = tangent.chambers.changes(self.num_frames) if self.chambers else None
         return tangent.collect()
 
     # ---- adjoints ---------------------------------------------------------------------------------------------------
@@ -218,6 +230,8 @@ class Sweep:
         norms = seed.put(self._adjoint, self.solver.last_frame_is_state)
         if self.contacts:
             self._adjoint.seed_contacts(seed.contact_forces, self.frame_time)
+        if self.chambers:
+            self._adjoint.chambers.adjoints = seed.chamber_pressures
         self.health = []
         stop = 0 if self.truncate is None else max(0, self.steps - self.truncate) * self.solver.substeps
         kept, end = self._kept, checkpoints.num_segments

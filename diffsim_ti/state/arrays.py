@@ -59,6 +59,7 @@ class SceneArrays:
         self.fixed, self.held, self.feels_faces = scene.fixed, scene.held, feels_faces
         self.supports = scene.supports
         self.pressures = scene.pressures if presses else ()  # that gather with the tetrahedra's corners
+        self.chambers = scene.chambers if presses else ()  # likewise
         self.mesh, self.precision, self.self_contact = mesh, precision, scene.term(SelfContact)
         self._upload_topology(scene)
         rows = scene.inputs.parameters
@@ -71,7 +72,7 @@ class SceneArrays:
             drag=rows.first(scene.term(Drag)),
             forces=bool(scene.dead_loads),
             forces_keyed=scene.inputs.keyed_forces,
-            pressed=bool(self.pressures),
+            pressed=bool(self.pressures or self.chambers),
             motion=scene.motion is not None,
             guided=bool(len(scene.supports.guided)),
             num_parameters=rows.total,
@@ -114,8 +115,15 @@ class SceneArrays:
             start, corner_of = with_more_corners(start, corner_of, self.pressed_triangles.ravel(), num_corners)
             self.num_pressed = len(self.pressed_triangles)
             num_corners += 3 * self.num_pressed
-            self.pressed = runtime.upload(self.pressed_triangles.ravel(), ti.i32)
-            self.pressed_load = runtime.upload(self.load_of, ti.i32)
+        if self.pressures or self.chambers:
+            triangles, load_of = scene.pressed_triangles
+            self.pressed = runtime.upload(triangles.ravel() if len(triangles) else np.zeros(1), ti.i32)
+            self.pressed_load = runtime.upload(load_of if len(load_of) else np.zeros(1), ti.i32)
+        self.first_chamber_corner = num_corners
+        if self.chambers:
+            closed = np.concatenate([chamber.enclosure.triangles for chamber in self.chambers])
+            start, corner_of = with_more_corners(start, corner_of, closed.ravel(), num_corners)
+            num_corners += closed.size
         self.start, self.corner_of = runtime.upload(start, ti.i32), runtime.upload(corner_of, ti.i32)
         self.corner = runtime.array(self.vector, num_corners)
         self.force_slot = self.motion_slot = runtime.array(ti.i32, 1)
@@ -161,7 +169,7 @@ class SceneArrays:
         return Features(
             **self._features,
             forces_per_step=forces is not None and len(forces) > 1,
-            pressure_per_step=bool(self.pressures) and len(follower) > 1,
+            pressure_per_step=self._features["pressed"] and len(follower) > 1,
             uniform=self.values.coefficients.ndim == 1,
             density=density,
             shape=shape,
@@ -175,7 +183,7 @@ class SceneArrays:
         moved = before != self.features()
         sources = {name: on_device(self, name, values) for name in PARTS if name != "mass"}
         sources["parameters"] = np.concatenate([values.parameters, self.tables]), self.fp
-        if not (self.contacts or self.self_contact or self.pressures):
+        if not (self.contacts or self.self_contact or self.pressures or self.chambers):
             sources["rest"] = np.zeros((1, 3)), self.vector
         sources["inverse_mass"] = self._inverse_mass(values.mass), self.fp
         for name, (data, dtype) in sources.items():
@@ -186,6 +194,11 @@ class SceneArrays:
             elif old is None or getattr(old, name, None) is not getattr(values, name, data):
                 runtime.fill(current, data)
         return moved
+
+    def clear_corners_of_loads(self) -> None:
+        """No forces at the corners of pressed triangles and of chambers, where tetrahedra alone are to be gathered."""
+        if self.pressures or self.chambers:
+            clear_from(self.corner, self.first_pressed)
 
     def load_rows(self, **rows: np.ndarray) -> None:
         """Other rows of motion, path, forces or pressure, by name: those of the steps to come."""
@@ -279,6 +292,21 @@ class History:
 def _copy_slot(source: ti.types.ndarray(ndim=2), s: ti.i32, target: ti.types.ndarray(ndim=2), t: ti.i32):
     for i in range(source.shape[1]):
         target[t, i] = source[s, i]
+
+
+@ti.kernel
+def _clear_from(corner: ti.types.ndarray(ndim=1), first: ti.i32):
+    for c in range(first, corner.shape[0]):
+        corner[c] = 0 * corner[c]
+
+
+def clear_from(corner, first: int) -> None:
+    """corner[first:] = 0; on the CPU without the cost of a launch."""
+    host = runtime.view(corner)
+    if host is None:
+        _clear_from(corner, first)
+    else:
+        host[first:] = 0
 
 
 @ti.kernel

@@ -31,6 +31,7 @@ class Workspace:
     pairs_kind = SurfacePairs
     first_step = 0  # steps that were done before this run, for reports
     potential = None  # of implicit steps
+    chambers = None  # of explicit steps
     faces = None  # of explicit steps, that feel obstacles between their corners
     energy_watch = None  # counts energy that long steps add, for solvers that neither damp nor limit it
     changes = 0  # of the state from outside its passes
@@ -132,6 +133,10 @@ class Workspace:
     def contact_forces(self, frame_time: float):
         """Mean forces [N] of frames that take `frame_time` [s], shape (frames, obstacles, 2: by push and by friction,
         num_vertices, 3)."""
+        raise NotImplementedError
+
+    def chamber_pressures(self, num_frames: int, per_frame: int):
+        """Pressures [Pa] of chambers whose volume is held, shape (frames, chambers), frames `per_frame` passes apart."""
         raise NotImplementedError
 
     def make_record(self, num_slots: int) -> History:

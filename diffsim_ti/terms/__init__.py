@@ -1,5 +1,6 @@
 """Loads, contacts and damping: one per file."""
 
+from diffsim_ti.terms.chambers import Chamber, FilledChamber, GasChamber
 from diffsim_ti.terms.drag import Drag
 from diffsim_ti.terms.external_force import ExternalForce
 from diffsim_ti.terms.gravity import Gravity
@@ -14,14 +15,28 @@ from diffsim_ti.terms.self_contact import SelfContact
 from diffsim_ti.terms.term import Term, VertexForce
 
 OBSTACLES = (Ground, HalfSpace, Sphere, Box, Capsule, Cylinder, MeshObstacle)
-TERMS = (Gravity, Drag, ExternalForce, Traction, Pressure, BodyForce, *OBSTACLES, SelfContact)
+TERMS = (
+    Gravity,
+    Drag,
+    ExternalForce,
+    Traction,
+    Pressure,
+    BodyForce,
+    GasChamber,
+    FilledChamber,
+    *OBSTACLES,
+    SelfContact,
+)
 __all__ = [
     "BodyForce",
     "Box",
     "Capsule",
+    "Chamber",
     "Cylinder",
     "Drag",
     "ExternalForce",
+    "FilledChamber",
+    "GasChamber",
     "Gravity",
     "Ground",
     "HalfSpace",

@@ -37,7 +37,7 @@ class TorchFrames(_States):
 
 
 class _RolloutNode(torch.autograd.Function):
-    """Inputs of a rollout -> displacements and velocities of its frames, and contact forces where its runs note them; the
+    """Inputs of a rollout -> displacements and velocities of its frames, and what else its runs note; the
     gradient by the first is that by positions."""
 
     @staticmethod
@@ -45,8 +45,7 @@ class _RolloutNode(torch.autograd.Function):
         run, *frames = rollout.torch_face.forward(dict(zip(names, tensors)))
         if rollout.computed:
             kept.append(rollout.frames_of(run))
-            if rollout.sweep.contacts:
-                frames.append(torch.from_numpy(kept[0].contact_forces).to(frames[0]))
+            frames += [torch.from_numpy(getattr(kept[0], name)).to(frames[0]) for name in rollout.sweep.noted]
         ctx.run, ctx.rollout, ctx.names, ctx.tensors = run, rollout, names, tensors
         return tuple(x.to(tensors[0].device) if tensors else x for x in frames)
 
@@ -72,7 +71,7 @@ class _OutputNode(torch.autograd.Function):
     def backward(ctx, seed):
         seeds = {ctx.name: seed.detach().to("cpu", torch.float64).numpy()}
         change = ctx.rollout.pulled_to_frames(ctx.frames, seeds)
-        states = ("positions", "velocities", "contact_forces")
+        states = ("positions", "velocities", "contact_forces", "chamber_pressures")
         gradients = {name: getattr(change, name) for name in states} | change.inputs
         if "initial_positions" in gradients:
             gradients["initial_displacements"] = gradients["initial_positions"]
@@ -125,7 +124,7 @@ def rollout_frames(rollout: Rollout, **tensors: torch.Tensor) -> TorchFrames:
     states, outputs = _RolloutNode.apply(rollout, names, kept, *tensors.values()), {}
     displacements, velocities = states[:2]
     for name in rollout.computed:
-        around = (*("positions", "velocities", "contact_forces")[: len(states)], *names)
+        around = ("positions", "velocities", *rollout.sweep.noted, *names)
         outputs[name] = _OutputNode.apply(rollout, name, kept[0], around, *states, *tensors.values())
     if "rest_positions" not in tensors:
         rest = torch.from_numpy(np.array(rollout.values["rest_positions"])).to(displacements)

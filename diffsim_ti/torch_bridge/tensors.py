@@ -74,6 +74,7 @@ class TensorSeed:
 
     def __init__(self, face: "TensorRollout", pair: list, with_positions: bool, contact_forces: np.ndarray | None):
         self.face, self.pair, self.with_positions, self.contact_forces = face, pair, with_positions, contact_forces
+        self.chamber_pressures = None  # of implicit runs
 
     def put(self, adjoint, last_frame_is_state: bool) -> tuple[float, float]:
         norms = []
@@ -180,17 +181,19 @@ class TensorRollout:
     def vjp(self, run: Run, by_displacements: torch.Tensor, by_velocities: torch.Tensor, *more, wanted) -> dict:
         """Gradients by the wanted inputs from those by the frames: tensors for START if direct, NumPy arrays else.
 
-        more: that by contact forces, where runs note them.
+        more: those by what else the sweep notes.
         """
-        forces = more[0].detach().to("cpu", torch.float64).numpy() if more else None
         rollout, adjoints = self.rollout, (by_displacements, by_velocities)
+        noted = dict(zip(rollout.sweep.noted, (x.detach().to("cpu", torch.float64).numpy() for x in more)))
         direct = is_direct(rollout, wanted)
         on_host = [name for name in wanted if not (direct and name in START)]
         on_host = ["initial_positions" if name == "initial_displacements" else name for name in on_host]
         if direct:
-            seed = TensorSeed(self, [self._ready(x) for x in adjoints], "initial_positions" in on_host, forces)
+            seed = TensorSeed(
+                self, [self._ready(x) for x in adjoints], "initial_positions" in on_host, noted.get("contact_forces")
+            )
         else:
-            seed = HostSeed(*(x.detach().to("cpu", torch.float64).numpy() for x in adjoints), forces)
+            seed = HostSeed(*(x.detach().to("cpu", torch.float64).numpy() for x in adjoints), **noted)
             for name, x in (("positions", seed.positions), ("velocities", seed.velocities)):
                 check_finite(name, x, rollout.save_every)
         derived = rollout.sweep.pull_back(run, seed)

@@ -8,6 +8,7 @@ import diffsim_ti as ds
 from diffsim_ti.inputs.surface_areas import SurfaceAreas
 
 from . import bodies
+from .chambers import chamber, hollow
 from .loads import load, rollers
 from .obstacles import MESH_WIDTH, Placed, place, push_direction
 from .open_materials import open_material
@@ -85,7 +86,7 @@ def build(seed: int, precision: str | None = None) -> Configuration:
     if kind.self_contact:
         mesh, start, way = (bodies.pair if rng.random() < 0.6 else bodies.fold)(rng)
     else:
-        mesh = bodies.body(rng)
+        mesh = hollow(rng) if kind.chamber else bodies.body(rng)
         if rng.random() < 0.25:
             other = bodies.body(rng)
             mesh = ds.TetrahedralMesh.joined([mesh, other.translated([6 * CELL, 0, 0])])
@@ -125,6 +126,10 @@ def build(seed: int, precision: str | None = None) -> Configuration:
     more = np.random.default_rng([21, seed])
     for name in kind.loads:
         own = load(name, more, mesh, steps, duration, mass.sum())
+        terms.insert(int(more.integers(0, len(terms) + 1)), own)
+
+    if kind.chamber:
+        own = chamber(kind.chamber, more, mesh, start, steps, duration, E)
         terms.insert(int(more.integers(0, len(terms) + 1)), own)
 
     velocities = None

@@ -21,6 +21,7 @@ OBSTACLES = ("Ground", "HalfSpace", "Sphere", "Bowl", "Box", "Capsule", "Cylinde
 LOADS = tuple(
     f"{kind} {how}" for kind in ("Traction", "Pressure", "BodyForce") for how in ("constant", "per step", "keyed")
 )
+CHAMBERS = tuple(f"{kind} {how}" for kind in ("gas", "volume") for how in ("constant", "per step", "keyed"))
 NARROW = ("Sphere", "Box", "Capsule", "Cylinder")  # of which some are
 
 
@@ -58,6 +59,7 @@ class Structure:
     contact_damping: float
     loads: tuple[str, ...]  # on surfaces and volumes, each with how it is given
     rollers: bool  # some of what is fixed is held in some directions alone
+    chamber: str  # what the cavity of a hollow body holds, and how that is given; "" of others
 
     @property
     def explicit(self) -> bool:
@@ -78,7 +80,7 @@ class Structure:
         return (
             f"structure {self.number}: {self.law.__name__}, {self.solver.__name__}, {self.precision}, {self.volume}"
             f"{', parallel' if self.parallel else ''}; obstacles: {', '.join(kinds) or 'none'}, {how}; "
-            f"forces {', '.join([self.forces, *self.loads])}; {', '.join(words)}"
+            f"forces {', '.join([self.forces, *self.loads, *[self.chamber] * bool(self.chamber)])}; {', '.join(words)}"
         )
 
 
@@ -134,4 +136,7 @@ def structure(number: int) -> Structure:
         turn((0.0, 0.005, 0.005, 0.2, 1.0), number, 7),
         tuple(turn(LOADS, 3 * number + k, 12) for k in range(1 + number // 4 % 3)) if number % 4 == 3 else (),
         fixed and not static and number % 5 in (0, 4) and not staged,
+        turn(CHAMBERS[:3] if solver in EXPLICIT else CHAMBERS, number // 4, 13)
+        if number % 4 == 1 and not self_contact
+        else "",
     )

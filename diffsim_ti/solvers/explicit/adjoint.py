@@ -45,6 +45,10 @@ class ExplicitAdjoint:
         # of pressures by each triangle and of the places of its corners
         self.pressed_felt = runtime.array(a.vector, a.follower.shape[0], max(a.num_pressed, 1))
         self.pressed_rest = runtime.array(a.vector, 3 * a.num_pressed * self.features.shape)
+        # of numbers of chambers, by steps, and of the places of their corners
+        corners = workspace.chambers.triangles.size if workspace.chambers else 0
+        self.chamber_felt = runtime.array(a.vector, a.follower.shape[0], 4 * len(a.chambers))
+        self.chamber_rest = runtime.array(a.vector, corners * self.features.shape)
         self.faces = FeltAdjoint(self, workspace.faces) if workspace.faces else None
         if workspace.impulses:
             self.impulses = ImpulseRecord(workspace)
@@ -82,7 +86,7 @@ class ExplicitAdjoint:
             self.impulses.clear()
             self.mass_adj[:] = 0
         self.numbers.clear()
-        pressed = self.pressed_felt, self.pressed_rest
+        pressed = self.pressed_felt, self.pressed_rest, self.chamber_felt, self.chamber_rest
         for target in (self.felt, self.path, self.u, self.v, self.w, self.z, *pressed):
             if target is not None:
                 runtime.fill(target, 0)
@@ -131,6 +135,8 @@ class ExplicitAdjoint:
             launch(**numbers, **run, base=base, halt=halt, kick=kick)
             if alone:
                 self.faces.end(alone, numbers)
+        if ws.chambers:
+            ws.chambers.vjp(history, slot, numbers, self, self.features.shape)
         if ws.pairs:
             ws.pairs.ensure(history.u, slot)
             ws.pairs.vjp(history.u, slot, self.w, self.corner)
@@ -205,9 +211,15 @@ class ExplicitAdjoint:
     def _collect_pressures(self, out: Derived):
         """Adds the adjoints of pressures; returns those of the rest shape."""
         a, rest = self.ws.arrays, np.zeros((self.ws.arrays.num_vertices, 3))
-        np.add.at(out.follower, (slice(None), a.load_of), runtime.fetch(self.pressed_felt).astype(np.float64))
-        if self.features.shape:
+        if a.pressures:
+            np.add.at(out.follower, (slice(None), a.load_of), runtime.fetch(self.pressed_felt).astype(np.float64))
+        if a.pressures and self.features.shape:
             np.add.at(rest, a.pressed_triangles.ravel(), runtime.fetch(self.pressed_rest).astype(np.float64))
+        if a.chambers:
+            out.follower[:, len(a.pressures) :] += runtime.fetch(self.chamber_felt).astype(np.float64)
+        if a.chambers and self.features.shape:
+            corners = self.ws.chambers.triangles.ravel()
+            np.add.at(rest, corners, runtime.fetch(self.chamber_rest).astype(np.float64))
         return rest
 
 
@@ -241,6 +253,8 @@ class ExplicitTangent:
                 ws.pairs.ensure(history.u, slot)
                 of_contact = self.tangent.parameters[a.parameters_of_self_contact]
                 ws.pairs.product(history.u, slot, self.u, a.corner, self.numbers.rest, of_contact)
+            if ws.chambers:
+                ws.chambers.jvp(history, slot, numbers, self.u, self.numbers)
             alone = ws.faces.alone(history, slot + 1) if ws.faces else None
             with nullcontext() if alone is None else alone:
                 if alone:

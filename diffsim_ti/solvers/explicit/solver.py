@@ -11,9 +11,10 @@ from diffsim_ti import runtime
 from diffsim_ti.contact.surface_pairs import Tunnelling
 from diffsim_ti.inputs import Derived
 from diffsim_ti.monitor.energy_balance import EnergyBalance
-from diffsim_ti.potential.follower_pressure import FollowerPressure
+from diffsim_ti.potential.chamber_pressure import following
 from diffsim_ti.potential.way import Way
 from diffsim_ti.solvers.explicit.adjoint import ExplicitAdjoint, ExplicitTangent
+from diffsim_ti.solvers.explicit.chambers import Chambers
 from diffsim_ti.solvers.explicit.contact_stage import ROWS
 from diffsim_ti.solvers.explicit.felt_faces import FeltFaces, feels_faces
 from diffsim_ti.solvers.explicit.impulse_record import ImpulseRecord
@@ -69,6 +70,11 @@ class ExplicitSolver(Solver):
         if not 0 <= contact_damping <= 1:
             raise ValueError(f"contact_damping must lie between 0 and 1, got {contact_damping}")
         self.contact, self.contact_damping = contact, float(contact_damping)
+        if (arguments[0] if arguments else options["scene"]).holds_volumes:
+            raise ValueError(
+                "explicit steps cannot hold a volume (FilledChamber): take an implicit or static solver, or a "
+                "GasChamber whose pressure is high enough that its volume hardly changes"
+            )
         super().__init__(*arguments, **options)
         self._refuse_guides_in_stages()
 
@@ -88,7 +94,9 @@ class ExplicitSolver(Solver):
 
     def passes_per_launch(self) -> int:
         """How many passes one launch does at most where they run in parallel (runtime/repeated_loops.py)."""
-        alone = self.scene.term(SelfContact) or feels_faces(self.scene)  # which act between passes
+        alone = (
+            self.scene.term(SelfContact) or feels_faces(self.scene) or self.scene.chambers
+        )  # which act between passes
         return 1 if alone or runtime.runs_on_cpu() or not runtime.can_repeat() else MOST_PASSES
 
     @abstractmethod
@@ -134,11 +142,13 @@ class ExplicitWorkspace(Workspace):
         self.repeated = self.parallel and self.in_parallel > 1
         features, a = self.arrays.features(), self.arrays
         self.faces = FeltFaces(self) if a.feels_faces else None
+        self.chambers = Chambers(self) if a.chambers else None
         noted = ROWS * len(a.obstacles), a.num_vertices
         self.contact = SimpleNamespace(
             stage=runtime.array(a.vector, *(noted if features.staged else (1, 1))),
             work=runtime.array(a.fp, a.num_vertices if features.driven else 1),  # done on each vertex from outside [J]
         )
+        self.following = following(self.scene)
         self.probe = None  # room for a pass that is not taken
         self.energy_watch = EnergyBalance(self) if EnergyBalance.knows(a.law) else None
 
@@ -180,6 +190,8 @@ class ExplicitWorkspace(Workspace):
         seen, step = self.watch.rows(), self.kernels(self.arrays.features()).step
         launch = self.bound(step, state=(self.probe, self.frames, self.watch, self.contact), table=self.table)
         for numbers in self.launches(j, j + 1, num_passes, 0, 1):
+            if self.chambers:
+                self.chambers.forces(self.probe, 0, numbers)
             launch(**numbers, base=j, stride=1)
         self.watch.put(seen)
         return runtime.fetch(self.probe.f)[0].astype(np.float64)
@@ -187,17 +199,26 @@ class ExplicitWorkspace(Workspace):
     def loads_at(self, j: int, num_passes: int) -> np.ndarray:
         """External forces [N] on each vertex, as pass j of a run takes them."""
         a, schedule, out = self.arrays, self.solver.schedule, np.zeros((self.arrays.num_vertices, 3))
-        weights = self.solver.weights(np.array([j]), num_passes, self.rate)
-        lags = [int(np.ravel(lag)[0]) for lag in (weights.lag0, weights.lag1)]
-        kicks = [(j - lag, schedule.end(j - lag) if lag else schedule.begin(j)) for lag in lags]
+        kicks = self._kicks(j, num_passes)
         if a.rows["forces"] is not None:
             keyed = a.features().forces_keyed
             out[self.scene.loaded_vertices] = 0.5 * sum(schedule.load(a.rows["forces"], *k, keyed) for k in kicks)
-        if a.pressures:
-            p = 0.5 * sum(schedule.pressure(a.rows["follower"], *k) for k in kicks)
-            x = a.values.rest + runtime.fetch_row(self.state.u, 0)
-            out += FollowerPressure(a.pressed_triangles, a.load_of, a.num_vertices).at(p).forces(x)
+        if self.following is not None:
+            out += self.following.at(self.numbers_at(j, num_passes)).forces(
+                a.values.rest + runtime.fetch_row(self.state.u, 0)
+            )
         return out
+
+    def _kicks(self, j: int, num_passes: int) -> list[tuple[int, float]]:
+        """(pass, share of its step) of the loads that the two kicks of pass j take."""
+        schedule, weights = self.solver.schedule, self.solver.weights(np.array([j]), num_passes, self.rate)
+        lags = [int(np.ravel(lag)[0]) for lag in (weights.lag0, weights.lag1)]
+        return [(j - lag, schedule.end(j - lag) if lag else schedule.begin(j)) for lag in lags]
+
+    def numbers_at(self, j: int, num_passes: int) -> np.ndarray:
+        """Pressures and numbers of chambers, as pass j of a run takes them."""
+        rows = self.arrays.rows["follower"]
+        return 0.5 * sum(self.solver.schedule.pressure(rows, *kick) for kick in self._kicks(j, num_passes))
 
     def kernels(self, features) -> ExplicitKernels:
         """The kernels for some features of the scene."""
@@ -205,7 +226,7 @@ class ExplicitWorkspace(Workspace):
 
     def most_passes(self, work: int) -> int:
         """How many passes a launch may take; work: of a pass, in those of tetrahedra."""
-        if self.parallel or self.pairs or self.faces:
+        if self.parallel or self.pairs or self.faces or self.chambers:
             return self.in_parallel
         return max(1, self.work_per_launch // work)
 
@@ -216,7 +237,7 @@ class ExplicitWorkspace(Workspace):
         """
         a, solver = self.arrays, self.solver
         num_rows = max((len(x) for x in (a.values.path, a.values.motion) if x is not None), default=1)
-        if num_rows == 1 and (a.pressures or a.features().forces_keyed):  # they ask in which step a pass lies
+        if num_rows == 1 and (a.features().pressed or a.features().forces_keyed):  # they ask in which step a pass lies
             num_rows = max(1 + len(x) for x in (a.values.forces, a.values.follower) if x is not None)
         run = num_passes, num_rows, save_every, self.rate, solver.schedule
         turn, sizes = -1 if backwards else 1, dict(num_items=a.num_items, num_vertices=a.num_vertices)
@@ -242,6 +263,8 @@ class ExplicitWorkspace(Workspace):
             slot = (numbers["first"] - base) * stride
             if pairs:
                 pairs.forces(history.u, slot, self.arrays.corner)
+            if self.chambers:
+                self.chambers.forces(history, slot, numbers)
             if self.faces:
                 self.faces.before_pass(history, slot)
             launch(**numbers, base=base, stride=stride)

@@ -13,6 +13,7 @@ from diffsim_ti.inputs import Derived
 from diffsim_ti.potential.face_kernels import face_kernels
 from diffsim_ti.potential.face_lattice import rest_of_areas
 from diffsim_ti.potential.kernels import potential_kernels
+from diffsim_ti.solvers.implicit.chamber_record import ChamberRecord
 from diffsim_ti.solvers.implicit.contact_record import ContactRecord, Shares, SharesAdjoint
 from diffsim_ti.solvers.implicit.pressed import PressedAdjoint, PressedTangent
 from diffsim_ti.solvers.implicit.recorded_passes import RecordedPasses
@@ -49,6 +50,7 @@ class ImplicitAdjoint(RecordedPasses):
             faces = face_kernels(self.features, a.precision, workspace.parallel)
             self.face_areas = runtime.array(a.fp, 3 * len(a.mesh.surface_triangles) if self.features.areas else 1)
             self._vjp_of_faces = p.faces.bind(faces.vjp, adjoint=(self, self.numbers))
+        self.chambers = ChamberRecord(workspace)
         self.contacts, areas = None, self.face_areas if p.faces else runtime.array(a.fp, 1)
         if workspace.impulses:
             self.contacts = ContactRecord(workspace)
@@ -122,6 +124,9 @@ class ImplicitAdjoint(RecordedPasses):
         p_free, q_free = p * ws.free, q * ws.free
         # the equation
         by_star = self.solve(s.c0 * p_free + s.e0 / s.gamma * q_free + by_contacts * ws.free)
+        nu = None
+        if ws.volumes:
+            by_star, nu = ws.volumes.adjoint(self.places, by_star, self.chambers.adjoint(j, per_frame), self.solve)
         runtime.fill(ws.potential.w, by_star[None])
         for target in (self.lag, self.walls, self.pressed):
             runtime.fill(target, 0)
@@ -135,8 +140,10 @@ class ImplicitAdjoint(RecordedPasses):
         share = ws.load_share(j, s)
         if self.pressure is not None:
             by_place = ws.follower.vjp(self.places, by_star)
+            felt = ws.follower.pressures_vjp(self.places, by_star)
+            if nu is not None:
+                by_place = by_place + ws.volumes.add_targets(nu, self.places, felt)
             reaction, self.rest_by_pressure = reaction + by_place, self.rest_by_pressure + by_place
-            felt = share * ws.follower.pressures_vjp(self.places, by_star)
             ws.solver.schedule.add_pressure(self.pressure, j, ws.share_at_stage(j, s), felt)
         self.gravity += share * (ws.mass * by_star).sum(0)
         self.mass_adj += (by_star * self.weight(share)).sum(1)
@@ -250,7 +257,7 @@ class ImplicitTangent(RecordedPasses):
         self.contacts = ContactRecord(workspace) if workspace.impulses else None
         self._shares = Shares(workspace) if workspace.impulses else None
         self.rate_dot = float(tangent.parameters[a.features().drag]) if a.features().drag >= 0 else 0.0
-        self.frames = [], []
+        self.frames, self.chambers = ([], []), ChamberRecord(workspace)
 
     @one_blas_thread
     def advance(self, first: int, last: int, num_passes: int, save_every: int) -> None:
@@ -301,9 +308,14 @@ class ImplicitTangent(RecordedPasses):
             dR += share * ws.mass * tangent.parameters[a.features().gravity :][:3]
         dR += ws.given_forces(tangent.forces, j, s)
         if tangent.follower is not None:
-            dp = share * ws.solver.schedule.pressure(tangent.follower, j, ws.share_at_stage(j, s))
+            dp = ws.solver.schedule.pressure(tangent.follower, j, ws.share_at_stage(j, s))
             dR += ws.follower.jvp(self.places, held + tangent.rest, dp)
-        d_star = held + self.solve(dR + self.mass * (dx + s.gamma * dy))
+        d_star = self.solve(dR + self.mass * (dx + s.gamma * dy))
+        if ws.volumes:
+            targets = ws.volumes.targets_jvp(self.places, held + tangent.rest, dp)
+            d_star, change = ws.volumes.tangent(self.places, d_star, targets, self.solve)
+            self.chambers.note(j, per_frame, change)
+        d_star = held + d_star
         if self.contacts:
             self._note_contacts(j, per_frame, d_star)
         before = self.du, self.dv

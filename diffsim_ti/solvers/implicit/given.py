@@ -1,12 +1,14 @@
-"""What is given in the passes of an implicit run: prescribed places, dead loads, follower pressures."""
+"""What is given in the passes of an implicit run: prescribed places, dead loads, follower pressures, chambers."""
 
 from functools import cached_property
 
 import numpy as np
 
 from diffsim_ti.inputs import Derived
+from diffsim_ti.potential.chamber_pressure import following
 from diffsim_ti.potential.follower_pressure import FollowerPressure, is_symmetric
 from diffsim_ti.potential.free import projectors_of
+from diffsim_ti.solvers.implicit.held_volumes import HeldVolumes
 from diffsim_ti.solvers.implicit.stage import Stage
 
 
@@ -47,16 +49,49 @@ class GivenInPasses:
         if self.follower is not None:
             share = self.share_at_stage(j, stage)
             p = self.solver.schedule.pressure(self.arrays.rows["follower"], j, share)
-            self.follower.at(self.load_share(j, stage) * p)
+            self.follower.at(p, self.load_share(j, stage))
+        if self.volumes:
+            self.volumes.stiffen(self.preconditioner(stage.inertia * self.mass)[1])
 
     def follower_pressure(self) -> FollowerPressure | None:
-        """The scene's pressures."""
-        scene = self.scene
-        if not scene.pressures:
+        """What presses on the surface as it is."""
+        free, rest = projectors_of(self.free), self.arrays.values.rest
+        return following(self.scene, is_symmetric(*self.scene.pressed_triangles, free, rest))
+
+    def held_volumes(self, eps: float) -> HeldVolumes | None:
+        """The scene's chambers that hold a volume."""
+        if not self.scene.holds_volumes:
             return None
-        (triangles, load_of), free = scene.pressed_triangles, projectors_of(self.free)
-        symmetric = is_symmetric(triangles, load_of, free, self.arrays.values.rest)
-        return FollowerPressure(triangles, load_of, scene.mesh.num_vertices, symmetric)
+        return HeldVolumes(self.follower, self.free, self.arrays.values.rest, self.solver.tolerance, eps)
+
+    def start_multipliers(self, j: int, u: np.ndarray) -> None:
+        """Begin pass j with the pressures of held volumes that the pass before it ended with."""
+        if self.volumes:
+            now = self._pass_of_all(j)
+            if j == 0:  # steps that come one by one are not to fill the memory
+                self.multipliers = {k: kept for k, kept in self.multipliers.items() if k >= now - 1}
+            before = self.multipliers.get(now - 1)
+            self.volumes.place(u, np.zeros(len(self.volumes.laws)) if before is None else before)
+
+    def keep_multipliers(self, j: int) -> None:
+        """Note those that pass j ended with."""
+        if self.volumes:
+            self.multipliers[self._pass_of_all(j)] = self.volumes.multipliers
+
+    def take_multipliers(self, j: int, u: np.ndarray) -> None:
+        """Stand where pass j ended, at u."""
+        if self.volumes:
+            self.volumes.place(u, self.multipliers[self._pass_of_all(j)])
+
+    def chamber_pressures(self, num_frames: int, per_frame: int) -> np.ndarray:
+        out = np.zeros((num_frames, len(self.scene.chambers)))
+        for frame in range(1, num_frames):
+            out[frame, self.follower.held] = self.multipliers[self._pass_of_all(frame * per_frame - 1)]
+        return out
+
+    def _pass_of_all(self, j: int) -> int:
+        """Number of pass j, also of the steps of a run that come one by one."""
+        return self.first_step * self.solver.substeps + j
 
     def loads(self, j: int, stage: Stage) -> np.ndarray:
         """Dead loads on each vertex [N]: weight and external forces; statics lay them on in substeps."""

@@ -71,7 +71,9 @@ class Newton:
         max_iterations: int,
         eps: float,
         follower=None,
+        volumes=None,
     ):
+        self.volumes = volumes  # of chambers, that are held (held_volumes.py), or None
         self.follower = follower  # pressures (potential/follower_pressure.py), or None
         self.by_residual = follower is not None and not follower.symmetric
         self.moves = mask_of(free)  # in some direction
@@ -102,6 +104,8 @@ class Newton:
         self.reports.append(report)
         self.mass, self.inertial, self.loads = mass, inertial, loads
         u = self.potential.place(start)
+        if self.volumes:
+            self.volumes.place(u, self.volumes.multipliers)
         self.preconditioner, self.stiffness = self.preconditioners(mass)
         E, size, norm, rough = self._evaluate(u), 0.0, np.inf, False
         self.upright = bool(np.all(E[2] > 0))
@@ -114,7 +118,7 @@ class Newton:
             report.residuals.append(norm / size if size > 0 else 0.0)
             if rounds is not None and norm <= self.roughly * size:
                 return u
-            solved = norm <= self.tolerance * size + floor
+            solved = norm <= self.tolerance * size + floor and (not self.volumes or self.volumes.met(u))
             if solved and (not rough or norm <= floor):
                 downhill = self._downhill() if leave_saddles and not self.by_residual else None
                 if downhill is None:
@@ -127,11 +131,17 @@ class Newton:
                 continue
             if not np.isfinite(norm):
                 break
+            norm = norm or np.inf  # only a volume is not as it is to be
             self.preconditioner.update(u)
             forcing = self._forcing(norm, before, solved, size, floor)
             rough = forcing > max(self.inexact, 0.3 * floor / norm)
-            direction = cleaned(self.free, self._direction(R, max(forcing, 10 * self.eps)))
+            direction, R = self._step(u, R, max(forcing, 10 * self.eps))
             moved = self._search(u, direction, R, E)
+            if self.volumes:
+                self._count_anew(u, moved, direction)
+            if moved is None and self.volumes and self.volumes.can_stiffen():
+                self.potential.place(u)
+                continue
             if moved is None:
                 if solved and self.by_residual:  # |R| is as small as rounding lets it be
                     return self.potential.place(u)
@@ -175,12 +185,36 @@ class Newton:
         """Relative residual of a round's linear solve: rough while rounds gain little, but not of the last one, whose error
         slow motions of stiff bodies would show. Eisenstat, Walker 1996, Choosing the Forcing Terms in an Inexact Newton
         Method, choice 2, doi:10.1137/0917003."""
+        if not np.isfinite(norm):
+            return self.inexact
         exact = max(min(self.inexact, np.sqrt(norm / size)), 0.3 * floor / norm)  # rounding would hide more
         gained = min(norm / before, 1.0) if np.isfinite(before) else 1.0
         return exact if solved else max(exact, min(self.rough, 0.9 * gained**2))
 
-    def _direction(self, R, forcing):
+    def _step(self, u, R, forcing):
+        """(direction, R): Newton's, towards the volumes that are held, and the residual that it goes down by."""
         A = self.operator()
+        direction = self._direction(A, R, forcing)
+        if self.volumes:
+            done = A.products
+            least, limit = min(forcing, self.inexact), 10 * len(R)
+
+            def solve(g):
+                if self.by_residual:
+                    return gmres(A, g, self.preconditioner, least, limit)[0]
+                return conjugate_gradients(A, g, self.preconditioner, least, limit, self.eps)[0]
+
+            direction, change, self._rise = self.volumes.bordered(u, direction, solve)
+            self.report.products, R = self.report.products + A.products - done, R + change
+        return cleaned(self.free, direction), R
+
+    def _count_anew(self, u, moved, direction) -> None:
+        """Multipliers go as far as the step from u along a direction that was found."""
+        step = (u if moved is None else moved[0]) - u
+        share = float((step * direction).sum()) / max(float((direction * direction).sum()), 1e-300)
+        self.volumes.arrive(u + step, min(max(share, 0.0), 1.0), self._rise)
+
+    def _direction(self, A, R, forcing):
         limit = 10 * len(R)
         if self.by_residual:
             self._indefinite = False

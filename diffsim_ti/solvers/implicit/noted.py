@@ -32,7 +32,8 @@ class Noted:
         step, solves = self.step_of(j, num_passes), self.newton.reports
         self.report.note(step, seconds, solves)
         saddles, unstable = (sum(getattr(solve, name) for solve in solves) for name in ("saddles", "indefinite"))
-        if self.arrays.contacts or self.pairs:  # whose curved barriers are indefinite where nothing buckles
+        # whose curved barriers, and states beside the volumes that are held, are indefinite where nothing buckles
+        if self.arrays.contacts or self.pairs or self.volumes:
             unstable = 0
         if self.is_static and (saddles or unstable):
             rounds = sum(max(len(solve.residuals) - 1, 0) for solve in solves)

@@ -31,6 +31,7 @@ class RecordedPasses:
         ws.potential.place(self.u_star)
         self.operator = Operator(ws.potential, self.mass, ws.free, ws.follower, self.transposed)
         self.places = ws.arrays.values.rest + ws.potential.held_at
+        ws.take_multipliers(j, ws.potential.held_at)
         self._preconditioner = None
 
     def solve(self, b: np.ndarray) -> np.ndarray:

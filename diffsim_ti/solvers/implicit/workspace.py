@@ -68,13 +68,16 @@ class ImplicitWorkspace(ObstacleWays, Noted, GivenInPasses, Workspace):
         me = weakref.proxy(self)  # no circle: a dropped run gives its memory back at once
         way, preconditioner = (lambda *step: me.way_past_obstacles(*step)), (lambda mass: me.preconditioner(mass))
         self.follower = self.follower_pressure()
-        self.newton = Newton(self.potential, self.free, way, preconditioner, tolerance, rounds, eps, self.follower)
+        self.volumes, self.multipliers = self.held_volumes(eps), {}  # the pressures [Pa] that each pass ended with
+        followers = self.follower, self.volumes
+        self.newton = Newton(self.potential, self.free, way, preconditioner, tolerance, rounds, eps, *followers)
         self._preconditioners = {}
         self.way, self.approach = Way(self.arrays, self.parallel), Approach(self)
         self.check_apart()
 
     def restart(self) -> None:
         super().restart()
+        self.multipliers = {}
         self._begin_anew()
         if self.energy_watch:
             self.energy_watch.clear()
@@ -203,11 +206,13 @@ class ImplicitWorkspace(ObstacleWays, Noted, GivenInPasses, Workspace):
             held = self.arrays.held
             start = self.with_held(start, u[held] + (place - u[held]) / stage.c0)
         self.begin(j, stage, u, x)
+        self.start_multipliers(j, u)
         try:
             u_star = self._solve(u, start, (mass, inertial, loads), stage)
         except NotConverged as error:
             raise self._explained(error, u) from None
         self.u_star = u_star
+        self.keep_multipliers(j)
         v_star = (u_star - x) / stage.gamma
         u_next = stage.c0 * u_star + (1 - stage.c0) * u
         v_next = stage.e0 * v_star + stage.e1 * y

@@ -1,0 +1,116 @@
+"""Volumes that are held: the part of Newton's method and of its derivatives that finds multipliers.
+
+A step holds V(u) = target by a multiplier p for each chamber. The bordered system
+
+    K d - g dp = R,    g . d = r = target - V
+
+is solved by K' = K + gamma g (x) g, which is positive definite where the body is stable under the constraint, also where K
+is not: with y = K'^-1 R, z = K'^-1 g and mu = (r - g . y) / (g . z), d = y + mu z and dp = mu - gamma r. As the Newton
+direction of the augmented Lagrangian at multiplier p + mu it goes downhill there, for a line search.
+Nocedal, Wright, Numerical Optimization, 2nd ed., 2006, 17.3 and 18.4, doi:10.1007/978-0-387-40065-5.
+"""
+
+import numpy as np
+
+
+class HeldVolumes:
+    """Of the chambers of a ChamberPressure (potential/) that hold their volume.
+
+    free: what vertices may do; eps: rounding of displacements.
+    """
+
+    share = 0.1  # measured: a hundredth loses thick spheres, all of it halves the steps
+
+    def __init__(self, follower, free, rest: np.ndarray, tolerance: float, eps: float):
+        self.follower, self.free, self.rest, self.tolerance, self.eps = follower, free, rest, tolerance, eps
+        self.laws = [follower.laws[k] for k in follower.held]
+
+    def stiffen(self, stiffness: np.ndarray) -> None:
+        """Set gamma so that gamma |g|^2 is a tenth of the stiffness of a vertex [N/m], shape (num_vertices, 1)."""
+        self._stiffer = 0
+        for law, g in zip(self.laws, self.gradients(self.rest)):
+            g = g * self.free
+            law.gamma = self.share * float((g * stiffness * g).sum() / max((g * g).sum() ** 2, 1e-300))
+
+    def can_stiffen(self) -> bool:
+        """Raise gamma tenfold, if that was not done too often since `stiffen`."""
+        self._stiffer += 1
+        for law in self.laws:
+            law.gamma *= 10
+        return self._stiffer <= 3
+
+    def gradients(self, x: np.ndarray) -> list[np.ndarray]:
+        """dV/dx of each."""
+        return [self.follower.enclosures[k].gradient(x) for k in self.follower.held]
+
+    def place(self, u: np.ndarray, multipliers: np.ndarray | None = None) -> None:
+        """Count from the volumes at u, at the pressures there or at `multipliers`."""
+        V = self.follower.volumes(self.rest + u)[self.follower.held]
+        for k, (law, now) in enumerate(zip(self.laws, V)):
+            law.multiplier = law.pressure(now) if multipliers is None else float(multipliers[k])
+            law.volume = float(now)
+
+    def arrive(self, u: np.ndarray, share: float, rise: np.ndarray) -> None:
+        """Count from u, which a share of a direction has led to: the pressures before `bordered` and that share of dp."""
+        self.place(u, self._before + share * rise)
+
+    @property
+    def multipliers(self) -> np.ndarray:
+        """Pressures at the volumes that are counted from [Pa]."""
+        return np.array([law.multiplier for law in self.laws])
+
+    @property
+    def missing(self) -> np.ndarray:
+        """Targets less volumes where `place` was."""
+        return np.array([law.target - law.volume for law in self.laws])
+
+    def met(self, u: np.ndarray) -> bool:
+        """Whether volumes are as asked for, to tolerance and rounding."""
+        for law, left, g in zip(self.laws, self.missing, self.gradients(self.rest + u)):
+            noise = 4 * self.eps * float((np.abs(g) * np.abs(u)).sum()) + 1e-14 * abs(law.target)
+            if abs(left) > self.tolerance * abs(law.target) + noise:
+                return False
+        return True
+
+    def bordered(self, u: np.ndarray, y: np.ndarray, solve) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(d, what comes to R, dp) from y; solve(g): K'^-1 g. The multipliers go to p + mu, for the line search."""
+        G = [g * self.free for g in self.gradients(self.rest + u)]
+        Z = [solve(g) for g in G]
+        S = np.array([[float((g * z).sum()) for z in Z] for g in G])
+        r, self._before = self.missing, self.multipliers
+        mu = np.linalg.lstsq(S, r - np.array([float((g * y).sum()) for g in G]), rcond=None)[0]
+        for law, more in zip(self.laws, mu):
+            law.multiplier += more
+        d, change = y + sum(m * z for m, z in zip(mu, Z)), sum(m * g for m, g in zip(mu, G))
+        return d, change, mu - np.array([law.gamma for law in self.laws]) * r
+
+    # ---- derivatives -------------------------------------------------------------------------------------------------
+
+    def tangent(self, x: np.ndarray, y: np.ndarray, targets: np.ndarray, solve) -> tuple[np.ndarray, np.ndarray]:
+        """(du, dp) from y = K'^-1 dR, the target in dR having the slope gamma; targets: their change less what V changes by
+        all that does not follow from dR."""
+        G = [g * self.free for g in self.gradients(x)]
+        Z = [solve(g) for g in G]
+        S = np.array([[float((g * z).sum()) for z in Z] for g in G])
+        dp = np.linalg.solve(S, targets - np.array([float((g * y).sum()) for g in G]))
+        return y + sum(m * z for m, z in zip(dp, Z)), dp
+
+    def targets_jvp(self, x: np.ndarray, dx: np.ndarray, numbers_dot: np.ndarray) -> np.ndarray:
+        """Change of targets for that of the numbers, less that of volumes by dx."""
+        rows = [self.follower.rows[k] for k in self.follower.held]
+        changes = [law.target_by_numbers() @ numbers_dot[own] for law, own in zip(self.laws, rows)]
+        return np.array(changes) - [float((G * dx).sum()) for G in self.gradients(x)]
+
+    def add_targets(self, nu: np.ndarray, x: np.ndarray, numbers_adj: np.ndarray) -> np.ndarray:
+        """Add to the adjoint of the numbers what comes by targets; returns that of x by volumes."""
+        for k, law, own in zip(self.follower.held, self.laws, nu):
+            numbers_adj[self.follower.rows[k]] += own * law.target_by_numbers()
+        return -sum(own * G for own, G in zip(nu, self.gradients(x)))
+
+    def adjoint(self, x: np.ndarray, y: np.ndarray, by_pressure: np.ndarray, solve) -> tuple[np.ndarray, np.ndarray]:
+        """(w, nu) from y = K'^-T p: the adjoint of R, and what comes to that of targets, and less to that of volumes."""
+        G = [g * self.free for g in self.gradients(x)]
+        Z = [solve(g) for g in G]
+        S = np.array([[float((g * z).sum()) for z in Z] for g in G])
+        nu = np.linalg.solve(S, by_pressure + np.array([float((g * y).sum()) for g in G]))
+        return y - sum(m * z for m, z in zip(nu, Z)), nu

@@ -1,0 +1,133 @@
+"""Chambers: cavities of the body that hold a gas, or a liquid of given volume."""
+
+from copy import copy
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from diffsim_ti.inputs import POSITIVE, Input, Link
+from diffsim_ti.inputs.chambers import RestVolume
+from diffsim_ti.inputs.loads import InTime
+from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.mesh.enclosure import Enclosure
+from diffsim_ti.terms.over_time import OverTime, amount, is_keyed, rows_at
+from diffsim_ti.terms.term import Term
+
+ATMOSPHERE = 101325.0  # [Pa]
+
+
+class Chamber(Term):
+    """A cavity, by a surface of the body around it, whose filling pushes on it with one pressure.
+
+    The surface is closed, or has rims that are held wholly or move in planes (supports by component), which close it there.
+    Its triangles are those of the body, whose normals point out of the body and so into the chamber: a positive pressure
+    inflates it. The forces are those of `Pressure`, p dV/dx, V the volume inside.
+    """
+
+    shape = ()  # of what is given over time
+    num_numbers = 0  # what is read of it lies in rows of its own
+    row_names: tuple[str, ...] = ()  # of its numbers, each of which has a row in time
+
+    def __init__(self, argument: str, given: OverTime, unit: str, plain: str, surface, name: str | None, *more: Input):
+        described = replace(amount(argument, given, (), unit, plain), range=POSITIVE)
+        super().__init__(described, *more, name=name)
+        self._given, self.keyed, self.surface = given, is_keyed(given), surface
+        if self.keyed:
+            self.rows([0.0])  # refuses what does not fit
+
+    @property
+    def plain(self) -> str:
+        """Plain name of what is given over time."""
+        return self.described[0].plain
+
+    def rows(self, times: ArrayLike) -> np.ndarray:
+        """That at each time [s], where it is keyed."""
+        return rows_at(f"{type(self).__name__}: {self.plain}", self._given, times, ())
+
+    def check(self, mesh: TetrahedralMesh) -> None:
+        if len(self.triangles(mesh)) == 0:
+            raise ValueError(f"{type(self).__name__}: its surface is empty; name a set that has members")
+
+    def triangles(self, mesh: TetrahedralMesh) -> np.ndarray:
+        """Its surface, as vertex indices, normals into it, shape (k, 3)."""
+        return mesh.surface_triangles[mesh.surface_indices(self.surface)]
+
+    def settled(self, scene, density, initial_positions, initial_velocities) -> "Chamber":
+        out, mesh, supports = copy(self), scene.mesh, scene.supports
+        free = np.tile(np.eye(3), (mesh.num_vertices, 1, 1))
+        free[supports.vertices] -= supports.held
+        called = f"{type(self).__name__}" + (f" {self.name!r}" if self.name else "")
+        moves = scene.motion is not None
+        out.enclosure = Enclosure.of(self.triangles(mesh), free, mesh.vertices, called, moves)
+        return out
+
+    def in_time(self, own: str) -> list[str]:
+        """Names of the rows of its numbers, of which `own` is the beginning."""
+        return [f"{own} {row} in time" for row in self.row_names]
+
+    def links(self, names: dict[str, str], own: str) -> list[Link]:
+        volume = f"{own} volume"
+        sources = [volume if row == "rest" else names[i.plain] for row, i in zip(self.row_names, self._described_rows)]
+        out = [RestVolume(self.enclosure, volume)]
+        for k, (source, row) in enumerate(zip(sources, self.in_time(own))):
+            out.append(InTime(source, row, 1, self.keyed and k == 0))
+        return out
+
+    @property
+    def _described_rows(self) -> list:
+        described = iter(self.described)
+        return [None if row == "rest" else next(described) for row in self.row_names]
+
+
+class GasChamber(Chamber):
+    """A gas in a cavity: it pushes with p = p_0 (V_0 / V)^n - p_out, V_0 the volume of the chamber at rest.
+
+    pressure: p_0 [Pa], absolute: what the gas would have in the chamber at rest, so that p_0 V_0 is the amount that is in it
+        (n R T of an ideal gas); over time as in `Traction`, for gas that is pumped in, shape (steps,) for each step.
+    surface: of the cavity, as in `Traction`; None: all of the body's surface, which encloses no chamber.
+    outside: p_out [Pa], absolute; default one atmosphere. exponent: n, 1 of an isothermal gas, 1.4 of air that moves too
+        fast to exchange heat.
+    Inputs with gradient: "gas_pressure", "outside_pressure", "gas_exponent", or "<name>.pressure", ".outside", ".exponent".
+    The gas has no mass and one pressure everywhere. Statics lay p on in load steps. Explicit steps sum the volume before
+    each substep, in a launch of its own; what the gas adds to the stiffness counts in the stable step.
+    Raises ValueError for surfaces that enclose no volume, numbers that are not positive, and what does not fit.
+    Bonet, Wood 2008, Nonlinear Continuum Mechanics for Finite Element Analysis, 2nd ed., 8.5.2; Rumpel, Schweizerhof 2003,
+    Volume-dependent pressure loading and its influence on the stability of structures, doi:10.1002/nme.561.
+    """
+
+    row_names = ("pressure", "outside", "rest", "exponent")
+
+    def __init__(
+        self,
+        pressure: OverTime,
+        surface: str | ArrayLike | None = None,
+        outside: float = ATMOSPHERE,
+        exponent: float = 1.0,
+        name: str | None = None,
+    ):
+        more = (
+            Input("outside", outside, ((),), "Pa", plain="outside_pressure", label="outside"),
+            Input("exponent", exponent, ((),), "-", POSITIVE, plain="gas_exponent", label="exponent"),
+        )
+        super().__init__("pressure", pressure, "Pa", "gas_pressure", surface, name, *more)
+
+
+class FilledChamber(Chamber):
+    """A cavity filled with what does not change its volume: V is given, and the pressure is what that takes.
+
+    volume: V [m^3], over time as in `Traction`, for what is pumped in, shape (steps,) for each step. Where a rim is open in
+        planes, V is what is on the body's side of them. `Scene.chamber_volume` has that at rest.
+    surface: as in `GasChamber`.
+    Input with gradient: "chamber_volume" or "<name>.volume". The pressure is a result: `ChamberPressure`, with gradient.
+    Implicit and static solvers hold V at the end of each substep (the midpoint rule in the middle of it), by a Lagrange
+    multiplier: so a chamber is followed beyond the largest pressure that it bears. Statics go from the volume at rest in
+    load steps. Explicit solvers refuse it.
+    Raises ValueError for surfaces that enclose no volume, numbers that are not positive, and what does not fit.
+    Nocedal, Wright, Numerical Optimization, 2nd ed., 2006, 17.3 and 18.4, doi:10.1007/978-0-387-40065-5.
+    """
+
+    row_names = ("volume", "rest")
+
+    def __init__(self, volume: OverTime, surface: str | ArrayLike | None = None, name: str | None = None):
+        super().__init__("volume", volume, "m^3", "chamber_volume", surface, name)
