@@ -44,11 +44,14 @@ from diffsim_ti.solvers import (
 )
 from diffsim_ti.state.solve_report import Buckled, SolveReport
 from diffsim_ti.terms import (
+    Anchor,
     BodyForce,
     Box,
+    Cable,
     Capsule,
     Cylinder,
     Drag,
+    ElasticFoundation,
     ExternalForce,
     Gravity,
     Ground,
@@ -57,6 +60,7 @@ from diffsim_ti.terms import (
     Pressure,
     SelfContact,
     Sphere,
+    Spring,
     Traction,
 )
 from diffsim_ti.verify import check_gradients, dot_product_test, taylor_test
@@ -77,6 +81,10 @@ __all__ = [
     "Traction",
     "Pressure",
     "BodyForce",
+    "Spring",
+    "Cable",
+    "Anchor",
+    "ElasticFoundation",
     "Ground",
     "HalfSpace",
     "Sphere",

@@ -88,7 +88,7 @@ class ForwardRun:
     def __init__(self, scene: Scene, solver_class: type[Solver], frame_time: float, dt: float | None = None, **options):
         check_strength(scene)
         self.scene, self.seen, self.adapts = scene, Seen(), dt is None
-        self.driven = scene.motion is not None or bool(scene.moving) or bool(scene.pressures)
+        self.driven = scene.motion is not None or bool(scene.moving) or bool(scene.pressures or scene.cables)
         self.before_part: Callable[[], object] | None = None
         self.obstacles = tuple(t for t in scene.terms if isinstance(t, Obstacle))
         gravity = scene.term(Gravity)

@@ -15,7 +15,8 @@ from diffsim_ti.materials.patch_law import PatchLaw
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.potential.assembled import body_stiffness
 from diffsim_ti.supports import Fixed, Supports
-from diffsim_ti.terms import Drag, Gravity, Obstacle, Pressure, SelfContact, Term
+from diffsim_ti.mesh.paths import Paths
+from diffsim_ti.terms import Cable, Drag, ElasticFoundation, Gravity, Obstacle, Pressure, SelfContact, Spring, Term
 from diffsim_ti.terms.motion import Motion, sampled
 from diffsim_ti.terms.obstacles.obstacle import PER_AREA
 
@@ -94,6 +95,10 @@ class Scene:
         self.moving = tuple(t for t in self.ordered_terms if t.path is not None)
         self.dead_loads = tuple(t for t in self.ordered_terms if t.dead)
         self.pressures = tuple(t for t in self.ordered_terms if isinstance(t, Pressure))
+        self.springs = tuple(t for t in self.ordered_terms if isinstance(t, Spring))
+        self.cables = tuple(t for t in self.ordered_terms if isinstance(t, Cable))
+        self.ties = self.springs + self.cables
+        self.foundations = tuple(t for t in self.ordered_terms if isinstance(t, ElasticFoundation))
         self.inputs = Inputs(self, density, initial_positions, initial_velocities)
         self._check_start()
         if volume == "tetrahedra":
@@ -206,6 +211,21 @@ class Scene:
         """(triangles that pressures act on, shape (k, 3), the number of the one of `pressures` that each belongs to)."""
         triangles = [np.zeros((0, 3), np.int64), *(term.triangles(self.mesh) for term in self.pressures)]
         return np.concatenate(triangles), np.repeat(np.arange(len(triangles)) - 1, [len(rows) for rows in triangles])
+
+    @property
+    def tie_paths(self) -> Paths:
+        """Where springs run and, after them, cables."""
+        return Paths.joined([term.paths(self.mesh) for term in self.ties])
+
+    @property
+    def one_sided_ties(self) -> np.ndarray:
+        """Of each tie whether it pulls only."""
+        return np.concatenate([np.full(len(term.paths(self.mesh)), term.one_sided) for term in self.ties])
+
+    @property
+    def founded_vertices(self) -> np.ndarray:
+        """Sorted indices of the vertices that foundations hold."""
+        return np.unique(np.concatenate([np.zeros(0, np.int64), *(t.indices(self.mesh) for t in self.foundations)]))
 
     def places(self, time: float) -> dict[Term, np.ndarray]:
         """Displacement of each moving obstacle at a time [s], shape (3,) [m]."""

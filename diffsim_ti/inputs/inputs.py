@@ -10,8 +10,10 @@ from numpy.typing import ArrayLike
 from diffsim_ti.inputs import links
 from diffsim_ti.inputs.chain import Chain, Link
 from diffsim_ti.inputs.description import POSITIVE, Input, frozen, length, speed
+from diffsim_ti.inputs.foundation import FoundationRows
 from diffsim_ti.inputs.loads import PressureRows, SumOfForces
 from diffsim_ti.inputs.surface_areas import SurfaceAreas
+from diffsim_ti.inputs.ties import JoinedRows, JoinedSegments
 from diffsim_ti.rows import Rows
 
 if TYPE_CHECKING:
@@ -35,6 +37,9 @@ class Derived:
     motion: np.ndarray | None = None  # (steps + 1, num_held, 3) [m]
     path: np.ndarray | None = None  # displacements of obstacles, (steps + 1, num_moving, 3) [m]
     follower: np.ndarray | None = None  # pressures as each step begins and ends, and 0, (1 or steps, loads, 3) [Pa]
+    ties: np.ndarray | None = None  # numbers of springs and cables (inputs/ties.py), (1 or steps, 2 ties, 3)
+    tie_segments: np.ndarray | None = None  # between their points at rest, (points, 3) [m]
+    foundation: np.ndarray | None = None  # rows of the stiffness of vertices on foundations, (3 k, 3) [N/m]
 
     def zeros(self) -> "Derived":
         """The same shapes, all zero."""
@@ -134,7 +139,7 @@ class Inputs:
         return out
 
     def _sums_of_loads(self) -> list[Link]:
-        """What adds the forces of dead loads, and what lists pressures."""
+        """What adds the forces of dead loads and foundations, and what lists pressures, springs and cables."""
         own = {term: f"numbers of term {k}" for k, term in enumerate(self.scene.ordered_terms)}
         dead, pressures = self.scene.dead_loads, self.scene.pressures
         out = []
@@ -143,7 +148,18 @@ class Inputs:
             out.append(SumOfForces([f"{own[t]} forces" for t in dead], indices, self.keyed_forces, "forces"))
         if pressures:
             out.append(PressureRows([f"{own[t]} in time" for t in pressures], "follower"))
+        if self.scene.ties:
+            out.append(JoinedRows([f"{own[t]} rows" for t in self.scene.ties], "ties"))
+            out.append(JoinedSegments([f"{own[t]} segments" for t in self.scene.ties], "tie_segments"))
+        if founded := self.scene.foundations:
+            indices = [term.indices(self.mesh) for term in founded]
+            out.append(FoundationRows([f"{own[t]} matrices" for t in founded], indices, "foundation"))
         return out
+
+    @property
+    def makes_rows(self) -> bool:
+        """Whether what changes from step to step is made of inputs together."""
+        return self.sums_loads or bool(self.scene.pressures or self.scene.cables)
 
     @property
     def keyed_forces(self) -> bool:
@@ -171,7 +187,7 @@ class Inputs:
         out = self.at_times([step * dt, (step + 1) * dt]) | (values or {})
         for name in self._per_step:
             rules = [rule for rule in self.described[name].shapes if len(rule) == out[name].ndim]
-            if any("steps" in rule for rule in rules) and (self.sums_loads or self.scene.pressures):
+            if any("steps" in rule for rule in rules) and self.makes_rows:
                 if step >= len(out[name]):
                     raise ValueError(f"{name} is given for {len(out[name])} steps, this is step {step}")
                 out[name] = out[name][step : step + 1]

@@ -1,14 +1,19 @@
-"""Weight and loads on the vertices of a body at the states that frames show, with derivatives, for outputs."""
+"""Weight, loads and what is attached on the vertices of a body at the states that frames show, with derivatives, for outputs."""
 
 import numpy as np
 
 from diffsim_ti.inputs import Derived
+from diffsim_ti.potential.attached import Attached
 from diffsim_ti.potential.follower_pressure import FollowerPressure
+from diffsim_ti.state.schedule import Schedule
 from diffsim_ti.terms import Gravity
+
+STEPS = Schedule(1.0, 1)  # a pass for each step
 
 
 class GivenLoads:
-    """Forces [N], shape (num_vertices, 3): weight, dead loads and pressures, those of the step that ends in a frame."""
+    """Forces [N], shape (num_vertices, 3): weight, dead loads, pressures, springs, cables and foundations, those of the step
+    that ends in a frame."""
 
     def __init__(self, scene):
         self.scene, self.follower = scene, None
@@ -17,6 +22,7 @@ class GivenLoads:
         self.loaded, self.keyed = scene.loaded_vertices if scene.dead_loads else None, scene.inputs.keyed_forces
         if scene.pressures:
             self.follower = FollowerPressure(*scene.pressed_triangles, scene.mesh.num_vertices)
+        self.attached = Attached.of(scene)
 
     @staticmethod
     def _row(step: int, rows: np.ndarray) -> np.ndarray:
@@ -30,6 +36,14 @@ class GivenLoads:
     def _pressures(self, step: int, rows: np.ndarray) -> np.ndarray:
         return self._row(step, rows)[:, 1 if step else 0]
 
+    @staticmethod
+    def _time(step: int) -> tuple:
+        """(schedule, pass, share of its step) of a frame."""
+        return STEPS, max(step - 1, 0), float(step > 0)
+
+    def _attached(self, derived: Derived, step: int) -> Attached:
+        return self.attached.at(derived, derived.ties, *self._time(step))
+
     def forces(self, derived: Derived, x: np.ndarray, step: int) -> np.ndarray:
         """At places x [m] after so many steps."""
         out = np.zeros(x.shape)
@@ -39,6 +53,8 @@ class GivenLoads:
             out[self.loaded] += self._dead(step, derived.forces)
         if self.follower is not None:
             out += self.follower.at(self._pressures(step, derived.follower)).forces(x)
+        if self.attached:
+            out += self._attached(derived, step).forces(x - derived.rest)
         return out
 
     def jvp(self, derived: Derived, moved: Derived, x: np.ndarray, dx: np.ndarray, step: int) -> np.ndarray:
@@ -52,6 +68,9 @@ class GivenLoads:
         if self.follower is not None:
             pressures = self._pressures(step, derived.follower)
             out += self.follower.at(pressures).jvp(x, dx, self._pressures(step, moved.follower))
+        if self.attached:
+            attached, du = self._attached(derived, step), dx - moved.rest
+            out += attached.jvp(x - derived.rest, du, moved, *self._time(step))
         return out
 
     def vjp(self, derived: Derived, x: np.ndarray, w: np.ndarray, step: int, adj: Derived) -> np.ndarray:
@@ -61,8 +80,12 @@ class GivenLoads:
             adj.parameters[self.gravity.start : self.gravity.start + 3] += derived.mass @ w
         if self.loaded is not None:
             self._dead(step, adj.forces)[:] += w[self.loaded]
+        out = np.zeros(x.shape)
+        if self.attached:
+            out += self._attached(derived, step).vjp(x - derived.rest, w, adj, *self._time(step))
+            adj.rest -= out
         if self.follower is None:
-            return np.zeros(x.shape)
+            return out
         follower = self.follower.at(self._pressures(step, derived.follower))
         self._pressures(step, adj.follower)[:] += follower.pressures_vjp(x, w)
-        return follower.vjp(x, w)
+        return out + follower.vjp(x, w)

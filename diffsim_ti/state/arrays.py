@@ -59,6 +59,8 @@ class SceneArrays:
         self.fixed, self.held, self.feels_faces = scene.fixed, scene.held, feels_faces
         self.supports = scene.supports
         self.pressures = scene.pressures if presses else ()  # that gather with the tetrahedra's corners
+        self.paths = scene.tie_paths if presses and scene.ties else None
+        self.founded = scene.founded_vertices if presses else np.zeros(0, np.int64)
         self.mesh, self.precision, self.self_contact = mesh, precision, scene.term(SelfContact)
         self._upload_topology(scene)
         rows = scene.inputs.parameters
@@ -72,6 +74,9 @@ class SceneArrays:
             forces=bool(scene.dead_loads),
             forces_keyed=scene.inputs.keyed_forces,
             pressed=bool(self.pressures),
+            tied=self.paths is not None,
+            cabled=self.paths is not None and bool(scene.cables),
+            founded=bool(len(self.founded)),
             motion=scene.motion is not None,
             guided=bool(len(scene.supports.guided)),
             num_parameters=rows.total,
@@ -108,6 +113,7 @@ class SceneArrays:
             self.parameters_of_self_contact = scene.inputs.parameters.of(self.self_contact)
             start, corner_of = with_own_corner(start, corner_of, mesh.surface_vertices, num_corners)
             num_corners += len(mesh.surface_vertices)
+        start, corner_of, num_corners = self._upload_ties(scene, start, corner_of, num_corners)
         self.first_pressed, self.num_pressed = num_corners, 0
         if self.pressures:
             self.pressed_triangles, self.load_of = scene.pressed_triangles
@@ -126,6 +132,24 @@ class SceneArrays:
         if len(scene.supports.guided):
             self.guide_slot = runtime.upload(slots(scene.supports.guided, n), ti.i32)
             self.guides = runtime.upload(scene.supports.guides.reshape(-1, 3), self.vector)
+
+    def _upload_ties(self, scene, start, corner_of, num_corners: int) -> tuple:
+        """(start, corner_of, number of corners), with those of springs and then of cables, which are loads."""
+        self.num_ties, self.first_tied, self.first_load = 0, num_corners, num_corners
+        if len(self.founded):
+            self.foundation_slot = runtime.upload(slots(self.founded, self.num_vertices), ti.i32)
+        if self.paths is None:
+            return start, corner_of, num_corners
+        paths, self.num_ties = self.paths, len(self.paths)
+        springs = sum(len(term.paths(self.mesh)) for term in scene.springs)
+        self.first_load += int(paths.first_corner[paths.first_point[springs]])
+        start, corner_of = with_more_corners(start, corner_of, paths.vertices, num_corners)
+        self.tie_start = runtime.upload(paths.first_point, ti.i32)
+        self.point_start = runtime.upload(paths.first_corner, ti.i32)
+        self.point_vertex = runtime.upload(paths.vertices, ti.i32)
+        self.point_weight = runtime.upload(paths.weights, self.fp)
+        self.tie_one_sided = runtime.upload(scene.one_sided_ties, ti.i32)
+        return start, corner_of, num_corners + len(paths.vertices)
 
     def _twins(self, scene) -> list[tuple]:
         """(compile-time twin, first parameter, column of the path or -1) of the obstacles; their tables stand behind the
@@ -162,6 +186,7 @@ class SceneArrays:
             **self._features,
             forces_per_step=forces is not None and len(forces) > 1,
             pressure_per_step=bool(self.pressures) and len(follower) > 1,
+            ties_per_step=self.paths is not None and len(self.values.ties) > 1,
             uniform=self.values.coefficients.ndim == 1,
             density=density,
             shape=shape,
@@ -171,7 +196,7 @@ class SceneArrays:
         """Bring values to the device; True if array shapes or kernels changed, so that launches must be bound anew."""
         old, before = self.values, None if self.values is None else self.features()
         self.values, self._known_features = values, {}
-        self.rows = {name: getattr(values, name) for name in ("motion", "path", "forces", "follower")}
+        self.rows = {name: getattr(values, name) for name in ("motion", "path", "forces", "follower", "ties")}
         moved = before != self.features()
         sources = {name: on_device(self, name, values) for name in PARTS if name != "mass"}
         sources["parameters"] = np.concatenate([values.parameters, self.tables]), self.fp
@@ -188,7 +213,7 @@ class SceneArrays:
         return moved
 
     def load_rows(self, **rows: np.ndarray) -> None:
-        """Other rows of motion, path, forces or pressure, by name: those of the steps to come."""
+        """Other rows of motion, path, forces, pressure or ties, by name: those of the steps to come."""
         for name, data in rows.items():
             runtime.fill(getattr(self, name), data)
             self.rows[name] = data

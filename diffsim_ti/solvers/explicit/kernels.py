@@ -7,10 +7,12 @@ import taichi as ti
 
 from diffsim_ti.elements.pressed_triangle import PRESSED, PressedTriangle
 from diffsim_ti.elements.tetrahedron import Onwards
+from diffsim_ti.elements.tie import TIED, TieElement
 from diffsim_ti.runtime import Bundle, Kernel, let, traced
+from diffsim_ti.solvers.explicit.foundations import FOUNDED
 from diffsim_ti.solvers.explicit.guides import GUIDED
 from diffsim_ti.solvers.explicit.kick_drift import KickDrift
-from diffsim_ti.state.numbers import ADJOINT, OF_STEPS, SCENE, TANGENT, with_state
+from diffsim_ti.state.numbers import ADJOINT, ALONE, OF_STEPS, SCENE, TANGENT, with_state
 from diffsim_ti.state.schedule import pass_at, reversed_pass
 
 A = ti.template()
@@ -59,9 +61,23 @@ class ExplicitKernels:
         features = self.vertex.features
         return PressedTriangle(self.vertex.law.precision, features.pressure_per_step, features.shape)
 
+    @property
+    def tied(self) -> bool:
+        return self.vertex.features.tied
+
+    @property
+    def founded(self) -> bool:
+        return self.vertex.features.founded
+
+    @cached_property
+    def tie(self) -> TieElement:
+        return TieElement(self.vertex.law.precision, self.vertex.features.ties_per_step)
+
     @traced
     def num_elements(self, plan):
-        """Items of tetrahedra, and after them pressed triangles."""
+        """Items of tetrahedra, after them pressed triangles, and after them springs and cables."""
+        if self.tied:
+            return let(plan.num_items + plan.num_pressed + plan.num_ties)
         return let(plan.num_items + plan.num_pressed) if self.pressed else plan.num_items
 
     @traced
@@ -120,12 +136,17 @@ class ExplicitKernels:
 
     @ti.func
     def elements(self, e, j, scene: A, state: A, table: A, plan: A):
-        if ti.static(self.pressed):
+        if ti.static(self.pressed or self.tied):
             if e < plan.num_items:
                 self.tetrahedra(e, j, scene, state, table, plan)
             else:
-                now, s = pass_at(table, j - plan.window), (j - plan.base) * plan.stride
-                self.triangle.forces(e - plan.num_items, now, scene, state, s, plan.first_pressed)
+                k, now, s = e - plan.num_items, pass_at(table, j - plan.window), (j - plan.base) * plan.stride
+                if ti.static(self.pressed):
+                    if k < plan.num_pressed:
+                        self.triangle.forces(k, now, scene, state, s, plan.first_pressed)
+                if ti.static(self.tied):
+                    if k >= plan.num_pressed:
+                        self.tie.forces(k - plan.num_pressed, now, scene, state, s, plan.first_tied)
         else:
             self.tetrahedra(e, j, scene, state, table, plan)
 
@@ -169,12 +190,17 @@ class ExplicitKernels:
 
     @ti.func
     def elements_jvp(self, e, scene: A, state: A, tangent: A, table: A, plan: A):
-        if ti.static(self.pressed):
+        if ti.static(self.pressed or self.tied):
             if e < plan.num_items:
                 self.tetrahedra_jvp(e, scene, state, tangent, table, plan)
             else:
-                now, s = pass_at(table, plan.first - plan.window), plan.first - plan.base
-                self.triangle.forces_jvp(e - plan.num_items, now, scene, state, s, tangent, plan.first_pressed)
+                k, now, s = e - plan.num_items, pass_at(table, plan.first - plan.window), plan.first - plan.base
+                if ti.static(self.pressed):
+                    if k < plan.num_pressed:
+                        self.triangle.forces_jvp(k, now, scene, state, s, tangent, plan.first_pressed)
+                if ti.static(self.tied):
+                    if k >= plan.num_pressed:
+                        self.tie.forces_jvp(k - plan.num_pressed, now, scene, state, s, tangent, plan.first_tied)
         else:
             self.tetrahedra_jvp(e, scene, state, tangent, table, plan)
 
@@ -199,7 +225,7 @@ class ExplicitKernels:
     @cached_property
     def step_jvp(self) -> Kernel:
         """The tangent of pass `first` along recorded slots; the change of the state is advanced in place."""
-        tangent = TANGENT | dict(follower=PRESSED["follower"]) if self.pressed else TANGENT
+        tangent = TANGENT | {name: kind for name, kind in self.further().items() if name in ALONE}
         own = dict(state=self.state(), tangent=self.with_record(CHANGE) | tangent)
         return self._kernel("step_jvp", self.passes_jvp, own, False, rate_dot="float")
 
@@ -207,12 +233,17 @@ class ExplicitKernels:
 
     @ti.func
     def elements_vjp(self, e, j, scene: A, state: A, adjoint: A, table: A, plan: A):
-        if ti.static(self.pressed):
+        if ti.static(self.pressed or self.tied):
             if e < plan.num_items:
                 self.tetrahedra_vjp(e, j, scene, state, adjoint, table, plan)
             else:
-                now, s = pass_at(table, j - plan.window), j - plan.base
-                self.triangle.forces_vjp(e - plan.num_items, now, scene, state, s, adjoint, plan.first_pressed)
+                k, now, s = e - plan.num_items, pass_at(table, j - plan.window), j - plan.base
+                if ti.static(self.pressed):
+                    if k < plan.num_pressed:
+                        self.triangle.forces_vjp(k, now, scene, state, s, adjoint, plan.first_pressed)
+                if ti.static(self.tied):
+                    if k >= plan.num_pressed:
+                        self.tie.forces_vjp(k - plan.num_pressed, now, scene, state, s, adjoint, plan.first_tied)
         else:
             self.tetrahedra_vjp(e, j, scene, state, adjoint, table, plan)
 
@@ -277,6 +308,9 @@ class ExplicitKernels:
         own |= dict(w="vectors2", felt="vectors2")
         if self.pressed:
             own |= dict(pressed_felt="vectors2", pressed_rest="vectors")
+        if self.tied:
+            own |= dict(tie_felt="vectors2", tie_rest="vectors")
+        own |= dict(foundation_felt="vectors") if self.founded else {}
         arrays = dict(state=self.state(), adjoint=own)
         return self._kernel("step_vjp", self.passes_vjp, arrays, self.repeated, **numbers)
 
@@ -295,10 +329,24 @@ class ExplicitKernels:
         own = dict(scene=corners, adjoint=dict(u="vectors2", v="vectors2") | CORNERS)
         return Kernel("finish_vjp", self.gather_rest, self.vertex.law.precision, own, dict(num_vertices="int"))
 
+    def further(self) -> dict:
+        """What only some scenes have."""
+        features, out = self.vertex.features, {}
+        for has, arrays in (
+            (self.pressed, PRESSED),
+            (self.tied, TIED),
+            (self.founded, FOUNDED),
+            (features.guided, GUIDED),
+        ):
+            out |= arrays if has else {}
+        return out
+
     def _kernel(self, name: str, body, arrays: dict, repeated: bool, **numbers) -> Kernel:
-        scene, counted = (SCENE | PRESSED, ("num_pressed", "first_pressed")) if self.pressed else (SCENE, ())
-        scene = scene | GUIDED if self.vertex.features.guided else scene
-        arrays = dict(scene=scene) | arrays | dict(table=PLAN)
+        counted = ("num_pressed", "first_pressed") if self.pressed else ()
+        counted += ("num_ties", "first_tied") if self.tied else ()
+        counted += ("first_load",) if self.vertex.features.loaded_corners else ()
+        counted += ("num_pressed",) if self.tied and not self.pressed else ()
+        arrays = dict(scene=SCENE | self.further()) | arrays | dict(table=PLAN)
         numbers = NUMBERS | dict.fromkeys(counted, "int") | numbers
         numbers |= dict(per_frame="int") if self.recorded else {}
         if repeated:

@@ -71,6 +71,7 @@ class ImplicitAdjoint(RecordedPasses):
         self.p, self.q = self.frames[0][-1].copy(), self.frames[1][-1].copy()
         self.pending = [np.zeros_like(self.p), np.zeros_like(self.p)]
         self.mass_adj, self.gravity, self.rate = np.zeros(len(self.p)), np.zeros(3), 0.0
+        self.attached = a.values.zeros()  # of springs, cables and foundations
         self.pressure = None if a.values.follower is None else np.zeros_like(a.values.follower)
         self.rest_by_pressure = np.zeros_like(self.p)
         self.forces = None if a.values.forces is None else np.zeros_like(a.values.forces)
@@ -129,6 +130,8 @@ class ImplicitAdjoint(RecordedPasses):
         if ws.potential.faces:
             reaction = reaction + self._vjp_of_faces()
         reaction = reaction + by_contacts
+        if ws.attached:
+            reaction = reaction + ws.attached.vjp(ws.potential.held_at, by_star, self.attached, *ws.time_of(j, s))
         share = ws.load_share(j, s)
         if self.pressure is not None:
             by_place = ws.follower.vjp(self.places, by_star)
@@ -215,6 +218,8 @@ class ImplicitAdjoint(RecordedPasses):
             rest = rest + rest_of_areas(a.mesh, a.values.rest, by_areas)
         out.rest = rest + self.rest_by_pressure + out.rest
         out.forces, out.motion, out.path, out.follower = self.forces, self.motion, self.path, self.pressure
+        for name in ("ties", "tie_segments", "foundation"):
+            setattr(out, name, getattr(self.attached, name))
         if self.motion is not None:
             out.displacement[a.held] += self.anchor
         return out
@@ -292,6 +297,8 @@ class ImplicitTangent(RecordedPasses):
         if tangent.follower is not None:
             dp = share * ws.solver.schedule.pressure(tangent.follower, j, ws.share_at_stage(j, s))
             dR += ws.follower.jvp(self.places, held + tangent.rest, dp)
+        if ws.attached:
+            dR += ws.attached.jvp(ws.potential.held_at, held, tangent, *ws.time_of(j, s))
         d_star = held + self.solve(dR + self.mass * (dx + s.gamma * dy))
         if self.contacts:
             self._note_contacts(j, per_frame, d_star)

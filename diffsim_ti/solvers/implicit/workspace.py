@@ -9,6 +9,7 @@ from diffsim_ti import runtime
 from diffsim_ti.contact.implicit_pairs import ImplicitPairs
 from diffsim_ti.contact.surface_pairs import Tunnelling
 from diffsim_ti.monitor.energy_watch import EnergyWatch
+from diffsim_ti.potential.attached import Attached
 from diffsim_ti.potential.free import FreeDirections, held_as, mask_of
 from diffsim_ti.potential.potential import Potential
 from diffsim_ti.potential.way import Way
@@ -66,6 +67,7 @@ class ImplicitWorkspace(ObstacleWays, Noted, GivenInPasses, Workspace):
         me = weakref.proxy(self)  # no circle: a dropped run gives its memory back at once
         way, preconditioner = (lambda *step: me.way_past_obstacles(*step)), (lambda mass: me.preconditioner(mass))
         self.follower = self.follower_pressure()
+        self.attached = self.potential.attached = Attached.of(self.scene)
         self.newton = Newton(self.potential, self.free, way, preconditioner, tolerance, rounds, eps, self.follower)
         self._preconditioners = {}
         self.way, self.approach = Way(self.arrays, self.parallel), Approach(self)
@@ -267,6 +269,7 @@ class ImplicitWorkspace(ObstacleWays, Noted, GivenInPasses, Workspace):
         self.walls_at_stage, self.walls_before = self._walls[::3].copy(), self._walls[1::3].copy()
         self.potential.begin(u, x, 1 / stage.gamma, self._walls)
         self.press(j, stage)
+        self.attach(j, stage)
 
     def walls(self, path: np.ndarray | None, j: int, stage: Stage) -> np.ndarray:
         """Three rows for each obstacle: displacement where forces are taken, displacement before, velocity."""
