@@ -13,9 +13,9 @@ from diffsim_ti.materials.material import Material
 from diffsim_ti.materials.moduli import youngs_poisson
 from diffsim_ti.materials.patch_law import PatchLaw
 from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.mesh.paths import Paths
 from diffsim_ti.potential.assembled import body_stiffness
 from diffsim_ti.supports import Fixed, Supports
-from diffsim_ti.mesh.paths import Paths
 from diffsim_ti.terms import Cable, Drag, ElasticFoundation, Gravity, Obstacle, Pressure, SelfContact, Spring, Term
 from diffsim_ti.terms.motion import Motion, sampled
 from diffsim_ti.terms.obstacles.obstacle import PER_AREA

@@ -47,8 +47,8 @@ class Segments(Link):
 
 
 class TieRows(Link):
-    """Rows of a term's ties. stiffness [N/m]: a number, or one for each; tension [N] and length [m] without force in time, as
-    `InTime` has them, of all ties together or of each; what is None is none, of a length: that at rest."""
+    """Rows of a term's ties. stiffness [N/m]: a number, or one for each; tension [N] and length [m] without force in time,
+    as `InTime` has them, of all ties together or of each; what is None is none, of a length: that at rest."""
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""Weight, loads and what is attached on the vertices of a body at the states that frames show, with derivatives, for outputs."""
+"""Weight, loads, springs, cables and foundations at the states that frames show, with derivatives, for outputs."""
 
 import numpy as np
 

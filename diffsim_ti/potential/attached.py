@@ -46,7 +46,7 @@ class Attached:
         return cls(scene) if scene.ties or scene.foundations else None
 
     def at(self, values: Derived, rows: np.ndarray | None, schedule: Schedule, j: int, share: float, laid: float = 1.0):
-        """As it is at a share of the step of pass j; rows: of ties, in time; laid: what share of given tensions is laid on."""
+        """At a share of the step of pass j; rows: of ties, in time; laid: share of given tensions that is laid on."""
         if self.ties:
             a, s, k = schedule.ties(rows, j, share)
             self.ties.at(values.tie_segments, a * self._laid(laid), s, k)
@@ -165,6 +165,6 @@ def attached_places(scene, of_piece: np.ndarray) -> tuple[np.ndarray, np.ndarray
             body = ends[~np.isin(ends, paths.anchored)]
             if len(body) == 1 and stiffness[k] > 0 and of_piece[paths.vertices[paths.first_corner[body[0]]]]:
                 along = directions(derived.tie_segments[first : first + 1])[0]
-                places.append((points[body] @ scene.mesh.vertices))
+                places.append(points[body] @ scene.mesh.vertices)
                 held.append((np.outer(along, along) if along.any() else np.eye(3))[None])
     return np.concatenate(places), np.concatenate(held)

@@ -23,8 +23,8 @@ class ElasticFoundation(Term):
 
     surface: a surface set's name, several, rows of `surface_triangles`; None: all of the surface. normal, tangential: one
     number or one for each of its triangles, in the order of `mesh.surface_indices(surface)`.
-    Inputs with gradient: "foundation_normal" and "foundation_tangential", or "<name>.normal" and "<name>.tangential"; the rest
-    shape counts by areas and normals.
+    Inputs with gradient: "foundation_normal" and "foundation_tangential", or "<name>.normal" and "<name>.tangential"; the
+    rest shape counts by areas and normals.
     Raises ValueError for unknown sets, other shapes, and stiffness below zero.
     Winkler 1867, Die Lehre von der Elasticitaet und Festigkeit, sec. 195; Hetenyi 1946, Beams on Elastic Foundation, ch. 1.
     """

@@ -97,8 +97,8 @@ def _points(mesh: TetrahedralMesh, given: Point, kind: str) -> list[tuple]:
         return [(np.array([i]), np.ones(1)) for i in value]
     if value.dtype.kind != "f" or value.ndim not in (1, 2) or value.shape[-1] != 3:
         raise ValueError(
-            f"{kind}: a point is a vertex (a whole number), a vertex set's name, a place [m] in the body at rest (3 floats), or "
-            f"Anchor(place) in space; got {given!r}"
+            f"{kind}: a point is a vertex (a whole number), a vertex set's name, a place [m] in the body at rest (3 "
+            f"floats), or Anchor(place) in space; got {given!r}"
         )
     located = mesh.locate(np.atleast_2d(value))
     kept = np.abs(located.weights) > 1e-9  # of a point on a vertex, edge or face
@@ -113,8 +113,8 @@ class Spring(Tie):
 
     start, end: vertices (a number, several, or a vertex set's name), material points (places [m] at rest, shape (3,) or
     (k, 3), floats), or `Anchor`s; as many at both ends, or one at one of them for all.
-    stiffness [N/m]: one number or one for each. rest_length [m]: l, one or one for each; default: the length at rest. tension
-    [N]: instead of it, the pull at that length (below zero: a push), T = tension + k (L - L_rest), one or one for each.
+    stiffness [N/m]: one number or one for each. rest_length [m]: l, one or one for each; default: the length at rest.
+    tension [N]: instead of it, the pull at that length (below zero: a push), T = tension + k (L - L_rest).
     Forces on points of the body sum to zero with those of the anchors, and so do their moments.
     Inputs with gradient: "spring_stiffness", "spring_rest_length", "spring_tension", "spring_anchors" where given, or
     "<name>.stiffness" and so on. The rest shape counts through lengths at rest.
@@ -176,8 +176,8 @@ class Cable(Tie):
     points: two or more, one after the other: vertices (numbers), material points (3 floats [m] each, at rest), `Anchor`s.
     Each pulls on its point with T towards the next and towards the one before, so that forces sum to zero with those of
     the anchors. In load steps of statics a given tension grows with the loads, a length does not.
-    Inputs with gradient: "cable_tension" or "cable_length", "cable_stiffness", "cable_anchors", or "<name>.tension" and so on;
-    of the shape given, (steps + 1,) of what is linear within steps. The gradient by a slack cable's numbers is zero.
+    Inputs with gradient: "cable_tension" or "cable_length", "cable_stiffness", "cable_anchors", or "<name>.tension" and
+    so on; of the shape given, (steps + 1,) of what is linear within steps. The gradient by a slack cable's numbers is zero.
     Raises ValueError unless either tension, or length and stiffness are given; for fewer than two points, neighbours that
     coincide at rest, points outside the body, what is not finite or below zero.
     Bern, Banzet, Poranne, Coros 2019, Trajectory Optimization for Cable-Driven Soft Robot Locomotion,
