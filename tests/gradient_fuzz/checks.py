@@ -5,6 +5,7 @@ import numpy as np
 import diffsim_ti as ds
 from diffsim_ti import verify
 from diffsim_ti.terms.loads import Load
+from diffsim_ti.terms.ties import Cable
 
 from . import faces
 from .structures import CELL
@@ -107,8 +108,8 @@ class Chain:
             {n for n in ("external_forces",) if n in self.values and self.values[n].ndim == 3},
         )
         for term in scene.terms:
-            if isinstance(term, Load):
-                (name,) = scene.input_names(term).values()
+            if isinstance(term, (Load, Cable)):
+                name = scene.input_names(term)[term.plain]
                 if term.keyed:
                     self.keyed.add(name)
                 elif self.values[name].ndim > len(term.shape):

@@ -21,6 +21,10 @@ OBSTACLES = ("Ground", "HalfSpace", "Sphere", "Bowl", "Box", "Capsule", "Cylinde
 LOADS = tuple(
     f"{kind} {how}" for kind in ("Traction", "Pressure", "BodyForce") for how in ("constant", "per step", "keyed")
 )
+TIES = (
+    *("Spring within", "Spring anchored", "ElasticFoundation one", "ElasticFoundation each"),
+    *(f"Cable {what} {how}" for what in ("tension", "length") for how in ("constant", "per step", "keyed")),
+)
 NARROW = ("Sphere", "Box", "Capsule", "Cylinder")  # of which some are
 
 
@@ -57,6 +61,7 @@ class Structure:
     contact: str  # of explicit solvers
     contact_damping: float
     loads: tuple[str, ...]  # on surfaces and volumes, each with how it is given
+    ties: tuple[str, ...]  # springs, cables, foundations
     rollers: bool  # some of what is fixed is held in some directions alone
 
     @property
@@ -78,7 +83,7 @@ class Structure:
         return (
             f"structure {self.number}: {self.law.__name__}, {self.solver.__name__}, {self.precision}, {self.volume}"
             f"{', parallel' if self.parallel else ''}; obstacles: {', '.join(kinds) or 'none'}, {how}; "
-            f"forces {', '.join([self.forces, *self.loads])}; {', '.join(words)}"
+            f"forces {', '.join([self.forces, *self.loads, *self.ties])}; {', '.join(words)}"
         )
 
 
@@ -133,5 +138,6 @@ def structure(number: int) -> Structure:
         contact,
         turn((0.0, 0.005, 0.005, 0.2, 1.0), number, 7),
         tuple(turn(LOADS, 3 * number + k, 12) for k in range(1 + number // 4 % 3)) if number % 4 == 3 else (),
+        tuple(turn(TIES, 3 * number + k, 13) for k in range(1 + number // 4 % 3)) if number % 4 == 2 else (),
         fixed and not static and number % 5 in (0, 4) and not staged,
     )
