@@ -8,9 +8,12 @@ import pytest
 from cuda_on_cpu.counters import Absent, Counters
 
 from diffsim_ti import (
+    Anchor,
     BDF2Solver,
+    Cable,
     Capsule,
     Corotated,
+    ElasticFoundation,
     Gravity,
     Ground,
     ImplicitEulerSolver,
@@ -20,6 +23,7 @@ from diffsim_ti import (
     SelfContact,
     SemiImplicitSolver,
     SmithNeoHookean,
+    Spring,
     TetrahedralMesh,
     Traction,
     VelocityVerletSolver,
@@ -184,6 +188,9 @@ def solvers_in_single_precision(cube):
     fixed = {"xmin": "x", "ymin": [0, 1, 1]}
     guided = Scene(cube, SmithNeoHookean(1e5, 0.4), 1000.0, [Gravity(), *loads], fixed, precision="f32")
     yield explicit(guided, VelocityVerletSolver)
+    ties = Spring(0, 7, 100.0), Cable([1, Anchor([0.0, 0.5, 0.0]), 6], tension=lambda t: 10 * t)
+    held = Scene(cube, SmithNeoHookean(1e5, 0.4), 1000.0, [*ties, ElasticFoundation(1e4, 1e3, "ymin")], precision="f32")
+    yield explicit(held, VelocityVerletSolver)
     yield ImplicitEulerSolver(scene(cube, precision="f32"), dt=5e-3)
     yield BDF2Solver(scene(cube, precision="f32"), dt=5e-3)
 
