@@ -23,7 +23,8 @@ def tie(kind: str, rng, mesh, steps: int, duration: float, mass: np.ndarray, bea
         ends = mesh.vertices.mean(0) + CELL * rng.normal(size=(2, 3))
         others = ds.Anchor(ends) if how == "anchored" else int(rng.integers(0, mesh.num_vertices))
         few = np.stack([_inside(rng, mesh), _inside(rng, mesh)])
-        given = [{}, dict(tension=pull * rng.normal(size=2)), dict(rest_length=CELL * rng.uniform(0.8, 1.2))]
+        at_rest = np.linalg.norm(few - (ends if how == "anchored" else mesh.vertices[others]), axis=1)
+        given = [{}, dict(tension=pull * rng.normal(size=2)), dict(rest_length=at_rest * rng.uniform(0.98, 1.02, 2))]
         return ds.Spring(few, others, stiff * rng.uniform(0.3, 1.0, 2), **given[rng.integers(0, 3)])
     places.insert(1, ds.Anchor(mesh.vertices.mean(0) + 2 * CELL * rng.normal(size=3)))
     what, when = how.split(" ", 1)
