@@ -47,11 +47,14 @@ from diffsim_ti.solvers import (
 )
 from diffsim_ti.state.solve_report import Buckled, SolveReport
 from diffsim_ti.terms import (
+    Anchor,
     BodyForce,
     Box,
+    Cable,
     Capsule,
     Cylinder,
     Drag,
+    ElasticFoundation,
     ExternalForce,
     FilledChamber,
     GasChamber,
@@ -62,6 +65,7 @@ from diffsim_ti.terms import (
     Pressure,
     SelfContact,
     Sphere,
+    Spring,
     Traction,
 )
 from diffsim_ti.verify import check_gradients, dot_product_test, taylor_test
@@ -84,6 +88,10 @@ __all__ = [
     "GasChamber",
     "FilledChamber",
     "BodyForce",
+    "Spring",
+    "Cable",
+    "Anchor",
+    "ElasticFoundation",
     "Ground",
     "HalfSpace",
     "Sphere",

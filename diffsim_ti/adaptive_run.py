@@ -98,7 +98,7 @@ class ForwardRun:
     ):
         check_strength(scene)
         self.scene, self.seen, self.adapts = scene, Seen(), dt is None
-        self.driven = scene.motion is not None or bool(scene.moving) or bool(scene.following)
+        self.driven = scene.motion is not None or bool(scene.moving) or bool(scene.following or scene.cables)
         self.before_part: Callable[[], object] | None = None
         self.obstacles = tuple(t for t in scene.terms if isinstance(t, Obstacle))
         gravity = scene.term(Gravity)

@@ -13,9 +13,22 @@ from diffsim_ti.materials.material import Material
 from diffsim_ti.materials.moduli import youngs_poisson
 from diffsim_ti.materials.patch_law import PatchLaw
 from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.mesh.paths import Paths
 from diffsim_ti.potential.assembled import body_stiffness
 from diffsim_ti.supports import Fixed, Supports
-from diffsim_ti.terms import Chamber, Drag, FilledChamber, Gravity, Obstacle, Pressure, SelfContact, Term
+from diffsim_ti.terms import (
+    Cable,
+    Chamber,
+    Drag,
+    ElasticFoundation,
+    FilledChamber,
+    Gravity,
+    Obstacle,
+    Pressure,
+    SelfContact,
+    Spring,
+    Term,
+)
 from diffsim_ti.terms.motion import Motion, sampled
 from diffsim_ti.terms.obstacles.obstacle import PER_AREA
 
@@ -96,6 +109,10 @@ class Scene:
         self.pressures = tuple(t for t in self.ordered_terms if isinstance(t, Pressure))
         self.chambers = tuple(t for t in self.ordered_terms if isinstance(t, Chamber))
         self.following = (*self.pressures, *self.chambers)  # what presses on the surface as it is
+        self.springs = tuple(t for t in self.ordered_terms if isinstance(t, Spring))
+        self.cables = tuple(t for t in self.ordered_terms if isinstance(t, Cable))
+        self.ties = self.springs + self.cables
+        self.foundations = tuple(t for t in self.ordered_terms if isinstance(t, ElasticFoundation))
         self.inputs = Inputs(self, density, initial_positions, initial_velocities)
         self._check_start()
         if volume == "tetrahedra":
@@ -228,6 +245,21 @@ class Scene:
         u = None if positions is None else np.asarray(positions, np.float64) - self.mesh.vertices
         own = self.chambers[self.place_of_chamber(chamber)]
         return own.enclosure.volume(self.mesh.vertices + self.checked_displacements(u))
+
+    @property
+    def tie_paths(self) -> Paths:
+        """Where springs run and, after them, cables."""
+        return Paths.joined([term.paths(self.mesh) for term in self.ties])
+
+    @property
+    def one_sided_ties(self) -> np.ndarray:
+        """Of each tie whether it pulls only."""
+        return np.concatenate([np.full(len(term.paths(self.mesh)), term.one_sided) for term in self.ties])
+
+    @property
+    def founded_vertices(self) -> np.ndarray:
+        """Sorted indices of the vertices that foundations hold."""
+        return np.unique(np.concatenate([np.zeros(0, np.int64), *(t.indices(self.mesh) for t in self.foundations)]))
 
     def places(self, time: float) -> dict[Term, np.ndarray]:
         """Displacement of each moving obstacle at a time [s], shape (3,) [m]."""

@@ -104,9 +104,9 @@ class Simulator:
             rows = self.scene.path_rows([self.time, self.time + self.solver.dt])
             arrays.load_rows(path=np.stack(list(rows.values()), 1))
         inputs = self.scene.inputs
-        if inputs.sums_loads or self.scene.following:
+        if inputs.makes_rows:
             now = inputs.derive(inputs.at_step(self.step_count, self.solver.dt, self._set))
-            made = dict(forces=now.forces if inputs.sums_loads else None, follower=now.follower)
+            made = dict(forces=now.forces if inputs.sums_loads else None, follower=now.follower, ties=now.ties)
             arrays.load_rows(**{name: rows for name, rows in made.items() if rows is not None})
         if not inputs.sums_loads and values.forces is not None and len(values.forces) > 1:
             rows = values.forces

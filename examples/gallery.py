@@ -37,6 +37,7 @@ EXAMPLES = {
     "control/train_controller": ("", "train_controller.gif"),
     "control/wall_shot": ("output", "wall_shot.png"),
     "control/throw_at_target": ("output", "throw_at_target.png"),
+    "control/tendon_finger": ("output", "tendon_finger.png"),
     "contact/bowl": ("--cells 4 --frames 60 --film output/bowl.gif", "bowl.gif"),
     "contact/incline": ("output", "incline.png"),
     "contact/stack": ("output", "stack.png"),

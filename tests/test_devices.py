@@ -158,6 +158,8 @@ except RuntimeError as error:
 
 @pytest.mark.parametrize("make", [TetrahedralMesh.create_cube, DifferentiableSimulator])
 def test_device_cuda_is_refused_where_taichi_runs_elsewhere(make):
+    if runtime.arch_name() == "cuda":
+        pytest.skip("Taichi runs on CUDA here")
     arguments = {"device": "cuda"}
     if make is DifferentiableSimulator:
         import torch

@@ -9,9 +9,12 @@ from chamber_meshes import hollow_cube
 from cuda_on_cpu.counters import Absent, Counters
 
 from diffsim_ti import (
+    Anchor,
     BDF2Solver,
+    Cable,
     Capsule,
     Corotated,
+    ElasticFoundation,
     GasChamber,
     Gravity,
     Ground,
@@ -22,6 +25,7 @@ from diffsim_ti import (
     SelfContact,
     SemiImplicitSolver,
     SmithNeoHookean,
+    Spring,
     TetrahedralMesh,
     Traction,
     VelocityVerletSolver,
@@ -188,6 +192,9 @@ def solvers_in_single_precision(cube):
     yield explicit(guided, VelocityVerletSolver)
     gas = GasChamber(lambda t: 1.1e5 + t, "cavity")
     yield explicit(Scene(hollow_cube(), SmithNeoHookean(1e5, 0.4), 1000.0, gas, "bottom", precision="f32"))
+    ties = Spring(0, 7, 100.0), Cable([1, Anchor([0.0, 0.5, 0.0]), 6], tension=lambda t: 10 * t)
+    held = Scene(cube, SmithNeoHookean(1e5, 0.4), 1000.0, [*ties, ElasticFoundation(1e4, 1e3, "ymin")], precision="f32")
+    yield explicit(held, VelocityVerletSolver)
     yield ImplicitEulerSolver(scene(cube, precision="f32"), dt=5e-3)
     yield BDF2Solver(scene(cube, precision="f32"), dt=5e-3)
 

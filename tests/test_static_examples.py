@@ -57,6 +57,16 @@ def test_tuning_fork(tmp_path, capsys):
     assert "finer mesh" in capsys.readouterr().out
 
 
+def test_tendon_finger(tmp_path, capsys):
+    """Newton's method is quadratic with a right slope."""
+    numbers = example("control/tendon_finger").main(tmp_path, quick=True)
+    assert numbers["miss"] < 1e-8 and numbers["iterations"] <= 7
+    assert 7.0 < numbers["tension"] < 12.0 and 0.010 < numbers["pulled"] < 0.025
+    assert numbers["tip"][1] == pytest.approx(-0.05, abs=1e-8) and abs(numbers["tip"][2] - 0.008) < 2e-3
+    assert (tmp_path / "tendon_finger.png").stat().st_size > 10_000
+    assert "of the tendon" in capsys.readouterr().out
+
+
 def test_stiffness_from_picture(capsys):
     """Within 2 %, and within three times the spread that the noise of the picture leaves."""
     numbers = example("identify/stiffness_from_picture").main(quick=True)

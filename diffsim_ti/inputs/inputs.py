@@ -10,8 +10,10 @@ from numpy.typing import ArrayLike
 from diffsim_ti.inputs import links
 from diffsim_ti.inputs.chain import Chain, Link
 from diffsim_ti.inputs.description import POSITIVE, Input, frozen, length, speed
+from diffsim_ti.inputs.foundation import FoundationRows
 from diffsim_ti.inputs.loads import PressureRows, SumOfForces
 from diffsim_ti.inputs.surface_areas import SurfaceAreas
+from diffsim_ti.inputs.ties import JoinedRows, JoinedSegments
 from diffsim_ti.rows import Rows
 
 if TYPE_CHECKING:
@@ -36,6 +38,9 @@ class Derived:
     path: np.ndarray | None = None  # displacements of obstacles, (steps + 1, num_moving, 3) [m]
     # pressures, then numbers of chambers, as each step begins and ends, and 0, (1 or steps, loads and numbers, 3)
     follower: np.ndarray | None = None
+    ties: np.ndarray | None = None  # numbers of springs and cables (inputs/ties.py), (1 or steps, 2 ties, 3)
+    tie_segments: np.ndarray | None = None  # between their points at rest, (points, 3) [m]
+    foundation: np.ndarray | None = None  # rows of the stiffness of vertices on foundations, (3 k, 3) [N/m]
 
     def zeros(self) -> "Derived":
         """The same shapes, all zero."""
@@ -135,7 +140,7 @@ class Inputs:
         return out
 
     def _sums_of_loads(self) -> list[Link]:
-        """What adds the forces of dead loads, and what lists pressures and the numbers of chambers."""
+        """What adds the forces of dead loads and foundations, and what lists pressures, chambers, springs and cables."""
         own = {term: f"numbers of term {k}" for k, term in enumerate(self.scene.ordered_terms)}
         dead, pressures = self.scene.dead_loads, self.scene.pressures
         out = []
@@ -147,7 +152,18 @@ class Inputs:
         ]
         if rows:
             out.append(PressureRows(rows, "follower"))
+        if self.scene.ties:
+            out.append(JoinedRows([f"{own[t]} rows" for t in self.scene.ties], "ties"))
+            out.append(JoinedSegments([f"{own[t]} segments" for t in self.scene.ties], "tie_segments"))
+        if founded := self.scene.foundations:
+            indices = [term.indices(self.mesh) for term in founded]
+            out.append(FoundationRows([f"{own[t]} matrices" for t in founded], indices, "foundation"))
         return out
+
+    @property
+    def makes_rows(self) -> bool:
+        """Whether what changes from step to step is made of inputs together."""
+        return self.sums_loads or bool(self.scene.following or self.scene.cables)
 
     @property
     def keyed_forces(self) -> bool:
@@ -175,7 +191,7 @@ class Inputs:
         out = self.at_times([step * dt, (step + 1) * dt]) | (values or {})
         for name in self._per_step:
             rules = [rule for rule in self.described[name].shapes if len(rule) == out[name].ndim]
-            if any("steps" in rule for rule in rules) and (self.sums_loads or self.scene.following):
+            if any("steps" in rule for rule in rules) and self.makes_rows:
                 if step >= len(out[name]):
                     raise ValueError(f"{name} is given for {len(out[name])} steps, this is step {step}")
                 out[name] = out[name][step : step + 1]

@@ -9,6 +9,7 @@ import taichi as ti
 
 from diffsim_ti import runtime
 from diffsim_ti.elements.patched_tetrahedron import functions_of
+from diffsim_ti.potential.attached import Attached
 from diffsim_ti.potential.kernels import potential_kernels
 from diffsim_ti.runtime import Kernel
 from diffsim_ti.state.features import Features
@@ -70,7 +71,8 @@ def observer_kernels(law, features: Features) -> ObserverKernels:
 
 
 class Energy(float):
-    """A total energy [J] that knows its parts: kinetic, elastic, gravity (zero at y = 0 for g along y), contact."""
+    """A total energy [J] that knows its parts: kinetic, elastic, gravity (zero at y = 0 for g along y), contact, springs,
+    foundations (cables are loads, and have none)."""
 
     parts: dict[str, float]
 
@@ -133,6 +135,15 @@ def barrier_energies(workspace: Workspace) -> np.ndarray:
     return runtime.fetch(out.contact).astype(np.float64)
 
 
+def attached_energies(workspace: Workspace) -> dict[str, float]:
+    """Energies [J] of springs and foundations in the current state."""
+    attached = Attached.of(workspace.scene)
+    if not attached:
+        return {}
+    a, u = workspace.arrays, runtime.fetch_row(workspace.state.u, 0)
+    return attached.at(a.values, a.rows["ties"], workspace.solver.schedule, 0, 0.0).stored(u)
+
+
 def energy(workspace: Workspace) -> Energy:
     """Energy of the current state, summed in float64."""
     a, values = workspace.arrays, workspace.arrays.values
@@ -151,4 +162,4 @@ def energy(workspace: Workspace) -> Energy:
         parts["contact"] += float(workspace.faces.energies().sum())
     if workspace.pairs:
         parts["contact"] = parts.get("contact", 0.0) + workspace.pairs.look(workspace.state.u)[0]
-    return Energy(parts)
+    return Energy(parts | attached_energies(workspace))

@@ -8,7 +8,9 @@ import numpy as np
 from diffsim_ti import runtime
 from diffsim_ti.mesh.geometry import shape_gradients
 from diffsim_ti.mesh.patches import volume_patches
+from diffsim_ti.potential.attached import Attached
 from diffsim_ti.potential.kernels import potential_kernels
+from diffsim_ti.state.schedule import Schedule
 from diffsim_ti.state.workspace import Workspace
 
 if TYPE_CHECKING:
@@ -49,6 +51,8 @@ def element_limit(scene: "Scene", values: dict | None = None) -> StepLimit:
     are at least those of the element.
     """
     values, material = scene.inputs.values if values is None else values, scene.material
+    if scene.cables:
+        values = scene.inputs.at_times([0.0]) | values
     mu, lam = material.lame({name: values[name] for name in material.inputs})
     derived = scene.inputs.derive(values)
     if scene.volume == "patches" and np.ndim(lam):
@@ -58,9 +62,12 @@ def element_limit(scene: "Scene", values: dict | None = None) -> StepLimit:
     N = shape_gradients(derived.gradients)
     largest = np.linalg.eigvalsh(np.einsum("eai,eaj->eij", N, N))[:, -1]
     omega2 = 4 / values["density"] * (np.maximum(lam, 0) * (N**2).sum((1, 2)) + 2 * mu * largest)
-    worst = int(np.argmax(omega2))
-    gases = _gas_bound(scene, values, derived) if scene.chambers else 0.0
-    return StepLimit(float(2 / np.sqrt(omega2[worst] + gases)), worst, "element bound")
+    worst, attached = int(np.argmax(omega2)), Attached.of(scene)
+    more = _gas_bound(scene, values, derived) if scene.chambers else 0.0
+    if attached:  # what all of its parts add at the most
+        at = attached.stiffest(derived, derived.ties, Schedule(1.0, 1))
+        more += at.largest_omega2(derived.mass, derived.displacement, scene.fixed)
+    return StepLimit(float(2 / np.sqrt(omega2[worst] + more)), worst, "element bound")
 
 
 def _gas_bound(scene: "Scene", values: dict, derived) -> float:
@@ -89,6 +96,7 @@ class Stiffness:
         at = (workspace.state, self)
         self._multiply = kernels.stiffness.bind(a.in_lanes, scene=a, pass_=self, at=at, out=self)
         self.vector, self._random = None, np.random.default_rng(1)
+        self.attached = Attached.of(workspace.scene)  # springs, cables and foundations
 
     @property
     def root(self) -> np.ndarray:
@@ -108,7 +116,12 @@ class Stiffness:
         a.clear_corners_of_loads()
         self._multiply(num_items=a.num_items, num_tetrahedra=a.num_places, num_vertices=a.num_vertices, per_gamma=0.0)
         y = runtime.fetch(self.y)[0].astype(np.float64) * scale
-        return -root * (y + self.ws.chambers.product(w) if self.ws.chambers else y)
+        y = -root * (y + self.ws.chambers.product(w) if self.ws.chambers else y)
+        if self.attached:
+            now = runtime.fetch_row(self.ws.state.u, 0)
+            at = self.attached.stiffest(a.values, a.rows["ties"], self.ws.solver.schedule)
+            y += root * at.product(now, w)
+        return y
 
     def largest(self, tolerance: float = 1e-3) -> tuple[float, float]:
         """(largest eigenvalue omega^2 [1/s^2], residual bound) by Lanczos; keeps the vector for `lower_bound`.

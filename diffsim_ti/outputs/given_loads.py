@@ -1,15 +1,19 @@
-"""Weight and loads on the vertices of a body at the states that frames show, with derivatives, for outputs."""
+"""Weight, loads, springs, cables and foundations at the states that frames show, with derivatives, for outputs."""
 
 import numpy as np
 
 from diffsim_ti.inputs import Derived
+from diffsim_ti.potential.attached import Attached
 from diffsim_ti.potential.chamber_pressure import following
+from diffsim_ti.state.schedule import Schedule
 from diffsim_ti.terms import Gravity
+
+STEPS = Schedule(1.0, 1)  # a pass for each step
 
 
 class GivenLoads:
-    """Forces [N], shape (num_vertices, 3): weight, dead loads and pressures after so many steps: those of the last of these
-    as it ends; with `begins`, as it begins."""
+    """Forces [N], shape (num_vertices, 3): weight, dead loads, pressures, chambers, springs, cables and foundations after so
+    many steps: those of the last of these as it ends; with `begins`, as it begins."""
 
     def __init__(self, scene, weight: bool = True):
         if scene.holds_volumes:
@@ -21,6 +25,7 @@ class GivenLoads:
         gravity = scene.term(Gravity) if weight else None
         self.gravity = None if gravity is None else scene.inputs.parameters.of(gravity)
         self.loaded, self.keyed = scene.loaded_vertices if scene.dead_loads else None, scene.inputs.keyed_forces
+        self.attached = Attached.of(scene)
 
     @staticmethod
     def _row(step: int, rows: np.ndarray) -> np.ndarray:
@@ -34,6 +39,14 @@ class GivenLoads:
     def _pressures(self, step: int, rows: np.ndarray, begins: bool) -> np.ndarray:
         return self._row(step, rows)[:, 1 if step and not begins else 0]
 
+    @staticmethod
+    def _time(step: int, begins: bool) -> tuple:
+        """(schedule, pass, share of its step) of a frame."""
+        return STEPS, max(step - 1, 0), float(step > 0 and not begins)
+
+    def _attached(self, derived: Derived, step: int, begins: bool) -> Attached:
+        return self.attached.at(derived, derived.ties, *self._time(step, begins))
+
     def forces(self, derived: Derived, x: np.ndarray, step: int, begins: bool = False) -> np.ndarray:
         """At places x [m] after so many steps."""
         out = np.zeros(x.shape)
@@ -43,6 +56,8 @@ class GivenLoads:
             out[self.loaded] += self._dead(step, derived.forces, begins)
         if self.follower is not None:
             out += self.follower.at(self._pressures(step, derived.follower, begins)).forces(x)
+        if self.attached:
+            out += self._attached(derived, step, begins).forces(x - derived.rest)
         return out
 
     def jvp(
@@ -58,6 +73,9 @@ class GivenLoads:
         if self.follower is not None:
             pressures = self._pressures(step, derived.follower, begins)
             out += self.follower.at(pressures).jvp(x, dx, self._pressures(step, moved.follower, begins))
+        if self.attached:
+            attached, du = self._attached(derived, step, begins), dx - moved.rest
+            out += attached.jvp(x - derived.rest, du, moved, *self._time(step, begins))
         return out
 
     def vjp(
@@ -69,8 +87,12 @@ class GivenLoads:
             adj.parameters[self.gravity.start : self.gravity.start + 3] += derived.mass @ w
         if self.loaded is not None:
             self._dead(step, adj.forces, begins)[:] += w[self.loaded]
+        out = np.zeros(x.shape)
+        if self.attached:
+            out += self._attached(derived, step, begins).vjp(x - derived.rest, w, adj, *self._time(step, begins))
+            adj.rest -= out
         if self.follower is None:
-            return np.zeros(x.shape)
+            return out
         follower = self.follower.at(self._pressures(step, derived.follower, begins))
         self._pressures(step, adj.follower, begins)[:] += follower.pressures_vjp(x, w)
-        return follower.vjp(x, w)
+        return out + follower.vjp(x, w)

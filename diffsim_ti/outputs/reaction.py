@@ -135,6 +135,8 @@ class Reaction(Output):
             rest -= by_u
         adj = adjoint.collect()
         adj.mass, adj.parameters = adj.mass + by_loads.mass, adj.parameters + by_loads.parameters
-        adj.forces, adj.follower, adj.rest = by_loads.forces, by_loads.follower, adj.rest + rest
+        adj.rest = adj.rest + rest + by_loads.rest
+        for name in ("forces", "follower", "ties", "tie_segments", "foundation"):
+            setattr(adj, name, getattr(by_loads, name))
         inputs = self.scene.inputs.derive_vjp(frames.inputs, adj, tuple(frames.inputs))
         return Change(positions, velocities, inputs)

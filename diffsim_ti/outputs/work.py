@@ -18,8 +18,9 @@ class WorkOfLoads(Output):
 
         W_k - W_(k-1) = 1/6 [F_b(a) + 2 F_b(m) + 2 F_e(m) + F_e(b)] . (b - a),        m = (a + b) / 2
 
-    a, b: positions in the two frames; F_b(x), F_e(x): forces of all tractions, body forces, external forces and pressures
-    at x, as the first step between the frames begins and as the last one ends; with weight=True also those of gravity.
+    a, b: positions in the two frames; F_b(x), F_e(x): forces of all tractions, body forces, external forces, pressures,
+    gases, springs, cables and foundations at x, as the first step between the frames begins and as the last one ends; with
+    weight=True also those of gravity.
     It is Simpson's rule along straight ways from frame to frame under loads that go linearly in time: exact, to round-off,
     for such ways; for loads that are constant and dead (and weight), and for a constant pressure on a closed surface (minus
     p times the change of volume), whatever the way. Else its error falls as the square of the time between frames; with
@@ -39,7 +40,8 @@ class WorkOfLoads(Output):
     def settled(self, scene: "Scene") -> "WorkOfLoads":
         out = copy(self)
         out.scene, out.loads = scene, GivenLoads(scene, weight=self.weight)
-        if out.loads.gravity is None and out.loads.loaded is None and out.loads.follower is None:
+        given = out.loads.gravity, out.loads.loaded, out.loads.follower, out.loads.attached or None
+        if all(x is None for x in given):
             raise ValueError(
                 "WorkOfLoads: the scene has no load: add a Traction, BodyForce, ExternalForce or Pressure, or count gravity "
                 "by weight=True"

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from diffsim_ti import runtime
+from diffsim_ti.potential.attached import Attached
 from diffsim_ti.potential.face_contact import FaceContact
 from diffsim_ti.potential.kernels import potential_kernels
 from diffsim_ti.potential.patch_coupling import PatchCoupling
@@ -35,6 +36,7 @@ class Potential:
         self.elastic, self.J = runtime.array(a.fp, m), runtime.array(a.fp, m)
         self._launches, self._coupling, self._barrier_blocks = {}, None, None  # made when first needed
         self.z = arrays.law_states(1)  # the state of the law, held during a pass
+        self.attached: Attached | None = None  # springs, cables, foundations: set by whom a time is known
 
     def launch(self, name: str, lanes: bool = True, **records) -> None:
         """Run a kernel at the present displacement; records: more arrays than the potential's own."""
@@ -93,6 +95,8 @@ class Potential:
             contact = np.concatenate([contact, self.pairs.energies()])
         if self.faces:
             contact = np.concatenate([contact, self.faces.energies()])
+        if self.attached:
+            contact = np.concatenate([contact, self.attached.energies(self.held_at)])
         return elastic.sum() + contact.sum(), np.abs(elastic).sum() + np.abs(contact).sum(), J
 
     def forces(self) -> tuple[np.ndarray, np.ndarray]:
@@ -103,7 +107,9 @@ class Potential:
         forces, sizes = (runtime.fetch(x).astype(np.float64) for x in (self.y, self.size))
         if self.faces:
             pushed = self.faces.forces()
-            return forces[0] + pushed, sizes + np.linalg.norm(pushed, axis=1)
+            forces, sizes = forces + pushed, sizes + np.linalg.norm(pushed, axis=1)
+        if self.attached:
+            forces, sizes = forces + self.attached.forces(self.held_at), sizes + self.attached.sizes(self.held_at)
         return forces[0], sizes
 
     def product(self, w: np.ndarray, convex: bool = False) -> np.ndarray:
@@ -114,7 +120,8 @@ class Potential:
             self.pairs.hessian_product(self.u, self.w, convex)
         self.launch("product")
         y = runtime.fetch(self.y)[0].astype(np.float64)
-        return (y + self.faces.product() if self.faces else y) * -scale
+        y = (y + self.faces.product() if self.faces else y) * -scale
+        return y + self.attached.product(self.held_at, w, convex) if self.attached else y
 
     def blocks(self) -> np.ndarray:
         """3x3 diagonal blocks of d2E/du2 [N/m], shape (num_vertices, 3, 3)."""
@@ -125,6 +132,8 @@ class Potential:
         blocks = np.swapaxes(runtime.fetch(self._block_arrays.blocks).astype(np.float64), 0, 1)
         if self.faces:
             blocks = blocks + self.faces.blocks()
+        if self.attached:
+            blocks = blocks + self.attached.blocks(self.held_at)
         return blocks if a.patches is None else blocks + self.coupling.diagonal(self.patch_gradients())
 
     @cached_property
@@ -153,9 +162,10 @@ class Potential:
         return self.arrays.from_blocks(runtime.fetch(self._block_arrays.tangent), 81).reshape(-1, 9, 9)
 
     def contact_blocks(self) -> np.ndarray | None:
-        """The part of contact in `blocks`; None without contacts."""
+        """The part of contact and of what is attached in `blocks`; None without."""
+        attached = self.attached.blocks(self.held_at) if self.attached else None
         if not (self.arrays.contacts or self.pairs):
-            return None
+            return attached
         if self._barrier_blocks is None:
             self._barrier_blocks = SimpleNamespace(
                 blocks=runtime.array(self.arrays.vector, 3, self.arrays.num_vertices)
@@ -164,4 +174,5 @@ class Potential:
         if self.pairs:
             self.pairs.add_blocks(self.u, self._barrier_blocks.blocks)
         blocks = np.swapaxes(runtime.fetch(self._barrier_blocks.blocks).astype(np.float64), 0, 1)
-        return blocks + self.faces.blocks() if self.faces else blocks
+        blocks = blocks + self.faces.blocks() if self.faces else blocks
+        return blocks if attached is None else blocks + attached

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diffsim_ti.mesh.sets import pieces
+from diffsim_ti.potential.attached import attached_places
 from diffsim_ti.solvers.implicit.solver import ImplicitSolver, Stage
 from diffsim_ti.supports import rigid_motions_left
 
@@ -59,7 +60,9 @@ class StaticSolver(ImplicitSolver):
         used = [k for k in range(piece.max(initial=-1) + 1) if np.any(piece[mesh.tetrahedra[:, 0]] == k)]
         for number, k in enumerate(used):
             own = piece[supports.vertices] == k
-            free = rigid_motions_left(mesh.vertices[supports.vertices[own]], supports.held[own])
+            places, held = attached_places(self.scene, piece == k)
+            held = np.concatenate([supports.held[own], held])
+            free = rigid_motions_left(np.concatenate([mesh.vertices[supports.vertices[own]], places]), held)
             if free:
                 which = f"piece {number} of {len(used)} of the body" if len(used) > 1 else "the body"
                 raise ValueError(

@@ -9,37 +9,11 @@ from diffsim_ti import runtime
 from diffsim_ti.inputs import Derived
 from diffsim_ti.mesh.patches import in_eights, volume_patches
 from diffsim_ti.runtime import LANES
+from diffsim_ti.state.corners import clear_from, slots, vertex_corners, with_more_corners, with_own_corner
 from diffsim_ti.state.features import Features, grouped
 from diffsim_ti.state.numbers import PARTS, on_device
 from diffsim_ti.state.schedule import Schedule
 from diffsim_ti.terms import Drag, Gravity, Obstacle, SelfContact
-
-
-def vertex_corners(tetrahedra: np.ndarray, num_vertices: int) -> tuple[np.ndarray, np.ndarray]:
-    """Compressed rows: the corners c = 4 e + a that meet at vertex i are corner_of[start[i] : start[i + 1]]."""
-    corner_of = np.argsort(tetrahedra.ravel(), kind="stable")
-    counts = np.bincount(tetrahedra.ravel(), minlength=num_vertices)
-    return np.concatenate([[0], np.cumsum(counts)]), corner_of
-
-
-def with_own_corner(start: np.ndarray, corner_of: np.ndarray, vertices: np.ndarray, first: int) -> tuple:
-    """The same rows with one corner more, first + k, at the end of that of vertices[k]."""
-    longer = np.insert(corner_of, start[vertices + 1], first + np.arange(len(vertices)))
-    return start + np.searchsorted(vertices, np.arange(len(start))), longer
-
-
-def with_more_corners(start: np.ndarray, corner_of: np.ndarray, vertices: np.ndarray, first: int) -> tuple:
-    """The same rows with corners more, first + k, at the end of those of vertices[k], which may repeat."""
-    order = np.argsort(vertices, kind="stable")
-    longer = np.insert(corner_of, start[vertices[order] + 1], first + order)
-    return start + np.searchsorted(vertices[order], np.arange(len(start))), longer
-
-
-def slots(indices: np.ndarray, num_vertices: int) -> np.ndarray:
-    """Place of each vertex in a list of vertices, -1 where it is not listed."""
-    out = np.full(num_vertices, -1)
-    out[indices] = np.arange(len(indices))
-    return out
 
 
 class SceneArrays:
@@ -60,6 +34,8 @@ class SceneArrays:
         self.supports = scene.supports
         self.pressures = scene.pressures if presses else ()  # that gather with the tetrahedra's corners
         self.chambers = scene.chambers if presses else ()  # likewise
+        self.paths = scene.tie_paths if presses and scene.ties else None
+        self.founded = scene.founded_vertices if presses else np.zeros(0, np.int64)
         self.mesh, self.precision, self.self_contact = mesh, precision, scene.term(SelfContact)
         self._upload_topology(scene)
         rows = scene.inputs.parameters
@@ -73,6 +49,9 @@ class SceneArrays:
             forces=bool(scene.dead_loads),
             forces_keyed=scene.inputs.keyed_forces,
             pressed=bool(self.pressures or self.chambers),
+            tied=self.paths is not None,
+            cabled=self.paths is not None and bool(scene.cables),
+            founded=bool(len(self.founded)),
             motion=scene.motion is not None,
             guided=bool(len(scene.supports.guided)),
             num_parameters=rows.total,
@@ -109,6 +88,7 @@ class SceneArrays:
             self.parameters_of_self_contact = scene.inputs.parameters.of(self.self_contact)
             start, corner_of = with_own_corner(start, corner_of, mesh.surface_vertices, num_corners)
             num_corners += len(mesh.surface_vertices)
+        start, corner_of, num_corners = self._upload_ties(scene, start, corner_of, num_corners)
         self.first_pressed, self.num_pressed = num_corners, 0
         if self.pressures:
             self.pressed_triangles, self.load_of = scene.pressed_triangles
@@ -134,6 +114,24 @@ class SceneArrays:
         if len(scene.supports.guided):
             self.guide_slot = runtime.upload(slots(scene.supports.guided, n), ti.i32)
             self.guides = runtime.upload(scene.supports.guides.reshape(-1, 3), self.vector)
+
+    def _upload_ties(self, scene, start, corner_of, num_corners: int) -> tuple:
+        """(start, corner_of, number of corners), with those of springs and then of cables, which are loads."""
+        self.num_ties, self.first_tied, self.first_load = 0, num_corners, num_corners
+        if len(self.founded):
+            self.foundation_slot = runtime.upload(slots(self.founded, self.num_vertices), ti.i32)
+        if self.paths is None:
+            return start, corner_of, num_corners
+        paths, self.num_ties = self.paths, len(self.paths)
+        springs = sum(len(term.paths(self.mesh)) for term in scene.springs)
+        self.first_load += int(paths.first_corner[paths.first_point[springs]])
+        start, corner_of = with_more_corners(start, corner_of, paths.vertices, num_corners)
+        self.tie_start = runtime.upload(paths.first_point, ti.i32)
+        self.point_start = runtime.upload(paths.first_corner, ti.i32)
+        self.point_vertex = runtime.upload(paths.vertices, ti.i32)
+        self.point_weight = runtime.upload(paths.weights, self.fp)
+        self.tie_one_sided = runtime.upload(scene.one_sided_ties, ti.i32)
+        return start, corner_of, num_corners + len(paths.vertices)
 
     def _twins(self, scene) -> list[tuple]:
         """(compile-time twin, first parameter, column of the path or -1) of the obstacles; their tables stand behind the
@@ -170,6 +168,7 @@ class SceneArrays:
             **self._features,
             forces_per_step=forces is not None and len(forces) > 1,
             pressure_per_step=self._features["pressed"] and len(follower) > 1,
+            ties_per_step=self.paths is not None and len(self.values.ties) > 1,
             uniform=self.values.coefficients.ndim == 1,
             density=density,
             shape=shape,
@@ -179,7 +178,7 @@ class SceneArrays:
         """Bring values to the device; True if array shapes or kernels changed, so that launches must be bound anew."""
         old, before = self.values, None if self.values is None else self.features()
         self.values, self._known_features = values, {}
-        self.rows = {name: getattr(values, name) for name in ("motion", "path", "forces", "follower")}
+        self.rows = {name: getattr(values, name) for name in ("motion", "path", "forces", "follower", "ties")}
         moved = before != self.features()
         sources = {name: on_device(self, name, values) for name in PARTS if name != "mass"}
         sources["parameters"] = np.concatenate([values.parameters, self.tables]), self.fp
@@ -196,12 +195,12 @@ class SceneArrays:
         return moved
 
     def clear_corners_of_loads(self) -> None:
-        """No forces at the corners of pressed triangles and of chambers, where tetrahedra alone are to be gathered."""
-        if self.pressures or self.chambers:
-            clear_from(self.corner, self.first_pressed)
+        """No forces at corners of springs, pressed triangles and chambers, where tetrahedra alone are to be gathered."""
+        if self.pressures or self.chambers or self.num_ties:
+            clear_from(self.corner, self.first_tied)
 
     def load_rows(self, **rows: np.ndarray) -> None:
-        """Other rows of motion, path, forces or pressure, by name: those of the steps to come."""
+        """Other rows of motion, path, forces, pressure or ties, by name: those of the steps to come."""
         for name, data in rows.items():
             runtime.fill(getattr(self, name), data)
             self.rows[name] = data
@@ -292,21 +291,6 @@ class History:
 def _copy_slot(source: ti.types.ndarray(ndim=2), s: ti.i32, target: ti.types.ndarray(ndim=2), t: ti.i32):
     for i in range(source.shape[1]):
         target[t, i] = source[s, i]
-
-
-@ti.kernel
-def _clear_from(corner: ti.types.ndarray(ndim=1), first: ti.i32):
-    for c in range(first, corner.shape[0]):
-        corner[c] = 0 * corner[c]
-
-
-def clear_from(corner, first: int) -> None:
-    """corner[first:] = 0; on the CPU without the cost of a launch."""
-    host = runtime.view(corner)
-    if host is None:
-        _clear_from(corner, first)
-    else:
-        host[first:] = 0
 
 
 @ti.kernel

@@ -51,6 +51,10 @@ class Features:
     forces_keyed: bool = False  # whether they change within steps
     pressed: bool = False  # whether passes take follower pressures on triangles
     pressure_per_step: bool = False
+    tied: bool = False  # whether there are springs or cables
+    ties_per_step: bool = False
+    cabled: bool = False
+    founded: bool = False  # whether vertices lie on an elastic foundation
     motion: bool = False
     guided: bool = False  # whether vertices are held in some directions alone
     moving: int = 0  # obstacles that follow a path
@@ -78,7 +82,12 @@ class Features:
     def driven(self) -> bool:
         """Whether something may do work on the body that its energy does not tell. Drag alone only takes some, and
         counting that would cost small scenes a fifth."""
-        return self.forces or self.motion or self.moving > 0 or self.pressed
+        return self.forces or self.motion or self.moving > 0 or self.loaded_corners
+
+    @property
+    def loaded_corners(self) -> bool:
+        """Whether vertices gather loads: of pressures, or of cables."""
+        return self.pressed or self.cabled
 
     @property
     def pressing(self) -> tuple[ObstacleGroup, ...]:

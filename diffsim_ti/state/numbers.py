@@ -53,9 +53,13 @@ PARTS = {
     "anchor": Part("vectors", _anchor, _whole),
     "path": Part("vectors2", _given("path"), _whole),
     "follower": Part("vectors2", _given("follower")),
+    "ties": Part("vectors2", _given("ties")),
+    "tie_segments": Part("vectors", _given("tie_segments")),
+    "foundation": Part("vectors", _given("foundation")),
 }
+ALONE = "follower", "ties", "tie_segments", "foundation"  # which only kernels of scenes that have them take
 TOPOLOGY = dict.fromkeys(("tets", "start", "corner_of", "force_slot", "motion_slot"), "ints")
-TANGENT = {name: part.kind for name, part in PARTS.items() if name != "follower"}  # which only what is pressed has
+TANGENT = {name: part.kind for name, part in PARTS.items() if name not in ALONE}
 SCENE = TOPOLOGY | TANGENT | dict(inverse_mass="scalars", corner="vectors")  # all that a kernel may read of a scene
 del SCENE["mass"]
 OF_TETRAHEDRA = {name: PARTS[name].kind for name in ("gradients", "volumes", "coefficients")}

@@ -87,6 +87,12 @@ class Schedule:
         begin, end, _ = rows[self.load_row(rows, j)].T
         return begin + share * (end - begin)
 
+    def ties(self, rows: np.ndarray, j: int, share: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(tension, slack, stiffness) of springs and cables (inputs/ties.py) at a share of the step of pass j."""
+        row = rows[self.load_row(rows, j)]
+        tension, slack = (part[:, 0] + share * (part[:, 1] - part[:, 0]) for part in (row[0::2], row[1::2]))
+        return tension, slack, row[0::2, 2]
+
     def add_load(self, rows_adj: np.ndarray, j: int, share: float, keyed: bool, adjoint: np.ndarray) -> None:
         """Adjoint of `load`."""
         row = rows_adj[self.load_row(rows_adj, j)]
@@ -101,6 +107,14 @@ class Schedule:
         row = rows_adj[self.load_row(rows_adj, j)]
         row[:, 0] += (1 - share) * adjoint
         row[:, 1] += share * adjoint
+
+    def add_ties(self, rows_adj: np.ndarray, j: int, share: float, adjoint: tuple) -> None:
+        """Adjoint of `ties`."""
+        row, (tension, slack, stiffness) = rows_adj[self.load_row(rows_adj, j)], adjoint
+        for part, by in ((row[0::2], tension), (row[1::2], slack)):
+            part[:, 0] += (1 - share) * by
+            part[:, 1] += share * by
+        row[0::2, 2] += stiffness
 
     def _rows(self, rows, j):
         r = min(self.row(j), len(rows) - 1)

@@ -35,6 +35,7 @@ class Workspace:
     faces = None  # of explicit steps, that feel obstacles between their corners
     energy_watch = None  # counts energy that long steps add, for solvers that neither damp nor limit it
     changes = 0  # of the state from outside its passes
+    attached = None  # springs, cables and foundations on the host (potential/attached.py)
     impulses = None  # of obstacles on vertices in each frame, where a loss names them
 
     def __init__(self, solver, derived: Derived):

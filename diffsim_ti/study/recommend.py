@@ -308,7 +308,8 @@ class Trials:
             out.append("damping: none in the scene")
         if not any(getattr(t, "acts_on_surface", False) for t in self.scene.terms):
             out.append("contact: none in the scene")
-        if not self.scene.dead_loads and not self.scene.following and self.scene.motion is None:
+        given = self.scene.dead_loads or self.scene.following or self.scene.cables
+        if not given and self.scene.motion is None:
             out.append("forces and motion per step")
         nu = self.scene.largest_poissons_ratio()
         if nu > LOCKING_RATIO + 1e-12:

@@ -3,6 +3,7 @@
 from diffsim_ti.terms.chambers import Chamber, FilledChamber, GasChamber
 from diffsim_ti.terms.drag import Drag
 from diffsim_ti.terms.external_force import ExternalForce
+from diffsim_ti.terms.foundation import ElasticFoundation
 from diffsim_ti.terms.gravity import Gravity
 from diffsim_ti.terms.loads import BodyForce, Load, Pressure, Traction
 from diffsim_ti.terms.obstacles.ball import Capsule, Sphere
@@ -13,27 +14,21 @@ from diffsim_ti.terms.obstacles.mesh_obstacle import MeshObstacle
 from diffsim_ti.terms.obstacles.obstacle import Obstacle
 from diffsim_ti.terms.self_contact import SelfContact
 from diffsim_ti.terms.term import Term, VertexForce
+from diffsim_ti.terms.ties import Anchor, Cable, Spring
 
 OBSTACLES = (Ground, HalfSpace, Sphere, Box, Capsule, Cylinder, MeshObstacle)
-TERMS = (
-    Gravity,
-    Drag,
-    ExternalForce,
-    Traction,
-    Pressure,
-    BodyForce,
-    GasChamber,
-    FilledChamber,
-    *OBSTACLES,
-    SelfContact,
-)
+LOADS = (ExternalForce, Traction, Pressure, BodyForce, GasChamber, FilledChamber, Spring, Cable, ElasticFoundation)
+TERMS = (Gravity, Drag, *LOADS, *OBSTACLES, SelfContact)
 __all__ = [
+    "Anchor",
     "BodyForce",
     "Box",
+    "Cable",
     "Capsule",
     "Chamber",
     "Cylinder",
     "Drag",
+    "ElasticFoundation",
     "ExternalForce",
     "FilledChamber",
     "GasChamber",
@@ -47,6 +42,7 @@ __all__ = [
     "Pressure",
     "SelfContact",
     "Sphere",
+    "Spring",
     "Term",
     "TERMS",
     "Traction",

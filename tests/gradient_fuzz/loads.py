@@ -36,6 +36,21 @@ def load(kind: str, rng, mesh, steps: int, duration: float, mass: float):
     return (ds.Traction if name == "Traction" else ds.Pressure)(given, some)
 
 
+def over_time(rng, steps: int, duration: float, how: str):
+    """size -> a positive number about that size, over time as `how` says."""
+
+    def made(size: float):
+        if how == "constant":
+            return size
+        if how == "per step":
+            return size * rng.uniform(0.9, 1.1, steps)
+        if rng.random() < 0.5:
+            return duration * np.array([0.0, rng.uniform(0.2, 0.8), 1.0]), size * rng.uniform(0.9, 1.1, 3)
+        return lambda t: size * (1 + 0.1 * np.sin(3 * t / duration))
+
+    return made
+
+
 def _scaled(given, share: float):
     if callable(given):
         return lambda t: share * given(t)

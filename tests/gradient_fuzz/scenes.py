@@ -13,6 +13,7 @@ from .loads import load, rollers
 from .obstacles import MESH_WIDTH, Placed, place, push_direction
 from .open_materials import open_material
 from .structures import CELL, LAWS, PER_STRUCTURE, Structure, structure
+from .ties import tie
 
 
 @dataclass
@@ -127,6 +128,9 @@ def build(seed: int, precision: str | None = None) -> Configuration:
     for name in kind.loads:
         own = load(name, more, mesh, steps, duration, mass.sum())
         terms.insert(int(more.integers(0, len(terms) + 1)), own)
+    more = np.random.default_rng([22, seed])
+    for name in kind.ties:
+        terms.append(tie(name, more, mesh, steps, duration, mass, beat))
 
     if kind.chamber:
         own = chamber(kind.chamber, more, mesh, start, steps, duration, E)

@@ -22,6 +22,10 @@ LOADS = tuple(
     f"{kind} {how}" for kind in ("Traction", "Pressure", "BodyForce") for how in ("constant", "per step", "keyed")
 )
 CHAMBERS = tuple(f"{kind} {how}" for kind in ("gas", "volume") for how in ("constant", "per step", "keyed"))
+TIES = (
+    *("Spring within", "Spring anchored", "ElasticFoundation one", "ElasticFoundation each"),
+    *(f"Cable {what} {how}" for what in ("tension", "length") for how in ("constant", "per step", "keyed")),
+)
 NARROW = ("Sphere", "Box", "Capsule", "Cylinder")  # of which some are
 
 
@@ -58,6 +62,7 @@ class Structure:
     contact: str  # of explicit solvers
     contact_damping: float
     loads: tuple[str, ...]  # on surfaces and volumes, each with how it is given
+    ties: tuple[str, ...]  # springs, cables, foundations
     rollers: bool  # some of what is fixed is held in some directions alone
     chamber: str  # what the cavity of a hollow body holds, and how that is given; "" of others
 
@@ -77,10 +82,11 @@ class Structure:
         flags = ("self_contact", "gravity", "drag", "fixed", "motion", "uniform", "rollers")
         words = [name for name in flags if getattr(self, name)]
         how = f"{self.contact} {self.contact_damping:g}" if self.explicit else "potential"
+        forces = [self.forces, *self.loads, *self.ties, *[self.chamber] * bool(self.chamber)]
         return (
             f"structure {self.number}: {self.law.__name__}, {self.solver.__name__}, {self.precision}, {self.volume}"
             f"{', parallel' if self.parallel else ''}; obstacles: {', '.join(kinds) or 'none'}, {how}; "
-            f"forces {', '.join([self.forces, *self.loads, *[self.chamber] * bool(self.chamber)])}; {', '.join(words)}"
+            f"forces {', '.join(forces)}; {', '.join(words)}"
         )
 
 
@@ -135,6 +141,7 @@ def structure(number: int) -> Structure:
         contact,
         turn((0.0, 0.005, 0.005, 0.2, 1.0), number, 7),
         tuple(turn(LOADS, 3 * number + k, 12) for k in range(1 + number // 4 % 3)) if number % 4 == 3 else (),
+        tuple(turn(TIES, 3 * number + k, 13) for k in range(1 + number // 4 % 3)) if number % 4 == 2 else (),
         fixed and not static and number % 5 in (0, 4) and not staged,
         turn(CHAMBERS[:3] if solver in EXPLICIT else CHAMBERS, number // 4, 13)
         if number % 4 == 1 and not self_contact

@@ -49,6 +49,9 @@ class ExplicitAdjoint:
         corners = workspace.chambers.triangles.size if workspace.chambers else 0
         self.chamber_felt = runtime.array(a.vector, a.follower.shape[0], 4 * len(a.chambers))
         self.chamber_rest = runtime.array(a.vector, corners * self.features.shape)
+        # of springs, cables and foundations
+        self.tie_felt, self.tie_rest = (runtime.array(a.vector, *x.shape) for x in (a.ties, a.tie_segments))
+        self.foundation_felt = runtime.array(a.vector, *a.foundation.shape)
         self.faces = FeltAdjoint(self, workspace.faces) if workspace.faces else None
         if workspace.impulses:
             self.impulses = ImpulseRecord(workspace)
@@ -61,6 +64,7 @@ class ExplicitAdjoint:
         same = same and self.felt.shape[0] == max(1, 2 * self.features.moving * self._steps)
         same = same and self.path.shape[0] == a.path.shape[0]
         same = same and self.pressed_felt.shape[0] == a.follower.shape[0]
+        same = same and self.tie_felt.shape == a.ties.shape
         return same and self.frames.frames_u.shape == workspace.frames.frames_u.shape
 
     def start(self, positions_adj: np.ndarray, velocities_adj: np.ndarray, last_frame_is_input: bool) -> None:
@@ -87,6 +91,7 @@ class ExplicitAdjoint:
             self.mass_adj[:] = 0
         self.numbers.clear()
         pressed = self.pressed_felt, self.pressed_rest, self.chamber_felt, self.chamber_rest
+        pressed += self.tie_felt, self.tie_rest, self.foundation_felt
         for target in (self.felt, self.path, self.u, self.v, self.w, self.z, *pressed):
             if target is not None:
                 runtime.fill(target, 0)
@@ -199,6 +204,13 @@ class ExplicitAdjoint:
             out.path += path.reshape(len(path), self.features.moving, self.num_parts, 3).sum(2)
         if self.features.pressed:
             rest = rest + self._collect_pressures(out)
+        for name, felt in (
+            ("ties", self.tie_felt),
+            ("tie_segments", self.tie_rest),
+            ("foundation", self.foundation_felt),
+        ):
+            if getattr(out, name) is not None:
+                setattr(out, name, runtime.fetch(felt).astype(np.float64))
         if self.features.shape:
             rest = rest + runtime.fetch(self.frames.frames_u).astype(np.float64).sum(0)
         out.rest = rest + out.rest

@@ -65,11 +65,11 @@ class GivenForces:
         return begin + self.share_of_step(step, now) * (end - begin)
 
     @ti.func
-    def pressed(self, i, scene: A, plan: A):
-        """What pressures do at vertex i, of what it gathers."""
+    def gathered(self, i, scene: A, plan: A):
+        """What pressures and cables do at vertex i, of what it gathers."""
         f = self.vector(0)
         for c in range(scene.start[i], scene.start[i + 1]):
-            if scene.corner_of[c] >= plan.first_pressed:
+            if scene.corner_of[c] >= plan.first_load:
                 f = f + scene.corner[scene.corner_of[c]]
         return f
 

@@ -5,10 +5,9 @@ from functools import cached_property, lru_cache
 
 import taichi as ti
 
-from diffsim_ti.elements.pressed_triangle import PRESSED, PressedTriangle
 from diffsim_ti.elements.tetrahedron import Onwards
 from diffsim_ti.runtime import Bundle, Kernel, let, traced
-from diffsim_ti.solvers.explicit.guides import GUIDED
+from diffsim_ti.solvers.explicit.further_elements import FurtherElements
 from diffsim_ti.solvers.explicit.kick_drift import KickDrift
 from diffsim_ti.state.numbers import ADJOINT, OF_STEPS, SCENE, TANGENT, with_state
 from diffsim_ti.state.schedule import pass_at, reversed_pass
@@ -50,19 +49,9 @@ class ExplicitKernels:
     def element(self):
         return self.vertex.element
 
-    @property
-    def pressed(self) -> bool:
-        return self.vertex.features.pressed
-
     @cached_property
-    def triangle(self) -> PressedTriangle:
-        features = self.vertex.features
-        return PressedTriangle(self.vertex.law.precision, features.pressure_per_step, features.shape)
-
-    @traced
-    def num_elements(self, plan):
-        """Items of tetrahedra, and after them pressed triangles."""
-        return let(plan.num_items + plan.num_pressed) if self.pressed else plan.num_items
+    def further(self) -> FurtherElements:
+        return FurtherElements(self.vertex.features, self.vertex.law.precision)
 
     @traced
     def onwards(self, now) -> Onwards:
@@ -120,12 +109,12 @@ class ExplicitKernels:
 
     @ti.func
     def elements(self, e, j, scene: A, state: A, table: A, plan: A):
-        if ti.static(self.pressed):
+        if ti.static(self.further.any):
             if e < plan.num_items:
                 self.tetrahedra(e, j, scene, state, table, plan)
             else:
                 now, s = pass_at(table, j - plan.window), (j - plan.base) * plan.stride
-                self.triangle.forces(e - plan.num_items, now, scene, state, s, plan.first_pressed)
+                self.further.forces(e - plan.num_items, now, scene, state, s, plan)
         else:
             self.tetrahedra(e, j, scene, state, table, plan)
 
@@ -141,7 +130,7 @@ class ExplicitKernels:
     def passes(self, scene: A, state: A, table: A, plan: A):
         """Slot 0 holds the state before pass `base`; with stride 1 each pass writes the next slot, and its forces."""
         if ti.static(self.parallel):
-            num_items, num_vertices = self.num_elements(plan), plan.num_vertices  # both bounds are read by one task
+            num_items, num_vertices = self.further.after(plan), plan.num_vertices  # both bounds are read by one task
             for e in range(num_items):
                 turn = self.turn_of_first(e, table)
                 if turn < plan.count:
@@ -154,7 +143,7 @@ class ExplicitKernels:
         else:
             ti.loop_config(serialize=True)
             for j in range(plan.first, plan.first + plan.count):
-                for e in range(self.num_elements(plan)):
+                for e in range(self.further.after(plan)):
                     self.elements(e, j, scene, state, table, plan)
                 now = self.pass_of(j, table, plan)
                 for i in range(plan.num_vertices):
@@ -169,12 +158,12 @@ class ExplicitKernels:
 
     @ti.func
     def elements_jvp(self, e, scene: A, state: A, tangent: A, table: A, plan: A):
-        if ti.static(self.pressed):
+        if ti.static(self.further.any):
             if e < plan.num_items:
                 self.tetrahedra_jvp(e, scene, state, tangent, table, plan)
             else:
                 now, s = pass_at(table, plan.first - plan.window), plan.first - plan.base
-                self.triangle.forces_jvp(e - plan.num_items, now, scene, state, s, tangent, plan.first_pressed)
+                self.further.forces_jvp(e - plan.num_items, now, scene, state, s, tangent, plan)
         else:
             self.tetrahedra_jvp(e, scene, state, tangent, table, plan)
 
@@ -189,7 +178,7 @@ class ExplicitKernels:
     @ti.func
     def passes_jvp(self, scene: A, state: A, tangent: A, table: A, plan: A):
         ti.loop_config(serialize=not self.parallel)
-        for e in range(self.num_elements(plan)):
+        for e in range(self.further.after(plan)):
             self.elements_jvp(e, scene, state, tangent, table, plan)
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.num_vertices):
@@ -199,20 +188,19 @@ class ExplicitKernels:
     @cached_property
     def step_jvp(self) -> Kernel:
         """The tangent of pass `first` along recorded slots; the change of the state is advanced in place."""
-        tangent = TANGENT | dict(follower=PRESSED["follower"]) if self.pressed else TANGENT
-        own = dict(state=self.state(), tangent=self.with_record(CHANGE) | tangent)
+        own = dict(state=self.state(), tangent=self.with_record(CHANGE) | TANGENT | self.further.tangent)
         return self._kernel("step_jvp", self.passes_jvp, own, False, rate_dot="float")
 
     # ---- adjoint -----------------------------------------------------------------------------------------------------
 
     @ti.func
     def elements_vjp(self, e, j, scene: A, state: A, adjoint: A, table: A, plan: A):
-        if ti.static(self.pressed):
+        if ti.static(self.further.any):
             if e < plan.num_items:
                 self.tetrahedra_vjp(e, j, scene, state, adjoint, table, plan)
             else:
                 now, s = pass_at(table, j - plan.window), j - plan.base
-                self.triangle.forces_vjp(e - plan.num_items, now, scene, state, s, adjoint, plan.first_pressed)
+                self.further.forces_vjp(e - plan.num_items, now, scene, state, s, adjoint, plan)
         else:
             self.tetrahedra_vjp(e, j, scene, state, adjoint, table, plan)
 
@@ -238,7 +226,7 @@ class ExplicitKernels:
         """The gather of K w is left to the next call (or to `finish_vjp`), so that each pass has two loops, as forward."""
         moving = ti.static(self.vertex.features.moving)
         if ti.static(self.parallel):
-            num_items, num_vertices, parts = self.num_elements(plan), plan.num_vertices, moving * plan.num_parts
+            num_items, num_vertices, parts = self.further.after(plan), plan.num_vertices, moving * plan.num_parts
             for i in range(num_vertices):
                 turn = self.turn_of_first(i, table)
                 if turn < plan.count:
@@ -260,7 +248,7 @@ class ExplicitKernels:
                 now = self.pass_back(j, table, plan)
                 for i in range(plan.num_vertices):
                     self.vertex.step_vjp(i, j, now, scene, state, adjoint, plan)
-                for e in range(self.num_elements(plan)):
+                for e in range(self.further.after(plan)):
                     self.elements_vjp(e, j, scene, state, adjoint, table, plan)
                 for p in range(moving * plan.num_parts):
                     self.vertex.obstacles.fold_part(p, plan.num_vertices, j, j, adjoint, table, plan)
@@ -275,8 +263,7 @@ class ExplicitKernels:
         numbers = dict.fromkeys(("num_passes", "halt", "kick", "steps", "num_parts"), "int")
         own = self.with_record(CHANGE) | ADJOINT | OF_STEPS | CORNERS
         own |= dict(w="vectors2", felt="vectors2")
-        if self.pressed:
-            own |= dict(pressed_felt="vectors2", pressed_rest="vectors")
+        own |= self.further.adjoint
         arrays = dict(state=self.state(), adjoint=own)
         return self._kernel("step_vjp", self.passes_vjp, arrays, self.repeated, **numbers)
 
@@ -296,10 +283,8 @@ class ExplicitKernels:
         return Kernel("finish_vjp", self.gather_rest, self.vertex.law.precision, own, dict(num_vertices="int"))
 
     def _kernel(self, name: str, body, arrays: dict, repeated: bool, **numbers) -> Kernel:
-        scene, counted = (SCENE | PRESSED, ("num_pressed", "first_pressed")) if self.pressed else (SCENE, ())
-        scene = scene | GUIDED if self.vertex.features.guided else scene
-        arrays = dict(scene=scene) | arrays | dict(table=PLAN)
-        numbers = NUMBERS | dict.fromkeys(counted, "int") | numbers
+        arrays = dict(scene=SCENE | self.further.arrays) | arrays | dict(table=PLAN)
+        numbers = NUMBERS | self.further.counts | numbers
         numbers |= dict(per_frame="int") if self.recorded else {}
         if repeated:
             arrays["table"], numbers = PLAN | TURNS, numbers | dict(times="int")

@@ -23,6 +23,7 @@ import taichi as ti
 from diffsim_ti.elements.patched_tetrahedron import functions_of
 from diffsim_ti.runtime import PRECISIONS
 from diffsim_ti.solvers.explicit.contact_stage import ContactStage
+from diffsim_ti.solvers.explicit.foundations import Foundations
 from diffsim_ti.solvers.explicit.given_forces import GivenForces
 from diffsim_ti.solvers.explicit.guides import Guides
 from diffsim_ti.solvers.explicit.obstacle_stages import ObstacleStages
@@ -62,6 +63,10 @@ class KickDrift:
     @cached_property
     def given(self) -> GivenForces:
         return GivenForces(self.features, self.law.precision)
+
+    @cached_property
+    def foundations(self) -> Foundations:
+        return Foundations(self.law.precision)
 
     @cached_property
     def guides(self) -> Guides:
@@ -109,6 +114,8 @@ class KickDrift:
                 f = self.obstacles.add_force(i, f, u, v, now, scene)
         if ti.static(self.features.forces):
             f += self.given.force(i, now, scene, scene.forces)
+        if ti.static(self.features.founded):
+            f += self.foundations.force(i, u, scene, scene.foundation)
         # kick, frame, kick
         v_mid, v_plus = self.kicked(i, v, f, now, scene)
         if now.frame >= 0:
@@ -155,8 +162,8 @@ class KickDrift:
         _, v_plus = self.kicked(i, v, f, now, scene)
         if ti.static(self.features.forces):
             load = self.given.force(i, now, scene, scene.forces)
-        if ti.static(self.features.pressed):
-            load += self.given.pressed(i, scene, plan)
+        if ti.static(self.features.loaded_corners):
+            load += self.given.gathered(i, scene, plan)
         own = f - load  # the body's
         if inverse > 0:
             if ti.static(self.features.gravity >= 0):
@@ -169,7 +176,7 @@ class KickDrift:
                     self.guides.free(i, v_plus, scene),
                 )
                 u_next, v_next = u + self.guides.free(i, u_next - u, scene), self.guides.free(i, v_next, scene)
-            if ti.static(self.features.forces or self.features.pressed):
+            if ti.static(self.features.forces or self.features.loaded_corners):
                 done += half * load.dot((pre + post) * (v + v_plus) + (pre * pre - post * post) * inverse * own)
             if ti.static(self.features.drag >= 0):
                 kept = ti.exp(-now.h * scene.parameters[ti.static(self.features.drag)])
@@ -197,6 +204,9 @@ class KickDrift:
                 df = self.obstacles.add_force_jvp(i, df, u, v, du, dv, now, scene, tangent)
         if ti.static(self.features.forces):
             df += self.given.force(i, now, scene, tangent.forces)
+        if ti.static(self.features.founded):
+            df += self.foundations.force(i, du, scene, scene.foundation)
+            df += self.foundations.force(i, u, scene, tangent.foundation)
         inverse = scene.inverse_mass[i]
         da = inverse * (df - inverse * tangent.mass[i] * state.f[s, i])
         if ti.static(self.features.gravity >= 0):
@@ -307,6 +317,9 @@ class KickDrift:
                     adjoint.sums[row, i] = adjoint.sums[row, i] + a_adj[d]
         if ti.static(self.features.forces):
             self.given.add_vjp(i, f_adj, now, scene, adjoint)
+        if ti.static(self.features.founded):
+            p += self.foundations.force(i, f_adj, scene, scene.foundation)
+            self.foundations.add_vjp(i, u, f_adj, scene, adjoint)
         if ti.static(len(self.features.pressing) > 0):
             if scene.surface[i] > 0:
                 p, q = self.obstacles.add_force_vjp(i, p, q, u, v, f_adj, now, scene, adjoint)

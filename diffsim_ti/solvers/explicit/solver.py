@@ -11,6 +11,7 @@ from diffsim_ti import runtime
 from diffsim_ti.contact.surface_pairs import Tunnelling
 from diffsim_ti.inputs import Derived
 from diffsim_ti.monitor.energy_balance import EnergyBalance
+from diffsim_ti.potential.attached import Attached
 from diffsim_ti.potential.chamber_pressure import following
 from diffsim_ti.potential.way import Way
 from diffsim_ti.solvers.explicit.adjoint import ExplicitAdjoint, ExplicitTangent
@@ -149,6 +150,7 @@ class ExplicitWorkspace(Workspace):
             work=runtime.array(a.fp, a.num_vertices if features.driven else 1),  # done on each vertex from outside [J]
         )
         self.following = following(self.scene)
+        self.attached = Attached.of(self.scene)  # springs, cables and foundations, for what looks between passes
         self.probe = None  # room for a pass that is not taken
         self.energy_watch = EnergyBalance(self) if EnergyBalance.knows(a.law) else None
 
@@ -198,15 +200,17 @@ class ExplicitWorkspace(Workspace):
 
     def loads_at(self, j: int, num_passes: int) -> np.ndarray:
         """External forces [N] on each vertex, as pass j of a run takes them."""
-        a, schedule, out = self.arrays, self.solver.schedule, np.zeros((self.arrays.num_vertices, 3))
-        kicks = self._kicks(j, num_passes)
+        a, schedule, u = self.arrays, self.solver.schedule, runtime.fetch_row(self.state.u, 0)
+        out, kicks = np.zeros_like(u, np.float64), self._kicks(j, num_passes)
         if a.rows["forces"] is not None:
             keyed = a.features().forces_keyed
             out[self.scene.loaded_vertices] = 0.5 * sum(schedule.load(a.rows["forces"], *k, keyed) for k in kicks)
         if self.following is not None:
-            out += self.following.at(self.numbers_at(j, num_passes)).forces(
-                a.values.rest + runtime.fetch_row(self.state.u, 0)
-            )
+            out += self.following.at(self.numbers_at(j, num_passes)).forces(a.values.rest + u)
+        if a.features().cabled:
+            both = [schedule.ties(a.rows["ties"], *k) for k in kicks]
+            numbers = (0.5 * (begin + end) for begin, end in zip(*both))
+            out += self.attached.ties.at(a.values.tie_segments, *numbers).forces(u, cables=True)
         return out
 
     def _kicks(self, j: int, num_passes: int) -> list[tuple[int, float]]:
@@ -237,11 +241,14 @@ class ExplicitWorkspace(Workspace):
         """
         a, solver = self.arrays, self.solver
         num_rows = max((len(x) for x in (a.values.path, a.values.motion) if x is not None), default=1)
-        if num_rows == 1 and (a.features().pressed or a.features().forces_keyed):  # they ask in which step a pass lies
-            num_rows = max(1 + len(x) for x in (a.values.forces, a.values.follower) if x is not None)
+        # they ask in which step a pass lies
+        if num_rows == 1 and (a.features().pressed or a.paths or a.features().forces_keyed):
+            given = a.values.forces, a.values.follower, a.values.ties
+            num_rows = max(1 + len(x) for x in given if x is not None)
         run = num_passes, num_rows, save_every, self.rate, solver.schedule
         turn, sizes = -1 if backwards else 1, dict(num_items=a.num_items, num_vertices=a.num_vertices)
         sizes |= dict(contact_damping=solver.contact_damping, num_pressed=a.num_pressed, first_pressed=a.first_pressed)
+        sizes |= dict(num_ties=a.num_ties, first_tied=a.first_tied, first_load=a.first_load)
         for window, begin, end in self.table.windows(first, last)[::turn]:
             self.table.show(window, run, lambda first, last: solver.pass_table(first, last, *run[:4]))
             number = -(-(end - begin) // most)

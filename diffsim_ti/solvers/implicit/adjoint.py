@@ -1,4 +1,4 @@
-"""The reverse sweep and the tangent of implicit passes: one linear solve per pass with the exact Hessian.
+"""The reverse sweep of implicit passes: one linear solve per pass with the exact Hessian.
 
 A pass solves R(u*, theta) = 0 with -dR/du = A = c M + d2E/du2, which is symmetric. So du* = A^-1 dR for a change of
 theta, and for the adjoint p of u* the adjoint of theta is lambda . dR/dtheta with A lambda = p.
@@ -14,11 +14,11 @@ from diffsim_ti.potential.face_kernels import face_kernels
 from diffsim_ti.potential.face_lattice import rest_of_areas
 from diffsim_ti.potential.kernels import potential_kernels
 from diffsim_ti.solvers.implicit.chamber_record import ChamberRecord
-from diffsim_ti.solvers.implicit.contact_record import ContactRecord, Shares, SharesAdjoint
-from diffsim_ti.solvers.implicit.pressed import PressedAdjoint, PressedTangent
+from diffsim_ti.solvers.implicit.contact_record import ContactRecord, SharesAdjoint
+from diffsim_ti.solvers.implicit.pressed import PressedAdjoint
 from diffsim_ti.solvers.implicit.recorded_passes import RecordedPasses
 from diffsim_ti.solvers.implicit.threads import one_blas_thread
-from diffsim_ti.state.numbers import Adjoint, Tangent
+from diffsim_ti.state.numbers import Adjoint
 
 
 class ImplicitAdjoint(RecordedPasses):
@@ -76,6 +76,7 @@ class ImplicitAdjoint(RecordedPasses):
         self.p, self.q = self.frames[0][-1].copy(), self.frames[1][-1].copy()
         self.pending = [np.zeros_like(self.p), np.zeros_like(self.p)]
         self.mass_adj, self.gravity, self.rate = np.zeros(len(self.p)), np.zeros(3), 0.0
+        self.attached = a.values.zeros()  # of springs, cables and foundations
         self.pressure = None if a.values.follower is None else np.zeros_like(a.values.follower)
         self.rest_by_pressure = np.zeros_like(self.p)
         self.forces = None if a.values.forces is None else np.zeros_like(a.values.forces)
@@ -137,6 +138,8 @@ class ImplicitAdjoint(RecordedPasses):
         if ws.potential.faces:
             reaction = reaction + self._vjp_of_faces()
         reaction = reaction + by_contacts
+        if ws.attached:
+            reaction = reaction + ws.attached.vjp(ws.potential.held_at, by_star, self.attached, *ws.time_of(j, s))
         share = ws.load_share(j, s)
         if self.pressure is not None:
             by_place = ws.follower.vjp(self.places, by_star)
@@ -229,120 +232,8 @@ class ImplicitAdjoint(RecordedPasses):
             rest = rest + rest_of_areas(a.mesh, a.values.rest, by_areas)
         out.rest = rest + self.rest_by_pressure + out.rest
         out.forces, out.motion, out.path, out.follower = self.forces, self.motion, self.path, self.pressure
+        for name in ("ties", "tie_segments", "foundation"):
+            setattr(out, name, getattr(self.attached, name))
         if self.motion is not None:
             out.displacement[a.held] += self.anchor
         return out
-
-
-class ImplicitTangent(RecordedPasses):
-    """The tangent of a run: changes of the state for changes of everything that the equation names."""
-
-    def __init__(self, workspace, tangent: Derived):
-        super().__init__(workspace)
-        a, self.tangent = workspace.arrays, tangent
-        p = workspace.potential
-        self.du, self.dv, self.tangent_before = tangent.displacement.copy(), tangent.velocity.copy(), None
-        self.features = a.features()
-        kernels = potential_kernels(a.law, self.features, workspace.parallel, a.in_lanes)
-        self.numbers = Tangent(a, tangent)
-        self.lag, self.walls, self.pressed = (runtime.array(a.vector, *x.shape) for x in (p.lag, p.walls, p.pressed))
-        self._presses = PressedTangent(workspace, self) if p.presses else None
-        self.z, own = a.law_states(1), dict(scene=a, pass_=p, at=p, out=p, tangent=(self, self.numbers))
-        if self.z is not None:
-            runtime.fill(self.z, 0)
-            self._law = SimpleNamespace(z=self.z, w=p.w)
-        self._jvp = kernels.jvp.bind(a.in_lanes, **own)
-        if p.faces:
-            self._jvp_of_faces = p.faces.bind(p.faces.kernels.jvp, tangent=(self, self.numbers))
-        self.contacts = ContactRecord(workspace) if workspace.impulses else None
-        self._shares = Shares(workspace) if workspace.impulses else None
-        self.rate_dot = float(tangent.parameters[a.features().drag]) if a.features().drag >= 0 else 0.0
-        self.frames, self.chambers = ([], []), ChamberRecord(workspace)
-
-    @one_blas_thread
-    def advance(self, first: int, last: int, num_passes: int, save_every: int) -> None:
-        """Tangent of passes first .. last - 1, recorded from slot 0."""
-        for j in range(first, last):
-            if j % save_every == 0:
-                self.save_frame(j // save_every)
-            self.open(j, first)
-            self._pass(j, save_every)
-            if self.z is not None:
-                runtime.fill(self.ws.potential.w, self.du[None])
-                own = dict(at=self.ws.record, tangent=(self._law, self.numbers))
-                self.ws.launch_law_state("jvp", self.features, j, j - first, j - first + 1, **own)
-
-    def _pass(self, j: int, per_frame: int) -> None:
-        ws, s, tangent, a = self.ws, self.stage, self.tangent, self.ws.arrays
-        db0, db1, de0, de1 = (x * self.rate_dot for x in s.by_rate)
-        dx, dy = s.a0 * self.du, s.b0 * self.dv + db0 * self.v
-        if self.before is not None:
-            dx = dx + s.a1 * self.tangent_before[0]
-            dy = dy + s.b1 * self.tangent_before[1] + db1 * self.before[1]
-        place, speed = ws.prescribed(j, tangent)
-        now = self.du[a.held]
-        held = ws.with_held(np.zeros_like(self.du), now if place is None else now + (place - now) / s.c0)
-        runtime.fill(ws.potential.w, held[None])
-        if ws.potential.has_friction:
-            runtime.fill(self.lag, np.stack([self.du, dx]))
-        walls = None if tangent.path is None else ws.walls(tangent.path, j, s)
-        if walls is not None:
-            runtime.fill(self.walls, walls)
-        if self._presses:
-            self._presses.begin(self.du, walls)
-        if ws.pairs:
-            ws.pairs.product(
-                ws.potential.u,
-                0,
-                ws.potential.w,
-                a.corner,
-                self.numbers.rest,
-                tangent.parameters[a.parameters_of_self_contact],
-            )
-        self._jvp(**ws.potential.sizes())
-        share = ws.load_share(j, s)
-        dR = runtime.fetch(ws.potential.y)[0].astype(np.float64) + tangent.mass[:, None] * self.weight(share)
-        if ws.potential.faces:
-            dR += self._jvp_of_faces()
-        if a.features().gravity >= 0:
-            dR += share * ws.mass * tangent.parameters[a.features().gravity :][:3]
-        dR += ws.given_forces(tangent.forces, j, s)
-        if tangent.follower is not None:
-            dp = ws.solver.schedule.pressure(tangent.follower, j, ws.share_at_stage(j, s))
-            dR += ws.follower.jvp(self.places, held + tangent.rest, dp)
-        d_star = self.solve(dR + self.mass * (dx + s.gamma * dy))
-        if ws.volumes:
-            targets = ws.volumes.targets_jvp(self.places, held + tangent.rest, dp)
-            d_star, change = ws.volumes.tangent(self.places, d_star, targets, self.solve)
-            self.chambers.note(j, per_frame, change)
-        d_star = held + d_star
-        if self.contacts:
-            self._note_contacts(j, per_frame, d_star)
-        before = self.du, self.dv
-        self.du = s.c0 * d_star + (1 - s.c0) * self.du
-        self.dv = s.e0 * (d_star - dx) / s.gamma + s.e1 * dy + de0 * self.v_star + de1 * self.y
-        place, speed = (x[a.held] for x in before) if place is None else (place, speed)
-        self.du, self.dv = ws.with_held(self.du, place), ws.with_held(self.dv, speed)
-        if s.static:
-            self.dv = np.zeros_like(self.dv)
-        self.tangent_before = before
-
-    def _note_contacts(self, j: int, per_frame: int, d_star: np.ndarray) -> None:
-        """Change of the forces of obstacles in pass j, u* changing by d_star."""
-        runtime.fill(self.ws.potential.w, d_star[None])
-        record = dict(tangent=(SimpleNamespace(lag=self.lag, walls=self.walls, pressed=self.pressed), self.numbers))
-        self.contacts.add(j, per_frame, self.stage.static, lambda: self._shares.forces("jvp", **record))
-
-    def contact_forces(self, frame_time: float) -> np.ndarray:
-        """Changes of the frames' contact forces."""
-        return self.contacts.forces
-
-    def save_frame(self, frame: int) -> None:
-        """Copy the current tangent to a frame."""
-        for saved, now in zip(self.frames, (self.du, self.dv)):
-            saved.append(now.copy())
-
-    def collect(self) -> tuple[np.ndarray, np.ndarray]:
-        """Changes of the frames' positions and velocities."""
-        du, dv = (np.stack(x) for x in self.frames)
-        return du + self.tangent.rest, dv

@@ -53,6 +53,16 @@ class GivenInPasses:
         if self.volumes:
             self.volumes.stiffen(self.preconditioner(stage.inertia * self.mass)[1])
 
+    def attach(self, j: int, stage: Stage) -> None:
+        """Springs, cables and foundations as they are in pass j."""
+        if self.attached:
+            values, rows = self.arrays.values, self.arrays.rows["ties"]
+            self.attached.at(values, rows, *self.time_of(j, stage))
+
+    def time_of(self, j: int, stage: Stage) -> tuple:
+        """(schedule, pass, share of its step, share of the loads), which attached things are told."""
+        return self.solver.schedule, j, self.share_at_stage(j, stage), self.load_share(j, stage)
+
     def follower_pressure(self) -> FollowerPressure | None:
         """What presses on the surface as it is."""
         free, rest = projectors_of(self.free), self.arrays.values.rest

@@ -9,6 +9,7 @@ from diffsim_ti import runtime
 from diffsim_ti.contact.implicit_pairs import ImplicitPairs
 from diffsim_ti.contact.surface_pairs import Tunnelling
 from diffsim_ti.monitor.energy_watch import EnergyWatch
+from diffsim_ti.potential.attached import Attached
 from diffsim_ti.potential.free import FreeDirections, held_as, mask_of
 from diffsim_ti.potential.potential import Potential
 from diffsim_ti.potential.way import Way
@@ -70,6 +71,7 @@ class ImplicitWorkspace(ObstacleWays, Noted, GivenInPasses, Workspace):
         self.follower = self.follower_pressure()
         self.volumes, self.multipliers = self.held_volumes(eps), {}  # the pressures [Pa] that each pass ended with
         followers = self.follower, self.volumes
+        self.attached = self.potential.attached = Attached.of(self.scene)
         self.newton = Newton(self.potential, self.free, way, preconditioner, tolerance, rounds, eps, *followers)
         self._preconditioners = {}
         self.way, self.approach = Way(self.arrays, self.parallel), Approach(self)
@@ -276,6 +278,7 @@ class ImplicitWorkspace(ObstacleWays, Noted, GivenInPasses, Workspace):
         if self.pressed:
             self.pressed.begin(u, self._walls)
         self.press(j, stage)
+        self.attach(j, stage)
 
     def walls(self, path: np.ndarray | None, j: int, stage: Stage) -> np.ndarray:
         """Three rows for each obstacle: displacement where forces are taken, displacement before, velocity."""

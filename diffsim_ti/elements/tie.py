@@ -1,0 +1,175 @@
+"""Springs and cables in explicit passes: each a path of points with one tension along it.
+
+Point p of a path lies at X_p + U_p, U_p the weighted sum of its vertices' displacements, and d_p leads from it to the next.
+T = a + k e, e = sum (|d_p| - |D_p|) + s, D_p: d_p at rest (inputs/ties.py). Corner c of the paths' points writes corner
+`first + c`, and vertices gather it with those of tetrahedra. Lengths come as changes of lengths, so that single precision
+keeps its digits near rest.
+"""
+
+from dataclasses import dataclass
+
+import taichi as ti
+
+from diffsim_ti.runtime import PRECISIONS
+
+A = ti.template()  # an array or Bundle handed to a Taichi function
+TIED = dict.fromkeys(("tie_start", "point_start", "point_vertex", "tie_one_sided"), "ints") | dict(
+    point_weight="scalars", tie_segments="vectors", ties="vectors2"
+)
+
+
+@dataclass(frozen=True)
+class TieElement:
+    """Functions of one tie in a pass; per_step: whether its numbers have a row for each step."""
+
+    precision: str
+    per_step: bool
+
+    @property
+    def fp(self):
+        return PRECISIONS[self.precision]
+
+    @property
+    def vector(self):
+        return ti.types.vector(4, self.fp)
+
+    @ti.func
+    def length(self, d):
+        return ti.sqrt(d.norm_sqr())  # `norm` adds a float64 zero
+
+    @ti.func
+    def unit(self, d):
+        size, out = self.length(d), self.vector(0)
+        if size > 0:
+            out = d / size
+        return out
+
+    @ti.func
+    def moved(self, p, x: A, s, scene: A):
+        """Displacement of point p."""
+        out = self.vector(0)
+        for c in range(scene.point_start[p], scene.point_start[p + 1]):
+            out += scene.point_weight[c] * x[s, scene.point_vertex[c]]
+        return out
+
+    @ti.func
+    def parted(self, p, x: A, s, scene: A):
+        """How much more than point p the next one moves."""
+        return self.moved(p + 1, x, s, scene) - self.moved(p, x, s, scene)
+
+    @ti.func
+    def row(self, force):
+        r = 0
+        if ti.static(self.per_step):
+            r = force
+        return r
+
+    @ti.func
+    def share(self, force, now: A):
+        """How far in that step the pass lies: it ends a step before its own."""
+        return ti.select(force == now.row, now.begin, ti.cast(1, self.fp))
+
+    @ti.func
+    def numbers(self, t, now: A, rows: A):
+        """(a, s, k), the mean of both kicks."""
+        out, half = self.vector(0), ti.cast(0.5, self.fp)
+        for force in ti.static((now.force0, now.force1)):
+            pull, slack = rows[self.row(force), 2 * t], rows[self.row(force), 2 * t + 1]
+            share = self.share(force, now)
+            out[0] += half * (pull[0] + share * (pull[1] - pull[0]))
+            out[1] += half * (slack[0] + share * (slack[1] - slack[0]))
+            out[2] += half * pull[2]
+        return out
+
+    @ti.func
+    def stretch(self, t, u: A, s, scene: A):
+        """L - L0."""
+        out = ti.cast(0, self.fp)
+        for p in range(scene.tie_start[t], scene.tie_start[t + 1] - 1):
+            D, moved = scene.tie_segments[p], self.parted(p, u, s, scene)
+            both = self.length(D) + self.length(D + moved)
+            if both > 0:
+                out += moved.dot(D + (D + moved)) / both
+        return out
+
+    @ti.func
+    def pull(self, t, n, u: A, s, scene: A):
+        """(T, e as far as it pulls, k as far as e does)"""
+        e, k = self.stretch(t, u, s, scene) + n[1], n[2]
+        if scene.tie_one_sided[t] > 0 and e <= 0:
+            e, k = ti.cast(0, self.fp), ti.cast(0, self.fp)
+        return self.vector(n[0] + n[2] * e, e, k, ti.cast(0, self.fp))
+
+    @ti.func
+    def store(self, p, f, first, scene: A, corner: A):
+        """The force of a point, to its vertices."""
+        for c in range(scene.point_start[p], scene.point_start[p + 1]):
+            corner[first + c] = scene.point_weight[c] * f
+
+    @ti.func
+    def across(self, T, k, d, x):
+        """T/|d| of what of x lies across d; of a spring without length k x."""
+        size, t = self.length(d), self.unit(d)
+        q = k
+        if size > 0:
+            q = T / size
+        return q * (x - t.dot(x) * t)
+
+    @ti.func
+    def forces(self, t, now: A, scene: A, state: A, s, first):
+        T = self.pull(t, self.numbers(t, now, scene.ties), state.u, s, scene)[0]
+        before, last = self.vector(0), scene.tie_start[t + 1] - 1
+        for p in range(scene.tie_start[t], last + 1):
+            after = self.vector(0)
+            if p < last:
+                after = T * self.unit(scene.tie_segments[p] + self.parted(p, state.u, s, scene))
+            self.store(p, after - before, first, scene, scene.corner)
+            before = after
+
+    @ti.func
+    def forces_jvp(self, t, now: A, scene: A, state: A, s, tangent: A, first):
+        n, dn = self.numbers(t, now, scene.ties), self.numbers(t, now, tangent.ties)
+        pulled, de = self.pull(t, n, state.u, s, scene), dn[1]
+        last = scene.tie_start[t + 1] - 1
+        for p in range(scene.tie_start[t], last):
+            D, dD = scene.tie_segments[p], tangent.tie_segments[p]
+            d, dd = D + self.parted(p, state.u, s, scene), dD + self.parted(p, tangent.u, 0, scene)
+            de += self.unit(d).dot(dd) - self.unit(D).dot(dD)
+        dT = dn[0] + dn[2] * pulled[1] + pulled[2] * de
+        before = self.vector(0)
+        for p in range(scene.tie_start[t], last + 1):
+            after = self.vector(0)
+            if p < last:
+                d = scene.tie_segments[p] + self.parted(p, state.u, s, scene)
+                dd = tangent.tie_segments[p] + self.parted(p, tangent.u, 0, scene)
+                after = dT * self.unit(d) + self.across(pulled[0], n[2], d, dd)
+            self.store(p, after - before, first, scene, scene.corner)
+            before = after
+
+    @ti.func
+    def forces_vjp(self, t, now: A, scene: A, state: A, s, adjoint: A, first):
+        """Products of the derivative, which is symmetric, with adjoint.w, to corners; adds the adjoints of a tie's numbers
+        to adjoint.tie_felt and those of its segments at rest to adjoint.tie_rest."""
+        n, zero = self.numbers(t, now, scene.ties), ti.cast(0, self.fp)
+        pulled, T_adj = self.pull(t, n, state.u, s, scene), zero
+        last = scene.tie_start[t + 1] - 1
+        for p in range(scene.tie_start[t], last):
+            d = scene.tie_segments[p] + self.parted(p, state.u, s, scene)
+            T_adj += self.unit(d).dot(self.vector(0) - self.parted(p, adjoint.w, 0, scene))
+        e_adj, before = T_adj * pulled[2], self.vector(0)
+        for p in range(scene.tie_start[t], last + 1):
+            after = self.vector(0)
+            if p < last:
+                D = scene.tie_segments[p]
+                d, w = D + self.parted(p, state.u, s, scene), self.vector(0) - self.parted(p, adjoint.w, 0, scene)
+                after = e_adj * self.unit(d) + self.across(pulled[0], n[2], d, w)
+                adjoint.tie_rest[p] = adjoint.tie_rest[p] + after - e_adj * self.unit(D)
+            self.store(p, before - after, first, scene, adjoint.corner)
+            before = after
+        for force in ti.static((now.force0, now.force1)):
+            half, share, r = ti.cast(0.5, self.fp), self.share(force, now), self.row(force)
+            by_a, by_s = half * T_adj, half * e_adj
+            pull = self.vector((1 - share) * by_a, share * by_a, half * T_adj * pulled[1], zero)
+            slack = self.vector((1 - share) * by_s, share * by_s, zero, zero)
+            adjoint.tie_felt[r, 2 * t] = adjoint.tie_felt[r, 2 * t] + pull
+            adjoint.tie_felt[r, 2 * t + 1] = adjoint.tie_felt[r, 2 * t + 1] + slack

@@ -1,0 +1,170 @@
+"""What holds a body by springs, cables and elastic foundations, in float64 on the host."""
+
+import numpy as np
+
+from diffsim_ti.inputs import Derived
+from diffsim_ti.inputs.ties import directions
+from diffsim_ti.potential.ties import Ties
+from diffsim_ti.state.schedule import Schedule
+
+
+class Foundation:
+    """f = -K u of vertices; `at` says K, shape (k, 3, 3)."""
+
+    def __init__(self, vertices: np.ndarray):
+        self.vertices = vertices
+
+    def at(self, rows: np.ndarray) -> "Foundation":
+        """With rows of K, shape (3 k, 3)."""
+        self.K = rows.reshape(-1, 3, 3)
+        return self
+
+    def forces(self, u: np.ndarray) -> np.ndarray:
+        """On its vertices [N], shape (k, 3)."""
+        return -np.einsum("kij,kj->ki", self.K, u[self.vertices])
+
+    def energies(self, u: np.ndarray) -> np.ndarray:
+        """Of each of its vertices [J]."""
+        return -0.5 * (self.forces(u) * u[self.vertices]).sum(1)
+
+
+class Attached:
+    """Energy, forces and derivatives of a scene's springs, cables and foundations; shapes (num_vertices, 3)."""
+
+    def __init__(self, scene):
+        n, self.num_springs = scene.mesh.num_vertices, 0
+        self.ties = self.foundation = None
+        if scene.ties:
+            cables = np.concatenate([np.full(len(t.paths(scene.mesh)), t in scene.cables) for t in scene.ties])
+            self.ties = Ties(scene.tie_paths, scene.one_sided_ties, cables, n)
+        if scene.foundations:
+            self.foundation = Foundation(scene.founded_vertices)
+
+    @classmethod
+    def of(cls, scene) -> "Attached | None":
+        """None where a scene has none."""
+        return cls(scene) if scene.ties or scene.foundations else None
+
+    def at(self, values: Derived, rows: np.ndarray | None, schedule: Schedule, j: int, share: float, laid: float = 1.0):
+        """At a share of the step of pass j; rows: of ties, in time; laid: share of given tensions that is laid on."""
+        if self.ties:
+            a, s, k = schedule.ties(rows, j, share)
+            self.ties.at(values.tie_segments, a * self._laid(laid), s, k)
+        if self.foundation:
+            self.foundation.at(values.foundation)
+        return self
+
+    def stiffest(self, values: Derived, rows: np.ndarray | None, schedule: Schedule) -> "Attached":
+        """With the largest tension and stiffness of each tie in `rows` and its least length: what a step has to follow."""
+        if self.ties:
+            ends = rows.reshape(len(rows), -1, 2, 3)
+            a, s = ends[:, :, 0, :2].max((0, 2)), ends[:, :, 1, :2].max((0, 2))
+            self.ties.at(values.tie_segments, a, s, ends[:, :, 0, 2].max(0))
+        if self.foundation:
+            self.foundation.at(values.foundation)
+        return self
+
+    def largest_omega2(self, mass: np.ndarray, u: np.ndarray, fixed: np.ndarray) -> float:
+        """A bound of the largest eigenvalue of M^-1 K [1/s^2] on the free vertices at displacements u, by sums of rows."""
+        rows = self.ties.row_sums(u) if self.ties else np.zeros(len(u))
+        if self.foundation:
+            rows[self.foundation.vertices] += np.abs(self.foundation.K).sum(2).max(1)
+        free = np.setdiff1d(np.nonzero(mass > 0)[0], fixed)
+        return float((rows[free] / mass[free]).max(initial=0.0))
+
+    def _laid(self, share: float) -> np.ndarray:
+        """Of each tie: those of springs are there from the start."""
+        return np.where(self.ties.cables, share, 1.0)
+
+    def energies(self, u: np.ndarray) -> np.ndarray:
+        """[J] of ties and of vertices on foundations."""
+        parts = [part.energies(u) for part in (self.ties, self.foundation) if part]
+        return np.concatenate(parts)
+
+    def stored(self, u: np.ndarray) -> dict[str, float]:
+        """Energies [J] by name, without that of cables, which are loads."""
+        out = {}
+        if self.ties and not self.ties.cables.all():
+            out["springs"] = float(self.ties.energies(u)[~self.ties.cables].sum())
+        if self.foundation:
+            out["foundations"] = float(self.foundation.energies(u).sum())
+        return out
+
+    def forces(self, u: np.ndarray) -> np.ndarray:
+        """[N]"""
+        out = self.ties.forces(u) if self.ties else np.zeros_like(u)
+        if self.foundation:
+            out[self.foundation.vertices] += self.foundation.forces(u)
+        return out
+
+    def sizes(self, u: np.ndarray) -> np.ndarray:
+        """Sum of the sizes of the forces that meet at each vertex [N]."""
+        out = self.ties.sizes(u) if self.ties else np.zeros(len(u))
+        if self.foundation:
+            out[self.foundation.vertices] += np.linalg.norm(self.foundation.forces(u), axis=1)
+        return out
+
+    def product(self, u: np.ndarray, w: np.ndarray, convex: bool = False) -> np.ndarray:
+        """d2E/du2 w [N]; convex: without what has negative curvature."""
+        out = self.ties.product(u, w, convex) if self.ties else np.zeros_like(w)
+        if self.foundation:
+            out[self.foundation.vertices] -= self.foundation.forces(w)
+        return out
+
+    def blocks(self, u: np.ndarray) -> np.ndarray:
+        """3x3 diagonal blocks of d2E/du2 [N/m]."""
+        out = self.ties.blocks(u) if self.ties else np.zeros((len(u), 3, 3))
+        if self.foundation:
+            out[self.foundation.vertices] += self.foundation.K
+        return out
+
+    def jvp(self, u, du, moved: Derived, schedule: Schedule, j: int, share: float, laid: float = 1.0) -> np.ndarray:
+        """Change of the forces for changes of displacements and numbers, at the time that `at` was told."""
+        out = np.zeros_like(du)
+        if self.ties:
+            a, s, k = schedule.ties(moved.ties, j, share)
+            out += self.ties.jvp(u, du, moved.tie_segments, a * self._laid(laid), s, k)
+        if self.foundation:
+            own, f = self.foundation.vertices, self.foundation
+            out[own] += f.forces(du) - np.einsum("kij,kj->ki", moved.foundation.reshape(-1, 3, 3), u[own])
+        return out
+
+    def vjp(self, u, w, adj: Derived, schedule: Schedule, j: int, share: float, laid: float = 1.0) -> np.ndarray:
+        """Adjoint of displacements for that of the forces; adds those of numbers to `adj`."""
+        out = np.zeros_like(w)
+        if self.ties:
+            by_u, segments, (a, s, k) = self.ties.vjp(u, w)
+            out += by_u
+            adj.tie_segments += segments
+            schedule.add_ties(adj.ties, j, share, (a * self._laid(laid), s, k))
+        if self.foundation:
+            own = self.foundation.vertices
+            out[own] += self.foundation.forces(w)
+            adj.foundation -= (w[own][:, :, None] * u[own][:, None]).reshape(-1, 3)
+        return out
+
+
+def attached_places(scene, of_piece: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Places at rest [m] where springs to anchors and foundations hold a piece of the body, a mask over its vertices, and
+    projectors onto the directions in which they do, (k, 3) and (k, 3, 3)."""
+    places, held = [np.zeros((0, 3))], [np.zeros((0, 3, 3))]
+    derived = scene.inputs.derive(scene.inputs.at_times([0.0])) if scene.springs or scene.foundations else None
+    if scene.foundations:
+        vertices = scene.founded_vertices
+        values, vectors = np.linalg.eigh(derived.foundation.reshape(-1, 3, 3))
+        kept = (values > 1e-9 * values.max(initial=0.0))[:, None] * vectors
+        own = of_piece[vertices]
+        places.append(scene.mesh.vertices[vertices[own]])
+        held.append((kept @ np.swapaxes(kept, 1, 2))[own])
+    if scene.springs:
+        paths, n = scene.tie_paths, scene.mesh.num_vertices
+        points, stiffness = paths.matrix(n), derived.ties[0, 0::2, 2]
+        springs = sum(len(term.paths(scene.mesh)) for term in scene.springs)
+        for k, first in enumerate(paths.first_point[:springs]):
+            ends = np.array([first, first + 1])
+            body = ends[~np.isin(ends, paths.anchored)]
+            if len(body) == 1 and stiffness[k] > 0 and of_piece[paths.vertices[paths.first_corner[body[0]]]]:
+                along = directions(derived.tie_segments[first : first + 1])[0]
+                places.append(points[body] @ scene.mesh.vertices)
+                held.append((np.outer(along, along) if along.any() else np.eye(3))[None])
+    return np.concatenate(places), np.concatenate(held)

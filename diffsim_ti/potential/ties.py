@@ -1,0 +1,132 @@
+"""Springs and cables in float64 on the host: energy, forces, their derivatives both ways.
+
+The numbers are those of inputs/ties.py: T = a + k e, e = L - L0 + s, and where a tie pulls only, e is zero where it would be
+less. d = D + C u: segments, D at rest, C from displacements of vertices.
+"""
+
+import numpy as np
+
+from diffsim_ti.inputs.ties import directions
+from diffsim_ti.mesh.paths import Paths
+
+
+class Ties:
+    """Springs and, after them, cables; `at` says what they are at a time."""
+
+    def __init__(self, paths: Paths, one_sided: np.ndarray, cables: np.ndarray, num_vertices: int):
+        self.paths, self.one_sided, self.cables = paths, one_sided, cables
+        places, starts = paths.matrix(num_vertices), paths.starts
+        self.parted = (places[starts + 1] - places[starts]).tocsr()  # C
+        entries = self.parted.tocoo()
+        self._entries = entries.row, entries.data
+        pairs, self._pair = np.unique(paths.path_of[entries.row] * num_vertices + entries.col, return_inverse=True)
+        self._pair_path, self._pair_vertex = np.divmod(pairs, num_vertices)
+        self.num_vertices = num_vertices
+
+    def at(self, segments: np.ndarray, tension: np.ndarray, slack: np.ndarray, stiffness: np.ndarray) -> "Ties":
+        """With segments at rest (points, 3) [m], and a, s, k of each tie."""
+        self.D, self.a, self.s, self.k = segments[self.paths.starts], tension, slack, stiffness
+        self._seen = None
+        return self
+
+    def _sums(self, of_segments):
+        """Of each path."""
+        return np.bincount(self.paths.path_of, of_segments, len(self.paths))
+
+    def _state(self, u):
+        """(t, lengths, L - L0, e as far as it pulls, k as far as e does, T)"""
+        if self._seen is not None and np.array_equal(self._seen[0], u):
+            return self._seen[1]
+        moved = self.parted @ u
+        d, length = self.D + moved, np.linalg.norm(self.D + moved, axis=1)
+        both = length + np.linalg.norm(self.D, axis=1)
+        longer = (moved * (self.D + d)).sum(1)
+        stretch = self._sums(np.divide(longer, both, out=np.zeros_like(both), where=both > 0))
+        e = stretch + self.s
+        pulls = ~(self.one_sided & (e <= 0))
+        e, k = e * pulls, self.k * pulls
+        out = directions(d), length, stretch, e, k, self.a + self.k * e
+        self._seen = np.array(u), out
+        return out
+
+    def _across(self, t, length, T, x):
+        """T/|d| of what of x lies across segments; of a spring without length k x."""
+        T, k = T[self.paths.path_of], self.k[self.paths.path_of]
+        q = np.divide(T, length, out=np.array(k), where=length > 0)
+        return q[:, None] * (x - (t * x).sum(1)[:, None] * t)
+
+    def lengths(self, u: np.ndarray) -> np.ndarray:
+        """Length of each path [m]."""
+        return self._sums(self._state(u)[1])
+
+    def tensions(self, u: np.ndarray) -> np.ndarray:
+        """T of each [N]."""
+        return self._state(u)[5]
+
+    def energies(self, u: np.ndarray) -> np.ndarray:
+        """a (L - L0) + k e^2 / 2 of each [J]."""
+        _, _, stretch, e, k, _ = self._state(u)
+        return self.a * stretch + 0.5 * k * e * e
+
+    def forces(self, u: np.ndarray, cables: bool = False) -> np.ndarray:
+        """On vertices [N], shape (num_vertices, 3); cables: theirs alone."""
+        t, *_, T = self._state(u)
+        T = T * self.cables if cables else T
+        return -(self.parted.T @ (T[self.paths.path_of, None] * t))
+
+    def sizes(self, u: np.ndarray) -> np.ndarray:
+        """Sum of the sizes of the forces that meet at each vertex [N]."""
+        T = np.abs(self._state(u)[5])[self.paths.path_of]
+        return abs(self.parted).T @ T
+
+    def product(self, u: np.ndarray, w: np.ndarray, convex: bool = False) -> np.ndarray:
+        """d2E/du2 w [N]; convex: without what pushes, which has negative curvature."""
+        t, length, _, _, k, T = self._state(u)
+        dd = self.parted @ w
+        along = (k * self._sums((t * dd).sum(1)))[self.paths.path_of]
+        across = self._across(t, length, np.maximum(T, 0) if convex else T, dd)
+        return self.parted.T @ (along[:, None] * t + across)
+
+    def blocks(self, u: np.ndarray) -> np.ndarray:
+        """3x3 diagonal blocks of d2E/du2 [N/m], shape (num_vertices, 3, 3)."""
+        t, length, _, _, k, T = self._state(u)
+        row, data = self._entries
+        g = np.stack([np.bincount(self._pair, data * t[row, d], len(self._pair_path)) for d in range(3)], 1)
+        out = np.zeros((self.num_vertices, 3, 3))
+        np.add.at(out, self._pair_vertex, k[self._pair_path, None, None] * g[:, :, None] * g[:, None, :])
+        bare = np.stack([self._across(t, length, T, np.tile(axis, (len(t), 1))) for axis in np.eye(3)], 2)
+        squared = self.parted.multiply(self.parted).T.tocsr()
+        return out + (squared @ bare.reshape(-1, 9)).reshape(-1, 3, 3)
+
+    def row_sums(self, u: np.ndarray) -> np.ndarray:
+        """A bound of the sums of |d2E/du2| over the block row of each vertex [N/m]."""
+        t, length, _, _, k, T = self._state(u)
+        row, data = self._entries
+        g = np.stack([np.bincount(self._pair, data * t[row, d], len(self._pair_path)) for d in range(3)], 1)
+        size = np.linalg.norm(g, axis=1)
+        whole = np.bincount(self._pair_path, size, len(self.paths))
+        out = np.bincount(self._pair_vertex, (k * whole)[self._pair_path] * size, self.num_vertices)
+        T, k = T[self.paths.path_of], self.k[self.paths.path_of]
+        q = np.abs(np.divide(T, length, out=np.array(k), where=length > 0))
+        C = abs(self.parted)
+        return out + C.T @ (q * np.asarray(C.sum(1)).ravel())
+
+    def jvp(self, u, du, segments_dot, tension_dot, slack_dot, stiffness_dot) -> np.ndarray:
+        """Change of the forces for changes of everything."""
+        t, length, _, e, k, T = self._state(u)
+        dD = segments_dot[self.paths.starts]
+        dd = dD + self.parted @ du
+        de = self._sums((t * dd).sum(1) - (directions(self.D) * dD).sum(1)) + slack_dot
+        dT = (tension_dot + stiffness_dot * e + k * de)[self.paths.path_of]
+        return -(self.parted.T @ (dT[:, None] * t + self._across(t, length, T, dd)))
+
+    def vjp(self, u: np.ndarray, w: np.ndarray) -> tuple:
+        """Adjoints of (u, segments, (a, s, k)) for the adjoint w of the forces."""
+        t, length, _, e, k, T = self._state(u)
+        w = -(self.parted @ w)
+        T_adj = self._sums((t * w).sum(1))
+        e_adj = T_adj * k
+        d_adj = e_adj[self.paths.path_of, None] * t + self._across(t, length, T, w)
+        segments = np.zeros((self.paths.num_points, 3))
+        segments[self.paths.starts] = d_adj - e_adj[self.paths.path_of, None] * directions(self.D)
+        return self.parted.T @ d_adj, segments, (T_adj, e_adj, T_adj * e)

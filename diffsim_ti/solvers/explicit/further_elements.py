@@ -1,0 +1,107 @@
+"""What passes go through besides tetrahedra, and what else only some scenes have: pressed triangles, springs and cables,
+foundations, guides."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import taichi as ti
+
+from diffsim_ti.elements.pressed_triangle import PRESSED, PressedTriangle
+from diffsim_ti.elements.tie import TIED, TieElement
+from diffsim_ti.runtime import let, traced
+from diffsim_ti.solvers.explicit.foundations import FOUNDED
+from diffsim_ti.solvers.explicit.guides import GUIDED
+from diffsim_ti.state.features import Features
+from diffsim_ti.state.numbers import ALONE
+
+A = ti.template()  # an array or Bundle handed to a Taichi function
+
+
+@dataclass(frozen=True)
+class FurtherElements:
+    """Functions of item k of those after the tetrahedra: pressed triangles first."""
+
+    features: Features
+    precision: str
+
+    @property
+    def any(self) -> bool:
+        return self.pressed or self.tied
+
+    @property
+    def pressed(self) -> bool:
+        return self.features.pressed
+
+    @property
+    def tied(self) -> bool:
+        return self.features.tied
+
+    @cached_property
+    def triangle(self) -> PressedTriangle:
+        return PressedTriangle(self.precision, self.features.pressure_per_step, self.features.shape)
+
+    @cached_property
+    def tie(self) -> TieElement:
+        return TieElement(self.precision, self.features.ties_per_step)
+
+    @traced
+    def after(self, plan):
+        """Number of items of tetrahedra and of these."""
+        if self.tied:
+            return let(plan.num_items + plan.num_pressed + plan.num_ties)
+        return let(plan.num_items + plan.num_pressed) if self.pressed else plan.num_items
+
+    @property
+    def arrays(self) -> dict:
+        """What kernels read of the scene for all of that."""
+        has, out = self.features, {}
+        for some, own in ((has.pressed, PRESSED), (has.tied, TIED), (has.founded, FOUNDED), (has.guided, GUIDED)):
+            out |= own if some else {}
+        return out
+
+    @property
+    def tangent(self) -> dict:
+        """Those of which there are changes."""
+        return {name: kind for name, kind in self.arrays.items() if name in ALONE}
+
+    @property
+    def adjoint(self) -> dict:
+        """Where their adjoints are added."""
+        out = dict(pressed_felt="vectors2", pressed_rest="vectors") if self.pressed else {}
+        out |= dict(tie_felt="vectors2", tie_rest="vectors") if self.tied else {}
+        return out | (dict(foundation_felt="vectors") if self.features.founded else {})
+
+    @property
+    def counts(self) -> dict:
+        """The numbers that kernels take."""
+        out = ["num_pressed"] if self.any else []
+        out += ["first_pressed"] if self.pressed else []
+        out += ["num_ties", "first_tied"] if self.tied else []
+        return dict.fromkeys([*out, *(["first_load"] if self.features.loaded_corners else [])], "int")
+
+    @ti.func
+    def forces(self, k, now: A, scene: A, state: A, s, plan: A):
+        if ti.static(self.pressed):
+            if k < plan.num_pressed:
+                self.triangle.forces(k, now, scene, state, s, plan.first_pressed)
+        if ti.static(self.tied):
+            if k >= plan.num_pressed:
+                self.tie.forces(k - plan.num_pressed, now, scene, state, s, plan.first_tied)
+
+    @ti.func
+    def forces_jvp(self, k, now: A, scene: A, state: A, s, tangent: A, plan: A):
+        if ti.static(self.pressed):
+            if k < plan.num_pressed:
+                self.triangle.forces_jvp(k, now, scene, state, s, tangent, plan.first_pressed)
+        if ti.static(self.tied):
+            if k >= plan.num_pressed:
+                self.tie.forces_jvp(k - plan.num_pressed, now, scene, state, s, tangent, plan.first_tied)
+
+    @ti.func
+    def forces_vjp(self, k, now: A, scene: A, state: A, s, adjoint: A, plan: A):
+        if ti.static(self.pressed):
+            if k < plan.num_pressed:
+                self.triangle.forces_vjp(k, now, scene, state, s, adjoint, plan.first_pressed)
+        if ti.static(self.tied):
+            if k >= plan.num_pressed:
+                self.tie.forces_vjp(k - plan.num_pressed, now, scene, state, s, adjoint, plan.first_tied)

@@ -1,0 +1,74 @@
+"""An elastic foundation on a surface."""
+
+from copy import copy
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from diffsim_ti.inputs import Input, Link
+from diffsim_ti.inputs.foundation import FoundationStiffness
+from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.terms.term import Term
+from diffsim_ti.terms.ties import AT_LEAST_0
+
+
+class ElasticFoundation(Term):
+    """Springs under a surface that pull it back to where it is at rest (Winkler): on each vertex f = -K u, u its
+    displacement from the rest shape,
+
+        K = sum over its triangles of A / 3 [t I + (c - t) N N^T]
+
+    A, N: area and normal at rest, c: `normal`, t: `tangential`: stiffness per area [N/m^3]. It pushes and pulls alike, and
+    stands still. Exact for what is constant on linear triangles.
+
+    surface: a surface set's name, several, rows of `surface_triangles`; None: all of the surface. normal, tangential: one
+    number or one for each of its triangles, in the order of `mesh.surface_indices(surface)`.
+    Inputs with gradient: "foundation_normal" and "foundation_tangential", or "<name>.normal" and "<name>.tangential"; the
+    rest shape counts by areas and normals.
+    Raises ValueError for unknown sets, other shapes, and stiffness below zero.
+    Winkler 1867, Die Lehre von der Elasticitaet und Festigkeit, sec. 195; Hetenyi 1946, Beams on Elastic Foundation, ch. 1.
+    """
+
+    num_numbers = 0  # what kernels read of it lies in arrays of its own
+
+    def __init__(
+        self,
+        normal: ArrayLike,
+        tangential: ArrayLike = 0.0,
+        surface: str | ArrayLike | None = None,
+        name: str | None = None,
+    ):
+        both = [
+            Input(argument, given, ((), ("k",)), "N/m^3", AT_LEAST_0, plain=f"foundation_{argument}", label=argument)
+            for argument, given in (("normal", normal), ("tangential", tangential))
+        ]
+        super().__init__(*both, name=name)
+        self.surface = surface
+
+    def triangles(self, mesh: TetrahedralMesh) -> np.ndarray:
+        """Where it acts, as vertex indices, shape (k, 3)."""
+        return mesh.surface_triangles[mesh.surface_indices(self.surface)]
+
+    def indices(self, mesh: TetrahedralMesh) -> np.ndarray:
+        """Vertices that it holds."""
+        return np.unique(self.triangles(mesh))
+
+    def check(self, mesh: TetrahedralMesh) -> None:
+        count = len(self.triangles(mesh))
+        if count == 0:
+            raise ValueError("ElasticFoundation holds nothing: the set is empty; name a set that has members")
+        for i in self.described:
+            if i.value.ndim and len(i.value) != count:
+                raise ValueError(
+                    f"ElasticFoundation: {i.name} has {len(i.value)} numbers for {count} triangles; give one or {count}"
+                )
+
+    def settled(self, scene, density, initial_positions, initial_velocities) -> "ElasticFoundation":
+        out = copy(self)
+        out.mesh = scene.mesh
+        return out
+
+    def links(self, names: dict[str, str], own: str) -> list[Link]:
+        normal, tangential = (names[i.plain] for i in self.described)
+        triangles, vertices = self.triangles(self.mesh), self.indices(self.mesh)
+        return [FoundationStiffness(triangles, vertices, normal, tangential, f"{own} matrices")]
