@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from chamber_meshes import hollow_cube
 from matplotlib.image import imread
 
 import diffsim_ti as ds
@@ -55,6 +56,26 @@ def test_pressure_stands_on_the_surface_as_it_is():
     (mark,) = marks_of(scene_of(ds.Pressure(-50.0, "xmax")), x)
     assert not mark.onto.any() and mark.vectors[:, 1] == pytest.approx(50.0)  # suction pulls outwards
     assert marks_of(scene_of(ds.Pressure(0.0)), x) == []
+
+
+def test_springs_cables_foundations_and_gases():
+    """Lines from point to point as they are now, anchors and founded vertices as points, the gas's own pressure."""
+    X, top = cube().vertices, np.array([0.1, 0.4, 0.1])
+    ties = ds.Spring(0, 1, 10.0), ds.Cable([[0.1, 0.2, 0.1], ds.Anchor(top), 2], tension=1.0, name="tendon")
+    marks = marks_of(scene_of(*ties, ds.ElasticFoundation(1e4, 0.0, "ymax")), 1.5 * X)
+    spring, tendon, anchor, founded = marks
+    assert [m.label for m in marks] == ["spring", "tendon", "tendon, anchored", "foundation"]
+    np.testing.assert_allclose(spring.ends, 1.5 * X[None, [0, 1]])
+    np.testing.assert_allclose(tendon.ends, [[[0.15, 0.3, 0.15], top], [top, 1.5 * X[2]]], atol=1e-15)
+    np.testing.assert_allclose(anchor.points, [top])
+    assert len(founded.points) == 9 and np.all(founded.points[:, 1] == pytest.approx(0.3))
+    body = hollow_cube()
+    gas = ds.Scene(
+        body, ds.StableNeoHookean(5e4, 0.3), 1000.0, ds.GasChamber(2e5, "cavity", 5e4), "bottom", precision="f64"
+    )
+    (mark,) = marks_of(gas, 2.0 * body.vertices)  # eight times the volume
+    assert mark.label == "gas [Pa]" and not mark.onto.any()  # it sucks
+    assert np.linalg.norm(mark.vectors, axis=1) == pytest.approx(5e4 - 2e5 / 8)
 
 
 def test_forces_of_vertices_and_of_volumes():

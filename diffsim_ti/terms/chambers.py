@@ -11,6 +11,7 @@ from diffsim_ti.inputs.chambers import RestVolume
 from diffsim_ti.inputs.loads import InTime
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.enclosure import Enclosure
+from diffsim_ti.terms.marks import pressing
 from diffsim_ti.terms.over_time import OverTime, amount, is_keyed, rows_at
 from diffsim_ti.terms.term import Term
 
@@ -111,6 +112,12 @@ class GasChamber(Chamber):
             Input("exponent", exponent, ((),), "-", POSITIVE, plain="gas_exponent", label="exponent"),
         )
         super().__init__("pressure", pressure, "Pa", "gas_pressure", surface, name, *more)
+
+    def drawn(self, moment):
+        p, outside, exponent = (float(moment.values[i.plain]) for i in self.described)
+        ratio = self.enclosure.volume(moment.mesh.vertices) / self.enclosure.volume(moment.positions)
+        label = f"{self.name or 'gas'} [Pa]"
+        return pressing(label, moment, self.triangles(moment.mesh), p * ratio**exponent - outside)
 
 
 class FilledChamber(Chamber):

@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 from diffsim_ti.inputs import Input, Link
 from diffsim_ti.inputs.foundation import FoundationStiffness
 from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.terms.marks import MOST, Points, spread
 from diffsim_ti.terms.term import Term
 from diffsim_ti.terms.ties import AT_LEAST_0
 
@@ -67,6 +68,11 @@ class ElasticFoundation(Term):
         out = copy(self)
         out.mesh = scene.mesh
         return out
+
+    def drawn(self, moment):
+        vertices = self.indices(moment.mesh)
+        vertices = vertices[spread(moment.mesh.vertices[vertices], MOST)]
+        return [Points(self.name or "foundation", moment.positions[vertices])]
 
     def links(self, names: dict[str, str], own: str) -> list[Link]:
         normal, tangential = (names[i.plain] for i in self.described)

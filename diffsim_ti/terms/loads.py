@@ -8,8 +8,7 @@ from numpy.typing import ArrayLike
 from diffsim_ti.inputs import Link
 from diffsim_ti.inputs.loads import InTime, Spread, VertexAreas, VertexShares
 from diffsim_ti.mesh import TetrahedralMesh
-from diffsim_ti.mesh.geometry import triangle_normals
-from diffsim_ti.terms.marks import MOST, Arrows, arrows, spread
+from diffsim_ti.terms.marks import arrows, pressing
 from diffsim_ti.terms.over_time import OverTime, amount, is_keyed, rows_at
 from diffsim_ti.terms.term import Term
 
@@ -168,15 +167,8 @@ class Pressure(Load):
         return [self.in_time(names, own)]
 
     def drawn(self, moment):
-        triangles, pressure = self.triangles(moment.mesh), float(moment.values[self.plain])
-        if pressure == 0:
-            return []
-        middle = moment.mesh.vertices[triangles].mean(1)
-        triangles = triangles[spread(middle, MOST)]
-        n = triangle_normals(moment.positions, triangles)
-        vectors = -pressure * n / np.linalg.norm(n, axis=1, keepdims=True)
-        onto = np.full(len(n), pressure > 0)
-        return [Arrows(f"{self.name or 'pressure'} [Pa]", moment.positions[triangles].mean(1), vectors, onto)]
+        label, pressure = f"{self.name or 'pressure'} [Pa]", float(moment.values[self.plain])
+        return pressing(label, moment, self.triangles(moment.mesh), pressure)
 
 
 def _some(load: Load, rows: np.ndarray) -> np.ndarray:

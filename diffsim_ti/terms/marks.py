@@ -73,6 +73,16 @@ def arrows(
     return Arrows(label, positions[vertices], vectors, into)
 
 
+def pressing(label: str, moment: Moment, triangles: np.ndarray, pressure: float) -> list[Arrows]:
+    """Arrows of a pressure [Pa] on triangles, against their normals if it is positive; none where it is zero."""
+    if pressure == 0:
+        return []
+    triangles = triangles[spread(moment.mesh.vertices[triangles].mean(1), MOST)]
+    n = triangle_normals(moment.positions, triangles)
+    vectors = -pressure * n / np.linalg.norm(n, axis=1, keepdims=True)
+    return [Arrows(label, moment.positions[triangles].mean(1), vectors, np.full(len(n), pressure > 0))]
+
+
 def vertex_normals(mesh: TetrahedralMesh, positions: np.ndarray) -> np.ndarray:
     """Area vectors [m^2] of the surface around each vertex, a third of each triangle's, shape (num_vertices, 3)."""
     out, normals = np.zeros((mesh.num_vertices, 3)), triangle_normals(positions, mesh.surface_triangles)

@@ -12,6 +12,7 @@ from diffsim_ti.inputs.loads import InTime
 from diffsim_ti.inputs.ties import Segments, TieRows
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.paths import Paths
+from diffsim_ti.terms.marks import Lines, Points
 from diffsim_ti.terms.over_time import OverTime, amount, is_keyed, rows_at
 from diffsim_ti.terms.term import Term
 
@@ -55,6 +56,16 @@ class Tie(Term):
         out = copy(self)
         out.mesh = scene.mesh
         return out
+
+    def drawn(self, moment):
+        paths, label = self.paths(moment.mesh), self.name or type(self).__name__.lower()
+        points = paths.matrix(moment.mesh.num_vertices) @ moment.positions
+        marks = []
+        if len(paths.anchored):
+            plain = next(i.plain for i in self.described if i.name == "anchors")
+            points[paths.anchored] = moment.values[plain]
+            marks = [Points(f"{label}, anchored", points[paths.anchored])]
+        return [Lines(label, np.stack([points[paths.starts], points[paths.starts + 1]], 1)), *marks]
 
     def links(self, names: dict[str, str], own: str) -> list[Link]:
         paths, segments, made = self.paths(self.mesh), f"{own} segments", {}
