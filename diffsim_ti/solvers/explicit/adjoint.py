@@ -90,8 +90,10 @@ class ExplicitAdjoint:
             self.impulses.clear()
             self.mass_adj[:] = 0
         self.numbers.clear()
-        pressed = self.pressed_felt, self.pressed_rest, self.chamber_felt, self.chamber_rest
-        pressed += self.tie_felt, self.tie_rest, self.foundation_felt
+        has, pressed = self.features, (self.pressed_felt, self.pressed_rest)
+        pressed += (self.chamber_felt, self.chamber_rest) if self.ws.chambers else ()
+        pressed += (self.tie_felt, self.tie_rest) if has.tied else ()
+        pressed += (self.foundation_felt,) if has.founded else ()
         for target in (self.felt, self.path, self.u, self.v, self.w, self.z, *pressed):
             if target is not None:
                 runtime.fill(target, 0)

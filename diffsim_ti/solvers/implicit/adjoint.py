@@ -129,7 +129,7 @@ class ImplicitAdjoint(RecordedPasses):
         if ws.volumes:
             by_star, nu = ws.volumes.adjoint(self.places, by_star, self.chambers.adjoint(j, per_frame), self.solve)
         runtime.fill(ws.potential.w, by_star[None])
-        for target in (self.lag, self.walls, self.pressed):
+        for target in (self.lag, self.walls, *[self.pressed] * ws.potential.presses):
             runtime.fill(target, 0)
         if ws.pairs:
             ws.pairs.vjp(ws.potential.u, 0, ws.potential.w, ws.arrays.corner)
