@@ -34,15 +34,11 @@ def rollout_of(name, solver, rough=True, moving=True, **options):
 
 
 @pytest.mark.parametrize("name", SHAPES)
-def test_every_input(name, request):
+def test_every_input(name):
     """Moduli, density, gravity, the shape's numbers, stiffness, width, friction, path, rest shape: against differences.
-
-    Points within faces feel one of the shapes; test_contact_faces.py has the others.
 
     Friction is C1, so that Taylor's rate may fall below 2 where a step leaves its smooth piece: differences decide here.
     """
-    if name != "box":
-        request.getfixturevalue("vertices_alone")
     rollout = rollout_of(name, ds.SemiImplicitSolver)
     report = ds.check_gradients(rollout, verbose=False)
     assert rollout.forward().contact_resolution.smallest_gap < 0.19

@@ -86,7 +86,9 @@ def test_no_step_is_too_large_for_the_barrier(speed):
 
 def rubbing(solver, shape="ground", **options) -> ds.Rollout:
     """A body pressed on a moving, rough obstacle, sliding and sticking."""
-    mesh, rng = tetrahedron(0.006), np.random.default_rng(0)
+    # nearer to what points within faces feel, these push with 1e6 N at first, and rounding is as large
+    height = 0.02 if shape in ("sphere", "box") else 0.006
+    mesh, rng = tetrahedron(height), np.random.default_rng(0)
     obstacle = SHAPES[shape](
         stiffness=2e3, width=0.05, friction=0.4, friction_speed=0.05, path=lambda t: [0.3 * t, 0.1 * t, -0.2 * t]
     )
@@ -115,9 +117,7 @@ def test_gradients_through_friction_on_a_moving_obstacle(solver):
 @pytest.mark.executed_ptx
 @pytest.mark.parametrize("shape", ["half_space", "sphere", "box", "mesh"])
 def test_reverse_sweep_against_tangent_on_every_shape(shape):
-    """To what linear solves of 1e-11 leave: forces of points within faces are ten times firmer than those of vertices."""
-    gate = 1e-9 if shape == "half_space" else 1e-8  # 1.3e-9 seen
-    assert ds.dot_product_test(rubbing(ds.ImplicitEulerSolver, shape)) < gate
+    assert ds.dot_product_test(rubbing(ds.ImplicitEulerSolver, shape)) < 1e-9
 
 
 @solvers
