@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import taichi as ti
 
-from diffsim_ti.runtime import PRECISIONS
+from diffsim_ti.elements.step_numbers import StepNumbers
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
 PRESSED = dict(
@@ -17,44 +17,16 @@ PRESSED = dict(
 
 
 @dataclass(frozen=True)
-class PressedTriangle:
+class PressedTriangle(StepNumbers):
     """Functions of one triangle in a pass; per_step: whether pressures have a row for each step; shape: of adjoints."""
 
-    precision: str
-    per_step: bool
     shape: bool
-
-    @property
-    def fp(self):
-        return PRECISIONS[self.precision]
-
-    @property
-    def vector(self):
-        return ti.types.vector(4, self.fp)
-
-    @ti.func
-    def cross(self, a, b):
-        zero = ti.cast(0, self.fp)
-        return self.vector(a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0], zero)
 
     @ti.func
     def edges(self, t, x: A, rest: A, s, scene: A):
         """x_1 - x_0 and x_2 - x_0 of rest + x in slot s."""
         i, j, k = scene.pressed[3 * t], scene.pressed[3 * t + 1], scene.pressed[3 * t + 2]
         return (rest[j] - rest[i]) + (x[s, j] - x[s, i]), (rest[k] - rest[i]) + (x[s, k] - x[s, i])
-
-    @ti.func
-    def row(self, force):
-        """The row of pressures that a kick of a step takes."""
-        r = 0
-        if ti.static(self.per_step):
-            r = force
-        return r
-
-    @ti.func
-    def share(self, force, now: A):
-        """How far in that step the pass lies: it ends a step before its own."""
-        return ti.select(force == now.row, now.begin, ti.cast(1, self.fp))
 
     @ti.func
     def factor(self, t, now: A, rows: A, scene: A):

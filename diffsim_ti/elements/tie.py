@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import taichi as ti
 
-from diffsim_ti.runtime import PRECISIONS
+from diffsim_ti.elements.step_numbers import StepNumbers
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
 TIED = dict.fromkeys(("tie_start", "point_start", "point_vertex", "tie_one_sided"), "ints") | dict(
@@ -19,19 +19,8 @@ TIED = dict.fromkeys(("tie_start", "point_start", "point_vertex", "tie_one_sided
 
 
 @dataclass(frozen=True)
-class TieElement:
+class TieElement(StepNumbers):
     """Functions of one tie in a pass; per_step: whether its numbers have a row for each step."""
-
-    precision: str
-    per_step: bool
-
-    @property
-    def fp(self):
-        return PRECISIONS[self.precision]
-
-    @property
-    def vector(self):
-        return ti.types.vector(4, self.fp)
 
     @ti.func
     def length(self, d):
@@ -56,18 +45,6 @@ class TieElement:
     def parted(self, p, x: A, s, scene: A):
         """How much more than point p the next one moves."""
         return self.moved(p + 1, x, s, scene) - self.moved(p, x, s, scene)
-
-    @ti.func
-    def row(self, force):
-        r = 0
-        if ti.static(self.per_step):
-            r = force
-        return r
-
-    @ti.func
-    def share(self, force, now: A):
-        """How far in that step the pass lies: it ends a step before its own."""
-        return ti.select(force == now.row, now.begin, ti.cast(1, self.fp))
 
     @ti.func
     def numbers(self, t, now: A, rows: A):

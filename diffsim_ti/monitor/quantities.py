@@ -137,7 +137,7 @@ def barrier_energies(workspace: Workspace) -> np.ndarray:
 
 def attached_energies(workspace: Workspace) -> dict[str, float]:
     """Energies [J] of springs and foundations in the current state."""
-    attached = Attached.of(workspace.scene)
+    attached = workspace.kept("attached", lambda: Attached.of(workspace.scene))
     if not attached:
         return {}
     a, u = workspace.arrays, runtime.fetch_row(workspace.state.u, 0)

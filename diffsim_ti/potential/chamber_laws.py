@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from diffsim_ti.terms import FilledChamber
+
 
 class Gas:
     """p = p_0 (V_0 / V)^n - p_out of numbers (p_0, p_out, V_0, n)."""
@@ -80,9 +82,6 @@ class Held:
         return change * (self.pressure(V) - 0.5 * self.gamma * change) if V + change > 0 else -np.inf
 
 
-LAWS = {4: Gas, 2: Held}
-
-
 def law_of(chamber) -> Gas | Held:
     """The law of a term (terms/chambers.py)."""
-    return LAWS[len(chamber.row_names)]()
+    return Held() if isinstance(chamber, FilledChamber) else Gas()

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import taichi as ti
 
+from diffsim_ti.runtime import at, let, traced
 from diffsim_ti.state.obstacle_functions import ObstacleFunctions
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
@@ -83,17 +84,18 @@ class ObstaclePotential(ObstacleFunctions):
             felt = g.force.touches(scene.parameters, g.first + k * g.size, X, pass_.lag[0, i])
         return felt
 
+    @traced
+    def felt_at(self, g, k, i, scene, pass_):
+        """What friction takes its normal force from, as `rub` has it: a place, or `pressed`."""
+        if self.reaches(g):
+            return None, let(at(pass_.pressed, g.number + k, i))
+        return self.rest_before(g, k, i, scene, pass_), let(at(pass_.lag, 0, i))
+
     @ti.func
     def lost(self, g: A, k, i, u, scene: A, pass_: A, plan: A):
         """Potential of friction by the velocity [W]."""
         v, wall, first = self.velocity(i, u, pass_, plan), pass_.walls[3 * (g.number + k) + 2], g.first + k * g.size
-        value = ti.cast(0, self.fp)
-        if ti.static(self.reaches(g)):
-            value = g.force.dissipation(scene.parameters, first, None, pass_.pressed[g.number + k, i], v, wall)
-        else:
-            X = self.rest_before(g, k, i, scene, pass_)
-            value = g.force.dissipation(scene.parameters, first, X, pass_.lag[0, i], v, wall)
-        return value
+        return g.force.dissipation(scene.parameters, first, self.felt_at(g, k, i, scene, pass_), v, wall)
 
     @ti.func
     def push(self, g: A, k, i, u, scene: A, pass_: A):
@@ -103,25 +105,14 @@ class ObstaclePotential(ObstacleFunctions):
     @ti.func
     def drag(self, g: A, k, i, u, scene: A, pass_: A, plan: A):
         v, wall, first = self.velocity(i, u, pass_, plan), pass_.walls[3 * (g.number + k) + 2], g.first + k * g.size
-        f = self.vector(0)
-        if ti.static(self.reaches(g)):
-            f = g.force.rub(scene.parameters, first, None, pass_.pressed[g.number + k, i], v, wall)
-        else:
-            X = self.rest_before(g, k, i, scene, pass_)
-            f = g.force.rub(scene.parameters, first, X, pass_.lag[0, i], v, wall)
-        return f
+        return g.force.rub(scene.parameters, first, self.felt_at(g, k, i, scene, pass_), v, wall)
 
     @ti.func
     def drag_product(self, g: A, k, i, u, w, scene: A, pass_: A, plan: A):
         """Change of `drag` for a change w of the displacement."""
         v, wall, first = self.velocity(i, u, pass_, plan), pass_.walls[3 * (g.number + k) + 2], g.first + k * g.size
-        f, dv = self.vector(0), plan.per_gamma * w
-        if ti.static(self.reaches(g)):
-            f = g.force.rub_product(scene.parameters, first, None, pass_.pressed[g.number + k, i], v, wall, dv)
-        else:
-            X = self.rest_before(g, k, i, scene, pass_)
-            f = g.force.rub_product(scene.parameters, first, X, pass_.lag[0, i], v, wall, dv)
-        return f
+        dv = plan.per_gamma * w
+        return g.force.rub_product(scene.parameters, first, self.felt_at(g, k, i, scene, pass_), v, wall, dv)
 
     @ti.func
     def whole_energy(self, i, u, scene: A, pass_: A, plan: A):
@@ -181,17 +172,17 @@ class ObstaclePotential(ObstacleFunctions):
     def drag_jvp(self, g: A, k, i, u, du, scene: A, pass_: A, tangent: A, plan: A):
         n, first = 3 * (g.number + k), g.first + k * g.size
         v, wall, dwall = self.velocity(i, u, pass_, plan), pass_.walls[n + 2], tangent.walls[n + 2]
-        f, dv = self.vector(0), plan.per_gamma * (du - tangent.lag[1, i])
+        moved, dv = self.vector(0), plan.per_gamma * (du - tangent.lag[1, i])
         if ti.static(self.reaches(g)):
-            P, dP = pass_.pressed[g.number + k, i], tangent.pressed[g.number + k, i]
-            f = g.force.rub_jvp(scene.parameters, first, None, P, v, wall, tangent.parameters, dP, dv, dwall)
+            moved = tangent.pressed[g.number + k, i]
         else:
-            X, before = self.rest_before(g, k, i, scene, pass_), pass_.lag[0, i]
-            du_before = tangent.lag[0, i] + tangent.rest[i] - tangent.walls[n + 1]
-            f = g.force.rub_jvp(scene.parameters, first, X, before, v, wall, tangent.parameters, du_before, dv, dwall)
-            f = self.on_area(g, i, f, scene)
-            if ti.static(g.force.per_area):
-                f += tangent.surface[i] * self.drag(g, k, i, u, scene, pass_, plan)
+            moved = tangent.lag[0, i] + tangent.rest[i] - tangent.walls[n + 1]
+        f = g.force.rub_jvp(
+            scene.parameters, first, self.felt_at(g, k, i, scene, pass_), v, wall, tangent.parameters, moved, dv, dwall
+        )
+        f = self.on_rubbed_area(g, i, f, scene)
+        if ti.static(g.force.per_area and not self.reaches(g)):
+            f += tangent.surface[i] * self.drag(g, k, i, u, scene, pass_, plan)
         return f
 
     @ti.func
@@ -224,29 +215,23 @@ class ObstaclePotential(ObstacleFunctions):
 
     @ti.func
     def drag_vjp(self, g: A, k, i, u, w, scene: A, pass_: A, adjoint: A, plan: A):
-        n, first, zero = 3 * (g.number + k), g.first + k * g.size, self.vector(0)
+        n, first = 3 * (g.number + k), g.first + k * g.size
         if ti.static(g.force.per_area and self.features.shape and not self.reaches(g)):
             self.add_to_area(g, i, self.drag(g, k, i, u, scene, pass_, plan).dot(w), adjoint)
         w = self.on_rubbed_area(g, i, w, scene)
-        v, wall, by_v = self.velocity(i, u, pass_, plan), pass_.walls[n + 2], self.vector(0)
+        v, wall = self.velocity(i, u, pass_, plan), pass_.walls[n + 2]
+        by_felt, by_v, by_wall, by = g.force.rub_vjp(
+            scene.parameters, first, self.felt_at(g, k, i, scene, pass_), v, wall, w
+        )
+        for m in ti.static(range(g.size)):
+            adjoint.sums[first + m, i] = adjoint.sums[first + m, i] + by[m]
         if ti.static(self.reaches(g)):
-            P = pass_.pressed[g.number + k, i]
-            by_P, by_speed, by_wall, by = g.force.rub_vjp(scene.parameters, first, None, P, v, wall, w)
-            for m in ti.static(range(g.size)):
-                adjoint.sums[first + m, i] = adjoint.sums[first + m, i] + by[m]
-            adjoint.pressed[g.number + k, i] = by_P
-            adjoint.walls[n + 2, i] = by_wall
-            by_v = by_speed
+            adjoint.pressed[g.number + k, i] = by_felt
         else:
-            X = self.rest_before(g, k, i, scene, pass_)
-            by_lag, by_speed, by_wall, by = g.force.rub_vjp(scene.parameters, first, X, pass_.lag[0, i], v, wall, w)
-            for m in ti.static(range(g.size)):
-                adjoint.sums[first + m, i] = adjoint.sums[first + m, i] + by[m]
-            self.add_to_rest(i, by_lag, adjoint)
-            adjoint.lag[0, i] = adjoint.lag[0, i] + by_lag
-            adjoint.walls[n + 1, i] = zero - by_lag
-            adjoint.walls[n + 2, i] = by_wall
-            by_v = by_speed
+            self.add_to_rest(i, by_felt, adjoint)
+            adjoint.lag[0, i] = adjoint.lag[0, i] + by_felt
+            adjoint.walls[n + 1, i] = self.vector(0) - by_felt
+        adjoint.walls[n + 2, i] = by_wall
         adjoint.lag[1, i] = adjoint.lag[1, i] - plan.per_gamma * by_v
         return plan.per_gamma * by_v
 

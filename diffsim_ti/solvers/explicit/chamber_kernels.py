@@ -10,7 +10,8 @@ from functools import cached_property
 
 import taichi as ti
 
-from diffsim_ti.runtime import PRECISIONS, Kernel
+from diffsim_ti.elements.step_numbers import StepNumbers
+from diffsim_ti.runtime import Kernel
 from diffsim_ti.state.schedule import pass_at
 
 A = ti.template()
@@ -23,27 +24,12 @@ NUMBERS = dict.fromkeys(("num_triangles", "num_sums", "pass_", "window", "slot",
 
 
 @dataclass(frozen=True)
-class ChamberKernels:
-    """parts: sums that each chamber's triangles are cut into; per_step: whether numbers have a row for each step."""
+class ChamberKernels(StepNumbers):
+    """parts: sums that each chamber's triangles are cut into."""
 
-    precision: str
     parts: int
-    per_step: bool
     parallel: bool
     shape: bool
-
-    @property
-    def fp(self):
-        return PRECISIONS[self.precision]
-
-    @property
-    def vector(self):
-        return ti.types.vector(4, self.fp)
-
-    @ti.func
-    def cross(self, a, b):
-        zero = ti.cast(0, self.fp)
-        return self.vector(a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0], zero)
 
     @ti.func
     def sixth(self):
@@ -103,17 +89,6 @@ class ChamberKernels:
         return total
 
     # ---- the law -----------------------------------------------------------------------------------------------------
-
-    @ti.func
-    def row(self, force):
-        r = 0
-        if ti.static(self.per_step):
-            r = force
-        return r
-
-    @ti.func
-    def share(self, force, now: A):
-        return ti.select(force == now.row, now.begin, ti.cast(1, self.fp))
 
     @ti.func
     def filling(self, at, now: A, rows: A):

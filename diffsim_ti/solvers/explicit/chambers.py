@@ -43,7 +43,7 @@ class Chambers:
     def _launch(self, name: str, numbers: dict, slot: int, shape: bool = False, **records) -> None:
         ws, a = self.ws, self.ws.arrays
         per_step = len(a.values.follower) > 1
-        kernels = kernels_of(ChamberKernels, a.precision, self.parts, per_step, ws.parallel, shape)
+        kernels = kernels_of(ChamberKernels, a.precision, per_step, self.parts, ws.parallel, shape)
         sizes = dict(num_triangles=len(self.triangles), num_sums=self.count * self.parts, slot=slot)
         sizes |= dict(first=a.first_chamber_corner, first_row=len(a.pressures))
         launch = ws.bound(getattr(kernels, name), chambers=self.arrays, table=ws.table, **records)

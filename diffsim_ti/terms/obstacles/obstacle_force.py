@@ -209,11 +209,12 @@ class ObstacleForce(VertexForce):
         vectors = [self._vector(adjoints[k : k + 3]) for k in (0, 3, 6)]
         return (*vectors, adjoints[9], tuple(adjoints[10:]))
 
-    # ---- friction as a force of implicit passes, at the velocity v, with N and n at the displacement u; where X is None,
-    # u is the normal force N n itself [N] --------------------------------------------------------------------------------
+    # ---- friction as a force of implicit passes, at the velocity v; felt: (X, u), the place where N and n are those of the
+    # barrier, or (None, N n), the normal force itself [N] -----------------------------------------------------------------
 
     @traced
-    def _record_rub(self, parameters, first, X, u, v, wall):
+    def _record_rub(self, parameters, first, felt, v, wall):
+        X, u = felt
         if X is None:
             g = Graph(self.fp, parameters)
             p, place = (
@@ -232,39 +233,39 @@ class ObstacleForce(VertexForce):
         return [at(parameters, first + k) for k in range(self.size)]
 
     @traced
-    def dissipation(self, parameters, first, X, u, v, wall):
+    def dissipation(self, parameters, first, felt, v, wall):
         """Potential of friction by the velocity [W]."""
-        g, p, _, speed, wall, n, push = self._record_rub(parameters, first, X, u, v, wall)
+        g, p, _, speed, wall, n, push = self._record_rub(parameters, first, felt, v, wall)
         return friction.dissipation(g, n, push, speed, wall, p[self.count + 2], p[self.count + 3]).value
 
     @traced
-    def _rubbed(self, parameters, first, X, u, v, wall):
-        g, p, moved, speed, wall, n, push = self._record_rub(parameters, first, X, u, v, wall)
+    def _rubbed(self, parameters, first, felt, v, wall):
+        g, p, moved, speed, wall, n, push = self._record_rub(parameters, first, felt, v, wall)
         return g, p, moved, speed, wall, friction.rub(g, n, push, speed, wall, p[self.count + 2], p[self.count + 3])
 
     @traced
-    def rub(self, parameters, first, X, u, v, wall):
+    def rub(self, parameters, first, felt, v, wall):
         """Force of friction [N]; `wall`: the obstacle's velocity."""
-        return self._vector([k.value for k in self._rubbed(parameters, first, X, u, v, wall)[-1]])
+        return self._vector([k.value for k in self._rubbed(parameters, first, felt, v, wall)[-1]])
 
     @traced
-    def rub_product(self, parameters, first, X, u, v, wall, dv):
+    def rub_product(self, parameters, first, felt, v, wall, dv):
         """Its change for a change of the velocity alone."""
-        g, _, _, speed, _, f = self._rubbed(parameters, first, X, u, v, wall)
+        g, _, _, speed, _, f = self._rubbed(parameters, first, felt, v, wall)
         return self._vector(g.forward([(x, at(dv, d)) for d, x in enumerate(speed)], f))
 
     @traced
-    def rub_jvp(self, parameters, first, X, u, v, wall, parameters_dot, du, dv, dwall):
+    def rub_jvp(self, parameters, first, felt, v, wall, parameters_dot, du, dv, dwall):
         """Its change for changes of everything."""
-        g, p, moved, speed, walls, f = self._rubbed(parameters, first, X, u, v, wall)
+        g, p, moved, speed, walls, f = self._rubbed(parameters, first, felt, v, wall)
         dots = [(q, at(parameters_dot, first + k)) for k, q in enumerate(p)]
         for leaves, change in ((moved, du), (speed, dv), (walls, dwall)):
             dots += [(leaf, at(change, d)) for d, leaf in enumerate(leaves)]
         return self._vector(g.forward(dots, f))
 
     @traced
-    def rub_vjp(self, parameters, first, X, u, v, wall, w):
+    def rub_vjp(self, parameters, first, felt, v, wall, w):
         """(adjoints of u, v, wall as vectors, and of the obstacle's numbers, a tuple) for the adjoint w of the force."""
-        g, p, moved, speed, walls, f = self._rubbed(parameters, first, X, u, v, wall)
+        g, p, moved, speed, walls, f = self._rubbed(parameters, first, felt, v, wall)
         adjoints = g.reverse([(k, let(at(w, d))) for d, k in enumerate(f)], [*moved, *speed, *walls, *p])
         return (*(self._vector(adjoints[k : k + 3]) for k in (0, 3, 6)), tuple(adjoints[9:]))
