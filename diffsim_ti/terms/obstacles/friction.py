@@ -23,11 +23,19 @@ def keeps(g, speed, c, eps):
     return g.select(sticks, stuck, sliding)
 
 
+def normal_force(g, n, push):
+    """(unit normal, N) of a barrier's force push n: the gradient n of a sampled distance is not quite of length one, and
+    what is left of a velocity without its part along n would then not lie across it."""
+    size = g.sqrt(g.dot(n, n))
+    return [x / size for x in n], push * size
+
+
 def slide(g, n, push, v, wall, mu, h_over_m, eps):
-    """Velocity after friction: n the normal, `push` the barrier's force N, v and wall the velocities of vertex and obstacle.
+    """Velocity after friction: push n the barrier's force, v and wall the velocities of vertex and obstacle.
 
     Everything is a number of the graph `g`, or a list of three.
     """
+    n, push = normal_force(g, n, push)
     t, speed = tangential(g, n, v, wall)
     lost = g.number(1) - keeps(g, speed, h_over_m * mu * push, eps)
     return [a - lost * x for a, x in zip(v, t)]

@@ -224,7 +224,7 @@ class ObstacleForce(VertexForce):
             n = [x / push for x in place]
         else:
             g, p, place, d, n = self.record(parameters, first, X, u)
-            push = self._push(g, p, d)
+            n, push = friction.normal_force(g, n, self._push(g, p, d))
         speed, wall = ([g.leaf(at(vector, d)) for d in range(3)] for vector in (v, wall))
         return g, p, place, speed, wall, n, push
 
