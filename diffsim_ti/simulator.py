@@ -164,6 +164,8 @@ class Simulator:
         frames.steps = np.array([self.step_count])
         if self._notes:
             frames.contact_forces = self.workspace.contact_forces(self.solver.dt)[1:]
+        if output.reads_chamber_pressures and self.scene.holds_volumes:
+            frames.chamber_pressures = self.workspace.last_chamber_pressures()[None]
         return self.settled(output).value(frames)[0]
 
     def settled(self, output: Output) -> Output:

@@ -324,3 +324,18 @@ def test_torch_and_tape_agree_with_arrays():
         rollout.run()
         measure()
     assert own.grad.to_numpy() == pytest.approx(expected, rel=1e-7)
+
+
+@pytest.mark.parametrize("kind", [ds.ImplicitEulerSolver, ds.StaticSolver], ids=lambda s: s.__name__)
+def test_a_simulator_tells_the_pressure_of_a_held_volume(kind):
+    rollout = rollout_of(kind, filled())
+    frames, simulator = rollout.forward(), ds.Simulator(rollout.solver)
+    pressure = ds.ChamberPressure("oil")
+    assert simulator.output(pressure) == 0
+    for k in range(1, STEPS + 1):
+        simulator.step()
+        if kind is not ds.StaticSolver or k == 1:  # whose load steps begin anew in each step of a simulator
+            assert simulator.output(pressure) == pytest.approx(frames["p_0"][k], rel=1e-6) and frames["p_0"][k] != 0
+    simulator.set_substeps(3)
+    simulator.reset()
+    assert simulator.output(pressure) == 0

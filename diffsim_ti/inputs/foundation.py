@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from diffsim_ti.inputs.chain import Link
-from diffsim_ti.mesh.geometry import triangle_normals
+from diffsim_ti.mesh.geometry import triangle_normals, triangle_normals_jvp, triangle_normals_vjp
 
 
 class FoundationStiffness(Link):
@@ -43,10 +43,7 @@ class FoundationStiffness(Link):
 
     def jvp(self, x, dx):
         (X, c, t), (dX, dc, dt) = x, dx
-        n, moved = triangle_normals(X, self.triangles), dX[self.triangles]
-        e, f = (X[self.triangles[:, k]] - X[self.triangles[:, 0]] for k in (1, 2))
-        de, df = moved[:, 1] - moved[:, 0], moved[:, 2] - moved[:, 0]
-        dn = (np.cross(de, f) + np.cross(e, df)) / 2
+        n, dn = triangle_normals(X, self.triangles), triangle_normals_jvp(X, self.triangles, dX)
         A, across = self._parts(n)
         dA = (n * dn).sum(1)[:, None, None] / A
         turned = (n[:, :, None] * dn[:, None] + dn[:, :, None] * n[:, None]) / A - across * dA / A
@@ -64,10 +61,7 @@ class FoundationStiffness(Link):
         size = A[:, :, 0]
         n_adj = by_across * (twice / size - along[:, None] * n / size**2)
         n_adj += (t[..., None] if t.ndim else t) * trace[:, None] * n / size
-        corners, out = X[self.triangles], np.zeros_like(X)
-        for a in range(3):  # n = sum of x_a x x_next / 2
-            edge = corners[:, (a + 1) % 3] - corners[:, (a + 2) % 3]
-            np.add.at(out, self.triangles[:, a], np.cross(edge, n_adj) / 2)
+        out = triangle_normals_vjp(X, self.triangles, n_adj)
         return out, by_c if c.ndim else by_c.sum(), by_t if t.ndim else by_t.sum()
 
 

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from diffsim_ti.inputs.chain import Link
-from diffsim_ti.mesh.geometry import triangle_areas_vjp, triangle_normals
+from diffsim_ti.mesh.geometry import triangle_areas_vjp, triangle_normals, triangle_normals_jvp
 
 
 class InTime(Link):
@@ -58,10 +58,7 @@ class VertexAreas(Link):
         return (self._to_vertices(np.linalg.norm(triangle_normals(X, self.triangles), axis=1)),)
 
     def jvp(self, x, dx):
-        (X,), moved = x, dx[0][self.triangles]
-        e, f = (X[self.triangles[:, k]] - X[self.triangles[:, 0]] for k in (1, 2))
-        de, df = (moved[:, k] - moved[:, 0] for k in (1, 2))
-        n, dn = np.cross(e, f) / 2, (np.cross(de, f) + np.cross(e, df)) / 2
+        n, dn = triangle_normals(x[0], self.triangles), triangle_normals_jvp(x[0], self.triangles, dx[0])
         return (self._to_vertices((n * dn).sum(1) / np.linalg.norm(n, axis=1)),)
 
     def vjp(self, x, y_adj):

@@ -45,14 +45,24 @@ def triangle_normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     return np.cross(b - a, c - a) / 2
 
 
+def triangle_normals_jvp(vertices: np.ndarray, triangles: np.ndarray, change: np.ndarray) -> np.ndarray:
+    """Change of the normals for one of the vertices."""
+    (a, b, c), (da, db, dc) = (np.moveaxis(x[triangles], 1, 0) for x in (vertices, change))
+    return (np.cross(db - da, c - a) + np.cross(b - a, dc - da)) / 2
+
+
+def triangle_normals_vjp(vertices: np.ndarray, triangles: np.ndarray, normals_adj: np.ndarray) -> np.ndarray:
+    """Adjoints of vertices, shape (num_vertices, 3), for those of the normals, sum of x_a x x_b / 2 around a triangle."""
+    x, out = vertices[triangles], np.zeros_like(vertices)
+    np.add.at(out, triangles, np.cross(normals_adj[:, None], np.roll(x, -2, 1) - np.roll(x, -1, 1)) / 2)
+    return out
+
+
 def triangle_areas_vjp(vertices: np.ndarray, triangles: np.ndarray, areas_adj: np.ndarray) -> np.ndarray:
     """Adjoints of vertices, shape (num_vertices, 3), for those of areas."""
-    x, normals = vertices[triangles], triangle_normals(vertices, triangles)
+    normals = triangle_normals(vertices, triangles)
     unit = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-    slopes = np.cross(unit[:, None], np.roll(x, -2, 1) - np.roll(x, -1, 1)) / 2  # dA/dx_a = N x (x_c - x_b) / 2
-    out = np.zeros_like(vertices)
-    np.add.at(out, triangles, areas_adj[:, None, None] * slopes)
-    return out
+    return triangle_normals_vjp(vertices, triangles, areas_adj[:, None] * unit)
 
 
 def rotation_matrix(rotation, angle: float | None) -> np.ndarray:

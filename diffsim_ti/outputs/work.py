@@ -37,6 +37,9 @@ class WorkOfLoads(Output):
     def __init__(self, weight: bool = False, name: str = "work"):
         self.weight, self.name = bool(weight), name
 
+    def __repr__(self) -> str:
+        return f"WorkOfLoads(weight={self.weight}, name={self.name!r})"
+
     def settled(self, scene: "Scene") -> "WorkOfLoads":
         out = copy(self)
         out.scene, out.loads = scene, GivenLoads(scene, weight=self.weight)

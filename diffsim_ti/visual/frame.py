@@ -49,7 +49,8 @@ class Frame:
     time [s]; positions, displacements [m], velocities [m/s]: shape (num_vertices, 3).
     fields: numbers to colour by, one per vertex or per tetrahedron, under the names in fields.py: "displacement" [m],
     "speed" [m/s], "von_mises" [Pa], "energy_density" [J/m^3], "J" [-] ...; where the scene has loads, "loads" [N]: what
-    tractions, pressures, body and external forces do to each vertex, shape (num_vertices, 3).
+    tractions, pressures, gases, body and external forces, springs, cables and foundations do to each vertex, shape
+    (num_vertices, 3).
     obstacles: points of each obstacle [m], or None where the setting has them. marks: arrows, lines and points that show
     the scene's terms (scene_marks.py). units: {name of a field: its unit}, where known.
     """

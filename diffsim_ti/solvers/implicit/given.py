@@ -99,6 +99,13 @@ class GivenInPasses:
             out[frame, self.follower.held] = self.multipliers[self._pass_of_all(frame * per_frame - 1)]
         return out
 
+    def last_chamber_pressures(self) -> np.ndarray:
+        """Those of chambers whose volume is held after the last pass, shape (chambers,); zero before the first."""
+        out = np.zeros(len(self.scene.chambers))
+        if self.multipliers:
+            out[self.follower.held] = self.multipliers[max(self.multipliers)]
+        return out
+
     def _pass_of_all(self, j: int) -> int:
         """Number of pass j, also of the steps of a run that come one by one."""
         return self.first_step * self.solver.substeps + j
