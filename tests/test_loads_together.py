@@ -47,9 +47,9 @@ def terms() -> dict[str, ds.terms.Term]:
     }
 
 
-def scene_of(order=None, leave=(), precision="f64", **options) -> ds.Scene:
+def scene_of(order=None, leave=(), more=(), precision="f64", **options) -> ds.Scene:
     named = terms()
-    listed = [named[name] for name in (order or named) if name not in leave]
+    listed = [*more, *(named[name] for name in (order or named) if name not in leave)]
     law = ds.StableNeoHookean(1e5 * np.random.default_rng(2).uniform(0.7, 1.3, BODY.num_tetrahedra), 0.3)
     moving = np.random.default_rng(6).standard_normal(BODY.vertices.shape)  # so that all springs are felt at once
     moving[BODY.vertex_sets["bottom"]] = 0
@@ -72,6 +72,24 @@ def rollout_of(kind, scene=None, **options) -> ds.Rollout:
 def test_every_number_beside_all_others(kind):
     unfelt = ("drag_rate",) if kind is ds.StaticSolver else ()
     assert_transposed(rollout_of(kind), 1e-12 if kind.explicit else 1e-8, unfelt)
+
+
+@pytest.mark.executed_ptx
+@pytest.mark.parametrize(
+    "kind, parallel, options",
+    [
+        (ds.VelocityVerletSolver, True, dict(volume="patches")),
+        (ds.SemiImplicitSolver, False, dict(more=[ds.SelfContact(300.0, 0.01)])),
+        (ds.ImplicitEulerSolver, True, dict(volume="patches", more=[ds.SelfContact(300.0, 0.01)])),
+    ],
+    ids=lambda x: getattr(x, "__name__", None),
+)
+def test_and_beside_patches_and_self_contact(kind, parallel, options):
+    """Which have corners of their own, before those of springs, pressures and chambers."""
+    exact = {} if kind.explicit else dict(tolerance=1e-12)
+    solver = kind(scene_of(**options), dt=2e-4 if kind.explicit else 4e-3, substeps=2, parallel=parallel, **exact)
+    rollout = ds.Rollout(solver, STEPS, save_every=1, gradients="all")
+    assert ds.dot_product_test(rollout) < (1e-12 if kind.explicit else 1e-8)
 
 
 @pytest.mark.parametrize("kind", [ds.VelocityVerletSolver, ds.ImplicitEulerSolver], ids=lambda s: s.__name__)
