@@ -16,9 +16,10 @@ from diffsim_ti.runtime import LANES, assign, at, let
 
 @dataclass(frozen=True)
 class Items:
-    """Reading and writing of items in a float type."""
+    """Reading and writing of items in a float type; nodes: how many each tetrahedron has."""
 
     fp: object
+    nodes: int = 4
 
     @cached_property
     def vector(self):
@@ -44,35 +45,36 @@ class Block(Items):
         """`count` numbers from `first` on, of the `rows` that each block has."""
         return [let(at(array, rows * item + first + k)) for k in range(count)]
 
-    def row(self, array, slot, count: int, item):
-        """`count` numbers of an item in a slot of an array of slots."""
-        return [let(at(array, slot, count * item + k)) for k in range(count)]
+    def row(self, array, slot, first: int, count: int, rows: int, item):
+        """The same in a slot of an array of slots."""
+        return [let(at(array, slot, rows * item + first + k)) for k in range(count)]
 
-    def put_row(self, array, slot, item, numbers):
+    def put_row(self, array, slot, first: int, rows: int, item, numbers):
         for k, number in enumerate(numbers):
-            assign(at(array, slot, len(numbers) * item + k), number)
+            assign(at(array, slot, rows * item + first + k), number)
 
     def corners(self, vectors, slot, tets, item):
-        """[a][d]: component d of the vector at corner a."""
+        """[a][d]: component d of the vector at node a."""
         out = []
-        for a in range(4):
-            whole = [let(at(vectors, slot, at(tets, 4 * LANES * item + LANES * a + lane))) for lane in range(LANES)]
+        for a in range(self.nodes):
+            places = (self.nodes * LANES * item + LANES * a + lane for lane in range(LANES))
+            whole = [let(at(vectors, slot, at(tets, place))) for place in places]
             out.append([let(self.lanes(*(at(w, d) for w in whole))) for d in range(3)])
         return out
 
     def store(self, corner, item, forces, zero, add: bool = False):
-        for a in range(4):
+        for a in range(self.nodes):
             for lane in range(LANES):
                 force = self.vector(*(at(forces[a][d], lane) for d in range(3)), zero)
-                self.put_force(at(corner, 4 * LANES * item + 4 * lane + a), force, add)
+                self.put_force(at(corner, self.nodes * (LANES * item + lane) + a), force, add)
 
     def put(self, array, rows: int, item, first, numbers):
         for k, number in enumerate(numbers):
             assign(at(array, rows * item + first + k), number)
 
-    def add(self, array, rows: int, item, numbers):
+    def add(self, array, rows: int, item, numbers, first: int = 0):
         for k, number in enumerate(numbers):
-            target = at(array, rows * item + k)
+            target = at(array, rows * item + first + k)
             assign(target, target + number)
 
 
@@ -85,27 +87,28 @@ class Single(Items):
     def numbers(self, array, first: int, count: int, rows: int, item):
         return [let(at(at(array, rows * (item // LANES) + first + k), item % LANES)) for k in range(count)]
 
-    def row(self, array, slot, count: int, item):
-        return [let(at(at(array, slot, count * (item // LANES) + k), item % LANES)) for k in range(count)]
+    def row(self, array, slot, first: int, count: int, rows: int, item):
+        return [let(at(at(array, slot, rows * (item // LANES) + first + k), item % LANES)) for k in range(count)]
 
-    def put_row(self, array, slot, item, numbers):
+    def put_row(self, array, slot, first: int, rows: int, item, numbers):
         for k, number in enumerate(numbers):
-            assign(at(at(array, slot, len(numbers) * (item // LANES) + k), item % LANES), number)
+            assign(at(at(array, slot, rows * (item // LANES) + first + k), item % LANES), number)
 
     def corners(self, vectors, slot, tets, item):
         block, lane = item // LANES, item % LANES
-        whole = [let(at(vectors, slot, at(tets, 4 * LANES * block + LANES * a + lane))) for a in range(4)]
+        places = (self.nodes * LANES * block + LANES * a + lane for a in range(self.nodes))
+        whole = [let(at(vectors, slot, at(tets, place))) for place in places]
         return [[let(at(w, d)) for d in range(3)] for w in whole]
 
     def store(self, corner, item, forces, zero, add: bool = False):
-        for a in range(4):
-            self.put_force(at(corner, 4 * item + a), self.vector(*forces[a], zero), add)
+        for a in range(self.nodes):
+            self.put_force(at(corner, self.nodes * item + a), self.vector(*forces[a], zero), add)
 
     def put(self, array, rows: int, item, first, numbers):
         for k, number in enumerate(numbers):
             assign(at(at(array, rows * (item // LANES) + first + k), item % LANES), number)
 
-    def add(self, array, rows: int, item, numbers):
+    def add(self, array, rows: int, item, numbers, first: int = 0):
         for k, number in enumerate(numbers):
-            target = at(at(array, rows * (item // LANES) + k), item % LANES)
+            target = at(at(array, rows * (item // LANES) + first + k), item % LANES)
             assign(target, target + number)

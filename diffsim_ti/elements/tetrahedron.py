@@ -1,7 +1,8 @@
-"""The linear tetrahedron: what each one adds to forces, to their differential and to the adjoint.
+"""The tetrahedron of four or ten nodes: what each one adds to forces, to their differential and to the adjoint.
 
-H = sum_a (u_a - u_0) (x) grad N_a, a = 1..3, is the displacement gradient; corner forces f_a = -V P grad N_a go to
-`corner[4 e + a]`, and vertices gather them, so that there are no atomics and every run gives the same bits.
+At each point, H = D B is the displacement gradient, D = du/dxi (nodes.py) and B = dxi/dX, whose rows are grad xi_k; V is
+the point's share of the volume. Forces are minus the derivatives of sum V psi(H); that of node a goes to
+`corner[nodes e + a]`, and vertices gather them, so that there are no atomics and every run gives the same bits.
 
 Functions take one item, a block of eight tetrahedra or a single one (items.py). The last block is filled up with copies of
 tetrahedron 0, whose corners no vertex gathers. `scene` is a Bundle of tets, gradients, volumes, coefficients, start,
@@ -15,6 +16,7 @@ from types import SimpleNamespace
 import taichi as ti
 
 from diffsim_ti.elements.items import Block, Single
+from diffsim_ti.elements.nodes import Nodes, nodes_of
 from diffsim_ti.materials.calculus.tensor import Tensor, inner, sum_of
 from diffsim_ti.materials.law import Law
 from diffsim_ti.runtime import LANES, Bundle, let, traced
@@ -32,11 +34,13 @@ class Onwards(Bundle):
 
 @dataclass(frozen=True)
 class Tetrahedron:
-    """Functions of one item for a law; `uniform`: one set of coefficients serves all; `lanes`: items are blocks."""
+    """Functions of one item for a law; `uniform`: one set of coefficients serves all; `lanes`: items are blocks; `order`: 1
+    or 2, of the functions between nodes."""
 
     law: Law
     uniform: bool
     lanes: bool
+    order: int = 1
 
     @property
     def fp(self):
@@ -45,7 +49,17 @@ class Tetrahedron:
     @cached_property
     def items(self):
         """How items are read and written."""
-        return (Block if self.lanes else Single)(self.fp)
+        return (Block if self.lanes else Single)(self.fp, self.nodes.count)
+
+    @cached_property
+    def nodes(self) -> Nodes:
+        """How nodes make gradients."""
+        return nodes_of(self.order, self.fp)
+
+    @property
+    def points(self) -> range:
+        """Where the law is evaluated."""
+        return range(self.nodes.points)
 
     @cached_property
     def types(self) -> SimpleNamespace:
@@ -71,15 +85,19 @@ class Tetrahedron:
     # ---- what an item has -------------------------------------------------------------------------------------------
 
     @traced
-    def edges(self, item, scene, u, s) -> Tensor:
-        """Columns u_a - u_0 of slot s."""
-        x = self.items.corners(u, s, scene.tets, item)
-        return Tensor(x[a][d] - x[0][d] for d in range(3) for a in (1, 2, 3))
+    def edges(self, item, scene, x, s) -> list[Tensor]:
+        """dx/dxi at each point, of slot s."""
+        return self.nodes.edges(self.items.corners(x, s, scene.tets, item))
 
     @traced
-    def gradients_of(self, item, array) -> Tensor:
-        """Rows grad N_1..3."""
-        return Tensor(self.items.numbers(array, 0, 9, 9, item))
+    def gradient(self, item, scene, u, s, q: int = 0) -> Tensor:
+        """H at point q, for kernels that look at a state."""
+        return self.edges(item, scene, u, s)[q] @ self.gradients_of(item, scene.gradients, q)
+
+    @traced
+    def gradients_of(self, item, array, q: int = 0) -> Tensor:
+        """Rows grad xi_1..3 at point q."""
+        return Tensor(self.items.numbers(array, 9 * q, 9, 9 * self.nodes.points, item))
 
     @traced
     def coefficients_of(self, item, array) -> list:
@@ -88,30 +106,32 @@ class Tetrahedron:
         return self.items.numbers(array, 0, K, K, 0 if self.uniform else item)
 
     @traced
-    def state_of(self, item, z, s) -> list:
-        """The law's state in slot s of z; none if it has no state."""
+    def state_of(self, item, z, s, q: int = 0) -> list:
+        """The law's state at point q in slot s of z; none if it has no state."""
         S = len(self.law.state_names)
-        return self.items.row(z, s, S, item) if S else []
+        return self.items.row(z, s, S * q, S, S * self.nodes.points, item) if S else []
 
     @traced
-    def numbers_at(self, item, scene, at, s) -> list:
-        """What the law takes besides tensors at slot s: its coefficients and its state."""
+    def put_state(self, item, z, s, numbers, q: int = 0) -> None:
+        self.items.put_row(z, s, len(numbers) * q, len(numbers) * self.nodes.points, item, numbers)
+
+    @traced
+    def numbers_at(self, item, scene, at, s, q: int = 0) -> list:
+        """What the law takes besides tensors at point q and slot s: its coefficients and its state."""
         p = self.coefficients_of(item, scene.coefficients)
-        return [*p, *self.state_of(item, at.z, s)] if self.has_state else p
+        return [*p, *self.state_of(item, at.z, s, q)] if self.has_state else p
 
     @traced
-    def volume_of(self, item, array):
-        return self.items.numbers(array, 0, 1, 1, item)[0]
+    def volume_of(self, item, array, q: int = 0):
+        """That of point q."""
+        return self.items.numbers(array, q, 1, self.nodes.points, item)[0]
 
     # ---- corners ----------------------------------------------------------------------------------------------------
 
     @traced
-    def store(self, item, corner, Q, add: bool = False) -> None:
-        """Columns of Q are minus the forces of corners 1..3; corner 0 balances them. add: to what is there."""
-        minus, zero = ti.cast(-1, self.fp), ti.cast(0, self.fp)
-        forces = [[let(minus * Q[d, a]) for d in range(3)] for a in range(3)]
-        balance = [let(sum_of(Q[d, a] for a in range(3))) for d in range(3)]
-        self.items.store(corner, item, [balance, *forces], zero, add)
+    def store(self, item, corner, pushes, add: bool = False) -> None:
+        """Forces of what works on minus dx/dxi, a Tensor for each point. add: to what is there."""
+        self.items.store(corner, item, self.nodes.forces(pushes), ti.cast(0, self.fp), add)
 
     @ti.func
     def gather(self, i, scene: A, corner: A):
@@ -134,67 +154,84 @@ class Tetrahedron:
 
     @traced
     def _edges_read(self, item, scene, at, s) -> list:
-        """Edges of all whose gradients the law reads, at slot s."""
-        return [self.edges(item, scene, x, s) for x in ((at.u, at.v) if self.reads_rates else (at.u,))]
+        """For each point, edges of all whose gradients the law reads, at slot s."""
+        return list(zip(*(self.edges(item, scene, x, s) for x in ((at.u, at.v) if self.reads_rates else (at.u,)))))
 
     @traced
     def forces(self, item, scene, at, s, corner) -> None:
         """Corner forces at slot s."""
-        B = self.gradients_of(item, scene.gradients)
-        x = [D @ B for D in self._edges_read(item, scene, at, s)]
-        P = self.law.stress_at(x, self.numbers_at(item, scene, at, s))
-        self.store(item, corner, (P * self.volume_of(item, scene.volumes)) @ B.transpose())
+        pushes = []
+        for q, D in enumerate(self._edges_read(item, scene, at, s)):
+            B = self.gradients_of(item, scene.gradients, q)
+            P = self.law.stress_at([d @ B for d in D], self.numbers_at(item, scene, at, s, q))
+            pushes.append((P * self.volume_of(item, scene.volumes, q)) @ B.transpose())
+        self.store(item, corner, pushes)
 
     @traced
     def stiffness(self, item, scene, at, s, corner) -> None:
         """Corner products of the derivative of the elastic force with at.w (negative semi-definite at rest)."""
-        B = self.gradients_of(item, scene.gradients)
-        H, dH = self.edges(item, scene, at.u, s) @ B, self.edges(item, scene, at.w, 0) @ B
-        dP = self.law.stress_differential(H, dH, self.numbers_at(item, scene, at, s))
-        self.store(item, corner, (dP * self.volume_of(item, scene.volumes)) @ B.transpose())
+        pushes = []
+        for q, (D, W) in enumerate(zip(self.edges(item, scene, at.u, s), self.edges(item, scene, at.w, 0))):
+            B = self.gradients_of(item, scene.gradients, q)
+            dP = self.law.stress_differential(D @ B, W @ B, self.numbers_at(item, scene, at, s, q))
+            pushes.append((dP * self.volume_of(item, scene.volumes, q)) @ B.transpose())
+        self.store(item, corner, pushes)
 
     @traced
     def forces_jvp(self, item, scene, at, s, change, corner, dots) -> None:
         """Change of the corner forces for a change of what `at` has, in slot 0, and of coefficients and rest shape."""
-        B, B_dot = self.gradients_of(item, scene.gradients), self.gradients_of(item, dots.gradients)
-        volume, q = self.volume_of(item, scene.volumes), self.numbers_at(item, scene, at, s)
-        D, dD = self._edges_read(item, scene, at, s), self._edges_read(item, scene, change, 0)
-        x, dx = [d @ B for d in D], [moved @ B + d @ B_dot for d, moved in zip(D, dD)]
-        P, dP = self.law.stress_and_jvp_at(x, dx, q, self._numbers_jvp(item, change, dots))
-        turned = B * self.volume_of(item, dots.volumes) + B_dot * volume
-        self.store(item, corner, (dP * volume) @ B.transpose() + P @ turned.transpose())
+        pushes, dD_of = [], self._edges_read(item, scene, change, 0)
+        for q, D in enumerate(self._edges_read(item, scene, at, s)):
+            B, B_dot = self.gradients_of(item, scene.gradients, q), self.gradients_of(item, dots.gradients, q)
+            volume, numbers = self.volume_of(item, scene.volumes, q), self.numbers_at(item, scene, at, s, q)
+            x, dx = [d @ B for d in D], [moved @ B + d @ B_dot for d, moved in zip(D, dD_of[q])]
+            P, dP = self.law.stress_and_jvp_at(x, dx, numbers, self._numbers_jvp(item, change, dots, q))
+            turned = B * self.volume_of(item, dots.volumes, q) + B_dot * volume
+            pushes.append((dP * volume) @ B.transpose() + P @ turned.transpose())
+        self.store(item, corner, pushes)
 
     @traced
-    def _numbers_jvp(self, item, change, dots) -> list:
+    def _numbers_jvp(self, item, change, dots, q) -> list:
         dp = self.coefficients_of(item, dots.coefficients)
-        return [*dp, *self.state_of(item, change.z, 0)] if self.has_state else dp
+        return [*dp, *self.state_of(item, change.z, 0, q)] if self.has_state else dp
 
     @traced
     def forces_vjp(self, item, scene, at, s, w, corner, adjoint, shape: bool, add: bool = False) -> None:
         """Corner products with w of the transposed derivatives of the force by u, to `corner` (add: to what is there), and
-        by v, to adjoint.rate_corner; adds the adjoints of coefficients and state and, if `shape`, of grad N and V.
+        by v, to adjoint.rate_corner; adds the adjoints of coefficients and state and, if `shape`, of B and V.
 
-        The work of the forces on w is -V P(D B) : (W B), with D, W the edges of u and w.
+        The work of the forces on w is -sum V P(D B) : (W B), with D, W the edges of u and w.
         """
-        B, volume = self.gradients_of(item, scene.gradients), self.volume_of(item, scene.volumes)
-        D, W = self._edges_read(item, scene, at, s), self.edges(item, scene, w, 0)
-        x, dH, q = [d @ B for d in D], W @ B, self.numbers_at(item, scene, at, s)
-        both = self.law.stress_and_vjp_at if shape else self.law.stress_vjp_at
-        *P, by_x, products = both(x, dH, q)  # the stress itself is felt by the rest shape alone
-        self.store(item, corner, (by_x[0] * volume) @ B.transpose(), add)
+        pushes, rates, by_p = [], [], None
+        for q, (D, W) in enumerate(zip(self._edges_read(item, scene, at, s), self.edges(item, scene, w, 0))):
+            B, volume = self.gradients_of(item, scene.gradients, q), self.volume_of(item, scene.volumes, q)
+            x, dH, numbers = [d @ B for d in D], W @ B, self.numbers_at(item, scene, at, s, q)
+            both = self.law.stress_and_vjp_at if shape else self.law.stress_vjp_at
+            *P, by_x, products = both(x, dH, numbers)  # the stress itself is felt by the rest shape alone
+            pushes.append((by_x[0] * volume) @ B.transpose())
+            if self.reads_rates:
+                rates.append((by_x[1] * volume) @ B.transpose())
+            minus = let(ti.cast(-1, self.fp) * volume)
+            own, by_z = self._parted([minus * product for product in products])
+            by_p = own if by_p is None else [a + b for a, b in zip(by_p, own)]
+            if self.has_state:
+                known = self.state_of(item, adjoint.z, 0, q)
+                self.put_state(item, adjoint.z, 0, [a + b for a, b in zip(known, by_z)], q)
+            if shape:
+                (P,) = P
+                by_B = sum_of([*(d.transpose() @ by for d, by in zip(D, by_x)), W.transpose() @ P])
+                self._add_shape(item, adjoint, q, by_B * minus, ti.cast(-1, self.fp) * inner(P, dH))
+        self.store(item, corner, pushes, add)
         if self.reads_rates:
-            self.store(item, adjoint.rate_corner, (by_x[1] * volume) @ B.transpose())
-        minus = let(ti.cast(-1, self.fp) * volume)
-        by_p, by_z = self._parted([minus * product for product in products])
+            self.store(item, adjoint.rate_corner, rates)
         self.items.add(adjoint.coefficients, len(by_p), item, by_p)
-        if self.has_state:
-            known = self.state_of(item, adjoint.z, 0)
-            self.items.put_row(adjoint.z, 0, item, [a + b for a, b in zip(known, by_z)])
-        if shape:
-            (P,) = P
-            by_B = sum_of([*(d.transpose() @ by for d, by in zip(D, by_x)), W.transpose() @ P])
-            self.items.add(adjoint.gradients, 9, item, (by_B * minus).numbers)
-            self.items.add(adjoint.volumes, 1, item, [ti.cast(-1, self.fp) * inner(P, dH)])
+
+    @traced
+    def _add_shape(self, item, adjoint, q, by_B: Tensor, by_V) -> None:
+        """Add adjoints of B and V of point q."""
+        points = self.nodes.points
+        self.items.add(adjoint.gradients, 9 * points, item, by_B.numbers, 9 * q)
+        self.items.add(adjoint.volumes, points, item, [by_V], q)
 
     @traced
     def _parted(self, numbers: list) -> tuple[list, list]:
@@ -205,39 +242,48 @@ class Tetrahedron:
     # ---- the law's state after a pass --------------------------------------------------------------------------------
 
     @traced
-    def _read_onwards(self, item, scene, at, s, u_slot) -> tuple:
-        """(B, D, H, numbers of the law) for the state in slot s and the displacement in slot `u_slot`, default s."""
-        B, D = self.gradients_of(item, scene.gradients), self.edges(item, scene, at.u, s if u_slot is None else u_slot)
-        return B, D, D @ B, self.numbers_at(item, scene, at, s)
+    def _read_onwards(self, item, scene, at, s, u_slot) -> list:
+        """For each point (B, D, H, numbers of the law), of the state in slot s and the displacement in slot `u_slot`, default
+        s."""
+        out = []
+        for q, D in enumerate(self.edges(item, scene, at.u, s if u_slot is None else u_slot)):
+            B = self.gradients_of(item, scene.gradients, q)
+            out.append((B, D, D @ B, self.numbers_at(item, scene, at, s, q)))
+        return out
 
     @traced
     def move_on(self, item, scene, at, s, slot, onwards, u_slot=None) -> None:
         """Put the state after a pass into a slot."""
-        _, _, H, q = self._read_onwards(item, scene, at, s, u_slot)
-        after, held = self.law.next_state_at(H, q, onwards.h), self._parted(q)[1]
-        self.items.put_row(at.z, slot, item, [onwards.pick(a, b) for a, b in zip(after, held)])
+        for q, (_, _, H, numbers) in enumerate(self._read_onwards(item, scene, at, s, u_slot)):
+            after, held = self.law.next_state_at(H, numbers, onwards.h), self._parted(numbers)[1]
+            self.put_state(item, at.z, slot, [onwards.pick(a, b) for a, b in zip(after, held)], q)
 
     @traced
     def move_on_jvp(self, item, scene, at, s, change, dots, onwards, u_slot=None) -> None:
         """Its change, in place of that of the state before."""
-        B, D, H, q = self._read_onwards(item, scene, at, s, u_slot)
-        dH = self.edges(item, scene, change.u, 0) @ B + D @ self.gradients_of(item, dots.gradients)
-        dq = self._numbers_jvp(item, change, dots)
-        after, held = self.law.next_state_jvp(H, dH, q, dq, onwards.h), self._parted(dq)[1]
-        self.items.put_row(change.z, 0, item, [onwards.pick(a, b) for a, b in zip(after, held)])
+        moved = self.edges(item, scene, change.u, 0)
+        for q, (B, D, H, numbers) in enumerate(self._read_onwards(item, scene, at, s, u_slot)):
+            dH = moved[q] @ B + D @ self.gradients_of(item, dots.gradients, q)
+            dq = self._numbers_jvp(item, change, dots, q)
+            after, held = self.law.next_state_jvp(H, dH, numbers, dq, onwards.h), self._parted(dq)[1]
+            self.put_state(item, change.z, 0, [onwards.pick(a, b) for a, b in zip(after, held)], q)
 
     @traced
     def move_on_vjp(self, item, scene, at, s, onwards, corner, adjoint, shape: bool, u_slot=None) -> None:
         """From the adjoint of the state after a pass to that of the state before, in its place, and, in corners, to that of
-        the displacement; adds those of coefficients and, if `shape`, of grad N."""
-        B, D, H, q = self._read_onwards(item, scene, at, s, u_slot)
-        later = self.state_of(item, adjoint.z, 0)
-        zero = [let(0 * x) for x in later]
-        by_H, by_q = self.law.next_state_vjp(H, q, onwards.h, [onwards.pick(x, o) for x, o in zip(later, zero)])
-        by_p, by_z = self._parted(by_q)
-        held = [onwards.pick(o, x) for x, o in zip(later, zero)]
-        self.items.put_row(adjoint.z, 0, item, [a + b for a, b in zip(by_z, held)])
-        self.items.add(adjoint.coefficients, len(by_p), item, by_p)
-        self.store(item, corner, (by_H * ti.cast(-1, self.fp)) @ B.transpose())
-        if shape:
-            self.items.add(adjoint.gradients, 9, item, (D.transpose() @ by_H).numbers)
+        the displacement; adds those of coefficients and, if `shape`, of B."""
+        pushes, points = [], self.nodes.points
+        for q, (B, D, H, numbers) in enumerate(self._read_onwards(item, scene, at, s, u_slot)):
+            later = self.state_of(item, adjoint.z, 0, q)
+            zero = [let(0 * x) for x in later]
+            by_H, by_q = self.law.next_state_vjp(
+                H, numbers, onwards.h, [onwards.pick(x, o) for x, o in zip(later, zero)]
+            )
+            by_p, by_z = self._parted(by_q)
+            held = [onwards.pick(o, x) for x, o in zip(later, zero)]
+            self.put_state(item, adjoint.z, 0, [a + b for a, b in zip(by_z, held)], q)
+            self.items.add(adjoint.coefficients, len(by_p), item, by_p)
+            pushes.append((by_H * ti.cast(-1, self.fp)) @ B.transpose())
+            if shape:
+                self.items.add(adjoint.gradients, 9 * points, item, (D.transpose() @ by_H).numbers, 9 * q)
+        self.store(item, corner, pushes)

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti.inputs import links
 from diffsim_ti.inputs.chain import Chain, Link
+from diffsim_ti.inputs.curved_shape import CurvedShape, StressPoints
 from diffsim_ti.inputs.description import POSITIVE, Input, frozen, length, speed
 from diffsim_ti.inputs.foundation import FoundationRows
 from diffsim_ti.inputs.loads import PressureRows, SumOfForces
@@ -30,8 +31,8 @@ class Derived:
     mass: np.ndarray  # (num_vertices,) [kg]
     parameters: np.ndarray  # the numbers of all terms, one after the other
     rest: np.ndarray  # (num_vertices, 3) [m]
-    gradients: np.ndarray  # (num_tetrahedra, 3, 3), rows grad N_1..3 [1/m]
-    volumes: np.ndarray  # (num_tetrahedra,) [m^3]
+    gradients: np.ndarray  # (num_tetrahedra, 3, 3), rows grad N_1..3 [1/m]; of ten nodes (num_tetrahedra, 4, 3, 3)
+    volumes: np.ndarray  # (num_tetrahedra,) [m^3]; of ten nodes (num_tetrahedra, 4)
     surface: np.ndarray | None = None  # (num_vertices,) of the surface, 0 within [m^2]
     forces: np.ndarray | None = None  # (1 or steps, k, 3), or (1 or steps, 2 k, 3) as each step begins and ends [N]
     motion: np.ndarray | None = None  # (steps + 1, num_held, 3) [m]
@@ -116,10 +117,10 @@ class Inputs:
         """Those of the body, of its material, of the terms, and what joins the terms' numbers and paths."""
         mesh, scene, places = self.mesh, self.scene, {}
         out = [
-            links.RestShape(mesh.tetrahedra),
+            links.RestShape(mesh.tetrahedra) if mesh.order == 1 else CurvedShape(mesh.elements),
             links.Displacement(),
             links.FreeVelocity(scene.supports.free),
-            links.LumpedMass(mesh.tetrahedra, mesh.num_vertices),
+            links.LumpedMass(mesh),
             *scene.material.links(),
         ]
         if any(term.acts_on_surface for term in scene.terms):
@@ -216,9 +217,9 @@ class Inputs:
         return Derived(*map(known.get, READ))
 
     @property
-    def rest_gradients(self) -> np.ndarray:
-        """grad N_1..3 of each tetrahedron of the mesh [1/m], shape (num_tetrahedra, 3, 3)."""
-        return self.derive(self.values).gradients
+    def stress_points(self) -> StressPoints:
+        """Of the mesh's own rest shape."""
+        return StressPoints.of(self.mesh, self.derive(self.values))
 
     def derive_jvp(self, values: dict, tangents: dict) -> Derived:
         """Change of what kernels read for changes `tangents` of some inputs."""

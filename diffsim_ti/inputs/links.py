@@ -90,27 +90,29 @@ class FreeVelocity(Link):
 
 
 class LumpedMass(Link):
-    """Of each vertex, sum rho V / 4 over its tetrahedra; rho is one number or one per tetrahedron."""
+    """Of each vertex, sum rho V s_a over its elements, with the node's share s_a, 1/4 of four nodes; rho is one number or one
+    per tetrahedron."""
 
-    reads, writes = ("density", "volumes"), ("mass",)
+    writes = ("mass",)
 
-    def __init__(self, tetrahedra: np.ndarray, num_vertices: int):
-        self.tetrahedra, self.num_vertices = tetrahedra, num_vertices
+    def __init__(self, mesh):
+        self.elements, self.num_vertices, self.shares = mesh.elements, mesh.num_vertices, mesh.reference.lumped
+        self.reads = ("density", "volumes" if mesh.order == 1 else "element volumes")
 
     def value(self, density, volumes):
-        return (self._to_vertices(density * volumes / 4),)
+        return (self._to_vertices(density * volumes),)
 
     def jvp(self, x, dx):
         (density, volumes), (d_density, d_volumes) = x, dx
-        return (self._to_vertices((d_density * volumes + density * d_volumes) / 4),)
+        return (self._to_vertices(d_density * volumes + density * d_volumes),)
 
     def vjp(self, x, y_adj):
-        (density, volumes), mass_adj = x, y_adj[0][self.tetrahedra].sum(1) / 4
+        (density, volumes), mass_adj = x, (y_adj[0][self.elements] * self.shares).sum(1)
         by_density = volumes * mass_adj
         return by_density if density.ndim else by_density.sum(), density * mass_adj
 
-    def _to_vertices(self, per_tetrahedron: np.ndarray) -> np.ndarray:
-        return np.bincount(self.tetrahedra.ravel(), np.repeat(per_tetrahedron, 4), self.num_vertices)
+    def _to_vertices(self, per_element: np.ndarray) -> np.ndarray:
+        return np.bincount(self.elements.ravel(), np.outer(per_element, self.shares).ravel(), self.num_vertices)
 
 
 class Same(Link):

@@ -70,6 +70,8 @@ class ReferenceElement:
 
         Hinton, Rock, Zienkiewicz 1976, doi:10.1002/eqe.4290040305.
         """
+        if self.order == 1:
+            return np.full(4, 0.25)
         xi, weights = quadrature(4)
         diagonal = weights @ self.functions(xi) ** 2
         return diagonal / diagonal.sum()

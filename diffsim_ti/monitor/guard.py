@@ -256,7 +256,7 @@ class Guard:
         bad = "velocity" if not np.all(np.isfinite(ws.velocity_of(vertex))) else "displacement"
         ws.restore(self.good, 0)
         J = quantities.tetrahedron_fields(ws).J
-        around = np.nonzero((ws.scene.mesh.tetrahedra == vertex).any(1))[0]
+        around = np.nonzero((ws.scene.mesh.elements == vertex).any(1))[0]
         J_around = np.where(np.isfinite(J[around]), J[around], -np.inf)
         tet = int(around[J_around.argmin()]) if around.size else 0
         stable, state = self._stable_step()

@@ -28,37 +28,41 @@ class ObserverKernels:
 
     @cached_property
     def element(self):
-        return functions_of(self.law, self.features.uniform, False)
+        return functions_of(self.law, self.features, False)
 
     @ti.func
     def observe(self, scene: A, at: A, out: A, plan: A):
         for e in range(plan.num_places):
-            H = self.element.edges(e, scene, at.u, 0).dot(self.element.gradients_of(e, scene.gradients))
-            p = self.element.numbers_at(e, scene, at, 0)
-            F = H.matrix() + ti.Matrix.identity(self.element.types.fp, 3)
-            det = F.determinant()
-            S = self.law.stress(H, p).matrix() @ F.transpose() / det  # Cauchy
-            out.energy[e] = self.law.energy_density(H, p)
-            out.J[e] = det
-            a, b, c = S[0, 0] - S[1, 1], S[1, 1] - S[2, 2], S[2, 2] - S[0, 0]
-            shear = S[0, 1] * S[0, 1] + S[1, 2] * S[1, 2] + S[2, 0] * S[2, 0]
-            out.von_mises[e] = ti.sqrt(ti.cast(0.5, self.element.types.fp) * (a * a + b * b + c * c) + 3 * shear)
+            for q in ti.static(self.element.points):
+                H = self.element.gradient(e, scene, at.u, 0, q)
+                p = self.element.numbers_at(e, scene, at, 0, q)
+                F = H.matrix() + ti.Matrix.identity(self.element.types.fp, 3)
+                det = F.determinant()
+                S = self.law.stress(H, p).matrix() @ F.transpose() / det  # Cauchy
+                k = ti.static(len(self.element.points)) * e + q
+                out.energy[k] = self.law.energy_density(H, p)
+                out.J[k] = det
+                a, b, c = S[0, 0] - S[1, 1], S[1, 1] - S[2, 2], S[2, 2] - S[0, 0]
+                shear = S[0, 1] * S[0, 1] + S[1, 2] * S[1, 2] + S[2, 0] * S[2, 0]
+                out.von_mises[k] = ti.sqrt(ti.cast(0.5, self.element.types.fp) * (a * a + b * b + c * c) + 3 * shear)
 
     @ti.func
     def store(self, scene: A, at: A, out: A, plan: A):
         for e in range(plan.num_places):
-            H = self.element.edges(e, scene, at.u, 0).dot(self.element.gradients_of(e, scene.gradients))
-            out.energy[e] = self.law.energy_density(H, self.element.numbers_at(e, scene, at, 0))
+            for q in ti.static(self.element.points):
+                H = self.element.gradient(e, scene, at.u, 0, q)
+                energy = self.law.energy_density(H, self.element.numbers_at(e, scene, at, 0, q))
+                out.energy[ti.static(len(self.element.points)) * e + q] = energy
 
     @cached_property
     def stored(self) -> Kernel:
-        """Energy density [J/m^3] of each tetrahedron alone, for what looks often."""
+        """Energy density [J/m^3] at each point alone, for what looks often."""
         own = dict(scene=SCENE, at=with_state(dict(u="vectors2"), self.law), out=dict(energy="scalars"))
         return Kernel("stored", self.store, self.law.precision, own, dict(num_places="int"))
 
     @cached_property
     def fields(self) -> Kernel:
-        """Energy density [J/m^3], von Mises stress [Pa], J of each tetrahedron."""
+        """Energy density [J/m^3], von Mises stress [Pa], J at each point."""
         out = dict.fromkeys(("energy", "von_mises", "J"), "scalars")
         own = dict(scene=SCENE, at=with_state(dict(u="vectors2"), self.law), out=out)
         return Kernel("fields", self.observe, self.law.precision, own, dict(num_places="int"))
@@ -84,7 +88,8 @@ class Energy(float):
 
 @dataclass
 class TetrahedronFields:
-    """Per tetrahedron: energy density [J/m^3], von Mises stress [Pa], volume ratio J [-]; float64."""
+    """Per tetrahedron: energy density [J/m^3], von Mises stress [Pa], volume ratio J [-]; float64. Of ten nodes: means over
+    the points, and the smallest J there."""
 
     energy_density: np.ndarray
     von_mises: np.ndarray
@@ -96,14 +101,17 @@ def tetrahedron_fields(workspace: Workspace) -> TetrahedronFields:
     a = workspace.arrays
 
     def bind():
-        out = SimpleNamespace(**{name: runtime.array(a.fp, a.num_places) for name in ("energy", "von_mises", "J")})
+        room = a.points * a.num_places
+        out = SimpleNamespace(**{name: runtime.array(a.fp, room) for name in ("energy", "von_mises", "J")})
         return out, observer_kernels(a.law, a.features()).fields.bind(scene=a, at=workspace.state, out=out)
 
     out, launch = workspace.kept("fields", bind)
     launch(num_places=a.num_places)
-    return TetrahedronFields(
-        *(runtime.fetch(x)[a.place].astype(np.float64) for x in (out.energy, out.von_mises, out.J))
-    )
+    energy, von_mises, J = (a.at_points(runtime.fetch(x)) for x in (out.energy, out.von_mises, out.J))
+    if a.points > 1:
+        share = a.values.volumes / a.values.volumes.sum(1, keepdims=True)
+        energy, von_mises, J = (energy * share).sum(1), (von_mises * share).sum(1), J.min(1)
+    return TetrahedronFields(energy, von_mises, J)
 
 
 def elastic_energy(workspace: Workspace) -> float:
@@ -111,12 +119,12 @@ def elastic_energy(workspace: Workspace) -> float:
     a = workspace.arrays
 
     def bind():
-        out = SimpleNamespace(energy=runtime.array(a.fp, a.num_places))
+        out = SimpleNamespace(energy=runtime.array(a.fp, a.points * a.num_places))
         return out, observer_kernels(a.law, a.features()).stored.bind(scene=a, at=workspace.state, out=out)
 
     out, launch = workspace.kept("stored", bind)
     launch(num_places=a.num_places)
-    return float(runtime.fetch(out.energy)[a.place].astype(np.float64) @ a.values.volumes)
+    return float(a.at_points(runtime.fetch(out.energy)).ravel() @ a.values.volumes.ravel())
 
 
 def barrier_energies(workspace: Workspace) -> np.ndarray:
@@ -149,7 +157,8 @@ def energy(workspace: Workspace) -> Energy:
     a, values = workspace.arrays, workspace.arrays.values
     u, v = (runtime.fetch(x)[0].astype(np.float64) for x in (workspace.state.u, workspace.state.v))
     parts = {"kinetic": float(0.5 * (values.mass * (v**2).sum(1)).sum())}
-    parts["elastic"] = float((tetrahedron_fields(workspace).energy_density * values.volumes).sum())
+    volumes = values.volumes if a.points == 1 else values.volumes.sum(1)
+    parts["elastic"] = float((tetrahedron_fields(workspace).energy_density * volumes).sum())
     features = a.features()
     if features.gravity >= 0:
         g = values.parameters[features.gravity :][:3]

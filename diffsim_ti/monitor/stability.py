@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diffsim_ti import runtime
-from diffsim_ti.mesh.geometry import shape_gradients
+from diffsim_ti.inputs import StressPoints
 from diffsim_ti.mesh.patches import volume_patches
 from diffsim_ti.potential.attached import Attached
 from diffsim_ti.potential.kernels import potential_kernels
@@ -55,19 +55,31 @@ def element_limit(scene: "Scene", values: dict | None = None) -> StepLimit:
         values = scene.inputs.at_times([0.0]) | values
     mu, lam = material.lame({name: values[name] for name in material.inputs})
     derived = scene.inputs.derive(values)
-    if scene.volume == "patches" and np.ndim(lam):
+    if scene.volume == "patches" and np.ndim(lam) and scene.mesh.order == 1:
         patches = volume_patches(scene.mesh)
         means = np.bincount(patches, lam * derived.volumes) / np.bincount(patches, derived.volumes)
         lam = means[patches]
-    N = shape_gradients(derived.gradients)
-    largest = np.linalg.eigvalsh(np.einsum("eai,eaj->eij", N, N))[:, -1]
-    omega2 = 4 / values["density"] * (np.maximum(lam, 0) * (N**2).sum((1, 2)) + 2 * mu * largest)
+    dilatation, largest = _squares_of_strains(scene.mesh, derived)
+    omega2 = (np.maximum(lam, 0) * dilatation + 2 * mu * largest) / values["density"]
     worst, attached = int(np.argmax(omega2)), Attached.of(scene)
     more = _gas_bound(scene, values, derived) if scene.chambers else 0.0
     if attached:  # what all of its parts add at the most
         at = attached.stiffest(derived, derived.ties, Schedule(1.0, 1))
         more += at.largest_omega2(derived.mass, derived.displacement, scene.fixed)
     return StepLimit(float(2 / np.sqrt(omega2[worst] + more)), worst, "element bound")
+
+
+def _squares_of_strains(mesh, derived) -> tuple[np.ndarray, np.ndarray]:
+    """For each element, the most that the integrals of (div v)^2 and |grad v|^2 may be of that of v^2 by lumped masses."""
+    element, (_, N, V) = mesh.reference, StressPoints.of(mesh, derived)
+    if element.order == 1:
+        return 4 * (N**2).sum((1, 2)), 4 * np.linalg.eigvalsh(np.einsum("eai,eaj->eij", N, N))[:, -1]
+    m, Q = len(mesh.elements), element.num_points
+    share = V.reshape(m, Q) / V.reshape(m, Q).sum(1, keepdims=True)
+    N = N.reshape(m, Q, -1, 3) * np.sqrt(share)[:, :, None, None] / np.sqrt(element.lumped)[:, None]
+    rows = np.swapaxes(N, 2, 3).reshape(m, 3 * Q, -1)  # of grad v, whose squares are those of the smaller Gram matrices
+    of_dilatation = np.einsum("eqai,epai->eqp", N, N, optimize=True)
+    return np.linalg.eigvalsh(of_dilatation)[:, -1], np.linalg.eigvalsh(rows @ np.swapaxes(rows, 1, 2))[:, -1]
 
 
 def _gas_bound(scene: "Scene", values: dict, derived) -> float:
@@ -173,11 +185,10 @@ class Stiffness:
 
     def worst_tetrahedron(self) -> int:
         """The tetrahedron where that vector moves most relative to its size."""
-        mesh = self.ws.scene.mesh
-        w = self.root * self.vector
-        D = w[mesh.tetrahedra[:, 1:]] - w[mesh.tetrahedra[:, :1]]
-        strain = np.einsum("eai,eaj->eij", D, self.ws.arrays.values.gradients)
-        return int(np.argmax((strain**2).sum((1, 2)) * self.ws.arrays.values.volumes))
+        a = self.ws.arrays
+        points = StressPoints.of(a.mesh, a.values)
+        strain = points.displacement_gradients(self.root * self.vector)
+        return int(np.argmax((strain**2).sum((1, 2)) * points.volumes)) // a.points
 
 
 def lanczos_limit(workspace: Workspace, tolerance: float = 1e-3) -> StepLimit:

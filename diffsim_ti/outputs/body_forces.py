@@ -30,7 +30,7 @@ class BodyForceKernels:
 
     @cached_property
     def element(self):
-        return functions_of(self.law, self.features.uniform, self.lanes)
+        return functions_of(self.law, self.features, self.lanes)
 
     def _kernel(self, name: str, body, **arrays) -> Kernel:
         own = dict(scene=SCENE, at=STATE, out=CORNERS | dict(y="vectors2", y_rate="vectors2")) | arrays

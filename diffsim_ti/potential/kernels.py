@@ -32,12 +32,12 @@ class PotentialKernels:
 
     @cached_property
     def element(self):
-        return functions_of(self.law, self.features.uniform, self.lanes)
+        return functions_of(self.law, self.features, self.lanes)
 
     @cached_property
     def single(self):
         """The element without lanes."""
-        return functions_of(self.law, self.features.uniform, False)
+        return functions_of(self.law, self.features, False)
 
     @cached_property
     def obstacles(self) -> ObstaclePotential:
@@ -65,10 +65,12 @@ class PotentialKernels:
     def energies(self, scene: A, pass_: A, at: A, out: A, plan: A):
         ti.loop_config(serialize=not self.parallel)
         for e in range(plan.num_tetrahedra):
-            H = self.single.edges(e, scene, at.u, 0).dot(self.single.gradients_of(e, scene.gradients))
-            psi = self.law.energy_density(H, self.single.numbers_at(e, scene, at, 0))
-            out.elastic[e] = psi * self.single.volume_of(e, scene.volumes)
-            out.J[e] = self.volume_ratio(H)
+            for q in ti.static(self.single.points):
+                H = self.single.gradient(e, scene, at.u, 0, q)
+                psi = self.law.energy_density(H, self.single.numbers_at(e, scene, at, 0, q))
+                k = ti.static(len(self.single.points)) * e + q
+                out.elastic[k] = psi * self.single.volume_of(e, scene.volumes, q)
+                out.J[k] = self.volume_ratio(H)
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.num_vertices):
             value = ti.cast(0, self.fp)
@@ -78,7 +80,7 @@ class PotentialKernels:
 
     @cached_property
     def energy(self) -> Kernel:
-        """Energy [J] and volume ratio of each tetrahedron, energy of contact and friction [J] of each vertex."""
+        """Energy [J] and volume ratio of each point, energy of contact and friction [J] of each vertex."""
         out = dict(elastic="scalars", J="scalars", contact="scalars")
         return self._kernel("energy", self.energies, at=dict(u="vectors2"), out=out)
 
@@ -165,12 +167,13 @@ class PotentialKernels:
 
     @traced
     def tangent_column(self, e, scene, at, c, tangent):
-        """Column c of d2psi/dF2, nine numbers, to rows 9 c .. 9 c + 8 of its block."""
+        """Column c of d2psi/dF2 at each point q, nine numbers, to rows 81 q + 9 c .. 81 q + 9 c + 8 of its block."""
         el = self.element
-        H = el.edges(e, scene, at.u, 0) @ el.gradients_of(e, scene.gradients)
         dH = Tensor(el.broadcast(ti.cast(c == k, self.fp)) for k in range(9))
-        dP = self.law.stress_differential(H, dH, el.numbers_at(e, scene, at, 0))
-        el.put(tangent, 81, e, 9 * c, dP.numbers)
+        for q in el.points:
+            H = el.gradient(e, scene, at.u, 0, q)
+            dP = self.law.stress_differential(H, dH, el.numbers_at(e, scene, at, 0, q))
+            el.put(tangent, 81 * len(el.points), e, 81 * q + 9 * c, dP.numbers)
 
     @traced
     def corner_blocks(self, e, scene, tangent, columns):
@@ -204,16 +207,21 @@ class PotentialKernels:
         for e in range(plan.num_items):
             for c in range(9):
                 self.tangent_column(e, scene, at, c, out.tangent)
-            self.corner_blocks(e, scene, out.tangent, (out.corner0, out.corner1, out.corner2))
+            if ti.static(self.features.order == 1):
+                self.corner_blocks(e, scene, out.tangent, (out.corner0, out.corner1, out.corner2))
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.num_vertices):
             for d, corner in ti.static(enumerate((out.corner0, out.corner1, out.corner2))):
                 column = self.contact_column(i, d, at, scene, pass_, plan)
-                out.blocks[d, i] = self.element.gather(i, scene, corner) - column
+                if ti.static(self.features.order == 1):
+                    out.blocks[d, i] = self.element.gather(i, scene, corner) - column
+                else:
+                    out.blocks[d, i] = 0 - column
 
     @cached_property
     def blocks(self) -> Kernel:
-        """d2psi/dF2 of each tetrahedron, and the 3x3 diagonal blocks of -df/du, by columns."""
+        """d2psi/dF2 of each point, and the 3x3 diagonal blocks of -df/du, by columns; of ten nodes the tetrahedra's part is
+        left to the host."""
         out = dict.fromkeys(("corner0", "corner1", "corner2"), "vectors") | dict(tangent="blocks", blocks="vectors2")
         return self._kernel("blocks", self.all_blocks, at=dict(u="vectors2"), out=out)
 

@@ -10,19 +10,21 @@ class PatchCoupling:
     (patched_tetrahedron.py). A row for each pair of a patch and one of its vertices.
     """
 
-    def __init__(self, arrays, tetrahedra: np.ndarray):
+    def __init__(self, arrays):
         self._place, self._n = arrays.place, arrays.num_vertices
-        values, factors = arrays.values, arrays.law.base.last_without_lam
-        pairs, row_of = np.unique(arrays.patches[:, None] * self._n + tetrahedra, return_inverse=True)
+        values, factors, elements = arrays.values, arrays.law.base.last_without_lam, arrays.mesh.elements
+        self._nodes = elements.shape[1]
+        pairs, row_of = np.unique(arrays.patches[:, None] * self._n + elements, return_inverse=True)
         self._row_of, self.patches, self.vertices = row_of.ravel(), pairs // self._n, pairs % self._n
-        p = np.broadcast_to(values.coefficients, (len(tetrahedra), values.coefficients.shape[-1]))
+        p = np.broadcast_to(values.coefficients, (len(elements), values.coefficients.shape[-1]))
         lam = p[:, -1] - sum(f * p[:, k] for k, f in enumerate(factors))
-        volumes = np.bincount(arrays.patches, values.volumes)
-        self.c = np.bincount(arrays.patches, lam * values.volumes) / volumes**2
+        own = values.volumes if arrays.points == 1 else values.volumes.sum(1)
+        volumes = np.bincount(arrays.patches, own)
+        self.c = np.bincount(arrays.patches, lam * own) / volumes**2
 
     def rows(self, corner: np.ndarray) -> np.ndarray:
         """g by rows, shape (num_rows, 3), from the corner forces of unit pressures."""
-        at_corners = corner.reshape(-1, 4, 3)[self._place].reshape(-1, 3)
+        at_corners = corner.reshape(-1, self._nodes, 3)[self._place].reshape(-1, 3)
         return np.stack([np.bincount(self._row_of, at_corners[:, d], len(self.vertices)) for d in range(3)], 1)
 
     def diagonal(self, g: np.ndarray) -> np.ndarray:

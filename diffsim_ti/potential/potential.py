@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from diffsim_ti import runtime
+from diffsim_ti.inputs import StressPoints
 from diffsim_ti.potential.attached import Attached
 from diffsim_ti.potential.face_contact import FaceContact
 from diffsim_ti.potential.kernels import potential_kernels
@@ -33,8 +34,9 @@ class Potential:
         self.pressed = runtime.array(a.vector, num_obstacles if self.presses else 1, n if self.presses else 1)
         self.per_gamma, self.held_at = 1.0, np.zeros((n, 3))
         self.size, self.contact = runtime.array(a.fp, n), runtime.array(a.fp, n)
-        self.elastic, self.J = runtime.array(a.fp, m), runtime.array(a.fp, m)
+        self.elastic, self.J = runtime.array(a.fp, a.points * m), runtime.array(a.fp, a.points * m)
         self._launches, self._coupling, self._barrier_blocks = {}, None, None  # made when first needed
+        self._points = None
         self.z = arrays.law_states(1)  # the state of the law, held during a pass
         self.attached: Attached | None = None  # springs, cables, foundations: set by whom a time is known
 
@@ -88,7 +90,7 @@ class Potential:
             runtime.fill(self.z, state)
 
     def energy(self) -> tuple[float, float, np.ndarray]:
-        """(energy [J], the sum of its absolute parts, J of each tetrahedron)."""
+        """(energy [J], the sum of its absolute parts, J at each point)."""
         self.launch("energy", lanes=False)
         elastic, contact, J = (runtime.fetch(x).astype(np.float64) for x in (self.elastic, self.contact, self.J))
         if self.pairs:
@@ -134,20 +136,40 @@ class Potential:
             blocks = blocks + self.faces.blocks()
         if self.attached:
             blocks = blocks + self.attached.blocks(self.held_at)
+        if a.points > 1:
+            blocks = blocks + self._element_blocks()
         return blocks if a.patches is None else blocks + self.coupling.diagonal(self.patch_gradients())
+
+    def _element_blocks(self) -> np.ndarray:
+        """The part of tetrahedra of ten nodes in `blocks`: sum V grad N_a . d2psi/dF2 . grad N_a."""
+        nodes, N, volumes = self.stress_points
+        C = self.tangents().reshape(-1, 3, 3, 3, 3)
+        out = np.zeros((self.arrays.num_vertices, 3, 3))
+        for a in range(nodes.shape[1]):
+            own = np.einsum("pijkl,pj,pl,p->pik", C, N[:, a], N[:, a], volumes, optimize=True)
+            np.add.at(out, nodes[:, a], own)
+        return out
+
+    @property
+    def stress_points(self) -> StressPoints:
+        """Of the rest shape that is loaded."""
+        if self._points is None or self._points[0] is not self.arrays.values:
+            self._points = self.arrays.values, StressPoints.of(self.arrays.mesh, self.arrays.values)
+        return self._points[1]
 
     @cached_property
     def _block_arrays(self) -> SimpleNamespace:
         a = self.arrays
         corners = {f"corner{d}": runtime.array(a.vector, *a.corner.shape) for d in range(3)}
-        tangent, blocks = runtime.array(a.lanes, 81 * a.num_blocks), runtime.array(a.vector, 3, a.num_vertices)
+        room = 81 * a.points * a.num_blocks
+        tangent, blocks = runtime.array(a.lanes, room), runtime.array(a.vector, 3, a.num_vertices)
         return SimpleNamespace(tangent=tangent, blocks=blocks, **corners)
 
     @property
     def coupling(self) -> PatchCoupling:
         """What patches add to d2E/du2, by the numbers that are loaded."""
         if self._coupling is None or self._coupling[0] is not self.arrays.values:
-            self._coupling = self.arrays.values, PatchCoupling(self.arrays, self.tetrahedra)
+            self._coupling = self.arrays.values, PatchCoupling(self.arrays)
         return self._coupling[1]
 
     def patch_gradients(self) -> np.ndarray:
@@ -157,9 +179,9 @@ class Potential:
         return self.coupling.rows(runtime.fetch(a.corner)[: a.first_contact_corner].astype(np.float64))
 
     def tangents(self) -> np.ndarray:
-        """d2psi/dF2 [Pa] of each tetrahedron, its patch's pressure held, where `blocks` was last called, shape
-        (num_tetrahedra, 9, 9)."""
-        return self.arrays.from_blocks(runtime.fetch(self._block_arrays.tangent), 81).reshape(-1, 9, 9)
+        """d2psi/dF2 [Pa] at each point, its patch's pressure held, where `blocks` was last called, shape (points, 9, 9)."""
+        a = self.arrays
+        return a.from_blocks(runtime.fetch(self._block_arrays.tangent), 81 * a.points).reshape(-1, 9, 9)
 
     def contact_blocks(self) -> np.ndarray | None:
         """The part of contact and of what is attached in `blocks`; None without."""

@@ -102,10 +102,10 @@ class Solver(ABC):
     def starts_deformed(self, strain: float = 0.05) -> bool:
         """Whether the start is strained so much that the bound at rest may not hold."""
         if self._deformed is None:
-            inputs, tets = self.scene.inputs, self.scene.mesh.tetrahedra
+            inputs = self.scene.inputs
             u = inputs.values["initial_positions"] - inputs.values["rest_positions"]
-            D = np.swapaxes(u[tets[:, 1:]] - u[tets[:, :1]], 1, 2)
-            self._deformed = bool(u.any() and np.abs(np.matmul(D, inputs.rest_gradients)).max() > strain)
+            H = inputs.stress_points.displacement_gradients
+            self._deformed = bool(u.any() and np.abs(H(u)).max() > strain)
         return self._deformed
 
     def _refuse_unstable(self) -> None:

@@ -24,6 +24,7 @@ class SceneArrays:
         fp = runtime.PRECISIONS[precision]
         self.fp, self.vector, self.lanes = fp, ti.types.vector(4, fp), ti.types.vector(LANES, fp)
         self.law = scene.law
+        self.nodes, self.points = mesh.reference.num_nodes, mesh.reference.num_points  # of each element
         self._order_tetrahedra(scene)
         self.num_coefficients, self.num_blocks = len(self.law.coefficient_names), len(self.order) // LANES
         self.in_lanes = self.law.lanes and runtime.runs_on_cpu()
@@ -41,6 +42,7 @@ class SceneArrays:
         rows = scene.inputs.parameters
         self.obstacles = self._twins(scene)
         self._features = dict(
+            order=mesh.order,
             groups=grouped(self.obstacles),
             stages=stages_contact,
             moving=len(scene.moving),
@@ -67,7 +69,7 @@ class SceneArrays:
         """`order`: the tetrahedron in each lane; `place`: the lane of each; `num_places`: lanes to go through."""
         m = scene.mesh.num_tetrahedra
         self.patches = volume_patches(scene.mesh) if scene.volume == "patches" else None
-        if self.patches is not None:
+        if self.patches is not None and scene.mesh.order == 1:
             self.order, self.place = in_eights(self.patches)
             self.num_places = len(self.order)
             self._alone = np.zeros(self.num_places)  # 1 where a lane is no repetition
@@ -79,11 +81,11 @@ class SceneArrays:
 
     def _upload_topology(self, scene) -> None:
         mesh, n = self.mesh, self.num_vertices
-        self.tets = runtime.upload(self.to_blocks(mesh.tetrahedra).ravel(), ti.i32)
-        self.first_contact_corner, num_corners = 4 * LANES * self.num_blocks, 4 * LANES * self.num_blocks
-        start, corner_of = vertex_corners(mesh.tetrahedra, n)
-        if self.patches is not None:
-            corner_of = 4 * self.place[corner_of // 4] + corner_of % 4
+        self.tets = runtime.upload(self.to_blocks(mesh.elements).ravel(), ti.i32)
+        self.first_contact_corner = num_corners = self.nodes * LANES * self.num_blocks
+        start, corner_of = vertex_corners(mesh.elements, n)
+        if not isinstance(self.place, slice):
+            corner_of = self.nodes * self.place[corner_of // self.nodes] + corner_of % self.nodes
         if self.self_contact:  # each surface vertex gathers one corner more, after those of its tetrahedra
             self.parameters_of_self_contact = scene.inputs.parameters.of(self.self_contact)
             start, corner_of = with_own_corner(start, corner_of, mesh.surface_vertices, num_corners)
@@ -249,15 +251,21 @@ class SceneArrays:
         flat = np.swapaxes(blocks.reshape(-1, rows, LANES), 1, 2).reshape(-1, rows)
         return flat[self.place].astype(np.float64)
 
+    def at_points(self, numbers: np.ndarray) -> np.ndarray:
+        """What kernels write for each point, in float64, shape (num_tetrahedra,), or (num_tetrahedra, points) with several."""
+        if self.points == 1:
+            return numbers[self.place].astype(np.float64)
+        return numbers.reshape(-1, self.points)[self.place].astype(np.float64)
+
     def law_states(self, num_slots: int):
         """Room for what the law remembers; None if it has no state."""
-        rows = len(self.law.state_names) * self.num_blocks
+        rows = len(self.law.state_names) * self.points * self.num_blocks
         return runtime.array(self.lanes, num_slots, rows) if rows else None
 
     def initial_state_blocks(self) -> np.ndarray:
         """Blocks of the law's initial state."""
         initial = self.law.initial_state or (0.0,) * len(self.law.state_names)
-        return np.repeat(np.tile(initial, self.num_blocks)[:, None], LANES, 1)
+        return np.repeat(np.tile(initial, self.points * self.num_blocks)[:, None], LANES, 1)
 
     def coefficient_blocks(self, coefficients: np.ndarray) -> np.ndarray:
         """Blocks of coefficients, shape (K,) or (num_tetrahedra, K); a single block serves all if they are uniform."""
@@ -267,7 +275,7 @@ class SceneArrays:
     def volume_blocks(self, volumes: np.ndarray) -> np.ndarray:
         """Blocks of volumes; repetitions in a patch have none."""
         blocks = self.to_blocks(volumes)
-        return blocks if self.patches is None else blocks * self._alone.reshape(-1, LANES)
+        return blocks if isinstance(self.place, slice) else blocks * self._alone.reshape(-1, LANES)
 
 
 class History:

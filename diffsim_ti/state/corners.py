@@ -6,10 +6,10 @@ import taichi as ti
 from diffsim_ti import runtime
 
 
-def vertex_corners(tetrahedra: np.ndarray, num_vertices: int) -> tuple[np.ndarray, np.ndarray]:
-    """Compressed rows: the corners c = 4 e + a that meet at vertex i are corner_of[start[i] : start[i + 1]]."""
-    corner_of = np.argsort(tetrahedra.ravel(), kind="stable")
-    counts = np.bincount(tetrahedra.ravel(), minlength=num_vertices)
+def vertex_corners(elements: np.ndarray, num_vertices: int) -> tuple[np.ndarray, np.ndarray]:
+    """Compressed rows: the corners c = nodes e + a that meet at vertex i are corner_of[start[i] : start[i + 1]]."""
+    corner_of = np.argsort(elements.ravel(), kind="stable")
+    counts = np.bincount(elements.ravel(), minlength=num_vertices)
     return np.concatenate([[0], np.cumsum(counts)]), corner_of
 
 

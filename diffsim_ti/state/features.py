@@ -42,6 +42,7 @@ def grouped(obstacles) -> tuple[ObstacleGroup, ...]:
 class Features:
     """What kernels are compiled for, besides the law."""
 
+    order: int = 1  # of the functions between an element's nodes
     groups: tuple[ObstacleGroup, ...] = ()
     stages: bool = False  # whether obstacles with a distance act as a stage of the passes, not as a force
     gravity: int = -1  # where it starts in the parameter array, -1: none

@@ -38,9 +38,15 @@ def _whole(arrays, x):
 
 PARTS = {
     "gradients": Part(
-        "blocks", lambda a, d: a.to_blocks(d.gradients), lambda a, x: a.from_blocks(x, 9).reshape(-1, 3, 3)
+        "blocks",
+        lambda a, d: a.to_blocks(d.gradients),
+        lambda a, x: a.from_blocks(x, 9 * a.points).reshape(a.values.gradients.shape),
     ),
-    "volumes": Part("blocks", lambda a, d: a.volume_blocks(d.volumes), lambda a, x: a.from_blocks(x, 1)[:, 0]),
+    "volumes": Part(
+        "blocks",
+        lambda a, d: a.volume_blocks(d.volumes),
+        lambda a, x: a.from_blocks(x, a.points).reshape(a.values.volumes.shape),
+    ),
     "coefficients": Part(
         "blocks", lambda a, d: a.coefficient_blocks(d.coefficients), lambda a, x: a.from_blocks(x, a.num_coefficients)
     ),
@@ -99,7 +105,7 @@ class Adjoint:
     def __init__(self, arrays, features, more=()):
         self._arrays, self._features = arrays, features
         a, blocks = arrays, arrays.num_blocks
-        shape = blocks if features.shape else 0
+        shape = a.points * blocks if features.shape else 0
         self.coefficients = runtime.array(a.lanes, a.num_coefficients * blocks)
         self.gradients, self.volumes = runtime.array(a.lanes, 9 * shape), runtime.array(a.lanes, shape)
         self.sums = runtime.array(a.fp, features.sums().total, a.num_vertices)

@@ -50,7 +50,7 @@ class KickDrift:
 
     @cached_property
     def element(self):
-        return functions_of(self.law, self.features.uniform, self.lanes)
+        return functions_of(self.law, self.features, self.lanes)
 
     @cached_property
     def obstacles(self) -> ObstacleStages:

@@ -27,7 +27,7 @@ class LawStateKernels:
 
     @cached_property
     def element(self):
-        return functions_of(self.law, self.features.uniform, self.lanes)
+        return functions_of(self.law, self.features, self.lanes)
 
     @traced
     def onwards(self, plan) -> Onwards:

@@ -129,14 +129,14 @@ def _factorised(A):
 
 def vertex_rotations(potential, u: np.ndarray) -> np.ndarray | None:
     """Mean rotation at each vertex, shape (num_vertices, 3, 3), weighted by volume; None where all are small."""
-    a, tets = potential.arrays, potential.tetrahedra
-    D = u[tets[:, 1:]] - u[tets[:, :1]]
-    H = np.matmul(np.swapaxes(D, 1, 2), a.values.gradients)
+    points, n = potential.stress_points, potential.arrays.num_vertices
+    at, count = points.nodes.ravel(), points.nodes.shape[1]
+    H = points.displacement_gradients(u)
     if np.abs(H).max(initial=0.0) < 0.02:
         return None
-    H *= a.values.volumes[:, None, None]
-    F = np.stack([np.bincount(tets.ravel(), np.repeat(H.reshape(-1, 9)[:, k], 4), a.num_vertices) for k in range(9)], 1)
-    F /= np.bincount(tets.ravel(), np.repeat(a.values.volumes, 4), a.num_vertices)[:, None] + 1e-300
+    H *= points.volumes[:, None, None]
+    F = np.stack([np.bincount(at, np.repeat(H.reshape(-1, 9)[:, k], count), n) for k in range(9)], 1)
+    F /= np.bincount(at, np.repeat(points.volumes, count), n)[:, None] + 1e-300
     return rotations_of(F.reshape(-1, 3, 3) + np.eye(3))
 
 

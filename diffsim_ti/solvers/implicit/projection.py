@@ -4,7 +4,7 @@ import numpy as np
 
 
 class Projection:
-    """w -> sum over tetrahedra of V B^T (C+ - C) B w, with C = d2psi/dF2 and C+ the same without negative eigenvalues.
+    """w -> sum over points of V B^T (C+ - C) B w, with C = d2psi/dF2 and C+ the same without negative eigenvalues.
 
     Only tetrahedra with an eigenvalue below -slight |C| are changed: most of a body that is pressed have slightly negative
     ones, for pressed springs yield sideways, and their neighbours hold them.
@@ -22,16 +22,15 @@ class Projection:
         values, vectors = np.linalg.eigh(0.5 * (C + np.swapaxes(C, 1, 2)))
         least = 1e-4 * np.abs(values).max(1, initial=0.0)[:, None]
         change = np.maximum(values, least) - values
-        volumes, B = a.values.volumes[some], a.values.gradients[some]
-        self.C = np.einsum("eij,ej,ekj,e->eik", vectors, change, vectors, volumes, optimize=True)
-        self.N = np.concatenate([-B.sum(1, keepdims=True), B], 1)
-        self.tets, self.num_vertices = potential.tetrahedra[some], a.num_vertices
+        nodes, N, volumes = potential.stress_points
+        self.C = np.einsum("eij,ej,ekj,e->eik", vectors, change, vectors, volumes[some], optimize=True)
+        self.N, self.nodes, self.num_vertices = N[some], nodes[some], a.num_vertices
 
     def __call__(self, w: np.ndarray) -> np.ndarray:
-        dH = np.einsum("eac,eaj->ecj", w[self.tets], self.N)
+        dH = np.einsum("eac,eaj->ecj", w[self.nodes], self.N)
         dP = np.matmul(self.C, dH.reshape(-1, 9, 1)).reshape(-1, 3, 3)
         forces = np.einsum("ecj,eaj->eac", dP, self.N).reshape(-1, 3)
-        at = self.tets.ravel()
+        at = self.nodes.ravel()
         return np.stack([np.bincount(at, forces[:, d], self.num_vertices) for d in range(3)], 1)
 
 
