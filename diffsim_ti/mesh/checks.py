@@ -7,7 +7,10 @@ import warnings
 
 import numpy as np
 
+from diffsim_ti.mesh import jacobian
 from diffsim_ti.mesh.geometry import FACES, edge_matrices, signed_volumes, squared_edges
+from diffsim_ti.mesh.reference_element import MID_EDGES
+from diffsim_ti.mesh.ten_nodes import FACE_NODES, MIRRORED
 
 # A tetrahedron with det [e1 e2 e3] below this share of its longest edge cubed is flat. The determinant's own rounding
 # is about 1e-15 of it, so 1e-12 leaves three digits of volume; the quality is then 1e-8, a usable sliver's above 1e-4.
@@ -32,15 +35,17 @@ def checked_vertices(vertices) -> np.ndarray:
 
 
 def checked_tetrahedra(tetrahedra, num_vertices: int) -> np.ndarray:
-    """An int64 copy of shape (num_tetrahedra, 4) whose rows hold four different indices below num_vertices."""
+    """An int64 copy of shape (num_tetrahedra, 4 or 10) whose rows hold different indices below num_vertices."""
     given = np.asarray(tetrahedra)
     if given.size == 0:
         raise ValueError(f"a mesh needs at least one tetrahedron, got an array of shape {given.shape}")
     if given.dtype.kind not in "iu":
         raise ValueError(f"tetrahedra must be integers, got dtype {given.dtype}; convert with .astype(np.int64)")
-    if given.ndim != 2 or given.shape[1] != 4:
-        hint = "; these look like 10-node tetrahedra: keep the first 4 columns" if given.shape[-1] == 10 else ""
-        raise ValueError(f"tetrahedra must have shape (num_tetrahedra, 4), got {given.shape}{hint}")
+    if given.ndim != 2 or given.shape[1] not in (4, 10):
+        raise ValueError(
+            f"tetrahedra must have shape (num_tetrahedra, 4), or (num_tetrahedra, 10) with mid-edge vertices, got "
+            f"{given.shape}; give one row of vertex indices per tetrahedron"
+        )
     bad = np.nonzero(((given < 0) | (given >= num_vertices)).any(1))[0]
     if len(bad):
         row = given[bad[0]]
@@ -53,26 +58,85 @@ def checked_tetrahedra(tetrahedra, num_vertices: int) -> np.ndarray:
     ordered = np.sort(tetrahedra, 1)
     bad = np.nonzero((ordered[:, 1:] == ordered[:, :-1]).any(1))[0]
     if len(bad):
+        count = {4: "four", 10: "ten"}[given.shape[1]]
         raise ValueError(
-            f"a tetrahedron needs four different vertices: tetrahedron {bad[0]} is {tetrahedra[bad[0]].tolist()} "
+            f"a tetrahedron needs {count} different vertices: tetrahedron {bad[0]} is {tetrahedra[bad[0]].tolist()} "
             f"({len(bad)} such tetrahedra); remove them"
         )
     return tetrahedra
 
 
+def _flat_below(vertices: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
+    longest = np.sqrt(squared_edges(vertices, tetrahedra).max(1))
+    size = np.abs(vertices).max(1)[tetrahedra].max(1)
+    return (FLAT * longest + FLAT_ROUNDING * size) * longest**2 / 6
+
+
 def checked_volumes(vertices: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
     """Signed volumes V [m^3]; ValueError where 6 |V| <= (1e-12 L + 8 eps max|x|) L^2, L the longest edge, x coordinates."""
     volumes = signed_volumes(edge_matrices(vertices, tetrahedra))
-    longest = np.sqrt(squared_edges(vertices, tetrahedra).max(1))
-    size = np.abs(vertices).max(1)[tetrahedra].max(1)
-    flat = np.nonzero(6 * np.abs(volumes) <= (FLAT * longest + FLAT_ROUNDING * size) * longest**2)[0]
+    flat = np.nonzero(np.abs(volumes) <= _flat_below(vertices, tetrahedra))[0]
     if len(flat):
         first = flat[0]
+        longest = np.sqrt(squared_edges(vertices, tetrahedra[first : first + 1]).max())
         raise ValueError(
-            f"tetrahedron {first} is flat: volume {volumes[first]:.3g} m^3, longest edge {longest[first]:.3g} m, "
+            f"tetrahedron {first} is flat: volume {volumes[first]:.3g} m^3, longest edge {longest:.3g} m, "
             f"vertices {tetrahedra[first].tolist()} ({len(flat)} such tetrahedra); remove them or remesh"
         )
     return volumes
+
+
+def curved(vertices: np.ndarray, elements: np.ndarray) -> np.ndarray:
+    """Elements whose mid-edge vertices are not at the middles of straight edges, to round-off; Booleans, shape (m,)."""
+    if elements.shape[1] == 4:
+        return np.zeros(len(elements), bool)
+    ends = vertices[elements[:, MID_EDGES]]
+    off = np.linalg.norm(vertices[elements[:, 4:]] - ends.mean(2), axis=2).max(1)
+    longest = np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=2).max(1)
+    return off > FLAT * longest + FLAT_ROUNDING * np.abs(vertices).max(1)[elements].max(1)
+
+
+def checked_curved_volumes(vertices: np.ndarray, elements: np.ndarray, volumes: np.ndarray) -> np.ndarray:
+    """Those of curved elements too, integrals of J = det dx/dxi; ValueError where J is not positive all over an element.
+
+    J counts as positive above the threshold of `checked_volumes`, by the bounds of `jacobian`.
+    """
+    some = np.nonzero(curved(vertices, elements))[0]
+    if not len(some):
+        return volumes
+    nodes = vertices[elements[some]]
+    least = 6 * _flat_below(vertices, elements[some, :4])
+    wrong = jacobian.not_above(nodes, least)
+    if len(wrong):
+        first = some[wrong[np.argmin(jacobian.lowest(nodes[wrong]) / volumes[some[wrong]])]]
+        order = _nearest_edges(vertices[elements[first]])
+        columns = np.concatenate([np.arange(4), 4 + order])
+        remedy = (
+            "straighten or remesh what is bent so far (Gmsh: Mesh.HighOrderOptimize = 2), or take the corners alone, "
+            "tetrahedra[:, :4], and call .quadratic()"
+        )
+        if np.any(order != np.arange(6)) and not len(jacobian.not_above(nodes[:, columns], least)):
+            remedy = (
+                "these are in another order (VTK's is that of the edges 01, 12, 20, 03, 13, 23; Gmsh swaps the last two): "
+                f"take tetrahedra[:, {columns.tolist()}]"
+            )
+        J = jacobian.lowest(vertices[elements[first]][None])[0]
+        raise ValueError(
+            f"J = det dx/dxi must be positive all over an element: tetrahedron {first} has {J:.3g} m^3, 6 V = "
+            f"{6 * volumes[first]:.3g} m^3 by its corners, mid-edge vertices {elements[first, 4:].tolist()} ({len(wrong)} "
+            f"such tetrahedra); {remedy}"
+        )
+    volumes = volumes.copy()
+    volumes[some] = jacobian.volumes(nodes)
+    return volumes
+
+
+def _nearest_edges(nodes: np.ndarray) -> np.ndarray:
+    """For each edge the mid-edge vertex that is nearest to its middle, such that the sum of squares is least, shape (6,)."""
+    from scipy.optimize import linear_sum_assignment
+
+    middles = nodes[MID_EDGES].mean(1)
+    return linear_sum_assignment(((middles[:, None] - nodes[None, 4:]) ** 2).sum(2))[1]
 
 
 def oriented(tetrahedra: np.ndarray, volumes: np.ndarray, fix_orientation: bool) -> np.ndarray:
@@ -89,15 +153,16 @@ def oriented(tetrahedra: np.ndarray, volumes: np.ndarray, fix_orientation: bool)
             f"{subject} (volume {volumes[worst]:.3g} m^3); pass fix_orientation=True or swap two of its vertices"
         )
     tetrahedra = tetrahedra.copy()
-    tetrahedra[inside_out, 2:] = tetrahedra[inside_out, :1:-1]
+    tetrahedra[inside_out] = tetrahedra[inside_out][:, MIRRORED[: tetrahedra.shape[1]]]
     return tetrahedra
 
 
-def surface_of(tetrahedra: np.ndarray, num_vertices: int) -> np.ndarray:
-    """Faces of one tetrahedron only, oriented outwards, shape (k, 3); one sort of all faces.
+def surface_of(elements: np.ndarray, num_vertices: int) -> np.ndarray:
+    """Faces of one tetrahedron only, oriented outwards, shape (k, 3), or (k, 6) of ten-node ones; one sort of all faces.
 
     ValueError for a repeated tetrahedron, a face of more than two tetrahedra, and two tetrahedra on one side of a face.
     """
+    tetrahedra = elements[:, :4]
     corners = tetrahedra[:, FACES].reshape(-1, 3)
     a, b, c = np.sort(corners, 1).T
     if num_vertices < 2_000_000:  # three indices fit in one 64-bit key
@@ -134,7 +199,8 @@ def surface_of(tetrahedra: np.ndarray, num_vertices: int) -> np.ndarray:
         )
     single = np.ones(len(order), bool)
     single[1:][same] = single[:-1][same] = False
-    return corners[np.sort(order[single])]
+    places = np.sort(order[single])
+    return corners[places] if elements.shape[1] == 4 else elements[places[:, None] // 4, FACE_NODES[places % 4]]
 
 
 def warn_of_orphans(orphans: np.ndarray) -> None:

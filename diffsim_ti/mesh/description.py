@@ -40,8 +40,8 @@ def _numbers(values) -> str:
 
 
 def content_hash(mesh: "TetrahedralMesh") -> str:
-    """SHA-256 of vertices and tetrahedra, 64 hexadecimal digits."""
+    """SHA-256 of vertices and elements, 64 hexadecimal digits."""
     digest = hashlib.sha256(np.array([mesh.num_vertices, mesh.num_tetrahedra], "<i8").tobytes())
     digest.update(mesh.vertices.astype("<f8").tobytes())
-    digest.update(mesh.tetrahedra.astype("<i8").tobytes())
+    digest.update(mesh.elements.astype("<i8").tobytes())
     return digest.hexdigest()

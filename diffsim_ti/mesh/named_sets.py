@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.mesh.geometry import triangle_normals
-from diffsim_ti.mesh.sets import checked_sets, chosen_indices, places_of_triangles
+from diffsim_ti.mesh.sets import checked_sets, chosen_indices, rows_of
 
 if TYPE_CHECKING:
     from diffsim_ti.mesh.tetrahedral_mesh import TetrahedralMesh
@@ -57,13 +57,13 @@ class NamedSets:
             return np.arange(count)
         if not isinstance(chosen, str) and np.ndim(chosen) == 2:
             triangles = np.asarray(chosen)
-            if triangles.shape[1] != 3 or triangles.dtype.kind not in "iu":
+            if triangles.shape[1] not in (3, self._surface_faces.shape[1]) or triangles.dtype.kind not in "iu":
                 raise ValueError(f"triangles must be vertex indices of shape (k, 3), got shape {triangles.shape}")
-            chosen = places_of_triangles(triangles, self.surface_triangles)
-            if len(chosen) and chosen.min() < 0:
-                first = triangles[np.argmin(chosen)]
+            chosen, none = rows_of(triangles[:, :3], self.surface_triangles, self._surface_faces)
+            if none.any():
+                first = triangles[np.argmax(none)]
                 raise ValueError(
-                    f"triangle {first.tolist()} is not on the surface ({(chosen < 0).sum()} of {len(chosen)} are not); "
+                    f"triangle {first.tolist()} is not on the surface ({none.sum()} of {len(none)} are not); "
                     "take rows of surface_triangles"
                 )
         return chosen_indices(chosen, self._surface_sets, count, "surface")

@@ -66,24 +66,44 @@ def places_of_triangles(triangles: np.ndarray, among: np.ndarray) -> np.ndarray:
     return np.where(at < len(among), at, -1)
 
 
-def rows_on_surface(sets: dict | None, surface: np.ndarray) -> dict[str, np.ndarray]:
+def rows_of(triangles: np.ndarray, surface: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(rows of the surface that triangles are, four for one that has the corners of a face of six nodes; which are none)."""
+    rows = places_of_triangles(triangles, surface)
+    if faces.shape[1] == 3:
+        return rows[rows >= 0], rows < 0
+    whole = places_of_triangles(triangles, faces[:, :3])
+    four = (4 * whole[whole >= 0, None] + np.arange(4)).ravel()
+    return np.concatenate([rows[rows >= 0], four]), (rows < 0) & (whole < 0)
+
+
+def rows_on_surface(sets: dict | None, surface: np.ndarray, faces: np.ndarray) -> dict[str, np.ndarray]:
     """name -> rows of the surface, from triangles as vertex indices; those within the body are left out, and sets that are
-    left with none."""
+    left with none.
+
+    faces: whole faces of the surface; the corners of one of six nodes (with its middles or without) stand for four rows.
+    """
     out = {}
     for name, triangles in (sets or {}).items():
         triangles = np.asarray(triangles)
-        if triangles.ndim != 2 or triangles.shape[1] != 3 or triangles.dtype.kind not in "iu":
+        if triangles.ndim != 2 or triangles.shape[1] not in (3, faces.shape[1]) or triangles.dtype.kind not in "iu":
             raise ValueError(
                 f"surface set {name!r}: triangles must be vertex indices of shape (k, 3), got shape {triangles.shape}"
             )
-        rows = places_of_triangles(triangles, surface)
-        if np.any(rows >= 0) or not len(triangles):
-            out[name] = rows[rows >= 0]
+        rows, _ = rows_of(triangles[:, :3], surface, faces)
+        if len(rows) or not len(triangles):
+            out[name] = rows
     return out
 
 
 def join(meshes: list) -> tuple[np.ndarray, np.ndarray, dict]:
-    """(vertices, tetrahedra, sets by arguments of TetrahedralMesh) of several bodies, one after the other."""
+    """(vertices, elements, sets by arguments of TetrahedralMesh) of several bodies, one after the other."""
+    orders = [mesh.order for mesh in meshes]
+    if len(set(orders)) > 1:
+        k = orders.index(3 - orders[0])
+        raise ValueError(
+            f"meshes to be joined must be of one order: mesh 0 is of order {orders[0]}, mesh {k} of order {orders[k]}; call "
+            ".quadratic() on those of order 1, or .linear() on the others"
+        )
     firsts = np.cumsum([0, *(mesh.num_vertices for mesh in meshes)])
     first_tets = np.cumsum([0, *(mesh.num_tetrahedra for mesh in meshes)])
     triangles = [
@@ -98,7 +118,7 @@ def join(meshes: list) -> tuple[np.ndarray, np.ndarray, dict]:
         surface_sets={name: np.concatenate([sets[name] for sets in triangles if name in sets]) for name in names},
     )
     vertices = np.concatenate([mesh.vertices for mesh in meshes])
-    return vertices, np.concatenate([mesh.tetrahedra + first for mesh, first in zip(meshes, firsts)]), sets
+    return vertices, np.concatenate([mesh.elements + first for mesh, first in zip(meshes, firsts)]), sets
 
 
 def without_unused(vertices: np.ndarray, tetrahedra: np.ndarray, sets: dict, triangles: dict) -> tuple:
@@ -116,7 +136,8 @@ def pieces(mesh) -> np.ndarray:
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
-    pairs = mesh.tetrahedra[:, [0, 1, 0, 2, 0, 3]].reshape(-1, 2).T
+    others = mesh.elements[:, 1:]
+    pairs = np.stack([np.repeat(mesh.elements[:, 0], others.shape[1]), others.ravel()])
     graph = coo_matrix((np.ones(pairs.shape[1], bool), tuple(pairs)), (mesh.num_vertices, mesh.num_vertices))
     return connected_components(graph, directed=False)[1]
 

@@ -13,27 +13,36 @@ from numpy.typing import ArrayLike
 from diffsim_ti import runtime
 from diffsim_ti.mesh import checks, geometry
 from diffsim_ti.mesh.description import content_hash, describe
+from diffsim_ti.mesh.elements import Elements
 from diffsim_ti.mesh.files import KEEPS_SETS, read_mesh, write_mesh
 from diffsim_ti.mesh.grid import box
 from diffsim_ti.mesh.locate import LocatedPoints, locate
 from diffsim_ti.mesh.named_sets import NamedSets
 from diffsim_ti.mesh.sets import checked_sets, join, pieces, rows_on_surface, without_unused
+from diffsim_ti.mesh.ten_nodes import edges_of
+
+CONNECTIVITY = (  # what stays when vertices move
+    "_elements _tetrahedra _surface_faces _surface_triangles _middles _vertex_sets _tetrahedron_sets _surface_sets".split()
+)
 
 
-class TetrahedralMesh(NamedSets):
-    """Linear tetrahedra at rest. Immutable: arrays are read-only float64 or int64, changes return a new mesh.
+class TetrahedralMesh(NamedSets, Elements):
+    """Tetrahedra of four or ten nodes at rest. Immutable: arrays are read-only float64 or int64, changes return a new mesh.
 
     vertices: positions [m], shape (num_vertices, 3).
     tetrahedra: vertex indices from 0, integers, shape (num_tetrahedra, 4), positive volume
-        det [x1 - x0, x2 - x0, x3 - x0] / 6 > 0.
+        det [x1 - x0, x2 - x0, x3 - x0] / 6 > 0. With ten columns elements are quadratic: four corners, then the mid-edge
+        vertices of 01, 12, 20, 03, 13, 23 (VTK's order), wherever they are as long as the map of the element is one to one.
     vertex_sets, tetrahedron_sets: name -> indices or Boolean mask; kept as sorted indices.
     surface_sets: name -> triangles of the surface as vertex indices, shape (k, 3), in any order; kept as sorted indices of
-        rows of `surface_triangles`. Triangles within the body are left out.
+        rows of `surface_triangles`. Triangles within the body are left out. With ten nodes the corners of a face, alone or
+        before its middles, shape (k, 6), stand for its four triangles.
     fix_orientation: swap two vertices of each inside-out tetrahedron instead of refusing it.
 
     Raises ValueError for wrong shapes or dtypes, indices out of range, non-finite coordinates, a repeated vertex in a
-    tetrahedron, flat, inside-out, repeated or overlapping tetrahedra, and a face of more than two tetrahedra. Warns
-    (UserWarning) of vertices that no tetrahedron uses and of slivers. All thresholds are relative to the tetrahedron.
+    tetrahedron, flat, inside-out, repeated or overlapping tetrahedra, a face of more than two tetrahedra, curved elements
+    that are not one to one, and mid-edge vertices in another order. Warns (UserWarning) of vertices that no tetrahedron
+    uses and of slivers. All thresholds are relative to the tetrahedron.
     """
 
     def __init__(
@@ -46,17 +55,16 @@ class TetrahedralMesh(NamedSets):
         surface_sets: dict | None = None,
         fix_orientation: bool = False,
     ):
-        self._vertices = checks.checked_vertices(vertices)
-        self._tetrahedra = checks.checked_tetrahedra(tetrahedra, len(self._vertices))
-        volumes = checks.checked_volumes(self._vertices, self._tetrahedra)
-        self._tetrahedra = checks.oriented(self._tetrahedra, volumes, fix_orientation)
-        self._volumes = np.abs(volumes)
-        self._surface_triangles = checks.surface_of(self._tetrahedra, self.num_vertices)
+        vertices = checks.checked_vertices(vertices)
+        elements = checks.checked_tetrahedra(tetrahedra, len(vertices))
+        volumes = checks.checked_volumes(vertices, elements[:, :4])
+        elements = checks.oriented(elements, volumes, fix_orientation)
+        volumes = checks.checked_curved_volumes(vertices, elements, np.abs(volumes))
+        self._put(vertices, elements, volumes)
         self._vertex_sets = checked_sets(vertex_sets, self.num_vertices, "vertex")
         self._tetrahedron_sets = checked_sets(tetrahedron_sets, self.num_tetrahedra, "tetrahedron")
-        on_surface = rows_on_surface(surface_sets, self._surface_triangles)
+        on_surface = rows_on_surface(surface_sets, self._surface_triangles, self._surface_faces)
         self._surface_sets = checked_sets(on_surface, len(self._surface_triangles), "surface")
-        self._freeze()
         checks.warn_of_orphans(self.unused_vertices)
         checks.warn_of_slivers(self)
 
@@ -161,7 +169,7 @@ class TetrahedralMesh(NamedSets):
 
     @property
     def tetrahedra(self) -> np.ndarray:
-        """Vertex indices, shape (num_tetrahedra, 4), positively oriented."""
+        """Vertex indices of the corners, shape (num_tetrahedra, 4), positively oriented."""
         return self._tetrahedra
 
     @property
@@ -179,7 +187,7 @@ class TetrahedralMesh(NamedSets):
 
     @property
     def surface_triangles(self) -> np.ndarray:
-        """Faces of one tetrahedron only, normals pointing outwards, shape (k, 3)."""
+        """Faces of one tetrahedron only, normals pointing outwards, shape (k, 3); of a face of six nodes four triangles."""
         return self._surface_triangles
 
     @cached_property
@@ -190,13 +198,12 @@ class TetrahedralMesh(NamedSets):
     @property
     def unused_vertices(self) -> np.ndarray:
         """Indices of the vertices that no tetrahedron uses."""
-        return np.nonzero(np.bincount(self.tetrahedra.ravel(), minlength=self.num_vertices) == 0)[0]
+        return np.nonzero(np.bincount(self.elements.ravel(), minlength=self.num_vertices) == 0)[0]
 
     @cached_property
     def edges(self) -> np.ndarray:
-        """Each edge once, shape (k, 2), the smaller index first."""
-        low, high = np.sort(self.tetrahedra[:, geometry.EDGES].reshape(-1, 2), 1).T
-        return _frozen(np.stack(np.divmod(np.unique(low * self.num_vertices + high), self.num_vertices), 1))
+        """Each edge once, by its two corners, shape (k, 2), the smaller index first."""
+        return _frozen(edges_of(self.tetrahedra, self.num_vertices)[0])
 
     @cached_property
     def num_pieces(self) -> int:
@@ -207,7 +214,7 @@ class TetrahedralMesh(NamedSets):
 
     @property
     def volumes(self) -> np.ndarray:
-        """det [x1 - x0, x2 - x0, x3 - x0] / 6 > 0 per tetrahedron [m^3], shape (num_tetrahedra,)."""
+        """det [x1 - x0, x2 - x0, x3 - x0] / 6 > 0 per tetrahedron [m^3], shape (num_tetrahedra,), curved or not."""
         return self._volumes
 
     @cached_property
@@ -217,7 +224,8 @@ class TetrahedralMesh(NamedSets):
 
     @cached_property
     def shape_gradients(self) -> np.ndarray:
-        """grad N_a [1/m], shape (num_tetrahedra, 4, 3); displacement gradient = sum_a u_a (x) grad N_a."""
+        """grad N_a of linear functions of the corners [1/m], shape (num_tetrahedra, 4, 3); with four nodes the displacement
+        gradient is sum_a u_a (x) grad N_a."""
         return _frozen(geometry.shape_gradients(geometry.inverse_edges(self.vertices, self.tetrahedra)))
 
     @cached_property
@@ -301,19 +309,14 @@ class TetrahedralMesh(NamedSets):
 
     def _moved(self, vertices: np.ndarray) -> "TetrahedralMesh":
         """The same connectivity at other positions; checked, and nothing cached that depends on positions."""
+        vertices = checks.checked_vertices(vertices)
+        volumes = checks.checked_volumes(vertices, self._tetrahedra)
+        checks.oriented(self._tetrahedra, volumes, fix_orientation=False)
+        volumes = checks.checked_curved_volumes(vertices, self._elements, volumes)
         new = object.__new__(type(self))
-        new._vertices, new._tetrahedra = checks.checked_vertices(vertices), self._tetrahedra
-        new._volumes = checks.checked_volumes(new._vertices, new._tetrahedra)
-        new._surface_triangles = self._surface_triangles
-        checks.oriented(new._tetrahedra, new._volumes, fix_orientation=False)
-        new._vertex_sets, new._tetrahedron_sets = self._vertex_sets, self._tetrahedron_sets
-        new._surface_sets = self._surface_sets
-        new._freeze()
+        new.__dict__.update({name: self.__dict__[name] for name in CONNECTIVITY})
+        new._vertices, new._volumes = _frozen(vertices), _frozen(volumes)
         return new
-
-    def _freeze(self) -> None:
-        for array in (self._vertices, self._tetrahedra, self._volumes, self._surface_triangles):
-            _frozen(array)
 
     def __setstate__(self, state: dict) -> None:
         """Copies and unpickled meshes are read-only too (NumPy forgets the flag)."""

@@ -1,0 +1,87 @@
+"""Tetrahedra of ten nodes as arrays: their faces, their mid-edge vertices, and the way from four nodes and back."""
+
+import numpy as np
+
+from diffsim_ti.mesh.geometry import FACES
+from diffsim_ti.mesh.reference_element import MID_EDGES
+
+_MIDDLE = {frozenset(ends): 4 + k for k, ends in enumerate(MID_EDGES.tolist())}
+
+
+def _row(corners) -> list[int]:
+    """Corners, and the middles from each to the next."""
+    a, b, c = corners
+    return [a, b, c, _MIDDLE[frozenset((a, b))], _MIDDLE[frozenset((b, c))], _MIDDLE[frozenset((c, a))]]
+
+
+FACE_NODES = np.array([_row(corners) for corners in FACES.tolist()])  # of each face: corners, middles of 01, 12, 20
+MIRRORED = np.array([0, 1, 3, 2, 4, 8, 7, 6, 5, 9])  # corners 2 and 3 swapped
+QUARTERS = np.array([[0, 3, 5], [1, 4, 3], [2, 5, 4], [3, 4, 5]])  # triangles of a face, turned as it is
+
+
+def triangles_of(faces: np.ndarray) -> np.ndarray:
+    """Triangles of whole faces, shape (4 k, 3): three at the corners, then the one between; of three nodes, as they are."""
+    return faces[:, QUARTERS].reshape(-1, 3) if faces.shape[1] == 6 else faces
+
+
+def edges_of(corners: np.ndarray, num_vertices: int) -> tuple[np.ndarray, np.ndarray]:
+    """(edges, the edge of each of MID_EDGES): each edge once, smaller index first, ascending, shape (k, 2) and (m, 6)."""
+    low, high = np.sort(corners[:, MID_EDGES].reshape(-1, 2), 1).T
+    keys, place = np.unique(low * num_vertices + high, return_inverse=True)
+    return np.stack(np.divmod(keys, num_vertices), 1), place.reshape(-1, 6)
+
+
+def with_middles(vertices: np.ndarray, tetrahedra: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(vertices, elements of ten nodes, edges): a vertex at the middle of each edge, after those given."""
+    edges, place = edges_of(tetrahedra, len(vertices))
+    middles = (vertices[edges[:, 0]] + vertices[edges[:, 1]]) / 2
+    return np.concatenate([vertices, middles]), np.concatenate([tetrahedra, len(vertices) + place], 1), edges
+
+
+def middles_of(elements: np.ndarray, num_vertices: int) -> np.ndarray:
+    """Rows (mid-edge vertex, its two ends), one for each edge, shape (k, 3); none with four nodes.
+
+    ValueError where an edge has two mid-edge vertices, a mid-edge vertex two edges, or a corner is one.
+    """
+    if elements.shape[1] == 4:
+        return np.zeros((0, 3), np.int64)
+    edges, place = edges_of(elements[:, :4], num_vertices)
+    place, middles = place.ravel(), elements[:, 4:].ravel()
+    _, first = np.unique(place, return_index=True)
+    out = middles[first]
+    other = np.nonzero(middles != out[place])[0]
+    remedy = "order the last six columns by the edges 01, 12, 20, 03, 13, 23 of the corners, and merge equal vertices"
+    if len(other):
+        k = other[0]
+        i, j = edges[place[k]]
+        raise ValueError(
+            f"an edge has one vertex at its middle: the edge of vertices {i} and {j} has {out[place[k]]} in tetrahedron "
+            f"{first[place[k]] // 6} and {middles[k]} in tetrahedron {k // 6}; {remedy}"
+        )
+    used, count = np.unique(out, return_counts=True)
+    if np.any(count > 1):
+        twice = used[np.argmax(count)]
+        i, j = edges[np.nonzero(out == twice)[0][:2]]
+        raise ValueError(
+            f"a mid-edge vertex belongs to one edge: vertex {twice} stands on those of vertices {i.tolist()} and "
+            f"{j.tolist()}; {remedy}"
+        )
+    both = np.intersect1d(used, elements[:, :4])
+    if len(both):
+        raise ValueError(f"a vertex is a corner or stands on an edge: vertex {both[0]} does both; {remedy}")
+    return np.concatenate([out[:, None], edges], 1)
+
+
+def middles_in_set(members: np.ndarray, mesh, edges: np.ndarray) -> np.ndarray:
+    """Rows of edges of a linear mesh whose middles belong to a set of vertices.
+
+    These are the edges of triangles of the surface, and of tetrahedra, whose vertices are all in it.
+    """
+    inside = np.zeros(mesh.num_vertices, bool)
+    inside[members] = True
+    triangles = mesh.surface_triangles[inside[mesh.surface_triangles].all(1)]
+    whole = mesh.tetrahedra[inside[mesh.tetrahedra].all(1)]
+    pairs = np.concatenate([triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), whole[:, MID_EDGES].reshape(-1, 2)])
+    low, high = np.sort(pairs, 1).T
+    keys = edges[:, 0] * mesh.num_vertices + edges[:, 1]
+    return np.nonzero(np.isin(keys, low * mesh.num_vertices + high))[0]
