@@ -93,7 +93,7 @@ class PatchedTetrahedron(Tetrahedron):
 
     @traced
     def _patch_of(self, item, scene, at, s, w=None, dots=None) -> list[SimpleNamespace]:
-        """What an item knows at its points, with its patch's W, lam_p, theta_p, pi and, for changes w of u, their changes."""
+        """What an item knows at its points, with its patch's lam_p, theta_p, pi and, for changes w of u, their changes."""
         job = Bundle(scene=scene, at=at, s=s, w=w, dots=dots)
         known, of_patch = self._own(item, job), {}
         volume, stiff, swollen, *changes = self._sums(item, job, known)
@@ -109,8 +109,8 @@ class PatchedTetrahedron(Tetrahedron):
         return [SimpleNamespace(**vars(t), **of_patch, q=[*t.p, pressure]) for t in known]
 
     @traced
-    def numbers_at(self, item, scene, at, s, q: int = 0) -> list:
-        return self._patch_of(item, scene, at, s)[q].q
+    def seen(self, item, scene, at, s) -> list[tuple]:
+        return [(t.H, t.q) for t in self._patch_of(item, scene, at, s)]
 
     # ---- forces and their derivatives -------------------------------------------------------------------------------
 

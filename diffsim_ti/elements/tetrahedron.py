@@ -90,9 +90,12 @@ class Tetrahedron:
         return self.nodes.edges(self.items.corners(x, s, scene.tets, item))
 
     @traced
-    def gradient(self, item, scene, u, s, q: int = 0) -> Tensor:
-        """H at point q, for kernels that look at a state."""
-        return self.edges(item, scene, u, s)[q] @ self.gradients_of(item, scene.gradients, q)
+    def seen(self, item, scene, at, s) -> list[tuple]:
+        """(H, what the law takes besides) at each point, for kernels that look at a state."""
+        return [
+            (D @ self.gradients_of(item, scene.gradients, q), self.numbers_at(item, scene, at, s, q))
+            for q, D in enumerate(self.edges(item, scene, at.u, s))
+        ]
 
     @traced
     def gradients_of(self, item, array, q: int = 0) -> Tensor:
@@ -243,8 +246,8 @@ class Tetrahedron:
 
     @traced
     def _read_onwards(self, item, scene, at, s, u_slot) -> list:
-        """For each point (B, D, H, numbers of the law), of the state in slot s and the displacement in slot `u_slot`, default
-        s."""
+        """For each point (B, D, H, numbers of the law), of the state in slot s and the displacement in slot `u_slot` (None:
+        s)."""
         out = []
         for q, D in enumerate(self.edges(item, scene, at.u, s if u_slot is None else u_slot)):
             B = self.gradients_of(item, scene.gradients, q)

@@ -90,8 +90,8 @@ class FreeVelocity(Link):
 
 
 class LumpedMass(Link):
-    """Of each vertex, sum rho V s_a over its elements, with the node's share s_a, 1/4 of four nodes; rho is one number or one
-    per tetrahedron."""
+    """Of each vertex, sum rho V s_a over its elements, with the node's share s_a, 1/4 of four nodes; rho is one number or
+    one per tetrahedron."""
 
     writes = ("mass",)
 

@@ -12,8 +12,8 @@ def volume_patches(mesh) -> np.ndarray:
     """Patch of each tetrahedron, numbered from 0, shape (num_tetrahedra,); found once for a mesh.
 
     Centroids are bisected across the longest extent until at most eight are left, so that patches are compact. A patch
-    hangs together (its tetrahedra share vertices), and never mixes members of a tetrahedron set with others. A tetrahedron of
-    ten nodes is a patch by itself.
+    hangs together (its tetrahedra share vertices), and never mixes members of a tetrahedron set with others. A tetrahedron
+    of ten nodes is a patch by itself.
     """
     if mesh.order == 2:
         return np.arange(mesh.num_tetrahedra)

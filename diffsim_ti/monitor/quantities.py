@@ -11,7 +11,8 @@ from diffsim_ti import runtime
 from diffsim_ti.elements.patched_tetrahedron import functions_of
 from diffsim_ti.potential.attached import Attached
 from diffsim_ti.potential.kernels import potential_kernels
-from diffsim_ti.runtime import Kernel
+from diffsim_ti.runtime import Kernel, assign, traced
+from diffsim_ti.runtime import at as entry
 from diffsim_ti.state.features import Features
 from diffsim_ti.state.numbers import SCENE, with_state
 from diffsim_ti.state.workspace import Workspace
@@ -30,29 +31,36 @@ class ObserverKernels:
     def element(self):
         return functions_of(self.law, self.features, False)
 
+    @traced
+    def observe_points(self, e, scene, at, out):
+        for q, (H, p) in enumerate(self.element.seen(e, scene, at, 0)):
+            self.observe_point(e * len(self.element.points) + q, H, self.law.stress(H, p), out)
+            assign(entry(out.energy, e * len(self.element.points) + q), self.law.energy_density(H, p))
+
+    @ti.func
+    def observe_point(self, k, H: A, P: A, out: A):
+        F = H.matrix() + ti.Matrix.identity(self.element.types.fp, 3)
+        det = F.determinant()
+        S = P.matrix() @ F.transpose() / det  # Cauchy
+        out.J[k] = det
+        a, b, c = S[0, 0] - S[1, 1], S[1, 1] - S[2, 2], S[2, 2] - S[0, 0]
+        shear = S[0, 1] * S[0, 1] + S[1, 2] * S[1, 2] + S[2, 0] * S[2, 0]
+        out.von_mises[k] = ti.sqrt(ti.cast(0.5, self.element.types.fp) * (a * a + b * b + c * c) + 3 * shear)
+
+    @traced
+    def store_points(self, e, scene, at, out):
+        for q, (H, p) in enumerate(self.element.seen(e, scene, at, 0)):
+            assign(entry(out.energy, e * len(self.element.points) + q), self.law.energy_density(H, p))
+
     @ti.func
     def observe(self, scene: A, at: A, out: A, plan: A):
         for e in range(plan.num_places):
-            for q in ti.static(self.element.points):
-                H = self.element.gradient(e, scene, at.u, 0, q)
-                p = self.element.numbers_at(e, scene, at, 0, q)
-                F = H.matrix() + ti.Matrix.identity(self.element.types.fp, 3)
-                det = F.determinant()
-                S = self.law.stress(H, p).matrix() @ F.transpose() / det  # Cauchy
-                k = ti.static(len(self.element.points)) * e + q
-                out.energy[k] = self.law.energy_density(H, p)
-                out.J[k] = det
-                a, b, c = S[0, 0] - S[1, 1], S[1, 1] - S[2, 2], S[2, 2] - S[0, 0]
-                shear = S[0, 1] * S[0, 1] + S[1, 2] * S[1, 2] + S[2, 0] * S[2, 0]
-                out.von_mises[k] = ti.sqrt(ti.cast(0.5, self.element.types.fp) * (a * a + b * b + c * c) + 3 * shear)
+            self.observe_points(e, scene, at, out)
 
     @ti.func
     def store(self, scene: A, at: A, out: A, plan: A):
         for e in range(plan.num_places):
-            for q in ti.static(self.element.points):
-                H = self.element.gradient(e, scene, at.u, 0, q)
-                energy = self.law.energy_density(H, self.element.numbers_at(e, scene, at, 0, q))
-                out.energy[ti.static(len(self.element.points)) * e + q] = energy
+            self.store_points(e, scene, at, out)
 
     @cached_property
     def stored(self) -> Kernel:

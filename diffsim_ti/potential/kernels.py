@@ -8,7 +8,8 @@ import taichi as ti
 from diffsim_ti.elements.patched_tetrahedron import functions_of
 from diffsim_ti.materials.calculus.tensor import Tensor, sum_of
 from diffsim_ti.potential.obstacles import ObstaclePotential
-from diffsim_ti.runtime import PRECISIONS, Bundle, Kernel, let, traced
+from diffsim_ti.runtime import PRECISIONS, Bundle, Kernel, assign, let, traced
+from diffsim_ti.runtime import at as entry
 from diffsim_ti.state.features import Features
 from diffsim_ti.state.numbers import ADJOINT, SCENE, TANGENT, with_state
 
@@ -61,16 +62,19 @@ class PotentialKernels:
     def volume_ratio(self, H):
         return (H.matrix() + ti.Matrix.identity(self.fp, 3)).determinant()
 
+    @traced
+    def elastic_energies(self, e, scene, at, out):
+        for q, (H, numbers) in enumerate(self.single.seen(e, scene, at, 0)):
+            k = e * len(self.single.points) + q
+            psi = self.law.energy_density(H, numbers)
+            assign(entry(out.elastic, k), psi * self.single.volume_of(e, scene.volumes, q))
+            assign(entry(out.J, k), self.volume_ratio(H))
+
     @ti.func
     def energies(self, scene: A, pass_: A, at: A, out: A, plan: A):
         ti.loop_config(serialize=not self.parallel)
         for e in range(plan.num_tetrahedra):
-            for q in ti.static(self.single.points):
-                H = self.single.gradient(e, scene, at.u, 0, q)
-                psi = self.law.energy_density(H, self.single.numbers_at(e, scene, at, 0, q))
-                k = ti.static(len(self.single.points)) * e + q
-                out.elastic[k] = psi * self.single.volume_of(e, scene.volumes, q)
-                out.J[k] = self.volume_ratio(H)
+            self.elastic_energies(e, scene, at, out)
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.num_vertices):
             value = ti.cast(0, self.fp)
@@ -170,9 +174,8 @@ class PotentialKernels:
         """Column c of d2psi/dF2 at each point q, nine numbers, to rows 81 q + 9 c .. 81 q + 9 c + 8 of its block."""
         el = self.element
         dH = Tensor(el.broadcast(ti.cast(c == k, self.fp)) for k in range(9))
-        for q in el.points:
-            H = el.gradient(e, scene, at.u, 0, q)
-            dP = self.law.stress_differential(H, dH, el.numbers_at(e, scene, at, 0, q))
+        for q, (H, numbers) in enumerate(el.seen(e, scene, at, 0)):
+            dP = self.law.stress_differential(H, dH, numbers)
             el.put(tangent, 81 * len(el.points), e, 81 * q + 9 * c, dP.numbers)
 
     @traced

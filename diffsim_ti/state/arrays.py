@@ -252,7 +252,7 @@ class SceneArrays:
         return flat[self.place].astype(np.float64)
 
     def at_points(self, numbers: np.ndarray) -> np.ndarray:
-        """What kernels write for each point, in float64, shape (num_tetrahedra,), or (num_tetrahedra, points) with several."""
+        """What kernels write for each point, in float64, shape (num_tetrahedra,), or (num_tetrahedra, points)."""
         if self.points == 1:
             return numbers[self.place].astype(np.float64)
         return numbers.reshape(-1, self.points)[self.place].astype(np.float64)
