@@ -605,8 +605,8 @@ def test_files_that_are_refused(tmp_path):
             r"holds no tetrahedra; cell types found: triangle \(1\); fill the surface with tetrahedra",
         ),
         (
-            write(tmp_path / "ten.vtu", [("tetra10", [list(range(10))])], ten),
-            r"only 4-node tetrahedra .* cell types found: tetra10 \(1\); export linear elements",
+            write(tmp_path / "ten.vtu", [("tetra10", [list(range(10))]), ("tetra", TET)], ten),
+            r"of four nodes, or of ten; cell types found: tetra10 \(1\), tetra \(1\); export elements of order 1 or 2",
         ),
         (
             write(tmp_path / "mixed.vtu", both, cube.vertices),

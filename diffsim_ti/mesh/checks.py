@@ -118,7 +118,7 @@ def checked_curved_volumes(vertices: np.ndarray, elements: np.ndarray, volumes: 
         if np.any(order != np.arange(6)) and not len(jacobian.not_above(nodes[:, columns], least)):
             remedy = (
                 "these are in another order (VTK's is that of the edges 01, 12, 20, 03, 13, 23; Gmsh swaps the last two): "
-                f"take tetrahedra[:, {columns.tolist()}]"
+                f"take tetrahedra[:, {columns.tolist()}], or pass fix_orientation=True"
             )
         J = jacobian.lowest(vertices[elements[first]][None])[0]
         raise ValueError(
@@ -129,6 +129,18 @@ def checked_curved_volumes(vertices: np.ndarray, elements: np.ndarray, volumes: 
     volumes = volumes.copy()
     volumes[some] = jacobian.volumes(nodes)
     return volumes
+
+
+def middles_in_order(vertices: np.ndarray, elements: np.ndarray) -> np.ndarray:
+    """Elements with J <= 0 somewhere get their mid-edge vertices in the order of the edges that these are nearest to."""
+    some = np.nonzero(curved(vertices, elements))[0]
+    if not len(some):
+        return elements
+    wrong = some[jacobian.not_above(vertices[elements[some]], 6 * _flat_below(vertices, elements[some, :4]))]
+    elements = elements.copy()
+    for e in wrong:
+        elements[e, 4:] = elements[e, 4 + _nearest_edges(vertices[elements[e]])]
+    return elements
 
 
 def _nearest_edges(nodes: np.ndarray) -> np.ndarray:

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from diffsim_ti.mesh import jacobian
 from diffsim_ti.mesh.sets import sizes
 
 if TYPE_CHECKING:
@@ -25,6 +26,7 @@ def describe(mesh: "TetrahedralMesh") -> str:
             f"surface: {len(mesh.surface_triangles)} triangles, {len(mesh.surface_vertices)} vertices",
             "size: " + " x ".join(f"{d:.6g}" for d in high - low) + f" m, from ({_numbers(low)}) to ({_numbers(high)})",
             f"volume: {mesh.volume:.6g} m^3",
+            *_ten_nodes(mesh),
             f"edges: {lengths.min():.4g} to {lengths.max():.4g} m, mean {lengths.mean():.4g} m",
             f"worst quality: {mesh.quality[worst]:.3g} in tetrahedron {worst}; mean {mesh.quality.mean():.3g} of 1",
             f"smallest altitude: {mesh.altitudes[thin].min():.4g} m in tetrahedron {thin}",
@@ -33,6 +35,27 @@ def describe(mesh: "TetrahedralMesh") -> str:
             f"surface sets: {sizes(mesh.surface_sets)}",
         ]
     )
+
+
+def _ten_nodes(mesh: "TetrahedralMesh") -> list[str]:
+    if mesh.order == 1:
+        return []
+    text = f"ten-node tetrahedra: {len(mesh.corners)} corners, {len(mesh.middles)} mid-edge vertices"
+    if not mesh.curved.any():
+        return [f"{text}, straight edges"]
+    J = lowest_jacobian(mesh)
+    worst = int(np.argmin(J))
+    return [
+        f"{text}; {mesh.curved.sum()} are curved, lowest bound of J over its mean {J[worst]:.3g} in tetrahedron {worst}"
+    ]
+
+
+def lowest_jacobian(mesh: "TetrahedralMesh") -> np.ndarray:
+    """Lower bound of J = det dx/dxi over its mean in each element, shape (num_tetrahedra,); 1 where edges are straight."""
+    out = np.ones(mesh.num_tetrahedra)
+    some = mesh.curved
+    out[some] = jacobian.lowest(mesh.vertices[mesh.elements[some]]) / (6 * mesh.volumes[some])
+    return out
 
 
 def _numbers(values) -> str:

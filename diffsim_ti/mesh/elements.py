@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diffsim_ti.mesh import checks, jacobian
+from diffsim_ti.mesh import checks
 from diffsim_ti.mesh.geometry import edge_matrices, signed_volumes
 from diffsim_ti.mesh.reference_element import ReferenceElement, reference_element
 from diffsim_ti.mesh.sets import checked_sets
@@ -133,11 +133,3 @@ class Elements:
         own = (self._tetrahedra, self._surface_faces, self._surface_triangles, self._middles)
         for array in (vertices, elements, volumes, *own):
             array.flags.writeable = False
-
-
-def lowest_jacobian(mesh: "TetrahedralMesh") -> np.ndarray:
-    """Lower bound of J over its mean in each element, shape (num_tetrahedra,); 1 where edges are straight."""
-    out = np.ones(mesh.num_tetrahedra)
-    curved = mesh.curved
-    out[curved] = jacobian.lowest(mesh.vertices[mesh.elements[curved]]) / (6 * mesh.volumes[curved])
-    return out

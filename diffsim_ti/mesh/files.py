@@ -6,21 +6,23 @@ from pathlib import Path
 
 import numpy as np
 
-DIMENSION = {"vertex": 0, "line": 1, "triangle": 2, "tetra": 3}  # the cells that a file may hold
+DIMENSION = {"vertex": 0, "line": 1, "line3": 1, "triangle": 2, "triangle6": 2, "tetra": 3, "tetra10": 3}  # in a file
 TAGS = ("gmsh:physical", "medit:ref", "cell_tags", "avsucd:material")  # integer cell data that group cells
 VERTEX_PREFIX = "vertex_set:"  # 0/1 data arrays in VTU and VTK files
-CELL_PREFIXES = {"tetra": "tetrahedron_set:", "triangle": "surface_set:"}
+CELL_PREFIXES = {3: "tetrahedron_set:", 2: "surface_set:"}
 KEEPS_SETS = (".msh", ".vtu", ".vtk")
+KEEPS_TEN_NODES = (*KEEPS_SETS, ".inp", ".xdmf")
 
 
 def read_mesh(path) -> tuple[np.ndarray, np.ndarray, dict, dict, dict]:
-    """Vertices, tetrahedra, vertex sets, tetrahedron sets and named triangles of a file; see `TetrahedralMesh.from_file`."""
+    """Vertices, elements of four or ten nodes, vertex sets, tetrahedron sets and named triangles (by their corners) of a
+    file; see `TetrahedralMesh.from_file`."""
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"mesh file {path} does not exist (looked in {Path.cwd()})")
     mesh = _read(path)
     _check_cell_types(mesh)
-    blocks = [k for k, block in enumerate(mesh.cells) if block.type == "tetra"]
+    blocks = [k for k, block in enumerate(mesh.cells) if DIMENSION[block.type] == 3]
     offset = dict(zip(blocks, np.cumsum([0] + [len(mesh.cells[k].data) for k in blocks])))
     vertex_sets, tetrahedron_sets, triangles = {}, {}, {}
 
@@ -29,8 +31,8 @@ def read_mesh(path) -> tuple[np.ndarray, np.ndarray, dict, dict, dict]:
             tetrahedron_sets.setdefault(name, []).append(rows + offset[k])
         elif len(rows):
             vertex_sets.setdefault(name, []).append(mesh.cells[k].data[rows].ravel())
-            if mesh.cells[k].type == "triangle":
-                triangles.setdefault(name, []).append(mesh.cells[k].data[rows])
+            if DIMENSION[mesh.cells[k].type] == 2:
+                triangles.setdefault(name, []).append(mesh.cells[k].data[rows, :3])
 
     for name, k, rows in _groups(mesh):
         add(name, k, rows)
@@ -72,12 +74,12 @@ def _check_cell_types(mesh) -> None:
         found[block.type] = found.get(block.type, 0) + len(block.data)
     other = sorted(set(found) - set(DIMENSION))
     listing = ", ".join(f"{kind} ({count})" for kind, count in found.items()) or "none"
-    if any(kind.startswith("tetra") for kind in other):
+    if any(kind.startswith("tetra") for kind in other) or {"tetra", "tetra10"} <= set(found):
         raise ValueError(
-            f"only 4-node tetrahedra can be read; cell types found: {listing}; export linear elements "
-            "(in Gmsh: Mesh.ElementOrder = 1)"
+            f"a file holds tetrahedra of four nodes, or of ten; cell types found: {listing}; export elements of order 1 or "
+            "2 (in Gmsh: Mesh.ElementOrder = 2)"
         )
-    if found.get("tetra", 0) == 0:
+    if not found.get("tetra", 0) and not found.get("tetra10", 0):
         raise ValueError(
             f"the file holds no tetrahedra; cell types found: {listing}; fill the surface with tetrahedra first, "
             "for example with Gmsh, TetGen or fTetWild"
@@ -96,13 +98,13 @@ def _groups(mesh):
         if name != "gmsh:bounding_entities":
             yield from ((name, k, np.asarray(rows, np.int64)) for k, rows in enumerate(members) if rows is not None)
     for key, blocks in mesh.cell_data.items():
-        for kind, prefix in CELL_PREFIXES.items():
-            own = [k for k, block in enumerate(mesh.cells) if block.type == kind and key.startswith(prefix)]
+        for dim, prefix in CELL_PREFIXES.items():
+            own = [k for k, block in enumerate(mesh.cells) if DIMENSION[block.type] == dim and key.startswith(prefix)]
             yield from ((key.removeprefix(prefix), k, np.nonzero(blocks[k])[0]) for k in own)
         if key not in TAGS:
             continue
         blocks = [np.asarray(values).astype(np.int64) for values in blocks]
-        used = {int(tag) for block, v in zip(mesh.cells, blocks) if block.type == "tetra" for tag in np.unique(v)}
+        used = {int(tag) for block, v in zip(mesh.cells, blocks) if DIMENSION[block.type] == 3 for tag in np.unique(v)}
         for k, (block, values) in enumerate(zip(mesh.cells, blocks)):
             dim = DIMENSION[block.type]
             for tag in np.unique(values).tolist():
@@ -127,44 +129,57 @@ def _merge_repeated(tetrahedra: np.ndarray, sets: dict) -> tuple[np.ndarray, dic
     return tetrahedra[keep], {name: np.unique(new[rows]) for name, rows in sets.items()}
 
 
-def write_mesh(path, vertices, tetrahedra, vertex_sets: dict, tetrahedron_sets: dict, triangles: dict) -> list[str]:
-    """Write the mesh in the format that the suffix names; returns the names of the sets that the format cannot keep.
-
-    triangles: name -> vertex indices of a surface set, shape (k, 3).
-    """
+def write_mesh(path, mesh) -> list[str]:
+    """Write the mesh in the format that the suffix names; returns the names of the sets that the format cannot keep."""
     import meshio
 
     path = Path(path)
-    vertex_sets = {n: rows for n, rows in vertex_sets.items() if not _same_vertices(rows, triangles.get(n))}
+    if mesh.order == 2 and path.suffix not in KEEPS_TEN_NODES:
+        raise ValueError(
+            f"cannot save {path}: ten-node tetrahedra go into {', '.join(KEEPS_TEN_NODES)}; use one of these, or save "
+            "mesh.linear()"
+        )
+    faces = {name: _cells_of(mesh, rows) for name, rows in mesh.surface_sets.items()}
+    vertex_sets = {n: rows for n, rows in mesh.vertex_sets.items() if not _same_vertices(rows, faces.get(n))}
+    tetrahedra = ("tetra" if mesh.order == 1 else "tetra10", mesh.elements)
     if path.suffix == ".msh":
-        _write_gmsh(meshio, path, vertices, tetrahedra, vertex_sets, tetrahedron_sets, triangles)
+        _write_gmsh(meshio, path, mesh.vertices, tetrahedra, vertex_sets, mesh.tetrahedron_sets, faces)
         return []
-    cells, point_data, cell_data, lost = [("tetra", tetrahedra)], {}, {}, [*vertex_sets, *tetrahedron_sets, *triangles]
+    cells, point_data, cell_data, lost = [tetrahedra], {}, {}, [*vertex_sets, *mesh.tetrahedron_sets, *faces]
     if path.suffix in KEEPS_SETS:
-        m, surface = len(tetrahedra), np.zeros((0, 3), np.int64)
-        if triangles:
-            surface, inverse = np.unique(np.concatenate([*triangles.values()]), axis=0, return_inverse=True)
-            inverse = np.split(inverse.ravel(), np.cumsum([len(rows) for rows in triangles.values()])[:-1])
-            cells.append(("triangle", surface))
-        sizes = [m, len(surface)][: len(cells)]
-        members = {CELL_PREFIXES["tetra"] + name: (0, rows) for name, rows in tetrahedron_sets.items()}
-        if triangles:
-            members |= {CELL_PREFIXES["triangle"] + name: (1, rows) for name, rows in zip(triangles, inverse)}
-        for name, (block, rows) in members.items():
-            cell_data[name] = [_mask(rows if k == block else [], size) for k, size in enumerate(sizes)]
-        point_data = {VERTEX_PREFIX + name: _mask(rows, len(vertices)) for name, rows in vertex_sets.items()}
+        members = [(CELL_PREFIXES[3] + name, 0, rows) for name, rows in mesh.tetrahedron_sets.items()]
+        for kind in ("triangle", "triangle6"):
+            own = {name: cells_of[kind] for name, cells_of in faces.items() if kind in cells_of}
+            if own:
+                surface, inverse = np.unique(np.concatenate([*own.values()]), axis=0, return_inverse=True)
+                parts = np.split(inverse.ravel(), np.cumsum([len(rows) for rows in own.values()])[:-1])
+                members += [(CELL_PREFIXES[2] + name, len(cells), rows) for name, rows in zip(own, parts)]
+                cells.append((kind, surface))
+        for name, block, rows in members:
+            masks = cell_data.setdefault(name, [np.zeros(len(data), np.int32) for _, data in cells])
+            masks[block][rows] = 1
+        point_data = {VERTEX_PREFIX + name: _mask(rows, mesh.num_vertices) for name, rows in vertex_sets.items()}
         lost = []
-    mesh = meshio.Mesh(vertices, cells, point_data=point_data, cell_data=cell_data)
+    out = meshio.Mesh(mesh.vertices, cells, point_data=point_data, cell_data=cell_data)
     try:
-        mesh.write(path)
+        out.write(path)
     except (meshio.WriteError, meshio.ReadError) as error:
         raise ValueError(f"cannot save {path}: {error}; use one of {', '.join(KEEPS_SETS)}") from error
     return lost
 
 
-def _same_vertices(rows: np.ndarray, triangles: np.ndarray | None) -> bool:
+def _cells_of(mesh, rows: np.ndarray) -> dict[str, np.ndarray]:
+    """Kind of cell -> vertices, of rows of the surface: whole faces of six nodes as such, triangles as they are."""
+    if mesh.order == 1:
+        return {"triangle": mesh.surface_triangles[rows]}
+    whole = np.bincount(rows // 4, minlength=len(mesh.surface_faces)) == 4
+    out = {"triangle6": mesh.surface_faces[whole], "triangle": mesh.surface_triangles[rows[~whole[rows // 4]]]}
+    return {kind: cells for kind, cells in out.items() if len(cells) or kind == "triangle6"}
+
+
+def _same_vertices(rows: np.ndarray, cells: dict[str, np.ndarray] | None) -> bool:
     """Whether a vertex set is that of its triangles, which say so when they are read again."""
-    return triangles is not None and np.array_equal(rows, np.unique(triangles))
+    return cells is not None and np.array_equal(rows, np.unique(np.concatenate([c.ravel() for c in cells.values()])))
 
 
 def _mask(rows, count: int) -> np.ndarray:
@@ -173,31 +188,32 @@ def _mask(rows, count: int) -> np.ndarray:
     return mask
 
 
-def _write_gmsh(meshio, path, vertices, tetrahedra, vertex_sets, tetrahedron_sets, triangles) -> None:
+def _write_gmsh(meshio, path, vertices, tetrahedra, vertex_sets, tetrahedron_sets, faces) -> None:
     """Gmsh 2.2, binary: sets as named physical groups of points, surfaces, volumes; a member of several is listed again."""
+    kind, tetrahedra = tetrahedra
     field_data, first, again = {}, np.zeros(len(tetrahedra), np.int64), []
     for tag, (name, rows) in enumerate(tetrahedron_sets.items(), start=1):
         field_data[name] = np.array([tag, 3])
         free = first[rows] == 0
         first[rows[free]] = tag
         again.append((rows[~free], tag))
-    blocks, tags = [("tetra", tetrahedra)], [first]
+    blocks, tags = [(kind, tetrahedra)], [first]
     for rows, tag in again:
         if len(rows):
-            blocks.append(("tetra", tetrahedra[rows]))
+            blocks.append((kind, tetrahedra[rows]))
             tags.append(np.full(len(rows), tag))
-    surfaces = [("triangle", name, cells) for name, cells in triangles.items()]
-    points = [("vertex", name, rows[:, None]) for name, rows in vertex_sets.items()]
-    for kind, group in (("triangle", surfaces), ("vertex", points)):
-        for tag, (_, name, cells) in enumerate(group, start=1):
+    points = {name: {"vertex": rows[:, None]} for name, rows in vertex_sets.items()}
+    for dim, group in ((2, faces), (0, points)):
+        for tag, (name, parts) in enumerate(group.items(), start=1):
             if name in field_data:  # meshio knows one dimension per name
                 known = {3: "tetrahedron", 2: "surface"}[int(field_data[name][1])]
-                which = {"vertex": "vertex", "triangle": "surface"}[kind]
+                which = {0: "vertex", 2: "surface"}[dim]
                 raise ValueError(f"cannot save {path}: {name!r} names a {which} set and a {known} set; rename one")
-            field_data[name] = np.array([tag, DIMENSION[kind]])
-            if len(cells):
-                blocks.append((kind, cells))
-                tags.append(np.full(len(cells), tag))
+            field_data[name] = np.array([tag, dim])
+            for kind, cells in parts.items():
+                if len(cells):
+                    blocks.append((kind, cells))
+                    tags.append(np.full(len(cells), tag))
     cell_data = {"gmsh:physical": tags, "gmsh:geometrical": tags}
     mesh = meshio.Mesh(vertices, blocks, cell_data=cell_data, field_data=field_data)
     mesh.write(path, file_format="gmsh22", binary=True)

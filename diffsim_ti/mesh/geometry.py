@@ -65,6 +65,22 @@ def triangle_areas_vjp(vertices: np.ndarray, triangles: np.ndarray, areas_adj: n
     return triangle_normals_vjp(vertices, triangles, areas_adj[:, None] * unit)
 
 
+def nearest_on_triangles(point: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """The point nearest to `point` of each triangle, shape (k, 3): its foot where that lies inside, else on an edge."""
+    edges = np.roll(triangles, -1, 1) - triangles  # edge a runs from corner a to the next
+    t = np.einsum("kai,kai->ka", point - triangles, edges) / np.einsum("kai,kai->ka", edges, edges)
+    on_edges = triangles + np.clip(t, 0, 1)[:, :, None] * edges
+    nearest = ((on_edges - point) ** 2).sum(2).argmin(1)
+    out = on_edges[np.arange(len(triangles)), nearest]
+    normal = np.cross(edges[:, 0], edges[:, 1])
+    height = np.einsum("ki,ki->k", point - triangles[:, 0], normal) / np.einsum("ki,ki->k", normal, normal)
+    foot = point - height[:, None] * normal
+    inward = np.cross(normal[:, None], edges)
+    inside = np.all(np.einsum("kai,kai->ka", foot[:, None] - triangles, inward) >= 0, 1)
+    out[inside] = foot[inside]
+    return out
+
+
 def rotation_matrix(rotation, angle: float | None) -> np.ndarray:
     """The matrix of a turn about the axis `rotation` by angle [rad], or `rotation` itself; ValueError if it is none.
 

@@ -74,11 +74,20 @@ class NamedSets:
 
     def surface_where(self, predicate: Callable) -> np.ndarray:
         """Sorted indices of the surface triangles where a function of all centroids [m] and outward unit normals, both of
-        shape (k, 3), is true: `lambda x, n: n[:, 1] > 0.9`."""
-        triangles = self.surface_triangles
-        normals = triangle_normals(self.vertices, triangles)
+        shape (k, 3), is true: `lambda x, n: n[:, 1] > 0.9`.
+
+        With ten nodes these are the places at the middle and the mean normals of whole faces, and all four triangles of a
+        face are taken.
+        """
+        faces, normals = self.surface_faces, triangle_normals(self.vertices, self.surface_triangles)
+        corners = self.vertices[faces[:, :3]]
+        centroids = corners.mean(1)
+        if self.order == 2:
+            sag = self.vertices[faces[:, 3:]] - (corners + np.roll(corners, -1, 1)) / 2
+            centroids, normals = centroids + 4 / 9 * sag.sum(1), normals.reshape(-1, 4, 3).sum(1)
         unit = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-        return self.surface_indices(_mask(predicate(self.vertices[triangles].mean(1), unit), len(triangles)))
+        chosen = _mask(predicate(centroids, unit), len(faces))
+        return self.surface_indices(np.repeat(chosen, len(self.surface_triangles) // len(faces)))
 
     # Naming
 

@@ -37,7 +37,8 @@ class TetrahedralMesh(NamedSets, Elements):
     surface_sets: name -> triangles of the surface as vertex indices, shape (k, 3), in any order; kept as sorted indices of
         rows of `surface_triangles`. Triangles within the body are left out. With ten nodes the corners of a face, alone or
         before its middles, shape (k, 6), stand for its four triangles.
-    fix_orientation: swap two vertices of each inside-out tetrahedron instead of refusing it.
+    fix_orientation: swap two vertices of each inside-out tetrahedron instead of refusing it, and put mid-edge vertices of
+        another order (Gmsh's is not VTK's) into place.
 
     Raises ValueError for wrong shapes or dtypes, indices out of range, non-finite coordinates, a repeated vertex in a
     tetrahedron, flat, inside-out, repeated or overlapping tetrahedra, a face of more than two tetrahedra, curved elements
@@ -59,6 +60,8 @@ class TetrahedralMesh(NamedSets, Elements):
         elements = checks.checked_tetrahedra(tetrahedra, len(vertices))
         volumes = checks.checked_volumes(vertices, elements[:, :4])
         elements = checks.oriented(elements, volumes, fix_orientation)
+        if fix_orientation:
+            elements = checks.middles_in_order(vertices, elements)
         volumes = checks.checked_curved_volumes(vertices, elements, np.abs(volumes))
         self._put(vertices, elements, volumes)
         self._vertex_sets = checked_sets(vertex_sets, self.num_vertices, "vertex")
@@ -106,11 +109,11 @@ class TetrahedralMesh(NamedSets, Elements):
         Blocks of tetrahedra are joined. Named groups of tetrahedra become tetrahedron sets, groups of triangles, lines
         or points the vertex sets of their vertices, and those triangles that lie on the surface a surface set too; integer
         tags without a name become "tag_<n>", except 0 and a tag that all tetrahedra share. Other triangles, lines and
-        points are ignored.
+        points are ignored. Ten-node tetrahedra keep their mid-edge vertices, and edges that are curved.
         drop_orphans: leave out vertices that no tetrahedron uses (Gmsh writes some) and renumber; default: warn.
 
-        Raises FileNotFoundError, and ValueError for an unreadable file, one without tetrahedra, 10-node tetrahedra,
-        other cells beside tetrahedra (cell types are named), and whatever the constructor refuses.
+        Raises FileNotFoundError, and ValueError for an unreadable file, one without tetrahedra or with both
+        kinds, other cells beside tetrahedra (cell types are named), and whatever the constructor refuses.
         """
         vertices, tetrahedra, vertex_sets, tetrahedron_sets, triangles = read_mesh(path)
         if drop_orphans and tetrahedra.min() >= 0 and tetrahedra.max() < len(vertices):
@@ -139,10 +142,10 @@ class TetrahedralMesh(NamedSets, Elements):
         Sets are kept in .msh (Gmsh 2.2 binary, as physical groups of points, surfaces and volumes) and in .vtu and .vtk (as
         0/1 data arrays "vertex_set:<name>", "tetrahedron_set:<name>", "surface_set:<name>", with triangles as cells; .vtk
         turns blanks in names into underscores); other formats lose them with a UserWarning. These three keep every digit.
-        ValueError for an unknown suffix, and in .msh for a name of two sets (not a surface set and its own vertices).
+        Ten-node tetrahedra go into these three, .inp and .xdmf. ValueError for an unknown suffix, and in .msh for a name of
+        two sets (not a surface set and its own vertices).
         """
-        triangles = {name: self.surface_triangles[rows] for name, rows in self._surface_sets.items()}
-        lost = write_mesh(path, self.vertices, self.tetrahedra, self._vertex_sets, self._tetrahedron_sets, triangles)
+        lost = write_mesh(path, self)
         if lost:
             kept = ", ".join(KEEPS_SETS)
             warnings.warn(f"{path} cannot keep the sets {', '.join(lost)}; these formats can: {kept}", stacklevel=2)

@@ -73,9 +73,10 @@ def to_vertices(mesh: TetrahedralMesh, values: ArrayLike) -> np.ndarray:
             f"values: expected one per vertex ({mesh.num_vertices}) or per tetrahedron ({mesh.num_tetrahedra}), "
             f"got shape {values.shape}"
         )
-    corners, weight = mesh.tetrahedra.ravel(), np.repeat(mesh.volumes, 4)
-    total = np.bincount(corners, weight, mesh.num_vertices)
-    return np.bincount(corners, weight * np.repeat(values, 4), mesh.num_vertices) / np.where(total > 0, total, 1)
+    num_nodes = mesh.elements.shape[1]
+    at, weight = mesh.elements.ravel(), np.repeat(mesh.volumes, num_nodes)
+    total = np.bincount(at, weight, mesh.num_vertices)
+    return np.bincount(at, weight * np.repeat(values, num_nodes), mesh.num_vertices) / np.where(total > 0, total, 1)
 
 
 def field_of(simulator: Simulator, name: str) -> np.ndarray:

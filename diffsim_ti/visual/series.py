@@ -55,7 +55,7 @@ class SavedSeries:
                 f"{self._frames[0][1]}: must hold displacements, has {sorted(first.point_data)}; take a series of "
                 "diffsim-ti"
             )
-        rest = TetrahedralMesh(first.points - first.point_data["displacement"], first.cells_dict["tetra"])
+        rest = TetrahedralMesh(first.points - first.point_data["displacement"], first.cells[0].data)
         own = next(ElementTree.parse(path).getroot().iter("Collection"))
         ground, self._labels = own.get("ground"), json.loads(own.get("marks", "[]"))
         self._units = json.loads(own.get("units", "{}"))

@@ -11,7 +11,8 @@ class ArraysWriter(Writer):
     """Writes the frames' arrays when it is closed; until then they are kept in memory. n frames:
 
     time [s], shape (n,); positions, displacements [m], velocities [m/s], shape (n, num_vertices, 3); the fields (von_mises,
-    energy_density, J ...), shape (n, num_tetrahedra); rest_positions [m], tetrahedra, fixed. Obstacles are left out.
+    energy_density, J ...), shape (n, num_tetrahedra); rest_positions [m], tetrahedra (num_tetrahedra, 4 or 10), fixed. Obstacles are
+    left out.
     """
 
     suffixes = (".npz",)
@@ -30,5 +31,5 @@ class ArraysWriter(Writer):
         if self._frames:
             rows = {name: np.stack([frame[name] for frame in self._frames]) for name in self._frames[0]}
             mesh = self.setting.mesh
-            body = dict(rest_positions=mesh.vertices, tetrahedra=mesh.tetrahedra, fixed=self.setting.fixed)
+            body = dict(rest_positions=mesh.vertices, tetrahedra=mesh.elements, fixed=self.setting.fixed)
             np.savez_compressed(self.path, **rows, **body)

@@ -34,8 +34,8 @@ class ParaViewWriter(Writer):
     valid series. Frames that an earlier series of that name left in the folder are removed first. Frames hold
     displacement [m], velocity [m/s] and what is fixed per vertex, and von_mises [Pa], energy_density [J/m^3] and J [-] per
     tetrahedron, in the precision of the displacements; besides, what else a frame's fields have for every vertex or
-    every tetrahedron, such as forces and stresses (`Frame.of_run`), tensors row by row. Raises OSError if the folder
-    cannot be written.
+    every tetrahedron, such as forces and stresses (`Frame.of_run`), tensors row by row. Ten-node tetrahedra are quadratic
+    cells. Raises OSError if the folder cannot be written.
     """
 
     suffixes = (".pvd",)
@@ -71,7 +71,7 @@ class ParaViewWriter(Writer):
         )
         saved = meshio.Mesh(
             np.asarray(frame.positions, np.float64),
-            [("tetra", self.setting.mesh.tetrahedra)],
+            [("tetra" if self.setting.mesh.order == 1 else "tetra10", self.setting.mesh.elements)],
             point_data=point_data | {"fixed": held} | self._held(dtype),
             cell_data={name: [value] for name, value in cell_data.items()},
         )

@@ -1,0 +1,105 @@
+"""Where in a ten-node tetrahedron a point lies: the inverse of x(xi) = sum_a N_a(xi) X_a, straight edges or curved."""
+
+import numpy as np
+
+from diffsim_ti.mesh.geometry import nearest_on_triangles
+from diffsim_ti.mesh.reference_element import MID_EDGES, QUADRATIC, barycentric
+
+ITERATIONS = 40
+ACCURACY = 1e-12  # of the size of an element
+
+
+def reach(nodes: np.ndarray, centres: np.ndarray) -> np.ndarray:
+    """Radius of a ball about each centre that holds the element, shape (m,): by the control points of its edges.
+
+    An element lies in the convex hull of these (Bernstein functions are positive and sum to one).
+    """
+    return np.linalg.norm(_control_points(nodes) - centres[:, None], axis=2).max(1)
+
+
+def _control_points(nodes: np.ndarray) -> np.ndarray:
+    return np.concatenate([nodes[:, :4], 2 * nodes[:, 4:] - nodes[:, MID_EDGES].mean(2)], 1)
+
+
+def barycentric_in(nodes: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """L of a point in each element, shape (m, 4); NaN where it is far outside. nodes (m, 10, 3), points (m, 3).
+
+    It starts from the tetrahedron of the corners, then from the centroid and the corners, and halves steps that lead away.
+    """
+    D = np.moveaxis(nodes[:, 1:4] - nodes[:, :1], 1, 2)
+    hull = np.einsum("eij,eaj->eai", np.linalg.inv(D), _control_points(nodes) - nodes[:, :1])
+    first = np.linalg.solve(D, (points - nodes[:, 0])[..., None])[..., 0]
+    outside = (first < hull.min(1) - 1e-6).any(1) | (first > hull.max(1) + 1e-6).any(1)
+    out, left = np.full((len(nodes), 3), np.nan), np.nonzero(~outside)[0]
+    for start in (first, np.full(3, 0.25), *np.concatenate([np.zeros((1, 3)), np.eye(3)])):
+        xi, found = _newton(nodes[left], points[left], np.broadcast_to(start, (len(nodes), 3))[left])
+        out[left[found]] = xi[found]
+        left = left[~found]
+        if not len(left):
+            break
+    return barycentric(out)
+
+
+def _newton(nodes: np.ndarray, points: np.ndarray, xi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(xi, where it was found)"""
+    size = np.ptp(nodes, axis=1).max(1)
+
+    def miss(xi):
+        return np.einsum("en,eni->ei", QUADRATIC.functions(xi), nodes) - points
+
+    xi, off = xi.copy(), miss(xi)
+    for _ in range(ITERATIONS):
+        norms = np.linalg.norm(off, axis=1)
+        found = norms <= ACCURACY * size
+        if found.all():
+            break
+        J = np.einsum("enj,eni->eij", QUADRATIC.derivatives(xi), nodes)
+        singular = np.abs(np.linalg.det(J)) < 1e-12 * size**3
+        J[singular] = size[singular, None, None] * np.eye(3)
+        step = -np.linalg.solve(J, off[..., None])[..., 0]
+        step[found] = 0.0
+        for _ in range(8):
+            tried = miss(xi + step)
+            away = np.linalg.norm(tried, axis=1) > norms
+            if not away.any():
+                break
+            step[away] /= 2
+        xi = xi + step
+        off = miss(xi)
+    return xi, np.linalg.norm(off, axis=1) <= 1e3 * ACCURACY * size
+
+
+def face_functions(s: np.ndarray) -> np.ndarray:
+    """The six shape functions of a face at (s, t), shape (2,): 1 - s - t, s, t are its barycentric coordinates."""
+    L = np.array([1 - s.sum(), *s])
+    return np.concatenate([L * (2 * L - 1), 4 * L * np.roll(L, -1)])
+
+
+def _face_tangents(s: np.ndarray) -> np.ndarray:
+    """Derivatives of the face's functions by s and t, shape (6, 2)."""
+    L, by = np.array([1 - s.sum(), *s]), np.array([[-1.0, -1], [1, 0], [0, 1]])
+    middles = 4 * (L[:, None] * np.roll(by, -1, 0) + np.roll(L, -1)[:, None] * by)
+    return np.concatenate([(4 * L - 1)[:, None] * by, middles])
+
+
+def nearest_on_face(point: np.ndarray, nodes: np.ndarray, s: np.ndarray) -> np.ndarray:
+    """Coordinates (s, t) of the nearest point of a face of six nodes, shape (6, 3), from a start near to it.
+
+    Steps of Gauss and Newton: to the nearest point of the triangle that the tangents make of the face.
+    """
+    corners = np.array([[0.0, 0], [1, 0], [0, 1]])
+    distance = np.linalg.norm(face_functions(s) @ nodes - point)
+    for _ in range(ITERATIONS):
+        T = nodes.T @ _face_tangents(s)
+        tangent = face_functions(s) @ nodes + (corners - s) @ T.T
+        place = nearest_on_triangles(point, tangent[None])[0]
+        step = np.linalg.lstsq(T, place - tangent[0], rcond=None)[0] - s
+        for _ in range(8):
+            closer = np.linalg.norm(face_functions(s + step) @ nodes - point)
+            if closer <= distance:
+                break
+            step = step / 2
+        if closer > distance or np.abs(step).max() < ACCURACY:
+            return s
+        s, distance = np.clip(s + step, 0, 1), closer
+    return s
