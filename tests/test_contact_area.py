@@ -19,7 +19,7 @@ ROUGH = dict(friction=0.3, friction_speed=5.0)
 
 
 def areas_of(mesh, X=None) -> np.ndarray:
-    link = SurfaceAreas(mesh.surface_triangles, mesh.num_vertices)
+    link = SurfaceAreas(mesh)
     return link.value(mesh.vertices if X is None else X)[0]
 
 

@@ -124,7 +124,7 @@ class Inputs:
             *scene.material.links(),
         ]
         if any(term.acts_on_surface for term in scene.terms):
-            out.append(SurfaceAreas(mesh.surface_triangles, mesh.num_vertices))
+            out.append(SurfaceAreas(mesh))
         for k, term in enumerate(scene.ordered_terms):
             own, rows = f"numbers of term {k}", self.parameters.of(term)
             summed = term.dead and self.sums_loads

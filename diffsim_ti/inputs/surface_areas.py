@@ -15,12 +15,19 @@ class SurfaceAreas(Link):
     the same shares however a square is cut in two. Where the surface is flat or bends little, a is the sum of these shares.
     What counts at an edge is what faces one way: where a cube lies on its bottom, its sides carry nothing, and sides of
     any height are not felt. a is the mean, over the surface around, of what faces the same way, by the square of the cosine.
+
+    Of ten-node tetrahedra, whose faces are four triangles each, a face's corners hand on nearly all of their shares to its
+    three middles: under an even pressure a quadratic face pushes its middles alone (A / 3 each, corners 0), and what its
+    corners have beyond that makes stresses below uneven. They keep a twentieth, so that they are stopped too.
     """
 
     reads, writes = ("rest",), ("surface",)
 
-    def __init__(self, triangles: np.ndarray, num_vertices: int):
-        self.triangles, self.num_vertices = triangles, num_vertices
+    kept = 0.05  # of the share of a face's corner, where its middles are vertices too
+
+    def __init__(self, mesh):
+        self.triangles, self.num_vertices = mesh.surface_triangles, mesh.num_vertices
+        self.at_corner = np.isin(self.triangles, mesh.tetrahedra) if mesh.order == 2 else None
 
     def value(self, X):
         return (self._areas(self._moments(*self._shapes(X)[:2])),)
@@ -32,10 +39,26 @@ class SurfaceAreas(Link):
         angles = np.arctan2(np.linalg.norm(np.cross(e, f), axis=2), (e * f).sum(2))
         return triangle_normals(X, self.triangles), angles, e, f
 
+    def _dealt(self, angles):
+        """What corners of triangles count for: their angles, but for what those of six-node faces hand on, which stand in
+        the first three triangles of four."""
+        if self.at_corner is None:
+            return angles
+        handed_on = (1 - self.kept) * self.at_corner * angles
+        out = angles - handed_on
+        out[3::4] += handed_on.reshape(-1, 12).sum(1)[:, None] / 3
+        return out
+
+    def _dealt_vjp(self, out_adj):
+        if self.at_corner is None:
+            return out_adj
+        to_middles = np.repeat(out_adj[3::4].sum(1) / 3, 4)[:, None]
+        return out_adj + (1 - self.kept) * self.at_corner * (to_middles - out_adj)
+
     def _moments(self, n, angles):
         """M of each vertex."""
         outer = n[:, :, None] * n[:, None, :] / np.linalg.norm(n, axis=1)[:, None, None]
-        return self._to_vertices(angles[:, :, None, None] / np.pi * outer[:, None])
+        return self._to_vertices(self._dealt(angles)[:, :, None, None] / np.pi * outer[:, None])
 
     def _areas(self, M):
         total = np.trace(M, axis1=1, axis2=2)
@@ -54,7 +77,7 @@ class SurfaceAreas(Link):
         N, slopes = n / size, self._slopes(self._moments(n, angles))[self.triangles]
         turned = np.einsum("tcij,tj->tci", slopes, N)
         along = np.einsum("tci,ti->tc", turned, N)
-        by_n = angles[:, :, None] / np.pi * (2 * turned - along[:, :, None] * N[:, None])
+        by_n = self._dealt(angles)[:, :, None] / np.pi * (2 * turned - along[:, :, None] * N[:, None])
         return along * size / np.pi, by_n, N, e, f
 
     def jvp(self, x, dx):
@@ -62,14 +85,15 @@ class SurfaceAreas(Link):
         moved = dx[0][self.triangles]
         de, df = np.roll(moved, -1, 1) - moved, np.roll(moved, -2, 1) - moved
         by_e, by_f = _turn(N, e, f)
-        change = by_angle * ((by_e * de).sum(2) + (by_f * df).sum(2))
+        change = by_angle * self._dealt((by_e * de).sum(2) + (by_f * df).sum(2))
         dn = (np.cross(de[:, 0], f[:, 0]) + np.cross(e[:, 0], df[:, 0])) / 2
         return (self._to_vertices(change + np.einsum("tci,ti->tc", by_n, dn)),)
 
     def vjp(self, x, y_adj):
         by_angle, by_n, N, e, f = self._parts(*x)
         own = y_adj[0][self.triangles]
-        by_e, by_f = ((own * by_angle)[:, :, None] * by for by in _turn(N, e, f))
+        by_own = self._dealt_vjp(own * by_angle)
+        by_e, by_f = (by_own[:, :, None] * by for by in _turn(N, e, f))
         by_corner = np.roll(by_e, 1, 1) + np.roll(by_f, 2, 1) - by_e - by_f
         n_adj = np.einsum("tc,tci->ti", own, by_n)
         by_corner += np.cross(np.roll(e, -1, 1) / -2, n_adj[:, None])

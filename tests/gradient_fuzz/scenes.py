@@ -206,7 +206,7 @@ def _obstacles(kind, rng, mesh, start, fixed, stiff, duration) -> tuple[list, li
         width = MESH_WIDTH if o.name == "MeshObstacle" else CELL * rng.uniform(0.25, 0.5)
         options = dict(stiffness=stiff * rng.uniform(0.3, 1.0) * (10 if o.narrow else 1))  # of few points
         if o.per_area:  # no vertex's barrier is stiffer
-            largest = SurfaceAreas(mesh.surface_triangles, mesh.num_vertices).value(mesh.vertices)[0].max()
+            largest = SurfaceAreas(mesh).value(mesh.vertices)[0].max()
             options = dict(stiffness_per_area=options["stiffness"] / largest)
         if o.friction:
             typical = 0.05 * CELL / duration
