@@ -3,6 +3,7 @@
 import numpy as np
 
 import diffsim_ti as ds
+from diffsim_ti.mesh.reference_element import MID_EDGES
 
 from .structures import CELL
 
@@ -27,6 +28,26 @@ def with_part(mesh, rng):
     """With a set of tetrahedra of its own."""
     count = int(rng.integers(1, mesh.num_tetrahedra + 1))
     return mesh.with_tetrahedron_set("part", np.sort(rng.permutation(mesh.num_tetrahedra)[:count]))
+
+
+def with_middles(mesh, start, rng):
+    """(the same body of ten-node tetrahedra, some of whose edges are bent, and the start of all nodes)."""
+    straight = mesh.quadratic()
+    ends = straight.elements[:, MID_EDGES]
+    moved, started = np.zeros((2, *straight.vertices.shape))
+    started[: len(start)] = start - mesh.vertices
+    started[straight.elements[:, 4:]] = started[ends].mean(2)
+    if rng.random() < 0.6:
+        middles = np.unique(straight.elements[:, 4:])
+        moved[middles] = 0.03 * CELL * rng.uniform(-1, 1, (len(middles), 3))
+    bent = ds.TetrahedralMesh(
+        straight.vertices + moved,
+        straight.elements,
+        vertex_sets=straight.vertex_sets,
+        tetrahedron_sets=straight.tetrahedron_sets,
+        surface_sets={name: straight.surface_triangles[rows] for name, rows in straight.surface_sets.items()},
+    )
+    return bent, bent.vertices + started
 
 
 def single(rng):

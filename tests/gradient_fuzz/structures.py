@@ -65,6 +65,7 @@ class Structure:
     ties: tuple[str, ...]  # springs, cables, foundations
     rollers: bool  # some of what is fixed is held in some directions alone
     chamber: str  # what the cavity of a hollow body holds, and how that is given; "" of others
+    order: int  # of the functions between nodes
 
     @property
     def explicit(self) -> bool:
@@ -82,6 +83,7 @@ class Structure:
         flags = ("self_contact", "gravity", "drag", "fixed", "motion", "uniform", "rollers")
         words = [name for name in flags if getattr(self, name)]
         how = f"{self.contact} {self.contact_damping:g}" if self.explicit else "potential"
+        words += ["ten nodes"] * (self.order == 2)
         forces = [self.forces, *self.loads, *self.ties, *[self.chamber] * bool(self.chamber)]
         return (
             f"structure {self.number}: {self.law.__name__}, {self.solver.__name__}, {self.precision}, {self.volume}"
@@ -146,4 +148,5 @@ def structure(number: int) -> Structure:
         turn(CHAMBERS[:3] if solver in EXPLICIT else CHAMBERS, number // 4, 13)
         if number % 4 == 1 and not self_contact
         else "",
+        turn((1, 1, 2), number, 14),
     )
