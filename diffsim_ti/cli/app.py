@@ -18,6 +18,7 @@ from diffsim_ti.cli.options import (
     Folder,
     MaterialName,
     MeshFile,
+    Order,
     Poisson,
     Precision,
     Size,
@@ -100,6 +101,7 @@ def simulate(
     poissons_ratio: Poisson = 0.4,
     density: Density = 1000.0,
     volume: Volume = "tetrahedra",
+    order: Order = 1,
     size: Size = None,
     up: UpAxis = Up.y,
     fix_orientation: FixOrientation = False,
@@ -149,7 +151,7 @@ def simulate(
     writers = [writer_for(path, view) for path in dict.fromkeys(asked)]
     kind = solver_class(solver)
     law = make_material(material, youngs_modulus, poissons_ratio)
-    body = load_body(mesh, size, up, fix_orientation)
+    body = load_body(mesh, size, up, fix_orientation, order)
     runtime.init(backend, precision, threads)
     scene, _ = fall_scene(
         body,
@@ -206,6 +208,7 @@ def check_gradients(
     poissons_ratio: Poisson = 0.4,
     density: Density = 1000.0,
     material: MaterialName = "StableNeoHookean",
+    order: Order = 1,
     size: Size = None,
     up: UpAxis = Up.y,
     steps: Annotated[int, typer.Option(help="length of the rollout")] = 50,
@@ -231,7 +234,7 @@ def check_gradients(
     from diffsim_ti.verify import check_gradients as check
 
     runtime.init(backend, precision)
-    law, body = make_material(material, youngs_modulus, poissons_ratio), load_body(mesh, size, up)
+    law, body = make_material(material, youngs_modulus, poissons_ratio), load_body(mesh, size, up, order=order)
     ground = make_ground(body, law, density, -9.81, 0.5, width=0.02 * np.ptp(body.bounding_box, 0).max())
     lift = 0.5 * float(ground.values["barrier_width"]) - body.bounding_box[0, 1]
     body = body.translated([0, lift, 0])

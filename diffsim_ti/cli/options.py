@@ -35,6 +35,7 @@ Density = Annotated[float, typer.Option(help="[kg/m^3]")]
 Volume = Annotated[
     str, typer.Option(help="where a change of volume is resisted: tetrahedra, or patches (near nu = 0.5)")
 ]
+Order = Annotated[int, typer.Option(help="1: linear tetrahedra; 2: ten-node ones of the same mesh, which bend right")]
 Backend = Annotated[str, typer.Option(help="cpu, cuda or vulkan")]
 Precision = Annotated[str, typer.Option(help="f32 or f64")]
 Threads = Annotated[int | None, typer.Option(help="CPU threads, default all")]
@@ -45,10 +46,15 @@ Folder = Annotated[Path, typer.Option("--output", "-o", help="folder for what is
 # ---- a scene from options ---------------------------------------------------------------------------------------------
 
 
-def load_body(path: Path, size: float | None = None, up: Up = Up.y, fix_orientation: bool = False) -> TetrahedralMesh:
-    """The mesh of a file, y up and of the size asked for; vertices of no tetrahedron are left out."""
+def load_body(
+    path: Path, size: float | None = None, up: Up = Up.y, fix_orientation: bool = False, order: int = 1
+) -> TetrahedralMesh:
+    """The mesh of a file, y up and of the size asked for; vertices of no tetrahedron are left out. order 2: of ten-node
+    tetrahedra, made from linear ones where the file has these."""
     from diffsim_ti.mesh import TetrahedralMesh
 
+    if order not in (1, 2):
+        raise ValueError(f"--order must be 1 or 2, got {order}")
     mesh = TetrahedralMesh.from_file(path, fix_orientation=fix_orientation, drop_orphans=True)
     axis, sign = "xyz".index(up.value[-1]), -1 if up.value[0] == "-" else 1
     if up is not Up.y:
@@ -58,7 +64,7 @@ def load_body(path: Path, size: float | None = None, up: Up = Up.y, fix_orientat
         if not size > 0:
             raise ValueError(f"--size must be > 0 [m], got {size:g}")
         mesh = mesh.scaled(size / np.ptp(mesh.bounding_box, 0).max())
-    return mesh
+    return mesh.quadratic() if order > mesh.order else mesh
 
 
 def make_material(name: str, youngs_modulus: float, poissons_ratio: float) -> Material:

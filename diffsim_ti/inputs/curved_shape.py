@@ -73,6 +73,13 @@ class CurvedShape(Link):
         return (X_adj,)
 
 
+def ratios_at_corners(elements: np.ndarray, rest: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """J = det(dx/dxi) / det(dX/dxi) at the corners of ten-node elements, shape (m, 4): where one folds first."""
+    by_xi = QUADRATIC.derivatives(np.concatenate([np.zeros((1, 3)), np.eye(3)]))
+    after, before = (np.einsum("eai,qak->eqik", x[elements], by_xi, optimize=True) for x in (rest + u, rest))
+    return np.linalg.det(after) / np.linalg.det(before)
+
+
 class StressPoints(NamedTuple):
     """The points of all tetrahedra, one after the other, for sums on the host."""
 

@@ -6,9 +6,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.scene import Scene
 
-ELEMENTS = {"linear": {}, "patches": {"volume": "patches"}}  # kinds of element: name -> arguments of Scene
+# kinds of element: name -> what `Problem.scene` takes: arguments of Scene, and the order of the mesh
+ELEMENTS = {
+    "linear": {},
+    "patches": {"volume": "patches"},
+    "quadratic": {"order": 2},
+    "quadratic, mean dilatation": {"order": 2, "volume": "patches"},
+}
+
+
+def of_order(mesh: TetrahedralMesh, order: int) -> TetrahedralMesh:
+    """A mesh of linear tetrahedra, or its ten-node ones."""
+    return mesh.quadratic() if order == 2 else mesh
 
 
 @dataclass(frozen=True)
@@ -47,8 +59,8 @@ class Problem:
     scale: what errors are divided by; default the largest of the exact numbers.
     adjoint(frames, mesh) -> the loss's gradient by the frames' positions, such as a `FrameLoss`; `inputs`: those asked for.
     cells, patterns, elements: the meshes of the chart, and the kinds of elements (ELEMENTS) to try on each.
-    reference_cells: those that the reference is extrapolated from (it then includes the mesh's error); None: the reference
-        is of each mesh with linear elements by itself (the error of steps and precision).
+    reference_cells: those that the reference is extrapolated from, of ten-node tetrahedra (it then includes the mesh's
+        error); None: the reference is of each mesh with linear elements by itself (the error of steps and precision).
     largest_step [s]: steps to start from, where the stable one does not say (contact to come).
     static: an equilibrium; only StaticSolver takes part.
     levels: steps per solver, each half the last.
@@ -85,7 +97,7 @@ class Problem:
             cells=self.cells[:2],
             patterns=self.patterns[:1],
             elements=self.elements[:1],
-            reference_cells=self.reference_cells and (4, 6, 8),
+            reference_cells=self.reference_cells and self.reference_cells[:3],
         )
 
     @classmethod

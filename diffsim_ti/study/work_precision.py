@@ -40,6 +40,11 @@ class Point:
     on_front: bool = False
 
     @property
+    def order(self) -> int:
+        """Of the elements."""
+        return ELEMENTS[self.element].get("order", 1)
+
+    @property
     def label(self) -> str:
         mesh = f"{self.cells} cells {self.pattern}" if self.cells > 1 else self.pattern
         mesh += "" if self.element == "linear" else f" {self.element}"
@@ -132,22 +137,25 @@ def run(problem: Problem, rollout: Rollout) -> tuple[float, np.ndarray]:
 # ---- references -------------------------------------------------------------------------------------------------------
 
 
-def reference(problem: Problem, cells: int | None = None, pattern: str = "five", substeps: int = 4) -> tuple:
+def reference(
+    problem: Problem, cells: int | None = None, pattern: str = "five", substeps: int = 4, element: str = "linear"
+) -> tuple:
     """(the right numbers, their own relative error): the closed form, or extrapolated from converging runs in float64.
 
     By steps on a mesh of so many cells: from h and h / 2 of velocity Verlet, whose error falls as h^2; the error is the
-    last change. By meshes (problem.reference_cells): from the last two, whose error falls as the square of the cell; the
-    error is the distance from what the first two give.
+    last change. By meshes (problem.reference_cells) of ten-node tetrahedra: from the last two, whose error falls about as
+    the square of the cell (what edges of a clamp leave of the third order); the error is the distance from what the first
+    two give.
     """
     if problem.exact is not None:
         return problem.exact, 0.0
     if problem.reference_cells is None or cells is not None:
-        scene = problem.scene(cells or problem.cells[0], pattern, "f64")
+        scene = problem.scene(cells or problem.cells[0], pattern, "f64", **ELEMENTS[element])
         k = substeps * choose_substeps(problem, scene, VelocityVerletSolver, 1)[0]
         coarse, fine = (run(problem, make_rollout(problem, scene, VelocityVerletSolver, s))[1] for s in (k, 2 * k))
         best = fine + (fine - coarse) / 3
         return best, distance(problem, fine, best)
-    values = [reference(problem, n, substeps=1)[0] for n in problem.reference_cells]
+    values = [reference(problem, n, substeps=1, element="quadratic")[0] for n in problem.reference_cells]
     sizes = 1 / np.array(problem.reference_cells, float) ** 2
 
     def extrapolate(a, b):
@@ -186,7 +194,7 @@ class Runs:
     ):
         self.problem, self.solvers, self.precisions = problem, solvers, precisions
         self.levels, self.repeats, self.limit = levels, repeats, limit
-        self.rate: dict = {}  # (solver, precision) -> [s] per tetrahedron and substep
+        self.rate: dict = {}  # (solver, order, precision) -> [s] per tetrahedron and substep
         self.left_out: list[str] = []
         self._done: list[Point] = []
 
@@ -222,8 +230,8 @@ class Runs:
 
     def predict(self, point: Point, explicit: bool) -> float:
         """Expected wall time of one run [s]."""
-        guess = GUESS[explicit] * (3 if self.problem.differentiates else 1)
-        rate = self.rate.get((point.solver, point.precision), guess)
+        guess = GUESS[explicit] * (3 if self.problem.differentiates else 1) * (5 if point.order == 2 else 1)
+        rate = self.rate.get((point.solver, point.order, point.precision), guess)
         return 2e-4 + rate * max(point.tetrahedra, 200) * point.substeps
 
     def estimate(self) -> float:
@@ -261,9 +269,9 @@ class Runs:
                 continue
             best = min(times)
             point.seconds = best / self.problem.duration
-            known = self.rate.get((point.solver, point.precision))
+            known = self.rate.get((point.solver, point.order, point.precision))
             rate = best / max(point.tetrahedra, 200) / point.substeps
-            self.rate[point.solver, point.precision] = rate if known is None else 0.5 * (known + rate)
+            self.rate[point.solver, point.order, point.precision] = rate if known is None else 0.5 * (known + rate)
         self._drop_hopeless(points)
         return points
 
