@@ -211,3 +211,14 @@ def test_points_of_the_host_are_those_of_the_kernels():
     H = StressPoints.of(scene.mesh, scene.inputs.derive(scene.inputs.values)).displacement_gradients(u)
     J = np.linalg.det(np.eye(3) + H)
     assert np.allclose(potential_of(scene, u).energy()[2], J, rtol=1e-12)
+
+
+def test_fields_show_where_an_element_folds():
+    """J = 1 - 0.8 x of a quadratic stretch along x is least at a corner, beyond the points of stresses."""
+    cube = ds.TetrahedralMesh.create_cube(2).quadratic()
+    x = cube.vertices + np.array([1, 0, 0]) * -0.4 * cube.vertices[:, :1] ** 2
+    scene = ds.Scene(cube, ds.StableNeoHookean(1e5, 0.3), initial_positions=x, precision="f64")
+    fields = ds.Simulator(ds.VelocityVerletSolver(scene, 1e-4)).tetrahedron_fields()
+    assert fields.J.min() == pytest.approx(1 - 0.8, abs=1e-12)
+    total = potential_of(scene, x - cube.vertices).energy()[0]
+    assert (fields.energy_density * cube.volumes).sum() == pytest.approx(total, rel=1e-12)

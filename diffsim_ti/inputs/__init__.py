@@ -1,7 +1,7 @@
 """From what users name (E, nu, density, rest shape ...) to what kernels read, with the chain rule both ways."""
 
 from diffsim_ti.inputs.chain import Chain, Link
-from diffsim_ti.inputs.curved_shape import StressPoints
+from diffsim_ti.inputs.curved_shape import StressPoints, ratios_at_corners
 from diffsim_ti.inputs.description import NOT_NEGATIVE, POSITIVE, Input, Range, RunSize
 from diffsim_ti.inputs.inputs import Derived, Inputs
 
@@ -16,4 +16,5 @@ __all__ = [
     "POSITIVE",
     "Range",
     "StressPoints",
+    "ratios_at_corners",
 ]

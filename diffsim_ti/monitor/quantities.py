@@ -9,6 +9,7 @@ import taichi as ti
 
 from diffsim_ti import runtime
 from diffsim_ti.elements.patched_tetrahedron import functions_of
+from diffsim_ti.inputs import ratios_at_corners
 from diffsim_ti.potential.attached import Attached
 from diffsim_ti.potential.kernels import potential_kernels
 from diffsim_ti.runtime import Kernel, assign, traced
@@ -97,7 +98,7 @@ class Energy(float):
 @dataclass
 class TetrahedronFields:
     """Per tetrahedron: energy density [J/m^3], von Mises stress [Pa], volume ratio J [-]; float64. Of ten nodes: means over
-    the points, and the smallest J there."""
+    the points, and the smallest J there and at the corners."""
 
     energy_density: np.ndarray
     von_mises: np.ndarray
@@ -118,7 +119,9 @@ def tetrahedron_fields(workspace: Workspace) -> TetrahedronFields:
     energy, von_mises, J = (a.at_points(runtime.fetch(x)) for x in (out.energy, out.von_mises, out.J))
     if a.points > 1:
         share = a.values.volumes / a.values.volumes.sum(1, keepdims=True)
-        energy, von_mises, J = (energy * share).sum(1), (von_mises * share).sum(1), J.min(1)
+        energy, von_mises = (energy * share).sum(1), (von_mises * share).sum(1)
+        u = runtime.fetch_row(workspace.state.u, 0).astype(np.float64)
+        J = np.minimum(J.min(1), ratios_at_corners(a.mesh.elements, a.values.rest, u).min(1))
     return TetrahedronFields(energy, von_mises, J)
 
 
