@@ -82,24 +82,39 @@ def _face_tangents(s: np.ndarray) -> np.ndarray:
     return np.concatenate([(4 * L - 1)[:, None] * by, middles])
 
 
+# Second derivatives of the face's functions by s and t, which are constants, shape (6, 2, 2)
+_BY = np.array([[-1.0, -1], [1, 0], [0, 1]])
+_NEXT = np.roll(_BY, -1, 0)
+_CURVATURES = np.concatenate(
+    [4 * _BY[:, :, None] * _BY[:, None], 4 * (_BY[:, :, None] * _NEXT[:, None] + _NEXT[:, :, None] * _BY[:, None])]
+)
+
+
 def nearest_on_face(point: np.ndarray, nodes: np.ndarray, s: np.ndarray) -> np.ndarray:
     """Coordinates (s, t) of the nearest point of a face of six nodes, shape (6, 3), from a start near to it.
 
-    Steps of Gauss and Newton: to the nearest point of the triangle that the tangents make of the face.
+    Newton's method for |x(s, t) - point|^2 / 2 within the triangle; the step solves the quadratic model there: the nearest
+    point of the triangle in the metric of the second derivatives (those of Gauss and Newton where these are not positive).
     """
     corners = np.array([[0.0, 0], [1, 0], [0, 1]])
-    distance = np.linalg.norm(face_functions(s) @ nodes - point)
+    off = face_functions(s) @ nodes - point
     for _ in range(ITERATIONS):
         T = nodes.T @ _face_tangents(s)
-        tangent = face_functions(s) @ nodes + (corners - s) @ T.T
-        place = nearest_on_triangles(point, tangent[None])[0]
-        step = np.linalg.lstsq(T, place - tangent[0], rcond=None)[0] - s
-        for _ in range(8):
-            closer = np.linalg.norm(face_functions(s + step) @ nodes - point)
-            if closer <= distance:
+        H = T.T @ T + np.einsum("aij,a->ij", _CURVATURES, nodes @ off)
+        if np.linalg.eigvalsh(H)[0] <= 1e-6 * np.trace(T.T @ T):
+            H = T.T @ T
+        C = np.linalg.cholesky(H)
+        model = np.pad((corners - s) @ C, ((0, 0), (0, 1)))
+        target = np.pad(-np.linalg.solve(C, T.T @ off), (0, 1))
+        step = np.linalg.solve(C.T, nearest_on_triangles(target, model[None])[0, :2])
+        for _ in range(20):
+            tried = face_functions(s + step) @ nodes - point
+            if tried @ tried <= off @ off:
                 break
             step = step / 2
-        if closer > distance or np.abs(step).max() < ACCURACY:
+        if tried @ tried > off @ off:
             return s
-        s, distance = np.clip(s + step, 0, 1), closer
+        s, off = np.clip(s + step, 0, 1), tried
+        if np.abs(step).max() < ACCURACY:
+            break
     return s
