@@ -8,23 +8,28 @@ from diffsim_ti.state.arrays import SceneArrays
 
 
 def element_matrices(potential) -> np.ndarray:
-    """12x12 stiffness of each tetrahedron where `potential.blocks` was last called, as (m, 4, 4, 3, 3) blocks [N/m]; a
-    patch's pressure is held.
+    """Stiffness of each element where `potential.blocks` was last called, as (m, nodes, nodes, 3, 3) blocks [N/m]; a patch's
+    pressure is held.
     """
-    a = potential.arrays
-    m, B = a.num_tetrahedra, a.values.gradients
-    N = np.concatenate([-B.sum(1, keepdims=True), B], 1)
-    C = potential.tangents().reshape(m, 3, 3, 3, 3) * a.values.volumes[:, None, None, None, None]
-    right = np.matmul(C.reshape(m, 27, 3), np.swapaxes(N, 1, 2)).reshape(m, 3, 3, 3, 4)
-    return np.einsum("eaj,eijkb->eabik", N, right, optimize=True)
+    a, (_, N, V) = potential.arrays, potential.stress_points
+    count, k = N.shape[:2]
+    C = potential.tangents().reshape(count, 3, 3, 3, 3) * V[:, None, None, None, None]
+    right = np.matmul(C.reshape(count, 27, 3), np.swapaxes(N, 1, 2)).reshape(count, 3, 3, 3, k)
+    if a.points == 1:
+        return np.einsum("eaj,eijkb->eabik", N, right, optimize=True)
+    m, q = a.num_tetrahedra, a.points
+    N, right = N.reshape(m, q, k, 3), right.reshape(m, q, 3, 3, 3, k)
+    left = np.moveaxis(N, 2, 1).reshape(m, k, 3 * q)
+    right = np.moveaxis(right, 3, 2).reshape(m, 3 * q, 9 * k)  # j beside the points
+    return np.moveaxis((left @ right).reshape(m, k, 3, 3, k), 4, 2)
 
 
 def assemble(potential, mass, free):
     """(c M + K as a block matrix, places of its diagonal blocks); what is held keeps a diagonal."""
     from scipy.sparse import bsr_matrix
 
-    n, tets = potential.arrays.num_vertices, potential.tetrahedra.astype(np.int64)
-    places = (tets[:, :, None] * n + tets[:, None, :]).ravel()
+    n, nodes = potential.arrays.num_vertices, potential.arrays.mesh.elements.astype(np.int64)
+    places = (nodes[:, :, None] * n + nodes[:, None, :]).ravel()
     entries = element_matrices(potential).reshape(-1, 9)
     if potential.arrays.patches is not None:
         rows, columns, blocks = potential.coupling.entries(potential.patch_gradients())

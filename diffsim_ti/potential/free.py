@@ -29,6 +29,11 @@ class FreeDirections:
         out[self.guided] -= self.guides
         return out
 
+    def of(self, vertices: np.ndarray) -> "FreeDirections":
+        """The same of some vertices, sorted, by their places."""
+        here = np.isin(self.guided, vertices)
+        return FreeDirections(self.mask[vertices], np.searchsorted(vertices, self.guided[here]), self.guides[here])
+
     def around(self, blocks: np.ndarray) -> np.ndarray:
         """P B P for a block of each vertex, shape (num_vertices, 3, 3)."""
         P, out = np.eye(3) - self.guides, np.array(blocks)
