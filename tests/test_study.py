@@ -125,7 +125,7 @@ def test_chart_writes_picture_table_and_record(tmp_path):
 
 
 def test_runs_that_raise_are_shown_as_refused_and_long_ones_are_named():
-    asked = replace(problem("lame"), cells=(2,), patterns=("five",))
+    asked = replace(problem("lame"), cells=(2,), patterns=("five",), elements=("linear",))
     unstable = replace(asked, scene=lambda *a, **k: asked.scene(*a, **k).replace(density=1e3))
     result = chart(unstable, solvers=(ds.VelocityVerletSolver,), precisions=("f32",), levels=2, repeats=1, limit=1e-9)
     assert not result.points and len(result.left_out) == 2 and "would take" in result.left_out[0]
