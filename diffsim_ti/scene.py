@@ -39,6 +39,7 @@ def _kind(term) -> tuple:
 
 
 LOCKING_RATIO = 0.45  # Poisson's ratio above which linear tetrahedra lock noticeably
+LOCKING_RATIO_OF_TEN_NODES = 0.49  # beyond it their mean dilatation is the better
 
 
 class Scene:
@@ -78,7 +79,7 @@ class Scene:
         precision: str | None = None,
         volume: str = "tetrahedra",
     ):
-        self._arguments = dict(
+        self.arguments = dict(
             mesh=mesh,
             material=material,
             density=density,
@@ -126,7 +127,7 @@ class Scene:
 
     def replace(self, **changes) -> "Scene":
         """A scene with some arguments replaced."""
-        return Scene(**self._arguments | changes)
+        return Scene(**self.arguments | changes)
 
     def _check_terms(self) -> None:
         for term in self.terms:
@@ -159,12 +160,14 @@ class Scene:
         return float(np.max(youngs_poisson(mu, lam)[1]))
 
     def _warn_if_locking(self) -> None:
-        nu = self.largest_poissons_ratio()
-        if nu > LOCKING_RATIO + 1e-12:
+        nu, linear = self.largest_poissons_ratio(), self.mesh.order == 1
+        limit, kind = (LOCKING_RATIO, "linear") if linear else (LOCKING_RATIO_OF_TEN_NODES, "ten-node")
+        remedy = "take mesh.quadratic(), " if linear else ""
+        if nu > limit + 1e-12:
             warnings.warn(
-                f"{self.material.name}: Poisson's ratio {nu:.6g} is above {LOCKING_RATIO}, where linear tetrahedra lock "
-                '(bend too little): pass volume="patches" to the Scene, cut cells with pattern="five", refine the mesh, or '
-                "lower the ratio",
+                f"{self.material.name}: Poisson's ratio {nu:.6g} is above {limit}, where {kind} tetrahedra lock "
+                f'(bend too little): {remedy}pass volume="patches" to the Scene, cut cells with pattern="five", refine the '
+                "mesh, or lower the ratio",
                 stacklevel=3,
             )
 

@@ -13,6 +13,7 @@ import pytest
 import diffsim_ti as ds
 from diffsim_ti.solvers import SOLVERS
 from diffsim_ti.study import PROBLEMS, Problem, chart, charts, pareto_front, problem, problems, recommend
+from diffsim_ti.study.elements import refined
 from diffsim_ti.study.work_precision import Point, choose_substeps, make_rollout, reference, run
 
 EXPLICIT = [kind for kind in SOLVERS if kind.explicit]
@@ -156,7 +157,9 @@ def held_back(name: str) -> tuple:
 @lru_cache
 def advised(name: str, gradients: bool = False):
     scene, duration, tolerance = held_back(name)
-    return recommend(scene, duration, tolerance, gradients=gradients, budget=5.0 if name == "pull" else 3.0)
+    return recommend(
+        scene, duration, tolerance, gradients=gradients, budget=5.0 if name == "pull" else 3.0, elements=False
+    )
 
 
 def moved(scene, kind, precision, duration, substeps) -> np.ndarray:
@@ -231,7 +234,7 @@ def test_advice_overlooks_nothing_twice_as_cheap(name):
 
 def test_advice_states_memory_and_keeps_to_it():
     scene, duration, tolerance = held_back("drop")
-    advice = recommend(scene, duration, tolerance, memory=0.05, budget=2.0)
+    advice = recommend(scene, duration, tolerance, memory=0.05, budget=2.0, elements=False)
     rollout = advice.rollout(scene, 4)
     assert 0 < advice.megabytes <= 0.05 and rollout.memory <= 0.05
     frames = rollout.forward()
@@ -248,7 +251,7 @@ def test_advice_names_patches_where_tetrahedra_lock(bulk_modulus, says):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of locking
         scene = ds.Scene(ds.TetrahedralMesh.create_cube(2, 0.1), law, 1000.0, [ds.Gravity()], fixed="ymin")
-    advice = recommend(scene, 0.01, 0.05, gradients=False, budget=1.0)
+    advice = recommend(scene, 0.01, 0.05, gradients=False, budget=1.0, elements=False)
     assert says in " ".join(advice.left_out)
 
 
@@ -279,3 +282,31 @@ def test_gradients_of_an_own_scene_are_charted_too():
     assert result.reference_error < 1e-2 and errors[2] < 0.5 * errors[0] < 0.5
     with pytest.raises(ValueError, match="no input named 'youngs'"):
         Problem.of_scene(scene, duration, gradient="youngs")
+
+
+def test_advice_compares_elements_of_the_mesh():
+    """A slender beam bends: linear tetrahedra are far off, ten-node ones keep to the tolerance, held by a name or by
+    indices alike."""
+    mesh = ds.TetrahedralMesh.create_box((6, 2, 2), (1, 0.2, 0.2), "five")
+    start = mesh.vertices + 0.02 * mesh.vertices[:, [1, 0, 2]] * [0, 1, 0]
+    names = []
+    for fixed in ("xmin", mesh.vertex_sets["xmin"]):
+        scene = ds.Scene(
+            mesh, ds.StableNeoHookean(1e6, 0.3), 1000.0, ds.Gravity(), fixed=fixed, initial_positions=start
+        )
+        advice = recommend(scene, 0.2, 0.05, gradients=False, budget=20.0)
+        error = {trial.element: trial.error for trial in advice.elements}
+        assert error["linear"] > 0.1 and error["patches"] > 0.1 and np.nan_to_num(error["quadratic"]) < 0.03
+        names.append(advice.element)
+        assert "elements: " in str(advice) and "linear error" in str(advice)
+    assert all(name.startswith("quadratic") for name in names)
+
+
+def test_a_refined_mesh_is_the_same_body():
+    mesh = ds.TetrahedralMesh.create_cube(3).with_tetrahedron_set("some", [1, 5])
+    finer = refined(mesh)
+    assert finer.num_tetrahedra == 8 * mesh.num_tetrahedra and finer.volume == pytest.approx(mesh.volume, rel=1e-14)
+    some = finer.volumes[finer.tetrahedron_sets["some"]].sum()
+    assert some == pytest.approx(mesh.volumes[[1, 5]].sum(), rel=1e-14)
+    for name, rows in finer.surface_sets.items():
+        assert set(finer.vertex_sets[name]) == set(finer.surface_triangles[rows].ravel())

@@ -9,6 +9,7 @@ import numpy as np
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.scene import LOCKING_RATIO, Scene
 from diffsim_ti.solvers import SOLVERS, BDF2Solver, VelocityVerletSolver, stable_dt
+from diffsim_ti.study.elements import ElementTrial, ElementTrials, own_element
 from diffsim_ti.study.problem import Problem, distance
 from diffsim_ti.study.recommendation import Option, Recommendation
 from diffsim_ti.terms import Drag
@@ -25,6 +26,7 @@ def recommend(
     gradients: bool = True,
     budget: float = 20.0,
     frames: int = 8,
+    elements: bool = True,
 ) -> Recommendation:
     """The cheapest way to run `scene` for `duration` [s] with a relative error of motion below `tolerance`.
 
@@ -33,6 +35,8 @@ def recommend(
     gradients: whether runs will be differentiated, which is then timed as well.
     budget [s]: wall time of the trials, compiling apart; if the reference of the whole duration would take more, trials
     cover a first part and errors grow with time from there.
+    elements: whether linear tetrahedra, patches and ten-node tetrahedra of the scene's mesh are compared too, by what the
+    mesh itself makes wrong; the advice's `element` is the cheapest that keeps to the tolerance.
 
     Raises ValueError for a duration or tolerance that is no such thing, FloatingPointError if nothing meets the tolerance.
     """
@@ -46,6 +50,8 @@ def recommend(
         warnings.simplefilter("ignore", UserWarning)  # of trials with coarse steps, whose errors are measured
         trials = Trials(scene, duration, tolerance, memory, gradients, budget, frames)
         trials.run()
+        if elements:
+            trials.compare_elements()
     return trials.advice()
 
 
@@ -68,6 +74,7 @@ class Trials:
         self.tried: list[Option] = []
         self.notes: list[str] = []
         self.spent = 0.0  # [s] of the trials, compile time apart
+        self.elements: list[ElementTrial] = []
         self._find_reference()
 
     def _find_reference(self) -> None:
@@ -231,6 +238,15 @@ class Trials:
             return True
         return False
 
+    def compare_elements(self) -> None:
+        """Try the kinds of elements over the span of the reference."""
+        compared = ElementTrials(self.scene, self.span, self.frames, 0.5 * self.budget)
+        try:
+            self.elements = compared.run()
+        except FloatingPointError as error:
+            self.notes.append(f"elements were not compared: {type(error).__name__}")
+        self.notes += compared.notes
+
     def _best(self) -> Option | None:
         good = [o for o in self.tried if o.error <= SAFETY * self.tolerance]
         return min(good, key=lambda o: o.seconds, default=None)
@@ -262,11 +278,22 @@ class Trials:
             self.memory,
             plan.memory if self.gradients else 0.0,
             max(best.error, self.own_error),
-            "linear",
+            self._element(),
             self._reasons(best, plan),
             self._left_out(best),
             self.tried,
+            self.elements,
         )
+
+    def _element(self) -> str:
+        """The cheapest kind that keeps to the tolerance, or the one that is nearest; the scene's own if none was tried."""
+        known = [trial for trial in self.elements if np.isfinite(trial.error)]
+        good = [trial for trial in known if trial.error <= self.tolerance]
+        if good:
+            return min(good, key=lambda trial: trial.seconds).element
+        if any(np.isnan(trial.error) for trial in self.elements):
+            return "quadratic"
+        return min(known, key=lambda trial: trial.error).element if known else own_element(self.scene)
 
     def _reasons(self, best, plan) -> list[str]:
         others = {}
@@ -314,7 +341,10 @@ class Trials:
         nu = self.scene.largest_poissons_ratio()
         if nu > LOCKING_RATIO + 1e-12:
             if self.scene.volume == "tetrahedra":
-                out.append(f'nothing against locking, though nu = {nu:.4g}: volume="patches" of a Scene is advised')
+                out.append(
+                    f'nothing against locking, though nu = {nu:.4g}: volume="patches" of a Scene is advised, or ten-node '
+                    "tetrahedra, mesh.quadratic()"
+                )
         else:
             out.append(f"elements against locking: nu = {nu:.4g} is at most {LOCKING_RATIO}")
         return out + self.notes

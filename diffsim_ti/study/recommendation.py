@@ -6,6 +6,7 @@ import numpy as np
 
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.scene import Scene
+from diffsim_ti.study.elements import ElementTrial
 
 
 @dataclass
@@ -30,7 +31,8 @@ class Recommendation:
     """What to use: `solver`, `dt` [s], `steps`, `precision`, `memory` [MB] for the checkpoints, `element`; what to expect
     of it: `seconds` of wall time, `megabytes` kept for gradients, `error` relative to the largest displacement.
 
-    `reasons`: three lines; `left_out`: what the scene does without, and why. `rollout(scene)` makes it.
+    `reasons`: three lines; `left_out`: what the scene does without, and why. `rollout(scene)` makes it, of the scene as it
+    is. `elements`: what its mesh makes wrong by each kind of element; `element`: the cheapest that keeps to the tolerance.
     """
 
     option: Option
@@ -43,6 +45,7 @@ class Recommendation:
     reasons: list[str]
     left_out: list[str]
     tried: list[Option] = field(repr=False, default_factory=list)
+    elements: list[ElementTrial] = field(repr=False, default_factory=list)
 
     solver = property(lambda self: self.option.solver)
     precision = property(lambda self: self.option.precision)
@@ -65,6 +68,7 @@ class Recommendation:
                 f"expect: {self.seconds:.3g} s of wall time, {kept} kept, "
                 f"error {self.error:.2g} of the largest displacement",
                 *(f"- {line}" for line in self.reasons),
+                *([f"- elements: {'; '.join(map(str, self.elements))}, of the mesh alone"] if self.elements else []),
                 "left out: " + "; ".join(self.left_out),
             ]
         )

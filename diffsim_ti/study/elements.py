@@ -1,0 +1,138 @@
+"""Which elements a scene needs: the error of its mesh by linear tetrahedra, patches and ten-node tetrahedra."""
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.mesh.reference_element import MID_EDGES
+from diffsim_ti.rollout import Rollout
+from diffsim_ti.scene import Scene
+from diffsim_ti.solvers import VelocityVerletSolver, stable_dt
+from diffsim_ti.study.problem import ELEMENTS
+
+SHARE = 0.8  # of the stable step at the start
+HELD = "held, by indices"  # the set of what a scene holds so
+
+
+@dataclass
+class ElementTrial:
+    """A kind of element (ELEMENTS) on a scene's own mesh: the largest distance of its motion from that of finer elements at
+    the mesh's vertices over the largest displacement (NaN: not known), and the wall time [s] of the run."""
+
+    element: str
+    error: float
+    seconds: float
+
+    def __str__(self) -> str:
+        error = "error not known" if np.isnan(self.error) else f"error {self.error:.2g}"
+        return f"{self.element} {error} in {self.seconds:.2g} s"
+
+
+def refined(mesh: TetrahedralMesh) -> TetrahedralMesh:
+    """Each linear tetrahedron cut into eight at the middles of its edges; sets as in `quadratic()`.
+
+    Bey 1995, Tetrahedral grid refinement, doi:10.1007/BF02238487.
+    """
+    e = mesh.quadratic().elements
+    m01, m12, m20, m03, m13, m23 = range(4, 10)
+    of_corners = [[0, m01, m20, m03], [m01, 1, m12, m13], [m20, m12, 2, m23], [m03, m13, m23, 3]]
+    within = [[m01, m12, m20, m13], [m01, m20, m03, m13], [m20, m23, m03, m13], [m20, m12, m23, m13]]
+    tetrahedra = e[:, of_corners + within].reshape(-1, 4)
+    of = {k: (8 * rows[:, None] + np.arange(8)).ravel() for k, rows in mesh.tetrahedron_sets.items()}
+    nodes = mesh.quadratic()
+    surface = {name: nodes.surface_triangles[rows] for name, rows in nodes.surface_sets.items()}
+    sets = dict(vertex_sets=nodes.vertex_sets, tetrahedron_sets=of, surface_sets=surface)
+    return TetrahedralMesh(nodes.vertices, tetrahedra, **sets)
+
+
+def on_ten_nodes(scene: Scene, mesh: TetrahedralMesh | None = None) -> Scene:
+    """The same scene of ten-node tetrahedra; mesh: another linear mesh than the scene's, whose first vertices are its own
+    and whose others are middles of its edges. Raises ValueError for what cannot be carried over."""
+    given, base = dict(scene.arguments), scene.mesh if mesh is None else mesh
+    fixed = given["fixed"]
+    by_name = fixed is None or isinstance(fixed, (str, dict)) or all(isinstance(name, str) for name in np.ravel(fixed))
+    if not by_name:
+        if mesh is not None:
+            raise ValueError(
+                "vertices that are held by their indices are not those of a finer mesh: name them as a set"
+            )
+        base, given["fixed"] = base.with_vertex_set(HELD, fixed), HELD
+    nodes = base.quadratic()
+    for name in ("initial_positions", "initial_velocities"):
+        if np.ndim(given[name]) == 2:
+            given[name] = _at_nodes(np.asarray(given[name], np.float64), scene.mesh, mesh, nodes)
+    return Scene(**given | dict(mesh=nodes, volume="tetrahedra"))
+
+
+def _at_nodes(x: np.ndarray, own: TetrahedralMesh, finer: TetrahedralMesh | None, nodes: TetrahedralMesh) -> np.ndarray:
+    for mesh in (own.quadratic(), nodes) if finer is not None else (nodes,):
+        out = np.zeros((mesh.num_vertices, 3))
+        out[: len(x)] = x
+        out[mesh.elements[:, 4:]] = x[mesh.elements[:, MID_EDGES]].mean(2)
+        x = out
+    return x
+
+
+def own_element(scene: Scene) -> str:
+    """The kind that a scene has."""
+    how = {"order": 2} if scene.mesh.order == 2 else {}
+    how |= {"volume": scene.volume} if scene.volume != "tetrahedra" else {}
+    return next(name for name, own in ELEMENTS.items() if own == how)
+
+
+class ElementTrials:
+    """Runs of a scene by kinds of elements over `duration` [s], for at most about `budget` [s] of wall time."""
+
+    def __init__(self, scene: Scene, duration: float, frames: int, budget: float):
+        self.scene, self.duration, self.frames, self.budget = scene.replace(precision="f64"), duration, frames, budget
+        self.notes: list[str] = []
+
+    def run(self) -> list[ElementTrial]:
+        """Trials of all kinds, by time; none if the scene cannot be had of ten-node tetrahedra."""
+        scene, motions, seconds = self.scene, {}, {}
+        try:
+            scenes = {name: self._scene(name) for name in ELEMENTS}
+        except ValueError as error:
+            self.notes.append(f"ten-node tetrahedra were not tried: {error}")
+            return []
+        for name, made in scenes.items():
+            motions[name], seconds[name] = self._motion(made)
+        finest, error_of_finest = self._finest(seconds["quadratic"])
+        if finest is None:
+            finest = motions["quadratic"]
+        n, largest = scene.mesh.num_vertices, np.linalg.norm(finest, axis=2).max()
+        found = []
+        for name, moved in motions.items():
+            apart = np.linalg.norm(moved[:, :n] - finest[:, :n], axis=2).max() / largest
+            unknown = name.startswith("quadratic") and not error_of_finest
+            found.append(ElementTrial(name, np.nan if unknown else float(apart), seconds[name]))
+        return sorted(found, key=lambda trial: trial.seconds)
+
+    def _scene(self, name: str) -> Scene:
+        how = ELEMENTS[name]
+        made = on_ten_nodes(self.scene) if how.get("order") == 2 else self.scene
+        return made.replace(volume=how.get("volume", "tetrahedra"))
+
+    def _finest(self, seconds: float) -> tuple:
+        """(motion of ten-node tetrahedra on the mesh that is refined once, whether there is one); it takes some 16 times as
+        long."""
+        uniform = all(np.ndim(self.scene.inputs.values[name]) == 0 for name in (*self.scene.material.inputs, "density"))
+        if 40 * seconds > self.budget or not uniform or self.scene.mesh.order == 2:
+            return None, False
+        try:
+            return self._motion(on_ten_nodes(self.scene, refined(self.scene.mesh)))[0], True
+        except (ValueError, FloatingPointError):
+            return None, False
+
+    def _motion(self, scene: Scene) -> tuple[np.ndarray, float]:
+        step = SHARE * stable_dt(scene).dt
+        solver = VelocityVerletSolver(
+            scene, dt=self.duration / self.frames, substeps=int(np.ceil(self.duration / self.frames / step))
+        )
+        rollout = Rollout(solver, self.frames, save_every=1)
+        rollout.forward()  # compiles
+        begin = time.perf_counter()
+        moved = rollout.forward().displacements
+        return moved - moved[0], time.perf_counter() - begin
