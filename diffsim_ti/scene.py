@@ -224,10 +224,11 @@ class Scene:
         return np.unique(np.concatenate([np.zeros(0, np.int64), *(t.indices(self.mesh) for t in self.dead_loads)]))
 
     @property
-    def pressed_triangles(self) -> tuple[np.ndarray, np.ndarray]:
-        """(triangles that pressures act on, shape (k, 3), the number of the one of `pressures` that each belongs to)."""
-        triangles = [np.zeros((0, 3), np.int64), *(term.triangles(self.mesh) for term in self.pressures)]
-        return np.concatenate(triangles), np.repeat(np.arange(len(triangles)) - 1, [len(rows) for rows in triangles])
+    def pressed_faces(self) -> tuple[np.ndarray, np.ndarray]:
+        """(faces that pressures act on, shape (k, 3) or (k, 6), which of `pressures` each belongs to)."""
+        none = self.mesh.surface_faces[:0]
+        faces = [none, *(term.faces(self.mesh) for term in self.pressures)]
+        return np.concatenate(faces), np.repeat(np.arange(len(faces)) - 1, [len(rows) for rows in faces])
 
     @property
     def holds_volumes(self) -> bool:

@@ -11,9 +11,7 @@ import taichi as ti
 from diffsim_ti.elements.step_numbers import StepNumbers
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
-PRESSED = dict(
-    pressed="ints", pressed_load="ints", follower="vectors2"
-)  # three vertices each, number of the load, rows
+PRESSED = dict(pressed="ints", pressed_load="ints", follower="vectors2")  # vertices of each, number of the load, rows
 
 
 @dataclass(frozen=True)
@@ -21,6 +19,7 @@ class PressedTriangle(StepNumbers):
     """Functions of one triangle in a pass; per_step: whether pressures have a row for each step; shape: of adjoints."""
 
     shape: bool
+    nodes = 3
 
     @ti.func
     def edges(self, t, x: A, rest: A, s, scene: A):
@@ -69,7 +68,11 @@ class PressedTriangle(StepNumbers):
             adjoint.corner[first + 3 * t + a] = by
             if ti.static(self.shape):
                 adjoint.pressed_rest[3 * t + a] = adjoint.pressed_rest[3 * t + a] + by
-        felt = ti.cast(-1.0 / 12.0, self.fp) * w.dot(self.cross(e, f))
+        self.add_felt(t, now, ti.cast(-1.0 / 12.0, self.fp) * w.dot(self.cross(e, f)), adjoint)
+
+    @ti.func
+    def add_felt(self, t, now: A, felt, adjoint: A):
+        """Adds the adjoint of the pressure."""
         for force in ti.static((now.force0, now.force1)):
             share, r, ends = self.share(force, now), self.row(force), self.vector(0)
             ends[0], ends[1] = felt * (1 - share), felt * share

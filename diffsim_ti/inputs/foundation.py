@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from diffsim_ti.inputs.chain import Link
-from diffsim_ti.mesh.geometry import triangle_normals, triangle_normals_jvp, triangle_normals_vjp
+from diffsim_ti.mesh.face_points import face_points
 
 
 class FoundationStiffness(Link):
@@ -14,19 +14,27 @@ class FoundationStiffness(Link):
         A / 3 [t I + (c - t) N N^T]
 
     A, N: area and unit normal at rest; c, t: normal and tangential stiffness per area [N/m^3], a number or one for each
-    triangle.
+    triangle. Over faces of six nodes the integral of N_i [t I + (c - t) N N^T].
     """
 
-    def __init__(self, triangles: np.ndarray, vertices: np.ndarray, normal: str, tangential: str, writes: str):
+    def __init__(self, faces: np.ndarray, vertices: np.ndarray, normal: str, tangential: str, writes: str):
         self.reads, self.writes = ("rest", normal, tangential), (writes,)
-        self.triangles, self.count = triangles, len(vertices)
-        self.corners = np.searchsorted(vertices, triangles)
+        self.points, self.count = face_points(faces), len(vertices)
+        self.nodes = np.searchsorted(vertices, faces)
 
     def _to_vertices(self, of_each):
-        out = np.zeros((self.count, 3, 3))
-        for a in range(3):
-            np.add.at(out, self.corners[:, a], of_each / 3)
+        out, by_nodes = np.zeros((self.count, 3, 3)), self.points.to_nodes(of_each)
+        for a in range(self.nodes.shape[1]):
+            np.add.at(out, self.nodes[:, a], by_nodes[:, a])
         return out
+
+    def _at_points(self, x):
+        """Of each point what its face has."""
+        return np.repeat(x, self.points.points) if x.ndim else x
+
+    def _of_faces(self, by_points, x):
+        """Adjoint of what faces have, or all of them."""
+        return by_points.reshape(-1, self.points.points).sum(1) if x.ndim else by_points.sum()
 
     @staticmethod
     def _parts(n):
@@ -35,15 +43,15 @@ class FoundationStiffness(Link):
         return A, n[:, :, None] * n[:, None, :] / A
 
     def _filled(self, A, across, c, t):
-        c, t = (x[..., None, None] for x in (c, t))
+        c, t = (self._at_points(x)[..., None, None] for x in (c, t))
         return self._to_vertices(t * A * np.eye(3) + (c - t) * across)
 
     def value(self, X, c, t):
-        return (self._filled(*self._parts(triangle_normals(X, self.triangles)), c, t),)
+        return (self._filled(*self._parts(self.points.normals(X)), c, t),)
 
     def jvp(self, x, dx):
         (X, c, t), (dX, dc, dt) = x, dx
-        n, dn = triangle_normals(X, self.triangles), triangle_normals_jvp(X, self.triangles, dX)
+        n, dn = self.points.normals(X), self.points.normals_jvp(X, dX)
         A, across = self._parts(n)
         dA = (n * dn).sum(1)[:, None, None] / A
         turned = (n[:, :, None] * dn[:, None] + dn[:, :, None] * n[:, None]) / A - across * dA / A
@@ -51,18 +59,19 @@ class FoundationStiffness(Link):
 
     def vjp(self, x, y_adj):
         X, c, t = x
-        Y = y_adj[0][self.corners].sum(1) / 3  # of each triangle
-        n = triangle_normals(X, self.triangles)
+        Y = self.points.from_nodes(y_adj[0][self.nodes])
+        n = self.points.normals(X)
         A, across = self._parts(n)
         trace, along = np.trace(Y, axis1=1, axis2=2), (Y * across).sum((1, 2))
         by_c, by_t = along, A[:, 0, 0] * trace - along
-        by_across = (c - t)[..., None] if np.ndim(c - t) else c - t
+        soft = self._at_points(t)
+        by_across = self._at_points(c) - soft
+        by_across = by_across[..., None] if by_across.ndim else by_across
         twice = np.einsum("tij,tj->ti", Y + np.swapaxes(Y, 1, 2), n)
         size = A[:, :, 0]
         n_adj = by_across * (twice / size - along[:, None] * n / size**2)
-        n_adj += (t[..., None] if t.ndim else t) * trace[:, None] * n / size
-        out = triangle_normals_vjp(X, self.triangles, n_adj)
-        return out, by_c if c.ndim else by_c.sum(), by_t if t.ndim else by_t.sum()
+        n_adj += (soft[..., None] if soft.ndim else soft) * trace[:, None] * n / size
+        return self.points.normals_vjp(X, n_adj), self._of_faces(by_c, c), self._of_faces(by_t, t)
 
 
 class FoundationRows(Link):

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from diffsim_ti.inputs.chain import Link
-from diffsim_ti.mesh.geometry import triangle_areas_vjp, triangle_normals, triangle_normals_jvp
+from diffsim_ti.mesh.face_points import face_points
 
 
 class InTime(Link):
@@ -42,40 +42,44 @@ class InTime(Link):
 
 
 class VertexAreas(Link):
-    """Of rest positions the area [m^2] of each of some vertices: a third of each of the given triangles around it, which is
-    what a constant traction on these asks for."""
+    """Of rest positions the area [m^2] of each of some vertices, the integral of its shape function over the given faces
+    around it, which is what a constant traction on these asks for: a third of triangles; of flat faces of six nodes a
+    third at mid-edge vertices and nothing at corners."""
 
     reads = ("rest",)
 
-    def __init__(self, triangles: np.ndarray, vertices: np.ndarray, writes: str):
-        self.triangles, self.writes = triangles, (writes,)
-        self.corners, self.count = np.searchsorted(vertices, triangles), len(vertices)
+    def __init__(self, faces: np.ndarray, vertices: np.ndarray, writes: str):
+        self.points, self.writes = face_points(faces), (writes,)
+        self.nodes, self.count = np.searchsorted(vertices, faces), len(vertices)
 
     def _to_vertices(self, areas):
-        return np.bincount(self.corners.ravel(), np.repeat(areas / 3, 3), self.count)
+        return np.bincount(self.nodes.ravel(), self.points.to_nodes(areas).ravel(), self.count)
 
     def value(self, X):
-        return (self._to_vertices(np.linalg.norm(triangle_normals(X, self.triangles), axis=1)),)
+        return (self._to_vertices(np.linalg.norm(self.points.normals(X), axis=1)),)
 
     def jvp(self, x, dx):
-        n, dn = triangle_normals(x[0], self.triangles), triangle_normals_jvp(x[0], self.triangles, dx[0])
+        n, dn = self.points.normals(x[0]), self.points.normals_jvp(x[0], dx[0])
         return (self._to_vertices((n * dn).sum(1) / np.linalg.norm(n, axis=1)),)
 
     def vjp(self, x, y_adj):
-        return (triangle_areas_vjp(x[0], self.triangles, y_adj[0][self.corners].sum(1) / 3),)
+        n = self.points.normals(x[0])
+        unit = n / np.linalg.norm(n, axis=1, keepdims=True)
+        return (self.points.normals_vjp(x[0], self.points.from_nodes(y_adj[0][self.nodes])[:, None] * unit),)
 
 
 class VertexShares(Link):
-    """What each of some vertices has of the volume [m^3] or, with density, of the mass [kg] of the given tetrahedra, a
-    fourth of each around it."""
+    """What each of some vertices has of the volume [m^3] or, with density, of the mass [kg] of the given tetrahedra around
+    it: a fourth of each, or the shares of lumped masses of ten nodes."""
 
-    def __init__(self, tetrahedra: np.ndarray, chosen: np.ndarray, vertices: np.ndarray, of_mass: bool, writes: str):
-        self.reads, self.writes = ("volumes", "density") if of_mass else ("volumes",), (writes,)
-        self.chosen, self.count = chosen, len(vertices)
-        self.corners = np.searchsorted(vertices, tetrahedra[chosen])
+    def __init__(self, mesh, chosen: np.ndarray, vertices: np.ndarray, of_mass: bool, writes: str):
+        volumes = "volumes" if mesh.order == 1 else "element volumes"
+        self.reads, self.writes = (volumes, "density") if of_mass else (volumes,), (writes,)
+        self.chosen, self.count, self.shares = chosen, len(vertices), mesh.reference.lumped
+        self.nodes = np.searchsorted(vertices, mesh.elements[chosen])
 
     def _to_vertices(self, of_each):
-        return np.bincount(self.corners.ravel(), np.repeat(of_each[self.chosen] / 4, 4), self.count)
+        return np.bincount(self.nodes.ravel(), np.outer(of_each[self.chosen], self.shares).ravel(), self.count)
 
     def value(self, volumes, *density):
         return (self._to_vertices(density[0] * volumes if density else volumes),)
@@ -87,7 +91,7 @@ class VertexShares(Link):
 
     def vjp(self, x, y_adj):
         by_each = np.zeros_like(x[0])
-        by_each[self.chosen] = y_adj[0][self.corners].sum(1) / 4
+        by_each[self.chosen] = (y_adj[0][self.nodes] * self.shares).sum(1)
         if len(x) == 1:
             return (by_each,)
         volumes, density = x

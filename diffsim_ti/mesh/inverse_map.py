@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from diffsim_ti.mesh import reference_face
 from diffsim_ti.mesh.geometry import nearest_on_triangles
 from diffsim_ti.mesh.reference_element import MID_EDGES, QUADRATIC, barycentric
 
@@ -69,27 +70,6 @@ def _newton(nodes: np.ndarray, points: np.ndarray, xi: np.ndarray) -> tuple[np.n
     return xi, np.linalg.norm(off, axis=1) <= 1e3 * ACCURACY * size
 
 
-def face_functions(s: np.ndarray) -> np.ndarray:
-    """The six shape functions of a face at (s, t), shape (2,): 1 - s - t, s, t are its barycentric coordinates."""
-    L = np.array([1 - s.sum(), *s])
-    return np.concatenate([L * (2 * L - 1), 4 * L * np.roll(L, -1)])
-
-
-def _face_tangents(s: np.ndarray) -> np.ndarray:
-    """Derivatives of the face's functions by s and t, shape (6, 2)."""
-    L, by = np.array([1 - s.sum(), *s]), np.array([[-1.0, -1], [1, 0], [0, 1]])
-    middles = 4 * (L[:, None] * np.roll(by, -1, 0) + np.roll(L, -1)[:, None] * by)
-    return np.concatenate([(4 * L - 1)[:, None] * by, middles])
-
-
-# Second derivatives of the face's functions by s and t, which are constants, shape (6, 2, 2)
-_BY = np.array([[-1.0, -1], [1, 0], [0, 1]])
-_NEXT = np.roll(_BY, -1, 0)
-_CURVATURES = np.concatenate(
-    [4 * _BY[:, :, None] * _BY[:, None], 4 * (_BY[:, :, None] * _NEXT[:, None] + _NEXT[:, :, None] * _BY[:, None])]
-)
-
-
 def nearest_on_face(point: np.ndarray, nodes: np.ndarray, s: np.ndarray) -> np.ndarray:
     """Coordinates (s, t) of the nearest point of a face of six nodes, shape (6, 3), from a start near to it.
 
@@ -97,10 +77,10 @@ def nearest_on_face(point: np.ndarray, nodes: np.ndarray, s: np.ndarray) -> np.n
     point of the triangle in the metric of the second derivatives (those of Gauss and Newton where these are not positive).
     """
     corners = np.array([[0.0, 0], [1, 0], [0, 1]])
-    off = face_functions(s) @ nodes - point
+    off = _place(s, nodes) - point
     for _ in range(ITERATIONS):
-        T = nodes.T @ _face_tangents(s)
-        H = T.T @ T + np.einsum("aij,a->ij", _CURVATURES, nodes @ off)
+        T = nodes.T @ reference_face.derivatives(s[None])[0]
+        H = T.T @ T + np.einsum("aij,a->ij", reference_face.SECOND, nodes @ off)
         if np.linalg.eigvalsh(H)[0] <= 1e-6 * np.trace(T.T @ T):
             H = T.T @ T
         C = np.linalg.cholesky(H)
@@ -108,7 +88,7 @@ def nearest_on_face(point: np.ndarray, nodes: np.ndarray, s: np.ndarray) -> np.n
         target = np.pad(-np.linalg.solve(C, T.T @ off), (0, 1))
         step = np.linalg.solve(C.T, nearest_on_triangles(target, model[None])[0, :2])
         for _ in range(20):
-            tried = face_functions(s + step) @ nodes - point
+            tried = _place(s + step, nodes) - point
             if tried @ tried <= off @ off:
                 break
             step = step / 2
@@ -118,3 +98,7 @@ def nearest_on_face(point: np.ndarray, nodes: np.ndarray, s: np.ndarray) -> np.n
         if np.abs(step).max() < ACCURACY:
             break
     return s
+
+
+def _place(s: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+    return reference_face.functions(s[None])[0] @ nodes

@@ -6,7 +6,8 @@ from functools import cached_property
 import numpy as np
 
 from diffsim_ti.mesh.geometry import FACES, nearest_on_triangles
-from diffsim_ti.mesh.inverse_map import barycentric_in, face_functions, nearest_on_face, reach
+from diffsim_ti.mesh.inverse_map import barycentric_in, nearest_on_face, reach
+from diffsim_ti.mesh.reference_face import functions
 from diffsim_ti.mesh.ten_nodes import FACE_NODES, QUARTERS
 
 TOLERANCE = 1e-9  # how far below zero a barycentric coordinate may fall to round-off
@@ -139,7 +140,7 @@ def _nearest_on_faces(mesh, points: np.ndarray, owner: np.ndarray) -> tuple[np.n
             s = st[0] + np.linalg.lstsq(T, on[row] - x[0], rcond=None)[0] @ (st[1:] - st[0])
             if sag[f] > 0:
                 s = nearest_on_face(point, faces[f], np.clip(s, 0, 1))
-            place = face_functions(s) @ faces[f]
+            place = functions(s[None])[0] @ faces[f]
             if np.linalg.norm(place - point) < least:
                 least, places[k], (near[k], side) = np.linalg.norm(place - point), place, divmod(owner[f], 4)
                 L[k] = 0.0

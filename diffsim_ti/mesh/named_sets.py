@@ -68,6 +68,25 @@ class NamedSets:
                 )
         return chosen_indices(chosen, self._surface_sets, count, "surface")
 
+    def faces_of(self, chosen: str | ArrayLike | Iterable[str] | None) -> np.ndarray:
+        """Whole faces of the surface, as vertex indices, shape (k, 3), or (k, 6) of ten-node tetrahedra; chosen as in
+        `surface_indices`, in the order of these.
+
+        ValueError where some of a face's four triangles are chosen and others not: integrals are over whole faces.
+        """
+        rows = self.surface_indices(chosen)
+        if self.order == 1:
+            return self.surface_triangles[rows]
+        counts = np.bincount(rows // 4, minlength=len(self.surface_faces))
+        cut = np.nonzero((counts > 0) & (counts < 4))[0]
+        if len(cut):
+            raise ValueError(
+                f"loads act on whole faces: of face {cut[0]}, rows {4 * cut[0]}..{4 * cut[0] + 3} of surface_triangles, "
+                f"{counts[cut[0]]} of 4 triangles are chosen ({len(cut)} such faces); choose faces by surface_where, or all "
+                "four rows"
+            )
+        return self.surface_faces[counts == 4]
+
     def vertices_where(self, predicate: Callable) -> np.ndarray:
         """Sorted indices of the vertices where a function of all positions is true: `lambda x: x[:, 0] < 0.1`."""
         return self.vertex_indices(_mask(predicate(self.vertices), self.num_vertices))

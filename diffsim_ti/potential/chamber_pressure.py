@@ -13,12 +13,12 @@ class ChamberPressure(FollowerPressure):
     """
 
     def __init__(self, scene, symmetric: bool = True):
-        triangles, load_of = scene.pressed_triangles
-        own = [chamber.enclosure.triangles[: chamber.enclosure.num_own] for chamber in scene.chambers]
+        faces, load_of = scene.pressed_faces
+        own = [chamber.enclosure.faces for chamber in scene.chambers]
         self.num_pressures = len(scene.pressures)
         loads = self.num_pressures + np.repeat(np.arange(len(own)), [len(rows) for rows in own])
         super().__init__(
-            np.concatenate([triangles, *own]), np.concatenate([load_of, loads]), scene.mesh.num_vertices, symmetric
+            np.concatenate([faces, *own]), np.concatenate([load_of, loads]), scene.mesh.num_vertices, symmetric
         )
         self.enclosures = [chamber.enclosure for chamber in scene.chambers]
         self.laws = [law_of(chamber) for chamber in scene.chambers]
@@ -115,4 +115,4 @@ def following(scene, symmetric: bool = True) -> FollowerPressure | None:
     """What presses on a scene's surface as it is now, or None."""
     if scene.chambers:
         return ChamberPressure(scene, symmetric)
-    return FollowerPressure(*scene.pressed_triangles, scene.mesh.num_vertices, symmetric) if scene.pressures else None
+    return FollowerPressure(*scene.pressed_faces, scene.mesh.num_vertices, symmetric) if scene.pressures else None

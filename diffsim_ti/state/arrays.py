@@ -91,16 +91,15 @@ class SceneArrays:
             start, corner_of = with_own_corner(start, corner_of, mesh.surface_vertices, num_corners)
             num_corners += len(mesh.surface_vertices)
         start, corner_of, num_corners = self._upload_ties(scene, start, corner_of, num_corners)
-        self.first_pressed, self.num_pressed = num_corners, 0
+        self.first_pressed, (faces, self.load_of) = num_corners, scene.pressed_faces
+        self.pressed_nodes = faces if self.pressures else faces[:0]
+        self.num_pressed = len(self.pressed_nodes)
         if self.pressures:
-            self.pressed_triangles, self.load_of = scene.pressed_triangles
-            start, corner_of = with_more_corners(start, corner_of, self.pressed_triangles.ravel(), num_corners)
-            self.num_pressed = len(self.pressed_triangles)
-            num_corners += 3 * self.num_pressed
+            start, corner_of = with_more_corners(start, corner_of, faces.ravel(), num_corners)
+            num_corners += faces.size
         if self.pressures or self.chambers:
-            triangles, load_of = scene.pressed_triangles
-            self.pressed = runtime.upload(triangles.ravel() if len(triangles) else np.zeros(1), ti.i32)
-            self.pressed_load = runtime.upload(load_of if len(load_of) else np.zeros(1), ti.i32)
+            self.pressed = runtime.upload(faces.ravel() if len(faces) else np.zeros(1), ti.i32)
+            self.pressed_load = runtime.upload(self.load_of if len(faces) else np.zeros(1), ti.i32)
         self.first_chamber_corner = num_corners
         if self.chambers:
             closed = np.concatenate([chamber.enclosure.triangles for chamber in self.chambers])

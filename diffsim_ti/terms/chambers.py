@@ -11,6 +11,7 @@ from diffsim_ti.inputs.chambers import RestVolume
 from diffsim_ti.inputs.loads import InTime
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.enclosure import Enclosure
+from diffsim_ti.mesh.ten_nodes import triangles_of
 from diffsim_ti.terms.marks import pressing
 from diffsim_ti.terms.over_time import OverTime, amount, is_keyed, rows_at
 from diffsim_ti.terms.term import Term
@@ -47,12 +48,12 @@ class Chamber(Term):
         return rows_at(f"{type(self).__name__}: {self.plain}", self._given, times, ())
 
     def check(self, mesh: TetrahedralMesh) -> None:
-        if len(self.triangles(mesh)) == 0:
+        if len(self.faces(mesh)) == 0:
             raise ValueError(f"{type(self).__name__}: its surface is empty; name a set that has members")
 
-    def triangles(self, mesh: TetrahedralMesh) -> np.ndarray:
-        """Its surface, as vertex indices, normals into it, shape (k, 3)."""
-        return mesh.surface_triangles[mesh.surface_indices(self.surface)]
+    def faces(self, mesh: TetrahedralMesh) -> np.ndarray:
+        """Its surface, as vertex indices, normals into it, shape (k, 3) or (k, 6)."""
+        return mesh.faces_of(self.surface)
 
     def settled(self, scene, density, initial_positions, initial_velocities) -> "Chamber":
         out, mesh, supports = copy(self), scene.mesh, scene.supports
@@ -60,7 +61,7 @@ class Chamber(Term):
         free[supports.vertices] -= supports.held
         called = f"{type(self).__name__}" + (f" {self.name!r}" if self.name else "")
         moves = scene.motion is not None
-        out.enclosure = Enclosure.of(self.triangles(mesh), free, mesh.vertices, called, moves)
+        out.enclosure = Enclosure.of(self.faces(mesh), free, mesh.vertices, called, moves)
         return out
 
     def in_time(self, own: str) -> list[str]:
@@ -117,7 +118,7 @@ class GasChamber(Chamber):
         p, outside, exponent = (float(moment.values[i.plain]) for i in self.described)
         ratio = self.enclosure.volume(moment.mesh.vertices) / self.enclosure.volume(moment.positions)
         label = f"{self.name or 'gas'} [Pa]"
-        return pressing(label, moment, self.triangles(moment.mesh), p * ratio**exponent - outside)
+        return pressing(label, moment, triangles_of(self.faces(moment.mesh)), p * ratio**exponent - outside)
 
 
 class FilledChamber(Chamber):

@@ -20,10 +20,10 @@ class ElasticFoundation(Term):
         K = sum over its triangles of A / 3 [t I + (c - t) N N^T]
 
     A, N: area and normal at rest, c: `normal`, t: `tangential`: stiffness per area [N/m^3]. It pushes and pulls alike, and
-    stands still. Exact for what is constant on linear triangles.
+    stands still. With ten-node tetrahedra the integral of the vertex's shape function takes the place of A / 3.
 
     surface: a surface set's name, several, rows of `surface_triangles`; None: all of the surface. normal, tangential: one
-    number or one for each of its triangles, in the order of `mesh.surface_indices(surface)`.
+    number or one for each of its faces, in the order of `mesh.faces_of(surface)`.
     Inputs with gradient: "foundation_normal" and "foundation_tangential", or "<name>.normal" and "<name>.tangential"; the
     rest shape counts by areas and normals.
     Raises ValueError for unknown sets, other shapes, and stiffness below zero.
@@ -46,22 +46,22 @@ class ElasticFoundation(Term):
         super().__init__(*both, name=name)
         self.surface = surface
 
-    def triangles(self, mesh: TetrahedralMesh) -> np.ndarray:
-        """Where it acts, as vertex indices, shape (k, 3)."""
-        return mesh.surface_triangles[mesh.surface_indices(self.surface)]
+    def faces(self, mesh: TetrahedralMesh) -> np.ndarray:
+        """Where it acts, as vertex indices, shape (k, 3) or (k, 6)."""
+        return mesh.faces_of(self.surface)
 
     def indices(self, mesh: TetrahedralMesh) -> np.ndarray:
         """Vertices that it holds."""
-        return np.unique(self.triangles(mesh))
+        return np.unique(self.faces(mesh))
 
     def check(self, mesh: TetrahedralMesh) -> None:
-        count = len(self.triangles(mesh))
+        count, kind = len(self.faces(mesh)), "triangles" if mesh.order == 1 else "faces"
         if count == 0:
             raise ValueError("ElasticFoundation holds nothing: the set is empty; name a set that has members")
         for i in self.described:
             if i.value.ndim and len(i.value) != count:
                 raise ValueError(
-                    f"ElasticFoundation: {i.name} has {len(i.value)} numbers for {count} triangles; give one or {count}"
+                    f"ElasticFoundation: {i.name} has {len(i.value)} numbers for {count} {kind}; give one or {count}"
                 )
 
     def settled(self, scene, density, initial_positions, initial_velocities) -> "ElasticFoundation":
@@ -76,5 +76,5 @@ class ElasticFoundation(Term):
 
     def links(self, names: dict[str, str], own: str) -> list[Link]:
         normal, tangential = (names[i.plain] for i in self.described)
-        triangles, vertices = self.triangles(self.mesh), self.indices(self.mesh)
-        return [FoundationStiffness(triangles, vertices, normal, tangential, f"{own} matrices")]
+        faces, vertices = self.faces(self.mesh), self.indices(self.mesh)
+        return [FoundationStiffness(faces, vertices, normal, tangential, f"{own} matrices")]

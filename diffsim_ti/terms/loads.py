@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 from diffsim_ti.inputs import Link
 from diffsim_ti.inputs.loads import InTime, Spread, VertexAreas, VertexShares
 from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.mesh.ten_nodes import triangles_of
 from diffsim_ti.terms.marks import arrows, pressing
 from diffsim_ti.terms.over_time import OverTime, amount, is_keyed, rows_at
 from diffsim_ti.terms.term import Term
@@ -48,7 +49,8 @@ class Load(Term):
 class Traction(Load):
     """Force per area of the surface at rest, t [N/m^2], whatever becomes of the surface: a dead load, f_i = t A_i.
 
-    A_i is a third of the area of each triangle around vertex i, exact for what is constant on linear triangles.
+    A_i is the integral of the shape function of vertex i over the surface: a third of the area of each triangle around it;
+    with ten-node tetrahedra a third of each face at its mid-edge vertices and, where it is flat, nothing at its corners.
 
     traction: 3 numbers [N/m^2]; or one set for each step, shape (steps, 3), each held during its step; or a function of time
         [s] that returns 3 numbers, or keyframes (times, values), a tuple, sampled at the steps and linear within each.
@@ -67,15 +69,15 @@ class Traction(Load):
         self.surface = surface
 
     def check(self, mesh: TetrahedralMesh) -> None:
-        self.triangles(mesh)
+        self.faces(mesh)
 
-    def triangles(self, mesh: TetrahedralMesh) -> np.ndarray:
-        """Where it acts, as vertex indices, shape (k, 3)."""
-        return mesh.surface_triangles[_some(self, mesh.surface_indices(self.surface))]
+    def faces(self, mesh: TetrahedralMesh) -> np.ndarray:
+        """Where it acts, as vertex indices, shape (k, 3) or (k, 6)."""
+        return _some(self, mesh.faces_of(self.surface))
 
     def indices(self, mesh: TetrahedralMesh) -> np.ndarray:
         """Vertices that are acted upon."""
-        return np.unique(self.triangles(mesh))
+        return np.unique(self.faces(mesh))
 
     def drawn(self, moment):
         vertices = self.indices(moment.mesh)
@@ -84,14 +86,15 @@ class Traction(Load):
 
     def force_links(self, names: dict[str, str], own: str) -> list[Link]:
         """To forces of its vertices, by the name `own` forces."""
-        areas = VertexAreas(self.triangles(self.mesh), self.indices(self.mesh), f"{own} areas")
+        areas = VertexAreas(self.faces(self.mesh), self.indices(self.mesh), f"{own} areas")
         return [self.in_time(names, own), areas, Spread((f"{own} in time", f"{own} areas"), f"{own} forces")]
 
 
 class BodyForce(Load):
     """Force per volume at rest b [N/m^3], or per mass [m/s^2], on some of a body: dead loads f_i = b V_i or b m_i.
 
-    V_i and m_i are a fourth of the volume and mass of each tetrahedron around vertex i. Uniform weight is `Gravity`.
+    V_i and m_i are a fourth of the volume and mass of each tetrahedron around vertex i, or the shares of lumped masses of
+    ten-node ones. Uniform weight is `Gravity`.
 
     force: 3 numbers, over time as in `Traction`; per: "volume" or "mass". tetrahedra: a tetrahedron set's name, several,
         indices or a mask; None: all.
@@ -122,7 +125,7 @@ class BodyForce(Load):
 
     def indices(self, mesh: TetrahedralMesh) -> np.ndarray:
         """Vertices that are acted upon."""
-        return np.unique(mesh.tetrahedra[self.chosen(mesh)])
+        return np.unique(mesh.elements[self.chosen(mesh)])
 
     def drawn(self, moment):
         mesh, unit = moment.mesh, self.described[0].unit
@@ -133,15 +136,17 @@ class BodyForce(Load):
     def force_links(self, names: dict[str, str], own: str) -> list[Link]:
         """To forces of its vertices, by the name `own` forces."""
         mesh, weights = self.mesh, f"{own} weights"
-        shares = VertexShares(mesh.tetrahedra, self.chosen(mesh), self.indices(mesh), self.per == "mass", weights)
+        shares = VertexShares(mesh, self.chosen(mesh), self.indices(mesh), self.per == "mass", weights)
         return [self.in_time(names, own), shares, Spread((f"{own} in time", weights), f"{own} forces")]
 
 
 class Pressure(Load):
     """Pressure p [Pa] on the surface as it is now: it follows area and normal, f_a = -p n / 3 at each corner of a triangle.
 
-    n = (x_1 - x_0) x (x_2 - x_0) / 2 points outwards, so that positive pressures push inwards; exact for what is constant on
-    linear triangles. On a closed surface it has the potential p V, V the volume inside, and its tangent is symmetric. On one
+    n = (x_1 - x_0) x (x_2 - x_0) / 2 points outwards, so that positive pressures push inwards; on faces of six nodes f_a is
+    minus the integral of p N_a dx/ds x dx/dt, exactly.
+
+    On a closed surface it has the potential p V, V the volume inside, and its tangent is symmetric. On one
     with an edge that moves freely it has neither: implicit and static solvers then search by the residual, solve with GMRES,
     and transpose for gradients. Its stiffness does not enter the stable step of explicit solvers.
 
@@ -157,18 +162,18 @@ class Pressure(Load):
         self.surface = surface
 
     def check(self, mesh: TetrahedralMesh) -> None:
-        self.triangles(mesh)
+        self.faces(mesh)
 
-    def triangles(self, mesh: TetrahedralMesh) -> np.ndarray:
-        """Where it acts, as vertex indices, normals outwards, shape (k, 3)."""
-        return mesh.surface_triangles[_some(self, mesh.surface_indices(self.surface))]
+    def faces(self, mesh: TetrahedralMesh) -> np.ndarray:
+        """Where it acts, as vertex indices, normals outwards, shape (k, 3) or (k, 6)."""
+        return _some(self, mesh.faces_of(self.surface))
 
     def links(self, names: dict[str, str], own: str) -> list[Link]:
         return [self.in_time(names, own)]
 
     def drawn(self, moment):
         label, pressure = f"{self.name or 'pressure'} [Pa]", float(moment.values[self.plain])
-        return pressing(label, moment, self.triangles(moment.mesh), pressure)
+        return pressing(label, moment, triangles_of(self.faces(moment.mesh)), pressure)
 
 
 def _some(load: Load, rows: np.ndarray) -> np.ndarray:

@@ -11,8 +11,8 @@ class ArraysWriter(Writer):
     """Writes the frames' arrays when it is closed; until then they are kept in memory. n frames:
 
     time [s], shape (n,); positions, displacements [m], velocities [m/s], shape (n, num_vertices, 3); the fields (von_mises,
-    energy_density, J ...), shape (n, num_tetrahedra); rest_positions [m], tetrahedra (num_tetrahedra, 4 or 10), fixed. Obstacles are
-    left out.
+    energy_density, J ...), shape (n, num_tetrahedra); rest_positions [m], tetrahedra, all vertices of each, fixed.
+    Obstacles are left out.
     """
 
     suffixes = (".npz",)

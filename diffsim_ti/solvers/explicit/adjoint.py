@@ -44,7 +44,7 @@ class ExplicitAdjoint:
         self.z = a.law_states(1)  # of the state of the law
         # of pressures by each triangle and of the places of its corners
         self.pressed_felt = runtime.array(a.vector, a.follower.shape[0], max(a.num_pressed, 1))
-        self.pressed_rest = runtime.array(a.vector, 3 * a.num_pressed * self.features.shape)
+        self.pressed_rest = runtime.array(a.vector, a.pressed_nodes.size * self.features.shape)
         # of numbers of chambers, by steps, and of the places of their corners
         corners = workspace.chambers.triangles.size if workspace.chambers else 0
         self.chamber_felt = runtime.array(a.vector, a.follower.shape[0], 4 * len(a.chambers))
@@ -228,7 +228,7 @@ class ExplicitAdjoint:
         if a.pressures:
             np.add.at(out.follower, (slice(None), a.load_of), runtime.fetch(self.pressed_felt).astype(np.float64))
         if a.pressures and self.features.shape:
-            np.add.at(rest, a.pressed_triangles.ravel(), runtime.fetch(self.pressed_rest).astype(np.float64))
+            np.add.at(rest, a.pressed_nodes.ravel(), runtime.fetch(self.pressed_rest).astype(np.float64))
         if a.chambers:
             out.follower[:, len(a.pressures) :] += runtime.fetch(self.chamber_felt).astype(np.float64)
         if a.chambers and self.features.shape:

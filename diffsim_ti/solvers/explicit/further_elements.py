@@ -6,6 +6,7 @@ from functools import cached_property
 
 import taichi as ti
 
+from diffsim_ti.elements.pressed_face import pressed_element
 from diffsim_ti.elements.pressed_triangle import PRESSED, PressedTriangle
 from diffsim_ti.elements.tie import TIED, TieElement
 from diffsim_ti.runtime import let, traced
@@ -38,7 +39,8 @@ class FurtherElements:
 
     @cached_property
     def triangle(self) -> PressedTriangle:
-        return PressedTriangle(self.precision, self.features.pressure_per_step, self.features.shape)
+        has = self.features
+        return pressed_element(has.order, self.precision, has.pressure_per_step, has.shape)
 
     @cached_property
     def tie(self) -> TieElement:

@@ -66,7 +66,7 @@ class GivenInPasses:
     def follower_pressure(self) -> FollowerPressure | None:
         """What presses on the surface as it is."""
         free, rest = projectors_of(self.free), self.arrays.values.rest
-        return following(self.scene, is_symmetric(*self.scene.pressed_triangles, free, rest))
+        return following(self.scene, is_symmetric(*self.scene.pressed_faces, free, rest))
 
     def held_volumes(self, eps: float) -> HeldVolumes | None:
         """The scene's chambers that hold a volume."""

@@ -1,0 +1,82 @@
+"""Integrals over faces of three or of six nodes: points with normals, and what each of the nodes has of a point."""
+
+import numpy as np
+
+from diffsim_ti.mesh import reference_face
+from diffsim_ti.mesh.geometry import triangle_normals, triangle_normals_jvp, triangle_normals_vjp
+
+
+class LinearFaces:
+    """Triangles: one point each, of which each corner has a third; exact for what is constant on them."""
+
+    points = 1
+
+    def __init__(self, faces: np.ndarray):
+        self.faces = faces
+
+    def normals(self, x: np.ndarray) -> np.ndarray:
+        """Normals of the points, as long as their areas [m^2], shape (faces * points, 3)."""
+        return triangle_normals(x, self.faces)
+
+    def normals_jvp(self, x: np.ndarray, change: np.ndarray) -> np.ndarray:
+        """Their change for one of the vertices."""
+        return triangle_normals_jvp(x, self.faces, change)
+
+    def normals_vjp(self, x: np.ndarray, normals_adj: np.ndarray) -> np.ndarray:
+        """Adjoint of x, shape (num_vertices, 3), for that of the normals."""
+        return triangle_normals_vjp(x, self.faces, normals_adj)
+
+    def to_nodes(self, of_points: np.ndarray) -> np.ndarray:
+        """Integrals of the shape functions times what points have (times their areas), shape (faces, nodes, ...)."""
+        return np.repeat((of_points / 3)[:, None], 3, 1)
+
+    def from_nodes(self, of_nodes: np.ndarray) -> np.ndarray:
+        """What nodes have, shape (faces, nodes, ...), at the points: the transpose of `to_nodes`."""
+        return of_nodes.sum(1) / 3
+
+
+class QuadraticFaces:
+    """Faces of six nodes: six points each, exact for pressures that follow, and for tractions where edges are straight."""
+
+    points = len(reference_face.WEIGHTS)
+
+    def __init__(self, faces: np.ndarray):
+        self.faces = faces
+        self._N = reference_face.functions(reference_face.POINTS)
+        self._by = reference_face.derivatives(reference_face.POINTS)
+
+    def _tangents(self, x):
+        """(dx/ds, dx/dt), shape (faces, points, 3)."""
+        return np.einsum("qad,fai->dfqi", self._by, x[self.faces], optimize=True)
+
+    def _half(self, products):
+        """Weighted with half the points' shares, all points one after the other."""
+        return (products * (reference_face.WEIGHTS / 2)[:, None]).reshape(-1, 3)
+
+    def normals(self, x):
+        return self._half(np.cross(*self._tangents(x)))
+
+    def normals_jvp(self, x, change):
+        (e, f), (de, df) = self._tangents(x), self._tangents(change)
+        return self._half(np.cross(de, f) + np.cross(e, df))
+
+    def normals_vjp(self, x, normals_adj):
+        e, f = self._tangents(x)
+        n = normals_adj.reshape(e.shape) * (reference_face.WEIGHTS / 2)[:, None]
+        by_nodes = np.einsum("qad,dfqi->fai", self._by, np.stack([np.cross(f, n), np.cross(n, e)]), optimize=True)
+        out = np.zeros_like(x)
+        np.add.at(out, self.faces, by_nodes)
+        return out
+
+    def to_nodes(self, of_points):
+        by_face = of_points.reshape(len(self.faces), self.points, *of_points.shape[1:])
+        return np.einsum("qa,fq...->fa...", self._N, by_face, optimize=True)
+
+    def from_nodes(self, of_nodes):
+        at = np.einsum("qa,fa...->fq...", self._N, of_nodes, optimize=True)
+        return at.reshape(-1, *of_nodes.shape[2:])
+
+
+def face_points(faces: np.ndarray) -> LinearFaces | QuadraticFaces:
+    """Of faces of three or six nodes, shape (k, 3) or (k, 6)."""
+    return QuadraticFaces(faces) if faces.shape[1] == 6 else LinearFaces(faces)
