@@ -28,7 +28,8 @@ class PressedFace(PressedTriangle):
     @traced
     def times(self, factors, vectors):
         """Sum of vectors times numbers that are known when the kernel is compiled."""
-        return let(sum_of([v * ti.cast(float(c), self.fp) for c, v in zip(factors, vectors) if c != 0]))
+        parts = [v * ti.cast(float(c), self.fp) for c, v in zip(factors, vectors) if c != 0]
+        return let(sum_of(parts)) if parts else let(self.vector(0))
 
     @traced
     def tangents(self, t, x, rest, s, scene) -> list[tuple]:
