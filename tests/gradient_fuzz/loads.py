@@ -31,9 +31,16 @@ def load(kind: str, rng, mesh, steps: int, duration: float, mass: float):
         per = "mass" if rng.random() < 0.5 else "volume"
         given = _scaled(given, 1e-3) if per == "mass" else given
         return ds.BodyForce(given, None if rng.random() < 0.3 else some, per)
-    count = len(mesh.surface_triangles)
-    some = None if rng.random() < 0.3 else np.sort(rng.permutation(count)[: rng.integers(1, count + 1)])
+    some = None if rng.random() < 0.3 else some_faces(rng, mesh)
     return (ds.Traction if name == "Traction" else ds.Pressure)(given, some)
+
+
+def some_faces(rng, mesh) -> np.ndarray:
+    """Rows of `surface_triangles` of whole faces."""
+    each = 4 if mesh.order == 2 else 1
+    count = len(mesh.surface_triangles) // each
+    chosen = np.sort(rng.permutation(count)[: rng.integers(1, count + 1)])
+    return (each * chosen[:, None] + np.arange(each)).ravel()
 
 
 def over_time(rng, steps: int, duration: float, how: str):

@@ -4,7 +4,7 @@ import numpy as np
 
 import diffsim_ti as ds
 
-from .loads import over_time
+from .loads import over_time, some_faces
 from .structures import CELL
 
 
@@ -14,8 +14,7 @@ def tie(kind: str, rng, mesh, steps: int, duration: float, mass: np.ndarray, bea
     name, how = kind.split(" ", 1)
     stiff, pull = rng.uniform(0.005, 0.02) * mass.min() / beat**2, 9.81 * mass.mean() * rng.uniform(1, 10)
     if name == "ElasticFoundation":
-        count = len(mesh.surface_triangles)
-        some = np.sort(rng.permutation(count)[: rng.integers(1, count + 1)])
+        some = some_faces(rng, mesh)
         each = stiff / CELL**2 * rng.uniform(0.2, 1.0, (2, len(some)))
         return ds.ElasticFoundation(each[0] if how == "each" else each[0, 0], each[1, 0], some)
     places = [_point(rng, mesh) for _ in range(int(rng.integers(2, 5)))]
