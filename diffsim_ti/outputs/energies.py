@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class ElasticEnergy(Output):
-    """Energy of strain [J], sum over tetrahedra of V psi(F), in each frame; shape (frames,).
+    """Energy of strain [J], sum over tetrahedra, or their points, of V psi(F), in each frame; shape (frames,).
 
     sets: tetrahedron sets, by name, indices or mask, for the energy of each; shape (frames, len(sets)). name: how a loss
     calls it. The gradient is exact by all inputs.
@@ -37,45 +37,54 @@ class ElasticEnergy(Output):
             )
         out = copy(self)
         out.scene, out.law, out.all = scene, law, np.arange(mesh.num_tetrahedra)
-        out.masks = np.ones((1, mesh.num_tetrahedra))
+        masks = np.ones((1, mesh.num_tetrahedra))
         if self.sets is not None:
-            out.masks = np.zeros((len(self.sets), mesh.num_tetrahedra))
-            for mask, chosen in zip(out.masks, self.sets):
+            masks = np.zeros((len(self.sets), mesh.num_tetrahedra))
+            for mask, chosen in zip(masks, self.sets):
                 mask[mesh.tetrahedron_indices(chosen)] = 1
+        out.points = mesh.reference.num_points
+        out.masks = np.repeat(masks, out.points, 1)  # of the points of all tetrahedra
         return out
 
     def shape(self, num_frames: int) -> tuple[int, ...]:
         return (num_frames,) if self.sets is None else (num_frames, len(self.sets))
 
     def _densities(self, frames):
-        """(what kernels read, deformation, psi, P, dpsi/dp), the last three by frames and tetrahedra."""
+        """(what kernels read, deformation, psi, P, dpsi/dp), the last three by frames and points."""
         derived = self.scene.inputs.derive(frames.inputs)
-        deformation = Deformation.of(frames, derived, self.scene.mesh.tetrahedra, self.all)
+        deformation = Deformation.of(frames, derived, self.scene.mesh, self.all)
         F, K = deformation.F, len(self.law.coefficient_names)
-        p = np.tile(np.broadcast_to(derived.coefficients, (len(self.all), K)), (len(F), 1))
+        p = np.tile(self._at_points(derived.coefficients), (len(F), 1))
         psi, P, by = (x.astype(np.float64) for x in evaluate(self.law, F.reshape(-1, 3, 3), p))
         return derived, deformation, psi.reshape(F.shape[:2]), P.reshape(F.shape), by.reshape(*F.shape[:2], K)
 
+    def _at_points(self, coefficients: np.ndarray) -> np.ndarray:
+        """Of all points, shape (points, K)."""
+        K = len(self.law.coefficient_names)
+        return np.repeat(np.broadcast_to(coefficients, (len(self.all), K)), self.points, 0)
+
     def value(self, frames: "Frames") -> np.ndarray:
         derived, _, psi, *_ = self._densities(frames)
-        return ((psi * derived.volumes) @ self.masks.T).reshape(self.shape(len(psi)))
+        return ((psi * derived.volumes.ravel()) @ self.masks.T).reshape(self.shape(len(psi)))
 
     def jvp(self, frames: "Frames", change: Change) -> np.ndarray:
         derived, deformation, psi, P, by = self._densities(frames)
         moved = self.scene.inputs.derive_jvp(frames.inputs, change.inputs)
         du = (np.zeros(frames.positions.shape) if change.positions is None else change.positions) - moved.rest
         dpsi = (P * deformation.jvp(du, moved.gradients)).sum((2, 3))
-        dpsi = dpsi + (by * np.broadcast_to(moved.coefficients, by.shape[1:])).sum(2)
-        return ((dpsi * derived.volumes + psi * moved.volumes) @ self.masks.T).reshape(self.shape(len(psi)))
+        dpsi = dpsi + (by * self._at_points(moved.coefficients)).sum(2)
+        return ((dpsi * derived.volumes.ravel() + psi * moved.volumes.ravel()) @ self.masks.T).reshape(
+            self.shape(len(psi))
+        )
 
     def vjp(self, frames: "Frames", seed: np.ndarray) -> Change:
         derived, deformation, psi, P, by = self._densities(frames)
-        adjoint, weight = derived.zeros(), seed.reshape(len(psi), -1) @ self.masks  # by frames and tetrahedra
-        scaled = weight * derived.volumes
+        adjoint, weight = derived.zeros(), seed.reshape(len(psi), -1) @ self.masks  # by frames and points
+        scaled = weight * derived.volumes.ravel()
         positions, adjoint.gradients = deformation.vjp(scaled[..., None, None] * P, frames.positions.shape[1])
-        by_p = (scaled[..., None] * by).sum(0)
+        by_p = (scaled[..., None] * by).sum(0).reshape(len(self.all), self.points, -1).sum(1)
         adjoint.coefficients = by_p if derived.coefficients.ndim == 2 else by_p.sum(0)
-        adjoint.volumes, adjoint.rest = (weight * psi).sum(0), -positions.sum(0)
+        adjoint.volumes, adjoint.rest = (weight * psi).sum(0).reshape(derived.volumes.shape), -positions.sum(0)
         inputs = self.scene.inputs.derive_vjp(frames.inputs, adjoint, tuple(frames.inputs))
         return Change(positions=positions, inputs=inputs)
 
