@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.inputs import StressPoints
 from diffsim_ti.outputs.body_forces import BodyForces
 
 if TYPE_CHECKING:
@@ -67,15 +68,21 @@ class Modes:
                     if part is not None:
                         setattr(total, name, getattr(total, name) + weight * part)
                 by_state += weight * by_u
-                total.mass = total.mass - weight * self.eigenvalues[i] * (self.shapes[i] ** 2).sum(1)
+                self._add_mass(total, -weight * self.eigenvalues[i], self.shapes[i])
         return self.scene.inputs.derive_vjp(values, total, tuple(values)) | {"displacements": by_state}
+
+    def _add_mass(self, total, weight: float, phi: np.ndarray) -> None:
+        """Adds the adjoint of masses for that of phi . M phi."""
+        if total.element_masses is None:
+            total.mass = total.mass + weight * (phi**2).sum(1)
+            return
+        at = phi[self.scene.mesh.elements]
+        total.element_masses = total.element_masses + weight * at @ np.swapaxes(at, 1, 2)
 
 
 def _slope(body: BodyForces, u: np.ndarray, phi: np.ndarray, derived):
     """Derivatives of phi . K phi, of what kernels read and of u."""
-    X, tets = derived.rest, body.scene.mesh.tetrahedra
-    edges = phi[tets[:, 1:]] - phi[tets[:, :1]]
-    H = np.einsum("eai,eaj->eij", edges, derived.gradients)
+    X, H = derived.rest, StressPoints.of(body.scene.mesh, derived).displacement_gradients(phi)
     step = 2e-3 / max(np.abs(H).max(), 1e-300)  # a strain that a law's third derivatives resolve
     total, by_u, v = derived.zeros(), np.zeros_like(X), np.zeros_like(X)
     for shift, weight in ((-2, 1), (-1, -8), (1, 8), (2, -1)):
@@ -110,8 +117,8 @@ def modes(scene: "Scene", k: int, displacements: ArrayLike | None = None) -> Mod
     """The k lowest modes of small vibrations of a body about a state: K phi = lambda M phi, f = sqrt(lambda) / 2 pi.
 
     K: `scene.stiffness_matrix(displacements)`, of the body's stress at displacements [m] from the rest shape, default none;
-    M: `scene.mass_matrix()`, lumped; vertices do not move where they are held, and what presses or loads the body is
-    not in K.
+    M: `scene.mass_matrix()`, lumped, or consistent of ten-node tetrahedra; vertices do not move where they are held, and
+    what presses or loads the body is not in K.
     A body that is not fixed has six frequencies of 0, its rigid motions, with k counting them. Everything is in float64.
 
     Raises ValueError for k outside 1 .. the number of free unknowns, shapes that do not fit, or a law with rates or a state.
@@ -124,20 +131,22 @@ def modes(scene: "Scene", k: int, displacements: ArrayLike | None = None) -> Mod
     if scene.precision != "f64":
         scene = scene.replace(precision="f64")
     u = scene.checked_displacements(displacements)
+    scene = scene.with_consistent_mass()
     free = free_directions(scene)
     count = free.shape[1]
     if int(k) != k or not 1 <= k <= count:
         raise ValueError(f"modes: k must be a whole number of 1 .. {count}, the free unknowns, got {k}")
     k = int(k)
-    scale = 1 / np.sqrt(abs(free).T.power(2) @ scene.mass_matrix().diagonal())
+    mass = scene.mass_matrix()
+    scale = 1 / np.sqrt(abs(free).T.power(2) @ mass.diagonal())
     K = free.T @ scene.stiffness_matrix(u) @ free
     A = diags(scale) @ (0.5 * (K + K.T)) @ diags(scale)
+    M = diags(scale) @ (free.T @ mass @ free) @ diags(scale) if scene.mesh.order == 2 else None  # else the identity
+    size = float(abs(A).sum(1).max())
     if count <= DENSE or 3 * k >= count:
-        values, vectors = eigh(A.toarray(), subset_by_index=[0, k - 1])
-        size = float(abs(A).sum(1).max())
+        values, vectors = eigh(A.toarray(), None if M is None else M.toarray(), subset_by_index=[0, k - 1])
     else:
-        size = float(abs(A).sum(1).max())
-        values, vectors = eigsh(A.tocsc(), k, sigma=-1e-6 * size, which="LM", tol=1e-13)
+        values, vectors = eigsh(A.tocsc(), k, M, sigma=-1e-6 * size, which="LM", tol=1e-13)
         order = np.argsort(values)
         values, vectors = values[order], vectors[:, order]
     values = np.where(np.abs(values) < 1e-13 * size, 0.0, values)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
-from diffsim_ti.inputs import Inputs
+from diffsim_ti.inputs import ConsistentMass, Inputs
 from diffsim_ti.materials.material import Material
 from diffsim_ti.materials.moduli import youngs_poisson
 from diffsim_ti.materials.patch_law import PatchLaw
@@ -47,7 +47,8 @@ class Scene:
 
     mesh: TetrahedralMesh, the rest shape.
     material: a law with its numbers (materials/).
-    density [kg/m^3]: one number or one per tetrahedron; vertices carry the lumped mass sum rho V / 4.
+    density [kg/m^3]: one number or one per tetrahedron; vertices carry the lumped mass sum rho V / 4. Ten-node tetrahedra
+        have consistent masses and weight, lumped ones (HRZ) in explicit steps.
     terms: loads, contacts, damping (terms/); gravity, drag and self-contact at most once. What is not listed costs
         nothing. Their order means nothing but that of obstacles of one kind, whose forces and frictions act one after
         the other. Names of terms, each another (Ground(name="floor")), begin the names of their inputs: "floor.stiffness".
@@ -124,6 +125,17 @@ class Scene:
         """The law that kernels are compiled for."""
         law = self.material.law(self.precision)
         return PatchLaw(self.precision, law) if self.volume == "patches" else law
+
+    consistent = False  # whether masses and weight are consistent
+
+    def with_consistent_mass(self) -> "Scene":
+        """The scene as statics, implicit steps and modes have it: ten-node tetrahedra with consistent masses and weight."""
+        if self.mesh.order == 1 or self.consistent:
+            return self
+        out, names = copy(self), ("density", "initial_positions", "initial_velocities")
+        out.consistent = True
+        out.inputs = Inputs(out, *(self.arguments[name] for name in names))
+        return out
 
     def replace(self, **changes) -> "Scene":
         """A scene with some arguments replaced."""
@@ -296,10 +308,15 @@ class Scene:
         return body_stiffness(scene, self.checked_displacements(displacements))
 
     def mass_matrix(self):
-        """M [kg], lumped, as a diagonal SciPy CSR matrix of all 3 num_vertices unknowns, in float64."""
-        from scipy.sparse import diags
+        """M [kg] as a SciPy CSR matrix of all 3 num_vertices unknowns, in float64: lumped and diagonal, as explicit steps
+        have it, or consistent of ten-node tetrahedra, as statics and implicit steps do."""
+        from scipy.sparse import diags, eye, kron
 
-        return diags(np.repeat(self.inputs.derive(self.inputs.values).mass, 3)).tocsr()
+        inputs = self.with_consistent_mass().inputs
+        derived = inputs.derive(inputs.values)
+        if derived.element_masses is None:
+            return diags(np.repeat(derived.mass, 3)).tocsr()
+        return kron(ConsistentMass.of(self.mesh, derived.element_masses).matrix, eye(3)).tocsr()
 
     def describe(self) -> str:
         """What is simulated, in a few lines."""

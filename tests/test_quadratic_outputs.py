@@ -18,17 +18,21 @@ def rollout_of(kind):
     mesh = body()
     E = np.linspace(4e4, 8e4, mesh.num_tetrahedra) if kind == "verlet" else 5e4
     law = ds.Corotated if kind == "verlet" else ds.StableNeoHookean
-    start = dict(initial_positions=bent(mesh.vertices)) if kind == "verlet" else {}
+    start = {} if kind == "static" else dict(initial_positions=bent(mesh.vertices))
     scene = ds.Scene(mesh, law(E, 0.3), 900.0, ds.Gravity((3.0, -9.81, 2.0)), "xmin", precision="f64", **start)
-    solver = ds.VelocityVerletSolver(scene, dt=2e-4) if kind == "verlet" else ds.StaticSolver(scene, tolerance=1e-12)
+    solver = {
+        "verlet": lambda: ds.VelocityVerletSolver(scene, dt=2e-4),
+        "static": lambda: ds.StaticSolver(scene, tolerance=1e-12),
+        "midpoint": lambda: ds.ImplicitMidpointSolver(scene, dt=5e-3, tolerance=1e-12),
+    }[kind]()
     more = [ds.MaterialPoints(POINTS)]
     return ds.Rollout(solver, 2, save_every=1, outputs=outputs() + more, gradients="all")
 
 
-@pytest.mark.parametrize("kind", ["verlet", "static"])
+@pytest.mark.parametrize("kind", ["verlet", "static", "midpoint"])
 def test_derivatives(kind):
     """Seeds are the transpose of tangents, and gradients agree with differences, for each output and input by itself."""
-    assert_derivatives(rollout_of(kind), kind == "verlet", 1e-11 if kind == "verlet" else 1e-8)
+    assert_derivatives(rollout_of(kind), kind != "static", 1e-11 if kind == "verlet" else 1e-8)
 
 
 def test_a_homogeneous_stretch_has_its_closed_form():

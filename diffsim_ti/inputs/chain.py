@@ -97,6 +97,8 @@ class Chain:
         pulled, before = self._way(tuple(wanted))
         known, total = self._through(before, values), {n: y for n, y in adjoints.items() if y is not None}
         for link in reversed(pulled):
+            if not any(name in total for name in link.writes):
+                continue
             x = [known[name] for name in link.reads]
             try:
                 y_adj = [total[name] for name in link.writes]

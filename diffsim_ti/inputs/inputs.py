@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti.inputs import links
 from diffsim_ti.inputs.chain import Chain, Link
+from diffsim_ti.inputs.consistent_mass import ElementMasses
 from diffsim_ti.inputs.curved_shape import CurvedShape, StressPoints
 from diffsim_ti.inputs.description import POSITIVE, Input, frozen, length, speed
 from diffsim_ti.inputs.foundation import FoundationRows
@@ -41,6 +42,7 @@ class Derived:
     follower: np.ndarray | None = None
     ties: np.ndarray | None = None  # numbers of springs and cables (inputs/ties.py), (1 or steps, 2 ties, 3)
     tie_segments: np.ndarray | None = None  # between their points at rest, (points, 3) [m]
+    element_masses: np.ndarray | None = None  # consistent, of ten nodes, (num_tetrahedra, 10, 10) [kg]
     foundation: np.ndarray | None = None  # rows of the stiffness of vertices on foundations, (3 k, 3) [N/m]
 
     def zeros(self) -> "Derived":
@@ -121,6 +123,7 @@ class Inputs:
             links.Displacement(),
             links.FreeVelocity(scene.supports.free),
             links.LumpedMass(mesh),
+            *([ElementMasses(mesh.elements)] if scene.consistent else []),
             *scene.material.links(),
         ]
         if any(term.acts_on_surface for term in scene.terms):
@@ -128,7 +131,8 @@ class Inputs:
         for k, term in enumerate(scene.ordered_terms):
             own, rows = f"numbers of term {k}", self.parameters.of(term)
             summed = term.dead and self.sums_loads
-            links_of = term.force_links(named[term], own) if summed else term.links(named[term], own)
+            names = named[term]
+            links_of = term.force_links(names, own, scene.consistent) if summed else term.links(names, own)
             out += links_of
             as_they_are = not any(own in link.writes for link in links_of)
             places |= _placed(term, named[term], rows) if as_they_are else {own: rows}

@@ -99,6 +99,39 @@ class VertexShares(Link):
         return by_each * density, by_density if density.ndim else by_density.sum()
 
 
+class ConsistentShares(Link):
+    """What `VertexShares` says by integrals of the shape functions of ten nodes, of volumes or of masses."""
+
+    def __init__(self, mesh, chosen: np.ndarray, vertices: np.ndarray, of_mass: bool, writes: str):
+        self.reads, self.writes = ("element_masses",) if of_mass else ("element_masses", "density"), (writes,)
+        self.chosen, self.count, self.nodes = chosen, len(vertices), np.searchsorted(vertices, mesh.elements[chosen])
+
+    def _to_vertices(self, masses):
+        return np.bincount(self.nodes.ravel(), masses[self.chosen].sum(2).ravel(), self.count)
+
+    @staticmethod
+    def _by(density):
+        return np.reshape(density, (-1, 1, 1))
+
+    def value(self, masses, *density):
+        return (self._to_vertices(masses / self._by(density[0]) if density else masses),)
+
+    def jvp(self, x, dx):
+        if len(x) == 1:
+            return self.value(dx[0])
+        rho = self._by(x[1])
+        return (self._to_vertices(dx[0] / rho - x[0] / rho**2 * self._by(dx[1])),)
+
+    def vjp(self, x, y_adj):
+        masses_adj = np.zeros_like(x[0])
+        masses_adj[self.chosen] = y_adj[0][self.nodes][:, :, None]
+        if len(x) == 1:
+            return (masses_adj,)
+        rho = self._by(x[1])
+        by_density = -(masses_adj * x[0] / rho**2).sum((1, 2))
+        return masses_adj / rho, by_density if x[1].ndim else by_density.sum()
+
+
 class Spread(Link):
     """Forces of vertices, weight times vector, from vectors of shape (2, rows, 3) and one weight for each vertex."""
 

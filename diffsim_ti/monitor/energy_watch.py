@@ -4,6 +4,7 @@ import weakref
 
 import numpy as np
 
+from diffsim_ti.inputs import kinetic_energy
 from diffsim_ti.state.workspace import Workspace
 
 
@@ -61,7 +62,7 @@ class EnergyWatch:
         potential.place(u_star)
         work = float((potential.forces()[0] * (u_next - u)).sum()) - self._work_of_obstacles(u_star, places[1], drift)
         self.gained += energies[1] - energies[0] + work + kinetic
-        self.moving = max(self.moving, 0.5 * float((self.ws.mass * v_next**2).sum()) + energies[1])
+        self.moving = max(self.moving, kinetic_energy(self.ws.mass, v_next) + energies[1])
 
     def _work_of_obstacles(self, u_star: np.ndarray, places: np.ndarray, drift: np.ndarray) -> float:
         """dE/dw (w' - w) [J], by differences over a hundredth of the smallest gap."""

@@ -9,7 +9,7 @@ import taichi as ti
 
 from diffsim_ti import runtime
 from diffsim_ti.elements.patched_tetrahedron import functions_of
-from diffsim_ti.inputs import ratios_at_corners
+from diffsim_ti.inputs import kinetic_energy, ratios_at_corners
 from diffsim_ti.potential.attached import Attached
 from diffsim_ti.potential.kernels import potential_kernels
 from diffsim_ti.runtime import Kernel, assign, traced
@@ -167,13 +167,13 @@ def energy(workspace: Workspace) -> Energy:
     """Energy of the current state, summed in float64."""
     a, values = workspace.arrays, workspace.arrays.values
     u, v = (runtime.fetch(x)[0].astype(np.float64) for x in (workspace.state.u, workspace.state.v))
-    parts = {"kinetic": float(0.5 * (values.mass * (v**2).sum(1)).sum())}
+    parts = {"kinetic": kinetic_energy(workspace.mass, v)}
     volumes = values.volumes if a.points == 1 else values.volumes.sum(1)
     parts["elastic"] = float((tetrahedron_fields(workspace).energy_density * volumes).sum())
     features = a.features()
     if features.gravity >= 0:
         g = values.parameters[features.gravity :][:3]
-        parts["gravity"] = float(-(values.mass * ((values.rest + u) @ g)).sum())
+        parts["gravity"] = float(-((values.rest + u) * (workspace.mass * g)).sum())
     if features.groups:
         parts["contact"] = float(barrier_energies(workspace).sum())
         if workspace.potential is not None and workspace.potential.faces:

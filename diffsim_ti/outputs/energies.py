@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.inputs import ConsistentMass
 from diffsim_ti.materials.evaluate import evaluate
 from diffsim_ti.outputs.deformation import Deformation
 from diffsim_ti.outputs.output import Change, Output
@@ -90,7 +91,8 @@ class ElasticEnergy(Output):
 
 
 class KineticEnergy(Output):
-    """Energy of motion [J], sum over vertices of m v^2 / 2, in each frame; shape (frames,).
+    """Energy of motion [J], sum over vertices of m v^2 / 2, in each frame; shape (frames,). Where masses are consistent, in
+    implicit steps of ten-node tetrahedra, v . M v / 2.
 
     sets: vertex sets, by name, indices or mask, for the energy of each; shape (frames, len(sets)). name: how a loss
     calls it.
@@ -115,20 +117,33 @@ class KineticEnergy(Output):
     def _read(self, frames):
         return frames.velocities.astype(np.float64), self.scene.inputs.derive(frames.inputs)
 
+    def _products(self, derived, v: np.ndarray) -> np.ndarray:
+        """M v of each frame, or its change for those of M."""
+        if derived.element_masses is None:
+            return derived.mass[:, None] * v
+        mass = ConsistentMass.of(self.scene.mesh, derived.element_masses)
+        return np.stack([mass * frame for frame in v])
+
     def value(self, frames: "Frames") -> np.ndarray:
         v, derived = self._read(frames)
-        return (0.5 * (v**2).sum(2) @ (self.masks * derived.mass).T).reshape(self.shape(len(v)))
+        return (0.5 * (v * self._products(derived, v)).sum(2) @ self.masks.T).reshape(self.shape(len(v)))
 
     def jvp(self, frames: "Frames", change: Change) -> np.ndarray:
         v, derived = self._read(frames)
-        dm = self.scene.inputs.derive_jvp(frames.inputs, change.inputs).mass
+        moved = self.scene.inputs.derive_jvp(frames.inputs, change.inputs)
         dv = np.zeros(v.shape) if change.velocities is None else change.velocities
-        grown = (v * dv).sum(2) @ (self.masks * derived.mass).T + 0.5 * (v**2).sum(2) @ (self.masks * dm).T
-        return grown.reshape(self.shape(len(v)))
+        grown = dv * self._products(derived, v) + v * (self._products(derived, dv) + self._products(moved, v))
+        return (0.5 * grown.sum(2) @ self.masks.T).reshape(self.shape(len(v)))
 
     def vjp(self, frames: "Frames", seed: np.ndarray) -> Change:
         v, derived = self._read(frames)
-        adjoint, weight = derived.zeros(), seed.reshape(len(v), -1) @ self.masks
-        adjoint.mass = 0.5 * (weight * (v**2).sum(2)).sum(0)
+        adjoint, weight = derived.zeros(), (seed.reshape(len(v), -1) @ self.masks)[..., None]
+        if derived.element_masses is None:
+            adjoint.mass = 0.5 * (weight * v**2).sum((0, 2))
+        else:
+            nodes = self.scene.mesh.elements
+            for own, scaled in zip(v, 0.5 * weight * v):
+                adjoint.element_masses += np.einsum("eai,ebi->eab", scaled[nodes], own[nodes])
         inputs = self.scene.inputs.derive_vjp(frames.inputs, adjoint, tuple(frames.inputs))
-        return Change(velocities=(weight * derived.mass)[..., None] * v, inputs=inputs)
+        by_v = 0.5 * (weight * self._products(derived, v) + self._products(derived, weight * v))
+        return Change(velocities=by_v, inputs=inputs)

@@ -21,7 +21,7 @@ class GivenLoads:
                 "the pressure of a FilledChamber is no function of a frame's state, so that reactions in its scene are not "
                 "known: give it as a GasChamber or a Pressure of what ChamberPressure found"
             )
-        self.scene, self.follower = scene, following(scene)
+        self.scene, self.follower, self.elements = scene, following(scene), scene.mesh.elements
         gravity = scene.term(Gravity) if weight else None
         self.gravity = None if gravity is None else scene.inputs.parameters.of(gravity)
         self.loaded, self.keyed = scene.loaded_vertices if scene.dead_loads else None, scene.inputs.keyed_forces
@@ -47,11 +47,17 @@ class GivenLoads:
     def _attached(self, derived: Derived, step: int, begins: bool) -> Attached:
         return self.attached.at(derived, derived.ties, *self._time(step, begins))
 
+    def _masses(self, derived: Derived) -> np.ndarray:
+        """What gravity acts on, shape (num_vertices,), or its change."""
+        if derived.element_masses is None:
+            return derived.mass
+        return np.bincount(self.elements.ravel(), derived.element_masses.sum(2).ravel(), len(derived.mass))
+
     def forces(self, derived: Derived, x: np.ndarray, step: int, begins: bool = False) -> np.ndarray:
         """At places x [m] after so many steps."""
         out = np.zeros(x.shape)
         if self.gravity is not None:
-            out += derived.mass[:, None] * derived.parameters[self.gravity][:3]
+            out += self._masses(derived)[:, None] * derived.parameters[self.gravity][:3]
         if self.loaded is not None:
             out[self.loaded] += self._dead(step, derived.forces, begins)
         if self.follower is not None:
@@ -67,7 +73,7 @@ class GivenLoads:
         out = np.zeros(x.shape)
         if self.gravity is not None:
             g, dg = (of.parameters[self.gravity][:3] for of in (derived, moved))
-            out += moved.mass[:, None] * g + derived.mass[:, None] * dg
+            out += self._masses(moved)[:, None] * g + self._masses(derived)[:, None] * dg
         if self.loaded is not None:
             out[self.loaded] += self._dead(step, moved.forces, begins)
         if self.follower is not None:
@@ -83,8 +89,12 @@ class GivenLoads:
     ) -> np.ndarray:
         """Adjoint of x for that of the forces; adds those of all else to `adj`."""
         if self.gravity is not None:
-            adj.mass += w @ derived.parameters[self.gravity][:3]
-            adj.parameters[self.gravity.start : self.gravity.start + 3] += derived.mass @ w
+            by_mass = w @ derived.parameters[self.gravity][:3]
+            if derived.element_masses is None:
+                adj.mass += by_mass
+            else:
+                adj.element_masses += by_mass[self.elements][:, :, None]
+            adj.parameters[self.gravity.start : self.gravity.start + 3] += self._masses(derived) @ w
         if self.loaded is not None:
             self._dead(step, adj.forces, begins)[:] += w[self.loaded]
         out = np.zeros(x.shape)

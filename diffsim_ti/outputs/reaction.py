@@ -135,6 +135,7 @@ class Reaction(Output):
             rest -= by_u
         adj = adjoint.collect()
         adj.mass, adj.parameters = adj.mass + by_loads.mass, adj.parameters + by_loads.parameters
+        adj.element_masses = by_loads.element_masses
         adj.rest = adj.rest + rest + by_loads.rest
         for name in ("forces", "follower", "ties", "tie_segments", "foundation"):
             setattr(adj, name, getattr(by_loads, name))

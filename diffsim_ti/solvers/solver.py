@@ -47,7 +47,8 @@ class Solver(ABC):
             raise ValueError(f"dt must be > 0 [s], got {dt}")
         if int(substeps) != substeps or substeps < 1:
             raise ValueError(f"substeps must be a whole number >= 1, got {substeps}")
-        self.scene, self.dt, self.substeps = scene, float(dt), int(substeps)
+        self.scene = scene if self.explicit else scene.with_consistent_mass()
+        self.dt, self.substeps = float(dt), int(substeps)
         self.parallel, self.allow_unstable, self.check_start = parallel, allow_unstable, check_start
         runtime.check_host_init()
         runtime.check_backend(scene.precision)

@@ -7,7 +7,7 @@ import taichi as ti
 
 from diffsim_ti import runtime
 from diffsim_ti.contact.surface_pairs import SurfacePairs
-from diffsim_ti.inputs import Derived
+from diffsim_ti.inputs import Derived, Mass
 from diffsim_ti.runtime import Kernel
 from diffsim_ti.state.arrays import History, SceneArrays, copy_slot, first_bad_vertex
 from diffsim_ti.state.solve_report import SolveReport
@@ -82,6 +82,15 @@ class Workspace:
     def place_obstacles(self, now: int) -> None:
         """Put obstacles where they are before pass `now`, for what looks at the state there."""
         self.arrays.place_obstacles(self.solver.schedule, now)
+
+    @property
+    def mass(self) -> Mass:
+        """Of the vertices, as the solver has it."""
+        return self.mass_of(self.arrays.values)
+
+    def mass_of(self, values: Derived) -> Mass:
+        """The same of some values, or of changes of them."""
+        return values.mass[:, None]
 
     def kept(self, name, make):
         """make(), kept until launches must be bound anew."""

@@ -31,7 +31,7 @@ class ExternalForce(Term):
     def links(self, names, own):
         return [PerStep(names["external_forces"], "forces", 3)]
 
-    def force_links(self, names, own):
+    def force_links(self, names, own, consistent=False):
         """Beside other loads, by the name `own` forces."""
         return [InTime(names["external_forces"], f"{own} forces", 3, keyed=False)]
 

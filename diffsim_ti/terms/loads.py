@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.inputs import Link
-from diffsim_ti.inputs.loads import InTime, Spread, VertexAreas, VertexShares
+from diffsim_ti.inputs.loads import ConsistentShares, InTime, Spread, VertexAreas, VertexShares
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.ten_nodes import triangles_of
 from diffsim_ti.terms.marks import arrows, pressing
@@ -84,7 +84,7 @@ class Traction(Load):
         label = f"{self.name or 'traction'} [N/m^2]"
         return [arrows(label, moment.mesh, moment.positions, vertices, moment.values[self.plain])]
 
-    def force_links(self, names: dict[str, str], own: str) -> list[Link]:
+    def force_links(self, names: dict[str, str], own: str, consistent: bool = False) -> list[Link]:
         """To forces of its vertices, by the name `own` forces."""
         areas = VertexAreas(self.faces(self.mesh), self.indices(self.mesh), f"{own} areas")
         return [self.in_time(names, own), areas, Spread((f"{own} in time", f"{own} areas"), f"{own} forces")]
@@ -93,8 +93,9 @@ class Traction(Load):
 class BodyForce(Load):
     """Force per volume at rest b [N/m^3], or per mass [m/s^2], on some of a body: dead loads f_i = b V_i or b m_i.
 
-    V_i and m_i are a fourth of the volume and mass of each tetrahedron around vertex i, or the shares of lumped masses of
-    ten-node ones. Uniform weight is `Gravity`.
+    V_i and m_i are a fourth of the volume and mass of each tetrahedron around vertex i; of ten-node ones integrals of N_i
+    in statics and implicit steps, and shares of lumped masses in explicit ones, so that free fall stays rigid. Uniform
+    weight is `Gravity`.
 
     force: 3 numbers, over time as in `Traction`; per: "volume" or "mass". tetrahedra: a tetrahedron set's name, several,
         indices or a mask; None: all.
@@ -133,10 +134,10 @@ class BodyForce(Load):
         label = f"{self.name or 'body force'} [{unit}]"
         return [arrows(label, mesh, moment.positions, vertices, moment.values[self.plain], most=24)]
 
-    def force_links(self, names: dict[str, str], own: str) -> list[Link]:
+    def force_links(self, names: dict[str, str], own: str, consistent: bool = False) -> list[Link]:
         """To forces of its vertices, by the name `own` forces."""
-        mesh, weights = self.mesh, f"{own} weights"
-        shares = VertexShares(mesh, self.chosen(mesh), self.indices(mesh), self.per == "mass", weights)
+        mesh, weights, kind = self.mesh, f"{own} weights", ConsistentShares if consistent else VertexShares
+        shares = kind(mesh, self.chosen(mesh), self.indices(mesh), self.per == "mass", weights)
         return [self.in_time(names, own), shares, Spread((f"{own} in time", weights), f"{own} forces")]
 
 

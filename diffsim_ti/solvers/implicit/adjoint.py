@@ -76,6 +76,8 @@ class ImplicitAdjoint(RecordedPasses):
         self.p, self.q = self.frames[0][-1].copy(), self.frames[1][-1].copy()
         self.pending = [np.zeros_like(self.p), np.zeros_like(self.p)]
         self.mass_adj, self.gravity, self.rate = np.zeros(len(self.p)), np.zeros(3), 0.0
+        masses = a.values.element_masses
+        self.element_masses = None if masses is None else np.zeros_like(masses)
         self.attached = a.values.zeros()  # of springs, cables and foundations
         self.pressure = None if a.values.follower is None else np.zeros_like(a.values.follower)
         self.rest_by_pressure = np.zeros_like(self.p)
@@ -149,12 +151,14 @@ class ImplicitAdjoint(RecordedPasses):
             reaction, self.rest_by_pressure = reaction + by_place, self.rest_by_pressure + by_place
             ws.solver.schedule.add_pressure(self.pressure, j, ws.share_at_stage(j, s), felt)
         self.gravity += share * (ws.mass * by_star).sum(0)
-        self.mass_adj += (by_star * self.weight(share)).sum(1)
+        self._add_mass(by_star, self.weight(share))
         if self.forces is not None:
             felt, keyed = share * by_star[ws.force_vertices], ws.scene.inputs.keyed_forces
             ws.solver.schedule.add_load(self.forces, j, ws.share_at_stage(j, s), keyed, felt)
         # where inertia starts from
         inertial = self.mass * by_star
+        if self.element_masses is not None:
+            reaction = reaction - inertial  # held vertices are felt by their neighbours' inertia too
         x_adj = inertial - s.e0 / s.gamma * q_free
         by_lag, by_begin = np.zeros_like(p), 0.0
         if ws.potential.has_friction:
@@ -179,6 +183,14 @@ class ImplicitAdjoint(RecordedPasses):
             self._pull_back_held(j, p, q, reaction, u_adj, v_adj)
         self.p, self.q = u_adj + self.pending[0], v_adj + self.pending[1]
         self.pending = [s.a1 * x_adj, s.b1 * y_adj] if self.before is not None else [0 * x_adj, 0 * y_adj]
+
+    def _add_mass(self, by_star: np.ndarray, weight: np.ndarray) -> None:
+        """Adds the adjoints of masses: weight, per mass, works on by_star."""
+        if self.element_masses is None:
+            self.mass_adj += (by_star * weight).sum(1)
+            return
+        at = self.ws.arrays.mesh.elements
+        self.element_masses += by_star[at] @ np.swapaxes(weight[at], 1, 2)
 
     def _pull_back_held(self, j, p, q, reaction, u_adj, v_adj) -> None:
         """Adds what comes by the held parts, of which nothing is in u_adj and v_adj of the equation."""
@@ -219,6 +231,7 @@ class ImplicitAdjoint(RecordedPasses):
         """Adjoints of what kernels read, in float64, at the start of the run."""
         a, features, out = self.ws.arrays, self.features, self.numbers.collect()
         out.displacement, out.velocity, out.mass = self.p, self.q, self.mass_adj
+        out.element_masses = self.element_masses
         if features.gravity >= 0:
             out.parameters[features.gravity :][:3] = self.gravity
         if features.drag >= 0:

@@ -4,7 +4,7 @@ from functools import cached_property
 
 import numpy as np
 
-from diffsim_ti.inputs import Derived
+from diffsim_ti.inputs import ConsistentMass, Derived, Mass
 from diffsim_ti.potential.chamber_pressure import following
 from diffsim_ti.potential.follower_pressure import FollowerPressure, is_symmetric
 from diffsim_ti.potential.free import projectors_of
@@ -118,6 +118,18 @@ class GivenInPasses:
             out += self.mass * values.parameters[features.gravity :][:3]
         out = self._add_forces(self.arrays.rows["forces"], out, j, stage)
         return out * self.load_share(j, stage)
+
+    def led_by_loads(self, j: int, stage: Stage, inertial: np.ndarray, mass: Mass) -> tuple:
+        """(where inertia leads, loads that are left): dead loads act like a shift of where it leads, so that free flight is
+        exact; of consistent masses weight does, for which M need not be inverted."""
+        if not isinstance(mass, ConsistentMass):
+            loads = self.loads(j, stage)
+            shift = np.divide(loads, mass, out=np.zeros_like(loads), where=mass > 0)
+            return inertial + shift, np.zeros_like(loads)
+        values, features = self.arrays.values, self.arrays.features()
+        if features.gravity >= 0:
+            inertial = inertial + values.parameters[features.gravity :][:3] / stage.inertia
+        return inertial, self.given_forces(self.arrays.rows["forces"], j, stage)
 
     def _add_forces(self, rows: np.ndarray | None, out: np.ndarray, j: int, stage: Stage) -> np.ndarray:
         if rows is not None:

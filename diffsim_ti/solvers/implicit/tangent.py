@@ -20,7 +20,7 @@ class ImplicitTangent(RecordedPasses):
 
     def __init__(self, workspace, tangent: Derived):
         super().__init__(workspace)
-        a, self.tangent = workspace.arrays, tangent
+        a, self.tangent, self.mass_dot = workspace.arrays, tangent, workspace.mass_of(tangent)
         p = workspace.potential
         self.du, self.dv, self.tangent_before = tangent.displacement.copy(), tangent.velocity.copy(), None
         self.features = a.features()
@@ -82,7 +82,7 @@ class ImplicitTangent(RecordedPasses):
             )
         self._jvp(**ws.potential.sizes())
         share = ws.load_share(j, s)
-        dR = runtime.fetch(ws.potential.y)[0].astype(np.float64) + tangent.mass[:, None] * self.weight(share)
+        dR = runtime.fetch(ws.potential.y)[0].astype(np.float64) + self.mass_dot * self.weight(share)
         if ws.potential.faces:
             dR += self._jvp_of_faces()
         if a.features().gravity >= 0:
@@ -93,7 +93,7 @@ class ImplicitTangent(RecordedPasses):
             dR += ws.follower.jvp(self.places, held + tangent.rest, dp)
         if ws.attached:
             dR += ws.attached.jvp(ws.potential.held_at, held, tangent, *ws.time_of(j, s))
-        d_star = self.solve(dR + self.mass * (dx + s.gamma * dy))
+        d_star = self.solve(dR + self.mass * (dx + s.gamma * dy - held))
         if ws.volumes:
             targets = ws.volumes.targets_jvp(self.places, held + tangent.rest, dp)
             d_star, change = ws.volumes.tangent(self.places, d_star, targets, self.solve)

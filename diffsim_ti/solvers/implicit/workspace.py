@@ -8,6 +8,7 @@ import numpy as np
 from diffsim_ti import runtime
 from diffsim_ti.contact.implicit_pairs import ImplicitPairs
 from diffsim_ti.contact.surface_pairs import Tunnelling
+from diffsim_ti.inputs import ConsistentMass, Mass, diagonal_of, kinetic_energy
 from diffsim_ti.monitor.energy_watch import EnergyWatch
 from diffsim_ti.potential.attached import Attached
 from diffsim_ti.potential.free import FreeDirections, held_as, mask_of
@@ -60,7 +61,7 @@ class ImplicitWorkspace(ObstacleWays, Noted, GivenInPasses, Workspace):
             self._launches["potential"] = True
             self.pressed = Pressed(self) if self.potential.presses else None
         a = self.arrays
-        self.mass = derived.mass[:, None]
+        self._mass = self.mass_of(derived)
         self.free = (runtime.fetch(a.inverse_mass)[:, None] > 0).astype(np.float64)
         if a.features().guided:
             self.free = FreeDirections(self.free, a.supports.guided, a.supports.guides)
@@ -76,6 +77,16 @@ class ImplicitWorkspace(ObstacleWays, Noted, GivenInPasses, Workspace):
         self._preconditioners = {}
         self.way, self.approach = Way(self.arrays, self.parallel), Approach(self)
         self.check_apart()
+
+    @property
+    def mass(self) -> Mass:
+        return self._mass
+
+    def mass_of(self, values) -> Mass:
+        """Consistent of ten-node tetrahedra, lumped of linear ones."""
+        if values.element_masses is None:
+            return super().mass_of(values)
+        return ConsistentMass.of(self.scene.mesh, values.element_masses)
 
     def restart(self) -> None:
         super().restart()
@@ -157,8 +168,9 @@ class ImplicitWorkspace(ObstacleWays, Noted, GivenInPasses, Workspace):
         sizes = dict(num_items=a.num_items, num_vertices=a.num_vertices, slot=slot, end=end)
         self.bound(kernel, **records)(**sizes, h=float(self.solver.schedule.length(j)))
 
-    def preconditioner(self, mass: np.ndarray) -> tuple:
+    def preconditioner(self, mass: Mass) -> tuple:
         """(preconditioner for c M + K with mass = c m, size of the diagonal of that at rest [N/m])."""
+        mass = diagonal_of(mass)
         key = float(mass.sum())
         if key not in self._preconditioners:
             with self.potential.at_rest():
@@ -198,11 +210,11 @@ class ImplicitWorkspace(ObstacleWays, Noted, GivenInPasses, Workspace):
         stage = self.solver.stage(self.rate, before is None)
         x, y = self.inertial(stage, u, v, before)
         place, speed = self.prescribed(j, self.arrays.values)
-        mass, loads = stage.inertia * self.mass, self.loads(j, stage)
-        inertial = x + stage.gamma * y
-        if not stage.static:  # dead loads act like a shift of where inertia leads: free flight is then exact
-            inertial = inertial + np.divide(loads, mass, out=np.zeros_like(loads), where=mass > 0)
-            loads = np.zeros_like(loads)
+        mass, inertial = stage.inertia * self.mass, x + stage.gamma * y
+        if stage.static:
+            loads = self.loads(j, stage)
+        else:
+            inertial, loads = self.led_by_loads(j, stage, inertial, mass)
         start = u if stage.static else u + self.free * (inertial - u)
         if place is not None:
             held = self.arrays.held
@@ -231,9 +243,9 @@ class ImplicitWorkspace(ObstacleWays, Noted, GivenInPasses, Workspace):
 
     def _kinetic_added(self, u, v, u_next, v_star, y, stage: Stage) -> float:
         """Kinetic energy [J] that a pass has added beyond the work of what accelerates the free vertices, before drag."""
-        work = (v_star - y) / stage.gamma * (u_next - u)
-        moves = mask_of(self.free)
-        return float((self.mass * moves * (0.5 * (v_star**2 - v**2) - work)).sum())
+        after, before, way, rate = (x * mask_of(self.free) for x in (v_star, v, u_next - u, (v_star - y) / stage.gamma))
+        added = kinetic_energy(self.mass, after) - kinetic_energy(self.mass, before)
+        return added - float((rate * (self.mass * way)).sum())
 
     def _solve(self, u, start, problem: tuple, stage: Stage) -> np.ndarray:
         """The minimum of the pass; problem: mass, inertial, loads of `Newton.solve`."""

@@ -1,0 +1,112 @@
+"""Consistent masses of ten-node tetrahedra, M_ab = integral of rho N_a N_b: what statics, implicit steps and modes take.
+
+Lumped masses, which explicit steps divide by, put an element's weight where its stresses cannot carry it evenly: strains of
+a hanging bar would fall short by an order. Zienkiewicz, Taylor, Zhu, The Finite Element Method, 6th ed., 16.2.4.
+"""
+
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from diffsim_ti.inputs.chain import Link
+from diffsim_ti.mesh.reference_element import QUADRATIC, quadrature
+
+if TYPE_CHECKING:
+    from diffsim_ti.mesh import TetrahedralMesh
+
+
+class ElementMasses(Link):
+    """Of densities and rest positions the masses M_ab of each element [kg], shape (m, 10, 10), by a rule that is exact for
+    curved edges too: N_a N_b is of degree four, det dX/dxi a cubic."""
+
+    reads, writes = ("density", "rest_positions"), ("element_masses",)
+
+    def __init__(self, elements: np.ndarray):
+        self.elements = elements
+        xi, weights = quadrature(7)
+        N = QUADRATIC.functions(xi)
+        self.by_xi = QUADRATIC.derivatives(xi)
+        self.products = np.einsum("q,qa,qb->qab", weights / 6, N, N).reshape(len(xi), 100)
+
+    def _edges(self, X):
+        return np.einsum("eai,qak->eqik", X[self.elements], self.by_xi, optimize=True)
+
+    def _by_volume(self, det):
+        """Integrals of N_a N_b for det dX/dxi at the points."""
+        return (det @ self.products).reshape(-1, 10, 10)
+
+    def value(self, density, X):
+        return (_times(density, self._by_volume(np.linalg.det(self._edges(X)))),)
+
+    def jvp(self, x, dx):
+        (density, X), (d_density, dX) = x, dx
+        D = self._edges(X)
+        det = np.linalg.det(D)
+        d_det = det * np.einsum("eqij,eqji->eq", np.linalg.inv(D), self._edges(dX))
+        return (_times(d_density, self._by_volume(det)) + _times(density, self._by_volume(d_det)),)
+
+    def vjp(self, x, y_adj):
+        (density, X), (adj,) = x, y_adj
+        D = self._edges(X)
+        det = np.linalg.det(D)
+        by_density = (self._by_volume(det) * adj).sum((1, 2))
+        by_det = _times(density, adj).reshape(-1, 100) @ self.products.T
+        by_D = (by_det * det)[..., None, None] * np.swapaxes(np.linalg.inv(D), 2, 3)
+        X_adj = np.zeros_like(X)
+        np.add.at(X_adj, self.elements, np.einsum("eqik,qak->eai", by_D, self.by_xi, optimize=True))
+        return by_density if density.ndim else by_density.sum(), X_adj
+
+
+def _times(density, matrices):
+    return np.broadcast_to(density, len(matrices))[:, None, None] * matrices
+
+
+class ConsistentMass:
+    """The matrix M of all vertices, or a multiple: `mass * x` is M x for vectors x of the vertices, shape (n, 3), and M 1 g
+    for one vector g of all of them. Where each vertex has a mass of its own, an array (n, 1) stands in its place.
+    """
+
+    __array_ufunc__ = None  # so that NumPy leaves x * mass to this class
+
+    def __init__(self, matrix, factor: float = 1.0):
+        self.matrix, self.factor = matrix, factor
+
+    @classmethod
+    def of(cls, mesh: "TetrahedralMesh", element_masses: np.ndarray) -> "ConsistentMass":
+        """Of all elements together."""
+        from scipy.sparse import coo_matrix
+
+        elements, n = mesh.elements, mesh.num_vertices
+        rows, columns = np.repeat(elements, elements.shape[1], 1).ravel(), np.tile(elements, elements.shape[1]).ravel()
+        return cls(coo_matrix((element_masses.ravel(), (rows, columns)), shape=(n, n)).tocsr())
+
+    def __mul__(self, x):
+        if np.ndim(x) == 0:
+            return ConsistentMass(self.matrix, self.factor * x)
+        return self.factor * (self.lumped * x if np.ndim(x) == 1 else self.matrix @ x)
+
+    __rmul__ = __mul__
+
+    @cached_property
+    def lumped(self) -> np.ndarray:
+        """M 1 of the matrix without its factor, shape (n, 1): the masses that weight acts on; negative at corners."""
+        return np.asarray(self.matrix.sum(1)).reshape(-1, 1)
+
+    @property
+    def diagonal(self) -> np.ndarray:
+        """Its diagonal, shape (n, 1)."""
+        return self.factor * self.matrix.diagonal()[:, None]
+
+
+Mass = np.ndarray | ConsistentMass
+
+
+def diagonal_of(mass: Mass) -> np.ndarray:
+    """What a preconditioner may take in its place, shape (n, 1)."""
+    return mass.diagonal if isinstance(mass, ConsistentMass) else mass
+
+
+def kinetic_energy(mass: Mass, v: np.ndarray) -> float:
+    """v . M v / 2 [J]"""
+    return 0.5 * float((v * (mass * v)).sum())
