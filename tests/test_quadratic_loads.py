@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from quadratic_meshes import box, crumpled, face_rule, renumbered, ring, six, six_by, wavy
+from chamber_meshes import hollow_cube, pitted_cube
+from quadratic_meshes import box, crumpled, face_rule, renumbered, ring, six, six_by, wavy, with_vertices
 from test_every_adjoint import assert_transposed
 
 import diffsim_ti as ds
@@ -233,3 +234,77 @@ def test_gradients_are_those_of_differences():
 @pytest.mark.parametrize("closed", [False, True])
 def test_adjoints_of_equilibria_are_the_transposes_of_tangents(closed):
     assert_transposed(ds.Rollout(ds.StaticSolver(loaded(closed=closed), tolerance=1e-12), 2, gradients="all"), 1e-8)
+
+
+# Chambers
+
+
+def curved(mesh, size=0.006) -> ds.TetrahedralMesh:
+    """Ten-node tetrahedra whose edges are bent at random, but for what lies in the plane z = 0, which stays there."""
+    mesh = mesh.quadratic()
+    moved = size * np.random.default_rng(8).uniform(-1, 1, mesh.vertices.shape)
+    moved[mesh.vertices[:, 2] < 1e-9, 2] = 0
+    return with_vertices(mesh, mesh.vertices + moved)
+
+
+def hollow(terms) -> ds.Scene:
+    return ds.Scene(curved(hollow_cube()), LAW, 1000.0, terms, fixed="bottom", precision="f64")
+
+
+def pitted(terms) -> ds.Scene:
+    """Its rim slides in a plane, with curved edges."""
+    mesh = pitted_cube()
+    mesh = curved(mesh.with_vertex_set("wall", mesh.vertices[:, 0] < 0.02))
+    return ds.Scene(mesh, LAW, 1000.0, terms, fixed={"cut": "z", "wall": "xy"}, precision="f64")
+
+
+GAS = dict(pressure=1.1 * 101325, surface="cavity", exponent=1.3, name="gas")
+
+
+@pytest.mark.parametrize("make", [hollow, pitted])
+def test_chambers_have_the_volume_of_their_curved_faces(make):
+    scene = make([ds.GasChamber(**GAS)])
+    mesh, rng = scene.mesh, np.random.default_rng(9)
+    x = mesh.vertices + scene.supports.free(0.01 * rng.normal(size=mesh.vertices.shape))
+    _, normals, places = on_faces(mesh, mesh.faces_of("cavity"), x)  # what is open lies in z = 0, as the origin does
+    assert scene.chamber_volume("gas", x) == pytest.approx(-(normals * places).sum() / 3, rel=1e-12)
+    enclosure, w = scene.chambers[0].enclosure, scene.supports.free(rng.normal(size=x.shape))
+    slope = (enclosure.volume(x + 1e-5 * w) - enclosure.volume(x - 1e-5 * w)) / 2e-5
+    gradient = (enclosure.gradient(x) * w).sum()
+    assert gradient == pytest.approx(slope, rel=1e-6)
+    faces = mesh.faces_of("cavity")
+    push = FollowerPressure(faces, np.zeros(len(faces), int), mesh.num_vertices).at([1.0]).forces(x)
+    assert (push * w).sum() == pytest.approx(gradient, rel=1e-11)
+
+
+@pytest.mark.parametrize("make", [hollow, pitted])
+@pytest.mark.parametrize("solver", [ds.VelocityVerletSolver, ds.ImplicitMidpointSolver], ids=lambda s: s.__name__)
+def test_every_number_of_a_gas(make, solver):
+    scene = make([ds.GasChamber(**GAS | dict(pressure=1.1 * 101325 * np.array([1.0, 1.1])))])
+    options = dict(dt=5e-5, substeps=2) if solver.explicit else dict(dt=2e-3, tolerance=1e-12)
+    rollout = ds.Rollout(solver(scene, **options), 2, gradients="all")
+    assert_transposed(rollout, 1e-11 if solver.explicit else 1e-8)
+
+
+@pytest.mark.parametrize("make", [hollow, pitted])
+def test_explicit_steps_feel_the_gas(make):
+    scene, bare, h = make([ds.GasChamber(**GAS)]), make([]), 1e-7
+    u = scene.supports.free(0.002 * np.random.default_rng(9).normal(size=scene.mesh.vertices.shape))
+    moved = [
+        ds.Scene(
+            s.mesh,
+            LAW,
+            1000.0,
+            s.terms,
+            fixed="bottom" if make is hollow else {"cut": "z", "wall": "xy"},
+            initial_positions=s.mesh.vertices + u,
+            precision="f64",
+        )
+        for s in (scene, bare)
+    ]
+    both = [ds.Rollout(ds.SemiImplicitSolver(s, h), 1).forward().velocities[-1] for s in moved]
+    chamber, x = scene.chambers[0].enclosure, scene.mesh.vertices + u
+    p = 1.1 * 101325 * (chamber.volume(scene.mesh.vertices) / chamber.volume(x)) ** 1.3 - 101325
+    force = scene.supports.free(p * chamber.gradient(x))
+    found = (both[0] - both[1]) / h * derived(scene).mass[:, None]
+    np.testing.assert_allclose(found, force, atol=1e-5 * np.abs(force).max())

@@ -46,7 +46,7 @@ class Enclosure:
     """
 
     def __init__(self, faces: np.ndarray, lids: list[tuple[int, int, int, float]], point: np.ndarray | None):
-        own, weights = _weighted_triangles(faces)
+        own, weights = weighted_triangles(faces)
         self.faces, self.num_own, self.point = faces, len(own), point
         rows = np.array([lid[:3] for lid in lids], np.int64).reshape(-1, 3)
         self.triangles = np.concatenate([own, rows])
@@ -110,7 +110,7 @@ class Enclosure:
         return float((by * step).sum()) / 6
 
 
-def _weighted_triangles(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def weighted_triangles(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(triangles (k, 3), weights (k,)) whose cones have the volume of those of the faces."""
     if faces.shape[1] == 3:
         return faces, np.ones(len(faces))

@@ -33,7 +33,7 @@ def barycentric_in(nodes: np.ndarray, points: np.ndarray) -> np.ndarray:
     outside = (first < hull.min(1) - 1e-6).any(1) | (first > hull.max(1) + 1e-6).any(1)
     out, left = np.full((len(nodes), 3), np.nan), np.nonzero(~outside)[0]
     for start in (first, np.full(3, 0.25), *np.concatenate([np.zeros((1, 3)), np.eye(3)])):
-        xi, found = _newton(nodes[left], points[left], np.broadcast_to(start, (len(nodes), 3))[left])
+        xi, found = solved(nodes[left], points[left], np.broadcast_to(start, (len(nodes), 3))[left])
         out[left[found]] = xi[found]
         left = left[~found]
         if not len(left):
@@ -41,8 +41,8 @@ def barycentric_in(nodes: np.ndarray, points: np.ndarray) -> np.ndarray:
     return barycentric(out)
 
 
-def _newton(nodes: np.ndarray, points: np.ndarray, xi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(xi, where it was found)"""
+def solved(nodes: np.ndarray, points: np.ndarray, xi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(xi of a point in each element, also beyond it, where it was found), by Newton's method from xi, shape (m, 3)."""
     size = np.ptp(nodes, axis=1).max(1)
 
     def miss(xi):

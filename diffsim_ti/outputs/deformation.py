@@ -5,21 +5,24 @@ from dataclasses import dataclass
 import numpy as np
 
 from diffsim_ti.mesh.geometry import edge_matrices
+from diffsim_ti.mesh.reference_element import QUADRATIC
 
 
 @dataclass
 class Deformation:
-    """H = D B of some tetrahedra, D the edges of the displacement, rows of B grad N_1..3; arrays (frames, m, 3, 3)."""
+    """H = D B at the points of some tetrahedra, D = du/dxi, rows of B grad xi; arrays (frames, points, 3, 3)."""
 
     D: np.ndarray
     B: np.ndarray
-    tetrahedra: np.ndarray
+    elements: np.ndarray
+    order: int
 
     @classmethod
-    def of(cls, frames, derived, tetrahedra: np.ndarray, chosen) -> "Deformation":
+    def of(cls, frames, derived, mesh, chosen) -> "Deformation":
         """chosen: which of all tetrahedra."""
-        u = frames.displacements.astype(np.float64)
-        return cls(np.stack([edge_matrices(x, tetrahedra) for x in u]), derived.gradients[chosen], tetrahedra)
+        u, elements = frames.displacements.astype(np.float64), mesh.elements[chosen]
+        B = derived.gradients[chosen].reshape(-1, 3, 3)
+        return cls(_edges(u, elements, mesh.order), B, elements, mesh.order)
 
     @property
     def H(self) -> np.ndarray:
@@ -31,31 +34,54 @@ class Deformation:
 
     def jvp(self, du: np.ndarray, dB: np.ndarray) -> np.ndarray:
         """dH for changes of the displacements, shape (frames, num_vertices, 3), and of B."""
-        dD = np.stack([edge_matrices(x, self.tetrahedra) for x in du])
-        return dD @ self.B + self.D @ dB
+        return _edges(du, self.elements, self.order) @ self.B + self.D @ dB.reshape(self.B.shape)
 
     def vjp(self, H_adj: np.ndarray, num_vertices: int) -> tuple[np.ndarray, np.ndarray]:
-        """(adjoint of the displacements, of B) for that of H."""
-        by_edge = np.swapaxes(H_adj @ np.swapaxes(self.B, -1, -2), -1, -2)  # a row for each edge
+        """(adjoint of the displacements, of B, by tetrahedra) for that of H."""
+        D_adj = H_adj @ np.swapaxes(self.B, -1, -2)
         out = np.zeros((len(H_adj), num_vertices, 3))
-        for u_adj, rows in zip(out, by_edge):
-            np.add.at(u_adj, self.tetrahedra[:, 1:].ravel(), rows.reshape(-1, 3))
-            np.add.at(u_adj, self.tetrahedra[:, 0], -rows.sum(1))
-        return out, (np.swapaxes(self.D, -1, -2) @ H_adj).sum(0)
+        for u_adj, by_D in zip(out, D_adj):
+            if self.order == 2:
+                by_D = by_D.reshape(len(self.elements), -1, 3, 3)
+                np.add.at(u_adj, self.elements, np.einsum("eqik,qak->eai", by_D, _BY_XI, optimize=True))
+                continue
+            rows = np.swapaxes(by_D, -1, -2)  # a row for each edge
+            np.add.at(u_adj, self.elements[:, 1:].ravel(), rows.reshape(-1, 3))
+            np.add.at(u_adj, self.elements[:, 0], -rows.sum(1))
+        by_B = (np.swapaxes(self.D, -1, -2) @ H_adj).sum(0)
+        return out, by_B.reshape(len(self.elements), -1, 3, 3) if self.order == 2 else by_B
 
 
-class VertexMeans:
-    """Means over the tetrahedra around each vertex, by their volumes V: T_i = sum V_e T_e / sum V_e."""
+_BY_XI = QUADRATIC.derivatives(QUADRATIC.points)
 
-    def __init__(self, tetrahedra: np.ndarray, num_vertices: int):
-        from scipy.sparse import csr_matrix
 
-        m = len(tetrahedra)
-        ones, columns = np.ones(4 * m), np.repeat(np.arange(m), 4)
-        self._around = csr_matrix((ones, (tetrahedra.ravel(), columns)), shape=(num_vertices, m))
+def _edges(u: np.ndarray, elements: np.ndarray, order: int) -> np.ndarray:
+    """du/dxi at the points, shape (frames, points, 3, 3)."""
+    if order == 1:
+        return np.stack([edge_matrices(x, elements) for x in u])
+    return np.einsum("feai,qak->feqik", u[:, elements], _BY_XI, optimize=True).reshape(len(u), -1, 3, 3)
+
+
+class PointMeans:
+    """Means over points by their volumes V, T_i = sum V_p T_p / sum V_p; of item i over `around`, rows of ones."""
+
+    def __init__(self, around):
+        self._around = around
+
+    @classmethod
+    def of_vertices(cls, mesh) -> "PointMeans":
+        """Of each vertex over all points of the tetrahedra around."""
+        points, nodes = mesh.reference.num_points, mesh.reference.num_nodes
+        columns = np.repeat(np.arange(mesh.num_tetrahedra * points).reshape(-1, points), nodes, 0)
+        return cls(_ones(np.repeat(mesh.elements.ravel(), points), columns.ravel(), mesh.num_vertices))
+
+    @classmethod
+    def of_tetrahedra(cls, count: int, points: int) -> "PointMeans":
+        """Of each tetrahedron over its points."""
+        return cls(_ones(np.repeat(np.arange(count), points), np.arange(count * points), count))
 
     def value(self, T: np.ndarray, V: np.ndarray) -> np.ndarray:
-        """T: (frames, m, ...) -> (frames, num_vertices, ...)."""
+        """T: (frames, points, ...) -> (frames, items, ...)."""
         rows = (T * _like(V, T)).reshape(*T.shape[:2], -1)
         out = np.stack([self._around @ frame for frame in rows])
         return out.reshape(len(T), -1, *T.shape[2:]) / _like(self._around @ V, T)
@@ -74,6 +100,12 @@ class VertexMeans:
         back = back.reshape(len(V), len(T), -1).swapaxes(0, 1).reshape(T.shape)
         kept = self._around.T @ (scaled * mean).reshape(len(T), len(total), -1).sum((0, 2))
         return back * _like(V, T), (back * T).reshape(len(T), len(V), -1).sum((0, 2)) - kept
+
+
+def _ones(rows: np.ndarray, columns: np.ndarray, num_rows: int):
+    from scipy.sparse import csr_matrix
+
+    return csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(num_rows, columns.max() + 1))
 
 
 def _like(per_item: np.ndarray, T: np.ndarray) -> np.ndarray:

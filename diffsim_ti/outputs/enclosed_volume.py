@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.mesh.enclosure import weighted_triangles
 from diffsim_ti.outputs.output import Change, Output
 
 if TYPE_CHECKING:
@@ -18,24 +19,34 @@ class EnclosedVolume(Output):
 
         V = 1/6 sum over triangles of a . (b x c),        a, b, c the corners, counted from the first vertex
 
-    triangles: vertex indices, shape (k, 3), of a surface that is closed and turned one way, such as that of a cavity, whose
-        normals then point into the body and V is negative unless they are turned; None: the body's whole surface, so that V
-        is the volume of the body itself. name: how a loss calls it.
+    and with ten-node tetrahedra what curved faces enclose (mesh/enclosure.py).
+
+    triangles: vertex indices, shape (k, 3), or (k, 6) of whole faces with ten-node tetrahedra (`mesh.surface_faces`), of a
+        surface that is closed and turned one way, such as that of a cavity, whose normals then point into the body and V is
+        negative unless they are turned; None: the body's whole surface, so that V is the volume of the body itself.
+    name: how a loss calls it.
     Raises ValueError for a surface with an open edge, or one whose triangles are not turned one way.
     Mirtich 1996, Fast and accurate computation of polyhedral mass properties, doi:10.1080/10867651.1996.10487458.
     """
 
     def __init__(self, triangles: ArrayLike | None = None, name: str = "volume"):
         self.triangles, self.name = None if triangles is None else np.array(triangles, np.int64), name
-        if self.triangles is not None and (self.triangles.ndim != 2 or self.triangles.shape[1] != 3):
-            raise ValueError(f"EnclosedVolume: triangles must have shape (k, 3), got {self.triangles.shape}")
+        if self.triangles is not None and (self.triangles.ndim != 2 or self.triangles.shape[1] not in (3, 6)):
+            raise ValueError(f"EnclosedVolume: triangles must have shape (k, 3) or (k, 6), got {self.triangles.shape}")
 
     def settled(self, scene: "Scene") -> "EnclosedVolume":
         out, n = copy(self), scene.mesh.num_vertices
-        out.triangles = scene.mesh.surface_triangles if self.triangles is None else self.triangles
-        if out.triangles.size == 0 or out.triangles.min() < 0 or out.triangles.max() >= n:
+        faces = scene.mesh.surface_faces if self.triangles is None else self.triangles
+        if faces.size == 0 or faces.min() < 0 or faces.max() >= n:
             raise ValueError(f"EnclosedVolume: triangles must name vertices 0 .. {n - 1}")
-        a, b = out.triangles, np.roll(out.triangles, -1, 1)
+        if faces.shape[1] != scene.mesh.surface_faces.shape[1]:
+            raise ValueError(
+                f"EnclosedVolume: faces of this mesh have {scene.mesh.surface_faces.shape[1]} vertices, got "
+                f"{faces.shape[1]}: take whole faces, as mesh.surface_faces and mesh.faces_of(...) give them; columns "
+                "[0, 2, 1, 5, 4, 3] turn one of six round"
+            )
+        out.triangles, out.weights = weighted_triangles(faces)
+        a, b = faces[:, :3], np.roll(faces[:, :3], -1, 1)
         there, back = np.sort((a * n + b).ravel()), np.sort((b * n + a).ravel())
         if not np.array_equal(there, back):
             open_edge = int(np.setxor1d(there, back)[0]) if len(np.setxor1d(there, back)) else int(there[0])
@@ -54,7 +65,7 @@ class EnclosedVolume(Output):
 
     def value(self, frames: "Frames") -> np.ndarray:
         x = self._corners(frames)
-        return (x[:, :, 0] * np.cross(x[:, :, 1], x[:, :, 2])).sum((1, 2)) / 6
+        return (self.weights[:, None] * x[:, :, 0] * np.cross(x[:, :, 1], x[:, :, 2])).sum((1, 2)) / 6
 
     def jvp(self, frames: "Frames", change: Change) -> np.ndarray:
         if change.positions is None:
@@ -65,7 +76,7 @@ class EnclosedVolume(Output):
     def vjp(self, frames: "Frames", seed: np.ndarray) -> Change:
         x, out = self._corners(frames), np.zeros(frames.positions.shape)
         for a in range(3):
-            by = np.cross(x[:, :, (a + 1) % 3], x[:, :, (a + 2) % 3]) / 6 * seed[:, None, None]
+            by = np.cross(x[:, :, (a + 1) % 3], x[:, :, (a + 2) % 3]) * self.weights[:, None] / 6 * seed[:, None, None]
             for frame, rows in zip(out, by):
                 np.add.at(frame, self.triangles[:, a], rows)
         return Change(positions=out)  # a closed surface: the first vertex, from which it counts, adds nothing

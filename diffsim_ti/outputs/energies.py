@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.inputs import ConsistentMass
 from diffsim_ti.materials.evaluate import evaluate
 from diffsim_ti.outputs.deformation import Deformation
 from diffsim_ti.outputs.output import Change, Output
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class ElasticEnergy(Output):
-    """Energy of strain [J], sum over tetrahedra of V psi(F), in each frame; shape (frames,).
+    """Energy of strain [J], sum over tetrahedra, or their points, of V psi(F), in each frame; shape (frames,).
 
     sets: tetrahedron sets, by name, indices or mask, for the energy of each; shape (frames, len(sets)). name: how a loss
     calls it. The gradient is exact by all inputs.
@@ -37,51 +38,61 @@ class ElasticEnergy(Output):
             )
         out = copy(self)
         out.scene, out.law, out.all = scene, law, np.arange(mesh.num_tetrahedra)
-        out.masks = np.ones((1, mesh.num_tetrahedra))
+        masks = np.ones((1, mesh.num_tetrahedra))
         if self.sets is not None:
-            out.masks = np.zeros((len(self.sets), mesh.num_tetrahedra))
-            for mask, chosen in zip(out.masks, self.sets):
+            masks = np.zeros((len(self.sets), mesh.num_tetrahedra))
+            for mask, chosen in zip(masks, self.sets):
                 mask[mesh.tetrahedron_indices(chosen)] = 1
+        out.points = mesh.reference.num_points
+        out.masks = np.repeat(masks, out.points, 1)  # of the points of all tetrahedra
         return out
 
     def shape(self, num_frames: int) -> tuple[int, ...]:
         return (num_frames,) if self.sets is None else (num_frames, len(self.sets))
 
     def _densities(self, frames):
-        """(what kernels read, deformation, psi, P, dpsi/dp), the last three by frames and tetrahedra."""
+        """(what kernels read, deformation, psi, P, dpsi/dp), the last three by frames and points."""
         derived = self.scene.inputs.derive(frames.inputs)
-        deformation = Deformation.of(frames, derived, self.scene.mesh.tetrahedra, self.all)
+        deformation = Deformation.of(frames, derived, self.scene.mesh, self.all)
         F, K = deformation.F, len(self.law.coefficient_names)
-        p = np.tile(np.broadcast_to(derived.coefficients, (len(self.all), K)), (len(F), 1))
+        p = np.tile(self._at_points(derived.coefficients), (len(F), 1))
         psi, P, by = (x.astype(np.float64) for x in evaluate(self.law, F.reshape(-1, 3, 3), p))
         return derived, deformation, psi.reshape(F.shape[:2]), P.reshape(F.shape), by.reshape(*F.shape[:2], K)
 
+    def _at_points(self, coefficients: np.ndarray) -> np.ndarray:
+        """Of all points, shape (points, K)."""
+        K = len(self.law.coefficient_names)
+        return np.repeat(np.broadcast_to(coefficients, (len(self.all), K)), self.points, 0)
+
     def value(self, frames: "Frames") -> np.ndarray:
         derived, _, psi, *_ = self._densities(frames)
-        return ((psi * derived.volumes) @ self.masks.T).reshape(self.shape(len(psi)))
+        return ((psi * derived.volumes.ravel()) @ self.masks.T).reshape(self.shape(len(psi)))
 
     def jvp(self, frames: "Frames", change: Change) -> np.ndarray:
         derived, deformation, psi, P, by = self._densities(frames)
         moved = self.scene.inputs.derive_jvp(frames.inputs, change.inputs)
         du = (np.zeros(frames.positions.shape) if change.positions is None else change.positions) - moved.rest
         dpsi = (P * deformation.jvp(du, moved.gradients)).sum((2, 3))
-        dpsi = dpsi + (by * np.broadcast_to(moved.coefficients, by.shape[1:])).sum(2)
-        return ((dpsi * derived.volumes + psi * moved.volumes) @ self.masks.T).reshape(self.shape(len(psi)))
+        dpsi = dpsi + (by * self._at_points(moved.coefficients)).sum(2)
+        return ((dpsi * derived.volumes.ravel() + psi * moved.volumes.ravel()) @ self.masks.T).reshape(
+            self.shape(len(psi))
+        )
 
     def vjp(self, frames: "Frames", seed: np.ndarray) -> Change:
         derived, deformation, psi, P, by = self._densities(frames)
-        adjoint, weight = derived.zeros(), seed.reshape(len(psi), -1) @ self.masks  # by frames and tetrahedra
-        scaled = weight * derived.volumes
+        adjoint, weight = derived.zeros(), seed.reshape(len(psi), -1) @ self.masks  # by frames and points
+        scaled = weight * derived.volumes.ravel()
         positions, adjoint.gradients = deformation.vjp(scaled[..., None, None] * P, frames.positions.shape[1])
-        by_p = (scaled[..., None] * by).sum(0)
+        by_p = (scaled[..., None] * by).sum(0).reshape(len(self.all), self.points, -1).sum(1)
         adjoint.coefficients = by_p if derived.coefficients.ndim == 2 else by_p.sum(0)
-        adjoint.volumes, adjoint.rest = (weight * psi).sum(0), -positions.sum(0)
+        adjoint.volumes, adjoint.rest = (weight * psi).sum(0).reshape(derived.volumes.shape), -positions.sum(0)
         inputs = self.scene.inputs.derive_vjp(frames.inputs, adjoint, tuple(frames.inputs))
         return Change(positions=positions, inputs=inputs)
 
 
 class KineticEnergy(Output):
-    """Energy of motion [J], sum over vertices of m v^2 / 2, in each frame; shape (frames,).
+    """Energy of motion [J], sum over vertices of m v^2 / 2, in each frame; shape (frames,). Where masses are consistent, in
+    implicit steps of ten-node tetrahedra, v . M v / 2.
 
     sets: vertex sets, by name, indices or mask, for the energy of each; shape (frames, len(sets)). name: how a loss
     calls it.
@@ -106,20 +117,33 @@ class KineticEnergy(Output):
     def _read(self, frames):
         return frames.velocities.astype(np.float64), self.scene.inputs.derive(frames.inputs)
 
+    def _products(self, derived, v: np.ndarray) -> np.ndarray:
+        """M v of each frame, or its change for those of M."""
+        if derived.element_masses is None:
+            return derived.mass[:, None] * v
+        mass = ConsistentMass.of(self.scene.mesh, derived.element_masses)
+        return np.stack([mass * frame for frame in v])
+
     def value(self, frames: "Frames") -> np.ndarray:
         v, derived = self._read(frames)
-        return (0.5 * (v**2).sum(2) @ (self.masks * derived.mass).T).reshape(self.shape(len(v)))
+        return (0.5 * (v * self._products(derived, v)).sum(2) @ self.masks.T).reshape(self.shape(len(v)))
 
     def jvp(self, frames: "Frames", change: Change) -> np.ndarray:
         v, derived = self._read(frames)
-        dm = self.scene.inputs.derive_jvp(frames.inputs, change.inputs).mass
+        moved = self.scene.inputs.derive_jvp(frames.inputs, change.inputs)
         dv = np.zeros(v.shape) if change.velocities is None else change.velocities
-        grown = (v * dv).sum(2) @ (self.masks * derived.mass).T + 0.5 * (v**2).sum(2) @ (self.masks * dm).T
-        return grown.reshape(self.shape(len(v)))
+        grown = dv * self._products(derived, v) + v * (self._products(derived, dv) + self._products(moved, v))
+        return (0.5 * grown.sum(2) @ self.masks.T).reshape(self.shape(len(v)))
 
     def vjp(self, frames: "Frames", seed: np.ndarray) -> Change:
         v, derived = self._read(frames)
-        adjoint, weight = derived.zeros(), seed.reshape(len(v), -1) @ self.masks
-        adjoint.mass = 0.5 * (weight * (v**2).sum(2)).sum(0)
+        adjoint, weight = derived.zeros(), (seed.reshape(len(v), -1) @ self.masks)[..., None]
+        if derived.element_masses is None:
+            adjoint.mass = 0.5 * (weight * v**2).sum((0, 2))
+        else:
+            nodes = self.scene.mesh.elements
+            for own, scaled in zip(v, 0.5 * weight * v):
+                adjoint.element_masses += np.einsum("eai,ebi->eab", scaled[nodes], own[nodes])
         inputs = self.scene.inputs.derive_vjp(frames.inputs, adjoint, tuple(frames.inputs))
-        return Change(velocities=(weight * derived.mass)[..., None] * v, inputs=inputs)
+        by_v = 0.5 * (weight * self._products(derived, v) + self._products(derived, weight * v))
+        return Change(velocities=by_v, inputs=inputs)

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffsim_ti.mesh.geometry import inverse_edges
+from diffsim_ti.mesh.geometry import inverse_edges, shape_gradients
+from diffsim_ti.mesh.inverse_map import barycentric_in, solved
 from diffsim_ti.outputs.output import Change, Output
 
 if TYPE_CHECKING:
@@ -17,7 +18,8 @@ if TYPE_CHECKING:
 class MaterialPoints(Output):
     """Positions [m] of points that are named by where they lie in the rest shape; shape (frames, num_points, 3).
 
-    A point X of the tetrahedron with corners X_a moves as its corners do, with barycentric coordinates N_a(X):
+    A point X of the tetrahedron with vertices X_a moves as these do, with its shape functions N_a(X), which are barycentric
+    coordinates of four nodes:
 
         x = sum_a N_a(X) x_a = X + sum_a N_a(X) u_a,        sum_a N_a(X) X_a = X
 
@@ -39,43 +41,59 @@ class MaterialPoints(Output):
     def settled(self, scene: "Scene") -> "MaterialPoints":
         out = copy(self)
         out.located = scene.mesh.locate(self.points, nearest=self.nearest)
-        out.points = out.located.points
+        out.points, out.element = out.located.points, scene.mesh.reference
+        if out.element.order == 2:
+            out.xi = barycentric_in(scene.mesh.vertices[out.located.vertices], out.points)[:, 1:]
         return out
 
     def shape(self, num_frames: int) -> tuple[int, ...]:
         return num_frames, len(self.points), 3
 
     def _weights(self, frames) -> tuple[np.ndarray, np.ndarray]:
-        """(B, N): edge matrices inverted, shape (num_points, 3, 3), and coordinates, (num_points, 4), at the rest shape."""
-        X, corners = frames.inputs["rest_positions"], self.located.vertices
-        B = inverse_edges(X, corners)
-        inner = np.einsum("pij,pj->pi", B, self.points - X[corners[:, 0]])
-        return B, np.concatenate([1 - inner.sum(1, keepdims=True), inner], 1)
+        """(grad N, shape (num_points, nodes, 3), N, shape (num_points, nodes)) at the points, in the rest shape."""
+        X, nodes = frames.inputs["rest_positions"], self.located.vertices
+        if self.element.order == 2:
+            return self._quadratic_weights(X[nodes])
+        B = inverse_edges(X, nodes)
+        inner = np.einsum("pij,pj->pi", B, self.points - X[nodes[:, 0]])
+        return shape_gradients(B), np.concatenate([1 - inner.sum(1, keepdims=True), inner], 1)
 
-    def _deformation(self, frames, B: np.ndarray) -> np.ndarray:
+    def _quadratic_weights(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where the map of ten nodes at X, shape (num_points, 10, 3), reaches the points."""
+        xi, found = solved(X, self.points, self.xi)
+        if not found.all():
+            k = int(np.argmin(found))
+            raise ValueError(
+                f"MaterialPoints: rest_positions carry tetrahedron {self.located.tetrahedra[k]} so far from point {k} at "
+                f"{self.points[k].tolist()} that it cannot be followed; take a smaller step in the rest shape"
+            )
+        by_xi = self.element.derivatives(xi)
+        return by_xi @ np.linalg.inv(np.einsum("pai,pak->pik", X, by_xi)), self.element.functions(xi)
+
+    def _deformation(self, frames, gradients: np.ndarray) -> np.ndarray:
         """F at the points, shape (frames, num_points, 3, 3)."""
         u = frames.displacements[:, self.located.vertices].astype(np.float64)
-        return np.eye(3) + np.einsum("fpai,paj->fpij", u[:, :, 1:] - u[:, :, :1], B)
+        return np.eye(3) + np.einsum("fpai,paj->fpij", u, gradients)
 
     def value(self, frames: "Frames") -> np.ndarray:
         u = frames.displacements[:, self.located.vertices].astype(np.float64)
         return self.points + np.einsum("pa,fpai->fpi", self._weights(frames)[1], u)
 
     def jvp(self, frames: "Frames", change: Change) -> np.ndarray:
-        B, N = self._weights(frames)
+        gradients, N = self._weights(frames)
         out = np.zeros(self.shape(len(frames.positions)))
         if change.positions is not None:
             out += np.einsum("pa,fpai->fpi", N, change.positions[:, self.located.vertices])
         if "rest_positions" in change.inputs:
             moved = np.einsum("pa,pai->pi", N, change.inputs["rest_positions"][self.located.vertices])
-            out -= np.einsum("fpij,pj->fpi", self._deformation(frames, B), moved)
+            out -= np.einsum("fpij,pj->fpi", self._deformation(frames, gradients), moved)
         return out
 
     def vjp(self, frames: "Frames", seed: np.ndarray) -> Change:
-        B, N = self._weights(frames)
+        gradients, N = self._weights(frames)
         positions, rest = np.zeros(frames.positions.shape), np.zeros(frames.positions.shape[1:])
         for frame, s in zip(positions, seed):
             np.add.at(frame, self.located.vertices, N[:, :, None] * s[:, None])
-        pulled = np.einsum("fpij,fpi->pj", self._deformation(frames, B), seed)
+        pulled = np.einsum("fpij,fpi->pj", self._deformation(frames, gradients), seed)
         np.add.at(rest, self.located.vertices, -N[:, :, None] * pulled[:, None])
         return Change(positions=positions, inputs={"rest_positions": rest})

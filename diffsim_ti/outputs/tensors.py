@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffsim_ti.outputs.deformation import NUMBERS, Deformation, VertexMeans
+from diffsim_ti.outputs.deformation import NUMBERS, Deformation, PointMeans
 from diffsim_ti.outputs.law_on_arrays import LawOnArrays
 from diffsim_ti.outputs.output import Change, Output
 
@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 
 class _Tensors(Output):
     """at: "tetrahedra", (frames, num_tetrahedra, 3, 3); "vertices", the means over the tetrahedra around by their volumes;
-    or material points X [m], shape (k, 3), each with the tensor of its tetrahedron. numbers: what of them is given instead,
+    or material points X [m], shape (k, 3), each with the tensor of its tetrahedron. That of a tetrahedron with ten nodes is
+    the mean over its points, by their volumes. numbers: what of them is given instead,
     a name in deformation.NUMBERS, or None. name: how a loss calls it."""
 
     per_item = True  # whether there is a value for each tetrahedron or vertex
@@ -34,12 +35,15 @@ class _Tensors(Output):
             raise ValueError(f'{type(self).__name__}: at must be "tetrahedra", "vertices" or points, got {at!r}')
 
     def settled(self, scene: "Scene") -> "Output":
-        out, tets = copy(self), scene.mesh.tetrahedra
-        out.scene, out.num_vertices, out.means = scene, scene.mesh.num_vertices, None
-        out.chosen = np.arange(len(tets)) if isinstance(self.at, str) else scene.mesh.locate(self.at).tetrahedra
-        out.tetrahedra, out.count = tets[out.chosen], len(out.chosen)
-        if isinstance(self.at, str) and self.at == "vertices":
-            out.means, out.count = VertexMeans(tets, out.num_vertices), out.num_vertices
+        out, mesh = copy(self), scene.mesh
+        out.scene, out.num_vertices, out.means, out.points = scene, mesh.num_vertices, None, mesh.reference.num_points
+        every = isinstance(self.at, str)
+        out.chosen = np.arange(mesh.num_tetrahedra) if every else mesh.locate(self.at).tetrahedra
+        out.count = len(out.chosen)
+        if every and self.at == "vertices":
+            out.means, out.count = PointMeans.of_vertices(mesh), mesh.num_vertices
+        elif out.points > 1:
+            out.means = PointMeans.of_tetrahedra(out.count, out.points)
         return out
 
     def shape(self, num_frames: int) -> tuple[int, ...]:
@@ -59,9 +63,13 @@ class _Tensors(Output):
 
     def _start(self, frames):
         derived = self.scene.inputs.derive(frames.inputs)
-        deformation = Deformation.of(frames, derived, self.tetrahedra, self.chosen)
+        deformation = Deformation.of(frames, derived, self.scene.mesh, self.chosen)
         T = self._tensors(deformation, derived)
-        return derived, deformation, T, T if self.means is None else self.means.value(T, derived.volumes)
+        return derived, deformation, T, T if self.means is None else self.means.value(T, self._volumes(derived))
+
+    def _volumes(self, derived) -> np.ndarray:
+        """Of the points of the chosen tetrahedra."""
+        return derived.volumes[self.chosen].ravel()
 
     def value(self, frames: "Frames") -> np.ndarray:
         shown = self._start(frames)[3]
@@ -73,14 +81,15 @@ class _Tensors(Output):
         du = (np.zeros(frames.positions.shape) if change.positions is None else change.positions) - moved.rest
         dT = self._tensors_jvp(deformation, derived, deformation.jvp(du, moved.gradients[self.chosen]), moved)
         if self.means is not None:
-            dT = self.means.jvp(T, dT, derived.volumes, moved.volumes)
+            dT = self.means.jvp(T, dT, self._volumes(derived), self._volumes(moved))
         return NUMBERS[self.numbers][2](shown, dT) if self.numbers else dT
 
     def vjp(self, frames: "Frames", seed: np.ndarray) -> Change:
         derived, deformation, T, shown = self._start(frames)
         adjoint, seed = derived.zeros(), NUMBERS[self.numbers][3](shown, seed) if self.numbers else seed
         if self.means is not None:
-            seed, adjoint.volumes = self.means.vjp(T, derived.volumes, seed)
+            seed, by_volumes = self.means.vjp(T, self._volumes(derived), seed)
+            np.add.at(adjoint.volumes, self.chosen, by_volumes.reshape(-1, *adjoint.volumes.shape[1:]))
         H_adj = self._tensors_vjp(deformation, derived, seed, adjoint)
         positions, by_B = deformation.vjp(H_adj, self.num_vertices)
         np.add.at(adjoint.gradients, self.chosen, by_B)
@@ -161,9 +170,9 @@ class Stress(_Tensors):
         return out
 
     def _numbers(self, derived, frames: int) -> np.ndarray:
-        """Coefficients of the chosen tetrahedra of all frames, (frames m, K)."""
+        """Coefficients at the points of the chosen tetrahedra of all frames, (frames points, K)."""
         p = np.broadcast_to(derived.coefficients, (self.scene.mesh.num_tetrahedra, self.law.K))[self.chosen]
-        return np.tile(p, (frames, 1))
+        return np.tile(np.repeat(p, self.points, 0), (frames, 1))
 
     def _tensors(self, deformation, derived):
         H = deformation.H
@@ -192,7 +201,7 @@ class Stress(_Tensors):
             P_adj = seed @ F / J
             F_adj = np.swapaxes(seed, -1, -2) @ P / J - shrunk * np.swapaxes(np.linalg.inv(F), -1, -2)
         by_H, by_p = self.law.vjp(H, P_adj.reshape(-1, 3, 3), p)
-        by_p = by_p.reshape(len(seed), -1, self.law.K).sum(0)
+        by_p = by_p.reshape(len(seed), -1, self.points, self.law.K).sum((0, 2))
         if derived.coefficients.ndim == 1:
             adjoint.coefficients = adjoint.coefficients + by_p.sum(0)
         else:

@@ -9,6 +9,7 @@ import taichi as ti
 from diffsim_ti import runtime
 from diffsim_ti.runtime import kernels_of
 from diffsim_ti.solvers.explicit.chamber_kernels import ChamberKernels
+from diffsim_ti.solvers.explicit.curved_chambers import CurvedChamberKernels
 
 PARTS = 64  # sums that a GPU's threads make side by side for each chamber
 
@@ -38,12 +39,15 @@ class Chambers:
             volume=runtime.array(a.fp, self.count * self.parts),
             felt=runtime.array(a.fp, self.count * self.parts),
         )
+        self.kernels = ChamberKernels if scene.mesh.order == 1 else CurvedChamberKernels
+        if scene.mesh.order == 2:
+            self.arrays.weight = runtime.upload(np.concatenate([e.weights for e in closed]), a.fp)
         self.now = 0  # the pass that forces were last taken in
 
     def _launch(self, name: str, numbers: dict, slot: int, shape: bool = False, **records) -> None:
         ws, a = self.ws, self.ws.arrays
         per_step = len(a.values.follower) > 1
-        kernels = kernels_of(ChamberKernels, a.precision, per_step, self.parts, ws.parallel, shape)
+        kernels = kernels_of(self.kernels, a.precision, per_step, self.parts, ws.parallel, shape)
         sizes = dict(num_triangles=len(self.triangles), num_sums=self.count * self.parts, slot=slot)
         sizes |= dict(first=a.first_chamber_corner, first_row=len(a.pressures))
         launch = ws.bound(getattr(kernels, name), chambers=self.arrays, table=ws.table, **records)

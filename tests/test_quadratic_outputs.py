@@ -1,0 +1,76 @@
+"""Results of ten-node tetrahedra: tensors, energies, volumes and points, with their derivatives."""
+
+import numpy as np
+import pytest
+from quadratic_meshes import crumpled, with_vertices
+from test_tensor_outputs import POINTS, assert_derivatives, bent, outputs
+
+import diffsim_ti as ds
+
+
+def body() -> ds.TetrahedralMesh:
+    mesh = ds.TetrahedralMesh.create_box((3, 2, 2), size=(0.2, 0.1, 0.1)).quadratic()
+    x = mesh.vertices + 0.003 * np.random.default_rng(0).normal(size=mesh.vertices.shape)
+    return with_vertices(mesh, x)
+
+
+def rollout_of(kind):
+    mesh = body()
+    E = np.linspace(4e4, 8e4, mesh.num_tetrahedra) if kind == "verlet" else 5e4
+    law = ds.Corotated if kind == "verlet" else ds.StableNeoHookean
+    start = {} if kind == "static" else dict(initial_positions=bent(mesh.vertices))
+    scene = ds.Scene(mesh, law(E, 0.3), 900.0, ds.Gravity((3.0, -9.81, 2.0)), "xmin", precision="f64", **start)
+    solver = {
+        "verlet": lambda: ds.VelocityVerletSolver(scene, dt=2e-4),
+        "static": lambda: ds.StaticSolver(scene, tolerance=1e-12),
+        "midpoint": lambda: ds.ImplicitMidpointSolver(scene, dt=5e-3, tolerance=1e-12),
+    }[kind]()
+    more = [ds.MaterialPoints(POINTS)]
+    return ds.Rollout(solver, 2, save_every=1, outputs=outputs() + more, gradients="all")
+
+
+@pytest.mark.parametrize("kind", ["verlet", "static", "midpoint"])
+def test_derivatives(kind):
+    """Seeds are the transpose of tangents, and gradients agree with differences, for each output and input by itself."""
+    assert_derivatives(rollout_of(kind), kind != "static", 1e-11 if kind == "verlet" else 1e-8)
+
+
+def test_a_homogeneous_stretch_has_its_closed_form():
+    mesh, E, nu = crumpled(0.02), 5e4, 0.3
+    F = np.diag([1.3, 0.9, 1.1]) + 0.1 * np.random.default_rng(1).normal(size=(3, 3))
+    J, green = np.linalg.det(F), 0.5 * (F.T @ F - np.eye(3))
+    mu, lam = E / (2 * (1 + nu)), E * nu / ((1 + nu) * (1 - 2 * nu))
+    sigma = (mu * (F @ F.T - np.eye(3)) + lam * (J - 1) * J * np.eye(3)) / J
+    points = mesh.locate(mesh.centroids).points
+    kept = [ds.Stress(), ds.Stress("nodal", at="vertices"), ds.Strain("marked", at=points), ds.EnclosedVolume()]
+    kept += [ds.MaterialPoints(points), ds.ElasticEnergy(), ds.KineticEnergy()]
+    velocities = np.ones((mesh.num_vertices, 3)) * [1.0, 2, 2]
+    scene = ds.Scene(
+        mesh,
+        ds.StableNeoHookean(E, nu),
+        initial_positions=mesh.vertices @ F.T,
+        initial_velocities=velocities,
+        precision="f64",
+    )
+    frames = ds.Rollout(ds.VelocityVerletSolver(scene, dt=1e-6), 1, outputs=kept).forward()
+    assert frames["stress"][0] == pytest.approx(np.tile(sigma, (mesh.num_tetrahedra, 1, 1)), abs=1e-9 * E)
+    assert frames["nodal"][0] == pytest.approx(np.tile(sigma, (mesh.num_vertices, 1, 1)), abs=1e-9 * E)
+    assert frames["marked"][0] == pytest.approx(np.tile(green, (len(points), 1, 1)), abs=1e-10)
+    assert frames["volume"][0] == pytest.approx(J * mesh.volume, rel=1e-12)
+    np.testing.assert_allclose(frames["material_points"][0], points @ F.T, atol=1e-11)
+    assert frames["kinetic_energy"][0] == pytest.approx(0.5 * 1000 * mesh.volume * 9, rel=1e-12)
+    psi = mu / 2 * (np.trace(F.T @ F) - 3) - mu * np.log(J) + lam / 2 * (J - 1) ** 2
+    shares = scene.inputs.derive(scene.inputs.values).volumes.sum()  # the points' rule, exact where edges are straight
+    assert frames["elastic_energy"][0] == pytest.approx(psi * shares, rel=1e-9)
+
+
+def test_volumes_are_of_whole_faces():
+    mesh = body()
+    scene = ds.Scene(mesh, ds.StableNeoHookean(5e4, 0.3))
+    with pytest.raises(ValueError, match="faces of this mesh have 6 vertices, got 3: take whole faces"):
+        ds.EnclosedVolume(mesh.surface_triangles).settled(scene)
+    with pytest.raises(ValueError, match="the surface is open"):
+        ds.EnclosedVolume(mesh.surface_faces[1:]).settled(scene)
+    turned = ds.EnclosedVolume(mesh.surface_faces[:, [0, 2, 1, 5, 4, 3]])
+    frames = ds.Rollout(ds.VelocityVerletSolver(scene, 1e-6), 1, outputs=[turned]).forward()
+    assert frames["volume"][0] == pytest.approx(-mesh.volume, rel=1e-6)
