@@ -24,7 +24,7 @@ def hollow(rng) -> ds.TetrahedralMesh:
 
 def cavity(mesh) -> np.ndarray:
     """Its walls, as vertex indices."""
-    return mesh.surface_triangles[np.isin(mesh.surface_triangles, INNER).all(1)]
+    return mesh.surface_faces[np.isin(mesh.surface_faces[:, :3], INNER).all(1)]
 
 
 def chamber(kind: str, rng, mesh, start: np.ndarray, steps: int, duration: float, E: float):
