@@ -314,14 +314,6 @@ def test_mistakes_are_refused(mistake):
         ds.Scene(CUBE, ds.StableNeoHookean(1e5, 0.3), fixed=fixed, motion=motion)
 
 
-def test_explicit_stages_of_obstacles_are_refused():
-    terms, fixed = [ds.Ground(-0.1, 1e3)], {"xmin": "x"}
-    scene = ds.Scene(CUBE, ds.StableNeoHookean(1e5, 0.3), 1000.0, terms, fixed)
-    with pytest.raises(ValueError, match='held in some directions alone: pass contact="force"'):
-        ds.VelocityVerletSolver(scene, dt=1e-4)
-    ds.VelocityVerletSolver(scene, dt=1e-4, contact="force")
-
-
 REACTIONS = [
     ds.Reaction("ymin", name="bottom"),
     ds.Reaction("lid", name="moment", about=(0.1, 0.2, 0.3)),

@@ -2,6 +2,7 @@
 
 Friction with one obstacle may lead a vertex towards another one, which the stage has not asked. With e the way that friction
 adds and y_o > 0 the distances to which the stage leads, the vertex takes the share c(x) of all friction (held_back.py).
+A vertex that is held in some directions takes of each friction what lies in the others.
 """
 
 from dataclasses import dataclass
@@ -35,17 +36,26 @@ class ContactFriction(HeldBack):
         return after
 
     @ti.func
-    def slide_by(self, count, i, v, ratio, state: A):
+    def led(self, i, v, after, scene: A):
+        """Velocity of vertex i where friction alone would make v that after it."""
+        out = after
+        if ti.static(self.features.guided):
+            out = v + self.may(i, after - v, scene)
+        return out
+
+    @ti.func
+    def slide_by(self, count, i, v, ratio, scene: A, state: A):
         """Velocity after the friction of the first `count` obstacles, one after the other."""
         for o in range(count):
-            v = self.slide(ti.static(self.features.first_staged) + o, i, v, ratio, state)
+            after = self.slide(ti.static(self.features.first_staged) + o, i, v, ratio, state)
+            v = self.led(i, v, after, scene)
         return v
 
     @ti.func
-    def slide_all(self, i, v, ratio, state: A):
+    def slide_all(self, i, v, ratio, scene: A, state: A):
         """Velocity after the friction of all obstacles."""
         if ti.static(len(self.features.staged_rough) > 0):
-            v = self.slide_by(ti.static(self.features.num_staged), i, v, ratio, state)
+            v = self.slide_by(ti.static(self.features.num_staged), i, v, ratio, scene, state)
         return v
 
     # ---- what of it a vertex takes -------------------------------------------------------------------------------------
@@ -66,9 +76,9 @@ class ContactFriction(HeldBack):
         return most, number
 
     @ti.func
-    def rubbed(self, i, v, z, ratio, now: A, state: A):
+    def rubbed(self, i, v, z, ratio, now: A, scene: A, state: A):
         """Velocity after friction."""
-        after = self.slide_all(i, v, ratio, state)
+        after = self.slide_all(i, v, ratio, scene, state)
         x, _ = self.crowding(i, v, after, z, now, state)
         c, slope = self.share_and_slope(x)
         if slope < 0:
@@ -97,7 +107,8 @@ class ContactFriction(HeldBack):
         """Velocity after friction, and its change."""
         for g in ti.static(self.features.staged_rough):
             for k in range(g.count):
-                v, dv = self.slide_jvp_of(g, k, i, v, dv, ratio, dratio, now, state, tangent)
+                after, change = self.slide_jvp_of(g, k, i, v, dv, ratio, dratio, now, state, tangent)
+                v, dv = self.led(i, v, after, scene), self.led(i, dv, change, scene)
         return v, dv
 
     @ti.func
@@ -134,14 +145,17 @@ class ContactFriction(HeldBack):
             row = ROWS * (ti.static(self.features.first_staged) + before)
             pushed, felt, by_wall = state.stage[row + PUSH, i], state.stage[row + FELT, i], self.vector(0)
             if pushed.x > 0 and felt.z > 0:
-                start = self.slide_by(before, i, v, ratio, state)
+                start, held_adj = self.slide_by(before, i, v, ratio, scene, state), self.vector(0)
+                if ti.static(self.features.guided):
+                    held_adj = self.guides.held(i, v_adj, scene)
+                    v_adj = v_adj + -1 * held_adj
                 plane, wall = state.stage[row + PLANE, i], state.stage[row + WALL, i]
                 if ti.static(self.features.recorded):
                     v_adj += share * seed_of_friction(self, before, i, now, scene, adjoint)
                 by_plane, by_v, of_wall, more, by_mu, by_eps = stage.slide_vjp(
                     self.fp, plane, pushed.x, start, wall, ratio, felt.z, felt.w, v_adj
                 )
-                v_adj, by_wall = by_v, of_wall
+                v_adj, by_wall = by_v + held_adj if ti.static(self.features.guided) else by_v, of_wall
                 if ti.static(self.features.recorded):
                     v_adj += -share * seed_of_friction(self, before, i, now, scene, adjoint)
                     friction_by_mass(self, before, i, start, share, ratio, now, state, adjoint)
@@ -155,7 +169,7 @@ class ContactFriction(HeldBack):
     @ti.func
     def rubbed_vjp(self, i, u, v, v_adj, z, ratio, now: A, scene: A, state: A, adjoint: A):
         """(adjoints of v before friction, of h / m, of the move z, of alpha, of u); notes or adds those of all else."""
-        after, by_z, by_u = self.slide_all(i, v, ratio, state), self.vector(0), self.vector(0)
+        after, by_z, by_u = self.slide_all(i, v, ratio, scene, state), self.vector(0), self.vector(0)
         x, number = self.crowding(i, v, after, z, now, state)
         c, slope = self.share_and_slope(x)
         way_adj, own, by_alpha = v_adj, self.vector(0), ti.cast(0, self.fp)

@@ -2,8 +2,8 @@
 
 In a pass obstacle o gives vertex i h P_o n_o by its push and c m (v_o - v_(o-1)) by its friction, v_o being the velocity
 after the frictions of obstacles 1 .. o, and c the share of them that the vertex takes (contact_friction.py): what the stage
-adds to the vertex's momentum, to round-off. They are added to rows now.into + 2 o and now.into + 2 o + 1 of `impulse`;
-now.into is negative in passes that no frame counts.
+adds to the vertex's momentum, to round-off, or, in directions in which it is held, to what holds it. They are added to rows
+now.into + 2 o and now.into + 2 o + 1 of `impulse`; now.into is negative in passes that no frame counts.
 """
 
 import taichi as ti
@@ -17,7 +17,7 @@ A = ti.template()
 def note_impulses(self: A, i, v_plus, z, ratio, now: A, scene: A, state: A):
     """Add what the noted pushes, and the frictions on v+, are."""
     if now.into >= 0:
-        x, _ = self.crowding(i, v_plus, self.slide_all(i, v_plus, ratio, state), z, now, state)
+        x, _ = self.crowding(i, v_plus, self.slide_all(i, v_plus, ratio, scene, state), z, now, state)
         share, _ = self.share_and_slope(x)
         v = v_plus
         for c in range(ti.static(self.features.num_staged)):
@@ -27,7 +27,7 @@ def note_impulses(self: A, i, v_plus, z, ratio, now: A, scene: A, state: A):
             n = self.normal(state.stage[row + PLANE, i])
             state.impulse[at, i] = state.impulse[at, i] + now.h * pushed.x * n
             state.impulse[at + 1, i] = state.impulse[at + 1, i] + share * (after - v) / scene.inverse_mass[i]
-            v = after
+            v = self.led(i, v, after, scene)
 
 
 @ti.func
@@ -55,7 +55,7 @@ def note_friction_jvp(self: A, i, v, dv, share, dshare, ratio, dratio, now: A, s
                     after - v
                 )
                 tangent.impulse[at, i] = tangent.impulse[at, i] + gained
-                v, dv = after, dafter
+                v, dv = self.led(i, v, after, scene), self.led(i, dv, dafter, scene)
 
 
 @ti.func
@@ -98,5 +98,5 @@ def friction_by_share(self: A, i, v, ratio, now: A, scene: A, state: A, adjoint:
     for c in range(ti.static(self.features.num_staged)):
         after = self.slide(ti.static(self.features.first_staged) + c, i, v, ratio, state)
         out += (after - v).dot(seed_of_friction(self, c, i, now, scene, adjoint))
-        v = after
+        v = self.led(i, v, after, scene)
     return out

@@ -21,5 +21,16 @@ def work_of_stage(contact: A, i, v, now: A, scene: A, state: A):
             after = contact.slide(ti.static(contact.features.first_staged) + c, i, v, now.h * inverse, state)
         pushed = now.h * state.stage[row + PUSH, i].x * contact.normal(state.stage[row + PLANE, i])
         work += (pushed + (after - v) / inverse).dot(wall)
-        v = after
+        v += contact.may(i, after - v, scene)
+    return work
+
+
+@ti.func
+def work_of_lead(contact: A, i, lead, state: A):
+    """What holds vertex i takes the pushes there, on the way `lead` that it goes [J]."""
+    work = ti.cast(0, contact.fp)
+    for c in range(ti.static(contact.features.num_staged)):
+        row = ROWS * (ti.static(contact.features.first_staged) + c)
+        normal = contact.normal(state.stage[row + PLANE, i])
+        work += -state.stage[row + PUSH, i].x * normal.dot(lead)
     return work
