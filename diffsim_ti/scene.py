@@ -292,11 +292,12 @@ class Scene:
         return u
 
     def stiffness_matrix(self, displacements: ArrayLike | None = None):
-        """K = d2E/du2 [N/m] of the body's stress at displacements [m] from the rest shape, default none, shape
-        (num_vertices, 3), as a SciPy CSR matrix of all 3 num_vertices unknowns, x, y, z of vertex 0 first, in float64.
+        """K = d2E/du2 [N/m] of the body's stress, springs, cables and elastic foundations at displacements [m] from the rest
+        shape, default none, shape (num_vertices, 3), as a SciPy CSR matrix of all 3 num_vertices unknowns, x, y, z of vertex
+        0 first, in float64.
 
-        Fixed vertices have their rows: strike them out. What obstacles, self-contact, loads, springs and foundations add is
-        not in it.
+        Fixed vertices have their rows: strike them out. Tensions and lengths over time are those of time 0; a tension T adds
+        T / |d| across its segments d. What obstacles, self-contact and pressures add is not in it.
         Raises ValueError for shapes that do not fit, or a law that reads more than the displacement gradient.
         Zienkiewicz, Taylor, The Finite Element Method, vol. 2, 5th ed., 2000, sec. 10.3.
         """

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from diffsim_ti.potential.attached import Attached
 from diffsim_ti.potential.free import FreeDirections, mask_of, projectors_of
 from diffsim_ti.potential.potential import Potential
 from diffsim_ti.state.arrays import SceneArrays
@@ -52,11 +53,14 @@ def assemble(potential, mass, free):
 
 
 def body_stiffness(scene, displacements: np.ndarray):
-    """d2E/du2 [N/m] of stress at displacements [m], of all vertices alike, as a SciPy CSR matrix."""
-    arrays = SceneArrays(scene)
-    arrays.load(scene.inputs.derive(scene.inputs.values))
+    """d2E/du2 [N/m] of stress, springs, cables and foundations at displacements [m], of all vertices alike, as a SciPy CSR
+    matrix; what changes over time is that of time 0."""
+    arrays, attached = SceneArrays(scene), Attached.of(scene)
+    derived = scene.inputs.derive(scene.inputs.at_times([0.0]))
+    arrays.load(derived)
     potential = Potential(arrays, scene.mesh.tetrahedra, False)
     potential.place(displacements)
     potential.blocks()
     n = scene.mesh.num_vertices
-    return assemble(potential, np.zeros((n, 1)), np.ones((n, 1)))[0].tocsr()
+    own = assemble(potential, np.zeros((n, 1)), np.ones((n, 1)))[0].tocsr()
+    return own if attached is None else (own + attached.at_start(derived).matrix(displacements)).tocsr()

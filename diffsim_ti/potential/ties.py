@@ -98,6 +98,22 @@ class Ties:
         squared = self.parted.multiply(self.parted).T.tocsr()
         return out + (squared @ bare.reshape(-1, 9)).reshape(-1, 3, 3)
 
+    def turning(self, u: np.ndarray, w: np.ndarray) -> float:
+        """The largest |C w| / |d| of segments that have a length."""
+        length, moved = self._state(u)[1], np.linalg.norm(self.parted @ w, axis=1)
+        return float(np.divide(moved, length, out=np.zeros_like(moved), where=length > 0).max(initial=0.0))
+
+    def matrix(self, u: np.ndarray):
+        """d2E/du2 [N/m] as a SciPy sparse matrix, rows 3 i + d: C^T (k t t^T along each path + what lies across) C."""
+        from scipy.sparse import block_diag, csr_matrix, diags, identity, kron
+
+        t, length, _, _, k, T = self._state(u)
+        across = np.stack([self._across(t, length, T, np.tile(axis, (len(t), 1))) for axis in np.eye(3)], 2)
+        C = kron(self.parted, identity(3), "csr")
+        places = np.repeat(self.paths.path_of, 3), np.arange(t.size)
+        g = csr_matrix((t.ravel(), places), shape=(len(self.paths), t.size)) @ C  # dL/du of each path
+        return C.T @ block_diag(list(across), "csr") @ C + g.T @ diags(k) @ g
+
     def row_sums(self, u: np.ndarray) -> np.ndarray:
         """A bound of the sums of |d2E/du2| over the block row of each vertex [N/m]."""
         t, length, _, _, k, T = self._state(u)
