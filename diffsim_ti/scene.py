@@ -247,6 +247,17 @@ class Scene:
         """Whether some chamber holds a given volume."""
         return any(isinstance(term, FilledChamber) for term in self.chambers)
 
+    def places_of_tie(self, tie: Term | str) -> slice:
+        """Places of a spring's or cable's own in `tie_paths`, of one that is given by its name, or as the scene lists it."""
+        first = 0
+        for own in self.ties:
+            given, count = self._given[self.terms.index(own)], len(own.paths(self.mesh))
+            if tie is own or tie is given or (isinstance(tie, str) and tie == own.name):
+                return slice(first, first + count)
+            first += count
+        known = ", ".join(repr(t.name or t) for t in self.ties) or "none"
+        raise ValueError(f"this scene has no spring or cable {tie!r}; it has {known}: give them a name=")
+
     def place_of_chamber(self, chamber: Term | str) -> int:
         """Place in `chambers` of one that is given by its name, or as the scene lists it."""
         for k, own in enumerate(self.chambers):

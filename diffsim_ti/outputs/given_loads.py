@@ -11,6 +11,11 @@ from diffsim_ti.terms import Gravity
 STEPS = Schedule(1.0, 1)  # a pass for each step
 
 
+def at_end(step: int, begins: bool = False) -> tuple[Schedule, int, float]:
+    """(schedule, pass, share of its step) of a frame after so many steps."""
+    return STEPS, max(step - 1, 0), float(step > 0 and not begins)
+
+
 class GivenLoads:
     """Forces [N], shape (num_vertices, 3): weight, dead loads, pressures, chambers, springs, cables and foundations after so
     many steps: those of the last of these as it ends; with `begins`, as it begins."""
@@ -39,13 +44,8 @@ class GivenLoads:
     def _pressures(self, step: int, rows: np.ndarray, begins: bool) -> np.ndarray:
         return self._row(step, rows)[:, 1 if step and not begins else 0]
 
-    @staticmethod
-    def _time(step: int, begins: bool) -> tuple:
-        """(schedule, pass, share of its step) of a frame."""
-        return STEPS, max(step - 1, 0), float(step > 0 and not begins)
-
     def _attached(self, derived: Derived, step: int, begins: bool) -> Attached:
-        return self.attached.at(derived, derived.ties, *self._time(step, begins))
+        return self.attached.at(derived, derived.ties, *at_end(step, begins))
 
     def _masses(self, derived: Derived) -> np.ndarray:
         """What gravity acts on, shape (num_vertices,), or its change."""
@@ -81,7 +81,7 @@ class GivenLoads:
             out += self.follower.at(pressures).jvp(x, dx, self._pressures(step, moved.follower, begins))
         if self.attached:
             attached, du = self._attached(derived, step, begins), dx - moved.rest
-            out += attached.jvp(x - derived.rest, du, moved, *self._time(step, begins))
+            out += attached.jvp(x - derived.rest, du, moved, *at_end(step, begins))
         return out
 
     def vjp(
@@ -99,7 +99,7 @@ class GivenLoads:
             self._dead(step, adj.forces, begins)[:] += w[self.loaded]
         out = np.zeros(x.shape)
         if self.attached:
-            out += self._attached(derived, step, begins).vjp(x - derived.rest, w, adj, *self._time(step, begins))
+            out += self._attached(derived, step, begins).vjp(x - derived.rest, w, adj, *at_end(step, begins))
             adj.rest -= out
         if self.follower is None:
             return out
