@@ -301,6 +301,10 @@ def test_a_stiff_gas_counts_in_the_stable_step_and_forces_of_loads_do_not():
     assert hard.stable_dt(tight=True) < 0.6 * soft.stable_dt(tight=True)
     for solver in (soft, hard):
         assert solver.stable_dt() <= solver.stable_dt(tight=True)
+    pumped = [hollow([gas(pressure=how, outside=3e7)]) for how in ([1.0, 3e7], ([0.0, 1.0], [1.0, 3e7]))]
+    for of in pumped:  # in a later step
+        assert ds.stable_dt(of) == pytest.approx(hard.stable_dt(tight=True), rel=1e-6)
+        assert ds.stable_dt(of, tight=False) == pytest.approx(hard.stable_dt(), rel=1e-9)
     solver = ds.VelocityVerletSolver(hollow([ds.Pressure(1e3, "cavity"), gas()]), dt=1e-4)
     sim = ds.Simulator(solver)
     sim.run(2)

@@ -369,6 +369,26 @@ def test_the_stable_step_is_that_of_the_matrices(stiff):
         ds.VelocityVerletSolver(of, dt=1.01 * limit)
 
 
+def test_the_stable_step_sees_all_that_comes_over_time():
+    """Keyframes and steps at once, functions when a run samples them: the stiffest counts, not what is there at time 0."""
+    place = lidded().vertices[0] - 0.01
+    pull = lambda how: ds.Scene(  # noqa: E731
+        lidded(), ds.StableNeoHookean(1e3, 0.3), 1000.0, ds.Cable([0, ds.Anchor(place)], tension=how), precision="f64"
+    )
+    limit, slow = ds.stable_dt(pull(3e3)), ds.stable_dt(pull(1.0))
+    assert limit < 0.5 * slow
+    for how in ([1.0, 3e3, 2.0], ([0.0, 1.0, 2.0], [1.0, 3e3, 5.0])):
+        assert ds.stable_dt(pull(how)) == pytest.approx(limit, rel=1e-6)
+        assert ds.stable_dt(pull(how), tight=False) == pytest.approx(ds.stable_dt(pull(3e3), tight=False), rel=1e-9)
+        with pytest.raises(ValueError, match="exceeds the stable step"):
+            ds.SemiImplicitSolver(pull(how), dt=1.01 * limit)
+    grows = pull(lambda t: 1.0 + 3e3 * t / (9 * limit))
+    solver = ds.SemiImplicitSolver(grows, dt=1.01 * limit)
+    ds.Rollout(solver, 3)
+    with pytest.raises(ValueError, match="exceeds the stable step"):
+        ds.Rollout(solver, 10)
+
+
 @pytest.mark.parametrize("stiff", ["spring", "anchored", "foundation"])  # which are at rest
 def test_noise_grows_beyond_the_stable_step_and_not_below(stiff):
     of, sizes = soft(stiff), []
