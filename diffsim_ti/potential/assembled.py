@@ -35,6 +35,8 @@ def assemble(potential, mass, free):
     if potential.arrays.patches is not None:
         rows, columns, blocks = potential.coupling.entries(potential.patch_gradients())
         places, entries = np.concatenate([places, rows * n + columns]), np.concatenate([entries, blocks.reshape(-1, 9)])
+    each = np.arange(n, dtype=np.int64) * (n + 1)  # also of vertices in no tetrahedron
+    places, entries = np.concatenate([places, each]), np.concatenate([entries, np.zeros((n, 9))])
     places, inverse = np.unique(places, return_inverse=True)
     data = np.stack([np.bincount(inverse, entries[:, k], len(places)) for k in range(9)], 1).reshape(-1, 3, 3)
     rows, columns = places // n, places % n
@@ -42,7 +44,7 @@ def assemble(potential, mass, free):
     data[~(is_free[rows] & is_free[columns])] = 0
     if isinstance(free, FreeDirections):
         data = P[rows] @ data @ P[columns]
-    diagonal = np.searchsorted(places, np.arange(n, dtype=np.int64) * (n + 1))
+    diagonal = np.searchsorted(places, each)
     data[diagonal] += mass[:, :, None] * np.eye(3)
     data[diagonal[~is_free]] = np.eye(3) * (np.abs(data).max() or 1.0)
     if isinstance(free, FreeDirections):
