@@ -276,6 +276,47 @@ MISTAKES = {
 }
 
 
+def grooved() -> ds.Scene:
+    """A groove along x whose rim slides in three planes: the ends x = 0 and x = 0.3, which are parallel, and the top."""
+    mesh = ds.TetrahedralMesh.create_box((4, 4, 3), (0.3, 0.3, 0.2))
+    mesh = ds.TetrahedralMesh(
+        mesh.vertices, mesh.tetrahedra[(np.abs(mesh.centroids[:, 1:] - [0.15, 0.2]) > [0.05, 0.1]).any(1)]
+    )
+    X = mesh.vertices
+    mesh = mesh.with_vertex_set("ends", np.isin(X[:, 0], [0.0, X[:, 0].max()])).with_vertex_set("top", X[:, 2] > 0.199)
+    walls = lambda x, n: (np.abs(x[:, 1] - 0.15) < 0.0501) & (x[:, 2] > 0.0999) & (np.abs(n[:, 0]) < 0.5)  # noqa: E731
+    mesh = mesh.with_surface_set("groove", walls)
+    return ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3), 1000.0, gas_in("groove"), {"ends": "x", "top": "z"})
+
+
+def gas_in(surface) -> ds.GasChamber:
+    return ds.GasChamber(1.1e5, surface)
+
+
+def two_eighths() -> ds.Scene:
+    """Two eighths of spheres as one chamber, each with a rim in three planes of its own."""
+    one = eighth_sphere(layers=1, around=2)
+    n = one.num_vertices
+    X = np.concatenate([one.vertices, one.vertices + [0, 0, 3.0]])
+    mesh = ds.TetrahedralMesh(X, np.concatenate([one.tetrahedra, one.tetrahedra + n]))
+    for name in PLANES:
+        own = one.vertex_indices(name)
+        mesh = mesh.with_vertex_set(name, np.concatenate([own, own + n]))
+    middle = np.where(np.arange(2 * n)[:, None] < n, 0.0, [0, 0, 3.0])
+    inside = np.linalg.norm(X - middle, axis=1) < 1.0001
+    mesh = mesh.with_surface_set("inside", np.flatnonzero(inside[mesh.surface_triangles].all(1)))
+    return ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3), 1000.0, gas_in("inside"), PLANES)
+
+
+MISTAKES |= {
+    "planes without a common point": (grooved, "the rim of the surface lies in planes that share no point"),
+    "rims without a common point": (
+        two_eighths,
+        "two rims lie in planes that share no point: name the cavities one by",
+    ),
+}
+
+
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_mistakes_are_refused(mistake):
     make, message = MISTAKES[mistake]
