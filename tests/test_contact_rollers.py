@@ -46,13 +46,15 @@ def test_rollers_in_a_plane_of_symmetry_change_nothing(solver):
 @solvers
 @pytest.mark.parametrize("damping", [0.0, 0.4])
 def test_energy_never_grows(solver, damping):
-    """Vertices on rails and in planes askew to up to three walls, at any stiffness, speed and step."""
+    """Vertices on rails and in planes askew to up to three walls, or to a rough one, at any stiffness, speed and step."""
     rng, lost = np.random.default_rng(3), []
-    for _ in range(4):
-        normals = rng.uniform([-0.08, 0.3, -0.08], [1, 1, 1], (rng.integers(1, 4), 3))
+    for friction in (0.0, 0.0, 0.0, 0.4, 0.4, 0.4):
+        normals = rng.uniform([-0.08, 0.3, -0.08], [1, 1, 1], (1 if friction else rng.integers(1, 4), 3))
         dt, speed = 10 ** rng.uniform(-3.3, -2), rng.uniform(0.5, 2)
         walls = [
-            ds.HalfSpace(-0.05 * n / np.linalg.norm(n), n, stiffness=10 ** rng.uniform(4, 6), width=0.1, friction=0.3)
+            ds.HalfSpace(
+                -0.05 * n / np.linalg.norm(n), n, stiffness=10 ** rng.uniform(4, 6), width=0.1, friction=friction
+            )
             for n in normals
         ]
         mesh = tetrahedron().with_vertex_set("rail", [0]).with_vertex_set("table", [1]).with_vertex_set("apex", [3])
@@ -63,7 +65,8 @@ def test_energy_never_grows(solver, damping):
         for _ in range(min(60, int(0.4 / speed / dt) + 4)):
             simulator.step()
             energies.append(float(simulator.compute_energy()))
-        assert np.diff(energies).max() < 1e-9 * energies[0]
+        rise = np.diff(energies)
+        assert rise.max() < 1e-9 * energies[0] and (damping or friction or np.abs(rise).max() < 1e-9 * energies[0])
         lost.append(1 - energies[-1] / energies[0])
     assert max(lost) > 1e-4  # friction takes some
 
@@ -142,17 +145,38 @@ def test_contact_forces_have_gradients():
     assert ds.dot_product_test(rollout) < 1e-11
 
 
+@solvers
+def test_of_friction_towards_another_wall_a_share_is_taken(solver):
+    """A rough belt throws vertices on rails that move against a rough wall: every number, and every force on either."""
+    belt = ds.Ground(-0.011, stiffness=1e6, width=0.01, friction=1.5, path=lambda t: [-20 * t, 0, 0], name="belt")
+    wall = ds.HalfSpace([-0.011, 0, 0], [1, 0.2, 0.1], stiffness=1e6, width=0.01, friction=0.3, name="wall")
+    mesh = tetrahedron().with_vertex_set("rail", [0]).with_vertex_set("rest", [1, 2, 3])
+    options = dict(fixed={"rail": [0.1, 0.3, 1.0], "rest": "xyz"}, motion={"rail": lambda t: [0.3 * t, 0.5 * t, t]})
+    scene = points(mesh, [belt, wall], initial_velocities=[-1.0, -6.0, 0.3], precision="f64", **options)
+    parts = [
+        ds.ContactForce(name, part, name=f"{part}_{name}")
+        for name in ("belt", "wall")
+        for part in ("normal", "friction")
+    ]
+    rollout = ds.Rollout(solver(scene, dt=1e-3, contact_damping=0.02), 3, 1, gradients="all", outputs=parts)
+    assert np.abs(rollout.forward()["friction_belt"]).max() > 100
+    assert check_rows(rollout) > 12
+
+
 def test_work_of_supports_that_move_is_counted():
-    """A roller leads a body along a floor that is askew to it: what it does against the pushes is no gain of the steps."""
-    mesh = ds.TetrahedralMesh.create_box(3, size=0.1, origin=(0, 0.0, 0))
-    ground = ds.HalfSpace((0.1, -0.003, 0), (-0.3, 1, 0), width=0.004, stiffness=2000.0)
-    motion = {"xmin": lambda t: [0.05 * np.sin(60 * t), 0, 0]}
-    shares = []
-    scene = ds.Scene(mesh, ds.StableNeoHookean(3e4, 0.3), 1000.0, ground, {"xmin": "x"}, motion, precision="f64")
-    for dt in (2e-4, 1e-4):
-        simulator = ds.Simulator(ds.VelocityVerletSolver(scene, dt=dt, contact_damping=0.0))
-        watch = simulator.workspace.energy_watch
-        watch.every = 10
-        simulator.run(round(0.1 / dt))
-        shares.append(watch.share)
-    assert watch.moving > 1e-3 and shares[0] < 2e-2 and shares[1] < 0.5 * shares[0], shares
+    """A roller leads a body along a rough floor that is askew to it and moves: what both do is no gain of the steps."""
+    mesh = ds.TetrahedralMesh.create_box(3, size=0.1)
+    motion = {"xmin": lambda t: [0.02 * np.sin(60 * t), 0, 0]}
+    for friction, path in ((0.0, None), (0.4, lambda t: [0.3 * t, 0.09 * t, 0.2 * t])):
+        floor = ds.HalfSpace((0, -0.003, 0), (0.3, 1, 0), width=0.004, stiffness=2000.0, friction=friction, path=path)
+        scene = ds.Scene(
+            mesh, ds.StableNeoHookean(3e4, 0.3), 1000.0, [ds.Gravity(), floor], {"xmin": "x"}, motion, precision="f64"
+        )
+        shares = []
+        for dt in (2e-4, 1e-4):
+            simulator = ds.Simulator(ds.VelocityVerletSolver(scene, dt=dt, contact_damping=0.0))
+            watch = simulator.workspace.energy_watch
+            watch.every = 10
+            simulator.run(round(0.1 / dt))
+            shares.append(watch.share)
+        assert watch.moving > 1 and shares[0] < 1e-4 and shares[1] < 0.4 * shares[0], shares

@@ -23,7 +23,7 @@ def note_impulses(self: A, i, v_plus, z, ratio, now: A, scene: A, state: A):
         for c in range(ti.static(self.features.num_staged)):
             o = ti.static(self.features.first_staged) + c
             row, at = ROWS * o, now.into + 2 * o
-            pushed, after = state.stage[row + PUSH, i], self.slide(o, i, v, ratio, state)
+            pushed, after = state.stage[row + PUSH, i], self.slide(o, i, v, ratio, scene, state)
             n = self.normal(state.stage[row + PLANE, i])
             state.impulse[at, i] = state.impulse[at, i] + now.h * pushed.x * n
             state.impulse[at + 1, i] = state.impulse[at + 1, i] + share * (after - v) / scene.inverse_mass[i]
@@ -50,7 +50,7 @@ def note_friction_jvp(self: A, i, v, dv, share, dshare, ratio, dratio, now: A, s
         for g in ti.static(self.features.staged_rough):
             for k in range(g.count):
                 at = now.into + 2 * (g.number + k) + 1
-                after, dafter = self.slide_jvp_of(g, k, i, v, dv, ratio, dratio, now, state, tangent)
+                after, dafter = self.slide_jvp_of(g, k, i, v, dv, ratio, dratio, now, scene, state, tangent)
                 gained = (share * (dafter - dv) + dshare * (after - v)) / inverse + share * tangent.mass[i] * (
                     after - v
                 )
@@ -81,12 +81,12 @@ def seed_of_friction(self: A, c, i, now: A, scene: A, adjoint: A):
 
 
 @ti.func
-def friction_by_mass(self: A, c, i, before, share, ratio, now: A, state: A, adjoint: A):
+def friction_by_mass(self: A, c, i, before, share, ratio, now: A, scene: A, state: A, adjoint: A):
     """Add the adjoint of the mass by the impulse of friction, `before` being the velocity before it."""
     if ti.static(self.features.density):
         if now.into >= 0:
             o, row = ti.static(self.features.first_staged) + c, ti.static(self.features.sums().first("mass"))
-            gained = share * (self.slide(o, i, before, ratio, state) - before)
+            gained = share * (self.slide(o, i, before, ratio, scene, state) - before)
             by = gained.dot(adjoint.impulse[now.into + 2 * o + 1, i])
             adjoint.sums[row, i] = adjoint.sums[row, i] + by
 
@@ -96,7 +96,7 @@ def friction_by_share(self: A, i, v, ratio, now: A, scene: A, state: A, adjoint:
     """Adjoint of the share of friction that the vertex takes, by the impulses."""
     out = ti.cast(0, self.fp)
     for c in range(ti.static(self.features.num_staged)):
-        after = self.slide(ti.static(self.features.first_staged) + c, i, v, ratio, state)
+        after = self.slide(ti.static(self.features.first_staged) + c, i, v, ratio, scene, state)
         out += (after - v).dot(seed_of_friction(self, c, i, now, scene, adjoint))
         v = self.led(i, v, after, scene)
     return out

@@ -18,10 +18,11 @@ def work_of_stage(contact: A, i, v, now: A, scene: A, state: A):
         row = ROWS * (ti.static(contact.features.first_staged) + c)
         wall, after = state.stage[row + WALL, i], v
         if ti.static(len(contact.features.staged_rough) > 0):
-            after = contact.slide(ti.static(contact.features.first_staged) + c, i, v, now.h * inverse, state)
+            after = contact.slide(ti.static(contact.features.first_staged) + c, i, v, now.h * inverse, scene, state)
         pushed = now.h * state.stage[row + PUSH, i].x * contact.normal(state.stage[row + PLANE, i])
+        after = contact.led(i, v, after, scene)
         work += (pushed + (after - v) / inverse).dot(wall)
-        v += contact.may(i, after - v, scene)
+        v = after
     return work
 
 
