@@ -123,7 +123,9 @@ def test_reactions_know_held_volumes(kind):
     else:
         assert_outputs_transposed(rollout)
         of, x = rollout.scene, rollout.forward().positions[-1]
-        rim = np.flatnonzero((x[:, 2] < 1e-9) & np.isin(np.arange(len(x)), of.chambers[0].triangles(of.mesh)))
+        rim = np.flatnonzero(
+            (x[:, 2] < 1e-9) & np.isin(np.arange(len(x)), of.mesh.surface_triangles[of.mesh.surface_indices("cavity")])
+        )
         around = x[rim[np.argsort(np.arctan2(*(x[rim, :2] - x[rim, :2].mean(0)).T))], :2]
         ahead = np.roll(around, -1, 0)
         area = abs((around[:, 0] * ahead[:, 1] - around[:, 1] * ahead[:, 0]).sum()) / 2
