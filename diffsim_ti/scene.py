@@ -190,16 +190,7 @@ class Scene:
 
     def place_of(self, obstacle: Term | str) -> int:
         """Place in `obstacles` of one that is given by its name, or as the scene lists it."""
-        names = [t.name for t in self.obstacles]
-        if isinstance(obstacle, str) and obstacle in names:
-            return names.index(obstacle)
-        for terms in (self.terms, self._given):
-            if obstacle in terms:
-                found = self.terms[terms.index(obstacle)]
-                if found in self.obstacles:
-                    return self.obstacles.index(found)
-        known = ", ".join(repr(t.name or t) for t in self.obstacles) or "none"
-        raise ValueError(f"this scene has no obstacle {obstacle!r}; it has {known}: give obstacles a name=")
+        return self._listed(obstacle, self.obstacles, "obstacle")
 
     def term(self, kind: type) -> Term | None:
         """The scene's first term of a kind, or None."""
@@ -247,25 +238,22 @@ class Scene:
         """Whether some chamber holds a given volume."""
         return any(isinstance(term, FilledChamber) for term in self.chambers)
 
+    def _listed(self, asked: Term | str, own: tuple, kind: str) -> int:
+        """Place among some of its terms of one that is given by its name, or as the scene lists it."""
+        for k, term in enumerate(own):
+            if asked is term or asked is self._given[self.terms.index(term)] or asked == (term.name or term):
+                return k
+        known = ", ".join(repr(t.name or t) for t in own) or "none"
+        raise ValueError(f"this scene has no {kind} {asked!r}; it has {known}: give them a name=")
+
     def places_of_tie(self, tie: Term | str) -> slice:
-        """Places of a spring's or cable's own in `tie_paths`, of one that is given by its name, or as the scene lists it."""
-        first = 0
-        for own in self.ties:
-            given, count = self._given[self.terms.index(own)], len(own.paths(self.mesh))
-            if tie is own or tie is given or (isinstance(tie, str) and tie == own.name):
-                return slice(first, first + count)
-            first += count
-        known = ", ".join(repr(t.name or t) for t in self.ties) or "none"
-        raise ValueError(f"this scene has no spring or cable {tie!r}; it has {known}: give them a name=")
+        """Places of a spring's or cable's own in `tie_paths`."""
+        ends = np.cumsum([0, *(len(own.paths(self.mesh)) for own in self.ties)])
+        return slice(*map(int, ends[self._listed(tie, self.ties, "spring or cable") :][:2]))
 
     def place_of_chamber(self, chamber: Term | str) -> int:
-        """Place in `chambers` of one that is given by its name, or as the scene lists it."""
-        for k, own in enumerate(self.chambers):
-            given = self._given[self.terms.index(own)]
-            if chamber is own or chamber is given or (isinstance(chamber, str) and chamber == own.name):
-                return k
-        known = ", ".join(repr(t.name or t) for t in self.chambers) or "none"
-        raise ValueError(f"this scene has no chamber {chamber!r}; it has {known}: give chambers a name=")
+        """Place of one in `chambers`."""
+        return self._listed(chamber, self.chambers, "chamber")
 
     def chamber_volume(self, chamber: Term | str, positions: ArrayLike | None = None) -> float:
         """Volume [m^3] of a chamber, given by its name or as the scene lists it, at positions [m], default at rest."""
