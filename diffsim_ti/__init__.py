@@ -29,6 +29,8 @@ from diffsim_ti.outputs import (
     Reaction,
     Strain,
     Stress,
+    TieLength,
+    TieTension,
     WorkOfLoads,
 )
 from diffsim_ti.rollout import Frames, Rollout
@@ -123,6 +125,8 @@ __all__ = [
     "ContactTraction",
     "Reaction",
     "Stress",
+    "TieLength",
+    "TieTension",
     "Strain",
     "EnclosedVolume",
     "ChamberPressure",

@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti.inputs import StressPoints
 from diffsim_ti.outputs.body_forces import BodyForces
+from diffsim_ti.potential.attached import Attached
 
 if TYPE_CHECKING:
     from diffsim_ti.scene import Scene
@@ -36,6 +37,7 @@ class Modes:
         Where frequencies coincide each mode takes the mean of its group, which is the one of them that is differentiable:
         the loss must weigh the modes of a group alike, and a group must not be cut by k. "displacements" is the gradient
         by the state, besides. Initial positions and loads have none: chain what moves the state through its own rollout.
+        Of what is given over time the gradient is that of time 0.
         phi . dK phi is the slope of the exact derivatives of phi . forces along phi, by differences of fourth order whose
         error is 1e-10 of it.
 
@@ -55,15 +57,15 @@ class Modes:
             if by[group[0]] and not abs(self.frequencies[group[0]]) > 0:
                 raise ValueError(f"modes {group} are motions without stiffness: their frequency 0 has no gradient")
         body = BodyForces(self.scene)
-        values = self.scene.inputs.values
-        derived = body.load(values)
+        values = self.scene.inputs.at_times([0.0])
+        derived, attached = body.load(values), Attached.of(self.scene)
         total, by_state = derived.zeros(), np.zeros_like(self.displacements)
         for group in self.groups:
             if not by[group[0]]:
                 continue
             weight = by[group[0]] / (8 * np.pi**2 * abs(self.frequencies[group[0]]))
             for i in group:
-                slope, by_u = _slope(body, self.displacements, self.shapes[i], derived)
+                slope, by_u = _slope(body, attached, self.displacements, self.shapes[i], derived)
                 for name, part in slope.parts().items():
                     if part is not None:
                         setattr(total, name, getattr(total, name) + weight * part)
@@ -80,20 +82,37 @@ class Modes:
         total.element_masses = total.element_masses + weight * at @ np.swapaxes(at, 1, 2)
 
 
-def _slope(body: BodyForces, u: np.ndarray, phi: np.ndarray, derived):
+FOURTH_ORDER = ((-2, 1 / 12), (-1, -8 / 12), (1, 8 / 12), (2, -1 / 12))  # shifts and weights of a difference
+
+
+def _slope(body: BodyForces, attached: Attached | None, u: np.ndarray, phi: np.ndarray, derived):
     """Derivatives of phi . K phi, of what kernels read and of u."""
     X, H = derived.rest, StressPoints.of(body.scene.mesh, derived).displacement_gradients(phi)
     step = 2e-3 / max(np.abs(H).max(), 1e-300)  # a strain that a law's third derivatives resolve
     total, by_u, v = derived.zeros(), np.zeros_like(X), np.zeros_like(X)
-    for shift, weight in ((-2, 1), (-1, -8), (1, 8), (2, -1)):
+    for shift, weight in FOURTH_ORDER:
         body.place(u + shift * step * phi, v)
         adjoint = body.adjoint()
         own, _ = body.vjp(phi, adjoint)
-        found, weight = adjoint.collect(), -weight / (12 * step)
+        found, weight = adjoint.collect(), -weight / step
         by_u += weight * own
         for name in ("coefficients", "gradients", "volumes"):
             setattr(total, name, getattr(total, name) + weight * getattr(found, name))
+    if attached is not None:
+        by_u += _slope_of_attached(attached.at_start(derived), u, phi, derived, total)
     return total, by_u
+
+
+def _slope_of_attached(attached: Attached, u: np.ndarray, phi: np.ndarray, derived, total) -> np.ndarray:
+    """The same of springs, cables and foundations; adds what kernels read to `total`."""
+    step, by_u = 2e-3 / attached.turning(u, phi), np.zeros_like(u)
+    for shift, weight in FOURTH_ORDER:
+        found = derived.zeros()
+        by_u -= weight / step * attached.vjp_at_start(u + shift * step * phi, phi, found)
+        for name in ("ties", "tie_segments", "foundation"):
+            if (part := getattr(found, name)) is not None:
+                setattr(total, name, getattr(total, name) - weight / step * part)
+    return by_u
 
 
 def free_directions(scene: "Scene"):
@@ -103,6 +122,7 @@ def free_directions(scene: "Scene"):
 
     held = np.zeros((scene.mesh.num_vertices, 3, 3))
     held[scene.held] = scene.supports.held
+    held[scene.mesh.unused_vertices] = np.eye(3)  # which have no mass
     values, vectors = np.linalg.eigh(held)  # of a vertex that is free or held wholly, the axes
     vertex, which = np.nonzero(values < 0.5)
     rows = 3 * vertex[:, None] + np.arange(3)
@@ -116,9 +136,9 @@ def free_directions(scene: "Scene"):
 def modes(scene: "Scene", k: int, displacements: ArrayLike | None = None) -> Modes:
     """The k lowest modes of small vibrations of a body about a state: K phi = lambda M phi, f = sqrt(lambda) / 2 pi.
 
-    K: `scene.stiffness_matrix(displacements)`, of the body's stress at displacements [m] from the rest shape, default none;
-    M: `scene.mass_matrix()`, lumped, or consistent of ten-node tetrahedra; vertices do not move where they are held, and
-    what presses or loads the body is not in K.
+    K: `scene.stiffness_matrix(displacements)`, of the body's stress, springs, cables and foundations at displacements [m]
+    from the rest shape, default none; M: `scene.mass_matrix()`, lumped, or consistent of ten-node tetrahedra; vertices do
+    not move where they are held, and obstacles and pressures are not in K.
     A body that is not fixed has six frequencies of 0, its rigid motions, with k counting them. Everything is in float64.
 
     Raises ValueError for k outside 1 .. the number of free unknowns, shapes that do not fit, or a law with rates or a state.

@@ -190,16 +190,7 @@ class Scene:
 
     def place_of(self, obstacle: Term | str) -> int:
         """Place in `obstacles` of one that is given by its name, or as the scene lists it."""
-        names = [t.name for t in self.obstacles]
-        if isinstance(obstacle, str) and obstacle in names:
-            return names.index(obstacle)
-        for terms in (self.terms, self._given):
-            if obstacle in terms:
-                found = self.terms[terms.index(obstacle)]
-                if found in self.obstacles:
-                    return self.obstacles.index(found)
-        known = ", ".join(repr(t.name or t) for t in self.obstacles) or "none"
-        raise ValueError(f"this scene has no obstacle {obstacle!r}; it has {known}: give obstacles a name=")
+        return self._listed(obstacle, self.obstacles, "obstacle")
 
     def term(self, kind: type) -> Term | None:
         """The scene's first term of a kind, or None."""
@@ -247,14 +238,22 @@ class Scene:
         """Whether some chamber holds a given volume."""
         return any(isinstance(term, FilledChamber) for term in self.chambers)
 
-    def place_of_chamber(self, chamber: Term | str) -> int:
-        """Place in `chambers` of one that is given by its name, or as the scene lists it."""
-        for k, own in enumerate(self.chambers):
-            given = self._given[self.terms.index(own)]
-            if chamber is own or chamber is given or (isinstance(chamber, str) and chamber == own.name):
+    def _listed(self, asked: Term | str, own: tuple, kind: str) -> int:
+        """Place among some of its terms of one that is given by its name, or as the scene lists it."""
+        for k, term in enumerate(own):
+            if asked is term or asked is self._given[self.terms.index(term)] or asked == (term.name or term):
                 return k
-        known = ", ".join(repr(t.name or t) for t in self.chambers) or "none"
-        raise ValueError(f"this scene has no chamber {chamber!r}; it has {known}: give chambers a name=")
+        known = ", ".join(repr(t.name or t) for t in own) or "none"
+        raise ValueError(f"this scene has no {kind} {asked!r}; it has {known}: give them a name=")
+
+    def places_of_tie(self, tie: Term | str) -> slice:
+        """Places of a spring's or cable's own in `tie_paths`."""
+        ends = np.cumsum([0, *(len(own.paths(self.mesh)) for own in self.ties)])
+        return slice(*map(int, ends[self._listed(tie, self.ties, "spring or cable") :][:2]))
+
+    def place_of_chamber(self, chamber: Term | str) -> int:
+        """Place of one in `chambers`."""
+        return self._listed(chamber, self.chambers, "chamber")
 
     def chamber_volume(self, chamber: Term | str, positions: ArrayLike | None = None) -> float:
         """Volume [m^3] of a chamber, given by its name or as the scene lists it, at positions [m], default at rest."""
@@ -292,11 +291,12 @@ class Scene:
         return u
 
     def stiffness_matrix(self, displacements: ArrayLike | None = None):
-        """K = d2E/du2 [N/m] of the body's stress at displacements [m] from the rest shape, default none, shape
-        (num_vertices, 3), as a SciPy CSR matrix of all 3 num_vertices unknowns, x, y, z of vertex 0 first, in float64.
+        """K = d2E/du2 [N/m] of the body's stress, springs, cables and elastic foundations at displacements [m] from the rest
+        shape, default none, shape (num_vertices, 3), as a SciPy CSR matrix of all 3 num_vertices unknowns, x, y, z of vertex
+        0 first, in float64.
 
-        Fixed vertices have their rows: strike them out. What obstacles, self-contact, loads, springs and foundations add is
-        not in it.
+        Fixed vertices have their rows: strike them out. Tensions and lengths over time are those of time 0; a tension T adds
+        T / |d| across its segments d. What obstacles, self-contact and pressures add is not in it.
         Raises ValueError for shapes that do not fit, or a law that reads more than the displacement gradient.
         Zienkiewicz, Taylor, The Finite Element Method, vol. 2, 5th ed., 2000, sec. 10.3.
         """

@@ -17,8 +17,8 @@ AREAS = {
     "implicit steps and equilibria": "implicit implicit_gradients implicit_contact swept solve_report",
     "patches against locking": "locking",
     "ten-node tetrahedra": "reference_element quadratic quadratic_mesh quadratic_loads quadratic_outputs quadratic_solvers",
-    "obstacles and friction": "contact contact_area contact_faces contact_stage contact_crossing contact_friction "
-    "face_friction contact_gradients own_obstacle",
+    "obstacles and friction": "contact contact_area contact_faces contact_stage contact_rollers contact_crossing "
+    "contact_friction face_friction contact_gradients own_obstacle",
     "self-contact": "self_contact self_contact_implicit self_contact_near self_contact_pairs",
     "PyTorch, optimisations": "torch torch_physics torch_solvers seed_snippets optimization",
     "charts, maps, advice": "study study_stability peers",

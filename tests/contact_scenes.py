@@ -61,7 +61,7 @@ def points(mesh, obstacle, mass: float = 1.0, fixed=(3,), terms=(), **options) -
         mesh,
         ds.LinearElastic(1e-6, 0.0),
         4 * mass / mesh.volume,
-        fixed=list(fixed),
+        fixed=fixed if isinstance(fixed, dict) else list(fixed),
         terms=[*terms, *np.atleast_1d(obstacle)],
         **options,
     )

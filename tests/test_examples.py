@@ -28,8 +28,10 @@ def test_identify_beam(capsys):
     assert "E = " in capsys.readouterr().out
 
 
-def test_indentation(capsys):
-    numbers = example("identify/indentation").main()
+def test_indentation(capsys, monkeypatch):
+    indentation = example("identify/indentation")
+    monkeypatch.setattr(indentation, "STEPS", 4)
+    numbers = indentation.main()
     assert max(numbers["errors"].values()) < 0.01 and numbers["runs"] <= 10
     assert max(numbers["spread"]) < 0.01  # standard errors, of numbers in logarithms
     assert "friction = " in capsys.readouterr().out

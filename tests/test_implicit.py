@@ -493,3 +493,25 @@ def test_blas_is_left_as_it_was():
         workspace.newton.solve = lambda *a, **k: (seen.append(set(threads())), solve(*a, **k))[1]
         workspace.advance(0, 1, 1)
         assert seen == [{1}] and threads() == before
+
+
+@pytest.mark.parametrize("where", ["first", "last"])
+@pytest.mark.parametrize("preconditioner", ["multigrid", "block_jacobi"])
+def test_vertices_in_no_tetrahedron_change_nothing(where, preconditioner):
+    """Statics and implicit steps find what they find without them; modes know that they have no mass."""
+    body = ds.TetrahedralMesh.create_box(3)
+    place = 0 if where == "first" else body.num_vertices
+    X = np.insert(body.vertices, place, [[0.3, 0.3, 0.3]], 0)
+    with pytest.warns(UserWarning, match="1 vertex in no tetrahedron"):
+        mesh = ds.TetrahedralMesh(X, body.tetrahedra + (place == 0))
+    for kind in (ds.StaticSolver, ds.ImplicitEulerSolver):
+        ends = []
+        for of in (mesh, body):
+            scene = ds.Scene(
+                of, ds.StableNeoHookean(1e5, 0.3), 1000.0, ds.Gravity(), of.vertices[:, 0] < 1e-9, precision="f64"
+            )
+            ends.append(ds.Rollout(kind(scene, preconditioner=preconditioner), 1).forward().positions[-1])
+        np.testing.assert_allclose(np.delete(ends[0], place, 0), ends[1], rtol=0, atol=1e-10)
+        np.testing.assert_array_equal(ends[0][place], X[place])
+    frequencies = [ds.modes(ds.Scene(of, ds.StableNeoHookean(1e5, 0.3)), 8).frequencies for of in (mesh, body)]
+    np.testing.assert_allclose(frequencies[0][6:], frequencies[1][6:], rtol=1e-9)

@@ -12,7 +12,8 @@ from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.picture import Arrows, Lines, Points, draw, marks_of
 from diffsim_ti.terms.marks import spread
 from diffsim_ti.visual.drawing import Drawing
-from diffsim_ti.visual.glyphs import COLOURS, LENGTH
+from diffsim_ti.visual.extent import Extent
+from diffsim_ti.visual.glyphs import COLOURS, LENGTH, arrow_length, ends
 from diffsim_ti.visual.series import SavedSeries
 from diffsim_ti.writers import Frame, View, open_writer
 
@@ -282,3 +283,23 @@ def test_a_scene_without_them_is_as_before(tmp_path):
         series.write(frame)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["run.pvd", "run_0000.vtu"]
     assert "marks" not in (tmp_path / "run.pvd").read_text() and SavedSeries(tmp_path / "run.pvd").setting.held is None
+
+
+def test_what_frames_span_is_kept_in_little_room():
+    """The box of many frames' arrows, whose scale is known at the end alone, is that of all of them together."""
+    mesh, rng = ds.TetrahedralMesh.create_box(2), np.random.default_rng(0)
+    extent, all_marks = Extent(mesh, "speed"), []
+    for k in range(300):
+        onto = rng.random(5) < 0.5
+        own = [
+            Arrows("load", rng.normal(size=(5, 3)), (1 + 0.01 * k) * rng.normal(size=(5, 3)), onto),
+            Arrows("still", np.ones((2, 3)), np.zeros((2, 3)), np.array([True, False])),
+            Lines("spring", rng.normal(size=(2, 2, 3))),
+            Points("bed", 0.9 * rng.normal(size=(3, 3))),
+        ]
+        extent.add(mesh.vertices, np.zeros(mesh.num_vertices), own)
+        all_marks += own
+    reached = np.concatenate([ends(mark, extent.scale, arrow_length(mesh)).reshape(-1, 3) for mark in all_marks])
+    whole = np.concatenate([mesh.vertices, reached])
+    np.testing.assert_allclose(extent.box, [whole.min(0), whole.max(0)], rtol=1e-12)
+    assert sum(len(rows) for rows in extent._arrows.values()) < 100

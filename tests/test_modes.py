@@ -6,6 +6,7 @@ from scipy.linalg import eigh
 
 import diffsim_ti as ds
 from diffsim_ti import verify
+from diffsim_ti.potential.attached import Attached
 
 E, NU, RHO = 3e6, 0.3, 1200.0
 
@@ -271,6 +272,82 @@ def test_coinciding_frequencies_have_the_gradient_of_their_mean():
     assert slope == pytest.approx(differences, rel=1e-6)
     with pytest.raises(ValueError, match="of which only the mean has a gradient"):
         found.gradients(np.eye(12)[pairs[0][0]])
+
+
+def held_up(mesh, **numbers) -> ds.Scene:
+    """A block between springs, tendons with and without stiffness, a spring without length, and two foundations."""
+    top = mesh.with_surface_set("lid", lambda x, n: n[:, 1] > 0.9)
+    given = dict(stiffness=9e3, tension=400.0, length=0.3, elastic=8e3, normal=3e6, tangential=1e6) | numbers
+    inner = numbers.get("inner", np.array([0.11, 0.05, 0.03]))
+    terms = [
+        ds.Spring([0, 1], [20, 14], given["stiffness"], tension=5.0),
+        ds.Spring(4, ds.Anchor(BLOCK.vertices[4]), 3e3),
+        ds.Cable([3, inner, 26, ds.Anchor([0.5, 0.3, 0.2])], given["tension"], name="tendon"),
+        ds.Cable([2, 15, 8], length=given["length"], stiffness=given["elastic"], name="rope"),
+        ds.Cable([2, 21], length=9.0, stiffness=1e4, name="slack"),
+        ds.ElasticFoundation(given["normal"], given["tangential"], "lid"),
+        ds.ElasticFoundation(2e4, 0.0, name="bed"),
+    ]
+    return scene_of(top, terms=terms)
+
+
+BLOCK = ds.TetrahedralMesh.create_box(3, size=(0.3, 0.11, 0.08))
+
+
+def test_stiffness_of_what_holds_a_body():
+    """The slope of all forces on it, and one mass on a spring, or between two pulls, as the textbook has them."""
+    scene, u = held_up(BLOCK), bent(BLOCK)
+    attached = Attached.of(scene).at_start(scene.inputs.derive(scene.inputs.values))
+    w, h = np.random.default_rng(0).normal(size=u.shape), 1e-6
+    slope = (attached.forces(u - h * w) - attached.forces(u + h * w)) / (2 * h)
+    bare = scene.replace(terms=())
+    found = ((scene.stiffness_matrix(u) - bare.stiffness_matrix(u)) @ w.ravel()).reshape(-1, 3)
+    assert found == pytest.approx(slope, abs=1e-8 * np.abs(slope).max())
+    soft = ds.TetrahedralMesh.create_box(2, size=0.1)
+    mass, k, T, d = RHO * soft.volume, 700.0, 50.0, 0.4
+    middle = soft.vertices.mean(0)
+    spring = ds.Spring(middle, ds.Anchor(middle + [d, 0, 0]), k)
+    strings = ds.Cable([ds.Anchor(middle - [0, d, 0]), middle, ds.Anchor(middle + [0, d, 0])], T)
+    still = {"xmin": "yz"} | {"xmax": "yz"}  # which leaves the motion along x
+    for term, stiffness in ((spring, k), (strings, 2 * T / d)):
+        scene = ds.Scene(soft, ds.LinearElastic(1e9, 0.0), RHO, term, still, precision="f64")
+        assert ds.modes(scene, 1).frequencies[0] == pytest.approx(np.sqrt(stiffness / mass) / (2 * np.pi), rel=1e-5)
+
+
+def test_gradients_by_what_holds_a_body():
+    """By every number of springs, cables and foundations, the rest shape, and the state that is bent."""
+    by, rng, u = np.array([1.0, -0.5, 0.3]), np.random.default_rng(3), bent(BLOCK)
+    scenes = [held_up(BLOCK), held_up(BLOCK, inner=13)]  # material points stay where they are if the rest shape moves
+    found = [ds.modes(scene, 3, u).gradients(by) for scene in scenes]
+    assert found[0]["slack.stiffness"] == 0 and found[0]["slack.length"] == 0
+    names = dict(
+        stiffness="spring_stiffness",
+        tension="tendon.tension",
+        length="rope.length",
+        elastic="rope.stiffness",
+        normal="foundation_normal",
+        tangential="foundation_tangential",
+    )
+
+    def loss(argument, value):
+        if argument == "displacements":
+            return by @ ds.modes(scenes[0], 3, value).frequencies
+        if argument == "rest_positions":
+            moved = ds.TetrahedralMesh(value, BLOCK.tetrahedra)
+            return by @ ds.modes(held_up(moved, inner=13), 3, u).frequencies
+        return by @ ds.modes(held_up(BLOCK, **{argument: value}), 3, u).frequencies
+
+    for argument in [*names, "displacements", "rest_positions"]:
+        name, fixed = names.get(argument, argument), argument == "rest_positions"
+        base = u if argument == "displacements" else scenes[fixed].inputs.values[name]
+        direction = (1e-3 if base.ndim else 0.1 * float(base)) * rng.normal(size=base.shape)
+        if fixed:
+            direction[4] = 0  # its anchor does not move with it
+        slope, s = (found[fixed][name] * direction).sum(), 2e-2 if base.ndim else 0.1
+        coarse, fine = (
+            (loss(argument, base + t * direction) - loss(argument, base - t * direction)) / (2 * t) for t in (s, s / 2)
+        )
+        assert slope == pytest.approx((4 * fine - coarse) / 3, rel=2e-6), argument
 
 
 def test_what_does_not_fit_is_refused():

@@ -19,7 +19,9 @@ def rollout_of(kind):
     E = np.linspace(4e4, 8e4, mesh.num_tetrahedra) if kind == "verlet" else 5e4
     law = ds.Corotated if kind == "verlet" else ds.StableNeoHookean
     start = {} if kind == "static" else dict(initial_positions=bent(mesh.vertices))
-    scene = ds.Scene(mesh, law(E, 0.3), 900.0, ds.Gravity((3.0, -9.81, 2.0)), "xmin", precision="f64", **start)
+    volume = "patches" if kind == "midpoint" else "tetrahedra"
+    gravity = ds.Gravity((3.0, -9.81, 2.0))
+    scene = ds.Scene(mesh, law(E, 0.3), 900.0, gravity, "xmin", precision="f64", volume=volume, **start)
     solver = {
         "verlet": lambda: ds.VelocityVerletSolver(scene, dt=2e-4),
         "static": lambda: ds.StaticSolver(scene, tolerance=1e-12),

@@ -201,7 +201,7 @@ def print_summary(run: "ForwardRun", setup: float, writing: float, files: list[s
     for retry in seen.retries[-3:]:
         row("", retry if len(retry) < 130 else retry[:127] + "...")
     row("wall time", f"compile and setup {setup:.2f} s, stepping {seen.seconds:.2f} s, writing {writing:.2f} s")
-    row("solves", str(sim.report))
+    row("solves", str(sim.report) if sim.report.steps else "none: explicit steps have no equations to solve")
     each = seen.seconds / substeps
     row("speed", f"{1 / each:.0f} substeps/s, {each / m * 1e9:.1f} ns per tetrahedron and substep")
     for name, energy in (("energy at start", run.energies[0]), ("energy at end", run.energies[-1])):

@@ -8,6 +8,7 @@ import numpy as np
 from diffsim_ti import runtime
 from diffsim_ti.inputs import StressPoints
 from diffsim_ti.mesh.patches import volume_patches
+from diffsim_ti.monitor.stiffest import stiffest
 from diffsim_ti.potential.attached import Attached
 from diffsim_ti.potential.kernels import potential_kernels
 from diffsim_ti.state.schedule import Schedule
@@ -48,11 +49,9 @@ def element_limit(scene: "Scene", values: dict | None = None) -> StepLimit:
 
     mu, lam are the law's small-strain moduli; with volume="patches" lam is the patch's mean. The eigenvalues of the
     assembled system never exceed the largest of its elements (Hughes, The Finite Element Method, 9.1); lumped vertex masses
-    are at least those of the element.
+    are at least those of the element. Gases and cables count with the largest they have over time (stiffest.py).
     """
-    values, material = scene.inputs.values if values is None else values, scene.material
-    if scene.cables:
-        values = scene.inputs.at_times([0.0]) | values
+    values, material = stiffest(scene, scene.inputs.values if values is None else values), scene.material
     mu, lam = material.lame({name: values[name] for name in material.inputs})
     derived = scene.inputs.derive(values)
     if scene.volume == "patches" and np.ndim(lam) and scene.mesh.order == 1:
@@ -87,7 +86,7 @@ def _gas_bound(scene: "Scene", values: dict, derived) -> float:
     free, out = np.delete(np.arange(scene.mesh.num_vertices), scene.fixed), 0.0
     for chamber in scene.chambers:
         names = scene.input_names(chamber)
-        p = np.max(chamber.rows([0.0]) if chamber.keyed else values[names[chamber.plain]])
+        p = np.max(values[names[chamber.plain]])
         V, g = chamber.enclosure.volume(derived.rest), chamber.enclosure.gradient(derived.rest)
         out += float(values[names["gas_exponent"]] * p / V * ((g[free] ** 2).sum(1) / derived.mass[free]).sum())
     return out

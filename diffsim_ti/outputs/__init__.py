@@ -10,6 +10,7 @@ from diffsim_ti.outputs.output import Change, Output
 from diffsim_ti.outputs.reaction import Reaction
 from diffsim_ti.outputs.states import Displacements, Positions, Velocities
 from diffsim_ti.outputs.tensors import Strain, Stress
+from diffsim_ti.outputs.ties import TieLength, TieTension
 from diffsim_ti.outputs.work import WorkOfLoads
 
 __all__ = [
@@ -27,6 +28,8 @@ __all__ = [
     "Reaction",
     "Strain",
     "Stress",
+    "TieLength",
+    "TieTension",
     "Velocities",
     "WorkOfLoads",
 ]

@@ -11,6 +11,7 @@ from diffsim_ti.inputs import ConsistentMass
 from diffsim_ti.materials.evaluate import evaluate
 from diffsim_ti.outputs.deformation import Deformation
 from diffsim_ti.outputs.output import Change, Output
+from diffsim_ti.outputs.patch_pressure import PatchPressure
 
 if TYPE_CHECKING:
     from diffsim_ti.rollout.frames import Frames
@@ -22,7 +23,8 @@ class ElasticEnergy(Output):
 
     sets: tetrahedron sets, by name, indices or mask, for the energy of each; shape (frames, len(sets)). name: how a loss
     calls it. The gradient is exact by all inputs.
-    Raises ValueError for volume="patches", whose pressure is the patch's, and laws with rates or a state.
+    With volume="patches" a tetrahedron has pi theta / 2 of its patch's pressure pi in the place of lam theta^2 / 2.
+    Raises ValueError for laws with rates or a state.
     Holzapfel, Nonlinear Solid Mechanics, 2000, sec. 6.1.
     """
 
@@ -31,13 +33,15 @@ class ElasticEnergy(Output):
 
     def settled(self, scene: "Scene") -> "ElasticEnergy":
         law, mesh = scene.law, scene.mesh
-        if scene.volume != "tetrahedra" or law.reads != ("H",) or law.state_names:
+        if law.reads != ("H",) or law.state_names:
             raise ValueError(
-                f"ElasticEnergy knows laws of the displacement gradient of each tetrahedron, not {type(law).__name__}: take "
-                'volume="tetrahedra", or a law without rates and state'
+                f"ElasticEnergy knows laws of the displacement gradient, not {type(law).__name__}: take a law without rates "
+                "and state"
             )
         out = copy(self)
-        out.scene, out.law, out.all = scene, law, np.arange(mesh.num_tetrahedra)
+        out.scene, out.all = scene, np.arange(mesh.num_tetrahedra)
+        out.patched = scene.volume == "patches"
+        out.law = law.base if out.patched else law
         masks = np.ones((1, mesh.num_tetrahedra))
         if self.sets is not None:
             masks = np.zeros((len(self.sets), mesh.num_tetrahedra))
@@ -51,13 +55,16 @@ class ElasticEnergy(Output):
         return (num_frames,) if self.sets is None else (num_frames, len(self.sets))
 
     def _densities(self, frames):
-        """(what kernels read, deformation, psi, P, dpsi/dp), the last three by frames and points."""
+        """(what kernels read, deformation, psi, P, dpsi/dp, pressures of patches or None), by frames and points: with
+        patches psi is what each point has by itself."""
         derived = self.scene.inputs.derive(frames.inputs)
         deformation = Deformation.of(frames, derived, self.scene.mesh, self.all)
         F, K = deformation.F, len(self.law.coefficient_names)
-        p = np.tile(self._at_points(derived.coefficients), (len(F), 1))
-        psi, P, by = (x.astype(np.float64) for x in evaluate(self.law, F.reshape(-1, 3, 3), p))
-        return derived, deformation, psi.reshape(F.shape[:2]), P.reshape(F.shape), by.reshape(*F.shape[:2], K)
+        at = PatchPressure.of(self.scene, derived, deformation.H) if self.patched else None
+        p = self._at_points(derived.coefficients) if at is None else at.kept
+        psi, P, by = evaluate(self.law, F.reshape(-1, 3, 3), np.tile(p, (len(F), 1)))
+        psi, P, by = (x.astype(np.float64) for x in (psi, P, by))
+        return derived, deformation, psi.reshape(F.shape[:2]), P.reshape(F.shape), by.reshape(*F.shape[:2], K), at
 
     def _at_points(self, coefficients: np.ndarray) -> np.ndarray:
         """Of all points, shape (points, K)."""
@@ -65,27 +72,34 @@ class ElasticEnergy(Output):
         return np.repeat(np.broadcast_to(coefficients, (len(self.all), K)), self.points, 0)
 
     def value(self, frames: "Frames") -> np.ndarray:
-        derived, _, psi, *_ = self._densities(frames)
+        derived, _, psi, _, _, at = self._densities(frames)
+        psi = psi if at is None else psi + 0.5 * at.value * at.theta
         return ((psi * derived.volumes.ravel()) @ self.masks.T).reshape(self.shape(len(psi)))
 
     def jvp(self, frames: "Frames", change: Change) -> np.ndarray:
-        derived, deformation, psi, P, by = self._densities(frames)
+        derived, deformation, psi, P, by, at = self._densities(frames)
         moved = self.scene.inputs.derive_jvp(frames.inputs, change.inputs)
         du = (np.zeros(frames.positions.shape) if change.positions is None else change.positions) - moved.rest
-        dpsi = (P * deformation.jvp(du, moved.gradients)).sum((2, 3))
-        dpsi = dpsi + (by * self._at_points(moved.coefficients)).sum(2)
-        return ((dpsi * derived.volumes.ravel() + psi * moved.volumes.ravel()) @ self.masks.T).reshape(
-            self.shape(len(psi))
-        )
+        dH, dp, dV = deformation.jvp(du, moved.gradients), self._at_points(moved.coefficients), moved.volumes.ravel()
+        dpsi = (P * dH).sum((2, 3)) + (by * (dp if at is None else at.without_lam(dp))).sum(2)
+        if at is not None:
+            psi = psi + 0.5 * at.value * at.theta
+            dpsi = dpsi + 0.5 * (at.jvp(dH, dp, dV) * at.theta + at.value * at.theta_jvp(dH))
+        return ((dpsi * derived.volumes.ravel() + psi * dV) @ self.masks.T).reshape(self.shape(len(psi)))
 
     def vjp(self, frames: "Frames", seed: np.ndarray) -> Change:
-        derived, deformation, psi, P, by = self._densities(frames)
+        derived, deformation, psi, P, by, at = self._densities(frames)
         adjoint, weight = derived.zeros(), seed.reshape(len(psi), -1) @ self.masks  # by frames and points
         scaled = weight * derived.volumes.ravel()
-        positions, adjoint.gradients = deformation.vjp(scaled[..., None, None] * P, frames.positions.shape[1])
-        by_p = (scaled[..., None] * by).sum(0).reshape(len(self.all), self.points, -1).sum(1)
+        H_adj, by_p, by_V = scaled[..., None, None] * P, (scaled[..., None] * by).sum(0), (weight * psi).sum(0)
+        if at is not None:
+            by_theta, by_lam, own = at.vjp(0.5 * scaled * at.theta)
+            H_adj = H_adj + (by_theta + 0.5 * scaled * at.value)[..., None, None] * at.G
+            by_p, by_V = at.split_vjp(by_p, by_lam), by_V + own + (0.5 * weight * at.value * at.theta).sum(0)
+        by_p = by_p.reshape(len(self.all), self.points, -1).sum(1)
+        positions, adjoint.gradients = deformation.vjp(H_adj, frames.positions.shape[1])
         adjoint.coefficients = by_p if derived.coefficients.ndim == 2 else by_p.sum(0)
-        adjoint.volumes, adjoint.rest = (weight * psi).sum(0).reshape(derived.volumes.shape), -positions.sum(0)
+        adjoint.volumes, adjoint.rest = by_V.reshape(derived.volumes.shape), -positions.sum(0)
         inputs = self.scene.inputs.derive_vjp(frames.inputs, adjoint, tuple(frames.inputs))
         return Change(positions=positions, inputs=inputs)
 

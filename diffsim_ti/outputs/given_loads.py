@@ -11,16 +11,19 @@ from diffsim_ti.terms import Gravity
 STEPS = Schedule(1.0, 1)  # a pass for each step
 
 
+def at_end(step: int, begins: bool = False) -> tuple[Schedule, int, float]:
+    """(schedule, pass, share of its step) of a frame after so many steps."""
+    return STEPS, max(step - 1, 0), float(step > 0 and not begins)
+
+
 class GivenLoads:
     """Forces [N], shape (num_vertices, 3): weight, dead loads, pressures, chambers, springs, cables and foundations after so
-    many steps: those of the last of these as it ends; with `begins`, as it begins."""
+    many steps: those of the last of these as it ends; with `begins`, as it begins.
+
+    held: the pressures [Pa] of the scene's chambers in a frame, of which those are taken that hold a volume.
+    """
 
     def __init__(self, scene, weight: bool = True):
-        if scene.holds_volumes:
-            raise ValueError(
-                "the pressure of a FilledChamber is no function of a frame's state, so that reactions in its scene are not "
-                "known: give it as a GasChamber or a Pressure of what ChamberPressure found"
-            )
         self.scene, self.follower, self.elements = scene, following(scene), scene.mesh.elements
         gravity = scene.term(Gravity) if weight else None
         self.gravity = None if gravity is None else scene.inputs.parameters.of(gravity)
@@ -39,13 +42,8 @@ class GivenLoads:
     def _pressures(self, step: int, rows: np.ndarray, begins: bool) -> np.ndarray:
         return self._row(step, rows)[:, 1 if step and not begins else 0]
 
-    @staticmethod
-    def _time(step: int, begins: bool) -> tuple:
-        """(schedule, pass, share of its step) of a frame."""
-        return STEPS, max(step - 1, 0), float(step > 0 and not begins)
-
     def _attached(self, derived: Derived, step: int, begins: bool) -> Attached:
-        return self.attached.at(derived, derived.ties, *self._time(step, begins))
+        return self.attached.at(derived, derived.ties, *at_end(step, begins))
 
     def _masses(self, derived: Derived) -> np.ndarray:
         """What gravity acts on, shape (num_vertices,), or its change."""
@@ -53,7 +51,25 @@ class GivenLoads:
             return derived.mass
         return np.bincount(self.elements.ravel(), derived.element_masses.sum(2).ravel(), len(derived.mass))
 
-    def forces(self, derived: Derived, x: np.ndarray, step: int, begins: bool = False) -> np.ndarray:
+    def _following(self, derived: Derived, step: int, begins: bool, held):
+        """Pressures and chambers of a frame."""
+        follower = self.follower.at(self._pressures(step, derived.follower, begins))
+        for k in follower.held if held is not None else ():
+            follower.laws[k].multiplier = float(held[k])  # without a penalty, gamma: the pressure whatever the volume
+        return follower
+
+    def held_jvp(self, x: np.ndarray, change: np.ndarray) -> np.ndarray:
+        """Change of the forces for that of the pressures of held volumes."""
+        return sum((change[k] * self.follower.unit_forces(x, k) for k in self.follower.held), np.zeros(x.shape))
+
+    def held_vjp(self, x: np.ndarray, w: np.ndarray) -> np.ndarray:
+        """Adjoint of the pressures of all chambers, zero of gases, for that of the forces."""
+        out = np.zeros(len(self.scene.chambers))
+        for k in self.follower.held:
+            out[k] = float((self.follower.unit_forces(x, k) * w).sum())
+        return out
+
+    def forces(self, derived: Derived, x: np.ndarray, step: int, begins: bool = False, held=None) -> np.ndarray:
         """At places x [m] after so many steps."""
         out = np.zeros(x.shape)
         if self.gravity is not None:
@@ -61,15 +77,22 @@ class GivenLoads:
         if self.loaded is not None:
             out[self.loaded] += self._dead(step, derived.forces, begins)
         if self.follower is not None:
-            out += self.follower.at(self._pressures(step, derived.follower, begins)).forces(x)
+            out += self._following(derived, step, begins, held).forces(x)
         if self.attached:
             out += self._attached(derived, step, begins).forces(x - derived.rest)
         return out
 
     def jvp(
-        self, derived: Derived, moved: Derived, x: np.ndarray, dx: np.ndarray, step: int, begins: bool = False
+        self,
+        derived: Derived,
+        moved: Derived,
+        x: np.ndarray,
+        dx: np.ndarray,
+        step: int,
+        begins: bool = False,
+        held=None,
     ) -> np.ndarray:
-        """Their change."""
+        """Their change, at held pressures."""
         out = np.zeros(x.shape)
         if self.gravity is not None:
             g, dg = (of.parameters[self.gravity][:3] for of in (derived, moved))
@@ -77,17 +100,17 @@ class GivenLoads:
         if self.loaded is not None:
             out[self.loaded] += self._dead(step, moved.forces, begins)
         if self.follower is not None:
-            pressures = self._pressures(step, derived.follower, begins)
-            out += self.follower.at(pressures).jvp(x, dx, self._pressures(step, moved.follower, begins))
+            follower = self._following(derived, step, begins, held)
+            out += follower.jvp(x, dx, self._pressures(step, moved.follower, begins))
         if self.attached:
             attached, du = self._attached(derived, step, begins), dx - moved.rest
-            out += attached.jvp(x - derived.rest, du, moved, *self._time(step, begins))
+            out += attached.jvp(x - derived.rest, du, moved, *at_end(step, begins))
         return out
 
     def vjp(
-        self, derived: Derived, x: np.ndarray, w: np.ndarray, step: int, adj: Derived, begins: bool = False
+        self, derived: Derived, x: np.ndarray, w: np.ndarray, step: int, adj: Derived, begins: bool = False, held=None
     ) -> np.ndarray:
-        """Adjoint of x for that of the forces; adds those of all else to `adj`."""
+        """Adjoint of x for that of the forces; adds those of all else, but for held pressures, to `adj`."""
         if self.gravity is not None:
             by_mass = w @ derived.parameters[self.gravity][:3]
             if derived.element_masses is None:
@@ -99,10 +122,10 @@ class GivenLoads:
             self._dead(step, adj.forces, begins)[:] += w[self.loaded]
         out = np.zeros(x.shape)
         if self.attached:
-            out += self._attached(derived, step, begins).vjp(x - derived.rest, w, adj, *self._time(step, begins))
+            out += self._attached(derived, step, begins).vjp(x - derived.rest, w, adj, *at_end(step, begins))
             adj.rest -= out
         if self.follower is None:
             return out
-        follower = self.follower.at(self._pressures(step, derived.follower, begins))
+        follower = self._following(derived, step, begins, held)
         self._pressures(step, adj.follower, begins)[:] += follower.pressures_vjp(x, w)
         return out + follower.vjp(x, w)

@@ -26,7 +26,7 @@ class Reaction(Output):
     So in equilibrium the reactions of all supports, the weight, the loads and the forces of obstacles add up to zero where
     supports share no vertices, or hold them in directions perpendicular to each other.
     What obstacles and self-contact do to held vertices themselves is not in it (ContactForce has the first), nor is the
-    inertia of vertices that a prescribed motion accelerates.
+    inertia of vertices that a prescribed motion accelerates. A held volume pushes with what `ChamberPressure` says of it.
 
     support: which of the held vertices, by a vertex set's name, indices, a mask or a list of names; None: all.
     about: the moment [N m] about this point [m] instead: sum (x_i - about) x R_i. per_vertex: of each vertex, ordered as
@@ -38,7 +38,7 @@ class Reaction(Output):
     Belytschko, Liu, Moran, Nonlinear Finite Elements for Continua and Structures, 2000, sec. 4.4.
     """
 
-    unit = "N"
+    unit, reads_chamber_pressures = "N", True
 
     def __init__(
         self,
@@ -78,12 +78,18 @@ class Reaction(Output):
     def _state(self, frames, k: int) -> tuple[np.ndarray, np.ndarray]:
         return frames.displacements[k].astype(np.float64), frames.velocities[k].astype(np.float64)
 
+    def _pressures(self, frames, k: int) -> np.ndarray | None:
+        """Of chambers that hold a volume in frame k."""
+        return frames.chamber_pressures[k] if self.scene.holds_volumes else None
+
     def _held(self, frames) -> np.ndarray:
         """What holds the vertices, shape (frames, k, 3)."""
         derived, out = self.body.load(frames.inputs), []
         for k, x in enumerate(frames.positions.astype(np.float64)):
             self.body.place(*self._state(frames, k))
-            f = self.body.forces() + self.loads.forces(derived, x, int(frames.steps[k]))
+            f = self.body.forces() + self.loads.forces(
+                derived, x, int(frames.steps[k]), held=self._pressures(frames, k)
+            )
             out.append(-self._onto(f[self.vertices]))
         return np.stack(out)
 
@@ -109,7 +115,9 @@ class Reaction(Output):
             self.body.place(*self._state(frames, k))
             df = self.body.jvp(dx[k] - moved.rest, dv[k], tangent)
             x = frames.positions[k].astype(np.float64)
-            df = df + self.loads.jvp(derived, moved, x, dx[k], int(frames.steps[k]))
+            df = df + self.loads.jvp(derived, moved, x, dx[k], int(frames.steps[k]), held=self._pressures(frames, k))
+            if change.chamber_pressures is not None and self.scene.holds_volumes:
+                df = df + self.loads.held_jvp(x, change.chamber_pressures[k])
             out.append(-self._onto(df[self.vertices]))
         if self.about is None:
             return self._of(frames, np.stack(out))
@@ -125,12 +133,15 @@ class Reaction(Output):
             w[:, self.vertices] = seed if self.per_vertex else seed[:, None]
         w[:, self.vertices] = -self._onto(w[:, self.vertices])
         derived, adjoint = self.body.load(frames.inputs), self.body.adjoint()
-        rest, by_loads = np.zeros(positions.shape[1:]), derived.zeros()
+        rest, by_loads, by_held = np.zeros(positions.shape[1:]), derived.zeros(), []
         for k in range(len(w)):
             self.body.place(*self._state(frames, k))
             by_u, by_v = self.body.vjp(w[k], adjoint)
             x = frames.positions[k].astype(np.float64)
-            positions[k] += by_u + self.loads.vjp(derived, x, w[k], int(frames.steps[k]), by_loads)
+            held, step = self._pressures(frames, k), int(frames.steps[k])
+            positions[k] += by_u + self.loads.vjp(derived, x, w[k], step, by_loads, held=held)
+            if held is not None:
+                by_held.append(self.loads.held_vjp(x, w[k]))
             velocities[k] += by_v
             rest -= by_u
         adj = adjoint.collect()
@@ -140,4 +151,4 @@ class Reaction(Output):
         for name in ("forces", "follower", "ties", "tie_segments", "foundation"):
             setattr(adj, name, getattr(by_loads, name))
         inputs = self.scene.inputs.derive_vjp(frames.inputs, adj, tuple(frames.inputs))
-        return Change(positions, velocities, inputs)
+        return Change(positions, velocities, inputs, chamber_pressures=np.stack(by_held) if by_held else None)

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.outputs.deformation import NUMBERS, Deformation, PointMeans
-from diffsim_ti.outputs.law_on_arrays import LawOnArrays
 from diffsim_ti.outputs.output import Change, Output
+from diffsim_ti.outputs.stresses import PatchStress, TetrahedronStress
 
 if TYPE_CHECKING:
     from diffsim_ti.rollout.frames import Frames
@@ -39,7 +39,7 @@ class _Tensors(Output):
         out.scene, out.num_vertices, out.means, out.points = scene, mesh.num_vertices, None, mesh.reference.num_points
         every = isinstance(self.at, str)
         out.chosen = np.arange(mesh.num_tetrahedra) if every else mesh.locate(self.at).tetrahedra
-        out.count = len(out.chosen)
+        out.read, out.count = out.chosen, len(out.chosen)  # read: whose deformation is looked at
         if every and self.at == "vertices":
             out.means, out.count = PointMeans.of_vertices(mesh), mesh.num_vertices
         elif out.points > 1:
@@ -63,7 +63,7 @@ class _Tensors(Output):
 
     def _start(self, frames):
         derived = self.scene.inputs.derive(frames.inputs)
-        deformation = Deformation.of(frames, derived, self.scene.mesh, self.chosen)
+        deformation = Deformation.of(frames, derived, self.scene.mesh, self.read)
         T = self._tensors(deformation, derived)
         return derived, deformation, T, T if self.means is None else self.means.value(T, self._volumes(derived))
 
@@ -79,7 +79,7 @@ class _Tensors(Output):
         derived, deformation, T, shown = self._start(frames)
         moved = self.scene.inputs.derive_jvp(frames.inputs, change.inputs)
         du = (np.zeros(frames.positions.shape) if change.positions is None else change.positions) - moved.rest
-        dT = self._tensors_jvp(deformation, derived, deformation.jvp(du, moved.gradients[self.chosen]), moved)
+        dT = self._tensors_jvp(deformation, derived, deformation.jvp(du, moved.gradients[self.read]), moved)
         if self.means is not None:
             dT = self.means.jvp(T, dT, self._volumes(derived), self._volumes(moved))
         return NUMBERS[self.numbers][2](shown, dT) if self.numbers else dT
@@ -92,7 +92,7 @@ class _Tensors(Output):
             np.add.at(adjoint.volumes, self.chosen, by_volumes.reshape(-1, *adjoint.volumes.shape[1:]))
         H_adj = self._tensors_vjp(deformation, derived, seed, adjoint)
         positions, by_B = deformation.vjp(H_adj, self.num_vertices)
-        np.add.at(adjoint.gradients, self.chosen, by_B)
+        np.add.at(adjoint.gradients, self.read, by_B)
         adjoint.rest = -positions.sum(0)
         inputs = self.scene.inputs.derive_vjp(frames.inputs, adjoint, tuple(frames.inputs))
         return Change(positions=positions, inputs=inputs)
@@ -138,8 +138,10 @@ class Stress(_Tensors):
     stress; where it is 0 it has a kink, and its gradient is given as 0.
     The gradient is exact by all inputs; in single precision the stress has an error of some 1e-6 of the modulus.
 
+    With volume="patches" its pressure is that of the tetrahedron's patch.
+
     Raises ValueError for another kind or `at`, both of these, or one of them of P, which is not symmetric, points outside
-    the mesh, volume="patches", whose pressure is the patch's, and laws that read more than the displacement gradient.
+    the mesh, and laws that read more than the displacement gradient.
     Holzapfel, Nonlinear Solid Mechanics, 2000, sec. 3.1.
     """
 
@@ -160,50 +162,40 @@ class Stress(_Tensors):
 
     def settled(self, scene: "Scene") -> "Stress":
         law = scene.law
-        if scene.volume != "tetrahedra" or law.reads != ("H",) or law.state_names:
+        if law.reads != ("H",) or law.state_names:
             raise ValueError(
-                f"Stress knows laws of the displacement gradient of each tetrahedron, not {type(law).__name__}: take "
-                'volume="tetrahedra", or a law without rates and state'
+                f"Stress knows laws of the displacement gradient, not {type(law).__name__}: take a law without rates and "
+                "state"
             )
         out = super().settled(scene)
-        out.law = LawOnArrays(law)
+        out.stresses = (TetrahedronStress if scene.volume == "tetrahedra" else PatchStress)(scene, out.chosen)
+        out.read = out.stresses.read
         return out
-
-    def _numbers(self, derived, frames: int) -> np.ndarray:
-        """Coefficients at the points of the chosen tetrahedra of all frames, (frames points, K)."""
-        p = np.broadcast_to(derived.coefficients, (self.scene.mesh.num_tetrahedra, self.law.K))[self.chosen]
-        return np.tile(np.repeat(p, self.points, 0), (frames, 1))
-
-    def _tensors(self, deformation, derived):
-        H = deformation.H
-        P = self.law.stress(H.reshape(-1, 3, 3), self._numbers(derived, len(H))).reshape(H.shape)
-        return P if self.kind == "first_piola" else self._cauchy(P, deformation.F)
 
     def _cauchy(self, P, F):
         return P @ np.swapaxes(F, -1, -2) / np.linalg.det(F)[..., None, None]
 
+    def _tensors(self, deformation, derived):
+        P = self.stresses.value(deformation.H, derived)
+        return P if self.kind == "first_piola" else self._cauchy(P, self.stresses.chosen_of(deformation.F))
+
     def _tensors_jvp(self, deformation, derived, dH, change):
-        H, F, p = deformation.H.reshape(-1, 3, 3), deformation.F, self._numbers(derived, len(dH))
-        dP = self.law.jvp(H, dH.reshape(-1, 3, 3), p, self._numbers(change, len(dH))).reshape(dH.shape)
+        dP = self.stresses.jvp(deformation.H, dH, derived, change)
         if self.kind == "first_piola":
             return dP
-        P, J = self.law.stress(H, p).reshape(dH.shape), np.linalg.det(F)[..., None, None]
+        F, dH = (self.stresses.chosen_of(x) for x in (deformation.F, dH))
+        P, J = self.stresses.value(deformation.H, derived), np.linalg.det(F)[..., None, None]
         grown = np.einsum("...ij,...ji->...", np.linalg.inv(F), dH)[..., None, None]
         Ft, dFt = np.swapaxes(F, -1, -2), np.swapaxes(dH, -1, -2)
         return (dP @ Ft + P @ dFt) / J - grown * self._cauchy(P, F)
 
     def _tensors_vjp(self, deformation, derived, seed, adjoint):
-        H, F, p = deformation.H.reshape(-1, 3, 3), deformation.F, self._numbers(derived, len(seed))
-        P_adj, F_adj = seed, 0.0
+        P_adj, F_adj = seed, np.zeros_like(seed)
         if self.kind == "cauchy":
-            P, J = self.law.stress(H, p).reshape(seed.shape), np.linalg.det(F)[..., None, None]
+            F, P = self.stresses.chosen_of(deformation.F), self.stresses.value(deformation.H, derived)
+            J = np.linalg.det(F)[..., None, None]
             shrunk = (seed * self._cauchy(P, F)).sum((-1, -2))[..., None, None]
             P_adj = seed @ F / J
             F_adj = np.swapaxes(seed, -1, -2) @ P / J - shrunk * np.swapaxes(np.linalg.inv(F), -1, -2)
-        by_H, by_p = self.law.vjp(H, P_adj.reshape(-1, 3, 3), p)
-        by_p = by_p.reshape(len(seed), -1, self.points, self.law.K).sum((0, 2))
-        if derived.coefficients.ndim == 1:
-            adjoint.coefficients = adjoint.coefficients + by_p.sum(0)
-        else:
-            np.add.at(adjoint.coefficients, self.chosen, by_p)
-        return by_H.reshape(seed.shape) + F_adj
+        by_H = self.stresses.vjp(deformation.H, P_adj, derived, adjoint)
+        return by_H + self.stresses.chosen_vjp(F_adj)

@@ -28,7 +28,7 @@ class WorkOfLoads(Output):
     there. What moves held vertices, obstacles and drag do no work of loads.
 
     weight: whether gravity counts. name: how a loss calls it. The gradient is exact by all inputs.
-    Raises ValueError for a scene without such loads.
+    Raises ValueError for a scene without such loads, or with a FilledChamber.
     Belytschko, Liu, Moran, Nonlinear Finite Elements for Continua and Structures, 2000, sec. 6.2.3 (energy balance).
     """
 
@@ -41,6 +41,11 @@ class WorkOfLoads(Output):
         return f"WorkOfLoads(weight={self.weight}, name={self.name!r})"
 
     def settled(self, scene: "Scene") -> "WorkOfLoads":
+        if scene.holds_volumes:
+            raise ValueError(
+                "WorkOfLoads: between frames the pressure of a FilledChamber is not known: give it as a GasChamber or a "
+                "Pressure of what ChamberPressure found"
+            )
         out = copy(self)
         out.scene, out.loads = scene, GivenLoads(scene, weight=self.weight)
         given = out.loads.gravity, out.loads.loaded, out.loads.follower, out.loads.attached or None

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from diffsim_ti.potential.attached import Attached
 from diffsim_ti.potential.free import FreeDirections, mask_of, projectors_of
 from diffsim_ti.potential.potential import Potential
 from diffsim_ti.state.arrays import SceneArrays
@@ -34,6 +35,8 @@ def assemble(potential, mass, free):
     if potential.arrays.patches is not None:
         rows, columns, blocks = potential.coupling.entries(potential.patch_gradients())
         places, entries = np.concatenate([places, rows * n + columns]), np.concatenate([entries, blocks.reshape(-1, 9)])
+    each = np.arange(n, dtype=np.int64) * (n + 1)  # also of vertices in no tetrahedron
+    places, entries = np.concatenate([places, each]), np.concatenate([entries, np.zeros((n, 9))])
     places, inverse = np.unique(places, return_inverse=True)
     data = np.stack([np.bincount(inverse, entries[:, k], len(places)) for k in range(9)], 1).reshape(-1, 3, 3)
     rows, columns = places // n, places % n
@@ -41,7 +44,7 @@ def assemble(potential, mass, free):
     data[~(is_free[rows] & is_free[columns])] = 0
     if isinstance(free, FreeDirections):
         data = P[rows] @ data @ P[columns]
-    diagonal = np.searchsorted(places, np.arange(n, dtype=np.int64) * (n + 1))
+    diagonal = np.searchsorted(places, each)
     data[diagonal] += mass[:, :, None] * np.eye(3)
     data[diagonal[~is_free]] = np.eye(3) * (np.abs(data).max() or 1.0)
     if isinstance(free, FreeDirections):
@@ -52,11 +55,14 @@ def assemble(potential, mass, free):
 
 
 def body_stiffness(scene, displacements: np.ndarray):
-    """d2E/du2 [N/m] of stress at displacements [m], of all vertices alike, as a SciPy CSR matrix."""
-    arrays = SceneArrays(scene)
-    arrays.load(scene.inputs.derive(scene.inputs.values))
+    """d2E/du2 [N/m] of stress, springs, cables and foundations at displacements [m], of all vertices alike, as a SciPy CSR
+    matrix; what changes over time is that of time 0."""
+    arrays, attached = SceneArrays(scene), Attached.of(scene)
+    derived = scene.inputs.derive(scene.inputs.at_times([0.0]))
+    arrays.load(derived)
     potential = Potential(arrays, scene.mesh.tetrahedra, False)
     potential.place(displacements)
     potential.blocks()
     n = scene.mesh.num_vertices
-    return assemble(potential, np.zeros((n, 1)), np.ones((n, 1)))[0].tocsr()
+    own = assemble(potential, np.zeros((n, 1)), np.ones((n, 1)))[0].tocsr()
+    return own if attached is None else (own + attached.at_start(derived).matrix(displacements)).tocsr()

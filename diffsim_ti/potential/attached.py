@@ -7,6 +7,8 @@ from diffsim_ti.inputs.ties import directions
 from diffsim_ti.potential.ties import Ties
 from diffsim_ti.state.schedule import Schedule
 
+START = Schedule(1.0, 1)
+
 
 class Foundation:
     """f = -K u of vertices; `at` says K, shape (k, 3, 3)."""
@@ -53,6 +55,14 @@ class Attached:
         if self.foundation:
             self.foundation.at(values.foundation)
         return self
+
+    def at_start(self, values: Derived) -> "Attached":
+        """As a run begins."""
+        return self.at(values, values.ties, START, 0, 0.0)
+
+    def vjp_at_start(self, u, w, adj: Derived) -> np.ndarray:
+        """`vjp` there."""
+        return self.vjp(u, w, adj, START, 0, 0.0)
 
     def stiffest(self, values: Derived, rows: np.ndarray | None, schedule: Schedule) -> "Attached":
         """With the largest tension and stiffness of each tie in `rows` and its least length: what a step has to follow."""
@@ -110,6 +120,23 @@ class Attached:
         if self.foundation:
             out[self.foundation.vertices] -= self.foundation.forces(w)
         return out
+
+    def matrix(self, u: np.ndarray):
+        """d2E/du2 [N/m] as a SciPy sparse matrix of all unknowns, rows 3 i + d."""
+        from scipy.sparse import coo_matrix
+
+        shape = (u.size, u.size)
+        out = self.ties.matrix(u) if self.ties else coo_matrix(shape)
+        if self.foundation:
+            vertices, axes = self.foundation.vertices, np.arange(3)
+            rows = np.broadcast_to(3 * vertices[:, None, None] + axes[:, None], self.foundation.K.shape)
+            columns = np.broadcast_to(3 * vertices[:, None, None] + axes, self.foundation.K.shape)
+            out = out + coo_matrix((self.foundation.K.ravel(), (rows.ravel(), columns.ravel())), shape=shape)
+        return out.tocsr()
+
+    def turning(self, u: np.ndarray, w: np.ndarray) -> float:
+        """How much a segment of springs and cables is changed by w at most, against its length; of foundations 1."""
+        return max(self.ties.turning(u, w), 1e-300) if self.ties else 1.0
 
     def blocks(self, u: np.ndarray) -> np.ndarray:
         """3x3 diagonal blocks of d2E/du2 [N/m]."""

@@ -98,6 +98,22 @@ class Ties:
         squared = self.parted.multiply(self.parted).T.tocsr()
         return out + (squared @ bare.reshape(-1, 9)).reshape(-1, 3, 3)
 
+    def turning(self, u: np.ndarray, w: np.ndarray) -> float:
+        """The largest |C w| / |d| of segments that have a length."""
+        length, moved = self._state(u)[1], np.linalg.norm(self.parted @ w, axis=1)
+        return float(np.divide(moved, length, out=np.zeros_like(moved), where=length > 0).max(initial=0.0))
+
+    def matrix(self, u: np.ndarray):
+        """d2E/du2 [N/m] as a SciPy sparse matrix, rows 3 i + d: C^T (k t t^T along each path + what lies across) C."""
+        from scipy.sparse import block_diag, csr_matrix, diags, identity, kron
+
+        t, length, _, _, k, T = self._state(u)
+        across = np.stack([self._across(t, length, T, np.tile(axis, (len(t), 1))) for axis in np.eye(3)], 2)
+        C = kron(self.parted, identity(3), "csr")
+        places = np.repeat(self.paths.path_of, 3), np.arange(t.size)
+        g = csr_matrix((t.ravel(), places), shape=(len(self.paths), t.size)) @ C  # dL/du of each path
+        return C.T @ block_diag(list(across), "csr") @ C + g.T @ diags(k) @ g
+
     def row_sums(self, u: np.ndarray) -> np.ndarray:
         """A bound of the sums of |d2E/du2| over the block row of each vertex [N/m]."""
         t, length, _, _, k, T = self._state(u)
@@ -111,22 +127,48 @@ class Ties:
         C = abs(self.parted)
         return out + C.T @ (q * np.asarray(C.sum(1)).ravel())
 
+    def lengths_jvp(self, u, du, segments_dot) -> np.ndarray:
+        """Change of the lengths."""
+        dd = segments_dot[self.paths.starts] + self.parted @ du
+        return self._sums((self._state(u)[0] * dd).sum(1))
+
+    def lengths_vjp(self, u, L_adj) -> tuple[np.ndarray, np.ndarray]:
+        """Adjoints of u and segments for that of the lengths."""
+        d_adj = L_adj[self.paths.path_of, None] * self._state(u)[0]
+        return self.parted.T @ d_adj, self._of_points(d_adj)
+
+    def tensions_jvp(self, u, du, segments_dot, tension_dot, slack_dot, stiffness_dot) -> np.ndarray:
+        """Change of T for changes of everything."""
+        _, _, _, e, k, _ = self._state(u)
+        dD = segments_dot[self.paths.starts]
+        de = self.lengths_jvp(u, du, segments_dot) - self._sums((directions(self.D) * dD).sum(1)) + slack_dot
+        return tension_dot + stiffness_dot * e + k * de
+
+    def tensions_vjp(self, u, T_adj) -> tuple:
+        """Adjoints of (u, segments, (a, s, k)) for that of T."""
+        t, _, _, e, k, _ = self._state(u)
+        e_adj = T_adj * k
+        of_segments = e_adj[self.paths.path_of, None]
+        segments = self._of_points(of_segments * (t - directions(self.D)))
+        return self.parted.T @ (of_segments * t), segments, (T_adj, e_adj, T_adj * e)
+
+    def _of_points(self, of_segments) -> np.ndarray:
+        """As rows of the points where segments begin."""
+        out = np.zeros((self.paths.num_points, 3))
+        out[self.paths.starts] = of_segments
+        return out
+
     def jvp(self, u, du, segments_dot, tension_dot, slack_dot, stiffness_dot) -> np.ndarray:
         """Change of the forces for changes of everything."""
-        t, length, _, e, k, T = self._state(u)
-        dD = segments_dot[self.paths.starts]
-        dd = dD + self.parted @ du
-        de = self._sums((t * dd).sum(1) - (directions(self.D) * dD).sum(1)) + slack_dot
-        dT = (tension_dot + stiffness_dot * e + k * de)[self.paths.path_of]
+        t, length, *_, T = self._state(u)
+        dd = segments_dot[self.paths.starts] + self.parted @ du
+        dT = self.tensions_jvp(u, du, segments_dot, tension_dot, slack_dot, stiffness_dot)[self.paths.path_of]
         return -(self.parted.T @ (dT[:, None] * t + self._across(t, length, T, dd)))
 
     def vjp(self, u: np.ndarray, w: np.ndarray) -> tuple:
         """Adjoints of (u, segments, (a, s, k)) for the adjoint w of the forces."""
-        t, length, _, e, k, T = self._state(u)
+        t, length, *_, T = self._state(u)
         w = -(self.parted @ w)
-        T_adj = self._sums((t * w).sum(1))
-        e_adj = T_adj * k
-        d_adj = e_adj[self.paths.path_of, None] * t + self._across(t, length, T, w)
-        segments = np.zeros((self.paths.num_points, 3))
-        segments[self.paths.starts] = d_adj - e_adj[self.paths.path_of, None] * directions(self.D)
-        return self.parted.T @ d_adj, segments, (T_adj, e_adj, T_adj * e)
+        by_u, segments, numbers = self.tensions_vjp(u, self._sums((t * w).sum(1)))
+        across = self._across(t, length, T, w)
+        return by_u + self.parted.T @ across, segments + self._of_points(across), numbers

@@ -46,6 +46,7 @@ class Sweep:
             raise ValueError(f"save_every = {save_every} must be >= 1 and divide steps = {steps}")
         self.num_frames = self.steps // self.save_every + 1
         self.values = self.scene.inputs.at_times(np.arange(self.steps + 1) * solver.dt)
+        solver.check_run(self.values)
         self.inputs = tuple(self.values)
         self.wanted = self._check_names(gradients)
         self.clip, self.truncate, self.careful = clip, truncate, health or clip is not None

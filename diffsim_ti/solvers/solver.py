@@ -9,6 +9,7 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.monitor import stability
+from diffsim_ti.monitor.stiffest import sampled_by_runs, stiffest
 from diffsim_ti.state.schedule import Schedule
 
 if TYPE_CHECKING:
@@ -89,12 +90,16 @@ class Solver(ABC):
         return 1
 
     def stable_dt(self, tight: bool = False) -> stability.StepLimit:
-        """Largest stable substep at the start: the safe element bound or, `tight`, the Lanczos value."""
+        """Largest stable substep at the start: the safe element bound or, `tight`, the Lanczos value. Pressures of gases,
+        tensions and lengths of cables are the stiffest of all keyframes and steps; functions of time are known at 0."""
         if not tight:
             return stability.element_limit(self.scene)
         if self._tight is None:
-            self._tight = stability.lanczos_limit(self.workspace(self.start_values()))
+            self._tight = self._tight_limit(self.scene.inputs.at_times([0.0, self.dt]))
         return self._tight
+
+    def _tight_limit(self, values: dict) -> stability.StepLimit:
+        return stability.lanczos_limit(self.workspace(self.scene.inputs.derive(stiffest(self.scene, values))))
 
     def start_values(self):
         """What kernels read at the start; a step of motion rows if fixed vertices move."""
@@ -110,9 +115,17 @@ class Solver(ABC):
         return self._deformed
 
     def _refuse_unstable(self) -> None:
-        if self.substep <= self.stable_dt().dt and not self.starts_deformed():
+        if self.substep > self.stable_dt().dt or self.starts_deformed():
+            self._refuse_beyond(self.stable_dt(tight=True))
+
+    def check_run(self, values: dict) -> None:
+        """Raise ValueError where the substep is beyond what gases and cables over time ask for, which a run samples."""
+        if not self.explicit or not self.check_start or self.allow_unstable or not sampled_by_runs(self.scene):
             return
-        tight = self.stable_dt(tight=True)
+        if self.substep > stability.element_limit(self.scene, values).dt:
+            self._refuse_beyond(self._tight_limit(values))
+
+    def _refuse_beyond(self, tight: stability.StepLimit) -> None:
         if self.substep > tight.dt:
             enough = math.ceil(self.dt / tight.dt / 0.95)
             raise ValueError(

@@ -1,6 +1,9 @@
 """The largest stable step of a scene, before a solver is chosen."""
 
+from collections.abc import Callable
+
 from diffsim_ti.monitor.stability import StepLimit, element_limit, lanczos_limit
+from diffsim_ti.monitor.stiffest import stiffest
 from diffsim_ti.scene import Scene
 from diffsim_ti.solvers.semi_implicit import SemiImplicitSolver
 from diffsim_ti.state.workspace import Workspace
@@ -9,14 +12,17 @@ from diffsim_ti.state.workspace import Workspace
 def stable_dt(scene: Scene, tight: bool = True) -> StepLimit:
     """Largest stable explicit step [s] of a scene at its start.
 
+    Pressures of gases, tensions and lengths of cables are the stiffest of all keyframes and steps; functions of time are
+    looked at by runs, which sample them.
     tight: 2 / omega_max of the assembled system, self-contact included (`lanczos_limit`); else the element bound at rest,
     without contact (`element_limit`), which needs no kernels and is smaller. Obstacles limit no step unless a solver is told
     contact="force"; that solver's own `stable_dt(tight=True)` knows them.
     """
-    return lanczos_limit(start_workspace(scene)) if tight else element_limit(scene)
+    return lanczos_limit(start_workspace(scene, stiffest)) if tight else element_limit(scene)
 
 
-def start_workspace(scene: Scene) -> Workspace:
-    """A workspace of the scene at its start; every explicit solver with its default contact has the same stiffness."""
+def start_workspace(scene: Scene, of: Callable[[Scene, dict], dict] = lambda scene, values: values) -> Workspace:
+    """A workspace of the scene at its start, with what `of` makes of its values; every explicit solver with its default
+    contact has the same stiffness."""
     solver = SemiImplicitSolver(scene, dt=1e-9, check_start=False)  # motions are asked for their values at 0 and dt
-    return solver.workspace(solver.start_values())
+    return solver.workspace(scene.inputs.derive(of(scene, scene.inputs.at_times([0.0, solver.dt]))))

@@ -34,7 +34,7 @@ class Chamber(Term):
     def __init__(self, argument: str, given: OverTime, unit: str, plain: str, surface, name: str | None, *more: Input):
         described = replace(amount(argument, given, (), unit, plain), range=POSITIVE)
         super().__init__(described, *more, name=name)
-        self._given, self.keyed, self.surface = given, is_keyed(given), surface
+        self.given, self.keyed, self.surface = given, is_keyed(given), surface
         if self.keyed:
             self.rows([0.0])  # refuses what does not fit
 
@@ -45,7 +45,7 @@ class Chamber(Term):
 
     def rows(self, times: ArrayLike) -> np.ndarray:
         """That at each time [s], where it is keyed."""
-        return rows_at(f"{type(self).__name__}: {self.plain}", self._given, times, ())
+        return rows_at(f"{type(self).__name__}: {self.plain}", self.given, times, ())
 
     def check(self, mesh: TetrahedralMesh) -> None:
         if len(self.faces(mesh)) == 0:

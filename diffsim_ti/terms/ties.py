@@ -212,22 +212,22 @@ class Cable(Tie):
         if len(points) < 2:
             raise ValueError(f"Cable: runs through two points at least, got {len(points)}")
         by_tension = length is None
-        argument, self._given = ("tension", tension) if by_tension else ("length", length)
+        argument, self.given = ("tension", tension) if by_tension else ("length", length)
         self.plain = f"cable_{argument}"
-        inputs = [amount(argument, self._given, (), "N" if by_tension else "m", self.plain)]
+        inputs = [amount(argument, self.given, (), "N" if by_tension else "m", self.plain)]
         if not by_tension:
             inputs.append(
                 Input("stiffness", stiffness, ((),), "N/m", AT_LEAST_0, plain="cable_stiffness", label="stiffness")
             )
         super().__init__(*inputs, *_anchors(points, "cable_anchors"), name=name)
-        self.points, self.keyed = list(points), is_keyed(self._given)
+        self.points, self.keyed = list(points), is_keyed(self.given)
         least = self.rows([0.0]) if self.keyed else inputs[0].value
         if np.any(least < 0):
             raise ValueError(f"Cable: {argument} must be >= 0, for it pulls only, got {float(np.min(least)):g}")
 
     def rows(self, times: ArrayLike) -> np.ndarray:
         """Its tension or length at each time [s], where it is keyed."""
-        return rows_at(f"Cable: {self.plain}", self._given, times, ())
+        return rows_at(f"Cable: {self.plain}", self.given, times, ())
 
     def paths(self, mesh: TetrahedralMesh) -> Paths:
         points, places = [], []

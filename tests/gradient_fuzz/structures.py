@@ -120,8 +120,6 @@ def structure(number: int) -> Structure:
     precision = "f32" if rng.random() < 0.2 else "f64"
     volume = "patches" if rng.random() < 0.2 else "tetrahedra"
     contact = turn(("stage", "stage", "force"), number, 6)
-    # which explicit steps refuse where vertices are held in some directions alone
-    staged = solver in EXPLICIT and bool(obstacles) and (contact == "stage" or obstacles[0].narrow)
     of_users = number % 8 == 1  # a law that is not the package's
     laws = open_laws(solver in EXPLICIT, static, volume == "patches") if of_users else LAWS
     return Structure(
@@ -144,7 +142,7 @@ def structure(number: int) -> Structure:
         turn((0.0, 0.005, 0.005, 0.2, 1.0), number, 7),
         tuple(turn(LOADS, 3 * number + k, 12) for k in range(1 + number // 4 % 3)) if number % 4 == 3 else (),
         tuple(turn(TIES, 3 * number + k, 13) for k in range(1 + number // 4 % 3)) if number % 4 == 2 else (),
-        fixed and not static and number % 5 in (0, 4) and not staged,
+        fixed and not static and number % 5 in (0, 4),
         turn(CHAMBERS[:3] if solver in EXPLICIT else CHAMBERS, number // 4, 13)
         if number % 4 == 1 and not self_contact
         else "",

@@ -2,8 +2,8 @@
 
 In a pass obstacle o gives vertex i h P_o n_o by its push and c m (v_o - v_(o-1)) by its friction, v_o being the velocity
 after the frictions of obstacles 1 .. o, and c the share of them that the vertex takes (contact_friction.py): what the stage
-adds to the vertex's momentum, to round-off. They are added to rows now.into + 2 o and now.into + 2 o + 1 of `impulse`;
-now.into is negative in passes that no frame counts.
+adds to the vertex's momentum, to round-off, or, in directions in which it is held, to what holds it. They are added to rows
+now.into + 2 o and now.into + 2 o + 1 of `impulse`; now.into is negative in passes that no frame counts.
 """
 
 import taichi as ti
@@ -17,17 +17,17 @@ A = ti.template()
 def note_impulses(self: A, i, v_plus, z, ratio, now: A, scene: A, state: A):
     """Add what the noted pushes, and the frictions on v+, are."""
     if now.into >= 0:
-        x, _ = self.crowding(i, v_plus, self.slide_all(i, v_plus, ratio, state), z, now, state)
+        x, _ = self.crowding(i, v_plus, self.slide_all(i, v_plus, ratio, scene, state), z, now, state)
         share, _ = self.share_and_slope(x)
         v = v_plus
         for c in range(ti.static(self.features.num_staged)):
             o = ti.static(self.features.first_staged) + c
             row, at = ROWS * o, now.into + 2 * o
-            pushed, after = state.stage[row + PUSH, i], self.slide(o, i, v, ratio, state)
+            pushed, after = state.stage[row + PUSH, i], self.slide(o, i, v, ratio, scene, state)
             n = self.normal(state.stage[row + PLANE, i])
             state.impulse[at, i] = state.impulse[at, i] + now.h * pushed.x * n
             state.impulse[at + 1, i] = state.impulse[at + 1, i] + share * (after - v) / scene.inverse_mass[i]
-            v = after
+            v = self.led(i, v, after, scene)
 
 
 @ti.func
@@ -50,12 +50,12 @@ def note_friction_jvp(self: A, i, v, dv, share, dshare, ratio, dratio, now: A, s
         for g in ti.static(self.features.staged_rough):
             for k in range(g.count):
                 at = now.into + 2 * (g.number + k) + 1
-                after, dafter = self.slide_jvp_of(g, k, i, v, dv, ratio, dratio, now, state, tangent)
+                after, dafter = self.slide_jvp_of(g, k, i, v, dv, ratio, dratio, now, scene, state, tangent)
                 gained = (share * (dafter - dv) + dshare * (after - v)) / inverse + share * tangent.mass[i] * (
                     after - v
                 )
                 tangent.impulse[at, i] = tangent.impulse[at, i] + gained
-                v, dv = after, dafter
+                v, dv = self.led(i, v, after, scene), self.led(i, dv, dafter, scene)
 
 
 @ti.func
@@ -81,12 +81,12 @@ def seed_of_friction(self: A, c, i, now: A, scene: A, adjoint: A):
 
 
 @ti.func
-def friction_by_mass(self: A, c, i, before, share, ratio, now: A, state: A, adjoint: A):
+def friction_by_mass(self: A, c, i, before, share, ratio, now: A, scene: A, state: A, adjoint: A):
     """Add the adjoint of the mass by the impulse of friction, `before` being the velocity before it."""
     if ti.static(self.features.density):
         if now.into >= 0:
             o, row = ti.static(self.features.first_staged) + c, ti.static(self.features.sums().first("mass"))
-            gained = share * (self.slide(o, i, before, ratio, state) - before)
+            gained = share * (self.slide(o, i, before, ratio, scene, state) - before)
             by = gained.dot(adjoint.impulse[now.into + 2 * o + 1, i])
             adjoint.sums[row, i] = adjoint.sums[row, i] + by
 
@@ -96,7 +96,7 @@ def friction_by_share(self: A, i, v, ratio, now: A, scene: A, state: A, adjoint:
     """Adjoint of the share of friction that the vertex takes, by the impulses."""
     out = ti.cast(0, self.fp)
     for c in range(ti.static(self.features.num_staged)):
-        after = self.slide(ti.static(self.features.first_staged) + c, i, v, ratio, state)
+        after = self.slide(ti.static(self.features.first_staged) + c, i, v, ratio, scene, state)
         out += (after - v).dot(seed_of_friction(self, c, i, now, scene, adjoint))
-        v = after
+        v = self.led(i, v, after, scene)
     return out

@@ -11,6 +11,7 @@ the minimum of a convex function, so there is one. vs is v+ after the friction o
 c is the solver's `contact_damping`: 1 is backward Euler of the barriers alone, 0 their discrete gradients, which keep the
 energy. The kinetic and the barriers' energy together never grow but by walls that move: where obstacles are flat they fall
 by c m |delta|^2 / 2 or more. The distance to a curved obstacle is that to its tangent plane, the safe side if it is convex.
+A vertex that is held in some directions goes the way `lead` there, and is pushed and rubbed only in the others.
 """
 
 from dataclasses import dataclass
@@ -20,7 +21,7 @@ import taichi as ti
 from diffsim_ti.solvers.explicit.contact_friction import ContactFriction
 from diffsim_ti.solvers.explicit.contact_impulses import note_impulses, note_pushes_jvp, seed_impulses
 from diffsim_ti.solvers.explicit.obstacle_stages import FELT, PLANE, PUSH, ROWS, SEED, WALL
-from diffsim_ti.solvers.explicit.wall_work import work_of_stage
+from diffsim_ti.solvers.explicit.wall_work import work_of_lead, work_of_stage
 from diffsim_ti.terms.obstacles import secant, stage
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
@@ -86,8 +87,9 @@ class ContactStage(ContactFriction):
     # ---- the move that all obstacles of a vertex agree on -------------------------------------------------------------
 
     @ti.func
-    def solve(self, i, start, free, a, now: A, state: A, plan: A):
-        """z = free + a sum P n by Newton's method from `start`, shorter where the slope along its step changes sign.
+    def solve(self, i, start, free, a, now: A, scene: A, state: A, plan: A):
+        """z = free + a sum P n by Newton's method from `start`, shorter where the slope along its step changes sign; n: of
+        the normals, what vertex i may do. What is held is that of `start` and `free` alike.
 
         Returns z, sum P n, and the entries of sum K n (x) n there. It ends where z changes by no more than the round-off of
         itself or of a distance, which no push can see.
@@ -99,7 +101,8 @@ class ContactStage(ContactFriction):
         for turn in range(MOST_ROUNDS):
             total, xyz, mixed, least = self.vector(0), self.vector(0), self.vector(0), ti.cast(1e30, self.fp)
             for o in range(ti.static(self.features.num_staged)):
-                n, P, K, gap = self.push(ti.static(self.features.first_staged) + o, i, trial, now, state, plan)
+                normal, P, K, gap = self.push(ti.static(self.features.first_staged) + o, i, trial, now, state, plan)
+                n = self.may(i, normal, scene)
                 total += P * n
                 least = ti.min(least, gap)
                 xyz += K * n * n
@@ -123,38 +126,51 @@ class ContactStage(ContactFriction):
         return now.alpha > 0 and scene.surface[i] > 0 and ratio > 0
 
     @ti.func
-    def advance(self, i, u, v_plus, now: A, scene: A, state: A, plan: A):
-        """(u', v') for the velocity v+ after the kick."""
-        v, delta, free, ratio = v_plus, self.vector(0), now.alpha * v_plus, now.h * scene.inverse_mass[i]
+    def way(self, i, v_plus, lead, now: A, scene: A):
+        """The way without obstacles; lead: that in directions in which the vertex is held."""
+        return self.may(i, now.alpha * v_plus, scene) + lead if ti.static(self.features.guided) else now.alpha * v_plus
+
+    @ti.func
+    def advance(self, i, u, v_plus, lead, now: A, scene: A, state: A, plan: A):
+        """(u', v') for the velocity v+ after the kick; what is held of them is left to the caller."""
+        v, delta, ratio = v_plus, self.vector(0), now.h * scene.inverse_mass[i]
+        free = self.way(i, v_plus, lead, now, scene)
         if self.acts(i, ratio, now, scene):
             if self.look(i, u, free, now, scene, state):
                 a = now.alpha * self.blend(plan) * ratio
-                z, total, _, _ = self.solve(i, self.vector(0), free, a, now, state, plan)
-                delta, v = ratio * total, self.rubbed(i, v_plus, z, ratio, now, state)
+                z, total, _, _ = self.solve(i, lead, free, a, now, scene, state, plan)
+                delta, v = ratio * total, self.rubbed(i, v_plus, z, ratio, now, scene, state)
                 if ti.static(self.features.recorded):
                     note_impulses(self, i, v_plus, z, ratio, now, scene, state)
                 if ti.static(self.features.moving > 0):
                     state.work[i] = state.work[i] + work_of_stage(self, i, v_plus, now, scene, state)
+                if ti.static(self.features.guided and self.features.motion):
+                    state.work[i] = state.work[i] + work_of_lead(self, i, lead, state)
         pressed = self.blend(plan) * delta
         return u + now.alpha * (v + pressed), now.decay * v + delta - (1 - now.decay) * pressed
 
     # ---- its tangent ---------------------------------------------------------------------------------------------------
 
     @ti.func
-    def advance_jvp(self, i, u, moved, v_plus, du, dv_plus, now: A, scene: A, state: A, tangent: A, plan: A):
+    def advance_jvp(
+        self, i, u, moved, v_plus, du, dv_plus, lead, dlead, now: A, scene: A, state: A, tangent: A, plan: A
+    ):
         """Changes of u' and v'; moved: u' - u, where the move is looked for."""
         v, dv, delta, ddelta = v_plus, dv_plus, self.vector(0), self.vector(0)
         inverse = scene.inverse_mass[i]
-        ratio, blend, free = now.h * inverse, self.blend(plan), now.alpha * v_plus
+        ratio, blend, free = now.h * inverse, self.blend(plan), self.way(i, v_plus, lead, now, scene)
         dalpha = now.alpha_by_rate * plan.rate_dot
         if self.acts(i, ratio, now, scene):
             if self.look(i, u, free, now, scene, state):
                 a, dratio = now.alpha * blend * ratio, -ratio * inverse * tangent.mass[i]
-                z, total, xyz, mixed = self.solve(i, moved, free, a, now, state, plan)
-                dtotal = self.note_changes(i, u, du, z, now, scene, state, tangent, plan)
-                b = dalpha * v_plus + now.alpha * dv_plus + blend * (dalpha * ratio + now.alpha * dratio) * total
+                z, total, xyz, mixed = self.solve(i, moved, free, a, now, scene, state, plan)
+                dtotal = self.note_changes(i, u, du, z, dlead, now, scene, state, tangent, plan)
+                b = self.may(i, dalpha * v_plus + now.alpha * dv_plus, scene)
+                b += blend * (dalpha * ratio + now.alpha * dratio) * total
                 dz = stage.solve_linear(self.features.num_staged, a, xyz, mixed, b + a * dtotal)
-                dtotal += self.add_change(i, dz, state)
+                dtotal += self.add_change(i, dz, scene, state)
+                if ti.static(self.features.guided):
+                    dz += dlead
                 delta, ddelta = ratio * total, dratio * total + ratio * dtotal
                 if ti.static(self.features.recorded):
                     note_pushes_jvp(self, i, now, state, tangent)
@@ -165,8 +181,9 @@ class ContactStage(ContactFriction):
         return du_next, dv_next + now.decay_by_rate * plan.rate_dot * w
 
     @ti.func
-    def note_changes(self, i, u, du, z, now: A, scene: A, state: A, tangent: A, plan: A):
-        """Note the change of (n, P) of each obstacle for the move z as it is; returns that of sum P n."""
+    def note_changes(self, i, u, du, z, dlead, now: A, scene: A, state: A, tangent: A, plan: A):
+        """Note the change of (n, P) of each obstacle for the move z as it is, but for what is held of it; returns that of
+        sum P n."""
         total = self.vector(0)
         for g in ti.static(self.features.staged):
             for k in range(g.count):
@@ -174,6 +191,8 @@ class ContactStage(ContactFriction):
                 X = scene.rest[i] - self.place(g, k, now, scene.path)
                 moved = du + tangent.rest[i] - self.place(g, k, now, tangent.path)
                 own, dmove = z - now.h * state.stage[row + WALL, i], -now.h * self.speed(g, k, now, tangent.path)
+                if ti.static(self.features.guided):
+                    dmove += dlead
                 change = stage.push_jvp(
                     g.force, scene.parameters, first, X, u, own, plan.contact_damping, tangent.parameters, moved, dmove
                 )
@@ -183,10 +202,10 @@ class ContactStage(ContactFriction):
                     change.w = change.w + pushed.x / scene.surface[i] * tangent.surface[i]
                 state.stage[row + SEED, i] = change
                 total += pushed.x * self.normal(change) + change.w * self.normal(state.stage[row + PLANE, i])
-        return total
+        return self.may(i, total, scene)
 
     @ti.func
-    def add_change(self, i, dz, state: A):
+    def add_change(self, i, dz, scene: A, state: A):
         """Add what the change dz of the move does to the noted pushes; returns the change of sum P n by it."""
         total = self.vector(0)
         for c in range(ti.static(self.features.num_staged)):
@@ -197,25 +216,25 @@ class ContactStage(ContactFriction):
             change.w = change.w + more
             state.stage[row + SEED, i] = change
             total += more * n
-        return total
+        return self.may(i, total, scene)
 
     # ---- its adjoint ---------------------------------------------------------------------------------------------------
 
     @ti.func
-    def advance_vjp(self, i, u, moved, v_plus, p, q, now: A, scene: A, state: A, adjoint: A, plan: A):
-        """(adjoint of u besides p, adjoint of v+) for adjoints p and q of u' and v'; adds those of all else.
+    def advance_vjp(self, i, u, moved, v_plus, lead, p, q, now: A, scene: A, state: A, adjoint: A, plan: A):
+        """(adjoint of u besides p, adjoints of v+ and lead) for adjoints p and q of u' and v'; adds those of all else.
 
-        moved: u' - u, where the move is looked for.
+        moved: u' - u, where the move is looked for. p and q have nothing in directions in which vertex i is held.
         """
-        free, w, u_adj = now.alpha * v_plus, v_plus, self.vector(0)
+        free, w, u_adj, lead_adj = self.way(i, v_plus, lead, now, scene), v_plus, self.vector(0), self.vector(0)
         inverse, blend = scene.inverse_mass[i], self.blend(plan)
         ratio, w_adj = now.h * inverse, now.alpha * p - (1 - now.decay) * q
         v_adj, by_alpha = now.alpha * p + now.decay * q, p.dot(v_plus)
         if self.acts(i, ratio, now, scene):
             if self.look(i, u, free, now, scene, state):
                 a = now.alpha * blend * ratio
-                z, total, xyz, mixed = self.solve(i, moved, free, a, now, state, plan)
-                w = self.rubbed(i, v_plus, z, ratio, now, state) + blend * ratio * total
+                z, total, xyz, mixed = self.solve(i, moved, free, a, now, scene, state, plan)
+                w = self.rubbed(i, v_plus, z, ratio, now, scene, state) + blend * ratio * total
                 delta_adj = q + blend * w_adj
                 by_alpha, by_ratio = p.dot(w), delta_adj.dot(total)
                 self.seed_all(i, ratio * delta_adj, state)
@@ -230,11 +249,15 @@ class ContactStage(ContactFriction):
                     by_alpha += of_alpha
                     by_z += of_z
                     u_adj += of_u
-                z_adj = stage.solve_linear(self.features.num_staged, a, xyz, mixed, self.by_move(i, state) + by_z)
+                z_adj = self.may(i, self.by_move(i, state) + by_z, scene)
+                z_adj = stage.solve_linear(self.features.num_staged, a, xyz, mixed, z_adj)
                 v_adj += now.alpha * z_adj
                 by_alpha += z_adj.dot(v_plus + blend * ratio * total)
                 by_ratio += blend * now.alpha * z_adj.dot(total)
-                u_adj += self.push_all_vjp(i, u, z, a * z_adj, now, scene, state, adjoint, plan)
+                by_u, by_lead = self.push_all_vjp(i, u, z, a * z_adj, now, scene, state, adjoint, plan)
+                u_adj += by_u
+                if ti.static(self.features.guided):
+                    lead_adj = self.guides.held(i, by_lead + by_z, scene)
                 if ti.static(self.features.density):
                     row = ti.static(self.features.sums().first("mass"))
                     adjoint.sums[row, i] = adjoint.sums[row, i] - ratio * inverse * by_ratio
@@ -242,7 +265,7 @@ class ContactStage(ContactFriction):
             row = ti.static(self.features.drag)
             by_rate = now.alpha_by_rate * by_alpha + now.decay_by_rate * q.dot(w)
             adjoint.sums[row, i] = adjoint.sums[row, i] + by_rate
-        return u_adj, v_adj
+        return u_adj, v_adj, lead_adj
 
     @ti.func
     def seed_all(self, i, total_adj, state: A):
@@ -266,8 +289,9 @@ class ContactStage(ContactFriction):
 
     @ti.func
     def push_all_vjp(self, i, u, z, total_adj, now: A, scene: A, state: A, adjoint: A, plan: A):
-        """Adjoint of u, from the noted adjoints and that of sum P n in the equation of the move; adds those of all else."""
-        u_adj = self.vector(0)
+        """(adjoint of u, of the move), from the noted adjoints and that of sum P n in the equation of the move; adds those
+        of all else."""
+        u_adj, move_adj = self.vector(0), self.vector(0)
         for g in ti.static(self.features.staged):
             for k in range(g.count):
                 row, first = ROWS * (g.number + k), g.first + k * g.size
@@ -286,6 +310,7 @@ class ContactStage(ContactFriction):
                 for m in ti.static(range(g.force.count + 2)):
                     adjoint.sums[first + m, i] = adjoint.sums[first + m, i] + by[m]
                 by_wall = -now.h * by_own
+                move_adj += by_own
                 if ti.static(g.force.friction):
                     at = first + g.force.count + 2
                     adjoint.sums[at, i] = adjoint.sums[at, i] + pushed.z
@@ -293,4 +318,4 @@ class ContactStage(ContactFriction):
                     by_wall += state.stage[row + WALL, i]
                 self.add_to_rest(i, by_u, adjoint)
                 self.add_to_path(g, k, i, now, by_u, by_wall, adjoint)
-        return u_adj
+        return u_adj, move_adj

@@ -50,7 +50,7 @@ class FaceDerivatives(FaceKernels):
         i, length, half = faces.vertices[s], self.part_length(now, plan), ti.cast(0.5, self.fp)
         inverse, before = scene.inverse_mass[i], own.speed_dot[s]
         gained = faces.speed[k + 1, s] - faces.speed[k, s]
-        change = faces.taken[k, s] * length * inverse * self.direct(self.gathered(s, faces))
+        change = faces.taken[k, s] * length * inverse * self.may(i, self.direct(self.gathered(s, faces)), scene)
         after = before + change - inverse * tangent.mass[i] * gained
         own.shift_dot[s] = own.shift_dot[s] + half * length * (before + after)
         own.speed_dot[s] = after
@@ -111,7 +111,7 @@ class FaceDerivatives(FaceKernels):
             own.begin_dot[s] = by_u - by_z
         q, inverse = own.speed_dot[s] + half * length * own.shift_dot[s], scene.inverse_mass[i]
         own.speed_dot[s] = q
-        own.seed[s] = faces.taken[k, s] * length * inverse * q
+        own.seed[s] = faces.taken[k, s] * length * inverse * self.may(i, q, scene)
         if ti.static(self.features.density):
             row, gained = ti.static(self.features.sums().first("mass")), faces.speed[k + 1, s] - faces.speed[k, s]
             adjoint.sums[row, i] = adjoint.sums[row, i] - inverse * self.dot3(q, gained)

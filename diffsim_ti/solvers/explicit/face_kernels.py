@@ -21,6 +21,7 @@ import taichi as ti
 from diffsim_ti.potential.face_lattice import FLAT
 from diffsim_ti.runtime import Bundle, Kernel, let, traced
 from diffsim_ti.solvers.explicit.face_walls import FaceWalls
+from diffsim_ti.solvers.explicit.guides import GUIDED
 from diffsim_ti.state.features import Features
 from diffsim_ti.state.numbers import SCENE
 from diffsim_ti.state.schedule import pass_at
@@ -45,7 +46,10 @@ class FaceKernels(FaceWalls):
 
     def _kernel(self, name: str, body, more=(), **arrays) -> Kernel:
         own = dict(
-            scene=SCENE, faces=FACES, state=dict(u="vectors2", v="vectors2"), table=dict(ints="ints", floats="scalars")
+            scene=SCENE | (GUIDED if self.features.guided else {}),
+            faces=FACES,
+            state=dict(u="vectors2", v="vectors2"),
+            table=dict(ints="ints", floats="scalars"),
         )
         return Kernel("face_" + name, body, self.precision, own | arrays, NUMBERS | dict.fromkeys(more, "int"))
 
@@ -234,7 +238,7 @@ class FaceKernels(FaceWalls):
         )
         before, load = faces.speed[k, s], length * length * whole[3] * inverse
         taken = ti.cast(1, self.fp) / ti.max(load, ti.cast(1, self.fp))
-        after = before + taken * length * inverse * self.direct(whole)
+        after = before + taken * length * inverse * self.may(faces.vertices[s], self.direct(whole), scene)
         faces.taken[k, s] = taken
         faces.shift[s] = faces.shift[s] + ti.cast(0.5, self.fp) * length * (before + after)
         faces.speed[k + 1, s] = after

@@ -67,16 +67,22 @@ class Guides:
         return out
 
     @ti.func
-    def end_vjp(self, i, k, p, q, now: A, scene: A, adjoint: A):
-        """(p, q, adjoints of u and v) from adjoints p, q of the end: what is left for the free parts, and what goes straight
-        to the state before, where the end is held there. Adds those of the motion."""
-        by_u, by_v = self.of_held(i, k, p, scene), self.of_held(i, k, q, scene)
-        p_free, q_free = p - by_u, q - by_v
+    def given_vjp(self, k, by_u, by_v, now: A, adjoint: A):
+        """What of adjoints of what is given goes straight to the state before; adds those of the motion."""
+        u_adj, v_adj = by_u, by_v
         if ti.static(self.motion):
             if k >= 0 and now.alpha > 0:
                 before, after = adjoint.motion[now.row, k], adjoint.motion[now.next, k]
                 adjoint.motion[now.row, k] = before + (1 - now.end) * by_u - now.per_step * by_v
                 adjoint.motion[now.next, k] = after + now.end * by_u + now.per_step * by_v
                 adjoint.anchor[k] = adjoint.anchor[k] + by_u
-                by_u, by_v = self.vector(0), self.vector(0)
-        return p_free, q_free, by_u, by_v
+                u_adj, v_adj = self.vector(0), self.vector(0)
+        return u_adj, v_adj
+
+    @ti.func
+    def end_vjp(self, i, k, p, q, now: A, scene: A, adjoint: A):
+        """(p, q, adjoints of u and v) from adjoints p, q of the end: what is left for the free parts, and what goes straight
+        to the state before, where the end is held there. Adds those of the motion."""
+        by_u, by_v = self.of_held(i, k, p, scene), self.of_held(i, k, q, scene)
+        u_adj, v_adj = self.given_vjp(k, by_u, by_v, now, adjoint)
+        return p - by_u, q - by_v, u_adj, v_adj

@@ -101,6 +101,15 @@ class KickDrift:
         v_mid = v + now.pre * a
         return v_mid, v_mid + now.post * a
 
+    @ti.func
+    def lead(self, i, u, v, now: A, scene: A, of: A):
+        """The way of vertex i in the pass in directions in which it is held; of: the scene, or its tangent."""
+        out = self.vector(0)
+        if ti.static(self.features.guided):
+            u_held, _ = self.guides.given(self.prescribed(i, scene), u, v, now, of)
+            out = self.guides.held(i, u_held - u, scene)
+        return out
+
     # ---- the pass ----------------------------------------------------------------------------------------------------
 
     @ti.func
@@ -127,7 +136,8 @@ class KickDrift:
         # drift and damping
         u_next, v_next = u + now.alpha * v_plus, now.decay * v_plus
         if ti.static(self.features.num_staged > 0):
-            u_next, v_next = self.contact.advance(i, u, v_plus, now, scene, state, plan)
+            lead = self.lead(i, u, v, now, scene, scene)
+            u_next, v_next = self.contact.advance(i, u, v_plus, lead, now, scene, state, plan)
         # prescribed motion
         if ti.static(self.features.guided):
             k = self.prescribed(i, scene)
@@ -229,8 +239,9 @@ class KickDrift:
         dv_next = now.decay * dv_plus + now.decay_by_rate * plan.rate_dot * v_plus
         if ti.static(self.features.num_staged > 0):
             _, before = self.kicked(i, v, state.f[s, i], now, scene)
+            lead, dlead = self.lead(i, u, v, now, scene, scene), self.lead(i, du, dv, now, scene, tangent)
             du_next, dv_next = self.contact.advance_jvp(
-                i, u, state.u[t, i] - u, before, du, dv_plus, now, scene, state, tangent, plan
+                i, u, state.u[t, i] - u, before, du, dv_plus, lead, dlead, now, scene, state, tangent, plan
             )
         # prescribed motion
         if ti.static(self.features.guided):
@@ -281,10 +292,15 @@ class KickDrift:
                 v_plus_adj = q
         if ti.static(self.features.num_staged > 0):
             _, before = self.kicked(i, v, state.f[s, i], now, scene)
-            moved = state.u[t, i] - u
-            by_u, v_plus_adj = self.contact.advance_vjp(i, u, moved, before, p, q, now, scene, state, adjoint, plan)
+            moved, lead = state.u[t, i] - u, self.lead(i, u, v, now, scene, scene)
+            by_u, v_plus_adj, by_lead = self.contact.advance_vjp(
+                i, u, moved, before, lead, p, q, now, scene, state, adjoint, plan
+            )
             p += by_u
-            if k >= 0:
+            if ti.static(self.features.guided):
+                by_end, _ = self.guides.given_vjp(k, by_lead, self.vector(0), now, adjoint)
+                p += by_end - by_lead
+            elif k >= 0:
                 v_plus_adj = q
         elif ti.static(self.features.drag >= 0):
             v_plus, row = state.v[t, i] / now.decay, ti.static(self.features.drag)

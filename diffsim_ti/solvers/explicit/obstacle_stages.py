@@ -5,10 +5,12 @@ is displaced the other way. Obstacles of one kind are gone through in a loop (st
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import taichi as ti
 
 from diffsim_ti.runtime import Bundle, let, traced
+from diffsim_ti.solvers.explicit.guides import Guides
 from diffsim_ti.state.obstacle_functions import ObstacleFunctions
 from diffsim_ti.state.schedule import pass_at
 
@@ -22,6 +24,18 @@ ROWS = 5
 @dataclass(frozen=True)
 class ObstacleStages(ObstacleFunctions):
     """Taichi functions of one vertex; `now` is the pass (state/schedule.py), g a group of obstacles, k a place in it."""
+
+    @cached_property
+    def guides(self) -> Guides:
+        return Guides(self.precision, self.features.motion)
+
+    @ti.func
+    def may(self, i, x, scene: A):
+        """What of x vertex i may do: all, unless it is held in some directions."""
+        out = x
+        if ti.static(self.features.guided):
+            out = self.guides.free(i, x, scene)
+        return out
 
     # ---- where obstacles are -----------------------------------------------------------------------------------------
 

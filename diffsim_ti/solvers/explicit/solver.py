@@ -58,8 +58,7 @@ class ExplicitSolver(Solver):
     contact_damping: of the stage, from 0, which keeps the energy of a contact, to 1, which damps what the step does not
         resolve and is the smoothest. A vertex that is pressed with N rests at velocity (1 - c) h N / 2 m in the
         semi-implicit solver, whose rest is exact with 1, and at -c h N / 2 m in velocity Verlet, exact with 0.
-    Raises ValueError for another `contact`, damping outside [0, 1], and obstacles in a stage where vertices are held in some
-    directions alone.
+    Raises ValueError for another `contact`, or damping outside [0, 1].
     """
 
     explicit = True
@@ -77,17 +76,6 @@ class ExplicitSolver(Solver):
                 "GasChamber whose pressure is high enough that its volume hardly changes"
             )
         super().__init__(*arguments, **options)
-        self._refuse_guides_in_stages()
-
-    def _refuse_guides_in_stages(self) -> None:
-        """A stage moves vertices along the normals of obstacles, and knows nothing of what holds them."""
-        if len(self.scene.supports.guided) and any(term.acts_on_surface for term in self.scene.terms):
-            if self.stages_contact or feels_faces(self.scene):
-                raise ValueError(
-                    "explicit steps cannot treat obstacles in a stage of their own where vertices are held in some "
-                    'directions alone: pass contact="force" (with obstacles that are wider than faces), or take an implicit '
-                    "solver"
-                )
 
     @property
     def stages_contact(self) -> bool:

@@ -186,7 +186,8 @@ class ImplicitWorkspace(ObstacleWays, Noted, GivenInPasses, Workspace):
         if self.solver.preconditioner != "auto":
             return self.solver.preconditioner == "multigrid"
         ratio = np.max(size[mass > 0] / mass[mass > 0], initial=0.0) if mass.any() else np.inf
-        return len(size) > 1000 and ratio > 1000
+        most = 1000 if self.scene.mesh.order == 1 else 200  # vertices up to which blocks alone take less time
+        return len(size) > most and ratio > 1000
 
     def read(self, history, slot: int) -> tuple:
         """(u, v, (u-, v-) or None) of a slot, in float64."""

@@ -1,0 +1,96 @@
+"""First Piola-Kirchhoff stresses at the points of tetrahedra on the host, with derivatives: by each one's law, or by
+patches."""
+
+import numpy as np
+
+from diffsim_ti.outputs.law_on_arrays import LawOnArrays
+from diffsim_ti.outputs.patch_pressure import PatchPressure
+
+
+class TetrahedronStress:
+    """P at the points of the tetrahedra `chosen`, by frames; `read`: those whose displacement gradients H, shape (frames,
+    points, 3, 3), it takes, here the same."""
+
+    def __init__(self, scene, chosen: np.ndarray):
+        self.scene, self.chosen, self.read, self.points = scene, chosen, chosen, scene.mesh.reference.num_points
+        self.law = LawOnArrays(scene.law)
+
+    def chosen_of(self, x: np.ndarray) -> np.ndarray:
+        """Of arrays of the tetrahedra that are read, those that are chosen."""
+        return x
+
+    def chosen_vjp(self, x: np.ndarray) -> np.ndarray:
+        """Its transpose."""
+        return x
+
+    def _numbers(self, coefficients: np.ndarray, frames: int) -> np.ndarray:
+        """Coefficients of all frames, (frames points, K)."""
+        every = np.broadcast_to(coefficients, (self.scene.mesh.num_tetrahedra, self.law.K))
+        return np.tile(np.repeat(every[self.read], self.points, 0), (frames, 1))
+
+    def value(self, H, derived) -> np.ndarray:
+        """P [Pa]."""
+        p = self._numbers(derived.coefficients, len(H))
+        return self.law.stress(H.reshape(-1, 3, 3), p).reshape(H.shape)
+
+    def jvp(self, H, dH, derived, change) -> np.ndarray:
+        """Its change for those of H and of the scene's numbers."""
+        p, dp = (self._numbers(x.coefficients, len(H)) for x in (derived, change))
+        return self.law.jvp(H.reshape(-1, 3, 3), dH.reshape(-1, 3, 3), p, dp).reshape(H.shape)
+
+    def vjp(self, H, P_adj, derived, adjoint) -> np.ndarray:
+        """Adjoint of H for that of P; adds those of the scene's numbers."""
+        p = self._numbers(derived.coefficients, len(H))
+        by_H, by_p = self.law.vjp(H.reshape(-1, 3, 3), P_adj.reshape(-1, 3, 3), p)
+        self._add_coefficients(by_p.reshape(len(H), -1, self.law.K).sum(0), derived, adjoint)
+        return by_H.reshape(H.shape)
+
+    def _add_coefficients(self, by_p, derived, adjoint) -> None:
+        by_p = by_p.reshape(-1, self.points, self.law.K).sum(1)
+        if derived.coefficients.ndim == 1:
+            adjoint.coefficients = adjoint.coefficients + by_p.sum(0)
+        else:
+            np.add.at(adjoint.coefficients, self.read, by_p)
+
+
+class PatchStress(TetrahedronStress):
+    """The same with volume="patches": P(H; p') + pi dtheta/dF. It reads all tetrahedra, for a patch's pressure is of all of
+    its own (patch_pressure.py)."""
+
+    def __init__(self, scene, chosen: np.ndarray):
+        self.scene, self.points = scene, scene.mesh.reference.num_points
+        self.chosen, self.read = chosen, np.arange(scene.mesh.num_tetrahedra)
+        self.at = (self.points * chosen[:, None] + np.arange(self.points)).ravel()  # points of those chosen
+        self.law = LawOnArrays(scene.law.base)
+
+    def chosen_of(self, x):
+        return x[:, self.at]
+
+    def chosen_vjp(self, x):
+        out = np.zeros((len(x), self.points * len(self.read), *x.shape[2:]))
+        for into, rows in zip(out, x):
+            np.add.at(into, self.at, rows)
+        return out
+
+    def value(self, H, derived):
+        at = PatchPressure.of(self.scene, derived, H)
+        own = self.law.stress(H.reshape(-1, 3, 3), np.tile(at.kept, (len(H), 1))).reshape(H.shape)
+        return self.chosen_of(own + at.value[..., None, None] * at.G)
+
+    def jvp(self, H, dH, derived, change):
+        at = PatchPressure.of(self.scene, derived, H, dH)
+        dp = self._numbers(change.coefficients, 1)
+        p, moved = (np.tile(x, (len(H), 1)) for x in (at.kept, at.without_lam(dp)))
+        own = self.law.jvp(H.reshape(-1, 3, 3), dH.reshape(-1, 3, 3), p, moved).reshape(H.shape)
+        dpi = at.jvp(dH, dp, change.volumes.ravel())
+        return self.chosen_of(own + dpi[..., None, None] * at.G + at.value[..., None, None] * at.turned)
+
+    def vjp(self, H, P_adj, derived, adjoint):
+        W = self.chosen_vjp(P_adj)
+        at = PatchPressure.of(self.scene, derived, H, W)
+        by_H, by_kept = self.law.vjp(H.reshape(-1, 3, 3), W.reshape(-1, 3, 3), np.tile(at.kept, (len(H), 1)))
+        by_theta, by_lam, by_V = at.vjp(at.theta_jvp(W))  # the work of dtheta/dF on W is the adjoint of pi
+        by_kept = by_kept.reshape(len(H), -1, self.law.K).sum(0)
+        self._add_coefficients(at.split_vjp(by_kept, by_lam), derived, adjoint)
+        adjoint.volumes = adjoint.volumes + by_V.reshape(adjoint.volumes.shape)
+        return by_H.reshape(H.shape) + at.value[..., None, None] * at.turned + by_theta[..., None, None] * at.G
