@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.inputs import ConsistentMass, Derived
 from diffsim_ti.materials.evaluate import evaluate
 from diffsim_ti.outputs.deformation import Deformation
 from diffsim_ti.outputs.output import Change, Output
@@ -81,7 +82,8 @@ class ElasticEnergy(Output):
 
 
 class KineticEnergy(Output):
-    """Energy of motion [J], sum over vertices of m v^2 / 2, in each frame; shape (frames,).
+    """Energy of motion [J], sum over vertices of m v^2 / 2, in each frame; shape (frames,). Implicit steps of ten-node
+    tetrahedra have consistent masses: v . M v / 2, a set having the rows of its vertices.
 
     sets: vertex sets, by name, indices or mask, for the energy of each; shape (frames, len(sets)). name: how a loss
     calls it.
@@ -108,18 +110,36 @@ class KineticEnergy(Output):
 
     def value(self, frames: "Frames") -> np.ndarray:
         v, derived = self._read(frames)
-        return (0.5 * (v**2).sum(2) @ (self.masks * derived.mass).T).reshape(self.shape(len(v)))
+        return self._products(v, v, derived, 0.5).reshape(self.shape(len(v)))
+
+    def _products(self, v: np.ndarray, w: np.ndarray, of: Derived, factor: float) -> np.ndarray:
+        """factor v . M w of each frame, of the rows of each set: shape (frames, sets)."""
+        if of.element_masses is None:
+            return factor * (v * w).sum(2) @ (self.masks * of.mass).T
+        M = ConsistentMass.of(self.scene.mesh, of.element_masses)
+        return factor * np.stack([(a * (M * b)).sum(1) for a, b in zip(v, w)]) @ self.masks.T
 
     def jvp(self, frames: "Frames", change: Change) -> np.ndarray:
         v, derived = self._read(frames)
-        dm = self.scene.inputs.derive_jvp(frames.inputs, change.inputs).mass
+        moved = self.scene.inputs.derive_jvp(frames.inputs, change.inputs)
         dv = np.zeros(v.shape) if change.velocities is None else change.velocities
-        grown = (v * dv).sum(2) @ (self.masks * derived.mass).T + 0.5 * (v**2).sum(2) @ (self.masks * dm).T
+        half = 0.5 if derived.element_masses is not None else 1.0
+        grown = self._products(v, dv, derived, half) + self._products(v, v, moved, 0.5)
+        if derived.element_masses is not None:  # neighbours of a set move with it
+            grown = grown + self._products(dv, v, derived, half)
         return grown.reshape(self.shape(len(v)))
 
     def vjp(self, frames: "Frames", seed: np.ndarray) -> Change:
         v, derived = self._read(frames)
         adjoint, weight = derived.zeros(), seed.reshape(len(v), -1) @ self.masks
-        adjoint.mass = 0.5 * (weight * (v**2).sum(2)).sum(0)
+        if derived.element_masses is None:
+            adjoint.mass = 0.5 * (weight * (v**2).sum(2)).sum(0)
+            by_v = (weight * derived.mass)[..., None] * v
+        else:
+            M, by_v = ConsistentMass.of(self.scene.mesh, derived.element_masses), np.zeros(v.shape)
+            for k, (a, b) in enumerate(zip(weight[..., None] * v, v)):
+                by_v[k] = 0.5 * (weight[k][:, None] * (M * b) + M * a)
+                nodes = self.scene.mesh.elements
+                adjoint.element_masses += 0.5 * a[nodes] @ np.swapaxes(b[nodes], 1, 2)
         inputs = self.scene.inputs.derive_vjp(frames.inputs, adjoint, tuple(frames.inputs))
-        return Change(velocities=(weight * derived.mass)[..., None] * v, inputs=inputs)
+        return Change(velocities=by_v, inputs=inputs)
