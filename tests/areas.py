@@ -16,7 +16,8 @@ AREAS = {
     "contact_force reaction tensor_outputs work modes identification",
     "implicit steps and equilibria": "implicit implicit_gradients implicit_contact swept solve_report",
     "patches against locking": "locking",
-    "ten-node tetrahedra": "reference_element quadratic quadratic_mesh quadratic_loads quadratic_outputs quadratic_solvers",
+    "ten-node tetrahedra": "reference_element quadratic quadratic_mesh quadratic_loads quadratic_outputs quadratic_solvers "
+    "quadratic_answers",
     "obstacles and friction": "contact contact_area contact_faces contact_stage contact_rollers contact_crossing "
     "contact_friction face_friction contact_gradients own_obstacle",
     "self-contact": "self_contact self_contact_implicit self_contact_near self_contact_pairs",

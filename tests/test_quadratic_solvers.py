@@ -1,5 +1,6 @@
 """Ten-node tetrahedra at rest, in implicit steps and in vibration: against scikit-fem's, closed forms, differences."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -9,6 +10,7 @@ from test_quadratic import curved_mesh, loaded
 
 import diffsim_ti as ds
 from diffsim_ti.inputs.consistent_mass import ConsistentMass, ElementMasses
+from diffsim_ti.outputs.output import Change
 
 IMPLICIT = (ds.ImplicitEulerSolver, ds.ImplicitMidpointSolver, ds.BDF2Solver)
 VOLUMES = pytest.mark.parametrize("volume", ["tetrahedra", "patches"])
@@ -57,6 +59,31 @@ def test_free_fall_is_rigid(solver):
     scene = ds.Scene(curved_mesh(2), ds.StableNeoHookean(1e5, 0.3), terms=ds.Gravity(), precision="f64")
     moved = ds.Rollout(solver(scene, 2e-3, 2), 10).forward().displacements[-1]
     assert np.ptp(moved, axis=0).max() < 1e-14 and moved[0, 1] < -1.9e-3
+
+
+@pytest.mark.parametrize("solver", [ds.ImplicitMidpointSolver, ds.VelocityVerletSolver], ids=lambda s: s.__name__)
+def test_kinetic_energy_is_of_the_masses_in_use(solver):
+    """v . M v / 2, consistent in implicit steps and lumped in explicit ones; of sets with all its derivatives."""
+    scene = loaded()
+    every = np.arange(scene.mesh.num_vertices)
+    output = ds.KineticEnergy([every, every[:9], every[9:]])
+    rollout = ds.Rollout(solver(scene, 2e-3, 4), 4, save_every=2, outputs=[output])
+    frames, out, rng = rollout.forward(), output.settled(rollout.scene), np.random.default_rng(3)
+    energies, v = frames["kinetic_energy"], frames.velocities
+    mass = scene.mass_matrix()[::3, ::3].toarray()
+    if solver.explicit:
+        mass = np.diag(scene.inputs.derive(scene.inputs.values).mass)
+    assert energies[:, 0] == pytest.approx(0.5 * np.einsum("kai,ab,kbi->k", v, mass, v), rel=1e-12)
+    assert energies[:, 1] + energies[:, 2] == pytest.approx(energies[:, 0], rel=1e-12)
+    changes = {name: rng.normal(size=frames.inputs[name].shape) for name in ("density", "rest_positions")}
+    dv, seed = rng.normal(size=v.shape), rng.normal(size=energies.shape)
+    by = out.vjp(frames, seed)
+    forward = (seed * out.jvp(frames, Change(velocities=dv, inputs=changes))).sum()
+    backward = (by.velocities * dv).sum() + sum((by.inputs[name] * change).sum() for name, change in changes.items())
+    assert backward == pytest.approx(forward, rel=1e-10)
+    moved = [out.value(replace(frames, velocities=v + side * 1e-4 * dv)) for side in (1, -1)]
+    slope = out.jvp(frames, Change(velocities=dv, inputs={}))
+    assert (moved[0] - moved[1]) / 2e-4 == pytest.approx(slope, rel=1e-8, abs=1e-10)
 
 
 # ---- gradients ----------------------------------------------------------------------------------------------------------
@@ -167,12 +194,12 @@ def test_verlet_is_scikit_fems():
 
 
 def test_midpoint_is_scikit_fems():
-    """Each of 20 steps solves their equation, M (v' - v) = h (f((u + u') / 2) + M g)."""
+    """Each of 50 steps solves their equation, M (v' - v) = h (f((u + u') / 2) + M g)."""
     mesh, h = bar((3, 2, 2)), 5e-3
-    frames = ds.Rollout(ds.ImplicitMidpointSolver(clamped(mesh), h, tolerance=1e-13), 20, save_every=1).forward()
+    frames = ds.Rollout(ds.ImplicitMidpointSolver(clamped(mesh), h, tolerance=1e-13), 50, save_every=1).forward()
     peer, free = Peer(mesh), np.setdiff1d(np.arange(mesh.num_vertices), mesh.vertex_sets["xmin"])
     weight = peer.weight([0, -9.81, 0])
-    for k in range(20):
+    for k in range(50):
         (u, after), (v, faster) = frames.displacements[k : k + 2], frames.velocities[k : k + 2]
         assert np.abs(after - u - h / 2 * (v + faster)).max() < 1e-12
         left = peer.mass @ (faster - v) - h * (peer.forces((u + after) / 2) + weight)

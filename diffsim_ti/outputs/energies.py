@@ -105,8 +105,8 @@ class ElasticEnergy(Output):
 
 
 class KineticEnergy(Output):
-    """Energy of motion [J], sum over vertices of m v^2 / 2, in each frame; shape (frames,). Where masses are consistent, in
-    implicit steps of ten-node tetrahedra, v . M v / 2.
+    """Energy of motion [J], sum over vertices of m v^2 / 2, in each frame; shape (frames,). Implicit steps of ten-node
+    tetrahedra have consistent masses: v . M v / 2, a set having the rows of its vertices.
 
     sets: vertex sets, by name, indices or mask, for the energy of each; shape (frames, len(sets)). name: how a loss
     calls it.

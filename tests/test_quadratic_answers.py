@@ -1,0 +1,64 @@
+"""Ten-node tetrahedra against known answers of bending: the elastica, Cook's membrane, a thick plate."""
+
+import numpy as np
+import pytest
+
+import diffsim_ti as ds
+
+
+def tip_of(scene: ds.Scene, place, load_steps: int = 1) -> np.ndarray:
+    """Displacement of the vertex nearest to a place [m]."""
+    u = ds.Rollout(ds.StaticSolver(scene, load_steps=load_steps), 1).forward().displacements[-1]
+    return u[np.linalg.norm(scene.mesh.vertices - place, axis=1).argmin()]
+
+
+# rho g A L^3 / (E I): x, drop of the tip over L
+ELASTICA = {5.0: (0.8467, 0.4959), 10.0: (0.6564, 0.7002), 50.0: (0.2450, 0.9079)}
+
+
+@pytest.mark.parametrize("number", ELASTICA)
+def test_elastica_under_its_own_weight(number):
+    """nu 0, a square section, length over height 50, 50 x 2 x 2 cells."""
+    h, E = 0.02, 1e7
+    mesh = ds.TetrahedralMesh.create_box((51, 3, 3), (1.0, h, h), "five").quadratic()
+    density = number * E * h**2 / 12 / 9.81
+    scene = ds.Scene(mesh, ds.StableNeoHookean(E, 0.0), density, ds.Gravity(), fixed="xmin", precision="f64")
+    u = tip_of(scene, (1.0, h / 2, h / 2), load_steps=4 if number < 20 else 8)
+    assert (1 + u[0], -u[1]) == pytest.approx(ELASTICA[number], rel=5e-3)
+
+
+@pytest.mark.parametrize(
+    "material, traction, exact, gate",
+    [
+        (ds.StableNeoHookean(2 * 0.4225 * 1.3, 0.3), 1 / 16, 13.577, 5e-3),
+        (ds.LinearElastic(70.0, 1 / 3), 6.25, 32.18, 1e-2),
+    ],
+    ids=["large", "linear"],
+)
+def test_cooks_membrane(material, traction, exact, gate):
+    """Plane strain, N, mm, MPa, twelve by twelve cells: rise of the upper right corner."""
+    box = ds.TetrahedralMesh.create_box((13, 13, 2), (1, 1, 4 / 48), "five")
+    s, r, q = box.vertices.T
+    vertices = np.stack([48 * s, 44 * s + r * (44 - 28 * s), 48 * q], 1)
+    sets = {"xmin": box.vertex_sets["xmin"], "xmax": box.vertex_sets["xmax"], "all": np.arange(len(vertices))}
+    mesh = ds.TetrahedralMesh(vertices, box.tetrahedra, vertex_sets=sets).quadratic()
+    assert len(mesh.vertex_sets["all"]) == mesh.num_vertices
+    edge = np.isin(mesh.surface_triangles, mesh.vertex_sets["xmax"]).all(1)
+    scene = ds.Scene(
+        mesh,
+        material,
+        1.0,
+        ds.Traction([0.0, traction, 0.0], np.nonzero(edge)[0]),
+        fixed={"xmin": "xyz", "all": "z"},
+        precision="f64",
+    )
+    assert tip_of(scene, (48.0, 60.0, 2.0))[1] == pytest.approx(exact, rel=gate)
+
+
+def test_thick_plate():
+    """10 x 10 x 1 m, whose sides do not move along themselves: exact frequencies of three-dimensional elasticity."""
+    mesh = ds.TetrahedralMesh.create_box((13, 13, 3), (10.0, 10.0, 1.0), "five").quadratic()
+    held = {"xmin": "yz", "xmax": "yz", "ymin": "xz", "ymax": "xz"}
+    scene = ds.Scene(mesh, ds.LinearElastic(200e9, 0.3), 8000.0, fixed=held, precision="f64")
+    exact = [45.9712, 109.8569, 109.8569, 155.0434, 155.0434, 168.8193, 205.8646, 205.8646, 219.2645]
+    assert ds.modes(scene, 9).frequencies == pytest.approx(exact, rel=1e-2)
