@@ -123,6 +123,21 @@ def test_torch_gives_the_same_gradients(solver, truncate):
             np.testing.assert_allclose(tensors[name].grad, expected[name], rtol=1e-12, err_msg=name)
 
 
+@pytest.mark.parametrize("truncate", [None, 1])
+@pytest.mark.parametrize("name", ["rest_positions", "initial_positions"])
+def test_torch_gives_the_same_gradients_by_places(name, truncate):
+    """What the start has, or hands on to the rest shape, is cut off where the sweep does not come so far."""
+    ours, theirs = (rollout_of(list(crowd()), ds.SemiImplicitSolver, truncate=truncate) for _ in range(2))
+    frames = ours.forward()
+    w = np.random.default_rng(8).standard_normal(frames.positions.shape)
+    expected = ours.vjp(frames, w, 0 * w)[name]
+    places = torch.tensor(theirs.values[name], dtype=torch.float64, requires_grad=True)
+    velocities = torch.tensor(theirs.values["initial_velocities"], dtype=torch.float64, requires_grad=True)
+    moved = rollout_frames(theirs, **{name: places}, initial_velocities=velocities).positions
+    (torch.from_numpy(w) * moved).sum().backward()
+    np.testing.assert_allclose(places.grad, expected, rtol=1e-12, atol=1e-12 * np.abs(w).sum())
+
+
 @every
 def test_contacts(solver):
     gate = 1e-12 if solver.explicit else 1e-8

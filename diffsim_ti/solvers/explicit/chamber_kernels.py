@@ -108,6 +108,13 @@ class ChamberKernels(StepNumbers):
         absolute = self.filling(at, now, rows) * grown
         return absolute - outside, absolute, grown, log, V0, n
 
+    @ti.func
+    def law_jvp(self, at, swelling, now: A, absolute, grown, log, V0, n, rows: A):
+        """Change of p - p_out for dV / V and changes of the chamber's numbers."""
+        dp = grown * self.filling(at, now, rows) - n * absolute * swelling
+        dp += absolute * (n / V0 * rows[0, at + 2][0] + log * rows[0, at + 3][0])
+        return dp - rows[0, at + 1][0]
+
     # ---- loops -------------------------------------------------------------------------------------------------------
 
     @ti.func
@@ -141,10 +148,7 @@ class ChamberKernels(StepNumbers):
                 dy = [self.change(t, a, tangent, chambers) for a in ti.static(range(3))]
                 V, dV = self.whole(c, chambers.volume), self.whole(c, chambers.felt)
                 p, absolute, grown, log, V0, n = self.law(first, V, now, scene.follower)
-                dp = grown * self.filling(first, now, tangent.follower) - n * absolute / V * dV
-                dp -= tangent.follower[0, first + 1][0]
-                dp += absolute * n / V0 * tangent.follower[0, first + 2][0]
-                dp += absolute * log * tangent.follower[0, first + 3][0]
+                dp = self.law_jvp(first, dV / V, now, absolute, grown, log, V0, n, tangent.follower)
                 e, f, de, de2 = y[1] - y[0], y[2] - y[0], dy[1] - dy[0], dy[2] - dy[0]
                 df = self.sixth() * (p * (self.cross(de, f) + self.cross(e, de2)) + dp * self.cross(e, f))
             for a in ti.static(range(3)):

@@ -68,10 +68,7 @@ class CurvedChamberKernels(ChamberKernels):
             dy = [self.change(t, a, tangent, chambers) for a in ti.static(range(3))]
             V, dV = self.whole(c, chambers.volume), self.whole(c, chambers.felt)
             p, absolute, grown, log, V0, n = self.law(first, V, now, scene.follower)
-            dp = grown * self.filling(first, now, tangent.follower) - n * absolute / V * dV
-            dp -= tangent.follower[0, first + 1][0]
-            dp += absolute * n / V0 * tangent.follower[0, first + 2][0]
-            dp += absolute * log * tangent.follower[0, first + 3][0]
+            dp = self.law_jvp(first, dV / V, now, absolute, grown, log, V0, n, tangent.follower)
             sixth = self.sixth() * chambers.weight[t]
             for a in ti.static(range(3)):
                 b, c_ = y[(a + 1) % 3], y[(a + 2) % 3]
