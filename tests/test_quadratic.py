@@ -9,6 +9,7 @@ from test_gradients import random_mesh
 
 import diffsim_ti as ds
 from diffsim_ti.inputs import StressPoints
+from diffsim_ti.inputs.surface_areas import SurfaceAreas
 from diffsim_ti.materials import MATERIALS
 from diffsim_ti.mesh.reference_element import quadrature
 from diffsim_ti.potential.potential import Potential
@@ -224,3 +225,45 @@ def test_fields_show_where_an_element_folds():
     assert fields.J.min() == pytest.approx(1 - 0.8, abs=1e-12)
     total = potential_of(scene, x - cube.vertices).energy()[0]
     assert (fields.energy_density * cube.volumes).sum() == pytest.approx(total, rel=1e-12)
+
+
+# ---- contact ------------------------------------------------------------------------------------------------------------
+
+
+def test_areas_of_faces_lie_at_their_middles():
+    """A twentieth of a corner's share stays with it; the sides of a cube keep their area; derivatives are exact."""
+    cube = ds.TetrahedralMesh.create_cube(3, 0.2, "five").quadratic()
+    areas, y = SurfaceAreas(cube).value(cube.vertices)[0], cube.vertices[:, 1]
+    assert areas[np.isclose(y, 0)].sum() == pytest.approx(0.04, rel=1e-12)
+    corner, middle = (np.argmin(np.linalg.norm(cube.vertices - x, axis=1)) for x in ([0.1, 0, 0.1], [0.1, 0, 0.05]))
+    assert areas[corner] == pytest.approx(0.05 * 0.01 / 4, rel=1e-12) and areas[middle] > 10 * areas[corner]
+    mesh, rng = curved_mesh(2), np.random.default_rng(0)
+    link, X, w = SurfaceAreas(mesh), np.array(mesh.vertices), rng.normal(size=mesh.num_vertices)
+    dX = rng.normal(size=X.shape)
+    (da,) = link.jvp((X,), (dX,))
+    difference = (link.value(X + 1e-6 * dX)[0] - link.value(X - 1e-6 * dX)[0]) / 2e-6
+    assert np.abs(da - difference).max() < 1e-7 * np.abs(da).max()
+    assert (link.vjp((X,), (w,))[0] * dX).sum() == pytest.approx((w * da).sum(), rel=1e-12)
+
+
+def test_a_slab_under_a_plate_has_even_stress():
+    """To two per cent, for the middles of faces carry what an even pressure gives them."""
+    box = ds.TetrahedralMesh.create_box((5, 3, 5), (1, 0.25, 1), pattern="five").quadratic()
+    X, squeeze, width = box.vertices, 0.02, 0.005
+    sets = dict(bottom=X[:, 1] == 0, middle=[np.argmin(np.linalg.norm(X - [0.5, 0, 0.5], axis=1))])
+    sets["side"] = [np.argmin(np.linalg.norm(X - [1, 0, 0.5], axis=1))]
+    mesh = ds.TetrahedralMesh(X, box.elements, vertex_sets=sets)
+    barrier = dict(stiffness_per_area=5e6, width=width)
+    plate = ds.HalfSpace((0, 0.25 + width, 0), (0, -1, 0), path=lambda t: np.array([0, -squeeze * t, 0]), **barrier)
+    scene = ds.Scene(
+        mesh,
+        ds.StableNeoHookean(1e5, 0.3),
+        terms=plate,
+        fixed={"bottom": "y", "middle": "xz", "side": "z"},
+        precision="f64",
+    )
+    frames = ds.Rollout(ds.StaticSolver(scene, load_steps=4), 1, outputs=[ds.Stress()]).forward()
+    centres = X[mesh.tetrahedra].mean(1)
+    inner = (np.abs(centres[:, [0, 2]] - 0.5) < 0.3).all(1)
+    sigma = frames["stress"][-1][inner, 1, 1]
+    assert sigma.mean() < -6e3 and np.abs(sigma / sigma.mean() - 1).max() < 0.02

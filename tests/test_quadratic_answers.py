@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import diffsim_ti as ds
+from diffsim_ti.mesh.reference_element import quadrature
 
 
 def tip_of(scene: ds.Scene, place, load_steps: int = 1) -> np.ndarray:
@@ -62,3 +63,55 @@ def test_thick_plate():
     scene = ds.Scene(mesh, ds.LinearElastic(200e9, 0.3), 8000.0, fixed=held, precision="f64")
     exact = [45.9712, 109.8569, 109.8569, 155.0434, 155.0434, 168.8193, 205.8646, 205.8646, 219.2645]
     assert ds.modes(scene, 9).frequencies == pytest.approx(exact, rel=1e-2)
+
+
+def smooth_error(cells: int, volume: str) -> tuple[float, float]:
+    """Errors, in the mean square, of displacements and of their gradients for u = c sin(pi x) sin(pi y) sin(pi z) on the
+    unit cube, held all around, with its body force integrated consistently."""
+    mesh = ds.TetrahedralMesh.create_cube(cells + 1, 1.0, "five").quadratic()
+    X, element, c = mesh.vertices, mesh.reference, np.array([0.02, -0.01, 0.03])
+    mu, lam, p = 1e5 / 2.6, 1e5 * 0.3 / (1.3 * 0.4), np.pi
+
+    def waves(x):
+        """(values, gradients, second derivatives) of sin(pi x) sin(pi y) sin(pi z)"""
+        s, k = np.sin(p * x), p * np.cos(p * x)
+        slope = [k[..., i] * s[..., (i + 1) % 3] * s[..., (i + 2) % 3] for i in range(3)]
+        twice = np.empty((*x.shape, 3))
+        for i in range(3):
+            for j in range(3):
+                if i == j:
+                    twice[..., i, j] = -(p**2) * s.prod(-1)
+                else:
+                    twice[..., i, j] = k[..., i] * k[..., j] * s[..., 3 - i - j]
+        return s.prod(-1), np.stack(slope, -1), twice
+
+    xi, weights = quadrature(6)
+    N, places = element.functions(xi), np.einsum("qa,eai->eqi", element.functions(xi), X[mesh.elements])
+    value, slope, second = waves(places)
+    force = 3 * p**2 * mu * value[..., None] * c - (mu + lam) * np.einsum("j,eqij->eqi", c, second)
+    nodal = np.zeros_like(X)
+    np.add.at(nodal, mesh.elements, np.einsum("e,q,qa,eqi->eai", mesh.volumes, weights, N, force))
+    scene = ds.Scene(
+        mesh,
+        ds.LinearElastic(1e5, 0.3),
+        terms=ds.ExternalForce(nodal),
+        fixed=mesh.surface_vertices,
+        precision="f64",
+        volume=volume,
+    )
+    u = ds.Rollout(ds.StaticSolver(scene, tolerance=1e-12), 1).forward().displacements[-1]
+    corners = X[mesh.tetrahedra]
+    B = np.linalg.inv(np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2))  # edges are straight
+    H = np.einsum("eai,qak,ekj->eqij", u[mesh.elements], element.derivatives(xi), B, optimize=True)
+    off = np.einsum("qa,eai->eqi", N, u[mesh.elements]) - value[..., None] * c
+    turned = H - c[:, None] * slope[..., None, :]
+    mean = lambda x: float(np.sqrt(np.einsum("e,q,eq->", mesh.volumes, weights, x)))  # noqa: E731
+    return mean((off**2).sum(-1)), mean((turned**2).sum((-1, -2)))
+
+
+@pytest.mark.parametrize("volume, displacement, stress", [("tetrahedra", 2.8, 1.85), ("patches", 1.8, 0.95)])
+def test_orders_of_convergence(volume, displacement, stress):
+    """Three of displacements and two of stresses for plain elements, two and one with mean dilatation."""
+    coarse, fine = (np.array(smooth_error(n, volume)) for n in (4, 8))
+    orders = np.log2(coarse / fine)
+    assert orders[0] > displacement and orders[1] > stress, orders
