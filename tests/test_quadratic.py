@@ -4,10 +4,13 @@ from functools import cache
 
 import numpy as np
 import pytest
+import taichi as ti
+import torch
 from test_every_adjoint import assert_transposed
 from test_gradients import random_mesh
 
 import diffsim_ti as ds
+from diffsim_ti.diff_simulator import rollout_frames
 from diffsim_ti.inputs import StressPoints
 from diffsim_ti.inputs.surface_areas import SurfaceAreas
 from diffsim_ti.materials import MATERIALS
@@ -267,3 +270,33 @@ def test_a_slab_under_a_plate_has_even_stress():
     inner = (np.abs(centres[:, [0, 2]] - 0.5) < 0.3).all(1)
     sigma = frames["stress"][-1][inner, 1, 1]
     assert sigma.mean() < -6e3 and np.abs(sigma / sigma.mean() - 1).max() < 0.02
+
+
+# ---- the other faces ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("options", [{}, dict(checkpoint_every=2)], ids=["all kept", "segments"])
+def test_torch_and_tape_give_the_same_gradients(options):
+    """Of a run whose states are all kept, and one that is run again in segments."""
+    ours, theirs, taped = (rollout_of(ds.VelocityVerletSolver, **options) for _ in range(3))
+    frames = ours.forward()
+    w = np.random.default_rng(9).normal(size=frames.positions.shape)
+    expected = ours.vjp(frames, w, 0 * w)
+    names = ("youngs_modulus", "density", "rest_positions", "initial_velocities")
+    tensors = {name: torch.tensor(ours.values[name], requires_grad=True) for name in names}
+    (torch.from_numpy(w) * rollout_frames(theirs, **tensors).positions).sum().backward()
+    loss, weights = ti.field(ti.f64, shape=(), needs_grad=True), ti.Vector.field(3, ti.f64, shape=w.shape[:2])
+    weights.from_numpy(w)
+
+    @ti.kernel
+    def weigh(x: ti.template()):
+        for f, i in weights:
+            loss[None] += x[f, i].dot(weights[f, i])
+
+    with ti.ad.Tape(loss):
+        taped.run()
+        weigh(taped.positions)
+    for name in names:
+        size = np.abs(expected[name]).max()
+        np.testing.assert_allclose(tensors[name].grad, expected[name], rtol=0, atol=1e-12 * size, err_msg=name)
+        np.testing.assert_allclose(taped.gradients[name], expected[name], rtol=0, atol=1e-12 * size, err_msg=name)
