@@ -80,7 +80,7 @@ class StageWithoutPush(ContactStage):
         adjoint: ti.template(),
         plan: ti.template(),
     ):
-        return self.vector(0)
+        return self.vector(0), self.vector(0)
 
 
 def scaled(adjoint, derived):
