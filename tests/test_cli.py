@@ -467,3 +467,11 @@ def test_check_gradients_prints_the_table_for_a_mesh(cube_file):
     done = command("check-gradients", cube_file, "--steps", 5)
     rows = [line for line in done.stdout.splitlines() if line.endswith("right")]
     assert done.returncode == 0 and len(rows) == 11 and "WRONG" not in done.stdout, done
+
+
+def test_order_makes_ten_nodes_of_four(tmp_path):
+    path = tmp_path / "cube.vtu"
+    TetrahedralMesh.create_cube(2).save(path)
+    assert options.load_body(path).order == 1 and options.load_body(path, order=2).order == 2
+    with pytest.raises(ValueError, match="--order must be 1 or 2, got 3"):
+        options.load_body(path, order=3)

@@ -53,7 +53,7 @@ def test_row_sums_of_masses_are_negative_at_corners():
     """-1/20 and 1/5 of an element with straight edges."""
     mesh = ds.TetrahedralMesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 1, 2, 3]]).quadratic()
     (M,) = ElementMasses(mesh.elements).value(np.array(6.0), mesh.vertices)
-    assert np.allclose(ConsistentMass.of(mesh, M).lumped[:, 0], [-1 / 20] * 4 + [1 / 5] * 6, atol=1e-14)
+    assert np.allclose(ConsistentMass.of(mesh, M).row_sums[:, 0], [-1 / 20] * 4 + [1 / 5] * 6, atol=1e-14)
 
 
 @pytest.mark.parametrize("solver", IMPLICIT, ids=lambda s: s.__name__)

@@ -310,3 +310,11 @@ def test_a_refined_mesh_is_the_same_body():
     assert some == pytest.approx(mesh.volumes[[1, 5]].sum(), rel=1e-14)
     for name, rows in finer.surface_sets.items():
         assert set(finer.vertex_sets[name]) == set(finer.surface_triangles[rows].ravel())
+
+
+def test_advice_takes_a_scene_of_ten_nodes_as_it_is():
+    mesh = ds.TetrahedralMesh.create_box((4, 2, 2), (0.3, 0.1, 0.1), "five").quadratic()
+    scene = ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3), terms=ds.Gravity(), fixed="xmin")
+    advice = recommend(scene, 0.02, 0.05, gradients=False, budget=1.0)
+    assert advice.element == "quadratic" and not advice.elements
+    assert "elements were not compared: the mesh has ten nodes already" in str(advice)

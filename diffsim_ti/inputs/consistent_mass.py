@@ -84,12 +84,12 @@ class ConsistentMass:
     def __mul__(self, x):
         if np.ndim(x) == 0:
             return ConsistentMass(self.matrix, self.factor * x)
-        return self.factor * (self.lumped * x if np.ndim(x) == 1 else self.matrix @ x)
+        return self.factor * (self.row_sums * x if np.ndim(x) == 1 else self.matrix @ x)
 
     __rmul__ = __mul__
 
     @cached_property
-    def lumped(self) -> np.ndarray:
+    def row_sums(self) -> np.ndarray:
         """M 1 of the matrix without its factor, shape (n, 1): the masses that weight acts on; negative at corners."""
         return np.asarray(self.matrix.sum(1)).reshape(-1, 1)
 

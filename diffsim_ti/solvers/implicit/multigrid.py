@@ -3,7 +3,6 @@
 import numpy as np
 
 from diffsim_ti import runtime
-from diffsim_ti.mesh.reference_element import MID_EDGES
 from diffsim_ti.potential.assembled import assemble
 from diffsim_ti.potential.free import Free, FreeDirections, projectors_of
 
@@ -96,16 +95,12 @@ class Multigrid:
 def of_corners(matrix, free: Free, mesh, rest: np.ndarray) -> tuple:
     """(matrix of the linear elements on the corners of ten-node ones, what these may do, their places, the interpolation
     from them: the middle of an edge moves by the mean of its ends)."""
-    from scipy.sparse import csr_matrix, eye, kron
+    from scipy.sparse import eye, kron
 
-    corners, n = np.unique(mesh.tetrahedra), mesh.num_vertices
-    middles, first = np.unique(mesh.elements[:, 4:], return_index=True)
-    ends = np.searchsorted(corners, mesh.elements[:, MID_EDGES].reshape(-1, 2)[first])
-    weights = np.concatenate([np.ones(len(corners)), np.full(ends.size, 0.5)])
-    at = np.concatenate([corners, np.repeat(middles, 2)]), np.concatenate([np.arange(len(corners)), ends.ravel()])
+    corners = mesh.corners
     allowed = free[corners] if isinstance(free, np.ndarray) else free.of(corners)
     may, may_here = (_block_diagonal(projectors_of(x)) for x in (free, allowed))
-    up = may @ kron(csr_matrix((weights, at), shape=(n, len(corners))), eye(3)) @ may_here
+    up = may @ kron(mesh.from_corners, eye(3)) @ may_here
     coarse = (up.T @ matrix @ up).tocsr()
     held = eye(3 * len(corners)) - may_here
     return (
