@@ -75,7 +75,7 @@ class Simulator:
             self.workspace.forget_contacts()
         try:
             with self.workspace.report.of_passes(passes):
-                self._guard.advance(0, passes, passes, self.solver.substeps if self._notes else 0)
+                self._guard.advance(0, passes, passes, int(self._notes))
         except FloatingPointError:
             self.workspace.restore(self._before, 0)
             if self._notes:

@@ -11,7 +11,7 @@ from test_term_order import SOLVERS
 import diffsim_ti as ds
 from diffsim_ti.diff_simulator import rollout_frames
 from diffsim_ti.potential.attached import Attached
-from diffsim_ti.state.schedule import Schedule
+from diffsim_ti.state.schedule import EqualSteps
 
 STEPS = 4
 TIMES = np.array([0.0, 0.003, 0.1])
@@ -176,7 +176,7 @@ def ties_of(terms, mesh) -> tuple[Attached, np.ndarray]:
     """(what is attached at the start, places of vertices)"""
     of = scene(terms, mesh=mesh)
     derived = of.inputs.derive(of.inputs.at_step(0, 1e-3))
-    return Attached.of(of).at(derived, derived.ties, Schedule(1e-3, 1), 0, 0.0), mesh.vertices
+    return Attached.of(of).at(derived, derived.ties, EqualSteps(1e-3, 1), 0, 0.0), mesh.vertices
 
 
 def test_forces_are_derivatives_of_energies():

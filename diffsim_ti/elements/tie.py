@@ -49,13 +49,13 @@ class TieElement(StepNumbers):
     @ti.func
     def numbers(self, t, now: A, rows: A):
         """(a, s, k), the mean of both kicks."""
-        out, half = self.vector(0), ti.cast(0.5, self.fp)
-        for force in ti.static((now.force0, now.force1)):
+        out = self.vector(0)
+        for force, weight in ti.static(((now.force0, now.share0), (now.force1, now.share1))):
             pull, slack = rows[self.row(force), 2 * t], rows[self.row(force), 2 * t + 1]
             share = self.share(force, now)
-            out[0] += half * (pull[0] + share * (pull[1] - pull[0]))
-            out[1] += half * (slack[0] + share * (slack[1] - slack[0]))
-            out[2] += half * pull[2]
+            out[0] += weight * (pull[0] + share * (pull[1] - pull[0]))
+            out[1] += weight * (slack[0] + share * (slack[1] - slack[0]))
+            out[2] += weight * pull[2]
         return out
 
     @ti.func
@@ -143,10 +143,10 @@ class TieElement(StepNumbers):
                 adjoint.tie_rest[p] = adjoint.tie_rest[p] + after - e_adj * self.unit(D)
             self.store(p, before - after, first, scene, adjoint.corner)
             before = after
-        for force in ti.static((now.force0, now.force1)):
-            half, share, r = ti.cast(0.5, self.fp), self.share(force, now), self.row(force)
-            by_a, by_s = half * T_adj, half * e_adj
-            pull = self.vector((1 - share) * by_a, share * by_a, half * T_adj * pulled[1], zero)
+        for force, weight in ti.static(((now.force0, now.share0), (now.force1, now.share1))):
+            share, r = self.share(force, now), self.row(force)
+            by_a, by_s = weight * T_adj, weight * e_adj
+            pull = self.vector((1 - share) * by_a, share * by_a, weight * T_adj * pulled[1], zero)
             slack = self.vector((1 - share) * by_s, share * by_s, zero, zero)
             adjoint.tie_felt[r, 2 * t] = adjoint.tie_felt[r, 2 * t] + pull
             adjoint.tie_felt[r, 2 * t + 1] = adjoint.tie_felt[r, 2 * t + 1] + slack

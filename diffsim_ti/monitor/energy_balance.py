@@ -71,7 +71,7 @@ class EnergyBalance:
     def before(self, first: int, num_passes: int) -> None:
         """Passes from `first` on come next; whatever was done to the state since the last ones is outside the balance."""
         ws, window = self.ws, self.window
-        if window and (window.changes, window.substep) == (ws.changes, ws.solver.substep):
+        if window and (window.changes, window.substep) == (ws.changes, ws.substep):
             return
         if self._start is None:
             self._start = ws.history(1)
@@ -83,7 +83,7 @@ class EnergyBalance:
             runtime.fill(self.ws.contact.work, 0)
             if self.ws.faces:
                 runtime.fill(self.ws.faces.work, 0)
-        self.window = Window(first, num_passes, self.ws.changes, self.ws.solver.substep, level)
+        self.window = Window(first, num_passes, self.ws.changes, self.ws.substep, level)
         if level is None and self.ws.arrays.features().moving:
             self.ws.place_obstacles(first)
             self.window.walls = runtime.fetch(self.ws.arrays.offsets)
@@ -126,7 +126,7 @@ class EnergyBalance:
     def _level(self, now: int, num_passes: int, walls: np.ndarray | None = None) -> float:
         """The level [J] of the current state, which is that before pass `now`."""
         ws, a = self.ws, self.ws.arrays
-        values, h = a.values, ws.solver.substep
+        values, h = a.values, ws.substep
         if walls is None:
             ws.place_obstacles(now)
         else:

@@ -74,6 +74,15 @@ class Guard:
 
     def advance(self, first: int, last: int, num_passes: int, save_every: int = 0, recording: bool = False) -> None:
         """Passes first .. last - 1, looked after; recording, slot j of the record holds the state before pass j."""
+        stretches = self.ws.solver.schedule.stretches(first, last)
+        for begin, end in stretches:
+            self.ws.substep = float(self.ws.solver.schedule.length(begin))
+            self._advance(begin, end, num_passes, save_every, recording)
+            if len(stretches) > 1 or self.ws.watch.parts:
+                self.ws.watch.close(self.ws.substep)
+
+    def _advance(self, first: int, last: int, num_passes: int, save_every: int, recording: bool) -> None:
+        """The same where all have one length."""
         balance = self.ws.energy_watch if self.ws.solver.explicit else None
         while first < last:
             stop = min(last, first + self.every)
@@ -109,9 +118,9 @@ class Guard:
             looks.append(("", watch.largest_omega_dt(), 2, 1.8))
         for what, omega_dt, limit, enough in looks:
             if omega_dt > limit and not self._warned:
-                self._warned, step, h = True, self.ws.step_of(now - 1, num_passes), solver.substep
+                self._warned, step, h = True, self.ws.step_of(now - 1, num_passes), self.ws.substep
                 warnings.warn(
-                    f"step {step}, t = {step * solver.dt:.6g} s: a contact {what}was stiffer than the substep {h:.3g} s "
+                    f"{self.ws.when(step)}: a contact {what}was stiffer than the substep {h:.3g} s "
                     f"can follow (omega dt = {omega_dt:.3g} > {limit}), so that energy may be gained in it: take substeps "
                     f"of {enough * h / omega_dt:.3g} s, or a softer or wider barrier",
                     stacklevel=5,
@@ -123,15 +132,15 @@ class Guard:
         if self._warned_of_gain or watch is None or watch.share <= 0.1:
             return
         self._warned_of_gain, step = True, self.ws.step_of(now - 1, num_passes)
-        enough = solver.substep / (2 if solver.explicit else 4)
+        enough = self.ws.substep / (2 if solver.explicit else 4)
         others = "ImplicitEulerSolver, which damps most"
         others = others if getattr(solver, "multistep", False) else f"BDF2Solver or {others}"
         said = (
-            f"step {step}, t = {step * solver.dt:.6g} s: {type(solver).__name__} has gained {watch.gained:.3g} J, "
+            f"{self.ws.when(step)}: {type(solver).__name__} has gained {watch.gained:.3g} J, "
             f"{watch.share:.0%} of the energy that moves, from nonlinear motion or contact within its substeps of "
-            f"{solver.substep:.3g} s: take substeps of {enough:.3g} s, or {others}"
+            f"{self.ws.substep:.3g} s: take substeps of {enough:.3g} s, or {others}"
         )
-        about = watch.gained, watch.share, step, step * solver.dt, enough
+        about = watch.gained, watch.share, step, float(solver.schedule.time(step)), enough
         warnings.warn(EnergyGained(said, *about), stacklevel=5)
 
     def _look_at_step(self, now: int, num_passes: int) -> None:
@@ -143,8 +152,8 @@ class Guard:
             self._stiffness = stability.Stiffness(self.ws)
         omega2 = self._stiffness.lower_bound()
         apart = self._flies_apart()
-        if np.isfinite(omega2) and omega2 * solver.substep**2 <= 4 and not apart:
-            near = omega2 * solver.substep**2 > 0.9**2 * 4
+        if np.isfinite(omega2) and omega2 * self.ws.substep**2 <= 4 and not apart:
+            near = omega2 * self.ws.substep**2 > 0.9**2 * 4
             self.every = min(2 * self.every, self.close if near else self.usual)
             return
         step, limit = self.ws.step_of(now - 1, num_passes), 2 / np.sqrt(omega2)
@@ -157,7 +166,7 @@ class Guard:
             "squeezed, or vertices press into a contact)"
         )
         raise Divergence(
-            f"step {step}, t = {step * solver.dt:.6g} s: the substep {solver.substep:.4g} s {why}: reduce dt, raise "
+            f"{self.ws.when(step)}: the substep {self.ws.substep:.4g} s {why}: reduce dt, raise "
             "substeps, or pass allow_unstable=True",
             step,
             None,
@@ -168,12 +177,12 @@ class Guard:
     def _flies_apart(self) -> bool:
         """Whether vertices cross the body within a substep: no state that a stable step leads to."""
         v = runtime.fetch(self.ws.state.v)[0].astype(np.float64)
-        spread = np.abs(v - v.mean(0)).max() * self.ws.solver.substep
+        spread = np.abs(v - v.mean(0)).max() * self.ws.substep
         return bool(spread > np.ptp(self.ws.arrays.values.rest, 0).max())
 
     def _diagnose_crossing(self, bad_by: int, num_passes: int) -> None:
         """Run again to the first pass that crosses, and raise; the state before it is restored."""
-        ws, solver = self.ws, self.ws.solver
+        ws = self.ws
         ws.watch.put(self._seen)
         ws.restore(self.good, 0)
         for j in range(self.good_pass, bad_by):
@@ -190,7 +199,7 @@ class Guard:
         speeds = [float(np.linalg.norm(ws.velocity_of(i) - drift)) for i in vertices]
         speed, vertex = max(speeds), vertices[int(np.argmax(speeds))]
         width, of_face = float(term.values["barrier_width"]), len(vertices) == 3
-        enough = min(0.1 * width / max(speed, 1e-300), (0.25 if of_face else 0.5) * solver.substep)
+        enough = min(0.1 * width / max(speed, 1e-300), (0.25 if of_face else 0.5) * self.ws.substep)
         stiffness = self._stiffness_needed(k, vertex, speed)
         ws.place_obstacles(j)
         if of_face and ws.faces.saturated:  # their force has to be resolved first
@@ -205,15 +214,15 @@ class Guard:
             stiffer = ws.arrays.stiffer(k, vertices, stiffness)
             remedy = f"the barrier cannot stop it at any step: raise its {stiffer}, or its width"
         stable, _ = self._stable_step()
-        if not solver.substep <= stable:  # the speed is of the steps' own making
-            stiffness, enough = None, min(0.5 * solver.substep, 0.7 * stable)
+        if not self.ws.substep <= stable:  # the speed is of the steps' own making
+            stiffness, enough = None, min(0.5 * self.ws.substep, 0.7 * stable)
             remedy = (
                 f"the substep has outgrown the stable step {stable:.3g} s of this state, whose elements are squeezed: "
                 f"reduce the substep to {enough:.3g} s"
             )
         raise Crossing(
-            f"step {step}, t = {step * solver.dt:.6g} s: {place_name(vertices)} gets {depth:.3g} m behind {term!r} within a "
-            f"substep of {solver.substep:.4g} s, at {speed:.4g} m/s: {remedy}; the state before is kept",
+            f"{self.ws.when(step)}: {place_name(vertices)} gets {depth:.3g} m behind {term!r} within a "
+            f"substep of {self.ws.substep:.4g} s, at {speed:.4g} m/s: {remedy}; the state before is kept",
             step,
             vertex,
             enough,
@@ -245,7 +254,7 @@ class Guard:
 
     def _diagnose(self, bad_by: int, num_passes: int) -> None:
         """Run again from the last good state, pass by pass, and raise at the first bad one; that state is restored."""
-        ws, solver = self.ws, self.ws.solver
+        ws = self.ws
         ws.restore(self.good, 0)
         for j in range(self.good_pass, bad_by):
             self.mark(j)
@@ -262,13 +271,13 @@ class Guard:
         stable, state = self._stable_step()
         step = self.ws.step_of(j, num_passes)
         why = (
-            f"the substep {solver.substep:.4g} s exceeds the stable step {stable:.4g} s {state}: reduce dt, "
+            f"the substep {self.ws.substep:.4g} s exceeds the stable step {stable:.4g} s {state}: reduce dt, "
             "raise substeps, or use an implicit solver"
-            if not solver.substep <= stable
+            if not self.ws.substep <= stable
             else f"the stable step {state} is {stable:.4g} s, so look at forces, contacts, inputs and inverted tetrahedra"
         )
         raise Divergence(
-            f"step {step}, t = {step * solver.dt:.6g} s: {bad} of vertex {vertex} is not finite; smallest J around it "
+            f"{self.ws.when(step)}: {bad} of vertex {vertex} is not finite; smallest J around it "
             f"= {J_around.min():.3g} in tetrahedron {tet}; {why}; the last good state is kept",
             step,
             vertex,

@@ -11,7 +11,7 @@ from diffsim_ti.mesh.patches import volume_patches
 from diffsim_ti.monitor.stiffest import stiffest
 from diffsim_ti.potential.attached import Attached
 from diffsim_ti.potential.kernels import potential_kernels
-from diffsim_ti.state.schedule import Schedule
+from diffsim_ti.state.schedule import EqualSteps
 from diffsim_ti.state.workspace import Workspace
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ def element_limit(scene: "Scene", values: dict | None = None) -> StepLimit:
     worst, attached = int(np.argmax(omega2)), Attached.of(scene)
     more = _gas_bound(scene, values, derived) if scene.chambers else 0.0
     if attached:  # what all of its parts add at the most
-        at = attached.stiffest(derived, derived.ties, Schedule(1.0, 1))
+        at = attached.stiffest(derived, derived.ties, EqualSteps(1.0, 1))
         more += at.largest_omega2(derived.mass, derived.displacement, scene.fixed)
     return StepLimit(float(2 / np.sqrt(omega2[worst] + more)), worst, "element bound")
 

@@ -5,10 +5,10 @@ import numpy as np
 from diffsim_ti.inputs import Derived
 from diffsim_ti.potential.attached import Attached
 from diffsim_ti.potential.chamber_pressure import following
-from diffsim_ti.state.schedule import Schedule
+from diffsim_ti.state.schedule import EqualSteps, Schedule
 from diffsim_ti.terms import Gravity
 
-STEPS = Schedule(1.0, 1)  # a pass for each step
+STEPS = EqualSteps(1.0, 1)  # a pass for each step
 
 
 def at_end(step: int, begins: bool = False) -> tuple[Schedule, int, float]:

@@ -5,9 +5,9 @@ import numpy as np
 from diffsim_ti.inputs import Derived
 from diffsim_ti.inputs.ties import directions
 from diffsim_ti.potential.ties import Ties
-from diffsim_ti.state.schedule import Schedule
+from diffsim_ti.state.schedule import EqualSteps, Schedule
 
-START = Schedule(1.0, 1)
+START = EqualSteps(1.0, 1)
 
 
 class Foundation:

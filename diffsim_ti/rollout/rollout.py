@@ -14,6 +14,7 @@ from diffsim_ti.rollout.run import Run
 from diffsim_ti.rollout.sweep import Sweep
 from diffsim_ti.rollout.taped import TapeFace
 from diffsim_ti.solvers.solver import Solver
+from diffsim_ti.state.schedule import UnequalSteps
 from diffsim_ti.state.solve_report import SolveReport
 
 
@@ -22,7 +23,7 @@ class Rollout:
 
     solver: any solver; its scene names the inputs (`rollout.inputs`): initial_positions, initial_velocities,
         the material's numbers, density, the terms' numbers, prescribed_motion, rest_positions.
-    steps: number of steps of solver.dt.
+    steps: number of steps of solver.dt; or the length of each [s], or `UnequalSteps` with substeps for each.
     save_every: a frame every so many steps, besides the start; must divide `steps`. Default: only the end.
     checkpoint_every: keep a state every so many steps and compute the rest again in the reverse sweep.
     memory: or a budget [MB] from which they are chosen (default 1000). The gradient is bitwise the same.
@@ -45,7 +46,7 @@ class Rollout:
     def __init__(
         self,
         solver: Solver,
-        steps: int,
+        steps: int | ArrayLike | UnequalSteps,
         save_every: int | None = None,
         checkpoint_every: int | None = None,
         memory: float | None = None,
@@ -56,6 +57,7 @@ class Rollout:
         outputs: Output | Iterable[Output] = (),
         runs: int | None = None,
     ):
+        solver, steps = self._stepped(solver, steps)
         self.solver, self.scene = solver, solver.scene
         options = dict(
             save_every=save_every,
@@ -79,6 +81,17 @@ class Rollout:
         self.tape_face = TapeFace(self, runs)
         self.torch_face = None  # made by the first run from tensors (torch_bridge/tensors.py)
 
+    @staticmethod
+    def _stepped(solver: Solver, steps) -> tuple[Solver, int]:
+        """The solver that takes these steps, and how many they are."""
+        if np.ndim(steps) == 1 and not isinstance(steps, UnequalSteps):
+            steps = UnequalSteps(steps, solver.substeps)
+        if isinstance(steps, UnequalSteps):
+            return solver.on(steps), len(steps)
+        if not np.isscalar(steps) or int(steps) != steps or steps < 0:
+            raise ValueError(f"steps must be a whole number >= 0, lengths of steps [s], or UnequalSteps, got {steps!r}")
+        return solver, int(steps)
+
     def _check_outputs(self, outputs) -> dict[str, Output]:
         out: dict[str, Output] = {}
         for output in outputs:
@@ -94,12 +107,19 @@ class Rollout:
 
     def with_scene(self, **changes) -> "Rollout":
         """The same rollout of a scene with some arguments replaced, such as precision="f64"."""
-        return Rollout(self.solver.for_scene(self.scene.replace(**changes)), self.steps, **self._options)
+        solver, unequal = self.solver.for_scene(self.scene.replace(**changes)), self.schedule
+        return Rollout(solver, self.steps if unequal is None else unequal, **self._options)
+
+    @property
+    def schedule(self) -> UnequalSteps | None:
+        """The steps, where they are not equal."""
+        schedule = self.solver.schedule
+        return schedule if isinstance(schedule, UnequalSteps) else None
 
     @property
     def times(self) -> np.ndarray:
         """Times of the frames [s]."""
-        return np.arange(self.num_frames) * self.save_every * self.solver.dt
+        return self.solver.schedule.time(np.arange(self.num_frames) * self.save_every)
 
     @property
     def checkpoints(self) -> Checkpoints:

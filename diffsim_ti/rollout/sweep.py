@@ -38,14 +38,12 @@ class Sweep:
     ):
         self.contacts = contacts  # whether runs note what obstacles do to each vertex in each frame
         self.chambers = chambers and solver.scene.holds_volumes  # whether pressures in chambers are wanted of frames
-        self.solver, self.scene, self.steps = solver, solver.scene, int(steps)
-        if self.steps != steps or steps < 0:
-            raise ValueError(f"steps must be a whole number >= 0, got {steps}")
+        self.solver, self.scene, self.steps = solver, solver.scene, steps
         self.save_every = max(self.steps, 1) if save_every is None else int(save_every)
         if self.save_every < 1 or self.steps % self.save_every:
             raise ValueError(f"save_every = {save_every} must be >= 1 and divide steps = {steps}")
         self.num_frames = self.steps // self.save_every + 1
-        self.values = self.scene.inputs.at_times(np.arange(self.steps + 1) * solver.dt)
+        self.values = self.scene.inputs.at_times(solver.schedule.time(np.arange(self.steps + 1)))
         solver.check_run(self.values)
         self.inputs = tuple(self.values)
         self.wanted = self._check_names(gradients)
@@ -53,8 +51,8 @@ class Sweep:
         self.health: list[dict] = []
         self.first_step = 0  # steps that came before those of a run, for reports
         self.num_passes = solver.num_passes(self.steps)
-        self.passes_per_frame = self.save_every * solver.substeps
-        every = None if checkpoint_every is None else max(1, int(checkpoint_every)) * solver.substeps
+        a_step = self.num_passes / max(self.steps, 1)
+        every = None if checkpoint_every is None else max(1, round(max(1, int(checkpoint_every)) * a_step))
         self.state_bytes = 4 * self.scene.mesh.num_vertices * runtime.NUMPY[self.scene.precision]().itemsize
         places = -(-self.scene.mesh.num_tetrahedra // runtime.LANES) * runtime.LANES
         law_state = places * len(self.scene.law.state_names) / (4 * self.scene.mesh.num_vertices)
@@ -76,9 +74,10 @@ class Sweep:
         return names
 
     @property
-    def frame_time(self) -> float:
-        """Time between two frames [s]."""
-        return self.save_every * self.solver.dt
+    def frame_time(self) -> np.ndarray:
+        """Time of each frame since the one before [s], shape (frames, 1, 1, 1, 1); the first has that of the second."""
+        times = [self.solver.schedule.frame_time(max(k, 1), self.save_every) for k in range(self.num_frames)]
+        return np.reshape(times if self.steps else [1.0], (-1, 1, 1, 1, 1))
 
     def contact_forces(self) -> np.ndarray | None:
         """Mean forces [N] of obstacles on vertices in the frames of the last run (state/workspace.py), if they are noted."""
@@ -86,7 +85,7 @@ class Sweep:
 
     def chamber_pressures(self) -> np.ndarray | None:
         """Pressures [Pa] in chambers in the frames of the last run, if they are wanted."""
-        return self.workspace.chamber_pressures(self.num_frames, self.passes_per_frame) if self.chambers else None
+        return self.workspace.chamber_pressures(self.num_frames, self.save_every) if self.chambers else None
 
     @property
     def noted(self) -> tuple[str, ...]:
@@ -169,7 +168,7 @@ class Sweep:
             first = checkpoints.bounds(segment)[0]
             last = checkpoints.bounds(path[k + 1])[0] if k + 1 < len(path) else self.num_passes
             with ws.report.of_passes(last - first):
-                self._guard.advance(first, last, self.num_passes, self.passes_per_frame, self._recorded)
+                self._guard.advance(first, last, self.num_passes, self.save_every, self._recorded)
         if self.solver.last_frame_is_state:
             ws.save_frame(self.num_frames - 1)
         self._kept, self._current = path, run  # segments whose starts are in the snapshots
@@ -193,7 +192,7 @@ class Sweep:
         for k in range(checkpoints.num_segments):
             first, last = checkpoints.bounds(k)
             self._record(first, last)
-            tangent.advance(first, last, self.num_passes, self.passes_per_frame)
+            tangent.advance(first, last, self.num_passes, self.save_every)
             ws.restore(ws.record, last - first)
         if self.solver.last_frame_is_state:
             tangent.save_frame(self.num_frames - 1)
@@ -234,7 +233,7 @@ class Sweep:
         if self.chambers:
             self._adjoint.chambers.adjoints = seed.chamber_pressures
         self.health = []
-        stop = 0 if self.truncate is None else max(0, self.steps - self.truncate) * self.solver.substeps
+        stop = 0 if self.truncate is None else self.solver.schedule.first(max(0, self.steps - self.truncate))
         kept, end = self._kept, checkpoints.num_segments
         self._kept = kept[:1]  # the sweep overwrites the others, also if it does not get to its end
         while end > 0 and checkpoints.bounds(end - 1)[1] > stop:
@@ -262,17 +261,18 @@ class Sweep:
 
     def _reverse_segment(self, first: int, last: int, stop: int, end: int, careful: bool) -> None:
         """Passes last - 1 .. stop of a segment that begins with pass `first`; the whole sweep stops at pass `end`."""
-        save, adjoint = self.passes_per_frame, self._adjoint
+        save, adjoint, schedule = self.save_every, self._adjoint, self.solver.schedule
         if not careful:
             adjoint.reverse(first, last, self.num_passes, save, stop, 0 < stop == end)
             return
-        substeps, passes = self.solver.substeps, self.steps * self.solver.substeps
+        passes = int(schedule.first(self.steps))
         while last > stop:
-            begin = max(stop, (min(last, passes) - 1) // substeps * substeps)
-            at_step = begin % substeps == 0 and begin < passes  # and not where a segment happens to begin
+            begin = max(stop, int(schedule.first(schedule.row(min(last, passes) - 1))))
+            step = int(schedule.row(begin))
+            at_step = begin == schedule.first(step) and begin < passes  # and not where a segment happens to begin
             adjoint.reverse(first, last, self.num_passes, save, begin, at_step and begin > 0)
             if at_step:
-                self._look_at_adjoint(begin // substeps)
+                self._look_at_adjoint(step)
                 if begin > end:
                     adjoint.reverse_kick(begin, first, self.num_passes)
             last = begin
@@ -283,7 +283,7 @@ class Sweep:
         if not np.isfinite(by_position + by_velocity):
             now = self.workspace.first_step + step
             raise FloatingPointError(
-                f"the adjoint became not finite in step {now} (t = {now * self.solver.dt:g} s): "
+                f"the adjoint became not finite in step {now} (t = {self.solver.schedule.time(now):g} s): "
                 "look at the loss and at how long the rollout stays smooth; parameters are unchanged"
             )
         scaled = 1.0
@@ -307,7 +307,7 @@ class Sweep:
 
     def _warn_if_exploded(self, of_frames, of_start) -> None:
         """Norms of the adjoints of displacements and velocities, where the sweep began and where it ended."""
-        duration = max(self.steps, 1) * self.solver.dt
+        duration = float(self.solver.schedule.time(self.steps)) or self.solver.dt
         start, end = (by_u + by_v / duration for by_u, by_v in (of_frames, of_start))
         if end > 1e8 * start > 0:
             warnings.warn(

@@ -15,7 +15,7 @@ class ImplicitEulerSolver(ImplicitSolver):
 
     order = 1
 
-    def stage(self, rate, fresh):
-        h = self.substep
+    def stage(self, rate, fresh, j):
+        h = float(self.schedule.length(j))
         d = math.exp(-rate * h)
         return Stage(h, b0=d, by_rate=(-h * d, 0.0, 0.0, 0.0))

@@ -19,8 +19,8 @@ class ImplicitMidpointSolver(ImplicitSolver):
     order = 2
     may_gain_energy = True
 
-    def stage(self, rate, fresh):
-        h = self.substep
+    def stage(self, rate, fresh, j):
+        h = float(self.schedule.length(j))
         d = math.exp(-0.5 * rate * h)
         slope = -0.5 * h * d
         return Stage(0.5 * h, b0=d, c0=2.0, e0=2 * d, e1=-d, by_rate=(slope, 0.0, 2 * slope, -slope))

@@ -1,6 +1,5 @@
 """Symplectic Euler, the seeds' semi-implicit solver."""
 
-import math
 from typing import overload
 
 from diffsim_ti.materials.material import Material
@@ -90,13 +89,9 @@ class SemiImplicitSolver(ExplicitSolver):
             raise RuntimeError("no simulator runs this solver yet: make Simulator(solver) first")
         return torch.from_numpy(simulator.positions)
 
-    def num_passes(self, steps: int) -> int:
-        return steps * self.substeps
-
     def lags(self, j, num_passes):
         return True
 
     def weights(self, j, num_passes, rate):
-        h = self.dt / self.substeps
-        decay = math.exp(-rate * h)
-        return Weights(0, 0, 0.0, h, h * decay, decay, -h * h * decay, -h * decay)
+        h, decay = self.lengths(j, rate)
+        return Weights(0, 0, 0.5, 0.5, 0.0, h, h * decay, decay, -h * h * decay, -h * decay)

@@ -6,11 +6,12 @@ from abc import ABC
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
 from diffsim_ti.monitor import stability
 from diffsim_ti.monitor.stiffest import sampled_by_runs, stiffest
-from diffsim_ti.state.schedule import Schedule
+from diffsim_ti.state.schedule import EqualSteps, Schedule, UnequalSteps
 
 if TYPE_CHECKING:
     from diffsim_ti.scene import Scene
@@ -58,6 +59,7 @@ class Solver(ABC):
                 f"{type(scene.law).__name__} reads {', '.join(scene.law.reads)}, but {type(self).__name__} knows forces of "
                 "displacements only; take SemiImplicitSolver or VelocityVerletSolver"
             )
+        self._schedule: UnequalSteps | None = None
         self._tight: stability.StepLimit | None = None
         self._deformed: bool | None = None
         if self.explicit and check_start and not allow_unstable:
@@ -70,12 +72,34 @@ class Solver(ABC):
     @property
     def schedule(self) -> Schedule:
         """Where each pass lies in time."""
-        return Schedule(self.dt, self.substeps)
+        return self._schedule or EqualSteps(self.dt, self.substeps)
+
+    def on(self, schedule: UnequalSteps) -> "Solver":
+        """The same solver on other steps. Raises ValueError for steps that it cannot take."""
+        out = self.for_scene(self.scene)
+        out._schedule = schedule
+        out.check_schedule(schedule)
+        return out
+
+    def check_schedule(self, schedule: UnequalSteps) -> None:
+        """Raise ValueError for steps that this solver cannot take."""
+        if self.explicit and self.check_start and not self.allow_unstable:
+            self._refuse_unstable()
+
+    def lengths(self, j: ArrayLike, rate: float) -> tuple[np.ndarray, np.ndarray]:
+        """(lengths h of passes j [s], exp(-rate h))"""
+        h, place = np.unique(self.schedule.length(np.asarray(j)), return_inverse=True)
+        decay = np.array([math.exp(-rate * x) for x in h])  # whose last bit NumPy's own may have otherwise
+        return h[place].reshape(np.shape(j)), decay[place].reshape(np.shape(j))
+
+    def num_passes(self, steps: int) -> int:
+        """Passes that so many steps take."""
+        return int(self.schedule.first(steps))
 
     @property
     def substep(self) -> float:
-        """Length h of a substep [s]."""
-        return self.dt / self.substeps
+        """Length h of a substep [s]; of unequal ones the longest."""
+        return self.schedule.longest
 
     def runs_parallel(self) -> bool:
         """Whether passes are launched one by one on all threads."""
@@ -127,10 +151,12 @@ class Solver(ABC):
 
     def _refuse_beyond(self, tight: stability.StepLimit) -> None:
         if self.substep > tight.dt:
-            enough = math.ceil(self.dt / tight.dt / 0.95)
+            what, remedy = "dt / substeps =", f"reduce dt, pass substeps={math.ceil(self.dt / tight.dt / 0.95)}"
+            if self._schedule:
+                what, remedy = f"of {self._schedule}, the longest:", "shorten the longest steps"
             raise ValueError(
-                f"the substep dt / substeps = {self.substep:.4g} s exceeds the stable step {tight}: reduce dt, "
-                f"pass substeps={enough}, use an implicit solver, or pass allow_unstable=True"
+                f"the substep {what} {self.substep:.4g} s exceeds the stable step {tight}: {remedy}, use an implicit "
+                "solver, or pass allow_unstable=True"
             )
 
     def choose_substeps(self, share: float = 0.7) -> None:

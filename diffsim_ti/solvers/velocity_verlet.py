@@ -1,7 +1,5 @@
 """Velocity Verlet: second order at the cost of symplectic Euler."""
 
-import math
-
 import numpy as np
 
 from diffsim_ti.solvers.explicit.solver import ExplicitSolver, Weights
@@ -12,27 +10,30 @@ class VelocityVerletSolver(ExplicitSolver):
 
     Second order; the two half kicks that meet at a time share one force evaluation. Drag acts in the middle of the
     drift (exact, symmetric). Stable for h <= 2 / omega_max. Forces given per step enter a kick that two steps share
-    with half of each. Hairer, Lubich, Wanner, Geometric Numerical Integration, I.1.4, doi:10.1007/3-540-30666-8.
+    with half of each, or with their parts of it where steps are unequal. Hairer, Lubich, Wanner, Geometric Numerical
+    Integration, I.1.4, doi:10.1007/3-540-30666-8.
     """
 
     order = 2
     last_frame_is_state = False
 
     def num_passes(self, steps: int) -> int:
-        return steps * self.substeps + 1
+        return super().num_passes(steps) + 1
 
     def lags(self, j, num_passes):
         return 0 < j < num_passes
 
     def weights(self, j, num_passes, rate):
-        h = self.dt / self.substeps
-        decay = math.exp(-rate * h)
+        (h, decay), (before, _) = self.lengths(j, rate), self.lengths(np.maximum(j - 1, 0), rate)
         kicked, kicks = j > 0, j < num_passes - 1  # the half kicks that end a step, and that begin one
         drifts = lambda x, none=0.0: np.where(kicks, x, none)  # noqa: E731
+        part = np.where(kicked & kicks, before / (before + h), 0.5)  # of the kick that ends a step
+        shares = part, 1 - part
         return Weights(
             kicked * 1,
             (~kicks & kicked) * 1,
-            kicked * h / 2,
+            *shares,
+            kicked * before / 2,
             kicks * h / 2,
             drifts(h * (1 + decay) / 2),
             drifts(decay, 1.0),

@@ -8,44 +8,81 @@ r + 1. Pass j begins at the share `begin` of its step and ends at the share `end
 Rows may be arrays of any shape; nothing here says that they are three numbers.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import taichi as ti
+from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
 
-INTS = ("row", "next", "force0", "force1", "frame", "opens")
-FLOATS = ("begin", "end", "per_step", "h", "pre", "post", "alpha", "decay", "alpha_by_rate", "decay_by_rate")
+INTS = ("row", "next", "force0", "force1", "frame", "counted", "opens")
+FLOATS = (
+    *("begin", "end", "per_step", "h", "pre", "post", "share0", "share1"),
+    *("alpha", "decay", "alpha_by_rate", "decay_by_rate"),
+)
 
 
-@dataclass(frozen=True)
-class Schedule:
-    """Equal steps of dt [s], each of `substeps` equal passes; j may be a number or an array of passes."""
+class Schedule(ABC):
+    """Steps, each of equal passes; j may be a number or an array of passes, which may end one beyond the last."""
 
-    dt: float
-    substeps: int
-
+    @abstractmethod
     def row(self, j):
         """The step that pass j lies in."""
-        return j // self.substeps
 
-    def begin(self, j):
-        """Share of its step at which pass j begins."""
-        return j % self.substeps / self.substeps
+    @abstractmethod
+    def first(self, step):
+        """Passes before a step; also how many so many steps take."""
 
-    def end(self, j):
-        """Share of its step at which pass j ends."""
-        return (j % self.substeps + 1) / self.substeps
+    @abstractmethod
+    def time(self, step):
+        """When a step begins [s]."""
 
+    @abstractmethod
     def step_length(self, j):
         """Length of the step of pass j [s]."""
-        return self.dt + 0 * j
 
+    @abstractmethod
     def length(self, j):
         """Length h of pass j [s]."""
-        return self.dt / self.substeps + 0 * j
+
+    @abstractmethod
+    def begin(self, j):
+        """Share of its step at which pass j begins."""
+
+    @abstractmethod
+    def end(self, j):
+        """Share of its step at which pass j ends."""
+
+    @property
+    @abstractmethod
+    def longest(self) -> float:
+        """The longest pass [s]."""
+
+    @abstractmethod
+    def stretches(self, first: int, last: int) -> list[tuple[int, int]]:
+        """Passes first .. last - 1 in parts, (first, last), within which all have one length."""
+
+    # ---- frames, one every so many steps -----------------------------------------------------------------------------
+
+    def shown(self, j, every: int):
+        """The frame that the state before pass j is, or -1; every: 0 for no frames."""
+        row = self.row(j)
+        return np.where((every > 0) & (j == self.first(row)) & (row % max(every, 1) == 0), row // max(every, 1), -1)
+
+    def counted(self, j, every: int):
+        """The frame that pass j leads to, or -1."""
+        return self.row(j) // every + 1 if every else -1 + 0 * j
+
+    def ends_frame(self, j: int, every: int) -> bool:
+        """Whether the state after pass j is a frame."""
+        return bool(self.shown(j + 1, every) >= 0)
+
+    def frame_time(self, frame: int, every: int) -> float:
+        """Time between a frame and the one before [s]."""
+        return float(self.time(frame * every) - self.time((frame - 1) * every))
 
     # ---- rows of a motion, and their adjoints ------------------------------------------------------------------------
 
@@ -125,17 +162,18 @@ class Schedule:
     def table(
         self, first: int, last: int, num_rows: int, save_every: int, weights: dict
     ) -> tuple[np.ndarray, np.ndarray]:
-        """(INTS, FLOATS) of passes first .. last - 1, one row each; weights: the solver's numbers by name (explicit/)."""
+        """(INTS, FLOATS) of passes first .. last - 1, one row each; weights: the solver's numbers by name (explicit/);
+        save_every: steps between frames."""
         j = np.arange(first, last)
         row = np.minimum(self.row(j), num_rows - 1)
-        saved = (j % save_every == 0) if save_every else np.zeros(len(j), bool)
         ints = {
             "row": row,
             "next": np.minimum(row + 1, num_rows - 1),
             "force0": self.row(j - weights["lag0"]),
             "force1": self.row(j - weights["lag1"]),
-            "frame": np.where(saved, j // max(save_every, 1), -1),
-            "opens": j % self.substeps == 0,
+            "frame": self.shown(j, save_every),
+            "counted": self.counted(j, save_every),
+            "opens": j == self.first(self.row(j)),
         }
         floats = dict(begin=self.begin(j), end=self.end(j), per_step=1 / self.step_length(j), h=self.length(j))
         floats |= {name: weights[name] for name in FLOATS if name in weights}
@@ -143,6 +181,117 @@ class Schedule:
             np.stack([np.broadcast_to(columns[name], len(j)) for name in names], 1)
             for names, columns in ((INTS, ints), (FLOATS, floats))
         )
+
+
+@dataclass(frozen=True)
+class EqualSteps(Schedule):
+    """As many steps as asked for, each of dt [s] and of `substeps` passes."""
+
+    dt: float
+    substeps: int
+
+    def row(self, j):
+        return j // self.substeps
+
+    def first(self, step):
+        return step * self.substeps
+
+    def time(self, step):
+        return step * self.dt
+
+    def step_length(self, j):
+        return self.dt + 0 * j
+
+    def length(self, j):
+        return self.dt / self.substeps + 0 * j
+
+    def begin(self, j):
+        return j % self.substeps / self.substeps
+
+    def end(self, j):
+        return (j % self.substeps + 1) / self.substeps
+
+    @property
+    def longest(self):
+        return self.dt / self.substeps
+
+    def stretches(self, first, last):
+        return [(first, last)] if first < last else []
+
+
+class UnequalSteps(Schedule):
+    """Steps of lengths [s] of one's own, shape (steps,), each divided into `substeps` equal passes: a number, or one for
+    each step.
+
+    Pass it as `steps` of a `Rollout`. Forces per step, motions and paths go by these steps, and frames stand at their ends.
+    Gradients are those of the steps as they are: exact, for nothing here depends on the state.
+    Symplectic solvers keep energy for long times with equal steps alone; each change of the step moves the energy that
+    they keep, by the order of the solver. Hairer, Lubich, Wanner, Geometric Numerical Integration, VIII.1,
+    doi:10.1007/3-540-30666-8.
+    Raises ValueError for lengths that are not > 0, and for substeps that are not whole numbers >= 1.
+    """
+
+    def __init__(self, lengths: ArrayLike, substeps: ArrayLike = 1):
+        lengths, parts = np.atleast_1d(np.asarray(lengths, np.float64)).copy(), np.asarray(substeps)
+        if lengths.ndim != 1 or not (np.all(np.isfinite(lengths)) and np.all(lengths > 0)):
+            raise ValueError("lengths of steps must be > 0 [s], one number for each step")
+        whole = parts.dtype.kind in "iuf" and np.all((parts == np.floor(parts)) & (parts >= 1) & np.isfinite(parts))
+        if not whole or parts.shape not in ((), lengths.shape):
+            raise ValueError(
+                f"substeps must be whole numbers >= 1, one for all steps or one for each of {len(lengths)}, got shape "
+                f"{parts.shape}"
+            )
+        self.lengths, self.substeps = lengths, np.broadcast_to(parts, lengths.shape).astype(np.int64)
+        self._first = np.concatenate([[0], np.cumsum(self.substeps)])
+        self._time = np.concatenate([[0.0], np.cumsum(lengths)])
+        for kept in (self.lengths, self.substeps, self._first, self._time):
+            kept.setflags(write=False)
+
+    def __len__(self) -> int:
+        return len(self.lengths)
+
+    def __repr__(self) -> str:
+        h = self.lengths / self.substeps
+        return (
+            f"UnequalSteps({len(self)} steps, {self._first[-1]} substeps of {h.min(initial=np.inf):.4g} to "
+            f"{h.max(initial=0):.4g} s, {self._time[-1]:.6g} s)"
+        )
+
+    def _step(self, j):
+        return np.minimum(self.row(j), len(self) - 1)
+
+    def row(self, j):
+        return np.searchsorted(self._first, j, side="right") - 1
+
+    def first(self, step):
+        return self._first[step]
+
+    def time(self, step):
+        return self._time[step]
+
+    def step_length(self, j):
+        return self.lengths[self._step(j)]
+
+    def length(self, j):
+        k = self._step(j)
+        return self.lengths[k] / self.substeps[k]
+
+    def begin(self, j):
+        k = self.row(j)
+        return (j - self._first[k]) / self.substeps[np.minimum(k, len(self) - 1)]
+
+    def end(self, j):
+        return (j - self._first[self.row(j)] + 1) / self.substeps[self._step(j)]
+
+    @property
+    def longest(self):
+        return float((self.lengths / self.substeps).max())
+
+    def stretches(self, first, last):
+        h = self.length(np.arange(first, last))
+        ends = np.flatnonzero(np.abs(np.diff(h)) > 1e-12 * h[1:]) + 1 + first if last > first else []
+        bounds = [first, *(int(e) for e in ends), last]
+        return [(a, b) for a, b in zip(bounds, bounds[1:]) if a < b]
 
 
 @runtime.traced

@@ -2,7 +2,7 @@
 
 import weakref
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -79,6 +79,13 @@ class ContactResolution:
         )
 
 
+def worst(seen: list[ContactResolution]) -> ContactResolution:
+    """The coarsest of several, with the smallest gap of all."""
+    coarsest, nearest = max(seen, key=lambda one: one.coarseness), min(seen, key=lambda one: one.smallest_gap)
+    where = {name: getattr(nearest, name) for name in ("smallest_gap", "vertex", "obstacle")}
+    return replace(coarsest, **where)
+
+
 def place_name(vertices: tuple[int, ...]) -> str:
     """A vertex, or a face by its corners, in words."""
     return f"vertex {vertices[0]}" if len(vertices) == 1 else f"face ({', '.join(map(str, vertices))})"
@@ -98,10 +105,21 @@ class ContactWatch:
 
     def clear(self) -> None:
         """Forget what was seen."""
+        self.parts: list[tuple[np.ndarray, float]] = []  # what was seen in passes of other lengths, and these [s]
+        self._clear()
+
+    def _clear(self) -> None:
         if self.contacts:
             rows = np.zeros(self.seen.shape)
             rows[::3] = np.inf
             runtime.fill(self.seen, rows)
+
+    def close(self, h: float) -> None:
+        """Passes of length h [s] are over: keep what was seen in them apart from what is seen next."""
+        rows = self.rows()
+        if self.contacts and np.isfinite(rows[::3]).any():
+            self.parts.append((rows, h))
+            self._clear()
 
     def rows(self) -> np.ndarray:
         """What was seen, to be put back by `put`."""
@@ -142,9 +160,9 @@ class ContactWatch:
 
     def seen_so_far(self) -> Callable[[], ContactResolution]:
         """The same, worked out when it is asked for: most runs never are."""
-        rows, values, solver = self.rows(), self.ws.arrays.values, self.ws.solver
-        h, largest = solver.substep, limits(solver)
-        return lambda: self._resolution(rows, values, h, largest)
+        values, largest = self.ws.arrays.values, limits(self.ws.solver)
+        parts = [*self.parts, (self.rows(), self.ws.substep)]
+        return lambda: worst([self._resolution(rows, values, h, largest) for rows, h in parts])
 
     def _resolution(
         self, rows: np.ndarray, values: Derived, h: float, largest: tuple[float, float]

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import NamedTuple
 
+import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
@@ -40,6 +41,7 @@ class Workspace:
 
     def __init__(self, solver, derived: Derived):
         self.solver, self.scene, self.report = solver, solver.scene, SolveReport()
+        self.substep = solver.substep  # length of the passes that were last looked after [s]
         self.owner = runtime.program()
         self.arrays = SceneArrays(self.scene, solver.stages_contact, self.feels_faces(self.scene), solver.explicit)
         self.parallel = solver.runs_parallel()
@@ -113,12 +115,16 @@ class Workspace:
     def step_of(self, j: int, num_passes: int) -> int:
         """The step that pass j belongs to; velocity Verlet's closing half kick belongs to the last one."""
         solver = self.solver
-        return self.first_step + min(j, num_passes - solver.num_passes(0) - 1) // solver.substeps
+        return self.first_step + int(solver.schedule.row(min(j, num_passes - solver.num_passes(0) - 1)))
+
+    def when(self, step: int) -> str:
+        """A step and its time, in words."""
+        return f"step {step}, t = {self.solver.schedule.time(step):.6g} s"
 
     def dated(self, error: Exception, j: int, num_passes: int) -> Exception:
         """The same error, which says when: in pass j of a run, before which `first_step` steps were done."""
         error.step = self.step_of(j, num_passes)
-        error.args = (f"step {error.step}, t = {error.step * self.solver.dt:.6g} s: {error}",)
+        error.args = (f"{self.when(error.step)}: {error}",)
         return error
 
     @property
@@ -140,13 +146,13 @@ class Workspace:
         """Note them anew."""
         raise NotImplementedError
 
-    def contact_forces(self, frame_time: float):
-        """Mean forces [N] of frames that take `frame_time` [s], shape (frames, obstacles, 2: by push and by friction,
-        num_vertices, 3)."""
+    def contact_forces(self, frame_time: np.ndarray):
+        """Mean forces [N] of frames, shape (frames, obstacles, 2: by push and by friction, num_vertices, 3); frame_time: how
+        long each takes [s], or all."""
         raise NotImplementedError
 
-    def chamber_pressures(self, num_frames: int, per_frame: int):
-        """Pressures [Pa] of chambers whose volume is held, shape (frames, chambers), frames `per_frame` passes apart."""
+    def chamber_pressures(self, num_frames: int, save_every: int):
+        """Pressures [Pa] of chambers whose volume is held, shape (frames, chambers), frames `save_every` steps apart."""
         raise NotImplementedError
 
     def make_record(self, num_slots: int) -> History:

@@ -79,7 +79,7 @@ class ExplicitAdjoint:
             runtime.fill(self.u, positions_adj[-1:])
             runtime.fill(self.v, velocities_adj[-1:])
 
-    def seed_contacts(self, forces_adj: np.ndarray | None, frame_time: float) -> None:
+    def seed_contacts(self, forces_adj: np.ndarray | None, frame_time: np.ndarray) -> None:
         """Set the adjoints of the frames' contact forces (None: zero)."""
         if forces_adj is not None:
             self.impulses.put(forces_adj / frame_time)
@@ -105,7 +105,7 @@ class ExplicitAdjoint:
     @property
     def _steps(self) -> int:
         """The most steps that the passes of a launch lie in; 1 where sums are made after each pass."""
-        substeps = self.ws.solver.substeps
+        substeps = int(np.min(self.ws.solver.schedule.substeps))
         return 1 + -(-(self.ws.in_parallel - 1) // substeps) if self.ws.repeated else 1
 
     def reverse(
@@ -285,7 +285,7 @@ class ExplicitTangent:
             change = runtime.fetch_row(self.v, 0) - before
             self.impulses.add_jvp(numbers, alone.speed, change, self.tangent.mass)
 
-    def contact_forces(self, frame_time: float) -> np.ndarray:
+    def contact_forces(self, frame_time: np.ndarray) -> np.ndarray:
         """Changes of the frames' contact forces."""
         return self.impulses.collect() / frame_time
 

@@ -94,10 +94,10 @@ class ChamberKernels(StepNumbers):
     def filling(self, at, now: A, rows: A):
         """p_0, the mean of both kicks."""
         p = ti.cast(0, self.fp)
-        for force in ti.static((now.force0, now.force1)):
+        for force, weight in ti.static(((now.force0, now.share0), (now.force1, now.share1))):
             ends = rows[self.row(force), at]
-            p += ends[0] + self.share(force, now) * (ends[1] - ends[0])
-        return p * ti.cast(0.5, self.fp)
+            p += weight * (ends[0] + self.share(force, now) * (ends[1] - ends[0]))
+        return p
 
     @ti.func
     def law(self, at, V, now: A, rows: A):
@@ -185,9 +185,9 @@ class ChamberKernels(StepNumbers):
     @ti.func
     def add_numbers(self, k, felt, absolute, grown, log, V0, n, now: A, adjoint: A):
         """Adds the adjoints of a gas's numbers, of which that of its pressure is `felt`."""
-        for force in ti.static((now.force0, now.force1)):
+        for force, weight in ti.static(((now.force0, now.share0), (now.force1, now.share1))):
             share, r, ends = self.share(force, now), self.row(force), self.vector(0)
-            by = ti.cast(0.5, self.fp) * felt * grown
+            by = weight * felt * grown
             ends[0], ends[1] = by * (1 - share), by * share
             adjoint.chamber_felt[r, k] = adjoint.chamber_felt[r, k] + ends
         for d, by in ti.static(((1, ti.cast(-1, self.fp)), (2, absolute * n / V0), (3, absolute * log))):

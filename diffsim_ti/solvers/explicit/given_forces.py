@@ -26,23 +26,18 @@ class GivenForces:
         return ti.types.vector(4, self.fp)
 
     @ti.func
-    def half(self):
-        return ti.cast(0.5, self.fp)  # dividing by 2 would compute in f64
-
-    @ti.func
     def force(self, i, now: A, scene: A, forces: A):
-        """External force on vertex i: of the present step, or half of each of the two that share a kick."""
+        """External force on vertex i: of the present step, or of the two that share a kick their part."""
         f = self.vector(0)
         k = scene.force_slot[i]
         if k >= 0:
             if ti.static(self.features.forces_keyed):
-                f = self.half() * (
-                    self.keyed_force(now.force0, k, now, forces) + self.keyed_force(now.force1, k, now, forces)
-                )
+                f = now.share0 * self.keyed_force(now.force0, k, now, forces)
+                f += now.share1 * self.keyed_force(now.force1, k, now, forces)
             else:
                 f = forces[0, k]
                 if ti.static(self.features.forces_per_step):
-                    f = self.half() * (forces[now.force0, k] + forces[now.force1, k])
+                    f = now.share0 * forces[now.force0, k] + now.share1 * forces[now.force1, k]
         return f
 
     @ti.func
@@ -78,12 +73,12 @@ class GivenForces:
         k = scene.force_slot[i]
         if k >= 0:
             if ti.static(self.features.forces_keyed):
-                for step in ti.static((now.force0, now.force1)):
-                    r, share, half = self.row_of_step(step), self.share_of_step(step, now), self.half()
-                    adjoint.forces[r, 2 * k] = adjoint.forces[r, 2 * k] + half * (1 - share) * f_adj
-                    adjoint.forces[r, 2 * k + 1] = adjoint.forces[r, 2 * k + 1] + half * share * f_adj
+                for step, weight in ti.static(((now.force0, now.share0), (now.force1, now.share1))):
+                    r, share = self.row_of_step(step), self.share_of_step(step, now)
+                    adjoint.forces[r, 2 * k] = adjoint.forces[r, 2 * k] + weight * (1 - share) * f_adj
+                    adjoint.forces[r, 2 * k + 1] = adjoint.forces[r, 2 * k + 1] + weight * share * f_adj
             elif ti.static(self.features.forces_per_step):
-                adjoint.forces[now.force0, k] = adjoint.forces[now.force0, k] + self.half() * f_adj
-                adjoint.forces[now.force1, k] = adjoint.forces[now.force1, k] + self.half() * f_adj
+                adjoint.forces[now.force0, k] = adjoint.forces[now.force0, k] + now.share0 * f_adj
+                adjoint.forces[now.force1, k] = adjoint.forces[now.force1, k] + now.share1 * f_adj
             else:
                 adjoint.forces[0, k] = adjoint.forces[0, k] + f_adj

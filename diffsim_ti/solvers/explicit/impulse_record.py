@@ -55,7 +55,7 @@ class ImpulseRecord:
 
     def frame_of(self, numbers: dict) -> int | None:
         """The frame that counts the pass of a launch, if one does."""
-        return numbers["first"] // numbers["per_frame"] + 1 if numbers["per_frame"] else None
+        return numbers["counted"] if numbers["counted"] >= 0 else None
 
     def add(self, numbers: dict, change: np.ndarray) -> None:
         """Add what faces did in a pass; change: of the velocity by them [m/s]."""

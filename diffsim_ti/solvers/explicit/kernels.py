@@ -73,17 +73,17 @@ class ExplicitKernels:
         return self.vertex.features.recorded
 
     @traced
-    def counted(self, now, j, plan):
-        """A pass with `into`: the first row of `impulse` of the frame that pass j leads to, -1 if none counts it."""
+    def counted(self, now):
+        """A pass with `into`: the first row of `impulse` of the frame that it leads to, -1 if none counts it."""
         if not self.recorded:
             return now
-        rows, each = 2 * self.vertex.obstacles.num_obstacles, plan.per_frame
-        return Bundle(**vars(now), into=let(ti.select(each > 0, (j // ti.max(each, 1) + 1) * rows, -1)))
+        rows = 2 * self.vertex.obstacles.num_obstacles
+        return Bundle(**vars(now), into=let(ti.select(now.counted >= 0, now.counted * rows, -1)))
 
     @traced
     def pass_of(self, j, table, plan):
         """Pass j."""
-        return self.counted(pass_at(table, j - plan.window), j, plan)
+        return self.counted(pass_at(table, j - plan.window))
 
     @ti.func
     def turn_of_first(self, item, table: A):
@@ -219,7 +219,7 @@ class ExplicitKernels:
     def pass_back(self, j, table, plan):
         """Pass j on the way back."""
         now = reversed_pass(pass_at(table, j - plan.window), j, plan)
-        return self.counted(self.vertex.obstacles.noting(now, plan), j, plan)
+        return self.counted(self.vertex.obstacles.noting(now, plan))
 
     @ti.func
     def passes_vjp(self, scene: A, state: A, adjoint: A, table: A, plan: A):
@@ -285,7 +285,6 @@ class ExplicitKernels:
     def _kernel(self, name: str, body, arrays: dict, repeated: bool, **numbers) -> Kernel:
         arrays = dict(scene=SCENE | self.further.arrays) | arrays | dict(table=PLAN)
         numbers = NUMBERS | self.further.counts | numbers
-        numbers |= dict(per_frame="int") if self.recorded else {}
         if repeated:
             arrays["table"], numbers = PLAN | TURNS, numbers | dict(times="int")
         return Kernel(name, body, self.vertex.law.precision, arrays, numbers, loops=2 * repeated)

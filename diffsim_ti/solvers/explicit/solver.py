@@ -30,11 +30,13 @@ from diffsim_ti.terms import SelfContact
 class Weights:
     """Numbers of passes (kick_drift.py) and their derivatives by the drag rate: one for all, or one for each.
 
-    A kick of pass j takes the mean of the external forces of the steps of passes j - lag0 and j - lag1.
+    A kick of pass j takes the shares share0 and share1 of the external forces of the steps of passes j - lag0 and j - lag1.
     """
 
     lag0: int
     lag1: int
+    share0: float
+    share1: float
     pre: float
     post: float
     alpha: float
@@ -101,10 +103,6 @@ class ExplicitSolver(Solver):
     def lags(self, j: int, num_passes: int) -> bool:
         """Whether before pass j the velocity is that of half a substep ago."""
 
-    @abstractmethod
-    def num_passes(self, steps: int) -> int:
-        """Passes that `steps` steps take."""
-
     def workspace(self, derived: Derived) -> "ExplicitWorkspace":
         """Arrays and bound launches for runs of this solver."""
         return ExplicitWorkspace(self, derived)
@@ -155,7 +153,7 @@ class ExplicitWorkspace(Workspace):
     def forget_contacts(self) -> None:
         self.impulses.clear()
 
-    def contact_forces(self, frame_time: float) -> np.ndarray:
+    def contact_forces(self, frame_time: np.ndarray) -> np.ndarray:
         return self.impulses.collect() / frame_time
 
     def forget(self) -> None:
@@ -192,25 +190,26 @@ class ExplicitWorkspace(Workspace):
         out, kicks = np.zeros_like(u, np.float64), self._kicks(j, num_passes)
         if a.rows["forces"] is not None:
             keyed = a.features().forces_keyed
-            out[self.scene.loaded_vertices] = 0.5 * sum(schedule.load(a.rows["forces"], *k, keyed) for k in kicks)
+            out[self.scene.loaded_vertices] = sum(w * schedule.load(a.rows["forces"], *k, keyed) for w, k in kicks)
         if self.following is not None:
             out += self.following.at(self.numbers_at(j, num_passes)).forces(a.values.rest + u)
         if a.features().cabled:
-            both = [schedule.ties(a.rows["ties"], *k) for k in kicks]
-            numbers = (0.5 * (begin + end) for begin, end in zip(*both))
+            both = [[w * part for part in schedule.ties(a.rows["ties"], *k)] for w, k in kicks]
+            numbers = (begin + end for begin, end in zip(*both))
             out += self.attached.ties.at(a.values.tie_segments, *numbers).forces(u, cables=True)
         return out
 
-    def _kicks(self, j: int, num_passes: int) -> list[tuple[int, float]]:
-        """(pass, share of its step) of the loads that the two kicks of pass j take."""
-        schedule, weights = self.solver.schedule, self.solver.weights(np.array([j]), num_passes, self.rate)
-        lags = [int(np.ravel(lag)[0]) for lag in (weights.lag0, weights.lag1)]
-        return [(j - lag, schedule.end(j - lag) if lag else schedule.begin(j)) for lag in lags]
+    def _kicks(self, j: int, num_passes: int) -> list[tuple[float, tuple[int, float]]]:
+        """(its share, (pass, share of its step)) of the loads that the two kicks of pass j take."""
+        schedule, w = self.solver.schedule, self.solver.weights(np.array([j]), num_passes, self.rate)
+        of_kicks = (w.share0, w.lag0), (w.share1, w.lag1)
+        kicks = [(float(np.ravel(share)[0]), int(np.ravel(lag)[0])) for share, lag in of_kicks]
+        return [(share, (j - lag, schedule.end(j - lag) if lag else schedule.begin(j))) for share, lag in kicks]
 
     def numbers_at(self, j: int, num_passes: int) -> np.ndarray:
         """Pressures and numbers of chambers, as pass j of a run takes them."""
         rows = self.arrays.rows["follower"]
-        return 0.5 * sum(self.solver.schedule.pressure(rows, *kick) for kick in self._kicks(j, num_passes))
+        return sum(w * self.solver.schedule.pressure(rows, *k) for w, k in self._kicks(j, num_passes))
 
     def kernels(self, features) -> ExplicitKernels:
         """The kernels for some features of the scene."""
@@ -243,7 +242,9 @@ class ExplicitWorkspace(Workspace):
             chunk = -(-(end - begin) // number)  # launches of one size
             stops = [*range(end, begin, -chunk), begin][::-1] if backwards else [*range(begin, end, chunk), end]
             for start, stop in list(zip(stops, stops[1:]))[::turn]:
-                yield sizes | dict(per_frame=save_every, window=window, first=start, count=stop - start, times=chunk)
+                counted = int(solver.schedule.counted(start, save_every))
+                own = dict(counted=counted, window=window, first=start, count=stop - start, times=chunk)
+                yield sizes | own
 
     def advance(self, first: int, last: int, num_passes: int, save_every: int = 0, base: int | None = None) -> None:
         """Passes first .. last - 1 from the current state; or recorded: slot j - base holds the state before pass j."""
@@ -269,6 +270,6 @@ class ExplicitWorkspace(Workspace):
                     self.impulses.add(numbers, change)
             if pairs:
                 try:
-                    pairs.check_pass(history.u, slot + stride, self.solver.substep)
+                    pairs.check_pass(history.u, slot + stride, float(self.solver.schedule.length(numbers["first"])))
                 except Tunnelling as error:
                     raise self.dated(error, numbers["first"], num_passes) from None

@@ -86,7 +86,7 @@ class ImplicitAdjoint(RecordedPasses):
         self.path = None if a.values.path is None else np.zeros_like(a.values.path)
         self.anchor = np.zeros((len(a.held), 3))
 
-    def seed_contacts(self, forces_adj: np.ndarray | None, frame_time: float) -> None:
+    def seed_contacts(self, forces_adj: np.ndarray | None, frame_time: np.ndarray) -> None:
         """Set the adjoints of the frames' contact forces (None: zero)."""
         self.contacts.forces = np.zeros_like(self.contacts.forces) if forces_adj is None else forces_adj
 
@@ -103,9 +103,10 @@ class ImplicitAdjoint(RecordedPasses):
             if self.z is not None:
                 self._pull_back_law(j, j - base)
             self._pull_back(j, save_every)
-            if save_every and j % save_every == 0 and j // save_every < len(self.frames[0]) - 1:
-                self.p += self.frames[0][j // save_every]
-                self.q += self.frames[1][j // save_every]
+            frame = int(self.ws.solver.schedule.shown(j, save_every))
+            if 0 <= frame < len(self.frames[0]) - 1:
+                self.p += self.frames[0][frame]
+                self.q += self.frames[1][frame]
 
     def _pull_back_law(self, j: int, slot: int) -> None:
         """The state of the law after pass j comes from that before, in a slot of the record, and from where it ends."""
@@ -113,14 +114,14 @@ class ImplicitAdjoint(RecordedPasses):
         self.ws.launch_law_state("vjp", self.features, j, slot, slot + 1, **own)
         self.p = self.p + runtime.fetch_row(self._law.y, 0)
 
-    def _pull_back_contacts(self, j: int, per_frame: int) -> tuple | None:
+    def _pull_back_contacts(self, j: int, save_every: int) -> tuple | None:
         """Adjoints of what the forces of obstacles in pass j depend on, where a loss names them (SharesAdjoint)."""
-        seed = self.contacts.seed(j, per_frame, self.stage.static) if self.contacts else None
+        seed = self.contacts.seed(j, save_every, self.stage.static) if self.contacts else None
         return None if seed is None else self._shares.pull_back(seed)
 
-    def _pull_back(self, j: int, per_frame: int) -> None:
+    def _pull_back(self, j: int, save_every: int) -> None:
         ws, s, p, q, held = self.ws, self.stage, self.p, self.q, self.ws.arrays.held
-        seen = self._pull_back_contacts(j, per_frame)
+        seen = self._pull_back_contacts(j, save_every)
         by_contacts = np.zeros_like(p) if seen is None else seen[0]
         if s.static:
             q = np.zeros_like(q)
@@ -129,7 +130,7 @@ class ImplicitAdjoint(RecordedPasses):
         by_star = self.solve(s.c0 * p_free + s.e0 / s.gamma * q_free + by_contacts * ws.free)
         nu = None
         if ws.volumes:
-            by_star, nu = ws.volumes.adjoint(self.places, by_star, self.chambers.adjoint(j, per_frame), self.solve)
+            by_star, nu = ws.volumes.adjoint(self.places, by_star, self.chambers.adjoint(j, save_every), self.solve)
         runtime.fill(ws.potential.w, by_star[None])
         for target in (self.lag, self.walls, *[self.pressed] * ws.potential.presses):
             runtime.fill(target, 0)

@@ -63,7 +63,7 @@ class Approach:
             ws.put_obstacles(before + done * drift)
             place = ws.newton.solve(place, *problem, rounds=self.rounds)
         ws.put_obstacles(before + done * drift)
-        speed = np.linalg.norm(drift[met.obstacle] - step[list(met.vertices)], axis=1).max() / ws.solver.substep
+        speed = np.linalg.norm(drift[met.obstacle] - step[list(met.vertices)], axis=1).max() / ws.substep
         raise Blocked.pinched(ws, place, met, 1 - done, float(speed))
 
     def _carried(self, place, step, walls, drift, obstacle: int):

@@ -20,7 +20,7 @@ class Blocked(NotConverged):
     @classmethod
     def pinched(cls, ws, u, met, left: float, speed: float) -> "Blocked":
         """What comes to the body has `left` of its way to go, and finds no room."""
-        term, h = ws.way.terms[met.obstacle], ws.solver.substep
+        term, h = ws.way.terms[met.obstacle], ws.substep
         gap, width = ws.gap_of(met, u), float(term.values["barrier_width"])
         short = min(0.5 * h, width / max(speed, 1e-300))
         message = (
@@ -45,7 +45,7 @@ class Blocked(NotConverged):
         remedy = (
             f"the barrier cannot stop it: raise its {ws.arrays.stiffer(met.obstacle, met.vertices, needed)}, or its width"
             if weak
-            else f"take substeps of {ws.solver.substep / 4:.3g} s"
+            else f"take substeps of {ws.substep / 4:.3g} s"
         )
         message = (
             f"{met} stands {gap:.3g} m before {term!r} (width {width:.3g} m), met at {speed:.4g} m/s, and Newton's method "

@@ -6,24 +6,27 @@ import numpy as np
 
 
 class ChamberRecord:
-    """Frames being `per_frame` passes apart, the pressure of a frame is that of the pass that leads to it."""
+    """The pressure of a frame is that of the pass that leads to it."""
 
     def __init__(self, workspace):
         self.ws = weakref.proxy(workspace)
         self.adjoints: np.ndarray | None = None  # by the frames' chamber pressures, None: zero
         self._changes: dict[int, np.ndarray] = {}
 
-    def adjoint(self, j: int, per_frame: int) -> np.ndarray:
-        """By the pressures of held volumes after pass j."""
-        held = self.ws.follower.held
-        if self.adjoints is None or not per_frame or (j + 1) % per_frame:
-            return np.zeros(len(held))
-        return self.adjoints[(j + 1) // per_frame, held]
+    def _frame(self, j: int, save_every: int) -> int:
+        """The frame that the state after pass j is, or -1."""
+        return int(self.ws.solver.schedule.shown(j + 1, save_every))
 
-    def note(self, j: int, per_frame: int, change: np.ndarray) -> None:
+    def adjoint(self, j: int, save_every: int) -> np.ndarray:
+        """By the pressures of held volumes after pass j."""
+        held, frame = self.ws.follower.held, self._frame(j, save_every)
+        return np.zeros(len(held)) if self.adjoints is None or frame < 0 else self.adjoints[frame, held]
+
+    def note(self, j: int, save_every: int, change: np.ndarray) -> None:
         """Change of those after pass j."""
-        if (j + 1) % per_frame == 0:
-            self._changes[(j + 1) // per_frame] = change
+        frame = self._frame(j, save_every)
+        if frame >= 0:
+            self._changes[frame] = change
 
     def changes(self, num_frames: int) -> np.ndarray:
         """Of the frames, shape (frames, chambers)."""

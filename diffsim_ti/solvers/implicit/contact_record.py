@@ -59,24 +59,26 @@ class ContactRecord:
     """Forces of all frames, shape (frames, obstacles, 2, num_vertices, 3)."""
 
     def __init__(self, workspace):
-        frames, a = workspace.frames.frames_u.shape[0], workspace.arrays
+        frames, a, self.schedule = workspace.frames.frames_u.shape[0], workspace.arrays, workspace.solver.schedule
         self.forces = np.zeros((frames, len(a.obstacles), 2, a.num_vertices, 3))
 
-    @staticmethod
-    def weight(j: int, per_frame: int, static: bool) -> float:
-        """How much pass j counts in its frame."""
-        return float((j + 1) % per_frame == 0) if static else 1 / per_frame
+    def _weight(self, j: int, save_every: int, static: bool) -> tuple[int, float]:
+        """(the frame that pass j leads to, how much it counts there)."""
+        frame = int(self.schedule.counted(j, save_every))
+        if frame < 0 or static:
+            return frame, float(frame >= 0 and self.schedule.ends_frame(j, save_every))
+        return frame, float(self.schedule.length(j) / self.schedule.frame_time(frame, save_every))
 
-    def add(self, j: int, per_frame: int, static: bool, make) -> None:
+    def add(self, j: int, save_every: int, static: bool, make) -> None:
         """Add make(), forces in pass j, to the frame that the pass leads to."""
-        weight = self.weight(j, per_frame, static) if per_frame else 0.0
+        frame, weight = self._weight(j, save_every, static)
         if weight:
-            self.forces[j // per_frame + 1] += weight * make()
+            self.forces[frame] += weight * make()
 
-    def seed(self, j: int, per_frame: int, static: bool) -> np.ndarray | None:
+    def seed(self, j: int, save_every: int, static: bool) -> np.ndarray | None:
         """Adjoint of the forces in pass j, `forces` being those of the frames; None where it is zero."""
-        weight = self.weight(j, per_frame, static) if per_frame else 0.0
-        out = weight * self.forces[j // per_frame + 1] if weight else None
+        frame, weight = self._weight(j, save_every, static)
+        out = weight * self.forces[frame] if weight else None
         return out if weight and out.any() else None
 
 

@@ -93,10 +93,11 @@ class GivenInPasses:
         if self.volumes:
             self.volumes.place(u, self.multipliers[self._pass_of_all(j)])
 
-    def chamber_pressures(self, num_frames: int, per_frame: int) -> np.ndarray:
+    def chamber_pressures(self, num_frames: int, save_every: int) -> np.ndarray:
         out = np.zeros((num_frames, len(self.scene.chambers)))
         for frame in range(1, num_frames):
-            out[frame, self.follower.held] = self.multipliers[self._pass_of_all(frame * per_frame - 1)]
+            last = self.solver.num_passes(frame * save_every) - 1
+            out[frame, self.follower.held] = self.multipliers[self._pass_of_all(last)]
         return out
 
     def last_chamber_pressures(self) -> np.ndarray:
@@ -108,7 +109,7 @@ class GivenInPasses:
 
     def _pass_of_all(self, j: int) -> int:
         """Number of pass j, also of the steps of a run that come one by one."""
-        return self.first_step * self.solver.substeps + j
+        return self.first_step * int(np.max(self.solver.schedule.substeps)) + j
 
     def loads(self, j: int, stage: Stage) -> np.ndarray:
         """Dead loads on each vertex [N]: weight and external forces; statics lay them on in substeps."""

@@ -17,15 +17,15 @@ class Noted:
     def forget_contacts(self) -> None:
         self.record_contacts()
 
-    def contact_forces(self, frame_time: float) -> np.ndarray:
+    def contact_forces(self, frame_time: np.ndarray) -> np.ndarray:
         return self.impulses.forces
 
-    def note_contacts(self, j: int, per_frame: int) -> None:
+    def note_contacts(self, j: int, save_every: int) -> None:
         """What obstacles did in pass j, where it is asked for."""
-        if self.impulses and per_frame:
+        if self.impulses and save_every:
             self.potential.place(self.u_star)
             shares = self.kept("shares", lambda: Shares(self))
-            self.impulses.add(j, per_frame, self.is_static, shares.forces)
+            self.impulses.add(j, save_every, self.is_static, shares.forces)
 
     def note_solves(self, j: int, num_passes: int, seconds: float) -> None:
         """What pass j took; statics say which saddles they left and, without contact, where states were not stable."""
@@ -50,4 +50,4 @@ class Noted:
     @property
     def is_static(self) -> bool:
         """Whether passes look for equilibria."""
-        return self.solver.stage(self.rate, True).static
+        return self.solver.stage(self.rate, True, 0).static

@@ -48,7 +48,7 @@ class ObstacleWays:
 
     def _speed(self, met, step, drift) -> float:
         """How fast a vertex or face and an obstacle meet that do so in a pass [m/s]."""
-        return float(np.linalg.norm(step[list(met.vertices)] - drift[met.obstacle], axis=1).max() / self.solver.substep)
+        return float(np.linalg.norm(step[list(met.vertices)] - drift[met.obstacle], axis=1).max() / self.substep)
 
     def _explained(self, error: NotConverged, u) -> NotConverged:
         """The error, or what stood in the way."""

@@ -22,7 +22,7 @@ class RecordedPasses:
         ws = self.ws
         self.u, self.v, self.before = ws.read(ws.record, j - base)
         self.u_next = ws.read(ws.record, j - base + 1)[0]
-        self.stage = stage = ws.solver.stage(ws.rate, self.before is None)
+        self.stage = stage = ws.solver.stage(ws.rate, self.before is None, j)
         self.x, self.y = ws.inertial(stage, self.u, self.v, self.before)
         self.u_star = (self.u_next - (1 - stage.c0) * self.u) / stage.c0
         self.mass = stage.inertia * ws.mass

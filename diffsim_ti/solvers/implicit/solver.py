@@ -58,12 +58,9 @@ class ImplicitSolver(Solver):
         self.tolerance, self.max_iterations = float(tolerance), int(max_iterations)
         super().__init__(scene, dt, substeps, parallel)
 
-    def num_passes(self, steps: int) -> int:
-        return steps * self.substeps
-
     @abstractmethod
-    def stage(self, rate: float, fresh: bool) -> Stage:
-        """The numbers of a pass; `fresh`: there is no state before the present one."""
+    def stage(self, rate: float, fresh: bool, j: int) -> Stage:
+        """The numbers of pass j; `fresh`: there is no state before the present one."""
 
     def workspace(self, derived):
         return ImplicitWorkspace(self, derived)

@@ -44,8 +44,9 @@ class ImplicitTangent(RecordedPasses):
     def advance(self, first: int, last: int, num_passes: int, save_every: int) -> None:
         """Tangent of passes first .. last - 1, recorded from slot 0."""
         for j in range(first, last):
-            if j % save_every == 0:
-                self.save_frame(j // save_every)
+            frame = int(self.ws.solver.schedule.shown(j, save_every))
+            if frame >= 0:
+                self.save_frame(frame)
             self.open(j, first)
             self._pass(j, save_every)
             if self.z is not None:
@@ -53,7 +54,7 @@ class ImplicitTangent(RecordedPasses):
                 own = dict(at=self.ws.record, tangent=(self._law, self.numbers))
                 self.ws.launch_law_state("jvp", self.features, j, j - first, j - first + 1, **own)
 
-    def _pass(self, j: int, per_frame: int) -> None:
+    def _pass(self, j: int, save_every: int) -> None:
         ws, s, tangent, a = self.ws, self.stage, self.tangent, self.ws.arrays
         db0, db1, de0, de1 = (x * self.rate_dot for x in s.by_rate)
         dx, dy = s.a0 * self.du, s.b0 * self.dv + db0 * self.v
@@ -97,10 +98,10 @@ class ImplicitTangent(RecordedPasses):
         if ws.volumes:
             targets = ws.volumes.targets_jvp(self.places, held + tangent.rest, dp)
             d_star, change = ws.volumes.tangent(self.places, d_star, targets, self.solve)
-            self.chambers.note(j, per_frame, change)
+            self.chambers.note(j, save_every, change)
         d_star = held + d_star
         if self.contacts:
-            self._note_contacts(j, per_frame, d_star)
+            self._note_contacts(j, save_every, d_star)
         before = self.du, self.dv
         self.du = s.c0 * d_star + (1 - s.c0) * self.du
         self.dv = s.e0 * (d_star - dx) / s.gamma + s.e1 * dy + de0 * self.v_star + de1 * self.y
@@ -110,13 +111,13 @@ class ImplicitTangent(RecordedPasses):
             self.dv = np.zeros_like(self.dv)
         self.tangent_before = before
 
-    def _note_contacts(self, j: int, per_frame: int, d_star: np.ndarray) -> None:
+    def _note_contacts(self, j: int, save_every: int, d_star: np.ndarray) -> None:
         """Change of the forces of obstacles in pass j, u* changing by d_star."""
         runtime.fill(self.ws.potential.w, d_star[None])
         record = dict(tangent=(SimpleNamespace(lag=self.lag, walls=self.walls, pressed=self.pressed), self.numbers))
-        self.contacts.add(j, per_frame, self.stage.static, lambda: self._shares.forces("jvp", **record))
+        self.contacts.add(j, save_every, self.stage.static, lambda: self._shares.forces("jvp", **record))
 
-    def contact_forces(self, frame_time: float) -> np.ndarray:
+    def contact_forces(self, frame_time: np.ndarray) -> np.ndarray:
         """Changes of the frames' contact forces."""
         return self.contacts.forces
 

@@ -27,6 +27,7 @@ from diffsim_ti.solvers.implicit.pressed import Pressed
 from diffsim_ti.solvers.implicit.stage import Stage
 from diffsim_ti.solvers.implicit.threads import one_blas_thread
 from diffsim_ti.state.arrays import History, copy_slot
+from diffsim_ti.state.schedule import EqualSteps
 from diffsim_ti.state.workspace import Workspace
 
 
@@ -137,8 +138,9 @@ class ImplicitWorkspace(ObstacleWays, Noted, GivenInPasses, Workspace):
             self._length = self.solver.substep
             self._begin_anew()
         for j in range(first, last):
-            if save_every and j % save_every == 0:
-                self.save_frame(j // save_every)
+            frame = int(self.solver.schedule.shown(j, save_every))
+            if frame >= 0:
+                self.save_frame(frame)
             u, v, before = self.read(self.state, 0)
             self.potential.hold(self.state, 0)
             begin, self.newton.reports = time.perf_counter(), []
@@ -171,16 +173,25 @@ class ImplicitWorkspace(ObstacleWays, Noted, GivenInPasses, Workspace):
     def preconditioner(self, mass: Mass) -> tuple:
         """(preconditioner for c M + K with mass = c m, size of the diagonal of that at rest [N/m])."""
         mass = diagonal_of(mass)
+        size_of, mass = mass, self._rounded(mass)
         key = float(mass.sum())
         if key not in self._preconditioners:
             with self.potential.at_rest():
                 blocks, contact = self.potential.blocks(), self.potential.contact_blocks()
             size = np.abs(blocks if contact is None else blocks - contact).sum((1, 2))[:, None]
             kind = Multigrid if self._wants_multigrid(size, mass) else BlockJacobi
-            if len(self._preconditioners) > 2:
+            if len(self._preconditioners) > 5:
                 self._preconditioners.pop(next(iter(self._preconditioners)))
-            self._preconditioners[key] = kind(self.potential, mass, self.free, size), size + mass
-        return self._preconditioners[key]
+            self._preconditioners[key] = kind(self.potential, mass, self.free, size), size
+        kept, size = self._preconditioners[key]
+        return kept, size + size_of
+
+    def _rounded(self, inertia: np.ndarray) -> np.ndarray:
+        """c m, of unequal steps for the nearest power of four of c, so that some preconditioners serve all steps."""
+        if isinstance(self.solver.schedule, EqualSteps) or not inertia.any():
+            return inertia
+        c = float(inertia.sum() / diagonal_of(self.mass).sum())
+        return inertia * (4.0 ** np.round(0.5 * np.log2(c)) / c)
 
     def _wants_multigrid(self, size: np.ndarray, mass: np.ndarray) -> bool:
         if self.solver.preconditioner != "auto":
@@ -208,7 +219,7 @@ class ImplicitWorkspace(ObstacleWays, Noted, GivenInPasses, Workspace):
         return stage.a0 * u + stage.a1 * before[0], stage.b0 * v + stage.b1 * before[1]
 
     def _pass(self, j, u, v, before):
-        stage = self.solver.stage(self.rate, before is None)
+        stage = self.solver.stage(self.rate, before is None, j)
         x, y = self.inertial(stage, u, v, before)
         place, speed = self.prescribed(j, self.arrays.values)
         mass, inertial = stage.inertia * self.mass, x + stage.gamma * y
