@@ -5,6 +5,7 @@ import os
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # read when taichi is imported
 os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")  # no network traffic from a simulator
 
+from diffsim_ti.adaptive_steps import adaptive_steps
 from diffsim_ti.contact.surface_pairs import Tunnelling
 from diffsim_ti.materials import (
     Corotated,
@@ -47,6 +48,7 @@ from diffsim_ti.solvers import (
     VelocityVerletSolver,
     stable_dt,
 )
+from diffsim_ti.state.schedule import UnequalSteps
 from diffsim_ti.state.solve_report import Buckled, SolveReport
 from diffsim_ti.terms import (
     Anchor,
@@ -119,6 +121,8 @@ __all__ = [
     "Buckled",
     "SolveReport",
     "Rollout",
+    "UnequalSteps",
+    "adaptive_steps",
     "Frames",
     "MaterialPoints",
     "ContactForce",

@@ -88,7 +88,7 @@ class Rollout:
             steps = UnequalSteps(steps, solver.substeps)
         if isinstance(steps, UnequalSteps):
             return solver.on(steps), len(steps)
-        if not np.isscalar(steps) or int(steps) != steps or steps < 0:
+        if not isinstance(steps, int | float | np.integer) or not (steps >= 0 and steps == int(min(steps, 1e18))):
             raise ValueError(f"steps must be a whole number >= 0, lengths of steps [s], or UnequalSteps, got {steps!r}")
         return solver, int(steps)
 

@@ -51,7 +51,9 @@ class StaticSolver(ImplicitSolver):
         return self.substeps
 
     def check_schedule(self, schedule):
-        raise ValueError("equilibria know no time, so that steps of unequal length mean nothing to them: pass their number")
+        raise ValueError(
+            "equilibria know no time, so that steps of unequal length mean nothing to them: pass their number"
+        )
 
     def stage(self, rate, fresh, j):
         return Stage(self.substep, b0=0.0, e0=0.0, static=True)

@@ -81,7 +81,9 @@ class FeltFaces:
             own = dict(scene=a, faces=self, state=state, table=ws.table)
             launches[key] = kernel.bind(**own, **records), state, records
         sizes = dict(num_vertices=a.num_vertices, num_faces=self.num_faces, num_surface=self.num_surface)
-        own = sizes | dict(slot=slot, between=int(between), h=float(ws.solver.schedule.length(plan["first"])), n=n, k=k)
+        own = sizes | dict(
+            slot=slot, between=int(between), h=float(ws.solver.schedule.length(plan.get("first", 0))), n=n, k=k
+        )
         numbers = ("first", "window", "steps", "num_parts")
         launches[key][0](**own | {name: plan.get(name, 0) for name in numbers if name in kernel.numbers})
 
