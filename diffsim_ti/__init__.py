@@ -9,11 +9,15 @@ from diffsim_ti.adaptive_steps import adaptive_steps
 from diffsim_ti.contact.surface_pairs import Tunnelling
 from diffsim_ti.materials import (
     Corotated,
+    FibreReinforced,
+    Gent,
     LinearElastic,
     MooneyRivlin,
+    Ogden,
     SmithNeoHookean,
     StableNeoHookean,
     StVenantKirchhoff,
+    Yeoh,
 )
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.modes import Modes, modes
@@ -84,6 +88,10 @@ __all__ = [
     "Corotated",
     "StVenantKirchhoff",
     "MooneyRivlin",
+    "Yeoh",
+    "Gent",
+    "Ogden",
+    "FibreReinforced",
     "Gravity",
     "Drag",
     "ExternalForce",

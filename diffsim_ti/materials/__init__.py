@@ -4,13 +4,17 @@ from diffsim_ti.materials.calculus.invariants import InvariantLaw
 from diffsim_ti.materials.calculus.strains import StrainLaw
 from diffsim_ti.materials.corotated import Corotated
 from diffsim_ti.materials.energy_law import EnergyLaw
+from diffsim_ti.materials.fibre_reinforced import FibreReinforced
+from diffsim_ti.materials.gent import Gent
 from diffsim_ti.materials.law import Law
 from diffsim_ti.materials.linear_elastic import LinearElastic
 from diffsim_ti.materials.material import Material
 from diffsim_ti.materials.mooney_rivlin import MooneyRivlin
+from diffsim_ti.materials.ogden import Ogden
 from diffsim_ti.materials.smith_neo_hookean import SmithNeoHookean
 from diffsim_ti.materials.st_venant_kirchhoff import StVenantKirchhoff
 from diffsim_ti.materials.stable_neo_hookean import StableNeoHookean
+from diffsim_ti.materials.yeoh import Yeoh
 
 MATERIALS = (StableNeoHookean, SmithNeoHookean, LinearElastic, Corotated, StVenantKirchhoff, MooneyRivlin)
 
@@ -18,13 +22,17 @@ __all__ = [
     "MATERIALS",
     "Corotated",
     "EnergyLaw",
+    "FibreReinforced",
+    "Gent",
     "InvariantLaw",
     "Law",
     "LinearElastic",
     "Material",
     "MooneyRivlin",
+    "Ogden",
     "SmithNeoHookean",
     "StVenantKirchhoff",
     "StableNeoHookean",
     "StrainLaw",
+    "Yeoh",
 ]

@@ -1,15 +1,14 @@
-"""Materials that are written outside the package (open_laws/), with random numbers: exponents, vectors, rates, states."""
+"""Materials by their energy, of the package and from outside it (open_laws/): exponents, vectors, rates, states."""
 
 import numpy as np
-from open_laws.fibres import FibreTissue
-from open_laws.gent import Gent
-from open_laws.ogden import Ogden
 from open_laws.power_law import Knowles
 from open_laws.relaxing import RelaxingRubber
 from open_laws.viscous import ViscousRubber
 
+from diffsim_ti.materials import FibreReinforced, Gent, Ogden, StableNeoHookean, Yeoh
+
 EVERYWHERE, ON_TETRAHEDRA, IN_STEPS, IN_EXPLICIT_STEPS = (
-    (Gent, FibreTissue, Ogden),
+    (Gent, FibreReinforced, Ogden, Yeoh),
     (Knowles,),
     (RelaxingRubber,),
     (ViscousRubber,),
@@ -26,15 +25,18 @@ def open_laws(explicit: bool, static: bool, patches: bool) -> tuple:
 def open_material(law: type, rng, mesh, E: float, nu: float, spread):
     """spread(number, share): what differs between tetrahedra, or not."""
     mu, lam = E / (2 * (1 + nu)), E * nu / ((1 + nu) * (1 - 2 * nu))
+    bulk = spread(lam + 2 / 3 * mu, 0.5)
     if law is Gent:
-        return Gent(mu=spread(mu, 0.5), limit=spread(rng.uniform(15, 60), 0.5), lam=spread(lam, 0.5))
-    if law is FibreTissue:
+        return Gent(mu=spread(mu, 0.5), limit=spread(rng.uniform(15, 60), 0.5), bulk_modulus=bulk)
+    if law is Yeoh:
+        return Yeoh(spread(mu / 2, 0.5), -0.02 * mu, spread(0.01 * mu, 0.5), bulk)
+    if law is FibreReinforced:
         fibre = rng.standard_normal((mesh.num_tetrahedra, 3) if rng.random() < 0.5 else 3)
         fibre = fibre / np.linalg.norm(fibre, axis=-1, keepdims=True)
-        return FibreTissue(mu=mu, lam=spread(lam, 0.5), k1=0.3 * mu, k2=spread(rng.uniform(0.2, 1.5), 0.5), fibre=fibre)
+        matrix = StableNeoHookean(mu=mu, lam=spread(lam, 0.5))
+        return FibreReinforced(matrix, 0.3 * mu, spread(rng.uniform(0.2, 1.5), 0.5), fibre)
     if law is Ogden:
-        numbers = dict(mu_1=0.5 * mu, a_1=rng.uniform(1.5, 3.0), mu_2=-0.3 * mu, a_2=rng.uniform(-3.0, -1.5), lam=lam)
-        return Ogden(**numbers | {"lam": spread(lam, 0.5)})
+        return Ogden([0.5 * mu, -0.3 * mu], [rng.uniform(1.5, 3.0), rng.uniform(-3.0, -1.5)], bulk)
     if law is Knowles:
         return Knowles(E=spread(E, 0.5), nu=nu, b=rng.uniform(0.5, 2.0), n=spread(rng.uniform(0.6, 1.5), 0.3))
     if law is ViscousRubber:

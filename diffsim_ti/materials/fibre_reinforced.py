@@ -1,0 +1,173 @@
+"""Fibres in a material: a direction for each tetrahedron in which it stiffens as it is stretched."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from diffsim_ti.differentiation import exp, maximum
+from diffsim_ti.materials.energy_law import EnergyLaw
+from diffsim_ti.materials.law import Law
+from diffsim_ti.materials.material import Material, _all_values, check_range
+from diffsim_ti.runtime import traced
+
+OWN = ("k1", "k2", "fibre")
+
+
+@dataclass(frozen=True)
+class FibreLaw(EnergyLaw):
+    """psi = k1/(2 k2) (exp(k2 e^2) - 1), e = max(a . C a / |a|^2 - 1, 0)"""
+
+    coefficient_names = ("k1", "k2", "a_x", "a_y", "a_z")
+
+    def psi(self, H, p):
+        k1, k2, *a = p
+        G = H + H.transpose() + H.transpose() @ H  # C - I
+        along = sum(a[i] * G[i, k] * a[k] for i in range(3) for k in range(3))
+        e = maximum(along / sum(x * x for x in a), 0)
+        return k1 / (2 * k2) * (exp(k2 * e * e) - 1)
+
+
+@dataclass(frozen=True)
+class FibreReinforcedLaw(Law):
+    """The sum of a law and of what fibres add; the coefficients of fibres come first."""
+
+    matrix: Law | None = None
+
+    @property
+    def fibres(self) -> FibreLaw:
+        return FibreLaw(self.precision)
+
+    @property
+    def coefficient_names(self):
+        return (*self.fibres.coefficient_names, *self.matrix.coefficient_names)
+
+    @property
+    def last_without_lam(self):
+        factors = self.matrix.last_without_lam
+        return (0,) * 5 + tuple(factors) if factors else ()
+
+    @property
+    def lanes(self):
+        return self.matrix.lanes
+
+    @property
+    def has_dilatation(self):
+        return self.matrix.has_dilatation
+
+    @traced
+    def energy_density(self, H, p):
+        return self.fibres.energy_density(H, p[:5]) + self.matrix.energy_density(H, p[5:])
+
+    @traced
+    def energy_by_coefficients(self, H, p):
+        return [*self.fibres.energy_by_coefficients(H, p[:5]), *self.matrix.energy_by_coefficients(H, p[5:])]
+
+    @traced
+    def stress(self, H, p):
+        return self.fibres.stress(H, p[:5]) + self.matrix.stress(H, p[5:])
+
+    @traced
+    def stress_differential(self, H, dH, p):
+        return self.fibres.stress_differential(H, dH, p[:5]) + self.matrix.stress_differential(H, dH, p[5:])
+
+    @traced
+    def stress_change(self, H, p, dp):
+        return self.fibres.stress_change(H, p[:5], dp[:5]) + self.matrix.stress_change(H, p[5:], dp[5:])
+
+    @traced
+    def stress_differential_and_products(self, H, dH, p):
+        of_fibres, by_fibres = self.fibres.stress_differential_and_products(H, dH, p[:5])
+        of_matrix, by_matrix = self.matrix.stress_differential_and_products(H, dH, p[5:])
+        return of_fibres + of_matrix, [*by_fibres, *by_matrix]
+
+    @traced
+    def dilatation(self, H):
+        return self.matrix.dilatation(H)
+
+    @traced
+    def dilatation_gradient(self, H):
+        return self.matrix.dilatation_gradient(H)
+
+    @traced
+    def dilatation_gradient_differential(self, H, dH):
+        return self.matrix.dilatation_gradient_differential(H, dH)
+
+
+class FibreReinforced(Material):
+    """`FibreReinforced(matrix, k1, k2, fibre)`: psi of the matrix, any material, plus that of fibres,
+
+        k1/(2 k2) (exp(k2 e^2) - 1) [J/m^3],  e = max(a . C a / |a|^2 - 1, 0),
+
+    which resist being stretched alone. k1 [Pa], k2 [-], fibre: the direction a at rest, of any length, shape (3,) or
+    (num_tetrahedra, 3). A second family of fibres is one more `FibreReinforced` around the first; its inputs are k1_2,
+    k2_2 and fibre_2. Small strains along stretched fibres have 4 k1 more of Young's modulus.
+    e^2 has a kink of second order at e = 0: gradients of a body whose fibres are all just slack or taut are one-sided.
+    Holzapfel, Gasser, Ogden 2000, A new constitutive framework for arterial wall mechanics, doi:10.1023/A:1010835316564.
+    Raises ValueError for numbers out of range, and for a matrix that has a state or depends on the velocity.
+    """
+
+    def __init__(self, matrix: Material, k1, k2, fibre):
+        if not isinstance(matrix, Material):
+            raise ValueError(f"FibreReinforced: matrix must be a material such as StableNeoHookean, got {matrix!r}")
+        law = matrix.law("f64")
+        if law.state_names or law.reads != ("H",):
+            raise ValueError(
+                f"FibreReinforced: a matrix of {matrix.name} has a state or a viscosity; take an elastic one"
+            )
+        self.matrix, self._extra = matrix, ""
+        families = sum(name.split("_")[0] == "k1" for name in matrix.inputs)
+        self.own = tuple(f"{name}_{families + 1}" if families else name for name in OWN)
+        self._numbers = dict(zip(self.own, (k1, k2, fibre))) | matrix._numbers
+        self.check({name: _all_values(name, number, self.shape_of(name)) for name, number in self._numbers.items()})
+
+    def shape_of(self, name):
+        return {self.own[2]: (3,)}.get(name, () if name in self.own else self.matrix.shape_of(name))
+
+    def unit_of(self, name):
+        return dict(zip(self.own, ("Pa", "-", "-"))).get(name) or self.matrix.unit_of(name)
+
+    def _of_matrix(self, values: dict) -> dict:
+        return {name: values[name] for name in self.matrix.inputs if name in values}
+
+    def check(self, values):
+        super().check({name: values[name] for name in self.own if name in values})
+        self.matrix.check(self._of_matrix(values))
+        k1, k2, fibre = self.own
+        check_range(k1, values[k1], 0, np.inf, True, "a stiffness [Pa]")
+        check_range(k2, values[k2], 0, np.inf, False, "an exponent; 1e-6 makes fibres quadratic")
+        length = np.linalg.norm(values[fibre], axis=-1)
+        check_range(f"length of {fibre}", length, 0, np.inf, False, "a direction needs a length")
+
+    def lame(self, values):
+        mu, lam = self.matrix.lame(self._of_matrix(values))
+        return mu + 2 * np.asarray(values[self.own[0]]), lam
+
+    def _joined(self, own: dict, of_matrix: np.ndarray) -> np.ndarray:
+        k1, k2, a = (np.asarray(own[name], np.float64) for name in self.own)
+        parts = [k1[..., None], k2[..., None], a, of_matrix]
+        shape = np.broadcast_shapes(*(part.shape[:-1] for part in parts))
+        return np.concatenate([np.broadcast_to(part, (*shape, part.shape[-1])) for part in parts], -1)
+
+    def coefficients(self, values):
+        self.check(values)
+        return self._joined(values, self.matrix.coefficients(self._of_matrix(values)))
+
+    def coefficients_jvp(self, values, tangents):
+        own = {name: np.broadcast_to(tangents.get(name, 0.0), np.shape(values[name])) for name in self.own}
+        return self._joined(own, self.matrix.coefficients_jvp(self._of_matrix(values), self._of_matrix(tangents)))
+
+    def coefficients_vjp(self, values, coefficients_adj):
+        adj = np.asarray(coefficients_adj, np.float64)
+        out = {}
+        for name, part in zip(self.own, (adj[..., 0], adj[..., 1], adj[..., 2:5])):
+            value = np.asarray(values[name])
+            uniform = value.ndim == len(self.shape_of(name))
+            out[name] = part.reshape(-1, *value.shape).sum(0) if uniform else part
+        return out | self.matrix.coefficients_vjp(self._of_matrix(values), adj[..., 5:])
+
+    def law(self, precision):
+        return FibreReinforcedLaw(precision, self.matrix.law(precision))
+
+    def __repr__(self):
+        own = super().__repr__()
+        return f"{own[:-1]}, matrix={self.matrix.name})"

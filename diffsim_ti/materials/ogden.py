@@ -1,0 +1,76 @@
+"""Ogden's rubber: a sum of powers of the principal stretches."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from diffsim_ti.differentiation import expm1_minus_x
+from diffsim_ti.materials.calculus.isochoric import isochoric
+from diffsim_ti.materials.calculus.stretches import sum_over_stretches
+from diffsim_ti.materials.calculus.tensor import invariants
+from diffsim_ti.materials.energy_law import EnergyLaw
+from diffsim_ti.materials.material import Material, check_range
+
+
+@dataclass(frozen=True)
+class OgdenLaw(EnergyLaw):
+    """psi = sum_k mu_k/a_k (sum_i l_i^a_k - 3) + K/2 (J - 1)^2, l_i = J^(-1/3) lambda_i, k = 1 .. terms"""
+
+    terms: int = 1
+
+    @property
+    def coefficient_names(self):
+        names = range(1, self.terms + 1)
+        return (*(f"mu_{k}" for k in names), *(f"a_{k}" for k in names), "bulk_modulus")
+
+    def psi(self, H, p):
+        pairs = list(zip(p[: self.terms], p[self.terms : 2 * self.terms]))
+        _, j, log = isochoric(H)
+
+        def of_stretch(l):  # logarithms of l_i add up to zero: what is linear in them drops out
+            return sum(mu / a * expm1_minus_x(a * (l - log / 3)) for mu, a in pairs)
+
+        return sum_over_stretches(H, of_stretch) + p[-1] / 2 * j * j
+
+    def theta(self, H):
+        return invariants(H)[1]
+
+
+class Ogden(Material):
+    """psi = sum_k mu_k/a_k (sum_i l_i^a_k - 3) + K/2 (J - 1)^2 [J/m^3], l_i = J^(-1/3) lambda_i.
+
+    `Ogden(moduli, exponents, bulk_modulus)`: mu_k [Pa] and a_k [-], one for each term, each mu_k a_k > 0, and K [Pa].
+    Vectors are for all tetrahedra, or of shape (num_tetrahedra, terms). Small strains have the shear modulus
+    sum_k mu_k a_k / 2 and the bulk modulus K; (mu, 2) is neo-Hookean, (2 c10, 2) with (-2 c01, -2) Mooney's. Others write
+    mu_k a_k / 2 for the modulus of a term: theirs times 2 / a_k are these. J must stay above 0.
+    Ogden 1972, Large deformation isotropic elasticity, doi:10.1098/rspa.1972.0026.
+    """
+
+    spellings = (("moduli", "exponents", "bulk_modulus"),)
+    units = {"exponents": "-"}
+
+    def __init__(self, moduli, exponents, bulk_modulus):
+        of_terms = [np.shape(next(iter(x.values())) if isinstance(x, dict) and x else x) for x in (moduli, exponents)]
+        if not all(of_terms) or of_terms[0][-1] != of_terms[1][-1] or not of_terms[0][-1]:
+            raise ValueError(
+                f"Ogden: moduli and exponents need one number for each term, got shapes {of_terms[0]} and {of_terms[1]}"
+            )
+        self.terms = of_terms[0][-1]
+        self.shapes = {"moduli": (self.terms,), "exponents": (self.terms,)}
+        super().__init__(moduli=moduli, exponents=exponents, bulk_modulus=bulk_modulus)
+
+    def check(self, values):
+        super().check(values)
+        check_range("bulk_modulus", values["bulk_modulus"], 0, np.inf, False, "a stiffness [Pa]")
+        if values["moduli"].ndim == values["exponents"].ndim or len({np.shape(x)[:-1] for x in values.values()}) < 3:
+            parts = np.broadcast_arrays(values["moduli"], values["exponents"])
+            for k in range(self.terms):
+                stiffness = parts[0][..., k] * parts[1][..., k]
+                check_range(f"mu_{k + 1} a_{k + 1}", stiffness, 0, np.inf, False, "each term must stiffen the body")
+
+    def lame(self, values):
+        mu = (np.asarray(values["moduli"]) * values["exponents"]).sum(-1) / 2
+        return mu, values["bulk_modulus"] - 2 / 3 * mu
+
+    def law(self, precision):
+        return OgdenLaw(precision, terms=self.terms)

@@ -1,0 +1,48 @@
+"""Yeoh's rubber: three numbers that follow the curve of a tensile test to large stretches."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from diffsim_ti.materials.calculus.isochoric import isochoric
+from diffsim_ti.materials.calculus.tensor import invariants
+from diffsim_ti.materials.energy_law import EnergyLaw
+from diffsim_ti.materials.material import Material, check_range
+
+
+@dataclass(frozen=True)
+class YeohLaw(EnergyLaw):
+    """psi = c10 i + c20 i^2 + c30 i^3 + K/2 (J - 1)^2, i = J^(-2/3) I_C - 3"""
+
+    coefficient_names = ("c10", "c20", "c30", "bulk_modulus")
+
+    def psi(self, H, p):
+        c10, c20, c30, bulk = p
+        i, j, _ = isochoric(H)
+        return i * (c10 + i * (c20 + i * c30)) + bulk / 2 * j * j
+
+    def theta(self, H):
+        return invariants(H)[1]
+
+
+class Yeoh(Material):
+    """psi = c10 i + c20 i^2 + c30 i^3 + K/2 (J - 1)^2 [J/m^3], i = J^(-2/3) I_C - 3.
+
+    `Yeoh(c10, c20, c30, bulk_modulus)` [Pa]: small strains have the shear modulus 2 c10 and the bulk modulus K; c20, often
+    negative, softens what follows, c30 > 0 stiffens large stretches. J must stay above 0.
+    Yeoh 1993, Some forms of the strain energy function for rubber, doi:10.5254/1.3538343.
+    """
+
+    spellings = (("c10", "c20", "c30", "bulk_modulus"),)
+
+    def check(self, values):
+        super().check(values)
+        for name in ("c10", "bulk_modulus"):
+            check_range(name, values[name], 0, np.inf, False, "a stiffness [Pa]")
+
+    def lame(self, values):
+        mu = 2 * np.asarray(values["c10"])
+        return mu, values["bulk_modulus"] - 2 / 3 * mu
+
+    def law(self, precision):
+        return YeohLaw(precision)
