@@ -95,7 +95,7 @@ class PressedFace(PressedTriangle):
     @ti.func
     def forces_vjp(self, t, now: A, scene: A, state: A, s, adjoint: A, first):
         felt = self.push_vjp(t, self.factor(t, now, scene.follower, scene), scene, state, s, adjoint, first)
-        self.add_felt(t, now, ti.cast(-1.0 / 12.0, self.fp) * felt, adjoint)
+        self.add_felt(t, now, ti.cast(-1.0 / 6.0, self.fp) * felt, adjoint)
 
 
 def pressed_element(order: int, precision: str, per_step: bool, shape: bool) -> PressedTriangle:
