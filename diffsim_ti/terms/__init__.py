@@ -14,10 +14,11 @@ from diffsim_ti.terms.obstacles.mesh_obstacle import MeshObstacle
 from diffsim_ti.terms.obstacles.obstacle import Obstacle
 from diffsim_ti.terms.self_contact import SelfContact
 from diffsim_ti.terms.term import Term, VertexForce
+from diffsim_ti.terms.muscle import Muscle
 from diffsim_ti.terms.ties import Anchor, Cable, Spring
 
 OBSTACLES = (Ground, HalfSpace, Sphere, Box, Capsule, Cylinder, MeshObstacle)
-LOADS = (ExternalForce, Traction, Pressure, BodyForce, GasChamber, FilledChamber, Spring, Cable, ElasticFoundation)
+LOADS = (ExternalForce, Traction, Pressure, BodyForce, GasChamber, FilledChamber, Spring, Cable, Muscle, ElasticFoundation)
 TERMS = (Gravity, Drag, *LOADS, *OBSTACLES, SelfContact)
 __all__ = [
     "Anchor",
@@ -37,6 +38,7 @@ __all__ = [
     "HalfSpace",
     "Load",
     "MeshObstacle",
+    "Muscle",
     "OBSTACLES",
     "Obstacle",
     "Pressure",
