@@ -27,6 +27,7 @@ def muscles(mesh) -> list:
         ds.Muscle([0, 1, 0], [1e4, 2e4], rng.uniform(size=(STEPS, 2)), ["left", "right"], per="set", name="pair"),
         ds.Muscle(fibres, 1e4, rng.uniform(size=m), per="tetrahedron"),
         ds.Muscle([0, 0, 1], 8e3, lambda t: np.full(2, 0.3 + 20 * t), ["right", "left"], per="set", name="wave"),
+        ds.Gravity(),
     ]
 
 
@@ -42,10 +43,7 @@ def rollout_of(kind, terms=None, order=1, steps=STEPS, precision="f64", **option
     return ds.Rollout(solver, steps, save_every=1, gradients="all")
 
 
-@pytest.mark.parametrize(
-    "kind, order",
-    [(kind, 1) for kind in SOLVERS] + [(ds.VelocityVerletSolver, 2), (ds.ImplicitEulerSolver, 2)],
-)
+@pytest.mark.parametrize("kind, order", [(kind, 1) for kind in SOLVERS] + [(ds.VelocityVerletSolver, 2)])
 def test_every_number(kind, order):
     """By a dot product each: activations of every spelling, stresses, the rest shape."""
     assert_transposed(rollout_of(kind, order=order), 1e-11 if kind.explicit else 1e-8)
@@ -72,7 +70,7 @@ def test_a_bar_shortens_as_its_closed_form_says(order):
 
 @pytest.mark.parametrize("kind", [ds.VelocityVerletSolver, ds.ImplicitEulerSolver], ids=lambda s: s.__name__)
 def test_momentum_stays_to_round_off(kind):
-    frames = (rollout := rollout_of(kind, steps=3, fixed=None)).forward()
+    frames = (rollout := rollout_of(kind, muscles(mesh_of())[:-1], fixed=None)).forward()
     m = rollout.scene.inputs.derive(rollout.scene.inputs.values).mass[:, None]
     v = frames.velocities[-1]
     size = np.abs(m * v).sum()
@@ -82,13 +80,14 @@ def test_momentum_stays_to_round_off(kind):
         assert np.linalg.norm(np.cross(half, m * v).sum(0)) < 1e-10 * size
 
 
-def test_long_steps_are_calm():
-    """Fibres of 30 kPa, whose force held over a step blows up at 2.5 ms: implicit steps of 20 ms come to rest."""
+@pytest.mark.parametrize("kind", [ds.SemiImplicitSolver, ds.ImplicitEulerSolver], ids=lambda s: s.__name__)
+def test_long_steps_gain_nothing(kind):
+    """Fibres as strong as the body, for 80 steps of 5 ms: swings stay as wide as the first, or are damped."""
     mesh = ds.TetrahedralMesh.create_cube(2, size=0.1)
     scene = ds.Scene(mesh, ds.StableNeoHookean(3e4, 0.4), 1000.0, [ds.Muscle([1, 0, 0], 3e4, 1.0)], precision="f64")
-    frames = ds.Rollout(ds.ImplicitEulerSolver(scene, dt=0.02), 40, save_every=20).forward()
-    assert np.abs(frames.velocities[-1]).max() < 1e-3
-    assert np.ptp(frames.positions[-1][:, 0]) < 0.08
+    frames = ds.Rollout(kind(scene, dt=5e-3), 80, save_every=1).forward()
+    speed = np.sqrt((frames.velocities**2).sum((1, 2)))
+    assert speed[:40].max() > 0.5 and speed[40:].max() < (1.02 if kind.explicit else 0.3) * speed[:40].max()
 
 
 @pytest.mark.parametrize(
@@ -99,7 +98,8 @@ def test_long_steps_are_calm():
         (dict(activation=-0.1), "activation must be >= 0"),
         (dict(stress=-1.0), ">= 0"),
         (dict(tetrahedra="left", per="set"), "names of sets"),
-        (dict(activation=np.ones(3), tetrahedra=["left", "right"], per="set"), "activations of shape"),
+        (dict(activation=np.ones(3), tetrahedra=["left", "right"], per="set"), "must have shape"),
+        (dict(activation=np.ones(2), per="tetrahedron"), "activations of shape"),
         (dict(fibre=np.eye(3)[:2]), "2 directions"),
     ],
 )

@@ -18,7 +18,18 @@ from diffsim_ti.terms.muscle import Muscle
 from diffsim_ti.terms.ties import Anchor, Cable, Spring
 
 OBSTACLES = (Ground, HalfSpace, Sphere, Box, Capsule, Cylinder, MeshObstacle)
-LOADS = (ExternalForce, Traction, Pressure, BodyForce, GasChamber, FilledChamber, Spring, Cable, Muscle, ElasticFoundation)
+LOADS = (
+    ExternalForce,
+    Traction,
+    Pressure,
+    BodyForce,
+    GasChamber,
+    FilledChamber,
+    Spring,
+    Cable,
+    Muscle,
+    ElasticFoundation,
+)
 TERMS = (Gravity, Drag, *LOADS, *OBSTACLES, SelfContact)
 __all__ = [
     "Anchor",

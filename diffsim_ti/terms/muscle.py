@@ -57,8 +57,17 @@ class Muscle(Cable):
         self.given, self.plain, self.keyed, self.per = activation, "activation", is_keyed(activation), per
         self.fibre, self.tetrahedra = a / np.linalg.norm(a, axis=-1, keepdims=True), tetrahedra
         self.ndim = len(shape) + 1
-        inputs = amount("activation", activation, shape, "-", "activation"), Input(
-            "stress", stress, ((),) if per == "all" else ((), shape), "Pa", AT_LEAST_0, plain="muscle_stress", label="stress"
+        inputs = (
+            amount("activation", activation, shape, "-", "activation"),
+            Input(
+                "stress",
+                stress,
+                ((),) if per == "all" else ((), shape),
+                "Pa",
+                AT_LEAST_0,
+                plain="muscle_stress",
+                label="stress",
+            ),
         )
         Term.__init__(self, *inputs, name=name)
         if np.any((self.rows([0.0]) if self.keyed else inputs[0].value) < 0):
@@ -82,7 +91,9 @@ class Muscle(Cable):
         if len(chosen) == 0:
             raise ValueError("Muscle acts on nothing: the set is empty; name a set that has members")
         if self.fibre.ndim == 2 and len(self.fibre) != len(chosen):
-            raise ValueError(f"Muscle: fibre has {len(self.fibre)} directions for {len(chosen)} tetrahedra; give one or all")
+            raise ValueError(
+                f"Muscle: fibre has {len(self.fibre)} directions for {len(chosen)} tetrahedra; give one or all"
+            )
         count = () if self.per == "all" else (len(self.tetrahedra) if self.per == "set" else len(chosen),)
         alpha, stress = (i.value for i in self.described)
         last = self.rows([0.0]).shape[1:] if self.keyed else alpha.shape[alpha.ndim - len(count) :]
