@@ -6,6 +6,7 @@ from diffsim_ti.terms.external_force import ExternalForce
 from diffsim_ti.terms.foundation import ElasticFoundation
 from diffsim_ti.terms.gravity import Gravity
 from diffsim_ti.terms.loads import BodyForce, Load, Pressure, Traction
+from diffsim_ti.terms.muscle import Muscle
 from diffsim_ti.terms.obstacles.ball import Capsule, Sphere
 from diffsim_ti.terms.obstacles.box import Box, Cylinder
 from diffsim_ti.terms.obstacles.ground import Ground
@@ -14,7 +15,6 @@ from diffsim_ti.terms.obstacles.mesh_obstacle import MeshObstacle
 from diffsim_ti.terms.obstacles.obstacle import Obstacle
 from diffsim_ti.terms.self_contact import SelfContact
 from diffsim_ti.terms.term import Term, VertexForce
-from diffsim_ti.terms.muscle import Muscle
 from diffsim_ti.terms.ties import Anchor, Cable, Spring
 
 OBSTACLES = (Ground, HalfSpace, Sphere, Box, Capsule, Cylinder, MeshObstacle)

@@ -20,14 +20,14 @@ PER = ("all", "set", "tetrahedron")
 
 
 class Muscle(Cable):
-    """Fibres along a in tetrahedra, which add the energy alpha s (|F a| - 1) [J/m^3] and so the stress P = alpha s t a^T, t =
-    F a / |F a|: a pull that turns with the fibre, whatever its length. Evaluated in every substep and every Newton iteration.
+    """Fibres along a in tetrahedra, which add the energy alpha s (|F a| - 1) [J/m^3] and so the stress P = alpha s t a^T,
+    t = F a / |F a|: a pull that turns with the fibre, whatever its length, in every substep and every Newton iteration.
 
     fibre: the direction a at rest, of any length, shape (3,) or (k, 3) for the k tetrahedra. stress [Pa]: s, what a fibre
     pulls with at alpha = 1, per area at rest; one number, or one for each activation.
     activation: alpha >= 0, over time: one number, one for each step (shape (steps,)), a function of time [s], or keyframes
-    (times, values), a tuple, linear between. per: what has an activation of its own: "all" together; each "set" of those that
-    `tetrahedra` names; each "tetrahedron". Then alpha has one number for each, shape (n,), or (steps, n) for each step.
+    (times, values), a tuple, linear between. per: what has an activation of its own: "all" together; each "set" of those
+    that `tetrahedra` names; each "tetrahedron". Then alpha has one number for each, shape (n,), or (steps, n) by steps.
     tetrahedra: a tetrahedron set's name, several, indices or a mask; None: all.
     Forces and their moments sum to zero in each tetrahedron. If the rest shape changes, fibres go along with it.
     In load steps of statics activations grow with the loads. Energy that a muscle gives counts as work of a load.
