@@ -14,7 +14,7 @@ import diffsim_ti as ds
 from diffsim_ti import runtime, verify
 from diffsim_ti.differentiation import x_minus_log1p
 from diffsim_ti.elements.items import Block, Single
-from diffsim_ti.materials import EnergyLaw, FibreReinforced, Gent, Material, Ogden, Yeoh
+from diffsim_ti.materials import EnergyLaw, FibreReinforced, Gent, Grown, Material, Ogden, Yeoh
 from diffsim_ti.materials.calculus.tensor import Tensor, invariants
 from diffsim_ti.materials.gent import GentLaw
 from diffsim_ti.materials.ogden import OgdenLaw
@@ -65,6 +65,10 @@ def ogden(F, mu_1, mu_2, a_1, a_2, bulk):
     return mp.fsum(terms) + bulk / 2 * (J - 1) ** 2
 
 
+def grown(F, growth, *tissue_numbers):
+    return (1 + growth) ** 3 * tissue(F / (1 + growth), *tissue_numbers)
+
+
 OWN = {  # material, the energy again, one set of coefficients
     "yeoh": (Yeoh(1.0, -0.1, 0.05, 3.0), yeoh, [1.0, -0.1, 0.05, 3.0]),
     "gent": (Gent(2.0, 6.0, 3.0), gent, [2.0, 6.0, 3.0]),
@@ -73,6 +77,11 @@ OWN = {  # material, the energy again, one set of coefficients
         FibreReinforced(Gent(2.0, 6.0, 3.0), 1.5, 0.8, [1.0, 0.5, -0.3]),
         tissue,
         [1.5, 0.8, 1, 0.5, -0.3, 2, 6, 3],
+    ),
+    "grown": (
+        Grown(FibreReinforced(Gent(2.0, 6.0, 3.0), 1.5, 0.8, [1.0, 0.5, -0.3]), 0.1),
+        grown,
+        [0.1, 1.5, 0.8, 1, 0.5, -0.3, 2, 6, 3],
     ),
     "ogden": (Ogden([2.0, -0.5], [1.3, -2.0], 3.0), ogden, [2.0, -0.5, 1.3, -2.0, 3.0]),
 }
