@@ -90,7 +90,9 @@ class Grown(Material):
             raise ValueError(f"Grown: material must be a material such as StableNeoHookean, got {material!r}")
         law = material.law("f64")
         if law.state_names or law.reads != ("H",) or "growth" in material.inputs:
-            raise ValueError(f"Grown: {material.name} has a state, a viscosity or a growth; take an elastic one without")
+            raise ValueError(
+                f"Grown: {material.name} has a state, a viscosity or a growth; take an elastic one without"
+            )
         self.material, self._extra = material, ""
         self._numbers = dict(growth=growth) | material._numbers
         self.check({name: _all_values(name, number, self.shape_of(name)) for name, number in self._numbers.items()})
