@@ -1,5 +1,7 @@
 """Muscles: the closed form of a bar, every derivative in every solver, momentum, long steps, errors."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from test_every_adjoint import assert_transposed
@@ -107,3 +109,13 @@ def test_what_does_not_fit_is_refused(options, words):
     with pytest.raises(ValueError, match=words):
         terms = [ds.Muscle(**(dict(fibre=[1, 0, 0], stress=1e4, activation=0.5) | options))]
         ds.Scene(mesh_of(), ds.StableNeoHookean(1e5, 0.3), 1000.0, terms)
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_it_is_drawn_along_its_fibres(order):
+    mesh = mesh_of(order)
+    (lines,) = ds.Muscle([0, 2, 0], 1e4, 0.5, "left", name="calf").drawn(
+        SimpleNamespace(mesh=mesh, positions=mesh.vertices)
+    )
+    along = lines.ends[:, 1] - lines.ends[:, 0]
+    assert lines.label == "calf" and np.all(along[:, 1] > 0) and np.abs(along[:, [0, 2]]).max() < 1e-12

@@ -109,22 +109,26 @@ class Muscle(Cable):
         return (self.groups(mesh)[0][:, None] * q + np.arange(q)).ravel()
 
     def paths(self, mesh: TetrahedralMesh) -> Paths:
-        """Along the fibre through each point of the stresses, from -h a / 2 to h a / 2: x parts there by h F a."""
+        """At each point of the stresses from a point at rest in the origin to h F a, a sum of places whose weights add up to
+        zero: half the work of a path from one point of the fibre to another."""
         reference, (chosen, _) = mesh.reference, self.groups(mesh)
-        nodes = mesh.elements[chosen]
-        N = reference.functions(reference.points)
-        X = mesh.vertices[nodes]
+        nodes, none = mesh.elements[chosen], (np.zeros(0, np.int64), np.zeros(0))
         by_xi = reference.derivatives(reference.points)  # (q, n, 3)
-        J = np.einsum("tni,qnk->tqik", X, by_xi)
+        J = np.einsum("tni,qnk->tqik", mesh.vertices[nodes], by_xi)
         gradients = np.einsum("qnk,tqki->tqni", by_xi, np.linalg.inv(J))
         h = np.cbrt(np.abs(np.linalg.det(J)))[:, :, None]
-        along = 0.5 * h * np.einsum("tqni,ti->tqn", gradients, np.broadcast_to(self.fibre, (len(chosen), 3)))
-        return Paths.of([[(own, n - w), (own, n + w)] for own, part in zip(nodes, along) for n, w in zip(N, part)])
+        along = h * np.einsum("tqni,ti->tqn", gradients, np.broadcast_to(self.fibre, (len(chosen), 3)))
+        return Paths.of([[none, (own, w)] for own, part in zip(nodes, along) for w in part])
 
     def drawn(self, moment):
-        paths = self.paths(moment.mesh)
-        points = (paths.matrix(moment.mesh.num_vertices) @ moment.positions).reshape(-1, 2, 3)
-        return [Lines(self.name or "muscle", points[spread(points.mean(1), MOST)])]
+        mesh, reference = moment.mesh, moment.mesh.reference
+        nodes = mesh.elements[self.groups(mesh)[0]]
+        middles = np.einsum("qn,tni->tqi", reference.functions(reference.points), moment.positions[nodes]).reshape(
+            -1, 3
+        )
+        shown = spread(middles, MOST)
+        half = (0.5 * self.paths(mesh).matrix(mesh.num_vertices)[1::2] @ moment.positions)[shown]
+        return [Lines(self.name or "muscle", np.stack([middles[shown] - half, middles[shown] + half], 1))]
 
     def links(self, names: dict[str, str], own: str) -> list[Link]:
         mesh, paths, segments = self.mesh, self.paths(self.mesh), f"{own} segments"
