@@ -14,7 +14,7 @@ import diffsim_ti as ds
 from diffsim_ti import runtime, verify
 from diffsim_ti.differentiation import x_minus_log1p
 from diffsim_ti.elements.items import Block, Single
-from diffsim_ti.materials import EnergyLaw, FibreReinforced, Gent, Material, Ogden, Yeoh
+from diffsim_ti.materials import EnergyLaw, FibreReinforced, Gent, Grown, Material, Ogden, Yeoh
 from diffsim_ti.materials.calculus.tensor import Tensor, invariants
 from diffsim_ti.materials.gent import GentLaw
 from diffsim_ti.materials.ogden import OgdenLaw
@@ -65,6 +65,12 @@ def ogden(F, mu_1, mu_2, a_1, a_2, bulk):
     return mp.fsum(terms) + bulk / 2 * (J - 1) ** 2
 
 
+def grown(F, growth, mu, lam):
+    e = (F + F.T) / (2 * (1 + growth)) - mp.eye(3)
+    trace = e[0, 0] + e[1, 1] + e[2, 2]
+    return (1 + growth) ** 3 * (mu * squares(e) + lam / 2 * trace**2)
+
+
 OWN = {  # material, the energy again, one set of coefficients
     "yeoh": (Yeoh(1.0, -0.1, 0.05, 3.0), yeoh, [1.0, -0.1, 0.05, 3.0]),
     "gent": (Gent(2.0, 6.0, 3.0), gent, [2.0, 6.0, 3.0]),
@@ -74,6 +80,7 @@ OWN = {  # material, the energy again, one set of coefficients
         tissue,
         [1.5, 0.8, 1, 0.5, -0.3, 2, 6, 3],
     ),
+    "grown": (Grown(ds.LinearElastic(mu=1.0, lam=2.0), 0.1), grown, [0.1, 1.0, 2.0]),
     "ogden": (Ogden([2.0, -0.5], [1.3, -2.0], 3.0), ogden, [2.0, -0.5, 1.3, -2.0, 3.0]),
 }
 every_own = pytest.mark.parametrize("name", OWN)

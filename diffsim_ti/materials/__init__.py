@@ -6,6 +6,7 @@ from diffsim_ti.materials.corotated import Corotated
 from diffsim_ti.materials.energy_law import EnergyLaw
 from diffsim_ti.materials.fibre_reinforced import FibreReinforced
 from diffsim_ti.materials.gent import Gent
+from diffsim_ti.materials.grown import Grown
 from diffsim_ti.materials.law import Law
 from diffsim_ti.materials.linear_elastic import LinearElastic
 from diffsim_ti.materials.material import Material
@@ -24,6 +25,7 @@ __all__ = [
     "EnergyLaw",
     "FibreReinforced",
     "Gent",
+    "Grown",
     "InvariantLaw",
     "Law",
     "LinearElastic",

@@ -6,6 +6,7 @@ from diffsim_ti.terms.external_force import ExternalForce
 from diffsim_ti.terms.foundation import ElasticFoundation
 from diffsim_ti.terms.gravity import Gravity
 from diffsim_ti.terms.loads import BodyForce, Load, Pressure, Traction
+from diffsim_ti.terms.muscle import Muscle
 from diffsim_ti.terms.obstacles.ball import Capsule, Sphere
 from diffsim_ti.terms.obstacles.box import Box, Cylinder
 from diffsim_ti.terms.obstacles.ground import Ground
@@ -17,7 +18,18 @@ from diffsim_ti.terms.term import Term, VertexForce
 from diffsim_ti.terms.ties import Anchor, Cable, Spring
 
 OBSTACLES = (Ground, HalfSpace, Sphere, Box, Capsule, Cylinder, MeshObstacle)
-LOADS = (ExternalForce, Traction, Pressure, BodyForce, GasChamber, FilledChamber, Spring, Cable, ElasticFoundation)
+LOADS = (
+    ExternalForce,
+    Traction,
+    Pressure,
+    BodyForce,
+    GasChamber,
+    FilledChamber,
+    Spring,
+    Cable,
+    Muscle,
+    ElasticFoundation,
+)
 TERMS = (Gravity, Drag, *LOADS, *OBSTACLES, SelfContact)
 __all__ = [
     "Anchor",
@@ -37,6 +49,7 @@ __all__ = [
     "HalfSpace",
     "Load",
     "MeshObstacle",
+    "Muscle",
     "OBSTACLES",
     "Obstacle",
     "Pressure",
