@@ -28,7 +28,19 @@ AREAS = {
     "examples and pages": "examples contact_examples static_examples torch_examples readme",
     "command line, resources, backends": "cli strength layout resources devices launch executed_ptx single_precision",
 }
+# files of a minute or so, the longest first: in several processes they come before all others
+LONGEST = (
+    "gradient_fuzz term_order every_adjoint contact_gradients contact_stage contact_faces implicit outputs locking "
+    "chambers springs quadratic_solvers torch_physics examples contact_crossing quadratic_loads self_contact_implicit "
+    "contact_rollers loads_together open_laws laws_with_state swept quadratic quadratic_answers"
+).split()
 AREA_OF = {name: area for area, names in AREAS.items() for name in names.split()}
+
+
+def place(stem: str) -> int:
+    """Where a file comes when processes share the suite: the longest first."""
+    name = stem.removeprefix("test_")
+    return LONGEST.index(name) if name in LONGEST else len(LONGEST)
 
 
 def minutes_of(reports) -> dict[str, float]:
