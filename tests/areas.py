@@ -31,9 +31,9 @@ AREAS = {
 # files of a minute or so, the longest first: in several processes they come before all others
 LONGEST = (
     "gradient_fuzz term_order every_adjoint static_examples examples contact_examples hertz quadratic_answers "
-    "torch_examples implicit contact_gradients contact_stage contact_faces outputs locking chambers springs quadratic_solvers "
-    "torch_physics quadratic_loads self_contact_implicit contact_rollers loads_together open_laws laws_with_state swept "
-    "quadratic contact_area seed_snippets"
+    "torch_examples implicit contact_gradients contact_stage contact_faces outputs locking chambers springs "
+    "quadratic_solvers torch_physics quadratic_loads self_contact_implicit contact_rollers loads_together open_laws "
+    "laws_with_state swept quadratic contact_area seed_snippets"
 ).split()
 AREA_OF = {name: area for area, names in AREAS.items() for name in names.split()}
 
