@@ -180,7 +180,7 @@ def test_points_within_faces_are_an_integral(monkeypatch):
         scene = ds.Scene(ds.TetrahedralMesh.create_box(2, size=0.1), SOFT, terms=[ball], precision="f64")
         solver = ds.ImplicitEulerSolver(scene)
         workspace, u = solver.workspace(solver.start_values()), np.zeros((8, 3))
-        workspace.begin(0, solver.stage(0.0, True), u, u)
+        workspace.begin(0, solver.stage(0.0, True, 0), u, u)
         workspace.potential.place(u)
         found.append((workspace.potential.faces.energies().sum(), workspace.potential.faces.forces()[:, 1].sum()))
     assert found[0][0] > 1e-3

@@ -126,7 +126,7 @@ def faces_touching():
     solver = ds.ImplicitEulerSolver(ds.Scene(mesh, SOFT, terms=[ball, box], precision="f64"))
     workspace = solver.workspace(solver.start_values())
     u = 1e-3 * np.random.default_rng(0).standard_normal((mesh.num_vertices, 3))
-    workspace.begin(0, solver.stage(0.0, True), u, u)
+    workspace.begin(0, solver.stage(0.0, True, 0), u, u)
     return workspace, u
 
 
