@@ -30,10 +30,11 @@ AREAS = {
 }
 # files of a minute or so, the longest first: in several processes they come before all others
 LONGEST = (
-    "gradient_fuzz term_order every_adjoint static_examples examples contact_examples hertz quadratic_answers "
-    "torch_examples implicit contact_gradients contact_stage contact_faces outputs locking chambers springs "
-    "quadratic_solvers torch_physics quadratic_loads self_contact_implicit contact_rollers loads_together open_laws "
-    "laws_with_state swept quadratic contact_area seed_snippets"
+    "gradient_fuzz optimization torch_examples face_friction quadratic_outputs term_order every_adjoint "
+    "loads_together static_examples contact_examples examples implicit_contact swept hertz implicit "
+    "contact_gradients contact_stage contact_faces outputs locking chambers springs quadratic_solvers torch_physics "
+    "quadratic_loads self_contact_implicit contact_rollers unequal_steps open_laws laws_with_state quadratic "
+    "contact_area seed_snippets quadratic_answers"
 ).split()
 AREA_OF = {name: area for area, names in AREAS.items() for name in names.split()}
 
