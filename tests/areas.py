@@ -28,7 +28,21 @@ AREAS = {
     "examples and pages": "examples contact_examples static_examples torch_examples readme",
     "command line, resources, backends": "cli strength layout resources devices launch executed_ptx single_precision",
 }
+# files of a minute or so, the longest first: in several processes they come before all others
+LONGEST = (
+    "gradient_fuzz optimization torch_examples face_friction quadratic_outputs term_order every_adjoint "
+    "loads_together static_examples contact_examples examples implicit_contact swept hertz implicit "
+    "contact_gradients contact_stage contact_faces outputs locking chambers springs quadratic_solvers torch_physics "
+    "quadratic_loads self_contact_implicit contact_rollers unequal_steps open_laws laws_with_state quadratic "
+    "contact_area seed_snippets quadratic_answers"
+).split()
 AREA_OF = {name: area for area, names in AREAS.items() for name in names.split()}
+
+
+def place(stem: str) -> int:
+    """Where a file comes when processes share the suite: the longest first."""
+    name = stem.removeprefix("test_")
+    return LONGEST.index(name) if name in LONGEST else len(LONGEST)
 
 
 def minutes_of(reports) -> dict[str, float]:

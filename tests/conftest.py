@@ -26,6 +26,21 @@ def default_precision(taichi):
 
 def pytest_addoption(parser):
     parser.addoption("--minutes", action="store_true", help="write the minutes of each area to tests/README.md")
+    parser.addoption("--thorough", action="store_true", help="also tests whose behaviour a cheaper one proves, too")
+
+
+def pytest_configure(config):
+    config.option.loadscopereorder = False  # pytest-xdist would put files of few tests last, however long they are
+
+
+def pytest_collection_modifyitems(config, items):
+    """Without the thorough ones; of several processes none waits at the end for another's long file."""
+    if not config.getoption("--thorough"):
+        left_out = [item for item in items if item.get_closest_marker("thorough")]
+        config.hook.pytest_deselected(items=left_out)
+        items[:] = [item for item in items if item not in set(left_out)]
+    if hasattr(config, "workerinput"):
+        items.sort(key=lambda item: areas.place(item.path.stem))
 
 
 def pytest_terminal_summary(terminalreporter, config):

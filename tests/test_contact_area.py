@@ -138,11 +138,13 @@ def sliding_rollout(solver, precision="f64") -> ds.Rollout:
 ALL = [*EXPLICIT, FORCE[0], ds.ImplicitEulerSolver, ds.StaticSolver]
 
 
+@pytest.mark.usefixtures("vertices_alone")  # within faces, explicit steps: test_contact_faces.py
 @pytest.mark.parametrize("solver", ALL, ids=lambda s: s.__name__)
 def test_tangents_and_adjoints_belong_together(solver):
     assert_transposed(sliding_rollout(solver), 1e-11 if solver.explicit else 1e-7)
 
 
+@pytest.mark.usefixtures("vertices_alone")  # within faces, explicit steps: test_contact_faces.py
 @pytest.mark.parametrize("solver", ALL, ids=lambda s: s.__name__)
 def test_gradients_are_slopes(solver):
     """By the stiffnesses, and by the rest shape, which says how large the surface is."""

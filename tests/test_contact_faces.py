@@ -173,9 +173,9 @@ def rollout(solver, kind, precision="f64", stiffness=50.0, dt=4e-4, steps=6, **o
     "kind, solver, precision, options",
     [
         ("capsule", ds.SemiImplicitSolver, "f64", dict()),
-        ("capsule", ds.SemiImplicitSolver, "f64", dict(stiffness=2000.0, dt=3.2e-3, parallel=True)),  # in many parts
+        ("capsule", ds.SemiImplicitSolver, "f64", dict(stiffness=2000.0, dt=3.2e-3)),  # in many parts
         ("needle", ds.VelocityVerletSolver, "f64", dict(contact="force", per_area=True)),
-        ("thin box", ds.SemiImplicitSolver, "f32", dict(per_area=True)),
+        ("thin box", ds.SemiImplicitSolver, "f32", dict(per_area=True, parallel=True)),
     ],
 )
 def test_the_adjoint_is_the_transpose_of_the_tangent(kind, solver, precision, options):
@@ -187,7 +187,7 @@ def test_the_adjoint_is_the_transpose_of_the_tangent(kind, solver, precision, op
 
 @pytest.mark.parametrize("solver, per_area", [(ds.VelocityVerletSolver, True), (ds.SemiImplicitSolver, False)])
 def test_gradients_agree_with_differences_where_a_pass_is_gone_in_many_parts(solver, per_area):
-    made = rollout(solver, "capsule", stiffness=200.0 if per_area else 2000.0, dt=3.2e-3, per_area=per_area)
+    made = rollout(solver, "capsule", stiffness=200.0 if per_area else 2000.0, dt=3.2e-3, steps=3, per_area=per_area)
     frames = made.forward()
     made.vjp(frames, positions=np.ones_like(frames.positions))
     workspace = made.sweep.workspace

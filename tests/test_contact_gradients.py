@@ -11,7 +11,7 @@ import diffsim_ti as ds
 
 SOLVERS = [ds.SemiImplicitSolver, ds.VelocityVerletSolver]
 solvers = pytest.mark.parametrize("solver", SOLVERS)
-STEPS = 24
+STEPS, SUBSTEPS = 24, 2
 
 
 def path(t):
@@ -30,7 +30,9 @@ def rollout_of(name, solver, rough=True, moving=True, **options):
         [ds.Gravity(), ds.Drag(0.5), term],
         initial_velocities=[0.8, -1.0, 0.3],
     )
-    return ds.Rollout(solver(scene, dt=4e-3, substeps=4), STEPS, save_every=STEPS // 4, gradients="all", **options)
+    return ds.Rollout(
+        solver(scene, dt=4e-3, substeps=SUBSTEPS), STEPS, save_every=STEPS // 4, gradients="all", **options
+    )
 
 
 @pytest.mark.parametrize("name", SHAPES)
@@ -57,11 +59,13 @@ def test_tangent_and_mirror(name, solver):
     assert ds.dot_product_test(rollout_of(name, solver)) < 1e-12
 
 
+@pytest.mark.usefixtures("vertices_alone")  # within faces: test_contact_faces.py
 @solvers
 def test_smooth_contact_without_friction(solver):
     assert ds.check_gradients(rollout_of("cylinder", solver, rough=False), verbose=False).passed
 
 
+@pytest.mark.usefixtures("vertices_alone")  # within faces: test_contact_stage.py
 def test_several_rough_and_moving_obstacles():
     """Rows of sums, columns of paths and the order of frictions: two that move, two that are rough, one that is neither."""
     options = dict(stiffness=300.0, width=0.2)
@@ -79,7 +83,7 @@ def test_several_rough_and_moving_obstacles():
         [ds.Gravity(), *terms],
         initial_velocities=[-0.5, -1.0, 0.3],
     )
-    rollout = ds.Rollout(ds.VelocityVerletSolver(scene, dt=4e-3, substeps=4), STEPS)
+    rollout = ds.Rollout(ds.VelocityVerletSolver(scene, dt=4e-3, substeps=SUBSTEPS), STEPS)
     assert {"half_space_path", "sphere_path", "friction", "friction_2"} <= set(rollout.inputs)
     report = ds.check_gradients(rollout, verbose=False)
     assert all(row.relative_error < 1e-6 and row.taylor_rate > 1.5 for row in report.rows), str(report)
@@ -95,12 +99,14 @@ def test_the_same_however_it_is_run(solver):
     gradients = whole.vjp(frames, adjoint, adjoint)
     pieces = rollout_of("ground", solver, checkpoint_every=5)
     again = pieces.vjp(pieces.forward(), adjoint, adjoint)
-    spread = ds.Rollout(solver(whole.scene, dt=4e-3, substeps=4, parallel=True), STEPS, STEPS // 4, gradients="all")
+    spread = ds.Rollout(
+        solver(whole.scene, dt=4e-3, substeps=SUBSTEPS, parallel=True), STEPS, STEPS // 4, gradients="all"
+    )
     parallel = spread.vjp(spread.forward(), adjoint, adjoint)
     for name in gradients:
         np.testing.assert_array_equal(gradients[name], again[name], name)
         np.testing.assert_array_equal(gradients[name], parallel[name], name)
-    simulator = ds.Simulator(solver(whole.scene, dt=4e-3, substeps=4))
+    simulator = ds.Simulator(solver(whole.scene, dt=4e-3, substeps=SUBSTEPS))
     for frame in range(1, 5):
         simulator.run(STEPS // 4)
         np.testing.assert_allclose(simulator.positions, frames.positions[frame], atol=1e-14)

@@ -137,6 +137,7 @@ def test_every_number(solver, alone, request):
 
 
 @pytest.mark.executed_ptx
+@pytest.mark.usefixtures("vertices_alone")  # within faces: test_contact_force.py
 def test_contact_forces_have_gradients():
     """Forces on obstacles as a loss names them, of vertices on rollers."""
     rollout = crowded(EXPLICIT[0], MOTION, outputs=[ds.ContactForce("floor"), ds.ContactForce("ball", name="on_ball")])

@@ -17,7 +17,7 @@ def tip_of(scene: ds.Scene, place, load_steps: int = 1) -> np.ndarray:
 ELASTICA = {5.0: (0.8467, 0.4959), 10.0: (0.6564, 0.7002), 50.0: (0.2450, 0.9079)}
 
 
-@pytest.mark.parametrize("number", ELASTICA)
+@pytest.mark.parametrize("number", [5.0, pytest.param(10.0, marks=pytest.mark.thorough), 50.0])
 def test_elastica_under_its_own_weight(number):
     """nu 0, a square section, length over height 50, 50 x 2 x 2 cells."""
     h, E = 0.02, 1e7

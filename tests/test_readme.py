@@ -77,7 +77,7 @@ def check(command: str) -> None:
         click_command.make_parser(context).parse_args(list(options))
     elif program in ("python", "python3", "torchrun"):
         if words[:2] == ["-m", "pytest"]:
-            known = ["-n", "--dist", "-k", "-m", "--minutes"]
+            known = ["-n", "--dist", "-k", "-m", "--minutes", "--thorough"]
             assert all((ROOT / word).exists() for word in words[2:] if word.startswith("tests"))
             assert all(word in known for word in words[2:] if word.startswith("-"))
         elif words[0] != "-m":
