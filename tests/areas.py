@@ -13,7 +13,7 @@ AREAS = {
     "motion against closed forms": "reference_motion step_limit unequal_steps energy_watch hertz torture",
     "every adjoint, order, fuzz": "every_adjoint term_order gradient_fuzz",
     "gradients": "gradients gradient_clip gradient_faults checkpoints tape outputs "
-    "contact_force reaction tensor_outputs work modes identification",
+    "contact_force reaction tensor_outputs work modes identification identify",
     "implicit steps and equilibria": "implicit implicit_gradients implicit_contact swept solve_report",
     "patches against locking": "locking",
     "ten-node tetrahedra": "reference_element quadratic quadratic_mesh quadratic_loads quadratic_outputs quadratic_solvers "

@@ -2,7 +2,7 @@
 
 from diffsim_ti.identification.expected import compare, expected
 from diffsim_ti.identification.identifiability import Identifiability, identifiability
-from diffsim_ti.identification.identify import identify
+from diffsim_ti.identification.least_squares import identify
 from diffsim_ti.identification.measurements import Measurement
 from diffsim_ti.identification.priors import Normal, Smooth
 from diffsim_ti.identification.result import Identification, Information

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from diffsim_ti.identification.identify import described
+from diffsim_ti.identification.least_squares import described
 from diffsim_ti.identification.measurements import measurements
 from diffsim_ti.identification.priors import Priors
 from diffsim_ti.identification.problem import Problem

@@ -2,7 +2,6 @@
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.interpolate import CubicSpline
 
 from diffsim_ti.rollout import Frames, Rollout
 
@@ -53,6 +52,8 @@ class Measurement:
 
     def _rows(self, times: np.ndarray, offset: float, order: int = 0) -> np.ndarray:
         """Weights of the frames in each row of values, shape (rows, frames)."""
+        from scipy.interpolate import CubicSpline  # half a second to import
+
         return CubicSpline(times, np.eye(len(times)))(self.times + offset, order)
 
     def _taken(self, frames: Frames, y: np.ndarray, offset: float, order: int = 0) -> np.ndarray:

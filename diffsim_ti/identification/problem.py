@@ -93,7 +93,7 @@ class Problem:
             for free, part in self._of(k):
                 if not free.is_offset and free.input not in gradients:
                     raise ValueError(
-                        f"{free.label}: the rollout has no gradient by {free.input!r}; make it with gradients=[{free.input!r}]"
+                        f"{free.label}: the rollout has no gradient by {free.input!r}; name it in gradients="
                     )
                 by_x = [by_offset] if free.is_offset else free.gathered(k, gradients[free.input])
                 out[part] += free.slopes(point.t[part]) * by_x

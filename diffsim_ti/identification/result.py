@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy import stats
+from scipy.special import chdtr, chdtrc
 
 
 @dataclass
@@ -57,7 +57,7 @@ class Identification:
 
     estimates: {unknown: number or array}; covariance: of the numbers, in the order of `labels`, to first order;
     standard_errors, intervals (95 %, through the free variables): as estimates; unseen: see Information;
-    chi_square, degrees, p_value: of the residuals, whose sum of squares is chi^2 distributed where model and noise are right;
+    chi_square, degrees, p_value: of the residuals, whose sum of squares is chi^2 distributed if model and noise are right;
     iterations: a dict each; simulations: forward, tangent and reverse runs; stopped: why; state: for `resume`.
     inputs: of each experiment, for rollout.forward(**inputs[k]). Covariance and what follows from it are None where
     it was not asked for (many unknowns).
@@ -83,9 +83,7 @@ class Identification:
     @property
     def p_value(self) -> float:
         """Chance of residuals at least so far from what the noise explains, on either side."""
-        return float(
-            2 * min(stats.chi2.sf(self.chi_square, self.degrees), stats.chi2.cdf(self.chi_square, self.degrees))
-        )
+        return float(2 * min(chdtrc(self.degrees, self.chi_square), chdtr(self.degrees, self.chi_square)))
 
     @property
     def residuals_fit(self) -> bool:

@@ -132,9 +132,8 @@ def identify(
 
         (J^T J + damping) dt = -J^T r,    J = dr/dt by tangent runs, above 20 unknowns by products J d and J^T w in CG
 
-    rollout: one, or one per experiment. data: {output: values}, NaN where missing, with `noise` [the output's unit], a number
-    or {output: number}; or a `Measurement`, or a list of those; a list of all that, one per experiment, where there are
-    several. unknowns: {input: start, or Unknown}. prior: {unknown: Normal, Smooth, or a list of them}.
+    rollout: one, or one per experiment. data: {output: values}, NaN where missing, with `noise` [the output's unit], one
+    number or {output: number}; or a `Measurement`, or a list of those; for several experiments a list of all that. unknowns: {input: start, or Unknown}. prior: {unknown: Normal, Smooth, or a list of them}.
     tolerance: stop when a step promises less than this share of a standard error per unknown. covariance: default up to 20
     unknowns; costs a tangent run each. callback(report of the iteration): return True to stop. progress: print it.
     resume: a result's `state`, or a path, written after each iteration and gone on from if it is there.
