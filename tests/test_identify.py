@@ -158,7 +158,7 @@ def test_products_are_transposes_and_derivatives():
 def test_stopped_and_resumed(swing, tmp_path):
     data, path = tracks(swing.forward(**TRUE), np.random.default_rng(7)), tmp_path / "state.json"
     whole = ds.identify(swing, data, START)
-    part = ds.identify(swing, data, START, callback=lambda row: row["iteration"] == 2, resume=path)
+    part = ds.identify(swing, data, START, callback=lambda row, frames: row["iteration"] == 2, resume=path)
     assert part.stopped == "stopped by the callback" and len(part.iterations) == 2
     rest = ds.identify(swing, data, START, resume=path)
     assert rest.estimates == whole.estimates and len(rest.iterations) == len(whole.iterations)

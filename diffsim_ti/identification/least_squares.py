@@ -122,7 +122,7 @@ def identify(
     max_iterations: int = 50,
     tolerance: float = 0.03,
     covariance: bool | None = None,
-    callback: Callable[[dict], object] | None = None,
+    callback: Callable[[dict, list], object] | None = None,
     progress: bool = False,
     resume: dict | str | Path | None = None,
 ) -> Identification:
@@ -133,9 +133,11 @@ def identify(
         (J^T J + damping) dt = -J^T r,    J = dr/dt by tangent runs, above 20 unknowns by products J d and J^T w in CG
 
     rollout: one, or one per experiment. data: {output: values}, NaN where missing, with `noise` [the output's unit], one
-    number or {output: number}; or a `Measurement`, or a list of those; for several experiments a list of all that. unknowns: {input: start, or Unknown}. prior: {unknown: Normal, Smooth, or a list of them}.
+    number or {output: number}; or a `Measurement`, or a list of those; for several experiments a list of all that.
+    unknowns: {input: start, or Unknown}. prior: {unknown: Normal, Smooth, or a list of them}.
     tolerance: stop when a step promises less than this share of a standard error per unknown. covariance: default up to 20
-    unknowns; costs a tangent run each. callback(report of the iteration): return True to stop. progress: print it.
+    unknowns; costs a tangent run each. callback(report of the iteration, frames of each experiment):
+    return True to stop. progress: print it.
     resume: a result's `state`, or a path, written after each iteration and gone on from if it is there.
     Numbers that end a run (Divergence, NotConverged, ValueError) shorten the step.
     Raises ValueError for what does not fit, before any run, and what the first run raises.
@@ -180,7 +182,7 @@ def identify(
         if progress:
             shown = ", ".join(f"{label} {x:.5g}" for label, x in list(zip(problem.labels, row["numbers"]))[:4])
             print(f"{row['iteration']:3d}: chi^2 {row['chi_square']:.5g} of {problem.num_data}, {shown}", flush=True)
-        if callback is not None and callback(row) is True:
+        if callback is not None and callback(row, search.point.frames) is True:
             stopped = "stopped by the callback"
             break
         if rejected > 12:
