@@ -195,3 +195,21 @@ def test_refusals(swing):
             ds.identify(swing, *arguments)
     with pytest.raises(ValueError, match="must lie inside range"):
         ds.Unknown(2.0, range=(0.0, 1.0))
+
+
+def test_the_command(tmp_path, capsys):
+    from diffsim_ti.cli import main
+
+    MESH.save(tmp_path / "body.vtu")
+    rollout = body()
+    x, times = rollout.forward(**TRUE).positions[:, MARKERS], rollout.times
+    x = x + 1e-4 * np.random.default_rng(9).standard_normal(x.shape) * (times > 0)[:, None, None]
+    rows = [f"{t},{k},{','.join(map(str, p))}" for t, frame in zip(times, x) for k, p in enumerate(frame)]
+    (tmp_path / "tracks.csv").write_text("\n".join(["time,marker,x,y,z", *rows[:9], *rows[10:]]))
+    command = ["identify", str(tmp_path / "body.vtu"), str(tmp_path / "tracks.csv"), "--unknown", "youngs_modulus=5e4"]
+    command += ["--nu", "0.3", "--noise", "1e-4", "--fixed", "xmin", "--output", str(tmp_path / "fit.png")]
+    with pytest.raises(SystemExit) as end:
+        main(command)
+    assert end.value.code == 0 and (tmp_path / "fit.png").stat().st_size > 10_000
+    line = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("youngs_modulus = "))
+    assert float(line.split()[2]) == pytest.approx(8e4, rel=0.02) and "95 %" in line

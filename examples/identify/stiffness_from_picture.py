@@ -1,7 +1,7 @@
 """The stiffness of three parts of an arm from one picture of it at rest: where the vertices of its surface hang.
 
-Density is known, for an equilibrium under weight alone tells E / rho and nothing more. `identify` finds the E of each named part, and
-says how well: the places are known to a tenth of a millimetre.
+Density is known, for an equilibrium under weight alone tells E / rho and nothing more. `identify` finds the E of each
+named part, and says how well: the places are known to a tenth of a millimetre.
 
     python examples/identify/stiffness_from_picture.py [folder for a picture]
 """
