@@ -13,7 +13,7 @@ COLUMNS = ("time", "marker", "x", "y", "z")
 
 
 def read_tracks(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """(times [s], places [m] of shape (times, markers, 3)) of a CSV with columns time, marker, x, y, z; NaN where missing."""
+    """(times [s], places [m] of shape (times, markers, 3)) of a CSV; NaN where missing."""
     with open(path, newline="") as file:
         reader = csv.DictReader(file)
         missing = [name for name in COLUMNS if name not in (reader.fieldnames or ())]
