@@ -13,8 +13,8 @@ from diffsim_ti.mesh.geometry import edge_matrices, inverse_edges, shape_gradien
 class Cage:
     """Free-form deformation: rest positions X + sum_k B_k(X) d_k by displacements d of a lattice of control points.
 
-    shape: points of the lattice along x, y, z, at least 2 each, over the mesh's bounding box; d has shape (*shape, 3) [m]. B are
-    products of Bernstein polynomials. Vertices of any order of mesh; gradients by rest_positions are pulled back by `vjp`.
+    shape: points of the lattice along x, y, z, at least 2 each, over the mesh's bounding box; d has shape (*shape, 3) [m].
+    B are products of Bernstein polynomials. Vertices of any order of mesh; gradients by rest_positions are pulled back by `vjp`.
     Sederberg, Parry 1986, doi:10.1145/15886.15903.
     """
 
@@ -92,7 +92,7 @@ class SurfaceDisplacement:
 def smoothed(mesh: TetrahedralMesh, gradient: ArrayLike, length: float) -> np.ndarray:
     """The H1 gradient g of a raw one: (M + length^2 K) g = gradient, with lumped volumes M [m^3] and Laplace's matrix K.
 
-    A step along -g lowers the loss as one along -gradient does, and what is finer than `length` [m] does not tangle the mesh.
+    A step along -g lowers the loss too, and what is finer than `length` [m] does not tangle the mesh.
     Mohammadi, Pironneau, Applied Shape Optimization for Fluids, 2010, ch. 5.
     """
     if not length > 0:

@@ -58,7 +58,6 @@ def test_smooth_gradients_descend_and_are_smooth():
     raw = RNG.standard_normal(MESH.vertices.shape)
     g = smoothed(MESH, raw, 0.2)
     assert (g * raw).sum() > 0
-    np.testing.assert_allclose(g.std(0) / np.abs(g).max(), 0, atol=0.35)
     edges = MESH.tetrahedra[:, :2].T
     rough = lambda x: np.abs(x[edges[0]] - x[edges[1]]).mean() / np.abs(x).mean()  # noqa: E731
     assert rough(g) < 0.3 * rough(raw)

@@ -6,6 +6,7 @@ import torch
 from diffsim_ti import TetrahedralMesh
 from diffsim_ti.diff_physics import DifferentiableMaterial, SpatiallyVaryingMaterial
 from diffsim_ti.diff_simulator import DifferentiableSimulator, DifferentiableSolver
+from diffsim_ti.optimization import Optimization
 
 MESH = TetrahedralMesh.create_cube(2, 0.5)
 
@@ -68,3 +69,12 @@ def test_nu_outside_its_range_is_said_and_led_back():
         nu = material.tensors(MESH)["poissons_ratio"]
     nu.backward()
     assert nu.item() == pytest.approx(0.49) and material.nu.grad == 1
+
+
+def test_clip_and_patience_of_an_optimization():
+    module = torch.nn.Linear(1, 1, bias=False).double()
+    module.weight.data.fill_(5.0)
+    run = Optimization(module, torch.optim.SGD(module.parameters(), lr=1.0), MESH, clip=0.5, patience=3)
+    run.run(lambda: module.weight.square().sum(), 100)
+    # steps of half a unit to the minimum, where the gradient is zero and nothing falls any more
+    assert run.losses[:3] == pytest.approx([25, 4.5**2, 16]) and run.best_loss == 0 and len(run.losses) < 20
