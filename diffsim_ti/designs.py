@@ -14,7 +14,7 @@ class Cage:
     """Free-form deformation: rest positions X + sum_k B_k(X) d_k by displacements d of a lattice of control points.
 
     shape: points of the lattice along x, y, z, at least 2 each, over the mesh's bounding box; d has shape (*shape, 3) [m].
-    B are products of Bernstein polynomials. Vertices of any order of mesh; gradients by rest_positions are pulled back by `vjp`.
+    B are products of Bernstein polynomials. For meshes of any order; `vjp` takes gradients by rest_positions.
     Sederberg, Parry 1986, doi:10.1145/15886.15903.
     """
 
