@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
 from diffsim_ti.inputs import ConsistentMass, Inputs
+from diffsim_ti.mass_scaling import MassScaling
 from diffsim_ti.materials.material import Material
 from diffsim_ti.materials.moduli import youngs_poisson
 from diffsim_ti.materials.patch_law import PatchLaw
@@ -62,6 +63,11 @@ class Scene:
     precision: "f32", "f64" or None for the default that `diffsim_ti.init` set.
     volume: where a change of volume is resisted: in each of the "tetrahedra", which lock as Poisson's ratio nears 0.5, or
         on average over "patches" of up to eight, which lock much less (patched_tetrahedron.py).
+    mass_scaling: the share of the mass, such as .01, that may be added to the vertices that limit explicit steps
+        (mass_scaling.py): bad tetrahedra then do not rule. Gravity acts on it, so that free fall stays as it is; weight and
+        reactions grow by the share. By which factors vertices are heavier is found for the numbers given here, and kept
+        whatever values a run takes; gradients by density and rest shape are those of such masses. `describe()` says how
+        much was added. Implicit steps and statics add none.
 
     Raises ValueError with rule, value and remedy for anything that does not fit, before any kernel runs. Warns where
     tetrahedra lock, above Poisson's ratio 0.45.
@@ -79,19 +85,11 @@ class Scene:
         initial_velocities: ArrayLike | None = None,
         precision: str | None = None,
         volume: str = "tetrahedra",
+        mass_scaling: float | None = None,
     ):
-        self.arguments = dict(
-            mesh=mesh,
-            material=material,
-            density=density,
-            terms=terms,
-            fixed=fixed,
-            motion=motion,
-            initial_positions=initial_positions,
-            initial_velocities=initial_velocities,
-            precision=precision,
-            volume=volume,
-        )
+        self.arguments = dict(mesh=mesh, material=material, density=density, terms=terms, fixed=fixed, motion=motion)
+        self.arguments |= dict(initial_positions=initial_positions, initial_velocities=initial_velocities)
+        self.arguments |= dict(precision=precision, volume=volume, mass_scaling=mass_scaling)
         self.mesh, self.material = mesh, material
         self.precision = runtime.check_precision(precision)
         if volume not in ("tetrahedra", "patches"):
@@ -115,6 +113,7 @@ class Scene:
         self.cables = tuple(t for t in self.ordered_terms if isinstance(t, Cable))
         self.ties = self.springs + self.cables
         self.foundations = tuple(t for t in self.ordered_terms if isinstance(t, ElasticFoundation))
+        self.mass_scaling = None if mass_scaling is None else MassScaling.of(self, density, mass_scaling)
         self.inputs = Inputs(self, density, initial_positions, initial_velocities)
         self._check_start()
         if volume == "tetrahedra":
@@ -129,11 +128,12 @@ class Scene:
     consistent = False  # whether masses and weight are consistent
 
     def with_consistent_mass(self) -> "Scene":
-        """The scene as statics, implicit steps and modes have it: ten-node tetrahedra with consistent masses and weight."""
-        if self.mesh.order == 1 or self.consistent:
+        """The scene as statics, implicit steps and modes have it: ten-node tetrahedra with consistent masses and weight, and
+        no mass that was added for the sake of an explicit step."""
+        if (self.mesh.order == 1 or self.consistent) and self.mass_scaling is None:
             return self
         out, names = copy(self), ("density", "initial_positions", "initial_velocities")
-        out.consistent = True
+        out.consistent, out.mass_scaling = self.mesh.order > 1, None
         out.inputs = Inputs(out, *(self.arguments[name] for name in names))
         return out
 
@@ -151,12 +151,11 @@ class Scene:
                 raise ValueError(f"a scene takes one {kind.__name__}, got several; add their numbers instead")
         named = [t for t in self.terms if t.name is not None]
         for k, term in enumerate(named):
-            other = next((t for t in named[:k] if t.name == term.name), None)
-            if other is not None:
+            for other in (t for t in named[:k] if t.name == term.name):
                 raise ValueError(f"two terms have the name {term.name!r}: {other!r} and {term!r}; give each its own")
-        if self.motion is not None and len(self.held) == 0:
-            raise ValueError("motion moves the fixed vertices, but none is fixed; pass fixed=...")
         if self.motion is not None:
+            if len(self.held) == 0:
+                raise ValueError("motion moves the fixed vertices, but none is fixed; pass fixed=...")
             self.motion_rows([0.0])
 
     def _check_start(self) -> None:
@@ -333,6 +332,7 @@ class Scene:
                 f"{self.material!r}" + (", volume averaged over patches" if self.volume == "patches" else ""),
                 f"mass {mass:.6g} kg, precision {self.precision}",
                 f"terms: {terms}",
+                *([str(self.mass_scaling)] if self.mass_scaling else []),
                 f"fixed vertices: {len(self.fixed)}"
                 + (f", in some directions {len(self.supports.guided)}" if len(self.supports.guided) else "")
                 + (", moving" if self.motion is not None else ""),

@@ -10,7 +10,7 @@ HEAD = "| area | files test_*.py | minutes |\n| --- | --- | ---: |\n"
 AREAS = {
     "meshes, scenes, materials": "mesh locate scene inputs loads chambers springs loads_together supports materials "
     "open_laws laws_with_state",
-    "motion against closed forms": "reference_motion step_limit unequal_steps energy_watch hertz torture",
+    "motion against closed forms": "reference_motion step_limit mass_scaling unequal_steps energy_watch hertz torture",
     "every adjoint, order, fuzz": "every_adjoint term_order gradient_fuzz",
     "gradients": "gradients gradient_clip gradient_faults checkpoints tape outputs "
     "contact_force reaction tensor_outputs work modes identification identify",

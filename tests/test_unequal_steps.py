@@ -173,7 +173,7 @@ def test_the_search_puts_substeps_where_the_impact_is(solver):
         (lambda s: ds.Rollout(ds.VelocityVerletSolver(s, dt=1e-4), [1e-4, 1.0]), "shorten the longest"),
         (lambda s: ds.Rollout(ds.BDF2Solver(s), [1e-3, 3e-3]), "2.4 times"),
         (lambda s: ds.Rollout(ds.StaticSolver(s), [1.0, 1.0]), "equilibria"),
-        (lambda s: ds.Rollout(ds.BDF2Solver(s), 2.5), "lengths of steps"),
+        (lambda s: ds.Rollout(ds.BDF2Solver(s), 2.5), "whole number >= 0, got 2.5; or pass lengths"),
         (lambda s: ds.adaptive_steps(ds.BDF2Solver(s), 3, 0.0), "tolerance"),
         (lambda s: ds.adaptive_steps(ds.BDF2Solver(s), 0, 1.0), "steps"),
         (lambda s: ds.adaptive_steps(ds.StaticSolver(s), 3, 1.0), "equilibria"),

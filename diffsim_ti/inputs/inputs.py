@@ -122,7 +122,7 @@ class Inputs:
             links.RestShape(mesh.tetrahedra) if mesh.order == 1 else CurvedShape(mesh.elements),
             links.Displacement(),
             links.FreeVelocity(scene.supports.free),
-            links.LumpedMass(mesh),
+            links.LumpedMass(mesh, scene.mass_scaling.factors if scene.mass_scaling else None),
             *([ElementMasses(mesh.elements)] if scene.consistent else []),
             *scene.material.links(),
         ]

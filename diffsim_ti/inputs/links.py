@@ -91,11 +91,12 @@ class FreeVelocity(Link):
 
 class LumpedMass(Link):
     """Of each vertex, sum rho V s_a over its elements, with the node's share s_a, 1/4 of four nodes; rho is one number or
-    one per tetrahedron."""
+    one per tetrahedron; times the vertex's factor where there are some."""
 
     writes = ("mass",)
 
-    def __init__(self, mesh):
+    def __init__(self, mesh, factors: np.ndarray | None = None):
+        self.factors = factors
         self.elements, self.num_vertices, self.shares = mesh.elements, mesh.num_vertices, mesh.reference.lumped
         self.reads = ("density", "volumes" if mesh.order == 1 else "element volumes")
 
@@ -107,12 +108,14 @@ class LumpedMass(Link):
         return (self._to_vertices(d_density * volumes + density * d_volumes),)
 
     def vjp(self, x, y_adj):
-        (density, volumes), mass_adj = x, (y_adj[0][self.elements] * self.shares).sum(1)
+        by_mass = y_adj[0] if self.factors is None else self.factors * y_adj[0]
+        (density, volumes), mass_adj = x, (by_mass[self.elements] * self.shares).sum(1)
         by_density = volumes * mass_adj
         return by_density if density.ndim else by_density.sum(), density * mass_adj
 
     def _to_vertices(self, per_element: np.ndarray) -> np.ndarray:
-        return np.bincount(self.elements.ravel(), np.outer(per_element, self.shares).ravel(), self.num_vertices)
+        mass = np.bincount(self.elements.ravel(), np.outer(per_element, self.shares).ravel(), self.num_vertices)
+        return mass if self.factors is None else self.factors * mass
 
 
 class Same(Link):

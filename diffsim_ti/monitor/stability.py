@@ -7,6 +7,7 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.inputs import StressPoints
+from diffsim_ti.mass_scaling import row_sums
 from diffsim_ti.mesh.patches import volume_patches
 from diffsim_ti.monitor.stiffest import stiffest
 from diffsim_ti.potential.attached import Attached
@@ -49,7 +50,8 @@ def element_limit(scene: "Scene", values: dict | None = None) -> StepLimit:
 
     mu, lam are the law's small-strain moduli; with volume="patches" lam is the patch's mean. The eigenvalues of the
     assembled system never exceed the largest of its elements (Hughes, The Finite Element Method, 9.1); lumped vertex masses
-    are at least those of the element. Gases and cables count with the largest they have over time (stiffest.py).
+    are at least those of the element. With mass scaling another bound counts where it is lower (mass_scaling.py). Gases and
+    cables count with the largest they have over time (stiffest.py).
     """
     values, material = stiffest(scene, scene.inputs.values if values is None else values), scene.material
     mu, lam = material.lame({name: values[name] for name in material.inputs})
@@ -65,7 +67,12 @@ def element_limit(scene: "Scene", values: dict | None = None) -> StepLimit:
     if attached:  # what all of its parts add at the most
         at = attached.stiffest(derived, derived.ties, EqualSteps(1.0, 1))
         more += at.largest_omega2(derived.mass, derived.displacement, scene.fixed)
-    return StepLimit(float(2 / np.sqrt(omega2[worst] + more)), worst, "element bound")
+    bound = omega2[worst]
+    if scene.mass_scaling:
+        rows = row_sums(scene.mesh, mu, lam, scene.volume == "patches") / np.where(derived.mass > 0, derived.mass, 1.0)
+        bound, stiffest_vertex = min(bound, rows.max()), int(rows.argmax())
+        worst = int(np.argmax((scene.mesh.tetrahedra == stiffest_vertex).any(1)))
+    return StepLimit(float(2 / np.sqrt(bound + more)), worst, "element bound")
 
 
 def _squares_of_strains(mesh, derived) -> tuple[np.ndarray, np.ndarray]:

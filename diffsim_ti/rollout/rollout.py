@@ -89,7 +89,9 @@ class Rollout:
         if isinstance(steps, UnequalSteps):
             return solver.on(steps), len(steps)
         if not isinstance(steps, int | float | np.integer) or not (steps >= 0 and steps == int(min(steps, 1e18))):
-            raise ValueError(f"steps must be a whole number >= 0, lengths of steps [s], or UnequalSteps, got {steps!r}")
+            raise ValueError(
+                f"steps must be a whole number >= 0, got {steps!r}; or pass lengths of steps [s], or UnequalSteps"
+            )
         return solver, int(steps)
 
     def _check_outputs(self, outputs) -> dict[str, Output]:
