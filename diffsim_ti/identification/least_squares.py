@@ -156,12 +156,16 @@ def identify(
     while len(search.report) < max_iterations:
         if rejected == 0:
             search.linearize(dense)
-        step = search.step(dense)
+        if dense or rejected == 0:
+            step = search.step(dense)
+        else:
+            step = step * 0.3  # products are dear: along the same way
         promised = float(-search.gradient @ step)
         if promised <= tolerance**2 * problem.size:
             stopped, converged = "converged", True
             break
-        why = search.try_step(search.limited(step))
+        step = search.limited(step)
+        why = search.try_step(step)
         rejected = rejected + 1 if why else 0
         row = dict(
             iteration=len(search.report) + 1,
