@@ -7,6 +7,17 @@ os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")  # no network traffic from 
 
 from diffsim_ti.adaptive_steps import adaptive_steps
 from diffsim_ti.contact.surface_pairs import Tunnelling
+from diffsim_ti.identification import (
+    Identification,
+    Measurement,
+    Normal,
+    Smooth,
+    Unknown,
+    compare,
+    expected,
+    identifiability,
+    identify,
+)
 from diffsim_ti.materials import (
     Corotated,
     FibreReinforced,
@@ -150,6 +161,15 @@ __all__ = [
     "KineticEnergy",
     "modes",
     "Modes",
+    "identify",
+    "Unknown",
+    "Measurement",
+    "Normal",
+    "Smooth",
+    "Identification",
+    "expected",
+    "compare",
+    "identifiability",
     "taylor_test",
     "dot_product_test",
     "check_gradients",

@@ -10,6 +10,7 @@ from diffsim_ti.materials.evaluate import evaluate
 from diffsim_ti.torch_bridge.autograd import first_order_only, torch
 from diffsim_ti.torch_bridge.barrier_contact import DifferentiableBarrierContact
 from diffsim_ti.torch_bridge.implicit_differentiation import ImplicitDifferentiation, conjugate_gradient
+from diffsim_ti.torch_bridge.step_sizes import bounded, refuse_steps
 
 __all__ = [
     "TorchMaterial",
@@ -22,6 +23,10 @@ __all__ = [
     "smooth_step",
     "log_barrier",
 ]
+
+
+TINY = 1e-30  # instead of Adam's eps
+NU_RANGE = -0.9, 0.49  # what an optimiser may try
 
 
 class _EnergyDensity(torch.autograd.Function):
@@ -88,6 +93,33 @@ class TorchMaterial(torch.nn.Module):
         """The material's inputs on a mesh, in the graph."""
         return {"youngs_modulus": self.E, "poissons_ratio": self.nu}
 
+    def rooms(self) -> dict[str, tuple[torch.nn.Parameter, float]]:
+        """{name: (parameter, how far a single step may move it at most, in its unit)}; none where it is not known."""
+        return {}
+
+    def check_steps(self) -> None:
+        """Raise ValueError, naming `parameter_groups`, where an optimiser of these parameters would leave their ranges.
+
+        Those of Adam's kind count, which move a number by lr whatever its gradient.
+        """
+        refuse_steps(self.rooms())
+
+    def parameter_groups(self, relative: float = 0.05) -> list[dict]:
+        """Groups for torch, `Adam(material.parameter_groups(relative=0.05))`: each number has a step of its own size.
+
+        lr of a group is `relative` times the number's size (the mean of its magnitudes), and `relative` itself for
+        logarithms. eps is 0, since gradients by pascals are far below Adam's 1e-8. For optimisers that normalise gradients.
+        Kingma, Ba, Adam, 2015, arXiv:1412.6980.
+        """
+        if not 0 < relative < 1:
+            raise ValueError(f"relative: a share between 0 and 1, got {relative}")
+        groups = []
+        for name, parameter in self.named_parameters():
+            if parameter.requires_grad:
+                size = 1.0 if name.startswith("log_") else float(parameter.detach().abs().mean()) or 1.0
+                groups.append(dict(params=[parameter], lr=relative * size, eps=TINY, name=name))
+        return groups
+
     def core(self, mesh):
         """The core's material on a mesh, at the present values."""
         return self.material(*(x.detach().double().cpu().numpy() for x in self.tensors(mesh).values()))
@@ -110,7 +142,11 @@ class DifferentiableMaterial(TorchMaterial):
 
     A gradient by E in pascals is tiny: 4e-11 in the seeds' identification block, far below Adam's eps of 1e-8, so that
     Adam's lr of 5e3 moves E by 20 Pa a step. Optimise log E with a scaled loss over all frames, or use LBFGS
-    (examples/identify/identify_torch.py).
+    (examples/identify/identify_torch.py); or `Adam(material.parameter_groups(relative=0.05))`.
+
+    What an optimiser moves out of nu_range (default -0.9 to 0.49, or to the nu given) is taken at the bound, with a warning,
+    and keeps the gradient that leads back. An optimiser whose lr exceeds what E or nu can move is refused before the first
+    run.
     """
 
     def __init__(
@@ -122,6 +158,7 @@ class DifferentiableMaterial(TorchMaterial):
         E=None,
         nu=None,
         law=StableNeoHookean,
+        nu_range=None,
     ):
         super().__init__()
         self.material = law
@@ -133,6 +170,18 @@ class DifferentiableMaterial(TorchMaterial):
             value = torch.as_tensor(value, dtype=dtype).detach().clone()
             self.register_parameter(name, torch.nn.Parameter(value, requires_grad=requires_grad))
         law(self.E.detach().double().cpu().numpy(), self.nu.detach().double().cpu().numpy())  # checks the numbers
+        given = float(self.nu.detach().min()), float(self.nu.detach().max())
+        low, high = (min(NU_RANGE[0], given[0]), max(NU_RANGE[1], given[1])) if nu_range is None else nu_range
+        if not -1 < low <= given[0] <= given[1] <= high < 0.5:
+            raise ValueError(f"nu_range must lie in (-1, 0.5) and contain nu, got {nu_range} and {given}")
+        self.nu_range = float(low), float(high)
+
+    def tensors(self, mesh) -> dict[str, torch.Tensor]:
+        """E as it is, and nu within nu_range, in the graph."""
+        return {"youngs_modulus": self.E, "poissons_ratio": bounded(self.nu, *self.nu_range, name="Poisson's ratio")}
+
+    def rooms(self) -> dict[str, tuple[torch.nn.Parameter, float]]:
+        return {"E": (self.E, float(self.E.detach().min())), "nu": (self.nu, self.nu_range[1] - self.nu_range[0])}
 
 
 class SpatiallyVaryingMaterial(TorchMaterial):
@@ -140,8 +189,8 @@ class SpatiallyVaryingMaterial(TorchMaterial):
 
     `SpatiallyVaryingMaterial(num_elements, base_youngs, base_poisson)`: Parameters log_E and nu, one per tetrahedron.
     `SpatiallyVaryingMaterial(base_E=, base_nu=, grid_resolution=, E_range=, requires_grad=)`: one Parameter of control
-    values in Pa on a regular grid over the mesh's bounding box, trilinear at the tetrahedra's centroids and clamped to
-    E_range; nu is a buffer. E is then a function of the mesh: `youngs_modulus(mesh)`.
+    values in Pa on a regular grid over the mesh's bounding box, trilinear at the tetrahedra's centroids and held in
+    E_range, with the gradient that leads back into it; nu is a buffer. E is then `youngs_modulus(mesh)`.
     """
 
     def __init__(
@@ -168,6 +217,7 @@ class SpatiallyVaryingMaterial(TorchMaterial):
         if base_poisson is not None or base_nu is not None:
             nu = float(_one_of("base_poisson, base_nu", base_poisson, base_nu))
         law(E, nu)
+        self.nu_range = min(NU_RANGE[0], nu - 1e-6), max(NU_RANGE[1], nu + 1e-6)  # nu is stored in float32
         if (num_elements is None) == (grid_resolution is None):
             raise ValueError(
                 "give num_elements (a value per tetrahedron) or grid_resolution (values on a grid), not both"
@@ -198,7 +248,7 @@ class SpatiallyVaryingMaterial(TorchMaterial):
         if self.grid_resolution is not None:
             weights, corners = _trilinear(mesh, self.grid_resolution)
             values = self.control.reshape(-1)[torch.from_numpy(corners).to(self.control.device)]
-            return (torch.from_numpy(weights).to(self.control) * values).sum(1).clamp(*self.E_range)
+            return bounded((torch.from_numpy(weights).to(self.control) * values).sum(1), *self.E_range)
         if len(self.log_E) != mesh.num_tetrahedra:
             raise ValueError(
                 f"num_elements: the mesh has {mesh.num_tetrahedra} tetrahedra, the material {len(self.log_E)}"
@@ -206,7 +256,12 @@ class SpatiallyVaryingMaterial(TorchMaterial):
         return self.E
 
     def tensors(self, mesh) -> dict[str, torch.Tensor]:
-        return {"youngs_modulus": self.youngs_modulus(mesh), "poissons_ratio": self.nu}
+        return {"youngs_modulus": self.youngs_modulus(mesh), "poissons_ratio": bounded(self.nu, *self.nu_range)}
+
+    def rooms(self) -> dict[str, tuple[torch.nn.Parameter, float]]:
+        if self.grid_resolution is not None:
+            return {"control": (self.control, self.E_range[1] - self.E_range[0])}
+        return {"log_E": (self.log_E, math.log(1e3)), "nu": (self.nu, self.nu_range[1] - self.nu_range[0])}
 
 
 @lru_cache(maxsize=4)

@@ -255,6 +255,7 @@ class DifferentiableSimulator:
     def _rollout(self, steps: int, with_forces: bool, checkpoint_every, save_every) -> Rollout:
         key = (steps, with_forces, checkpoint_every, save_every)
         if key not in self._rollouts:
+            self.material.check_steps()
             solver = self._core_solver(self._scene(with_forces), self._substeps)
             if len(self._rollouts) >= self.kept_rollouts:
                 self._rollouts.pop(next(iter(self._rollouts)))

@@ -86,6 +86,8 @@ class Optimization:
 
     module: holds the parameters; path: state file, resumed from if it is there; None keeps nothing. A resumed run is
     bitwise the uninterrupted one (parameters, optimiser, random numbers). `losses` has the loss before each iteration,
+    clip: largest norm of the whole gradient, which is scaled back to it. patience: end where so many iterations brought no
+    lower loss.
     `best_loss` the lowest, whose parameters `restore_best()` brings back; `seconds` counts all parts of the run.
     """
 
@@ -96,7 +98,10 @@ class Optimization:
         mesh: TetrahedralMesh,
         path: str | Path | None = None,
         save_every: int = 1,
+        clip: float | None = None,
+        patience: int | None = None,
     ):
+        self.clip, self.patience = clip, patience
         self.module, self.optimizer, self.mesh, self.path, self.save_every = module, optimizer, mesh, path, save_every
         self.iteration, self.losses, self.seconds = 0, [], 0.0
         self.best_loss, self._best = math.inf, copy.deepcopy(module.state_dict())
@@ -123,9 +128,12 @@ class Optimization:
             if not torch.isfinite(value):
                 raise FloatingPointError(f"iteration {self.iteration}: the loss is {value.item()}; take smaller steps")
             value.backward()
+            if self.clip is not None:
+                groups = self.optimizer.param_groups
+                torch.nn.utils.clip_grad_norm_([p for group in groups for p in group["params"]], self.clip)
             return value
 
-        while self.iteration < iterations:
+        while self.iteration < iterations and not self.is_stuck():
             start, before = time.perf_counter(), copy.deepcopy(self.module.state_dict())
             try:
                 value = self.optimizer.step(closure).item()
@@ -142,6 +150,11 @@ class Optimization:
             if self.path is not None and (self.iteration % self.save_every == 0 or self.iteration == iterations):
                 self.save()
         return self
+
+    def is_stuck(self) -> bool:
+        """Whether the last `patience` iterations brought no lower loss."""
+        n = self.patience
+        return n is not None and len(self.losses) > n and min(self.losses[-n:]) >= min(self.losses[:-n])
 
     def save(self) -> None:
         """Write the state file."""

@@ -13,7 +13,7 @@ AREAS = {
     "motion against closed forms": "reference_motion step_limit mass_scaling unequal_steps energy_watch hertz torture",
     "every adjoint, order, fuzz": "every_adjoint term_order gradient_fuzz",
     "gradients": "gradients gradient_clip gradient_faults checkpoints tape outputs "
-    "contact_force reaction tensor_outputs work modes identification",
+    "contact_force reaction tensor_outputs work modes identification identify",
     "implicit steps and equilibria": "implicit implicit_gradients implicit_contact swept solve_report",
     "patches against locking": "locking",
     "ten-node tetrahedra": "reference_element quadratic quadratic_mesh quadratic_loads quadratic_outputs quadratic_solvers "
@@ -21,7 +21,7 @@ AREAS = {
     "obstacles and friction": "contact contact_area contact_faces contact_stage contact_rollers contact_crossing "
     "contact_friction face_friction contact_gradients own_obstacle",
     "self-contact": "self_contact self_contact_implicit self_contact_near self_contact_pairs",
-    "PyTorch, optimisations": "torch torch_physics torch_solvers seed_snippets optimization",
+    "PyTorch, optimisations": "torch torch_physics torch_solvers seed_snippets step_sizes optimization designs",
     "charts, maps, advice": "study study_stability peers",
     "pictures, films, the window": "picture_drawing picture_film marks "
     "optimization_picture writers viewer viewer_window gallery",

@@ -10,6 +10,7 @@ import numpy as np
 import typer
 
 from diffsim_ti.adaptive_run import Interrupted
+from diffsim_ti.cli.identify import identify
 from diffsim_ti.cli.options import (
     SUFFIXES,
     Backend,
@@ -45,6 +46,7 @@ app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, help="So
 register_study(app)  # chart, stability, recommend
 ClickException = typer.BadParameter.__mro__[2]  # typer carries click inside or beside it, depending on its version
 register(app)
+app.command()(identify)
 
 
 @app.callback()

@@ -1,8 +1,7 @@
 """Find Young's modulus and friction of a soft block from the force on a ball that is pressed in and dragged.
 
 A laboratory records force against displacement. The ball goes down 8 mm, then 12 mm to the side; the force that it feels is
-`ContactForce`. Its derivatives by both numbers come from tangents, one run each, and SciPy's least squares does the rest,
-in logarithms. Data carry noise of .2 % of the largest force.
+`ContactForce`. `identify` finds both numbers. Data carry noise of .2 % of the largest force.
 
     python examples/identify/indentation.py [folder for a picture]
 """
@@ -11,7 +10,6 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from scipy.optimize import least_squares
 
 import diffsim_ti as ds
 from diffsim_ti import picture
@@ -52,39 +50,20 @@ def main(folder: str | None = None) -> dict:
     rollout = experiment()
     names = {"youngs_modulus": "youngs_modulus", "friction": "ball.friction"}  # of inputs
 
-    def run(log_numbers):
-        return rollout.forward(**{names[n]: np.exp(x) for n, x in zip(GUESS, log_numbers)})
+    def run(numbers):
+        return rollout.forward(**{names[n]: x for n, x in numbers.items()})["force"]
 
-    exact = -run(np.log([*TRUTH.values()]))["force"]  # what the block does to the ball
+    exact = run(TRUTH)
     noise = NOISE * np.abs(exact).max()
     seen = exact + noise * np.random.default_rng(0).standard_normal(exact.shape)
-    runs = []
-
-    def residual(log_numbers):
-        runs.append(run(log_numbers))
-        return ((-runs[-1]["force"] - seen) / noise).ravel()
-
-    def jacobian(log_numbers):
-        frames = runs[-1]
-        columns = [
-            -rollout.tangents(frames, **{names[n]: np.exp(x)})["force"].ravel() / noise
-            for n, x in zip(GUESS, log_numbers)
-        ]
-        return np.stack(columns, 1)
-
-    found = least_squares(residual, np.log([*GUESS.values()]), jacobian, x_scale=1.0, xtol=1e-6)
-    numbers = dict(zip(GUESS, np.exp(found.x)))
-    spread = np.sqrt(np.diag(np.linalg.inv(found.jac.T @ found.jac)))  # relative, for the unknowns are logarithms
+    found = ds.identify(rollout, {"force": seen}, {n: ds.Unknown(x, input=names[n]) for n, x in GUESS.items()}, noise)
+    numbers, spread = found.estimates, found.information.deviations  # relative, for the unknowns are logarithms
     errors = {name: abs(numbers[name] / TRUTH[name] - 1) for name in TRUTH}
-    print(
-        f"E = {numbers['youngs_modulus']:.5g} Pa ({100 * errors['youngs_modulus']:.2f} % off, standard error "
-        f"{100 * spread[0]:.2f} %), friction = {numbers['friction']:.4f} ({100 * errors['friction']:.2f} % off, standard "
-        f"error {100 * spread[1]:.2f} %), from {GUESS} in {len(runs)} runs"
-    )
-    force = -run(found.x)["force"]
+    print(found)
+    force = run(numbers)
     if folder:
-        draw(Path(folder) / "indentation.png", rollout, seen, force, -run(np.log([*GUESS.values()]))["force"])
-    return dict(numbers=numbers, errors=errors, spread=spread, runs=len(runs), force=force, seen=seen)
+        draw(Path(folder) / "indentation.png", rollout, -seen, -force, -run(GUESS))  # what the block does to the ball
+    return dict(numbers=numbers, errors=errors, spread=spread, runs=1 + len(found.iterations), force=force, seen=seen)
 
 
 def draw(path: Path, rollout, seen, found, guess) -> None:

@@ -1,0 +1,43 @@
+"""A picture of an identification: data and fit, residuals over the noise, numbers with their intervals."""
+
+from pathlib import Path
+
+import numpy as np
+
+from diffsim_ti.identification.measurements import Measurement
+from diffsim_ti.identification.result import Identification
+from diffsim_ti.rollout import Frames
+
+
+def save_picture(path: str | Path, found: Identification, measurement: Measurement, frames: Frames) -> None:
+    """Write the picture of one experiment's measurement; frames: of the run with the numbers found."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    r = measurement.residual(frames, float(found.estimates.get("time_offset", 0.0)))
+    seen = measurement.seen
+    times = frames.times if measurement.times is None else measurement.times
+    t = np.broadcast_to(times.reshape(-1, *[1] * (seen.ndim - 1)), seen.shape)[seen]
+    fit = measurement.values[seen] + r * measurement.deviation
+    figure, axes = plt.subplots(1, 3, figsize=(12, 3.6), layout="constrained")
+    axes[0].plot(t, measurement.values[seen], "o", mfc="none", ms=4, label="data")
+    axes[0].plot(t, fit, ".", ms=4, label="fit")
+    axes[0].set(xlabel="time [s]", ylabel=measurement.output)
+    axes[0].legend()
+    axes[1].plot(t, r, ".", ms=4)
+    axes[1].axhspan(-1.96, 1.96, alpha=0.15)
+    axes[1].set(
+        xlabel="time [s]", ylabel="residual / noise", title=f"chi² {found.chi_square:.4g} of {found.degrees:.4g}"
+    )
+    for i, label in enumerate(found.labels if found.intervals else []):
+        low, high = np.concatenate([np.atleast_2d(x) for x in found.intervals.values()])[i] / found.numbers[i]
+        axes[2].plot([low, high], [i, i], "|-")
+        axes[2].annotate(
+            f"{label} {found.numbers[i]:.5g}", (1, i), xytext=(0, 6), textcoords="offset points", ha="center"
+        )
+    axes[2].set(xlabel="95 % interval over the estimate", yticks=[], ylim=(-0.5, len(found.labels) - 0.3))
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=120)
+    plt.close(figure)

@@ -1,0 +1,135 @@
+"""What is looked for: numbers of inputs, each as a free variable without bounds, spread over the input by regions."""
+
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from diffsim_ti.rollout import Rollout
+
+TIME_OFFSET = "time_offset"  # of measurements with times of their own [s]
+
+
+class Unknown:
+    """Numbers x of an input, found through free variables t in which no bound exists:
+
+        logarithm  x = start exp(t)                      (default where start > 0)
+        bounded    x = low + (high - low) / (1 + e^-s),  s = t + s(start)        (with `range`)
+        linear     x = start + scale t                   (with `scale`, and where start <= 0)
+
+    start: a guess, one number or one per group. range: (low, high). scale: a change that matters, in the input's unit.
+    regions: names of the mesh's sets of tetrahedra, a number for each, what lies in none keeps the scene's value; "each" for
+    one per tetrahedron; or whole numbers of the input's shape, equal ones for what changes together, -1 for what is held.
+    input: its name; default the unknown's own. "time_offset" [s] is added to the times of measurements.
+    experiments: indices of the rollouts that it acts in; default all.
+    Errors are ValueErrors before any run. Seber, Wild, Nonlinear Regression, 1989, sec. 2.8, on such transformations.
+    """
+
+    def __init__(
+        self,
+        start: ArrayLike,
+        range: tuple[float, float] | None = None,
+        regions: str | Iterable[str] | ArrayLike | None = None,
+        input: str | None = None,
+        scale: float | None = None,
+        experiments: Iterable[int] | None = None,
+    ):
+        self.start, self.range, self.regions, self.input = np.array(start, np.float64), range, regions, input
+        self.scale, self.experiments = scale, None if experiments is None else tuple(experiments)
+        if range is not None and not (range[0] < self.start.min() and self.start.max() < range[1]):
+            raise ValueError(f"Unknown: start = {self.start} must lie inside range = {range}")
+        if range is not None and scale is not None:
+            raise ValueError("Unknown: give range or scale, not both")
+
+    def settled(self, label: str, rollouts: list[Rollout]) -> "Free":
+        """This unknown in these experiments."""
+        return Free(self, label, rollouts)
+
+
+class Free:
+    """An unknown of given experiments: `size` variables t, their numbers x, and where these go in the input."""
+
+    def __init__(self, unknown: Unknown, label: str, rollouts: list[Rollout]):
+        self.label, self.input, self.unknown = label, unknown.input or label, unknown
+        self.experiments = range(len(rollouts)) if unknown.experiments is None else unknown.experiments
+        self.rows = {k: self._groups(rollouts[k]) for k in self.experiments}
+        self.is_offset = self.input == TIME_OFFSET
+        self.size = 1 + max(int(rows.max(initial=0)) for rows in self.rows.values())
+        if unknown.start.shape not in ((), (self.size,)):
+            raise ValueError(f"{label}: start has shape {unknown.start.shape}, expected one number or {self.size}")
+        self.start = np.broadcast_to(unknown.start, (self.size,)).astype(float)
+        scale, is_log = unknown.scale, unknown.scale is None and unknown.range is None and np.all(self.start > 0)
+        self.kind = "bounded" if unknown.range is not None else "log" if is_log else "linear"
+        if self.kind == "linear" and scale is None:
+            raise ValueError(
+                f"{label}: start = {unknown.start} has no logarithm; give range or scale [the input's unit]"
+            )
+
+    def _groups(self, rollout: Rollout) -> np.ndarray:
+        regions, mesh = self.unknown.regions, rollout.scene.mesh
+        if self.input == TIME_OFFSET:
+            return np.zeros((), int)
+        if self.input not in rollout.inputs:
+            raise ValueError(
+                f"{self.label}: no input named {self.input!r}; this rollout has {', '.join(rollout.inputs)}"
+            )
+        if regions is None:
+            return np.zeros(rollout.values[self.input].shape, int)
+        if isinstance(regions, str) and regions == "each":
+            return np.arange(mesh.num_tetrahedra)
+        named = [regions] if isinstance(regions, str) else list(regions) if not isinstance(regions, np.ndarray) else []
+        if named and all(isinstance(name, str) for name in named):
+            rows = np.full(mesh.num_tetrahedra, -1)
+            for k, name in enumerate(named):
+                if name not in mesh.tetrahedron_sets:
+                    known = ", ".join(mesh.tetrahedron_sets) or "none"
+                    raise ValueError(f"{self.label}: no set of tetrahedra named {name!r}; the mesh has {known}")
+                rows[mesh.tetrahedron_sets[name]] = k
+            return rows
+        rows = np.asarray(regions, int)
+        if rows.shape not in (rollout.values[self.input].shape, (mesh.num_tetrahedra,)):
+            raise ValueError(
+                f"{self.label}: regions have shape {rows.shape}, the input {rollout.values[self.input].shape}"
+            )
+        return rows
+
+    def numbers(self, t: np.ndarray) -> np.ndarray:
+        """x(t)"""
+        if self.kind == "log":
+            return self.start * np.exp(t)
+        if self.kind == "linear":
+            return self.start + self.unknown.scale * t
+        low, high = self.unknown.range
+        at = np.log((self.start - low) / (high - self.start))
+        return low + (high - low) / (1 + np.exp(-(t + at)))
+
+    def slopes(self, t: np.ndarray) -> np.ndarray:
+        """dx/dt"""
+        x = self.numbers(t)
+        if self.kind == "log":
+            return x
+        if self.kind == "linear":
+            return np.full(self.size, float(self.unknown.scale))
+        low, high = self.unknown.range
+        return (x - low) * (high - x) / (high - low)
+
+    def free(self, x: ArrayLike) -> np.ndarray:
+        """t(x)"""
+        x = np.broadcast_to(np.asarray(x, float), (self.size,))
+        if self.kind == "log":
+            return np.log(x / self.start)
+        if self.kind == "linear":
+            return (x - self.start) / self.unknown.scale
+        low, high = self.unknown.range
+        return np.log((x - low) / (high - x)) - np.log((self.start - low) / (high - self.start))
+
+    def spread(self, k: int, x: np.ndarray, into: np.ndarray) -> np.ndarray:
+        """The input of experiment k with these numbers where they go, and `into` elsewhere."""
+        rows = self.rows[k]
+        return np.where(rows < 0, np.broadcast_to(into, rows.shape), x[rows])
+
+    def gathered(self, k: int, gradient: np.ndarray) -> np.ndarray:
+        """The transpose of `spread` in x."""
+        rows = self.rows[k].ravel()
+        kept = rows >= 0
+        return np.bincount(rows[kept], np.broadcast_to(gradient, self.rows[k].shape).ravel()[kept], self.size)

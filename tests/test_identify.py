@@ -1,0 +1,215 @@
+"""Numbers from measurements: estimates, intervals that hold as often as they say, what data do not tell, and its price."""
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+import diffsim_ti as ds
+from diffsim_ti.identification.priors import Priors
+from diffsim_ti.identification.problem import Problem
+
+MESH = ds.TetrahedralMesh.create_box([4, 2, 2], [0.6, 0.2, 0.2], pattern="five")
+TRUE = dict(youngs_modulus=8e4, poissons_ratio=0.3)
+NOISE = 1e-3
+MARKERS = MESH.vertex_indices("xmax")
+
+
+def body(steps=20, save_every=2, terms=None, **options) -> ds.Rollout:
+    scene = ds.Scene(MESH, ds.StableNeoHookean(**TRUE), terms=terms or [ds.Gravity()], fixed="xmin", precision="f64")
+    return ds.Rollout(ds.SemiImplicitSolver(scene, dt=1e-2, substeps=4), steps, save_every=save_every, **options)
+
+
+@pytest.fixture(scope="module")
+def swing():
+    return body()
+
+
+def tracks(exact, rng, noise=NOISE, **options):
+    seen = exact.positions[:, MARKERS]
+    return ds.Measurement("positions", seen + noise * rng.standard_normal(seen.shape), noise, MARKERS, **options)
+
+
+START = dict(youngs_modulus=4e4, poissons_ratio=0.2)
+
+
+def test_intervals_of_marker_tracks_hold_as_often_as_they_say(swing):
+    exact, inside, fits = swing.forward(**TRUE), np.zeros((100, 2), bool), 0
+    for seed in range(100):
+        start = dict(youngs_modulus=7.6e4, poissons_ratio=0.28)
+        found = ds.identify(swing, tracks(exact, np.random.default_rng(seed)), start)
+        assert found.converged
+        inside[seed] = [low < TRUE[name] < high for name, (low, high) in found.intervals.items()]
+        fits += found.residuals_fit
+    assert inside.sum(0).min() >= 87 and 0.92 <= inside.mean() <= 0.98 and fits >= 95
+
+
+def test_no_more_simulations_than_least_squares_with_differences(swing):
+    data = tracks(swing.forward(**TRUE), np.random.default_rng(1))
+    found, runs = ds.identify(swing, data, START), []
+
+    def residual(t):
+        runs.append(1)
+        return data.residual(swing.forward(youngs_modulus=np.exp(t[0]), poissons_ratio=t[1]), 0.0)
+
+    theirs = least_squares(residual, [np.log(4e4), 0.2], bounds=([0, -0.9], [20, 0.49]), xtol=1e-4, ftol=1e-4)
+    assert found.simulations <= len(runs)
+    assert found.chi_square <= 2 * theirs.cost * (1 + 1e-3)
+    assert found.estimates["poissons_ratio"] == pytest.approx(
+        theirs.x[1], abs=0.1 * found.standard_errors["poissons_ratio"]
+    )
+    assert str(found).splitlines()[0].startswith("youngs_modulus = ") and "as the noise explains" in str(found)
+
+
+def test_what_gravity_alone_does_not_tell_is_said(swing):
+    data = tracks(swing.forward(**TRUE), np.random.default_rng(2))
+    found = ds.identify(swing, data, dict(youngs_modulus=7e4, density=900.0))
+    assert len(found.unseen) == 1 and found.converged and "NOT SEEN" in str(found)
+    assert found.unseen[0]["youngs_modulus"] == pytest.approx(found.unseen[0]["density"], abs=0.02)
+    assert found.estimates["youngs_modulus"] / found.estimates["density"] == pytest.approx(80, rel=0.02)
+    low, high = found.intervals["density"]
+    assert low < 100 and high > 1e4
+    known = ds.identify(
+        swing, data, dict(youngs_modulus=7e4, density=900.0), prior={"density": ds.Normal(1000.0, 0.02)}
+    )
+    assert known.standard_errors["youngs_modulus"] == pytest.approx(0.02 * 8e4, rel=0.2)
+
+
+def test_wrong_noise_is_noticed(swing):
+    data = tracks(swing.forward(**TRUE), np.random.default_rng(3), noise=2 * NOISE)
+    data = ds.Measurement("positions", data.values, NOISE, MARKERS)
+    found = ds.identify(swing, data, START)
+    assert not found.residuals_fit and "NOT explained" in str(found)
+
+
+@pytest.mark.parametrize("dense", [True, False])
+def test_regions_missing_samples_and_two_experiments(swing, dense, monkeypatch):
+    regions, E = np.repeat(np.arange(3), len(MESH.tetrahedra) // 3), np.array([5e4, 1e5, 2e5])
+    other = body(terms=[ds.Gravity((0.0, 0.0, -9.8))])
+    rng, data = np.random.default_rng(4), []
+    if not dense:
+        monkeypatch.setattr("diffsim_ti.identification.least_squares.DENSE", 1)
+    for rollout in (swing, other):
+        x = rollout.forward(youngs_modulus=E[regions]).positions
+        x = x + 1e-4 * rng.standard_normal(x.shape)
+        x[rng.random(x.shape) < 0.3] = np.nan
+        data.append({"positions": x})
+    unknowns = {"youngs_modulus": ds.Unknown(8e4, regions=regions)}
+    found = ds.identify([swing, other], data, unknowns, noise=1e-4, covariance=True)
+    off = (found.estimates["youngs_modulus"] - E) / found.standard_errors["youngs_modulus"]
+    assert found.converged and np.abs(off).max() < 3 and found.residuals_fit
+    assert found.inputs[0]["youngs_modulus"].shape == (len(MESH.tetrahedra),)
+
+
+def test_a_field_with_neighbours_alike(swing):
+    x = swing.forward(youngs_modulus=np.where(MESH.centroids[:, 0] > 0.3, 2e5, 5e4)).positions
+    unknowns = {"youngs_modulus": ds.Unknown(1e5, regions="each")}
+    x = x + 1e-4 * np.random.default_rng(5).standard_normal(x.shape)
+    for edges in (False, True):
+        prior = {"youngs_modulus": ds.Smooth(0.3, edges)}
+        found = ds.identify(swing, {"positions": x}, unknowns, 1e-4, prior, covariance=True)
+        E, s = found.estimates["youngs_modulus"], found.standard_errors["youngs_modulus"]
+        assert found.converged and np.all(np.abs(np.log(E[MESH.centroids[:, 0] < 0.2] / 5e4)) < 0.3) and np.all(s > 0)
+
+
+def test_an_offset_of_time(swing):
+    fine = body(60, 1)
+    exact = fine.forward(**TRUE)
+    start, rng = 7, np.random.default_rng(6)
+    seen = exact.positions[start:51:2, MARKERS]
+    data = ds.Measurement(
+        "positions", seen + 1e-4 * rng.standard_normal(seen.shape), 1e-4, MARKERS, exact.times[start:51:2] - 0.033
+    )
+    found = ds.identify(fine, data, {"youngs_modulus": 6e4, "time_offset": ds.Unknown(0.0, scale=0.01)})
+    assert found.estimates["time_offset"] == pytest.approx(0.033, abs=3 * found.standard_errors["time_offset"])
+    assert found.standard_errors["time_offset"] < 1e-3 and found.residuals_fit
+
+
+def test_products_are_transposes_and_derivatives():
+    points = ds.MaterialPoints([[0.5, 0.1, 0.1], [0.3, 0.05, 0.1]])
+    rollout = body(8, 2, outputs=[points, ds.Reaction("xmin", name="force")])
+    at = np.linspace(0.01, 0.07, 5)
+    data = [
+        ds.Measurement("material_points", np.zeros((5, 2, 3)), 1e-3, times=at),
+        ds.Measurement("force", np.zeros(rollout.outputs["force"].shape(5)), 2.0),
+        ds.Measurement("positions", np.zeros((5, 4, 3)), 1e-3, MARKERS),
+    ]
+    each = ds.Unknown(8e4, regions="each")
+    problem = Problem(
+        [rollout],
+        [data],
+        {"E": ds.Unknown(each.start, regions="each", input="youngs_modulus"), "poissons_ratio": 0.3}
+        | {"gravity": ds.Unknown(-9.8, regions=[-1, 0, -1], scale=1.0), "time_offset": ds.Unknown(0.0, scale=0.01)},
+    )
+    rng = np.random.default_rng(0)
+    t, d = 0.1 * rng.standard_normal((2, problem.size))
+    point = problem.run(t)
+    w = rng.standard_normal(len(point.residual))
+    Jd = problem.product(point, d)
+    assert w @ Jd == pytest.approx(problem.transposed(point, w) @ d, rel=1e-11)
+    eps = 1e-5
+    differences = (problem.run(t + eps * d).residual - problem.run(t - eps * d).residual) / (2 * eps)
+    np.testing.assert_allclose(Jd, differences, rtol=1e-5, atol=1e-6 * np.abs(Jd).max())
+    for edges in (False, True):
+        prior = Priors({"E": ds.Smooth(0.1, edges), "poissons_ratio": ds.Normal(0.35, 0.1)}, problem.unknowns, MESH)
+        slope = (prior.cost(t + eps * d) - prior.cost(t - eps * d)) / (4 * eps)
+        assert prior.gradient(t) @ d == pytest.approx(slope, rel=1e-7)
+
+
+def test_stopped_and_resumed(swing, tmp_path):
+    data, path = tracks(swing.forward(**TRUE), np.random.default_rng(7)), tmp_path / "state.json"
+    whole = ds.identify(swing, data, START)
+    part = ds.identify(swing, data, START, callback=lambda row, frames: row["iteration"] == 2, resume=path)
+    assert part.stopped == "stopped by the callback" and len(part.iterations) == 2
+    rest = ds.identify(swing, data, START, resume=path)
+    assert rest.estimates == whole.estimates and len(rest.iterations) == len(whole.iterations)
+    with pytest.raises(ValueError, match="resume: the state is of"):
+        ds.identify(swing, data, dict(youngs_modulus=1e5), resume=part.state)
+
+
+def test_expected_intervals_and_the_best_markers(swing):
+    foreseen = ds.expected(swing, ds.Measurement("positions", np.zeros((11, 4, 3)), NOISE, MARKERS), TRUE)
+    found = ds.identify(swing, tracks(swing.forward(**TRUE), np.random.default_rng(8)), TRUE)
+    for name, s in found.standard_errors.items():
+        assert foreseen.standard_errors[name] == pytest.approx(s, rel=0.1)
+    places = {name: MESH.vertex_indices(name) for name in ("xmin", "xmax")}
+    choices = {k: ds.Measurement("positions", np.zeros((11, len(v), 3)), NOISE, v) for k, v in places.items()}
+    ranked = ds.compare(swing, choices, TRUE)
+    assert list(ranked) == ["xmax", "xmin"] and len(ranked["xmin"].unseen) == 2 and not ranked["xmax"].unseen
+    assert ranked["xmax"].standard_errors == pytest.approx(foreseen.standard_errors)
+
+
+def test_refusals(swing):
+    data = {"positions": np.zeros((11, MESH.num_vertices, 3))}
+    for arguments, expected in (
+        ((data, {"stiffness": 1.0}, 1.0), "no input named 'stiffness'"),
+        (({"stress": 1.0}, {"density": 1.0}, 1.0), "no output named 'stress'"),
+        (({"positions": np.zeros(3)}, {"density": 1.0}, 1.0), "expected values of shape"),
+        ((data, {"density": 1.0}), "need noise"),
+        ((data, {"density": 1.0}, 0.0), "noise must be > 0"),
+        ((data, {}, 1.0), "nothing is unknown"),
+        ((data, {"density": -1.0}, 1.0), "has no logarithm; give range or scale"),
+        ((data, {"youngs_modulus": ds.Unknown(1.0, regions="soft")}, 1.0), "no set of tetrahedra named 'soft'"),
+        ((data, {"density": 1.0}, 1.0, {"E": ds.Normal(1.0, 1.0)}), "prior: no unknown named 'E'"),
+    ):
+        with pytest.raises(ValueError, match=expected):
+            ds.identify(swing, *arguments)
+    with pytest.raises(ValueError, match="must lie inside range"):
+        ds.Unknown(2.0, range=(0.0, 1.0))
+
+
+def test_the_command(tmp_path, capsys):
+    from diffsim_ti.cli import main
+
+    MESH.save(tmp_path / "body.vtu")
+    rollout = body()
+    x, times = rollout.forward(**TRUE).positions[:, MARKERS], rollout.times
+    x = x + 1e-4 * np.random.default_rng(9).standard_normal(x.shape) * (times > 0)[:, None, None]
+    rows = [f"{t},{k},{','.join(map(str, p))}" for t, frame in zip(times, x) for k, p in enumerate(frame)]
+    (tmp_path / "tracks.csv").write_text("\n".join(["time,marker,x,y,z", *rows[:9], *rows[10:]]))
+    command = ["identify", str(tmp_path / "body.vtu"), str(tmp_path / "tracks.csv"), "--unknown", "youngs_modulus=5e4"]
+    command += ["--nu", "0.3", "--noise", "1e-4", "--fixed", "xmin", "--output", str(tmp_path / "fit.png")]
+    with pytest.raises(SystemExit) as end:
+        main(command)
+    assert end.value.code == 0 and (tmp_path / "fit.png").stat().st_size > 10_000
+    line = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("youngs_modulus = "))
+    assert float(line.split()[2]) == pytest.approx(8e4, rel=0.02) and "95 %" in line
