@@ -127,7 +127,12 @@ class ImplicitAdjoint(RecordedPasses):
             q = np.zeros_like(q)
         p_free, q_free = p * ws.free, q * ws.free
         # the equation
-        by_star = self.solve(s.c0 * p_free + s.e0 / s.gamma * q_free + by_contacts * ws.free)
+        seed = s.c0 * p_free + s.e0 / s.gamma * q_free + by_contacts * ws.free
+        if np.abs(seed).max(initial=0.0) < 1e-18 * np.abs(p).max(
+            initial=0.0
+        ):  # rounding of what is held, no direction of ours
+            seed = np.zeros_like(seed)
+        by_star = self.solve(seed)
         nu = None
         if ws.volumes:
             by_star, nu = ws.volumes.adjoint(self.places, by_star, self.chambers.adjoint(j, save_every), self.solve)
