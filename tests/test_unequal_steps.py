@@ -154,6 +154,8 @@ def test_the_search_puts_substeps_where_the_impact_is(solver):
     fine = ds.Rollout(ds.VelocityVerletSolver(scene, dt=4e-3, substeps=400), 15, save_every=15).forward()
     end = ds.Rollout(plain, steps).forward().positions[-1]
     assert np.linalg.norm(end - fine.positions[-1], axis=1).max() < 5 * tolerance  # motion stretches errors
+    again = ds.Rollout(plain, lambda s: ds.adaptive_steps(s, 15, tolerance))
+    assert np.array_equal(again.schedule.substeps, steps.substeps)
     finer = ds.adaptive_steps(plain, 15, tolerance / 10)
     assert finer.substeps.sum() > 1.5 * steps.substeps.sum()
     assert ds.Rollout(plain, finer).forward().contact_resolution.substep <= 4e-3

@@ -1,6 +1,6 @@
 """Rollout: n steps of a solver as one differentiable operation."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,7 +23,8 @@ class Rollout:
 
     solver: any solver; its scene names the inputs (`rollout.inputs`): initial_positions, initial_velocities,
         the material's numbers, density, the terms' numbers, prescribed_motion, rest_positions.
-    steps: number of steps of solver.dt; or the length of each [s], or `UnequalSteps` with substeps for each.
+    steps: number of steps of solver.dt; or the length of each [s], or `UnequalSteps` with substeps for each;
+        or a function of the solver that returns one of these, such as one that calls `adaptive_steps`.
     save_every: a frame every so many steps, besides the start; must divide `steps`. Default: only the end.
     checkpoint_every: keep a state every so many steps and compute the rest again in the reverse sweep.
     memory: or a budget [MB] from which they are chosen (default 1000). The gradient is bitwise the same.
@@ -46,7 +47,7 @@ class Rollout:
     def __init__(
         self,
         solver: Solver,
-        steps: int | ArrayLike | UnequalSteps,
+        steps: int | ArrayLike | UnequalSteps | Callable[[Solver], UnequalSteps],
         save_every: int | None = None,
         checkpoint_every: int | None = None,
         memory: float | None = None,
@@ -84,6 +85,7 @@ class Rollout:
     @staticmethod
     def _stepped(solver: Solver, steps) -> tuple[Solver, int]:
         """The solver that takes these steps, and how many they are."""
+        steps = steps(solver) if callable(steps) else steps
         if np.ndim(steps) == 1 and not isinstance(steps, UnequalSteps):
             steps = UnequalSteps(steps, solver.substeps)
         if isinstance(steps, UnequalSteps):
