@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 
+from diffsim_ti.checked import instance, number, whole
 from diffsim_ti.monitor.guard import Divergence
 from diffsim_ti.simulator import Simulator
 from diffsim_ti.solvers.solver import Solver
@@ -35,16 +36,14 @@ def adaptive_steps(solver: Solver, steps: int, tolerance: float) -> UnequalSteps
     meet.
     Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, II.4, doi:10.1007/978-3-540-78862-1.
     """
+    instance("adaptive_steps", "solver", solver, Solver, "a solver such as VelocityVerletSolver(scene)")
     if not solver.order:
         raise ValueError(f"{type(solver).__name__} finds equilibria, whose error no shorter step makes smaller")
-    if not (math.isfinite(tolerance) and tolerance > 0):
-        raise ValueError(f"tolerance must be > 0 [m], got {tolerance}")
-    if int(steps) != steps or steps < 1:
-        raise ValueError(f"steps must be a whole number >= 1, got {steps}")
-    search = _Search(solver, int(steps), tolerance)
-    substeps, errors = (np.array(column) for column in zip(*(search.advance() for _ in range(int(steps)))))
+    tolerance, steps = number("tolerance", tolerance, unit="m"), whole("steps", steps, 1)
+    search = _Search(solver, steps, tolerance)
+    substeps, errors = (np.array(column) for column in zip(*(search.advance() for _ in range(steps))))
     substeps = np.ceil(substeps * (errors.sum() / tolerance) ** (1 / solver.order))
-    return UnequalSteps(np.full(int(steps), solver.dt), _smooth(np.maximum(substeps, search.fewest)))
+    return UnequalSteps(np.full(steps, solver.dt), _smooth(np.maximum(substeps, search.fewest)))
 
 
 def _smooth(substeps: np.ndarray) -> np.ndarray:

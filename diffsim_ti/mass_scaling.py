@@ -35,7 +35,7 @@ class MassScaling:
         """At most a `share` of the mass, at the material's numbers as they are given. Raises ValueError for a share outside
         (0, 0.2], and for ten-node tetrahedra."""
         mesh, material = scene.mesh, scene.material
-        if not 0 < share <= 0.2:
+        if isinstance(share, str) or not 0 < share <= 0.2:
             raise ValueError(f"mass_scaling must lie in (0, 0.2], got {share}: 0.01 adds at most 1 % of the mass")
         if mesh.order > 1:
             raise ValueError("mass_scaling is for linear tetrahedra: take mesh.linear(), or an implicit solver")

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
+from diffsim_ti.checked import instance, listed
 from diffsim_ti.inputs import ConsistentMass, Inputs
 from diffsim_ti.mass_scaling import MassScaling
 from diffsim_ti.materials.material import Material
@@ -90,12 +91,15 @@ class Scene:
         self.arguments = dict(mesh=mesh, material=material, density=density, terms=terms, fixed=fixed, motion=motion)
         self.arguments |= dict(initial_positions=initial_positions, initial_velocities=initial_velocities)
         self.arguments |= dict(precision=precision, volume=volume, mass_scaling=mass_scaling)
-        self.mesh, self.material = mesh, material
+        self.mesh = instance("Scene", "mesh", mesh, TetrahedralMesh, "a TetrahedralMesh")
+        self.material = instance(
+            "Scene", "material", material, Material, "a material such as StableNeoHookean(1e5, 0.3)"
+        )
         self.precision = runtime.check_precision(precision)
         if volume not in ("tetrahedra", "patches"):
             raise ValueError(f'volume must be "tetrahedra" or, against locking, "patches", got {volume!r}')
         self.volume = volume
-        self.terms = tuple([terms] if isinstance(terms, Term) else terms)
+        self.terms = tuple([terms] if isinstance(terms, Term) else listed("terms", terms, "terms such as Gravity()"))
         self.supports = Supports(mesh, fixed)
         self.fixed, self.held = self.supports.fixed, self.supports.vertices  # in all directions; in some
         self.motion = motion

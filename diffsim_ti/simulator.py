@@ -6,11 +6,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
+from diffsim_ti.checked import instance, numbers
 from diffsim_ti.monitor import quantities
 from diffsim_ti.monitor.guard import Guard
 from diffsim_ti.monitor.quantities import Energy, TetrahedronFields
 from diffsim_ti.outputs import Output
 from diffsim_ti.rollout.frames import Frames
+from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.state.solve_report import SolveReport
 from diffsim_ti.state.watch import ContactResolution
 from diffsim_ti.terms import ExternalForce
@@ -28,11 +30,12 @@ class Simulator:
     """
 
     def __init__(self, *arguments, contact_forces: bool = False):
-        solver = arguments[-1]
+        solver = arguments[-1] if arguments else None
         if len(arguments) == 3:
             solver.bind(arguments[0], arguments[1])
         elif len(arguments) != 1:
             raise TypeError("Simulator takes a solver, or a mesh, a material and a solver")
+        instance("Simulator", "its last argument", solver, Solver, "a solver such as SemiImplicitSolver(scene)")
         if solver.scene is None:
             raise ValueError(
                 "the solver has no scene: use Simulator(mesh, material, solver), or a solver made from a Scene"
@@ -185,9 +188,9 @@ class Simulator:
             ("velocities", velocities, state.v, 0.0),
         ):
             if value is not None:
-                value = np.asarray(value, np.float64)
-                if value.shape != shape:
-                    raise ValueError(f"{name}: expected shape {shape}, got {value.shape}")
+                value = numbers(name, value)
+                if value.shape != shape or not np.all(np.isfinite(value)):
+                    raise ValueError(f"{name}: expected finite numbers of shape {shape}, got shape {value.shape}")
                 value = value - origin
                 if name == "velocities":
                     value = self.scene.supports.free(value)

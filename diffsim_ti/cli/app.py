@@ -1,5 +1,6 @@
 """The command line: `diffsim-ti` or `python -m diffsim_ti`. One function per command; heavy imports inside them."""
 
+import math
 import sys
 import time
 import warnings
@@ -41,6 +42,8 @@ from diffsim_ti.cli.study import register as register_study
 from diffsim_ti.cli.view import register
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.scene import Scene
+
+MOST_FRAMES = 10**6  # of a run: beyond it a duration is a slip
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, help="Soft bodies on tetrahedra.")
 register_study(app)  # chart, stability, recommend
@@ -146,8 +149,13 @@ def simulate(
 
     begin = time.perf_counter()
     for name, value in (("duration", duration), ("fps", fps), ("density", density)):
-        if not value > 0:
-            raise ValueError(f"--{name} must be > 0, got {value:g}")
+        if not (value > 0 and math.isfinite(value)):
+            raise ValueError(f"--{name} must be > 0 and finite, got {value:g}")
+    if duration * fps > MOST_FRAMES:
+        raise ValueError(
+            f"--duration {duration:g} at --fps {fps:g} makes {duration * fps:.3g} frames, more than {MOST_FRAMES:.0e}: "
+            "shorten it, or take fewer frames per second"
+        )
     view = View(fps=fps, azimuth=azimuth, title=mesh.stem, fit="end", arrows=tuple(arrows or ()))
     asked = [file_in(o, mesh.stem + suffix) for o in output or [Path("output/simulate")] for suffix in (".pvd", ".png")]
     writers = [writer_for(path, view) for path in dict.fromkeys(asked)]

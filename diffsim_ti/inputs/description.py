@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.checked import numbers
+
 # lengths: numbers, or "vertices", "tetrahedra" of the mesh, "steps", "steps + 1" of a run
 Shape = tuple[int | str, ...]
 
@@ -90,7 +92,7 @@ class Input:
             object.__setattr__(self, "given", self.value)
             object.__setattr__(self, "value", self.value.detach().cpu().numpy())
         if self.value is not None:
-            object.__setattr__(self, "value", frozen(np.array(self.value, np.float64)))
+            object.__setattr__(self, "value", frozen(numbers(self.plain or self.name, self.value)))
             object.__setattr__(self, "shapes", self.shapes or (self.value.shape,))
         object.__setattr__(self, "plain", self.plain or self.name)
 

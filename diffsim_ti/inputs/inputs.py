@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.checked import numbers
 from diffsim_ti.inputs import links
 from diffsim_ti.inputs.chain import Chain, Link
 from diffsim_ti.inputs.consistent_mass import ElementMasses
@@ -98,7 +99,10 @@ class Inputs:
         """What every scene has: its start, its material's numbers, its density."""
         n, X = self.mesh.num_vertices, self.mesh.vertices
         velocities = np.zeros(3) if velocities is None else velocities
-        velocities = np.broadcast_to(np.asarray(velocities, np.float64), (n, 3))
+        velocities = numbers("initial_velocities", velocities)
+        if velocities.shape not in ((), (3,), (n, 3)):
+            raise ValueError(f"initial_velocities: expected 3 numbers [m/s] or shape {(n, 3)}, got {velocities.shape}")
+        velocities = np.broadcast_to(velocities, (n, 3))
         places, per_tetrahedron = (("vertices", 3),), ((), ("tetrahedra",))
         return [
             Input("initial_positions", X if positions is None else positions, places, "m", change=length),

@@ -7,6 +7,7 @@ import warnings
 
 import numpy as np
 
+from diffsim_ti.checked import numbers
 from diffsim_ti.mesh import jacobian
 from diffsim_ti.mesh.geometry import FACES, edge_matrices, signed_volumes, squared_edges
 from diffsim_ti.mesh.reference_element import MID_EDGES
@@ -22,7 +23,7 @@ SLIVER = 0.1  # quality below which a tetrahedron is reported as a sliver
 
 def checked_vertices(vertices) -> np.ndarray:
     """A float64 copy of shape (num_vertices, 3); ValueError for a wrong shape or a NaN or infinite coordinate."""
-    vertices = np.array(vertices, np.float64, order="C")
+    vertices = np.ascontiguousarray(numbers("vertices", vertices))
     if vertices.ndim != 2 or vertices.shape[1:] != (3,) or len(vertices) == 0:
         raise ValueError(f"vertices must have shape (num_vertices, 3) with at least 4 rows, got {vertices.shape}")
     bad = np.nonzero(~np.isfinite(vertices).all(1))[0]

@@ -4,6 +4,8 @@ from itertools import permutations
 
 import numpy as np
 
+from diffsim_ti.checked import numbers
+
 # Cell corner (a, b, c) in {0, 1}^3. Kuhn: one tetrahedron per order of walking x, y, z from (0,0,0) to (1,1,1); all
 # share that diagonal. Five: a regular tetrahedron on four alternate corners and one at each other corner.
 _KUHN = [[tuple(int(axis in walk[:step]) for axis in range(3)) for step in range(4)] for walk in permutations(range(3))]
@@ -16,6 +18,7 @@ _FIVE = [
 ]
 _FIVE_MIRRORED = [[(1 - a, b, c) for a, b, c in corners] for corners in _FIVE]
 PATTERNS = ("kuhn", "five")
+MOST = 10**8  # vertices, of which each has some 1 kB of a scene
 
 
 def _positive(cell: list) -> np.ndarray:
@@ -31,12 +34,16 @@ def box(resolution, size, pattern: str, origin) -> tuple[np.ndarray, np.ndarray,
     counts = np.broadcast_to(np.asarray(resolution), (3,))
     if counts.dtype.kind not in "iu" or counts.min() < 2:
         raise ValueError(f"resolution counts vertices a side, as 1 or 3 integers of at least 2; got {resolution!r}")
-    lengths, start = (np.broadcast_to(np.asarray(given, np.float64), (3,)) for given in (size, origin))
+    lengths, start = (
+        np.broadcast_to(numbers(what, given), (3,)) for what, given in (("size", size), ("origin", origin))
+    )
     if not (np.all(np.isfinite(lengths)) and np.all(lengths > 0)):
         raise ValueError(f"size must be positive and finite [m], as 1 or 3 numbers; got {size!r}")
     if pattern not in PATTERNS:
         raise ValueError(f"pattern must be one of {', '.join(PATTERNS)}; got {pattern!r}")
     nx, ny, nz = (int(n) for n in counts)
+    if nx * ny * nz > MOST:
+        raise ValueError(f"resolution {resolution!r} makes {nx * ny * nz:.3g} vertices; take at most {MOST:.0e}")
     axes = [o + length * (np.arange(n) / (n - 1)) for o, length, n in zip(start, lengths, (nx, ny, nz))]
     vertices = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     i, j, k = (part.reshape(-1, 1, 1) for part in np.indices((nx - 1, ny - 1, nz - 1)))

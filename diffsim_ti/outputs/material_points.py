@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.checked import numbers
 from diffsim_ti.mesh.geometry import inverse_edges, shape_gradients
 from diffsim_ti.mesh.inverse_map import barycentric_in, solved
 from diffsim_ti.outputs.output import Change, Output
@@ -33,7 +34,7 @@ class MaterialPoints(Output):
     """
 
     def __init__(self, points: ArrayLike, name: str = "material_points", nearest: bool = False):
-        self.points, self.name, self.nearest = np.array(points, np.float64), name, bool(nearest)
+        self.points, self.name, self.nearest = numbers("MaterialPoints: points", points), name, bool(nearest)
 
     def __repr__(self) -> str:
         return f"MaterialPoints({len(self.points)} points, name={self.name!r})"

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
+from diffsim_ti.checked import instance, listed
 from diffsim_ti.inputs import Derived
 from diffsim_ti.outputs import Change, Displacements, Output, Positions, Velocities
 from diffsim_ti.rollout.checkpoints import Checkpoints
@@ -58,6 +59,7 @@ class Rollout:
         outputs: Output | Iterable[Output] = (),
         runs: int | None = None,
     ):
+        instance("Rollout", "solver", solver, Solver, "a solver such as SemiImplicitSolver(scene)")
         solver, steps = self._stepped(solver, steps)
         self.solver, self.scene = solver, solver.scene
         options = dict(
@@ -69,7 +71,7 @@ class Rollout:
             truncate=truncate,
             health=health,
         )
-        given = (outputs,) if isinstance(outputs, Output) else tuple(outputs)
+        given = (outputs,) if isinstance(outputs, Output) else tuple(listed("outputs", outputs, "Outputs"))
         contacts = any(getattr(output, "reads_contact_forces", False) for output in given)
         chambers = any(getattr(output, "reads_chamber_pressures", False) for output in given)
         self.sweep = sweep = Sweep(solver, steps, **options, contacts=contacts, chambers=chambers)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 from diffsim_ti import runtime
+from diffsim_ti.checked import listed, number, whole
 from diffsim_ti.inputs import Derived
 from diffsim_ti.monitor.guard import Guard
 from diffsim_ti.rollout.checkpoints import choose_checkpoints
@@ -39,7 +40,7 @@ class Sweep:
         self.contacts = contacts  # whether runs note what obstacles do to each vertex in each frame
         self.chambers = chambers and solver.scene.holds_volumes  # whether pressures in chambers are wanted of frames
         self.solver, self.scene, self.steps = solver, solver.scene, steps
-        self.save_every = max(self.steps, 1) if save_every is None else int(save_every)
+        self.save_every = max(self.steps, 1) if save_every is None else whole("save_every", save_every, 0)
         if self.save_every < 1 or self.steps % self.save_every:
             raise ValueError(f"save_every = {save_every} must be >= 1 and divide steps = {steps}")
         self.num_frames = self.steps // self.save_every + 1
@@ -47,7 +48,11 @@ class Sweep:
         solver.check_run(self.values)
         self.inputs = tuple(self.values)
         self.wanted = self._check_names(gradients)
-        self.clip, self.truncate, self.careful = clip, truncate, health or clip is not None
+        self.clip = None if clip is None else number("clip", clip)
+        self.truncate = None if truncate is None else whole("truncate", truncate)
+        self.careful = health or clip is not None
+        memory = None if memory is None else number("memory", memory, unit="MB")
+        checkpoint_every = None if checkpoint_every is None else whole("checkpoint_every", checkpoint_every, 0)
         self.health: list[dict] = []
         self.first_step = 0  # steps that came before those of a run, for reports
         self.num_passes = solver.num_passes(self.steps)
@@ -67,7 +72,9 @@ class Sweep:
     def _check_names(self, names) -> tuple[str, ...]:
         if names is None:
             return tuple(name for name in self.inputs if name != "rest_positions")
-        names = self.inputs if names == "all" else tuple([names] if isinstance(names, str) else names)
+        if isinstance(names, str):
+            names = self.inputs if names == "all" else (names,)
+        names = tuple(listed("gradients", names, "names of inputs"))
         unknown = [name for name in names if name not in self.inputs]
         if unknown:
             raise ValueError(f"gradients: no input named {unknown[0]!r}; this rollout has {', '.join(self.inputs)}")

@@ -7,6 +7,7 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
+from diffsim_ti.checked import whole
 from diffsim_ti.outputs import Change
 from diffsim_ti.rollout import field_copies
 from diffsim_ti.rollout.field_seed import STATES, field_seed
@@ -29,7 +30,8 @@ class TapeFace:
     """
 
     def __init__(self, rollout: "Rollout", runs: int | None):
-        if runs is not None and not (int(runs) == runs and runs >= 1):
+        runs = runs if runs is None else whole("runs", runs)
+        if runs is not None and runs < 1:
             raise ValueError(f"runs must be a whole number >= 1, or None for one run, got {runs}")
         self._rollout, self.runs = weakref.ref(rollout), runs  # the rollout holds this: no circle
         scene = rollout.scene

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
+from diffsim_ti.checked import number, shown, whole
 from diffsim_ti.monitor import stability
 from diffsim_ti.monitor.stiffest import sampled_by_runs, stiffest
 from diffsim_ti.state.schedule import EqualSteps, Schedule, UnequalSteps
@@ -45,10 +46,8 @@ class Solver(ABC):
         allow_unstable: bool = False,
         check_start: bool = True,
     ):
-        if not (math.isfinite(dt) and dt > 0):
-            raise ValueError(f"dt must be > 0 [s], got {dt}")
-        if int(substeps) != substeps or substeps < 1:
-            raise ValueError(f"substeps must be a whole number >= 1, got {substeps}")
+        dt, substeps = number("dt", dt, unit="s"), whole("substeps", substeps, 1)
+        self.check_scene(scene)
         self.scene = scene if self.explicit else scene.with_consistent_mass()
         self.dt, self.substeps = float(dt), int(substeps)
         self.parallel, self.allow_unstable, self.check_start = parallel, allow_unstable, check_start
@@ -64,6 +63,11 @@ class Solver(ABC):
         self._deformed: bool | None = None
         if self.explicit and check_start and not allow_unstable:
             self._refuse_unstable()
+
+    def check_scene(self, scene) -> None:
+        """Raise ValueError for what is no scene."""
+        if not hasattr(scene, "with_consistent_mass"):
+            raise ValueError(f"{type(self).__name__}: takes a Scene, got {shown(scene)}")
 
     def for_scene(self, scene: "Scene") -> "Solver":
         """The same solver for another scene."""

@@ -36,6 +36,7 @@ class StaticSolver(ImplicitSolver):
         parallel: bool | None = None,
         preconditioner: str = "auto",
     ):
+        self.check_scene(scene)
         law = scene.law
         if law.state_names:
             raise ValueError(

@@ -17,6 +17,7 @@ import taichi as ti
 from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
+from diffsim_ti.checked import numbers
 
 INTS = ("row", "next", "force0", "force1", "frame", "counted", "opens")
 FLOATS = (
@@ -232,7 +233,7 @@ class UnequalSteps(Schedule):
     """
 
     def __init__(self, lengths: ArrayLike, substeps: ArrayLike = 1):
-        lengths, parts = np.atleast_1d(np.asarray(lengths, np.float64)).copy(), np.asarray(substeps)
+        lengths, parts = np.atleast_1d(numbers("lengths of steps", lengths)), np.asarray(substeps)
         if lengths.ndim != 1 or not (np.all(np.isfinite(lengths)) and np.all(lengths > 0)):
             raise ValueError("lengths of steps must be > 0 [s], one number for each step")
         whole = parts.dtype.kind in "iuf" and np.all((parts == np.floor(parts)) & (parts >= 1) & np.isfinite(parts))

@@ -5,6 +5,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.checked import numbers, shown
+
 # a function of time [s], or keyframes (times [s], displacements [m])
 Motion = Callable[[float], ArrayLike] | tuple[ArrayLike, ArrayLike]
 
@@ -17,7 +19,9 @@ def sampled(name: str, motion: Motion, times: ArrayLike, k: int) -> np.ndarray:
     if callable(motion):
         out = np.array([np.broadcast_to(np.asarray(motion(float(t)), np.float64), (k, 3)) for t in times])
     else:
-        at, to = (np.asarray(part, np.float64) for part in motion)
+        if not isinstance(motion, tuple | list) or len(motion) != 2:
+            raise ValueError(f"{name}: a function of time, or keyframes (times, displacements), got {shown(motion)}")
+        at, to = (numbers(name, part) for part in motion)
         to = np.broadcast_to(to[:, None, :] if to.ndim == 2 else to, (len(at), k, 3))
         if np.any(np.diff(at) <= 0):
             raise ValueError(f"{name}: keyframe times must increase")

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.checked import numbers, present
 from diffsim_ti.inputs import Input, Link
 from diffsim_ti.inputs.loads import InTime
 from diffsim_ti.inputs.muscles import MuscleTension
@@ -50,11 +51,12 @@ class Muscle(Cable):
             raise ValueError(f"Muscle: per must be one of {', '.join(map(repr, PER))}, got {per!r}")
         if per == "set" and (isinstance(tetrahedra, str) or not all(isinstance(s, str) for s in tetrahedra or [0])):
             raise ValueError(f'Muscle: per="set" takes tetrahedra=["left", "right"], names of sets, got {tetrahedra!r}')
-        a = np.asarray(fibre, np.float64)
+        a = numbers("Muscle: fibre", fibre)
         if a.shape[-1:] != (3,) or a.ndim > 2 or not np.all(np.isfinite(a)) or np.any(np.linalg.norm(a, axis=-1) == 0):
             raise ValueError(f"Muscle: fibre must be finite directions, shape (3,) or (k, 3), got shape {a.shape}")
         shape = () if per == "all" else (len(tetrahedra),) if per == "set" else ("k",)
         self.given, self.plain, self.keyed, self.per = activation, "activation", is_keyed(activation), per
+        present("Muscle: stress", stress)
         self.fibre, self.tetrahedra = a / np.linalg.norm(a, axis=-1, keepdims=True), tetrahedra
         self.ndim = len(shape) + 1
         inputs = (

@@ -6,6 +6,7 @@ from copy import copy
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.checked import present
 from diffsim_ti.inputs import Input, Link
 from diffsim_ti.inputs.description import Range, length
 from diffsim_ti.inputs.loads import InTime
@@ -146,6 +147,7 @@ class Spring(Tie):
     ):
         if rest_length is not None and tension is not None:
             raise ValueError("Spring: rest_length and tension both say how it is stretched at rest; give one of them")
+        present("Spring: stiffness", stiffness)
         shapes = (), ("k",)
         inputs = [Input("stiffness", stiffness, shapes, "N/m", AT_LEAST_0, plain="spring_stiffness", label="stiffness")]
         if rest_length is not None:

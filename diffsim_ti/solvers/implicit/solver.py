@@ -12,6 +12,7 @@ velocities by exp(-c h) in a stage of its own. Statics: no inertia, u* is where 
 from abc import abstractmethod
 from typing import TYPE_CHECKING
 
+from diffsim_ti.checked import number, whole
 from diffsim_ti.solvers.implicit.adjoint import ImplicitAdjoint
 from diffsim_ti.solvers.implicit.stage import Stage
 from diffsim_ti.solvers.implicit.tangent import ImplicitTangent
@@ -51,11 +52,9 @@ class ImplicitSolver(Solver):
         if preconditioner not in ("auto", "block_jacobi", "multigrid"):
             raise ValueError(f"preconditioner must be auto, block_jacobi or multigrid, got {preconditioner!r}")
         self.preconditioner = preconditioner
-        if not 0 < tolerance < 1:
+        if not 0 < number("tolerance", tolerance) < 1:
             raise ValueError(f"tolerance must lie between 0 and 1, got {tolerance}")
-        if int(max_iterations) != max_iterations or max_iterations < 1:
-            raise ValueError(f"max_iterations must be a whole number >= 1, got {max_iterations}")
-        self.tolerance, self.max_iterations = float(tolerance), int(max_iterations)
+        self.tolerance, self.max_iterations = float(tolerance), whole("max_iterations", max_iterations, 1)
         super().__init__(scene, dt, substeps, parallel)
 
     @abstractmethod

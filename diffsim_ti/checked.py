@@ -1,0 +1,65 @@
+"""What public entries check of what they are given: rule, value, remedy, before anything is computed."""
+
+import math
+from collections.abc import Iterable
+
+import numpy as np
+
+
+def shown(value) -> str:
+    """A value in a message, never a whole array."""
+    if isinstance(value, np.ndarray) and value.size > 6:
+        return f"an array of shape {value.shape}"
+    text = repr(value)
+    return text if len(text) <= 80 else f"{text[:77]}..."
+
+
+def number(name: str, value, low: float = 0.0, unit: str = "", included: bool = False) -> float:
+    """A finite number above `low`, or at least it."""
+    rule = f"{name} must be {'>=' if included else '>'} {low:g}{f' [{unit}]' if unit else ''}, got {shown(value)}"
+    try:
+        out = float(value)
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(rule) from None
+    if isinstance(value, bool | str) or not math.isfinite(out) or not (out >= low if included else out > low):
+        raise ValueError(rule)
+    return out
+
+
+def whole(name: str, value, least: int = 0) -> int:
+    """A whole number, at least so large."""
+    try:
+        out = int(value)
+        if isinstance(value, bool | str) or out != value or not least <= out < 2**53:
+            raise ValueError
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"{name} must be a whole number >= {least}, got {shown(value)}") from None
+    return out
+
+
+def instance(owner: str, name: str, value, kind: type | tuple, remedy: str):
+    """A value of a kind."""
+    if not isinstance(value, kind):
+        raise ValueError(f"{owner}: {name} must be {remedy}, got {shown(value)}")
+    return value
+
+
+def listed(name: str, value, of: str) -> Iterable:
+    """Several of something."""
+    if not isinstance(value, Iterable) or isinstance(value, str | bytes):
+        raise ValueError(f"{name} must be one or several {of}, got {shown(value)}")
+    return value
+
+
+def numbers(name: str, value) -> np.ndarray:
+    """A new float64 array."""
+    try:
+        return np.array(value, np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"{name} must be numbers, got {shown(value)}") from None
+
+
+def present(name: str, value) -> None:
+    """Something, not None."""
+    if value is None:
+        raise ValueError(f"{name} must be given, got None")

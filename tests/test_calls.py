@@ -1,0 +1,108 @@
+"""Wrong calls of public constructors: only ValueError and TypeError come out, raised by the package, in one line."""
+
+import traceback
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import diffsim_ti as ds
+from diffsim_ti.checked import shown
+
+PACKAGE = str(Path(ds.__file__).parent)
+WRONG = (
+    *(None, "a", "", b"x", 0, -1, 3, 2.5, np.nan, np.inf, -np.inf, 1e300, 10**400, True, 1j, object(), type),
+    *([], [1], [1, 2, 3], ["a"], [None], [[1, 2], [3]], {}, {"a": 1}, {1: 2}, (), set(), lambda: 3, lambda t: "x"),
+    *(np.zeros(0), np.zeros((2, 3)), np.zeros((8, 3)), np.full((8, 3), np.nan), np.zeros(5, bool), np.array("x")),
+)
+
+
+@lru_cache
+def objects() -> dict:
+    mesh = ds.TetrahedralMesh.create_cube(2)
+    scene = ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3), terms=[ds.Gravity()], precision="f64")
+    return dict(mesh=mesh, scene=scene, solver=ds.BDF2Solver(scene, dt=1e-3))
+
+
+def calls() -> dict:
+    """{name: (what is called, its right arguments)}"""
+    mesh, scene, solver = objects().values()
+    body = dict(mesh=mesh, material=ds.StableNeoHookean(1e5, 0.3))
+    wall = dict(stiffness_per_area=1e6, width=0.01, friction=0.3, friction_speed=1e-3, path=None, name=None)
+    steps = dict(scene=scene, dt=1e-4, substeps=1, parallel=None)
+    optional = dict(density=1e3, terms=(), fixed=None, motion=None, initial_positions=None, initial_velocities=None)
+    return {
+        "Scene": (ds.Scene, body | optional | dict(precision=None, volume="tetrahedra", mass_scaling=None)),
+        "create_cube": (ds.TetrahedralMesh.create_cube, dict(resolution=2, size=1.0, pattern="kuhn")),
+        "TetrahedralMesh": (ds.TetrahedralMesh, dict(vertices=mesh.vertices, tetrahedra=mesh.tetrahedra)),
+        "StableNeoHookean": (ds.StableNeoHookean, dict(youngs_modulus=1e5, poissons_ratio=0.3)),
+        "Yeoh": (ds.Yeoh, dict(c10=1e4, c20=0.0, c30=0.0, bulk_modulus=1e5)),
+        "Ogden": (ds.Ogden, dict(moduli=[1e4], exponents=[2.0], bulk_modulus=1e5)),
+        "FibreReinforced": (
+            ds.FibreReinforced,
+            dict(matrix=ds.StableNeoHookean(1e5, 0.3), k1=1e4, k2=1.0, fibre=[1, 0, 0]),
+        ),
+        "Gravity": (ds.Gravity, dict(gravity=-9.81)),
+        "Drag": (ds.Drag, dict(rate=1.0)),
+        "Ground": (ds.Ground, dict(height=-1.0) | wall),
+        "Sphere": (ds.Sphere, dict(center=[0, -3, 0], radius=1.0, inside=False) | wall),
+        "Box": (ds.Box, dict(center=[0, -3, 0], size=[1, 1, 1]) | wall),
+        "Spring": (ds.Spring, dict(start=0, end=7, stiffness=1.0, rest_length=None, tension=None, name=None)),
+        "Cable": (ds.Cable, dict(points=[0, 7], tension=1.0, length=None, stiffness=None)),
+        "Muscle": (ds.Muscle, dict(fibre=[1, 0, 0], stress=1.0, activation=1.0, tetrahedra=None, per="all")),
+        "Pressure": (ds.Pressure, dict(pressure=1.0, surface=None)),
+        "VelocityVerletSolver": (ds.VelocityVerletSolver, steps | dict(contact="stage", contact_damping=0.01)),
+        "BDF2Solver": (ds.BDF2Solver, steps | dict(tolerance=1e-6, max_iterations=9, preconditioner="auto")),
+        "StaticSolver": (ds.StaticSolver, dict(scene=scene, load_steps=1, tolerance=1e-8)),
+        "Simulator": (ds.Simulator, dict(solver=solver)),
+        "Rollout": (
+            ds.Rollout,
+            dict(solver=solver, steps=4, save_every=2, checkpoint_every=None, memory=None, gradients=None)
+            | dict(clip=None, truncate=None, health=False, outputs=(), runs=None),
+        ),
+        "UnequalSteps": (ds.UnequalSteps, dict(lengths=[1e-3], substeps=1)),
+        "MaterialPoints": (ds.MaterialPoints, dict(points=[[0.5, 0.5, 0.5]], name="x", nearest=False)),
+    }
+
+
+def complaint(make, arguments: dict) -> str | None:
+    """What is wrong with how a call fails; None if it does not, or as it should."""
+    try:
+        if make is ds.Simulator:
+            make(*arguments.values())
+        else:
+            made = make(**arguments)
+            if hasattr(made, "check") and hasattr(made, "described"):  # terms see the mesh later
+                ds.Scene(objects()["mesh"], ds.StableNeoHookean(1e5, 0.3), terms=[made], precision="f64")
+    except (ValueError, TypeError) as error:
+        last = traceback.extract_tb(error.__traceback__)[-1].filename
+        if isinstance(error, TypeError) and not last.startswith(PACKAGE) and "argument" not in str(error):
+            return f"TypeError of {last}: {error}"
+        return None if len(str(error)) < 700 and str(error).strip() else f"message of {len(str(error))} letters"
+    except Exception as error:
+        return f"{type(error).__name__}: {error}"
+    return None
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", calls())
+def test_wrong_arguments(name):
+    make, right = calls()[name]
+    bad = [
+        f"{argument}={shown(wrong)}: {said}"
+        for argument in right
+        for wrong in WRONG
+        if (said := complaint(make, right | {argument: wrong})) is not None
+    ]
+    assert not bad, "\n".join(bad)
+
+
+def test_states_and_sizes_are_checked_at_once():
+    with pytest.raises(ValueError, match="makes 1e"):
+        ds.TetrahedralMesh.create_cube(10**9)
+    simulator = ds.Simulator(objects()["solver"])
+    before = simulator.positions
+    with pytest.raises(ValueError, match="positions: expected finite numbers"):
+        simulator.set_state(positions=np.full((8, 3), np.nan))
+    assert np.array_equal(simulator.positions, before)
