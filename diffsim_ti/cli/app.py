@@ -146,8 +146,8 @@ def simulate(
 
     begin = time.perf_counter()
     for name, value in (("duration", duration), ("fps", fps), ("density", density)):
-        if not value > 0:
-            raise ValueError(f"--{name} must be > 0, got {value:g}")
+        if not 0 < value < np.inf:
+            raise ValueError(f"--{name} must be > 0 and finite, got {value:g}")
     view = View(fps=fps, azimuth=azimuth, title=mesh.stem, fit="end", arrows=tuple(arrows or ()))
     asked = [file_in(o, mesh.stem + suffix) for o in output or [Path("output/simulate")] for suffix in (".pvd", ".png")]
     writers = [writer_for(path, view) for path in dict.fromkeys(asked)]

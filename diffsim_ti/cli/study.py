@@ -184,8 +184,8 @@ def growth(
     from diffsim_ti import runtime
     from diffsim_ti.study.growth import GROWTH_SCENES, study_growth, write_growth
 
-    if not duration > 0:
-        raise ValueError(f"--duration must be > 0 [s], got {duration:g}")
+    if not 0 < duration < np.inf:
+        raise ValueError(f"--duration must be > 0 and finite [s], got {duration:g}")
     runtime.init(backend, precision)
     if scene == "all":
         scenes = {name: make(precision) for name, make in GROWTH_SCENES.items()}
