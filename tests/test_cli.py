@@ -491,3 +491,13 @@ def test_inside_out_meshes_name_the_option(tmp_path):
     with pytest.raises(ValueError, match="--fix-orientation") as error:
         options.load_body(path)
     assert "fix_orientation=True" not in str(error.value)
+
+
+@pytest.mark.parametrize("content", [None, "<VTKFile type='UnstructuredGrid'"])
+def test_broken_frames_of_a_series_are_named(capsys, tmp_path, content):
+    entry = '<DataSet timestep="0" part="0" file="a_0000.vtu"/>'
+    (tmp_path / "a.pvd").write_text(f'<VTKFile type="Collection"><Collection>{entry}</Collection></VTKFile>')
+    if content:
+        (tmp_path / "a_0000.vtu").write_text(content)
+    said = fails(capsys, "render", tmp_path / "a.pvd", "-o", tmp_path / "a.png")
+    assert "a_0000.vtu" in said and "cannot be read" in said
