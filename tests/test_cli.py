@@ -475,3 +475,29 @@ def test_order_makes_ten_nodes_of_four(tmp_path):
     assert options.load_body(path).order == 1 and options.load_body(path, order=2).order == 2
     with pytest.raises(ValueError, match="--order must be 1 or 2, got 3"):
         options.load_body(path, order=3)
+
+
+@pytest.mark.parametrize("option", ["--duration", "--fps"])
+def test_endless_runs_are_refused(capsys, tmp_path, option):
+    path = tmp_path / "cube.vtu"
+    TetrahedralMesh.create_cube(2).save(path)
+    assert f"{option} must be > 0 and finite" in fails(capsys, "simulate", path, option, "inf")
+
+
+def test_inside_out_meshes_name_the_option(tmp_path):
+    path = tmp_path / "turned.vtu"
+    points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]])
+    meshio.Mesh(points, [("tetra", [[0, 1, 2, 3], [2, 1, 3, 4]])]).write(path)
+    with pytest.raises(ValueError, match="--fix-orientation") as error:
+        options.load_body(path)
+    assert "fix_orientation=True" not in str(error.value)
+
+
+@pytest.mark.parametrize("content", [None, "<VTKFile type='UnstructuredGrid'"])
+def test_broken_frames_of_a_series_are_named(capsys, tmp_path, content):
+    entry = '<DataSet timestep="0" part="0" file="a_0000.vtu"/>'
+    (tmp_path / "a.pvd").write_text(f'<VTKFile type="Collection"><Collection>{entry}</Collection></VTKFile>')
+    if content:
+        (tmp_path / "a_0000.vtu").write_text(content)
+    said = fails(capsys, "render", tmp_path / "a.pvd", "-o", tmp_path / "a.png")
+    assert "a_0000.vtu" in said and "cannot be read" in said

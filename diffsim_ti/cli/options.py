@@ -55,7 +55,12 @@ def load_body(
 
     if order not in (1, 2):
         raise ValueError(f"--order must be 1 or 2, got {order}")
-    mesh = TetrahedralMesh.from_file(path, fix_orientation=fix_orientation, drop_orphans=True)
+    try:
+        mesh = TetrahedralMesh.from_file(path, fix_orientation=fix_orientation, drop_orphans=True)
+    except ValueError as error:  # the remedy, in the words of the command line
+        if "fix_orientation=True" not in str(error):
+            raise
+        raise ValueError(str(error).replace("fix_orientation=True", "--fix-orientation")) from error
     axis, sign = "xyz".index(up.value[-1]), -1 if up.value[0] == "-" else 1
     if up is not Up.y:
         rows = np.eye(3)[[(axis + 2) % 3, axis, (axis + 1) % 3]]

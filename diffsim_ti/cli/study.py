@@ -60,7 +60,7 @@ def chart(
         str,
         typer.Argument(
             help="oscillator, lame, lame-gradient, beam, sag, bounce, bounce-gradient, "
-            "identify; a mesh; or a Python file that defines scene"
+            "identify; a mesh; or a Python file that defines scene, which is run"
         ),
     ],
     output: Folder = Path("output/chart"),
@@ -184,8 +184,8 @@ def growth(
     from diffsim_ti import runtime
     from diffsim_ti.study.growth import GROWTH_SCENES, study_growth, write_growth
 
-    if not duration > 0:
-        raise ValueError(f"--duration must be > 0 [s], got {duration:g}")
+    if not 0 < duration < np.inf:
+        raise ValueError(f"--duration must be > 0 and finite [s], got {duration:g}")
     runtime.init(backend, precision)
     if scene == "all":
         scenes = {name: make(precision) for name, make in GROWTH_SCENES.items()}
@@ -200,7 +200,7 @@ def growth(
 
 
 def recommend(
-    scene: Annotated[Path, typer.Argument(help="a mesh, or a Python file that defines scene")],
+    scene: Annotated[Path, typer.Argument(help="a mesh, or a Python file that defines scene, which is run")],
     duration: Annotated[float, typer.Option(help="simulated time [s]")] = 0.2,
     tolerance: Annotated[float, typer.Option(help="of the motion, over the largest displacement")] = 1e-2,
     memory: Annotated[float | None, typer.Option(help="most that gradients may keep [MB]")] = None,

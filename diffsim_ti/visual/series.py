@@ -14,7 +14,7 @@ from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.terms.obstacles.shapes import Triangles
 from diffsim_ti.visual.fields import FIELDS
 from diffsim_ti.visual.frame import Frame, Setting
-from diffsim_ti.visual.series_marks import read_marks
+from diffsim_ti.visual.series_marks import read_marks, read_part
 
 
 def listed(path: str | Path) -> list[tuple[float, str, Path]]:
@@ -80,19 +80,15 @@ class SavedSeries:
         return Frame(self._frames[k][0], saved.points, u, v, fields, around, marks, self._units)
 
     def _mesh(self, k: int):
-        import meshio
-
-        return meshio.read(self._frames[k][1])
+        return read_part(self._frames[k][1])
 
     def _shapes(self, k: int) -> list[Triangles]:
         """(points [m], triangles) of each obstacle in frame k."""
-        import meshio
-
         if "1" not in self._parts[k]:
             return []
         file = self._parts[k]["1"]
         if self._read[0] != file:
-            surface = meshio.read(file)
+            surface = read_part(file)
             triangles, number = surface.cells_dict["triangle"], surface.cell_data["obstacle"][0]
             out = []
             for obstacle in np.unique(number):

@@ -45,11 +45,20 @@ def write_marks(path: Path, drawn: Sequence[Mark], labels: list[str]) -> None:
     ).write(path, file_format="vtu", binary=True)
 
 
-def read_marks(path: Path, labels: Sequence[str]) -> list[Mark]:
-    """What `write_marks` wrote; those of one label and kind are one."""
+def read_part(path: Path):
+    """The meshio mesh of one file of a series. Raises ValueError, with its name, if it is missing or damaged."""
     import meshio
 
-    saved, out = meshio.read(path), []
+    try:
+        return meshio.vtu.read(path)  # meshio.read prints and exits
+    except Exception as error:  # meshio lets those of its parsers through
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise ValueError(f"{path}, a file of the series, cannot be read: {reason}; write the series again") from error
+
+
+def read_marks(path: Path, labels: Sequence[str]) -> list[Mark]:
+    """What `write_marks` wrote; those of one label and kind are one."""
+    saved, out = read_part(path), []
     for block, number, kind in zip(saved.cells, saved.cell_data["mark"], saved.cell_data["kind"]):
         for which, how in np.unique(np.stack([number, kind], 1), axis=0):
             own = block.data[(number == which) & (kind == how)]
