@@ -3,7 +3,6 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.special import chdtr, chdtrc
 
 
 @dataclass
@@ -83,6 +82,8 @@ class Identification:
     @property
     def p_value(self) -> float:
         """Chance of residuals at least so far from what the noise explains, on either side."""
+        from scipy.special import chdtr, chdtrc
+
         return float(2 * min(chdtrc(self.degrees, self.chi_square), chdtr(self.degrees, self.chi_square)))
 
     @property
