@@ -26,6 +26,17 @@ def number(name: str, value, low: float = 0.0, unit: str = "", included: bool = 
     return out
 
 
+def between(name: str, value, low: float, high: float, ends: bool) -> float:
+    """A number from `low` to `high`; ends: these too."""
+    try:
+        out = float(value)
+    except (TypeError, ValueError, OverflowError):
+        out = math.nan
+    if isinstance(value, bool | str) or not (low <= out <= high if ends else low < out < high):
+        raise ValueError(f"{name} must lie between {low:g} and {high:g}, got {shown(value)}")
+    return out
+
+
 def whole(name: str, value, least: int = 0) -> int:
     """A whole number, at least so large."""
     try:

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from diffsim_ti import runtime
-from diffsim_ti.checked import number
+from diffsim_ti.checked import between
 from diffsim_ti.contact.surface_pairs import Tunnelling
 from diffsim_ti.inputs import Derived
 from diffsim_ti.monitor.energy_balance import EnergyBalance
@@ -70,9 +70,7 @@ class ExplicitSolver(Solver):
     def __init__(self, *arguments, contact: str = "stage", contact_damping: float = CONTACT_DAMPING, **options):
         if contact not in ("stage", "force"):
             raise ValueError(f'contact must be "stage" or "force", got {contact!r}')
-        if not 0 <= number("contact_damping", contact_damping, included=True) <= 1:
-            raise ValueError(f"contact_damping must lie between 0 and 1, got {contact_damping}")
-        self.contact, self.contact_damping = contact, float(contact_damping)
+        self.contact, self.contact_damping = contact, between("contact_damping", contact_damping, 0, 1, ends=True)
         scene = arguments[0] if arguments else options.get("scene")
         if getattr(scene, "holds_volumes", False):
             raise ValueError(

@@ -12,7 +12,7 @@ velocities by exp(-c h) in a stage of its own. Statics: no inertia, u* is where 
 from abc import abstractmethod
 from typing import TYPE_CHECKING
 
-from diffsim_ti.checked import number, whole
+from diffsim_ti.checked import between, whole
 from diffsim_ti.solvers.implicit.adjoint import ImplicitAdjoint
 from diffsim_ti.solvers.implicit.stage import Stage
 from diffsim_ti.solvers.implicit.tangent import ImplicitTangent
@@ -52,9 +52,8 @@ class ImplicitSolver(Solver):
         if preconditioner not in ("auto", "block_jacobi", "multigrid"):
             raise ValueError(f"preconditioner must be auto, block_jacobi or multigrid, got {preconditioner!r}")
         self.preconditioner = preconditioner
-        if not 0 < number("tolerance", tolerance) < 1:
-            raise ValueError(f"tolerance must lie between 0 and 1, got {tolerance}")
-        self.tolerance, self.max_iterations = float(tolerance), whole("max_iterations", max_iterations, 1)
+        self.tolerance = between("tolerance", tolerance, 0, 1, ends=False)
+        self.max_iterations = whole("max_iterations", max_iterations, 1)
         super().__init__(scene, dt, substeps, parallel)
 
     @abstractmethod
