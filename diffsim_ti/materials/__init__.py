@@ -7,6 +7,7 @@ from diffsim_ti.materials.energy_law import EnergyLaw
 from diffsim_ti.materials.fibre_reinforced import FibreReinforced
 from diffsim_ti.materials.gent import Gent
 from diffsim_ti.materials.grown import Grown
+from diffsim_ti.materials.kelvin_voigt import KelvinVoigt
 from diffsim_ti.materials.law import Law
 from diffsim_ti.materials.linear_elastic import LinearElastic
 from diffsim_ti.materials.material import Material
@@ -27,6 +28,7 @@ __all__ = [
     "Gent",
     "Grown",
     "InvariantLaw",
+    "KelvinVoigt",
     "Law",
     "LinearElastic",
     "Material",
