@@ -242,9 +242,7 @@ class Tetrahedron:
             if self.holds(at):
                 *by_held, _ = by_z[len(self.law.state_names) :]
                 by_z = by_z[: len(self.law.state_names)]
-                self.items.put_row(
-                    adjoint.held, 0, len(by_held) * q, len(by_held) * self.nodes.points, item, by_held
-                )
+                self.items.put_row(adjoint.held, 0, len(by_held) * q, len(by_held) * self.nodes.points, item, by_held)
             by_p = own if by_p is None else [a + b for a, b in zip(by_p, own)]
             if self.has_state:
                 known = self.state_of(item, adjoint.z, 0, q)

@@ -13,6 +13,7 @@ from diffsim_ti.materials.linear_elastic import LinearElastic
 from diffsim_ti.materials.material import Material
 from diffsim_ti.materials.mooney_rivlin import MooneyRivlin
 from diffsim_ti.materials.ogden import Ogden
+from diffsim_ti.materials.prony import Prony
 from diffsim_ti.materials.smith_neo_hookean import SmithNeoHookean
 from diffsim_ti.materials.st_venant_kirchhoff import StVenantKirchhoff
 from diffsim_ti.materials.stable_neo_hookean import StableNeoHookean
@@ -34,6 +35,7 @@ __all__ = [
     "Material",
     "MooneyRivlin",
     "Ogden",
+    "Prony",
     "SmithNeoHookean",
     "StVenantKirchhoff",
     "StableNeoHookean",

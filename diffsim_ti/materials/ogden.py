@@ -74,7 +74,8 @@ class Ogden(Material):
 
     def lame_jvp(self, values, tangents):
         (mu, a, _), (dmu, da, dbulk) = (
-            [np.broadcast_to(of.get(name, 0.0), np.shape(values[name])) for name in self.inputs] for of in (values, tangents)
+            [np.broadcast_to(of.get(name, 0.0), np.shape(values[name])) for name in self.inputs]
+            for of in (values, tangents)
         )
         change = (dmu * a + mu * da).sum(-1) / 2
         return change, dbulk - 2 / 3 * change
