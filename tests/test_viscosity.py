@@ -251,7 +251,7 @@ def test_gradients_by_every_number(name, solver):
     gates(r, 1e-12 if solver.explicit else 1e-10, *own, "initial_positions", "rest_positions")
 
 
-@pytest.mark.parametrize("solver", [ds.SemiImplicitSolver, ds.BDF2Solver])
+@pytest.mark.parametrize("solver", [pytest.param(ds.SemiImplicitSolver, marks=pytest.mark.thorough), ds.BDF2Solver])
 def test_gradients_of_ten_nodes(solver):
     body = swung(ds.KelvinVoigt(ds.LinearElastic(E, NU), **DASHPOTS), ONE.quadratic(), fixed=[0])
     r = ds.Rollout(made(solver, body, 4e-3), 3, gradients="all")

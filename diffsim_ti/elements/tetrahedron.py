@@ -121,8 +121,8 @@ class Tetrahedron:
 
     @traced
     def numbers_at(self, item, scene, at, s, q: int = 0) -> list:
-        """What the law takes besides tensors at point q and slot s: its coefficients, its state and, in an implicit pass, what
-        is held in it."""
+        """What the law takes besides tensors at point q and slot s: its coefficients, its state, and what is held in an
+        implicit pass."""
         p = self.coefficients_of(item, scene.coefficients)
         p = [*p, *self.state_of(item, at.z, s, q)] if self.has_state else p
         return [*p, *self.held_of(item, at.held, q), self.rate_of(at)] if self.holds(at) else p

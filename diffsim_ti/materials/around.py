@@ -8,9 +8,9 @@ from diffsim_ti.materials.material import Material, _all_values, _short, summed
 
 
 class Around(Material):
-    """A material with the numbers `own`, names in order, around `material`, whose moduli of small strains count as (mu, lam).
+    """A material with the numbers `own`, names in order, around `material`.
 
-    A subclass gives its own coefficients of these, with derivatives.
+    A subclass gives its own coefficients, of these numbers and the moduli (mu, lam) of small strains, with derivatives.
     """
 
     def _surround(self, material: Material, numbers: dict) -> None:

@@ -23,8 +23,8 @@ from diffsim_ti.runtime import let, traced
 class KelvinVoigtLaw(Law):
     """P = P_base + F S, S = 2 eta R + lam_v tr(R) 1, with the rate R of Green's strain.
 
-    In explicit passes R = sym(F^T F_dot). In implicit ones (`in_step`) R = rate (E - Z), Z the strain held: then S comes from
-    the potential 1 / (2 rate) R : S, whose Hessian is symmetric, and a rigid turn from one state to the next has no rate.
+    In explicit passes R = sym(F^T F_dot). In implicit ones (`in_step`) R = rate (E - Z), Z the strain held: then S has the
+    potential 1 / (2 rate) R : S, whose Hessian is symmetric, and a rigid turn from one state to the next has no rate.
     """
 
     base: Law | None = None
@@ -197,8 +197,8 @@ class KelvinVoigt(Around):
 
         S = 2 eta E_dot + (zeta - 2/3 eta) tr(E_dot) 1 [Pa],  E_dot = sym(F^T F_dot) the rate of Green's strain.
 
-    `KelvinVoigt(material, time=tau)` [s]: eta = tau mu, zeta = tau (lam + 2/3 mu) of the moduli of small strains, those of the
-    isotropic part; so small vibrations of frequency omega have the damping ratio tau omega / 2 (Rayleigh's
+    `KelvinVoigt(material, time=tau)` [s]: eta = tau mu, zeta = tau (lam + 2/3 mu) of the moduli of small strains, those of
+    the isotropic part; so small vibrations of frequency omega have the damping ratio tau omega / 2 (Rayleigh's
     stiffness-proportional damping). Or `KelvinVoigt(material, shear_viscosity=eta, bulk_viscosity=zeta)` [Pa s]. Each is one
     number, one per tetrahedron or by sets, an input with gradient: viscous_time, or shear_viscosity and bulk_viscosity.
 

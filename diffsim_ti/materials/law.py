@@ -82,9 +82,9 @@ class Law:
         """Its change for a change dH, a Tensor."""
 
     def in_steps(self) -> "Law":
-        """The law as implicit passes take it, of the displacement gradient alone. One that reads rates can be an energy there
-        of the change from what is held in a pass, numbers of `held_names`, and of a rate [1/s]: they follow the state in p.
-        Itself, where it does not know how."""
+        """The law as implicit passes take it, of the displacement gradient alone. One that reads rates can be an energy
+        there, of the change from what is held in a pass, numbers of `held_names`, and of a rate [1/s]: they follow the state
+        in p. Itself, where it does not know how."""
         return self
 
     @traced

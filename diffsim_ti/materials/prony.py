@@ -134,15 +134,16 @@ class Prony(Around):
 
         S = S_material(F) + sum_i g_i C : (E - z_i) [Pa],  dz_i/dt = (E - z_i) / tau_i,  z_i = 0 at the start,
 
-    S the second Piola-Kirchhoff stress, E Green's strain, C : E = 2 mu E + lam tr(E) 1 with the moduli of the isotropic part
-    at small strains. `Prony(material, shares, times)`: g_i >= 0 [-], of the moduli that last, which are the material's, and
-    tau_i > 0 [s]: N numbers for all, or of shape (num_tetrahedra, N); inputs with gradient, prony_shares and prony_times. At
-    once the body is 1 + sum g_i times as stiff, and a held strain relaxes by exp(-t / tau_i). A series given as shares a_i of
-    what is stiff at once has g_i = a_i / (1 - sum a).
+    S the second Piola-Kirchhoff stress, E Green's strain, C : E = 2 mu E + lam tr(E) 1 with the moduli of small strains of
+    the isotropic part. `Prony(material, shares, times)`: g_i >= 0 [-], of the moduli that last, which are the material's,
+    and tau_i > 0 [s], N numbers for all or of shape (num_tetrahedra, N); inputs with gradient, prony_shares and
+    prony_times. At once the body is 1 + sum g_i times as stiff, and a held strain relaxes by exp(-t / tau_i). A series given
+    as shares a_i of what is stiff at once has g_i = a_i / (1 - sum a).
 
     z_i are numbers of each tetrahedron that a run keeps with its state, moved on exactly for the strain of each substep
-    (law.py: of first order in its length). All of it is an energy, what is lost is sum g_i / tau_i (E - z_i) : C : (E - z_i),
-    never negative, and crushed elements have it too. Viscosity goes around it: `KelvinVoigt(Prony(...), time=...)`.
+    (law.py: of first order in its length). The stress has an energy, and what is lost [W/m^3],
+    sum g_i / tau_i (E - z_i) : C : (E - z_i), is never negative; crushed elements have it too. Viscosity goes around it:
+    `KelvinVoigt(Prony(...), time=...)`.
     Statics and volume="patches" do not know it.
     Simo, Hughes, Computational Inelasticity, 1998, ch. 10.3, doi:10.1007/b98904.
     Raises ValueError for numbers out of range, and a material that has a state or a viscosity.

@@ -168,8 +168,8 @@ class Stiffness:
         return y
 
     def largest(self, tolerance: float = 1e-3) -> tuple[float, float]:
-        """(largest eigenvalue omega^2 [1/s^2], residual bound) by Lanczos; keeps the vector for `lower_bound`. With viscosity
-        (2 / h)^2 of the longest stable step h, at whose rate it is the largest eigenvalue.
+        """(largest eigenvalue omega^2 [1/s^2], residual bound) by Lanczos; keeps the vector for `lower_bound`. With
+        viscosity (2 / h)^2 of the longest stable step h, at whose rate it is the largest eigenvalue.
 
         Some eigenvalue lies within the residual of the Ritz value (Parlett, The Symmetric Eigenvalue Problem, 4.5).
         """
@@ -181,15 +181,19 @@ class Stiffness:
                 break
         return value, residual
 
+    def set_rate(self, rate: float) -> None:
+        """Set s [1/s]."""
+        runtime.fill(self.rate, rate)
+
     def _of_step(self) -> float:
         """(2 / h)^2 of the longest stable step of the vector's own motion, at whose rate products are from now on."""
         x, s = self.vector / np.linalg.norm(self.vector), float(runtime.fetch(self.rate)[0]) or 1.0
         parts = []
         for rate in (0.0, s):
-            runtime.fill(self.rate, rate)
+            self.set_rate(rate)
             parts.append(float((x * self.product(x)).sum()))
         s2 = float(with_damping(parts[0], (parts[1] - parts[0]) / s))
-        runtime.fill(self.rate, np.sqrt(s2))
+        self.set_rate(np.sqrt(s2))
         return s2
 
     def _largest(self, tolerance: float) -> tuple[float, float]:
