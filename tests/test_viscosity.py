@@ -235,7 +235,7 @@ def gates(r: ds.Rollout, round_off: float, *inputs: str) -> None:
 @pytest.mark.parametrize(
     "name, solver",
     [
-        ("time", ds.SemiImplicitSolver),
+        pytest.param("time", ds.SemiImplicitSolver, marks=pytest.mark.thorough),
         ("dashpots", ds.VelocityVerletSolver),
         ("both", ds.VelocityVerletSolver),
         ("prony", ds.SemiImplicitSolver),
@@ -316,7 +316,7 @@ def test_steps_are_those_of_a_rollout():
 # ---- recovery ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("solver", [ds.SemiImplicitSolver, ds.BDF2Solver])
+@pytest.mark.parametrize("solver", [ds.SemiImplicitSolver, pytest.param(ds.BDF2Solver, marks=pytest.mark.thorough)])
 def test_stiffness_and_viscosity_are_found_from_motion(solver):
     """E, nu and tau to 1 %, from places measured to 1e-4 of the size, by a few steps of Gauss and Newton."""
     true = dict(youngs_modulus=1e4, poissons_ratio=0.33, viscous_time=0.02)
