@@ -190,7 +190,7 @@ class ForwardRun:
     def _advance_part_implicitly(self, why: str) -> bool:
         """The part by implicit Euler, where no explicit step tried holds; whether that could be done."""
         sim = self.simulator
-        if self.scene.law.reads != ("H",):  # what implicit solvers do not know
+        if self.scene.law.in_steps().reads != ("H",):  # what implicit solvers do not know
             return False
         if self._implicit is None:
             self._implicit = Simulator(ImplicitEulerSolver(self.scene, dt=sim.solver.dt), **self._noted)

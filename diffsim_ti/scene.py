@@ -303,7 +303,7 @@ class Scene:
         Raises ValueError for shapes that do not fit, or a law that reads more than the displacement gradient.
         Zienkiewicz, Taylor, The Finite Element Method, vol. 2, 5th ed., 2000, sec. 10.3.
         """
-        if self.law.reads != ("H",) or self.law.state_names:
+        if self.law.in_steps().reads != ("H",) or self.law.state_names:
             raise ValueError(
                 f"{type(self.law).__name__} is more than an energy of the displacement gradient: it has no K"
             )

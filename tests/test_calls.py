@@ -43,6 +43,8 @@ def calls() -> dict:
             ds.FibreReinforced,
             dict(matrix=ds.StableNeoHookean(1e5, 0.3), k1=1e4, k2=1.0, fibre=[1, 0, 0]),
         ),
+        "KelvinVoigt": (ds.KelvinVoigt, dict(material=ds.StableNeoHookean(1e5, 0.3), time=0.01)),
+        "Prony": (ds.Prony, dict(material=ds.StableNeoHookean(1e5, 0.3), shares=[0.5], times=[0.1])),
         "Gravity": (ds.Gravity, dict(gravity=-9.81)),
         "Drag": (ds.Drag, dict(rate=1.0)),
         "Ground": (ds.Ground, dict(height=-1.0) | wall),

@@ -46,7 +46,14 @@ def test_no_explicit_solver_is_wrong_silently(kind, axis):
 
 
 @pytest.mark.parametrize("kind", SOLVERS)
-@pytest.mark.parametrize("axis, values", [("impact", (2.0,)), ("compression", (0.7,))])
+@pytest.mark.parametrize(
+    "axis, values",
+    [
+        ("impact", (2.0,)),
+        ("compression", (0.7,)),
+        pytest.param("viscosity", (0.01, 1.0, 20.0), marks=pytest.mark.thorough),
+    ],
+)
 def test_no_solver_is_wrong_silently_where_steps_meet_their_end(kind, axis, values):
     """Impacts and squeezed starts, within and beyond the steps that follow them: bounded, damped, or said."""
     with warnings.catch_warnings():

@@ -20,6 +20,7 @@ from diffsim_ti.elements.nodes import Nodes, nodes_of
 from diffsim_ti.materials.calculus.tensor import Tensor, inner, sum_of
 from diffsim_ti.materials.law import Law
 from diffsim_ti.runtime import LANES, Bundle, let, traced
+from diffsim_ti.runtime import at as entry
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
 
@@ -120,9 +121,26 @@ class Tetrahedron:
 
     @traced
     def numbers_at(self, item, scene, at, s, q: int = 0) -> list:
-        """What the law takes besides tensors at point q and slot s: its coefficients and its state."""
+        """What the law takes besides tensors at point q and slot s: its coefficients, its state, and what is held in an
+        implicit pass."""
         p = self.coefficients_of(item, scene.coefficients)
-        return [*p, *self.state_of(item, at.z, s, q)] if self.has_state else p
+        p = [*p, *self.state_of(item, at.z, s, q)] if self.has_state else p
+        return [*p, *self.held_of(item, at.held, q), self.rate_of(at)] if self.holds(at) else p
+
+    def holds(self, at) -> bool:
+        """Whether what the law holds in a pass is there."""
+        return bool(self.law.held_names) and hasattr(at, "held")
+
+    @traced
+    def held_of(self, item, held, q: int = 0) -> list:
+        """What is held in a pass at point q."""
+        n = len(self.law.held_names)
+        return self.items.row(held, 0, n * q, n, n * self.nodes.points, item)
+
+    @traced
+    def rate_of(self, at):
+        """Changes in a pass times this are rates [1/s]."""
+        return self.items.broadcast(let(entry(at.rate, 0)))
 
     @traced
     def volume_of(self, item, array, q: int = 0):
@@ -172,11 +190,15 @@ class Tetrahedron:
 
     @traced
     def stiffness(self, item, scene, at, s, corner) -> None:
-        """Corner products of the derivative of the elastic force with at.w (negative semi-definite at rest)."""
+        """Corner products of the derivative of the elastic force with at.w (negative semi-definite at rest), and of a
+        viscous one, times a rate."""
         pushes = []
         for q, (D, W) in enumerate(zip(self.edges(item, scene, at.u, s), self.edges(item, scene, at.w, 0))):
             B = self.gradients_of(item, scene.gradients, q)
-            dP = self.law.stress_differential(D @ B, W @ B, self.numbers_at(item, scene, at, s, q))
+            H, dH, numbers = D @ B, W @ B, self.numbers_at(item, scene, at, s, q)
+            dP = self.law.stress_differential(H, dH, numbers)
+            if self.law.viscous and not self.holds(at):
+                dP = dP + self.law.viscous_differential(H, dH, numbers) * self.rate_of(at)
             pushes.append((dP * self.volume_of(item, scene.volumes, q)) @ B.transpose())
         self.store(item, corner, pushes)
 
@@ -196,7 +218,8 @@ class Tetrahedron:
     @traced
     def _numbers_jvp(self, item, change, dots, q) -> list:
         dp = self.coefficients_of(item, dots.coefficients)
-        return [*dp, *self.state_of(item, change.z, 0, q)] if self.has_state else dp
+        dp = [*dp, *self.state_of(item, change.z, 0, q)] if self.has_state else dp
+        return [*dp, *self.held_of(item, change.held, q), let(0 * dp[0])] if self.holds(change) else dp
 
     @traced
     def forces_vjp(self, item, scene, at, s, w, corner, adjoint, shape: bool, add: bool = False) -> None:
@@ -216,6 +239,10 @@ class Tetrahedron:
                 rates.append((by_x[1] * volume) @ B.transpose())
             minus = let(ti.cast(-1, self.fp) * volume)
             own, by_z = self._parted([minus * product for product in products])
+            if self.holds(at):
+                *by_held, _ = by_z[len(self.law.state_names) :]
+                by_z = by_z[: len(self.law.state_names)]
+                self.items.put_row(adjoint.held, 0, len(by_held) * q, len(by_held) * self.nodes.points, item, by_held)
             by_p = own if by_p is None else [a + b for a, b in zip(by_p, own)]
             if self.has_state:
                 known = self.state_of(item, adjoint.z, 0, q)

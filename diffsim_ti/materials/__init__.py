@@ -7,11 +7,13 @@ from diffsim_ti.materials.energy_law import EnergyLaw
 from diffsim_ti.materials.fibre_reinforced import FibreReinforced
 from diffsim_ti.materials.gent import Gent
 from diffsim_ti.materials.grown import Grown
+from diffsim_ti.materials.kelvin_voigt import KelvinVoigt
 from diffsim_ti.materials.law import Law
 from diffsim_ti.materials.linear_elastic import LinearElastic
 from diffsim_ti.materials.material import Material
 from diffsim_ti.materials.mooney_rivlin import MooneyRivlin
 from diffsim_ti.materials.ogden import Ogden
+from diffsim_ti.materials.prony import Prony
 from diffsim_ti.materials.smith_neo_hookean import SmithNeoHookean
 from diffsim_ti.materials.st_venant_kirchhoff import StVenantKirchhoff
 from diffsim_ti.materials.stable_neo_hookean import StableNeoHookean
@@ -27,11 +29,13 @@ __all__ = [
     "Gent",
     "Grown",
     "InvariantLaw",
+    "KelvinVoigt",
     "Law",
     "LinearElastic",
     "Material",
     "MooneyRivlin",
     "Ogden",
+    "Prony",
     "SmithNeoHookean",
     "StVenantKirchhoff",
     "StableNeoHookean",

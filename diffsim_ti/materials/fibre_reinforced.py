@@ -138,6 +138,10 @@ class FibreReinforced(Material):
         length = np.linalg.norm(values[fibre], axis=-1)
         check_range(f"length of {fibre}", length, 0, np.inf, False, "a direction needs a length")
 
+    @property
+    def isotropic(self):
+        return self.matrix.isotropic
+
     def lame(self, values):
         mu, lam = self.matrix.lame(self._of_matrix(values))
         return mu + 2 * np.asarray(values[self.own[0]]), lam

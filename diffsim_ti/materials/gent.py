@@ -36,15 +36,12 @@ class Gent(Material):
 
     spellings = (("mu", "limit", "bulk_modulus"),)
     units = {"limit": "-"}
+    to_lame = np.array([[1.0, 0, 0], [-2 / 3, 0, 1]])
 
     def check(self, values):
         super().check(values)
         check_range("limit", values["limit"], 0, np.inf, False, "of J^(-2/3) I_C - 3 [-], 30 to 100 for rubber")
         check_range("bulk_modulus", values["bulk_modulus"], 0, np.inf, False, "a stiffness [Pa]")
-
-    def lame(self, values):
-        mu = np.asarray(values["mu"])
-        return mu, values["bulk_modulus"] - 2 / 3 * mu
 
     def law(self, precision):
         return GentLaw(precision)

@@ -111,6 +111,10 @@ class Grown(Material):
         self.material.check(self._of_material(values))
         check_range("growth", values["growth"], -1, np.inf, False, "a strain; -1 leaves nothing of the body")
 
+    @property
+    def isotropic(self):
+        return self.material.isotropic
+
     def lame(self, values):
         mu, lam = self.material.lame(self._of_material(values))
         return tuple(part * np.maximum(1 + np.asarray(values["growth"]), 1) for part in (mu, lam))

@@ -39,6 +39,8 @@ class Law:
     initial_state = ()  # one number for each of them, or none: zero
     reads = ("H",)
     last_without_lam = ()  # factors f: with lam = 0 the last coefficient is sum_k f_k p_k; empty: zero
+    viscous = False  # whether it has a `viscous_differential`
+    held_names = ()  # numbers of each tetrahedron that are held in an implicit pass, and a rate, see `in_steps`
     lanes = True  # written with + - * / and max alone, so that a number may be a vector of lanes
 
     @property
@@ -78,6 +80,16 @@ class Law:
     @traced
     def dilatation_gradient_differential(self, H, dH):
         """Its change for a change dH, a Tensor."""
+
+    def in_steps(self) -> "Law":
+        """The law as implicit passes take it, of the displacement gradient alone. One that reads rates can be an energy
+        there, of the change from what is held in a pass, numbers of `held_names`, and of a rate [1/s]: they follow the state
+        in p. Itself, where it does not know how."""
+        return self
+
+    @traced
+    def viscous_differential(self, H, dH, p):
+        """Change of the stress for a change dH of the velocity's gradient [Pa s], a Tensor."""
 
     @traced
     def stress_differential(self, H, dH, p):

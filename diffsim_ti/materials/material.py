@@ -143,6 +143,47 @@ class Material(ABC):
             f"{self.name} does not say its moduli of small strains: write lame(self, values), which returns (mu, lam) [Pa]"
         )
 
+    def lame_jvp(self, values: dict, tangents: dict) -> tuple[np.ndarray, np.ndarray]:
+        """Their change for changes of the values; names left out do not change."""
+        if self.to_lame is not None:
+            dp = self.coefficients_jvp(values, tangents) @ self.to_lame.T
+            return dp[..., 0], dp[..., 1]
+        self._check_known_moduli()
+        v = [np.asarray(values[name], np.float64) for name in self._of_lame]
+        dv = [np.broadcast_to(tangents.get(name, 0.0), x.shape) for name, x in zip(self._of_lame, v)]
+        return moduli.lame_jvp(*v, *dv) if self._begins_with_E_and_nu() else tuple(np.broadcast_arrays(*dv))
+
+    def lame_vjp(self, values: dict, mu_adj: np.ndarray, lam_adj: np.ndarray) -> dict[str, np.ndarray]:
+        """Adjoint of each value that they depend on, from theirs, each shape () or (num_tetrahedra,)."""
+        if self.to_lame is not None:
+            return self.coefficients_vjp(values, np.stack(np.broadcast_arrays(mu_adj, lam_adj), -1) @ self.to_lame)
+        self._check_known_moduli()
+        parts = mu_adj, lam_adj
+        if self._begins_with_E_and_nu():
+            parts = moduli.lame_vjp(*(np.asarray(values[name], np.float64) for name in self._of_lame), *parts)
+        return {name: summed(part, values[name]) for name, part in zip(self._of_lame, parts)}
+
+    @property
+    def _of_lame(self) -> tuple[str, str]:
+        return self.inputs[:2] if self._begins_with_E_and_nu() else ("mu", "lam")
+
+    def _check_known_moduli(self) -> None:
+        """Raise NotImplementedError where a subclass says moduli whose derivatives it does not."""
+        if type(self).lame is not Material.lame:
+            raise NotImplementedError(
+                f"{self.name} does not say how its moduli of small strains change: write lame_jvp and lame_vjp beside lame"
+            )
+
+    @property
+    def isotropic(self) -> "Material":
+        """What its viscosity is measured by: itself, or the material that it is made around."""
+        return self
+
+    def viscosities(self, values: dict) -> tuple[np.ndarray, np.ndarray] | None:
+        """(eta, lam_v) [Pa s], each shape () or (num_tetrahedra,), of a viscous stress 2 eta E_dot + lam_v tr(E_dot) 1; None
+        without."""
+        return None
+
     def coefficients(self, values: dict) -> np.ndarray:
         """The law's coefficients [Pa]: shape (K,) if all values are uniform, else (num_tetrahedra, K)."""
         self.check(values)
@@ -215,6 +256,12 @@ class Coefficients(Link):
 
     def vjp(self, x, y_adj):
         return tuple(self.material.coefficients_vjp(dict(zip(self.reads, x)), y_adj[0]).values())
+
+
+def summed(adjoint: np.ndarray, value, shape: tuple = ()) -> np.ndarray:
+    """The adjoint of a number of that shape which is uniform, or one per tetrahedron, from that of each tetrahedron."""
+    adjoint, uniform = np.asarray(adjoint, np.float64), np.ndim(value) == len(shape)
+    return adjoint.reshape(-1, *shape).sum(0) if uniform else np.broadcast_to(adjoint, np.shape(value))
 
 
 def check_range(name: str, value, low: float, high: float, low_included: bool, remedy: str) -> None:

@@ -9,7 +9,7 @@ from diffsim_ti.materials.calculus.isochoric import isochoric
 from diffsim_ti.materials.calculus.stretches import sum_over_stretches
 from diffsim_ti.materials.calculus.tensor import invariants
 from diffsim_ti.materials.energy_law import EnergyLaw
-from diffsim_ti.materials.material import Material, check_range
+from diffsim_ti.materials.material import Material, check_range, summed
 
 
 @dataclass(frozen=True)
@@ -71,6 +71,20 @@ class Ogden(Material):
     def lame(self, values):
         mu = (np.asarray(values["moduli"]) * values["exponents"]).sum(-1) / 2
         return mu, values["bulk_modulus"] - 2 / 3 * mu
+
+    def lame_jvp(self, values, tangents):
+        (mu, a, _), (dmu, da, dbulk) = (
+            [np.broadcast_to(of.get(name, 0.0), np.shape(values[name])) for name in self.inputs]
+            for of in (values, tangents)
+        )
+        change = (dmu * a + mu * da).sum(-1) / 2
+        return change, dbulk - 2 / 3 * change
+
+    def lame_vjp(self, values, mu_adj, lam_adj):
+        by_shear = np.asarray(mu_adj - 2 / 3 * np.asarray(lam_adj))[..., None] / 2
+        (mu, a, bulk), shape = (np.asarray(values[name]) for name in self.inputs), (self.terms,)
+        own = summed(by_shear * a, mu, shape), summed(by_shear * mu, a, shape), summed(lam_adj, bulk)
+        return dict(zip(self.inputs, own))
 
     def law(self, precision):
         return OgdenLaw(precision, terms=self.terms)

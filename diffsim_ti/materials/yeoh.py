@@ -34,15 +34,12 @@ class Yeoh(Material):
     """
 
     spellings = (("c10", "c20", "c30", "bulk_modulus"),)
+    to_lame = np.array([[2.0, 0, 0, 0], [-4 / 3, 0, 0, 1]])
 
     def check(self, values):
         super().check(values)
         for name in ("c10", "bulk_modulus"):
             check_range(name, values[name], 0, np.inf, False, "a stiffness [Pa]")
-
-    def lame(self, values):
-        mu = 2 * np.asarray(values["c10"])
-        return mu, values["bulk_modulus"] - 2 / 3 * mu
 
     def law(self, precision):
         return YeohLaw(precision)

@@ -53,6 +53,10 @@ class EnergyWatch:
     ) -> None:
         """A step went from u by u_star to u_next, obstacles from places[0] by places[1] to places[2] (displacements [m],
         shape (num_obstacles, 3)); contacts are as in its pass. kinetic: what it has added to that energy [J]."""
+        with self.ws.potential.without_viscosity():  # what it takes is no gain, and none of a step's making
+            self._note(u, u_star, u_next, v_next, places, kinetic)
+
+    def _note(self, u, u_star, u_next, v_next, places, kinetic) -> None:
         potential, energies, drift = self.ws.potential, [], places[2] - places[0]
         for displacement, place in ((u, places[0]), (u_next, places[2])):
             self.ws.put_obstacles(place)

@@ -46,8 +46,10 @@ def element_limit(scene: "Scene", values: dict | None = None) -> StepLimit:
     """A step that is safe at rest, from each tetrahedron by itself, without contact.
 
         omega^2 <= (4 / rho) [max(lam, 0) sum_a |grad N_a|^2 + 2 mu lambda_max(sum_a grad N_a (x) grad N_a)]
-        dt = 2 / omega
+        dt = 2 / omega, or with viscosity (sqrt(c^2 + 4 omega^2) - c) / omega^2,
 
+    c [1/s] being the same bound with eta, lam_v in the place of mu, lam: with x the eigenvector of a step, of unit mass,
+    its eigenvalues are those of an oscillator of stiffness x . K x and damping x . C x.
     mu, lam are the law's small-strain moduli; with volume="patches" lam is the patch's mean. The eigenvalues of the
     assembled system never exceed the largest of its elements (Hughes, The Finite Element Method, 9.1); lumped vertex masses
     are at least those of the element. With mass scaling another bound counts where it is lower (mass_scaling.py). Gases and
@@ -61,18 +63,36 @@ def element_limit(scene: "Scene", values: dict | None = None) -> StepLimit:
         means = np.bincount(patches, lam * derived.volumes) / np.bincount(patches, derived.volumes)
         lam = means[patches]
     dilatation, largest = _squares_of_strains(scene.mesh, derived)
-    omega2 = (np.maximum(lam, 0) * dilatation + 2 * mu * largest) / values["density"]
-    worst, attached = int(np.argmax(omega2)), Attached.of(scene)
+    viscous = material.viscosities({name: values[name] for name in material.inputs})
+
+    def bound_of(mu, lam):
+        return (np.maximum(lam, 0) * dilatation + 2 * mu * largest) / values["density"]
+
+    def largest_of(omega2, c):
+        each = with_damping(omega2, c)
+        return omega2[worst := int(np.argmax(each))], c[worst] if np.ndim(c) else c, worst
+
+    omega2, c, worst = largest_of(bound_of(mu, lam), 0.0 if viscous is None else bound_of(*viscous))
+    attached = Attached.of(scene)
     more = _gas_bound(scene, values, derived) if scene.chambers else 0.0
     if attached:  # what all of its parts add at the most
         at = attached.stiffest(derived, derived.ties, EqualSteps(1.0, 1))
         more += at.largest_omega2(derived.mass, derived.displacement, scene.fixed)
-    bound = omega2[worst]
     if scene.mass_scaling:
-        rows = row_sums(scene.mesh, mu, lam, scene.volume == "patches") / np.where(derived.mass > 0, derived.mass, 1.0)
-        bound, stiffest_vertex = min(bound, rows.max()), int(rows.argmax())
-        worst = int(np.argmax((scene.mesh.tetrahedra == stiffest_vertex).any(1)))
-    return StepLimit(float(2 / np.sqrt(bound + more)), worst, "element bound")
+        mass = np.where(derived.mass > 0, derived.mass, 1.0)
+        rows = row_sums(scene.mesh, mu, lam, scene.volume == "patches") / mass
+        damped = 0.0 if viscous is None else row_sums(scene.mesh, *viscous, False) / mass
+        *of_rows, vertex = largest_of(rows, damped)
+        if with_damping(*of_rows) < with_damping(omega2, c):
+            omega2, c = of_rows
+        worst = int(np.argmax((scene.mesh.tetrahedra == vertex).any(1)))
+    return StepLimit(float(2 / np.sqrt(with_damping(omega2 + more, c))), worst, "element bound")
+
+
+def with_damping(omega2, c):
+    """(2 / h)^2 for the longest step h of an oscillator u'' + c u' + omega^2 u = 0 whose damping is taken from the velocity
+    before the kick: h = (2 / omega) (sqrt(1 + xi^2) - xi), xi = c / (2 omega)."""
+    return (0.5 * (c + np.sqrt(c * c + 4 * omega2))) ** 2
 
 
 def _squares_of_strains(mesh, derived) -> tuple[np.ndarray, np.ndarray]:
@@ -100,7 +120,11 @@ def _gas_bound(scene: "Scene", values: dict, derived) -> float:
 
 
 class Stiffness:
-    """Products of M^-1/2 (-df/du) M^-1/2 on the free vertices, at the current state of a workspace."""
+    """Products of M^-1/2 (-df/du - s df/dv) M^-1/2 on the free vertices, at the current state of a workspace.
+
+    s = 2 / h is the `rate` [1/s] of a step h, which is stable where no eigenvalue is beyond s^2 (`element_limit`); without
+    viscosity it means nothing.
+    """
 
     def __init__(self, workspace: Workspace):
         self.ws = workspace
@@ -110,7 +134,9 @@ class Stiffness:
         self.pressed = self.lag  # no friction
         features = a.features()
         felt = replace(features, groups=features.pressing)  # a stage limits no step
-        kernels = potential_kernels(a.law, felt, workspace.parallel, a.in_lanes)
+        law = workspace.scene.law  # as explicit passes take it
+        self.viscous, self.rate = law.viscous, runtime.array(a.fp, 1)
+        kernels = potential_kernels(law, felt, workspace.parallel, a.in_lanes)
         at = (workspace.state, self)
         self._multiply = kernels.stiffness.bind(a.in_lanes, scene=a, pass_=self, at=at, out=self)
         self.vector, self._random = None, np.random.default_rng(1)
@@ -142,10 +168,35 @@ class Stiffness:
         return y
 
     def largest(self, tolerance: float = 1e-3) -> tuple[float, float]:
-        """(largest eigenvalue omega^2 [1/s^2], residual bound) by Lanczos; keeps the vector for `lower_bound`.
+        """(largest eigenvalue omega^2 [1/s^2], residual bound) by Lanczos; keeps the vector for `lower_bound`. With
+        viscosity (2 / h)^2 of the longest stable step h, at whose rate it is the largest eigenvalue.
 
         Some eigenvalue lies within the residual of the Ritz value (Parlett, The Symmetric Eigenvalue Problem, 4.5).
         """
+        value, residual = self._largest(tolerance)
+        for _ in range(20 if self.viscous and value > 0 else 0):
+            s2 = self._of_step()
+            value, residual = self._largest(tolerance)
+            if value <= (1 + tolerance) * s2:
+                break
+        return value, residual
+
+    def set_rate(self, rate: float) -> None:
+        """Set s [1/s]."""
+        runtime.fill(self.rate, rate)
+
+    def _of_step(self) -> float:
+        """(2 / h)^2 of the longest stable step of the vector's own motion, at whose rate products are from now on."""
+        x, s = self.vector / np.linalg.norm(self.vector), float(runtime.fetch(self.rate)[0]) or 1.0
+        parts = []
+        for rate in (0.0, s):
+            self.set_rate(rate)
+            parts.append(float((x * self.product(x)).sum()))
+        s2 = float(with_damping(parts[0], (parts[1] - parts[0]) / s))
+        self.set_rate(np.sqrt(s2))
+        return s2
+
+    def _largest(self, tolerance: float) -> tuple[float, float]:
         from scipy.sparse.linalg import LinearOperator, eigsh
 
         n = self.root.size
@@ -187,7 +238,7 @@ class Stiffness:
         count = len(basis)
         values, vectors = np.linalg.eigh(ritz[:count, :count])  # reads the lower half
         self.vector = sum(c * q for c, q in zip(vectors[:, -1], basis))
-        return float(values[-1])
+        return self._of_step() if self.viscous else float(values[-1])
 
     def worst_tetrahedron(self) -> int:
         """The tetrahedron where that vector moves most relative to its size."""

@@ -33,7 +33,7 @@ class ElasticEnergy(Output):
 
     def settled(self, scene: "Scene") -> "ElasticEnergy":
         law, mesh = scene.law, scene.mesh
-        if law.reads != ("H",) or law.state_names:
+        if law.in_steps().reads != ("H",) or law.state_names:
             raise ValueError(
                 f"ElasticEnergy knows laws of the displacement gradient, not {type(law).__name__}: take a law without rates "
                 "and state"

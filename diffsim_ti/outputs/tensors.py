@@ -162,7 +162,7 @@ class Stress(_Tensors):
 
     def settled(self, scene: "Scene") -> "Stress":
         law = scene.law
-        if law.reads != ("H",) or law.state_names:
+        if law.in_steps().reads != ("H",) or law.state_names:
             raise ValueError(
                 f"Stress knows laws of the displacement gradient, not {type(law).__name__}: take a law without rates and "
                 "state"

@@ -11,7 +11,7 @@ from diffsim_ti.potential.obstacles import ObstaclePotential
 from diffsim_ti.runtime import PRECISIONS, Bundle, Kernel, assign, let, traced
 from diffsim_ti.runtime import at as entry
 from diffsim_ti.state.features import Features
-from diffsim_ti.state.numbers import ADJOINT, SCENE, TANGENT, with_state
+from diffsim_ti.state.numbers import ADJOINT, SCENE, TANGENT, with_held, with_pass
 
 A = ti.template()
 PASS = dict(walls="vectors", lag="vectors2", pressed="vectors2")  # what contact sees of a pass (obstacles.py)
@@ -45,7 +45,7 @@ class PotentialKernels:
         return ObstaclePotential(self.features, self.law.precision)
 
     def _kernel(self, name: str, body, **arrays) -> Kernel:
-        own = dict(scene=SCENE, pass_=PASS) | arrays | dict(at=with_state(arrays["at"], self.law))
+        own = dict(scene=SCENE, pass_=PASS) | arrays | dict(at=with_pass(arrays["at"], self.law))
         return Kernel(name, body, self.law.precision, own, NUMBERS)
 
     @ti.func
@@ -258,8 +258,9 @@ class PotentialKernels:
 
     @traced
     def change(self, at, tangent) -> Bundle:
-        """What forces see of a change: w of the displacement, z of the law's state."""
-        return Bundle(u=at.w, z=tangent.z) if self.element.has_state else Bundle(u=at.w)
+        """What forces see of a change: w of the displacement, z of the law's state, `held` of what it holds in a pass."""
+        own = {name: getattr(tangent, name) for name in ("z", "held") if hasattr(tangent, name)}
+        return Bundle(u=at.w, **own)
 
     @ti.func
     def all_jvp(self, scene: A, pass_: A, at: A, out: A, tangent: A, plan: A):
@@ -277,7 +278,7 @@ class PotentialKernels:
     def jvp(self) -> Kernel:
         """Change y of the forces for changes w of the displacement and of everything else that they depend on."""
         own = dict(at=dict(u="vectors2", w="vectors2"), out=dict(y="vectors2"))
-        own["tangent"] = with_state(TANGENT | PASS, self.law)
+        own["tangent"] = with_held(TANGENT | PASS, self.law)
         return self._kernel("jvp", self.all_jvp, **own)
 
     @ti.func
@@ -296,7 +297,7 @@ class PotentialKernels:
     def vjp(self) -> Kernel:
         """y = df/du w (it is symmetric) and adjoints of the pass; adds the adjoints of all else that forces depend on."""
         adjoint = ADJOINT | dict(lag="vectors2", walls="vectors2", pressed="vectors2")
-        own = dict(at=dict(u="vectors2", w="vectors2"), out=dict(y="vectors2"), adjoint=with_state(adjoint, self.law))
+        own = dict(at=dict(u="vectors2", w="vectors2"), out=dict(y="vectors2"), adjoint=with_held(adjoint, self.law))
         return self._kernel("vjp", self.all_vjp, **own)
 
 

@@ -38,6 +38,8 @@ class Potential:
         self._launches, self._coupling, self._barrier_blocks = {}, None, None  # made when first needed
         self._points = None
         self.z = arrays.law_states(1)  # the state of the law, held during a pass
+        self.held = arrays.held_numbers()  # what the law measures rates from in a pass
+        self.rate = runtime.array(a.fp, 1) if a.law.viscous else None  # [1/s], of changes in a pass; zero in statics
         self.attached: Attached | None = None  # springs, cables, foundations: set by whom a time is known
 
     def launch(self, name: str, lanes: bool = True, **records) -> None:
@@ -80,14 +82,26 @@ class Potential:
     @contextmanager
     def at_rest(self):
         """At rest, and then back to where it was."""
-        held, state = self.held_at, None if self.z is None else runtime.fetch(self.z)
-        self.place(np.zeros_like(held))
-        if state is not None:
+        u, kept = self.held_at, [(x, runtime.fetch(x)) for x in (self.z, self.held) if x is not None]
+        self.place(np.zeros_like(u))
+        if self.z is not None:
             runtime.fill(self.z, self.arrays.initial_state_blocks())
+        if self.held is not None:
+            runtime.fill(self.held, 0)
         yield
-        self.place(held)
-        if state is not None:
-            runtime.fill(self.z, state)
+        self.place(u)
+        for array, numbers in kept:
+            runtime.fill(array, numbers)
+
+    @contextmanager
+    def without_viscosity(self):
+        """What the law stores alone."""
+        rate = None if self.rate is None else runtime.fetch(self.rate)
+        if rate is not None:
+            runtime.fill(self.rate, 0)
+        yield
+        if rate is not None:
+            runtime.fill(self.rate, rate)
 
     def energy(self) -> tuple[float, float, np.ndarray]:
         """(energy [J], the sum of its absolute parts, J at each point)."""

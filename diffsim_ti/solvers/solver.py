@@ -53,7 +53,7 @@ class Solver(ABC):
         self.parallel, self.allow_unstable, self.check_start = parallel, allow_unstable, check_start
         runtime.check_host_init()
         runtime.check_backend(scene.precision)
-        if not self.explicit and scene.law.reads != ("H",):
+        if not self.explicit and scene.law.in_steps().reads != ("H",):
             raise ValueError(
                 f"{type(scene.law).__name__} reads {', '.join(scene.law.reads)}, but {type(self).__name__} knows forces of "
                 "displacements only; take SemiImplicitSolver or VelocityVerletSolver"

@@ -19,11 +19,18 @@ from diffsim_ti.terms import Drag, Gravity, Obstacle, SelfContact
 class SceneArrays:
     """What the kernels read of a scene: its topology, once, and its numbers (state/numbers.py), per load."""
 
-    def __init__(self, scene, stages_contact: bool = False, feels_faces: bool = False, presses: bool = False):
+    def __init__(
+        self,
+        scene,
+        stages_contact: bool = False,
+        feels_faces: bool = False,
+        presses: bool = False,
+        in_steps: bool = False,
+    ):
         mesh, precision = scene.mesh, scene.precision
         fp = runtime.PRECISIONS[precision]
         self.fp, self.vector, self.lanes = fp, ti.types.vector(4, fp), ti.types.vector(LANES, fp)
-        self.law = scene.law
+        self.law = scene.law.in_steps() if in_steps else scene.law  # as implicit passes take it
         self.nodes, self.points = mesh.reference.num_nodes, mesh.reference.num_points  # of each element
         self._order_tetrahedra(scene)
         self.num_coefficients, self.num_blocks = len(self.law.coefficient_names), len(self.order) // LANES
@@ -260,6 +267,11 @@ class SceneArrays:
         """Room for what the law remembers; None if it has no state."""
         rows = len(self.law.state_names) * self.points * self.num_blocks
         return runtime.array(self.lanes, num_slots, rows) if rows else None
+
+    def held_numbers(self):
+        """Room for what the law holds in a pass; None if that is nothing."""
+        rows = len(self.law.held_names) * self.points * self.num_blocks
+        return runtime.array(self.lanes, 1, rows) if rows else None
 
     def initial_state_blocks(self) -> np.ndarray:
         """Blocks of the law's initial state."""

@@ -78,6 +78,18 @@ def with_state(arrays: dict, law) -> dict:
     return arrays | dict(z="blocks2") if law.state_names else arrays
 
 
+def with_pass(arrays: dict, law) -> dict:
+    """The arrays of a state in a pass, with what a law holds there and its rate."""
+    arrays = with_state(arrays, law) | (dict(rate="scalars") if law.viscous else {})
+    return arrays | dict(held="blocks2") if law.held_names else arrays
+
+
+def with_held(arrays: dict, law) -> dict:
+    """Changes or adjoints of these."""
+    arrays = with_state(arrays, law)
+    return arrays | dict(held="blocks2") if law.held_names else arrays
+
+
 def on_device(arrays, name: str, derived: Derived):
     """(data, element type) of a part; a single zero where the scene has no such thing."""
     kind = PARTS[name].kind

@@ -43,7 +43,10 @@ class Workspace:
         self.solver, self.scene, self.report = solver, solver.scene, SolveReport()
         self.substep = solver.substep  # length of the passes that were last looked after [s]
         self.owner = runtime.program()
-        self.arrays = SceneArrays(self.scene, solver.stages_contact, self.feels_faces(self.scene), solver.explicit)
+        explicit = solver.explicit
+        self.arrays = SceneArrays(
+            self.scene, solver.stages_contact, self.feels_faces(self.scene), explicit, in_steps=not explicit
+        )
         self.parallel = solver.runs_parallel()
         self.pairs = self.pairs_kind(self.arrays, self.parallel) if self.arrays.self_contact else None
         self.state = self.history(1)

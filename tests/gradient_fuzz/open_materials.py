@@ -5,12 +5,12 @@ from open_laws.power_law import Knowles
 from open_laws.relaxing import RelaxingRubber
 from open_laws.viscous import ViscousRubber
 
-from diffsim_ti.materials import FibreReinforced, Gent, Ogden, StableNeoHookean, Yeoh
+from diffsim_ti.materials import FibreReinforced, Gent, KelvinVoigt, Ogden, Prony, StableNeoHookean, Yeoh
 
 EVERYWHERE, ON_TETRAHEDRA, IN_STEPS, IN_EXPLICIT_STEPS = (
     (Gent, FibreReinforced, Ogden, Yeoh),
-    (Knowles,),
-    (RelaxingRubber,),
+    (Knowles, KelvinVoigt),
+    (RelaxingRubber, Prony),
     (ViscousRubber,),
 )
 
@@ -39,8 +39,18 @@ def open_material(law: type, rng, mesh, E: float, nu: float, spread):
         return Ogden([0.5 * mu, -0.3 * mu], [rng.uniform(1.5, 3.0), rng.uniform(-3.0, -1.5)], bulk)
     if law is Knowles:
         return Knowles(E=spread(E, 0.5), nu=nu, b=rng.uniform(0.5, 2.0), n=spread(rng.uniform(0.6, 1.5), 0.3))
+    if law is KelvinVoigt:
+        elastic, time = StableNeoHookean(E=spread(E, 0.5), nu=nu), spread(10 ** rng.uniform(-4, -2), 0.5)
+        return KelvinVoigt(elastic, time=time)
+    if law is Prony:
+        return branches(StableNeoHookean(mu=mu, lam=spread(lam, 0.5)), rng)
     if law is ViscousRubber:
         return ViscousRubber(E=spread(E, 0.5), nu=nu, viscosity=spread(1e-4 * E * rng.uniform(0.3, 3.0), 0.5))
     return RelaxingRubber(
         mu=spread(mu, 0.5), lam=lam, g=spread(rng.uniform(0.2, 1.0) * mu, 0.5), tau=rng.uniform(2e-3, 5e-2)
     )
+
+
+def branches(elastic, rng) -> Prony:
+    """Two of them."""
+    return Prony(elastic, rng.uniform(0.1, 1.0, 2), 10 ** rng.uniform(-3, -1, 2))

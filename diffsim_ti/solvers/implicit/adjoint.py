@@ -45,6 +45,7 @@ class ImplicitAdjoint(RecordedPasses):
             corner, y = runtime.array(a.vector, *a.corner.shape), runtime.array(a.vector, 1, n)
             runtime.fill(corner, 0)  # also where surfaces in contact have theirs
             self._law = SimpleNamespace(z=self.z, corner=corner, y=y)
+        self.held = a.held_numbers()  # in a pass, by the law
         self._vjp = self.kernels.vjp.bind(a.in_lanes, **own)
         if p.faces:
             faces = face_kernels(self.features, a.precision, workspace.parallel)
@@ -189,6 +190,9 @@ class ImplicitAdjoint(RecordedPasses):
             self._pull_back_held(j, p, q, reaction, u_adj, v_adj)
         self.p, self.q = u_adj + self.pending[0], v_adj + self.pending[1]
         self.pending = [s.a1 * x_adj, s.b1 * y_adj] if self.before is not None else [0 * x_adj, 0 * y_adj]
+        if ws.strains:
+            by_u, by_before = ws.strains.vjp(s, self.u, self.before, self)
+            self.p, self.pending[0] = self.p + by_u, self.pending[0] + by_before
 
     def _add_mass(self, by_star: np.ndarray, weight: np.ndarray) -> None:
         """Adds the adjoints of masses: weight, per mass, works on by_star."""

@@ -27,6 +27,8 @@ class RecordedPasses:
         self.u_star = (self.u_next - (1 - stage.c0) * self.u) / stage.c0
         self.mass = stage.inertia * ws.mass
         ws.begin(j, stage, self.u, self.x)
+        if ws.strains:
+            ws.strains.hold(stage, self.u, self.before)
         ws.potential.hold(ws.record, j - base)
         ws.potential.place(self.u_star)
         self.operator = Operator(ws.potential, self.mass, ws.free, ws.follower, self.transposed)

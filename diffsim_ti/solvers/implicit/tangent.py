@@ -32,6 +32,7 @@ class ImplicitTangent(RecordedPasses):
         if self.z is not None:
             runtime.fill(self.z, 0)
             self._law = SimpleNamespace(z=self.z, w=p.w)
+        self.held = a.held_numbers()
         self._jvp = kernels.jvp.bind(a.in_lanes, **own)
         if p.faces:
             self._jvp_of_faces = p.faces.bind(p.faces.kernels.jvp, tangent=(self, self.numbers))
@@ -72,6 +73,8 @@ class ImplicitTangent(RecordedPasses):
             runtime.fill(self.walls, walls)
         if self._presses:
             self._presses.begin(self.du, walls)
+        if ws.strains:
+            ws.strains.jvp(s, (self.u, self.du), (self.before, self.tangent_before), self)
         if ws.pairs:
             ws.pairs.product(
                 ws.potential.u,

@@ -16,6 +16,7 @@ from diffsim_ti.potential.potential import Potential
 from diffsim_ti.potential.way import Way
 from diffsim_ti.solvers.implicit.approach import Approach
 from diffsim_ti.solvers.implicit.given import GivenInPasses
+from diffsim_ti.solvers.implicit.held_strains import HeldStrains
 from diffsim_ti.solvers.implicit.law_state import law_state_kernels
 from diffsim_ti.solvers.implicit.linear import NotConverged
 from diffsim_ti.solvers.implicit.multigrid import Multigrid
@@ -61,6 +62,7 @@ class ImplicitWorkspace(ObstacleWays, Noted, GivenInPasses, Workspace):
             self.potential = Potential(self.arrays, self.scene.mesh.tetrahedra, self.parallel, self.pairs)
             self._launches["potential"] = True
             self.pressed = Pressed(self) if self.potential.presses else None
+            self.strains = HeldStrains(self) if self.potential.held is not None else None
         a = self.arrays
         self._mass = self.mass_of(derived)
         self.free = (runtime.fetch(a.inverse_mass)[:, None] > 0).astype(np.float64)
@@ -232,6 +234,8 @@ class ImplicitWorkspace(ObstacleWays, Noted, GivenInPasses, Workspace):
             held = self.arrays.held
             start = self.with_held(start, u[held] + (place - u[held]) / stage.c0)
         self.begin(j, stage, u, x)
+        if self.strains:
+            self.strains.hold(stage, u, before)
         self.start_multipliers(j, u)
         try:
             u_star = self._solve(u, start, (mass, inertial, loads), stage)

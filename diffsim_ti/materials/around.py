@@ -1,0 +1,99 @@
+"""What materials made around another one share: numbers of their own, and coefficients of these that come first."""
+
+from abc import abstractmethod
+
+import numpy as np
+
+from diffsim_ti.materials.material import Material, _all_values, _short, summed
+
+
+class Around(Material):
+    """A material with the numbers `own`, names in order, around `material`.
+
+    A subclass gives its own coefficients, of these numbers and the moduli (mu, lam) of small strains, with derivatives.
+    """
+
+    def _surround(self, material: Material, numbers: dict) -> None:
+        """Take the numbers. Raises ValueError where something is no material, or a name is taken."""
+        if not isinstance(material, Material):
+            raise ValueError(f"{self.name}: material must be a material such as StableNeoHookean, got {material!r}")
+        law = material.law("f64")
+        if law.state_names and self.remembers or law.reads != ("H",):
+            raise ValueError(
+                f"{self.name}: {material.name} has a state or a viscosity of its own; take one without, and put the "
+                "viscosity around all else"
+            )
+        self.material, self.own, self.J_floor, self._extra = material, tuple(numbers), None, ""
+        self._numbers = numbers | material._numbers
+        self.check({name: _all_values(name, number, self.shape_of(name)) for name, number in self._numbers.items()})
+
+    remembers = True  # whether its law has a state
+
+    def shape_of(self, name):
+        return self.shapes.get(name, ()) if name in self.own else self.material.shape_of(name)
+
+    def unit_of(self, name):
+        return self.units[name] if name in self.own else self.material.unit_of(name)
+
+    def inner(self, values: dict) -> dict:
+        """Of some values, those of the material within."""
+        return {name: values[name] for name in self.material.inputs if name in values}
+
+    def check(self, values):
+        super().check({name: values[name] for name in self.own})
+        self.material.check(self.inner(values))
+
+    @property
+    def isotropic(self):
+        return self.material.isotropic
+
+    def _moduli_values(self, values: dict) -> dict:
+        return {name: values[name] for name in self.isotropic.inputs if name in values}
+
+    def _numbers_of(self, values: dict) -> list:
+        """Own values, and (mu, lam)."""
+        own = [np.asarray(values[name], np.float64) for name in self.own]
+        return [*own, *self.isotropic.lame(self._moduli_values(values))]
+
+    @abstractmethod
+    def own_coefficients(self, *numbers) -> list:
+        """Columns, each shape () or (num_tetrahedra,), of own numbers, mu and lam."""
+
+    @abstractmethod
+    def own_jvp(self, numbers: list, changes: list) -> list:
+        """Their changes."""
+
+    @abstractmethod
+    def own_vjp(self, numbers: list, by_columns: list) -> list:
+        """Adjoints of own numbers, mu and lam, those of each tetrahedron."""
+
+    @staticmethod
+    def _joined(columns: list, of_material: np.ndarray) -> np.ndarray:
+        parts = [*(np.asarray(x, np.float64)[..., None] for x in columns), of_material]
+        shape = np.broadcast_shapes(*(part.shape[:-1] for part in parts))
+        return np.concatenate([np.broadcast_to(part, (*shape, part.shape[-1])) for part in parts], -1)
+
+    def coefficients(self, values):
+        self.check(values)
+        own = self.own_coefficients(*self._numbers_of(values))
+        return self._joined(own, self.material.coefficients(self.inner(values)))
+
+    def coefficients_jvp(self, values, tangents):
+        own = [np.broadcast_to(tangents.get(name, 0.0), np.shape(values[name])) for name in self.own]
+        by_moduli = self.isotropic.lame_jvp(self._moduli_values(values), self._moduli_values(tangents))
+        columns = self.own_jvp(self._numbers_of(values), [*own, *by_moduli])
+        return self._joined(columns, self.material.coefficients_jvp(self.inner(values), self.inner(tangents)))
+
+    def coefficients_vjp(self, values, coefficients_adj):
+        adj, count = np.asarray(coefficients_adj, np.float64), len(self.law("f64").coefficient_names)
+        first = count - len(self.material.law("f64").coefficient_names)
+        *own, mu, lam = self.own_vjp(self._numbers_of(values), [adj[..., k] for k in range(first)])
+        out = {name: summed(part, values[name], self.shape_of(name)) for name, part in zip(self.own, own)}
+        out |= self.material.coefficients_vjp(self.inner(values), adj[..., first:])
+        for name, part in self.isotropic.lame_vjp(self._moduli_values(values), mu, lam).items():
+            out[name] = out[name] + part
+        return out
+
+    def __repr__(self):
+        own = {name: self._numbers[name] for name in self.own}
+        return f"{self.name}({self.material!r}, {', '.join(f'{name}={_short(x)}' for name, x in own.items())})"
