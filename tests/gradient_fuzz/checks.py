@@ -116,7 +116,7 @@ class Chain:
 
     def part(self, first: int, steps: int, save_every: int):
         """(rollout, frames) of some steps from the state before step `first`."""
-        rollout = ds.Rollout(self.configuration.solver, steps, save_every=save_every, gradients="all")
+        rollout = self.configuration.part(first, steps, save_every=save_every, gradients="all")
         values = dict(
             initial_positions=self.states.positions[first].astype(np.float64),
             initial_velocities=self.states.velocities[first].astype(np.float64),

@@ -112,7 +112,7 @@ class Judge:
     def __init__(self, configuration: Configuration):
         self.configuration, kind = configuration, configuration.structure
         self.rollout, rng = configuration.rollout(), configuration.rng(1)
-        self.duration = configuration.steps * configuration.solver.dt
+        self.duration = float(self.rollout.solver.schedule.time(configuration.steps))
         self.frames = self.rollout.forward()
         shape = self.frames.positions.shape
         self.w = rng.standard_normal(shape) / CELL
@@ -219,12 +219,13 @@ class Judge:
         configuration = self.configuration
         watched = configuration.rollout(save_every=1).forward()
         felt = sticks = slides = False
-        dt = configuration.solver.dt
+        ends = watched.times
         for placed, path in zip(configuration.placed, configuration.paths):
-            for x, v, t in zip(watched.positions[1:], watched.velocities[1:], watched.times[1:]):
+            for k in range(1, len(ends)):
+                x, v, t, dt = watched.positions[k], watched.velocities[k], ends[k], ends[k] - ends[k - 1]
                 here, before = ((path_at(path, s) if path is not None else np.zeros(3)) for s in (t, t - dt))
                 if configuration.structure.static:  # friction acts on how far the step went
-                    v = x - watched.positions[int(round(t / dt)) - 1]
+                    v = x - watched.positions[k - 1]
                 touching, speed = placed.touching(x.astype(np.float64), v, here, (here - before) / dt)
                 touching[configuration.scene.fixed] = False
                 felt = felt or np.any(touching)

@@ -7,7 +7,7 @@ import numpy as np
 import diffsim_ti as ds
 from diffsim_ti.inputs.surface_areas import SurfaceAreas
 
-from . import bodies
+from . import bodies, newer
 from .chambers import chamber, hollow
 from .loads import load, rollers
 from .obstacles import MESH_WIDTH, Placed, place, push_direction
@@ -26,6 +26,7 @@ class Configuration:
     steps: int
     options: dict  # of the Rollout
     placed: list[Placed]
+    schedule: ds.UnequalSteps | None  # of steps that are not all dt
     paths: list  # of the obstacles in `placed`, None for those that stand still
     terms: list
 
@@ -34,7 +35,14 @@ class Configuration:
         return self.solver.scene
 
     def rollout(self, **changes) -> ds.Rollout:
-        return ds.Rollout(self.solver, self.steps, **self.options | changes)
+        return self.part(0, self.steps, **self.options | changes)
+
+    def part(self, first: int, steps: int, **options) -> ds.Rollout:
+        """Of some of its steps."""
+        own = self.schedule
+        if own is not None:
+            own = ds.UnequalSteps(own.lengths[first:][:steps], own.substeps[first:][:steps])
+        return ds.Rollout(self.solver, steps if own is None else own, **options)
 
     def rng(self, salt: int):
         return np.random.default_rng([self.seed, salt])
@@ -102,6 +110,7 @@ def build(seed: int, precision: str | None = None) -> Configuration:
     if kind.order == 2:
         mesh, start = bodies.with_middles(mesh, start, np.random.default_rng([23, seed]))
     law, E = material(kind, rng, mesh)
+    law = newer.grown(kind, seed, law, mesh)
     density = rng.uniform(600, 1200) * (1 + 0.3 * rng.random(mesh.num_tetrahedra) if rng.random() < 0.4 else 1.0)
     fixed = _fixed(kind, rng, mesh) if kind.fixed else None
     if kind.rollers:
@@ -109,7 +118,8 @@ def build(seed: int, precision: str | None = None) -> Configuration:
     steps, substeps, dt = _schedule(
         kind, rng, mesh, E, np.min(density), np.abs(start - mesh.vertices).max() > 0.1 * CELL
     )
-    duration = steps * dt
+    schedule = newer.unequal_steps(kind, seed, steps, dt, substeps)
+    duration = steps * dt if schedule is None else float(schedule.time(steps))
 
     mass = np.bincount(mesh.elements.ravel(), np.outer(density * mesh.volumes, mesh.reference.lumped).ravel())
     beat = 2e-3 if kind.static else dt / substeps if kind.explicit else duration / 25
@@ -134,6 +144,7 @@ def build(seed: int, precision: str | None = None) -> Configuration:
     for name in kind.ties:
         terms.append(tie(name, more, mesh, steps, duration, mass, beat))
 
+    terms += newer.muscles(kind, seed, mesh, steps, duration, E)
     if kind.chamber:
         own = chamber(kind.chamber, more, mesh, start, steps, duration, E)
         terms.insert(int(more.integers(0, len(terms) + 1)), own)
@@ -157,10 +168,11 @@ def build(seed: int, precision: str | None = None) -> Configuration:
         initial_velocities=velocities,
         precision=kind.precision,
         volume=kind.volume,
+        mass_scaling=newer.mass_scaling(kind, seed),
     )
     options = dict(save_every=int(rng.choice([k for k in range(1, steps + 1) if steps % k == 0])), gradients="all")
     solver = _solver(kind, scene, dt, substeps)
-    return Configuration(seed, kind, solver, steps, options, placed, paths, terms)
+    return Configuration(seed, kind, solver, steps, options, placed, schedule, paths, terms)
 
 
 def _fixed(kind, rng, mesh):

@@ -1,0 +1,45 @@
+"""What joins configurations by draws of its own: steps of unequal length, scaled masses, muscles, growth."""
+
+import numpy as np
+
+import diffsim_ti as ds
+
+from .loads import over_time
+
+
+def unequal_steps(kind, seed: int, steps: int, dt: float, substeps: int) -> ds.UnequalSteps | None:
+    """Lengths up to dt, in explicit runs with substeps of their own; None for most."""
+    rng = np.random.default_rng([24, seed])
+    if kind.static or rng.random() > 0.35:
+        return None
+    lengths = dt * rng.uniform(0.5, 1.0, steps)
+    return ds.UnequalSteps(lengths, rng.integers(substeps, substeps + 3, steps) if kind.explicit else substeps)
+
+
+def mass_scaling(kind, seed: int) -> float | None:
+    rng = np.random.default_rng([25, seed])
+    return rng.uniform(0.005, 0.1) if kind.explicit and kind.order == 1 and rng.random() < 0.3 else None
+
+
+def muscles(kind, seed: int, mesh, steps: int, duration: float, E: float) -> list[ds.Muscle]:
+    """In a fifth of the structures."""
+    if np.random.default_rng([26, kind.number]).random() > 0.2:
+        return []
+    rng, m = np.random.default_rng([27, seed]), mesh.num_tetrahedra
+    some = np.sort(rng.permutation(m)[: rng.integers(1, m + 1)])
+    fibre = rng.standard_normal((len(some), 3) if rng.random() < 0.5 else 3)
+    stress = 0.02 * E * rng.uniform(0.2, 1.0)
+    if rng.random() < 0.3:
+        return [ds.Muscle(fibre, stress, rng.random((steps, len(some))), some, per="tetrahedron")]
+    how = ("constant", "per step", "keyed")[rng.integers(3)]
+    return [ds.Muscle(fibre, stress, over_time(rng, steps, duration, how)(1.0), some)]
+
+
+def grown(kind, seed: int, law, mesh):
+    """The material, in a sixth of the structures grown a little."""
+    elastic = law.law("f64").reads == ("H",) and not law.law("f64").state_names
+    chosen = np.random.default_rng([28, kind.number]).random() < 1 / 6
+    if not (elastic and chosen and kind.volume == "tetrahedra"):
+        return law
+    rng = np.random.default_rng([29, seed])
+    return ds.Grown(law, rng.uniform(-0.01, 0.02, () if rng.random() < 0.5 else mesh.num_tetrahedra))
