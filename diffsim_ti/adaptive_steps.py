@@ -5,7 +5,6 @@ import math
 import numpy as np
 
 from diffsim_ti.checked import instance, number, whole
-from diffsim_ti.monitor.guard import Divergence
 from diffsim_ti.simulator import Simulator
 from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.state.schedule import UnequalSteps
@@ -27,6 +26,7 @@ def adaptive_steps(solver: Solver, steps: int, tolerance: float) -> UnequalSteps
     a given sum of errors have n^(p + 1) in proportion to c: so n is chosen, and all are scaled until errors add up to the
     tolerance. That is no bound: motion stretches errors, or shrinks them.
 
+    BDF2 starts anew in each step of the search, by backward Euler, so that it finds more substeps than its runs need.
     The search costs about three runs of what it finds. Pass the result as `steps` of a `Rollout`. Gradients are exactly
     those of its steps, which do not change with the inputs; where they fit no longer, the run warns or raises as any other.
 
@@ -41,9 +41,9 @@ def adaptive_steps(solver: Solver, steps: int, tolerance: float) -> UnequalSteps
         raise ValueError(f"{type(solver).__name__} finds equilibria, whose error no shorter step makes smaller")
     tolerance, steps = number("tolerance", tolerance, unit="m"), whole("steps", steps, 1)
     search = _Search(solver, steps, tolerance)
-    substeps, errors = (np.array(column) for column in zip(*(search.advance() for _ in range(steps))))
+    substeps, errors, fewest = (np.array(column) for column in zip(*(search.advance() for _ in range(steps))))
     substeps = np.ceil(substeps * (errors.sum() / tolerance) ** (1 / solver.order))
-    return UnequalSteps(np.full(steps, solver.dt), _smooth(np.maximum(substeps, search.fewest)))
+    return UnequalSteps(np.full(steps, solver.dt), _smooth(np.maximum(substeps, fewest)))
 
 
 def _smooth(substeps: np.ndarray) -> np.ndarray:
@@ -74,19 +74,22 @@ class _Search:
         self.mass = self.simulator.workspace.arrays.values.mass
         self.steps, self.allowed, self.last = steps, tolerance / (steps * self.fewest), self.fewest
 
-    def advance(self) -> tuple[float, float]:
-        """Take the next step: (substeps that it needs, its error [m] with these)."""
-        sim, n = self.simulator, max(self.fewest, math.ceil(self.last / GROWTH))
+    def advance(self) -> tuple[float, float, int]:
+        """Take the next step: (substeps that it needs, its error [m] with these, the fewest with which it can be taken)."""
+        sim, n, fewest = self.simulator, max(self.fewest, math.ceil(self.last / GROWTH)), self.fewest
         sim.workspace.save(self.start, 0)
         while n <= MOST:
             coarse, fine = self._end(n), self._end(2 * n)
-            if coarse is not None and fine is not None:
-                error = self._error(coarse, fine)
-                enough = max(self.fewest, n * (error / (n * self.allowed)) ** (1 / (sim.solver.order + 1)))
-                if enough <= 2 * n:
-                    self.last = enough
-                    sim.step_count += 1
-                    return enough, error * (n / enough) ** sim.solver.order
+            if coarse is None or fine is None:
+                n *= 2
+                fewest = n
+                continue
+            error = self._error(coarse, fine)
+            enough = max(fewest, n * (error / (n * self.allowed)) ** (1 / (sim.solver.order + 1)))
+            if enough <= 2 * n:
+                self.last = enough
+                sim.step_count += 1
+                return enough, error * (n / enough) ** sim.solver.order, fewest
             n *= 2
         raise ValueError(
             f"step {sim.step_count}, t = {sim.time:.4g} s: {MOST} substeps do not keep its error small enough for the "
@@ -94,10 +97,8 @@ class _Search:
         )
 
     def _error(self, coarse: tuple, fine: tuple) -> float:
-        order, left = (
-            self.simulator.solver.order,
-            (self.steps - self.simulator.step_count - 1) * self.simulator.solver.dt,
-        )
+        solver, order = self.simulator.solver, self.simulator.solver.order
+        left = (self.steps - self.simulator.step_count - 1) * solver.dt
         du, dv = (a - b for a, b in zip(coarse, fine))
         carried = left * np.linalg.norm(self.mass @ dv) / self.mass.sum()
         return float(np.linalg.norm(du, axis=1).max() + carried) * 2**order / (2**order - 1)
@@ -110,7 +111,7 @@ class _Search:
         sim.set_substeps(n)
         try:
             sim.step()
-        except Divergence:
+        except FloatingPointError:  # Divergence, NotConverged
             return None
         sim.step_count -= 1
         return sim.displacements.astype(np.float64), sim.velocities.astype(np.float64)

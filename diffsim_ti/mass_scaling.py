@@ -6,7 +6,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.checked import numbers, shown
+from diffsim_ti.inputs.links import LumpedMass
+from diffsim_ti.mesh.geometry import inverse_edges, shape_gradients
 from diffsim_ti.mesh.patches import volume_patches
 
 if TYPE_CHECKING:
@@ -15,7 +17,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class MassScaling:
-    """`factors` (num_vertices,) by which vertices are heavier; `share` of the mass that was added.
+    """`factors` (num_vertices,) by which vertices are heavier; `share` of the mass that was added; `gain`: how many times
+    longer the step of the bound below is.
 
     The body's omega^2 is at most the largest of the rows' |K_ab|, summed over b, by their masses (Gershgorin, in blocks of a
     vertex each). For a limit W the least mass with which no row is beyond it is that of
@@ -39,16 +42,23 @@ class MassScaling:
             raise ValueError(f"mass_scaling must lie in (0, 0.2], got {share}: 0.01 adds at most 1 % of the mass")
         if mesh.order > 1:
             raise ValueError("mass_scaling is for linear tetrahedra: take mesh.linear(), or an implicit solver")
+        density = numbers("density", density)
+        if density.shape not in ((), (mesh.num_tetrahedra,)) or not np.all(density > 0):
+            raise ValueError(f"density must be > 0 [kg/m^3], one number or one per tetrahedron, got {shown(density)}")
         mu, lam = material.lame(material.values(mesh))
-        rows, mass = row_sums(mesh, mu, lam, scene.volume == "patches"), masses(mesh, density)
-        low, high = np.log(rows.max() / mass.sum() * 1e-6), np.log((rows / mass).max())
+        rows = row_sums(scene, mu, lam, scene.volume == "patches")
+        (mass,) = LumpedMass(mesh).value(density, mesh.volumes)
+        total, mass = mass.sum(), np.where(mass > 0, mass, 1.0)  # of vertices in no tetrahedron, whose rows are zero
+        if not rows.any():  # all is held
+            return cls(np.ones(len(mass)), 0.0, 1.0)
+        low, high = np.log(rows.max() / total * 1e-6), np.log((rows / mass).max())
         for _ in range(100):
             middle = 0.5 * (low + high)
-            beyond = np.maximum(rows / np.exp(middle) - mass, 0).sum() > share * mass.sum()
+            beyond = np.maximum(rows / np.exp(middle) - mass, 0).sum() > share * total
             low, high = (middle, high) if beyond else (low, middle)
         factors = np.maximum(rows / np.exp(high) / mass, 1.0)
         factors.setflags(write=False)
-        added = float((mass * (factors - 1)).sum() / mass.sum())
+        added = float((mass * (factors - 1)).sum() / total)
         return cls(factors, added, float(np.sqrt((rows / mass).max() / np.exp(high))))
 
     def __str__(self) -> str:
@@ -58,27 +68,16 @@ class MassScaling:
         )
 
 
-def masses(mesh: TetrahedralMesh, density) -> np.ndarray:
-    """Lumped, of each vertex [kg]."""
-    X, tets = mesh.vertices, mesh.tetrahedra
-    volumes = np.linalg.det(X[tets[:, 1:]] - X[tets[:, :1]]) / 6
-    of_tetrahedra = np.repeat(np.broadcast_to(density, volumes.shape) * volumes / 4, 4)
-    mass = np.bincount(tets.ravel(), of_tetrahedra, mesh.num_vertices)
-    return np.where(mass > 0, mass, 1.0)  # of vertices in no tetrahedron, whose rows are zero
-
-
-def row_sums(mesh: TetrahedralMesh, mu, lam, patches: bool) -> np.ndarray:
+def row_sums(scene: "Scene", mu, lam, patches: bool) -> np.ndarray:
     """sum_b |K_ab| [N/m] of each vertex a, by the spectral norm of the 3 x 3 blocks of the assembled stiffness at rest,
 
         K_ab = sum_e V [lam N_a (x) N_b + mu N_b (x) N_a + mu (N_a . N_b) 1],  N_a = grad N_a.
 
-    A mean over patches takes stiffness away from volume changes, so that lam may be that of the stiffest of a patch.
+    zero where a vertex is held wholly, which limits no step. A mean over patches takes stiffness away from volume changes,
+    so that lam may be that of the stiffest of a patch.
     """
-    X, tets = mesh.vertices, mesh.tetrahedra
-    edges = X[tets[:, 1:]] - X[tets[:, :1]]
-    N = np.swapaxes(np.linalg.inv(edges), 1, 2)
-    N = np.concatenate([-N.sum(1, keepdims=True), N], 1)
-    volumes = np.linalg.det(edges) / 6
+    mesh, tets, volumes = scene.mesh, scene.mesh.tetrahedra, scene.mesh.volumes
+    N = shape_gradients(inverse_edges(mesh.vertices, tets))
     if patches and np.ndim(lam):
         own = volume_patches(mesh)
         stiffest = np.full(own.max() + 1, -np.inf)
@@ -94,4 +93,6 @@ def row_sums(mesh: TetrahedralMesh, mu, lam, patches: bool) -> np.ndarray:
             entry = lam[:, None, None] * N[:, :, None, i] * N[:, None, :, j]
             entry = entry + mu[:, None, None] * N[:, None, :, i] * N[:, :, None, j] + (along if i == j else 0)
             blocks[:, i, j] = np.bincount(place, entry.ravel(), len(pairs))
-    return np.bincount(pairs // n, np.linalg.norm(blocks, ord=2, axis=(1, 2)), n)
+    rows = np.bincount(pairs // n, np.linalg.norm(blocks, ord=2, axis=(1, 2)), n)
+    rows[scene.fixed] = 0.0
+    return rows

@@ -311,8 +311,8 @@ class Scene:
         return body_stiffness(scene, self.checked_displacements(displacements))
 
     def mass_matrix(self):
-        """M [kg] as a SciPy CSR matrix of all 3 num_vertices unknowns, in float64: lumped and diagonal, as explicit steps
-        have it, or consistent of ten-node tetrahedra, as statics and implicit steps do."""
+        """M [kg] as a SciPy CSR matrix of all 3 num_vertices unknowns, in float64: lumped and diagonal of linear tetrahedra,
+        without what `mass_scaling` adds for explicit steps; consistent of ten-node tetrahedra, as implicit steps have it."""
         from scipy.sparse import diags, eye, kron
 
         inputs = self.with_consistent_mass().inputs

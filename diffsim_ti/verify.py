@@ -104,10 +104,15 @@ def central_difference(f: Callable[[float], float], scale: float = 1.0) -> tuple
     return float(best), float(error)
 
 
+def _mean_step(rollout: Rollout) -> float:
+    """Length of its steps [s], on average."""
+    return float(rollout.solver.schedule.time(rollout.steps)) / rollout.steps if rollout.steps else rollout.solver.dt
+
+
 def input_scale(rollout: Rollout, name: str) -> float:
     """A size of change that matters for an input: its own, or for lengths and velocities that of a tetrahedron's edge."""
     scene = rollout.scene
-    run = RunSize(float(np.cbrt(np.mean(scene.mesh.volumes))), rollout.steps, rollout.solver.dt)
+    run = RunSize(float(np.cbrt(np.mean(scene.mesh.volumes))), rollout.steps, _mean_step(rollout))
     return scene.inputs.described[name].change(rollout.values[name], run)
 
 
@@ -277,11 +282,11 @@ def gradient_health(rollout: Rollout, limit: float = 1e10) -> GradientHealth:
     """
     if not rollout.health:
         raise ValueError("no health report: make the Rollout with health=True and run its reverse sweep first")
-    dt = rollout.solver.dt
     steps = np.array([h["step"] for h in rollout.health])
+    times, dt = rollout.solver.schedule.time(steps), _mean_step(rollout)
     norms = np.array([np.hypot(dt * h["norm_position"], h["norm_velocity"]) for h in rollout.health])
     good = norms > 0
-    slope = np.polyfit(-steps[good] * dt, np.log(norms[good]), 1)[0] if good.sum() > 2 else 0.0
+    slope = np.polyfit(-times[good], np.log(norms[good]), 1)[0] if good.sum() > 2 else 0.0
     over = np.nonzero(norms > limit * norms[good][0])[0] if good.any() else []
     return GradientHealth(steps, norms, float(slope), int(steps[over[0]]) if len(over) else None)
 

@@ -53,6 +53,28 @@ def test_no_more_is_added_than_allowed_and_where_it_is_needed():
     assert 1 < scene(1e-4).mass_scaling.gain < scaled.mass_scaling.gain
 
 
+def test_what_is_held_takes_no_mass():
+    """A sliver at the clamp does not limit the step of the others, nor does its bound."""
+    mesh = with_slivers()
+    sliver = mesh.tetrahedra[np.argmin(mesh.volumes)]
+    s = scene(0.01, mesh, fixed=sliver)
+    assert np.all(s.mass_scaling.factors[sliver] == 1) and s.mass_scaling.factors.max() > 1
+    solver = ds.VelocityVerletSolver(s, dt=1e-7)
+    assert solver.stable_dt() <= solver.stable_dt(tight=True) * (1 + 1e-3)
+    whole = scene(0.01, mesh, fixed=np.arange(mesh.num_vertices))
+    assert np.all(whole.mass_scaling.factors == 1) and whole.mass_scaling.share == 0
+
+
+def test_vertices_of_no_tetrahedron_count_for_nothing():
+    mesh = with_slivers()
+    apart = np.concatenate([mesh.vertices, [[5.0, 5, 5], [6, 6, 6]]])
+    with pytest.warns(UserWarning):
+        more = ds.TetrahedralMesh(apart, mesh.tetrahedra)
+    one, other = scene(0.01, mesh).mass_scaling, scene(0.01, more).mass_scaling
+    np.testing.assert_array_equal(other.factors, np.append(one.factors, [1, 1]))
+    assert other.share == one.share
+
+
 def test_free_fall_stays_as_it_is():
     s = scene(0.05)
     frames = ds.Rollout(ds.VelocityVerletSolver(s, dt=1e-3), 50).forward()
@@ -101,3 +123,9 @@ def test_implicit_steps_and_statics_add_no_mass():
 def test_what_is_refused(share, mesh, words):
     with pytest.raises(ValueError, match=words):
         scene(share, mesh)
+
+
+@pytest.mark.parametrize("density", ["x", [1.0, 2.0], 0.0, np.nan, None])
+def test_wrong_densities_are_refused_in_our_words(density):
+    with pytest.raises(ValueError, match="density must be"):
+        scene(density=density)

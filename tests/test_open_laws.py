@@ -374,6 +374,17 @@ def test_fibres_per_set():
     np.testing.assert_array_equal(fibre[:3], [[0, 1, 0], [1, 0, 0], [0, 1, 0]])
 
 
+def test_moduli_and_exponents_may_go_by_other_sets():
+    """Which are compared on the mesh alone, where each tetrahedron has its own."""
+    mesh = ds.TetrahedralMesh.create_cube(2, 1.0)
+    mesh = ds.TetrahedralMesh(mesh.vertices, mesh.tetrahedra, tetrahedron_sets={"a": [0], "b": [1]})
+    exponents = {"a": [2.0], "b": [3.0], "default": [4.0]}
+    material = Ogden({"a": [1.0], "default": [2.0]}, exponents, 5.0)
+    np.testing.assert_allclose(material.lame(material.values(mesh))[0][:3], [1.0, 3.0, 4.0])
+    with pytest.raises(ValueError, match="mu_1 a_1 must be > 0, got -2 in tetrahedron 1"):
+        Ogden({"a": [1.0], "default": [2.0]}, exponents | {"b": [-1.0]}, 5.0).values(mesh)
+
+
 def test_two_families_of_fibres():
     """The stress of both adds up, and inputs of the second have names of their own."""
     a, b = [1.0, 0.3, 0], [0.2, 1.0, 0.5]
@@ -464,11 +475,15 @@ class ReadsTime(EnergyLaw):
     [
         (lambda: Ogden([1.0, 1.0], [-2.0, 2.0], 1.0), r"mu_1 a_1 must be > 0, got -2"),
         (lambda: Ogden([1.0, 1.0], [2.0], 1.0), r"one number for each term"),
+        (lambda: Ogden({"a": [1.0], "b": [2.0]}, {"a": [2.0], "b": [-2.0]}, 1.0), r"mu_1 a_1 must be > 0"),
         (lambda: Ogden(1.0, 2.0, 1.0), r"one number for each term"),
         (lambda: Yeoh(-1.0, 0.0, 0.0, 1.0), r"c10 must be > 0"),
         (lambda: Gent(1.0, 0.0, 1.0), r"limit must be > 0"),
-        (lambda: FibreReinforced(ViscousRubber(1e4, 0.3, 1.0), 1.0, 1.0, [1, 0, 0]), r"take an elastic one"),
-        (lambda: FibreReinforced(1e4, 1.0, 1.0, [1, 0, 0]), r"matrix must be a material"),
+        (
+            lambda: FibreReinforced(ViscousRubber(1e4, 0.3, 1.0), 1.0, 1.0, [1, 0, 0]),
+            r"a state or a viscosity of its own",
+        ),
+        (lambda: FibreReinforced(1e4, 1.0, 1.0, [1, 0, 0]), r"material must be a material such as"),
         (lambda: tissue_with([1.0, 2.0]), r"fibre must be 3 numbers or 3 per tetrahedron"),
         (lambda: tissue_with([0.0, 0, 0]), r"length of fibre must be > 0"),
         (lambda: tissue_with({"up": 1.0}), r"fibre\['up'\] must be 3 numbers"),

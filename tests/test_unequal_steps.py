@@ -129,6 +129,31 @@ def test_truncate_and_clip_go_by_steps():
     assert gradient[4:].any() and not gradient[:3].any()  # the kick at the cut is of both steps that meet there
 
 
+@pytest.mark.parametrize("solver", [ds.VelocityVerletSolver, ds.ImplicitEulerSolver])
+def test_contacts_are_judged_alike_whatever_is_kept(solver):
+    """Passes of each length by their own, also where a segment between checkpoints has one length alone."""
+    every = [None, 1, 2]
+    seen = [
+        taken_by(solver, falling(), [8e-4, 2e-4, 2e-4, 6e-4] * 16, checkpoint_every=k).forward().contact_resolution
+        for k in every
+    ]
+    assert seen[0].obstacle is not None and seen[0] == seen[1] == seen[2]
+    assert seen[0].substep == pytest.approx(4e-4)  # the longest, of two substeps a step, is the coarsest
+
+
+def test_health_goes_by_the_time_of_the_steps():
+    """A decay at one rate has that rate, whatever the lengths of steps are."""
+    mesh = ds.TetrahedralMesh.create_cube(2, 0.1)
+    scene = ds.Scene(mesh, ds.StableNeoHookean(1e3, 0.3), terms=[ds.Drag(30.0)], precision="f64")
+    rates = []
+    for steps in ([1e-3] * 24, [5e-4] * 12 + [1.5e-3] * 12):
+        rollout = taken_by(ds.SemiImplicitSolver, scene, steps, health=True)
+        frames = rollout.forward(initial_velocities=np.ones((8, 3)))
+        rollout.vjp(frames, velocities=np.stack([np.zeros((8, 3)), np.ones((8, 3))]))
+        rates.append(ds.verify.gradient_health(rollout).growth_rate)
+    np.testing.assert_allclose(rates, -30.0, rtol=1e-6)
+
+
 # ---- a search ---------------------------------------------------------------------------------------------------------
 
 
@@ -159,6 +184,19 @@ def test_the_search_puts_substeps_where_the_impact_is(solver):
     finer = ds.adaptive_steps(plain, 15, tolerance / 10)
     assert finer.substeps.sum() > 1.5 * steps.substeps.sum()
     assert ds.Rollout(plain, finer).forward().contact_resolution.substep <= 4e-3
+
+
+def test_a_search_goes_on_where_a_solve_does_not_converge():
+    """One substep would drive held vertices through a floor's barrier faster than Newton's method can follow."""
+    mesh = ds.TetrahedralMesh.create_box(3, 0.1, origin=(0, 0.02, 0))
+    scene = ds.Scene(mesh, ds.StableNeoHookean(1e4, 0.3), terms=[ds.Gravity()], fixed="ymax", precision="f64")
+    scene = scene.replace(motion=lambda t: [0, -0.04 * np.sin(np.pi * min(t / 0.1, 1.0)), 0])
+    solver = ds.ImplicitEulerSolver(scene, dt=0.05, max_iterations=4)
+    with pytest.raises(ds.NotConverged):
+        ds.Rollout(solver, 2).forward()
+    steps = ds.adaptive_steps(solver, 2, 1.0)
+    assert steps.substeps.min() > 1
+    ds.Rollout(solver, steps).forward()
 
 
 # ---- what is refused --------------------------------------------------------------------------------------------------

@@ -10,8 +10,11 @@ from diffsim_ti.materials.material import Material, _all_values, _short, summed
 class Around(Material):
     """A material with the numbers `own`, names in order, around `material`.
 
-    A subclass gives its own coefficients, of these numbers and the moduli (mu, lam) of small strains, with derivatives.
+    A subclass gives its own coefficients, of these numbers and, with `takes_moduli`, of the moduli (mu, lam) of small
+    strains of the isotropic part, with derivatives.
     """
+
+    takes_moduli = True
 
     def _surround(self, material: Material, numbers: dict) -> None:
         """Take the numbers. Raises ValueError where something is no material, or a name is taken."""
@@ -53,11 +56,11 @@ class Around(Material):
     def _numbers_of(self, values: dict) -> list:
         """Own values, and (mu, lam)."""
         own = [np.asarray(values[name], np.float64) for name in self.own]
-        return [*own, *self.isotropic.lame(self._moduli_values(values))]
+        return [*own, *(self.isotropic.lame(self._moduli_values(values)) if self.takes_moduli else ())]
 
     @abstractmethod
     def own_coefficients(self, *numbers) -> list:
-        """Columns, each shape () or (num_tetrahedra,), of own numbers, mu and lam."""
+        """Columns, each shape () or (num_tetrahedra,), of these."""
 
     @abstractmethod
     def own_jvp(self, numbers: list, changes: list) -> list:
@@ -65,7 +68,7 @@ class Around(Material):
 
     @abstractmethod
     def own_vjp(self, numbers: list, by_columns: list) -> list:
-        """Adjoints of own numbers, mu and lam, those of each tetrahedron."""
+        """Adjoints of the numbers, those of each tetrahedron."""
 
     @staticmethod
     def _joined(columns: list, of_material: np.ndarray) -> np.ndarray:
@@ -80,18 +83,21 @@ class Around(Material):
 
     def coefficients_jvp(self, values, tangents):
         own = [np.broadcast_to(tangents.get(name, 0.0), np.shape(values[name])) for name in self.own]
-        by_moduli = self.isotropic.lame_jvp(self._moduli_values(values), self._moduli_values(tangents))
+        by_moduli = ()
+        if self.takes_moduli:
+            by_moduli = self.isotropic.lame_jvp(self._moduli_values(values), self._moduli_values(tangents))
         columns = self.own_jvp(self._numbers_of(values), [*own, *by_moduli])
         return self._joined(columns, self.material.coefficients_jvp(self.inner(values), self.inner(tangents)))
 
     def coefficients_vjp(self, values, coefficients_adj):
         adj, count = np.asarray(coefficients_adj, np.float64), len(self.law("f64").coefficient_names)
         first = count - len(self.material.law("f64").coefficient_names)
-        *own, mu, lam = self.own_vjp(self._numbers_of(values), [adj[..., k] for k in range(first)])
+        own = self.own_vjp(self._numbers_of(values), [adj[..., k] for k in range(first)])
         out = {name: summed(part, values[name], self.shape_of(name)) for name, part in zip(self.own, own)}
         out |= self.material.coefficients_vjp(self.inner(values), adj[..., first:])
-        for name, part in self.isotropic.lame_vjp(self._moduli_values(values), mu, lam).items():
-            out[name] = out[name] + part
+        if self.takes_moduli:
+            for name, part in self.isotropic.lame_vjp(self._moduli_values(values), *own[-2:]).items():
+                out[name] = out[name] + part
         return out
 
     def __repr__(self):

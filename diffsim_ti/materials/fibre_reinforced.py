@@ -5,12 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from diffsim_ti.differentiation import exp, maximum
+from diffsim_ti.materials.around import Around
 from diffsim_ti.materials.energy_law import EnergyLaw
 from diffsim_ti.materials.law import Law
-from diffsim_ti.materials.material import Material, _all_values, check_range
+from diffsim_ti.materials.material import Material, check_range
 from diffsim_ti.runtime import traced
 
-OWN = ("k1", "k2", "fibre")
+UNITS = {"k1": "Pa", "k2": "-", "fibre": "-"}
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,7 @@ class FibreReinforcedLaw(Law):
         return self.matrix.dilatation_gradient_differential(H, dH)
 
 
-class FibreReinforced(Material):
+class FibreReinforced(Around):
     """`FibreReinforced(matrix, k1, k2, fibre)`: psi of the matrix, any material, plus that of fibres,
 
         k1/(2 k2) (exp(k2 e^2) - 1) [J/m^3],  e = max(a . C a / |a|^2 - 1, 0),
@@ -106,72 +107,35 @@ class FibreReinforced(Material):
     Raises ValueError for numbers out of range, and for a matrix that has a state or depends on the velocity.
     """
 
+    takes_moduli = False
+
     def __init__(self, matrix: Material, k1, k2, fibre):
-        if not isinstance(matrix, Material):
-            raise ValueError(f"FibreReinforced: matrix must be a material such as StableNeoHookean, got {matrix!r}")
-        law = matrix.law("f64")
-        if law.state_names or law.reads != ("H",):
-            raise ValueError(
-                f"FibreReinforced: a matrix of {matrix.name} has a state or a viscosity; take an elastic one"
-            )
-        self.matrix, self._extra = matrix, ""
-        families = sum(name.split("_")[0] == "k1" for name in matrix.inputs)
-        self.own = tuple(f"{name}_{families + 1}" if families else name for name in OWN)
-        self._numbers = dict(zip(self.own, (k1, k2, fibre))) | matrix._numbers
-        self.check({name: _all_values(name, number, self.shape_of(name)) for name, number in self._numbers.items()})
-
-    def shape_of(self, name):
-        return {self.own[2]: (3,)}.get(name, () if name in self.own else self.matrix.shape_of(name))
-
-    def unit_of(self, name):
-        return dict(zip(self.own, ("Pa", "-", "-"))).get(name) or self.matrix.unit_of(name)
-
-    def _of_matrix(self, values: dict) -> dict:
-        return {name: values[name] for name in self.matrix.inputs if name in values}
+        families = sum(name.split("_")[0] == "k1" for name in getattr(matrix, "inputs", ()))
+        names = [f"{name}_{families + 1}" if families else name for name in UNITS]
+        self.units, self.shapes = dict(zip(names, UNITS.values())), {names[2]: (3,)}
+        self._surround(matrix, dict(zip(names, (k1, k2, fibre))))
 
     def check(self, values):
-        super().check({name: values[name] for name in self.own if name in values})
-        self.matrix.check(self._of_matrix(values))
+        super().check(values)
         k1, k2, fibre = self.own
         check_range(k1, values[k1], 0, np.inf, True, "a stiffness [Pa]")
         check_range(k2, values[k2], 0, np.inf, False, "an exponent; 1e-6 makes fibres quadratic")
         length = np.linalg.norm(values[fibre], axis=-1)
         check_range(f"length of {fibre}", length, 0, np.inf, False, "a direction needs a length")
 
-    @property
-    def isotropic(self):
-        return self.matrix.isotropic
-
     def lame(self, values):
-        mu, lam = self.matrix.lame(self._of_matrix(values))
+        mu, lam = self.material.lame(self.inner(values))
         return mu + 2 * np.asarray(values[self.own[0]]), lam
 
-    def _joined(self, own: dict, of_matrix: np.ndarray) -> np.ndarray:
-        k1, k2, a = (np.asarray(own[name], np.float64) for name in self.own)
-        parts = [k1[..., None], k2[..., None], a, of_matrix]
-        shape = np.broadcast_shapes(*(part.shape[:-1] for part in parts))
-        return np.concatenate([np.broadcast_to(part, (*shape, part.shape[-1])) for part in parts], -1)
+    def own_coefficients(self, *numbers):
+        k1, k2, a = numbers
+        return [k1, k2, *(a[..., d] for d in range(3))]
 
-    def coefficients(self, values):
-        self.check(values)
-        return self._joined(values, self.matrix.coefficients(self._of_matrix(values)))
+    def own_jvp(self, numbers, changes):
+        return self.own_coefficients(*changes)
 
-    def coefficients_jvp(self, values, tangents):
-        own = {name: np.broadcast_to(tangents.get(name, 0.0), np.shape(values[name])) for name in self.own}
-        return self._joined(own, self.matrix.coefficients_jvp(self._of_matrix(values), self._of_matrix(tangents)))
-
-    def coefficients_vjp(self, values, coefficients_adj):
-        adj = np.asarray(coefficients_adj, np.float64)
-        out = {}
-        for name, part in zip(self.own, (adj[..., 0], adj[..., 1], adj[..., 2:5])):
-            value = np.asarray(values[name])
-            uniform = value.ndim == len(self.shape_of(name))
-            out[name] = part.reshape(-1, *value.shape).sum(0) if uniform else part
-        return out | self.matrix.coefficients_vjp(self._of_matrix(values), adj[..., 5:])
+    def own_vjp(self, numbers, by_columns):
+        return [*by_columns[:2], np.stack(by_columns[2:], -1)]
 
     def law(self, precision):
-        return FibreReinforcedLaw(precision, self.matrix.law(precision))
-
-    def __repr__(self):
-        own = super().__repr__()
-        return f"{own[:-1]}, matrix={self.matrix.name})"
+        return FibreReinforcedLaw(precision, self.material.law(precision))

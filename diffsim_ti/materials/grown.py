@@ -4,9 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from diffsim_ti.materials.around import Around
 from diffsim_ti.materials.calculus.tensor import add_to_diagonal, inner
 from diffsim_ti.materials.law import Law
-from diffsim_ti.materials.material import Material, _all_values, check_range
+from diffsim_ti.materials.material import Material, check_range
 from diffsim_ti.runtime import let, traced
 
 
@@ -71,7 +72,7 @@ class GrownLaw(Law):
         return dP * g, [by_growth, *(square * x for x in products)]
 
 
-class Grown(Material):
+class Grown(Around):
     """`Grown(material, growth)`: any elastic material, free of stress where F = F_g = (1 + growth) I, not where F = I:
 
         psi = det(F_g) psi_material(F F_g^-1) [J/m^3], P = det(F_g) P_material(F F_g^-1) F_g^-T
@@ -85,61 +86,30 @@ class Grown(Material):
     Raises ValueError for growth of -1 or less, and for a material that has a state or depends on the velocity.
     """
 
+    units = {"growth": "-"}
+    takes_moduli = False
+
     def __init__(self, material: Material, growth):
-        if not isinstance(material, Material):
-            raise ValueError(f"Grown: material must be a material such as StableNeoHookean, got {material!r}")
-        law = material.law("f64")
-        if law.state_names or law.reads != ("H",) or "growth" in material.inputs:
-            raise ValueError(
-                f"Grown: {material.name} has a state, a viscosity or a growth; take an elastic one without"
-            )
-        self.material, self._extra = material, ""
-        self._numbers = dict(growth=growth) | material._numbers
-        self.check({name: _all_values(name, number, self.shape_of(name)) for name, number in self._numbers.items()})
-
-    def shape_of(self, name):
-        return () if name == "growth" else self.material.shape_of(name)
-
-    def unit_of(self, name):
-        return "-" if name == "growth" else self.material.unit_of(name)
-
-    def _of_material(self, values: dict) -> dict:
-        return {name: values[name] for name in self.material.inputs if name in values}
+        if "growth" in getattr(material, "inputs", ()):
+            raise ValueError(f"Grown: {material.name} has a growth already; take a material without")
+        self._surround(material, dict(growth=growth))
 
     def check(self, values):
-        super().check({"growth": values["growth"]})
-        self.material.check(self._of_material(values))
+        super().check(values)
         check_range("growth", values["growth"], -1, np.inf, False, "a strain; -1 leaves nothing of the body")
 
-    @property
-    def isotropic(self):
-        return self.material.isotropic
-
     def lame(self, values):
-        mu, lam = self.material.lame(self._of_material(values))
+        mu, lam = self.material.lame(self.inner(values))
         return tuple(part * np.maximum(1 + np.asarray(values["growth"]), 1) for part in (mu, lam))
 
-    def _joined(self, growth, of_material: np.ndarray) -> np.ndarray:
-        growth = np.asarray(growth, np.float64)[..., None]
-        shape = np.broadcast_shapes(growth.shape[:-1], of_material.shape[:-1])
-        return np.concatenate([np.broadcast_to(x, (*shape, x.shape[-1])) for x in (growth, of_material)], -1)
+    def own_coefficients(self, *numbers):
+        return list(numbers)
 
-    def coefficients(self, values):
-        self.check(values)
-        return self._joined(values["growth"], self.material.coefficients(self._of_material(values)))
+    def own_jvp(self, numbers, changes):
+        return changes
 
-    def coefficients_jvp(self, values, tangents):
-        growth = np.broadcast_to(tangents.get("growth", 0.0), np.shape(values["growth"]))
-        own = self.material.coefficients_jvp(self._of_material(values), self._of_material(tangents))
-        return self._joined(growth, own)
-
-    def coefficients_vjp(self, values, coefficients_adj):
-        adj = np.asarray(coefficients_adj, np.float64)
-        by_growth = adj[..., 0] if np.ndim(values["growth"]) else adj[..., 0].sum()
-        return dict(growth=by_growth) | self.material.coefficients_vjp(self._of_material(values), adj[..., 1:])
+    def own_vjp(self, numbers, by_columns):
+        return by_columns
 
     def law(self, precision):
         return GrownLaw(precision, self.material.law(precision))
-
-    def __repr__(self):
-        return f"{super().__repr__()[:-1]}, material={self.material.name})"

@@ -62,10 +62,10 @@ class Ogden(Material):
     def check(self, values):
         super().check(values)
         check_range("bulk_modulus", values["bulk_modulus"], 0, np.inf, False, "a stiffness [Pa]")
-        if values["moduli"].ndim == values["exponents"].ndim or len({np.shape(x)[:-1] for x in values.values()}) < 3:
-            parts = np.broadcast_arrays(values["moduli"], values["exponents"])
+        mu, a = values["moduli"], values["exponents"]
+        if mu.shape == a.shape or 1 in (mu.ndim, a.ndim):  # else of sets, not on a mesh yet
             for k in range(self.terms):
-                stiffness = parts[0][..., k] * parts[1][..., k]
+                stiffness = mu[..., k] * a[..., k]
                 check_range(f"mu_{k + 1} a_{k + 1}", stiffness, 0, np.inf, False, "each term must stiffen the body")
 
     def lame(self, values):

@@ -74,11 +74,11 @@ class Guard:
 
     def advance(self, first: int, last: int, num_passes: int, save_every: int = 0, recording: bool = False) -> None:
         """Passes first .. last - 1, looked after; recording, slot j of the record holds the state before pass j."""
-        stretches = self.ws.solver.schedule.stretches(first, last)
-        for begin, end in stretches:
-            self.ws.substep = float(self.ws.solver.schedule.length(begin))
+        schedule = self.ws.solver.schedule
+        for begin, end in schedule.stretches(first, last):
+            self.ws.substep = float(schedule.length(begin))
             self._advance(begin, end, num_passes, save_every, recording)
-            if len(stretches) > 1 or self.ws.watch.parts:
+            if schedule.varies:
                 self.ws.watch.close(self.ws.substep)
 
     def _advance(self, first: int, last: int, num_passes: int, save_every: int, recording: bool) -> None:

@@ -80,8 +80,8 @@ def element_limit(scene: "Scene", values: dict | None = None) -> StepLimit:
         more += at.largest_omega2(derived.mass, derived.displacement, scene.fixed)
     if scene.mass_scaling:
         mass = np.where(derived.mass > 0, derived.mass, 1.0)
-        rows = row_sums(scene.mesh, mu, lam, scene.volume == "patches") / mass
-        damped = 0.0 if viscous is None else row_sums(scene.mesh, *viscous, False) / mass
+        rows = row_sums(scene, mu, lam, scene.volume == "patches") / mass
+        damped = 0.0 if viscous is None else row_sums(scene, *viscous, False) / mass
         *of_rows, vertex = largest_of(rows, damped)
         if with_damping(*of_rows) < with_damping(omega2, c):
             omega2, c = of_rows

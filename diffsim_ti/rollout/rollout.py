@@ -119,8 +119,7 @@ class Rollout:
     @property
     def schedule(self) -> UnequalSteps | None:
         """The steps, where they are not equal."""
-        schedule = self.solver.schedule
-        return schedule if isinstance(schedule, UnequalSteps) else None
+        return self.solver.schedule if self.solver.schedule.varies else None
 
     @property
     def times(self) -> np.ndarray:

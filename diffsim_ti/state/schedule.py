@@ -9,25 +9,22 @@ Rows may be arrays of any shape; nothing here says that they are three numbers.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import taichi as ti
 from numpy.typing import ArrayLike
 
-from diffsim_ti import runtime
 from diffsim_ti.checked import numbers
-
-INTS = ("row", "next", "force0", "force1", "frame", "counted", "opens")
-FLOATS = (
-    *("begin", "end", "per_step", "h", "pre", "post", "share0", "share1"),
-    *("alpha", "decay", "alpha_by_rate", "decay_by_rate"),
-)
+from diffsim_ti.state.pass_table import FLOATS, INTS
 
 
 class Schedule(ABC):
-    """Steps, each of equal passes; j may be a number or an array of passes, which may end one beyond the last."""
+    """Steps, each of equal passes; j may be a number or an array of passes, which may end one beyond the last.
+
+    varies: whether passes may differ in length.
+    """
+
+    varies = False
 
     @abstractmethod
     def row(self, j):
@@ -232,6 +229,8 @@ class UnequalSteps(Schedule):
     Raises ValueError for lengths that are not > 0, and for substeps that are not whole numbers >= 1.
     """
 
+    varies = True
+
     def __init__(self, lengths: ArrayLike, substeps: ArrayLike = 1):
         lengths, parts = np.atleast_1d(numbers("lengths of steps", lengths)), np.asarray(substeps)
         if lengths.ndim != 1 or not (np.all(np.isfinite(lengths)) and np.all(lengths > 0)):
@@ -293,58 +292,3 @@ class UnequalSteps(Schedule):
         ends = np.flatnonzero(np.abs(np.diff(h)) > 1e-12 * h[1:]) + 1 + first if last > first else []
         bounds = [first, *(int(e) for e in ends), last]
         return [(a, b) for a, b in zip(bounds, bounds[1:]) if a < b]
-
-
-@runtime.traced
-def reversed_pass(now, j, plan) -> runtime.Bundle:
-    """Pass j on the way back, `pre_adj` being what the kick before the state counts: none if the sweep halts at the state
-    (j = plan.halt); with plan.kick the pass is that kick alone."""
-    own, alone = dict(vars(now)), runtime.let(plan.kick > 0)
-    own["pre_adj"] = runtime.let(ti.select(j == plan.halt, 0 * now.pre, now.pre))
-    for name in ("post", "alpha", "alpha_by_rate", "decay_by_rate"):
-        own[name] = runtime.let(ti.select(alone, 0 * own[name], own[name]))
-    own["decay"] = runtime.let(ti.select(alone, 0 * now.decay + 1, now.decay))
-    own["frame"] = runtime.let(ti.select(alone, -1, now.frame))
-    return runtime.Bundle(**own)
-
-
-class PassTable:
-    """Tables of some passes on the device, row after row: `ints` and `floats`; the first row is that of pass `window`."""
-
-    size = 1024  # passes
-
-    def __init__(self, fp):
-        self.ints = runtime.array(ti.i32, self.size * len(INTS))
-        self.floats = runtime.array(fp, self.size * len(FLOATS))
-        self.turns = runtime.array(ti.i32, 2)  # of the loops of a launch
-        runtime.fill(self.turns, 0)
-        self._made, self._shown = {}, None
-
-    def windows(self, first: int, last: int) -> list[tuple[int, int, int]]:
-        """(window, first pass, last pass) of the windows that passes first .. last - 1 lie in."""
-        starts = range(first // self.size * self.size, last, self.size)
-        return [(start, max(first, start), min(last, start + self.size)) for start in starts]
-
-    def show(self, window: int, run: tuple, make: Callable) -> None:
-        """Bring a window's tables, make(first, last), to the device; `run` is what they depend on besides."""
-        if self._shown == (window, run):
-            return
-        if (window, run) not in self._made:
-            if len(self._made) > 8:
-                self._made.pop(next(iter(self._made)))
-            self._made[window, run] = make(window, min(window + self.size, run[0]))
-        self._shown = window, run
-        for target, rows in zip((self.ints, self.floats), self._made[window, run]):
-            whole = np.zeros(target.shape)
-            whole[: rows.size] = rows.ravel()
-            runtime.fill(target, whole)
-
-
-@runtime.traced
-def pass_at(table, k) -> runtime.Bundle:
-    """Row k of the tables in a kernel: what a pass is, by name."""
-    columns = {}
-    for array, names in ((table.ints, INTS), (table.floats, FLOATS)):
-        first = runtime.let(k * len(names))
-        columns |= {name: runtime.let(runtime.at(array, first + c)) for c, name in enumerate(names)}
-    return runtime.Bundle(**columns)

@@ -12,7 +12,7 @@ import taichi as ti
 
 from diffsim_ti.elements.step_numbers import StepNumbers
 from diffsim_ti.runtime import Kernel
-from diffsim_ti.state.schedule import pass_at
+from diffsim_ti.state.pass_table import pass_at
 
 A = ti.template()
 CHAMBERS = dict.fromkeys(("triangles", "own", "chamber", "begins", "anchor"), "ints") | dict(

@@ -10,7 +10,7 @@ import taichi as ti
 
 from diffsim_ti.runtime import Kernel
 from diffsim_ti.solvers.explicit.chamber_kernels import CHAMBERS, NUMBERS, SCENE, TABLE, ChamberKernels
-from diffsim_ti.state.schedule import pass_at
+from diffsim_ti.state.pass_table import pass_at
 
 A = ti.template()
 WEIGHTED = CHAMBERS | dict(weight="scalars")

@@ -9,7 +9,7 @@ from diffsim_ti.runtime import Kernel
 from diffsim_ti.solvers.explicit.face_kernels import FaceKernels
 from diffsim_ti.state.features import Features
 from diffsim_ti.state.numbers import ADJOINT, TANGENT
-from diffsim_ti.state.schedule import pass_at
+from diffsim_ti.state.pass_table import pass_at
 
 A = ti.template()
 # of surface vertices: changes, or adjoints, of e and v; what a part is given; those of u0

@@ -24,7 +24,7 @@ from diffsim_ti.solvers.explicit.face_walls import FaceWalls
 from diffsim_ti.solvers.explicit.guides import GUIDED
 from diffsim_ti.state.features import Features
 from diffsim_ti.state.numbers import SCENE
-from diffsim_ti.state.schedule import pass_at
+from diffsim_ti.state.pass_table import pass_at
 
 A = ti.template()
 FACES = dict.fromkeys(("corners", "own", "parts", "start", "entries", "vertices", "near"), "ints")

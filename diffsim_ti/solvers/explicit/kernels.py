@@ -10,7 +10,7 @@ from diffsim_ti.runtime import Bundle, Kernel, let, traced
 from diffsim_ti.solvers.explicit.further_elements import FurtherElements
 from diffsim_ti.solvers.explicit.kick_drift import KickDrift
 from diffsim_ti.state.numbers import ADJOINT, OF_STEPS, SCENE, TANGENT, with_state
-from diffsim_ti.state.schedule import pass_at, reversed_pass
+from diffsim_ti.state.pass_table import pass_at, reversed_pass
 
 A = ti.template()
 STATE = dict(

@@ -12,7 +12,7 @@ import taichi as ti
 from diffsim_ti.runtime import Bundle, let, traced
 from diffsim_ti.solvers.explicit.guides import Guides
 from diffsim_ti.state.obstacle_functions import ObstacleFunctions
-from diffsim_ti.state.schedule import pass_at
+from diffsim_ti.state.pass_table import pass_at
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
 # what a contact stage notes of obstacle o at vertex i, in state.stage[ROWS o + row, i]: (n, d); (stiffness, width, mu,

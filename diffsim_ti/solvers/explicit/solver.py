@@ -22,7 +22,7 @@ from diffsim_ti.solvers.explicit.felt_faces import FeltFaces, feels_faces
 from diffsim_ti.solvers.explicit.impulse_record import ImpulseRecord
 from diffsim_ti.solvers.explicit.kernels import ExplicitKernels, explicit_kernels
 from diffsim_ti.solvers.solver import Solver
-from diffsim_ti.state.schedule import PassTable
+from diffsim_ti.state.pass_table import PassTable
 from diffsim_ti.state.workspace import Workspace
 from diffsim_ti.terms import SelfContact
 

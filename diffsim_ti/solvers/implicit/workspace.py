@@ -28,7 +28,6 @@ from diffsim_ti.solvers.implicit.pressed import Pressed
 from diffsim_ti.solvers.implicit.stage import Stage
 from diffsim_ti.solvers.implicit.threads import one_blas_thread
 from diffsim_ti.state.arrays import History, copy_slot
-from diffsim_ti.state.schedule import EqualSteps
 from diffsim_ti.state.workspace import Workspace
 
 
@@ -190,7 +189,7 @@ class ImplicitWorkspace(ObstacleWays, Noted, GivenInPasses, Workspace):
 
     def _rounded(self, inertia: np.ndarray) -> np.ndarray:
         """c m, of unequal steps for the nearest power of four of c, so that some preconditioners serve all steps."""
-        if isinstance(self.solver.schedule, EqualSteps) or not inertia.any():
+        if not (self.solver.schedule.varies and inertia.any()):
             return inertia
         c = float(inertia.sum() / diagonal_of(self.mass).sum())
         return inertia * (4.0 ** np.round(0.5 * np.log2(c)) / c)
