@@ -74,3 +74,11 @@ def present(name: str, value) -> None:
     """Something, not None."""
     if value is None:
         raise ValueError(f"{name} must be given, got None")
+
+
+def shape_of(name: str, value) -> tuple:
+    """Shape of what is given as an array, rows of one length."""
+    try:
+        return np.shape(value)
+    except ValueError:
+        raise ValueError(f"{name} must be an array whose rows have one length, got {shown(value)}") from None

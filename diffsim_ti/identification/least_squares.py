@@ -136,8 +136,8 @@ def identify(
     number or {output: number}; or a `Measurement`, or a list of those; for several experiments a list of all that.
     unknowns: {input: start, or Unknown}. prior: {unknown: Normal, Smooth, or a list of them}.
     tolerance: stop when a step promises less than this share of a standard error per unknown. covariance: default up to 20
-    unknowns; costs a tangent run each. callback(report of the iteration, frames of each experiment):
-    return True to stop. progress: print it.
+    unknowns; costs a tangent run each. callback(report of the iteration, frames of each experiment),
+    first of the start as iteration 0: return True to stop. progress: print it.
     resume: a result's `state`, or a path, written after each iteration and gone on from if it is there.
     Numbers that end a run (Divergence, NotConverged, ValueError) shorten the step.
     Raises ValueError for what does not fit, before any run, and what the first run raises.
@@ -153,6 +153,16 @@ def identify(
     state = (json.loads(path.read_text()) if path.exists() else None) if path else resume
     search, dense, start = _Search(problem, priors, state), problem.size <= DENSE, time.perf_counter()
     stopped, converged, rejected = f"stopped after {max_iterations} iterations", False, 0
+
+    def row(promised: float | None = None, why: str | None = None) -> dict:
+        """The report of an iteration, or, without what it promised, of the start."""
+        chi_square = float(search.point.residual @ search.point.residual)
+        own = dict(iteration=len(search.report) + (promised is not None), cost=search.cost, chi_square=chi_square)
+        own |= dict(promised=promised, damping=search.damping, rejected=why, simulations=problem.simulations)
+        return own | dict(seconds=time.perf_counter() - start, numbers=problem.all_numbers(search.point.t).tolist())
+
+    if callback is not None and state is None and callback(row(), search.point.frames) is True:
+        return _result(search, "stopped by the callback", False, dense if covariance is None else covariance)
     while len(search.report) < max_iterations:
         if rejected == 0:
             search.linearize(dense)
@@ -167,26 +177,16 @@ def identify(
         step = search.limited(step)
         why = search.try_step(step)
         rejected = rejected + 1 if why else 0
-        row = dict(
-            iteration=len(search.report) + 1,
-            cost=search.cost,
-            chi_square=float(search.point.residual @ search.point.residual),
-            promised=promised,
-            damping=search.damping,
-            rejected=why,
-            simulations=problem.simulations,
-            seconds=time.perf_counter() - start,
-            numbers=problem.all_numbers(search.point.t).tolist(),
-        )
-        search.report.append(row)
+        done = row(promised, why)
+        search.report.append(done)
         if path:
             temporary = path.with_name(path.name + ".tmp")
             temporary.write_text(json.dumps(search.state))
             temporary.replace(path)
         if progress:
-            shown = ", ".join(f"{label} {x:.5g}" for label, x in list(zip(problem.labels, row["numbers"]))[:4])
-            print(f"{row['iteration']:3d}: chi^2 {row['chi_square']:.5g} of {problem.num_data}, {shown}", flush=True)
-        if callback is not None and callback(row, search.point.frames) is True:
+            shown = ", ".join(f"{label} {x:.5g}" for label, x in list(zip(problem.labels, done["numbers"]))[:4])
+            print(f"{done['iteration']:3d}: chi^2 {done['chi_square']:.5g} of {problem.num_data}, {shown}", flush=True)
+        if callback is not None and callback(done, search.point.frames) is True:
             stopped = "stopped by the callback"
             break
         if rejected > 12:

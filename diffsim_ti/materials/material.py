@@ -285,6 +285,8 @@ def _number(name: str, number, shape: tuple) -> np.ndarray:
     if value.ndim not in (len(shape), len(shape) + 1) or value.shape[value.ndim - len(shape) :] != shape:
         one = f"{shape[0]} numbers or {shape[0]}" if shape else "one number or one"
         raise ValueError(f"{name} must be {one} per tetrahedron, got an array of shape {value.shape}")
+    if not value.size:
+        raise ValueError(f"{name} must be numbers, got an empty array")
     return value.astype(np.float64)
 
 

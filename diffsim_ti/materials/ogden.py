@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from diffsim_ti.checked import shape_of
 from diffsim_ti.differentiation import expm1_minus_x
 from diffsim_ti.materials.calculus.isochoric import isochoric
 from diffsim_ti.materials.calculus.stretches import sum_over_stretches
@@ -50,7 +51,8 @@ class Ogden(Material):
     units = {"exponents": "-"}
 
     def __init__(self, moduli, exponents, bulk_modulus):
-        of_terms = [np.shape(next(iter(x.values())) if isinstance(x, dict) and x else x) for x in (moduli, exponents)]
+        firsts = [next(iter(x.values())) if isinstance(x, dict) and x else x for x in (moduli, exponents)]
+        of_terms = [shape_of(name, x) for name, x in zip(("moduli", "exponents"), firsts)]
         if not all(of_terms) or of_terms[0][-1] != of_terms[1][-1] or not of_terms[0][-1]:
             raise ValueError(
                 f"Ogden: moduli and exponents need one number for each term, got shapes {of_terms[0]} and {of_terms[1]}"

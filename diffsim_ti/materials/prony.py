@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from diffsim_ti.checked import shape_of
 from diffsim_ti.differentiation import exp
 from diffsim_ti.materials.around import Around
 from diffsim_ti.materials.calculus.green import PAIRS, SIX
@@ -152,7 +153,8 @@ class Prony(Around):
     units = {"prony_shares": "-", "prony_times": "s"}
 
     def __init__(self, material: Material, shares, times):
-        of_terms = [np.shape(next(iter(x.values())) if isinstance(x, dict) and x else x) for x in (shares, times)]
+        firsts = [next(iter(x.values())) if isinstance(x, dict) and x else x for x in (shares, times)]
+        of_terms = [shape_of(name, x) for name, x in zip(("shares", "times"), firsts)]
         if not all(of_terms) or of_terms[0][-1] != of_terms[1][-1] or not of_terms[0][-1]:
             raise ValueError(
                 f"Prony: shares and times need one number for each branch, got shapes {of_terms[0]} and {of_terms[1]}"

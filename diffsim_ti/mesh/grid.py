@@ -4,7 +4,7 @@ from itertools import permutations
 
 import numpy as np
 
-from diffsim_ti.checked import numbers
+from diffsim_ti.checked import numbers, shape_of, shown
 
 # Cell corner (a, b, c) in {0, 1}^3. Kuhn: one tetrahedron per order of walking x, y, z from (0,0,0) to (1,1,1); all
 # share that diagonal. Five: a regular tetrahedron on four alternate corners and one at each other corner.
@@ -31,13 +31,16 @@ def _positive(cell: list) -> np.ndarray:
 
 def box(resolution, size, pattern: str, origin) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
     """Vertices, tetrahedra and the six sides of a box; arguments as in `TetrahedralMesh.create_box`."""
-    counts = np.broadcast_to(np.asarray(resolution), (3,))
+    shape = shape_of("resolution", resolution)
+    counts = np.broadcast_to(np.asarray(resolution), (3,)) if shape in ((), (1,), (3,)) else np.zeros(3)
     if counts.dtype.kind not in "iu" or counts.min() < 2:
         raise ValueError(f"resolution counts vertices a side, as 1 or 3 integers of at least 2; got {resolution!r}")
-    lengths, start = (
-        np.broadcast_to(numbers(what, given), (3,)) for what, given in (("size", size), ("origin", origin))
-    )
-    if not (np.all(np.isfinite(lengths)) and np.all(lengths > 0)):
+    lengths, start = numbers("size", size), numbers("origin", origin)
+    for what, given in (("size", lengths), ("origin", start)):
+        if given.shape not in ((), (3,)) or not np.all(np.isfinite(given)):
+            raise ValueError(f"{what} must be finite [m], as 1 or 3 numbers; got {shown(given)}")
+    lengths, start = (np.broadcast_to(given, (3,)) for given in (lengths, start))
+    if not np.all(lengths > 0):
         raise ValueError(f"size must be positive and finite [m], as 1 or 3 numbers; got {size!r}")
     if pattern not in PATTERNS:
         raise ValueError(f"pattern must be one of {', '.join(PATTERNS)}; got {pattern!r}")

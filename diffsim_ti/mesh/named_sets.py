@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.checked import shape_of
 from diffsim_ti.mesh.geometry import triangle_normals
 from diffsim_ti.mesh.sets import checked_sets, chosen_indices, rows_of
 
@@ -55,7 +56,7 @@ class NamedSets:
         count = len(self.surface_triangles)
         if chosen is None:
             return np.arange(count)
-        if not isinstance(chosen, str) and np.ndim(chosen) == 2:
+        if not isinstance(chosen, str) and len(shape_of("surface", chosen)) == 2:
             triangles = np.asarray(chosen)
             if triangles.shape[1] not in (3, self._surface_faces.shape[1]) or triangles.dtype.kind not in "iu":
                 raise ValueError(f"triangles must be vertex indices of shape (k, 3), got shape {triangles.shape}")

@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from diffsim_ti.checked import shape_of
+
 
 def checked_sets(sets: dict | None, count: int, what: str) -> dict[str, np.ndarray]:
     """name -> sorted read-only indices; ValueError for a name that is no name and for indices that do not fit."""
@@ -27,6 +29,7 @@ def chosen_indices(chosen, sets: dict, count: int, what: str) -> np.ndarray:
 
 def indices_of(chosen, count: int, what: str) -> np.ndarray:
     """Sorted unique int64 indices from indices or a Boolean mask of length count; ValueError if they do not fit."""
+    shape_of(what, chosen)
     chosen = np.asarray(chosen)
     if chosen.dtype.kind == "b":
         if chosen.shape != (count,):

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
-from diffsim_ti.checked import instance, listed
+from diffsim_ti.checked import instance, listed, shape_of
 from diffsim_ti.inputs import Derived
 from diffsim_ti.outputs import Change, Displacements, Output, Positions, Velocities
 from diffsim_ti.rollout.checkpoints import Checkpoints
@@ -88,7 +88,7 @@ class Rollout:
     def _stepped(solver: Solver, steps) -> tuple[Solver, int]:
         """The solver that takes these steps, and how many they are."""
         steps = steps(solver) if callable(steps) else steps
-        if np.ndim(steps) == 1 and not isinstance(steps, UnequalSteps):
+        if not isinstance(steps, UnequalSteps) and len(shape_of("steps", steps)) == 1:
             steps = UnequalSteps(steps, solver.substeps)
         if isinstance(steps, UnequalSteps):
             return solver.on(steps), len(steps)

@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.checked import numbers
 from diffsim_ti.inputs import Input
 from diffsim_ti.terms.term import Term
 
@@ -15,7 +16,7 @@ class Gravity(Term):
     """
 
     def __init__(self, acceleration: ArrayLike = (0.0, -9.81, 0.0), name: str | None = None):
-        g = np.array(acceleration, dtype=np.float64)
+        g = numbers("Gravity: acceleration", acceleration)
         if g.shape == ():
             g = np.array([0.0, float(g), 0.0])
         if g.shape != (3,):

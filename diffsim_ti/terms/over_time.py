@@ -5,6 +5,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.checked import shape_of
 from diffsim_ti.inputs import Input
 
 # what holds all the time, one for each step, a function of time [s], or keyframes (times [s], values)
@@ -13,7 +14,7 @@ OverTime = ArrayLike | Callable[[float], ArrayLike] | tuple[ArrayLike, ArrayLike
 
 def is_keyed(given: OverTime) -> bool:
     """Whether a load is given by a function or by keyframes, and so changes within steps."""
-    return callable(given) or (isinstance(given, tuple) and len(given) == 2 and np.ndim(given[0]) == 1)
+    return callable(given) or (isinstance(given, tuple) and len(given) == 2 and len(shape_of("times", given[0])) == 1)
 
 
 def amount(argument: str, given: OverTime, shape: tuple, unit: str, plain: str) -> Input:

@@ -6,7 +6,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import ArrayLike
 
-from diffsim_ti.checked import numbers
+from diffsim_ti.checked import numbers, shape_of
 from diffsim_ti.inputs import POSITIVE, Input
 from diffsim_ti.runtime import traced
 from diffsim_ti.terms.described import extent, place
@@ -84,8 +84,8 @@ class Box(Obstacle):
         rotation: ArrayLike = (0.0, 0.0, 0.0),
         **options,
     ):
-        size = np.broadcast_to(numbers("Box: size", size), (3,)) if np.ndim(size) == 0 else size
-        turn = np.asarray(rotation, np.float64)
+        size = np.broadcast_to(numbers("Box: size", size), (3,)) if shape_of("Box: size", size) == () else size
+        turn = numbers("Box: rotation", rotation)
         if turn.shape != (3,) or not np.all(np.isfinite(turn)):
             raise ValueError(f"Box: rotation must be 3 finite numbers, axis times angle [rad], got {rotation}")
         angle = np.linalg.norm(turn)
