@@ -59,6 +59,7 @@ class Solver(ABC):
                 "displacements only; take SemiImplicitSolver or VelocityVerletSolver"
             )
         self._schedule: UnequalSteps | None = None
+        self._equal, self._equal_steps = None, None  # made once for dt and substeps as they are
         self._tight: stability.StepLimit | None = None
         self._deformed: bool | None = None
         if self.explicit and check_start and not allow_unstable:
@@ -76,7 +77,9 @@ class Solver(ABC):
     @property
     def schedule(self) -> Schedule:
         """Where each pass lies in time."""
-        return self._schedule or EqualSteps(self.dt, self.substeps)
+        if self._schedule is None and self._equal != (self.dt, self.substeps):
+            self._equal, self._equal_steps = (self.dt, self.substeps), EqualSteps(self.dt, self.substeps)
+        return self._schedule or self._equal_steps
 
     def on(self, schedule: UnequalSteps) -> "Solver":
         """The same solver on other steps. Raises ValueError for steps that it cannot take."""

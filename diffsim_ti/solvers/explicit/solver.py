@@ -226,13 +226,13 @@ class ExplicitWorkspace(Workspace):
 
         most: passes that a launch takes. backwards: from the last passes to the first.
         """
-        a, solver = self.arrays, self.solver
+        a, solver, schedule = self.arrays, self.solver, self.solver.schedule
         num_rows = max((len(x) for x in (a.values.path, a.values.motion) if x is not None), default=1)
         # they ask in which step a pass lies
         if num_rows == 1 and (a.features().pressed or a.paths or a.features().forces_keyed):
             given = a.values.forces, a.values.follower, a.values.ties
             num_rows = max(1 + len(x) for x in given if x is not None)
-        run = num_passes, num_rows, save_every, self.rate, solver.schedule
+        run = num_passes, num_rows, save_every, self.rate, schedule
         turn, sizes = -1 if backwards else 1, dict(num_items=a.num_items, num_vertices=a.num_vertices)
         sizes |= dict(contact_damping=solver.contact_damping, num_pressed=a.num_pressed, first_pressed=a.first_pressed)
         sizes |= dict(num_ties=a.num_ties, first_tied=a.first_tied, first_load=a.first_load)
@@ -242,7 +242,7 @@ class ExplicitWorkspace(Workspace):
             chunk = -(-(end - begin) // number)  # launches of one size
             stops = [*range(end, begin, -chunk), begin][::-1] if backwards else [*range(begin, end, chunk), end]
             for start, stop in list(zip(stops, stops[1:]))[::turn]:
-                counted = int(solver.schedule.counted(start, save_every))
+                counted = int(schedule.counted(start, save_every)) if save_every else -1
                 own = dict(counted=counted, window=window, first=start, count=stop - start, times=chunk)
                 yield sizes | own
 
