@@ -158,7 +158,15 @@ def test_products_are_transposes_and_derivatives():
 def test_stopped_and_resumed(swing, tmp_path):
     data, path = tracks(swing.forward(**TRUE), np.random.default_rng(7)), tmp_path / "state.json"
     whole = ds.identify(swing, data, START)
-    part = ds.identify(swing, data, START, callback=lambda row, frames: row["iteration"] == 2, resume=path)
+    seen = []
+
+    def stop(row, frames):
+        seen.append((row["iteration"], *row["numbers"]))
+        return row["iteration"] == 2
+
+    part = ds.identify(swing, data, START, callback=stop, resume=path)
+    assert [k for k, *_ in seen] == [0, 1, 2]
+    np.testing.assert_allclose(seen[0][1:], list(START.values()), rtol=1e-12)  # the start comes first
     assert part.stopped == "stopped by the callback" and len(part.iterations) == 2
     rest = ds.identify(swing, data, START, resume=path)
     assert rest.estimates == whole.estimates and len(rest.iterations) == len(whole.iterations)

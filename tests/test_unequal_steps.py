@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from example_files import example
 from test_gradients import full_scene
 
 import diffsim_ti as ds
@@ -184,6 +185,14 @@ def test_the_search_puts_substeps_where_the_impact_is(solver):
     finer = ds.adaptive_steps(plain, 15, tolerance / 10)
     assert finer.substeps.sum() > 1.5 * steps.substeps.sum()
     assert ds.Rollout(plain, finer).forward().contact_resolution.substep <= 4e-3
+
+
+def test_the_benchmark_of_an_impact(capsys):
+    """One start: a finer tolerance takes more substeps, and the finest gradient is the best of those."""
+    found = example("benchmarks/impact_steps").main(1)["adaptive"]
+    assert "| adaptive |" in capsys.readouterr().out
+    substeps, errors = (np.array(column) for column in zip(*((n, e) for n, e, _ in found)))
+    assert np.all(np.diff(substeps) > 0) and errors[-1] < 0.02 and errors[-1] <= errors.max()
 
 
 def test_a_search_goes_on_where_a_solve_does_not_converge():
