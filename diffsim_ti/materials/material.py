@@ -282,8 +282,7 @@ def _number(name: str, number, shape: tuple) -> np.ndarray:
             raise TypeError
     except (TypeError, ValueError):
         raise ValueError(f"{name} must be a number, an array of numbers or a dict of numbers, got {number!r}") from None
-    per_tetrahedron = value.ndim - len(shape)
-    if not value.size or per_tetrahedron not in (0, 1) or value.shape[per_tetrahedron:] != shape:
+    if not value.size or value.shape not in (shape, (len(np.atleast_1d(value)), *shape)):
         one = f"{shape[0]} numbers or {shape[0]}" if shape else "one number or one"
         raise ValueError(f"{name} must be {one} per tetrahedron, got an array of shape {value.shape}")
     return value.astype(np.float64)

@@ -79,7 +79,7 @@ class Solver(ABC):
         """Where each pass lies in time."""
         if self._schedule is None and self._equal != (self.dt, self.substeps):
             self._equal, self._equal_steps = (self.dt, self.substeps), EqualSteps(self.dt, self.substeps)
-        return self._schedule or self._equal_steps
+        return self._equal_steps if self._schedule is None else self._schedule
 
     def on(self, schedule: UnequalSteps) -> "Solver":
         """The same solver on other steps. Raises ValueError for steps that it cannot take."""
@@ -159,7 +159,7 @@ class Solver(ABC):
     def _refuse_beyond(self, tight: stability.StepLimit) -> None:
         if self.substep > tight.dt:
             what, remedy = "dt / substeps =", f"reduce dt, pass substeps={math.ceil(self.dt / tight.dt / 0.95)}"
-            if self._schedule:
+            if self._schedule is not None:
                 what, remedy = f"of {self._schedule}, the longest:", "shorten the longest steps"
             raise ValueError(
                 f"the substep {what} {self.substep:.4g} s exceeds the stable step {tight}: {remedy}, use an implicit "
