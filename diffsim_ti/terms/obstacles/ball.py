@@ -24,6 +24,7 @@ class SphereForce(ObstacleForce):
     inside: bool = False
 
     count = 4
+    lanes = True
 
     @property
     def hollow(self):
@@ -78,6 +79,7 @@ class CapsuleForce(ObstacleForce):
     """d = |x - nearest point of the segment a b| - radius."""
 
     count = 7
+    lanes = True
     convex = True
 
     @traced

@@ -48,6 +48,7 @@ class GroundForce(ObstacleForce):
     """Compile-time twin of Ground; the force is written out, since only one component of it is not zero."""
 
     count = 1
+    lanes = True
     hollow = True
 
     @traced

@@ -17,6 +17,7 @@ class HalfSpaceForce(ObstacleForce):
     """d = n . (x - point), n the normal made unit."""
 
     count = 6
+    lanes = True
     hollow = True
 
     @traced

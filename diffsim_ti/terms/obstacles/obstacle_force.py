@@ -28,6 +28,7 @@ class ObstacleForce(VertexForce):
     # what its distance says of a face between the face's corners: at least the least of theirs (hollow), that it lies on
     # one side of each tangent plane (convex), or neither
     hollow, convex = False, False
+    lanes = False  # whether `distance_and_normal` also takes numbers in lanes
     grain = 0.0  # parts of a face that are smaller [m] need not be told apart
 
     @property

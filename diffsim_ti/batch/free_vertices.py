@@ -1,0 +1,304 @@
+"""Vertices at which nothing acts but tetrahedra, gravity, given forces and drag, of eight scenes at once.
+
+What happens there is what explicit/kick_drift.py says; an obstacle that none of the eight comes near in a pass does nothing
+in it. Vectors are lists of three numbers in lanes here.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import taichi as ti
+
+from diffsim_ti.runtime import LANES, PRECISIONS, Bundle, assign, at, let, traced
+from diffsim_ti.solvers.explicit.given_forces import GivenForces
+from diffsim_ti.state.features import Features
+
+A = ti.template()
+FREE, NEAR, SPECIAL = range(3)  # vertices: as above; if obstacles are far; never
+MARGIN = 1.01  # of an obstacle's width, and of a move towards it, so that rounding decides nothing
+
+
+@traced
+class Numbers:
+    """Numbers of eight scenes: `array[k]` is number k of each, in lanes."""
+
+    _data_oriented = True
+
+    def __init__(self, array, first):
+        self._array, self._first = array, first
+
+    def __getitem__(self, k):
+        return at(self._array, self._first + k)
+
+
+@dataclass(frozen=True)
+class FreeVertices:
+    """Functions of vertex i of block b; s: the slot of its state."""
+
+    law: object
+    features: Features
+    own: frozenset
+
+    @property
+    def fp(self):
+        return PRECISIONS[self.law.precision]
+
+    @cached_property
+    def lanes(self):
+        return ti.types.vector(LANES, self.fp)
+
+    @cached_property
+    def given(self) -> GivenForces:
+        return GivenForces(self.features, self.law.precision)
+
+    @property
+    def some_special(self) -> bool:
+        """Whether something else may act at a vertex."""
+        return bool(self.features.groups) or self.features.motion or self.features.guided
+
+    # ---- reading and writing -----------------------------------------------------------------------------------------
+
+    @traced
+    def first_of(self, i, b, plan):
+        return let(3 * (b * plan.num_vertices + i))
+
+    @traced
+    def read(self, array, *place):
+        *slot, first = place
+        return [let(at(array, *slot, first + d)) for d in range(3)]
+
+    @traced
+    def write(self, array, numbers, *place):
+        *slot, first = place
+        for d, number in enumerate(numbers):
+            assign(at(array, *slot, first + d), number)
+
+    @traced
+    def add(self, array, numbers, *place):
+        self.write(array, [let(a + b) for a, b in zip(self.read(array, *place), numbers)], *place)
+
+    @traced
+    def add_number(self, array, number, *place):
+        target = at(array, *place)
+        assign(target, target + number)
+
+    @ti.func
+    def clear(self, b, i, corner: A, plan: A):
+        first = 3 * (b * plan.num_vertices + i)
+        for d in ti.static(range(3)):
+            corner[first + d] = self.lanes(0)
+
+    @traced
+    def inverse_mass(self, i, b, scene, plan):
+        return let(at(scene.inverse_mass, b * plan.num_vertices + i if "inverse_mass" in self.own else i))
+
+    @traced
+    def moves(self, inverse):
+        """Whether a vertex has a mass: 1 or 0 for all eight."""
+        one = at(inverse, 0) if "inverse_mass" in self.own else inverse
+        return let(ti.select(one > 0, ti.cast(1, self.fp), ti.cast(0, self.fp)))
+
+    @traced
+    def gravity(self, b, parameters, plan):
+        first = let(b * plan.num_parameters + self.features.gravity)
+        return self.read(parameters, first)
+
+    # ---- forces given on vertices --------------------------------------------------------------------------------------
+
+    @traced
+    def force_at(self, rows, row, place, share):
+        """share of the force in a row."""
+        return [let(share * x) for x in self.read(rows, row, place)]
+
+    @traced
+    def load_terms(self, i, b, now, scene, plan) -> list:
+        """(row, place, weight) of the rows of forces that vertex i takes; a weight of zero where it takes none."""
+        F, k = self.features, let(at(scene.force_slot, i))
+        loaded = let(ti.select(k >= 0, ti.cast(1, self.fp), ti.cast(0, self.fp)))
+        first, width = let(b * plan.num_loaded), (2 if F.forces_keyed else 1)
+        place = let(3 * (first + width * ti.max(k, 0)))
+        if F.forces_keyed:
+            out = []
+            for step, weight in ((now.force0, now.share0), (now.force1, now.share1)):
+                row, share = (step if F.forces_per_step else 0), ti.select(step == now.row, now.begin, ti.cast(1, self.fp))
+                share, weight = let(share), let(weight * loaded)
+                out += [(row, place, let(weight * (1 - share))), (row, let(place + 3), let(weight * share))]
+            return out
+        if F.forces_per_step:
+            return [(now.force0, place, let(now.share0 * loaded)), (now.force1, place, let(now.share1 * loaded))]
+        return [(0, place, loaded)]
+
+    @traced
+    def load(self, i, b, now, scene, forces, plan) -> list:
+        out = None
+        for row, place, weight in self.load_terms(i, b, now, scene, plan):
+            force = self.force_at(forces, row, place, weight)
+            out = force if out is None else [let(x + y) for x, y in zip(out, force)]
+        return out
+
+    # ---- forward -------------------------------------------------------------------------------------------------------
+
+    @traced
+    def moved(self, i, b, s, now, scene, state, plan):
+        """What a pass makes of vertex i: u, v before, f, v_mid, u_next, v_next."""
+        first, F = self.first_of(i, b, plan), self.features
+        u, v, f = self.read(state.u, s, first), self.read(state.v, s, first), self.read(scene.corner, first)
+        if F.forces:
+            f = [let(x + y) for x, y in zip(f, self.load(i, b, now, scene, scene.forces, plan))]
+        inverse = self.inverse_mass(i, b, scene, plan)
+        a = [let(inverse * x) for x in f]
+        if F.gravity >= 0:
+            moves = self.moves(inverse)
+            a = [let(x + moves * g) for x, g in zip(a, self.gravity(b, scene.parameters, plan))]
+        v_mid = [let(x + now.pre * y) for x, y in zip(v, a)]
+        v_plus = [let(x + now.post * y) for x, y in zip(v_mid, a)]
+        u_next = [let(x + now.alpha * y) for x, y in zip(u, v_plus)]
+        v_next = [let(now.decay * x) for x in v_plus]
+        return Bundle(first=first, u=u, f=f, v_mid=v_mid, u_next=u_next, v_next=v_next)
+
+    @ti.func
+    def step(self, i, b, s, now: A, scene: A, state: A, plan: A):
+        """Do the pass and return 1, or do nothing and return 0 if something else acts."""
+        moved, calm = self.moved(i, b, s, now, scene, state, plan), 1
+        if ti.static(self.some_special):
+            kind = scene.special[i]
+            if kind == SPECIAL:
+                calm = 0
+            if ti.static(len(self.lane_groups) > 0):
+                if kind == NEAR:
+                    if self.hits(i, b, moved, now, scene, plan) > 0:
+                        calm = 0
+        if calm == 1:
+            if now.frame >= 0:
+                self.write(state.frames_u, moved.u, now.frame, moved.first)
+                self.write(state.frames_v, moved.v_mid, now.frame, moved.first)
+            if plan.stride > 0:
+                self.write(state.f, moved.f, s, moved.first)
+            self.write(state.u, moved.u_next, s + plan.stride, moved.first)
+            self.write(state.v, moved.v_next, s + plan.stride, moved.first)
+        return calm
+
+    # ---- obstacles -----------------------------------------------------------------------------------------------------
+
+    @property
+    def lane_groups(self) -> tuple:
+        """Obstacles whose distance can be told in lanes; none if one cannot."""
+        staged = self.features.staged
+        return staged if len(staged) == len(self.features.groups) and all(g.force.lanes for g in staged) else ()
+
+    @ti.func
+    def hits(self, i, b, moved: A, now: A, scene: A, plan: A):
+        """In how many scenes an obstacle may be felt or noted in the pass."""
+        count = ti.cast(0, self.fp)
+        for g in ti.static(self.lane_groups):
+            for k in range(g.count):
+                count += self.hits_of(g, k, i, b, moved, now, scene, plan)
+        return count
+
+    @traced
+    def hits_of(self, g, k, i, b, moved, now, scene, plan):
+        first, parameters = let(g.first + k * g.size), Numbers(scene.parameters, let(b * plan.num_parameters))
+        X = self.rest(i, b, scene, plan)
+        move = [let(x - y) for x, y in zip(moved.u_next, moved.u)]
+        if g.path >= 0:
+            column = let(3 * (b * self.features.moving + g.path + k))
+            start, end = (self.read(scene.path, row, column) for row in (now.row, now.next))
+            gone = [let(y - x) for x, y in zip(start, end)]
+            X = [let(x - (y + now.begin * z)) for x, y, z in zip(X, start, gone)]
+            move = [let(x - (now.end - now.begin) * y) for x, y in zip(move, gone)]
+        X = [let(self.lanes(*[x] * LANES)) if not x.is_tensor() else x for x in X]
+        d, width = g.force.record(parameters, first, X, moved.u)[3].value, let(g.force.width(parameters, first))
+        far = let(d - MARGIN * width)
+        square = let(MARGIN * MARGIN * (move[0] * move[0] + move[1] * move[1] + move[2] * move[2]))
+        out = ti.cast(0, self.fp)
+        for lane in range(LANES):
+            f, m = let(at(far, lane)), let(at(square, lane))
+            out = out + ti.select(f < 0, ti.cast(1, self.fp), ti.select(m >= f * f, ti.cast(1, self.fp), ti.cast(0, self.fp)))
+        return let(out)
+
+    @traced
+    def rest(self, i, b, scene, plan):
+        if "rest" in self.own:
+            return self.read(scene.rest, self.first_of(i, b, plan))
+        whole = let(at(scene.rest, i))
+        return [let(at(whole, d)) for d in range(3)]
+
+    # ---- tangent -------------------------------------------------------------------------------------------------------
+
+    @traced
+    def step_jvp(self, i, b, s, now, scene, state, tangent, plan):
+        first, F, n = self.first_of(i, b, plan), self.features, let(b * plan.num_vertices + i)
+        du, dv, df = self.read(tangent.u, 0, first), self.read(tangent.v, 0, first), self.read(scene.corner, first)
+        if F.forces:
+            df = [let(x + y) for x, y in zip(df, self.load(i, b, now, scene, tangent.forces, plan))]
+        inverse, f = self.inverse_mass(i, b, scene, plan), self.read(state.f, s, first)
+        by_mass = let(inverse * at(tangent.mass, n))
+        da = [let(inverse * (x - by_mass * y)) for x, y in zip(df, f)]
+        if F.gravity >= 0:
+            moves = self.moves(inverse)
+            da = [let(x + moves * g) for x, g in zip(da, self.gravity(b, tangent.parameters, plan))]
+        dv_mid = [let(x + now.pre * y) for x, y in zip(dv, da)]
+        dv_plus = [let(x + now.post * y) for x, y in zip(dv_mid, da)]
+        du_next = [let(x + now.alpha * y) for x, y in zip(du, dv_plus)]
+        dv_next = [let(now.decay * y) for y in dv_plus]
+        if F.drag >= 0:
+            rate = let(at(tangent.rate, b))
+            v_plus = [let(x / now.decay) for x in self.read(state.v, let(s + 1), first)]
+            du_next = [let(x + now.alpha_by_rate * rate * y) for x, y in zip(du_next, v_plus)]
+            dv_next = [let(x + now.decay_by_rate * rate * y) for x, y in zip(dv_next, v_plus)]
+        self.note_frame(now, tangent, du, dv_mid, first)
+        self.write(tangent.u, du_next, 0, first)
+        self.write(tangent.v, dv_next, 0, first)
+
+    @ti.func
+    def note_frame(self, now: A, record: A, u: A, v: A, first):
+        if now.frame >= 0:
+            self.write(record.frames_u, u, now.frame, first)
+            self.write(record.frames_v, v, now.frame, first)
+
+    # ---- adjoint -------------------------------------------------------------------------------------------------------
+
+    @ti.func
+    def add_frame(self, now: A, p: A, v: A, adjoint: A, first):
+        """Add the adjoints of the frame that the pass shows."""
+        if now.frame >= 0:
+            self.add_to(p, adjoint.frames_u, now.frame, first)
+            self.add_to(v, adjoint.frames_v, now.frame, first)
+
+    @traced
+    def add_to(self, numbers, array, *place):
+        for number, more in zip(numbers, self.read(array, *place)):
+            assign(number, number + more)
+
+    @traced
+    def dot(self, x, y):
+        return let(x[0] * y[0] + x[1] * y[1] + x[2] * y[2])
+
+    @traced
+    def step_vjp(self, i, b, s, now, scene, state, adjoint, plan):
+        first, F, n = self.first_of(i, b, plan), self.features, let(b * plan.num_vertices + i)
+        p = [let(x + y) for x, y in zip(self.read(adjoint.u, 0, first), self.read(adjoint.corner, first))]
+        q = self.read(adjoint.v, 0, first)
+        v_plus_adj = [let(now.alpha * x + now.decay * y) for x, y in zip(p, q)]
+        if F.drag >= 0:
+            v_plus = [let(x / now.decay) for x in self.read(state.v, let(s + 1), first)]
+            by_rate = now.alpha_by_rate * self.dot(p, v_plus) + now.decay_by_rate * self.dot(q, v_plus)
+            self.add_number(adjoint.sums, let(by_rate), F.drag, n)
+        v_mid_adj = [let(x) for x in v_plus_adj]
+        self.add_frame(now, p, v_mid_adj, adjoint, first)
+        a_adj = [let(now.post * x + now.pre_adj * y) for x, y in zip(v_plus_adj, v_mid_adj)]
+        inverse = self.inverse_mass(i, b, scene, plan)
+        f_adj = [let(inverse * x) for x in a_adj]
+        if F.density:
+            by_mass = let(inverse * self.dot(f_adj, self.read(state.f, s, first)))
+            self.add_number(adjoint.sums, let(0 - by_mass), F.sums().first("mass"), n)
+        if F.gravity >= 0:
+            moves = self.moves(inverse)
+            for d in range(3):
+                self.add_number(adjoint.sums, let(moves * a_adj[d]), F.gravity + d, n)
+        if F.forces:
+            for row, place, weight in self.load_terms(i, b, now, scene, plan):
+                self.add(adjoint.forces, [let(weight * x) for x in f_adj], row, place)
+        self.write(adjoint.u, p, 0, first)
+        self.write(adjoint.v, v_mid_adj, 0, first)
+        self.write(adjoint.w, f_adj, 0, first)

@@ -1,0 +1,185 @@
+"""One scene of a batch as Taichi functions of a single scene see it, and the tetrahedra of eight scenes at once.
+
+Numbers that scenes have of their own lie in lanes: element b n + k of an array of vectors of eight holds number k of the
+scenes 8 b .. 8 b + 7, of which each has n. Vectors of vertices are three such numbers. What all scenes share lies as it
+does for one scene.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import taichi as ti
+from taichi.lang.expr import Expr
+
+from diffsim_ti.elements.items import Items
+from diffsim_ti.elements.tetrahedron import Tetrahedron
+from diffsim_ti.runtime import LANES, assign, at, let, traced
+
+A = ti.template()  # an array or Bundle handed to a Taichi function
+
+
+class Place(Expr):
+    """A vector of a kernel whose components lie apart; assigning to it writes them."""
+
+    def __init__(self, components, vector, zero):
+        super().__init__(vector(*components, zero))
+        self._components = components
+
+    def _assign(self, value):
+        for d, component in enumerate(self._components):
+            assign(component, at(value, d))
+
+
+@traced
+class View:
+    """Numbers of one scene: `array[k]`, or `array[slot, k]` of an array of slots.
+
+    first: where those of its block begin.
+    """
+
+    _data_oriented = True  # Taichi hands it on as it is
+
+    def __init__(self, array, first, lane):
+        self._array, self._first, self._lane = array, first, lane
+
+    def _number(self, index, k):
+        return at(at(self._array, *index, self._first + k), self._lane)
+
+    def __getitem__(self, index):
+        *slot, k = index if isinstance(index, tuple) else (index,)
+        return self._number(slot, k)
+
+
+@traced
+class Vectors(View):
+    """Vectors of one scene, with a fourth component of zero."""
+
+    def __init__(self, array, first, lane, vector, zero):
+        super().__init__(array, first, lane)
+        self._vector, self._zero = vector, zero
+
+    def __getitem__(self, index):
+        *slot, i = index if isinstance(index, tuple) else (index,)
+        first = let(3 * i)
+        return Place([self._number(slot, first + d) for d in range(3)], self._vector, self._zero)
+
+
+@traced
+class Scratch:
+    """What is noted of one vertex while it is worked on: `array[row, i]` for any i, in a column of its block."""
+
+    _data_oriented = True
+
+    def __init__(self, array, b):
+        self._array, self._b = array, b
+
+    def __getitem__(self, index):
+        return at(self._array, index[0], self._b) if isinstance(index, tuple) else at(self._array, self._b)
+
+
+@traced
+class Item:
+    """Tetrahedron e of block b; `vertices` and `tetrahedra` are where the block's vectors and tetrahedra begin."""
+
+    _data_oriented = True
+
+    def __init__(self, e, b, vertices, tetrahedra):
+        self.e, self.b, self.vertices, self.tetrahedra = e, b, vertices, tetrahedra
+
+
+@dataclass(frozen=True)
+class Scenes(Items):
+    """Tetrahedra of eight scenes at once; own: names of arrays of which each scene has its own."""
+
+    @cached_property
+    def lanes(self):
+        return ti.types.vector(LANES, self.fp)
+
+    def broadcast(self, number):
+        return let(self.lanes(*[number] * LANES))
+
+    def numbers(self, array, first: int, count: int, rows: int, item):
+        if isinstance(array, Shared):
+            return [self.broadcast(let(at(array.array, rows * item.e + first + k))) for k in range(count)]
+        if isinstance(array, Uniform):
+            return [let(at(array.array, rows * item.b + first + k)) for k in range(count)]
+        return [let(at(array, rows * (item.tetrahedra + item.e) + first + k)) for k in range(count)]
+
+    def row(self, array, slot, first: int, count: int, rows: int, item):
+        return [let(at(array, slot, rows * (item.tetrahedra + item.e) + first + k)) for k in range(count)]
+
+    def put_row(self, array, slot, first: int, rows: int, item, numbers):
+        for k, number in enumerate(numbers):
+            assign(at(array, slot, rows * (item.tetrahedra + item.e) + first + k), number)
+
+    def places(self, tets, item):
+        """Where the vector of each node begins."""
+        return [let(item.vertices + 3 * at(tets, self.nodes * item.e + a)) for a in range(self.nodes)]
+
+    def corners(self, vectors, slot, tets, item):
+        return [[let(at(vectors, slot, place + d)) for d in range(3)] for place in self.places(tets, item)]
+
+    def store(self, corner, item, forces, zero, add: bool = False):
+        """Straight to the nodes: no other thread works on these scenes."""
+        for place, force in zip(self.places(corner.tets, item), forces):
+            for d in range(3):
+                target = at(corner.array, place + d)
+                assign(target, target + force[d])
+
+    def put(self, array, rows: int, item, first, numbers):
+        for k, number in enumerate(numbers):
+            assign(at(array, rows * (item.tetrahedra + item.e) + first + k), number)
+
+    def add(self, array, rows: int, item, numbers, first: int = 0):
+        for k, number in enumerate(numbers):
+            target = at(array, rows * (item.tetrahedra + item.e) + first + k)
+            assign(target, target + number)
+
+
+@traced
+class Shared:
+    """Numbers of tetrahedra that all scenes share."""
+
+    _data_oriented = True
+
+    def __init__(self, array):
+        self.array = array
+
+
+@traced
+class Uniform:
+    """Numbers of which each scene has one set for all tetrahedra."""
+
+    _data_oriented = True
+
+    def __init__(self, array):
+        self.array = array
+
+
+@traced
+class Corners:
+    """Forces at the nodes, and which nodes a tetrahedron has."""
+
+    _data_oriented = True
+
+    def __init__(self, array, tets):
+        self.array, self.tets = array, tets
+
+
+@dataclass(frozen=True)
+class TetrahedronOfScenes(Tetrahedron):
+    """Functions of one tetrahedron of eight scenes."""
+
+    @cached_property
+    def items(self) -> Scenes:
+        return Scenes(self.fp, self.nodes.count)
+
+    @traced
+    def coefficients_of(self, item, array) -> list:
+        K = len(self.law.coefficient_names)
+        return self.items.numbers(array, 0, K, K, item)
+
+    @ti.func
+    def gather(self, i, scene: A, corner: A):
+        """What the tetrahedra have added at vertex i."""
+        return corner[i]
