@@ -1,1 +1,5 @@
 """Many scenes at once."""
+
+from diffsim_ti.batch.batch import Batch, BatchFrames
+
+__all__ = ["Batch", "BatchFrames"]

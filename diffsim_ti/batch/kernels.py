@@ -209,8 +209,8 @@ class BatchKernels:
                     for lane in range(LANES):
                         own, at_ = self.scene_of(b, lane, scene, plan), self.state_of(b, lane, state, plan)
                         change = self.change_of(b, lane, tangent, plan)
-                        rate = Bundle(**vars(plan), rate_dot=tangent.rate[b][lane])
-                        self.vertex.step_jvp(i, plan.first, self.one(now, lane), own, at_, change, rate)
+                        rated = self.rated(b, lane, tangent, plan)
+                        self.vertex.step_jvp(i, plan.first, self.one(now, lane), own, at_, change, rated)
             self.free.clear(b, i, scene.corner, plan)
 
     @traced
@@ -218,6 +218,11 @@ class BatchKernels:
         """Changes of what functions of tetrahedra read."""
         coefficients = Uniform(tangent.coefficients) if self.features.uniform else tangent.coefficients
         return Bundle(coefficients=coefficients, gradients=tangent.gradients, volumes=tangent.volumes)
+
+    @traced
+    def rated(self, b, lane, tangent, plan):
+        """The numbers of a kernel with the change of a scene's drag rate."""
+        return Bundle(**vars(plan), rate_dot=let(at(at(tangent.rate, b), lane)))
 
     @ti.func
     def was_calm(self, s, b, i, state: A, plan: A):

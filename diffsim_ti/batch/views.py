@@ -66,15 +66,20 @@ class Vectors(View):
 
 @traced
 class Scratch:
-    """What is noted of one vertex while it is worked on: `array[row, i]` for any i, in a column of its block."""
+    """What is noted of one vertex while it is worked on: `array[row, i]` for any i, in a column of its block.
+
+    Columns lie APART from each other, so that threads do not wait for each other's cache lines.
+    """
+
+    APART = 16
 
     _data_oriented = True
 
     def __init__(self, array, b):
-        self._array, self._b = array, b
+        self._array, self._column = array, let(b * self.APART)
 
     def __getitem__(self, index):
-        return at(self._array, index[0], self._b) if isinstance(index, tuple) else at(self._array, self._b)
+        return at(self._array, *([index[0]] if isinstance(index, tuple) else []), self._column)
 
 
 @traced

@@ -220,6 +220,11 @@ class Rollout:
         change = self._pushed_to_frames(frames, tangents)
         return {name: output.jvp(frames, change) for name, output in self.outputs.items()}
 
+    def changes_of(self, frames: Frames, positions: np.ndarray, velocities: np.ndarray, tangents: dict) -> dict:
+        """Changes of all outputs from those of the frames' states and of inputs."""
+        change = Change(positions, velocities, tangents)
+        return {name: output.jvp(frames, change) for name, output in self.outputs.items()}
+
     def _pushed_to_frames(self, frames: Frames, tangents: dict) -> Change:
         unknown = [name for name in tangents if name not in self.inputs]
         if unknown:

@@ -104,6 +104,23 @@ class Sweep:
         """Whether the reverse sweep stops before it comes to the start."""
         return self.truncate is not None and self.truncate < self.steps
 
+    # ---- what a sweep of many scenes makes in another way (batch/sweep.py) --------------------------------------------
+
+    def _derive(self, values: dict):
+        return self.scene.inputs.derive(values)
+
+    def _make_workspace(self, derived):
+        return self.solver.workspace(derived)
+
+    def _make_guard(self):
+        return Guard(self.workspace)
+
+    def _make_adjoint(self, density: bool, shape: bool):
+        return self.solver.adjoint(self.workspace, density, shape)
+
+    def _make_tangent(self, change):
+        return self.solver.tangent(self.workspace, change)
+
     # ---- forward ----------------------------------------------------------------------------------------------------
 
     def run(self, values: dict, start: Callable | None = None) -> Run:
@@ -142,14 +159,14 @@ class Sweep:
         if self._loaded is not None and all(values[name] is self._loaded[name] for name in values):
             self.workspace.restart()
         else:
-            derived, self._loaded = self.scene.inputs.derive(values), None
+            derived, self._loaded = self._derive(values), None
             if self.workspace is None:
-                self.workspace = self.solver.workspace(derived)
+                self.workspace = self._make_workspace(derived)
                 self.workspace.make_frames(self.num_frames)
                 if self.contacts:
                     self.workspace.record_contacts()
                 self._snapshots = self.workspace.history(self.checkpoints.snapshots)
-                self._guard = Guard(self.workspace)
+                self._guard = self._make_guard()
             else:
                 self.workspace.load(derived)
             self._loaded = values
@@ -195,7 +212,7 @@ class Sweep:
         current = self._current
         self._load(run)
         ws, checkpoints = self.workspace, self.checkpoints
-        tangent = self.solver.tangent(ws, change)
+        tangent = self._make_tangent(change)
         for k in range(checkpoints.num_segments):
             first, last = checkpoints.bounds(k)
             self._record(first, last)
@@ -233,7 +250,7 @@ class Sweep:
         if self._adjoint is None or not self._adjoint.fits(ws):
             shape = "rest_positions" in self.wanted
             density = shape or "density" in self.wanted  # the rest shape makes masses
-            self._adjoint = self.solver.adjoint(ws, density, shape)
+            self._adjoint = self._make_adjoint(density, shape)
         norms = seed.put(self._adjoint, self.solver.last_frame_is_state)
         if self.contacts:
             self._adjoint.seed_contacts(seed.contact_forces, self.frame_time)

@@ -162,11 +162,12 @@ class ContactWatch:
         """The same, worked out when it is asked for: most runs never are."""
         values, largest = self.ws.arrays.values, limits(self.ws.solver)
         parts = [*self.parts, (self.rows(), self.ws.substep)]
-        return lambda: worst([self._resolution(rows, values, h, largest) for rows, h in parts])
+        return lambda: worst([self.resolution_of(rows, values, h, largest) for rows, h in parts])
 
-    def _resolution(
+    def resolution_of(
         self, rows: np.ndarray, values: Derived, h: float, largest: tuple[float, float]
     ) -> ContactResolution:
+        """What such rows say, of passes of length h [s]."""
         if not self.contacts:
             return ContactResolution(0.0, 0.0, 0.0, float("inf"), None, None, h, *largest)
         rows = rows.astype(np.float64)

@@ -1,0 +1,290 @@
+"""Many scenes of one mesh, law and list of terms, whose numbers differ: forward, gradients and tangents at once."""
+
+import warnings
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from diffsim_ti.batch.sweep import LanesSweep, Own, value_of
+from diffsim_ti.batch.workspace import why_not
+from diffsim_ti.checked import whole
+from diffsim_ti.inputs.description import frozen
+from diffsim_ti.outputs import Output
+from diffsim_ti.rollout.frames import Frames, check_finite
+from diffsim_ti.rollout.rollout import Rollout
+from diffsim_ti.rollout.run import Run
+from diffsim_ti.solvers.solver import Solver
+from diffsim_ti.state.watch import ContactResolution
+
+
+class BatchFrames(Sequence):
+    """Saved states of many scenes: positions [m], velocities [m/s], displacements [m], (scenes, frames, n, 3).
+
+    `frames[b]` are those of scene b (`Frames`), `frames["name"]` any output of all scenes, (scenes, ...). alive: (scenes,),
+    whether the scene came to its end; the frames of one that did not hold its last good state from there on, and
+    `error(b)` is what a run of it alone raises. `contact_resolution`: one for each scene.
+    """
+
+    def __init__(self, batch: "Batch", values: dict, frames: list[Frames], last_good: np.ndarray, run: Run | None):
+        self._batch, self.values, self._frames, self.run = batch, values, frames, run
+        self.positions = np.stack([one.positions for one in frames])
+        self.velocities = np.stack([one.velocities for one in frames])
+        self.displacements = np.stack([one.displacements for one in frames])
+        self.times, self.last_good = frames[0].times, last_good
+        self.alive = last_good == len(self.times) - 1
+        self.outputs = {name: np.stack([one.outputs[name] for one in frames]) for name in frames[0].outputs}
+        self._errors: dict[int, Exception] = {}
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def __getitem__(self, key):
+        if isinstance(key, str):
+            known = dict(positions=self.positions, velocities=self.velocities, displacements=self.displacements)
+            known |= self.outputs
+            if key not in known:
+                raise KeyError(f"no output named {key!r}; there are {', '.join(known)}")
+            return known[key]
+        return self._frames[key]
+
+    @property
+    def contact_resolution(self) -> list[ContactResolution]:
+        """How near each scene came to obstacles, and how finely the substeps resolve that."""
+        return [one.contact_resolution for one in self._frames]
+
+    def error(self, b: int) -> Exception | None:
+        """What stopped scene b: the error of a run of it alone; None if it lives."""
+        if self.alive[b]:
+            return None
+        if b not in self._errors:
+            self._errors[b] = self._batch._error_alone(self, b)
+        return self._errors[b]
+
+
+class Batch:
+    """`scenes` runs of a solver's scene at once, with numbers of their own where they are given with a leading axis.
+
+    solver, steps, save_every, outputs, gradients, truncate, memory: as of `Rollout`; memory is that of all scenes.
+    scenes: how many, >= 1.
+    lanes: None, eight scenes at once in the lanes of vector units where the scene allows it, else one after the other;
+    True: ValueError, which says why, where it does not; False: one after the other. `lanes` then says which it is, and
+    `why_not` what keeps the scene from lanes.
+
+    Every input of `forward` is given once for all scenes, in a shape that `Rollout.forward` takes, or with one more axis of
+    length `scenes` in front. Gradients and tangents of inputs that were given once have their shape, gradients being summed
+    over scenes in their order; of others they have the leading axis. At equal steps the states of a scene are, bit for bit,
+    those of a `Rollout` of it alone, whatever its neighbours, its place among them and the number of threads.
+
+    Scenes fail alone (`BatchFrames.alive`): the gradient of one that did is zero, with a warning. In lanes a failure is a state
+    that is not finite, or a vertex behind an obstacle; gains of energy that a `Rollout` warns of are not looked for.
+
+    Freeman et al. 2021, Brax (leading axes of scenes), arXiv:2106.13281.
+    Raises ValueError for shapes that fit neither, or both, saying which there are.
+    """
+
+    def __init__(
+        self,
+        solver: Solver,
+        steps,
+        scenes: int,
+        save_every: int | None = None,
+        outputs: Output | Iterable[Output] = (),
+        gradients: str | Iterable[str] | None = None,
+        truncate: int | None = None,
+        memory: float | None = None,
+        lanes: bool | None = None,
+    ):
+        self.num_scenes = whole("scenes", scenes)
+        options = dict(save_every=save_every, gradients=gradients, truncate=truncate, memory=memory)
+        self.one = Rollout(solver, steps, outputs=outputs, **options)
+        self.solver, self.scene, self.inputs, self.wanted = self.one.solver, self.one.scene, self.one.inputs, self.one.wanted
+        self.steps, self.save_every, self.num_frames = self.one.steps, self.one.save_every, self.one.num_frames
+        self.why_not = why_not(self.solver) or ("an output reads forces of contact" if self.one.sweep.noted else None)
+        if lanes and self.why_not:
+            raise ValueError(f"scenes cannot be computed in lanes: {self.why_not}; leave out lanes=True")
+        self.lanes = self.why_not is None if lanes is None else bool(lanes)
+        self.sweep = LanesSweep(self.solver, self.steps, self.num_scenes, **options) if self.lanes else None
+
+    @property
+    def outputs(self) -> dict[str, Output]:
+        """What a loss may name, of one scene."""
+        return self.one.outputs
+
+    # ---- inputs ------------------------------------------------------------------------------------------------------
+
+    def _values(self, given: dict) -> dict:
+        """All values of a run: what was given, checked, and the scene's own."""
+        inputs, out = self.scene.inputs, dict(self.one.sweep.values)
+        unknown = [name for name in given if name not in self.inputs]
+        if unknown:
+            raise ValueError(f"no input named {unknown[0]!r}; this batch has {', '.join(self.inputs)}")
+        for name, value in given.items():
+            if self._is_own(name, value := np.asarray(value, np.float64)):
+                rows = [frozen(row) for row in value.copy()]
+                out[name] = Own(inputs.check({name: row})[name] for row in rows)
+            else:
+                known = out[name]
+                same = value.shape == known.shape and np.array_equal(value, known)
+                out[name] = known if same else inputs.check({name: value.copy()})[name]
+            for row in out[name] if isinstance(out[name], Own) else (out[name],):
+                inputs.check_steps({name: row}, self.steps)
+        return out
+
+    def _is_own(self, name: str, value: np.ndarray) -> bool:
+        """Whether a value has the axis of scenes in front."""
+        described, sizes, B = self.scene.inputs.described[name], self.scene.inputs.sizes, self.num_scenes
+        shared = described.fits(value.shape, sizes)
+        own = value.ndim > 0 and len(value) == B and described.fits(value.shape[1:], sizes)
+        if shared and own:
+            raise ValueError(
+                f"{name}: shape {value.shape} may be one value for all scenes or one for each of {B}: give the leading axis "
+                f"also if all scenes share it, as np.broadcast_to(x, ({B}, *x.shape))"
+            )
+        if not shared and not own:
+            raise ValueError(
+                f"{name}: expected {described.expected(sizes)}, or the same behind an axis of {B} scenes, got {value.shape}"
+            )
+        return own
+
+    # ---- forward -----------------------------------------------------------------------------------------------------
+
+    def forward(self, raise_errors: bool = False, **inputs: ArrayLike) -> BatchFrames:
+        """Run all scenes, with some inputs replaced. raise_errors: raise what stopped the first one that died."""
+        values = self._values(inputs)
+        run = (self._in_lanes if self.lanes else self._by_turns)(values)
+        dead = np.flatnonzero(~run.alive)
+        if raise_errors and dead.size:
+            raise run.error(int(dead[0]))
+        return run
+
+    def _in_lanes(self, values: dict) -> BatchFrames:
+        run, times = self.sweep.run(values), self.one.times
+        u, v = self.sweep.states()
+        with np.errstate(all="ignore"):
+            good = np.isfinite(u.sum((2, 3))) & np.isfinite(v.sum((2, 3)))
+        for b, step in self.sweep.crossed().items():
+            good[b, step // self.save_every + 1 :] = False
+        good[:, 0] = True
+        last_good = np.where(good.all(1), self.num_frames, np.argmin(good, 1)) - 1
+        for b in np.flatnonzero(last_good < self.num_frames - 1):
+            u[b, last_good[b] + 1 :], v[b, last_good[b] + 1 :] = u[b, last_good[b]], v[b, last_good[b]]
+        resolutions = self.sweep.resolutions() if self.scene.obstacles else [None] * self.num_scenes
+        frames = [self._frames_of(values, b, u[b], v[b], times, resolutions[b]) for b in range(self.num_scenes)]
+        return BatchFrames(self, values, frames, last_good, run)
+
+    def _frames_of(self, values: dict, b: int, u, v, times, resolution) -> Frames:
+        own = self.sweep.values_of(values, b)
+        positions = (own["rest_positions"] + u).astype(u.dtype)
+        frames = Frames(positions, v, u, times, own, resolution, run=Run(own))
+        frames.computed, frames.steps = self.one.computed, np.arange(self.num_frames) * self.save_every
+        for name, output in self.one.computed.items():
+            frames.outputs[name] = np.asarray(output.value(frames))
+        return frames
+
+    def _by_turns(self, values: dict) -> BatchFrames:
+        frames, errors = [], {}
+        for b in range(self.num_scenes):
+            own = {name: value_of(value, b) for name, value in values.items()}
+            try:
+                frames.append(self.one.forward(**own))
+            except FloatingPointError as error:
+                errors[b] = error
+                frames.append(self._stopped(own, error))
+        last_good = np.full(self.num_scenes, self.num_frames - 1)
+        for b, error in errors.items():
+            last_good[b] = max(0, getattr(error, "step", 0)) // self.save_every
+        out = BatchFrames(self, values, frames, last_good, None)
+        out._errors = errors
+        return out
+
+    def _stopped(self, values: dict, error: Exception) -> Frames:
+        """Frames of a scene that died, its last good state from there on."""
+        raise error
+
+    def _error_alone(self, frames: BatchFrames, b: int) -> Exception:
+        try:
+            self.one.forward(**{name: value_of(value, b) for name, value in frames.values.items()})
+        except FloatingPointError as error:
+            return error
+        step = int(frames.last_good[b]) * self.save_every
+        return FloatingPointError(f"scene {b}: its state is not finite after step {step}, though alone it runs through")
+
+    # ---- gradients ---------------------------------------------------------------------------------------------------
+
+    def vjp(
+        self, frames: BatchFrames, positions: ArrayLike | None = None, velocities: ArrayLike | None = None, **seeds
+    ) -> dict[str, np.ndarray]:
+        """Gradients of a loss by every wanted input, from its gradients by outputs of all scenes, (scenes, ...)."""
+        seeds = {"positions": positions, "velocities": velocities} | seeds
+        given = {name: np.asarray(x) for name, x in seeds.items() if x is not None}
+        for name, x in given.items():
+            if name not in self.outputs:
+                raise ValueError(f"no output named {name!r}; this batch has {', '.join(self.outputs)}")
+            shape = (self.num_scenes, *self.outputs[name].shape(self.num_frames))
+            if x.shape != shape:
+                raise ValueError(f"gradient by the frames' {name}: expected shape {shape}, got {x.shape}")
+            check_finite(name, x[frames.alive], self.save_every)
+        dead = np.flatnonzero(~frames.alive)
+        if dead.size:
+            warnings.warn(f"scenes {dead.tolist()} did not come to their end: their gradients are zero", stacklevel=2)
+        one_by_one = self._vjp_in_lanes if self.lanes else self._vjp_by_turns
+        return self._joined(frames.values, one_by_one(frames, given))
+
+    def _vjp_in_lanes(self, frames: BatchFrames, given: dict) -> list[dict | None]:
+        zero = np.zeros((self.num_frames, self.scene.mesh.num_vertices, 3))
+        changes, by_u, by_v = {}, [], []
+        for b in range(self.num_scenes):
+            if frames.alive[b]:
+                change = changes[b] = self.one.pulled_to_frames(frames[b], {name: x[b] for name, x in given.items()})
+            parts = (change.positions, change.velocities) if frames.alive[b] else (None, None)
+            for target, part in zip((by_u, by_v), parts):
+                target.append(zero if part is None else part)
+        derived = self.sweep.pull_back(frames.run, np.stack(by_u), np.stack(by_v))
+        return [
+            self.one.gradients_of(frames[b].run, derived[b], changes[b]) if frames.alive[b] else None
+            for b in range(self.num_scenes)
+        ]
+
+    def _vjp_by_turns(self, frames: BatchFrames, given: dict) -> list[dict | None]:
+        return [
+            self.one.vjp(frames[b], **{name: x[b] for name, x in given.items()}) if frames.alive[b] else None
+            for b in range(self.num_scenes)
+        ]
+
+    def _joined(self, values: dict, gradients: list[dict | None]) -> dict[str, np.ndarray]:
+        """Those of each scene where it had a value of its own, else their sum in the order of scenes."""
+        out = {}
+        for name in self.wanted:
+            rows = [
+                np.zeros_like(value_of(values[name], b)) if own is None else own[name] for b, own in enumerate(gradients)
+            ]
+            out[name] = np.stack(rows) if isinstance(values[name], Own) else sum(rows[1:], rows[0])
+        return out
+
+    # ---- tangents ----------------------------------------------------------------------------------------------------
+
+    def tangents(self, frames: BatchFrames, **tangents: ArrayLike) -> dict[str, np.ndarray]:
+        """Changes of all outputs, (scenes, ...), for changes of inputs, to first order, float64."""
+        unknown = [name for name in tangents if name not in self.inputs]
+        if unknown:
+            raise ValueError(f"tangents: no input named {unknown[0]!r}; this batch has {', '.join(self.inputs)}")
+        own = [
+            {name: self._row(name, x, frames.values[name], b) for name, x in tangents.items()}
+            for b in range(self.num_scenes)
+        ]
+        if not self.lanes:
+            rows = [self.one.tangents(frames[b], **own[b]) for b in range(self.num_scenes)]
+        else:
+            inputs = self.scene.inputs
+            derived = [inputs.derive_jvp(frames[b].inputs, own[b]) for b in range(self.num_scenes)]
+            du, dv = self.sweep.push_forward(frames.run, derived)
+            rows = [self.one.changes_of(frames[b], du[b], dv[b], own[b]) for b in range(self.num_scenes)]
+        return {name: np.stack([row[name] for row in rows]) for name in self.outputs}
+
+    def _row(self, name: str, tangent, value, b: int) -> np.ndarray:
+        """The change of scene b's value: that of the shared one, or its own."""
+        tangent, shape = np.asarray(tangent, np.float64), np.shape(value_of(value, b))
+        if isinstance(value, Own) or tangent.shape == (self.num_scenes, *shape):
+            return np.broadcast_to(tangent, (self.num_scenes, *shape))[b]
+        return np.broadcast_to(tangent, shape)

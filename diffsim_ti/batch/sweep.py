@@ -1,0 +1,125 @@
+"""n steps of many scenes in lanes: forward, in reverse from kept states, and in tangents."""
+
+import numpy as np
+
+from diffsim_ti import runtime
+from diffsim_ti.batch.adjoint import LanesAdjoint, LanesTangent
+from diffsim_ti.batch.lanes import vectors
+from diffsim_ti.batch.workspace import LanesWorkspace
+from diffsim_ti.inputs import Derived
+from diffsim_ti.rollout.checkpoints import choose_checkpoints
+from diffsim_ti.rollout.run import Run
+from diffsim_ti.rollout.sweep import Sweep
+from diffsim_ti.state.watch import ContactResolution, ContactWatch, limits
+
+
+class Own(tuple):
+    """The values of an input, one array for each scene."""
+
+
+def value_of(value, b: int) -> np.ndarray:
+    """What scene b has of it."""
+    return value[b] if isinstance(value, Own) else value
+
+
+class FrameByFrame:
+    """Takes scenes from frame to frame and notes when one of them gets onto or behind an obstacle."""
+
+    def __init__(self, workspace: LanesWorkspace):
+        self.ws = workspace
+        self.restart()
+
+    def restart(self) -> None:
+        self.crossed: dict[int, int] = {}  # {scene: pass before which it was seen}
+
+    def advance(self, first: int, last: int, num_passes: int, save_every: int = 0, recording: bool = False) -> None:
+        ws, contacts = self.ws, bool(self.ws.arrays.contacts)
+        if recording:
+            ws.save(ws.record, first)
+        while first < last:
+            stop = last
+            if contacts:
+                schedule = ws.solver.schedule
+                step = int(schedule.row(first))
+                stop = min(last, int(schedule.first((step // max(save_every, 1) + 1) * max(save_every, 1))))
+                stop = max(stop, first + 1)
+            ws.advance(first, stop, num_passes, save_every, 0 if recording else None)
+            if contacts:
+                gaps = ws.seen()[:, ::3].min((1, 2))
+                for b in np.flatnonzero(gaps <= 0):
+                    self.crossed.setdefault(int(b), first)
+            first = stop
+        if recording:
+            ws.restore(ws.record, last)
+
+
+class LanesSweep(Sweep):
+    """Runs of many scenes; values are arrays that all share, or `Own`."""
+
+    def __init__(self, solver, steps: int, num_scenes: int, memory: float | None = None, **options):
+        super().__init__(solver, steps, memory=memory, **options)
+        self.num_scenes = num_scenes
+        held = runtime.LANES * -(-num_scenes // runtime.LANES) / 4 * 3  # vectors of three, of whole blocks
+        self.checkpoints = choose_checkpoints(self.num_passes, int(self.state_bytes * held), None, memory)
+
+    def values_of(self, values: dict, b: int) -> dict:
+        """The values of scene b."""
+        return {name: value_of(value, b) for name, value in values.items()}
+
+    def _checked(self, values: dict) -> dict:
+        return values
+
+    def _derive(self, values: dict) -> list[Derived]:
+        return [self.scene.inputs.derive(self.values_of(values, b)) for b in range(self.num_scenes)]
+
+    def _make_workspace(self, derived):
+        return LanesWorkspace(self.solver, derived)
+
+    def _make_guard(self):
+        return FrameByFrame(self.workspace)
+
+    def _make_adjoint(self, density: bool, shape: bool):
+        return LanesAdjoint(self.workspace, density, shape)
+
+    def _make_tangent(self, change):
+        return LanesTangent(self.workspace, change)
+
+    def run(self, values: dict, start=None) -> Run:
+        """Run from values that are complete and checked."""
+        run = Run(values, start, self.first_step)
+        self._forward(run)
+        return run
+
+    def states(self) -> tuple[np.ndarray, np.ndarray]:
+        """Displacements and velocities of the frames of the last run, (scenes, frames, n, 3)."""
+        frames = self.workspace.frames
+        return vectors(frames.frames_u, self.num_scenes), vectors(frames.frames_v, self.num_scenes)
+
+    def crossed(self) -> dict[int, int]:
+        """{scene: the step in which it got behind an obstacle}"""
+        return {b: int(self.solver.schedule.row(j)) for b, j in self._guard.crossed.items()}
+
+    def resolutions(self) -> list[ContactResolution]:
+        """What contacts of each scene did in the last run."""
+        ws, seen = self.workspace, self.workspace.seen()
+        watch, largest = ContactWatch(ws), limits(self.solver)
+        return [watch.resolution_of(rows, d, ws.substep, largest) for rows, d in zip(seen, ws.derived)]
+
+    def pull_back(self, run: Run, positions_adj: np.ndarray, velocities_adj: np.ndarray) -> list[Derived]:
+        """Adjoints of what kernels read at the start of each scene's run, from those of the frames."""
+        self.bring_back(run)
+        self._seed = positions_adj, velocities_adj
+        self._reverse(self, False)
+        out = self._adjoint.collect(not self.truncates)
+        for derived in out if self.truncates else ():
+            derived.displacement[:], derived.velocity[:] = 0, 0
+        return out
+
+    def put(self, adjoint: LanesAdjoint, last_frame_is_state: bool) -> tuple[float, float]:
+        """Set the adjoint to the seed."""
+        adjoint.start(*self._seed, last_frame_is_state)
+        return 0.0, 0.0
+
+    def push_forward(self, run: Run, change: list[Derived]) -> tuple[np.ndarray, np.ndarray]:
+        du, dv = super().push_forward(run, change)
+        return du + np.stack([d.rest for d in change])[:, None], dv

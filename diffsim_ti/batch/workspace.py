@@ -1,0 +1,294 @@
+"""A run of many scenes in lanes: their numbers and states on the device, and the launches that take them on."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import taichi as ti
+
+from diffsim_ti import runtime
+from diffsim_ti.batch.free_vertices import NEAR, SPECIAL
+from diffsim_ti.batch.kernels import SHARED, BatchKernels, batch_kernels
+from diffsim_ti.batch.lanes import LanesHistory, in_slots, num_blocks, pack, unpack
+from diffsim_ti.batch.views import Scratch
+from diffsim_ti.inputs import Derived
+from diffsim_ti.solvers.explicit.contact_stage import ROWS
+from diffsim_ti.solvers.explicit.felt_faces import feels_faces
+from diffsim_ti.state.arrays import SceneArrays
+from diffsim_ti.state.pass_table import FLOATS, INTS, PassTable
+from diffsim_ti.state.solve_report import SolveReport
+from diffsim_ti.terms import SelfContact
+
+SPREAD = 1024  # items of a loop at least, for Taichi keeps fewer on one thread
+
+
+def why_not(solver) -> str | None:
+    """What keeps scenes of a solver from being computed in lanes, or None if nothing does."""
+    scene = solver.scene
+    if not solver.explicit:
+        return "the solver is not explicit"
+    if not runtime.runs_on_cpu():
+        return "lanes are for CPUs"
+    if not scene.law.lanes:
+        return f"the law of {type(scene.material).__name__} does not come in lanes"
+    if scene.law.state_names or scene.law.reads != ("H",):
+        return f"{type(scene.material).__name__} depends on more than the deformation"
+    if scene.volume != "tetrahedra":
+        return f"volume = {scene.volume!r}"
+    if scene.mesh.order != 1:
+        return "elements have ten nodes"
+    terms = dict(self_contact=scene.term(SelfContact), pressures=scene.pressures, chambers=scene.chambers)
+    terms |= dict(springs_or_cables=scene.ties, foundations=len(scene.founded_vertices))
+    terms |= dict(contact_within_faces=feels_faces(scene), mesh_obstacles=_tables(scene))
+    terms |= dict(unequal_steps=solver.schedule.varies)
+    there = [name.replace("_", " ") for name, some in terms.items() if some]
+    return f"it has {' and '.join(there)}" if there else None
+
+
+def _tables(scene) -> bool:
+    return any(term.table.size for term in scene.ordered_terms if term.acts_on_surface)
+
+
+class ScenesTable(PassTable):
+    """Tables of passes; where scenes have drag of their own, `floats` are those of one scene after the other in lanes."""
+
+    def __init__(self, fp, own: bool, blocks: int):
+        super().__init__(fp)
+        self.own, self._numbers = own, None
+        if own:
+            self.floats = runtime.array(ti.types.vector(runtime.LANES, fp), blocks * self.size * len(FLOATS))
+
+    def show_scenes(self, window: int, run: tuple, rates: tuple, make: Callable) -> None:
+        """As `show`, for the drag rates of all scenes [1/s]."""
+        if not self.own:
+            self.show(window, (*run, rates[0]), lambda first, last: make(first, last, rates[0]))
+        elif self._numbers != (window, run, rates):
+            self._numbers = window, run, rates
+            tables = [make(window, min(window + self.size, run[0]), rate) for rate in rates]
+            ints = np.zeros(self.size * len(INTS))
+            ints[: tables[0][0].size] = tables[0][0].ravel()
+            floats = np.zeros((len(rates), self.size * len(FLOATS)))
+            for row, (_, numbers) in zip(floats, tables):
+                row[: numbers.size] = numbers.ravel()
+            runtime.fill(self.ints, ints)
+            runtime.fill(self.floats, pack(floats))
+
+
+class LanesWorkspace:
+    """Scenes of one mesh, law and list of terms, eight in the lanes of a block; numbers may differ from scene to scene."""
+
+    first_step = 0
+
+    def __init__(self, solver, derived: list[Derived]):
+        self.solver, self.scene, self.report = solver, solver.scene, SolveReport()
+        self.num_scenes, self.num_blocks = len(derived), num_blocks(len(derived))
+        self.arrays = SceneArrays(self.scene, solver.stages_contact, False, True)
+        self.lanes, self.fp, self.substep = self.arrays.lanes, self.arrays.fp, solver.substep
+        self.num_rows = self.num_blocks * self.arrays.num_vertices
+        self.numbers, self.frames, self.record, self._launches = None, None, None, {}
+        self.load(derived, start=False)
+        self.state = LanesHistory(self, 1)
+        contacts = len(self.arrays.contacts)
+        rows = self.num_rows if contacts else 1
+        self.met = SimpleNamespace(
+            seen=runtime.array(self.lanes, 3 * contacts, rows),
+            stage=runtime.array(self.arrays.vector, ROWS * contacts, Scratch.APART * self.num_blocks),
+            work=runtime.array(self.fp, Scratch.APART * self.num_blocks),
+        )
+        self.restart()
+
+    # ---- the scenes' numbers -----------------------------------------------------------------------------------------
+
+    def load(self, derived: list[Derived], start: bool = True) -> None:
+        """Bring the scenes' numbers to the device and, with `start`, set their start."""
+        a, self.derived = self.arrays, derived
+        first = derived[0]
+        if any(d.coefficients.ndim != first.coefficients.ndim for d in derived):
+            m = a.num_tetrahedra
+            derived = [
+                replace(d, coefficients=np.broadcast_to(d.coefficients, (m, d.coefficients.shape[-1]))) for d in derived
+            ]
+        if first.forces is not None:
+            most = max(derived, key=lambda d: len(d.forces))
+            first = replace(derived[0], forces=most.forces)
+        else:
+            first = derived[0]
+        a.load(first)
+        own = {name for name in ("gradients", "volumes", "rest", "surface") if _differ(derived, name)}
+        own |= {"gradients", "volumes"} if own & {"gradients", "volumes"} else set()
+        own |= {"inverse_mass"} if _differ(derived, "mass") else set()
+        self.rates = tuple(self._rate(d) for d in derived)
+        own |= {"table"} if len(set(self.rates)) > 1 else set()
+        self.own, self.kernels_of_run = frozenset(own), None
+        sources = self._sources(derived)
+        if self.numbers is None:
+            self.numbers = SimpleNamespace(corner=runtime.array(self.lanes, 3 * self.num_rows))
+            runtime.fill(self.numbers.corner, 0)
+        for name, (data, dtype) in sources.items():
+            current = getattr(self.numbers, name, None)
+            if current is None or runtime.full_shape(current) != self._shape(data, dtype):
+                setattr(self.numbers, name, runtime.upload(data, dtype))
+                self._launches.clear()
+            else:
+                runtime.fill(current, data)
+        if getattr(self, "table", None) is None or self.table.own != ("table" in own):
+            self.table = ScenesTable(self.fp, "table" in own, self.num_blocks)
+            self._launches.clear()
+        if start:
+            self.restart()
+
+    @staticmethod
+    def _shape(data: np.ndarray, dtype) -> tuple:
+        if isinstance(dtype, type(ti.f32)):
+            return data.shape
+        return (*data.shape[:-1], *dtype.get_shape())
+
+    def _rate(self, derived: Derived) -> float:
+        at = self.arrays.features().drag
+        return float(derived.parameters[at]) if at >= 0 else 0.0
+
+    def _sources(self, derived: list[Derived]) -> dict:
+        """{name: (data, element type)} of what kernels read of the scenes."""
+        a, own, first = self.arrays, self.own, derived[0]
+        numbers = [np.concatenate([d.parameters, a.tables]) for d in derived]
+        out = dict(
+            tets=(a.mesh.elements.ravel(), ti.i32),
+            special=(self._special(), ti.i32),
+            coefficients=(pack(np.stack([d.coefficients.ravel() for d in derived])), self.lanes),
+            parameters=(pack(np.stack(numbers)), self.lanes),
+        )
+        self.num_parameters = len(numbers[0])
+        if a.features().guided:
+            out["guide_slot"], out["guides"] = (runtime.fetch(a.guide_slot), ti.i32), (runtime.fetch(a.guides), a.vector)
+        out["force_slot"] = runtime.fetch(a.force_slot), ti.i32
+        out["motion_slot"] = runtime.fetch(a.motion_slot), ti.i32
+        each = dict(
+            gradients=[d.gradients for d in derived],
+            volumes=[d.volumes for d in derived],
+            inverse_mass=[a._inverse_mass(d.mass) for d in (derived if "inverse_mass" in own else derived[:1])],
+            rest=[d.rest for d in derived],
+            surface=[np.zeros(1) if d.surface is None else d.surface for d in derived],
+        )
+        for name, arrays in each.items():
+            if name in own:
+                out[name] = pack(np.stack([x.ravel() for x in arrays])), self.lanes
+            else:
+                plain = SHARED[name] == "scalars"
+                out[name] = (arrays[0].ravel(), self.fp) if plain else (arrays[0], a.vector)
+        none = np.zeros((1, 1, 3))
+        anchors = [d.displacement[a.held] if d.motion is not None else none[0] for d in derived]
+        out["anchor"] = pack(np.stack([x.ravel() for x in anchors])), self.lanes
+        self.counts = {}
+        for name in ("forces", "motion", "path"):
+            rows = [none if getattr(d, name) is None else getattr(d, name) for d in derived]
+            out[name], self.counts[name] = (pack(in_slots(rows)), self.lanes), rows[0].shape[1]
+        self.num_step_rows = max((len(x) for x in (first.path, first.motion) if x is not None), default=1)
+        if self.num_step_rows == 1 and (a.features().forces_keyed or a.features().moving):
+            self.num_step_rows = max(1 + len(d.forces) for d in derived if d.forces is not None)
+        return out
+
+    def _special(self) -> np.ndarray:
+        a, features = self.arrays, self.arrays.features()
+        out = np.zeros(a.num_vertices, np.int32)
+        if features.groups:
+            free = batch_kernels(a.law, features, frozenset()).free
+            out[a.mesh.surface_vertices] = NEAR if free.lane_groups else SPECIAL
+        if features.motion:
+            out[a.held] = SPECIAL
+        if features.guided:
+            out[self.scene.supports.guided] = SPECIAL
+        return out
+
+    @property
+    def some_special(self) -> bool:
+        return self.kernels(self.arrays.features()).free.some_special
+
+    def kernels(self, features) -> BatchKernels:
+        return batch_kernels(self.arrays.law, features, self.own)
+
+    # ---- states ------------------------------------------------------------------------------------------------------
+
+    def history(self, num_slots: int) -> LanesHistory:
+        return LanesHistory(self, num_slots)
+
+    def restart(self) -> None:
+        """Set the states to the start."""
+        for target, name in ((self.state.u, "displacement"), (self.state.v, "velocity")):
+            starts = np.stack([getattr(d, name).ravel() for d in self.derived])
+            runtime.fill(target, pack(starts)[None])
+        seen = np.zeros(runtime.full_shape(self.met.seen))
+        seen[::3] = np.inf
+        runtime.fill(self.met.seen, seen)
+
+    def make_frames(self, count: int) -> None:
+        self.frames = self.room_for_frames(count)
+        self._launches.clear()
+
+    def room_for_frames(self, count: int) -> SimpleNamespace:
+        u, v = (runtime.array(self.lanes, count, 3 * self.num_rows) for _ in range(2))
+        return SimpleNamespace(frames_u=u, frames_v=v)
+
+    def make_record(self, num_slots: int) -> LanesHistory:
+        if self.record is None or self.record.num_slots < num_slots:
+            self.record = LanesHistory(self, num_slots, record=True)
+            self._launches.clear()
+        return self.record
+
+    def restore_to_record(self) -> None:
+        self.save(self.record, 0)
+
+    def save(self, target: LanesHistory, slot: int) -> None:
+        self.state.copy(0, target, slot)
+
+    def restore(self, source: LanesHistory, slot: int) -> None:
+        source.copy(slot, self.state, 0)
+
+    def save_frame(self, frame: int) -> None:
+        from diffsim_ti.state.arrays import copy_slot
+
+        copy_slot(self.state.u, 0, self.frames.frames_u, frame)
+        copy_slot(self.state.v, 0, self.frames.frames_v, frame)
+
+    def seen(self) -> np.ndarray:
+        """What each scene's contacts did: (scenes, 3 contacts, vertices), as in state/watch.py."""
+        return unpack(runtime.fetch(self.met.seen), self.num_scenes)
+
+    # ---- launches ----------------------------------------------------------------------------------------------------
+
+    def bound(self, kernel, **records) -> Callable:
+        parts = [part for record in records.values() for part in (record if type(record) is tuple else (record,))]
+        key = (kernel, *map(id, parts))
+        if key not in self._launches:
+            self._launches[key] = kernel.bind(True, scene=self.numbers, table=self.table, **records), parts
+        return self._launches[key][0]
+
+    def launches(self, first: int, last: int, num_passes: int, save_every: int, backwards: bool = False) -> Iterator:
+        """Numbers of the launches that passes first .. last - 1 take, for each of which their table is shown."""
+        a, solver, schedule = self.arrays, self.solver, self.solver.schedule
+        spread = max(1, -(-SPREAD // self.num_blocks))
+        sizes = dict(num_tetrahedra=a.num_tetrahedra, num_vertices=a.num_vertices, num_blocks=self.num_blocks, spread=spread)
+        sizes |= dict(num_loaded=self.counts["forces"], num_held=self.counts["motion"])
+        sizes |= dict(num_parameters=self.num_parameters, num_passes_shown=self.table.size)
+        sizes |= dict(contact_damping=solver.contact_damping)
+        run, turn = (num_passes, self.num_step_rows, save_every, schedule), -1 if backwards else 1
+        most = max(1, 16_000_000 // (a.num_tetrahedra * runtime.LANES * self.num_blocks))
+        for window, begin, end in self.table.windows(first, last)[::turn]:
+            self.table.show_scenes(window, run, self.rates, lambda f, l, rate: solver.pass_table(f, l, *run[:3], rate))
+            stops = [*range(end, begin, -most), begin][::-1] if backwards else [*range(begin, end, most), end]
+            for start, stop in list(zip(stops, stops[1:]))[::turn]:
+                yield sizes | dict(window=window, first=start, count=stop - start)
+
+    def advance(self, first: int, last: int, num_passes: int, save_every: int = 0, base: int | None = None) -> None:
+        """Passes first .. last - 1 from the current states; or recorded: slot j - base holds those before pass j."""
+        recording = base is not None
+        history, stride, base = self.record if recording else self.state, int(recording), base or 0
+        launch = self.bound(self.kernels(self.arrays.features()).step, state=(history, self.frames, self.met))
+        for numbers in self.launches(first, last, num_passes, save_every):
+            launch(**numbers, base=base, stride=stride)
+
+
+def _differ(derived: list[Derived], name: str) -> bool:
+    """Whether scenes have this of their own."""
+    one = getattr(derived[0], name)
+    return any(getattr(d, name) is not one for d in derived[1:])
