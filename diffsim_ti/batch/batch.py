@@ -169,7 +169,7 @@ class Batch:
         last_good = np.where(good.all(1), self.num_frames, np.argmin(good, 1)) - 1
         for b in np.flatnonzero(last_good < self.num_frames - 1):
             u[b, last_good[b] + 1 :], v[b, last_good[b] + 1 :] = u[b, last_good[b]], v[b, last_good[b]]
-        resolutions = self.sweep.resolutions() if self.scene.obstacles else [None] * self.num_scenes
+        resolutions = self.sweep.resolutions()
         frames = [self._frames_of(values, b, u[b], v[b], times, resolutions[b]) for b in range(self.num_scenes)]
         return BatchFrames(self, values, frames, last_good, run)
 
@@ -190,17 +190,27 @@ class Batch:
                 frames.append(self.one.forward(**own))
             except FloatingPointError as error:
                 errors[b] = error
-                frames.append(self._stopped(own, error))
-        last_good = np.full(self.num_scenes, self.num_frames - 1)
-        for b, error in errors.items():
-            last_good[b] = max(0, getattr(error, "step", 0)) // self.save_every
+                frames.append(self._stopped(own, self._last_good(error)))
+        last_good = np.array([self._last_good(errors.get(b)) for b in range(self.num_scenes)])
         out = BatchFrames(self, values, frames, last_good, None)
         out._errors = errors
         return out
 
-    def _stopped(self, values: dict, error: Exception) -> Frames:
-        """Frames of a scene that died, its last good state from there on."""
-        raise error
+    def _last_good(self, error: Exception | None) -> int:
+        """The last frame before an error."""
+        return self.num_frames - 1 if error is None else max(0, getattr(error, "step", 0)) // self.save_every
+
+    def _stopped(self, values: dict, last: int) -> Frames:
+        """Frames of a scene that died after frame `last`, whose state it holds from there on."""
+        until = Rollout(self.solver, last * self.save_every, save_every=self.save_every if last else None)
+        good = until.forward(**{name: x for name, x in values.items() if name in until.inputs})
+        rows = np.minimum(np.arange(self.num_frames), last)
+        states = good.positions[rows], good.velocities[rows], good.displacements[rows]
+        frames = Frames(*states, self.one.times, values, good.contact_resolution, run=good.run)
+        frames.computed, frames.steps = self.one.computed, np.arange(self.num_frames) * self.save_every
+        for name, output in self.one.computed.items():
+            frames.outputs[name] = np.asarray(output.value(frames))
+        return frames
 
     def _error_alone(self, frames: BatchFrames, b: int) -> Exception:
         try:

@@ -153,7 +153,7 @@ class BatchKernels:
         """A pass as one of the scenes has it."""
         if "table" not in self.own:
             return now
-        return Bundle(**{n: let(at(x, lane)) if x.is_tensor() else x for n, x in vars(now).items()})
+        return Bundle(**{n: let(at(x, lane)) if _in_lanes(x) else x for n, x in vars(now).items()})
 
     # ---- forward -----------------------------------------------------------------------------------------------------
 
@@ -293,3 +293,7 @@ class BatchKernels:
 def batch_kernels(law, features: Features, own: frozenset) -> BatchKernels:
     """Kernels for a law, a scene's features, and what each scene has of its own."""
     return BatchKernels(law, features, own)
+
+
+def _in_lanes(number) -> bool:
+    return not isinstance(number, int) and number.is_tensor()

@@ -252,6 +252,8 @@ class LanesWorkspace:
 
     def seen(self) -> np.ndarray:
         """What each scene's contacts did: (scenes, 3 contacts, vertices), as in state/watch.py."""
+        if not self.arrays.contacts:
+            return np.zeros((self.num_scenes, 0, 0))
         return unpack(runtime.fetch(self.met.seen), self.num_scenes)
 
     # ---- launches ----------------------------------------------------------------------------------------------------
