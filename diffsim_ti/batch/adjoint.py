@@ -66,45 +66,33 @@ class LanesAdjoint:
         u, corner = runtime.fetch(self.u), runtime.fetch(self.corner)
         runtime.fill(self.u, u + corner[None])
 
-    def collect(self, state: bool = True) -> list[Derived]:
-        """Adjoints of what kernels read, in float64, of each scene."""
+    def collect(self) -> Derived:
+        """Adjoints of what kernels read, in float64, all with the scenes as their first axis."""
         ws, B = self.ws, self.ws.num_scenes
         a, features, rows = ws.arrays, self.features, self.features.sums()
-        numbers = {
-            "sums": unpack(runtime.fetch(self.sums), B).astype(np.float64),
-            "coefficients": unpack(runtime.fetch(self.coefficients), B).astype(np.float64),
-            "u": vectors(self.u, B)[:, 0].astype(np.float64),
-            "v": vectors(self.v, B)[:, 0].astype(np.float64),
-            "anchor": unpack(runtime.fetch(self.anchor), B).astype(np.float64).reshape(B, -1, 3),
-        }
-        numbers |= {name: vectors(getattr(self, name), B).astype(np.float64) for name in OF_STEPS}
+        one, sums = ws.derived[0], self._of(self.sums)
+        out = Derived(*(None if x is None else np.zeros((B, *x.shape)) for x in one.parts().values()))
+        out.coefficients = self._of(self.coefficients).reshape(B, a.num_tetrahedra, -1)
+        out.parameters[:, : features.num_parameters] = sums[:, rows.of("parameters")].sum(2)
+        if features.density:
+            out.mass = sums[:, rows.first("mass")]
         if features.shape:
-            numbers |= {n: unpack(runtime.fetch(getattr(self, n)), B).astype(np.float64) for n in ("gradients", "volumes")}
-            numbers["frames"] = vectors(self.frames_u, B).astype(np.float64).sum(1)
-        out = []
-        for b, derived in enumerate(ws.derived):
-            one, sums = derived.zeros(), numbers["sums"][b]
-            one.coefficients = numbers["coefficients"][b].reshape(a.num_tetrahedra, -1)
-            one.parameters[: features.num_parameters] = sums[rows.of("parameters")].sum(1)
-            if features.density:
-                one.mass = sums[rows.first("mass")]
-            if features.shape:
-                one.rest = sums[rows.of("rest")].T + numbers["frames"][b]
-                one.gradients = numbers["gradients"][b].reshape(derived.gradients.shape)
-                one.volumes = numbers["volumes"][b].reshape(derived.volumes.shape)
-            if features.areas:
-                one.surface = sums[rows.first("surface")]
-            for name in OF_STEPS:
-                if getattr(one, name) is not None:
-                    by = numbers[name][b]
-                    setattr(one, name, by if by.shape == getattr(one, name).shape else by.sum(0, keepdims=True))
-            if state:
-                one.displacement, one.velocity = numbers["u"][b], numbers["v"][b]
-            if one.motion is not None:
-                one.displacement = one.displacement.copy()
-                one.displacement[a.held] += numbers["anchor"][b]
-            out.append(one)
+            frames = vectors(self.frames_u, B).astype(np.float64).sum(1)
+            out.rest = sums[:, rows.of("rest")].swapaxes(1, 2) + frames
+            out.gradients = self._of(self.gradients).reshape(B, *one.gradients.shape)
+            out.volumes = self._of(self.volumes).reshape(B, *one.volumes.shape)
+        if features.areas:
+            out.surface = sums[:, rows.first("surface")]
+        for name in OF_STEPS:
+            if getattr(one, name) is not None:
+                setattr(out, name, vectors(getattr(self, name), B).astype(np.float64))
+        out.displacement, out.velocity = (vectors(x, B)[:, 0].astype(np.float64) for x in (self.u, self.v))
+        if one.motion is not None:
+            out.displacement[:, a.held] += self._of(self.anchor).reshape(B, -1, 3)
         return out
+
+    def _of(self, array) -> np.ndarray:
+        return unpack(runtime.fetch(array), self.ws.num_scenes).astype(np.float64)
 
 
 class LanesTangent:

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 from diffsim_ti.batch.sweep import LanesSweep, Own, value_of
 from diffsim_ti.batch.workspace import why_not
 from diffsim_ti.checked import whole
+from diffsim_ti.inputs import Derived
 from diffsim_ti.inputs.description import frozen
 from diffsim_ti.outputs import Output
 from diffsim_ti.rollout.frames import Frames, check_finite
@@ -136,7 +137,8 @@ class Batch:
         described, sizes, B = self.scene.inputs.described[name], self.scene.inputs.sizes, self.num_scenes
         shared = described.fits(value.shape, sizes)
         own = value.ndim > 0 and len(value) == B and described.fits(value.shape[1:], sizes)
-        if shared and own:
+        exact = sizes | {"steps": self.steps, "steps + 1": self.steps + 1}  # and no rows of forces that no step takes
+        if own and described.fits(value.shape, exact):
             raise ValueError(
                 f"{name}: shape {value.shape} may be one value for all scenes or one for each of {B}: give the leading axis "
                 f"also if all scenes share it, as np.broadcast_to(x, ({B}, *x.shape))"
@@ -238,39 +240,59 @@ class Batch:
         dead = np.flatnonzero(~frames.alive)
         if dead.size:
             warnings.warn(f"scenes {dead.tolist()} did not come to their end: their gradients are zero", stacklevel=2)
-        one_by_one = self._vjp_in_lanes if self.lanes else self._vjp_by_turns
-        return self._joined(frames.values, one_by_one(frames, given))
+        return (self._vjp_in_lanes if self.lanes else self._vjp_by_turns)(frames, given)
 
-    def _vjp_in_lanes(self, frames: BatchFrames, given: dict) -> list[dict | None]:
-        zero = np.zeros((self.num_frames, self.scene.mesh.num_vertices, 3))
-        changes, by_u, by_v = {}, [], []
-        for b in range(self.num_scenes):
-            if frames.alive[b]:
-                change = changes[b] = self.one.pulled_to_frames(frames[b], {name: x[b] for name, x in given.items()})
-            parts = (change.positions, change.velocities) if frames.alive[b] else (None, None)
-            for target, part in zip((by_u, by_v), parts):
-                target.append(zero if part is None else part)
-        derived = self.sweep.pull_back(frames.run, np.stack(by_u), np.stack(by_v))
-        return [
-            self.one.gradients_of(frames[b].run, derived[b], changes[b]) if frames.alive[b] else None
-            for b in range(self.num_scenes)
-        ]
+    def _vjp_in_lanes(self, frames: BatchFrames, given: dict) -> dict[str, np.ndarray]:
+        shape = (self.num_scenes, *frames.positions.shape[1:])
+        by_u, by_v, direct = np.zeros(shape), np.zeros(shape), []
+        for b in np.flatnonzero(frames.alive):
+            change = self.one.pulled_to_frames(frames[b], {name: x[b] for name, x in given.items()})
+            direct.append((b, change.inputs))
+            for target, part in ((by_u, change.positions), (by_v, change.velocities)):
+                if part is not None:
+                    target[b] = part
+        derived = self.sweep.pull_back(frames.run, by_u, by_v)
+        parts, dead = derived.parts().values(), ~frames.alive
+        for part in parts:
+            if part is not None:
+                part[dead] = 0  # lanes of their own: they have left no trace in others
+        return self._by_inputs(frames, [None if x is None else np.asarray(x) for x in parts], direct)
 
-    def _vjp_by_turns(self, frames: BatchFrames, given: dict) -> list[dict | None]:
-        return [
-            self.one.vjp(frames[b], **{name: x[b] for name, x in given.items()}) if frames.alive[b] else None
-            for b in range(self.num_scenes)
-        ]
-
-    def _joined(self, values: dict, gradients: list[dict | None]) -> dict[str, np.ndarray]:
-        """Those of each scene where it had a value of its own, else their sum in the order of scenes."""
-        out = {}
-        for name in self.wanted:
+    def _by_inputs(self, frames: BatchFrames, parts: list, direct: list) -> dict[str, np.ndarray]:
+        """Gradients by the wanted inputs; what meets no number that scenes have of their own is summed over them first."""
+        inputs, values, wanted = self.scene.inputs, frames.values, self.wanted
+        own = tuple(name for name, x in values.items() if isinstance(x, Own))
+        alike = {name for name in wanted if name not in own and not inputs.chain.meets(name, own)}
+        each = tuple(name for name in wanted if name not in alike)
+        out = dict.fromkeys(wanted)
+        if alike:
+            total = Derived(*(None if x is None else x.sum(0) for x in parts))
+            out |= inputs.derive_vjp(self.sweep.values_of(values, 0), total, tuple(n for n in wanted if n in alike))
+        if each:
             rows = [
-                np.zeros_like(value_of(values[name], b)) if own is None else own[name] for b, own in enumerate(gradients)
+                inputs.derive_vjp(frames[b].inputs, Derived(*(None if x is None else x[b] for x in parts)), each)
+                for b in range(self.num_scenes)
             ]
-            out[name] = np.stack(rows) if isinstance(values[name], Own) else sum(rows[1:], rows[0])
+            out |= self._joined(values, rows, each)
+        for b, by_inputs in direct:
+            for name in set(by_inputs).intersection(wanted):
+                out[name] = np.array(out[name])
+                target = out[name][b] if name in own else out[name]
+                target += by_inputs[name]
         return out
+
+    def _vjp_by_turns(self, frames: BatchFrames, given: dict) -> dict[str, np.ndarray]:
+        rows = []
+        for b, alive in enumerate(frames.alive):
+            zero = {name: np.zeros_like(value_of(frames.values[name], b)) for name in self.wanted}
+            seeds = {name: x[b] for name, x in given.items()}
+            rows.append(self.one.vjp(frames[b], **seeds) if alive else zero)
+        return self._joined(frames.values, rows, self.wanted)
+
+    def _joined(self, values: dict, rows: list[dict], names: Iterable[str]) -> dict[str, np.ndarray]:
+        """Those of each scene where it had a value of its own, else their sum in the order of scenes."""
+        gradients = {name: [row[name] for row in rows] for name in names}
+        return {n: np.stack(x) if isinstance(values[n], Own) else sum(x[1:], x[0]) for n, x in gradients.items()}
 
     # ---- tangents ----------------------------------------------------------------------------------------------------
 

@@ -105,14 +105,14 @@ class LanesSweep(Sweep):
         watch, largest = ContactWatch(ws), limits(self.solver)
         return [watch.resolution_of(rows, d, ws.substep, largest) for rows, d in zip(seen, ws.derived)]
 
-    def pull_back(self, run: Run, positions_adj: np.ndarray, velocities_adj: np.ndarray) -> list[Derived]:
-        """Adjoints of what kernels read at the start of each scene's run, from those of the frames."""
+    def pull_back(self, run: Run, positions_adj: np.ndarray, velocities_adj: np.ndarray) -> Derived:
+        """Adjoints of what kernels read at the start of the runs, the scenes being their first axis, from those of frames."""
         self.bring_back(run)
         self._seed = positions_adj, velocities_adj
         self._reverse(self, False)
-        out = self._adjoint.collect(not self.truncates)
-        for derived in out if self.truncates else ():
-            derived.displacement[:], derived.velocity[:] = 0, 0
+        out = self._adjoint.collect()
+        if self.truncates:
+            out.displacement[:], out.velocity[:] = 0, 0
         return out
 
     def put(self, adjoint: LanesAdjoint, last_frame_is_state: bool) -> tuple[float, float]:

@@ -108,6 +108,17 @@ class Chain:
                 total[name] = total[name] + adjoint if name in total else adjoint
         return {name: np.asarray(total[name] if name in total else np.zeros_like(values[name])) for name in wanted}
 
+    def meets(self, name: str, others: Iterable[str]) -> bool:
+        """Whether a link that `name` leads to reads what others of the inputs lead to as well."""
+        reached, theirs = {name}, set(others)
+        for link in self.links:
+            by_name, by_others = not reached.isdisjoint(link.reads), not theirs.isdisjoint(link.reads)
+            if by_name and by_others:
+                return True
+            reached.update(link.writes if by_name else ())
+            theirs.update(link.writes if by_others else ())
+        return False
+
     def _way(self, wanted: tuple[str, ...]) -> tuple[list[Link], list[Link]]:
         """(links between the wanted inputs and what kernels read, links that give what those read)."""
         if wanted not in self._ways:
