@@ -6,6 +6,7 @@ os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # read when taichi is 
 os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")  # no network traffic from a simulator
 
 from diffsim_ti.adaptive_steps import adaptive_steps
+from diffsim_ti.batch import Batch, BatchFrames
 from diffsim_ti.contact.surface_pairs import Tunnelling
 from diffsim_ti.identification import (
     Identification,
@@ -147,6 +148,8 @@ __all__ = [
     "SolveReport",
     "Prony",
     "Rollout",
+    "Batch",
+    "BatchFrames",
     "UnequalSteps",
     "adaptive_steps",
     "Frames",

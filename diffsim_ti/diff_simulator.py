@@ -20,7 +20,7 @@ from diffsim_ti.solvers import SemiImplicitSolver, Solver, StaticSolver
 from diffsim_ti.terms import Drag, ExternalForce, Gravity, Obstacle, SelfContact, Term
 from diffsim_ti.terms.obstacles import barrier
 from diffsim_ti.terms.obstacles.obstacle import PER_AREA
-from diffsim_ti.torch_bridge.autograd import torch
+from diffsim_ti.torch_bridge.autograd import torch, uncompiled
 from diffsim_ti.torch_bridge.rollout_node import TorchFrames, rollout_frames
 from diffsim_ti.torch_bridge.tensors import DTYPES, checked_device
 
@@ -141,6 +141,7 @@ class DifferentiableSimulator:
         """Velocities [m/s], shape (num_vertices, 3), in the graph."""
         return self._velocities
 
+    @uncompiled
     def reset(self, positions: torch.Tensor | None = None, velocities: torch.Tensor | None = None) -> None:
         """Back to the start, or to given positions [m] and velocities [m/s], tensors of shape (num_vertices, 3)."""
         self._follow_dtype()
@@ -157,6 +158,7 @@ class DifferentiableSimulator:
         backpropagation through time)."""
         self._displacements, self._velocities = self._displacements.detach(), self._velocities.detach()
 
+    @uncompiled
     def step(self, external_forces: torch.Tensor | None = None) -> None:
         """Advance by dt; external_forces [N], shape (num_vertices, 3), with gradient."""
         if getattr(self.solver.method, "multistep", False):
@@ -166,6 +168,7 @@ class DifferentiableSimulator:
             )
         self._advance(1, external_forces)
 
+    @uncompiled
     def rollout(
         self,
         num_steps: int,

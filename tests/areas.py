@@ -12,7 +12,7 @@ AREAS = {
     "materials open_laws growth laws_with_state viscosity",
     "motion against closed forms": "reference_motion step_limit mass_scaling unequal_steps energy_watch hertz torture",
     "every adjoint, order, fuzz": "every_adjoint term_order gradient_fuzz",
-    "gradients": "gradients gradient_clip gradient_faults checkpoints tape outputs "
+    "gradients": "gradients batch gradient_clip gradient_faults checkpoints tape outputs "
     "contact_force reaction tensor_outputs work modes identification identify",
     "implicit steps and equilibria": "implicit implicit_gradients implicit_contact swept solve_report",
     "patches against locking": "locking",

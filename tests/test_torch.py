@@ -744,3 +744,22 @@ def test_verify_serves_the_same_rollout():
     """What proves the core proves the torch face: its Rollout is the core's."""
     sim = simulator()
     assert verify.dot_product_test(sim._rollout(4, False, None, None)) < 1e-12
+
+
+def test_torch_compile_breaks_its_graph_at_a_rollout():
+    """And functorch's transforms are refused in one line."""
+    scene = ds.Scene(ds.TetrahedralMesh.create_box(2, 0.1), ds.StableNeoHookean(1e4, 0.3), precision="f64")
+    rollout = ds.Rollout(ds.SemiImplicitSolver(scene, 1e-3), 2)
+
+    def loss(E):
+        return (
+            2
+            * rollout_frames(rollout, youngs_modulus=3 * E, initial_velocities=torch.eye(8, 3)).positions.square().sum()
+        )
+
+    numbers = [torch.tensor(3e3, dtype=torch.float64, requires_grad=True) for _ in range(2)]
+    for one, called in zip(numbers, (loss, torch.compile(loss, backend="eager"))):
+        called(one).backward()
+    assert numbers[0].grad == numbers[1].grad != 0
+    with pytest.raises(RuntimeError, match="take diffsim_ti.Batch"):
+        torch.func.vmap(loss)(torch.tensor([1e3, 2e3], dtype=torch.float64))

@@ -41,12 +41,21 @@ class LanesAdjoint:
 
     def start(self, positions_adj: np.ndarray, velocities_adj: np.ndarray, last_frame_is_input: bool) -> None:
         """Set the adjoints of the frames, shape (scenes, frames, n, 3), and clear the rest."""
-        for name in ("u", "v", "w", "corner", "coefficients", "gradients", "volumes", "sums", "felt", "anchor", *OF_STEPS):
-            runtime.fill(getattr(self, name), 0)
-        for target, state, adjoint in (
-            (self.frames_u, self.u, positions_adj),
-            (self.frames_v, self.v, velocities_adj),
+        for name in (
+            "u",
+            "v",
+            "w",
+            "corner",
+            "coefficients",
+            "gradients",
+            "volumes",
+            "sums",
+            "felt",
+            "anchor",
+            *OF_STEPS,
         ):
+            runtime.fill(getattr(self, name), 0)
+        for target, state, adjoint in ((self.frames_u, self.u, positions_adj), (self.frames_v, self.v, velocities_adj)):
             runtime.fill(target, pack(adjoint.reshape(*adjoint.shape[:2], -1)))
             if last_frame_is_input:
                 runtime.fill(state, pack(adjoint[:, -1:].reshape(len(adjoint), 1, -1)))
@@ -115,7 +124,9 @@ class LanesTangent:
             parameters=[np.concatenate([d.parameters, 0 * a.tables]) for d in tangents],
             rest=[d.rest for d in tangents],
             surface=[np.zeros(a.num_vertices) if d.surface is None else d.surface for d in tangents],
-            rate=[np.atleast_1d(d.parameters[self.features.drag] if self.features.drag >= 0 else 0.0) for d in tangents],
+            rate=[
+                np.atleast_1d(d.parameters[self.features.drag] if self.features.drag >= 0 else 0.0) for d in tangents
+            ],
             anchor=[np.zeros(3) if d.motion is None else d.displacement[a.held] for d in tangents],
         )
         for name, arrays in flat.items():

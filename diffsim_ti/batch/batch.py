@@ -1,11 +1,12 @@
 """Many scenes of one mesh, law and list of terms, whose numbers differ: forward, gradients and tangents at once."""
 
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.batch.frames import BatchFrames
 from diffsim_ti.batch.sweep import LanesSweep, Own, value_of
 from diffsim_ti.batch.workspace import why_not
 from diffsim_ti.checked import whole
@@ -16,51 +17,6 @@ from diffsim_ti.rollout.frames import Frames, check_finite
 from diffsim_ti.rollout.rollout import Rollout
 from diffsim_ti.rollout.run import Run
 from diffsim_ti.solvers.solver import Solver
-from diffsim_ti.state.watch import ContactResolution
-
-
-class BatchFrames(Sequence):
-    """Saved states of many scenes: positions [m], velocities [m/s], displacements [m], (scenes, frames, n, 3).
-
-    `frames[b]` are those of scene b (`Frames`), `frames["name"]` any output of all scenes, (scenes, ...). alive: (scenes,),
-    whether the scene came to its end; the frames of one that did not hold its last good state from there on, and
-    `error(b)` is what a run of it alone raises. `contact_resolution`: one for each scene.
-    """
-
-    def __init__(self, batch: "Batch", values: dict, frames: list[Frames], last_good: np.ndarray, run: Run | None):
-        self._batch, self.values, self._frames, self.run = batch, values, frames, run
-        self.positions = np.stack([one.positions for one in frames])
-        self.velocities = np.stack([one.velocities for one in frames])
-        self.displacements = np.stack([one.displacements for one in frames])
-        self.times, self.last_good = frames[0].times, last_good
-        self.alive = last_good == len(self.times) - 1
-        self.outputs = {name: np.stack([one.outputs[name] for one in frames]) for name in frames[0].outputs}
-        self._errors: dict[int, Exception] = {}
-
-    def __len__(self) -> int:
-        return len(self._frames)
-
-    def __getitem__(self, key):
-        if isinstance(key, str):
-            known = dict(positions=self.positions, velocities=self.velocities, displacements=self.displacements)
-            known |= self.outputs
-            if key not in known:
-                raise KeyError(f"no output named {key!r}; there are {', '.join(known)}")
-            return known[key]
-        return self._frames[key]
-
-    @property
-    def contact_resolution(self) -> list[ContactResolution]:
-        """How near each scene came to obstacles, and how finely the substeps resolve that."""
-        return [one.contact_resolution for one in self._frames]
-
-    def error(self, b: int) -> Exception | None:
-        """What stopped scene b: the error of a run of it alone; None if it lives."""
-        if self.alive[b]:
-            return None
-        if b not in self._errors:
-            self._errors[b] = self._batch._error_alone(self, b)
-        return self._errors[b]
 
 
 class Batch:
@@ -77,8 +33,9 @@ class Batch:
     over scenes in their order; of others they have the leading axis. At equal steps the states of a scene are, bit for bit,
     those of a `Rollout` of it alone, whatever its neighbours, its place among them and the number of threads.
 
-    Scenes fail alone (`BatchFrames.alive`): the gradient of one that did is zero, with a warning. In lanes a failure is a state
-    that is not finite, or a vertex behind an obstacle; gains of energy that a `Rollout` warns of are not looked for.
+    Scenes fail alone (`BatchFrames.alive`): the gradient of one that did is zero, with a warning. In lanes a failure is a
+    frame that is not finite or whose vertices cross the body within a substep, or a vertex behind an obstacle; gains of
+    energy that a `Rollout` warns of are not looked for.
 
     Freeman et al. 2021, Brax (leading axes of scenes), arXiv:2106.13281.
     Raises ValueError for shapes that fit neither, or both, saying which there are.
@@ -96,10 +53,15 @@ class Batch:
         memory: float | None = None,
         lanes: bool | None = None,
     ):
-        self.num_scenes = whole("scenes", scenes)
+        self.num_scenes = whole("scenes", scenes, 1)
         options = dict(save_every=save_every, gradients=gradients, truncate=truncate, memory=memory)
         self.one = Rollout(solver, steps, outputs=outputs, **options)
-        self.solver, self.scene, self.inputs, self.wanted = self.one.solver, self.one.scene, self.one.inputs, self.one.wanted
+        self.solver, self.scene, self.inputs, self.wanted = (
+            self.one.solver,
+            self.one.scene,
+            self.one.inputs,
+            self.one.wanted,
+        )
         self.steps, self.save_every, self.num_frames = self.one.steps, self.one.save_every, self.one.num_frames
         self.why_not = why_not(self.solver) or ("an output reads forces of contact" if self.one.sweep.noted else None)
         if lanes and self.why_not:
@@ -163,17 +125,23 @@ class Batch:
     def _in_lanes(self, values: dict) -> BatchFrames:
         run, times = self.sweep.run(values), self.one.times
         u, v = self.sweep.states()
-        with np.errstate(all="ignore"):
-            good = np.isfinite(u.sum((2, 3))) & np.isfinite(v.sum((2, 3)))
-        for b, step in self.sweep.crossed().items():
-            good[b, step // self.save_every + 1 :] = False
-        good[:, 0] = True
-        last_good = np.where(good.all(1), self.num_frames, np.argmin(good, 1)) - 1
+        last_good, crossed = np.full(self.num_scenes, self.num_frames - 1), self.sweep.crossed()
+        for b in {*np.flatnonzero(~self._sound(u[:, -1], v[:, -1])), *crossed}:
+            good = self._sound(u[b], v[b])
+            if b in crossed:
+                good[crossed[b] // self.save_every + 1 :] = False
+            last_good[b] = max(0, int(np.argmin(good)) - 1) if not good.all() else last_good[b]
         for b in np.flatnonzero(last_good < self.num_frames - 1):
             u[b, last_good[b] + 1 :], v[b, last_good[b] + 1 :] = u[b, last_good[b]], v[b, last_good[b]]
         resolutions = self.sweep.resolutions()
         frames = [self._frames_of(values, b, u[b], v[b], times, resolutions[b]) for b in range(self.num_scenes)]
         return BatchFrames(self, values, frames, last_good, run)
+
+    def _sound(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Whether states (k, n, 3) are finite and no vertex crosses the body within a substep."""
+        with np.errstate(all="ignore"):
+            spread = np.ptp(v, axis=1).max(1) * self.solver.substep
+            return np.isfinite(u.sum((1, 2))) & (spread <= 2 * np.ptp(self.scene.mesh.vertices, axis=0).max())
 
     def _frames_of(self, values: dict, b: int, u, v, times, resolution) -> Frames:
         own = self.sweep.values_of(values, b)
@@ -194,9 +162,7 @@ class Batch:
                 errors[b] = error
                 frames.append(self._stopped(own, self._last_good(error)))
         last_good = np.array([self._last_good(errors.get(b)) for b in range(self.num_scenes)])
-        out = BatchFrames(self, values, frames, last_good, None)
-        out._errors = errors
-        return out
+        return BatchFrames(self, values, frames, last_good, None, errors)
 
     def _last_good(self, error: Exception | None) -> int:
         """The last frame before an error."""
@@ -214,7 +180,8 @@ class Batch:
             frames.outputs[name] = np.asarray(output.value(frames))
         return frames
 
-    def _error_alone(self, frames: BatchFrames, b: int) -> Exception:
+    def error_alone(self, frames: BatchFrames, b: int) -> Exception:
+        """What a run of scene b alone raises."""
         try:
             self.one.forward(**{name: value_of(value, b) for name, value in frames.values.items()})
         except FloatingPointError as error:

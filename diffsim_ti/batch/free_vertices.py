@@ -120,7 +120,10 @@ class FreeVertices:
         if F.forces_keyed:
             out = []
             for step, weight in ((now.force0, now.share0), (now.force1, now.share1)):
-                row, share = (step if F.forces_per_step else 0), ti.select(step == now.row, now.begin, ti.cast(1, self.fp))
+                row, share = (
+                    (step if F.forces_per_step else 0),
+                    ti.select(step == now.row, now.begin, ti.cast(1, self.fp)),
+                )
                 share, weight = let(share), let(weight * loaded)
                 out += [(row, place, let(weight * (1 - share))), (row, let(place + 3), let(weight * share))]
             return out
@@ -210,10 +213,11 @@ class FreeVertices:
         d, width = g.force.record(parameters, first, X, moved.u)[3].value, let(g.force.width(parameters, first))
         far = let(d - MARGIN * width)
         square = let(MARGIN * MARGIN * (move[0] * move[0] + move[1] * move[1] + move[2] * move[2]))
-        out = ti.cast(0, self.fp)
+        one, none = ti.cast(1, self.fp), ti.cast(0, self.fp)
+        out = none
         for lane in range(LANES):
-            f, m = let(at(far, lane)), let(at(square, lane))
-            out = out + ti.select(f < 0, ti.cast(1, self.fp), ti.select(m >= f * f, ti.cast(1, self.fp), ti.cast(0, self.fp)))
+            gap, way = let(at(far, lane)), let(at(square, lane))
+            out = out + ti.select(gap < 0, one, ti.select(way >= gap * gap, one, none))
         return let(out)
 
     @traced

@@ -1,8 +1,8 @@
 """Kernels of many scenes: a thread takes a block of eight scenes through all passes of a launch.
 
-Tetrahedra are worked on in lanes, one scene in each, and add straight to the forces of their block. So are vertices at which
-nothing else acts in any of the eight (free_vertices.py); at the others the functions of a single scene (explicit/kick_drift.py)
-go through the eight scenes one after the other, by views of them.
+Tetrahedra are worked on in lanes, one scene in each, and add straight to the forces of their block. So are vertices at
+which nothing else acts in any of the eight (free_vertices.py); at the others the functions of a single scene
+(explicit/kick_drift.py) go through the eight scenes one after the other, by views of them.
 """
 
 from dataclasses import dataclass
@@ -111,7 +111,9 @@ class BatchKernels:
 
     @traced
     def of_steps(self, b, lane, record, plan):
-        sizes = dict(forces=plan.num_loaded, motion=plan.num_held, anchor=plan.num_held, path=max(self.features.moving, 1))
+        sizes = dict(
+            forces=plan.num_loaded, motion=plan.num_held, anchor=plan.num_held, path=max(self.features.moving, 1)
+        )
         return {name: self.vectors(getattr(record, name), let(b * size), lane) for name, size in sizes.items()}
 
     @traced

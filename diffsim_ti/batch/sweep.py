@@ -106,7 +106,7 @@ class LanesSweep(Sweep):
         return [watch.resolution_of(rows, d, ws.substep, largest) for rows, d in zip(seen, ws.derived)]
 
     def pull_back(self, run: Run, positions_adj: np.ndarray, velocities_adj: np.ndarray) -> Derived:
-        """Adjoints of what kernels read at the start of the runs, the scenes being their first axis, from those of frames."""
+        """Adjoints, from those of the frames, of what kernels read at the start; the scenes are their first axis."""
         self.bring_back(run)
         self._seed = positions_adj, velocities_adj
         self._reverse(self, False)

@@ -94,7 +94,7 @@ class Item:
 
 @dataclass(frozen=True)
 class Scenes(Items):
-    """Tetrahedra of eight scenes at once; own: names of arrays of which each scene has its own."""
+    """Tetrahedra of eight scenes at once; an item is an `Item`."""
 
     @cached_property
     def lanes(self):

@@ -15,7 +15,7 @@ from diffsim_ti.batch.views import Scratch
 from diffsim_ti.inputs import Derived
 from diffsim_ti.solvers.explicit.contact_stage import ROWS
 from diffsim_ti.solvers.explicit.felt_faces import feels_faces
-from diffsim_ti.state.arrays import SceneArrays
+from diffsim_ti.state.arrays import SceneArrays, copy_slot
 from diffsim_ti.state.pass_table import FLOATS, INTS, PassTable
 from diffsim_ti.state.solve_report import SolveReport
 from diffsim_ti.terms import SelfContact
@@ -160,7 +160,10 @@ class LanesWorkspace:
         )
         self.num_parameters = len(numbers[0])
         if a.features().guided:
-            out["guide_slot"], out["guides"] = (runtime.fetch(a.guide_slot), ti.i32), (runtime.fetch(a.guides), a.vector)
+            out["guide_slot"], out["guides"] = (
+                (runtime.fetch(a.guide_slot), ti.i32),
+                (runtime.fetch(a.guides), a.vector),
+            )
         out["force_slot"] = runtime.fetch(a.force_slot), ti.i32
         out["motion_slot"] = runtime.fetch(a.motion_slot), ti.i32
         each = dict(
@@ -245,8 +248,6 @@ class LanesWorkspace:
         source.copy(slot, self.state, 0)
 
     def save_frame(self, frame: int) -> None:
-        from diffsim_ti.state.arrays import copy_slot
-
         copy_slot(self.state.u, 0, self.frames.frames_u, frame)
         copy_slot(self.state.v, 0, self.frames.frames_v, frame)
 
@@ -269,7 +270,9 @@ class LanesWorkspace:
         """Numbers of the launches that passes first .. last - 1 take, for each of which their table is shown."""
         a, solver, schedule = self.arrays, self.solver, self.solver.schedule
         spread = max(1, -(-SPREAD // self.num_blocks))
-        sizes = dict(num_tetrahedra=a.num_tetrahedra, num_vertices=a.num_vertices, num_blocks=self.num_blocks, spread=spread)
+        sizes = dict(
+            num_tetrahedra=a.num_tetrahedra, num_vertices=a.num_vertices, num_blocks=self.num_blocks, spread=spread
+        )
         sizes |= dict(num_loaded=self.counts["forces"], num_held=self.counts["motion"])
         sizes |= dict(num_parameters=self.num_parameters, num_passes_shown=self.table.size)
         sizes |= dict(contact_damping=solver.contact_damping)

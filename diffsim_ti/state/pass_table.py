@@ -63,7 +63,7 @@ class PassTable:
 def pass_at(table, k, row=None) -> runtime.Bundle:
     """Row k of the tables in a kernel: what a pass is, by name; row: that of the floats, if it is another one."""
     columns = {}
-    for array, names, k in ((table.ints, INTS, k), (table.floats, FLOATS, k if row is None else row)):
-        first = runtime.let(k * len(names))
+    for array, names, at in ((table.ints, INTS, k), (table.floats, FLOATS, k if row is None else row)):
+        first = runtime.let(at * len(names))
         columns |= {name: runtime.let(runtime.at(array, first + c)) for c, name in enumerate(names)}
     return runtime.Bundle(**columns)

@@ -202,5 +202,6 @@ class ContactWatch:
         faces = self._corners
         mass = np.concatenate([values.mass, values.mass[faces].min(1, initial=np.inf)])
         stiffness = [np.concatenate([row, np.ones(len(faces))]) for row in stiffness]
-        energy = mass * travel**2 / (2 * h * h * np.array(stiffness))
+        with np.errstate(over="ignore"):  # of runs that blow up
+            energy = mass * travel**2 / (2 * h * h * np.array(stiffness))
         return np.interp(energy, STOPPED, DEPTHS) + 1e-12

@@ -1,5 +1,7 @@
 """What the modules of the PyTorch face share: torch itself, or what to install; and a clear no to second derivatives."""
 
+from functools import wraps
+
 try:
     import torch
 except ImportError as error:
@@ -8,6 +10,27 @@ except ImportError as error:
         f"({error}): pip install 'torch>=2.2,<2.14' (CPU only: add --index-url https://download.pytorch.org/whl/cpu); "
         "the rest of diffsim_ti works without it"
     ) from error
+
+
+def uncompiled(function):
+    """Decorate what reads tensors' numbers: torch.compile breaks its graph there, and what is called runs as it is."""
+    apart = torch._disable_dynamo(function)  # loads, when called, what torch.compile has loaded anyway
+
+    @wraps(function)
+    def called(*arguments, **named):
+        return (apart if torch.compiler.is_compiling() else function)(*arguments, **named)
+
+    return called
+
+
+def refuse_transforms(tensors) -> None:
+    """Raise RuntimeError for tensors of torch.func's transforms, whose numbers cannot be read."""
+    wrapped = getattr(getattr(torch._C, "_functorch", None), "is_functorch_wrapped_tensor", lambda tensor: False)
+    if any(isinstance(tensor, torch.Tensor) and wrapped(tensor) for tensor in tensors):
+        raise RuntimeError(
+            "torch.func's vmap, grad and jacrev cannot look into a simulation: for many scenes take diffsim_ti.Batch, whose "
+            "inputs have a leading axis, and for gradients tensor.backward() or torch.autograd"
+        )
 
 
 class _Refusal(torch.autograd.Function):

@@ -4,8 +4,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from diffsim_ti.batch import Batch
 from diffsim_ti.rollout import Rollout
-from diffsim_ti.torch_bridge.autograd import first_order_only, torch
+from diffsim_ti.torch_bridge.autograd import first_order_only, refuse_transforms, torch, uncompiled
+from diffsim_ti.torch_bridge.batch_node import TorchBatchFrames, batch_frames
 from diffsim_ti.torch_bridge.tensors import TensorRollout
 
 REMEDY = "use verify.hessian_product or verify.gauss_newton_product"
@@ -87,7 +89,8 @@ def _as_tensors(gradients: dict, names, tensors, needed) -> list:
     return out
 
 
-def rollout_frames(rollout: Rollout, **tensors: torch.Tensor) -> TorchFrames:
+@uncompiled
+def rollout_frames(rollout: Rollout | Batch, **tensors: torch.Tensor) -> TorchFrames | TorchBatchFrames:
     """Functional face: run a Rollout with some inputs given as tensors; one autograd node, gradients to all of them.
 
     Names are those of `rollout.inputs`, or "initial_displacements" instead of "initial_positions" (which keeps its digits
@@ -101,7 +104,12 @@ def rollout_frames(rollout: Rollout, **tensors: torch.Tensor) -> TorchFrames:
     memory torch cannot see.
     Raises ValueError for unknown names, wrong shapes, types that are not floating point, and tensors that require a
     gradient by density or rest_positions which the Rollout was told not to compute.
+
+    A `Batch` in place of the Rollout gives tensors of all its scenes (batch_node.py). `torch.compile` breaks its graph here.
     """
+    refuse_transforms(tensors.values())
+    if isinstance(rollout, Batch):
+        return batch_frames(rollout, tensors)
     if "initial_positions" in tensors and "initial_displacements" in tensors:
         raise ValueError("initial_positions and initial_displacements are two spellings of one input: give one")
     if "rest_positions" in tensors and "initial_displacements" in tensors:

@@ -6,6 +6,7 @@ the sum of squared final positions, the gradients are by both Lame parameters of
 
     python examples/benchmarks/speed.py --common [--json] [--sizes 6 11 21] [--precision f32] [--repeats 20]
     python examples/benchmarks/speed.py --growth          # cost per tetrahedron from 6 000 to 1 000 000 tetrahedra
+    python examples/benchmarks/speed.py --batch [--json] [--batches 6x64 11x16]    # many scenes at once, against one
 """
 
 import argparse
@@ -18,6 +19,7 @@ import numpy as np
 import diffsim_ti as ds
 
 SUBSTEPS, H = 20, 2.5e-4
+BATCH_STEPS = 10  # of many scenes at once
 
 
 def best_seconds(function, repeats: int) -> float:
@@ -76,10 +78,47 @@ def measure(resolution: int, precision: str, repeats: int) -> dict:
     }
 
 
+def batch_work(resolution: int, scenes: int, precision: str, contact: bool) -> tuple:
+    """(batch, rollout of one scene, values of the batch): the common work, or that on a rough floor with forces."""
+    one = common_rollout(resolution, precision, per_tetrahedron=False)
+    n, rng = one.scene.mesh.num_vertices, np.random.default_rng(0)
+    values = {"mu": one.sweep.values["mu"] * rng.uniform(0.9, 1.1, scenes)}
+    if contact:
+        floor, forces = ds.Ground(-0.011, friction=0.3), ds.ExternalForce(np.zeros((n, 3)))
+        one = one.with_scene(terms=[*one.scene.terms, floor, forces], initial_positions=one.scene.mesh.vertices)
+        values["external_forces"] = rng.normal(size=(scenes, n, 3)) / n
+    rollout = ds.Rollout(one.solver, BATCH_STEPS, gradients=["mu", "lam", "initial_positions"])
+    return ds.Batch(one.solver, BATCH_STEPS, scenes, gradients=rollout.wanted), rollout, values
+
+
+def measure_batch(resolution: int, scenes: int, precision: str, contact: bool, repeats: int) -> dict:
+    """Nanoseconds per tetrahedron, substep and scene of a batch and of one of its scenes, runs back to back."""
+    batch, rollout, values = batch_work(resolution, scenes, precision, contact)
+    own = {name: x[0] for name, x in values.items()}
+    seeds = np.zeros((scenes, 2, batch.scene.mesh.num_vertices, 3))
+    seeds[:, -1] = 1.0
+    work = {
+        "batch": (lambda: batch.forward(**values), lambda: batch.vjp(batch.forward(**values), seeds), scenes),
+        "one": (lambda: rollout.forward(**own), lambda: rollout.vjp(rollout.forward(**own), seeds[0]), 1),
+    }
+    best = {name: [math.inf, math.inf] for name in work}
+    for _ in range(repeats + 1):  # the first round compiles
+        for name, (*calls, count) in work.items():
+            best[name] = [min(b, best_seconds(call, 1) / count) for b, call in zip(best[name], calls)]
+    scale = 1e9 / (SUBSTEPS * BATCH_STEPS * batch.scene.mesh.num_tetrahedra)
+    row = {"tets": batch.scene.mesh.num_tetrahedra, "scenes": scenes, "contact": contact, "precision": precision}
+    for k, what in enumerate(("forward", "forward_backward")):
+        row |= {f"{what}_ns": round(best["batch"][k] * scale, 2), f"{what}_alone_ns": round(best["one"][k] * scale, 2)}
+        row[f"{what}_gain"] = round(best["one"][k] / best["batch"][k], 1)
+    return row
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--common", action="store_true", help="the common work (default)")
     parser.add_argument("--growth", action="store_true", help="6 000 to 1 000 000 tetrahedra")
+    parser.add_argument("--batch", action="store_true", help="many scenes at once, against one")
+    parser.add_argument("--batches", nargs="+", default=["6x64", "11x16", "6x8"], help="vertices a side x scenes")
     parser.add_argument("--json", action="store_true", help="one JSON line per size")
     parser.add_argument("--sizes", type=int, nargs="+", default=[6, 11, 21], help="vertices a side")
     parser.add_argument("--precision", default="f32", choices=["f32", "f64"])
@@ -87,6 +126,13 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=20)
     options = parser.parse_args()
     ds.init(options.arch, options.precision)
+    if options.batch:
+        for size in options.batches:
+            for contact in (False, True):
+                resolution, scenes = map(int, size.split("x"))
+                row = measure_batch(resolution, scenes, options.precision, contact, max(2, options.repeats // 4))
+                print(json.dumps(row) if options.json else "  ".join(f"{k} {x}" for k, x in row.items()), flush=True)
+        return
     sizes = [11, 21, 31, 45, 56] if options.growth else options.sizes
     for resolution in sizes:
         row = measure(

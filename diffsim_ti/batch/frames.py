@@ -1,0 +1,71 @@
+"""Saved states of many scenes."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from diffsim_ti.rollout.frames import Frames
+from diffsim_ti.rollout.run import Run
+from diffsim_ti.state.watch import ContactResolution
+
+if TYPE_CHECKING:
+    from diffsim_ti.batch.batch import Batch
+
+
+class BatchFrames(Sequence):
+    """Saved states of many scenes: positions [m], velocities [m/s], displacements [m], (scenes, frames, n, 3).
+
+    `frames[b]` are those of scene b (`Frames`), `frames["name"]` any output of all scenes, (scenes, ...). alive: (scenes,),
+    whether the scene came to its end; the frames of one that did not hold its last good state from there on, and
+    `error(b)` is what a run of it alone raises. `contact_resolution`: one for each scene.
+    """
+
+    def __init__(
+        self, batch: "Batch", values: dict, frames: list[Frames], last_good: np.ndarray, run: Run | None, errors=None
+    ):
+        self._batch, self.values, self._frames, self.run = batch, values, frames, run
+        self.positions = np.stack([one.positions for one in frames])
+        self.velocities = np.stack([one.velocities for one in frames])
+        self.displacements = np.stack([one.displacements for one in frames])
+        self.times, self.last_good = frames[0].times, last_good
+        self.alive = last_good == len(self.times) - 1
+        self.outputs = {name: np.stack([one.outputs[name] for one in frames]) for name in frames[0].outputs}
+        self._errors: dict[int, Exception] = errors or {}
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def __getitem__(self, key):
+        if isinstance(key, str):
+            known = dict(positions=self.positions, velocities=self.velocities, displacements=self.displacements)
+            known |= self.outputs
+            if key not in known:
+                raise KeyError(f"no output named {key!r}; there are {', '.join(known)}")
+            return known[key]
+        return self._frames[key]
+
+    @property
+    def end(self) -> dict[str, np.ndarray]:
+        """The last states as inputs of a run that goes on from there, in float64: initial_positions, initial_velocities.
+
+        A control loop replaces the rows of scenes that start anew.
+        """
+        rest = np.stack([one.inputs["rest_positions"] for one in self._frames])
+        return dict(
+            initial_positions=rest + self.displacements[:, -1].astype(np.float64),
+            initial_velocities=self.velocities[:, -1].astype(np.float64),
+        )
+
+    @property
+    def contact_resolution(self) -> list[ContactResolution]:
+        """How near each scene came to obstacles, and how finely the substeps resolve that."""
+        return [one.contact_resolution for one in self._frames]
+
+    def error(self, b: int) -> Exception | None:
+        """What stopped scene b: the error of a run of it alone; None if it lives."""
+        if self.alive[b]:
+            return None
+        if b not in self._errors:
+            self._errors[b] = self._batch.error_alone(self, b)
+        return self._errors[b]

@@ -1,0 +1,275 @@
+"""Many scenes at once: each is, bit for bit, the scene alone; gradients, tangents, scenes that die, tensors."""
+
+import warnings
+
+import numpy as np
+import pytest
+import torch
+
+import diffsim_ti as ds
+from diffsim_ti.diff_simulator import rollout_frames
+
+MESH = ds.TetrahedralMesh.create_box(3, 0.1)
+LOW = MESH.vertices[:, 1].min()
+EXPLICIT = ds.SemiImplicitSolver, ds.VelocityVerletSolver
+ROUND_OFF = {"f32": 2e-6, "f64": 1e-13}  # of sums over scenes, which a Rollout does not make
+
+
+def floor(friction: float = 0.3) -> ds.Ground:
+    return ds.Ground(LOW - 0.008, friction=friction, stiffness_per_area=2e5)
+
+
+def drawn(seed: int) -> tuple[ds.Batch, dict]:
+    """A random batch and values of its inputs, some of which scenes have of their own."""
+    rng = np.random.default_rng(seed)
+    precision, steps, B = ("f32", "f64")[seed % 2], int(rng.integers(2, 6)), int(rng.choice([1, 3, 8, 11]))
+    few = lambda share: rng.random() < share  # noqa: E731
+    terms, own = [], {}
+    if few(0.7):
+        terms.append(ds.Gravity(-9.8))
+        own["gravity"] = 5 * rng.normal(size=(B, 3))
+    if few(0.6):
+        terms.append(ds.Drag(0.5))
+        own["drag_rate"] = rng.uniform(0, 3, B)
+    if few(0.5):
+        rows = (steps, len(MESH.vertices), 3) if few(0.5) else (len(MESH.vertices), 3)
+        terms.append(ds.ExternalForce(0.05 * rng.normal(size=rows)))
+        own["external_forces"] = 0.05 * rng.normal(size=(B, *rows))
+    wall = rng.integers(4)
+    if wall == 1:
+        terms.append(floor())
+        own["friction"] = rng.uniform(0, 0.5, B)
+    if wall == 2:
+        push = lambda t: np.array([0.0, 0.3 * t, 0.2 * t])  # noqa: E731
+        terms.append(ds.HalfSpace((0, LOW - 0.008, 0), (0.1, 1, 0), path=push, friction=0.2, stiffness_per_area=2e5))
+        own["half_space_point"] = [0, LOW - 0.008, 0] + 1e-3 * rng.normal(size=(B, 3))
+    if wall == 3:
+        terms.append(ds.Sphere((0.05, 0.05, 0.05), 0.12, inside=True, stiffness_per_area=2e5))
+        own["sphere_radius"] = rng.uniform(0.115, 0.125, B)
+    held = rng.integers(3)
+    options = [{}, dict(fixed={"xmin": "xyz"}), dict(fixed={"xmin": "x"})][held]
+    if held and few(0.5):
+        options["motion"] = lambda t: np.array([0.1 * t, 0.0, 0.0])
+        if few(0.5):
+            own["prescribed_motion"] = None
+    law = (ds.StableNeoHookean, ds.LinearElastic, ds.SmithNeoHookean, ds.StVenantKirchhoff)[rng.integers(4)]
+    scene = ds.Scene(MESH, law(2e4, 0.3), 1000.0, terms=terms, precision=precision, **options)
+    solver = EXPLICIT[rng.integers(2)](scene, dt=2e-3, substeps=int(rng.integers(2, 6)))
+    more = dict(save_every=1 if few(0.5) else None, memory=0.3 * B if few(0.4) else None)
+    batch = ds.Batch(solver, steps, B, gradients="all", lanes=True, **more)
+    own["youngs_modulus"] = rng.uniform(1e4, 3e4, (B,) if few(0.6) else (B, MESH.num_tetrahedra))
+    own["density"] = rng.uniform(800, 1200, B)
+    own["rest_positions"] = MESH.vertices + 1e-3 * rng.normal(size=(B, *MESH.vertices.shape))
+    known = batch.one.sweep.values
+    if "prescribed_motion" in own:
+        own["prescribed_motion"] = np.stack([known["prescribed_motion"] * k for k in rng.uniform(0.5, 2, B)])
+    out = {name: x for name, x in own.items() if name in batch.inputs and few(0.6)}
+    return batch, out | {"initial_velocities": 0.1 * rng.normal(size=(B, *MESH.vertices.shape)) + [0, -1, 0]}
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_scenes_are_bit_for_bit_those_alone(seed):
+    batch, own = drawn(seed)
+    rng, B = np.random.default_rng(100 + seed), batch.num_scenes
+    frames = batch.forward(**own)
+    assert frames.alive.all()
+    seeds = [rng.normal(size=frames.positions.shape), 0.01 * rng.normal(size=frames.positions.shape)]
+    gradients, total = batch.vjp(frames, *seeds), {}
+    for b in range(B):
+        alone = batch.one.forward(**{name: x[b] for name, x in own.items()})
+        np.testing.assert_array_equal(frames.displacements[b], alone.displacements)
+        np.testing.assert_array_equal(frames.velocities[b], alone.velocities)
+        assert str(frames.contact_resolution[b]) == str(alone.contact_resolution)
+        for name, by in batch.one.vjp(alone, *(x[b] for x in seeds)).items():
+            if name not in own:
+                total[name] = total.get(name, 0) + by
+                continue
+            bound = ROUND_OFF[batch.scene.precision] if name == "drag_rate" else 0  # decay has another derivative
+            np.testing.assert_allclose(gradients[name][b], by, rtol=bound, atol=bound * np.abs(by).max(), err_msg=name)
+    for name, by in total.items():
+        bound = ROUND_OFF[batch.scene.precision] * max(np.abs(by).max(), 1e-300)
+        np.testing.assert_allclose(gradients[name], by, rtol=0, atol=bound, err_msg=name)
+    if seed < 10:
+        _check_dot_product(batch, frames, own, seeds, gradients, rng)
+
+
+def _check_dot_product(batch, frames, own, seeds, gradients, rng):
+    """Tangents along all inputs, those that scenes share too, against gradients."""
+    along = {name: 0.1 * np.abs(x) * rng.normal(size=x.shape) for name, x in own.items()}
+    for name in set(batch.inputs) - set(own):
+        value = batch.one.sweep.values[name]
+        along[name] = 0.01 * np.abs(value) * rng.normal(size=value.shape)
+    changes = batch.tangents(frames, **along)
+    parts = [(changes[name] * seed).ravel() for name, seed in zip(("positions", "velocities"), seeds)]
+    there = sum(part.sum() for part in parts)
+    here = sum((gradients[name] * dot).sum() for name, dot in along.items())
+    size = sum(np.abs(part).sum() for part in parts) + sum(np.abs(gradients[n] * dot).sum() for n, dot in along.items())
+    assert abs(there - here) <= {"f32": 1e-5, "f64": 1e-13}[batch.scene.precision] * size
+
+
+def simple(B: int, precision="f64", **options) -> ds.Batch:
+    scene = ds.Scene(MESH, ds.StableNeoHookean(2e4, 0.3), 1000.0, terms=[ds.Gravity(-9.8)], precision=precision)
+    return ds.Batch(ds.SemiImplicitSolver(scene, dt=2e-3, substeps=4), 4, B, save_every=2, **options)
+
+
+def test_neighbours_and_places_do_not_matter():
+    E = np.random.default_rng(0).uniform(1e4, 3e4, 11)
+    all_of_them = simple(11).forward(youngs_modulus=E).positions
+    some = [7, 2, 9]
+    np.testing.assert_array_equal(simple(3).forward(youngs_modulus=E[some]).positions, all_of_them[some])
+
+
+@pytest.mark.parametrize("lanes", [None, False], ids=["lanes", "by turns"])
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_scenes_fail_alone(lanes):
+    E = np.array([2e4, 2e4, 5e9, 2e4, 1e4])  # the third is far beyond its stable step
+    batch = simple(5, lanes=lanes)
+    speed = 0.1 * np.random.default_rng(0).normal(size=MESH.vertices.shape)
+    frames = batch.forward(youngs_modulus=E, initial_velocities=speed)
+    good = simple(4).forward(youngs_modulus=np.delete(E, 2), initial_velocities=speed)
+    np.testing.assert_array_equal(frames.alive, [True, True, False, True, True])
+    np.testing.assert_array_equal(np.delete(frames.positions, 2, 0), good.positions)
+    assert np.isfinite(frames.positions).all()
+    last = frames.last_good[2]
+    np.testing.assert_array_equal(frames.positions[2, last:], np.repeat(frames.positions[2, last][None], 3 - last, 0))
+    assert isinstance(frames.error(2), ds.Divergence) and frames.error(0) is None
+    with pytest.raises(ds.Divergence, match="stable step"):
+        batch.forward(youngs_modulus=E, initial_velocities=speed, raise_errors=True)
+    with pytest.warns(UserWarning, match=r"scenes \[2\] did not come to their end"):
+        gradient = batch.vjp(frames, np.ones_like(frames.positions))["youngs_modulus"]
+    by_good = simple(4).vjp(good, np.ones_like(good.positions))["youngs_modulus"]
+    assert gradient[2] == 0
+    np.testing.assert_array_equal(np.delete(gradient, 2), by_good)
+
+
+def test_a_scene_that_crosses_an_obstacle_fails_alone():
+    scene = ds.Scene(MESH, ds.StableNeoHookean(2e4, 0.3), 1000.0, terms=[ds.Ground(LOW - 0.05, stiffness=10.0)])
+    batch = ds.Batch(ds.SemiImplicitSolver(scene, dt=1e-3), 30, 3, save_every=5, lanes=True)
+    speed = np.zeros((3, *MESH.vertices.shape))
+    speed[:, :, 1] = np.array([-0.1, -20.0, 0.1])[:, None]
+    frames = batch.forward(initial_velocities=speed)
+    np.testing.assert_array_equal(frames.alive, [True, False, True])
+    assert isinstance(frames.error(1), ds.Crossing)
+    heights = frames.positions[1, :, :, 1].min(1)
+    assert (heights > LOW - 0.05).all()
+
+
+@pytest.mark.parametrize("lanes", [True, False], ids=["lanes", "by turns"])
+def test_outputs_of_all_scenes(lanes):
+    points = MESH.vertices[:4] * 0.9 + 0.005
+    batch = simple(3, outputs=[ds.MaterialPoints(points)], lanes=lanes)
+    frames = batch.forward(youngs_modulus=[1e4, 2e4, 3e4])
+    name = next(iter(frames.outputs))
+    assert frames[name].shape == (3, 3, 4, 3)
+    seed = np.random.default_rng(0).normal(size=frames[name].shape)
+    along = dict(youngs_modulus=np.array([3e3, 1e3, 2e3]))
+    change = batch.tangents(frames, **along)[name]
+    gradient = batch.vjp(frames, **{name: seed})["youngs_modulus"]
+    assert (change * seed).sum() == pytest.approx(gradient @ along["youngs_modulus"], rel=1e-10)
+
+
+def test_scenes_by_turns_where_lanes_do_not_serve():
+    scene = ds.Scene(MESH, ds.StableNeoHookean(2e4, 0.3), 1000.0, terms=[ds.Gravity(-9.8)], precision="f64")
+    solver = ds.ImplicitEulerSolver(scene, dt=5e-3)
+    with pytest.raises(ValueError, match="the solver is not explicit"):
+        ds.Batch(solver, 2, 3, lanes=True)
+    batch = ds.Batch(solver, 2, 3)
+    assert not batch.lanes and "explicit" in batch.why_not
+    E = np.array([1e4, 2e4, 3e4])
+    frames = batch.forward(youngs_modulus=E)
+    seed = np.random.default_rng(0).normal(size=frames.positions.shape)
+    gradients = batch.vjp(frames, seed)
+    for b in range(3):
+        alone = batch.one.forward(youngs_modulus=E[b])
+        np.testing.assert_array_equal(alone.positions, frames.positions[b])
+        assert gradients["youngs_modulus"][b] == batch.one.vjp(alone, seed[b])["youngs_modulus"]
+
+
+def test_a_control_loop_goes_on_from_its_ends():
+    batch = ds.Batch(simple(1).solver, 1, 4)
+    E = np.array([1e4, 1.5e4, 2e4, 3e4])
+    state = {}
+    for _ in range(3):
+        state = batch.forward(youngs_modulus=E, **state).end
+    whole = ds.Batch(batch.solver, 3, 4).forward(youngs_modulus=E)
+    np.testing.assert_allclose(state["initial_positions"], whole.positions[:, -1], rtol=0, atol=1e-16)
+    np.testing.assert_allclose(state["initial_velocities"], whole.velocities[:, -1], rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("lanes", [True, False], ids=["lanes", "by turns"])
+def test_tensors(lanes):
+    batch = simple(3, gradients="all", lanes=lanes)
+    E = torch.tensor([1e4, 2e4, 3e4], dtype=torch.float64, requires_grad=True)
+    rho = torch.tensor(1000.0, dtype=torch.float64, requires_grad=True)
+    u0 = torch.zeros((3, *MESH.vertices.shape), dtype=torch.float64, requires_grad=True)
+    v0 = torch.zeros(MESH.vertices.shape, dtype=torch.float64, requires_grad=True)
+
+    def loss(E, rho, u0, v0):
+        given = dict(youngs_modulus=E, density=rho, initial_displacements=u0, initial_velocities=v0)
+        frames = rollout_frames(batch, **given)
+        return frames.displacements[:, -1].square().sum() * 1e4 + frames.velocities[:, 1:, ::3].sum()
+
+    assert torch.autograd.gradcheck(lambda E: loss(E, rho, u0, v0), E, eps=1.0, atol=1e-9, rtol=1e-5)
+    loss(E, rho, u0, v0).backward()
+    whole = [x.grad.clone() for x in (E, rho, u0, v0)]
+    alone = [torch.zeros_like(x) for x in (E, rho, u0, v0)]
+    for b in range(3):
+        own = [E[b].detach().requires_grad_(), *(x.detach().clone().requires_grad_() for x in (rho, u0[b], v0))]
+        names = ("youngs_modulus", "density", "initial_displacements", "initial_velocities")
+        frames = rollout_frames(batch.one, **dict(zip(names, own)))
+        (frames.displacements[-1].square().sum() * 1e4 + frames.velocities[1:, ::3].sum()).backward()
+        alone[0][b], alone[2][b] = own[0].grad, own[2].grad
+        alone[1] += own[1].grad
+        alone[3] += own[3].grad
+    for here, there in zip(whole, alone):
+        torch.testing.assert_close(here, there, rtol=1e-11, atol=1e-12)
+
+
+def test_several_seeds_run_forward_once(monkeypatch):
+    batch = simple(3)
+    frames = batch.forward()
+    seed, runs = np.ones_like(frames.positions), []
+    batch.vjp(frames, seed)
+    forward = type(batch.sweep)._forward
+    monkeypatch.setattr(type(batch.sweep), "_forward", lambda self, run: (runs.append(run), forward(self, run)))
+    first, second = batch.vjp(frames, seed), batch.vjp(frames, 2 * seed)
+    assert not runs
+    np.testing.assert_allclose(2 * first["youngs_modulus"], second["youngs_modulus"], rtol=1e-13)
+
+
+@pytest.mark.parametrize(
+    "wrong, said",
+    [
+        (dict(youngs_modulus=np.ones((2, 1))), "behind an axis of 3 scenes, got"),
+        (dict(gravity=np.ones((4, 3))), "behind an axis of 3 scenes, got"),
+        (dict(youngs_modulus=[1e4, -1e4, 1e4]), "must be > 0|must lie in"),
+        (dict(speed=1.0), "no input named 'speed'; this batch has"),
+        (dict(density=[1e3, np.nan, 1e3]), "density must be finite"),
+    ],
+)
+def test_wrong_values_are_refused(wrong, said):
+    with pytest.raises(ValueError, match=said):
+        simple(3).forward(**wrong)
+
+
+def test_what_could_be_either_is_refused():
+    scene = ds.Scene(MESH, ds.StableNeoHookean(2e4, 0.3), 1000.0, precision="f64")
+    m = MESH.num_tetrahedra
+    batch = ds.Batch(ds.SemiImplicitSolver(scene, dt=1e-3), 1, m)
+    with pytest.raises(ValueError, match=rf"one value for all scenes or one for each of {m}"):
+        batch.forward(youngs_modulus=np.full(m, 1e4))
+    batch.forward(youngs_modulus=np.full((m, m), 1e4))
+
+
+def test_wrong_seeds_and_counts_are_refused():
+    with pytest.raises(ValueError, match="scenes"):
+        simple(0)
+    batch = simple(2)
+    frames = batch.forward()
+    with pytest.raises(ValueError, match="expected shape"):
+        batch.vjp(frames, np.ones(3))
+    with pytest.raises(ValueError, match="no output named"):
+        batch.vjp(frames, stress=np.ones(3))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        batch.vjp(frames, np.zeros_like(frames.positions))
