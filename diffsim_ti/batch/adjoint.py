@@ -9,6 +9,8 @@ from diffsim_ti.batch.lanes import in_slots, pack, unpack, vectors
 from diffsim_ti.inputs import Derived
 
 OF_STEPS = "forces", "motion", "path"
+CLEARED = ("u", "v", "w", "corner", "rate_corner", "coefficients", "gradients", "volumes", "sums", "felt", "anchor")
+CLEARED += OF_STEPS
 
 
 class LanesAdjoint:
@@ -21,10 +23,11 @@ class LanesAdjoint:
         n, m = 3 * ws.num_rows, ws.num_blocks * a.num_tetrahedra
         self.u, self.v, self.w = (runtime.array(ws.lanes, 1, n) for _ in range(3))
         self.corner = runtime.array(ws.lanes, n)
-        self.rate_corner = runtime.array(ws.lanes, 1)
+        self.rate_corner = runtime.array(ws.lanes, n if "H_dot" in a.law.reads else 1)
+        self.z = runtime.array(ws.lanes, 1, ws.law_rows) if ws.law_rows else None
         self.coefficients = runtime.array(ws.lanes, a.num_coefficients * m)
-        self.gradients = runtime.array(ws.lanes, 9 * m * shape)
-        self.volumes = runtime.array(ws.lanes, m * shape)
+        self.gradients = runtime.array(ws.lanes, 9 * a.points * m * shape)
+        self.volumes = runtime.array(ws.lanes, a.points * m * shape)
         self.sums = runtime.array(ws.lanes, self.features.sums().total, ws.num_rows)
         self.felt = runtime.array(ws.lanes, 2 * self.features.moving, n if self.features.moving else 1)
         for name in (*OF_STEPS, "anchor"):
@@ -74,6 +77,8 @@ class LanesAdjoint:
         """Complete the adjoint of the start."""
         u, corner = runtime.fetch(self.u), runtime.fetch(self.corner)
         runtime.fill(self.u, u + corner[None])
+        if "H_dot" in self.ws.arrays.law.reads:
+            runtime.fill(self.v, runtime.fetch(self.v) + runtime.fetch(self.rate_corner)[None])
 
     def collect(self) -> Derived:
         """Adjoints of what kernels read, in float64, all with the scenes as their first axis."""
@@ -114,6 +119,9 @@ class LanesTangent:
         for name, part in (("u", "displacement"), ("v", "velocity")):
             data = pack(np.stack([getattr(d, part).ravel() for d in tangents]))
             setattr(self, name, runtime.upload(data[None], ws.lanes))
+        self.z = runtime.array(ws.lanes, 1, ws.law_rows) if ws.law_rows else None
+        if self.z is not None:
+            runtime.fill(self.z, 0)
         uniform = self.features.uniform
         whole = [np.broadcast_to(d.coefficients, (a.num_tetrahedra, a.num_coefficients)) for d in tangents]
         flat = dict(

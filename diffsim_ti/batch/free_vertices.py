@@ -283,6 +283,8 @@ class FreeVertices:
         first, F, n = self.first_of(i, b, plan), self.features, let(b * plan.num_vertices + i)
         p = [let(x + y) for x, y in zip(self.read(adjoint.u, 0, first), self.read(adjoint.corner, first))]
         q = self.read(adjoint.v, 0, first)
+        if "H_dot" in self.law.reads:
+            q = [let(x + y) for x, y in zip(q, self.read(adjoint.rate_corner, first))]
         v_plus_adj = [let(now.alpha * x + now.decay * y) for x, y in zip(p, q)]
         if F.drag >= 0:
             v_plus = [let(x / now.decay) for x in self.read(state.v, let(s + 1), first)]

@@ -12,6 +12,7 @@ import taichi as ti
 
 from diffsim_ti.batch.free_vertices import FreeVertices
 from diffsim_ti.batch.views import Corners, Item, Scratch, Shared, TetrahedronOfScenes, Uniform, Vectors, View
+from diffsim_ti.elements.tetrahedron import Onwards
 from diffsim_ti.runtime import LANES, Bundle, Kernel, at, let, traced
 from diffsim_ti.solvers.explicit.kick_drift import KickDrift
 from diffsim_ti.state.features import Features
@@ -93,6 +94,19 @@ class BatchKernels:
         return Bundle(tets=scene.tets, coefficients=coefficients, corner=Corners(corner, scene.tets), **shape)
 
     @traced
+    def of_tetrahedra(self, scene, adjoint):
+        """Adjoints that functions of tetrahedra add to."""
+        names = ("coefficients", "gradients", "volumes", *(("z",) if self.law.state_names else ()))
+        corner = Corners(adjoint.rate_corner, scene.tets)
+        return Bundle(rate_corner=corner, **{name: getattr(adjoint, name) for name in names})
+
+    @traced
+    def onwards(self, now):
+        """How the law's state goes on in a pass; one that only kicks leaves it as it is."""
+        alpha = at(now.alpha, 0) if _in_lanes(now.alpha) else now.alpha
+        return Onwards(h=now.h, moves=let(alpha > 0))
+
+    @traced
     def vectors(self, array, first, lane):
         return Vectors(array, let(3 * first), lane, self.vertex.vector, ti.cast(0, self.vertex.fp))
 
@@ -140,7 +154,9 @@ class BatchKernels:
     @traced
     def adjoint_of(self, b, lane, adjoint, plan):
         """The adjoints of scene `lane`."""
-        states = self.states_of(("u", "v", "w", "frames_u", "frames_v", "felt", "corner"), b, lane, adjoint, plan)
+        names = ("u", "v", "w", "frames_u", "frames_v", "felt", "corner")
+        names += ("rate_corner",) if self.element.reads_rates else ()
+        states = self.states_of(names, b, lane, adjoint, plan)
         sums = View(adjoint.sums, let(b * plan.num_vertices), lane)
         return Bundle(sums=sums, **states, **self.of_steps(b, lane, adjoint, plan))
 
@@ -171,7 +187,10 @@ class BatchKernels:
         s, now = (j - plan.base) * plan.stride, self.pass_of(b, j, table, plan)
         tetrahedra = self.tetrahedra_of(scene, scene.corner)
         for e in range(plan.num_tetrahedra):
-            self.element.forces(self.item(e, b, plan), tetrahedra, state, s, tetrahedra.corner)
+            item = self.item(e, b, plan)
+            self.element.forces(item, tetrahedra, state, s, tetrahedra.corner)
+            if ti.static(self.element.has_state):
+                self.element.move_on(item, tetrahedra, state, s, s + plan.stride, self.onwards(now))
         for i in range(plan.num_vertices):
             calm = self.free.step(i, b, s, now, scene, state, plan)
             if ti.static(self.free.some_special):
@@ -201,7 +220,10 @@ class BatchKernels:
         s, now = plan.first - plan.base, self.pass_of(b, plan.first, table, plan)
         tetrahedra, changed = self.tetrahedra_of(scene, scene.corner), self.changed_of(tangent)
         for e in range(plan.num_tetrahedra):
-            self.element.forces_jvp(self.item(e, b, plan), tetrahedra, state, s, tangent, tetrahedra.corner, changed)
+            item = self.item(e, b, plan)
+            self.element.forces_jvp(item, tetrahedra, state, s, tangent, tetrahedra.corner, changed)
+            if ti.static(self.element.has_state):
+                self.element.move_on_jvp(item, tetrahedra, state, s, tangent, changed, self.onwards(now))
         for i in range(plan.num_vertices):
             calm = self.was_calm(s, b, i, state, plan)
             if calm == 1:
@@ -268,12 +290,16 @@ class BatchKernels:
                         by = self.adjoint_of(b, lane, adjoint, plan)
                         self.vertex.step_vjp(i, j, self.one(now, lane), own, at_, by, plan)
             self.free.clear(b, i, adjoint.corner, plan)
-        tetrahedra = self.tetrahedra_of(scene, adjoint.corner)
+            if ti.static(self.element.reads_rates):
+                self.free.clear(b, i, adjoint.rate_corner, plan)
+        tetrahedra, by_tetrahedra = self.tetrahedra_of(scene, adjoint.corner), self.of_tetrahedra(scene, adjoint)
         for e in range(plan.num_tetrahedra):
-            item = self.item(e, b, plan)
-            self.element.forces_vjp(
-                item, tetrahedra, state, s, adjoint.w, tetrahedra.corner, adjoint, self.features.shape
-            )
+            item, corner = self.item(e, b, plan), tetrahedra.corner
+            if ti.static(self.element.has_state):
+                self.element.move_on_vjp(
+                    item, tetrahedra, state, s, self.onwards(now), corner, by_tetrahedra, self.features.shape
+                )
+            self.element.forces_vjp(item, tetrahedra, state, s, adjoint.w, corner, by_tetrahedra, self.features.shape)
         for p in range(ti.static(self.features.moving)):
             for lane in range(LANES):
                 by = self.adjoint_of(b, lane, adjoint, plan)

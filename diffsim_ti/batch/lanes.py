@@ -47,15 +47,14 @@ def vectors(array, num_scenes: int) -> np.ndarray:
 class LanesHistory:
     """States of a batch in `num_slots` slots, forces and what vertices met with them if recorded, and the law's states."""
 
-    names = "u", "v"
-
     def __init__(self, workspace, num_slots: int, record: bool = False):
         lanes, n, self.num_slots = workspace.lanes, 3 * workspace.num_rows, num_slots
         self.u, self.v = (runtime.array(lanes, num_slots, n) for _ in range(2))
         self.f = runtime.array(lanes, *((num_slots, n) if record else (1, 1)))
+        self.z = runtime.array(lanes, num_slots, workspace.law_rows) if workspace.law_rows else None
         calm = record and workspace.some_special
         self.calm = runtime.array(ti.i32, num_slots * workspace.num_rows if calm else 1)
 
     def copy(self, slot: int, target: "LanesHistory", to: int) -> None:
-        for name in self.names:
+        for name in ("u", "v") if self.z is None else ("u", "v", "z"):
             copy_slot(getattr(self, name), slot, getattr(target, name), to)

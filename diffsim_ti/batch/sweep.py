@@ -60,7 +60,9 @@ class LanesSweep(Sweep):
         super().__init__(solver, steps, memory=memory, **options)
         self.num_scenes = num_scenes
         held = runtime.LANES * -(-num_scenes // runtime.LANES) / 4 * 3  # vectors of three, of whole blocks
-        self.checkpoints = choose_checkpoints(self.num_passes, int(self.state_bytes * held), None, memory)
+        self.checkpoints = choose_checkpoints(
+            self.num_passes, int(self.state_bytes * held), None, memory, self.checkpoints.law_state
+        )
 
     def values_of(self, values: dict, b: int) -> dict:
         """The values of scene b."""

@@ -32,12 +32,8 @@ def why_not(solver) -> str | None:
         return "lanes are for CPUs"
     if not scene.law.lanes:
         return f"the law of {type(scene.material).__name__} does not come in lanes"
-    if scene.law.state_names or scene.law.reads != ("H",):
-        return f"{type(scene.material).__name__} depends on more than the deformation"
     if scene.volume != "tetrahedra":
         return f"volume = {scene.volume!r}"
-    if scene.mesh.order != 1:
-        return "elements have ten nodes"
     terms = dict(self_contact=scene.term(SelfContact), pressures=scene.pressures, chambers=scene.chambers)
     terms |= dict(springs_or_cables=scene.ties, foundations=len(scene.founded_vertices))
     terms |= dict(contact_within_faces=feels_faces(scene), mesh_obstacles=_tables(scene))
@@ -196,7 +192,7 @@ class LanesWorkspace:
         out = np.zeros(a.num_vertices, np.int32)
         if features.groups:
             free = batch_kernels(a.law, features, frozenset()).free
-            out[a.mesh.surface_vertices] = NEAR if free.lane_groups else SPECIAL
+            out[self.derived[0].surface > 0] = NEAR if free.lane_groups else SPECIAL
         if features.motion:
             out[a.held] = SPECIAL
         if features.guided:
@@ -210,6 +206,18 @@ class LanesWorkspace:
     def kernels(self, features) -> BatchKernels:
         return batch_kernels(self.arrays.law, features, self.own)
 
+    @property
+    def law_rows(self) -> int:
+        """How many rows of lanes the law's states take."""
+        a = self.arrays
+        return len(a.law.state_names) * a.points * a.num_tetrahedra * self.num_blocks
+
+    def initial_states(self) -> np.ndarray:
+        law = self.arrays.law
+        initial = law.initial_state or (0.0,) * len(law.state_names)
+        rows = np.tile(initial, self.law_rows // len(initial))
+        return np.repeat(rows[:, None], runtime.LANES, 1)[None]
+
     # ---- states ------------------------------------------------------------------------------------------------------
 
     def history(self, num_slots: int) -> LanesHistory:
@@ -220,6 +228,8 @@ class LanesWorkspace:
         for target, name in ((self.state.u, "displacement"), (self.state.v, "velocity")):
             starts = np.stack([getattr(d, name).ravel() for d in self.derived])
             runtime.fill(target, pack(starts)[None])
+        if self.state.z is not None:
+            runtime.fill(self.state.z, self.initial_states())
         seen = np.zeros(runtime.full_shape(self.met.seen))
         seen[::3] = np.inf
         runtime.fill(self.met.seen, seen)
