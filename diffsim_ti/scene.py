@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
 from diffsim_ti.checked import instance, listed
-from diffsim_ti.inputs import ConsistentMass, Inputs
+from diffsim_ti.inputs import ConsistentMass, Inputs, poses
 from diffsim_ti.mass_scaling import MassScaling
 from diffsim_ti.materials.material import Material
 from diffsim_ti.materials.moduli import youngs_poisson
@@ -31,7 +31,8 @@ from diffsim_ti.terms import (
     Spring,
     Term,
 )
-from diffsim_ti.terms.motion import Motion, sampled
+from diffsim_ti.terms.motion import Motion
+from diffsim_ti.terms.pose import sampled_path
 from diffsim_ti.terms.obstacles.obstacle import PER_AREA
 
 
@@ -220,9 +221,14 @@ class Scene:
         return self.supports.rows(self.motion, times)
 
     def path_rows(self, times: ArrayLike) -> dict[str, np.ndarray]:
-        """Displacement of each moving obstacle at each time [s], by input name, shape (len(times), 3) [m]."""
+        """Path of each moving obstacle at each time [s], by input name, shape (len(times), 3, 6 or 7) [m]."""
         names = self.inputs.paths
-        return {name: sampled(name, t.path, times, 1)[:, 0] for name, t in zip(names, self.moving)}
+        return {name: sampled_path(name, t.path, times) for name, t in zip(names, self.moving)}
+
+    @property
+    def path_columns(self) -> int:
+        """How many vectors of a step's row the paths of obstacles are on the device."""
+        return sum(poses.COLUMNS if t.turns else 1 for t in self.moving)
 
     @property
     def loaded_vertices(self) -> np.ndarray:
@@ -280,7 +286,7 @@ class Scene:
         return np.unique(np.concatenate([np.zeros(0, np.int64), *(t.indices(self.mesh) for t in self.foundations)]))
 
     def places(self, time: float) -> dict[Term, np.ndarray]:
-        """Displacement of each moving obstacle at a time [s], shape (3,) [m]."""
+        """Displacement or pose of each moving obstacle at a time [s], shape (3,), (6,) or (7,) [m]."""
         return {term: rows[0] for term, rows in zip(self.moving, self.path_rows([time]).values())}
 
     # ---- matrices ----------------------------------------------------------------------------------------------------

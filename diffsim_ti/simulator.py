@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
+from diffsim_ti.inputs.poses import PoseColumns
 from diffsim_ti.checked import instance, numbers
 from diffsim_ti.monitor import quantities
 from diffsim_ti.monitor.guard import Guard
@@ -105,7 +106,7 @@ class Simulator:
             arrays.load_rows(motion=self.scene.motion_rows([self.time, self.time + self.solver.dt]))
         if values.path is not None:
             rows = self.scene.path_rows([self.time, self.time + self.solver.dt])
-            arrays.load_rows(path=np.stack(list(rows.values()), 1))
+            arrays.load_rows(path=PoseColumns(rows, "path").value(*rows.values())[0])
         inputs = self.scene.inputs
         if inputs.makes_rows:
             now = inputs.derive(inputs.at_step(self.step_count, self.solver.dt, self._set))

@@ -15,6 +15,7 @@ from diffsim_ti.inputs.curved_shape import CurvedShape, StressPoints
 from diffsim_ti.inputs.description import POSITIVE, Input, frozen, length, speed
 from diffsim_ti.inputs.foundation import FoundationRows
 from diffsim_ti.inputs.loads import PressureRows, SumOfForces
+from diffsim_ti.inputs.poses import PoseColumns
 from diffsim_ti.inputs.surface_areas import SurfaceAreas
 from diffsim_ti.inputs.ties import JoinedRows, JoinedSegments
 from diffsim_ti.rows import Rows
@@ -38,7 +39,7 @@ class Derived:
     surface: np.ndarray | None = None  # (num_vertices,) of the surface, 0 within [m^2]
     forces: np.ndarray | None = None  # (1 or steps, k, 3), or (1 or steps, 2 k, 3) as each step begins and ends [N]
     motion: np.ndarray | None = None  # (steps + 1, num_held, 3) [m]
-    path: np.ndarray | None = None  # displacements of obstacles, (steps + 1, num_moving, 3) [m]
+    path: np.ndarray | None = None  # paths of obstacles (inputs/poses.py), (steps + 1, columns, 3)
     # pressures, then numbers of chambers, as each step begins and ends, and 0, (1 or steps, loads and numbers, 3)
     follower: np.ndarray | None = None
     ties: np.ndarray | None = None  # numbers of springs and cables (inputs/ties.py), (1 or steps, 2 ties, 3)
@@ -143,7 +144,7 @@ class Inputs:
         out += self._sums_of_loads()
         out.append(links.Placed(places, "parameters", max(self.parameters.total, 1)))
         if self.paths:
-            out.append(links.Columns(self.paths, "path"))
+            out.append(PoseColumns(self.paths, "path"))
         if scene.motion is not None:
             out.append(links.Same("prescribed_motion", "motion"))
         return out

@@ -9,10 +9,12 @@ from functools import cached_property
 
 import taichi as ti
 
+from diffsim_ti.inputs.poses import COLUMNS
 from diffsim_ti.runtime import Bundle, let, traced
 from diffsim_ti.solvers.explicit.guides import Guides
 from diffsim_ti.state.obstacle_functions import ObstacleFunctions
 from diffsim_ti.state.pass_table import pass_at
+from diffsim_ti.terms.obstacles import turning
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
 # what a contact stage notes of obstacle o at vertex i, in state.stage[ROWS o + row, i]: (n, d); (stiffness, width, mu,
@@ -39,33 +41,133 @@ class ObstacleStages(ObstacleFunctions):
 
     # ---- where obstacles are -----------------------------------------------------------------------------------------
 
+    @traced
+    def column(self, g, k):
+        """Of the path of an obstacle."""
+        return g.path + COLUMNS * k if g.force.turns else g.path + k
+
     @ti.func
-    def place_at(self, g: A, k, share, now: A, path: A):
+    def shift_at(self, g: A, k, share, now: A, path: A):
         """Displacement of an obstacle at a share of the step."""
         place = self.vector(0)
         if ti.static(g.path >= 0):
-            start = path[now.row, g.path + k]
-            place = start + share * (path[now.next, g.path + k] - start)
+            start = path[now.row, self.column(g, k)]
+            place = start + share * (path[now.next, self.column(g, k)] - start)
         return place
 
+    @traced
+    def place_at(self, g, k, share, now, path):
+        """Displacement of an obstacle at a share of the step; of one that turns with its unit quaternion behind."""
+        shift = self.shift_at(g, k, share, now, path)
+        if not g.force.turns:
+            return shift
+        return self.turned.joined(shift, self.turn_at(g, k, share, now, path), 4)
+
     @ti.func
-    def place(self, g: A, k, now: A, path: A):
-        """Displacement of an obstacle when the pass begins."""
+    def turn_at(self, g: A, k, share, now: A, path: A):
+        c = self.column(g, k)
+        start = turning.from_rodrigues(self.turned.short(path[now.row, c + 1]), self.fp)
+        return turning.product(turning.quaternion(share * self.turned.short(path[now.row, c + 2]), self.fp), start)
+
+    @traced
+    def place(self, g, k, now, path):
+        """The same when the pass begins."""
         return self.place_at(g, k, now.begin, now, path)
+
+    @traced
+    def seen_now(self, g, k, rest, now, scene):
+        """X of a rest position when the pass begins (state/obstacle_functions.py)."""
+        return self.seen(g, rest, self.place(g, k, now, scene.path))
+
+    @traced
+    def moved(self, g, k, X, u, dr, now, scene, tangent):
+        """Change of the place for dr of X + u, and for that of the obstacle."""
+        shift = self.shift_at(g, k, now.begin, now, tangent.path)
+        if not g.force.turns:
+            return dr - shift
+        dplace = self.turned.joined(shift, self.turn_jvp(g, k, now, scene, tangent))
+        return self.turned.moved(g, g.first + k * g.size, X, u, dr, dplace, scene, tangent)
+
+    @ti.func
+    def turn_jvp(self, g: A, k, now: A, scene: A, tangent: A):
+        """theta when the pass begins."""
+        c = self.column(g, k)
+        a = now.begin * self.turned.short(scene.path[now.row, c + 2])
+        theta, dphi = self.turned.short(tangent.path[now.row, c + 1]), self.turned.short(tangent.path[now.row, c + 2])
+        return turning.rotated(a, theta, self.fp) + now.begin * turning.jacobian(a, dphi, self.fp)
 
     @ti.func
     def speed(self, g: A, k, now: A, path: A):
-        """Velocity of an obstacle in the pass."""
+        """Velocity of an obstacle in the pass, of one that turns that of the point which it turns about."""
         speed = self.vector(0)
         if ti.static(g.path >= 0):
-            speed = now.per_step * (path[now.next, g.path + k] - path[now.row, g.path + k])
+            speed = now.per_step * (path[now.next, self.column(g, k)] - path[now.row, self.column(g, k)])
         return speed
+
+    @ti.func
+    def spin(self, g: A, k, now: A, path: A):
+        """Angular velocity."""
+        return now.per_step * self.turned.short(path[now.row, self.column(g, k) + 2])
+
+    @traced
+    def wall(self, g, k, X, u, now, scene):
+        """Velocity of an obstacle at a vertex in the pass."""
+        v = self.speed(g, k, now, scene.path)
+        if not g.force.turns:
+            return v
+        r = self.turned.arm(g, g.first + k * g.size, X, u, scene)
+        return self.turned.wall(self.turned.short(v), self.spin(g, k, now, scene.path), now.h, r)
+
+    @traced
+    def wall_jvp(self, g, k, X, u, dr, now, scene, tangent):
+        """Its change, for dr of X + u."""
+        dv = self.speed(g, k, now, tangent.path)
+        return self.turned_wall_jvp(g, k, X, u, dr, dv, now, scene, tangent) if g.force.turns else dv
+
+    @ti.func
+    def turned_wall_jvp(self, g: A, k, X, u, dr, dv, now: A, scene: A, tangent: A):
+        first = g.first + k * g.size
+        arm, darm = self.turned.arm(g, first, X, u, scene), self.turned.short(dr)
+        darm += -1 * self.turned.short(self.shift_at(g, k, now.begin, now, tangent.path))
+        darm += -1 * self.turned.about(g, first, tangent.parameters)
+        omega, domega = self.spin(g, k, now, scene.path), self.spin(g, k, now, tangent.path)
+        return self.turned.wall_jvp(self.turned.short(dv), omega, domega, now.h, arm, darm)
+
+    @traced
+    def spread(self, g, k, i, X, u, by, by_wall, now, scene, adjoint, felt, column=None):
+        """Adjoint of u for those of the changed place and of the obstacle's velocity there; adds those of its path to column
+        `column` of felt.felt, and of the point that it turns about to column i of the sums."""
+        column = i if column is None else column
+        if g.force.turns:
+            return self.spread_turned(g, k, i, column, X, u, by, by_wall, now, scene, adjoint, felt)
+        self.add_to_path(g, k, column, now, by, by_wall, felt)
+        return by
+
+    @ti.func
+    def spread_turned(self, g: A, k, i, column, X, u, by, by_wall, now: A, scene: A, adjoint: A, felt: A):
+        first, b = g.first + k * g.size, self.turned.short(by_wall)
+        r, omega = self.turned.arm(g, first, X, u, scene), self.spin(g, k, now, scene.path)
+        by_omega, by_arm = self.turned.wall_vjp(omega, now.h, r, b)
+        by_u, _, by_theta = self.turned.spread(g, first, i, X, u, by, by_arm, scene, adjoint.sums)
+        self.add_to_path(g, k, column, now, by_u, by_wall, felt)
+        self.add_to_turn(g, k, column, now, by_theta, by_omega, scene, felt)
+        return by_u
+
+    @ti.func
+    def add_to_turn(self, g: A, k, i, now: A, by_theta, by_omega, scene: A, adjoint: A):
+        """Adjoints of the rotation of the row and of that in the step."""
+        phi, c = self.turned.short(scene.path[now.row, self.column(g, k) + 2]), now.felt + 2 * self.column(g, k)
+        back = -now.begin * phi
+        by_row = turning.rotated(back, by_theta, self.fp)
+        by_phi = now.begin * turning.jacobian(back, by_theta, self.fp) + now.per_step * by_omega
+        adjoint.felt[c + 2, i] = adjoint.felt[c + 2, i] + self.turned.long(by_row)
+        adjoint.felt[c + 4, i] = adjoint.felt[c + 4, i] + self.turned.long(by_phi)
 
     @ti.func
     def add_to_path(self, g: A, k, i, now: A, by_X, by_wall, adjoint: A):
         """Adjoints of the rows of the path that vertex i felt; summed over the vertices where a step begins."""
         if ti.static(g.path >= 0):
-            c, rate = now.felt + 2 * (g.path + k), now.per_step * by_wall
+            c, rate = now.felt + 2 * self.column(g, k), now.per_step * by_wall
             adjoint.felt[c, i] = adjoint.felt[c, i] - ((1 - now.begin) * by_X + rate)
             adjoint.felt[c + 1, i] = adjoint.felt[c + 1, i] - (now.begin * by_X - rate)
 
@@ -94,6 +196,13 @@ class ObstacleStages(ObstacleFunctions):
             adjoint.path[row, p] = adjoint.path[row, p] + to_row
             adjoint.path[after, p] = adjoint.path[after, p] + to_next
 
+    @traced
+    def way_of_wall(self, g, k, X, u, now, scene):
+        """How far an obstacle goes in the pass at a vertex."""
+        if g.force.turns:
+            return now.h * self.wall(g, k, X, u, now, scene)
+        return self.place_at(g, k, now.end, now, scene.path) - self.place(g, k, now, scene.path)
+
     # ---- what is noted -----------------------------------------------------------------------------------------------
 
     @ti.func
@@ -107,9 +216,8 @@ class ObstacleStages(ObstacleFunctions):
     @ti.func
     def note_one(self, g: A, k, i, u, u_next, now: A, scene: A, state: A):
         first, at = g.first + k * g.size, 3 * (g.number + k)
-        place = self.place(g, k, now, scene.path)
-        moved = self.place_at(g, k, now.end, now, scene.path) - place
-        X, move = scene.rest[i] - place, u_next - u - moved
+        X = self.seen_now(g, k, scene.rest[i], now, scene)
+        move = u_next - u - self.way_of_wall(g, k, X, u, now, scene)
         d, width = g.force.gap(scene.parameters, first, X, u), g.force.width(scene.parameters, first)
         far = d - width if ti.static(self.features.stages) else d  # a stage feels where a pass leads to
         if d < width or move.dot(move) >= far * far:
@@ -129,7 +237,7 @@ class ObstacleStages(ObstacleFunctions):
         """f and the force of all obstacles on vertex i."""
         for g in ti.static(self.features.pressing):
             for k in range(g.count):
-                X = scene.rest[i] - self.place(g, k, now, scene.path)
+                X = self.seen_now(g, k, scene.rest[i], now, scene)
                 f += self.on_area(g, i, g.force.force(scene.parameters, g.first + k * g.size, X, u, v), scene)
         return f
 
@@ -139,9 +247,9 @@ class ObstacleStages(ObstacleFunctions):
         for g in ti.static(self.features.pressing):
             for k in range(g.count):
                 first = g.first + k * g.size
-                X = scene.rest[i] - self.place(g, k, now, scene.path)
-                dX = tangent.rest[i] - self.place(g, k, now, tangent.path)
-                df += self.on_area(g, i, g.force.force_jvp(scene.parameters, first, X, u, v, du + dX, dv), scene)
+                X = self.seen_now(g, k, scene.rest[i], now, scene)
+                moved = self.moved(g, k, X, u, du + tangent.rest[i], now, scene, tangent)
+                df += self.on_area(g, i, g.force.force_jvp(scene.parameters, first, X, u, v, moved, dv), scene)
                 by = g.force.parameter_derivatives(scene.parameters, first, X, u, v)
                 for m in ti.static(range(g.size)):
                     df += self.on_area(g, i, by[m], scene) * tangent.parameters[first + m]
@@ -155,12 +263,12 @@ class ObstacleStages(ObstacleFunctions):
         for g in ti.static(self.features.pressing):
             for k in range(g.count):
                 first = g.first + k * g.size
-                X = scene.rest[i] - self.place(g, k, now, scene.path)
+                X = self.seen_now(g, k, scene.rest[i], now, scene)
                 w = self.on_area(g, i, f_adj, scene)
-                by_u, by_v = g.force.force_vjp(scene.parameters, first, X, u, v, w)
+                by_place, by_v = g.force.force_vjp(scene.parameters, first, X, u, v, w)
+                by_u = self.spread(g, k, i, X, u, by_place, self.vector(0), now, scene, adjoint, adjoint)
                 u_adj += by_u
                 v_adj += by_v
-                self.add_to_path(g, k, i, now, by_u, self.vector(0), adjoint)
                 by = g.force.parameter_derivatives(scene.parameters, first, X, u, v)
                 for m in ti.static(range(g.size)):
                     adjoint.sums[first + m, i] = adjoint.sums[first + m, i] + by[m].dot(w)
@@ -176,8 +284,8 @@ class ObstacleStages(ObstacleFunctions):
         work, v = ti.cast(0, self.fp), v_plus
         for g in ti.static(self.features.pressing):
             for k in range(g.count):
-                first, wall = g.first + k * g.size, self.speed(g, k, now, scene.path)
-                X = scene.rest[i] - self.place(g, k, now, scene.path)
+                first, X = g.first + k * g.size, self.seen_now(g, k, scene.rest[i], now, scene)
+                wall = self.wall(g, k, X, u, now, scene)
                 if ti.static(g.path >= 0):
                     force = self.on_area(g, i, g.force.force(scene.parameters, first, X, u, v_plus), scene)
                     work += now.h * force.dot(wall)
@@ -194,9 +302,9 @@ class ObstacleStages(ObstacleFunctions):
     def slide(self, g: A, k, i, u, v, now: A, scene: A):
         """Velocity of vertex i after the friction of one obstacle."""
         first, after = g.first + k * g.size, v
-        X = scene.rest[i] - self.place(g, k, now, scene.path)
+        X = self.seen_now(g, k, scene.rest[i], now, scene)
         if g.force.touches(scene.parameters, first, X, u):
-            wall = self.speed(g, k, now, scene.path)
+            wall = self.wall(g, k, X, u, now, scene)
             h_over_m = self.on_area(g, i, now.h * scene.inverse_mass[i], scene)
             after = g.force.slide(scene.parameters, first, X, u, v, wall, h_over_m)
         return after
@@ -225,10 +333,11 @@ class ObstacleStages(ObstacleFunctions):
             h_over_m = self.on_area(g, i, now.h * inverse, scene)
             for k in range(g.count):
                 first = g.first + k * g.size
-                X = scene.rest[i] - self.place(g, k, now, scene.path)
+                X = self.seen_now(g, k, scene.rest[i], now, scene)
                 if g.force.touches(scene.parameters, first, X, u):
-                    moved = du + tangent.rest[i] - self.place(g, k, now, tangent.path)
-                    wall, dwall = self.speed(g, k, now, scene.path), self.speed(g, k, now, tangent.path)
+                    moved = self.moved(g, k, X, u, du + tangent.rest[i], now, scene, tangent)
+                    wall = self.wall(g, k, X, u, now, scene)
+                    dwall = self.wall_jvp(g, k, X, u, du + tangent.rest[i], now, scene, tangent)
                     lighter = -h_over_m * inverse * tangent.mass[i]
                     if ti.static(g.force.per_area):
                         lighter += now.h * inverse * tangent.surface[i]
@@ -247,12 +356,13 @@ class ObstacleStages(ObstacleFunctions):
             for back in range(g.count):
                 k = g.count - 1 - back
                 first = g.first + k * g.size
-                X = scene.rest[i] - self.place(g, k, now, scene.path)
+                X = self.seen_now(g, k, scene.rest[i], now, scene)
                 if g.force.touches(scene.parameters, first, X, u):
                     start = self.slide_before(g.number + k, i, u, v, now, scene)
-                    by_u, by_v, by_wall, by_ratio, by = g.force.slide_vjp(
-                        scene.parameters, first, X, u, start, self.speed(g, k, now, scene.path), h_over_m, v_adj
+                    by_place, by_v, by_wall, by_ratio, by = g.force.slide_vjp(
+                        scene.parameters, first, X, u, start, self.wall(g, k, X, u, now, scene), h_over_m, v_adj
                     )
+                    by_u = self.spread(g, k, i, X, u, by_place, by_wall, now, scene, adjoint, adjoint)
                     v_adj = by_v
                     u_adj += by_u
                     for m in ti.static(range(g.size)):
@@ -262,5 +372,4 @@ class ObstacleStages(ObstacleFunctions):
                         adjoint.sums[row, i] = adjoint.sums[row, i] - h_over_m * inverse * by_ratio
                     self.add_to_area(g, i, now.h * inverse * by_ratio, adjoint)
                     self.add_to_rest(i, by_u, adjoint)
-                    self.add_to_path(g, k, i, now, by_u, by_wall, adjoint)
         return u_adj, v_adj
