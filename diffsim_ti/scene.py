@@ -32,8 +32,8 @@ from diffsim_ti.terms import (
     Term,
 )
 from diffsim_ti.terms.motion import Motion
-from diffsim_ti.terms.pose import sampled_path
 from diffsim_ti.terms.obstacles.obstacle import PER_AREA
+from diffsim_ti.terms.pose import sampled_path
 
 
 def _kind(term) -> tuple:

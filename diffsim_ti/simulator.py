@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
-from diffsim_ti.inputs.poses import PoseColumns
 from diffsim_ti.checked import instance, numbers
+from diffsim_ti.inputs.poses import PoseColumns
 from diffsim_ti.monitor import quantities
 from diffsim_ti.monitor.guard import Guard
 from diffsim_ti.monitor.quantities import Energy, TetrahedronFields

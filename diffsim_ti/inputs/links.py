@@ -1,6 +1,6 @@
 """Links of a body, its rest shape, mass and start, and what joins the numbers of terms and the paths of obstacles."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 
 import numpy as np
 

@@ -94,7 +94,7 @@ class Turned:
         """(adjoint of omega, of r)"""
         back = -tau * omega
         by_omega = turning.jacobian(back, turning.rotated(tau * omega, r, self.fp).cross(by), self.fp)
-        return by_omega, -omega.cross(turning.jacobian(back, by, self.fp))
+        return by_omega, turning.jacobian(back, by, self.fp).cross(omega)
 
     @ti.func
     def spread(self, g: A, first, i, X, u, by, by_arm, scene: A, sums: A):

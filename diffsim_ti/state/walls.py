@@ -1,8 +1,9 @@
 """Where obstacles are in a pass, rows of three numbers that kernels read, with tangent and adjoint, on the host.
 
 Obstacle k has rows 3 k, 3 k + 1 and 3 k + 2: its displacement where forces are taken, that where the pass begins, its
-velocity. Those that turn have four more behind all of these: modified Rodrigues parameters of both rotations, the angular
-velocity, and (tau, 0, 0), the time of the chord of its velocity (turned.py). Changes of rotations are theta, dR = [theta]x R.
+velocity. Those that turn have six more behind all of these: modified Rodrigues parameters of both rotations, the angular
+velocity, and, as the last, (tau, 0, 0), the time of the chord of its velocity (turned.py). Changes of rotations are theta,
+dR = [theta]x R. Every third row is where obstacles are: `places`; how they go from there is `drifts`, of rotations psi.
 """
 
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ import numpy as np
 from diffsim_ti import rotations
 from diffsim_ti.state.schedule import Schedule
 
-MORE = 4  # rows of an obstacle that turns
+MORE = 6  # rows of an obstacle that turns
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,7 @@ class Walls:
         turning = [(k, c) for k, (force, _, c) in enumerate(obstacles) if force.turns]
         self.turning = [(3 * len(obstacles) + MORE * n, c) for n, (_, c) in enumerate(turning)]
         self.size = 3 * len(obstacles) + MORE * len(turning)
-        self.row_of = {k: row for (k, _), (row, _) in zip(turning, self.turning)}  # of obstacle k
+        self.place_of = {k: row // 3 for (k, _), (row, _) in zip(turning, self.turning)}  # of obstacle k among places
 
     def value(self, path: np.ndarray | None, at: Moment | None) -> np.ndarray:
         """The rows, shape (size, 3); without a path all zero."""
@@ -48,7 +49,7 @@ class Walls:
                     turn = rotations.quaternion(share * phi)
                     out[row + m] = rotations.rodrigues(rotations.product(turn, start))
                 out[row + 2] = phi / at.schedule.step_length(at.j)
-                out[row + 3, 0] = at.tau
+                out[row + 5, 0] = at.tau
         return out
 
     def _translations(self, out, path, at):
@@ -56,6 +57,36 @@ class Walls:
         at_stage, speed = at.schedule.place(path, at.j, at.at_stage), at.schedule.rate(path, at.j)
         for k, c in self.columns:
             out[3 * k : 3 * k + 3] = at_stage[c], before[c], speed[c]
+
+    # ---- places ------------------------------------------------------------------------------------------------------
+
+    def drift(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+        """How obstacles go from places to others, the short way."""
+        out = after - before
+        for at in self.place_of.values():
+            a, b = rotations.from_rodrigues(before[at]), rotations.from_rodrigues(after[at])
+            out[at] = rotations.vector(rotations.product(b, rotations.conjugate(a)))
+        return out
+
+    def moved(self, places: np.ndarray, drift: np.ndarray, share: float) -> np.ndarray:
+        """Where they are when the share of a drift is done."""
+        out = places + share * drift
+        for at in self.place_of.values():
+            start = rotations.from_rodrigues(places[at])
+            out[at] = rotations.rodrigues(rotations.product(rotations.quaternion(share * drift[at]), start))
+        return out
+
+    def way_at(
+        self, k: int, places: np.ndarray, drift: np.ndarray, points: np.ndarray, about: np.ndarray
+    ) -> np.ndarray:
+        """How far obstacle k takes points [m] that it holds on a drift, shape (points, 3)."""
+        out = np.tile(drift[k], (len(points), 1))
+        if k in self.place_of:
+            arm = points - places[k] - about
+            out += rotations.turned(rotations.quaternion(drift[self.place_of[k]]), arm) - arm
+        return out
+
+    # ------------------------------------------------------------------------------------------------------------------
 
     def jvp(self, path: np.ndarray | None, dpath: np.ndarray | None, at: Moment) -> np.ndarray:
         """Change of the rows."""

@@ -77,8 +77,8 @@ class HeldBack(ObstacleStages):
         seed.w = by_y
         turned = g.force.outlook_jvp(scene.parameters, first, X, u, seed)
         g.force.outlook_vjp(scene.parameters, first, X, u, seed, adjoint.sums, i)
-        by_u = self.turn_of_plane(g, self.normal(turned) + by_y * n, n, seed)
-        by_u = self.spread(g, k, i, X, u, by_u, -now.h * by_z, now, scene, adjoint, out, column)
+        by_place = self.turn_of_plane(g, self.normal(turned) + by_y * n, n, seed)
+        by_u = self.spread(g, k, i, X, u, by_place, -now.h * by_z, now, scene, adjoint, out, column)
         return by_e, by_z, by_u
 
     @traced
