@@ -58,6 +58,18 @@ class Walls:
         for k, c in self.columns:
             out[3 * k : 3 * k + 3] = at_stage[c], before[c], speed[c]
 
+    def row_of(self, k: int, rows: np.ndarray) -> np.ndarray:
+        """Where obstacle k is where forces are taken: 3 numbers, or 7 of a pose."""
+        if k not in self.place_of:
+            return rows[3 * k]
+        return np.concatenate([rows[3 * k], rotations.from_rodrigues(rows[3 * self.place_of[k]])])
+
+    def velocity_at(self, k: int, rows: np.ndarray, point: np.ndarray, about: np.ndarray) -> np.ndarray:
+        """Of obstacle k at a point [m/s]."""
+        if k not in self.place_of:
+            return rows[3 * k + 2]
+        return rows[3 * k + 2] + np.cross(rows[3 * self.place_of[k] + 2], point - rows[3 * k] - about)
+
     # ---- places ------------------------------------------------------------------------------------------------------
 
     def drift(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:

@@ -156,6 +156,13 @@ class Obstacle(Term):
         """Distance [m] of each position, the obstacle being displaced by `offset` [m], or in a pose of 6 or 7 numbers."""
         return self.distance(brought_back(np.asarray(positions, np.float64), np.asarray(offset), self.about))
 
+    def way(self, positions: np.ndarray, before: np.ndarray, after: np.ndarray) -> float:
+        """How far it goes between two rows of its path, the most at the positions [m]."""
+        if not self.turns:
+            return float(np.linalg.norm(after - before))
+        there = carried(brought_back(positions, before, self.about), after, self.about)
+        return float(np.linalg.norm(there - positions, axis=1).max())
+
     def least_radius(self) -> float:
         """How round the obstacle is at least [m]: 0 where it has edges, infinite where it is flat or hollow."""
         return np.inf if getattr(getattr(self, "twin", None), "hollow", False) is True else 0.0
