@@ -18,7 +18,8 @@ def floor_of(scene: Scene) -> float | None:
 def obstacle_surfaces(scene: Scene, time: float = 0.0) -> list[Triangles]:
     """(points [m], shape (k, 3), triangles) of each obstacle of a scene at `time` [s] that has a surface to draw.
 
-    Floors that do not turn have none: they are drawn as a plane without end. Each shape says what it looks like (`Obstacle.surface`).
+    Floors that do not turn have none: they are drawn as a plane without end. Each shape says what it looks like
+    (`Obstacle.surface`).
     """
     out, size = [], float(np.ptp(scene.mesh.bounding_box, 0).max())
     for term in scene.terms:

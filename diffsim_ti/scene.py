@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
 from diffsim_ti.checked import instance, listed
-from diffsim_ti.inputs import ConsistentMass, Inputs, poses
+from diffsim_ti.inputs import ConsistentMass, Inputs
 from diffsim_ti.mass_scaling import MassScaling
 from diffsim_ti.materials.material import Material
 from diffsim_ti.materials.moduli import youngs_poisson
@@ -224,11 +224,6 @@ class Scene:
         """Path of each moving obstacle at each time [s], by input name, shape (len(times), 3, 6 or 7) [m]."""
         names = self.inputs.paths
         return {name: sampled_path(name, t.path, times) for name, t in zip(names, self.moving)}
-
-    @property
-    def path_columns(self) -> int:
-        """How many vectors of a step's row the paths of obstacles are on the device."""
-        return sum(poses.COLUMNS if t.turns else 1 for t in self.moving)
 
     @property
     def loaded_vertices(self) -> np.ndarray:

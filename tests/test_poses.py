@@ -103,3 +103,23 @@ def test_gradients_are_right(name):
     assert ds.dot_product_test(run) < (1e-8 if name == "implicit" else 1e-13)
     if name != "within faces":
         assert ds.check_gradients(run, inputs=["table.friction", "table.about", "table.path"], verbose=False).passed
+
+
+# ---- nothing passes in silence ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("solver", [ds.ImplicitEulerSolver, ds.SemiImplicitSolver])
+def test_a_plate_that_turns_takes_a_body_along(solver):
+    """Half a radian in an implicit step: its end goes twice the body's width."""
+    omega, more = (50.0, {}) if solver is not ds.SemiImplicitSolver else (8.0, dict(substeps=50))
+    mesh = ds.TetrahedralMesh.create_box(2, 0.1, origin=(0.2, 0, 0))
+    plate = ds.Box(
+        (0.25, 0.05, -0.02), (0.5, 0.2, 0.01), width=0.005, stiffness=1e4, path=lambda t: [0, 0, 0, 0, -omega * t, 0]
+    )
+    simulator = ds.Simulator(solver(ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3), terms=[plate]), dt=1e-2, **more))
+    for _ in range(2 if omega > 10 else 5):  # then it has flown off
+        simulator.step()
+        assert plate.gap(simulator.positions, plate.path(simulator.time)).min() > 0
+        back = rotations.quaternion(np.array([0, omega * simulator.time, 0]))
+        assert rotations.turned(back, simulator.positions)[:, 2].min() > -0.015  # on its side
+    assert np.linalg.norm(simulator.velocities.mean(0)) > 0.8 * 0.25 * omega

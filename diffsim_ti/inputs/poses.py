@@ -19,6 +19,11 @@ ONE_AXIS = 1e-2  # sine of the angle within which two rotation vectors have one 
 FULL_TURN = 2 * np.pi
 
 
+def columns_of(width: int) -> int:
+    """How many columns a path of 3, 6 or 7 numbers has."""
+    return 1 if width == 3 else COLUMNS
+
+
 def quaternions(rows: np.ndarray) -> np.ndarray:
     """Unit quaternions of rows of 6 or 7 numbers; ValueError for one of length zero."""
     if rows.shape[-1] == 6:
@@ -61,7 +66,9 @@ class PoseColumns(Link):
 
     The change of R is theta with dR = [theta]x R, in place of that of its parameters. With R' = R(phi) R,
 
-        J(phi) dphi = theta' - R(phi) theta,    theta = J(r) dr of a rotation vector r, 2 vec(dq q^*) / |q|^2 of a quaternion.
+        J(phi) dphi = theta' - R(phi) theta;
+
+    theta = J(r) dr of a rotation vector r, 2 vec(dq q^*) / |q|^2 of a quaternion.
 
     Raises ValueError for rows that are a full turn or more apart.
     """

@@ -1,8 +1,8 @@
 """Potential energy of obstacles at a vertex: barrier and friction, with all derivatives.
 
-Obstacles are looked at where they are in the pass, which `pass_.walls` says (state/walls.py). `pass_.lag` holds two rows: the displacement of the body
-where the pass begins, from which friction takes its normal force, and x, so that (u - x) per_gamma is the velocity.
-`pass_.pressed` holds a row for each obstacle (`reaches`).
+Obstacles are looked at where they are in the pass, which `pass_.walls` says (state/walls.py). `pass_.lag` holds two rows:
+the displacement of the body where the pass begins, from which friction takes its normal force, and x, so that
+(u - x) per_gamma is the velocity. `pass_.pressed` holds a row for each obstacle (`reaches`).
 """
 
 from dataclasses import dataclass

@@ -53,7 +53,7 @@ class SceneArrays:
             order=mesh.order,
             groups=grouped(self.obstacles),
             stages=stages_contact,
-            moving=scene.path_columns,
+            moving=sum(poses.columns_of(term.path_width) for term in scene.moving),
             gravity=rows.first(scene.term(Gravity)),
             drag=rows.first(scene.term(Drag)),
             forces=bool(scene.dead_loads),
@@ -145,7 +145,7 @@ class SceneArrays:
     def _twins(self, scene) -> list[tuple]:
         """(compile-time twin, first parameter, column of the path or -1) of the obstacles; their tables stand behind the
         parameters, one after the other."""
-        widths = [poses.COLUMNS if term.turns else 1 for term in scene.moving]
+        widths = [poses.columns_of(term.path_width) for term in scene.moving]
         columns, out = dict(zip(scene.moving, np.cumsum([0, *widths]).tolist())), []
         at = max(scene.inputs.parameters.total, 1)
         self.tables = np.concatenate([np.zeros(0), *(t.table for t in self.contacts)])

@@ -48,7 +48,7 @@ class FaceDerivatives(FaceKernels):
                         total += rows
             self.store(f, total, faces)
 
-    # Of an obstacle that turns. Forces turn with it: a change theta adds theta x f, and by_theta f x w. ---------------------
+    # ---- of an obstacle that turns, with which forces turn: theta adds theta x f, and its adjoint f x w ---------------
 
     @ti.func
     def turned_jvp(self, g: A, o, f, u, du, then: A, scene: A, faces: A, tangent: A):

@@ -35,9 +35,9 @@ class FaceForces(FaceRows):
         """(rows, least) of face f, whose corners have the rows X of rest positions relative to the obstacle and u; least:
         of d - r of all its points, or less.
 
-        Of "force" rows (f_a, D_a), the energy going to `faces`, of "push" not; of "jvp" change of f_a for changes w, those of the
-        obstacle's numbers being in `out`; "vjp": adjoints of u for adjoints w of f_a, those of the obstacle's numbers
-        going to `out`.
+        Of "force" rows (f_a, D_a), the energy going to `faces`, of "push" not; of "jvp" change of f_a for changes w, those
+        of the obstacle's numbers being in `out`; "vjp": adjoints of u for adjoints w of f_a, those of the obstacle's
+        numbers going to `out`.
         """
         found, first, row = self.rows(0), g.first + k * g.size, f * ti.static(self.num_obstacles) + g.number + k
         reach, width = faces.reach[row], g.force.width(scene.parameters, first)
