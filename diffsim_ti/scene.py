@@ -33,7 +33,7 @@ from diffsim_ti.terms import (
 )
 from diffsim_ti.terms.motion import Motion
 from diffsim_ti.terms.obstacles.obstacle import PER_AREA
-from diffsim_ti.terms.pose import sampled_path
+from diffsim_ti.terms.pose import Pose, sampled_path
 
 
 def _kind(term) -> tuple:
@@ -60,7 +60,7 @@ class Scene:
         numbers) or several, or "normal" of a flat surface set; so are rollers and symmetry planes made.
     motion: displacement of the held vertices from where they start: a function of time [s] that returns 3 numbers or
         shape (num_held, 3) [m], or keyframes (times, displacements) between which it is linear; of what is held in some
-        directions, only those count. Or, where `fixed` names sets, {name: such a motion}. Default: held still.
+        directions, only those count. A `Pose` turns them too. Or, where `fixed` names sets, {name: such a motion}. Default: held still.
     initial_positions [m], initial_velocities [m/s]: shape (num_vertices, 3) or 3 numbers (velocities); default at rest.
     precision: "f32", "f64" or None for the default that `diffsim_ti.init` set.
     volume: where a change of volume is resisted: in each of the "tetrahedra", which lock as Poisson's ratio nears 0.5, or
@@ -82,7 +82,7 @@ class Scene:
         density: ArrayLike = 1000.0,
         terms: Term | Iterable[Term] = (),
         fixed: Fixed | None = None,
-        motion: Motion | Mapping[str, Motion] | None = None,
+        motion: Motion | Pose | Mapping[str, Motion | Pose] | None = None,
         initial_positions: ArrayLike | None = None,
         initial_velocities: ArrayLike | None = None,
         precision: str | None = None,
@@ -103,7 +103,9 @@ class Scene:
         self.terms = tuple([terms] if isinstance(terms, Term) else listed("terms", terms, "terms such as Gravity()"))
         self.supports = Supports(mesh, fixed)
         self.fixed, self.held = self.supports.fixed, self.supports.vertices  # in all directions; in some
-        self.motion = motion
+        self.motion, self.clamps = motion, self.supports.clamps(motion)
+        parts = motion.values() if isinstance(motion, Mapping) else [motion]
+        self.translates = motion is not None and not all(isinstance(m, Pose) for m in parts)  # by what is no pose
         self._check_terms()
         self._given = self.terms
         settled = (t.settled(self, density, initial_positions, initial_velocities) for t in self.terms)
@@ -217,7 +219,8 @@ class Scene:
         }
 
     def motion_rows(self, times: ArrayLike) -> np.ndarray:
-        """Displacement of the held vertices from their start at each time [s], shape (len(times), num_held, 3) [m]."""
+        """Displacement of the held vertices from their start at each time [s], shape (len(times), num_held, 3) [m]; without
+        that of poses, which inputs say."""
         return self.supports.rows(self.motion, times)
 
     def path_rows(self, times: ArrayLike) -> dict[str, np.ndarray]:

@@ -103,7 +103,9 @@ class Simulator:
         """Bring what depends on the step to the device: motion of fixed vertices, forces per step."""
         arrays, values = self.workspace.arrays, self._start
         if values.motion is not None:
-            arrays.load_rows(motion=self.scene.motion_rows([self.time, self.time + self.solver.dt]))
+            times, inputs = [self.time, self.time + self.solver.dt], self.scene.inputs
+            clamped = inputs.derive(inputs.at_times(times)).motion if self.scene.clamps else None
+            arrays.load_rows(motion=self.scene.motion_rows(times) if clamped is None else clamped)
         if values.path is not None:
             rows = self.scene.path_rows([self.time, self.time + self.solver.dt])
             arrays.load_rows(path=PoseColumns(rows, "path").value(*rows.values())[0])

@@ -123,3 +123,20 @@ def test_a_plate_that_turns_takes_a_body_along(solver):
         back = rotations.quaternion(np.array([0, omega * simulator.time, 0]))
         assert rotations.turned(back, simulator.positions)[:, 2].min() > -0.015  # on its side
     assert np.linalg.norm(simulator.velocities.mean(0)) > 0.8 * 0.25 * omega
+
+
+# ---- clamps ------------------------------------------------------------------------------------------------------------
+
+
+def clamped(solver, **more) -> ds.Rollout:
+    mesh = ds.TetrahedralMesh.create_box(2, 0.1)
+    left, right = (np.flatnonzero(mesh.vertices[:, 0] == x) for x in (0.0, 0.1))
+    mesh = mesh.replace(vertex_sets={"left": left, "right": right}) if hasattr(mesh, "replace") else mesh
+    motion = {
+        "left": ds.Pose(lambda t: turning(t, 7), about=(0.0, 0.05, 0.04)),
+        "right": lambda t: [0.1 * t, 0, 0],
+    }
+    scene = ds.Scene(
+        mesh, ds.StableNeoHookean(1e5, 0.3), fixed={"left": "xyz", "right": "y"}, motion=motion, precision="f64"
+    )
+    return ds.Rollout(solver(scene, dt=2e-3, **more), steps=6, save_every=3, gradients="all")

@@ -61,6 +61,23 @@ def between(name: str, rows: np.ndarray) -> np.ndarray:
     return out + FULL_TURN * turns[:, None] * n
 
 
+def theta_of(rows: np.ndarray, drows: np.ndarray) -> np.ndarray:
+    """Changes theta of the rotations for changes of the rows."""
+    if rows.shape[1] == 6:
+        return np.einsum("kij,kj->ki", rotations.left_jacobian(rows[:, 3:]), drows[:, 3:])
+    q = rows[:, 3:]
+    return 2 * rotations.product(drows[:, 3:], rotations.conjugate(q))[:, 1:] / (q**2).sum(1, keepdims=True)
+
+
+def theta_vjp(rows: np.ndarray, theta: np.ndarray) -> np.ndarray:
+    """Adjoints of the rows' rotations for those of theta."""
+    if rows.shape[1] == 6:
+        return np.einsum("kji,kj->ki", rotations.left_jacobian(rows[:, 3:]), theta)
+    q = rows[:, 3:]
+    pure = np.concatenate([np.zeros((len(q), 1)), theta], 1)
+    return 2 * rotations.product(pure, q) / (q**2).sum(1, keepdims=True)
+
+
 class PoseColumns(Link):
     """Paths of obstacles side by side, shape (steps + 1, columns, 3): a displacement is a column, a pose three.
 
@@ -92,20 +109,13 @@ class PoseColumns(Link):
             )
         return np.stack([rows[:, :3], rotations.rodrigues(quaternions(rows)), phi], 1)
 
-    @staticmethod
-    def _theta(rows: np.ndarray, drows: np.ndarray) -> np.ndarray:
-        if rows.shape[1] == 6:
-            return np.einsum("kij,kj->ki", rotations.left_jacobian(rows[:, 3:]), drows[:, 3:])
-        q = rows[:, 3:]
-        return 2 * rotations.product(drows[:, 3:], rotations.conjugate(q))[:, 1:] / (q**2).sum(1, keepdims=True)
-
     def jvp(self, x, dx):
         out = []
         for name, rows, drows in zip(self.reads, x, dx):
             if rows.shape[1] == 3:
                 out.append(drows[:, None])
                 continue
-            phi, theta = self._columns(name, rows)[:-1, 2], self._theta(rows, drows)
+            phi, theta = self._columns(name, rows)[:-1, 2], theta_of(rows, drows)
             dphi = np.zeros_like(theta)
             change = theta[1:] - rotations.turned(rotations.quaternion(phi), theta[:-1])
             dphi[:-1] = np.einsum("kij,kj->ki", rotations.inverse_jacobian(phi), change)
@@ -126,15 +136,5 @@ class PoseColumns(Link):
         change = np.einsum("kji,kj->ki", rotations.inverse_jacobian(phi), own[:-1, 2])
         theta[1:] += change
         theta[:-1] -= rotations.turned(rotations.conjugate(rotations.quaternion(phi)), change)
-        if rows.shape[1] == 6:
-            by = np.einsum("kji,kj->ki", rotations.left_jacobian(rows[:, 3:]), theta)
-        else:
-            q = rows[:, 3:]
-            pure = np.concatenate([np.zeros((len(q), 1)), theta], 1)
-            by = 2 * rotations.product(pure, q) / (q**2).sum(1, keepdims=True)
-        return np.concatenate([own[:, 0], by], 1)
+        return np.concatenate([own[:, 0], theta_vjp(rows, theta)], 1)
 
-
-def place(columns: np.ndarray) -> np.ndarray:
-    """(translation, quaternion) of a row of a pose's columns, 7 numbers."""
-    return np.concatenate([columns[0], rotations.from_rodrigues(columns[1])])

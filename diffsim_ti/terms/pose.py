@@ -1,5 +1,7 @@
 """Poses over time, as paths of obstacles and motions of clamps have them: rows of 3, 6 or 7 numbers at some times."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -7,6 +9,36 @@ from diffsim_ti import rotations
 from diffsim_ti.checked import numbers
 from diffsim_ti.inputs.poses import between, quaternions
 from diffsim_ti.terms.motion import Motion, sampled
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """A motion of held vertices as of a rigid body, c + t + R (x - c): a clamp that turns.
+
+    path: a function of time [s], or keyframes (times, poses), of 6 numbers, a displacement t [m] and a rotation vector [rad],
+    or of 7, t and a quaternion (w, x, y, z) of any length, as a path of an `Obstacle`. It is sampled at the steps, within
+    which held vertices go straight: by turns of phi in a step at the radius r, r phi^2 / 8 within the arc.
+    about [m]: the point c.
+    Raises ValueError for a path of other numbers.
+    """
+
+    path: Motion
+    about: ArrayLike = (0.0, 0.0, 0.0)
+
+    def __post_init__(self):
+        if path_width(self.path) not in ROWS:
+            raise ValueError(
+                "Pose: path must give 6 or 7 numbers at each time, a displacement [m] and a rotation vector [rad] or a "
+                "quaternion; a displacement alone is a motion as it is"
+            )
+
+    @property
+    def width(self) -> int:
+        return path_width(self.path)
+
+    def rows(self, name: str, times: ArrayLike) -> np.ndarray:
+        """The path at each time [s], shape (len(times), width); name: how errors call it."""
+        return sampled_path(name, self.path, times)
+
 
 ROWS = 6, 7  # numbers of a pose: translation and rotation vector, or quaternion
 
