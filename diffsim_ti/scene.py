@@ -58,9 +58,9 @@ class Scene:
     fixed: vertices that do not move freely: a vertex set's name, indices, a Boolean mask or a list of set names. Or
         {name of a vertex or surface set: in which directions it is held}: axes such as "x" or "xyz", a direction (3
         numbers) or several, or "normal" of a flat surface set; so are rollers and symmetry planes made.
-    motion: displacement of the held vertices from where they start: a function of time [s] that returns 3 numbers or
-        shape (num_held, 3) [m], or keyframes (times, displacements) between which it is linear; of what is held in some
-        directions, only those count. A `Pose` turns them too. Or, where `fixed` names sets, {name: such a motion}. Default: held still.
+    motion: displacement of the held vertices from where they start: a function of time [s] that returns 3 numbers or shape
+        (num_held, 3) [m], or keyframes (times, displacements) between which it is linear; of what is held in some
+        directions, only those count. Or a `Pose`, which turns them; or, where `fixed` names sets, {name: such a motion}.
     initial_positions [m], initial_velocities [m/s]: shape (num_vertices, 3) or 3 numbers (velocities); default at rest.
     precision: "f32", "f64" or None for the default that `diffsim_ti.init` set.
     volume: where a change of volume is resisted: in each of the "tetrahedra", which lock as Poisson's ratio nears 0.5, or
@@ -219,8 +219,7 @@ class Scene:
         }
 
     def motion_rows(self, times: ArrayLike) -> np.ndarray:
-        """Displacement of the held vertices from their start at each time [s], shape (len(times), num_held, 3) [m]; without
-        that of poses, which inputs say."""
+        """Displacement of the held vertices from their start, without that of poses, shape (len(times), num_held, 3) [m]."""
         return self.supports.rows(self.motion, times)
 
     def path_rows(self, times: ArrayLike) -> dict[str, np.ndarray]:

@@ -99,7 +99,7 @@ class Supports:
         return out
 
     def rows(self, motion: Motion | Mapping[str, Motion], times: ArrayLike) -> np.ndarray:
-        """Prescribed displacements at each time [s], shape (len(times), k, 3) [m]; sets without a motion, or with a pose, stay.
+        """Prescribed displacements at each time [s], shape (len(times), k, 3) [m]; others stay.
 
         Raises ValueError where two sets want different motions of one vertex in one direction.
         """

@@ -8,7 +8,7 @@ import diffsim_ti as ds
 from diffsim_ti import rotations
 from diffsim_ti.inputs.poses import PoseColumns
 from diffsim_ti.obstacles import obstacle_surfaces
-from diffsim_ti.terms.pose import sampled_path
+from diffsim_ti.terms.pose import as_pose, sampled_path
 
 MU, CREEP, DT = 0.5, 1e-4, 5e-4
 SOLVERS = with_options(ds.SemiImplicitSolver, contact_damping=1.0), ds.ImplicitEulerSolver
@@ -130,13 +130,85 @@ def test_a_plate_that_turns_takes_a_body_along(solver):
 
 def clamped(solver, **more) -> ds.Rollout:
     mesh = ds.TetrahedralMesh.create_box(2, 0.1)
-    left, right = (np.flatnonzero(mesh.vertices[:, 0] == x) for x in (0.0, 0.1))
-    mesh = mesh.replace(vertex_sets={"left": left, "right": right}) if hasattr(mesh, "replace") else mesh
-    motion = {
-        "left": ds.Pose(lambda t: turning(t, 7), about=(0.0, 0.05, 0.04)),
-        "right": lambda t: [0.1 * t, 0, 0],
-    }
+    motion = {"xmin": ds.Pose(lambda t: turning(t, 7), about=(0.0, 0.05, 0.04)), "xmax": lambda t: [0.1 * t, 0, 0]}
     scene = ds.Scene(
-        mesh, ds.StableNeoHookean(1e5, 0.3), fixed={"left": "xyz", "right": "y"}, motion=motion, precision="f64"
+        mesh, ds.StableNeoHookean(1e5, 0.3), fixed={"xmin": "xyz", "xmax": "y"}, motion=motion, precision="f64"
     )
     return ds.Rollout(solver(scene, dt=2e-3, **more), steps=6, save_every=3, gradients="all")
+
+
+@pytest.mark.parametrize("solver, more", [(ds.SemiImplicitSolver, dict(substeps=4)), (ds.StaticSolver, {})])
+def test_a_clamp_turns(solver, more):
+    run = clamped(solver, **more)
+    frames, mesh = run.forward(), run.scene.mesh
+    held, about, (t, q) = mesh.vertex_indices("xmin"), np.array([0, 0.05, 0.04]), as_pose(turning(0.012, 7))
+    there = about + t + rotations.turned(q, mesh.vertices[held] - about)
+    assert np.allclose(frames.positions[-1, held], there, atol=1e-14)
+    names = "prescribed_pose.xmin", "prescribed_about.xmin", "prescribed_motion", "initial_positions", "rest_positions"
+    assert ds.dot_product_test(run) < (1e-6 if solver is ds.StaticSolver else 1e-13)
+    assert ds.check_gradients(run, inputs=names, verbose=False).passed
+    simulator = ds.Simulator(solver(run.scene, dt=2e-3, **more))
+    for _ in range(6):
+        simulator.step()
+    assert np.allclose(simulator.positions, frames.positions[-1], atol=1e-12 if more else 1e-7)
+
+
+def test_a_pose_that_does_not_turn_is_a_displacement():
+    made = {}
+    for name, path in (
+        ("pose", lambda t: [0.5 * t, -0.2 * t, 0, 1, 0, 0, 0]),
+        ("path", lambda t: [0.5 * t, -0.2 * t, 0]),
+    ):
+        mesh = ds.TetrahedralMesh.create_box(2, 0.1)
+        terms = [ds.Gravity(), ds.Ground(-0.004, stiffness_per_area=2e6, friction=0.4, path=path)]
+        scene = ds.Scene(
+            mesh, ds.StableNeoHookean(1e5, 0.3), terms=terms, precision="f64", initial_velocities=(0.3, -1, 0)
+        )
+        made[name] = ds.Rollout(ds.SemiImplicitSolver(scene, dt=2e-3, substeps=4), steps=12).forward().positions
+    assert np.abs(made["pose"] - made["path"]).max() < 1e-14
+
+
+# ---- rows --------------------------------------------------------------------------------------------------------------
+
+
+def test_rows_of_poses():
+    rng, axis = np.random.default_rng(0), np.array([0.1, 0.9, 0.2])
+    several = np.zeros((5, 6))
+    several[:, 3:] = np.array([-3.0, 0, 2, 6, 11])[:, None] * axis  # up to 0.8 turns in a step, and at nothing
+    link, x = PoseColumns(["a", "b", "c"], "path"), [rng.normal(size=(5, 3)), several, rng.normal(size=(5, 7))]
+    phi = link.value(*x)[0][:, 3]
+    assert np.allclose(phi[:-1], np.diff(several[:, 3:], axis=0), atol=1e-14)
+    dx, e = [rng.normal(size=part.shape) for part in x], 1e-6
+    after, before = (link.value(*(part + sign * e * d for part, d in zip(x, dx)))[0] for sign in (1, -1))
+    differences, change = (after - before) / (2 * e), link.jvp(x, dx)[0]
+    for c in (2, 5):  # theta
+        q, p = (rotations.from_rodrigues(rows[:, c]) for rows in (after, before))
+        differences[:, c] = rotations.vector(rotations.product(q, rotations.conjugate(p))) / (2 * e)
+    assert np.abs(differences - change).max() < 1e-8
+    w = rng.normal(size=change.shape)
+    pulled = sum((by * d).sum() for by, d in zip(link.vjp(x, [w]), dx))
+    assert abs((w * change).sum() - pulled) < 1e-13
+
+
+def test_keyframes():
+    turns = sampled_path("p", ([0, 1, 2], [[0] * 6, [1, 0, 0, 0, 10, 0], [1, 0, 0, 0, 0, 0]]), [0.25, 1.5])
+    assert np.allclose(turns, [[0.25, 0, 0, 0, 2.5, 0], [1, 0, 0, 0, 5, 0]])
+    half = np.sqrt(0.5)  # three quarters of a turn one way are a quarter the other way
+    short = sampled_path("p", ([0, 1], [[0, 0, 0, 1, 0, 0, 0], [0, 0, 0, -half, half, 0, 0]]), [0.5])
+    assert np.allclose(rotations.vector(short[:, 3:]), [[-np.pi / 4, 0, 0]])
+    with pytest.raises(ValueError, match="more than half a turn apart and not on one axis; put rows between"):
+        sampled_path("p", ([0, 1], [[0, 0, 0, 0, 3, 0], [0, 0, 0, 3, 0, 0]]), [0.0])
+    with pytest.raises(ValueError, match="less than a full turn; take shorter steps"):
+        PoseColumns(["p"], "path").value(np.array([[0.0] * 6, [0, 0, 0, 0, 7, 0]]))
+    with pytest.raises(ValueError, match="pass a path of 6 or 7 numbers, or no about"):
+        ds.Ground(about=(0, 0, 0))
+
+
+def test_obstacles_are_drawn_turned():
+    mesh = ds.TetrahedralMesh.create_box(2, 0.1, origin=(0, 1, 0))
+    floor = ds.Ground(path=lambda t: [0, 0, 0, 0, 0, t])
+    box = ds.Box((-4.0, 0, 0), 0.1, stiffness=1.0, path=lambda t: [0, t, 0, 0, 0, t], about=(1.0, 0, 0))
+    scene = ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3), terms=[ds.Gravity(), box, floor])
+    (solid, _), (square, _) = obstacle_surfaces(scene, np.pi / 2)
+    assert np.abs(square[:, 0]).max() < 1e-12 and np.abs(square[:, 1]).max() > 0.1
+    assert np.allclose(solid.mean(0), [1, np.pi / 2 - 5, 0])

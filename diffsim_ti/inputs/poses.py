@@ -137,4 +137,3 @@ class PoseColumns(Link):
         theta[1:] += change
         theta[:-1] -= rotations.turned(rotations.conjugate(rotations.quaternion(phi)), change)
         return np.concatenate([own[:, 0], theta_vjp(rows, theta)], 1)
-
