@@ -271,7 +271,8 @@ class ForwardRun:
         if self.obstacles and not self.implicit:  # a vertex shall not cross the barrier in a few substeps
             speed = np.linalg.norm(self.simulator.velocities, axis=1).max() + self._pull * self.frame_time
             now, then = (self.scene.places(self.simulator.time + step) for step in (0.0, dt))
-            speed += max((np.linalg.norm(then[t] - now[t]) / dt for t in now), default=0.0)
+            positions = self.simulator.positions
+            speed += max((t.way(positions, now[t], then[t]) / dt for t in now), default=0.0)
             in_a_width = STEPS.in_a_width[self.simulator.solver.contact]
             fewest = max(
                 fewest, in_a_width * speed * dt / min(float(t.values["barrier_width"]) for t in self.obstacles)

@@ -4,7 +4,6 @@ import numpy as np
 
 from diffsim_ti.scene import Scene
 from diffsim_ti.terms import Obstacle
-from diffsim_ti.terms.motion import sampled
 from diffsim_ti.terms.obstacles.shapes import Triangles, ball, bowl, box, revolved, square, tube
 
 __all__ = ["ball", "bowl", "box", "floor_of", "obstacle_surfaces", "revolved", "square", "tube"]
@@ -12,23 +11,19 @@ __all__ = ["ball", "bowl", "box", "floor_of", "obstacle_surfaces", "revolved", "
 
 def floor_of(scene: Scene) -> float | None:
     """Height of a scene's floor [m], or None: the first obstacle's that is one (`Obstacle.floor_height`)."""
-    heights = (term.floor_height() for term in scene.terms if isinstance(term, Obstacle))
+    heights = (term.floor_height() for term in scene.terms if isinstance(term, Obstacle) and not term.turns)
     return next((height for height in heights if height is not None), None)
 
 
 def obstacle_surfaces(scene: Scene, time: float = 0.0) -> list[Triangles]:
     """(points [m], shape (k, 3), triangles) of each obstacle of a scene at `time` [s] that has a surface to draw.
 
-    Floors have none: they are drawn as a plane without end. Each shape says what it looks like (`Obstacle.surface`).
+    Floors that do not turn have none: they are drawn as a plane without end. Each shape says what it looks like
+    (`Obstacle.surface`).
     """
     out, size = [], float(np.ptp(scene.mesh.bounding_box, 0).max())
     for term in scene.terms:
-        shape = term.surface(size) if isinstance(term, Obstacle) else None
+        shape = term.surface_at(size, time) if isinstance(term, Obstacle) else None
         if shape is not None:
-            out.append((shape[0] + _offset(term, time), shape[1]))
+            out.append(shape)
     return out
-
-
-def _offset(term: Obstacle, time: float) -> np.ndarray:
-    """Where a moving obstacle has got to [m]."""
-    return np.zeros(3) if term.path is None else sampled("path", term.path, [time], 1)[0, 0]

@@ -31,8 +31,9 @@ from diffsim_ti.terms import (
     Spring,
     Term,
 )
-from diffsim_ti.terms.motion import Motion, sampled
+from diffsim_ti.terms.motion import Motion
 from diffsim_ti.terms.obstacles.obstacle import PER_AREA
+from diffsim_ti.terms.pose import Pose, sampled_path
 
 
 def _kind(term) -> tuple:
@@ -57,9 +58,9 @@ class Scene:
     fixed: vertices that do not move freely: a vertex set's name, indices, a Boolean mask or a list of set names. Or
         {name of a vertex or surface set: in which directions it is held}: axes such as "x" or "xyz", a direction (3
         numbers) or several, or "normal" of a flat surface set; so are rollers and symmetry planes made.
-    motion: displacement of the held vertices from where they start: a function of time [s] that returns 3 numbers or
-        shape (num_held, 3) [m], or keyframes (times, displacements) between which it is linear; of what is held in some
-        directions, only those count. Or, where `fixed` names sets, {name: such a motion}. Default: held still.
+    motion: displacement of the held vertices from where they start: a function of time [s] that returns 3 numbers or shape
+        (num_held, 3) [m], or keyframes (times, displacements) between which it is linear; of what is held in some
+        directions, only those count. Or a `Pose`, which turns them; or, where `fixed` names sets, {name: such a motion}.
     initial_positions [m], initial_velocities [m/s]: shape (num_vertices, 3) or 3 numbers (velocities); default at rest.
     precision: "f32", "f64" or None for the default that `diffsim_ti.init` set.
     volume: where a change of volume is resisted: in each of the "tetrahedra", which lock as Poisson's ratio nears 0.5, or
@@ -81,7 +82,7 @@ class Scene:
         density: ArrayLike = 1000.0,
         terms: Term | Iterable[Term] = (),
         fixed: Fixed | None = None,
-        motion: Motion | Mapping[str, Motion] | None = None,
+        motion: Motion | Pose | Mapping[str, Motion | Pose] | None = None,
         initial_positions: ArrayLike | None = None,
         initial_velocities: ArrayLike | None = None,
         precision: str | None = None,
@@ -102,7 +103,9 @@ class Scene:
         self.terms = tuple([terms] if isinstance(terms, Term) else listed("terms", terms, "terms such as Gravity()"))
         self.supports = Supports(mesh, fixed)
         self.fixed, self.held = self.supports.fixed, self.supports.vertices  # in all directions; in some
-        self.motion = motion
+        self.motion, self.clamps = motion, self.supports.clamps(motion)
+        parts = motion.values() if isinstance(motion, Mapping) else [motion]
+        self.translates = motion is not None and not all(isinstance(m, Pose) for m in parts)  # by what is no pose
         self._check_terms()
         self._given = self.terms
         settled = (t.settled(self, density, initial_positions, initial_velocities) for t in self.terms)
@@ -216,13 +219,13 @@ class Scene:
         }
 
     def motion_rows(self, times: ArrayLike) -> np.ndarray:
-        """Displacement of the held vertices from their start at each time [s], shape (len(times), num_held, 3) [m]."""
+        """Displacement of the held vertices from their start, without that of poses, shape (len(times), num_held, 3) [m]."""
         return self.supports.rows(self.motion, times)
 
     def path_rows(self, times: ArrayLike) -> dict[str, np.ndarray]:
-        """Displacement of each moving obstacle at each time [s], by input name, shape (len(times), 3) [m]."""
+        """Path of each moving obstacle at each time [s], by input name, shape (len(times), 3, 6 or 7) [m]."""
         names = self.inputs.paths
-        return {name: sampled(name, t.path, times, 1)[:, 0] for name, t in zip(names, self.moving)}
+        return {name: sampled_path(name, t.path, times) for name, t in zip(names, self.moving)}
 
     @property
     def loaded_vertices(self) -> np.ndarray:
@@ -280,7 +283,7 @@ class Scene:
         return np.unique(np.concatenate([np.zeros(0, np.int64), *(t.indices(self.mesh) for t in self.foundations)]))
 
     def places(self, time: float) -> dict[Term, np.ndarray]:
-        """Displacement of each moving obstacle at a time [s], shape (3,) [m]."""
+        """Displacement or pose of each moving obstacle at a time [s], shape (3,), (6,) or (7,) [m]."""
         return {term: rows[0] for term, rows in zip(self.moving, self.path_rows([time]).values())}
 
     # ---- matrices ----------------------------------------------------------------------------------------------------

@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
 from diffsim_ti.checked import instance, numbers
+from diffsim_ti.inputs.poses import PoseColumns
 from diffsim_ti.monitor import quantities
 from diffsim_ti.monitor.guard import Guard
 from diffsim_ti.monitor.quantities import Energy, TetrahedronFields
@@ -102,10 +103,12 @@ class Simulator:
         """Bring what depends on the step to the device: motion of fixed vertices, forces per step."""
         arrays, values = self.workspace.arrays, self._start
         if values.motion is not None:
-            arrays.load_rows(motion=self.scene.motion_rows([self.time, self.time + self.solver.dt]))
+            times, inputs = [self.time, self.time + self.solver.dt], self.scene.inputs
+            clamped = inputs.derive(inputs.at_times(times)).motion if self.scene.clamps else None
+            arrays.load_rows(motion=self.scene.motion_rows(times) if clamped is None else clamped)
         if values.path is not None:
             rows = self.scene.path_rows([self.time, self.time + self.solver.dt])
-            arrays.load_rows(path=np.stack(list(rows.values()), 1))
+            arrays.load_rows(path=PoseColumns(rows, "path").value(*rows.values())[0])
         inputs = self.scene.inputs
         if inputs.makes_rows:
             now = inputs.derive(inputs.at_step(self.step_count, self.solver.dt, self._set))

@@ -5,9 +5,11 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.inputs.clamps import Clamp
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.geometry import triangle_normals
 from diffsim_ti.terms.motion import Motion, sampled
+from diffsim_ti.terms.pose import Pose
 
 # a vertex set's name, several, indices or a mask: held wholly; or {name of a set: in which directions it is held}
 Fixed = str | ArrayLike | Mapping[str, str | ArrayLike]
@@ -81,11 +83,28 @@ class Supports:
             return np.tile(np.linalg.pinv(directions, rcond=1e-6) @ directions, (len(vertices), 1, 1))
         return self.held[np.searchsorted(self.vertices, vertices)]
 
+    def clamps(self, motion) -> list[tuple[Clamp, Pose]]:
+        """What of a motion is a pose."""
+        if isinstance(motion, Pose):
+            every = np.arange(len(self.vertices))
+            one = np.tile(np.eye(3), (len(every), 1, 1))
+            return [(Clamp("prescribed_pose", "prescribed_about", self.vertices, every, one), motion)]
+        out = []
+        for name, own in motion.items() if isinstance(motion, Mapping) else ():
+            if isinstance(own, Pose) and name in self.by_name:
+                places, rows = self._rows[name]
+                projectors = self._inverse[places][:, :, rows] @ self.by_name[name][1]
+                names = f"prescribed_pose.{name}", f"prescribed_about.{name}"
+                out.append((Clamp(*names, self.vertices[places], places, projectors), own))
+        return out
+
     def rows(self, motion: Motion | Mapping[str, Motion], times: ArrayLike) -> np.ndarray:
-        """Prescribed displacements at each time [s], shape (len(times), k, 3) [m]; sets without a motion stay.
+        """Prescribed displacements at each time [s], shape (len(times), k, 3) [m]; others stay.
 
         Raises ValueError where two sets want different motions of one vertex in one direction.
         """
+        if isinstance(motion, Pose):
+            return np.zeros((len(times), len(self.vertices), 3))
         if not isinstance(motion, Mapping):
             return sampled("motion", motion, times, len(self.vertices))
         unknown = [name for name in motion if name not in self.by_name]
@@ -94,6 +113,8 @@ class Supports:
             raise ValueError(f"motion moves {unknown[0]!r}, which is not held; fixed has {known}")
         wanted = np.zeros((len(times), *self._normals.shape[:2]))
         for name, own in motion.items():
+            if isinstance(own, Pose):
+                continue
             vertices, rows = self._rows[name]
             given = sampled(f"motion of {name!r}", own, times, len(vertices))
             wanted[:, vertices, rows] = given @ self.by_name[name][1].T

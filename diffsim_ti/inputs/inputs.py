@@ -10,11 +10,13 @@ from numpy.typing import ArrayLike
 from diffsim_ti.checked import numbers
 from diffsim_ti.inputs import links
 from diffsim_ti.inputs.chain import Chain, Link
+from diffsim_ti.inputs.clamps import ClampedMotion
 from diffsim_ti.inputs.consistent_mass import ElementMasses
 from diffsim_ti.inputs.curved_shape import CurvedShape, StressPoints
-from diffsim_ti.inputs.description import POSITIVE, Input, frozen, length, speed
+from diffsim_ti.inputs.description import POSITIVE, Input, frozen, length, length_per_step, speed
 from diffsim_ti.inputs.foundation import FoundationRows
 from diffsim_ti.inputs.loads import PressureRows, SumOfForces
+from diffsim_ti.inputs.poses import PoseColumns
 from diffsim_ti.inputs.surface_areas import SurfaceAreas
 from diffsim_ti.inputs.ties import JoinedRows, JoinedSegments
 from diffsim_ti.rows import Rows
@@ -38,7 +40,7 @@ class Derived:
     surface: np.ndarray | None = None  # (num_vertices,) of the surface, 0 within [m^2]
     forces: np.ndarray | None = None  # (1 or steps, k, 3), or (1 or steps, 2 k, 3) as each step begins and ends [N]
     motion: np.ndarray | None = None  # (steps + 1, num_held, 3) [m]
-    path: np.ndarray | None = None  # displacements of obstacles, (steps + 1, num_moving, 3) [m]
+    path: np.ndarray | None = None  # paths of obstacles (inputs/poses.py), (steps + 1, columns, 3)
     # pressures, then numbers of chambers, as each step begins and ends, and 0, (1 or steps, loads and numbers, 3)
     follower: np.ndarray | None = None
     ties: np.ndarray | None = None  # numbers of springs and cables (inputs/ties.py), (1 or steps, 2 ties, 3)
@@ -114,7 +116,11 @@ class Inputs:
     def _at_last(self) -> list[Input]:
         """What stands at the end of the list: the rest shape, whose gradient costs extra, and the prescribed motion."""
         out = [Input("rest_positions", self.mesh.vertices, (("vertices", 3),), "m", change=length)]
-        if self.scene.motion is not None:
+        for clamp, pose in self.scene.clamps:
+            shape = ("steps + 1", pose.width)
+            out.append(Input(clamp.pose, None, (shape,), "m, rad", change=length_per_step))
+            out.append(Input(clamp.about, pose.about, ((3,),), "m", change=length))
+        if self.scene.translates:
             shape = ("steps + 1", len(self.scene.held), 3)
             out.append(Input("prescribed_motion", None, (shape,), "m", change=length))
         return out
@@ -143,8 +149,10 @@ class Inputs:
         out += self._sums_of_loads()
         out.append(links.Placed(places, "parameters", max(self.parameters.total, 1)))
         if self.paths:
-            out.append(links.Columns(self.paths, "path"))
-        if scene.motion is not None:
+            out.append(PoseColumns(self.paths, "path"))
+        if scene.clamps:
+            out.append(ClampedMotion([clamp for clamp, _ in scene.clamps], len(scene.held), scene.translates))
+        elif scene.motion is not None:
             out.append(links.Same("prescribed_motion", "motion"))
         return out
 
@@ -190,7 +198,8 @@ class Inputs:
     def at_times(self, times: ArrayLike) -> dict[str, np.ndarray]:
         """The values of a run, with those that are sampled at its times [s]."""
         scene = self.scene
-        rows = {"prescribed_motion": scene.motion_rows(times)} if scene.motion is not None else {}
+        rows = {"prescribed_motion": scene.motion_rows(times)} if scene.translates else {}
+        rows |= {clamp.pose: pose.rows(clamp.pose, times) for clamp, pose in scene.clamps}
         rows |= scene.path_rows(times) | {name: term.rows(times) for name, term in self.keyed}
         return self.values | {name: frozen(value) for name, value in rows.items()}
 

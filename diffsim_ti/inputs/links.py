@@ -1,6 +1,6 @@
 """Links of a body, its rest shape, mass and start, and what joins the numbers of terms and the paths of obstacles."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 
 import numpy as np
 
@@ -167,19 +167,3 @@ class Placed(Link):
 
     def vjp(self, x, y_adj):
         return [y_adj[0][place].reshape(part.shape) for place, part in zip(self.places, x)]
-
-
-class Columns(Link):
-    """Arrays of one shape (rows, ...) as columns, shape (rows, columns, ...)."""
-
-    def __init__(self, reads: Iterable[str], writes: str):
-        self.reads, self.writes = tuple(reads), (writes,)
-
-    def value(self, *x):
-        return (np.stack(x, 1),)
-
-    def jvp(self, x, dx):
-        return self.value(*dx)
-
-    def vjp(self, x, y_adj):
-        return [y_adj[0][:, k] for k in range(len(self.reads))]

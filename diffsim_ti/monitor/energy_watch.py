@@ -57,7 +57,8 @@ class EnergyWatch:
             self._note(u, u_star, u_next, v_next, places, kinetic)
 
     def _note(self, u, u_star, u_next, v_next, places, kinetic) -> None:
-        potential, energies, drift = self.ws.potential, [], places[2] - places[0]
+        potential, energies = self.ws.potential, []
+        drift = self.ws.arrays.walls.drift(places[0], places[2])
         for displacement, place in ((u, places[0]), (u_next, places[2])):
             self.ws.put_obstacles(place)
             potential.place(displacement)
@@ -76,7 +77,7 @@ class EnergyWatch:
         gap = self.ws.way.narrowest if near is None else min(near.value, self.ws.way.narrowest)
         share, energies = min(0.5, 0.01 * gap / np.abs(drift).max()), []
         for sign in (1, -1):
-            self.ws.put_obstacles(places + sign * share * drift)
+            self.ws.put_obstacles(self.ws.arrays.walls.moved(places, drift, sign * share))
             energies.append(self.ws.potential.energy()[0])
         self.ws.put_obstacles(places)
         return (energies[0] - energies[1]) / (2 * share)

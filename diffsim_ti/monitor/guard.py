@@ -7,6 +7,7 @@ import numpy as np
 from diffsim_ti import runtime
 from diffsim_ti.monitor import quantities, stability
 from diffsim_ti.monitor.energy_watch import EnergyGained
+from diffsim_ti.state.walls import Moment
 from diffsim_ti.state.watch import place_name
 from diffsim_ti.state.workspace import Workspace
 from diffsim_ti.terms.obstacles.barrier import beta
@@ -195,8 +196,7 @@ class Guard:
         ws.watch.put(self._seen)
         k, place, depth = crossing
         term, step, vertices = ws.watch.contacts[k], self.ws.step_of(j, num_passes), ws.watch.vertices_of(place)
-        drift = self._velocity_of_obstacle(k, j)
-        speeds = [float(np.linalg.norm(ws.velocity_of(i) - drift)) for i in vertices]
+        speeds = [float(np.linalg.norm(ws.velocity_of(i) - self._velocity_of_obstacle(k, j, i))) for i in vertices]
         speed, vertex = max(speeds), vertices[int(np.argmax(speeds))]
         width, of_face = float(term.values["barrier_width"]), len(vertices) == 3
         enough = min(0.1 * width / max(speed, 1e-300), (0.25 if of_face else 0.5) * self.ws.substep)
@@ -231,10 +231,15 @@ class Guard:
             stiffness,
         )
 
-    def _velocity_of_obstacle(self, k: int, j: int) -> np.ndarray:
-        """In pass j [m/s]."""
-        path, column = self.ws.arrays.rows["path"], self.ws.arrays.obstacles[k][2]
-        return np.zeros(3) if column < 0 else self.ws.solver.schedule.rate(path, j)[column]
+    def _velocity_of_obstacle(self, k: int, j: int, vertex: int) -> np.ndarray:
+        """At a vertex, when pass j begins [m/s]."""
+        arrays, schedule = self.ws.arrays, self.ws.solver.schedule
+        if arrays.obstacles[k][2] < 0:
+            return np.zeros(3)
+        begin = schedule.begin(j)
+        rows = arrays.walls.value(arrays.rows["path"], Moment(schedule, j, begin, begin))
+        position = arrays.values.rest[vertex] + runtime.fetch(self.ws.state.u)[0, vertex]
+        return arrays.walls.velocity_at(k, rows, position, self.ws.watch.contacts[k].about)
 
     def _stiffness_needed(self, k: int, vertex: int, speed: float) -> float | None:
         """Stiffness [N/m] whose barrier, alone, stops the vertex at a fiftieth of the width; None if the present one can.
@@ -245,7 +250,7 @@ class Guard:
         force, first, _ = arrays.obstacles[k]
         stiffness, width = arrays.stiffness_of(k, [vertex]), float(arrays.values.parameters[first + force.count + 1])
         self.ws.place_obstacles(self.good_pass)
-        offset = runtime.fetch(arrays.offsets)[3 * k].astype(np.float64)
+        offset = arrays.walls.row_of(k, runtime.fetch(arrays.offsets).astype(np.float64))
         position = arrays.values.rest[vertex] + runtime.fetch(self.ws.state.u)[0, vertex]
         gap = float(self.ws.watch.contacts[k].gap(position[None], offset)[0])
         held = stiffness * width**2 * beta(np.clip(gap / width, 1e-3, 1))

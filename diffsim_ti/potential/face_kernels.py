@@ -90,10 +90,9 @@ class FaceKernels(FacePoints):
             for g in ti.static(self.features.groups):
                 if ti.static(not g.force.hollow):
                     for k in range(g.count):
-                        by_u, n = self.around_one("product", g, k, i, scene, pass_, at, at), 3 * (g.number + k)
+                        by_u = self.around_one("product", g, k, i, scene, pass_, at, at)
                         self.around_one("numbers", g, k, i, scene, pass_, at, adjoint)
-                        adjoint.walls[n, i] = adjoint.walls[n, i] - by_u
-                        self.add_to_rest(i, by_u, adjoint)
+                        self.spread(g, k, i, by_u, scene, pass_, at, adjoint)
                         out.y[0, i] = out.y[0, i] + by_u
 
     @cached_property

@@ -29,7 +29,10 @@ from dataclasses import dataclass
 import taichi as ti
 
 from diffsim_ti.potential.face_lattice import FLAT, point_curvatures, point_energy, point_slopes
+from diffsim_ti.runtime import at, let, traced
 from diffsim_ti.state.obstacle_functions import ObstacleFunctions
+from diffsim_ti.state.walls import MORE
+from diffsim_ti.terms.obstacles import turning
 
 A = ti.template()
 
@@ -56,7 +59,8 @@ class FacePoints(ObstacleFunctions):
         for g in ti.static(self.features.groups):
             if ti.static(not g.force.hollow):
                 for k in range(g.count):
-                    out += self.around_one(what, g, k, i, scene, pass_, at, more)
+                    found = self.around_one(what, g, k, i, scene, pass_, at, more)
+                    out += self.with_turn(what, g, k, i, found, scene, pass_, at, more)
         return out
 
     @ti.func
@@ -64,8 +68,9 @@ class FacePoints(ObstacleFunctions):
         """The same of obstacle k of group g alone; of "numbers" nothing, but their adjoints for the adjoint at.w of the
         force go to `more`."""
         out, first, n = self.vector(0), g.first + k * g.size, g.number + k
-        wall, width = pass_.walls[3 * n], g.force.width(scene.parameters, first)
-        own = g.force.clearance(scene.parameters, first, scene.rest[i] - wall, at.u[0, i])[3]
+        wall, width, q = pass_.walls[3 * n], g.force.width(scene.parameters, first), self.turn_of(g, k, pass_)
+        X0, u0 = self.made(g, first, q, scene.rest[i] - wall, at.u[0, i], scene)
+        own = g.force.clearance(scene.parameters, first, X0, u0)[3]
         for c in range(pass_.face_start[i], pass_.face_start[i + 1]):
             row = c * ti.static(self.num_obstacles) + n
             reach, size, i3 = pass_.face_reach[row], ti.cast(0, self.fp), ti.Vector([i, 0, 0])
@@ -73,10 +78,12 @@ class FacePoints(ObstacleFunctions):
             for a in ti.static(range(3)):
                 if ti.static(a > 0):
                     i3[a] = pass_.face_next[2 * c + a - 1]
-                x, y, z = scene.rest[i3[a]] - wall, at.u[0, i3[a]], self.change_at(what, i3[a], n, at, more)
+                x, y = self.made(g, first, q, scene.rest[i3[a]] - wall, at.u[0, i3[a]], scene)
+                z = self.change_of(what, g, k, i3[a], at, pass_, scene, more)
                 if ti.static(what == "column"):
                     z = self.unit(more, a)
-                edge = (x - (scene.rest[i] - wall)) + (y - at.u[0, i])
+                z = self.turned_by(g, q, -1, z)
+                edge = (x - X0) + (y - u0)
                 size = ti.max(size, edge.norm_sqr())
                 for m in ti.static(range(4)):
                     X[a, m], u[a, m], w[a, m] = x[m], y[m], z[m]
@@ -94,7 +101,77 @@ class FacePoints(ObstacleFunctions):
                 if ti.static(what == "numbers" and g.force.per_area and self.features.shape):
                     more.face_areas[c] = more.face_areas[c] + found[0] / weight / ti.cast(parts * parts, self.fp)
                 out += found
+        if ti.static(what != "energy"):
+            out = self.turned_by(g, q, 1, out)
         return out
+
+    # ---- an obstacle that turns: corners as it was made, and results turned as it is. Others are seen as they are. -------
+
+    @traced
+    def turn_of(self, g, k, pass_):
+        """Unit quaternion."""
+        if not g.force.turns:
+            return None
+        row = 3 * self.num_obstacles + MORE * (g.turning + k)
+        return turning.from_rodrigues(self.turned.short(at(pass_.walls, row)), self.fp)
+
+    @traced
+    def made(self, g, first, q, X, u, scene):
+        """(X, u)"""
+        if not g.force.turns:
+            return X, u
+        c = self.turned.about(g, first, scene.parameters)
+        place = let(c + turning.turned(q, -1, let(self.turned.short(X) - c), self.fp))
+        return self.turned.long(place), self.turned_by(g, q, -1, u)
+
+    @traced
+    def turned_by(self, g, q, sign, x):
+        """R x, or R^T x."""
+        return self.turned.long(turning.turned(q, sign, self.turned.short(x), self.fp)) if g.force.turns else x
+
+    @traced
+    def change_of(self, what, g, k, i, at_, pass_, scene, more):
+        """How vertex i moves, relative to an obstacle."""
+        if not (g.force.turns and what == "jvp"):
+            return self.change_at(what, i, g.number + k, at_, more)
+        dr = at(at_.w, 0, i) + at(more.rest, i)
+        return self.turned.long(self.moved_with(g, k, i, dr, at(at_.u, 0, i), pass_, scene, more))
+
+    @ti.func
+    def moved_with(self, g: A, k, i, dr, u, pass_: A, scene: A, more: A):
+        n, row = 3 * (g.number + k), 3 * ti.static(self.num_obstacles) + MORE * (g.turning + k)
+        X = self.turned.joined(scene.rest[i] - pass_.walls[n], self.turn_of(g, k, pass_), 4)
+        dplace = self.turned.joined(more.walls[n], more.walls[row])
+        return self.turned.moved(g, g.first + k * g.size, X, u, dr, dplace, scene, more)
+
+    @ti.func
+    def add_turn(self, g: A, k, i, f, scene: A, pass_: A, more: A):
+        """The change of a force f of vertex i that turns with the obstacle."""
+        theta = self.turned.short(more.walls[3 * ti.static(self.num_obstacles) + MORE * (g.turning + k)])
+        return self.turned.long(theta.cross(self.turned.short(f)))
+
+    @ti.func
+    def spread(self, g: A, k, i, by_u, scene: A, pass_: A, at: A, adjoint: A):
+        """Add what adjoints by_u of a vertex's place, for the adjoint at.w of its force, say of the obstacle's."""
+        n, row = 3 * (g.number + k), 3 * ti.static(self.num_obstacles) + MORE * (g.turning + k)
+        if ti.static(g.force.turns):
+            f = self.around_one("force", g, k, i, scene, pass_, at, at)
+            turn = self.turned.short(f).cross(self.turned.short(at.w[0, i]))
+            X = self.turned.joined(scene.rest[i] - pass_.walls[n], self.turn_of(g, k, pass_), 4)
+            by, none = self.turned.joined(by_u, turn), ti.Vector.zero(self.fp, 3)
+            first = g.first + k * g.size
+            _, _, by_theta = self.turned.spread(g, first, i, X, at.u[0, i], by, none, scene, adjoint.sums)
+            adjoint.walls[row, i] = adjoint.walls[row, i] + self.turned.long(by_theta)
+        adjoint.walls[n, i] = adjoint.walls[n, i] - by_u
+        self.add_to_rest(i, by_u, adjoint)
+
+    @traced
+    def with_turn(self, what, g, k, i, found, scene, pass_, at_, more):
+        """What `around_one` found, with the turn of an obstacle that turns."""
+        if not (g.force.turns and what == "jvp"):
+            return found
+        f = self.around_one("force", g, k, i, scene, pass_, at_, at_)
+        return let(found + self.add_turn(g, k, i, f, scene, pass_, more))
 
     @ti.func
     def short(self, v):

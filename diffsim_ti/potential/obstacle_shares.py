@@ -126,7 +126,8 @@ class FaceShares(FacePoints):
             if ti.static(not g.force.hollow):
                 k = plan.which - g.number
                 if 0 <= k and k < g.count:
-                    f = self.around_one(what, g, k, i, scene, pass_, at, more)
+                    found = self.around_one(what, g, k, i, scene, pass_, at, more)
+                    f = self.with_turn(what, g, k, i, found, scene, pass_, at, more)
         return f
 
     @ti.func
@@ -160,9 +161,7 @@ class FaceShares(FacePoints):
                     if 0 <= k and k < g.count:
                         by_u = self.around_one("product", g, k, i, scene, pass_, at, at)
                         self.around_one("numbers", g, k, i, scene, pass_, at, adjoint)
-                        n = 3 * plan.which
-                        adjoint.walls[n, i] = adjoint.walls[n, i] - by_u
-                        self.add_to_rest(i, by_u, adjoint)
+                        self.spread(g, k, i, by_u, scene, pass_, at, adjoint)
             out.y[0, i] = by_u
 
     @cached_property

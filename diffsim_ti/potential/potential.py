@@ -28,7 +28,7 @@ class Potential:
         self.u, self.w, self.y = (runtime.array(a.vector, 1, n) for _ in range(3))  # displacement, direction, result
         self.has_friction = bool(a.features().rough)
         self.lag = runtime.array(a.vector, 2, n if self.has_friction else 1)  # as obstacles.py says, like the walls
-        self.walls = runtime.array(a.vector, 3 * num_obstacles)
+        self.walls = runtime.array(a.vector, a.walls.size)
         self.faces = FaceContact(self, parallel) if FaceContact.is_felt(arrays) else None
         self.presses = any(g.force.friction and not g.force.hollow for g in a.features().groups)
         self.pressed = runtime.array(a.vector, num_obstacles if self.presses else 1, n if self.presses else 1)

@@ -13,10 +13,12 @@ from functools import cached_property, lru_cache
 
 import taichi as ti
 
-from diffsim_ti.runtime import Kernel
+from diffsim_ti.runtime import Kernel, traced
 from diffsim_ti.state.features import Features
 from diffsim_ti.state.numbers import SCENE
 from diffsim_ti.state.obstacle_functions import ObstacleFunctions
+from diffsim_ti.state.walls import MORE
+from diffsim_ti.terms.obstacles import turning
 
 A = ti.template()
 MARCHES = 200  # halts on a way
@@ -121,28 +123,62 @@ class SweptKernels(ObstacleFunctions):
         return ti.select(nearest <= 0, nearest, least)
 
     @ti.func
-    def corners_at(self, j, n, t, scene: A, way: A, at: A):
+    def corners_at(self, g: A, k, j, t, scene: A, way: A, at: A):
         """(X, u) of a face, relative to obstacle n, when the share t of the step is done: rows of its corners."""
-        X, u = self.rows(0), self.rows(0)
+        X, u, n = self.rows(0), self.rows(0), g.number + k
         for a in ti.static(range(3)):
             i = way.corners[3 * j + a]
             x, y = scene.rest[i] - way.places[n], at.u[0, i] + t * (way.step[0, i] - way.drifts[n])
+            if ti.static(g.force.turns):
+                c, q = self.turned.about(g, g.first + k * g.size, scene.parameters), self.rotation(g, k, t, way)
+                x = self.turned.long(c + turning.turned(q, -1, self.turned.short(x) - c, self.fp))
+                y = self.turned.long(turning.turned(q, -1, self.turned.short(y), self.fp))
             for c in ti.static(range(3)):
                 X[a, c], u[a, c] = x[c], y[c]
         return X, u
 
     @ti.func
+    def rotation(self, g: A, k, t, way: A):
+        """Unit quaternion of an obstacle that turns when the share t of the step is done."""
+        n = self.place_of_turn(g, k)
+        start = turning.from_rodrigues(self.turned.short(way.places[n]), self.fp)
+        return turning.product(turning.quaternion(t * self.turned.short(way.drifts[n]), self.fp), start)
+
+    @traced
+    def place_of_turn(self, g, k):
+        return self.num_obstacles + MORE // 3 * (g.turning + k)
+
+    @ti.func
+    def speed_of(self, g: A, k, j, most, scene: A, way: A, at: A):
+        """What a point of a face does not go farther than in the step, as the obstacle sees it [m].
+
+        Of one that turns by psi, w = step - drift and r the arm: |w - psi x r| + most |psi| |w|, for r goes on by w.
+        """
+        speed, n = ti.cast(0, self.fp), g.number + k
+        for a in ti.static(range(3)):
+            i = way.corners[3 * j + a]
+            w = way.step[0, i] - way.drifts[n]
+            if ti.static(g.force.turns):
+                c = self.turned.about(g, g.first + k * g.size, scene.parameters)
+                r = self.turned.short(scene.rest[i] - way.places[n] + at.u[0, i]) - c
+                psi, ahead = self.turned.short(way.drifts[self.place_of_turn(g, k)]), self.turned.short(w)
+                across = self.length(ahead - psi.cross(r)) + most * self.length(psi) * self.length(ahead)
+                speed = ti.max(speed, across)
+            else:
+                speed = ti.max(speed, self.length(w))
+        return speed
+
+    @ti.func
     def share_of_one(self, g: A, k, j, scene: A, way: A, at: A, most, kept):
         """The free share of the step of vertex or face j before obstacle k of group g; all of it from within. Where the
         obstacle is met, the share `kept` of the distance, or of the width if that is less, is kept."""
-        first, n = g.first + k * g.size, g.number + k
-        speed, width, none = ti.cast(0, self.fp), g.force.width(scene.parameters, first), ti.cast(0, self.fp)
-        for a in ti.static(range(3)):
-            speed = ti.max(speed, self.length(way.step[0, way.corners[3 * j + a]] - way.drifts[n]))
+        first = g.first + k * g.size
+        width, none = g.force.width(scene.parameters, first), ti.cast(0, self.fp)
+        speed = self.speed_of(g, k, j, most, scene, way, at)
         t, free, near, halt, share = none, none, none, none, most
         for m in range(MARCHES):
             left = speed * (most - t)
-            X, u = self.corners_at(j, n, t, scene, way, at)
+            X, u = self.corners_at(g, k, j, t, scene, way, at)
             d = self.face_clearance(g, first, X, u, scene, left)
             if m == 0:
                 near = ti.min(d, width)
@@ -196,7 +232,7 @@ class SweptKernels(ObstacleFunctions):
             for g in ti.static(self.features.groups):
                 if ti.static(not g.force.hollow) or j < plan.num_vertices:
                     for k in range(g.count):
-                        X, u = self.corners_at(j, g.number + k, none, scene, way, at)
+                        X, u = self.corners_at(g, k, j, none, scene, way, at)
                         d = self.face_clearance(g, g.first + k * g.size, X, u, scene, plan.most)
                         if d < least:
                             least = d

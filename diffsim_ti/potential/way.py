@@ -29,7 +29,7 @@ class Met:
 class Way:
     """Vertices and faces of a surface against the obstacles of a scene, whose numbers are those that are loaded.
 
-    places, drifts [m], shape (num_obstacles, 3): displacements of the obstacles, and how far they go meanwhile.
+    places, drifts: where obstacles are, and how they go meanwhile (state/walls.py).
     """
 
     far = 1e30
@@ -42,12 +42,11 @@ class Way:
         hollow = all(group.force.hollow for group in a.features().groups)
         self.corners_of = np.concatenate([vertices, mesh.surface_triangles[: 0 if hollow else None]])
         self.num_vertices, self.count = len(vertices), len(self.corners_of)
-        m = len(self.terms)
         self._way = SimpleNamespace(
             corners=runtime.upload(self.corners_of.ravel(), ti.i32),
             step=runtime.array(a.vector, 1, a.num_vertices),
-            places=runtime.array(a.vector, m),
-            drifts=runtime.array(a.vector, m),
+            places=runtime.array(a.vector, a.walls.size // 3),
+            drifts=runtime.array(a.vector, a.walls.size // 3),
         )
         self._at = SimpleNamespace(u=runtime.array(a.vector, 1, a.num_vertices))
         self._out = SimpleNamespace(found=runtime.array(a.fp, self.count), blocker=runtime.array(ti.i32, self.count))

@@ -6,13 +6,14 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
-from diffsim_ti.inputs import Derived
+from diffsim_ti.inputs import Derived, poses
 from diffsim_ti.mesh.patches import in_eights, volume_patches
 from diffsim_ti.runtime import LANES
 from diffsim_ti.state.corners import clear_from, slots, vertex_corners, with_more_corners, with_own_corner
 from diffsim_ti.state.features import Features, grouped
 from diffsim_ti.state.numbers import PARTS, on_device
 from diffsim_ti.state.schedule import Schedule
+from diffsim_ti.state.walls import Moment, Walls
 from diffsim_ti.terms import Drag, Gravity, Obstacle, SelfContact
 
 
@@ -52,7 +53,7 @@ class SceneArrays:
             order=mesh.order,
             groups=grouped(self.obstacles),
             stages=stages_contact,
-            moving=len(scene.moving),
+            moving=sum(poses.columns_of(term.path_width) for term in scene.moving),
             gravity=rows.first(scene.term(Gravity)),
             drag=rows.first(scene.term(Drag)),
             forces=bool(scene.dead_loads),
@@ -65,9 +66,9 @@ class SceneArrays:
             guided=bool(len(scene.supports.guided)),
             num_parameters=rows.total,
         )
-        self.offsets = runtime.array(
-            self.vector, 3 * len(self.contacts)
-        )  # walls (potential/) as one looks between passes
+        # walls (potential/) as one looks between passes
+        self.walls = Walls(self.obstacles)
+        self.offsets = runtime.array(self.vector, self.walls.size)
         self.values: Derived | None = None
         self._known_features: dict[tuple[bool, bool], Features] = {}  # for these values
         self.rows: dict[str, np.ndarray | None] = {}  # of steps, as the device has them: motion, path, forces
@@ -144,14 +145,15 @@ class SceneArrays:
     def _twins(self, scene) -> list[tuple]:
         """(compile-time twin, first parameter, column of the path or -1) of the obstacles; their tables stand behind the
         parameters, one after the other."""
-        columns, out = {term: k for k, term in enumerate(scene.moving)}, []
+        widths = [poses.columns_of(term.path_width) for term in scene.moving]
+        columns, out = dict(zip(scene.moving, np.cumsum([0, *widths]).tolist())), []
         at = max(scene.inputs.parameters.total, 1)
         self.tables = np.concatenate([np.zeros(0), *(t.table for t in self.contacts)])
         for term in self.contacts:
             rows = scene.inputs.parameters.of(term)
             twin = term.kernel(scene.precision, **(dict(table=at) if term.table.size else {}))
             if isinstance(term, Obstacle):
-                twin = replace(twin, per_area=term.per_area)
+                twin = replace(twin, per_area=term.per_area, turns=term.turns)
             if twin.size != rows.stop - rows.start:  # it would read, and add to, another term's rows
                 raise AssertionError(
                     f"the kernel of {term!r} has {twin.size} numbers, its term {rows.stop - rows.start}"
@@ -239,10 +241,8 @@ class SceneArrays:
     def place_obstacles(self, schedule: Schedule, j: int) -> None:
         """Put what looks at a state between passes where the obstacles are when pass j begins."""
         if self.rows["path"] is not None:
-            now = schedule.place(self.rows["path"], j, schedule.begin(j))
-            walls = np.zeros((3 * len(self.obstacles), 3))
-            walls[::3] = [now[c] if c >= 0 else np.zeros(3) for _, _, c in self.obstacles]
-            runtime.fill(self.offsets, walls)
+            begin = schedule.begin(j)
+            runtime.fill(self.offsets, self.walls.value(self.rows["path"], Moment(schedule, j, begin, begin)))
 
     # ---- numbers of tetrahedra in blocks -----------------------------------------------------------------------------
 

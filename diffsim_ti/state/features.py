@@ -1,7 +1,8 @@
 """What a scene contains, known when kernels compile: an absent feature leaves no code."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+from diffsim_ti.inputs.poses import COLUMNS
 from diffsim_ti.rows import Rows
 from diffsim_ti.terms import VertexForce
 
@@ -14,6 +15,7 @@ class ObstacleGroup:
     first: int  # where the numbers of the first start in the parameter array
     number: int  # place of the first among all obstacles
     path: int = -1  # column of the first's path among those that move, -1 if they stand still
+    turning: int = -1  # place of the first among those that turn
     count: int = 1
 
     @property
@@ -22,19 +24,20 @@ class ObstacleGroup:
 
     def holds(self, force: VertexForce, first: int, path: int) -> bool:
         """Whether one more obstacle, next in the parameters and the paths, belongs to the group."""
-        next_path = -1 if self.path < 0 else self.path + self.count
+        next_path = -1 if self.path < 0 else self.path + self.count * (COLUMNS if force.turns else 1)
         return force == self.force and first == self.first + self.count * self.size and path == next_path
 
 
 def grouped(obstacles) -> tuple[ObstacleGroup, ...]:
     """Groups of obstacles given as (twin, first parameter, column of the path or -1), neighbours of one kind together."""
-    groups = []
+    groups, turning = [], 0
     for number, (force, first, path) in enumerate(obstacles):
         last = groups[-1] if groups else None
         if last and last.holds(force, first, path):
-            groups[-1] = ObstacleGroup(last.force, last.first, last.number, last.path, last.count + 1)
+            groups[-1] = replace(last, count=last.count + 1)
         else:
-            groups.append(ObstacleGroup(force, first, number, path))
+            groups.append(ObstacleGroup(force, first, number, path, turning if force.turns else -1))
+        turning += force.turns
     return tuple(groups)
 
 
@@ -58,7 +61,7 @@ class Features:
     founded: bool = False  # whether vertices lie on an elastic foundation
     motion: bool = False
     guided: bool = False  # whether vertices are held in some directions alone
-    moving: int = 0  # obstacles that follow a path
+    moving: int = 0  # columns of the paths that obstacles follow
     num_parameters: int = 0  # numbers of all terms
     uniform: bool = True  # one set of coefficients for all tetrahedra
     recorded: bool = False  # whether a loss names what a contact stage does

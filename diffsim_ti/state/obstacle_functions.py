@@ -1,11 +1,13 @@
 """What Taichi functions of obstacles at a vertex share, in explicit passes and in the potential energy."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import taichi as ti
 
-from diffsim_ti.runtime import PRECISIONS
+from diffsim_ti.runtime import PRECISIONS, traced
 from diffsim_ti.state.features import Features
+from diffsim_ti.state.turned import Turned
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
 
@@ -28,6 +30,15 @@ class ObstacleFunctions:
     @property
     def rows(self):
         return ti.types.matrix(3, 4, self.fp)
+
+    @cached_property
+    def turned(self) -> Turned:
+        return Turned(self.precision)
+
+    @traced
+    def seen(self, g, rest, place):
+        """X: a rest position relative to an obstacle at a place; of one that turns seven numbers (obstacle_force.py)."""
+        return self.turned.seen(rest, place) if g.force.turns else rest - place
 
     @property
     def num_obstacles(self) -> int:

@@ -94,6 +94,10 @@ class Schedule(ABC):
         r, after = self._rows(rows, j)
         return (rows[after] - rows[r]) / self.step_length(j)
 
+    def row_of(self, rows: np.ndarray, j: int) -> int:
+        """The row at which the step of pass j begins."""
+        return self._rows(rows, j)[0]
+
     def add_place(self, rows_adj: np.ndarray, j: int, share: float, adjoint: np.ndarray) -> None:
         """Adjoint of `place`."""
         r, after = self._rows(rows_adj, j)

@@ -13,6 +13,7 @@ from diffsim_ti.terms.obstacles.ground import Ground
 from diffsim_ti.terms.obstacles.half_space import HalfSpace
 from diffsim_ti.terms.obstacles.mesh_obstacle import MeshObstacle
 from diffsim_ti.terms.obstacles.obstacle import Obstacle
+from diffsim_ti.terms.pose import Pose
 from diffsim_ti.terms.self_contact import SelfContact
 from diffsim_ti.terms.term import Term, VertexForce
 from diffsim_ti.terms.ties import Anchor, Cable, Spring
@@ -52,6 +53,7 @@ __all__ = [
     "Muscle",
     "OBSTACLES",
     "Obstacle",
+    "Pose",
     "Pressure",
     "SelfContact",
     "Sphere",

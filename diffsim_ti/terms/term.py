@@ -128,8 +128,8 @@ class VertexForce(ABC):
 
     precision: str
     size = 0
-    # of obstacles only (obstacle.py): is there friction, is stiffness per area, are nearness and crossing noted?
-    friction, per_area, watched = False, False, False
+    # of obstacles only (obstacle.py): is there friction, is stiffness per area, does it turn, is nearness noted?
+    friction, per_area, turns, watched = False, False, False, False
 
     @property
     def fp(self):

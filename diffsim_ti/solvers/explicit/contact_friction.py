@@ -134,13 +134,17 @@ class ContactFriction(HeldBack):
     # ---- tangent -------------------------------------------------------------------------------------------------------
 
     @ti.func
-    def slide_jvp_of(self, g: A, k, i, v, dv, ratio, dratio, now: A, scene: A, state: A, tangent: A):
+    def slide_jvp_of(self, g: A, k, i, u, du, v, dv, ratio, dratio, now: A, scene: A, state: A, tangent: A):
         """Velocity after the friction of one obstacle, and its change."""
         row, numbers = ROWS * (g.number + k), g.first + k * g.size + g.force.count
         pushed, felt = state.stage[row + PUSH, i], state.stage[row + FELT, i]
         if pushed.x > 0:
             plane, wall = state.stage[row + PLANE, i], state.stage[row + WALL, i]
-            dwall, change = self.speed(g, k, now, tangent.path), state.stage[row + SEED, i]
+            X = self.seen_now(g, k, scene.rest[i], now, scene)
+            dwall, change = (
+                self.wall_jvp(g, k, X, u, du + tangent.rest[i], now, scene, tangent),
+                state.stage[row + SEED, i],
+            )
             dmu, deps = tangent.parameters[numbers + 2], tangent.parameters[numbers + 3]
             dafter = stage.slide_jvp(
                 self.fp, plane, pushed.x, v, wall, ratio, felt.z, felt.w, change, dv, dwall, dratio, dmu, deps
@@ -154,18 +158,18 @@ class ContactFriction(HeldBack):
         return v, dv
 
     @ti.func
-    def slide_all_jvp(self, i, v, dv, ratio, dratio, now: A, scene: A, state: A, tangent: A):
+    def slide_all_jvp(self, i, u, du, v, dv, ratio, dratio, now: A, scene: A, state: A, tangent: A):
         """Velocity after friction, and its change."""
         for g in ti.static(self.features.staged_rough):
             for k in range(g.count):
-                after, change = self.slide_jvp_of(g, k, i, v, dv, ratio, dratio, now, scene, state, tangent)
+                after, change = self.slide_jvp_of(g, k, i, u, du, v, dv, ratio, dratio, now, scene, state, tangent)
                 v, dv = self.led(i, v, after, scene), self.led(i, dv, change, scene)
         return v, dv
 
     @ti.func
     def rubbed_jvp(self, i, u, du, v, dv, z, dz, ratio, dratio, dalpha, now: A, scene: A, state: A, tangent: A):
         """Velocity after friction, and its change."""
-        after, change = self.slide_all_jvp(i, v, dv, ratio, dratio, now, scene, state, tangent)
+        after, change = self.slide_all_jvp(i, u, du, v, dv, ratio, dratio, now, scene, state, tangent)
         x, number = self.crowding(i, v, after, z, now, state)
         c, slope = self.share_and_slope(x)
         dc, start, dstart = ti.cast(0, self.fp), v, dv
@@ -179,7 +183,7 @@ class ContactFriction(HeldBack):
             dc = slope * dx
             after, change = v + c * way, dv + c * dway + dc * way
         if ti.static(self.features.recorded):
-            note_friction_jvp(self, i, start, dstart, c, dc, ratio, dratio, now, scene, state, tangent)
+            note_friction_jvp(self, i, u, du, start, dstart, c, dc, ratio, dratio, now, scene, state, tangent)
         return after, change
 
     # ---- adjoint -------------------------------------------------------------------------------------------------------

@@ -43,14 +43,14 @@ def note_pushes_jvp(self: A, i, now: A, state: A, tangent: A):
 
 
 @ti.func
-def note_friction_jvp(self: A, i, v, dv, share, dshare, ratio, dratio, now: A, scene: A, state: A, tangent: A):
+def note_friction_jvp(self: A, i, u, du, v, dv, share, dshare, ratio, dratio, now: A, scene: A, state: A, tangent: A):
     """The change of those of friction, v being the velocity before it."""
     if now.into >= 0:
         inverse = scene.inverse_mass[i]
         for g in ti.static(self.features.staged_rough):
             for k in range(g.count):
                 at = now.into + 2 * (g.number + k) + 1
-                after, dafter = self.slide_jvp_of(g, k, i, v, dv, ratio, dratio, now, scene, state, tangent)
+                after, dafter = self.slide_jvp_of(g, k, i, u, du, v, dv, ratio, dratio, now, scene, state, tangent)
                 gained = (share * (dafter - dv) + dshare * (after - v)) / inverse + share * tangent.mass[i] * (
                     after - v
                 )

@@ -55,8 +55,8 @@ class ContactStage(ContactFriction):
             if turn == 0 or near:
                 for g in ti.static(self.features.staged):
                     for k in range(g.count):
-                        first, wall = g.first + k * g.size, self.speed(g, k, now, scene.path)
-                        X = scene.rest[i] - self.place(g, k, now, scene.path)
+                        first, X = g.first + k * g.size, self.seen_now(g, k, scene.rest[i], now, scene)
+                        wall = self.wall(g, k, X, u, now, scene)
                         plane, width = (
                             g.force.outlook(scene.parameters, first, X, u),
                             g.force.width(scene.parameters, first),
@@ -188,9 +188,10 @@ class ContactStage(ContactFriction):
         for g in ti.static(self.features.staged):
             for k in range(g.count):
                 row, first = ROWS * (g.number + k), g.first + k * g.size
-                X = scene.rest[i] - self.place(g, k, now, scene.path)
-                moved = du + tangent.rest[i] - self.place(g, k, now, tangent.path)
-                own, dmove = z - now.h * state.stage[row + WALL, i], -now.h * self.speed(g, k, now, tangent.path)
+                X = self.seen_now(g, k, scene.rest[i], now, scene)
+                moved = self.moved(g, k, X, u, du + tangent.rest[i], now, scene, tangent)
+                dwall = self.wall_jvp(g, k, X, u, du + tangent.rest[i], now, scene, tangent)
+                own, dmove = z - now.h * state.stage[row + WALL, i], -now.h * dwall
                 if ti.static(self.features.guided):
                     dmove += dlead
                 change = stage.push_jvp(
@@ -296,17 +297,16 @@ class ContactStage(ContactFriction):
             for k in range(g.count):
                 row, first = ROWS * (g.number + k), g.first + k * g.size
                 pushed, seed = state.stage[row + PUSH, i], state.stage[row + SEED, i]
-                X = scene.rest[i] - self.place(g, k, now, scene.path)
-                own = z - now.h * self.speed(g, k, now, scene.path)
+                X = self.seen_now(g, k, scene.rest[i], now, scene)
+                own = z - now.h * self.wall(g, k, X, u, now, scene)
                 by_n = self.normal(seed) + pushed.x * total_adj
                 by_push = seed.w + self.normal(state.stage[row + PLANE, i]).dot(total_adj)
                 if ti.static(g.force.per_area):
                     self.add_to_area(g, i, by_push * pushed.x / scene.surface[i], adjoint)
                 by_push = self.on_area(g, i, by_push, scene)
-                by_u, by_own, by = stage.push_vjp(
+                by_place, by_own, by = stage.push_vjp(
                     g.force, scene.parameters, first, X, u, own, plan.contact_damping, by_n, by_push
                 )
-                u_adj += by_u
                 for m in ti.static(range(g.force.count + 2)):
                     adjoint.sums[first + m, i] = adjoint.sums[first + m, i] + by[m]
                 by_wall = -now.h * by_own
@@ -316,6 +316,7 @@ class ContactStage(ContactFriction):
                     adjoint.sums[at, i] = adjoint.sums[at, i] + pushed.z
                     adjoint.sums[at + 1, i] = adjoint.sums[at + 1, i] + pushed.w
                     by_wall += state.stage[row + WALL, i]
+                by_u = self.spread(g, k, i, X, u, by_place, by_wall, now, scene, adjoint, adjoint)
+                u_adj += by_u
                 self.add_to_rest(i, by_u, adjoint)
-                self.add_to_path(g, k, i, now, by_u, by_wall, adjoint)
         return u_adj, move_adj

@@ -5,7 +5,7 @@ from functools import cached_property, lru_cache
 
 import taichi as ti
 
-from diffsim_ti.runtime import Kernel
+from diffsim_ti.runtime import Bundle, Kernel, traced
 from diffsim_ti.solvers.explicit.face_kernels import FaceKernels
 from diffsim_ti.state.features import Features
 from diffsim_ti.state.numbers import ADJOINT, TANGENT
@@ -39,11 +39,58 @@ class FaceDerivatives(FaceKernels):
             u, du = self.rows_of(f, faces.place, k, faces), self.seed_rows(f, own, faces)
             for g in ti.static(self.groups):
                 for o in range(g.count):
-                    X = self.rest_rows(f, scene.rest, self.place(g, o, then, scene.path), faces)
-                    w = du + self.rest_rows(f, tangent.rest, self.place(g, o, then, tangent.path), faces)
-                    rows, _ = self.face("jvp", g, o, f, X, u, w, scene, faces, tangent)
-                    total += rows
+                    if ti.static(g.force.turns):
+                        total += self.turned_jvp(g, o, f, u, du, then, scene, faces, tangent)
+                    else:
+                        X = self.rest_rows(f, scene.rest, self.place(g, o, then, scene.path), faces)
+                        w = du + self.rest_rows(f, tangent.rest, self.place(g, o, then, tangent.path), faces)
+                        rows, _ = self.face("jvp", g, o, f, X, u, w, scene, faces, tangent)
+                        total += rows
             self.store(f, total, faces)
+
+    # ---- of an obstacle that turns, with which forces turn: theta adds theta x f, and its adjoint f x w ---------------
+
+    @ti.func
+    def turned_jvp(self, g: A, o, f, u, du, then: A, scene: A, faces: A, tangent: A):
+        place, w, theta = self.place(g, o, then, scene.path), self.rows(0), ti.Vector.zero(self.fp, 3)
+        for a in ti.static(range(3)):
+            i = faces.corners[3 * f + a]
+            X, dr = self.seen(g, scene.rest[i], place), self.row_of(du, a) + tangent.rest[i]
+            moved = self.moved(g, o, X, self.row_of(u, a), dr, then, scene, tangent)
+            theta = self.turned.short(moved, 3)
+            for m in ti.static(range(3)):
+                w[a, m] = moved[m]
+        X, made = self.made_rows(g, o, f, place, scene, faces), self.turned_rows(g, place, -1, u)
+        w, placed = self.turned_rows(g, place, -1, w), self.placed(tangent, place)
+        change, _ = self.face("jvp", g, o, f, X, made, w, scene, faces, placed)
+        push, _ = self.face("push", g, o, f, X, made, made, scene, faces, scene)
+        rows, pushes = self.turned_rows(g, place, 1, change), self.turned_rows(g, place, 1, push)
+        for a in ti.static(range(3)):
+            x = theta.cross(self.turned.short(self.row_of(pushes, a)))
+            for m in ti.static(range(3)):
+                rows[a, m] += x[m]
+        return rows
+
+    @traced
+    def placed(self, tangent, place):
+        """The changes of a scene's numbers, and where the obstacle is."""
+        return Bundle(**vars(tangent), place=place)
+
+    @ti.func
+    def turned_vjp(self, g: A, o, f, u, w, then: A, scene: A, faces: A, out: A):
+        place = self.place(g, o, then, scene.path)
+        X, made = self.made_rows(g, o, f, place, scene, faces), self.turned_rows(g, place, -1, u)
+        found, _ = self.face("vjp", g, o, f, X, made, self.turned_rows(g, place, -1, w), scene, faces, out)
+        push, _ = self.face("push", g, o, f, X, made, made, scene, faces, scene)
+        rows, pushes = self.turned_rows(g, place, 1, found), self.turned_rows(g, place, 1, push)
+        for a in ti.static(range(3)):
+            turned = self.turned.short(self.row_of(pushes, a)).cross(self.turned.short(self.row_of(w, a)))
+            by, seen = (
+                self.turned.joined(self.row_of(rows, a), turned),
+                self.seen(g, scene.rest[faces.corners[3 * f + a]], place),
+            )
+            self.spread(g, o, f, seen, self.row_of(u, a), by, self.vector(0), then, scene, out, out)
+        return rows
 
     @ti.func
     def go_on_jvp(self, s, k, now: A, scene: A, faces: A, state: A, tangent: A, own: A, plan: A):
@@ -123,11 +170,14 @@ class FaceDerivatives(FaceKernels):
             u, w = self.rows_of(f, faces.place, k, faces), self.seed_rows(f, own, faces)
             for g in ti.static(self.groups):
                 for o in range(g.count):
-                    X = self.rest_rows(f, scene.rest, self.place(g, o, then, scene.path), faces)
-                    rows, _ = self.face("vjp", g, o, f, X, u, w, scene, faces, out)
-                    total += rows
-                    by_X = self.row_of(rows, 0) + self.row_of(rows, 1) + self.row_of(rows, 2)
-                    self.add_to_path(g, o, f, then, by_X, self.vector(0), out)
+                    if ti.static(g.force.turns):
+                        total += self.turned_vjp(g, o, f, u, w, then, scene, faces, out)
+                    else:
+                        X = self.rest_rows(f, scene.rest, self.place(g, o, then, scene.path), faces)
+                        rows, _ = self.face("vjp", g, o, f, X, u, w, scene, faces, out)
+                        total += rows
+                        by_X = self.row_of(rows, 0) + self.row_of(rows, 1) + self.row_of(rows, 2)
+                        self.add_to_path(g, o, f, then, by_X, self.vector(0), out)
             self.store(f, total, faces)
 
     @ti.func

@@ -35,9 +35,9 @@ class FaceForces(FaceRows):
         """(rows, least) of face f, whose corners have the rows X of rest positions relative to the obstacle and u; least:
         of d - r of all its points, or less.
 
-        Of "force" rows (f_a, D_a), the energy going to `faces`; of "jvp" change of f_a for changes w, those of the
-        obstacle's numbers being in `out`; "vjp": adjoints of u for adjoints w of f_a, those of the obstacle's numbers
-        going to `out`.
+        Of "force" rows (f_a, D_a), the energy going to `faces`, of "push" not; of "jvp" change of f_a for changes w, those
+        of the obstacle's numbers being in `out`; "vjp": adjoints of u for adjoints w of f_a, those of the obstacle's
+        numbers going to `out`.
         """
         found, first, row = self.rows(0), g.first + k * g.size, f * ti.static(self.num_obstacles) + g.number + k
         reach, width = faces.reach[row], g.force.width(scene.parameters, first)
@@ -158,6 +158,8 @@ class FaceForces(FaceRows):
             if ti.static(what == "jvp"):
                 da, db = ti.Vector.zero(self.fp, 3), ti.Vector.zero(self.fp, 3)
                 moved = self.rest_rows(f, out.rest, self.vector(0), faces)
+                if ti.static(g.force.turns):
+                    moved = self.turned_rows(g, out.place, -1, moved)
                 for m in ti.static(range(3)):
                     da[m], db[m] = moved[1, m] - moved[0, m], moved[2, m] - moved[0, m]
                 share = n.dot(da.cross(b) + a.cross(db)) / (twice * twice)
@@ -187,7 +189,7 @@ class FaceForces(FaceRows):
         found, stiffness = self.rows(0), scene.parameters[first + g.force.count]
         scale, stiff = 0 - weight * stiffness * width, weight * stiffness
         Fs, Ft = point_slopes(sigma, t, g.force, self.fp)
-        if ti.static(what == "force"):
+        if ti.static(what in ("force", "push")):
             phi, _, _ = fade(t, g.force, self.fp)
             G = barrier.curvature(sigma, self.fp) * phi
             for a in ti.static(range(3)):

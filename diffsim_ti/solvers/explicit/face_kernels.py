@@ -121,14 +121,17 @@ class FaceKernels(FaceWalls):
         return middle[3] - self.size_of_rows(around) - reach - travel
 
     @ti.func
-    def way_of(self, g: A, k, f, now: A, u0, u1, scene: A):
-        """(rows of the corners' moves in the pass as the obstacle sees them, where the obstacle begins)"""
-        place = self.place(g, k, now, scene.path)
-        drift, move = self.place_at(g, k, now.end, now, scene.path) - place, u1 - u0
-        for a in ti.static(range(3)):
-            for m in ti.static(range(3)):
-                move[a, m] -= drift[m]
-        return move, place
+    def way_of(self, g: A, k, f, u0, begin, u1, end, now: A, scene: A, faces: A):
+        """Rows of the corners' moves from u0 to u1 as the obstacle sees them, at shares of the step."""
+        move = u1 - u0
+        if ti.static(g.force.turns):
+            move = self.way_between(g, k, f, u0, begin, u1, end, now, scene, faces)
+        else:
+            drift = self.place_at(g, k, end, now, scene.path) - self.place_at(g, k, begin, now, scene.path)
+            for a in ti.static(range(3)):
+                for m in ti.static(range(3)):
+                    move[a, m] -= drift[m]
+        return move
 
     @ti.func
     def comes_near(self, f, now: A, scene: A, faces: A, state: A, plan: A):
@@ -137,13 +140,16 @@ class FaceKernels(FaceWalls):
         for g in ti.static(self.groups):
             for k in range(g.count):
                 first = g.first + k * g.size
-                move, place = self.way_of(g, k, f, now, u0, u1, scene)
-                X, width = self.rest_rows(f, scene.rest, place, faces), g.force.width(scene.parameters, first)
-                travel = self.size_of_rows(move)
-                if self.bound(g, k, f, X, u0, travel, scene, faces) < width:
+                move, place = (
+                    self.way_of(g, k, f, u0, now.begin, u1, now.end, now, scene, faces),
+                    self.place(g, k, now, scene.path),
+                )
+                X, width = self.made_rows(g, k, f, place, scene, faces), g.force.width(scene.parameters, first)
+                travel, u = self.size_of_rows(move), self.turned_rows(g, place, -1, u0)
+                if self.bound(g, k, f, X, u, travel, scene, faces) < width:
                     bent = ti.cast(0, self.fp)
                     for c in range(3):
-                        bent = ti.max(bent, self.bent(g, first, X, u0 + ti.cast(0.5, self.fp) * c * move, scene))
+                        bent = ti.max(bent, self.bent(g, first, X, u + ti.cast(0.5, self.fp) * c * move, scene))
                     if bent > ti.cast(FLAT, self.fp) * width:
                         near, need = 1, ti.max(need, travel / width)
         if now.alpha <= 0:
@@ -172,10 +178,17 @@ class FaceKernels(FaceWalls):
         total = self.rows(0)
         for g in ti.static(self.groups):
             for k in range(g.count):
-                X = self.rest_rows(f, scene.rest, self.where(g, k, now, scene, faces, plan), faces)
-                rows, least = self.face("force", g, k, f, X, u, u, scene, faces, scene)
+                place = self.where(g, k, now, scene, faces, plan)
+                X, made = self.made_rows(g, k, f, place, scene, faces), self.turned_rows(g, place, -1, u)
+                found, least = self.face("force", g, k, f, X, made, made, scene, faces, scene)
+                rows = self.turned_rows(g, place, 1, found)
                 total += rows
-                if ti.static(g.path >= 0):
+                if ti.static(g.force.turns):
+                    for a in ti.static(range(3)):
+                        x, i = self.row_of(u, a), faces.corners[3 * f + a]
+                        speed = self.wall(g, k, self.seen(g, scene.rest[i], place), x, now, scene)
+                        faces.done[f] = faces.done[f] + length * self.dot3(self.row_of(rows, a), speed)
+                elif ti.static(g.path >= 0):
                     speed = self.speed(g, k, now, scene.path)
                     for a in ti.static(range(3)):
                         faces.done[f] = faces.done[f] + length * self.dot3(self.row_of(rows, a), speed)
@@ -286,16 +299,14 @@ class FaceKernels(FaceWalls):
             for g in ti.static(self.groups):
                 for o in range(g.count):
                     n, place = g.number + o, self.place_at(g, o, end, now, scene.path)
-                    drift, move = place - self.place_at(g, o, began, now, scene.path), u - before
-                    for a in ti.static(range(3)):
-                        for m in ti.static(range(3)):
-                            move[a, m] -= drift[m]
+                    move = self.way_of(g, o, f, before, began, u, end, now, scene, faces)
                     X, width = (
-                        self.rest_rows(f, scene.rest, place, faces),
+                        self.made_rows(g, o, f, place, scene, faces),
                         g.force.width(scene.parameters, g.first + o * g.size),
                     )
-                    if self.bound(g, o, f, X, u, self.size_of_rows(move), scene, faces) < width:
-                        least, reach = self.nearest(g, o, f, X, u, move, scene, faces), faces.reach[f * count + n]
+                    made = self.turned_rows(g, place, -1, u)
+                    if self.bound(g, o, f, X, made, self.size_of_rows(move), scene, faces) < width:
+                        least, reach = self.nearest(g, o, f, X, made, move, scene, faces), faces.reach[f * count + n]
                         if least < width + reach:
                             watch.seen[3 * n, column] = ti.min(watch.seen[3 * n, column], least)
                             watch.seen[3 * n + 1, column] = ti.max(watch.seen[3 * n + 1, column], load)

@@ -5,7 +5,10 @@ from dataclasses import dataclass
 import taichi as ti
 
 from diffsim_ti.potential.face_lattice import BENT
+from diffsim_ti.runtime import at, let, traced
 from diffsim_ti.solvers.explicit.held_back import HeldBack
+from diffsim_ti.state.walls import MORE
+from diffsim_ti.terms.obstacles import turning
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
 
@@ -24,11 +27,59 @@ class FaceRows(HeldBack):
 
     @ti.func
     def where(self, g: A, k, now: A, scene: A, faces: A, plan: A):
-        """Displacement of an obstacle."""
-        place = faces.offsets[3 * (g.number + k)]
+        """Displacement of an obstacle, of one that turns with its unit quaternion behind."""
+        place = self.offset(g, k, faces)
         if plan.between == 0:
             place = self.place(g, k, now, scene.path)
         return place
+
+    @traced
+    def offset(self, g, k, faces):
+        shift = let(at(faces.offsets, 3 * (g.number + k)))
+        if not g.force.turns:
+            return shift
+        s = self.turned.short(at(faces.offsets, 3 * self.num_obstacles + MORE * (g.turning + k)))
+        return self.turned.joined(shift, turning.from_rodrigues(s, self.fp), 4)
+
+    # ---- corners as an obstacle that turns was made; others are seen as they are ---------------------------------------
+
+    @traced
+    def made_rows(self, g, k, f, place, scene, faces):
+        """Rest positions of the corners of a face relative to an obstacle at a place."""
+        if not g.force.turns:
+            return self.rest_rows(f, scene.rest, place, faces)
+        return self.made_of(g, k, f, place, scene, faces)
+
+    @ti.func
+    def made_of(self, g: A, k, f, place, scene: A, faces: A):
+        c, q = self.turned.about(g, g.first + k * g.size, scene.parameters), self.turned.quaternion(place)
+        out = self.rest_rows(f, scene.rest, self.turned.long(place), faces)
+        for a in ti.static(range(3)):
+            x = c + turning.turned(q, -1, self.turned.short(self.row_of(out, a)) - c, self.fp)
+            for m in ti.static(range(3)):
+                out[a, m] = x[m]
+        return out
+
+    @traced
+    def turned_rows(self, g, place, sign, rows):
+        """Rows turned as the obstacle is, or with sign -1 back."""
+        return self.all_turned(self.turned.quaternion(place), sign, rows) if g.force.turns else rows
+
+    @ti.func
+    def all_turned(self, q, sign: ti.template(), rows):
+        out = rows
+        for a in ti.static(range(3)):
+            x = turning.turned(q, sign, self.turned.short(self.row_of(rows, a)), self.fp)
+            for m in ti.static(range(3)):
+                out[a, m] = x[m]
+        return out
+
+    @ti.func
+    def way_between(self, g: A, k, f, u0, begin, u1, end, now: A, scene: A, faces: A):
+        """Rows of the corners' moves from u0 to u1, and shares of the step, as the obstacle was made."""
+        before, after = self.place_at(g, k, begin, now, scene.path), self.place_at(g, k, end, now, scene.path)
+        X0, X1 = self.made_rows(g, k, f, before, scene, faces), self.made_rows(g, k, f, after, scene, faces)
+        return (X1 - X0) + (self.turned_rows(g, after, -1, u1) - self.turned_rows(g, before, -1, u0))
 
     @ti.func
     def size_of_rows(self, M):

@@ -20,7 +20,7 @@ class FaceWalls(FaceForces):
         for g in ti.static(self.features.staged):
             for k in range(g.count):
                 plane = self.plane(g, k, i, u, now, scene)
-                y = plane.w + self.normal(plane).dot(self.way_to(g, k, z, now, scene.path))
+                y = plane.w + self.normal(plane).dot(self.way_to(g, k, i, u, z, now, scene))
                 x = -self.normal(plane).dot(e) / y
                 if y > 0 and x > most:
                     most, number = x, g.number + k

@@ -14,7 +14,9 @@ from dataclasses import dataclass
 
 import taichi as ti
 
+from diffsim_ti.runtime import at, let, traced
 from diffsim_ti.solvers.explicit.obstacle_stages import ObstacleStages
+from diffsim_ti.terms.obstacles import turning
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
 
@@ -40,23 +42,24 @@ class HeldBack(ObstacleStages):
     @ti.func
     def plane(self, g: A, k, i, u, now: A, scene: A):
         """(n, d) of an obstacle at u, where it is when the pass begins."""
-        X = scene.rest[i] - self.place(g, k, now, scene.path)
+        X = self.seen_now(g, k, scene.rest[i], now, scene)
         return g.force.outlook(scene.parameters, g.first + k * g.size, X, u)
 
     @ti.func
-    def way_to(self, g: A, k, z, now: A, path: A):
-        """A move z as the obstacle sees it, or the change of both."""
-        return z - now.h * self.speed(g, k, now, path)
+    def way_to(self, g: A, k, i, u, z, now: A, scene: A):
+        """A move z from u as the obstacle sees it."""
+        return z - now.h * self.wall(g, k, self.seen_now(g, k, scene.rest[i], now, scene), u, now, scene)
 
     @ti.func
     def change_of_x(self, g: A, k, i, u, du, z, dz, e, de, x, now: A, scene: A, tangent: A):
         """Change of x, which obstacle k has, for a vertex that the stage has moved by z from u."""
-        first, X = g.first + k * g.size, scene.rest[i] - self.place(g, k, now, scene.path)
-        moved = du + tangent.rest[i] - self.place(g, k, now, tangent.path)
+        first, X = g.first + k * g.size, self.seen_now(g, k, scene.rest[i], now, scene)
+        moved = self.moved(g, k, X, u, du + tangent.rest[i], now, scene, tangent)
         plane = g.force.outlook(scene.parameters, first, X, u)
         turned = g.force.outlook_jvp(scene.parameters, first, X, u, moved, tangent.parameters)
-        n, dn, way = self.normal(plane), self.normal(turned), self.way_to(g, k, z, now, scene.path)
-        dy = turned.w + dn.dot(way) + n.dot(self.way_to(g, k, dz, now, tangent.path))
+        n, dn, way = self.normal(plane), self.normal(turned), self.way_to(g, k, i, u, z, now, scene)
+        dway = dz - now.h * self.wall_jvp(g, k, X, u, du + tangent.rest[i], now, scene, tangent)
+        dy = turned.w + dn.dot(way) + n.dot(dway)
         return -(dn.dot(e) + n.dot(de) + x * dy) / (plane.w + n.dot(way))
 
     @ti.func
@@ -65,15 +68,23 @@ class HeldBack(ObstacleStages):
 
         The change of n by u is symmetric.
         """
-        first, X = g.first + k * g.size, scene.rest[i] - self.place(g, k, now, scene.path)
+        first, X = g.first + k * g.size, self.seen_now(g, k, scene.rest[i], now, scene)
         plane = g.force.outlook(scene.parameters, first, X, u)
-        n, way = self.normal(plane), self.way_to(g, k, z, now, scene.path)
+        n, way = self.normal(plane), self.way_to(g, k, i, u, z, now, scene)
         ratio = by_x / (plane.w + n.dot(way))
         by_y = -ratio * x
         by_e, by_z, seed = -ratio * n, by_y * n, by_y * way + -ratio * e
         seed.w = by_y
         turned = g.force.outlook_jvp(scene.parameters, first, X, u, seed)
         g.force.outlook_vjp(scene.parameters, first, X, u, seed, adjoint.sums, i)
-        by_u = self.normal(turned) + by_y * n
-        self.add_to_path(g, k, column, now, by_u, -now.h * by_z, out)
+        by_place = self.turn_of_plane(g, self.normal(turned) + by_y * n, n, seed)
+        by_u = self.spread(g, k, i, X, u, by_place, -now.h * by_z, now, scene, adjoint, out, column)
         return by_e, by_z, by_u
+
+    @traced
+    def turn_of_plane(self, g, by_place, n, seed):
+        """With the adjoint of theta by that of n, of an obstacle that turns."""
+        if not g.force.turns:
+            return by_place
+        by_theta = turning.cross([at(n, d) for d in range(3)], [at(seed, d) for d in range(3)])
+        return self.turned.joined(by_place, let(ti.types.vector(3, self.fp)(*by_theta)))

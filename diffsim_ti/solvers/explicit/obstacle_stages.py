@@ -11,7 +11,7 @@ import taichi as ti
 
 from diffsim_ti.runtime import Bundle, let, traced
 from diffsim_ti.solvers.explicit.guides import Guides
-from diffsim_ti.state.obstacle_functions import ObstacleFunctions
+from diffsim_ti.solvers.explicit.obstacle_places import ObstaclePlaces
 from diffsim_ti.state.pass_table import pass_at
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
@@ -22,7 +22,7 @@ ROWS = 5
 
 
 @dataclass(frozen=True)
-class ObstacleStages(ObstacleFunctions):
+class ObstacleStages(ObstaclePlaces):
     """Taichi functions of one vertex; `now` is the pass (state/schedule.py), g a group of obstacles, k a place in it."""
 
     @cached_property
@@ -37,37 +37,7 @@ class ObstacleStages(ObstacleFunctions):
             out = self.guides.free(i, x, scene)
         return out
 
-    # ---- where obstacles are -----------------------------------------------------------------------------------------
-
-    @ti.func
-    def place_at(self, g: A, k, share, now: A, path: A):
-        """Displacement of an obstacle at a share of the step."""
-        place = self.vector(0)
-        if ti.static(g.path >= 0):
-            start = path[now.row, g.path + k]
-            place = start + share * (path[now.next, g.path + k] - start)
-        return place
-
-    @ti.func
-    def place(self, g: A, k, now: A, path: A):
-        """Displacement of an obstacle when the pass begins."""
-        return self.place_at(g, k, now.begin, now, path)
-
-    @ti.func
-    def speed(self, g: A, k, now: A, path: A):
-        """Velocity of an obstacle in the pass."""
-        speed = self.vector(0)
-        if ti.static(g.path >= 0):
-            speed = now.per_step * (path[now.next, g.path + k] - path[now.row, g.path + k])
-        return speed
-
-    @ti.func
-    def add_to_path(self, g: A, k, i, now: A, by_X, by_wall, adjoint: A):
-        """Adjoints of the rows of the path that vertex i felt; summed over the vertices where a step begins."""
-        if ti.static(g.path >= 0):
-            c, rate = now.felt + 2 * (g.path + k), now.per_step * by_wall
-            adjoint.felt[c, i] = adjoint.felt[c, i] - ((1 - now.begin) * by_X + rate)
-            adjoint.felt[c + 1, i] = adjoint.felt[c + 1, i] - (now.begin * by_X - rate)
+    # ---- adjoints of paths -------------------------------------------------------------------------------------------
 
     @traced
     def noting(self, now, plan):
@@ -107,9 +77,8 @@ class ObstacleStages(ObstacleFunctions):
     @ti.func
     def note_one(self, g: A, k, i, u, u_next, now: A, scene: A, state: A):
         first, at = g.first + k * g.size, 3 * (g.number + k)
-        place = self.place(g, k, now, scene.path)
-        moved = self.place_at(g, k, now.end, now, scene.path) - place
-        X, move = scene.rest[i] - place, u_next - u - moved
+        X = self.seen_now(g, k, scene.rest[i], now, scene)
+        move = u_next - u - self.way_of_wall(g, k, X, u, now, scene)
         d, width = g.force.gap(scene.parameters, first, X, u), g.force.width(scene.parameters, first)
         far = d - width if ti.static(self.features.stages) else d  # a stage feels where a pass leads to
         if d < width or move.dot(move) >= far * far:
@@ -129,7 +98,7 @@ class ObstacleStages(ObstacleFunctions):
         """f and the force of all obstacles on vertex i."""
         for g in ti.static(self.features.pressing):
             for k in range(g.count):
-                X = scene.rest[i] - self.place(g, k, now, scene.path)
+                X = self.seen_now(g, k, scene.rest[i], now, scene)
                 f += self.on_area(g, i, g.force.force(scene.parameters, g.first + k * g.size, X, u, v), scene)
         return f
 
@@ -139,9 +108,9 @@ class ObstacleStages(ObstacleFunctions):
         for g in ti.static(self.features.pressing):
             for k in range(g.count):
                 first = g.first + k * g.size
-                X = scene.rest[i] - self.place(g, k, now, scene.path)
-                dX = tangent.rest[i] - self.place(g, k, now, tangent.path)
-                df += self.on_area(g, i, g.force.force_jvp(scene.parameters, first, X, u, v, du + dX, dv), scene)
+                X = self.seen_now(g, k, scene.rest[i], now, scene)
+                moved = self.moved(g, k, X, u, du + tangent.rest[i], now, scene, tangent)
+                df += self.on_area(g, i, g.force.force_jvp(scene.parameters, first, X, u, v, moved, dv), scene)
                 by = g.force.parameter_derivatives(scene.parameters, first, X, u, v)
                 for m in ti.static(range(g.size)):
                     df += self.on_area(g, i, by[m], scene) * tangent.parameters[first + m]
@@ -155,12 +124,12 @@ class ObstacleStages(ObstacleFunctions):
         for g in ti.static(self.features.pressing):
             for k in range(g.count):
                 first = g.first + k * g.size
-                X = scene.rest[i] - self.place(g, k, now, scene.path)
+                X = self.seen_now(g, k, scene.rest[i], now, scene)
                 w = self.on_area(g, i, f_adj, scene)
-                by_u, by_v = g.force.force_vjp(scene.parameters, first, X, u, v, w)
+                by_place, by_v = g.force.force_vjp(scene.parameters, first, X, u, v, w)
+                by_u = self.spread(g, k, i, X, u, by_place, self.vector(0), now, scene, adjoint, adjoint)
                 u_adj += by_u
                 v_adj += by_v
-                self.add_to_path(g, k, i, now, by_u, self.vector(0), adjoint)
                 by = g.force.parameter_derivatives(scene.parameters, first, X, u, v)
                 for m in ti.static(range(g.size)):
                     adjoint.sums[first + m, i] = adjoint.sums[first + m, i] + by[m].dot(w)
@@ -176,8 +145,8 @@ class ObstacleStages(ObstacleFunctions):
         work, v = ti.cast(0, self.fp), v_plus
         for g in ti.static(self.features.pressing):
             for k in range(g.count):
-                first, wall = g.first + k * g.size, self.speed(g, k, now, scene.path)
-                X = scene.rest[i] - self.place(g, k, now, scene.path)
+                first, X = g.first + k * g.size, self.seen_now(g, k, scene.rest[i], now, scene)
+                wall = self.wall(g, k, X, u, now, scene)
                 if ti.static(g.path >= 0):
                     force = self.on_area(g, i, g.force.force(scene.parameters, first, X, u, v_plus), scene)
                     work += now.h * force.dot(wall)
@@ -194,9 +163,9 @@ class ObstacleStages(ObstacleFunctions):
     def slide(self, g: A, k, i, u, v, now: A, scene: A):
         """Velocity of vertex i after the friction of one obstacle."""
         first, after = g.first + k * g.size, v
-        X = scene.rest[i] - self.place(g, k, now, scene.path)
+        X = self.seen_now(g, k, scene.rest[i], now, scene)
         if g.force.touches(scene.parameters, first, X, u):
-            wall = self.speed(g, k, now, scene.path)
+            wall = self.wall(g, k, X, u, now, scene)
             h_over_m = self.on_area(g, i, now.h * scene.inverse_mass[i], scene)
             after = g.force.slide(scene.parameters, first, X, u, v, wall, h_over_m)
         return after
@@ -225,10 +194,11 @@ class ObstacleStages(ObstacleFunctions):
             h_over_m = self.on_area(g, i, now.h * inverse, scene)
             for k in range(g.count):
                 first = g.first + k * g.size
-                X = scene.rest[i] - self.place(g, k, now, scene.path)
+                X = self.seen_now(g, k, scene.rest[i], now, scene)
                 if g.force.touches(scene.parameters, first, X, u):
-                    moved = du + tangent.rest[i] - self.place(g, k, now, tangent.path)
-                    wall, dwall = self.speed(g, k, now, scene.path), self.speed(g, k, now, tangent.path)
+                    moved = self.moved(g, k, X, u, du + tangent.rest[i], now, scene, tangent)
+                    wall = self.wall(g, k, X, u, now, scene)
+                    dwall = self.wall_jvp(g, k, X, u, du + tangent.rest[i], now, scene, tangent)
                     lighter = -h_over_m * inverse * tangent.mass[i]
                     if ti.static(g.force.per_area):
                         lighter += now.h * inverse * tangent.surface[i]
@@ -247,12 +217,13 @@ class ObstacleStages(ObstacleFunctions):
             for back in range(g.count):
                 k = g.count - 1 - back
                 first = g.first + k * g.size
-                X = scene.rest[i] - self.place(g, k, now, scene.path)
+                X = self.seen_now(g, k, scene.rest[i], now, scene)
                 if g.force.touches(scene.parameters, first, X, u):
                     start = self.slide_before(g.number + k, i, u, v, now, scene)
-                    by_u, by_v, by_wall, by_ratio, by = g.force.slide_vjp(
-                        scene.parameters, first, X, u, start, self.speed(g, k, now, scene.path), h_over_m, v_adj
+                    by_place, by_v, by_wall, by_ratio, by = g.force.slide_vjp(
+                        scene.parameters, first, X, u, start, self.wall(g, k, X, u, now, scene), h_over_m, v_adj
                     )
+                    by_u = self.spread(g, k, i, X, u, by_place, by_wall, now, scene, adjoint, adjoint)
                     v_adj = by_v
                     u_adj += by_u
                     for m in ti.static(range(g.size)):
@@ -262,5 +233,4 @@ class ObstacleStages(ObstacleFunctions):
                         adjoint.sums[row, i] = adjoint.sums[row, i] - h_over_m * inverse * by_ratio
                     self.add_to_area(g, i, now.h * inverse * by_ratio, adjoint)
                     self.add_to_rest(i, by_u, adjoint)
-                    self.add_to_path(g, k, i, now, by_u, by_wall, adjoint)
         return u_adj, v_adj

@@ -38,7 +38,7 @@ class ImplicitAdjoint(RecordedPasses):
         n, num_obstacles = a.num_vertices, len(a.obstacles)
         self.potential = p
         self.lag = runtime.array(a.vector, 2, n if p.has_friction else 1)
-        self.walls = runtime.array(a.vector, 3 * num_obstacles, n if num_obstacles else 1)
+        self.walls = runtime.array(a.vector, a.walls.size, n if num_obstacles else 1)
         self.pressed = runtime.array(a.vector, *p.pressed.shape)
         self.z, own = a.law_states(1), dict(scene=a, pass_=p, at=p, out=p, adjoint=(self, self.numbers))
         if self.z is not None:  # the state of the law

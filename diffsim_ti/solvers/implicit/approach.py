@@ -32,7 +32,7 @@ class Approach:
         """
         ws, held = self.ws, held_as(self.ws.free, start, u)
         way, before, after = ws.way, ws.walls_before, ws.walls_at_stage
-        step, drift = held - u, after - before
+        step, drift = held - u, ws.arrays.walls.drift(before, after)
         if not (step.any() or drift.any()):
             return held
         ws.check_pairs(u, step)
@@ -47,8 +47,9 @@ class Approach:
 
     def _in_parts(self, place, step, before, drift, problem):
         ws, done, stuck = self.ws, 0.0, 0
+        moved = ws.arrays.walls.moved
         for _ in range(self.most_parts):
-            left, walls = 1 - done, before + done * drift
+            left, walls = 1 - done, moved(before, drift, done)
             share = ws.way.share(place, left * step, walls, left * drift, kept=self.kept)
             met = ws.way.met
             place, done = place + share * left * step, done + share * left
@@ -57,19 +58,22 @@ class Approach:
             stuck = stuck + 1 if share * left < self.least else 0
             if stuck > self.patience:
                 break
-            carried = self._carried(place, (1 - done) * step, before + done * drift, (1 - done) * drift, met.obstacle)
+            walls = moved(before, drift, done)
+            carried = self._carried(place, (1 - done) * step, walls, (1 - done) * drift, met.obstacle)
             if carried is not None:
                 return carried
-            ws.put_obstacles(before + done * drift)
+            ws.put_obstacles(walls)
             place = ws.newton.solve(place, *problem, rounds=self.rounds)
-        ws.put_obstacles(before + done * drift)
-        speed = np.linalg.norm(drift[met.obstacle] - step[list(met.vertices)], axis=1).max() / ws.substep
+        ws.put_obstacles(walls)
+        own = list(met.vertices)
+        carried = ws.carried(met.obstacle, place[own], walls, drift, own)
+        speed = np.linalg.norm(carried - step[own], axis=1).max() / ws.substep
         raise Blocked.pinched(ws, place, met, 1 - done, float(speed))
 
     def _carried(self, place, step, walls, drift, obstacle: int):
         """All that moves freely goes along with an obstacle; None where that way is not free."""
-        along = step + np.tile(drift[obstacle], (len(step), 1)) * self.ws.free
-        if not drift[obstacle].any() or self.ws.way.share(place, along, walls, drift) < 1:
+        along = step + self.ws.carried(obstacle, place, walls, drift) * self.ws.free
+        if not (along - step).any() or self.ws.way.share(place, along, walls, drift) < 1:
             return None
         return place + along if self._is_sound(place, place + along) else None
 

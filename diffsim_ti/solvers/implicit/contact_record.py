@@ -90,7 +90,7 @@ class SharesAdjoint(Shares):
         p, a = self.p, self.a
         self.seed = runtime.array(a.vector, 2 * self.num_obstacles, a.num_vertices)
         self.lag = runtime.array(a.vector, *p.lag.shape)
-        self.walls = runtime.array(a.vector, 3 * self.num_obstacles, a.num_vertices)
+        self.walls = runtime.array(a.vector, a.walls.size, a.num_vertices)
         self.pressed = runtime.array(a.vector, *p.pressed.shape)
         own = SimpleNamespace(lag=self.lag, walls=self.walls, pressed=self.pressed, face_areas=face_areas)
         self.numbers = (own, numbers)

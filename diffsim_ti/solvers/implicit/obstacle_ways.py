@@ -26,7 +26,7 @@ class ObstacleWays:
     def check_apart(self) -> None:
         """Raise Overlap if a face is in an obstacle, which vertices alone do not show."""
         u, walls = runtime.fetch_row(self.state.u, 0), runtime.fetch(self.arrays.offsets)[::3].astype(np.float64)
-        self.way.check_apart(u, walls[: len(self.way.terms)])
+        self.way.check_apart(u, walls)
 
     def _walls_at_end(self, j: int) -> np.ndarray:
         """Displacements of the obstacles at the end of pass j."""
@@ -36,19 +36,26 @@ class ObstacleWays:
         """Raise Tunnelling where surfaces, or a surface and an obstacle, meet beyond the middle of a step."""
         if self.pairs:
             self.pairs.check_end(u_star, u_next)
-        drift = self._walls_at_end(j) - self._walls[::3]
+        drift = self.arrays.walls.drift(self._walls[::3], self._walls_at_end(j))
         if self.way.share(u_star, u_next - u_star, self._walls[::3], drift) == 1:
             return
         met = self.way.met
-        speed = self._speed(met, u_next - u_star, drift) / 0.5
+        speed = self._speed(met, u_star, u_next - u_star, self._walls[::3], drift) / 0.5
         raise Tunnelling(
             f"beyond the middle of a step, where its forces were taken, {met} meets {self.way.terms[met.obstacle]!r} at "
             f"{speed:.4g} m/s: take a solver whose steps end where forces are taken, ImplicitEulerSolver or BDF2Solver"
         )
 
-    def _speed(self, met, step, drift) -> float:
+    def _speed(self, met, u, step, places, drift) -> float:
         """How fast a vertex or face and an obstacle meet that do so in a pass [m/s]."""
-        return float(np.linalg.norm(step[list(met.vertices)] - drift[met.obstacle], axis=1).max() / self.substep)
+        own = list(met.vertices)
+        carried = self.carried(met.obstacle, u[own], places, drift, own)
+        return float(np.linalg.norm(step[own] - carried, axis=1).max() / self.substep)
+
+    def carried(self, obstacle: int, u, places, drift, vertices=slice(None)) -> np.ndarray:
+        """How far an obstacle takes vertices that it holds at displacements u."""
+        points, about = self.arrays.values.rest[vertices] + u, self.way.terms[obstacle].about
+        return self.arrays.walls.way_at(obstacle, places, drift, points, about)
 
     def _explained(self, error: NotConverged, u) -> NotConverged:
         """The error, or what stood in the way."""
@@ -58,8 +65,9 @@ class ObstacleWays:
         met = self.way.nearest(report.place, self._walls[::3], self.way.widest)
         if met is None:
             return error
-        drift = self.walls_at_stage - self.walls_before
-        return Blocked.at_an_obstacle(self, error, report.place, met, self._speed(met, report.place - u, drift))
+        drift = self.arrays.walls.drift(self.walls_before, self.walls_at_stage)
+        speed = self._speed(met, u, report.place - u, self.walls_before, drift)
+        return Blocked.at_an_obstacle(self, error, report.place, met, speed)
 
     def gap_of(self, met, u) -> float:
         """Distance [m] of what stands before an obstacle."""

@@ -68,7 +68,7 @@ class ImplicitTangent(RecordedPasses):
         runtime.fill(ws.potential.w, held[None])
         if ws.potential.has_friction:
             runtime.fill(self.lag, np.stack([self.du, dx]))
-        walls = None if tangent.path is None else ws.walls(tangent.path, j, s)
+        walls = None if tangent.path is None else ws.walls_jvp(tangent.path, j, s)
         if walls is not None:
             runtime.fill(self.walls, walls)
         if self._presses:

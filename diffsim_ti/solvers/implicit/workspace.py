@@ -28,6 +28,7 @@ from diffsim_ti.solvers.implicit.pressed import Pressed
 from diffsim_ti.solvers.implicit.stage import Stage
 from diffsim_ti.solvers.implicit.threads import one_blas_thread
 from diffsim_ti.state.arrays import History, copy_slot
+from diffsim_ti.state.walls import Moment
 from diffsim_ti.state.workspace import Workspace
 
 
@@ -307,18 +308,20 @@ class ImplicitWorkspace(ObstacleWays, Noted, GivenInPasses, Workspace):
         self.press(j, stage)
         self.attach(j, stage)
 
+    def moment(self, j: int, stage: Stage) -> Moment:
+        """Where pass j lies for obstacles; a chord of two passes about its end for a solver of two steps."""
+        schedule, at_stage = self.solver.schedule, self.share_at_stage(j, stage)
+        begin = schedule.begin(j)
+        tau = (at_stage - begin) * float(schedule.step_length(j)) * (2 if stage.a1 else 1)
+        return Moment(schedule, j, at_stage, begin, tau)
+
     def walls(self, path: np.ndarray | None, j: int, stage: Stage) -> np.ndarray:
-        """Three rows for each obstacle: displacement where forces are taken, displacement before, velocity."""
-        obstacles, schedule = self.arrays.obstacles, self.solver.schedule
-        out = np.zeros((3 * len(obstacles), 3))
-        if path is not None:
-            before = schedule.place(path, j, schedule.begin(j))
-            at_stage = schedule.place(path, j, self.share_at_stage(j, stage))
-            speed = schedule.rate(path, j)
-            for k, (_, _, column) in enumerate(obstacles):
-                if column >= 0:
-                    out[3 * k : 3 * k + 3] = at_stage[column], before[column], speed[column]
-        return out
+        """Where obstacles are in pass j (state/walls.py)."""
+        return self.arrays.walls.value(path, self.moment(j, stage))
+
+    def walls_jvp(self, dpath: np.ndarray | None, j: int, stage: Stage) -> np.ndarray:
+        """Their change."""
+        return self.arrays.walls.jvp(self.arrays.rows["path"], dpath, self.moment(j, stage))
 
     def share_at_stage(self, j: int, stage: Stage) -> float:
         """Share of the step at which pass j takes its forces."""
@@ -327,11 +330,4 @@ class ImplicitWorkspace(ObstacleWays, Noted, GivenInPasses, Workspace):
 
     def walls_vjp(self, walls_adj: np.ndarray, j: int, stage: Stage, path_adj: np.ndarray) -> None:
         """Add the adjoints of the rows of paths for those of `walls`."""
-        schedule = self.solver.schedule
-        for k, (_, _, column) in enumerate(self.arrays.obstacles):
-            if column >= 0:
-                by_stage, by_before, by_speed = walls_adj[3 * k : 3 * k + 3]
-                rows = path_adj[:, column]
-                schedule.add_place(rows, j, self.share_at_stage(j, stage), by_stage)
-                schedule.add_place(rows, j, schedule.begin(j), by_before)
-                schedule.add_rate(rows, j, by_speed)
+        self.arrays.walls.vjp(self.arrays.rows["path"], walls_adj, self.moment(j, stage), path_adj)

@@ -7,7 +7,7 @@ import taichi as ti
 
 from diffsim_ti.inputs import Input
 from diffsim_ti.runtime import traced
-from diffsim_ti.terms.obstacles import barrier
+from diffsim_ti.terms.obstacles import barrier, shapes
 from diffsim_ti.terms.obstacles.obstacle import Obstacle, ObstacleForce
 
 
@@ -40,12 +40,17 @@ class Ground(Obstacle):
         )
 
     def kernel(self, precision: str) -> "GroundForce":
-        return GroundForce(precision, self.has_friction)
+        return (TurningGroundForce if self.turns else GroundForce)(precision, self.has_friction)
+
+    def surface(self, size):
+        """A square, of one that turns."""
+        height = float(self.values["ground_height"])
+        return shapes.square((self.about[0], height, self.about[2]), (0.0, 1.0, 0.0), size) if self.turns else None
 
 
 @dataclass(frozen=True)
-class GroundForce(ObstacleForce):
-    """Compile-time twin of Ground; the force is written out, since only one component of it is not zero."""
+class TurningGroundForce(ObstacleForce):
+    """d = y - height."""
 
     count = 1
     lanes = True
@@ -54,6 +59,11 @@ class GroundForce(ObstacleForce):
     @traced
     def distance_and_normal(self, g, p, X, u):
         return (X[1] - p[0]) + u[1], [g.number(0), g.number(1), g.number(0)]
+
+
+@dataclass(frozen=True)
+class GroundForce(TurningGroundForce):
+    """Compile-time twin of Ground; the force is written out, since only one component of it is not zero."""
 
     @ti.func
     def scaled(self, parameters: ti.template(), first, X, u):

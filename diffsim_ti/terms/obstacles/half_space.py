@@ -51,7 +51,7 @@ class HalfSpace(Obstacle):
         return float(self.values["half_space_point"][1]) if upwards else None
 
     def surface(self, size):
-        """A square; a floor is drawn as one."""
-        if self.floor_height() is not None:
+        """A square; a floor that does not turn is drawn as one."""
+        if self.floor_height() is not None and not self.turns:
             return None
         return shapes.square(self.values["half_space_point"], self.values["half_space_normal"], size)

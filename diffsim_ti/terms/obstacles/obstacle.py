@@ -3,15 +3,17 @@
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from diffsim_ti.inputs import NOT_NEGATIVE, Input
 from diffsim_ti.inputs.description import length_per_step
-from diffsim_ti.terms.described import positive
+from diffsim_ti.terms.described import place, positive
 from diffsim_ti.terms.gravity import Gravity
-from diffsim_ti.terms.motion import Motion, sampled
+from diffsim_ti.terms.motion import Motion
 from diffsim_ti.terms.obstacles.obstacle_force import ObstacleForce
 from diffsim_ti.terms.obstacles.shapes import Triangles
 from diffsim_ti.terms.obstacles.stiffness import stiffness_of_impact
+from diffsim_ti.terms.pose import brought_back, carried, path_width, sampled_path
 from diffsim_ti.terms.term import Term
 
 PER_AREA = "barrier_stiffness_per_area"  # plain name of the input
@@ -31,10 +33,15 @@ class Obstacle(Term):
     friction [-]: Coulomb's coefficient (friction.py); 0 compiles none. friction_speed [m/s]: the speed below which
     friction is smoothed, and with which a vertex that is held may creep.
     path: the obstacle's displacement over time [m], a function of time [s] that returns 3 numbers, or keyframes
-    (times, displacements) between which it is linear. It is sampled at the steps and linear within each.
+    (times, displacements) between which it is linear. It is sampled at the steps and linear within each. 6 or 7 numbers are
+    a pose: a displacement, then a rotation vector [rad] or a quaternion (w, x, y, z) of any length. It takes a point x of
+    the obstacle as it was made to c + t + R (x - c), with constant angular velocity between keyframes and within steps.
+    Quaternions take the short way; rotation vectors on one axis keep their turns, less than one in a step.
+    about [m]: the point c.
 
     Inputs with gradient: the shape's own numbers, "barrier_stiffness_per_area" or "barrier_stiffness", "barrier_width",
-    with friction also "friction" and "friction_speed", with a path "<shape>_path", shape (steps + 1, 3). A second
+    with friction also "friction" and "friction_speed", with a path "<shape>_path", shape (steps + 1, 3), of a pose
+    (steps + 1, 6 or 7), and "<shape>_about", shape (3,). A second
     obstacle's names end in _2; those of one with a name begin with it and go on as the argument: "floor.stiffness",
     "floor.path".
     In explicit steps frictions on one vertex act one after the other: kinds in a fixed order, obstacles of one kind as the
@@ -58,6 +65,7 @@ class Obstacle(Term):
         path: Motion | None = None,
         name: str | None = None,
         stiffness_per_area: float | None = None,
+        about: ArrayLike | None = None,
     ):
         if isinstance(shape, dict):  # {name: value}, with nothing more to say of them
             shape = [Input(plain, value) for plain, value in shape.items()]
@@ -67,9 +75,18 @@ class Obstacle(Term):
         for described in friction_of:  # also of what is smooth
             described.check_given(type(self).__name__)
         rough = friction_of if friction_of[0].value > 0 else ()
-        rows = [Input("path", None, (("steps + 1", 3),), "m", change=length_per_step, plain=self.path_name)]
-        super().__init__(*shape, stiff, felt, *rough, *(rows if path is not None else []), name=name)
-        self.path = path
+        self.path, self.path_width = path, 3 if path is None else path_width(path)
+        kind = type(self).__name__
+        if about is not None and not self.turns:
+            raise ValueError(
+                f"{kind}: about is the point that a pose turns it about; pass a path of 6 or 7 numbers, or no about"
+            )
+        centre = [place("about", (0.0, 0.0, 0.0) if about is None else about, self.about_name)] if self.turns else []
+        unit = "m, rad" if self.path_width == 6 else "m, -" if self.turns else "m"
+        rows = [
+            Input("path", None, (("steps + 1", self.path_width),), unit, change=length_per_step, plain=self.path_name)
+        ]
+        super().__init__(*shape, stiff, felt, *rough, *centre, *(rows if path is not None else []), name=name)
 
     def _stiffness(self, of_vertex: float | None, per_area: float | None) -> Input:
         """How stiff the barrier is: per area, or of each vertex."""
@@ -84,10 +101,29 @@ class Obstacle(Term):
         return positive("stiffness_per_area", 1.0 if per_area is None else per_area, "N/m^3", PER_AREA)
 
     @property
+    def _kind(self) -> str:
+        kind = type(self).__name__
+        return "".join("_" * (k > 0 and c.isupper()) + c.lower() for k, c in enumerate(kind))
+
+    @property
     def path_name(self) -> str:
         """Plain name of the input that moves the obstacle."""
-        kind = type(self).__name__
-        return "".join("_" * (k > 0 and c.isupper()) + c.lower() for k, c in enumerate(kind)) + "_path"
+        return f"{self._kind}_path"
+
+    @property
+    def about_name(self) -> str:
+        """Plain name of the point that it turns about."""
+        return f"{self._kind}_about"
+
+    @property
+    def turns(self) -> bool:
+        """Whether its path is a pose."""
+        return self.path_width > 3
+
+    @property
+    def about(self) -> np.ndarray:
+        """The point that it turns about [m], as it was made."""
+        return self.values[self.about_name] if self.turns else np.zeros(3)
 
     @property
     def has_friction(self) -> bool:
@@ -100,10 +136,10 @@ class Obstacle(Term):
         gravity = scene.term(Gravity)
         g = float(np.linalg.norm(gravity.values["gravity"])) if gravity else 0.0
         positions = scene.mesh.vertices if initial_positions is None else np.asarray(initial_positions, np.float64)
-        place = np.zeros(3) if self.path is None else sampled(self.path_name, self.path, [0.0], 1)[0, 0]
-        fall = max(float(self.gap(positions, place).min()), 0.0)
-        start = 0.0 if initial_velocities is None else np.linalg.norm(np.atleast_2d(initial_velocities), axis=1).max()
-        speed, width = float(np.sqrt(start**2 + 2 * g * fall)), float(self.values["barrier_width"])
+        start = np.zeros(3) if self.path is None else sampled_path(self.path_name, self.path, [0.0])[0]
+        fall = max(float(self.gap(positions, start).min()), 0.0)
+        first = 0.0 if initial_velocities is None else np.linalg.norm(np.atleast_2d(initial_velocities), axis=1).max()
+        speed, width = float(np.sqrt(first**2 + 2 * g * fall)), float(self.values["barrier_width"])
         stiffness = stiffness_of_impact(scene.mesh, scene.material, float(np.mean(density)), g, speed, width)
         if not stiffness > 0:
             raise ValueError(
@@ -117,8 +153,15 @@ class Obstacle(Term):
         raise NotImplementedError
 
     def gap(self, positions: np.ndarray, offset=(0.0, 0.0, 0.0)) -> np.ndarray:
-        """Distance [m] of each position, the obstacle being displaced by `offset` [m]."""
-        return self.distance(np.asarray(positions, np.float64) - offset)
+        """Distance [m] of each position, the obstacle being displaced by `offset` [m], or in a pose of 6 or 7 numbers."""
+        return self.distance(brought_back(np.asarray(positions, np.float64), np.asarray(offset), self.about))
+
+    def way(self, positions: np.ndarray, before: np.ndarray, after: np.ndarray) -> float:
+        """How far it goes between two rows of its path, the most at the positions [m]."""
+        if not self.turns:
+            return float(np.linalg.norm(after - before))
+        there = carried(brought_back(positions, before, self.about), after, self.about)
+        return float(np.linalg.norm(there - positions, axis=1).max())
 
     def least_radius(self) -> float:
         """How round the obstacle is at least [m]: 0 where it has edges, infinite where it is flat or hollow."""
@@ -144,13 +187,21 @@ class Obstacle(Term):
         """
         return None
 
+    def surface_at(self, size: float, time: float) -> Triangles | None:
+        """`surface` where its path has taken it at a time [s]."""
+        shape = self.surface(size)
+        if shape is None or self.path is None:
+            return shape
+        row = sampled_path(self.path_name, self.path, [time])[0]
+        return carried(shape[0], row, self.about), shape[1]
+
     def floor_height(self) -> float | None:
         """Height y [m] of the floor that the obstacle is, where it was made; None if it is no floor."""
         return None
 
     @property
     def variant(self) -> tuple:
-        return self.has_friction, self.path is not None, self.per_area
+        return self.has_friction, self.path is not None, self.per_area, self.turns
 
     def kernel(self, precision: str) -> ObstacleForce:
         return self.twin(precision, self.has_friction)

@@ -8,6 +8,7 @@ from diffsim_ti.differentiation import Graph
 from diffsim_ti.materials.calculus.tensor import sum_of
 from diffsim_ti.runtime import assign, at, let, traced
 from diffsim_ti.terms.obstacles import barrier, friction
+from diffsim_ti.terms.obstacles.turning import changes, cross, length_of, rotation_matrix
 from diffsim_ti.terms.term import VertexForce
 
 
@@ -17,11 +18,14 @@ class ObstacleForce(VertexForce):
 
     per_area: whether stiffness is per area [N/m^3]; what is said here of a vertex is then said of one square metre.
     A shape writes one function, `distance_and_normal`, in numbers of a graph; everything else follows from it. Positions
-    are relative to the obstacle: callers take its displacement from X.
+    are relative to the obstacle: callers take its displacement from X. The numbers of one that turns end in the point that
+    it turns about, and its X is seven numbers: a place, and the unit quaternion of its rotation. A change of X + u is then
+    six numbers, a change of place as the obstacle sees it and theta, the change dR = [theta]x R; so are adjoints.
     """
 
     friction: bool = False
     per_area: bool = field(default=False, kw_only=True)
+    turns: bool = field(default=False, kw_only=True)
 
     count = 0
     watched = True
@@ -33,7 +37,7 @@ class ObstacleForce(VertexForce):
 
     @property
     def size(self) -> int:
-        return self.count + (4 if self.friction else 2)
+        return self.count + (4 if self.friction else 2) + (3 if self.turns else 0)
 
     @traced
     def distance_and_normal(self, g, p, X, u) -> tuple:
@@ -47,8 +51,38 @@ class ObstacleForce(VertexForce):
         g = Graph(self.fp, parameters)
         p = [g.leaf(x) for x in self._numbers(parameters, first)]
         rest, moved = ([g.leaf(at(vector, d)) for d in range(3)] for vector in (X, u))
+        if length_of(X) == 7:
+            return g, p, *self._record_turned(g, p, let(X), rest, moved)
         d, n = self.distance_and_normal(g, p[: self.count], rest, moved)
         return g, p, moved, d, n
+
+    @traced
+    def _record_turned(self, g, p, X, rest, moved):
+        """(leaves of u and theta, d, n) from the place as the obstacle was made, c + R^T (X - c) + R^T u."""
+        R = rotation_matrix([at(X, 3 + k) for k in range(4)])
+        c = [x.value for x in p[self.size - 3 :]]
+        arm = [let(x.value - y) for x, y in zip(rest, c)]
+        made = [g.leaf(c[d] + sum_of(R[e][d] * arm[e] for e in range(3))) for d in range(3)]
+        theta = [g.number(0) for _ in range(3)]
+        back = [
+            g.function(
+                sum_of(R[e][d] * moved[e].value for e in range(3)),
+                *((moved[e], lambda e=e, d=d: R[e][d]) for e in range(3)),
+            )
+            for d in range(3)
+        ]
+        d, own = self.distance_and_normal(g, p[: self.count], made, back)
+        n = [let(sum_of(R[e][k] * own[k].value for k in range(3))) for e in range(3)]
+        by_theta = (0, n[2], -n[1]), (-n[2], 0, n[0]), (n[1], -n[0], 0)  # of theta x n
+        rows = [
+            g.function(
+                n[e],
+                *((own[k], lambda e=e, k=k: R[e][k]) for k in range(3)),
+                *((theta[k], lambda e=e, k=k: let(by_theta[e][k])) for k in range(3) if k != e),
+            )
+            for e in range(3)
+        ]
+        return [*moved, *theta], d, rows
 
     @traced
     def _push(self, g, p, d):
@@ -66,6 +100,8 @@ class ObstacleForce(VertexForce):
 
     @traced
     def _vector(self, numbers):
+        if len(numbers) == 6:
+            return let(ti.types.vector(6, self.fp)(*numbers))
         return let(ti.types.vector(4, self.fp)(*numbers, ti.cast(0, self.fp)))
 
     # ---- distance ---------------------------------------------------------------------------------------------------
@@ -85,7 +121,7 @@ class ObstacleForce(VertexForce):
     def outlook_jvp(self, parameters, first, X, u, du, parameters_dot=None):
         """Its change for changes of the place and, where given, of the obstacle's numbers."""
         g, p, moved, d, n = self.record(parameters, first, X, u)
-        dots = [(x, at(du, k)) for k, x in enumerate(moved)]
+        dots = changes(moved, du)
         if parameters_dot is not None:
             dots += [(q, at(parameters_dot, first + k)) for k, q in enumerate(p)]
         return let(ti.types.vector(4, self.fp)(*g.forward(dots, [*n, d])))
@@ -149,7 +185,7 @@ class ObstacleForce(VertexForce):
 
     @ti.func
     def force_vjp(self, parameters: ti.template(), first, X, u, v, w):
-        return self.force_jvp(parameters, first, X, u, v, w, w), 0 * w  # a force with a potential
+        return self._force_vjp(parameters, first, X, u, v, w), 0 * w
 
     @ti.func
     def parameter_derivatives(self, parameters: ti.template(), first, X, u, v):
@@ -159,13 +195,22 @@ class ObstacleForce(VertexForce):
         return by
 
     @traced
+    def _force_vjp(self, parameters, first, X, u, v, w):
+        by_u = self.force_jvp(parameters, first, X, u, v, w, w)  # a force with a potential
+        if not self.turns:
+            return by_u
+        f = let(self.force(parameters, first, X, u, v))
+        by_theta = cross([at(f, d) for d in range(3)], [at(w, d) for d in range(3)])
+        return self._vector([*(at(by_u, d) for d in range(3)), *by_theta])
+
+    @traced
     def _force(self, parameters, first, X, u):
         return self._vector([k.value for k in self._record_force(parameters, first, X, u)[3]])
 
     @traced
     def _force_jvp(self, parameters, first, X, u, du):
         g, _, moved, f = self._record_force(parameters, first, X, u)
-        return self._vector(g.forward([(x, at(du, d)) for d, x in enumerate(moved)], f))
+        return self._vector(g.forward(changes(moved, du), f))
 
     @traced
     def _zeros(self, u):
@@ -199,7 +244,7 @@ class ObstacleForce(VertexForce):
         g, p, moved, before, walls, ratio, after = self._record_slide(parameters, first, X, u, v, wall, h_over_m)
         dots = [(ratio, dh_over_m)] + [(q, at(parameters_dot, first + k)) for k, q in enumerate(p)]
         for leaves, change in ((moved, du), (before, dv), (walls, dwall)):
-            dots += [(leaf, at(change, d)) for d, leaf in enumerate(leaves)]
+            dots += changes(leaves, change)
         return self._vector(g.forward(dots, after))
 
     @traced
@@ -207,8 +252,7 @@ class ObstacleForce(VertexForce):
         """(adjoints of u, v, wall as vectors, of h_over_m, and of the obstacle's numbers, a tuple) for the adjoint w."""
         g, p, moved, before, walls, ratio, after = self._record_slide(parameters, first, X, u, v, wall, h_over_m)
         adjoints = g.reverse([(k, let(at(w, d))) for d, k in enumerate(after)], [*moved, *before, *walls, ratio, *p])
-        vectors = [self._vector(adjoints[k : k + 3]) for k in (0, 3, 6)]
-        return (*vectors, adjoints[9], tuple(adjoints[10:]))
+        return (*self._parted(adjoints, len(moved)), adjoints[len(moved) + 6], tuple(adjoints[len(moved) + 7 :]))
 
     # ---- friction as a force of implicit passes, at the velocity v; felt: (X, u), the place where N and n are those of the
     # barrier, or (None, N n), the normal force itself [N] -----------------------------------------------------------------
@@ -261,7 +305,7 @@ class ObstacleForce(VertexForce):
         g, p, moved, speed, walls, f = self._rubbed(parameters, first, felt, v, wall)
         dots = [(q, at(parameters_dot, first + k)) for k, q in enumerate(p)]
         for leaves, change in ((moved, du), (speed, dv), (walls, dwall)):
-            dots += [(leaf, at(change, d)) for d, leaf in enumerate(leaves)]
+            dots += changes(leaves, change)
         return self._vector(g.forward(dots, f))
 
     @traced
@@ -269,4 +313,9 @@ class ObstacleForce(VertexForce):
         """(adjoints of u, v, wall as vectors, and of the obstacle's numbers, a tuple) for the adjoint w of the force."""
         g, p, moved, speed, walls, f = self._rubbed(parameters, first, felt, v, wall)
         adjoints = g.reverse([(k, let(at(w, d))) for d, k in enumerate(f)], [*moved, *speed, *walls, *p])
-        return (*(self._vector(adjoints[k : k + 3]) for k in (0, 3, 6)), tuple(adjoints[9:]))
+        return (*self._parted(adjoints, len(moved)), tuple(adjoints[len(moved) + 6 :]))
+
+    @traced
+    def _parted(self, adjoints, count):
+        """Those of `count` numbers of a place, and of two vectors after them."""
+        return [self._vector(adjoints[a:b]) for a, b in ((0, count), (count, count + 3), (count + 3, count + 6))]

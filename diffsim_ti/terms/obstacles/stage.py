@@ -11,6 +11,7 @@ import taichi as ti
 from diffsim_ti.differentiation import Graph
 from diffsim_ti.runtime import at, let, traced
 from diffsim_ti.terms.obstacles import friction, secant
+from diffsim_ti.terms.obstacles.turning import changes
 
 
 @traced
@@ -22,7 +23,7 @@ def _vector(fp, numbers, last=0):
 def numbers(force: ti.template(), parameters: ti.template(), first):
     """(stiffness, width, mu, friction speed)"""
     out = ti.types.vector(4, force.fp)(0)
-    for k in ti.static(range(force.size - force.count)):
+    for k in ti.static(range(4 if force.friction else 2)):
         out[k] = parameters[first + force.count + k]
     return out
 
@@ -84,7 +85,7 @@ def push_jvp(force, parameters, first, X, u, move, damping, parameters_dot, du, 
     g, p, moved, leaves, n, pushed = _record_push(force, parameters, first, X, u, move, damping)
     dots = [(q, at(parameters_dot, first + k)) for k, q in enumerate(p)]
     for own, change in ((moved, du), (leaves, dmove)):
-        dots += [(leaf, at(change, d)) for d, leaf in enumerate(own)]
+        dots += changes(own, change)
     *dn, dp = g.forward(dots, [*n, pushed])
     return _vector(force.fp, dn, dp)
 
@@ -94,8 +95,9 @@ def push_vjp(force, parameters, first, X, u, move, damping, n_adj, push_adj):
     """(adjoints of u and move as vectors, those of the obstacle's numbers as a tuple) for those of n and P."""
     g, p, moved, leaves, n, pushed = _record_push(force, parameters, first, X, u, move, damping)
     seeds = [(k, let(at(n_adj, d))) for d, k in enumerate(n)] + [(pushed, push_adj)]
-    adjoints = g.reverse(seeds, [*moved, *leaves, *p])
-    return _vector(force.fp, adjoints[:3]), _vector(force.fp, adjoints[3:6]), tuple(adjoints[6:])
+    adjoints, count = g.reverse(seeds, [*moved, *leaves, *p]), len(moved)
+    of_place = let(ti.types.vector(6, force.fp)(*adjoints[:6])) if count == 6 else _vector(force.fp, adjoints[:3])
+    return of_place, _vector(force.fp, adjoints[count : count + 3]), tuple(adjoints[count + 3 :])
 
 
 # ---- friction, for a plane and a push that are known -------------------------------------------------------------------

@@ -1,0 +1,139 @@
+"""Poses of obstacles over time: from rows of numbers to what kernels read, with derivatives both ways.
+
+A row is a translation [m] and a rotation: 3 numbers (none), 6 (rotation vector [rad]), 7 (quaternion w, x, y, z of any
+length). Within a step a pose goes from its row to the next at constant velocity and constant angular velocity,
+
+    t + s (t' - t),    R(s phi) R,    0 <= s <= 1,    phi the rotation vector from R to R'.
+"""
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from diffsim_ti import rotations
+from diffsim_ti.checked import shown
+from diffsim_ti.inputs.chain import Link
+
+COLUMNS = 3  # of a pose: translation, R as modified Rodrigues parameters, phi
+ONE_AXIS = 1e-2  # sine of the angle within which two rotation vectors have one axis
+FULL_TURN = 2 * np.pi
+
+
+def columns_of(width: int) -> int:
+    """How many columns a path of 3, 6 or 7 numbers has."""
+    return 1 if width == 3 else COLUMNS
+
+
+def quaternions(rows: np.ndarray) -> np.ndarray:
+    """Unit quaternions of rows of 6 or 7 numbers; ValueError for one of length zero."""
+    if rows.shape[-1] == 6:
+        return rotations.quaternion(rows[..., 3:])
+    if not np.all(np.linalg.norm(rows[..., 3:], axis=-1) > 0):
+        raise ValueError("a quaternion (w, x, y, z) must not be zero; the rotation by nothing is (1, 0, 0, 0)")
+    return rotations.unit(rows[..., 3:])
+
+
+def between(name: str, rows: np.ndarray) -> np.ndarray:
+    """Rotation vectors from each row to the next, shape (rows - 1, 3).
+
+    Quaternions take the short way. Rotation vectors on one axis keep their turns, and others take the short way of half a
+    turn at most. Raises ValueError for rows that are farther apart.
+    """
+    q = quaternions(rows)
+    out = rotations.vector(rotations.product(q[1:], rotations.conjugate(q[:-1])))
+    if rows.shape[-1] == 7:
+        return out
+    a, b = rows[:-1, 3:], rows[1:, 3:]
+    far, size = np.linalg.norm(b - a, axis=-1), np.linalg.norm(out, axis=-1)
+    across = np.linalg.norm(np.cross(a, b), axis=-1)
+    alone = across <= ONE_AXIS * np.linalg.norm(a, axis=-1) * np.linalg.norm(b, axis=-1)
+    wrong = np.flatnonzero((far > np.pi) & ~alone)
+    if len(wrong):
+        k = wrong[0]
+        raise ValueError(
+            f"{name}: rotation vectors {shown(a[k].tolist())} and {shown(b[k].tolist())}, rows {k} and {k + 1}, are more "
+            "than half a turn apart and not on one axis; put rows between them"
+        )
+    # out + 2 pi k n, n its direction, nearest to the difference
+    n = np.where((size > 1e-9)[:, None], out, b - a)
+    n = n / np.maximum(np.linalg.norm(n, axis=-1, keepdims=True), 1e-300)
+    turns = np.where(far > np.pi, np.round((((b - a) * n).sum(-1) - size) / FULL_TURN), 0.0)
+    return out + FULL_TURN * turns[:, None] * n
+
+
+def theta_of(rows: np.ndarray, drows: np.ndarray) -> np.ndarray:
+    """Changes theta of the rotations for changes of the rows."""
+    if rows.shape[1] == 6:
+        return np.einsum("kij,kj->ki", rotations.left_jacobian(rows[:, 3:]), drows[:, 3:])
+    q = rows[:, 3:]
+    return 2 * rotations.product(drows[:, 3:], rotations.conjugate(q))[:, 1:] / (q**2).sum(1, keepdims=True)
+
+
+def theta_vjp(rows: np.ndarray, theta: np.ndarray) -> np.ndarray:
+    """Adjoints of the rows' rotations for those of theta."""
+    if rows.shape[1] == 6:
+        return np.einsum("kji,kj->ki", rotations.left_jacobian(rows[:, 3:]), theta)
+    q = rows[:, 3:]
+    pure = np.concatenate([np.zeros((len(q), 1)), theta], 1)
+    return 2 * rotations.product(pure, q) / (q**2).sum(1, keepdims=True)
+
+
+class PoseColumns(Link):
+    """Paths of obstacles side by side, shape (steps + 1, columns, 3): a displacement is a column, a pose three.
+
+    The change of R is theta with dR = [theta]x R, in place of that of its parameters. With R' = R(phi) R,
+
+        J(phi) dphi = theta' - R(phi) theta;
+
+    theta = J(r) dr of a rotation vector r, 2 vec(dq q^*) / |q|^2 of a quaternion.
+
+    Raises ValueError for rows that are a full turn or more apart.
+    """
+
+    def __init__(self, reads: Iterable[str], writes: str):
+        self.reads, self.writes = tuple(reads), (writes,)
+
+    def value(self, *x):
+        return (np.concatenate([self._columns(name, rows) for name, rows in zip(self.reads, x)], 1),)
+
+    @staticmethod
+    def _columns(name: str, rows: np.ndarray) -> np.ndarray:
+        if rows.shape[1] == 3:
+            return rows[:, None]
+        phi = np.zeros((len(rows), 3))
+        phi[:-1] = between(name, rows)
+        most = np.linalg.norm(phi, axis=1).max(initial=0.0)
+        if most > FULL_TURN - 1e-3:
+            raise ValueError(
+                f"{name}: turns by {most:.4g} rad in one step, which must be less than a full turn; take shorter steps"
+            )
+        return np.stack([rows[:, :3], rotations.rodrigues(quaternions(rows)), phi], 1)
+
+    def jvp(self, x, dx):
+        out = []
+        for name, rows, drows in zip(self.reads, x, dx):
+            if rows.shape[1] == 3:
+                out.append(drows[:, None])
+                continue
+            phi, theta = self._columns(name, rows)[:-1, 2], theta_of(rows, drows)
+            dphi = np.zeros_like(theta)
+            change = theta[1:] - rotations.turned(rotations.quaternion(phi), theta[:-1])
+            dphi[:-1] = np.einsum("kij,kj->ki", rotations.inverse_jacobian(phi), change)
+            out.append(np.stack([drows[:, :3], theta, dphi], 1))
+        return (np.concatenate(out, 1),)
+
+    def vjp(self, x, y_adj):
+        out, at = [], 0
+        for name, rows in zip(self.reads, x):
+            width = 1 if rows.shape[1] == 3 else COLUMNS
+            own = y_adj[0][:, at : at + width]
+            out.append(own[:, 0] if width == 1 else self._pose_vjp(name, rows, own))
+            at += width
+        return out
+
+    def _pose_vjp(self, name: str, rows: np.ndarray, own: np.ndarray) -> np.ndarray:
+        phi, theta = self._columns(name, rows)[:-1, 2], own[:, 1].copy()
+        change = np.einsum("kji,kj->ki", rotations.inverse_jacobian(phi), own[:-1, 2])
+        theta[1:] += change
+        theta[:-1] -= rotations.turned(rotations.conjugate(rotations.quaternion(phi)), change)
+        return np.concatenate([own[:, 0], theta_vjp(rows, theta)], 1)

@@ -1,0 +1,133 @@
+"""Where obstacles are in a pass, rows of three numbers that kernels read, with tangent and adjoint, on the host.
+
+Obstacle k has rows 3 k, 3 k + 1 and 3 k + 2: its displacement where forces are taken, that where the pass begins, its
+velocity. Those that turn have six more behind all of these: modified Rodrigues parameters of both rotations, the angular
+velocity, and, as the last, (tau, 0, 0), the time of the chord of its velocity (turned.py). Changes of rotations are theta,
+dR = [theta]x R. Every third row is where obstacles are: `places`; how they go from there is `drifts`, of rotations psi.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from diffsim_ti import rotations
+from diffsim_ti.state.schedule import Schedule
+
+MORE = 6  # rows of an obstacle that turns
+
+
+@dataclass(frozen=True)
+class Moment:
+    """Pass j, the shares of its step at which forces are taken and at which it begins, and tau [s]."""
+
+    schedule: Schedule
+    j: int
+    at_stage: float
+    begin: float
+    tau: float = 0.0
+
+
+class Walls:
+    """obstacles: as `SceneArrays.obstacles`; rows of paths are columns of `inputs/poses.py`."""
+
+    def __init__(self, obstacles: list[tuple]):
+        self.columns = [(k, c) for k, (_, _, c) in enumerate(obstacles) if c >= 0]
+        turning = [(k, c) for k, (force, _, c) in enumerate(obstacles) if force.turns]
+        self.turning = [(3 * len(obstacles) + MORE * n, c) for n, (_, c) in enumerate(turning)]
+        self.size = 3 * len(obstacles) + MORE * len(turning)
+        self.place_of = {k: row // 3 for (k, _), (row, _) in zip(turning, self.turning)}  # of obstacle k among places
+
+    def value(self, path: np.ndarray | None, at: Moment | None) -> np.ndarray:
+        """The rows, shape (size, 3); without a path all zero."""
+        out = np.zeros((self.size, 3))
+        if path is not None:
+            self._translations(out, path, at)
+            for row, c in self.turning:
+                s = at.schedule.row_of(path, at.j)
+                phi, start = path[s, c + 2], rotations.from_rodrigues(path[s, c + 1])
+                for m, share in enumerate((at.at_stage, at.begin)):
+                    turn = rotations.quaternion(share * phi)
+                    out[row + m] = rotations.rodrigues(rotations.product(turn, start))
+                out[row + 2] = phi / at.schedule.step_length(at.j)
+                out[row + 5, 0] = at.tau
+        return out
+
+    def _translations(self, out, path, at):
+        before = at.schedule.place(path, at.j, at.begin)
+        at_stage, speed = at.schedule.place(path, at.j, at.at_stage), at.schedule.rate(path, at.j)
+        for k, c in self.columns:
+            out[3 * k : 3 * k + 3] = at_stage[c], before[c], speed[c]
+
+    def row_of(self, k: int, rows: np.ndarray) -> np.ndarray:
+        """Where obstacle k is where forces are taken: 3 numbers, or 7 of a pose."""
+        if k not in self.place_of:
+            return rows[3 * k]
+        return np.concatenate([rows[3 * k], rotations.from_rodrigues(rows[3 * self.place_of[k]])])
+
+    def velocity_at(self, k: int, rows: np.ndarray, point: np.ndarray, about: np.ndarray) -> np.ndarray:
+        """Of obstacle k at a point [m/s]."""
+        if k not in self.place_of:
+            return rows[3 * k + 2]
+        return rows[3 * k + 2] + np.cross(rows[3 * self.place_of[k] + 2], point - rows[3 * k] - about)
+
+    # ---- places ------------------------------------------------------------------------------------------------------
+
+    def drift(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+        """How obstacles go from places to others, the short way."""
+        out = after - before
+        for at in self.place_of.values():
+            a, b = rotations.from_rodrigues(before[at]), rotations.from_rodrigues(after[at])
+            out[at] = rotations.vector(rotations.product(b, rotations.conjugate(a)))
+        return out
+
+    def moved(self, places: np.ndarray, drift: np.ndarray, share: float) -> np.ndarray:
+        """Where they are when the share of a drift is done."""
+        out = places + share * drift
+        for at in self.place_of.values():
+            start = rotations.from_rodrigues(places[at])
+            out[at] = rotations.rodrigues(rotations.product(rotations.quaternion(share * drift[at]), start))
+        return out
+
+    def way_at(
+        self, k: int, places: np.ndarray, drift: np.ndarray, points: np.ndarray, about: np.ndarray
+    ) -> np.ndarray:
+        """How far obstacle k takes points [m] that it holds on a drift, shape (points, 3)."""
+        out = np.tile(drift[k], (len(points), 1))
+        if k in self.place_of:
+            arm = points - places[k] - about
+            out += rotations.turned(rotations.quaternion(drift[self.place_of[k]]), arm) - arm
+        return out
+
+    # ------------------------------------------------------------------------------------------------------------------
+
+    def jvp(self, path: np.ndarray | None, dpath: np.ndarray | None, at: Moment) -> np.ndarray:
+        """Change of the rows."""
+        out = np.zeros((self.size, 3))
+        if dpath is not None:
+            self._translations(out, dpath, at)
+            for row, c in self.turning:
+                s = at.schedule.row_of(path, at.j)
+                phi, theta, dphi = path[s, c + 2], dpath[s, c + 1], dpath[s, c + 2]
+                for m, share in enumerate((at.at_stage, at.begin)):
+                    turn = rotations.quaternion(share * phi)
+                    out[row + m] = share * rotations.left_jacobian(share * phi) @ dphi + rotations.turned(turn, theta)
+                out[row + 2] = dphi / at.schedule.step_length(at.j)
+        return out
+
+    def vjp(self, path: np.ndarray, walls_adj: np.ndarray, at: Moment, path_adj: np.ndarray) -> None:
+        """Add the adjoints of the rows of paths for those of the rows here."""
+        schedule, j = at.schedule, at.j
+        for k, c in self.columns:
+            by_stage, by_before, by_speed = walls_adj[3 * k : 3 * k + 3]
+            rows = path_adj[:, c]
+            schedule.add_place(rows, j, at.at_stage, by_stage)
+            schedule.add_place(rows, j, at.begin, by_before)
+            schedule.add_rate(rows, j, by_speed)
+        for row, c in self.turning:
+            s = schedule.row_of(path, j)
+            phi = path[s, c + 2]
+            for m, share in enumerate((at.at_stage, at.begin)):
+                by, back = walls_adj[row + m], rotations.quaternion(-share * phi)
+                path_adj[s, c + 1] += rotations.turned(back, by)
+                path_adj[s, c + 2] += share * rotations.left_jacobian(share * phi).T @ by
+            path_adj[s, c + 2] += walls_adj[row + 2] / schedule.step_length(j)
