@@ -183,7 +183,7 @@ class ImplicitWorkspace(ObstacleWays, Noted, GivenInPasses, Workspace):
             kind = Multigrid if self._wants_multigrid(size, mass) else BlockJacobi
             if len(self._preconditioners) > 5:
                 self._preconditioners.pop(next(iter(self._preconditioners)))
-            self._preconditioners[key] = kind(self.potential, mass, self.free, size), size
+            self._preconditioners[key] = kind(self.potential, mass, self.free, size, self.parallel), size
         kept, size = self._preconditioners[key]
         return kept, size + size_of
 
