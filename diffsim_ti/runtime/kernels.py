@@ -29,6 +29,7 @@ def array_types(precision: str) -> dict:
         "vectors2": ndarray(vector, 2),
         "blocks": ndarray(lanes, 1),
         "blocks2": ndarray(lanes, 2),
+        "singles": ndarray(ti.f32, 1),
         "rows3": ndarray(ROWS[3], 1),
         "rows6": ndarray(ROWS[6], 1),
         "int": ti.i32,

@@ -109,35 +109,35 @@ def inverse_matrix(M):
 
 
 class Cycle:
-    """z = Q V Q^T r, V a V-cycle with a sweep of damped block Jacobi on each way, symmetric and positive definite.
+    """z = P Q V Q^T r for r = P r, V a V-cycle with a sweep of damped block Jacobi on each way: symmetric and positive
+    definite on what P leaves.
 
-    matrices: of each level, the coarsest last; ways: from each to the one before. Q: a block for each node of the finest.
+    matrices: of each level, the coarsest last; ways: from each to the one before. frames: `turned` Q and `allowed` P, a
+    block for each node of the finest level, by columns.
     Adams, Brezina, Hu, Tuminaro 2003, doi:10.1016/S0021-9991(03)00194-3.
     """
 
     wide = 1000  # nodes of a level from which on all threads work on it
 
-    def __init__(self, matrices: list, ways: list, precision: str, parallel: bool):
+    def __init__(self, matrices: list, ways: list, frames, precision: str, parallel: bool):
+        self.frames = frames
+        lanes = runtime.runs_on_cpu()  # vectors stay vectors, which takes half the time
         self.levels = [Level(M, self._wide(M, parallel)) for M in matrices]
         self._steps_down, self._steps_up = [], []
         for level, below, P in zip(self.levels, self.levels[1:], ways):
-            wide = parallel and level.nodes > self.wide or not runtime.runs_on_cpu()
-            kernels = kernels_of(CycleKernels, level.numbers, below.numbers, wide)
+            kernels = kernels_of(CycleKernels, level.numbers, below.numbers, self._wide(P, parallel))
             down, up = block_matrix(P.T.tobsr(P.blocksize[::-1])), block_matrix(P)
-            self._steps_down.append((kernels.down.bind(runtime.runs_on_cpu(), level=level, down=down, below=below), level, below))
-            self._steps_up.insert(0, (kernels.up.bind(runtime.runs_on_cpu(), level=level, up=up, below=below), level))
-        last, finest = self.levels[-1], self.levels[0]
-        self._solve = last.kernels.solve.bind(runtime.runs_on_cpu(), level=last, inverse=block_matrix(inverse_matrix(matrices[-1])))
-        self.frames = SimpleNamespace(turned=runtime.array(ROWS[3], 3 * finest.nodes))
-        ends = kernels_of(LevelKernels, 3, precision, self._wide(matrices[0], parallel))
-        self._ends, self._bound = ends, {}
+            step_down = kernels.down.bind(lanes, level=level, down=down, below=below)
+            self._steps_down.append((step_down, level, below))
+            self._steps_up.insert(0, (kernels.up.bind(lanes, level=level, up=up, below=below), level))
+        last = self.levels[-1]
+        inverse = block_matrix(inverse_matrix(matrices[-1]))
+        self._solve = last.kernels.solve.bind(lanes, level=last, inverse=inverse)
+        self._ends = kernels_of(LevelKernels, 3, precision, self._wide(matrices[0], parallel))
+        self._bound = {}
 
     def _wide(self, M, parallel: bool) -> bool:
         return parallel and M.shape[0] // M.blocksize[0] > self.wide or not runtime.runs_on_cpu()
-
-    def put_frames(self, Q: np.ndarray) -> None:
-        """Set Q, shape (nodes, 3, 3)."""
-        runtime.fill(self.frames.turned, np.swapaxes(Q, 1, 2).reshape(-1, 3))
 
     def put_diagonal(self, blocks: np.ndarray) -> None:
         """Set the diagonal blocks of the finest level."""
@@ -148,8 +148,8 @@ class Cycle:
         """at.z = Q V Q^T at.r; scale: a number that brings r to about one."""
         finest = self.levels[0]
         if id(at) not in self._bound:
-            own = dict(at=at, level=finest, frames=self.frames)
-            self._bound[id(at)] = self._ends.enter.bind(runtime.runs_on_cpu(), **own), self._ends.leave.bind(runtime.runs_on_cpu(), **own), at
+            own, lanes = dict(at=at, level=finest, frames=self.frames), runtime.runs_on_cpu()
+            self._bound[id(at)] = self._ends.enter.bind(lanes, **own), self._ends.leave.bind(lanes, **own), at
         enter, leave, _ = self._bound[id(at)]
         enter(nodes=finest.nodes, scale=scale)
         for step, level, below in self._steps_down:

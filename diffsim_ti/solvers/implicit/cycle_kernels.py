@@ -144,7 +144,7 @@ class LevelKernels:
 
     @cached_property
     def enter(self) -> Kernel:
-        """b = scale Q^T r and the first x of the finest level."""
+        """b = scale Q^T r, Q: `turned`, and the first x of the finest level."""
         arrays = dict(at=dict(r="vectors2"), level=level_arrays(3), frames=dict(turned="rows3"))
         return Kernel("enter", self.turn_back, self.precision, arrays, dict(nodes="int", scale="float"))
 
@@ -153,12 +153,13 @@ class LevelKernels:
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.nodes):
             own = level.y[i]
-            y = self.between.block(frames.turned, i, own, 3)
+            turned = self.between.block(frames.turned, i, own, 3)
+            y = self.between.block(frames.allowed, i, turned, 3)
             for j in ti.static(range(3)):
                 at.z[0, i][j] = ti.cast(y[j], PRECISIONS[self.precision]) * plan.scale
 
     @cached_property
     def leave(self) -> Kernel:
-        """z = scale Q y"""
-        arrays = dict(at=dict(z="vectors2"), level=level_arrays(3), frames=dict(turned="rows3"))
+        """z = scale P Q y, P: what vertices may do."""
+        arrays = dict(at=dict(z="vectors2"), level=level_arrays(3), frames=dict(turned="rows3", allowed="rows3"))
         return Kernel("leave", self.turn_forth, self.precision, arrays, dict(nodes="int", scale="float"))

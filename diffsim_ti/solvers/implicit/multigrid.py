@@ -5,8 +5,8 @@ import numpy as np
 from diffsim_ti import runtime
 from diffsim_ti.potential.assembled import assemble
 from diffsim_ti.potential.free import Free, FreeDirections, projectors_of
-from diffsim_ti.solvers.implicit.cycle import Cycle
-from diffsim_ti.solvers.implicit.rotations import vertex_rotations
+from diffsim_ti.solvers.implicit.cycle import Cycle, upload_rows
+from diffsim_ti.solvers.implicit.rotations import Frames
 
 
 class Multigrid:
@@ -49,24 +49,23 @@ class Multigrid:
             matrices, ways = [matrix, *matrices], [up, *ways]
         self._at_rest = matrix.data[diagonal]
         precision = potential.arrays.precision
-        self.cycle = Cycle([as_blocks(M) for M in matrices], [as_blocks(P) for P in ways], precision, parallel)
+        self.frames = Frames(potential, parallel)
+        self.frames.allowed = upload_rows(projectors_of(free), 3)
+        matrices, ways = [as_blocks(M) for M in matrices], [as_blocks(P) for P in ways]
+        self.cycle = Cycle(matrices, ways, self.frames, precision, parallel)
         self.r, self.z = (runtime.array(potential.arrays.vector, 1, len(rest_of_all)) for _ in range(2))
-        self._projectors = projectors_of(free)
-        self._turned, self._contact = True, None
+        self._contact = None
 
     def update(self, u: np.ndarray) -> None:
         """Adapt to the displacement at which the potential is placed."""
-        R = vertex_rotations(self.potential, u)
-        if R is not None or self._turned:
-            self.cycle.put_frames(self._projectors if R is None else self._projectors @ R)
-        self._turned = R is not None
+        self.frames.update()
         contact = self.potential.contact_blocks()
         if contact is None:
             return
         if isinstance(self.free, FreeDirections):
             contact = self.free.around(contact)
-        if R is not None:
-            contact = np.swapaxes(R, 1, 2) @ contact @ R
+        R = self.frames.matrices()
+        contact = np.swapaxes(R, 1, 2) @ contact @ R
         if self._contact is not None and np.array_equal(contact, self._contact):
             return
         self.cycle.put_diagonal(self._at_rest + contact)

@@ -1,19 +1,64 @@
 """How far each vertex of a body has turned."""
 
+from types import SimpleNamespace
+
 import numpy as np
+import taichi as ti
+
+from diffsim_ti import runtime
+from diffsim_ti.runtime import ROWS, kernels_of
+from diffsim_ti.solvers.implicit.frame_kernels import FrameKernels
 
 
-def vertex_rotations(potential, u: np.ndarray) -> np.ndarray | None:
-    """Mean rotation at each vertex, shape (num_vertices, 3, 3), weighted by volume; None where all are small."""
-    points, n = potential.stress_points, potential.arrays.num_vertices
-    at, count = points.nodes.ravel(), points.nodes.shape[1]
-    H = points.displacement_gradients(u)
-    if np.abs(H).max(initial=0.0) < 0.02:
-        return None
-    H *= points.volumes[:, None, None]
-    F = np.stack([np.bincount(at, np.repeat(H.reshape(-1, 9)[:, k], count), n) for k in range(9)], 1)
-    F /= np.bincount(at, np.repeat(points.volumes, count), n)[:, None] + 1e-300
-    return rotations_of(F.reshape(-1, 3, 3) + np.eye(3))
+class Frames:
+    """Mean rotations of the vertices of a potential's body, weighted by volume, on the device: `turned`, by columns."""
+
+    def __init__(self, potential, parallel: bool):
+        points, n, self.potential = potential.stress_points, potential.arrays.num_vertices, potential
+        self.count = len(points.volumes), points.nodes.shape[1], n
+        at = points.nodes.ravel()
+        order = np.argsort(at, kind="stable")
+        around = np.bincount(at, minlength=n)
+        share = 1 / (np.bincount(at, np.repeat(points.volumes, self.count[1]), n) + 1e-300)
+        gradients = points.gradients * points.volumes[:, None, None]
+        self.turned = runtime.array(ROWS[3], 3 * n)
+        self._body = SimpleNamespace(
+            nodes=runtime.upload(at, ti.i32),
+            gradients=runtime.upload(gradients.reshape(-1, 3), ROWS[3]),
+            strains=runtime.array(ROWS[3], 3 * len(points.volumes)),
+            start=runtime.upload(np.concatenate([[0], np.cumsum(around)]), ti.i32),
+            point=runtime.upload(order // self.count[1], ti.i32),
+            share=runtime.upload(np.where(around > 0, share, 0), ti.f32),
+            hard=runtime.array(ti.i32, n),
+        )
+        kernel = kernels_of(FrameKernels, potential.arrays.precision, parallel).frames
+        self._launch = kernel.bind(at=potential, body=self._body, frames=self)
+
+    def update(self) -> None:
+        """To the displacement at which the potential is placed."""
+        points, nodes, vertices = self.count
+        self._launch(points=points, nodes=nodes, vertices=vertices)
+        hard = np.nonzero(runtime.fetch(self._body.hard))[0]
+        if len(hard):
+            R = self.matrices()
+            R[hard] = rotations_of(self._means()[hard])
+            self.put(R)
+
+    def matrices(self) -> np.ndarray:
+        """Shape (num_vertices, 3, 3)."""
+        return np.swapaxes(runtime.fetch(self.turned).reshape(-1, 3, 3), 1, 2).astype(np.float64)
+
+    def put(self, R: np.ndarray) -> None:
+        """Set them."""
+        runtime.fill(self.turned, np.swapaxes(R, 1, 2).reshape(-1, 3))
+
+    def _means(self) -> np.ndarray:
+        """Mean deformation gradients."""
+        b = {name: runtime.fetch(getattr(self._body, name)) for name in ("strains", "point", "start", "share")}
+        columns = b["strains"].reshape(-1, 9)[b["point"]]
+        at = np.repeat(np.arange(self.count[2]), np.diff(b["start"]))
+        sums = np.stack([np.bincount(at, columns[:, k], self.count[2]) for k in range(9)], 1) * b["share"][:, None]
+        return np.swapaxes(sums.reshape(-1, 3, 3), 1, 2) + np.eye(3)
 
 
 def rotations_of(F: np.ndarray) -> np.ndarray:
