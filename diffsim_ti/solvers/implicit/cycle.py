@@ -7,9 +7,9 @@ import taichi as ti
 
 from diffsim_ti import runtime
 from diffsim_ti.runtime import ROWS, kernels_of
-from diffsim_ti.solvers.implicit.cycle_kernels import CycleKernels, LevelKernels
+from diffsim_ti.solvers.implicit.cycle_kernels import THETA, CycleKernels, LevelKernels
 
-DAMPING, SWEEPS, MARGIN = 1.8, 20, 1.05  # of block Jacobi: over the largest eigenvalue, as power iterations find it
+SWEEPS, MARGIN = 20, 1.05  # power iterations for a largest eigenvalue, and what they are trusted to
 
 
 def upload_rows(blocks: np.ndarray, numbers: int):
@@ -41,19 +41,19 @@ class Level:
         start = np.concatenate([[0], np.cumsum(np.bincount(rows[~on], minlength=self.nodes))])
         self.start, self.column = runtime.upload(start, ti.i32), runtime.upload(M.indices[~on], ti.i32)
         self.values = upload_rows(M.data[~on], self.numbers)
-        self.b, self.x, self.y = (runtime.array(ROWS[self.numbers], self.nodes) for _ in range(3))
+        self.b, self.x, self.d, self.y = (runtime.array(ROWS[self.numbers], self.nodes) for _ in range(4))
         self.diagonal, self.inverse = (
             runtime.array(ROWS[self.numbers], self.numbers * self.nodes) for _ in range(2)
         )
         self.kernels = kernels_of(LevelKernels, self.numbers, "f32", parallel)
-        self.damping = 1.0
+        self.theta = 1.0
         self.put(self.diagonal_blocks)
-        self.damping = DAMPING / (MARGIN * self._largest())
+        self.theta = THETA * MARGIN * self._largest()
         self.put(self.diagonal_blocks)
 
     def put(self, diagonal: np.ndarray) -> None:
         """Set the diagonal blocks."""
-        for target, blocks in ((self.diagonal, diagonal), (self.inverse, self.damping * inverses(diagonal))):
+        for target, blocks in ((self.diagonal, diagonal), (self.inverse, inverses(diagonal) / self.theta)):
             columns = np.swapaxes(blocks, 1, 2).reshape(-1, self.numbers)
             runtime.fill(target, np.pad(columns, ((0, 0), (0, self.inverse.element_shape[0] - self.numbers))))
 
@@ -109,8 +109,8 @@ def inverse_matrix(M):
 
 
 class Cycle:
-    """z = P Q V Q^T r for r = P r, V a V-cycle with a sweep of damped block Jacobi on each way: symmetric and positive
-    definite on what P leaves.
+    """z = P Q V Q^T r for r = P r, V a V-cycle with three terms of Chebyshev's polynomial in D^-1 A on each way, D the
+    diagonal blocks: symmetric and positive definite on what P leaves.
 
     matrices: of each level, the coarsest last; ways: from each to the one before. frames: `turned` Q and `allowed` P, a
     block for each node of the finest level, by columns.
