@@ -39,6 +39,7 @@ class Multigrid:
                 aggregated,
                 B=_allowed(_rigid_motions(rest), allowed),
                 strength=("symmetric", {"theta": 0.08}),
+                improve_candidates=(("block_gauss_seidel", {"sweep": "symmetric", "iterations": 2}), None),
                 max_coarse=100,
             ).levels
         finally:
