@@ -119,7 +119,7 @@ class Cycle:
 
     wide = 1000  # nodes of a level from which on all threads work on it
 
-    def __init__(self, matrices: list, ways: list, frames, precision: str, parallel: bool):
+    def __init__(self, matrices: list, ways: list, frames, parallel: bool):
         self.frames = frames
         lanes = runtime.runs_on_cpu()  # vectors stay vectors, which takes half the time
         self.levels = [Level(M, self._wide(M, parallel)) for M in matrices]
@@ -133,7 +133,8 @@ class Cycle:
         last = self.levels[-1]
         inverse = block_matrix(inverse_matrix(matrices[-1]))
         self._solve = last.kernels.solve.bind(lanes, level=last, inverse=inverse)
-        self._ends = kernels_of(LevelKernels, 3, precision, self._wide(matrices[0], parallel))
+        vectors = "f32" if runtime.arch_name() == "vulkan" else "f64"
+        self._ends = kernels_of(LevelKernels, 3, vectors, self._wide(matrices[0], parallel))
         self._bound = {}
 
     def _wide(self, M, parallel: bool) -> bool:

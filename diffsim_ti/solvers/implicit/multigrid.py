@@ -6,6 +6,7 @@ from diffsim_ti import runtime
 from diffsim_ti.potential.assembled import assemble
 from diffsim_ti.potential.free import Free, FreeDirections, projectors_of
 from diffsim_ti.solvers.implicit.cycle import Cycle, upload_rows
+from diffsim_ti.solvers.implicit.device_cg import DeviceCG
 from diffsim_ti.solvers.implicit.rotations import Frames
 
 
@@ -29,7 +30,7 @@ class Multigrid:
         with potential.at_rest():
             potential.blocks()
             matrix, diagonal = assemble(potential, mass, free)
-        aggregated, allowed, rest_of_all = matrix, free, rest
+        aggregated, allowed = matrix, free
         if mesh.order == 2:
             aggregated, allowed, rest, up = of_corners(matrix, free, mesh, rest)
         state = np.random.get_state()
@@ -49,12 +50,11 @@ class Multigrid:
         if mesh.order == 2:
             matrices, ways = [matrix, *matrices], [up, *ways]
         self._at_rest = matrix.data[diagonal]
-        precision = potential.arrays.precision
         self.frames = Frames(potential, parallel)
         self.frames.allowed = upload_rows(projectors_of(free), 3)
         matrices, ways = [as_blocks(M) for M in matrices], [as_blocks(P) for P in ways]
-        self.cycle = Cycle(matrices, ways, self.frames, precision, parallel)
-        self.r, self.z = (runtime.array(potential.arrays.vector, 1, len(rest_of_all)) for _ in range(2))
+        self.cycle = Cycle(matrices, ways, self.frames, parallel)
+        self.solver = DeviceCG(potential, self.cycle, parallel)
         self._contact = None
 
     def update(self, u: np.ndarray) -> None:
@@ -73,9 +73,10 @@ class Multigrid:
         self._contact = contact
 
     def __call__(self, r: np.ndarray) -> np.ndarray:
-        runtime.fill(self.r, r[None])
-        self.cycle(self, 1.0 / (np.linalg.norm(r) or 1.0))
-        return runtime.fetch_row(self.z, 0) * self.free
+        solver = self.solver
+        runtime.fill(solver.r, r[None])
+        self.cycle(solver, 1.0 / (np.linalg.norm(r) or 1.0))
+        return runtime.fetch_row(solver.z, 0) * self.free
 
 
 def as_blocks(M):
