@@ -27,8 +27,9 @@ class DeviceCG:
         self.part, self.state = runtime.array(fp, 3, self.chunks), runtime.array(fp, 8)
         self.mass, self.free = runtime.array(fp, n), runtime.array(fp, n)
         kernels = kernels_of(CGKernels, a.precision, precision, parallel)
-        self._turn = kernels.turn.bind(runs_on_cpu(), cg=self, at=potential)
-        self._step = kernels.step.bind(runs_on_cpu(), cg=self, at=potential)
+        lanes = runs_on_cpu() and a.precision == precision  # Taichi has no vector code for changes of precision
+        self._turn = kernels.turn.bind(lanes, cg=self, at=potential)
+        self._step = kernels.step.bind(lanes, cg=self, at=potential)
         self._look = 1 if runs_on_cpu() else 8  # iterations between looks at the state
         self._sizes = dict(chunks=self.chunks, length=self.length, nodes=n)
 

@@ -64,5 +64,6 @@ class LaidOn:
             end = "as where a load lies beyond a limit point, the most that the body carries: lay on less"
         return (
             f"no equilibrium was found: the path of equilibria from the state before goes to {done:.0%} of what is laid on "
-            f"(loads, motion of what is held), {end}, or take a solver with inertia, which follows the jump ({error})"
+            f"(loads, motion of what is held), {end}, or take a solver with inertia, which follows the jump "
+            f"(at once: {len(error.residuals)} rounds, to a relative residual of {error.residuals[-1]:.2g})"
         )
