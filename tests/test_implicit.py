@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import diffsim_ti as ds
-from diffsim_ti.solvers.implicit.multigrid import rotations_of
+from diffsim_ti.solvers.implicit.rotations import rotations_of
 from diffsim_ti.solvers.implicit.projection import has_eigenvalue_below
 
 SOLVERS = (ds.ImplicitEulerSolver, ds.ImplicitMidpointSolver, ds.BDF2Solver)

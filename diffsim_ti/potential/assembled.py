@@ -7,6 +7,8 @@ from diffsim_ti.potential.free import FreeDirections, mask_of, projectors_of
 from diffsim_ti.potential.potential import Potential
 from diffsim_ti.state.arrays import SceneArrays
 
+CHUNK = 2048  # elements whose matrices are made at once
+
 
 def element_matrices(potential) -> np.ndarray:
     """Stiffness of each element where `potential.blocks` was last called, as (m, nodes, nodes, 3, 3) blocks [N/m]; a patch's
@@ -14,10 +16,18 @@ def element_matrices(potential) -> np.ndarray:
     """
     a, (_, N, V) = potential.arrays, potential.stress_points
     count, k = N.shape[:2]
-    C = potential.tangents().reshape(count, 3, 3, 3, 3) * V[:, None, None, None, None]
-    right = np.matmul(C.reshape(count, 27, 3), np.swapaxes(N, 1, 2)).reshape(count, 3, 3, 3, k)
+    C = potential.tangents().reshape(count, 27, 3)
     if a.points == 1:
-        return np.einsum("eaj,eijkb->eabik", N, right, optimize=True)
+        out = np.empty((count, k, k, 3, 3))
+        for begin in range(0, count, CHUNK):  # short of what a cache holds
+            part = slice(begin, begin + CHUNK)
+            own, scaled = N[part], np.swapaxes(N[part] * V[part, None, None], 1, 2)
+            right = np.matmul(C[part], scaled).reshape(-1, 3, 3, 3 * k)  # i, j, (k, b)
+            right = np.ascontiguousarray(np.swapaxes(right, 1, 2)).reshape(-1, 3, 9 * k)
+            both = np.matmul(own, right).reshape(-1, k, 3, 3, k)  # a, i, k, b
+            out[part] = np.moveaxis(both, 4, 2)
+        return out
+    right = np.matmul(C * V[:, None, None], np.swapaxes(N, 1, 2)).reshape(count, 3, 3, 3, k)
     m, q = a.num_tetrahedra, a.points
     N, right = N.reshape(m, q, k, 3), right.reshape(m, q, 3, 3, 3, k)
     left = np.moveaxis(N, 2, 1).reshape(m, k, 3 * q)

@@ -132,12 +132,21 @@ class Potential:
         """d2E/du2 w [N]; `convex`: of contact between surfaces, only its convex part."""
         scale = np.abs(w).max() or 1.0  # f32 keeps its digits whatever the units
         runtime.fill(self.w, (w / scale)[None])
-        if self.pairs:
-            self.pairs.hessian_product(self.u, self.w, convex)
-        self.launch("product")
+        self.multiply(convex)
         y = runtime.fetch(self.y)[0].astype(np.float64)
         y = (y + self.faces.product() if self.faces else y) * -scale
         return y + self.attached.product(self.held_at, w, convex) if self.attached else y
+
+    def multiply(self, convex: bool = False) -> None:
+        """y = -d2E/du2 w on the device, without faces and what is attached."""
+        if self.pairs:
+            self.pairs.hessian_product(self.u, self.w, convex)
+        self.launch("product")
+
+    @property
+    def stays_on_device(self) -> bool:
+        """Whether `multiply` does all of `product`."""
+        return not (self.faces or self.attached)
 
     def blocks(self) -> np.ndarray:
         """3x3 diagonal blocks of d2E/du2 [N/m], shape (num_vertices, 3, 3)."""

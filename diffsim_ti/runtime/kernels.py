@@ -12,6 +12,7 @@ from diffsim_ti.runtime.launch import Launch
 from diffsim_ti.runtime.start import PRECISIONS, runs_on_cpu
 
 LANES = 8  # tetrahedra in a block
+ROWS = {3: ti.types.vector(4, ti.f32), 6: ti.types.vector(8, ti.f32)}  # three or six numbers of a preconditioner
 _serial = count()
 
 
@@ -28,6 +29,11 @@ def array_types(precision: str) -> dict:
         "vectors2": ndarray(vector, 2),
         "blocks": ndarray(lanes, 1),
         "blocks2": ndarray(lanes, 2),
+        "vectors2_f32": ndarray(ti.types.vector(4, ti.f32), 2),
+        "vectors2_f64": ndarray(ti.types.vector(4, ti.f64), 2),
+        "singles": ndarray(ti.f32, 1),
+        "rows3": ndarray(ROWS[3], 1),
+        "rows6": ndarray(ROWS[6], 1),
         "int": ti.i32,
         "float": fp,
     }

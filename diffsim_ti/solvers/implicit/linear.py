@@ -29,6 +29,12 @@ class Operator:
     def symmetric(self) -> bool:
         return self.follower is None or self.follower.symmetric
 
+    @property
+    def stays_on_device(self) -> bool:
+        """Whether products need nothing of the host."""
+        plain = isinstance(self.mass, np.ndarray) and isinstance(self.free, np.ndarray)
+        return plain and self.correction is None and self.follower is None and self.potential.stays_on_device
+
     def __call__(self, w: np.ndarray) -> np.ndarray:
         self.products += 1
         y = self.mass * w + self.potential.product(w, convex=self.correction is not None)
@@ -47,6 +53,11 @@ def conjugate_gradients(operator, b, preconditioner, tolerance: float, max_itera
     Stops at a direction p of negative curvature (else None) with the x before it or, if it is the first direction, with
     the preconditioned b: a direction of descent. Nocedal, Wright, Numerical Optimization, alg. 7.1.
     """
+    solver = getattr(preconditioner, "solver", None)
+    if solver is not None and operator.stays_on_device:
+        found = solver(operator.mass, operator.free, b, tolerance, max_iterations, eps)
+        operator.products += found[2]
+        return found
     x, r = np.zeros_like(b), b.copy()
     size = np.linalg.norm(b)
     if size == 0:

@@ -107,7 +107,7 @@ class Newton:
         if self.volumes:
             self.volumes.place(u, self.volumes.multipliers)
         self.preconditioner, self.stiffness = self.preconditioners(mass)
-        E, size, norm, rough = self._evaluate(u), 0.0, np.inf, False
+        E, size, norm, rough, solved = self._evaluate(u), 0.0, np.inf, False, False
         self.upright = bool(np.all(E[2] > 0))
         most = self.max_iterations if rounds is None else rounds
         while len(report.residuals) < min(most + report.cuts, self.patience * most):
@@ -147,7 +147,7 @@ class Newton:
                     return self.potential.place(u)
                 break
             u, E = moved
-        if norm <= 100 * floor or (rounds is not None and np.isfinite(norm)):  # rounding has the last word
+        if solved or norm <= 100 * floor or (rounds is not None and np.isfinite(norm)):  # rounding has the last word
             return u
         history = ", ".join(f"{r:.2g}" for r in report.residuals[-8:])
         report.place = u
@@ -157,6 +157,10 @@ class Newton:
             "load steps, or a looser tolerance",
             report.residuals,
         )
+
+    def is_unstable(self) -> bool:
+        """Whether Phi falls in some direction where the potential stands."""
+        return self._downhill() is not None
 
     def residual_at(self, u: np.ndarray) -> np.ndarray:
         """-dPhi/du of the last solve [N]."""

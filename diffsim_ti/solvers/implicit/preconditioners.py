@@ -14,7 +14,7 @@ class BlockJacobi:
     size: of the diagonal at rest [N/m], to which what is all but zero is raised.
     """
 
-    def __init__(self, potential, mass: np.ndarray, free: Free, size: np.ndarray):
+    def __init__(self, potential, mass: np.ndarray, free: Free, size: np.ndarray, parallel: bool = True):
         self.potential, self.mass, self.free, self.least = potential, mass, free, 1e-6 * (size + mass)
 
     def update(self, u: np.ndarray) -> None:

@@ -18,6 +18,7 @@ from diffsim_ti.solvers.implicit.approach import Approach
 from diffsim_ti.solvers.implicit.given import GivenInPasses
 from diffsim_ti.solvers.implicit.held_strains import HeldStrains
 from diffsim_ti.solvers.implicit.law_state import law_state_kernels
+from diffsim_ti.solvers.implicit.laid_on import LaidOn
 from diffsim_ti.solvers.implicit.linear import NotConverged
 from diffsim_ti.solvers.implicit.multigrid import Multigrid
 from diffsim_ti.solvers.implicit.newton import Newton
@@ -45,6 +46,7 @@ class ImplicitWorkspace(ObstacleWays, Noted, GivenInPasses, Workspace):
     """A run of an implicit solver. Vectors of vertices are worked on in float64 on the host, tetrahedra on the device."""
 
     pairs_kind = ImplicitPairs
+    enough = 20  # rounds with which an equilibrium that was not found is looked for in parts
 
     def __init__(self, solver, derived):
         self.potential, self._length = None, solver.substep
@@ -184,7 +186,7 @@ class ImplicitWorkspace(ObstacleWays, Noted, GivenInPasses, Workspace):
             kind = Multigrid if self._wants_multigrid(size, mass) else BlockJacobi
             if len(self._preconditioners) > 5:
                 self._preconditioners.pop(next(iter(self._preconditioners)))
-            self._preconditioners[key] = kind(self.potential, mass, self.free, size), size
+            self._preconditioners[key] = kind(self.potential, mass, self.free, size, self.parallel), size
         kept, size = self._preconditioners[key]
         return kept, size + size_of
 
@@ -266,9 +268,14 @@ class ImplicitWorkspace(ObstacleWays, Noted, GivenInPasses, Workspace):
     def _solve(self, u, start, problem: tuple, stage: Stage) -> np.ndarray:
         """The minimum of the pass; problem: mass, inertial, loads of `Newton.solve`."""
         held = self.approach(u, start, problem)
-        return self.newton.solve(self._admissible(start, held), *problem, leave_saddles=stage.static)
+        try:
+            return self.newton.solve(self.admissible(start, held), *problem, leave_saddles=stage.static)
+        except NotConverged as error:
+            if not stage.static or self.volumes or self.newton.max_iterations < self.enough:
+                raise
+            return LaidOn(self)(u, start, problem, error)
 
-    def _admissible(self, start, u):
+    def admissible(self, start, u):
         """The start of Newton's method: where inertia leads, or less far where something would turn inside out or meet an
         obstacle."""
         held = held_as(self.free, start, u)

@@ -1,0 +1,126 @@
+"""Kernels of conjugate gradients. Sums go over fixed chunks, then over these: the same bits with any number of threads."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import taichi as ti
+
+from diffsim_ti.runtime import PRECISIONS, Kernel
+
+A = ti.template()
+# places of numbers in `state`; STOPPED: 0 while it goes on, then 1 converged, 2 negative curvature
+RZ, BETA, ALPHA, SQUARE, STOPPED, COUNT, LEAST = range(7)
+
+
+@dataclass(frozen=True)
+class CGKernels:
+    """scene: precision of the products; vectors: that of all else."""
+
+    scene: str
+    vectors: str
+    parallel: bool
+
+    @property
+    def fp(self):
+        return PRECISIONS[self.vectors]
+
+    @ti.func
+    def dot(self, a, b):
+        return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+    @ti.func
+    def total(self, part: A, k, chunks):
+        """The sum of what chunks have left in row k."""
+        out = ti.cast(0, self.fp)
+        for c in range(chunks):
+            out += part[k, c]
+        return out
+
+    @ti.func
+    def first(self, cg: A, at: A, plan: A):
+        ti.loop_config(serialize=not self.parallel)
+        for c in range(plan.chunks):
+            rz = ti.cast(0, self.fp)
+            for i in range(c * plan.length, ti.min((c + 1) * plan.length, plan.nodes)):
+                rz += self.dot(cg.r[0, i], cg.z[0, i])
+            cg.part[0, c] = rz
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            rz, old = self.total(cg.part, 0, plan.chunks), cg.state[RZ]
+            cg.state[BETA] = ti.cast(0, self.fp)
+            if cg.state[COUNT] > 0 and cg.state[STOPPED] == 0:
+                cg.state[BETA] = rz / old
+            if cg.state[STOPPED] == 0:
+                cg.state[RZ] = rz
+        ti.loop_config(serialize=not self.parallel)
+        for i in range(plan.nodes):
+            if cg.state[STOPPED] == 0:
+                p = cg.z[0, i] + cg.p[0, i] * cg.state[BETA]
+                cg.p[0, i] = p
+                at.w[0, i] = ti.cast(p, PRECISIONS[self.scene])
+
+    @cached_property
+    def turn(self) -> Kernel:
+        """The next direction p = z + beta p."""
+        own = dict(part="scalars2", state="scalars") | dict.fromkeys(("r", "z", "p"), "vectors2")
+        arrays = dict(cg=own, at=dict(w=f"vectors2_{self.scene}"))
+        return Kernel("turn", self.first, self.vectors, arrays, dict(chunks="int", length="int", nodes="int"))
+
+    @ti.func
+    def multiply(self, c, cg: A, at: A, plan: A):
+        """A p, and p . A p, p . p, A p . A p of a chunk."""
+        curvature, pp, qq = ti.cast(0, self.fp), ti.cast(0, self.fp), ti.cast(0, self.fp)
+        for i in range(c * plan.length, ti.min((c + 1) * plan.length, plan.nodes)):
+            p = cg.p[0, i]
+            q = p * cg.mass[i] + ti.cast(at.y[0, i], self.fp) * ti.cast(-1, self.fp)
+            q = q * cg.free[i]
+            cg.q[0, i] = q
+            curvature += self.dot(p, q)
+            pp += self.dot(p, p)
+            qq += self.dot(q, q)
+        cg.part[0, c], cg.part[1, c], cg.part[2, c] = curvature, pp, qq
+
+    @ti.func
+    def choose(self, cg: A, plan: A):
+        """alpha = r . z / p . A p, zero once it has stopped."""
+        curvature = self.total(cg.part, 0, plan.chunks)
+        size = ti.sqrt(self.total(cg.part, 1, plan.chunks) * self.total(cg.part, 2, plan.chunks))
+        cg.state[ALPHA] = ti.cast(0, self.fp)
+        if cg.state[STOPPED] == 0:
+            cg.state[COUNT] = cg.state[COUNT] + ti.cast(1, self.fp)
+            if curvature > plan.rounding * size:
+                cg.state[ALPHA] = cg.state[RZ] / curvature
+            else:
+                cg.state[STOPPED] = ti.cast(2, self.fp)
+
+    @ti.func
+    def advance(self, cg: A, at: A, plan: A):
+        ti.loop_config(serialize=not self.parallel)
+        for c in range(plan.chunks):
+            self.multiply(c, cg, at, plan)
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            self.choose(cg, plan)
+        ti.loop_config(serialize=not self.parallel)
+        for c in range(plan.chunks):
+            square, alpha = ti.cast(0, self.fp), cg.state[ALPHA]
+            for i in range(c * plan.length, ti.min((c + 1) * plan.length, plan.nodes)):
+                if alpha != 0:
+                    cg.x[0, i] = cg.x[0, i] + cg.p[0, i] * alpha
+                    cg.r[0, i] = cg.r[0, i] + cg.q[0, i] * -alpha
+                square += self.dot(cg.r[0, i], cg.r[0, i])
+            cg.part[0, c] = square
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            cg.state[SQUARE] = self.total(cg.part, 0, plan.chunks)
+            if cg.state[STOPPED] == 0 and cg.state[SQUARE] <= cg.state[LEAST]:
+                cg.state[STOPPED] = ti.cast(1, self.fp)
+
+    @cached_property
+    def step(self) -> Kernel:
+        """x and r after a step along p, y being what the potential's product makes of it."""
+        own = dict(part="scalars2", state="scalars", mass="scalars", free="scalars")
+        own |= dict.fromkeys(("x", "r", "p", "q"), "vectors2")
+        arrays = dict(cg=own, at=dict(y=f"vectors2_{self.scene}"))
+        numbers = dict(chunks="int", length="int", nodes="int", rounding="float")
+        return Kernel("step", self.advance, self.vectors, arrays, numbers)

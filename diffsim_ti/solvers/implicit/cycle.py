@@ -1,0 +1,161 @@
+"""A V-cycle over matrices of blocks on the device, in float32, which memory's speed limits."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import taichi as ti
+
+from diffsim_ti import runtime
+from diffsim_ti.runtime import ROWS, kernels_of
+from diffsim_ti.solvers.implicit.cycle_kernels import THETA, CycleKernels, LevelKernels
+
+SWEEPS, MARGIN = 20, 1.05  # power iterations for a largest eigenvalue, and what they are trusted to
+
+
+def upload_rows(blocks: np.ndarray, numbers: int):
+    """Columns of blocks, shape (k, numbers, columns), as an array of k x columns vectors."""
+    width = {3: 4, 6: 8}[numbers]
+    out = np.zeros((len(blocks), blocks.shape[2], width), np.float32)
+    out[:, :, :numbers] = np.swapaxes(blocks, 1, 2)
+    return runtime.upload(out.reshape(-1, width), ROWS[numbers])
+
+
+def block_matrix(M) -> SimpleNamespace:
+    """A SciPy matrix of blocks on the device."""
+    return SimpleNamespace(
+        start=runtime.upload(M.indptr, ti.i32),
+        column=runtime.upload(M.indices, ti.i32),
+        values=upload_rows(M.data, M.blocksize[0]),
+    )
+
+
+class Level:
+    """A level: a matrix of square blocks whose largest eigenvalue against its diagonal blocks is found here."""
+
+    def __init__(self, M, parallel: bool):
+        self.numbers, self.nodes = M.blocksize[0], M.shape[0] // M.blocksize[0]
+        rows = np.repeat(np.arange(self.nodes), np.diff(M.indptr))
+        on = rows == M.indices
+        self.diagonal_blocks = np.zeros((self.nodes, self.numbers, self.numbers))
+        self.diagonal_blocks[rows[on]] = M.data[on]
+        start = np.concatenate([[0], np.cumsum(np.bincount(rows[~on], minlength=self.nodes))])
+        self.start, self.column = runtime.upload(start, ti.i32), runtime.upload(M.indices[~on], ti.i32)
+        self.values = upload_rows(M.data[~on], self.numbers)
+        self.b, self.x, self.d, self.y = (runtime.array(ROWS[self.numbers], self.nodes) for _ in range(4))
+        self.diagonal, self.inverse = (
+            runtime.array(ROWS[self.numbers], self.numbers * self.nodes) for _ in range(2)
+        )
+        self.kernels = kernels_of(LevelKernels, self.numbers, "f32", parallel)
+        self.theta = 1.0
+        self.put(self.diagonal_blocks)
+        self.theta = THETA * MARGIN * self._largest()
+        self.put(self.diagonal_blocks)
+
+    def put(self, diagonal: np.ndarray) -> None:
+        """Set the diagonal blocks."""
+        for target, blocks in ((self.diagonal, diagonal), (self.inverse, inverses(diagonal) / self.theta)):
+            columns = np.swapaxes(blocks, 1, 2).reshape(-1, self.numbers)
+            runtime.fill(target, np.pad(columns, ((0, 0), (0, self.inverse.element_shape[0] - self.numbers))))
+
+    def _largest(self) -> float:
+        """The largest eigenvalue of D^-1 A, by power iteration."""
+        sweep, size = self.kernels.sweep.bind(runtime.runs_on_cpu(), level=self), 1.0
+        x = np.zeros((self.nodes, self.inverse.element_shape[0]))
+        x[:, : self.numbers] = np.random.default_rng(0).standard_normal((self.nodes, self.numbers))
+        runtime.fill(self.b, 0)
+        for _ in range(SWEEPS):
+            runtime.fill(self.x, x / (np.linalg.norm(x) or 1.0))
+            sweep(nodes=self.nodes)
+            x = runtime.view(self.y)
+            x = self.y.to_numpy() if x is None else x
+            size = float(np.linalg.norm(x))
+        return max(size, 1.0)
+
+
+def inverses(blocks: np.ndarray) -> np.ndarray:
+    """Of symmetric positive semidefinite blocks; zero in directions in which they are."""
+    size = np.abs(blocks).max((1, 2), initial=0.0)
+    plain = np.linalg.det(blocks / np.maximum(size, 1e-300)[:, None, None]) > 1e-9
+    out = np.zeros_like(blocks)
+    out[plain] = np.linalg.inv(blocks[plain])
+    if not plain.all():
+        out[~plain] = np.linalg.pinv(0.5 * (blocks[~plain] + np.swapaxes(blocks[~plain], 1, 2)), 1e-7, hermitian=True)
+    return 0.5 * (out + np.swapaxes(out, 1, 2))
+
+
+def inverse_matrix(M):
+    """The inverse of a matrix of blocks, body by body, as one; motions that a block has not stay zero."""
+    from scipy.sparse import bsr_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    k, b = M.shape[0] // M.blocksize[0], M.blocksize[0]
+    graph = bsr_matrix((np.ones((len(M.indices), 1, 1)), M.indices, M.indptr), shape=(k, k)).tocsr()
+    count, label = connected_components(graph, directed=False)
+    M, rows, columns, data = M.tocsr(), [], [], []
+    for own in np.split(np.argsort(label, kind="stable"), np.cumsum(np.bincount(label))[:-1]) if count else []:
+        at = (own[:, None] * b + np.arange(b)).ravel()
+        dense = M[at][:, at].toarray()
+        there = np.abs(np.diagonal(dense)) > 0
+        inverse = np.zeros_like(dense)
+        inverse[np.ix_(there, there)] = np.linalg.inv(dense[np.ix_(there, there)])
+        inverse = 0.5 * (inverse + inverse.T)
+        rows.append(np.repeat(own, len(own)))
+        columns.append(np.tile(own, len(own)))
+        data.append(inverse.reshape(len(own), b, len(own), b).transpose(0, 2, 1, 3).reshape(-1, b, b))
+    rows, columns, data = (np.concatenate(parts) for parts in (rows, columns, data))
+    order = np.argsort(rows, kind="stable")
+    start = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=k))])
+    return bsr_matrix((data[order], columns[order], start), shape=(k * b, k * b))
+
+
+class Cycle:
+    """z = P Q V Q^T r for r = P r, V a V-cycle with three terms of Chebyshev's polynomial in D^-1 A on each way, D the
+    diagonal blocks: symmetric and positive definite on what P leaves.
+
+    matrices: of each level, the coarsest last; ways: from each to the one before. frames: `turned` Q and `allowed` P, a
+    block for each node of the finest level, by columns.
+    Adams, Brezina, Hu, Tuminaro 2003, doi:10.1016/S0021-9991(03)00194-3.
+    """
+
+    wide = 1000  # nodes of a level from which on all threads work on it
+
+    def __init__(self, matrices: list, ways: list, frames, parallel: bool):
+        self.frames = frames
+        lanes = runtime.runs_on_cpu()  # vectors stay vectors, which takes half the time
+        self.levels = [Level(M, self._wide(M, parallel)) for M in matrices]
+        self._steps_down, self._steps_up = [], []
+        for level, below, P in zip(self.levels, self.levels[1:], ways):
+            kernels = kernels_of(CycleKernels, level.numbers, below.numbers, self._wide(P, parallel))
+            down, up = block_matrix(P.T.tobsr(P.blocksize[::-1])), block_matrix(P)
+            step_down = kernels.down.bind(lanes, level=level, down=down, below=below)
+            self._steps_down.append((step_down, level, below))
+            self._steps_up.insert(0, (kernels.up.bind(lanes, level=level, up=up, below=below), level))
+        last = self.levels[-1]
+        inverse = block_matrix(inverse_matrix(matrices[-1]))
+        self._solve = last.kernels.solve.bind(lanes, level=last, inverse=inverse)
+        vectors = "f32" if runtime.arch_name() == "vulkan" else "f64"
+        self._ends = kernels_of(LevelKernels, 3, vectors, self._wide(matrices[0], parallel))
+        self._bound = {}
+
+    def _wide(self, M, parallel: bool) -> bool:
+        return parallel and M.shape[0] // M.blocksize[0] > self.wide or not runtime.runs_on_cpu()
+
+    def put_diagonal(self, blocks: np.ndarray) -> None:
+        """Set the diagonal blocks of the finest level."""
+        if len(self.levels) > 1:
+            self.levels[0].put(blocks)
+
+    def __call__(self, at, scale: float) -> None:
+        """at.z = Q V Q^T at.r; scale: a number that brings r to about one."""
+        finest = self.levels[0]
+        if id(at) not in self._bound:
+            own, lanes = dict(at=at, level=finest, frames=self.frames), runtime.runs_on_cpu()
+            self._bound[id(at)] = self._ends.enter.bind(lanes, **own), self._ends.leave.bind(lanes, **own), at
+        enter, leave, _ = self._bound[id(at)]
+        enter(nodes=finest.nodes, scale=scale)
+        for step, level, below in self._steps_down:
+            step(nodes=level.nodes, below=below.nodes)
+        self._solve(nodes=self.levels[-1].nodes)
+        for step, level in self._steps_up:
+            step(nodes=level.nodes)
+        leave(nodes=finest.nodes, scale=1 / scale)

@@ -1,0 +1,177 @@
+"""The preconditioner of implicit solves on the device, conjugate gradients there, and equilibria that are laid on in parts."""
+
+import numpy as np
+import pytest
+
+import diffsim_ti as ds
+from diffsim_ti.solvers.implicit.linear import Operator, conjugate_gradients
+
+
+def beam(precision="f64", **more) -> ds.Scene:
+    mesh = ds.TetrahedralMesh.create_box((17, 5, 5), (1.0, 0.25, 0.25))
+    own = dict(fixed=mesh.vertices_where(lambda X: X[:, 0] < 1e-9), precision=precision)
+    return ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.45), 1000.0, [ds.Gravity()], **own | more)
+
+
+@pytest.fixture(scope="module")
+def static():
+    """A workspace whose body hangs far down."""
+    solver = ds.StaticSolver(beam(), preconditioner="multigrid")
+    workspace = solver.workspace(solver.start_values())
+    workspace.advance(0, 1, 1)
+    return workspace
+
+
+def preconditioner_at(workspace, u):
+    workspace.potential.place(u)
+    found, _ = workspace.preconditioner(np.zeros((len(u), 1)))
+    found.update(u)
+    return found
+
+
+def test_a_cycle_is_symmetric_and_positive_definite(static):
+    u, rng = static.u_star, np.random.default_rng(0)
+    M = preconditioner_at(static, u)
+    assert len(M.cycle.levels) == 2 and np.abs(u).max() > 0.3
+    assert np.abs(M.frames.matrices()[-1] - np.eye(3)).max() > 0.3
+    for _ in range(4):
+        a, b = (rng.standard_normal(u.shape) * static.free for _ in range(2))
+        Ma, Mb = M(a), M(b)
+        sizes = np.sqrt((a * Ma).sum() * (b * Mb).sum())
+        assert abs((a * Mb).sum() - (b * Ma).sum()) < 2e-6 * sizes
+        assert (a * Ma).sum() > 0 and not Ma[static.free[:, 0] == 0].any()
+
+
+def test_a_cycle_solves_nearly(static):
+    M, A = preconditioner_at(static, static.u_star), static.newton.operator()
+    b = np.random.default_rng(1).standard_normal(static.u_star.shape) * static.free
+    x, residual, count, negative = conjugate_gradients(A, b, M, 1e-8, 500, 1e-16)
+    assert negative is None and residual <= 1e-8 and count < 40
+    assert np.linalg.norm(b - A(x)) < 2e-8 * np.linalg.norm(b)
+
+
+def test_conjugate_gradients_on_the_device_are_those_of_the_host(static):
+    M = preconditioner_at(static, static.u_star)
+    b = np.random.default_rng(2).standard_normal(static.u_star.shape) * static.free
+    here = conjugate_gradients(static.newton.operator(), b, M, 1e-6, 500, 1e-16)
+    there = conjugate_gradients(static.newton.operator(), b, lambda r: M(r), 1e-6, 500, 1e-16)
+    assert abs(here[2] - there[2]) <= 1
+    np.testing.assert_allclose(here[0], there[0], atol=1e-5 * np.abs(there[0]).max())
+
+
+def test_conjugate_gradients_stop_at_negative_curvature(static):
+    M = preconditioner_at(static, 0 * static.u_star)
+    mass = np.full((len(static.u_star), 1), -1e3)  # far below the stiffness of slow motions
+    A = Operator(static.potential, mass, static.free)
+    b = np.random.default_rng(3).standard_normal(static.u_star.shape) * static.free
+    found = [conjugate_gradients(A, b, how, 1e-6, 500, 1e-16) for how in (M, lambda r: M(r))]
+    for x, _, count, p in found:
+        assert p is not None and (p * A(p)).sum() < 0 < (b * x).sum()
+    assert found[0][2] == found[1][2]
+    np.testing.assert_allclose(found[0][0], found[1][0], atol=1e-4 * np.abs(found[1][0]).max())
+
+
+def final(solver, steps=1):
+    return ds.Rollout(solver, steps).forward().positions[-1]
+
+
+def test_equilibria_are_those_of_block_jacobi_and_come_with_the_same_bits(static):
+    other = final(ds.StaticSolver(beam(), preconditioner="block_jacobi"))
+    again = final(ds.StaticSolver(beam(), preconditioner="multigrid"))
+    own = static.scene.mesh.vertices + static.u_star
+    np.testing.assert_allclose(own, other, atol=1e-7)
+    np.testing.assert_array_equal(own, again)
+
+
+@pytest.mark.parametrize("precision, near", [("f64", 1e-7), ("f32", 2e-5)])
+def test_steps_and_gradients_are_those_of_block_jacobi(precision, near):
+    scene, found = beam(precision), []
+    for kind in ("multigrid", "block_jacobi"):
+        tolerance = 1e-8 if precision == "f64" else 1e-5
+        solver = ds.ImplicitEulerSolver(scene, dt=0.02, tolerance=tolerance, preconditioner=kind)
+        rollout = ds.Rollout(solver, 3, gradients=["youngs_modulus"])
+        frames = rollout.forward()
+        seed = np.zeros_like(frames.positions)
+        seed[-1, :, 1] = 1.0
+        gradient = rollout.vjp(frames, seed)
+        found.append((frames.positions[-1], float(np.sum(gradient["youngs_modulus"]))))
+    np.testing.assert_allclose(found[0][0], found[1][0], atol=near)
+    assert found[0][1] == pytest.approx(found[1][1], rel=1e3 * near)
+
+
+def test_a_floor_keeps_the_cycle_symmetric():
+    scene = beam()
+    mesh = scene.mesh
+    floor = ds.Ground(height=-0.02, width=0.03, stiffness=1e5)
+    scene = ds.Scene(mesh, scene.material, 1000.0, [ds.Gravity(), floor], fixed=scene.fixed, precision="f64")
+    solver = ds.StaticSolver(scene, preconditioner="multigrid")
+    workspace = solver.workspace(solver.start_values())
+    workspace.advance(0, 1, 1)
+    M, rng = preconditioner_at(workspace, workspace.u_star), np.random.default_rng(0)
+    assert workspace.potential.contact_blocks().any()
+    a, b = (rng.standard_normal((mesh.num_vertices, 3)) * workspace.free for _ in range(2))
+    Ma, Mb = M(a), M(b)
+    assert abs((a * Mb).sum() - (b * Ma).sum()) < 2e-6 * np.sqrt((a * Ma).sum() * (b * Mb).sum())
+
+
+# ---- what Newton's method does not find at once -------------------------------------------------------------------------
+
+
+def squashed(height: float, **more) -> ds.StaticSolver:
+    """A cube of five cells between plates that go together at once."""
+    mesh = ds.TetrahedralMesh.create_box(6, size=1.0)
+    held = mesh.vertices_where(lambda X: (X[:, 1] < 1e-9) | (X[:, 1] > 1 - 1e-9))
+    top = mesh.vertices[held, 1] > 0.5
+
+    def motion(t):
+        out = np.zeros((len(held), 3))
+        out[top, 1] = (height - 1) * min(t, 1.0)
+        return out
+
+    material = ds.StableNeoHookean(1e5, 0.499)
+    scene = ds.Scene(
+        mesh, material, 1000.0, [], fixed=held, motion=motion, volume="patches", precision="f64"
+    )
+    return ds.StaticSolver(scene, **more)
+
+
+@pytest.mark.parametrize("height", [3.0, 0.3])
+@pytest.mark.filterwarnings("ignore")
+def test_nearly_incompressible_cubes_are_stretched_and_squashed_in_one_load_step(height):
+    x = final(squashed(height))
+    assert np.all(np.isfinite(x)) and x[:, 1].max() >= height - 1e-9
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_an_equilibrium_that_is_not_found_at_once_is_found_in_parts():
+    at_once = final(squashed(0.6))
+    few = squashed(0.6, max_iterations=20)
+    workspace = few.workspace(few.start_values())
+    solve, calls = workspace.newton.solve, []
+
+    def fails_at_first(*arguments, **named):
+        calls.append(arguments)
+        if len(calls) == 1:
+            solve(*arguments, rounds=1)
+            raise ds.NotConverged("made to fail", [1.0])
+        return solve(*arguments, **named)
+
+    workspace.newton.solve = fails_at_first
+    workspace.advance(0, 1, 1)
+    assert len(calls) > 2
+    np.testing.assert_allclose(workspace.scene.mesh.vertices + workspace.u_star, at_once, atol=1e-6)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_what_no_part_leads_to_is_said_in_terms_of_the_problem():
+    solver = squashed(0.6, max_iterations=20)
+    workspace = solver.workspace(solver.start_values())
+    solve = workspace.newton.solve
+
+    def fails(*arguments, **named):
+        solve(*arguments, rounds=1)
+        raise ds.NotConverged("made to fail", [1.0])
+
+    workspace.newton.solve = fails
+    with pytest.raises(ds.NotConverged, match="path of equilibria .* goes to 0% of what is laid on.*limit point"):
+        workspace.advance(0, 1, 1)
