@@ -15,6 +15,7 @@ from diffsim_ti.runtime import Kernel
 
 A = ti.template()
 DOT = dict(weights_dot="vectors", pressing_dot="vectors", load_dot="scalars")
+SUMS = dict(numbers="vectors", mu_adj="scalars", sums="vectors", rest_adj="vectors")
 ADJ = dict(weights_adj="vectors", pressing_adj="vectors", load_adj="scalars", pulled="vectors")
 
 
@@ -218,10 +219,29 @@ class FrictionDerivatives(FrictionKernels):
         scene.rest_adj[s] = scene.rest_adj[s] + by_rest
 
     @ti.func
-    def slide_all_vjp(self, scene: A, at: A, plan: A):
+    def measure_all_vjp(self, scene: A, at: A, plan: A):
+        for kind in ti.static((VERTEX_TRIANGLE, EDGE_EDGE)):
+            ti.loop_config(serialize=not self.parallel)
+            for p in range(first_of(kind, plan), behind(kind, plan)):
+                if scene.pressing[p][3] > 0:
+                    self.measure_pair_vjp(kind, p, scene, at, plan)
         ti.loop_config(serialize=not self.parallel)
         for s in range(plan.num_surface):
             at.by_place[s] = self.vec4(0)
+            if scene.rubs[s] > 0:
+                self.collect_vertex(s, scene, at, plan)
+
+    @cached_property
+    def measure_vjp(self) -> Kernel:
+        """Adjoint of the displacement place[begin] (`by_place`) for `weights_adj` and `pressing_adj`; adds those of the
+        numbers and of the rest shape."""
+        at = dict(place="vectors2", by_place="vectors", by_mu="scalars")
+        return self.kernel("measure_vjp", self.measure_all_vjp, at, OWN | ADJ | SUMS, begin="int", num_rows="int")
+
+    @ti.func
+    def slide_all_vjp(self, scene: A, at: A, plan: A):
+        ti.loop_config(serialize=not self.parallel)
+        for s in range(plan.num_surface):
             if scene.rubs[s] > 0:
                 self.pull(s, scene, at, plan)
         for kind in ti.static((VERTEX_TRIANGLE, EDGE_EDGE)):
@@ -233,23 +253,14 @@ class FrictionDerivatives(FrictionKernels):
         for s in range(plan.num_surface):
             if scene.rubs[s] > 0:
                 self.end_vertex(s, scene, at, plan)
-        for kind in ti.static((VERTEX_TRIANGLE, EDGE_EDGE)):
-            ti.loop_config(serialize=not self.parallel)
-            for p in range(first_of(kind, plan), behind(kind, plan)):
-                if scene.pressing[p][3] > 0:
-                    self.measure_pair_vjp(kind, p, scene, at, plan)
-        ti.loop_config(serialize=not self.parallel)
-        for s in range(plan.num_surface):
-            if scene.rubs[s] > 0:
-                self.collect_vertex(s, scene, at, plan)
+        self.measure_all_vjp(scene, at, plan)
 
     @cached_property
     def slide_vjp(self) -> Kernel:
         """Adjoint of the velocity before the stage, of the displacement `place[begin]` where the pass began (`by_place`);
         adds those of all else. pending: whether corners still hold a part of the adjoints u_adj, v_adj after it."""
-        own = OWN | ADJ | dict(numbers="vectors", mu_adj="scalars", sums="vectors", rest_adj="vectors")
         at = self.state | dict(place="vectors2", u_adj="vectors2", v_adj="vectors2", start="ints", corners="ints")
         at |= dict(corner_adj="vectors", rate_corner="vectors", by_place="vectors")
         at |= dict.fromkeys(("by_rate", "by_mass", "by_speed", "by_mu"), "scalars")
         numbers = dict.fromkeys(("begin", "pending", "rates", "num_rows"), "int") | dict(ratio_by_rate="float")
-        return self.kernel("slide_vjp", self.slide_all_vjp, at, own, **PASS, **numbers)
+        return self.kernel("slide_vjp", self.slide_all_vjp, at, OWN | ADJ | SUMS, **PASS, **numbers)

@@ -4,6 +4,7 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.contact.hessian_kernels import HessianKernels
+from diffsim_ti.contact.lagged_friction import LaggedFriction
 from diffsim_ti.contact.listed_pair import SAFE
 from diffsim_ti.contact.surface_pairs import SurfacePairs, Tunnelling
 from diffsim_ti.runtime import kernels_of
@@ -15,6 +16,7 @@ class ImplicitPairs(SurfacePairs):
     After `place`, the list, the planes, the energies and the last corners of `arrays.corner` are those of that place.
     """
 
+    friction_kind = LaggedFriction
     longest_march = 200  # lists made along one step
 
     def __init__(self, arrays, parallel: bool):

@@ -93,10 +93,13 @@ class PairFriction:
     def begin_jvp(self, history, slot: int, u_dot, numbers) -> None:
         """What presses changes with u_dot[0] and `numbers`, a Tangent."""
         self._begin(history, slot)
+        self._changes(history.u, slot, u_dot, numbers)
+
+    def _changes(self, u, slot: int, u_dot, numbers) -> None:
         self._take("weights_dot", "pressing_dot")
         if not hasattr(self.own, "load_dot"):
             self.own.load_dot = runtime.array(self.a.fp, self.num_surface)
-        at = dict(u=history.u, w=u_dot, rest_dot=numbers.rest, parameters_dot=numbers.parameters)
+        at = dict(u=u, w=u_dot, rest_dot=numbers.rest, parameters_dot=numbers.parameters)
         self._run(self.derivatives.measure_jvp, at, slot=slot)
 
     def slide_jvp(self, history, slot: int, plan, rate_dot: float, u_dot, v_dot, numbers) -> None:
@@ -132,6 +135,20 @@ class PairFriction:
         own = dict(begin=slot, pending=int(pending), rates=int(adjoint.rate_corner.shape[0] > 1))
         own |= dict(num_rows=self.num_rows, ratio_by_rate=ratio_by_rate(plan))
         self._run(self.derivatives.slide_vjp, at, slot=slot + 1, keep=slot + 1, **own, **self._pass(plan))
+
+    def _pull_back(self, u, slot: int, felt: np.ndarray, w_adj: np.ndarray, pressing_adj: np.ndarray) -> np.ndarray:
+        """Adjoint of u[slot] at surface vertices for those of the weights and of (n, mu N) of some pairs; adds those of the
+        numbers and of the rest shape."""
+        self._take("weights_adj", "pressing_adj")
+        self._take("mu_adj", scalar=True)
+        for array, data in ((self.own.weights_adj, w_adj), (self.own.pressing_adj, pressing_adj)):
+            every = np.zeros((array.shape[0], 4))
+            every[felt] = data
+            runtime.fill(array, every)
+        runtime.fill(self.own.load_adj, 0)
+        at = dict(place=u, by_place=self._adjoints["by_place"], by_mu=self._adjoints["by_mu"])
+        self._run(self.derivatives.measure_vjp, at, slot=slot, begin=slot, num_rows=self.num_rows)
+        return runtime.fetch(self._adjoints["by_place"])
 
     def add_place(self, adjoint) -> None:
         """Add the adjoint of the displacement where the pass began."""
