@@ -23,7 +23,7 @@ ADJ = dict(weights_adj="vectors", pressing_adj="vectors", load_adj="scalars", pu
 class FrictionDerivatives(FrictionKernels):
     """Of the pairs that press; the state in the slot is that before the stage."""
 
-    # ---- of what presses -----------------------------------------------------------------------------------------------
+    # ---- of what presses ---------------------------------------------------------------------------------------------
 
     @ti.func
     def measure_pair_jvp(self, kind: A, p, scene: A, at: A, plan: A):
@@ -33,10 +33,10 @@ class FrictionDerivatives(FrictionKernels):
             r1, r2, r3 = self.changes_at_rest(p, scene, at.rest_dot)
             rest = scene.rest_weights[p]
             d_rest = three(scene.rest_plane[p]).dot(rest[1] * r1 + rest[2] * r2 + rest[3] * r3)
-            dk, dw = self.numbers_jvp(p, scene, at.parameters_dot[self.first], at.parameters_dot[self.first + 1], d_rest)
-            d_weights, dn, dN = self.pressed_jvp(
-                kind, p, y1, y2, y3, dy1 + r1, dy2 + r2, dy3 + r3, dk, dw, scene, plan
+            dk, dw = self.numbers_jvp(
+                p, scene, at.parameters_dot[self.first], at.parameters_dot[self.first + 1], d_rest
             )
+            d_weights, dn, dN = self.pressed_jvp(kind, p, y1, y2, y3, dy1 + r1, dy2 + r2, dy3 + r3, dk, dw, scene, plan)
             mu, d_mu = self.mu(p, scene), at.parameters_dot[self.first + 3 + self.row(p, scene)]
             scene.weights_dot[p] = d_weights
             scene.pressing_dot[p] = self.vec4(dn[0], dn[1], dn[2], mu * dN + d_mu / mu * scene.pressing[p][3])
@@ -69,7 +69,7 @@ class FrictionDerivatives(FrictionKernels):
         at = dict(u="vectors2", w="vectors2", rest_dot="vectors", parameters_dot="scalars")
         return self.kernel("measure_jvp", self.measure_all_jvp, at, OWN | DOT)
 
-    # ---- of the stage --------------------------------------------------------------------------------------------------
+    # ---- of the stage ------------------------------------------------------------------------------------------------
 
     @ti.func
     def slide_pair_jvp(self, kind: A, p, scene: A, at: A, plan: A):
@@ -113,7 +113,7 @@ class FrictionDerivatives(FrictionKernels):
         at = self.state | dict(du="vectors2", dv="vectors2", mass_dot="scalars", parameters_dot="scalars")
         return self.kernel("slide_jvp", self.slide_all_jvp, at, OWN | DOT, **PASS, ratio_dot="float")
 
-    # ---- adjoint of the stage ------------------------------------------------------------------------------------------
+    # ---- adjoint of the stage ----------------------------------------------------------------------------------------
 
     @ti.func
     def gathered(self, i, of: A, at: A):

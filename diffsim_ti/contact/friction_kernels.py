@@ -127,7 +127,7 @@ class FrictionKernels(PressedPair):
                 total += scene.corner[scene.corner_of[k]]
         return total
 
-    # ---- what presses where a pass begins ------------------------------------------------------------------------------
+    # ---- what presses where a pass begins ----------------------------------------------------------------------------
 
     @ti.func
     def measure_pair(self, kind: A, p, scene: A, at: A, plan: A):
@@ -162,7 +162,7 @@ class FrictionKernels(PressedPair):
         """Weights, normals and loads at u[slot], after `forces` there."""
         return self.kernel("measure", self.measure_all, dict(u="vectors2"), OWN)
 
-    # ---- the stage -----------------------------------------------------------------------------------------------------
+    # ---- the stage ---------------------------------------------------------------------------------------------------
 
     @ti.func
     def slip(self, s, c, eps):

@@ -10,8 +10,8 @@ from diffsim_ti.contact.pair_friction import PairFriction
 class LaggedFriction(PairFriction):
     """Of the pairs that press with N at the first displacement of a pass, with the weights w and the normal n there.
 
-    A pair slides with t = (I - n n^T) sum_i w_i v_i, v = (u - x) / gamma, and its corners feel -w_i mu N f(|t| / eps) t / |t|
-    (terms/obstacles/friction.py). Displacements, directions and results are NumPy arrays, shape (num_vertices, 3).
+    A pair slides with t = (I - n n^T) sum_i w_i v_i, v = (u - x) / gamma, and its corners feel
+    -w_i mu N f(|t| / eps) t / |t| (terms/obstacles/friction.py). Displacements, directions and results are NumPy arrays, shape (num_vertices, 3).
     """
 
     def __init__(self, pairs):
@@ -90,7 +90,7 @@ class LaggedFriction(PairFriction):
         """3x3 diagonal blocks of d2E/du2 [N/m]."""
         return self._scatter((self.w**2)[:, :, None, None] * self._stiffness(u)[:, None])
 
-    # ---- derivatives -----------------------------------------------------------------------------------------------------
+    # ---- derivatives -------------------------------------------------------------------------------------------------
 
     def _back_to_begin(self) -> None:
         """The list of pairs, and what presses, where the pass begins; `potential.place` leads away again."""

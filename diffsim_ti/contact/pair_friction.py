@@ -47,9 +47,7 @@ class PairFriction:
         self.pairs.run(kernel, at | self._guides, self.own, **numbers)
 
     def _state(self, history) -> dict:
-        return dict(
-            u=history.u, v=history.v, inverse_mass=self.a.inverse_mass, kept_u=self.kept_u, kept_v=self.kept_v
-        )
+        return dict(u=history.u, v=history.v, inverse_mass=self.a.inverse_mass, kept_u=self.kept_u, kept_v=self.kept_v)
 
     @staticmethod
     def _pass(plan) -> dict:
@@ -88,7 +86,7 @@ class PairFriction:
         self.pairs.forces(history.u, slot, self.a.corner)
         self.measure(history.u, slot)
 
-    # ---- tangent -------------------------------------------------------------------------------------------------------
+    # ---- tangent -----------------------------------------------------------------------------------------------------
 
     def begin_jvp(self, history, slot: int, u_dot, numbers) -> None:
         """What presses changes with u_dot[0] and `numbers`, a Tangent."""
@@ -108,7 +106,7 @@ class PairFriction:
         own = dict(ratio_dot=rate_dot * ratio_by_rate(plan), **self._pass(plan))
         self._run(self.derivatives.slide_jvp, self._state(history) | at, slot=slot, keep=slot, **own)
 
-    # ---- adjoint -------------------------------------------------------------------------------------------------------
+    # ---- adjoint -----------------------------------------------------------------------------------------------------
 
     def clear_sums(self) -> None:
         """Begin a reverse sweep."""

@@ -23,7 +23,7 @@ class SelfContact(Term):
     friction_speed [m/s]: the speed of sliding below which friction is smoothed, and with which what is held may creep:
     mu N f(s / friction_speed), f(y) = 2 y - y^2 for y < 1, 1 beyond. In explicit steps it is a stage of each pass that adds
     no energy, whatever the step (contact/friction_kernels.py); in implicit ones a force, with N and the normal from where
-    the step begins. Statics have none.
+    the step begins.
 
     Pairs of one body whose distance D at rest is below twice the width, neighbours along its surface or walls of a slit,
     have a width and a stiffness of their own, so that a body at rest does not press on itself:
@@ -40,10 +40,10 @@ class SelfContact(Term):
     One per scene. Implicit solvers keep surfaces apart on the whole way of every step; ImplicitMidpointSolver raises
     Tunnelling where the end of a step lies beyond a contact.
 
-    Raises ValueError for stiffness, width or friction_speed <= 0, friction < 0, names that are no sets, sets of one dict that
-    share a vertex, and, when a run starts, for a width beyond four mean edges of the
-    surface, for primitives that touch at rest, and for surfaces that touch or pass through each other. A substep in which
-    two primitives may have passed through each other raises Tunnelling.
+    Raises ValueError for stiffness, width or friction_speed <= 0, friction < 0, names that are no sets, sets of a dict that
+    share a vertex, and, when a run starts, for a width beyond four mean edges of the surface, for primitives that touch at
+    rest, and for surfaces that touch or pass through each other. A substep in which two primitives may have passed through
+    each other raises Tunnelling.
     Li et al. 2020, Incremental Potential Contact, doi:10.1145/3386569.3392425.
     """
 
@@ -76,9 +76,13 @@ class SelfContact(Term):
     def _check_pairs(pairs: tuple) -> None:
         for pair in pairs:
             if not (isinstance(pair, tuple) and len(pair) == 2 and all(isinstance(name, str) for name in pair)):
-                raise ValueError(f"SelfContact: friction needs pairs of names of sets, such as ('a', 'b'), got {pair!r}")
+                raise ValueError(
+                    f"SelfContact: friction needs pairs of names of sets, such as ('a', 'b'), got {pair!r}"
+                )
             if pair[0] != pair[1] and pair[::-1] in pairs:
-                raise ValueError(f"SelfContact: friction has {pair!r} and {pair[::-1]!r}, which are one pair: name it once")
+                raise ValueError(
+                    f"SelfContact: friction has {pair!r} and {pair[::-1]!r}, which are one pair: name it once"
+                )
 
     def check(self, mesh: TetrahedralMesh) -> None:
         if self.has_friction:

@@ -280,7 +280,9 @@ class ExplicitWorkspace(Workspace):
                     self.impulses.add(numbers, change)
             if pairs:
                 if pairs.friction:
-                    pairs.friction.slide(history, slot + stride, self.numbers_of(numbers["first"], num_passes), recording)
+                    pairs.friction.slide(
+                        history, slot + stride, self.numbers_of(numbers["first"], num_passes), recording
+                    )
                 try:
                     pairs.check_pass(history.u, slot + stride, float(self.solver.schedule.length(numbers["first"])))
                 except Tunnelling as error:
