@@ -11,7 +11,8 @@ class LaggedFriction(PairFriction):
     """Of the pairs that press with N at the first displacement of a pass, with the weights w and the normal n there.
 
     A pair slides with t = (I - n n^T) sum_i w_i v_i, v = (u - x) / gamma, and its corners feel
-    -w_i mu N f(|t| / eps) t / |t| (terms/obstacles/friction.py). Displacements, directions and results are NumPy arrays, shape (num_vertices, 3).
+    -w_i mu N f(|t| / eps) t / |t| (terms/obstacles/friction.py). Displacements, directions and
+    results are NumPy arrays, shape (num_vertices, 3).
     """
 
     def __init__(self, pairs):
