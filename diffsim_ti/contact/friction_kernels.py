@@ -20,14 +20,14 @@ from functools import cached_property
 
 import taichi as ti
 
-from diffsim_ti.contact.listed_pair import behind, first_of, three
+from diffsim_ti.contact.listed_pair import three
 from diffsim_ti.contact.pressed_pair import PressedPair
 from diffsim_ti.contact.proximity import EDGE_EDGE, VERTEX_TRIANGLE
 from diffsim_ti.runtime import Kernel
 
 A = ti.template()
 SIGNS = ((1, -1, -1, -1), (1, 1, -1, -1))  # of the weights of the corners
-OWN = dict(weights="vectors", pressing="vectors", load="scalars", rubs="ints", label="ints", row_of="ints")
+OWN = dict(weights="vectors", pressing="vectors", load="scalars", rubs="ints", label="ints", row_of="ints", any="ints")
 STATE = dict(u="vectors2", v="vectors2", inverse_mass="scalars", kept_u="vectors2", kept_v="vectors2")
 PASS = dict(keep="int", h="float", ratio="float")
 
@@ -139,19 +139,20 @@ class FrictionKernels(PressedPair):
             pressing = self.vec4(n[0], n[1], n[2], mu * N)
             scene.weights[p] = w
             if mu * N > 0:
+                scene.any[0] = 1
                 for k in ti.static(range(4)):
                     scene.rubs[scene.place[scene.pairs[4 * p + k]]] = 1
         scene.pressing[p] = pressing
 
     @ti.func
     def measure_all(self, scene: A, at: A, plan: A):
+        scene.any[0] = 0
         ti.loop_config(serialize=not self.parallel)
-        for s in range(plan.num_surface):
-            scene.rubs[s] = 0
-        for kind in ti.static((VERTEX_TRIANGLE, EDGE_EDGE)):
-            ti.loop_config(serialize=not self.parallel)
-            for p in range(first_of(kind, plan), behind(kind, plan)):
-                self.measure_pair(kind, p, scene, at, plan)
+        for p in range(plan.num_pairs):  # of both kinds: each loop takes time to start
+            if p < plan.num_vt:
+                self.measure_pair(VERTEX_TRIANGLE, p, scene, at, plan)
+            else:
+                self.measure_pair(EDGE_EDGE, p, scene, at, plan)
         ti.loop_config(serialize=not self.parallel)
         for s in range(plan.num_surface):
             if scene.rubs[s] > 0:
@@ -190,20 +191,27 @@ class FrictionKernels(PressedPair):
         return v, t, s, c, kappa, f, y, B
 
     @ti.func
+    def slide_pair(self, kind: A, p, scene: A, at: A, plan: A):
+        _, t, _, _, kappa, _, _, _ = self.sliding(kind, p, scene, at, plan)
+        r, w = (plan.h * scene.pressing[p][3] * kappa) * t, scene.weights[p]  # less the impulse
+        self.store(p, scene, w[1] * r, w[2] * r, w[3] * r)
+
+    @ti.func
     def slide_all(self, scene: A, at: A, plan: A):
-        for kind in ti.static((VERTEX_TRIANGLE, EDGE_EDGE)):
-            ti.loop_config(serialize=not self.parallel)
-            for p in range(first_of(kind, plan), behind(kind, plan)):
-                if scene.pressing[p][3] > 0:
-                    _, t, _, _, kappa, _, _, _ = self.sliding(kind, p, scene, at, plan)
-                    r, w = (plan.h * scene.pressing[p][3] * kappa) * t, scene.weights[p]  # less the impulse
-                    self.store(p, scene, w[1] * r, w[2] * r, w[3] * r)
+        ti.loop_config(serialize=not self.parallel)
+        for p in range(plan.num_pairs):
+            if scene.pressing[p][3] > 0:
+                if p < plan.num_vt:
+                    self.slide_pair(VERTEX_TRIANGLE, p, scene, at, plan)
+                else:
+                    self.slide_pair(EDGE_EDGE, p, scene, at, plan)
         ti.loop_config(serialize=not self.parallel)
         for s in range(plan.num_surface):
             i = scene.surface[s]
             if plan.keep >= 0:
                 at.kept_u[plan.keep, s], at.kept_v[plan.keep, s] = at.u[plan.slot, i], at.v[plan.slot, i]
             if scene.rubs[s] > 0:
+                scene.rubs[s] = 0
                 gained = at.inverse_mass[i] * self.may(i, self.sum_of_corners(s, scene), at)
                 at.v[plan.slot, i] = at.v[plan.slot, i] + gained
                 at.u[plan.slot, i] = at.u[plan.slot, i] + plan.ratio * gained

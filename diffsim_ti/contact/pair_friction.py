@@ -27,7 +27,10 @@ class PairFriction:
         key = a.precision, pairs.first, pairs.parallel, guided, len(rows)
         self.kernels, self.derivatives = kernels_of(FrictionKernels, *key), kernels_of(FrictionDerivatives, *key)
         n = self.num_surface
-        self.own = SimpleNamespace(rubs=runtime.array(ti.i32, n), load=runtime.array(a.fp, n))
+        self.own = SimpleNamespace(
+            any=runtime.array(ti.i32, 1), rubs=runtime.array(ti.i32, n), load=runtime.array(a.fp, n)
+        )
+        runtime.fill(self.own.rubs, 0)
         self.own.label, self.own.row_of = runtime.upload(labels, ti.i32), runtime.upload(rows.ravel(), ti.i32)
         self.kept_u = self.kept_v = runtime.array(a.vector, 1, 1)
         self._adjoints = None
@@ -62,11 +65,15 @@ class PairFriction:
 
     def measure(self, u, slot: int) -> None:
         """A pass begins at u[slot], where `pairs.forces` were computed."""
+        if not self.pairs.list.count:
+            runtime.fill(self.own.any, 0)
+            return
         self._run(self.kernels.measure, dict(u=u), slot=slot)
 
     def slide(self, history, slot: int, plan, recording: bool) -> None:
         """The pass led to a slot."""
-        if plan.alpha > 0:
+        host = runtime.view(self.own.any)
+        if plan.alpha > 0 and (recording or host is None or host[0]):
             keep = slot if recording else -1
             self._run(self.kernels.slide, self._state(history), slot=slot, keep=keep, **self._pass(plan))
 
