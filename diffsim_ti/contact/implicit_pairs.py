@@ -4,6 +4,7 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.contact.hessian_kernels import HessianKernels
+from diffsim_ti.contact.lagged_friction import LaggedFriction
 from diffsim_ti.contact.listed_pair import SAFE
 from diffsim_ti.contact.surface_pairs import SurfacePairs, Tunnelling
 from diffsim_ti.runtime import kernels_of
@@ -15,6 +16,7 @@ class ImplicitPairs(SurfacePairs):
     After `place`, the list, the planes, the energies and the last corners of `arrays.corner` are those of that place.
     """
 
+    friction_kind = LaggedFriction
     longest_march = 200  # lists made along one step
 
     def __init__(self, arrays, parallel: bool):
@@ -41,13 +43,13 @@ class ImplicitPairs(SurfacePairs):
     def hessian_product(self, u, w, convex: bool) -> None:
         """Change of the contact forces for changes w[0] of the positions, to the last corners of `arrays.corner`."""
         if convex:
-            self._run(self.hessian.products, dict(u=u, w=w, out=self.a.corner), slot=0)
+            self.run(self.hessian.products, dict(u=u, w=w, out=self.a.corner), slot=0)
         else:
             self.product(u, 0, w, self.a.corner, has_planes=True)
 
     def add_blocks(self, u, out) -> None:
         """Add the diagonal blocks of the Hessian's convex part to rows 0..2 of `out` (potential_kernels.py)."""
-        self._run(self.hessian.blocks, dict(u=u, out=out), slot=0)
+        self.run(self.hessian.blocks, dict(u=u, out=out), slot=0)
 
     def safe_share(self, u: np.ndarray, step: np.ndarray, most: float = 1.0) -> float:
         """A share of the step, at most `most`, up to which no two primitives meet on the way; close to the largest such
@@ -73,7 +75,7 @@ class ImplicitPairs(SurfacePairs):
 
     def _shares(self) -> np.ndarray:
         out = self.list.buffers.take("shares", self.kernels.fp, self.list.count)
-        self._run(self.hessian.shares, dict(w=self.step, out=out), slot=0, most=SAFE)
+        self.run(self.hessian.shares, dict(w=self.step, out=out), slot=0, most=SAFE)
         return runtime.fetch(out)[: self.list.count].astype(np.float64)
 
     def way_is_free(self, u: np.ndarray, step: np.ndarray) -> bool:

@@ -10,6 +10,7 @@ from diffsim_ti.contact.broad_phase import CandidatePairs
 from diffsim_ti.contact.buffers import branches, whole
 from diffsim_ti.contact.listed_pair import OPPOSITE
 from diffsim_ti.contact.motion_kernels import BLOCK, MotionKernels
+from diffsim_ti.contact.pair_friction import PairFriction
 from diffsim_ti.contact.pair_kernels import PairKernels
 from diffsim_ti.mesh.sets import pieces
 from diffsim_ti.runtime import kernels_of
@@ -34,6 +35,7 @@ class SurfacePairs:
     Forces go to the last corners of an array of corners, one for each surface vertex (state/arrays.py).
     """
 
+    friction_kind = PairFriction
     typical_slack = 0.5  # share of the width that half of the vertices get at most, so that lists stay short
     fewest_passes, most_passes = 3, 30  # that a list should last, by its slacks, but
     least_slack = 0.1  # they are at least this share of the width, and
@@ -68,6 +70,7 @@ class SurfacePairs:
         self.touched = runtime.array(ti.i32, n)
         self.fresh, self.age, self.builds = False, 0, 0
         self._checked_rest = self._scratch = None
+        self.friction = self.friction_kind(self) if term.has_friction else None
 
     @property
     def width(self) -> float:
@@ -123,11 +126,11 @@ class SurfacePairs:
         self._build(u, 0)
         self.check_apart(u)
 
-    def _run(self, kernel, at: dict, **numbers) -> None:
-        """Launch a kernel of pairs, with the arrays `at`."""
+    def run(self, kernel, at: dict, *more, **numbers) -> None:
+        """Launch a kernel of pairs, with the arrays `at`, and `more` of the scene."""
         k, a = self.list, self.a
         numbers |= dict(num_surface=k.num_surface, first_out=a.first_contact_corner)
-        scene = k, self, SimpleNamespace(rest=a.rest, parameters=a.parameters)
+        scene = *more, k, self, SimpleNamespace(rest=a.rest, parameters=a.parameters)
         self._launch(kernel, scene=scene, at=SimpleNamespace(**at))(
             **dict(num_vt=k.num_vt, num_pairs=k.count) | numbers
         )
@@ -146,7 +149,9 @@ class SurfacePairs:
         self.corner, self.plane = take("forces", vector, 4 * count), take("planes", vector, count)
         self.energy, self.numbers = take("energies", fp, count), take("numbers", vector, count)
         self.rest_plane, self.rest_weights = take("planes at rest", vector, count), take("weights", vector, count)
-        self._run(self.motion.begin, dict(u=u), slot=slot)
+        if self.friction:
+            self.friction.make_room()
+        self.run(self.motion.begin, dict(u=u), slot=slot)
         self.fresh, self.age = True, 0
         self.builds += 1
 
@@ -179,7 +184,7 @@ class SurfacePairs:
     def _check(self, u, slot: int, num_vt: int, num_pairs: int) -> tuple[bool, bool, bool]:
         """Whether the list is stale, whether pairs beyond it may have crossed, and whether pairs of it may have."""
         bodies = dict(num_bodies=self.num_bodies, markers=self.markers, lost=0.5 * self.width, **self._sums)
-        self._run(self.motion.check, dict(u=u), slot=slot, num_vt=num_vt, num_pairs=num_pairs, **bodies)
+        self.run(self.motion.check, dict(u=u), slot=slot, num_vt=num_vt, num_pairs=num_pairs, **bodies)
         flags = runtime.view(self.flags)
         stale, lost, crossed = runtime.fetch(self.flags) if flags is None else flags
         return bool(stale), bool(lost), bool(crossed)
@@ -247,7 +252,7 @@ class SurfacePairs:
 
     def forces(self, u, slot: int, out, exact: bool = False) -> None:
         """Contact forces at u[slot], to the last corners of `out`."""
-        self._run(self.kernels.forces, dict(u=u, out=out), slot=slot, exact=int(exact))
+        self.run(self.kernels.forces, dict(u=u, out=out), slot=slot, exact=int(exact))
 
     def product(self, u, slot: int, w, out, rest_dot=None, parameters_dot=(0.0, 0.0), has_planes=False) -> None:
         """Change of the contact forces for changes w[0] of the positions (and of rest shape, stiffness, width).
@@ -257,23 +262,27 @@ class SurfacePairs:
         at = dict(u=u, w=w, rest_dot=self.none if rest_dot is None else rest_dot, out=out)
         numbers = dict(zip(("d_stiffness", "d_width"), parameters_dot))
         numbers |= dict(by_rest=int(rest_dot is not None), has_planes=int(has_planes))
-        self._run(self.kernels.products, at, slot=slot, **numbers)
+        self.run(self.kernels.products, at, slot=slot, **numbers)
 
     def clear_sums(self) -> None:
         """Begin a reverse sweep."""
         runtime.fill(self.sums, 0)
         runtime.fill(self.rest_adj, 0)
+        if self.friction:
+            self.friction.clear_sums()
 
     def vjp(self, u, slot: int, w, out) -> None:
         """The product with the adjoint w[0] of the forces; adds the adjoints of stiffness, width and rest shape."""
         self.product(u, slot, w, out)
-        self._run(self.kernels.add_sums, dict(out=out), slot=slot)
+        self.run(self.kernels.add_sums, dict(out=out), slot=slot)
 
     def collect(self) -> tuple[np.ndarray, np.ndarray]:
-        """Adjoints of (stiffness, width) and of the rest shape, (num_vertices, 3), by the forces alone; float64."""
+        """Adjoints of (stiffness, width, those of friction) and of the rest shape, (num_vertices, 3), by the forces alone;
+        float64."""
         rest = np.zeros((self.mesh.num_vertices, 3))
         rest[self.mesh.surface_vertices] = runtime.fetch(self.rest_adj)
-        return whole(self.sums).astype(np.float64).sum(0)[:2], rest
+        numbers = whole(self.sums).astype(np.float64).sum(0)[:2]
+        return np.concatenate([numbers, self.friction.collect()]) if self.friction else numbers, rest
 
     # ---- to look at -------------------------------------------------------------------------------------------------
 

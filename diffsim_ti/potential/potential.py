@@ -42,6 +42,15 @@ class Potential:
         self.rate = runtime.array(a.fp, 1) if a.law.viscous else None  # [1/s], of changes in a pass; zero in statics
         self.attached: Attached | None = None  # springs, cables, foundations: set by whom a time is known
 
+    @property
+    def rubbing(self):
+        """Friction of surfaces on each other (contact/lagged_friction.py); None without."""
+        return self.pairs.friction if self.pairs else None
+
+    def _on_host(self) -> list:
+        """What acts on vertices from the host: what is attached, and friction of surfaces."""
+        return [part for part in (self.attached, self.rubbing) if part]
+
     def launch(self, name: str, lanes: bool = True, **records) -> None:
         """Run a kernel at the present displacement; records: more arrays than the potential's own."""
         a = self.arrays
@@ -65,6 +74,8 @@ class Potential:
             runtime.fill(self.walls, walls)
         if self.pairs:
             self.pairs.begin(u)
+        if self.rubbing:
+            self.rubbing.begin(u, x, per_gamma)
 
     def place(self, u: np.ndarray) -> np.ndarray:
         """Go to displacement u [m]; returns it as the device holds it."""
@@ -111,8 +122,7 @@ class Potential:
             contact = np.concatenate([contact, self.pairs.energies()])
         if self.faces:
             contact = np.concatenate([contact, self.faces.energies()])
-        if self.attached:
-            contact = np.concatenate([contact, self.attached.energies(self.held_at)])
+        contact = np.concatenate([contact, *(part.energies(self.held_at) for part in self._on_host())])
         return elastic.sum() + contact.sum(), np.abs(elastic).sum() + np.abs(contact).sum(), J
 
     def forces(self) -> tuple[np.ndarray, np.ndarray]:
@@ -124,8 +134,8 @@ class Potential:
         if self.faces:
             pushed = self.faces.forces()
             forces, sizes = forces + pushed, sizes + np.linalg.norm(pushed, axis=1)
-        if self.attached:
-            forces, sizes = forces + self.attached.forces(self.held_at), sizes + self.attached.sizes(self.held_at)
+        for part in self._on_host():
+            forces, sizes = forces + part.forces(self.held_at), sizes + part.sizes(self.held_at)
         return forces[0], sizes
 
     def product(self, w: np.ndarray, convex: bool = False) -> np.ndarray:
@@ -135,7 +145,7 @@ class Potential:
         self.multiply(convex)
         y = runtime.fetch(self.y)[0].astype(np.float64)
         y = (y + self.faces.product() if self.faces else y) * -scale
-        return y + self.attached.product(self.held_at, w, convex) if self.attached else y
+        return sum((part.product(self.held_at, w, convex) for part in self._on_host()), y)
 
     def multiply(self, convex: bool = False) -> None:
         """y = -d2E/du2 w on the device, without faces and what is attached."""
@@ -157,8 +167,8 @@ class Potential:
         blocks = np.swapaxes(runtime.fetch(self._block_arrays.blocks).astype(np.float64), 0, 1)
         if self.faces:
             blocks = blocks + self.faces.blocks()
-        if self.attached:
-            blocks = blocks + self.attached.blocks(self.held_at)
+        for part in self._on_host():
+            blocks = blocks + part.blocks(self.held_at)
         if a.points > 1:
             blocks = blocks + self._element_blocks()
         return blocks if a.patches is None else blocks + self.coupling.diagonal(self.patch_gradients())
@@ -208,7 +218,7 @@ class Potential:
 
     def contact_blocks(self) -> np.ndarray | None:
         """The part of contact and of what is attached in `blocks`; None without."""
-        attached = self.attached.blocks(self.held_at) if self.attached else None
+        attached = sum(part.blocks(self.held_at) for part in self._on_host()) if self._on_host() else None
         if not (self.arrays.contacts or self.pairs):
             return attached
         if self._barrier_blocks is None:

@@ -1,5 +1,11 @@
 """Contact of the surface with itself, and of several bodies with each other."""
 
+from collections.abc import Mapping
+
+import numpy as np
+
+from diffsim_ti.inputs import NOT_NEGATIVE, Input
+from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.terms.described import positive
 from diffsim_ti.terms.term import Term
 
@@ -9,7 +15,15 @@ class SelfContact(Term):
 
     Energy of a pair at distance d: m b(d) with b(d) = -stiffness (d - width)^2 log(d / width) for d < width, exactly zero
     beyond (barrier.py); m fades out edges that become parallel (contact/proximity.py), with lengths as in the mesh.
-    Pairs that share a vertex do not count. stiffness [N/m], width [m]. No friction.
+    Pairs that share a vertex do not count. stiffness [N/m], width [m].
+
+    friction [-]: Coulomb's coefficient of pairs that press with N = m |db/dd|; 0 compiles none. A dict has that of pairs of
+    sets of vertices or tetrahedra, {("palm", "ball"): 0.6}, and other pairs do not rub; a pair whose corners are in several
+    sets belongs to those of its vertex, or of each edge's first one, and of the triangle's first one.
+    friction_speed [m/s]: the speed of sliding below which friction is smoothed, and with which what is held may creep:
+    mu N f(s / friction_speed), f(y) = 2 y - y^2 for y < 1, 1 beyond. In explicit steps it is a stage of each pass that adds
+    no energy, whatever the step (contact/friction_kernels.py); in implicit ones a force, with N and the normal from where
+    the step begins.
 
     Pairs of one body whose distance D at rest is below twice the width, neighbours along its surface or walls of a slit,
     have a width and a stiffness of their own, so that a body at rest does not press on itself:
@@ -21,19 +35,84 @@ class SelfContact(Term):
     take the slope of one side. Different bodies (pieces of the mesh, see `TetrahedralMesh.joined`) may start nearer than the
     width and then press from the start.
 
-    Inputs with gradient: "self_contact_stiffness", "self_contact_width", or "<name>.stiffness", "<name>.width".
+    Inputs with gradient: "self_contact_stiffness", "self_contact_width", with friction "self_contact_friction_speed" and
+    "self_contact_friction", of a dict shape (pairs,); or "<name>.stiffness" and so on.
     One per scene. Implicit solvers keep surfaces apart on the whole way of every step; ImplicitMidpointSolver raises
     Tunnelling where the end of a step lies beyond a contact.
 
-    Raises ValueError for stiffness <= 0 or width <= 0 and, when a run starts, for a width beyond four mean edges of the
-    surface, for primitives that touch at rest, and for surfaces that touch or pass through each other. A substep in which
-    two primitives may have passed through each other raises Tunnelling.
+    Raises ValueError for stiffness, width or friction_speed <= 0, friction < 0, names that are no sets, sets of a dict that
+    share a vertex, and, when a run starts, for a width beyond four mean edges of the surface, for primitives that touch at
+    rest, and for surfaces that touch or pass through each other. A substep in which two primitives may have passed through
+    each other raises Tunnelling.
     Li et al. 2020, Incremental Potential Contact, doi:10.1145/3386569.3392425.
     """
 
-    def __init__(self, stiffness: float = 1e4, width: float = 1e-3, name: str | None = None):
+    def __init__(
+        self,
+        stiffness: float = 1e4,
+        width: float = 1e-3,
+        name: str | None = None,
+        friction: float | Mapping[tuple[str, str], float] = 0.0,
+        friction_speed: float = 1e-3,
+    ):
+        self.rubbing = tuple(friction) if isinstance(friction, Mapping) else None
+        speed = positive("friction_speed", friction_speed, "m/s", "self_contact_friction_speed")
+        value, shape = friction, ()
+        if self.rubbing is not None:
+            self._check_pairs(self.rubbing)
+            value, shape = [float(mu) for mu in friction.values()], (len(friction),)
+        mu = Input("friction", value, (shape,), "-", NOT_NEGATIVE, plain="self_contact_friction")
+        for described in (speed, mu):  # also of what is smooth
+            described.check_given("SelfContact")
+        self.has_friction = bool(np.any(mu.value > 0))
         super().__init__(
             positive("stiffness", stiffness, "N/m", "self_contact_stiffness"),
             positive("width", width, "m", "self_contact_width"),
+            *((speed, mu) if self.has_friction else ()),
             name=name,
         )
+
+    @staticmethod
+    def _check_pairs(pairs: tuple) -> None:
+        for pair in pairs:
+            if not (isinstance(pair, tuple) and len(pair) == 2 and all(isinstance(name, str) for name in pair)):
+                raise ValueError(
+                    f"SelfContact: friction needs pairs of names of sets, such as ('a', 'b'), got {pair!r}"
+                )
+            if pair[0] != pair[1] and pair[::-1] in pairs:
+                raise ValueError(
+                    f"SelfContact: friction has {pair!r} and {pair[::-1]!r}, which are one pair: name it once"
+                )
+
+    def check(self, mesh: TetrahedralMesh) -> None:
+        if self.has_friction:
+            self.labels(mesh)
+
+    def labels(self, mesh: TetrahedralMesh) -> tuple[np.ndarray, np.ndarray]:
+        """(a label of each surface vertex, which coefficient two labels have, or -1: shape (labels, labels))."""
+        label = np.zeros(mesh.num_vertices, int)
+        if self.rubbing is None:
+            return label[mesh.surface_vertices], np.zeros((1, 1), int)
+        names = sorted({name for pair in self.rubbing for name in pair})
+        for k, name in enumerate(names, start=1):
+            known = mesh.vertex_sets
+            members = known[name] if name in known else None
+            if members is None and name in mesh.tetrahedron_sets:
+                members = np.unique(mesh.elements[mesh.tetrahedron_sets[name]])
+            if members is None:
+                raise ValueError(
+                    f"SelfContact: friction names {name!r}, which is no set of vertices or tetrahedra of the mesh; it has "
+                    f"{sorted({*known, *mesh.tetrahedron_sets})}"
+                )
+            if np.any(label[members] > 0):
+                other, i = names[int(label[members].max()) - 1], int(members[label[members].argmax()])
+                raise ValueError(
+                    f"SelfContact: vertex {i} is in {other!r} and in {name!r}, and friction needs to know which it is; "
+                    "name sets that have no vertex in common"
+                )
+            label[members] = k
+        rows = np.full((len(names) + 1, len(names) + 1), -1)
+        for k, pair in enumerate(self.rubbing):
+            a, b = (names.index(name) + 1 for name in pair)
+            rows[a, b] = rows[b, a] = k
+        return label[mesh.surface_vertices], rows

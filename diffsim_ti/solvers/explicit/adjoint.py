@@ -1,7 +1,7 @@
 """The reverse sweep and the tangent of a chain of kick-drift passes, along recorded states."""
 
 import weakref
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from types import SimpleNamespace
 
 import numpy as np
@@ -132,7 +132,8 @@ class ExplicitAdjoint:
         launch = ws.bound(ws.kernels(self.features).step_vjp, state=states, adjoint=own, table=ws.table)
         run = dict(num_passes=num_passes, steps=self._steps, num_parts=self.num_parts)
         slot = numbers["first"] - base
-        with self._faces_of(slot + 1, kick) as alone:
+        rubs = ws.pairs.friction if ws.pairs and not kick else None
+        with self._rubbing(rubs, slot, numbers, num_passes), self._faces_of(slot + 1, kick) as alone:
             if alone:
                 if numbers["first"] < num_passes - 1:  # what comes first in the pass has to be there
                     self._gather(self)
@@ -147,6 +148,19 @@ class ExplicitAdjoint:
         if ws.pairs:
             ws.pairs.ensure(history.u, slot)
             ws.pairs.vjp(history.u, slot, self.w, self.corner)
+
+    @contextmanager
+    def _rubbing(self, friction, slot: int, numbers: dict, num_passes: int):
+        """Go back through the friction of surfaces on each other, and then through the pass without it."""
+        now = self.ws.numbers_of(numbers["first"], num_passes) if friction else None
+        if now is None or not now.alpha > 0:
+            yield
+            return
+        with friction.alone(self.ws.record, slot + 1):
+            pending = numbers["first"] < num_passes - 1
+            friction.slide_vjp(self.ws.record, slot, now, self, pending)
+            yield
+        friction.add_place(self)
 
     def _start_faces(self, alone, numbers: dict) -> None:
         """Go back through the contact of faces, whose impulse may be asked for."""
@@ -201,6 +215,11 @@ class ExplicitAdjoint:
             out.velocity += runtime.fetch(self.v)[0]
         if self.ws.pairs:
             out.parameters[self.ws.arrays.parameters_of_self_contact], rest = self.ws.pairs.collect()
+            if self.ws.pairs.friction:
+                by_mass, by_rate = self.ws.pairs.friction.collect_pass()
+                out.mass = out.mass + by_mass
+                if self.features.drag >= 0:
+                    out.parameters[self.features.drag] += by_rate
         if self.features.moving:
             path = runtime.fetch(self.path).astype(np.float64)
             out.path += path.reshape(len(path), self.features.moving, self.num_parts, 3).sum(2)
@@ -265,17 +284,31 @@ class ExplicitTangent:
             slot = numbers["first"] - first
             if ws.pairs:
                 ws.pairs.ensure(history.u, slot)
+                if ws.pairs.friction:
+                    ws.pairs.friction.begin_jvp(history, slot, self.u, self.numbers)
                 of_contact = self.tangent.parameters[a.parameters_of_self_contact]
                 ws.pairs.product(history.u, slot, self.u, a.corner, self.numbers.rest, of_contact)
             if ws.chambers:
                 ws.chambers.jvp(history, slot, numbers, self.u, self.numbers)
             alone = ws.faces.alone(history, slot + 1) if ws.faces else None
-            with nullcontext() if alone is None else alone:
+            with self._rubbing(slot, numbers, num_passes), nullcontext() if alone is None else alone:
                 if alone:
                     self.faces.start(alone, numbers)
                 launch(**numbers, base=first, rate_dot=self._rate_dot)
                 if alone:
                     self._end_faces(alone, numbers)
+
+    @contextmanager
+    def _rubbing(self, slot: int, numbers: dict, num_passes: int):
+        """The pass without friction of surfaces on each other, and then that."""
+        friction, history = self.ws.pairs.friction if self.ws.pairs else None, self.ws.record
+        now = self.ws.numbers_of(numbers["first"], num_passes) if friction else None
+        if now is None or not now.alpha > 0:
+            yield
+            return
+        with friction.alone(history, slot + 1):
+            yield
+            friction.slide_jvp(history, slot + 1, now, self._rate_dot, self.u, self.v, self.numbers)
 
     def _end_faces(self, alone, numbers: dict) -> None:
         """What faces do, whose impulse may be asked for."""

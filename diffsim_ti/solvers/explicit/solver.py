@@ -211,6 +211,12 @@ class ExplicitWorkspace(Workspace):
         rows = self.arrays.rows["follower"]
         return sum(w * self.solver.schedule.pressure(rows, *k) for w, k in self._kicks(j, num_passes))
 
+    def numbers_of(self, j: int, num_passes: int) -> SimpleNamespace:
+        """h [s] of pass j, and its weights as numbers."""
+        weights = vars(self.solver.weights(np.array([j]), num_passes, self.rate))
+        numbers = {name: float(np.ravel(x)[0]) for name, x in weights.items()}
+        return SimpleNamespace(h=float(self.solver.schedule.length(j)), **numbers)
+
     def kernels(self, features) -> ExplicitKernels:
         """The kernels for some features of the scene."""
         return explicit_kernels(self.arrays.law, features, self.parallel, self.arrays.in_lanes, self.repeated)
@@ -254,11 +260,15 @@ class ExplicitWorkspace(Workspace):
         launch = self.bound(step, state=states, table=self.table)
         if pairs:
             pairs.ensure(history.u, (first - base) * stride)
+            if recording and pairs.friction:
+                pairs.friction.keep(history.num_slots)
         most = self.most_passes(self.arrays.num_tetrahedra)
         for numbers in self.launches(first, last, num_passes, save_every, most):
             slot = (numbers["first"] - base) * stride
             if pairs:
                 pairs.forces(history.u, slot, self.arrays.corner)
+                if pairs.friction:
+                    pairs.friction.measure(history.u, slot)
             if self.chambers:
                 self.chambers.forces(history, slot, numbers)
             if self.faces:
@@ -269,6 +279,10 @@ class ExplicitWorkspace(Workspace):
                 if change is not None:
                     self.impulses.add(numbers, change)
             if pairs:
+                if pairs.friction:
+                    pairs.friction.slide(
+                        history, slot + stride, self.numbers_of(numbers["first"], num_passes), recording
+                    )
                 try:
                     pairs.check_pass(history.u, slot + stride, float(self.solver.schedule.length(numbers["first"])))
                 except Tunnelling as error:

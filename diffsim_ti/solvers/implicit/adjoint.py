@@ -147,6 +147,10 @@ class ImplicitAdjoint(RecordedPasses):
         if ws.potential.faces:
             reaction = reaction + self._vjp_of_faces()
         reaction = reaction + by_contacts
+        by_x, by_lag = 0.0, np.zeros_like(p)
+        if ws.potential.rubbing:
+            by_place, by_x, by_lag = ws.potential.rubbing.vjp(ws.potential.held_at, by_star)
+            reaction = reaction + by_place
         if ws.attached:
             reaction = reaction + ws.attached.vjp(ws.potential.held_at, by_star, self.attached, *ws.time_of(j, s))
         share = ws.load_share(j, s)
@@ -166,11 +170,10 @@ class ImplicitAdjoint(RecordedPasses):
         inertial = self.mass * by_star
         if self.element_masses is not None:
             reaction = reaction - inertial  # held vertices are felt by their neighbours' inertia too
-        x_adj = inertial - s.e0 / s.gamma * q_free
-        by_lag, by_begin = np.zeros_like(p), 0.0
+        x_adj, by_begin = inertial - s.e0 / s.gamma * q_free + by_x, 0.0
         if ws.potential.has_friction:
-            by_lag, by_x = runtime.fetch(self.lag).astype(np.float64) + (0.0 if seen is None else seen[1])
-            x_adj = x_adj + by_x
+            by_first, by_x = runtime.fetch(self.lag).astype(np.float64) + (0.0 if seen is None else seen[1])
+            by_lag, x_adj = by_lag + by_first, x_adj + by_x
         if self._by_pressed:
             by_pressed = runtime.fetch(self.pressed).astype(np.float64) + (0.0 if seen is None else seen[2])
             by_place, by_begin = self._by_pressed.pull_back(by_pressed)

@@ -65,6 +65,10 @@ class ImplicitTangent(RecordedPasses):
         place, speed = ws.prescribed(j, tangent)
         now = self.du[a.held]
         held = ws.with_held(np.zeros_like(self.du), now if place is None else now + (place - now) / s.c0)
+        rubbing, rubbed = ws.potential.rubbing, 0.0
+        if rubbing:
+            rubbed = rubbing.jvp(ws.potential.held_at, held, dx, self.du, self.numbers)
+            ws.potential.place(self.u_star)
         runtime.fill(ws.potential.w, held[None])
         if ws.potential.has_friction:
             runtime.fill(self.lag, np.stack([self.du, dx]))
@@ -87,6 +91,7 @@ class ImplicitTangent(RecordedPasses):
         self._jvp(**ws.potential.sizes())
         share = ws.load_share(j, s)
         dR = runtime.fetch(ws.potential.y)[0].astype(np.float64) + self.mass_dot * self.weight(share)
+        dR += rubbed
         if ws.potential.faces:
             dR += self._jvp_of_faces()
         if a.features().gravity >= 0:

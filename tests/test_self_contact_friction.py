@@ -1,0 +1,232 @@
+"""Friction of surfaces on each other: slopes, energy, momentum, gradients, coefficients of pairs of sets, refusals."""
+
+from functools import lru_cache
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import diffsim_ti as ds
+from diffsim_ti import runtime, verify
+
+SLOPE, G = 0.5, 9.81
+EXPLICIT = (ds.SemiImplicitSolver, ds.VelocityVerletSolver)
+IMPLICIT = (ds.ImplicitEulerSolver, ds.BDF2Solver, ds.ImplicitMidpointSolver)
+
+
+# ---- on a slope ------------------------------------------------------------------------------------------------------
+
+
+def on_slope(friction, start=None, drag=0.0, friction_speed=1e-3):
+    """A soft slab on a soft board of tan = 1/2, whose underside is held; the slope is down the x axis."""
+    board = ds.TetrahedralMesh.create_box((2, 2, 2), size=(0.9, 0.1, 0.4))
+    slab = ds.TetrahedralMesh.create_box((2, 2, 2), size=(0.2, 0.06, 0.2)).translated([0.15, 0.103, 0.11])
+    angle = np.arctan(SLOPE)
+    gravity = G * np.array([np.sin(angle), -np.cos(angle), 0])
+    contact = ds.SelfContact(1e4, 4e-3, friction=friction, friction_speed=friction_speed)
+    terms = [ds.Gravity(gravity), contact] + ([ds.Drag(drag)] if drag else [])
+    scene = ds.Scene(
+        ds.TetrahedralMesh.joined([board, slab]),
+        ds.KelvinVoigt(ds.StableNeoHookean(1e6, 0.3), time=2e-3),
+        1000.0,
+        terms,
+        fixed=np.flatnonzero(board.vertices[:, 1] == 0),
+        initial_positions=start,
+        precision="f64",
+    )
+    return scene, float(gravity[0] - friction * -gravity[1])
+
+
+def went(solver, dt, scene, steps):
+    """Frames of a run, and how far the slab goes [m]."""
+    frames = ds.Rollout(solver(scene, dt=dt), steps, gradients=[]).forward()
+    return frames, (frames.positions[-1] - frames.positions[0])[8:].mean(0)[0]
+
+
+@lru_cache
+def settled():
+    """The slab at rest in the barrier, with the friction that just holds it."""
+    return went(ds.ImplicitEulerSolver, 1e-2, on_slope(SLOPE, drag=30.0)[0], 60)[0].positions[-1]
+
+
+@pytest.mark.parametrize("solver, dt", [(ds.SemiImplicitSolver, 2.5e-4), (ds.BDF2Solver, 4e-3)])
+def test_slope(solver, dt):
+    """.51 holds, .49 slides, .3 slides as far as Coulomb's law says."""
+    steps = round(0.3 / dt)
+    end = steps * dt
+    assert 0 <= went(solver, dt, on_slope(0.51, settled())[0], steps)[1] <= 1e-3 * end
+    scene, down = on_slope(0.49, settled())
+    assert went(solver, dt, scene, steps)[1] > 0.9 * (0.5 * down * end**2)
+    scene, down = on_slope(0.3, settled())
+    np.testing.assert_allclose(went(solver, dt, scene, steps)[1], 0.5 * down * end**2, rtol=0.02)
+
+
+# ---- energy and momentum ---------------------------------------------------------------------------------------------
+
+
+def bodies(turn=0.1):
+    """Two tetrahedra that meet edge across edge, a little askew."""
+    corners = np.array([[-0.05, 0, 0], [0.05, 0, 0], [0, -0.08, -0.05], [0, -0.08, 0.05]])
+    lower = ds.TetrahedralMesh(corners, [[0, 1, 2, 3]], fix_orientation=True)
+    upper = lower.rotated([1, 0, 1], np.pi).rotated([1, 0.3, 0.2], turn).translated([0.01, 7e-3, 0.005])
+    mesh = ds.TetrahedralMesh.joined([lower, upper])
+    sets = mesh.vertex_sets | {"rail": [6], "rest": [7]}
+    return ds.TetrahedralMesh(mesh.vertices, mesh.tetrahedra, vertex_sets=sets)
+
+
+def rubbing(friction=0.4, terms=(), precision="f64", material=None, **options):
+    """They meet and rub: the upper one comes down and sidewards."""
+    velocity = np.zeros((8, 3))
+    velocity[4:] = [0.5, -3.0, 0.2]
+    contact = ds.SelfContact(2e4, 5e-3, friction=friction, friction_speed=0.05)
+    material = ds.StableNeoHookean(5e4, 0.3) if material is None else material
+    return ds.Scene(
+        bodies(), material, 1000.0, [contact, *terms], initial_velocities=velocity, precision=precision, **options
+    )
+
+
+@pytest.mark.parametrize("solver", EXPLICIT)
+def test_momentum(solver):
+    """Linear momentum is kept to round-off; friction takes energy that goes nowhere else."""
+    simulators = [ds.Simulator(solver(rubbing(mu), dt=1e-4)) for mu in (0.0, 0.4)]
+    kinetic = []
+    for simulator in simulators:
+        mass, before = simulator._start.mass[:, None], simulator.velocities
+        simulator.run(80)
+        after = simulator.velocities
+        assert np.abs((mass * (after - before)).sum(0)).max() <= 1e-13 * (mass * np.abs(before)).sum()
+        kinetic.append(simulator.compute_energy())
+    assert kinetic[1] < 0.999 * kinetic[0]
+
+
+def test_energy_never_grows_by_the_stage():
+    """Whatever the velocities, the length of a pass, the coefficient and the friction speed."""
+    low, up = (ds.TetrahedralMesh.create_box((3, 2, 3), size=(0.1, 0.05, 0.1)).rotated([0, 1, 0], a) for a in (0, 0.4))
+    mesh = ds.TetrahedralMesh.joined([low, up.translated([0.01, 0.053, 0.02])])
+    rng, lost = np.random.default_rng(3), []
+    for mu, eps in ((1e-2, 1e-5), (0.5, 1.0), (1e3, 1e-3)):
+        contact = ds.SelfContact(1e4, 5e-3, friction=mu, friction_speed=eps)
+        scene = ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3), 1000.0, [contact], fixed=[0], precision="f64")
+        ws = ds.Simulator(ds.SemiImplicitSolver(scene, dt=1e-5)).workspace
+        pairs, mass = ws.pairs, ws.arrays.values.mass
+        pairs.forces(ws.state.u, 0, ws.arrays.corner)
+        pairs.friction.measure(ws.state.u, 0)
+        for h in (1e-7, 1e-4, 1.0):
+            v = rng.normal(size=(1, mesh.num_vertices, 3)) * 10.0 ** rng.uniform(-3, 1)
+            v[0, 0] = 0
+            runtime.fill(ws.state.v, v)
+            pairs.friction.slide(ws.state, 0, SimpleNamespace(h=h, alpha=h, decay=1.0), recording=False)
+            after = runtime.fetch(ws.state.v)
+            before, now = (0.5 * float((mass[:, None] * x[0] ** 2).sum()) for x in (v, after))
+            assert now <= before * (1 + 1e-14)
+            lost.append(1 - now / before)
+    assert max(lost) > 0.1 and min(lost) < 1e-3
+
+
+# ---- gradients -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("solver", EXPLICIT)
+def test_tangent_and_adjoint_agree(solver):
+    rollout = ds.Rollout(solver(rubbing(terms=[ds.Drag(2.0)]), dt=1e-4), 60, save_every=20, gradients="all")
+    assert verify.dot_product_test(rollout) <= 1e-13
+
+
+@pytest.mark.parametrize("solver", IMPLICIT)
+def test_tangent_and_adjoint_of_implicit_steps_agree(solver):
+    scene = rubbing(terms=[ds.Drag(2.0)])
+    rollout = ds.Rollout(solver(scene, dt=5e-4, tolerance=1e-12), 12, save_every=4, gradients="all")
+    assert verify.dot_product_test(rollout) <= 1e-9
+
+
+NAMES = ["initial_positions", "self_contact_friction", "self_contact_friction_speed"]
+MORE = ["self_contact_width", "self_contact_stiffness", "density", "drag_rate", "rest_positions"]
+
+
+@pytest.mark.parametrize(
+    "solver, dt, names", [(ds.SemiImplicitSolver, 1e-4, NAMES + MORE), (ds.ImplicitEulerSolver, 5e-4, NAMES)]
+)
+def test_gradients(solver, dt, names):
+    options = dict(tolerance=1e-12) if solver in IMPLICIT else {}
+    made = solver(rubbing(terms=[ds.Drag(2.0)]), dt=dt, **options)
+    assert ds.check_gradients(ds.Rollout(made, round(4e-3 / dt), gradients=names)).passed
+
+
+@pytest.mark.parametrize("solver, dt, tolerance", [(ds.VelocityVerletSolver, 1e-4, 1e-13), (ds.BDF2Solver, 5e-4, 1e-9)])
+def test_with_everything_else(solver, dt, tolerance):
+    """An obstacle that rubs too, what is held in one direction or moves, a law of rates, two coefficients."""
+    ground = ds.Ground(height=-0.088, stiffness=2e4, width=0.01, friction=0.3, path=lambda t: [t, 0, 0])
+    friction = {("body_0", "body_1"): 0.4, ("body_0", "body_0"): 0.1}
+    scene = rubbing(
+        friction,
+        terms=[ds.Drag(2.0), ground],
+        material=ds.KelvinVoigt(ds.StableNeoHookean(5e4, 0.3), time=1e-3),
+        fixed={"rail": [0.1, 0.3, 1.0], "rest": "xyz"},
+        motion={"rail": lambda t: [0.3 * t, 0.5 * t, t], "rest": lambda t: [0.1 * t, 0, 0]},
+    )
+    rollout = ds.Rollout(
+        solver(scene, dt=dt, tolerance=1e-12) if solver in IMPLICIT else solver(scene, dt=dt),
+        round(5e-3 / dt),
+        gradients="all",
+    )
+    assert rollout.values["self_contact_friction"].shape == (2,)
+    assert verify.dot_product_test(rollout) <= tolerance
+
+
+# ---- pairs of sets, threads, checkpoints, refusals -------------------------------------------------------------------
+
+
+def end_of(friction, **options):
+    solver = ds.SemiImplicitSolver(rubbing(friction), dt=1e-4, **{k: v for k, v in options.items() if k == "parallel"})
+    own = {k: v for k, v in options.items() if k != "parallel"}
+    return ds.Rollout(solver, 60, gradients="all", **own)
+
+
+def test_pairs_of_sets():
+    """Pairs that are named rub as they would alone; others do not."""
+    ends = {}
+    for friction in (0.0, 0.4, {("body_0", "body_1"): 0.4}, {("body_1", "body_1"): 0.4, ("body_0", "body_1"): 0.0}):
+        ends[str(friction)] = end_of(friction).forward().positions[-1]
+    none, both, named, others = ends.values()
+    np.testing.assert_array_equal(both, named)
+    np.testing.assert_array_equal(none, others)
+    assert np.abs(none - both).max() > 1e-5
+
+
+def test_threads_and_checkpoints_do_not_change_a_bit():
+    frames, gradients = [], []
+    for options in ({}, dict(parallel=True), dict(checkpoint_every=7)):
+        rollout = end_of(0.4, **options)
+        frames.append(rollout.forward())
+        adjoints = np.random.default_rng(1).normal(size=(2, *frames[0].positions.shape))
+        gradients.append(rollout.vjp(frames[-1], *adjoints))
+        np.testing.assert_array_equal(frames[-1].positions, frames[0].positions)
+    for name, expected in gradients[0].items():
+        np.testing.assert_array_equal(gradients[2][name], expected, err_msg=name)
+
+
+def test_single_precision():
+    rollout = ds.Rollout(ds.SemiImplicitSolver(rubbing(precision="f32"), dt=1e-4), 60, gradients="all")
+    np.testing.assert_allclose(rollout.forward().positions[-1], end_of(0.4).forward().positions[-1], atol=2e-6)
+    assert verify.dot_product_test(rollout) <= 2e-5
+
+
+@pytest.mark.parametrize(
+    "options, words",
+    [
+        (dict(friction=-0.1), "friction.*must be one number >= 0"),
+        (dict(friction=0.1, friction_speed=0.0), "friction_speed.*must be > 0"),
+        (dict(friction={"palm": 0.1}), "pairs of names of sets"),
+        (dict(friction={("a", "b"): 0.1, ("b", "a"): 0.2}), "name it once"),
+    ],
+)
+def test_wrong_numbers(options, words):
+    with pytest.raises(ValueError, match=words):
+        ds.SelfContact(1e4, 5e-3, **options)
+
+
+def test_wrong_sets():
+    with pytest.raises(ValueError, match="'palm', which is no set of vertices or tetrahedra of the mesh; it has"):
+        rubbing({("palm", "body_0"): 0.5})
+    with pytest.raises(ValueError, match="vertex 6 is in 'body_1' and in 'rail'"):
+        rubbing({("rail", "body_1"): 0.5})
