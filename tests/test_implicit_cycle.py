@@ -129,9 +129,7 @@ def squashed(height: float, **more) -> ds.StaticSolver:
         return out
 
     material = ds.StableNeoHookean(1e5, 0.499)
-    scene = ds.Scene(
-        mesh, material, 1000.0, [], fixed=held, motion=motion, volume="patches", precision="f64"
-    )
+    scene = ds.Scene(mesh, material, 1000.0, [], fixed=held, motion=motion, volume="patches", precision="f64")
     return ds.StaticSolver(scene, **more)
 
 

@@ -9,7 +9,7 @@ from functools import cached_property
 
 import taichi as ti
 
-from diffsim_ti.runtime import LANES, PRECISIONS, Bundle, assign, at, let, traced
+from diffsim_ti.runtime import LANES, PRECISIONS, Bundle, assign, at, let, traced, variable
 from diffsim_ti.solvers.explicit.given_forces import GivenForces
 from diffsim_ti.state.features import Features
 
@@ -187,7 +187,8 @@ class FreeVertices:
     def lane_groups(self) -> tuple:
         """Obstacles whose distance can be told in lanes; none if one cannot."""
         staged = self.features.staged
-        return staged if len(staged) == len(self.features.groups) and all(g.force.lanes for g in staged) else ()
+        told = len(staged) == len(self.features.groups) and all(g.force.lanes and not g.force.turns for g in staged)
+        return staged if told else ()
 
     @ti.func
     def hits(self, i, b, moved: A, now: A, scene: A, plan: A):
@@ -290,7 +291,7 @@ class FreeVertices:
             v_plus = [let(x / now.decay) for x in self.read(state.v, let(s + 1), first)]
             by_rate = now.alpha_by_rate * self.dot(p, v_plus) + now.decay_by_rate * self.dot(q, v_plus)
             self.add_number(adjoint.sums, let(by_rate), F.drag, n)
-        v_mid_adj = [let(x) for x in v_plus_adj]
+        p, v_mid_adj = ([variable(x) for x in y] for y in (p, v_plus_adj))
         self.add_frame(now, p, v_mid_adj, adjoint, first)
         a_adj = [let(now.post * x + now.pre_adj * y) for x, y in zip(v_plus_adj, v_mid_adj)]
         inverse = self.inverse_mass(i, b, scene, plan)

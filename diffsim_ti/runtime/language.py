@@ -22,6 +22,11 @@ def let(value):
     return out
 
 
+def variable(value):
+    """A local variable of its own, to be assigned to."""
+    return impl.expr_init(value)
+
+
 def at(array, *index):
     """array[index] in a traced function."""
     return impl.subscript(None, array, *index)

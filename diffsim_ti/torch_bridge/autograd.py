@@ -14,11 +14,11 @@ except ImportError as error:
 
 def uncompiled(function):
     """Decorate what reads tensors' numbers: torch.compile breaks its graph there, and what is called runs as it is."""
-    apart = torch._disable_dynamo(function)  # loads, when called, what torch.compile has loaded anyway
-
     @wraps(function)
     def called(*arguments, **named):
-        return (apart if torch.compiler.is_compiling() else function)(*arguments, **named)
+        if torch.compiler.is_compiling():  # asked first: `disable` would load a compiler that nobody needs
+            return torch.compiler.disable(function)(*arguments, **named)
+        return function(*arguments, **named)
 
     return called
 
