@@ -1,5 +1,8 @@
 """What stands around a body: a scene's floor, its obstacles as triangles to draw, and simple shapes."""
 
+from collections.abc import Mapping
+from types import MappingProxyType
+
 import numpy as np
 
 from diffsim_ti.scene import Scene
@@ -15,15 +18,16 @@ def floor_of(scene: Scene) -> float | None:
     return next((height for height in heights if height is not None), None)
 
 
-def obstacle_surfaces(scene: Scene, time: float = 0.0) -> list[Triangles]:
+def obstacle_surfaces(scene: Scene, time: float = 0.0, rows: Mapping = MappingProxyType({})) -> list[Triangles]:
     """(points [m], shape (k, 3), triangles) of each obstacle of a scene at `time` [s] that has a surface to draw.
 
     Floors that do not turn have none: they are drawn as a plane without end. Each shape says what it looks like
-    (`Obstacle.surface`).
+    (`Obstacle.surface`). rows: {name of a path's input: its row at that time}, where a run was given one.
     """
     out, size = [], float(np.ptp(scene.mesh.bounding_box, 0).max())
+    given = {term: rows[name] for name, term in zip(scene.inputs.paths, scene.moving) if name in rows}
     for term in scene.terms:
-        shape = term.surface_at(size, time) if isinstance(term, Obstacle) else None
+        shape = term.surface_at(size, time, given.get(term)) if isinstance(term, Obstacle) else None
         if shape is not None:
             out.append(shape)
     return out

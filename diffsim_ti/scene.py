@@ -103,9 +103,7 @@ class Scene:
         self.terms = tuple([terms] if isinstance(terms, Term) else listed("terms", terms, "terms such as Gravity()"))
         self.supports = Supports(mesh, fixed)
         self.fixed, self.held = self.supports.fixed, self.supports.vertices  # in all directions; in some
-        self.motion, self.clamps = motion, self.supports.clamps(motion)
-        parts = motion.values() if isinstance(motion, Mapping) else [motion]
-        self.translates = motion is not None and not all(isinstance(m, Pose) for m in parts)  # by what is no pose
+        self.motion, (self.clamps, self.translates) = motion, self.supports.parts_of(motion)
         self._check_terms()
         self._given = self.terms
         settled = (t.settled(self, density, initial_positions, initial_velocities) for t in self.terms)

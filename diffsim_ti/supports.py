@@ -83,8 +83,12 @@ class Supports:
             return np.tile(np.linalg.pinv(directions, rcond=1e-6) @ directions, (len(vertices), 1, 1))
         return self.held[np.searchsorted(self.vertices, vertices)]
 
-    def clamps(self, motion) -> list[tuple[Clamp, Pose]]:
-        """What of a motion is a pose."""
+    def parts_of(self, motion: Motion | Pose | Mapping | None) -> tuple[list[tuple[Clamp, Pose]], bool]:
+        """What of a motion is a pose, and whether there is anything else."""
+        parts = motion.values() if isinstance(motion, Mapping) else [motion]
+        return self._clamps(motion), motion is not None and not all(isinstance(own, Pose) for own in parts)
+
+    def _clamps(self, motion) -> list[tuple[Clamp, Pose]]:
         if isinstance(motion, Pose):
             every = np.arange(len(self.vertices))
             one = np.tile(np.eye(3), (len(every), 1, 1))
@@ -98,7 +102,7 @@ class Supports:
                 out.append((Clamp(*names, self.vertices[places], places, projectors), own))
         return out
 
-    def rows(self, motion: Motion | Mapping[str, Motion], times: ArrayLike) -> np.ndarray:
+    def rows(self, motion: Motion | Pose | Mapping[str, Motion | Pose], times: ArrayLike) -> np.ndarray:
         """Prescribed displacements at each time [s], shape (len(times), k, 3) [m]; others stay.
 
         Raises ValueError where two sets want different motions of one vertex in one direction.

@@ -37,6 +37,15 @@ class Walls:
         self.size = 3 * len(obstacles) + MORE * len(turning)
         self.place_of = {k: row // 3 for (k, _), (row, _) in zip(turning, self.turning)}  # of obstacle k among places
 
+    def check(self, path: np.ndarray | None, at: Moment) -> None:
+        """Raise ValueError for a pass in which an obstacle turns farther than its way is looked at."""
+        for _, c in self.turning:
+            most = np.linalg.norm(path[at.schedule.row_of(path, at.j), c + 2]) * (at.schedule.end(at.j) - at.begin)
+            if most > 3.1:
+                raise ValueError(
+                    f"an obstacle turns by {most:.3g} rad in a pass, which must be less than half a turn: take smaller steps"
+                )
+
     def value(self, path: np.ndarray | None, at: Moment | None) -> np.ndarray:
         """The rows, shape (size, 3); without a path all zero."""
         out = np.zeros((self.size, 3))

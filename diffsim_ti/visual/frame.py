@@ -84,7 +84,9 @@ class Frame:
         step = int(frames.steps[k])
         shown |= _loads(scene, frames.positions[k], step, frames.inputs)
         drawn = marks_of(scene, frames.positions[k], float(frames.times[k]), step, frames.inputs)
-        moved = [points for points, _ in obstacle_surfaces(scene, float(frames.times[k]))] if scene.moving else None
+        rows = {name: frames.inputs[name][step] for name in scene.inputs.paths if name in frames.inputs}
+        surfaces = obstacle_surfaces(scene, float(frames.times[k]), rows)
+        moved = [points for points, _ in surfaces] if scene.moving else None
         return cls(float(frames.times[k]), frames.positions[k], u, v, fields | shown, moved, drawn, units)
 
     @classmethod

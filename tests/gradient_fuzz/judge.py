@@ -29,7 +29,7 @@ SINGLE = (2e-4, 2e-3)
 ROUNDING = {"f64": 1e-12, "f32": 1e-4}  # a derivative this much smaller than the largest of a configuration is rounding
 TINY = {"f64": 1e-16, "f32": 1e-8}  # what is left of terms that cancel, against the same
 REFUSALS = (ValueError, FloatingPointError, RuntimeError)
-LENGTHS = ("_positions", "_motion", "_path", "_center", "_point", "_start", "_end", "_position", "_height")
+LENGTHS = ("_positions", "_motion", "_path", "_center", "_point", "_about", "_start", "_end", "_position", "_height")
 
 
 @dataclass

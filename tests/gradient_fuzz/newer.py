@@ -1,4 +1,4 @@
-"""What joins configurations by draws of its own: steps of unequal length, scaled masses, muscles, growth."""
+"""What joins configurations by draws of its own: steps of unequal length, scaled masses, muscles, growth, poses."""
 
 import numpy as np
 
@@ -43,3 +43,25 @@ def grown(kind, seed: int, law, mesh):
         return law
     rng = np.random.default_rng([29, seed])
     return ds.Grown(law, rng.uniform(-0.01, 0.02, () if rng.random() < 0.5 else mesh.num_tetrahedra))
+
+
+def pose(kind, seed: int, number: int, path, x, duration: float) -> dict:
+    """Arguments of obstacle `number` that follows a path: in two fifths of the structures it turns too, about a point near
+    the points x, by rotation vectors or quaternions."""
+    if path is None or np.random.default_rng([30, kind.number]).random() > 0.4:
+        return dict(path=path)
+    rng, size = np.random.default_rng([31, seed, number]), 0.1
+    about = x[rng.integers(len(x))] + 0.1 * np.ptp(x, 0).max() * rng.standard_normal(3)
+    vectors, start = rng.random() < 0.5, np.array([1.0, 0, 0, 0]) * rng.uniform(0.5, 2.0)
+    a, b = size * rng.standard_normal((2, 3))
+
+    def turns(rotation):
+        # the start plus a pure quaternion of half the rotation, of a length that is not one
+        return rotation if vectors else start + start[0] * np.concatenate([[0.0], 0.5 * rotation])
+
+    if not callable(path):
+        times, places = path
+        return dict(path=(times, np.array([[*p, *turns(k * a + k**2 * b)] for k, p in enumerate(places)])), about=about)
+    return dict(
+        path=lambda t: np.concatenate([path(t), turns(a * np.sin(2 * t / duration) + b * t / duration)]), about=about
+    )

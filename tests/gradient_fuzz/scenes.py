@@ -58,9 +58,10 @@ def smooth_path(rng, size: float, duration: float):
 
 
 def path_at(path, t: float) -> np.ndarray:
+    """The displacement alone."""
     if callable(path):
-        return np.asarray(path(t))
-    return np.array([np.interp(t, path[0], column) for column in path[1].T])
+        return np.asarray(path(t))[:3]
+    return np.array([np.interp(t, path[0], column) for column in path[1].T[:3]])
 
 
 def material(kind: Structure, rng, mesh):
@@ -124,7 +125,7 @@ def build(seed: int, precision: str | None = None) -> Configuration:
     mass = np.bincount(mesh.elements.ravel(), np.outer(density * mesh.volumes, mesh.reference.lumped).ravel())
     beat = 2e-3 if kind.static else dt / substeps if kind.explicit else duration / 25
     stiff = mass.min() * (rng.uniform(0.15, 0.4) / beat) ** 2 / 35  # omega dt at a fifth of the width
-    placed, paths, push = _obstacles(kind, rng, mesh, start, fixed, stiff, duration)
+    placed, paths, push = _obstacles(kind, seed, rng, mesh, start, fixed, stiff, duration)
 
     terms = [p.term for p in placed]
     if kind.gravity:
@@ -201,7 +202,7 @@ def _schedule(kind, rng, mesh, E, density, bent) -> tuple[int, int, float]:
     return steps, substeps, float(5 * substep * substeps)
 
 
-def _obstacles(kind, rng, mesh, start, fixed, stiff, duration) -> tuple[list, list, np.ndarray]:
+def _obstacles(kind, seed, rng, mesh, start, fixed, stiff, duration) -> tuple[list, list, np.ndarray]:
     """(obstacles, their paths, the direction in which the first of them pushes)."""
     free = np.setdiff1d(np.arange(len(start)), [] if fixed is None else fixed)
     placed, paths, push = [], [], None
@@ -227,8 +228,9 @@ def _obstacles(kind, rng, mesh, start, fixed, stiff, duration) -> tuple[list, li
             typical = 0.05 * CELL / duration
             options |= dict(friction=rng.uniform(0.1, 0.8), friction_speed=typical * 10 ** rng.uniform(-1.0, 0.8))
         path = smooth_path(rng, 0.05 * CELL, duration) if o.path else None
-        placed.append(place(o, rng, start, n, width, options | dict(path=path), below))
-        paths.append(path)
+        moved = newer.pose(kind, seed, len(placed), path, start, duration)
+        placed.append(place(o, rng, start, n, width, options | moved, below))
+        paths.append(moved["path"])
     return placed, paths, rng.standard_normal(3) if push is None else push
 
 

@@ -307,6 +307,7 @@ class ImplicitWorkspace(ObstacleWays, Noted, GivenInPasses, Workspace):
 
     def begin(self, j: int, stage: Stage, u: np.ndarray, x: np.ndarray) -> None:
         """Tell the potential where obstacles are in pass j and where friction is measured from."""
+        self.arrays.walls.check(self.arrays.rows["path"], self.moment(j, stage))
         self._walls = self.walls(self.arrays.rows["path"], j, stage)
         self.walls_at_stage, self.walls_before = self._walls[::3].copy(), self._walls[1::3].copy()
         self.potential.begin(u, x, 1 / stage.gamma, self._walls)

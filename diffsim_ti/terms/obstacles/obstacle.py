@@ -187,12 +187,12 @@ class Obstacle(Term):
         """
         return None
 
-    def surface_at(self, size: float, time: float) -> Triangles | None:
-        """`surface` where its path has taken it at a time [s]."""
+    def surface_at(self, size: float, time: float, row: np.ndarray | None = None) -> Triangles | None:
+        """`surface` where its path has taken it at a time [s], or a row of its path."""
         shape = self.surface(size)
         if shape is None or self.path is None:
             return shape
-        row = sampled_path(self.path_name, self.path, [time])[0]
+        row = sampled_path(self.path_name, self.path, [time])[0] if row is None else row
         return carried(shape[0], row, self.about), shape[1]
 
     def floor_height(self) -> float | None:
