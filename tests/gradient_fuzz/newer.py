@@ -1,4 +1,4 @@
-"""What joins configurations by draws of its own: steps of unequal length, scaled masses, muscles, growth, surfaces that rub."""
+"""What joins configurations by draws of its own: unequal steps, scaled masses, muscles, growth, surfaces that rub."""
 
 import numpy as np
 
