@@ -111,7 +111,9 @@ def chart(
 
 
 def stability(
-    axis: Annotated[str, typer.Argument(help="stiffness, nu, impact, quality, compression, viscosity, or all")] = "all",
+    axis: Annotated[
+        str, typer.Argument(help="stiffness, nu, impact, quality, compression, viscosity, friction, or all")
+    ] = "all",
     solver: Annotated[list[str] | None, typer.Option(help="class name; may be repeated; default all")] = None,
     output: Folder = Path("output/stability"),
     quick: Quick = False,

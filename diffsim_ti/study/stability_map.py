@@ -14,7 +14,7 @@ from diffsim_ti.simulator import Simulator
 from diffsim_ti.solvers import SOLVERS
 from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.solvers.stable_step import start_workspace
-from diffsim_ti.terms import Ground, Term
+from diffsim_ti.terms import Ground, SelfContact, Term
 from diffsim_ti.terms.obstacles.obstacle import Obstacle
 from diffsim_ti.terms.obstacles.stiffness import stiffness_of_impact
 
@@ -78,6 +78,17 @@ def viscous(ratio: float) -> Scene:
     return body(viscous_time=ratio * power_limit(body()))
 
 
+def rubbing(friction: float) -> Scene:
+    """A soft cube that comes down askew on another one and slides on it, as far as they rub."""
+    mesh = TetrahedralMesh.create_box(3, 0.2, "five")
+    velocity = 0.05 * np.random.default_rng(0).standard_normal((2 * mesh.num_vertices, 3))
+    velocity[mesh.num_vertices :] += [1.0, -0.5, 0.2]
+    upper = mesh.rotated([0, 1, 0], 0.3, center=(0.1, 0.1, 0.1)).translated((0.03, 0.206, 0.02))
+    contact = SelfContact(1e3, 5e-3, friction=friction, friction_speed=0.01)
+    both, material = TetrahedralMesh.joined([mesh, upper]), SmithNeoHookean(1e5, 0.3)
+    return Scene(both, material, 1000.0, [contact], initial_velocities=velocity, precision="f64")
+
+
 AXES = {
     "stiffness": Axis("Young's modulus", "Pa", tuple(10.0 ** np.arange(3, 8.1, 1.0)), lambda E: body(E=E)),
     "nu": Axis(
@@ -94,6 +105,7 @@ AXES = {
         "stretch at the start", "-", (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3), lambda s: body(squeeze=s)
     ),
     "viscosity": Axis("damping ratio of the fastest motion", "-", (0.01, 0.1, 0.3, 1.0, 3.0, 20.0), viscous),
+    "friction": Axis("friction of soft on soft", "-", (0.0, 0.1, 0.3, 0.6, 1.0, 10.0), rubbing),
 }
 
 

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from diffsim_ti.checked import numbers
 from diffsim_ti.inputs import NOT_NEGATIVE, Input
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.terms.described import positive
@@ -56,11 +57,12 @@ class SelfContact(Term):
         friction_speed: float = 1e-3,
     ):
         self.rubbing = tuple(friction) if isinstance(friction, Mapping) else None
+        numbers("friction_speed", 0.0 if hasattr(friction_speed, "detach") else friction_speed)
         speed = positive("friction_speed", friction_speed, "m/s", "self_contact_friction_speed")
-        value, shape = friction, ()
+        value, shape = numbers("friction", friction) if friction is None else friction, ()
         if self.rubbing is not None:
             self._check_pairs(self.rubbing)
-            value, shape = [float(mu) for mu in friction.values()], (len(friction),)
+            value, shape = numbers("friction", list(friction.values())), (len(friction),)
         mu = Input("friction", value, (shape,), "-", NOT_NEGATIVE, plain="self_contact_friction")
         for described in (speed, mu):  # also of what is smooth
             described.check_given("SelfContact")

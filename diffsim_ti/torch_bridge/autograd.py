@@ -14,6 +14,7 @@ except ImportError as error:
 
 def uncompiled(function):
     """Decorate what reads tensors' numbers: torch.compile breaks its graph there, and what is called runs as it is."""
+
     @wraps(function)
     def called(*arguments, **named):
         if torch.compiler.is_compiling():  # asked first: `disable` would load a compiler that nobody needs

@@ -1,10 +1,11 @@
-"""What joins configurations by draws of its own: steps of unequal length, scaled masses, muscles, growth, poses."""
+"""What joins configurations by draws of its own: unequal steps, scaled masses, muscles, growth, poses, surfaces that rub."""
 
 import numpy as np
 
 import diffsim_ti as ds
 
 from .loads import over_time
+from .structures import CELL
 
 
 def unequal_steps(kind, seed: int, steps: int, dt: float, substeps: int) -> ds.UnequalSteps | None:
@@ -65,3 +66,14 @@ def pose(kind, seed: int, number: int, path, x, duration: float) -> dict:
     return dict(
         path=lambda t: np.concatenate([path(t), turns(a * np.sin(2 * t / duration) + b * t / duration)]), about=about
     )
+
+
+def rubbing(kind, seed: int, mesh, duration: float) -> dict:
+    """How surfaces rub on each other, in three fifths of the structures with self-contact; two bodies by their names."""
+    if np.random.default_rng([32, kind.number]).random() > 0.6:
+        return {}
+    rng = np.random.default_rng([33, seed])
+    mu, speed = rng.uniform(0.1, 0.8), 0.05 * CELL / duration * 10.0 ** rng.uniform(-0.5, 0.7)
+    named = mesh.num_pieces == 2 and rng.random() < 0.5
+    friction = {("body_0", "body_1"): mu, ("body_1", "body_1"): rng.uniform(0.1, 0.8)} if named else mu
+    return dict(friction=friction, friction_speed=speed)

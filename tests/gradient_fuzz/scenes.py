@@ -135,7 +135,8 @@ def build(seed: int, precision: str | None = None) -> Configuration:
     if kind.forces != "none":
         terms.append(_forces(kind, rng, mesh, steps, mass.mean()))
     if kind.self_contact:
-        terms.append(ds.SelfContact(stiffness=stiff * rng.uniform(0.05, 0.3), width=bodies.SELF_WIDTH))
+        stiffness, rough = stiff * rng.uniform(0.05, 0.3), newer.rubbing(kind, seed, mesh, duration)
+        terms.append(ds.SelfContact(stiffness=stiffness, width=bodies.SELF_WIDTH, **rough))
     terms = [terms[k] for k in rng.permutation(len(terms))]
     more = np.random.default_rng([21, seed])
     for name in kind.loads:
