@@ -36,7 +36,10 @@ def _describe(target, dtype, shape: tuple, layout) -> None:
     Ndarray.__init__(target)
     target.dtype, target.shape, target.element_type = getattr(dtype, "dtype", dtype), shape, dtype
     if target.dtype is not dtype:
-        target.n, target.element_type = dtype.n, _core.get_type_factory_instance().get_tensor_type((dtype.n,), dtype.dtype)
+        target.n, target.element_type = (
+            dtype.n,
+            _core.get_type_factory_instance().get_tensor_type((dtype.n,), dtype.dtype),
+        )
     prog, unnamed = impl.get_runtime().prog, _core.DebugInfo("")
     target.arr = prog.create_ndarray(target.element_type, shape, layout, zero_fill=True, dbg_info=unnamed)
 
