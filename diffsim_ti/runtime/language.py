@@ -13,8 +13,13 @@ def traced(function):
 
 
 def let(value):
-    """A local variable of the kernel that is being compiled, set to `value`."""
-    return impl.expr_init(value)
+    """A local variable of the kernel that is being compiled, set to `value`. Of such a variable it makes no second one."""
+    if getattr(value, "is_let", False):
+        return value
+    out = impl.expr_init(value)
+    if type(out) is impl.Expr:
+        out.is_let = True
+    return out
 
 
 def at(array, *index):
