@@ -56,7 +56,7 @@ def test_bowl(capsys):
     assert "no surface passed through another" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("precision", ["f32", "f64"])
+@pytest.mark.parametrize("precision", ["f32", pytest.param("f64", marks=pytest.mark.thorough)])
 def test_benchmark(precision):
     """In a process of its own: it starts Taichi."""
     command = [sys.executable, EXAMPLES / "benchmarks" / "speed.py", *"--common --json --sizes 4 --repeats 1".split()]

@@ -158,7 +158,7 @@ def held_back(name: str) -> tuple:
 def advised(name: str, gradients: bool = False):
     scene, duration, tolerance = held_back(name)
     return recommend(
-        scene, duration, tolerance, gradients=gradients, budget=15.0 if name == "pull" else 3.0, elements=False
+        scene, duration, tolerance, gradients=gradients, budget=8.0 if name == "pull" else 3.0, elements=False
     )
 
 

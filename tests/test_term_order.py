@@ -108,8 +108,15 @@ def assert_same_bits(ours: dict, theirs: dict, order) -> None:
         np.testing.assert_array_equal(ours[name], value, err_msg=f"{name} in the order {', '.join(order)}")
 
 
-@pytest.mark.parametrize("precision", ["f64", "f32"])
-@pytest.mark.parametrize("solver", SOLVERS, ids=lambda s: s.__name__)
+@pytest.mark.parametrize(
+    "solver, precision",
+    [
+        *((kind, "f64") for kind in SOLVERS),
+        (ds.SemiImplicitSolver, "f32"),
+        *(pytest.param(kind, "f32", marks=pytest.mark.thorough) for kind in SOLVERS[1:]),
+    ],
+    ids=lambda x: getattr(x, "__name__", x),
+)
 def test_any_order_gives_the_same_bits(solver, precision):
     first, *others = orders(crowd(), ORDERS if precision == "f64" else ORDERS // 3)
     expected = found(first, solver, precision=precision)
@@ -146,7 +153,7 @@ def test_names_follow_the_list_as_written():
                     np.testing.assert_array_equal(scene.inputs.values[here], term.values[own])
 
 
-@pytest.mark.parametrize("precision", ["f64", "f32"])
+@pytest.mark.parametrize("precision", ["f64", pytest.param("f32", marks=pytest.mark.thorough)])
 def test_tape(precision):
     """By a Taichi loss; gradients also in the fields of inputs."""
     expected = None
@@ -172,7 +179,9 @@ def test_tape(precision):
         assert_same_bits(got, expected, order)
 
 
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["f64", "f32"])
+@pytest.mark.parametrize(
+    "dtype", [torch.float64, pytest.param(torch.float32, marks=pytest.mark.thorough)], ids=["f64", "f32"]
+)
 def test_torch(dtype):
     """A simulator, whose own ground comes before the terms that it is given; tensors for every number of a term."""
     names, expected = ("drag", "sphere", "force", "slope", "pairs", "wall"), None
