@@ -152,7 +152,7 @@ def start(path) -> subprocess.Popen:
 
 
 def test_kill_at_random_moments(tmp_path):
-    """Processes of their own: the next run finds a whole file (warnings are errors there) and ends as if nothing had been."""
+    """In new processes: the next run finds a whole file (warnings are errors there) and ends as if nothing had been."""
     moments = random.Random(0)
     for _ in range(2):
         process = start(tmp_path / "run.state")
