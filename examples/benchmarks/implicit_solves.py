@@ -5,9 +5,9 @@
     python examples/benchmarks/implicit_solves.py --write               # the table also into examples/README.md
 
 The beam of implicit_steps.py in float64, tolerance 1e-6. Equilibrium: E = 1e5 Pa, it sags by its length, in one load step,
-preconditioner and all but compiling included. Steps: backward Euler, 10 ms, E = 1e6 Pa; the mean of four after the first, and
-with --gradient the reverse sweep through them. BLAS has one thread. Times are those of the processor, the least of some
-repetitions, because a machine may have other things to do.
+preconditioner and all but compiling included. Steps: backward Euler, 10 ms, E = 1e6 Pa; the mean of four after the first,
+and the reverse sweep through them. BLAS has one thread. Times are those of the processor, the least of some repetitions,
+because a machine may have other things to do.
 """
 
 import argparse
@@ -87,7 +87,9 @@ def row_elsewhere(checkout: str, size: int, repeats: int) -> list:
         "import json, implicit_solves as s\ns.ds.init(precision='f64')\n"
         f"with s.threadpool_limits(1): print(json.dumps(s.row_of({size}, {repeats})))"
     )
-    done = subprocess.run([sys.executable, "-c", code], env=found, cwd=here, stdout=subprocess.PIPE, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=found, cwd=here, stdout=subprocess.PIPE, text=True, check=True
+    )
     return json.loads(done.stdout.splitlines()[-1])
 
 

@@ -42,9 +42,7 @@ class Level:
         self.start, self.column = runtime.upload(start, ti.i32), runtime.upload(M.indices[~on], ti.i32)
         self.values = upload_rows(M.data[~on], self.numbers)
         self.b, self.x, self.d, self.y = (runtime.array(ROWS[self.numbers], self.nodes) for _ in range(4))
-        self.diagonal, self.inverse = (
-            runtime.array(ROWS[self.numbers], self.numbers * self.nodes) for _ in range(2)
-        )
+        self.diagonal, self.inverse = (runtime.array(ROWS[self.numbers], self.numbers * self.nodes) for _ in range(2))
         self.kernels = kernels_of(LevelKernels, self.numbers, "f32", parallel)
         self.theta = 1.0
         self.put(self.diagonal_blocks)
