@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import diffsim_ti as ds
-from diffsim_ti.solvers.implicit.rotations import rotations_of
 from diffsim_ti.solvers.implicit.projection import has_eigenvalue_below
+from diffsim_ti.solvers.implicit.rotations import rotations_of
 
 SOLVERS = (ds.ImplicitEulerSolver, ds.ImplicitMidpointSolver, ds.BDF2Solver)
 by_name = pytest.mark.parametrize("solver", SOLVERS, ids=lambda s: s.__name__)

@@ -1,4 +1,4 @@
-"""The preconditioner of implicit solves on the device, conjugate gradients there, and equilibria that are laid on in parts."""
+"""The preconditioner of implicit solves and conjugate gradients on the device; equilibria that are laid on in parts."""
 
 import numpy as np
 import pytest
@@ -65,7 +65,7 @@ def test_conjugate_gradients_stop_at_negative_curvature(static):
     A = Operator(static.potential, mass, static.free)
     b = np.random.default_rng(3).standard_normal(static.u_star.shape) * static.free
     found = [conjugate_gradients(A, b, how, 1e-6, 500, 1e-16) for how in (M, lambda r: M(r))]
-    for x, _, count, p in found:
+    for x, _, _, p in found:
         assert p is not None and (p * A(p)).sum() < 0 < (b * x).sum()
     assert found[0][2] == found[1][2]
     np.testing.assert_allclose(found[0][0], found[1][0], atol=1e-4 * np.abs(found[1][0]).max())

@@ -12,7 +12,7 @@ A = ti.template()
 
 
 def matrix_arrays(rows: int) -> dict:
-    """Of a matrix of blocks with so many rows: entries of row i are start[i] .. start[i + 1] - 1; values: a block's columns."""
+    """Of a matrix of blocks with so many rows; entries of row i are start[i] .. start[i + 1] - 1; values: columns."""
     return dict(start="ints", column="ints", values=f"rows{rows}")
 
 
@@ -24,8 +24,9 @@ def level_arrays(numbers: int) -> dict:
 
 
 def chebyshev(terms: int, share: float) -> tuple[float, list[tuple[float, float]]]:
-    """(theta over the largest eigenvalue, factors of (last change, D^-1 (b - A x) / theta) in each change but the first) of the
-    polynomial that is least on [share, 1] of the spectrum. Saad 2003, Iterative Methods for Sparse Linear Systems, alg. 12.1.
+    """(theta over the largest eigenvalue, factors of (last change, D^-1 (b - A x) / theta) in each change but the first)
+    of the polynomial that is least on [share, 1] of the spectrum.
+    Saad 2003, Iterative Methods for Sparse Linear Systems, alg. 12.1.
     """
     sigma, rho, factors = (1 + share) / (1 - share), (1 - share) / (1 + share), []
     for _ in range(terms - 1):

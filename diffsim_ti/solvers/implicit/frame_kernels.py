@@ -38,7 +38,7 @@ class FrameKernels:
 
     @ti.func
     def rotation(self, F, i, body: A):
-        """The rotation next to F by X <- (X + X^-T) / 2; the identity, and a mark, where F is nearly singular or mirrored."""
+        """The rotation next to F by X <- (X + X^-T) / 2; the identity and a mark where F is nearly singular or mirrored."""
         R, C = ti.Matrix.identity(ti.f32, 3), self.cofactors(F)
         det = F[0, 0] * C[0, 0] + F[1, 0] * C[1, 0] + F[2, 0] * C[2, 0]
         body.hard[i] = 1

@@ -17,8 +17,8 @@ from diffsim_ti.potential.way import Way
 from diffsim_ti.solvers.implicit.approach import Approach
 from diffsim_ti.solvers.implicit.given import GivenInPasses
 from diffsim_ti.solvers.implicit.held_strains import HeldStrains
-from diffsim_ti.solvers.implicit.law_state import law_state_kernels
 from diffsim_ti.solvers.implicit.laid_on import LaidOn
+from diffsim_ti.solvers.implicit.law_state import law_state_kernels
 from diffsim_ti.solvers.implicit.linear import NotConverged
 from diffsim_ti.solvers.implicit.multigrid import Multigrid
 from diffsim_ti.solvers.implicit.newton import Newton
