@@ -1,8 +1,9 @@
 """Random impacts of small bodies on thin walls, needles, plates and balls, at rest and moving, judged by geometry alone.
 
-    python tests/battery_of_impacts.py --cases 200 --seed 0 [--solver BDF2Solver] [--only 17 31]
+    python tests/battery_of_impacts.py --cases 200 --seed 0 [--turning] [--solver BDF2Solver] [--only 17 31]
 
 Each case runs once; where it raises, what the error advises is done and the case runs again, three times at most.
+--turning: obstacles turn about a point near them as well.
 """
 
 import argparse
@@ -11,6 +12,7 @@ import sys
 import time
 import warnings
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -46,6 +48,7 @@ class Case:
     resolution: int
     thickness: float
     moving: bool
+    turning: bool = False
     stiffness: float | None = None  # per area [N/m^3]
     substeps: int = 1  # of explicit solvers: times what stability asks for
     substep: float = float("inf")  # what explicit ones were advised [s]
@@ -68,10 +71,11 @@ class Case:
             f"{self.number}: {self.solver} {self.kind} {self.precision} {self.speed:.3g} m/s dt {self.dt:.3g} s E "
             f"{self.youngs_modulus:.2g} size {self.size:.3g} m, {self.resolution} vertices a side, thickness "
             f"{self.thickness:.3g} m{', moving' if self.moving else ''}"
+            f"{', turning' if self.turning else ''}"
         )
 
 
-def draw(number: int, seed: int, solvers) -> Case:
+def draw(number: int, seed: int, solvers, turning: bool = False) -> Case:
     rng, names = np.random.default_rng([seed, number]), list(solvers)
     log = lambda low, high: float(np.exp(rng.uniform(np.log(low), np.log(high))))  # noqa: E731
     return Case(
@@ -87,11 +91,12 @@ def draw(number: int, seed: int, solvers) -> Case:
         resolution=int(rng.integers(2, 5)),
         thickness=log(2e-3, 2e-2),
         moving=bool(rng.integers(2)),
+        turning=turning,
     )
 
 
 def build(case: Case):
-    """(solver, steps, Judge's solid, displacement of the obstacle over time) of a case."""
+    """(solver, steps, Judge's solid, where points lie in the obstacle as it was made at a time) of a case."""
     rng = np.random.default_rng([case.seed, case.number, 1])
     static, width = case.solver == "StaticSolver", 0.25 * float(np.clip(case.thickness, 4e-3, 1.2e-2)) + 1e-3
     if case.explicit:
@@ -117,7 +122,8 @@ def build(case: Case):
     else:
         path, more = (lambda t: [-speed * t, 0, 0]), dict(initial_velocities=(own, 0, 0))
     stiffness = case.stiffness or natural_stiffness(case, mesh, width)
-    obstacle = obstacle(width=width, stiffness_per_area=stiffness, path=path)
+    given, back = turning(case, path) if case.turning else (dict(path=path), lambda x, t: x - path(t))
+    obstacle = obstacle(width=width, stiffness_per_area=stiffness, **given)
     scene = ds.Scene(
         mesh, ds.StableNeoHookean(case.youngs_modulus, 0.3), DENSITY, [obstacle], precision=case.precision, **more
     )
@@ -125,7 +131,16 @@ def build(case: Case):
     if case.explicit:
         longest = min(SHARE * ds.stable_dt(scene).dt / case.substeps, case.substep)
         options["substeps"] = int(np.ceil(case.dt / longest))
-    return SOLVERS[case.solver](scene, dt=case.dt, **options), steps, solid, path
+    return SOLVERS[case.solver](scene, dt=case.dt, **options), steps, solid, back
+
+
+def turning(case: Case, path) -> tuple[dict, Callable]:
+    """(arguments of an obstacle that turns besides, where points lie in it as it was made)."""
+    rng = np.random.default_rng([case.seed, case.number, 2])
+    axis, about = unit(rng.standard_normal(3)), 0.5 * case.size * rng.standard_normal(3)
+    rate = rng.uniform(0.2, 1.0) * min(case.speed / case.size, 1.5 / case.dt) if case.solver != "StaticSolver" else 0.3
+    back = lambda x, t: about + (x - path(t) - about) @ rotation(axis * rate * t)  # noqa: E731
+    return dict(path=lambda t: [*path(t), *(axis * rate * t)], about=about), back
 
 
 def natural_stiffness(case: Case, mesh, width: float) -> float:
@@ -184,13 +199,13 @@ def turned(rng) -> np.ndarray:
 
 def run(case: Case) -> str:
     """ "in front", "impaled", "passed" (in silence), or what the error says."""
-    solver, steps, solid, path = build(case)
+    solver, steps, solid, back = build(case)
     try:
         simulator = ds.Simulator(solver)
-        judge = Judge(simulator.scene.mesh.surface_triangles, solid, simulator.positions)
+        judge = Judge(simulator.scene.mesh.surface_triangles, solid, back(simulator.positions, 0.0))
         for _ in range(steps):
             simulator.step()
-            wrong = judge.after_step(simulator.positions, path(simulator.time))
+            wrong = judge.after_step(back(simulator.positions, simulator.time), np.zeros(3))
             if wrong:
                 return f"{wrong} in step {simulator.step_count}"
     except (FloatingPointError, ValueError) as error:
@@ -257,10 +272,11 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--solver", choices=list(SOLVERS), action="append")
     parser.add_argument("--only", type=int, nargs="*", help="numbers of cases")
+    parser.add_argument("--turning", action="store_true")
     given = parser.parse_args()
     warnings.simplefilter("ignore", UserWarning)
     ds.init("cpu", precision="f64")
-    cases = (draw(n, given.seed, SOLVERS) for n in given.only or range(given.cases))
+    cases = (draw(n, given.seed, SOLVERS, given.turning) for n in given.only or range(given.cases))
     table = battery(c for c in cases if not given.solver or c.solver in given.solver)
     for name, row in table.items():
         print(f"{name:24s} " + ", ".join(f"{key} {row[key]}" for key in row))
