@@ -25,7 +25,7 @@ def obstacle_surfaces(scene: Scene, time: float = 0.0, rows: Mapping = MappingPr
     (`Obstacle.surface`). rows: {name of a path's input: its row at that time}, where a run was given one.
     """
     out, size = [], float(np.ptp(scene.mesh.bounding_box, 0).max())
-    given = {term: rows[name] for name, term in zip(scene.inputs.paths, scene.moving) if name in rows}
+    given = {term: rows[name] for name, term in zip(scene.inputs.paths, scene.moving) if name in rows} if rows else {}
     for term in scene.terms:
         shape = term.surface_at(size, time, given.get(term)) if isinstance(term, Obstacle) else None
         if shape is not None:

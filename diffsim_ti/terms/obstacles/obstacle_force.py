@@ -51,7 +51,7 @@ class ObstacleForce(VertexForce):
         g = Graph(self.fp, parameters)
         p = [g.leaf(x) for x in self._numbers(parameters, first)]
         rest, moved = ([g.leaf(at(vector, d)) for d in range(3)] for vector in (X, u))
-        if length_of(X) == 7:
+        if self.turns and length_of(X) == 7:  # not of a face's corners, which come as the obstacle was made
             return g, p, *self._record_turned(g, p, let(X), rest, moved)
         d, n = self.distance_and_normal(g, p[: self.count], rest, moved)
         return g, p, moved, d, n

@@ -13,8 +13,6 @@ from diffsim_ti.runtime import at, let, traced
 
 def length_of(vector) -> int:
     """How many components a vector of a kernel has."""
-    if isinstance(vector, list):  # of numbers in lanes
-        return len(vector)
     return vector.get_shape()[0] if hasattr(vector, "get_shape") else vector.n
 
 
