@@ -16,17 +16,16 @@ def element_matrices(potential) -> np.ndarray:
     """
     a, (_, N, V) = potential.arrays, potential.stress_points
     count, k = N.shape[:2]
-    C = potential.tangents().reshape(count, 27, 3)
     if a.points == 1:
         out = np.empty((count, k, k, 3, 3))
-        for begin in range(0, count, CHUNK):  # short of what a cache holds
-            part = slice(begin, begin + CHUNK)
+        for part, C in potential.tangent_chunks(CHUNK):
             own, scaled = N[part], np.swapaxes(N[part] * V[part, None, None], 1, 2)
-            right = np.matmul(C[part], scaled).reshape(-1, 3, 3, 3 * k)  # i, j, (k, b)
+            right = np.matmul(C.reshape(-1, 27, 3), scaled).reshape(-1, 3, 3, 3 * k)  # i, j, (k, b)
             right = np.ascontiguousarray(np.swapaxes(right, 1, 2)).reshape(-1, 3, 9 * k)
             both = np.matmul(own, right).reshape(-1, k, 3, 3, k)  # a, i, k, b
             out[part] = np.moveaxis(both, 4, 2)
         return out
+    C = potential.tangents().reshape(count, 27, 3)
     right = np.matmul(C * V[:, None, None], np.swapaxes(N, 1, 2)).reshape(count, 3, 3, 3, k)
     m, q = a.num_tetrahedra, a.points
     N, right = N.reshape(m, q, k, 3), right.reshape(m, q, 3, 3, 3, k)
@@ -41,14 +40,19 @@ def assemble(potential, mass, free):
 
     n, nodes = potential.arrays.num_vertices, potential.arrays.mesh.elements.astype(np.int64)
     places = (nodes[:, :, None] * n + nodes[:, None, :]).ravel()
-    entries = element_matrices(potential).reshape(-1, 9)
+    parts = [element_matrices(potential).reshape(-1, 9)]
     if potential.arrays.patches is not None:
         rows, columns, blocks = potential.coupling.entries(potential.patch_gradients())
-        places, entries = np.concatenate([places, rows * n + columns]), np.concatenate([entries, blocks.reshape(-1, 9)])
+        places = np.concatenate([places, rows * n + columns])
+        parts.append(blocks.reshape(-1, 9))
     each = np.arange(n, dtype=np.int64) * (n + 1)  # also of vertices in no tetrahedron
-    places, entries = np.concatenate([places, each]), np.concatenate([entries, np.zeros((n, 9))])
-    places, inverse = np.unique(places, return_inverse=True)
-    data = np.stack([np.bincount(inverse, entries[:, k], len(places)) for k in range(9)], 1).reshape(-1, 3, 3)
+    places, inverse = np.unique(np.concatenate([places, each]), return_inverse=True)
+    data, first = np.zeros((len(places), 9)), 0
+    for entries in parts:
+        own, first = inverse[first : first + len(entries)], first + len(entries)
+        for k in range(9):
+            data[:, k] += np.bincount(own, entries[:, k], len(places))
+    data = data.reshape(-1, 3, 3)
     rows, columns = places // n, places % n
     is_free, P = mask_of(free)[:, 0] > 0, projectors_of(free)
     data[~(is_free[rows] & is_free[columns])] = 0

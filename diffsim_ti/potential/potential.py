@@ -216,6 +216,14 @@ class Potential:
         a = self.arrays
         return a.from_blocks(runtime.fetch(self._block_arrays.tangent), 81 * a.points).reshape(-1, 9, 9)
 
+    def tangent_chunks(self, size: int):
+        """(slice, `tangents` of it) for so many tetrahedra after the other, which caches hold."""
+        a, source = self.arrays, runtime.view(self._block_arrays.tangent)
+        source = runtime.fetch(self._block_arrays.tangent) if source is None else source
+        for begin in range(0, a.num_tetrahedra, size):
+            part = slice(begin, min(begin + size, a.num_tetrahedra))
+            yield part, a.from_blocks(source, 81 * a.points, part).reshape(-1, 9, 9)
+
     def contact_blocks(self) -> np.ndarray | None:
         """The part of contact and of what is attached in `blocks`; None without."""
         attached = sum(part.blocks(self.held_at) for part in self._on_host()) if self._on_host() else None

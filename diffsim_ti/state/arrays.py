@@ -252,10 +252,16 @@ class SceneArrays:
         rows = per_tetrahedron.reshape(len(per_tetrahedron), -1)[order]
         return np.swapaxes(rows.reshape(len(order) // LANES, LANES, -1), 1, 2).reshape(-1, LANES)
 
-    def from_blocks(self, blocks: np.ndarray, rows: int) -> np.ndarray:
-        """The inverse: (num_tetrahedra, rows) in float64."""
-        flat = np.swapaxes(blocks.reshape(-1, rows, LANES), 1, 2).reshape(-1, rows)
-        return flat[self.place].astype(np.float64)
+    def from_blocks(self, blocks: np.ndarray, rows: int, part: slice = slice(None)) -> np.ndarray:
+        """The inverse: (num_tetrahedra, rows) in float64, or a part of the tetrahedra."""
+        blocks = blocks.reshape(-1, rows, LANES)
+        if isinstance(self.place, slice):  # they lie in order
+            begin, end, _ = part.indices(self.num_tetrahedra)
+            first = begin // LANES
+            flat = np.swapaxes(blocks[first : -(-end // LANES)], 1, 2).reshape(-1, rows)
+            return flat[begin - first * LANES : end - first * LANES].astype(np.float64)
+        block, lane = np.divmod(self.place[part], LANES)
+        return blocks[block, :, lane].astype(np.float64)
 
     def at_points(self, numbers: np.ndarray) -> np.ndarray:
         """What kernels write for each point, in float64, shape (num_tetrahedra,), or (num_tetrahedra, points)."""

@@ -30,7 +30,7 @@ class DeviceCG:
         lanes = runs_on_cpu() and a.precision == precision  # Taichi has no vector code for changes of precision
         self._turn = kernels.turn.bind(lanes, cg=self, at=potential)
         self._step = kernels.step.bind(lanes, cg=self, at=potential)
-        self._look = 1 if runs_on_cpu() else 8  # iterations between looks at the state
+        self._look = 1 if runs_on_cpu() else 10  # iterations between looks at the state
         self._sizes = dict(chunks=self.chunks, length=self.length, nodes=n)
 
     def __call__(self, mass, free, b: np.ndarray, tolerance: float, max_iterations: int, eps: float):

@@ -2,7 +2,7 @@
 
 What is out of balance at the start, R0, and the way of the held vertices are laid on in parts: a share s of both leaves
 R(u) - (1 - s) R0 = 0, which the start solves for s = 0. Shares grow where solves succeed and halve where they fail.
-Where no share helps, the path of equilibria has turned back (a limit point) or branched (a bifurcation).
+Where no share helps, the path of equilibria may have turned back (a limit point) or branched (a bifurcation).
 Allgower, Georg 2003, Introduction to Numerical Continuation Methods, doi:10.1137/1.9780898719154.
 """
 
@@ -61,7 +61,10 @@ class LaidOn:
                 "a small force that chooses the way"
             )
         else:
-            end = "as where a load lies beyond a limit point, the most that the body carries: lay on less"
+            end = (
+                "and is not seen to be unstable there: what comes next may lie beyond a limit point, the most that the body "
+                "carries, or be too hard for Newton's method: lay on less"
+            )
         return (
             f"no equilibrium was found: the path of equilibria from the state before goes to {done:.0%} of what is laid on "
             f"(loads, motion of what is held), {end}, or take a solver with inertia, which follows the jump "
