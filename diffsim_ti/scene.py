@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
 from diffsim_ti.checked import instance, listed
+from diffsim_ti.copies import check_functions, made_again
 from diffsim_ti.inputs import ConsistentMass, Inputs
 from diffsim_ti.mass_scaling import MassScaling
 from diffsim_ti.materials.material import Material
@@ -104,7 +105,7 @@ class Scene:
         self.fixed, self.held = self.supports.fixed, self.supports.vertices  # in all directions; in some
         self.motion = motion
         self._check_terms()
-        self._given = self.terms
+        self._given = self.arguments["terms"] = self.terms
         settled = (t.settled(self, density, initial_positions, initial_velocities) for t in self.terms)
         self.terms = tuple(copy(t) for t in settled)  # one that is listed twice is two
         self.ordered_terms = tuple(sorted(self.terms, key=_kind))
@@ -136,10 +137,16 @@ class Scene:
         no mass that was added for the sake of an explicit step."""
         if (self.mesh.order == 1 or self.consistent) and self.mass_scaling is None:
             return self
-        out, names = copy(self), ("density", "initial_positions", "initial_velocities")
+        out, names = Scene.__new__(Scene), ("density", "initial_positions", "initial_velocities")
+        vars(out).update(vars(self))
         out.consistent, out.mass_scaling = self.mesh.order > 1, None
         out.inputs = Inputs(out, *(self.arguments[name] for name in names))
         return out
+
+    def __reduce__(self):
+        """As it was made. Raises TypeError for functions that another process cannot import."""
+        check_functions("Scene", motion=self.motion, **{f"path of {t!r}": t.path for t in self._given})
+        return made_again, (Scene, self.arguments | dict(precision=self.precision))
 
     def replace(self, **changes) -> "Scene":
         """A scene with some arguments replaced."""

@@ -26,7 +26,7 @@ AREAS = {
     "pictures, films, the window": "picture_drawing picture_film marks "
     "optimization_picture writers viewer viewer_window gallery",
     "examples and pages": "examples contact_examples static_examples torch_examples readme",
-    "command line, resources, backends": "cli calls strength layout resources devices launch executed_ptx single_precision",
+    "command line, resources, backends": "cli calls hard_use strength layout resources devices launch executed_ptx single_precision",
 }
 # files of a minute or so, the longest first: in several processes they come before all others
 LONGEST = (

@@ -68,7 +68,9 @@ def check_length(duration: float, fps: float, dt: float | None) -> None:
 def check_time_it_takes(run: "ForwardRun", duration: float) -> None:
     """Raise ValueError for a run whose explicit steps would take more than a month."""
     steps = duration / run.first_substep
-    seconds = steps * (2e-6 + 2e-8 * run.scene.mesh.num_tetrahedra)  # two microseconds and 20 ns a tetrahedron: quick ones
+    seconds = steps * (
+        2e-6 + 2e-8 * run.scene.mesh.num_tetrahedra
+    )  # two microseconds and 20 ns a tetrahedron: quick ones
     if seconds > MOST_DAYS * 86400:
         raise ValueError(
             f"--duration {duration:g} s takes about {steps:.3g} steps of {run.first_substep:.3g} s, more than "

@@ -43,6 +43,10 @@ class Frames:
     steps: np.ndarray | None = field(default=None, repr=False)  # of the run that are done in each frame
     run: Run | None = field(default=None, repr=False)
 
+    def __getstate__(self) -> dict:
+        """Without the run, which lives on the device: a copy by pickle has no gradient."""
+        return vars(self) | dict(run=None)
+
     def __getitem__(self, name: str) -> np.ndarray:
         if name in ("positions", "velocities", "displacements"):
             return getattr(self, name)

@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
 from diffsim_ti.checked import instance, listed, shape_of
+from diffsim_ti.copies import made_again
 from diffsim_ti.inputs import Derived
 from diffsim_ti.outputs import Change, Displacements, Output, Positions, Velocities
 from diffsim_ti.rollout.checkpoints import Checkpoints
@@ -83,6 +84,11 @@ class Rollout:
         self.gradients: dict[str, np.ndarray] = {}
         self.tape_face = TapeFace(self, runs)
         self.torch_face = None  # made by the first run from tensors (torch_bridge/tensors.py)
+
+    def __reduce__(self):
+        """As it was made; values of its fields, and frames, are not in it."""
+        steps = self.steps if self.solver._schedule is None else self.solver._schedule
+        return made_again, (Rollout, dict(solver=self.solver, steps=steps) | self._options)
 
     @staticmethod
     def _stepped(solver: Solver, steps) -> tuple[Solver, int]:

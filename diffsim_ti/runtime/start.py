@@ -15,6 +15,7 @@ from taichi._lib import core as _core
 from taichi.lang import impl
 
 from diffsim_ti.runtime.device import count_cards
+from diffsim_ti.runtime.threads import LOCK, materialize
 
 PRECISIONS = {"f32": ti.f32, "f64": ti.f64}
 NUMPY = {"f32": np.float32, "f64": np.float64}
@@ -70,8 +71,9 @@ def init(arch: str = "cpu", precision: str = "f32", threads: int | None = None, 
     if threads is not None:
         options["cpu_max_num_threads"] = int(threads)
     set_precision(precision)
-    with contextlib.redirect_stdout(io.StringIO()):
+    with LOCK, contextlib.redirect_stdout(io.StringIO()):
         ti.init(arch=_ARCHS[arch], default_fp=ti.f64, fast_math=False, enable_fallback=False, **options)
+        materialize()  # in this thread, so that others can compile
 
 
 def _can_write_cache(path: str | None) -> bool:
@@ -128,7 +130,9 @@ def program() -> weakref.ref:
     """
     refuse_fork()
     if impl.get_runtime().prog is None:
-        init(_arch_of_parent())
+        with LOCK:
+            if impl.get_runtime().prog is None:
+                init(_arch_of_parent())
     _tell_workers()
     return weakref.ref(impl.get_runtime().prog)
 

@@ -17,12 +17,11 @@ from diffsim_ti.visual.fields import FIELDS
 from diffsim_ti.visual.frame import Frame, Setting
 from diffsim_ti.visual.series_marks import read_marks, read_part
 
-
 REMEDY = "take the .pvd that a run of diffsim-ti wrote"
 
 
 def text_of(name: str) -> str:
-    """A file's name as text that XML can hold: its bytes read as UTF-8 whatever the locale, or with "_" where they are none."""
+    """A file's name as text that XML can hold: its bytes as UTF-8 whatever the locale, "_" where they are none."""
     text = os.fsencode(name).decode("utf-8", "replace").replace("\ufffd", "_")
     return "".join(c if c.isprintable() else "_" for c in text)
 

@@ -67,7 +67,8 @@ class ParaViewWriter(Writer):
             elif name not in FIELDS:
                 point_data[name] = value
         point_data, cell_data = (
-            {text_of(name): _rows(value).astype(dtype) for name, value in data.items()} for data in (point_data, cell_data)
+            {text_of(name): _rows(value).astype(dtype) for name, value in data.items()}
+            for data in (point_data, cell_data)
         )
         saved = meshio.Mesh(
             np.asarray(frame.positions, np.float64),

@@ -5,8 +5,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from diffsim_ti.scene import Scene
 from diffsim_ti.visual.camera import Camera
 from diffsim_ti.visual.drawing import BACKENDS

@@ -2,10 +2,11 @@
 
 import numpy as np
 
+from diffsim_ti.copies import CarriesMore
 from diffsim_ti.potential.free import Free
 
 
-class NotConverged(FloatingPointError):
+class NotConverged(CarriesMore, FloatingPointError):
     """An iteration did not reach its tolerance. Carries `residuals`, the relative residual after each round."""
 
     def __init__(self, message: str, residuals):
