@@ -8,6 +8,20 @@ def made_again(kind: type, arguments: dict):
     return kind(**arguments)
 
 
+class MadeAgain:
+    """What is copied by the `arguments` of its constructor, in its precision. Raises TypeError for functions that another
+    process cannot import."""
+
+    arguments: dict
+    precision: str
+
+    def __reduce__(self):
+        given = self.arguments
+        paths = {f"path of {term!r}": term.path for term in given["terms"]}
+        check_functions(type(self).__name__, motion=given["motion"], **paths)
+        return made_again, (type(self), given | dict(precision=self.precision))
+
+
 def check_functions(owner: str, **given) -> None:
     """Raise TypeError for functions that no other process can import."""
     for name, value in given.items():

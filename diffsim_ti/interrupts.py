@@ -46,7 +46,7 @@ def check() -> None:
 
 def _end(*_) -> None:
     os.write(2, b"error: interrupted\n")
-    os._exit(130)
+    os._exit(130)  # at once
 
 
 def _raise(*_) -> None:

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
 from diffsim_ti.checked import instance, listed
-from diffsim_ti.copies import check_functions, made_again
+from diffsim_ti.copies import MadeAgain
 from diffsim_ti.inputs import ConsistentMass, Inputs
 from diffsim_ti.mass_scaling import MassScaling
 from diffsim_ti.materials.material import Material
@@ -45,7 +45,7 @@ LOCKING_RATIO = 0.45  # Poisson's ratio above which linear tetrahedra lock notic
 LOCKING_RATIO_OF_TEN_NODES = 0.49  # beyond it their mean dilatation is the better
 
 
-class Scene:
+class Scene(MadeAgain):
     """A body, its material and what acts on it. Frozen: build another scene instead of changing one.
 
     mesh: TetrahedralMesh, the rest shape.
@@ -89,9 +89,7 @@ class Scene:
         volume: str = "tetrahedra",
         mass_scaling: float | None = None,
     ):
-        self.arguments = dict(mesh=mesh, material=material, density=density, terms=terms, fixed=fixed, motion=motion)
-        self.arguments |= dict(initial_positions=initial_positions, initial_velocities=initial_velocities)
-        self.arguments |= dict(precision=precision, volume=volume, mass_scaling=mass_scaling)
+        self.arguments = {name: value for name, value in locals().items() if name != "self"}
         self.mesh = instance("Scene", "mesh", mesh, TetrahedralMesh, "a TetrahedralMesh")
         self.material = instance(
             "Scene", "material", material, Material, "a material such as StableNeoHookean(1e5, 0.3)"
@@ -142,11 +140,6 @@ class Scene:
         out.consistent, out.mass_scaling = self.mesh.order > 1, None
         out.inputs = Inputs(out, *(self.arguments[name] for name in names))
         return out
-
-    def __reduce__(self):
-        """As it was made. Raises TypeError for functions that another process cannot import."""
-        check_functions("Scene", motion=self.motion, **{f"path of {t!r}": t.path for t in self._given})
-        return made_again, (Scene, self.arguments | dict(precision=self.precision))
 
     def replace(self, **changes) -> "Scene":
         """A scene with some arguments replaced."""

@@ -40,6 +40,7 @@ class Frames:
     contact_forces: np.ndarray | None = field(default=None, repr=False)
     computed: dict = field(default_factory=dict, repr=False)
     chamber_pressures: np.ndarray | None = field(default=None, repr=False)
+    sets: dict = field(default_factory=dict, repr=False)  # of inputs given by named sets, by input (set_values.py)
     steps: np.ndarray | None = field(default=None, repr=False)  # of the run that are done in each frame
     run: Run | None = field(default=None, repr=False)
 

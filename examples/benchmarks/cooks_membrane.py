@@ -6,8 +6,8 @@ a vector is a gradient of the equilibrium by the external forces; conjugate grad
 
 Two problems, in N, mm and MPa: small strains, whose corner rises 32.18 mm, and large strains, 13.577 mm at the corner and
 14.499 mm in the middle of the edge. Linear tetrahedra approach both from below (locking), with an error of order h^2 or a
-little less, for the corner on the left is singular. Aitken's formula gives their limit where the errors of four meshes shrink
-by one factor; where they do not yet, none is printed.
+little less, for the corner on the left is singular. Aitken's formula gives their limit where the errors of four meshes
+shrink by one factor; where they do not yet, none is printed.
 
     python examples/benchmarks/cooks_membrane.py [--quick] [folder for a picture]
 """
