@@ -10,6 +10,7 @@ import os
 import signal
 import sys
 import threading
+from os import _exit as end_process  # at once
 
 _is_command = os.path.basename(sys.argv[0] if sys.argv else "").startswith("diffsim-ti") or (
     sys.argv[:1] == ["-m"] and "diffsim_ti" in getattr(sys, "orig_argv", ())
@@ -46,7 +47,7 @@ def check() -> None:
 
 def _end(*_) -> None:
     os.write(2, b"error: interrupted\n")
-    os._exit(130)  # at once
+    end_process(130)
 
 
 def _raise(*_) -> None:

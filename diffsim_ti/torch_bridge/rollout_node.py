@@ -98,9 +98,8 @@ def _spread(rollout: Rollout, name: str, numbers: Mapping) -> torch.Tensor:
     like = next((x for x in numbers.values() if x.is_floating_point()), torch.zeros((), dtype=torch.float64))
     out = torch.as_tensor(per_tetrahedron(rollout.scene, name, rollout.values[name])).to(like)
     for key, own in rows.items():
-        out = out.index_copy(
-            0, torch.tensor(np.array(own), device=like.device), numbers[key].to(like).expand(out[own].shape)
-        )
+        at = torch.tensor(own.tolist(), device=out.device)
+        out = out.index_copy(0, at, numbers[key].to(out).expand(len(at), *out.shape[1:]))
     return out
 
 
