@@ -5,6 +5,10 @@ import os
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # read when taichi is imported
 os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")  # no network traffic from a simulator
 
+from diffsim_ti import interrupts
+
+interrupts.guard_import()
+
 from diffsim_ti.adaptive_steps import adaptive_steps
 from diffsim_ti.batch import Batch, BatchFrames
 from diffsim_ti.contact.surface_pairs import Tunnelling

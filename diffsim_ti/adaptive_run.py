@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from diffsim_ti import runtime
+from diffsim_ti import interrupts, runtime
 from diffsim_ti.contact.surface_pairs import Overlap
 from diffsim_ti.monitor.quantities import Energy
 from diffsim_ti.monitor.stability import lanczos_limit
@@ -132,6 +132,12 @@ class ForwardRun:
         self._lowest, self._begun, self._squeezed, self._implicit = self._energy, self._energy, False, None
         self.energies, self.largest_energy = [self._energy], self._moving(self._energy)
         self._fastest = self.largest_energy  # of what moves, by its kinetic energy: what strains and falls can set free
+
+    @property
+    def first_substep(self) -> float:
+        """Length of the first substep to come [s]."""
+        dt = self.simulator.solver.dt
+        return dt / self._choose_substeps() if self.adapts else self.simulator.solver.substep
 
     def balance_anew(self) -> None:
         """Measure the rise and drift of energy from the present state on, which something outside has changed."""
@@ -313,6 +319,7 @@ def run_and_write(
         writing = time.perf_counter() - begin
         for k in range(frames + 1):
             try:
+                interrupts.check()
                 if k:
                     run.advance()
                 begin = time.perf_counter()

@@ -13,6 +13,7 @@ from pathlib import Path
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.torch_bridge.autograd import torch
 
+KEYS = ("iteration", "losses", "seconds", "best_loss", "best", "module", "optimizer", "random")
 MAGIC = b"diffsim_ti optimisation state, version 1\n"
 
 
@@ -78,7 +79,10 @@ def _read(path: Path, mesh) -> dict:
     known, _, payload = body.partition(b"\n")
     if known != mesh.content_hash.encode():
         raise ValueError(f"made for another mesh: {known.decode()[:12]}, this one is {mesh.content_hash[:12]}")
-    return torch.load(io.BytesIO(payload), weights_only=True)
+    state = torch.load(io.BytesIO(payload), weights_only=True)
+    if not isinstance(state, dict):
+        raise ValueError(f"holds a {type(state).__name__}, expected a dict of names")
+    return state
 
 
 class Optimization:
@@ -107,6 +111,12 @@ class Optimization:
         self.best_loss, self._best = math.inf, copy.deepcopy(module.state_dict())
         state = None if path is None else load_state(path, mesh)
         if state is not None:
+            missing = [name for name in KEYS if name not in state]
+            if missing:
+                raise ValueError(
+                    f"{path}: a state without {', '.join(missing)}; another program has written it: take another path, or "
+                    "delete the file to start anew"
+                )
             self.iteration, self.losses, self.seconds = state["iteration"], state["losses"], state["seconds"]
             self.best_loss, self._best = state["best_loss"], state["best"]
             module.load_state_dict(state["module"])

@@ -5,6 +5,8 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+from diffsim_ti import interrupts
+
 
 @contextmanager
 def progress(title: str, total: int) -> Iterator[Callable[..., None]]:
@@ -24,6 +26,7 @@ def progress(title: str, total: int) -> Iterator[Callable[..., None]]:
     task, start, said = bar.add_task(title, total=total, note=""), time.perf_counter(), [time.perf_counter()]
 
     def update(done: int, note: str = "") -> None:
+        interrupts.check()
         now = time.perf_counter()
         if console.is_terminal and now - start > 2 and not bar.live.is_started:
             bar.start()

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
 from diffsim_ti.checked import instance, listed
+from diffsim_ti.copies import MadeAgain
 from diffsim_ti.inputs import ConsistentMass, Inputs
 from diffsim_ti.mass_scaling import MassScaling
 from diffsim_ti.materials.material import Material
@@ -45,7 +46,7 @@ LOCKING_RATIO = 0.45  # Poisson's ratio above which linear tetrahedra lock notic
 LOCKING_RATIO_OF_TEN_NODES = 0.49  # beyond it their mean dilatation is the better
 
 
-class Scene:
+class Scene(MadeAgain):
     """A body, its material and what acts on it. Frozen: build another scene instead of changing one.
 
     mesh: TetrahedralMesh, the rest shape.
@@ -89,9 +90,7 @@ class Scene:
         volume: str = "tetrahedra",
         mass_scaling: float | None = None,
     ):
-        self.arguments = dict(mesh=mesh, material=material, density=density, terms=terms, fixed=fixed, motion=motion)
-        self.arguments |= dict(initial_positions=initial_positions, initial_velocities=initial_velocities)
-        self.arguments |= dict(precision=precision, volume=volume, mass_scaling=mass_scaling)
+        self.arguments = {name: value for name, value in locals().items() if name != "self"}
         self.mesh = instance("Scene", "mesh", mesh, TetrahedralMesh, "a TetrahedralMesh")
         self.material = instance(
             "Scene", "material", material, Material, "a material such as StableNeoHookean(1e5, 0.3)"
@@ -105,7 +104,7 @@ class Scene:
         self.fixed, self.held = self.supports.fixed, self.supports.vertices  # in all directions; in some
         self.motion, (self.clamps, self.translates) = motion, self.supports.parts_of(motion)
         self._check_terms()
-        self._given = self.terms
+        self._given = self.arguments["terms"] = self.terms
         settled = (t.settled(self, density, initial_positions, initial_velocities) for t in self.terms)
         self.terms = tuple(copy(t) for t in settled)  # one that is listed twice is two
         self.ordered_terms = tuple(sorted(self.terms, key=_kind))
@@ -137,7 +136,8 @@ class Scene:
         no mass that was added for the sake of an explicit step."""
         if (self.mesh.order == 1 or self.consistent) and self.mass_scaling is None:
             return self
-        out, names = copy(self), ("density", "initial_positions", "initial_velocities")
+        out, names = Scene.__new__(Scene), ("density", "initial_positions", "initial_velocities")
+        vars(out).update(vars(self))
         out.consistent, out.mass_scaling = self.mesh.order > 1, None
         out.inputs = Inputs(out, *(self.arguments[name] for name in names))
         return out

@@ -53,6 +53,12 @@ class Simulator:
         self._before = self.workspace.history(1)
         self.reset()
 
+    def __reduce__(self):
+        raise TypeError(
+            "a Simulator holds memory of the device and does not pickle: pickle its solver, positions and velocities, and "
+            "there Simulator(solver), set_state(positions, velocities)"
+        )
+
     def reset(self) -> None:
         """Back to the start of the scene."""
         self.step_count = 0

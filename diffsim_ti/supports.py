@@ -5,6 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.checked import numbers, shown
 from diffsim_ti.inputs.clamps import Clamp
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.geometry import triangle_normals
@@ -143,9 +144,12 @@ def _directions(mesh: TetrahedralMesh, name: str, how: str | ArrayLike) -> np.nd
                 f"along directions, 3 numbers each; got {how!r}"
             )
         return np.eye(3)[[AXES[axis] for axis in how]]
-    directions = np.atleast_2d(np.asarray(how, np.float64))
+    directions = np.atleast_2d(numbers(f"fixed: directions of {name!r}", how))
     if directions.ndim != 2 or directions.shape[1] != 3 or not np.all(np.isfinite(directions)):
-        raise ValueError(f"fixed: directions of {name!r} must be finite, of shape (3,) or (k, 3), got {how!r}")
+        raise ValueError(
+            f'fixed: {name!r} must be held along axes by letters, such as "x" or "xyz", or along directions, finite, of '
+            f"shape (3,) or (k, 3), got {shown(how)}"
+        )
     lengths = np.linalg.norm(directions, axis=1, keepdims=True)
     if not np.all(lengths > 0):
         raise ValueError(f"fixed: directions of {name!r} must not be zero, got {how!r}")

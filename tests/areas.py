@@ -8,8 +8,8 @@ HEAD = "| area | files test_*.py | minutes |\n| --- | --- | ---: |\n"
 
 # area -> files, without test_ and .py
 AREAS = {
-    "meshes, scenes, materials": "mesh locate scene inputs loads chambers springs muscles loads_together supports "
-    "materials open_laws growth laws_with_state viscosity",
+    "meshes, scenes, materials": "mesh locate scene inputs named_sets loads chambers springs muscles loads_together "
+    "supports materials open_laws growth laws_with_state viscosity",
     "motion against closed forms": "reference_motion step_limit mass_scaling unequal_steps energy_watch hertz torture",
     "every adjoint, order, fuzz": "every_adjoint term_order gradient_fuzz",
     "gradients": "gradients batch gradient_clip gradient_faults checkpoints tape outputs "
@@ -25,8 +25,9 @@ AREAS = {
     "charts, maps, advice": "study study_stability peers",
     "pictures, films, the window": "picture_drawing picture_film marks "
     "optimization_picture writers viewer viewer_window gallery",
-    "examples and pages": "examples environment contact_examples static_examples torch_examples readme",
-    "command line, resources, backends": "cli calls strength layout resources devices launch executed_ptx single_precision",
+    "examples and pages": "types examples environment contact_examples static_examples torch_examples readme",
+    "command line, resources, backends": "cli calls hard_use strength layout resources devices launch executed_ptx "
+    "single_precision",
 }
 # files of a minute or so, the longest first: in several processes they come before all others
 LONGEST = (

@@ -17,6 +17,7 @@ from diffsim_ti.rollout.frames import Frames, check_finite
 from diffsim_ti.rollout.rollout import Rollout
 from diffsim_ti.rollout.run import Run
 from diffsim_ti.solvers.solver import Solver
+from diffsim_ti.state.schedule import UnequalSteps
 
 
 class Batch:
@@ -44,7 +45,7 @@ class Batch:
     def __init__(
         self,
         solver: Solver,
-        steps,
+        steps: int | ArrayLike | UnequalSteps,
         scenes: int,
         save_every: int | None = None,
         outputs: Output | Iterable[Output] = (),

@@ -22,7 +22,13 @@ class BatchFrames(Sequence):
     """
 
     def __init__(
-        self, batch: "Batch", values: dict, frames: list[Frames], last_good: np.ndarray, run: Run | None, errors=None
+        self,
+        batch: "Batch",
+        values: dict,
+        frames: list[Frames],
+        last_good: np.ndarray,
+        run: Run | None,
+        errors: dict | list | None = None,
     ):
         self._batch, self.values, self._frames, self.run = batch, values, frames, run
         self.positions = np.stack([one.positions for one in frames])

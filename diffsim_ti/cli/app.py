@@ -1,6 +1,5 @@
 """The command line: `diffsim-ti` or `python -m diffsim_ti`. One function per command; heavy imports inside them."""
 
-import math
 import sys
 import time
 import warnings
@@ -10,6 +9,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
+from diffsim_ti import interrupts
 from diffsim_ti.adaptive_run import Interrupted
 from diffsim_ti.cli.identify import identify
 from diffsim_ti.cli.options import (
@@ -29,6 +29,8 @@ from diffsim_ti.cli.options import (
     UpAxis,
     Volume,
     Youngs,
+    check_length,
+    check_time_it_takes,
     fall_scene,
     fixed_vertices,
     forces_named,
@@ -42,8 +44,6 @@ from diffsim_ti.cli.study import register as register_study
 from diffsim_ti.cli.view import register
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.scene import Scene
-
-MOST_FRAMES = 10**6  # of a run: beyond it a duration is a slip
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, help="Soft bodies on tetrahedra.")
 register_study(app)  # chart, stability, recommend
@@ -66,24 +66,28 @@ def main(arguments: list[str] | None = None) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("default", UserWarning)
         warnings.showwarning = lambda message, *_, **__: print(f"warning: {message}", file=sys.stderr)
+        said = "interrupted"
         try:
+            interrupts.commands_may_run()
             code = app([a for a in arguments if a != "--traceback"], standalone_mode=False, prog_name="diffsim-ti")
         except Interrupted as stop:
-            code = _fail(str(stop), 130)
+            said, code = str(stop), 130
         except (KeyboardInterrupt, typer.Abort):
-            code = _fail("interrupted", 130)
+            code = 130
         except ClickException as error:
-            code = _fail(f"{error.format_message()} (see diffsim-ti --help)")
+            said, code = f"{error.format_message()} (see diffsim-ti --help)", 2
         except (ValueError, TypeError, RuntimeError, OSError, FloatingPointError, MemoryError) as error:
             if wants_traceback:
                 raise
-            code = _fail(str(error) or type(error).__name__)
-    sys.exit(code if isinstance(code, int) else 0)
-
-
-def _fail(message: str, code: int = 2) -> int:
-    print("error: " + " ".join(message.split()), file=sys.stderr)
-    return code
+            said, code = str(error) or type(error).__name__, 2
+        finally:
+            stopped = interrupts.command_ended()
+    if stopped and code != 130:
+        said, code = "interrupted", 130  # swallowed on its way
+    code = code if isinstance(code, int) else 0
+    if code in (2, 130):
+        print("error: " + " ".join(said.split()), file=sys.stderr)
+    sys.exit(code)
 
 
 # ---- commands ---------------------------------------------------------------------------------------------------------
@@ -148,14 +152,7 @@ def simulate(
     from diffsim_ti.writers import View, writer_for
 
     begin = time.perf_counter()
-    for name, value in (("duration", duration), ("fps", fps), ("density", density)):
-        if not (value > 0 and math.isfinite(value)):
-            raise ValueError(f"--{name} must be > 0 and finite, got {value:g}")
-    if duration * fps > MOST_FRAMES:
-        raise ValueError(
-            f"--duration {duration:g} at --fps {fps:g} makes {duration * fps:.3g} frames, more than {MOST_FRAMES:.0e}: "
-            "shorten it, or take fewer frames per second"
-        )
+    check_length(duration, fps, dt)
     view = View(fps=fps, azimuth=azimuth, title=mesh.stem, fit="end", arrows=tuple(arrows or ()))
     asked = [file_in(o, mesh.stem + suffix) for o in output or [Path("output/simulate")] for suffix in (".pvd", ".png")]
     writers = [writer_for(path, view) for path in dict.fromkeys(asked)]
@@ -180,6 +177,7 @@ def simulate(
     )
     frames = max(1, round(duration * fps))
     run = ForwardRun(scene, kind, duration / frames, dt, forces_named(arrows or (), scene))
+    check_time_it_takes(run, duration)
     setup = time.perf_counter() - begin
     writing, files, _ = run_and_write(run, frames, writers)
     print_summary(run, setup, writing, files)

@@ -1,5 +1,6 @@
 """What the commands share: types of options, the scene that options describe, the summary at the end."""
 
+import math
 from collections.abc import Sequence
 from enum import Enum
 from pathlib import Path
@@ -43,6 +44,40 @@ SUFFIXES = f"{', '.join(WRITERS)} (run_%04d.png: every frame, run.png: the end)"
 Folder = Annotated[Path, typer.Option("--output", "-o", help="folder for what is written")]
 
 
+MOST_FRAMES = 10**6  # of a run: beyond it a duration is a slip
+MOST_DAYS = 30  # that a run may be expected to take
+
+
+def check_length(duration: float, fps: float, dt: float | None) -> None:
+    """Raise ValueError for numbers of a run that are no such numbers, or make more frames or steps than anyone waits for."""
+    for name, value in (("duration", duration), ("fps", fps), ("dt", dt)):
+        if value is not None and not (value > 0 and math.isfinite(value)):
+            raise ValueError(f"--{name} must be > 0 and finite, got {value:g}")
+    if duration * fps > MOST_FRAMES:
+        raise ValueError(
+            f"--duration {duration:g} at --fps {fps:g} makes {duration * fps:.3g} frames, more than {MOST_FRAMES:.0e}: "
+            "shorten it, or take fewer frames per second"
+        )
+    if dt is not None and duration / dt > 1e12:
+        raise ValueError(
+            f"--duration {duration:g} in steps of --dt {dt:g} s takes {duration / dt:.3g} steps, more than 1e12: shorten "
+            "it, or leave --dt out"
+        )
+
+
+def check_time_it_takes(run: "ForwardRun", duration: float) -> None:
+    """Raise ValueError for a run whose explicit steps would take more than a month."""
+    steps = duration / run.first_substep
+    seconds = steps * (
+        2e-6 + 2e-8 * run.scene.mesh.num_tetrahedra
+    )  # two microseconds and 20 ns a tetrahedron: quick ones
+    if seconds > MOST_DAYS * 86400:
+        raise ValueError(
+            f"--duration {duration:g} s takes about {steps:.3g} steps of {run.first_substep:.3g} s, more than "
+            f"{seconds / 86400:.3g} days: shorten it, lower -E, or take --solver bdf2"
+        )
+
+
 # ---- a scene from options ---------------------------------------------------------------------------------------------
 
 
@@ -66,8 +101,8 @@ def load_body(
         rows = np.eye(3)[[(axis + 2) % 3, axis, (axis + 1) % 3]]
         mesh = mesh.rotated(np.diag([1, sign, sign]) @ rows)
     if size is not None:
-        if not size > 0:
-            raise ValueError(f"--size must be > 0 [m], got {size:g}")
+        if not 0 < size < math.inf:
+            raise ValueError(f"--size must be > 0 and finite [m], got {size:g}")
         mesh = mesh.scaled(size / np.ptp(mesh.bounding_box, 0).max())
     return mesh.quadratic() if order > mesh.order else mesh
 

@@ -2,8 +2,10 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from diffsim_ti.identification.least_squares import described
 from diffsim_ti.identification.measurements import measurements
@@ -34,7 +36,13 @@ class Expectation:
         return 0.5 * float(np.linalg.slogdet(self.information.covariance)[1])
 
 
-def expected(rollout: Rollout | Iterable[Rollout], data, unknowns: dict, noise=None, prior=None) -> Expectation:
+def expected(
+    rollout: Rollout | Iterable[Rollout],
+    data: Any,
+    unknowns: dict,
+    noise: ArrayLike | None = None,
+    prior: dict | None = None,
+) -> Expectation:
     """Intervals to expect of an experiment, from one run and a tangent for each unknown: the Cramer-Rao bound.
 
     Arguments as in `identify`; unknowns start at the numbers that are assumed. Of the data only shape, noise and NaN count;
@@ -62,7 +70,9 @@ def _complete(data, rollout: Rollout):
     return data
 
 
-def compare(rollout: Rollout, choices: dict, unknowns: dict, noise=None, prior=None) -> dict[str, Expectation]:
+def compare(
+    rollout: Rollout, choices: dict, unknowns: dict, noise: ArrayLike | None = None, prior: dict | None = None
+) -> dict[str, Expectation]:
     """Expectations of several measurements of one experiment, the best first: least volume of the confidence region.
 
     choices: {name: data as in `expected`}, such as Measurement("positions", zeros, noise, at=markers). One run and one

@@ -4,8 +4,10 @@ import json
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from diffsim_ti.identification.measurements import measurements
 from diffsim_ti.identification.priors import Priors
@@ -115,9 +117,9 @@ def _conjugate_gradients(product, b: np.ndarray, M: np.ndarray, tolerance: float
 
 def identify(
     rollout: Rollout | Iterable[Rollout],
-    data,
+    data: Any,
     unknowns: dict,
-    noise=None,
+    noise: ArrayLike | None = None,
     prior: dict | None = None,
     max_iterations: int = 50,
     tolerance: float = 0.03,

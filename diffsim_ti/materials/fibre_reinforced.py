@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from diffsim_ti.differentiation import exp, maximum
 from diffsim_ti.materials.around import Around
@@ -109,7 +110,7 @@ class FibreReinforced(Around):
 
     takes_moduli = False
 
-    def __init__(self, matrix: Material, k1, k2, fibre):
+    def __init__(self, matrix: Material, k1: ArrayLike | dict, k2: ArrayLike | dict, fibre: ArrayLike | dict):
         families = sum(name.split("_")[0] == "k1" for name in getattr(matrix, "inputs", ()))
         names = [f"{name}_{families + 1}" if families else name for name in UNITS]
         self.units, self.shapes = dict(zip(names, UNITS.values())), {names[2]: (3,)}

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from diffsim_ti.materials.around import Around
 from diffsim_ti.materials.calculus.tensor import add_to_diagonal, inner
@@ -89,7 +90,7 @@ class Grown(Around):
     units = {"growth": "-"}
     takes_moduli = False
 
-    def __init__(self, material: Material, growth):
+    def __init__(self, material: Material, growth: ArrayLike | dict):
         if "growth" in getattr(material, "inputs", ()):
             raise ValueError(f"Grown: {material.name} has a growth already; take a material without")
         self._surround(material, dict(growth=growth))

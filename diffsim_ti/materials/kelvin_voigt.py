@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from diffsim_ti.materials.around import Around
 from diffsim_ti.materials.calculus.green import (
@@ -216,7 +217,13 @@ class KelvinVoigt(Around):
     units = {"viscous_time": "s", "shear_viscosity": "Pa s", "bulk_viscosity": "Pa s"}
     remembers = False
 
-    def __init__(self, material: Material, time=None, shear_viscosity=None, bulk_viscosity=None):
+    def __init__(
+        self,
+        material: Material,
+        time: ArrayLike | dict | None = None,
+        shear_viscosity: ArrayLike | dict | None = None,
+        bulk_viscosity: ArrayLike | dict | None = None,
+    ):
         given = dict(viscous_time=time, shear_viscosity=shear_viscosity, bulk_viscosity=bulk_viscosity)
         given = {name: number for name, number in given.items() if number is not None}
         if tuple(given) not in (("viscous_time",), ("shear_viscosity", "bulk_viscosity")):

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from diffsim_ti.checked import shape_of
 from diffsim_ti.differentiation import expm1_minus_x
@@ -50,7 +51,7 @@ class Ogden(Material):
     spellings = (("moduli", "exponents", "bulk_modulus"),)
     units = {"exponents": "-"}
 
-    def __init__(self, moduli, exponents, bulk_modulus):
+    def __init__(self, moduli: ArrayLike | dict, exponents: ArrayLike | dict, bulk_modulus: ArrayLike | dict):
         firsts = [next(iter(x.values())) if isinstance(x, dict) and x else x for x in (moduli, exponents)]
         of_terms = [shape_of(name, x) for name, x in zip(("moduli", "exponents"), firsts)]
         if not all(of_terms) or of_terms[0][-1] != of_terms[1][-1] or not of_terms[0][-1]:

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from diffsim_ti.checked import shape_of
 from diffsim_ti.differentiation import exp
@@ -152,7 +153,7 @@ class Prony(Around):
 
     units = {"prony_shares": "-", "prony_times": "s"}
 
-    def __init__(self, material: Material, shares, times):
+    def __init__(self, material: Material, shares: ArrayLike | dict, times: ArrayLike | dict):
         firsts = [next(iter(x.values())) if isinstance(x, dict) and x else x for x in (shares, times)]
         of_terms = [shape_of(name, x) for name, x in zip(("shares", "times"), firsts)]
         if not all(of_terms) or of_terms[0][-1] != of_terms[1][-1] or not of_terms[0][-1]:

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
+from diffsim_ti.mesh import gmsh1
+
 DIMENSION = {"vertex": 0, "line": 1, "line3": 1, "triangle": 2, "triangle6": 2, "tetra": 3, "tetra10": 3}  # in a file
 TAGS = ("gmsh:physical", "medit:ref", "cell_tags", "avsucd:material")  # integer cell data that group cells
 VERTEX_PREFIX = "vertex_set:"  # 0/1 data arrays in VTU and VTK files
@@ -56,6 +58,11 @@ def _read(path: Path):
 
     with open(path, "rb") as file:
         is_gmsh = path.suffix == ".msh" and b"$" in file.read(1)
+    if is_gmsh and gmsh1.is_gmsh1(path):
+        try:
+            return gmsh1.read(path)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}; export it again") from error
     said = io.StringIO()
     try:
         with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):

@@ -38,7 +38,9 @@ def indices_of(chosen, count: int, what: str) -> np.ndarray:
     if chosen.size == 0:
         return np.zeros(0, np.int64)
     if chosen.dtype.kind not in "iu":
-        raise ValueError(f"{what}: indices must be integers, got dtype {chosen.dtype}; convert with .astype(np.int64)")
+        raise ValueError(
+            f"{what}: indices must be integers, got dtype {chosen.dtype}; give whole numbers, such as [0, 3]"
+        )
     chosen = np.unique(chosen).astype(np.int64)
     if chosen[0] < 0 or chosen[-1] >= count:
         bad = chosen[0] if chosen[0] < 0 else chosen[-1]

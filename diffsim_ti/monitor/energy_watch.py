@@ -4,11 +4,12 @@ import weakref
 
 import numpy as np
 
+from diffsim_ti.copies import CarriesMore
 from diffsim_ti.inputs import kinetic_energy
 from diffsim_ti.state.workspace import Workspace
 
 
-class EnergyGained(UserWarning):
+class EnergyGained(CarriesMore, UserWarning):
     """Steps have added energy to the motion. Carries `gained` [J], `share` of the energy that moves, `step`, `time` [s] and
     the `substep` [s] that is advised."""
 

@@ -5,6 +5,7 @@ import warnings
 import numpy as np
 
 from diffsim_ti import runtime
+from diffsim_ti.copies import CarriesMore
 from diffsim_ti.monitor import quantities, stability
 from diffsim_ti.monitor.energy_watch import EnergyGained
 from diffsim_ti.state.walls import Moment
@@ -13,7 +14,7 @@ from diffsim_ti.state.workspace import Workspace
 from diffsim_ti.terms.obstacles.barrier import beta
 
 
-class Divergence(FloatingPointError):
+class Divergence(CarriesMore, FloatingPointError):
     """The state is not finite, or the step has become unstable. Carries step, vertex, tetrahedron and stable_dt [s]."""
 
     def __init__(self, message: str, step: int, vertex: int | None, tetrahedron: int | None, stable_dt: float):

@@ -204,8 +204,12 @@ class Stiffness:
         if not start.any():
             return 0.0, 0.0
         with np.errstate(over="ignore", invalid="ignore"):
-            if not np.isfinite(np.linalg.norm(self.product(start))):
-                raise FloatingPointError("the stiffness of this state is not finite")
+            size = np.linalg.norm(self.product(start))
+        if not 0 < size < np.inf:
+            raise FloatingPointError(
+                f"the stiffness of this state is {'zero' if size == 0 else 'not finite'} in this precision: look at Young's "
+                'modulus and the scale of the mesh, or take precision="f64"'
+            )
         operator = LinearOperator((3 * n, 3 * n), lambda x: self.product(x.reshape(-1, 3)).ravel(), dtype=np.float64)
         value, vector = eigsh(operator, 1, which="LA", v0=start.ravel(), tol=tolerance, ncv=min(3 * n - 1, 24))
         self.vector = vector[:, 0].reshape(-1, 3)

@@ -40,8 +40,13 @@ class Frames:
     contact_forces: np.ndarray | None = field(default=None, repr=False)
     computed: dict = field(default_factory=dict, repr=False)
     chamber_pressures: np.ndarray | None = field(default=None, repr=False)
+    sets: dict = field(default_factory=dict, repr=False)  # of inputs given by named sets, by input (set_values.py)
     steps: np.ndarray | None = field(default=None, repr=False)  # of the run that are done in each frame
     run: Run | None = field(default=None, repr=False)
+
+    def __getstate__(self) -> dict:
+        """Without the run, which lives on the device: a copy by pickle has no gradient."""
+        return vars(self) | dict(run=None)
 
     def __getitem__(self, name: str) -> np.ndarray:
         if name in ("positions", "velocities", "displacements"):

@@ -7,11 +7,13 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
 from diffsim_ti.checked import instance, listed, shape_of
+from diffsim_ti.copies import made_again
 from diffsim_ti.inputs import Derived
 from diffsim_ti.outputs import Change, Displacements, Output, Positions, Velocities
 from diffsim_ti.rollout.checkpoints import Checkpoints
 from diffsim_ti.rollout.frames import Frames, HostSeed, check_finite
 from diffsim_ti.rollout.run import Run
+from diffsim_ti.rollout.set_values import gathered, spread_all
 from diffsim_ti.rollout.sweep import Sweep
 from diffsim_ti.rollout.taped import TapeFace
 from diffsim_ti.solvers.solver import Solver
@@ -84,6 +86,11 @@ class Rollout:
         self.tape_face = TapeFace(self, runs)
         self.torch_face = None  # made by the first run from tensors (torch_bridge/tensors.py)
 
+    def __reduce__(self):
+        """As it was made; values of its fields, and frames, are not in it."""
+        steps = self.steps if self.schedule is None else self.schedule
+        return made_again, (Rollout, dict(solver=self.solver, steps=steps) | self._options)
+
     @staticmethod
     def _stepped(solver: Solver, steps) -> tuple[Solver, int]:
         """The solver that takes these steps, and how many they are."""
@@ -149,8 +156,15 @@ class Rollout:
     # ---- with arrays ------------------------------------------------------------------------------------------------
 
     def forward(self, **values) -> Frames:
-        """Run from the scene's inputs, with some of them replaced, and return the saved frames."""
-        return self.frames_of(self.sweep.run(values))
+        """Run from the scene's inputs, with some of them replaced, and return the saved frames.
+
+        A material's numbers and others per tetrahedron may be given by named sets, `youngs_modulus={"soft": 2e4}`; gradients
+        by them have the same names, and so may tangents (set_values.py).
+        """
+        values, sets = spread_all(self.scene, self.values, values)
+        frames = self.frames_of(self.sweep.run(values))
+        frames.sets = sets
+        return frames
 
     def frames_of(self, run: Run) -> Frames:
         """The frames of the run that the sweep ran last, with all outputs."""
@@ -184,6 +198,8 @@ class Rollout:
         at_frames = [zero if x is None else x for x in (change.positions, change.velocities)]
         seed = HostSeed(*at_frames, change.contact_forces, change.chamber_pressures)
         self.gradients = self.gradients_of(frames.run, self.sweep.pull_back(frames.run, seed), change)
+        for name in self.gradients.keys() & frames.sets.keys():
+            self.gradients[name] = gathered(self.gradients[name], frames.sets[name])
         return self.gradients
 
     def pulled_to_frames(self, frames: Frames, seeds: dict) -> Change:
@@ -230,6 +246,8 @@ class Rollout:
         if unknown:
             raise ValueError(f"jvp: no input named {unknown[0]!r}; this rollout has {', '.join(self.inputs)}")
         values = frames.inputs
+        zero = {name: np.zeros_like(values[name]) for name in tangents}
+        tangents, _ = spread_all(self.scene, zero, tangents, frames.sets)
         tangents = {k: np.broadcast_to(np.asarray(x, np.float64), values[k].shape) for k, x in tangents.items()}
         derived = self.scene.inputs.derive_jvp(values, tangents)
         moved = self.sweep.push_forward(frames.run, derived)
@@ -242,7 +260,8 @@ class Rollout:
 
         Input fields hold the scene's values until a kernel or `from_numpy` writes others; `run` reads them. Those of outputs
         have shape (frames, num_vertices), and (runs, frames, num_vertices) in a Rollout of several `runs`.
-        "initial_displacements" is another spelling of "initial_positions", which keeps its digits in float32.
+        "youngs_modulus[soft]" is the number of a named set. "initial_displacements" is another spelling of
+        "initial_positions", which keeps its digits in float32.
         """
         return self.tape_face.field(name)
 

@@ -12,6 +12,7 @@ from diffsim_ti.outputs import Change
 from diffsim_ti.rollout import field_copies
 from diffsim_ti.rollout.field_seed import STATES, field_seed
 from diffsim_ti.rollout.run import Run
+from diffsim_ti.rollout.set_values import gathered, per_tetrahedron, rows_of_sets, split_name, spread
 from diffsim_ti.state.workspace import Workspace
 
 if TYPE_CHECKING:
@@ -55,6 +56,8 @@ class TapeFace:
             if name in rollout.outputs:
                 rows = () if self.runs is None else (self.runs,)
                 self._fields[name] = self._take((*rows, *rollout.outputs[name].shape(rollout.num_frames)))
+            elif split_name(name)[1] is not None:
+                self._fields[name] = self._field_of_set(name)
             elif SPELLING.get(name, name) in rollout.inputs:
                 if {name, *self._fields} >= {"initial_positions", "initial_displacements"}:
                     raise ValueError(
@@ -70,6 +73,31 @@ class TapeFace:
             else:
                 raise ValueError(f"no input named {name!r}; this rollout has {', '.join(rollout.inputs)}")
         return self._fields[name]
+
+    def _field_of_set(self, name: str):
+        """The number of a named set; where the scene's differ in it, the first."""
+        plain, key = split_name(name)
+        rows = rows_of_sets(self.rollout.scene, plain, [*self._sets().get(plain, ()), key])[key]
+        value = per_tetrahedron(self.rollout.scene, plain, self._loaded(plain))[rows[:1]].reshape(-1)
+        field = self._take(value.shape if value.size > 1 else ())
+        field.from_numpy(np.asarray(value if value.size > 1 else value[0], self.number))
+        return field
+
+    def _sets(self) -> dict:
+        """{input: {set: tetrahedra}} of the fields of named sets."""
+        named = [split_name(name) for name in self._fields]
+        inputs = dict.fromkeys(name for name, key in named if key is not None)
+        scene = self.rollout.scene
+        return {own: rows_of_sets(scene, own, [key for name, key in named if name == own and key]) for own in inputs}
+
+    def by_sets(self, gradients: dict) -> dict:
+        """Gradients by the numbers of named sets that have fields."""
+        return {
+            f"{name}[{key}]": gradient
+            for name, rows in self._sets().items()
+            if name in gradients
+            for key, gradient in gathered(gradients[name], rows).items()
+        }
 
     def _loaded(self, name: str) -> np.ndarray:
         """The scene's value of an input."""
@@ -153,6 +181,11 @@ class TapeFace:
                 if name == "initial_displacements":
                     value = value + rollout.values["rest_positions"]
                 out[SPELLING.get(name, name)] = value
+        for name, rows in self._sets().items():
+            if name in self._fields:
+                raise ValueError(f"{name}: fields of the whole and of named sets were asked for; use one of both")
+            numbers = {key: self._fields[f"{name}[{key}]"].to_numpy() for key in rows}
+            out[name] = spread(rollout.scene, name, self._loaded(name), numbers, rows)
         return out, direct and bool(start)
 
     def set_start(self, workspace: Workspace) -> None:
@@ -247,5 +280,6 @@ class TapedRun:
             change.add(Change(inputs=by_rest.inputs))
         derived = rollout.sweep.pull_back(self.run, field_seed(face, self.k, change))
         gradients = rollout.gradients_of(self.run, derived, change)
+        gradients |= face.by_sets(gradients)
         face.add_gradients(gradients)
         face.sum_up(gradients)

@@ -36,5 +36,7 @@ from diffsim_ti.runtime.start import (
     runs_on_cpu,
     set_precision,
 )
+from diffsim_ti.runtime.threads import take_turns as _take_turns
 
 _trace_faster()
+_take_turns()

@@ -13,6 +13,7 @@ from taichi.lang.matrix import VectorNdarray
 
 from diffsim_ti.runtime import device
 from diffsim_ti.runtime.start import arch_name, check_alive, is_alive, program, runs_on_cpu
+from diffsim_ti.runtime.threads import LOCK
 
 _allocated = {"bytes": 0}
 _MOST_NUMBERS = 2**31 - 1
@@ -77,7 +78,8 @@ def array(dtype, *shape: int):
         )
     size = count * np.dtype(to_numpy_dtype(dtype if is_scalar else dtype.dtype)).itemsize
     try:
-        out = _Scalars(dtype, shape) if is_scalar else _Vectors(dtype, shape)
+        with LOCK:
+            out = _Scalars(dtype, shape) if is_scalar else _Vectors(dtype, shape)
     except RuntimeError as error:
         if "out of memory" not in str(error).lower():
             raise
@@ -105,11 +107,11 @@ def upload(data: np.ndarray, dtype) -> "ti.Ndarray":
 
 def full_shape(target) -> tuple:
     """Shape of a Taichi array with its element's shape, as NumPy sees it."""
-    _check_owner(target)
+    check_owner(target)
     return tuple(target.shape) + tuple(getattr(target, "element_shape", ()) or ())
 
 
-def _check_owner(target) -> None:
+def check_owner(target) -> None:
     """The memory of an array of a dead program is gone, and so is what describes it."""
     owner = getattr(target, "owner", None)
     if owner is not None:
@@ -118,7 +120,7 @@ def _check_owner(target) -> None:
 
 def view(target) -> "np.ndarray | None":
     """A NumPy array over the memory of a Taichi array, no copy; None where that memory is not the host's."""
-    _check_owner(target)
+    check_owner(target)
     host = getattr(target, "host_view", None)
     if host is None and runs_on_cpu():
         dtype, shape = to_numpy_dtype(target.dtype), full_shape(target)
@@ -144,7 +146,8 @@ def fill(target, data) -> None:
     if on_cuda:  # Taichi would copy both ways, and wait three times
         device.copy_to_card(_address(target), whole)
     else:
-        target.from_numpy(whole)
+        with LOCK:
+            target.from_numpy(whole)
 
 
 def fetch(source, row: int | None = None) -> np.ndarray:

@@ -9,6 +9,7 @@ from taichi.lang import impl
 
 from diffsim_ti.runtime.arrays import to_numpy_dtype
 from diffsim_ti.runtime.start import program
+from diffsim_ti.runtime.threads import LOCK, materialize
 
 
 class FieldPool:
@@ -20,7 +21,9 @@ class FieldPool:
     def take(self, owner, dtype, shape: tuple, components: int = 0):
         """A field of that kind, zeroed; it comes back to the pool when `owner` is collected."""
         key = (program(), dtype, tuple(shape), components)
-        field = self._free[key].pop() if self._free[key] else self._make(dtype, tuple(shape), components)
+        with LOCK:
+            field = self._free[key].pop() if self._free[key] else self._make(dtype, tuple(shape), components)
+            materialize()
         weakref.finalize(owner, self._free[key].append, field)
         for part in (field, field.grad):
             part.from_numpy(np.zeros(tuple(shape) + ((components,) if components else ()), to_numpy_dtype(dtype)))

@@ -8,9 +8,10 @@ from taichi.lang import impl
 from taichi.types import primitive_types
 
 from diffsim_ti.runtime.argument_buffer import ArgumentBuffer
-from diffsim_ti.runtime.arrays import full_shape
+from diffsim_ti.runtime.arrays import check_owner, full_shape
 from diffsim_ti.runtime.repeated_loops import RepeatedLoops
 from diffsim_ti.runtime.start import arch_name, check_alive, program
+from diffsim_ti.runtime.threads import LOCK, materialize
 
 
 class Launch:
@@ -22,6 +23,8 @@ class Launch:
     """
 
     def __init__(self, kernel, *arrays, vectorized: bool = False, loops: int = 0):
+        for array in arrays:
+            check_owner(array)
         self._kernel, self._arrays, self._vectorized, self._loops = kernel._primal, arrays, vectorized, loops
         self._setters, self._buffer, self._repeated, self._owner = None, None, None, program()
 
@@ -29,7 +32,7 @@ class Launch:
         prog = impl.get_runtime().prog
         config, kernel = prog.config(), self._kernel
         with _settings(config, real_matrix_scalarize=not self._vectorized, advanced_optimization=False):
-            kernel.runtime.materialize()
+            materialize()
             compiled = kernel.compiled_kernels[kernel.ensure_compiled(*self._arrays, *numbers)]
             self._code = prog.compile_kernel(config, prog.get_device_caps(), compiled)
         if self._loops:
@@ -56,6 +59,10 @@ class Launch:
 
     def __call__(self, *numbers) -> None:
         check_alive(self._owner)
+        with LOCK:
+            self._launch(numbers)
+
+    def _launch(self, numbers: tuple) -> None:
         if self._setters is None:
             self._prepare(numbers)
         if self._buffer:
@@ -91,6 +98,10 @@ class TensorLaunch(Launch):
 
     def __call__(self, *tensors) -> None:
         check_alive(self._owner)
+        with LOCK:
+            self._launch(tensors)
+
+    def _launch(self, tensors: tuple) -> None:
         if self._setters is None:
             arrays = self._arrays
             self._arrays = (*tensors, *arrays)

@@ -5,6 +5,7 @@ import contextlib
 import io
 import multiprocessing
 import os
+import shutil
 import tempfile
 import warnings
 import weakref
@@ -15,6 +16,7 @@ from taichi._lib import core as _core
 from taichi.lang import impl
 
 from diffsim_ti.runtime.device import count_cards
+from diffsim_ti.runtime.threads import LOCK, materialize
 
 PRECISIONS = {"f32": ti.f32, "f64": ti.f64}
 NUMPY = {"f32": np.float32, "f64": np.float64}
@@ -65,13 +67,16 @@ def init(arch: str = "cpu", precision: str = "f32", threads: int | None = None, 
     options.setdefault("log_level", ti.ERROR)
     if not _can_write_cache(options.get("offline_cache_file_path") or os.environ.get("TI_OFFLINE_CACHE_FILE_PATH")):
         # Taichi makes the folder even then, and crashes at exit if it cannot
-        options |= dict(offline_cache=False, offline_cache_file_path=tempfile.mkdtemp(prefix="ticache-"))
+        folder = _settings.get("folder") or tempfile.mkdtemp(prefix="ticache-")
+        _settings["folder"] = folder  # until the end of this process
+        options |= dict(offline_cache=False, offline_cache_file_path=folder)
         os.environ.pop("TI_OFFLINE_CACHE_FILE_PATH", None)
     if threads is not None:
         options["cpu_max_num_threads"] = int(threads)
     set_precision(precision)
-    with contextlib.redirect_stdout(io.StringIO()):
+    with LOCK, contextlib.redirect_stdout(io.StringIO()):
         ti.init(arch=_ARCHS[arch], default_fp=ti.f64, fast_math=False, enable_fallback=False, **options)
+        materialize()  # in this thread, so that others can compile
 
 
 def _can_write_cache(path: str | None) -> bool:
@@ -109,8 +114,12 @@ if hasattr(os, "register_at_fork"):
 def _end_program() -> None:
     """Taichi writes the kernels that it compiled to its cache when its program ends, and an interpreter that exits does not
     end it where anything, such as the callback above, still leads to it."""
-    if impl.get_runtime().prog is not None and not _settings.get("forked"):
+    if _settings.get("forked"):
+        return
+    if impl.get_runtime().prog is not None:
         ti.reset()
+    if "folder" in _settings:
+        shutil.rmtree(_settings["folder"], ignore_errors=True)
 
 
 def refuse_fork() -> None:
@@ -128,7 +137,9 @@ def program() -> weakref.ref:
     """
     refuse_fork()
     if impl.get_runtime().prog is None:
-        init(_arch_of_parent())
+        with LOCK:
+            if impl.get_runtime().prog is None:
+                init(_arch_of_parent())
     _tell_workers()
     return weakref.ref(impl.get_runtime().prog)
 

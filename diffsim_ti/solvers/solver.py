@@ -70,6 +70,11 @@ class Solver(ABC):
         if not hasattr(scene, "with_consistent_mass"):
             raise ValueError(f"{type(self).__name__}: takes a Scene, got {shown(scene)}")
 
+    def __reduce__(self):
+        """As it was made, for its scene."""
+        own = dict(scene=self.scene) | {name: getattr(self, name) for name in self.arguments}
+        return _on_schedule, (type(self), own, self._schedule)
+
     def for_scene(self, scene: "Scene") -> "Solver":
         """The same solver for another scene."""
         return type(self)(scene, **{name: getattr(self, name) for name in self.arguments})
@@ -186,3 +191,8 @@ class Solver(ABC):
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}(dt={self.dt:g}, substeps={self.substeps})"
+
+
+def _on_schedule(kind: type, arguments: dict, schedule: UnequalSteps | None) -> Solver:
+    solver = kind(**arguments)
+    return solver if schedule is None else solver.on(schedule)

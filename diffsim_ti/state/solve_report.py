@@ -5,8 +5,10 @@ from collections import deque
 from contextlib import contextmanager
 from dataclasses import dataclass
 
+from diffsim_ti.copies import CarriesMore
 
-class Buckled(UserWarning):
+
+class Buckled(CarriesMore, UserWarning):
     """Statics left stationary states that were no minima, `saddles` of them in step `step`, or, where that is 0, met states
     with an indefinite Hessian in `unstable` rounds on the way to the equilibrium, which is how a body buckles whose mesh is
     not quite symmetric (not said where there is contact, whose barriers have such states anyway; the report counts all)."""

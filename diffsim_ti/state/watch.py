@@ -3,6 +3,7 @@
 import weakref
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -162,7 +163,10 @@ class ContactWatch:
         """The same, worked out when it is asked for: most runs never are."""
         values, largest = self.ws.arrays.values, limits(self.ws.solver)
         parts = [*self.parts, (self.rows(), self.ws.substep)]
-        return lambda: worst([self.resolution_of(rows, values, h, largest) for rows, h in parts])
+        return partial(self._worst_of, values, largest, parts)
+
+    def _worst_of(self, values: Derived, largest: tuple[float, float], parts: list) -> ContactResolution:
+        return worst([self.resolution_of(rows, values, h, largest) for rows, h in parts])
 
     def resolution_of(
         self, rows: np.ndarray, values: Derived, h: float, largest: tuple[float, float]

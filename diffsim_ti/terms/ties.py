@@ -17,7 +17,12 @@ from diffsim_ti.terms.marks import Lines, Points
 from diffsim_ti.terms.over_time import OverTime, amount, is_keyed, rows_at
 from diffsim_ti.terms.term import Term
 
-AT_LEAST_0 = Range(">= 0", lambda x: x >= 0, in_runs=False)  # differences about 0 step below it
+
+def _at_least_0(x):
+    return x >= 0
+
+
+AT_LEAST_0 = Range(">= 0", _at_least_0, in_runs=False)  # differences about 0 step below it
 
 
 class Anchor:

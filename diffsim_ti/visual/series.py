@@ -5,6 +5,7 @@ floor's height [m], `marks` are labels, `units` those of fields.
 """
 
 import json
+import os
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -16,17 +17,30 @@ from diffsim_ti.visual.fields import FIELDS
 from diffsim_ti.visual.frame import Frame, Setting
 from diffsim_ti.visual.series_marks import read_marks, read_part
 
+REMEDY = "take the .pvd that a run of diffsim-ti wrote"
 
-def listed(path: str | Path) -> list[tuple[float, str, Path]]:
-    """(time [s], part, file) of all that a .pvd lists. Raises ValueError if it is no such file."""
+
+def text_of(name: str) -> str:
+    """A file's name as text that XML can hold: its bytes as UTF-8 whatever the locale, "_" where they are none."""
+    text = os.fsencode(name).decode("utf-8", "replace").replace("\ufffd", "_")
+    return "".join(c if c.isprintable() else "_" for c in text)
+
+
+def listed(path: str | Path, remedy: str = REMEDY) -> list[tuple[float, str, Path]]:
+    """(time [s], part, file) of all that a .pvd lists. Raises ValueError, which ends in `remedy`, if it is no such file, and
+    FileNotFoundError."""
     path = Path(path)
     try:
-        rows = ElementTree.parse(path).getroot().iter("DataSet")
-        return [(float(row.attrib["timestep"]), row.get("part", "0"), path.parent / row.attrib["file"]) for row in rows]
-    except (ElementTree.ParseError, KeyError, ValueError) as error:
-        raise ValueError(
-            f"{path} is not a ParaView series (.pvd): {error}; remove it or choose another folder"
-        ) from error
+        root = ElementTree.parse(path).getroot()
+        if next(root.iter("Collection"), None) is None:
+            raise ValueError(f"its root is <{root.tag}>, and it has no <Collection>")
+        rows = [(row.attrib, path.parent / os.fsdecode(row.attrib["file"].encode())) for row in root.iter("DataSet")]
+        return [(float(row["timestep"]), row.get("part", "0"), file) for row, file in rows]
+    except FileNotFoundError as error:
+        raise FileNotFoundError(f"{path}: no such series; {remedy}") from error
+    except (ElementTree.ParseError, LookupError, ValueError) as error:
+        reason = f"an entry without {error}" if isinstance(error, KeyError) else error
+        raise ValueError(f"{path} is not a ParaView series (.pvd): {reason}; {remedy}") from error
 
 
 def frames_of(path: str | Path) -> list[tuple[float, Path]]:
@@ -43,24 +57,22 @@ class SavedSeries:
     def __init__(self, path: str | Path):
         self._frames = frames_of(path)
         self._parts: list[dict[str, Path]] = []  # of each frame
-        for _, part, file in listed(path):
-            self._parts += [{}] if part == "0" else []
-            self._parts[-1][part] = file
-        self._read: tuple[Path | None, list[Triangles]] = (None, [])
         if not self._frames:
             raise ValueError(f"{path}: must list at least one frame, lists none; run the simulation first")
+        for _, part, file in listed(path):
+            self._parts += [{}] if part == "0" or not self._parts else []
+            self._parts[-1][part] = file
+        self._read: tuple[Path | None, list[Triangles]] = (None, [])
         first = self._mesh(0)
-        if "displacement" not in first.point_data:
-            raise ValueError(
-                f"{self._frames[0][1]}: must hold displacements, has {sorted(first.point_data)}; take a series of "
-                "diffsim-ti"
-            )
         rest = TetrahedralMesh(first.points - first.point_data["displacement"], first.cells[0].data)
         own = next(ElementTree.parse(path).getroot().iter("Collection"))
-        ground, self._labels = own.get("ground"), json.loads(own.get("marks", "[]"))
-        self._units = json.loads(own.get("units", "{}"))
+        try:
+            ground = None if own.get("ground") is None else float(own.get("ground"))
+            self._labels, self._units = json.loads(own.get("marks", "[]")), json.loads(own.get("units", "{}"))
+        except ValueError as error:
+            raise ValueError(f"{path} is not a ParaView series (.pvd) of diffsim-ti: {error}; {REMEDY}") from error
         fixed = np.flatnonzero(first.point_data.get("fixed", []))
-        self.setting = Setting(rest, None if ground is None else float(ground), fixed, self._shapes(0))
+        self.setting = Setting(rest, ground, fixed, self._shapes(0))
         if "held" in first.point_data:
             self.setting.held = first.point_data["held"][fixed].reshape(-1, 3, 3)
 
@@ -80,7 +92,7 @@ class SavedSeries:
         return Frame(self._frames[k][0], saved.points, u, v, fields, around, marks, self._units)
 
     def _mesh(self, k: int):
-        return read_part(self._frames[k][1])
+        return read_part(self._frames[k][1], "displacement", "velocity")
 
     def _shapes(self, k: int) -> list[Triangles]:
         """(points [m], triangles) of each obstacle in frame k."""
@@ -88,7 +100,7 @@ class SavedSeries:
             return []
         file = self._parts[k]["1"]
         if self._read[0] != file:
-            surface = read_part(file)
+            surface = read_part(file, "obstacle")
             triangles, number = surface.cells_dict["triangle"], surface.cell_data["obstacle"][0]
             out = []
             for obstacle in np.unique(number):

@@ -45,12 +45,17 @@ def write_marks(path: Path, drawn: Sequence[Mark], labels: list[str]) -> None:
     ).write(path, file_format="vtu", binary=True)
 
 
-def read_part(path: Path):
-    """The meshio mesh of one file of a series. Raises ValueError, with its name, if it is missing or damaged."""
+def read_part(path: Path, *names: str):
+    """The meshio mesh of one file of a series. Raises ValueError, with its name, if it is missing or damaged, or holds no
+    data of those names."""
     import meshio
 
     try:
-        return meshio.vtu.read(path)  # meshio.read prints and exits
+        saved = meshio.vtu.read(path)  # meshio.read prints and exits
+        for name in names:
+            if name not in saved.point_data and name not in saved.cell_data:
+                raise ValueError(f"must hold {name!r}, has {sorted([*saved.point_data, *saved.cell_data])}")
+        return saved
     except Exception as error:  # meshio lets those of its parsers through
         reason = " ".join(str(error).split()) or type(error).__name__
         raise ValueError(f"{path}, a file of the series, cannot be read: {reason}; write the series again") from error
@@ -58,7 +63,7 @@ def read_part(path: Path):
 
 def read_marks(path: Path, labels: Sequence[str]) -> list[Mark]:
     """What `write_marks` wrote; those of one label and kind are one."""
-    saved, out = read_part(path), []
+    saved, out = read_part(path, "vector", "mark", "kind"), []
     for block, number, kind in zip(saved.cells, saved.cell_data["mark"], saved.cell_data["kind"]):
         for which, how in np.unique(np.stack([number, kind], 1), axis=0):
             own = block.data[(number == which) & (kind == how)]

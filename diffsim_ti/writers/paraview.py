@@ -13,7 +13,7 @@ import numpy as np
 
 from diffsim_ti.visual.fields import FIELDS
 from diffsim_ti.visual.frame import Frame, Setting
-from diffsim_ti.visual.series import listed
+from diffsim_ti.visual.series import listed, text_of
 from diffsim_ti.visual.series_marks import write_marks
 from diffsim_ti.writers.writer import Writer, register
 
@@ -42,14 +42,14 @@ class ParaViewWriter(Writer):
 
     def open(self, setting: Setting) -> None:
         self.setting, self.count = setting, 0
-        self.folder, self.name = self.path.parent, self.path.stem
+        self.folder, self.name = self.path.parent, os.fsdecode(text_of(self.path.stem).encode())
         self._rows: list[tuple[float, dict[int, Path]]] = []
         self._labels: list[str] = []  # of marks
         self._units: dict[str, str] = {}
         self._around: list[np.ndarray] | None = None  # obstacles as they were last written
         self._obstacles: list[Path] = []
         self.folder.mkdir(parents=True, exist_ok=True)
-        for _, _, old in listed(self.path) if self.path.exists() else []:
+        for _, _, old in listed(self.path, "remove it or choose another folder") if self.path.exists() else []:
             if old.parent == self.folder and old.stem.startswith(f"{self.name}_"):
                 old.unlink(missing_ok=True)
         self._write_list()
@@ -67,7 +67,8 @@ class ParaViewWriter(Writer):
             elif name not in FIELDS:
                 point_data[name] = value
         point_data, cell_data = (
-            {name: _rows(value).astype(dtype) for name, value in data.items()} for data in (point_data, cell_data)
+            {text_of(name): _rows(value).astype(dtype) for name, value in data.items()}
+            for data in (point_data, cell_data)
         )
         saved = meshio.Mesh(
             np.asarray(frame.positions, np.float64),
@@ -119,7 +120,7 @@ class ParaViewWriter(Writer):
         rows = ElementTree.SubElement(root, "Collection", own)
         for at, parts in self._rows:
             for part, file in parts.items():
-                row = dict(timestep=f"{at:.9g}", group="", part=str(part), file=file.name)
+                row = dict(timestep=f"{at:.9g}", group="", part=str(part), file=text_of(file.name))
                 ElementTree.SubElement(rows, "DataSet", row)
         ElementTree.indent(root)
         draft = self.path.with_suffix(f".pvd.{os.getpid()}")

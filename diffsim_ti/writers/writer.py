@@ -5,8 +5,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from diffsim_ti.scene import Scene
 from diffsim_ti.visual.camera import Camera
 from diffsim_ti.visual.drawing import BACKENDS
@@ -45,8 +43,8 @@ class View:
 
     def __post_init__(self):
         field_named(self.colour)
-        if not (np.isfinite(self.fps) and self.fps > 0):
-            raise ValueError(f"fps: must be finite and > 0, got {self.fps:g}; 30 is usual")
+        if not 0.01 <= self.fps <= 1e6:
+            raise ValueError(f"fps: must be from .01 to 1e6 frames per second, got {self.fps:g}; 30 is usual")
         if self.size is not None and min(self.size) < 16:
             raise ValueError(f"size: must be at least 16 pixels a side, got {tuple(self.size)}; try 640 480")
         if not abs(self.elevation) < 90:

@@ -1,14 +1,17 @@
 """Linear systems of the implicit solvers: A x = b with A = c M + d2E/du2 on the free vertices, by products alone."""
 
+from collections.abc import Iterable
+
 import numpy as np
 
+from diffsim_ti.copies import CarriesMore
 from diffsim_ti.potential.free import Free
 
 
-class NotConverged(FloatingPointError):
+class NotConverged(CarriesMore, FloatingPointError):
     """An iteration did not reach its tolerance. Carries `residuals`, the relative residual after each round."""
 
-    def __init__(self, message: str, residuals):
+    def __init__(self, message: str, residuals: Iterable[float]):
         super().__init__(message)
         self.residuals = list(residuals)
 

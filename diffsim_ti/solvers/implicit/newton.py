@@ -154,7 +154,8 @@ class Newton:
         raise NotConverged(
             f"Newton's method stopped after {len(report.residuals)} rounds at a relative residual of "
             f"{report.residuals[-1]:.2g} (asked for {self.tolerance:g}; the last ones: {history}): take smaller steps, more "
-            "load steps, or a looser tolerance",
+            "load steps, or a looser tolerance; where the equilibrium is unstable (it buckles or snaps) follow the "
+            "motion to the next one instead, by ImplicitEulerSolver with Drag",
             report.residuals,
         )
 

@@ -1,0 +1,81 @@
+"""Inputs that have a number for each tetrahedron, given by named sets: {"soft": 2e4}, and gradients by the same names.
+
+The number x_s of a set acts on its tetrahedra, so its gradient is the sum of theirs, dL/dx_s = sum_{e in s} dL/dx_e.
+Tetrahedra of no set that is named keep the scene's values; the set "default" names them.
+"""
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+
+from diffsim_ti.checked import shown
+from diffsim_ti.scene import Scene
+
+Rows = dict[str, np.ndarray]  # tetrahedra of each set
+
+
+def rows_of_sets(scene: Scene, name: str, sets: Iterable[str]) -> Rows:
+    """The tetrahedra of each set that an input is given by. Raises ValueError for what has no number per tetrahedron, for
+    unknown sets, and for sets that share tetrahedra."""
+    mesh, described = scene.mesh, scene.inputs.described.get(name)
+    if described is None:
+        raise ValueError(f"no input named {name!r}; this scene has {', '.join(scene.inputs.described)}")
+    if not any(rule[:1] == ("tetrahedra",) for rule in described.shapes):
+        raise ValueError(f"{name}: has no numbers per tetrahedron, so give an array or a number instead of named sets")
+    out, owner = {}, np.full(mesh.num_tetrahedra, -1)
+    named = [key for key in sets if key != "default"]
+    for k, key in enumerate(named):
+        if key not in mesh.tetrahedron_sets:
+            known = ", ".join(map(repr, mesh.tetrahedron_sets)) or "none"
+            raise ValueError(f"{name}: the mesh has no tetrahedron set {shown(key)} (it has: {known})")
+        rows = out[key] = np.asarray(mesh.tetrahedron_sets[key])
+        taken = rows[owner[rows] >= 0]
+        if len(taken):
+            other = named[owner[taken[0]]]
+            raise ValueError(f"{name}: tetrahedron {taken[0]} is in both {other!r} and {key!r}; make the sets disjoint")
+        owner[rows] = k
+    if "default" in sets:
+        out["default"] = np.flatnonzero(owner < 0)
+    return out
+
+
+def per_tetrahedron(scene: Scene, name: str, value: np.ndarray) -> np.ndarray:
+    """A copy of an input's value with a row for each tetrahedron."""
+    rule = next(rule for rule in scene.inputs.described[name].shapes if rule[:1] == ("tetrahedra",))
+    tail = value.shape[1:] if value.ndim == len(rule) else value.shape
+    return np.array(np.broadcast_to(value, (scene.mesh.num_tetrahedra, *tail)), np.float64)
+
+
+def spread(scene: Scene, name: str, base: np.ndarray, numbers: Mapping, rows: Rows) -> np.ndarray:
+    """The values of all tetrahedra: `base` where no set is named."""
+    out = per_tetrahedron(scene, name, base)
+    for key, own in rows.items():
+        number = np.asarray(numbers[key], np.float64)
+        if number.shape != out.shape[1:]:
+            raise ValueError(f"{name}[{key!r}]: expected shape {out.shape[1:]}, got {number.shape}")
+        out[own] = number
+    return out
+
+
+def spread_all(
+    scene: Scene, bases: Mapping, values: Mapping, known: Mapping[str, Rows] | None = None
+) -> tuple[dict, dict[str, Rows]]:
+    """(values with arrays instead of named sets, sets of the inputs that were given by them); known: sets of a run."""
+    out, sets = dict(values), {}
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            run = (known or {}).get(name, {})
+            sets[name] = {k: run[k] for k in value} if value.keys() <= run.keys() else rows_of_sets(scene, name, value)
+            out[name] = spread(scene, name, bases[name], value, sets[name])
+    return out, sets
+
+
+def gathered(gradient: np.ndarray, rows: Rows) -> dict[str, np.ndarray]:
+    """Gradients by the numbers of sets, from those by tetrahedra."""
+    return {key: gradient[own].sum(0) for key, own in rows.items()}
+
+
+def split_name(name: str) -> tuple[str, str | None]:
+    """ "youngs_modulus[soft]" as (input, set); a plain name as (name, None)."""
+    plain, bracket, rest = name.partition("[")
+    return (plain, rest[:-1]) if bracket and rest.endswith("]") else (name, None)
