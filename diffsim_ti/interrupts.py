@@ -27,7 +27,7 @@ def guard_import() -> None:
 def commands_may_run() -> None:
     """From now on the signal raises KeyboardInterrupt."""
     _seen["interrupted"] = False
-    if _is_command:
+    if _is_command and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # of jobs in the background
         signal.signal(signal.SIGINT, _raise)
         sys.unraisablehook = _raise_again
 

@@ -104,7 +104,14 @@ def test_films_of_odd_speeds_are_refused(capsys, tmp_path, fps):
 def test_interrupts_at_any_moment_end_in_one_line(tmp_path, delay):
     CUBE.save(tmp_path / "cube.vtu")
     command = [sys.executable, "-m", "diffsim_ti", "simulate", "cube.vtu", "--duration", "1000"]
-    run = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    run = subprocess.Popen(
+        command,
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
     time.sleep(delay)
     run.send_signal(signal.SIGINT)
     said = run.communicate(timeout=60)[1]

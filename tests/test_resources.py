@@ -15,7 +15,7 @@ import taichi as ti
 import diffsim_ti as ds
 from diffsim_ti import runtime
 from diffsim_ti.solvers import SOLVERS as ALL_SOLVERS
-from diffsim_ti.terms.obstacles.ground import GroundForce
+from diffsim_ti.terms.obstacles.ground import TurningGroundForce
 
 SOLVERS = [s for s in ALL_SOLVERS if s.explicit]  # the implicit ones: test_implicit*.py
 ROOT = Path(__file__).parents[1]
@@ -238,15 +238,16 @@ def test_dropped_scenes_leave_nothing():
     """110 scenes: memory goes back, and no kernel compiles after the first."""
     gc.collect()
     start = runtime.allocated_megabytes()
+    resident, compiled = [], []
     for k in range(110):
         build_and_drop(field=True)
-        if k == 20:
+        if k in (20, 65, 109):
             gc.collect()
-            resident, compiled = resident_megabytes(), specializations()
-    gc.collect()
+            resident.append(resident_megabytes())
+            compiled.append(specializations())
     assert runtime.allocated_megabytes() == pytest.approx(start, abs=1e-9)
-    assert resident_megabytes() - resident < 10
-    assert specializations() == compiled
+    assert min(np.diff(resident)) < 5  # a leak grows all the time; memory that is handed out in large pieces does not
+    assert len(set(compiled)) == 1
 
 
 def test_equal_scenes_share_their_kernels():
@@ -317,8 +318,8 @@ def test_absent_contact_leaves_no_code(solver, monkeypatch):
                 looked_up.append(instance)
             return original.__get__(instance, owner)
 
-    original = GroundForce.__dict__["distance_and_normal"]
-    monkeypatch.setattr(GroundForce, "distance_and_normal", Spy())
+    original = TurningGroundForce.__dict__["distance_and_normal"]
+    monkeypatch.setattr(TurningGroundForce, "distance_and_normal", Spy())
     # J_floor is a compile-time number of the law: a new J_floor means that everything compiles here
     material = ds.StableNeoHookean(1e5, 0.3, J_floor=0.0123 + 1e-4 * SOLVERS.index(solver))
     mesh = ds.TetrahedralMesh.create_box(2)

@@ -328,7 +328,7 @@ MISTAKES = {
     "no such set": ({"roof": "x"}, None, "no vertex set is called 'roof'"),
     "axes": ({"xmin": "xw"}, None, r"'xmin' must be held along axes such as \"x\" or \"xyz\".*got 'xw'"),
     "twice": ({"xmin": "xx"}, None, "must be held along axes"),
-    "shape": ({"xmin": [1, 0]}, None, r"must be finite, of shape \(3,\) or \(k, 3\)"),
+    "shape": ({"xmin": [1, 0]}, None, r"along directions, finite, of shape \(3,\) or \(k, 3\)"),
     "zero": ({"xmin": [0, 0, 0]}, None, "must not be zero"),
     "not flat": ({"round": "normal"}, None, "it is not flat"),
     "motion of none": (
