@@ -48,9 +48,10 @@ class Derived:
     element_masses: np.ndarray | None = None  # consistent, of ten nodes, (num_tetrahedra, 10, 10) [kg]
     foundation: np.ndarray | None = None  # rows of the stiffness of vertices on foundations, (3 k, 3) [N/m]
 
-    def zeros(self) -> "Derived":
-        """The same shapes, all zero."""
-        return Derived(*(None if part is None else np.zeros(part.shape) for part in self.parts().values()))
+    def zeros(self, but=()) -> "Derived":
+        """The same shapes, all zero; None for those in `but`."""
+        parts = self.parts().items()
+        return Derived(*(None if part is None or name in but else np.zeros(part.shape) for name, part in parts))
 
     def parts(self) -> dict[str, np.ndarray | None]:
         """{name: array}"""

@@ -6,10 +6,12 @@ Nothing else in the package touches `taichi.lang.impl` or `taichi._lib`.
 from diffsim_ti.runtime.arrays import (
     allocated_megabytes,
     array,
+    clear,
     fetch,
     fetch_row,
     fill,
     full_shape,
+    look,
     to_numpy_dtype,
     upload,
     view,

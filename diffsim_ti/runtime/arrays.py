@@ -120,13 +120,26 @@ def check_owner(target) -> None:
 
 def view(target) -> "np.ndarray | None":
     """A NumPy array over the memory of a Taichi array, no copy; None where that memory is not the host's."""
-    check_owner(target)
     host = getattr(target, "host_view", None)
-    if host is None and runs_on_cpu():
+    if host is not None:  # the usual way, as short as can be
+        check_alive(target.owner)
+        return host
+    check_owner(target)
+    if runs_on_cpu():
         dtype, shape = to_numpy_dtype(target.dtype), full_shape(target)
         kind = np.ctypeslib.as_ctypes_type(dtype) * int(np.prod(shape))
         host = target.host_view = np.ctypeslib.as_array(kind.from_address(_address(target))).reshape(shape)
     return host
+
+
+def clear(targets) -> None:
+    """Fill Taichi arrays with zeros."""
+    for target in targets:
+        host = view(target)
+        if host is None:
+            fill(target, 0)
+        else:
+            host.fill(0)
 
 
 def fill(target, data) -> None:
@@ -156,6 +169,14 @@ def fetch(source, row: int | None = None) -> np.ndarray:
     host = _copied(source, row) if host is None else host if row is None else host[row]
     is_vector = host.ndim > 0 and host.shape[-1] == 4 and host.ndim == len(source.shape) + (row is None)
     return host[..., :3].copy() if is_vector else host.copy()
+
+
+def look(source) -> np.ndarray:
+    """The numbers of an array, to be read at once: the array's own memory where that is the host's."""
+    host = view(source)
+    if host is None:
+        return fetch(source)
+    return host[..., :3] if host.ndim > len(source.shape) and host.shape[-1] == 4 else host
 
 
 def _copied(source, row: int | None = None) -> np.ndarray:

@@ -80,7 +80,7 @@ class Kernel:
         """
         arrays = [_found(records[bundle], name) for bundle, own in self.arrays.items() for name in own]
         launch, names = Launch(self.kernel, *arrays, vectorized=vectorized, loops=self.loops), self.numbers
-        return lambda **numbers: launch(*(numbers[name] for name in names))
+        return lambda **numbers: launch(*map(numbers.__getitem__, names))
 
 
 @lru_cache(maxsize=None)

@@ -258,8 +258,9 @@ class SceneArrays:
         if isinstance(self.place, slice):  # they lie in order
             begin, end, _ = part.indices(self.num_tetrahedra)
             first = begin // LANES
-            flat = np.swapaxes(blocks[first : -(-end // LANES)], 1, 2).reshape(-1, rows)
-            return flat[begin - first * LANES : end - first * LANES].astype(np.float64)
+            lanes_first = np.swapaxes(blocks[first : -(-end // LANES)], 1, 2)
+            flat = lanes_first.astype(np.float64, order="C").reshape(-1, rows)  # copied once
+            return flat[begin - first * LANES : end - first * LANES]
         block, lane = np.divmod(self.place[part], LANES)
         return blocks[block, :, lane].astype(np.float64)
 

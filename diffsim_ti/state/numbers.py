@@ -132,13 +132,14 @@ class Adjoint:
 
     def clear(self) -> None:
         """All zero."""
-        for name in self._names:
-            runtime.fill(getattr(self, name), 0)
+        runtime.clear(getattr(self, name) for name in self._names)
 
     def collect(self) -> Derived:
         """All of them in float64 on the host, those of the state being zero."""
         a, features, rows = self._arrays, self._features, self._features.sums()
-        out, sums = a.values.zeros(), runtime.fetch(self.sums).astype(np.float64)
+        read = self._names if features.shape else tuple(x for x in self._names if x not in ("gradients", "volumes"))
+        read = [name for name in read if name in PARTS and getattr(a.values, name, None) is not None]
+        out, sums = a.values.zeros(but=read), runtime.fetch(self.sums).astype(np.float64)
         out.parameters[: features.num_parameters] = sums[rows.of("parameters")].sum(1)
         if features.density:
             out.mass = sums[rows.first("mass")]
@@ -146,10 +147,8 @@ class Adjoint:
             out.rest = sums[rows.of("rest")].T
         if features.areas:
             out.surface = sums[rows.first("surface")]
-        for name in self._names:
-            missing = getattr(out, name, None) is None or (name in ("gradients", "volumes") and not features.shape)
-            if name in PARTS and not missing:
-                setattr(out, name, PARTS[name].unpack(a, runtime.fetch(getattr(self, name))))
+        for name in read:
+            setattr(out, name, PARTS[name].unpack(a, runtime.look(getattr(self, name))))
         if "anchor" in self._names and out.motion is not None:
             out.displacement[a.held] += runtime.fetch(self.anchor)
         return out

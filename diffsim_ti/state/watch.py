@@ -166,7 +166,8 @@ class ContactWatch:
         return partial(self._worst_of, values, largest, parts)
 
     def _worst_of(self, values: Derived, largest: tuple[float, float], parts: list) -> ContactResolution:
-        return worst([self.resolution_of(rows, values, h, largest) for rows, h in parts])
+        seen = [self.resolution_of(rows, values, h, largest) for rows, h in parts]
+        return worst(seen) if self.contacts else seen[-1]
 
     def resolution_of(
         self, rows: np.ndarray, values: Derived, h: float, largest: tuple[float, float]

@@ -1,7 +1,9 @@
 """The reverse sweep and the tangent of a chain of kick-drift passes, along recorded states."""
 
 import weakref
+from collections.abc import Callable
 from contextlib import contextmanager, nullcontext
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -94,9 +96,8 @@ class ExplicitAdjoint:
         pressed += (self.chamber_felt, self.chamber_rest) if self.ws.chambers else ()
         pressed += (self.tie_felt, self.tie_rest) if has.tied else ()
         pressed += (self.foundation_felt,) if has.founded else ()
-        for target in (self.felt, self.path, self.u, self.v, self.w, self.z, *pressed):
-            if target is not None:
-                runtime.fill(target, 0)
+        targets = self.felt, self.path, self.u, self.v, self.w, self.z, *pressed
+        runtime.clear(target for target in targets if target is not None)
         if self.ws.pairs:
             self.ws.pairs.clear_sums()
         if self.faces:
@@ -117,20 +118,28 @@ class ExplicitAdjoint:
         """
         halt = stop if to_state else -1
         most = self.ws.most_passes(2 * self.ws.arrays.num_tetrahedra)  # a pass costs twice as much as forward
+        launch = self._bound(num_passes)
         for numbers in self.ws.launches(stop, last, num_passes, save_every, most, backwards=True):
-            self._launch(numbers, base, num_passes, halt, kick=0)
+            self._launch(launch, numbers, base, num_passes, halt, kick=0)
 
     def reverse_kick(self, j: int, base: int, num_passes: int) -> None:
         """Go back through the half kick that leads to the state which pass j shows."""
         if np.any(self.ws.solver.weights(np.array([j]), num_passes, self.ws.rate).pre):
             for numbers in self.ws.launches(j, j + 1, num_passes, 0, 1):
-                self._launch(numbers, base, num_passes, halt=-1, kick=1)
+                self._launch(self._bound(num_passes), numbers, base, num_passes, halt=-1, kick=1)
 
-    def _launch(self, numbers: dict, base: int, num_passes: int, halt: int, kick: int) -> None:
-        ws, history, own = self.ws, self.ws.record, (self, self.numbers, self.frames)
-        states = (history, ws.frames, ws.watch, ws.contact)
+    def _bound(self, num_passes: int) -> Callable:
+        """The kernel of a pass, with what all passes of a run share."""
+        ws, own = self.ws, (self, self.numbers, self.frames)
+        states = (ws.record, ws.frames, ws.watch, ws.contact)
         launch = ws.bound(ws.kernels(self.features).step_vjp, state=states, adjoint=own, table=ws.table)
-        run = dict(num_passes=num_passes, steps=self._steps, num_parts=self.num_parts)
+        return partial(launch, num_passes=num_passes, steps=self._steps, num_parts=self.num_parts)
+
+    def _launch(self, launch: Callable, numbers: dict, base: int, num_passes: int, halt: int, kick: int) -> None:
+        ws, history = self.ws, self.ws.record
+        if not (ws.pairs or ws.chambers or self.faces):
+            launch(**numbers, base=base, halt=halt, kick=kick)
+            return
         slot = numbers["first"] - base
         rubs = ws.pairs.friction if ws.pairs and not kick else None
         with self._rubbing(rubs, slot, numbers, num_passes), self._faces_of(slot + 1, kick) as alone:
@@ -140,7 +149,7 @@ class ExplicitAdjoint:
                     runtime.fill(self.corner, 0)
                     runtime.fill(self.rate_corner, 0)
                 self._start_faces(alone, numbers)
-            launch(**numbers, **run, base=base, halt=halt, kick=kick)
+            launch(**numbers, base=base, halt=halt, kick=kick)
             if alone:
                 self.faces.end(alone, numbers)
         if ws.chambers:
