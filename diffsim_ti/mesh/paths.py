@@ -66,4 +66,7 @@ class Paths:
         """SciPy CSR matrix (points, num_vertices): places of points from those of vertices; zero for anchors."""
         from scipy.sparse import csr_matrix
 
-        return csr_matrix((self.weights, self.vertices, self.first_corner), shape=(self.num_points, num_vertices))
+        parts = self.weights, self.vertices, self.first_corner
+        out = csr_matrix(parts, shape=(self.num_points, num_vertices), copy=True)
+        out.sum_duplicates()  # and sort, as some products of scipy do unasked: later sums would have another order
+        return out
