@@ -5,7 +5,7 @@ import taichi as ti
 
 from diffsim_ti import runtime
 from diffsim_ti.runtime import LANES
-from diffsim_ti.state.arrays import copy_slot
+from diffsim_ti.state.history import copy_slot
 
 
 def num_blocks(num_scenes: int) -> int:

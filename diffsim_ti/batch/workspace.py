@@ -15,7 +15,8 @@ from diffsim_ti.batch.views import Scratch
 from diffsim_ti.inputs import Derived
 from diffsim_ti.solvers.explicit.contact_stage import ROWS
 from diffsim_ti.solvers.explicit.felt_faces import feels_faces
-from diffsim_ti.state.arrays import SceneArrays, copy_slot
+from diffsim_ti.state.arrays import SceneArrays
+from diffsim_ti.state.history import copy_slot
 from diffsim_ti.state.pass_table import FLOATS, INTS, PassTable
 from diffsim_ti.state.solve_report import SolveReport
 from diffsim_ti.terms import SelfContact

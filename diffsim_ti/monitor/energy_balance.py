@@ -7,7 +7,7 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.monitor import quantities
-from diffsim_ti.state.arrays import History
+from diffsim_ti.state.history import History
 from diffsim_ti.state.workspace import Workspace
 
 

@@ -12,7 +12,7 @@ from diffsim_ti import runtime
 from diffsim_ti.inputs import Derived
 from diffsim_ti.solvers.explicit.felt_faces import FeltAdjoint, FeltTangent
 from diffsim_ti.solvers.explicit.impulse_record import ImpulseRecord
-from diffsim_ti.state.arrays import copy_slot
+from diffsim_ti.state.history import copy_slot
 from diffsim_ti.state.numbers import OF_STEPS, Adjoint, Tangent
 from diffsim_ti.state.workspace import FrameArrays
 

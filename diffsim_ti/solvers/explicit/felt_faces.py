@@ -8,7 +8,7 @@ from diffsim_ti.mesh import geometry
 from diffsim_ti.potential.face_lattice import BENT, face_rows
 from diffsim_ti.solvers.explicit.face_derivatives import face_derivatives
 from diffsim_ti.solvers.explicit.face_kernels import face_kernels
-from diffsim_ti.state.arrays import copy_slot
+from diffsim_ti.state.history import copy_slot
 from diffsim_ti.terms.obstacles.barrier import beta
 
 TRAVEL, LOAD = 0.2, 0.2

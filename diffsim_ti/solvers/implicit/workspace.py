@@ -28,7 +28,7 @@ from diffsim_ti.solvers.implicit.preconditioners import BlockJacobi
 from diffsim_ti.solvers.implicit.pressed import Pressed
 from diffsim_ti.solvers.implicit.stage import Stage
 from diffsim_ti.solvers.implicit.threads import one_blas_thread
-from diffsim_ti.state.arrays import History, copy_slot
+from diffsim_ti.state.history import History, copy_slot
 from diffsim_ti.state.walls import Moment
 from diffsim_ti.state.workspace import Workspace
 

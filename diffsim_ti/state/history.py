@@ -1,0 +1,67 @@
+"""States of a run on the device, in slots."""
+
+import numpy as np
+import taichi as ti
+
+from diffsim_ti import runtime
+from diffsim_ti.state.arrays import SceneArrays
+
+
+class History:
+    """States of a run: u, v (and forces f if recorded) in `slots` slots, and z, what the law remembers, if it does."""
+
+    def __init__(self, arrays: SceneArrays, num_slots: int, record: bool, remembers: bool = True):
+        n = arrays.num_vertices
+        self.num_slots = num_slots
+        self.u = runtime.array(arrays.vector, num_slots, n)
+        self.v = runtime.array(arrays.vector, num_slots, n)
+        self.f = runtime.array(arrays.vector, num_slots, n) if record else runtime.array(arrays.vector, 1, 1)
+        self.z = arrays.law_states(num_slots) if remembers else None
+
+    def copy(self, slot: int, target: "History", to: int) -> None:
+        """Copy the state in a slot to one of another history."""
+        for name in ("u", "v") if self.z is None else ("u", "v", "z"):
+            copy_slot(getattr(self, name), slot, getattr(target, name), to)
+
+
+@ti.kernel
+def _copy_slot(source: ti.types.ndarray(ndim=2), s: ti.i32, target: ti.types.ndarray(ndim=2), t: ti.i32):
+    for i in range(source.shape[1]):
+        target[t, i] = source[s, i]
+
+
+@ti.kernel
+def _find_bad(u: ti.types.ndarray(ndim=2), v: ti.types.ndarray(ndim=2), bad: ti.types.ndarray(ti.i32, 1)):
+    for i in range(u.shape[1]):
+        finite = True
+        for d in ti.static(range(3)):
+            for value in ti.static((u[0, i][d], v[0, i][d])):
+                finite = finite and not (ti.math.isnan(value) or ti.math.isinf(value))
+        if not finite:
+            ti.atomic_min(bad[0], i)
+
+
+def copy_slot(source, s: int, target, t: int) -> None:
+    """target[t] = source[s]; on the CPU without the cost of a launch."""
+    host = runtime.view(target)
+    if host is None:
+        _copy_slot(source, s, target, t)
+    else:
+        host[t] = runtime.view(source)[s]
+
+
+def first_bad_vertex(history: History) -> int | None:
+    """The first vertex of slot 0 whose displacement or velocity is not finite, or None."""
+    u, v = runtime.view(history.u), runtime.view(history.v)
+    if u is not None:
+        with np.errstate(all="ignore"):
+            if np.isfinite(u[0].sum() + v[0].sum()):
+                return None
+            bad = np.nonzero(~np.isfinite(u[0].sum(1) + v[0].sum(1)))[0]
+        return int(bad[0]) if bad.size else None
+    n = history.u.shape[1]
+    out = runtime.array(ti.i32, 1)
+    runtime.fill(out, n)
+    _find_bad(history.u, history.v, out)
+    bad = int(runtime.fetch(out)[0])
+    return bad if bad < n else None
