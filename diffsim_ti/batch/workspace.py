@@ -166,7 +166,7 @@ class LanesWorkspace:
         each = dict(
             gradients=[d.gradients for d in derived],
             volumes=[d.volumes for d in derived],
-            inverse_mass=[a._inverse_mass(d.mass) for d in (derived if "inverse_mass" in own else derived[:1])],
+            inverse_mass=[a.inverse_of(d.mass) for d in (derived if "inverse_mass" in own else derived[:1])],
             rest=[d.rest for d in derived],
             surface=[np.zeros(1) if d.surface is None else d.surface for d in derived],
         )

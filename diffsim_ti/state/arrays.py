@@ -194,7 +194,7 @@ class SceneArrays:
         sources["parameters"] = np.concatenate([values.parameters, self.tables]), self.fp
         if not (self.contacts or self.self_contact or self.pressures or self.chambers):
             sources["rest"] = np.zeros((1, 3)), self.vector
-        sources["inverse_mass"] = self._inverse_mass(values.mass), self.fp
+        sources["inverse_mass"] = self.inverse_of(values.mass), self.fp
         for name, (data, dtype) in sources.items():
             current = getattr(self, name, None)
             if current is None or tuple(current.shape) != data.shape[: len(current.shape)]:
@@ -232,7 +232,7 @@ class SceneArrays:
         value, per_area = stiffness / self.area_of(obstacle, vertices), self.obstacles[obstacle][0].per_area
         return f"stiffness_per_area to {value:.3g} N/m^3" if per_area else f"stiffness to {value:.3g} N/m"
 
-    def _inverse_mass(self, mass: np.ndarray) -> np.ndarray:
+    def inverse_of(self, mass: np.ndarray) -> np.ndarray:
         """1 / m of the vertices that move freely, 0 of the others."""
         out = np.divide(1.0, mass, out=np.zeros_like(mass), where=mass > 0)
         out[self.fixed] = 0
