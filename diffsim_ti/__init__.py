@@ -99,7 +99,7 @@ from diffsim_ti.terms import (
 )
 from diffsim_ti.verify import check_gradients, dot_product_test, taylor_test
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 __all__ = [
     "init",
     "TetrahedralMesh",

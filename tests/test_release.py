@@ -1,0 +1,32 @@
+"""What says which version this is agrees, and the links of README.md lead somewhere; release.py builds and tries archives."""
+
+import re
+
+import diffsim_ti as ds
+from release import ROOT, released, tracked, with_links
+
+URL = "https://example.org/owner/name"
+
+
+def test_all_name_one_version():
+    said = re.search(r"^version: (\S+)$", (ROOT / "CITATION.cff").read_text(), re.M)[1]
+    newest = re.search(r"^\*\*(\S+?)\*\*", (ROOT / "CHANGELOG.md").read_text(), re.M)[1]
+    assert said == ds.__version__ and newest in (ds.__version__, "Next")
+
+
+def test_links_of_an_index_lead_to_files():
+    text = with_links((ROOT / "README.md").read_text(), URL, ds.__version__)
+    links = re.findall(r"(!?)\[[^\]]*\]\(([^)]+)\)", text)
+    own = [(mark, link.removeprefix(URL)) for mark, link in links if link.startswith(URL)]
+    assert len(own) > 20 and all(link.startswith(("https:", "#")) for _, link in links)
+    for mark, link in own:
+        kind, version, path = re.fullmatch(r"/(raw|blob)/v([^/]+)/([^#]+)(?:#.*)?", link).groups()
+        assert (kind == "raw") == bool(mark) and version == ds.__version__ and (ROOT / path).is_file(), link
+
+
+def test_a_release_holds_all_that_its_tests_need():
+    if not (ROOT / ".git").exists():
+        return  # unpacked from an archive: it is one
+    names = released(tracked())
+    assert {"tests/conftest.py", "tests/release.py", "assets/make_meshes.py", "pyproject.toml", "CITATION.cff"} <= names
+    assert not any(name.startswith(".ci") for name in names)
