@@ -2,8 +2,9 @@
 
 import re
 
-import diffsim_ti as ds
 from release import ROOT, released, tracked, with_links
+
+import diffsim_ti as ds
 
 URL = "https://example.org/owner/name"
 
