@@ -20,15 +20,19 @@ from pathlib import Path
 import diffsim_ti as ds
 
 ROOT = Path(__file__).parents[1]
+LEFT = re.compile(
+    r"__pycache__|\..*cache|\.venv|\.ci-venv|.*\.egg-info|build|dist|output|imgui\.ini|.*\.pyc|PKG-INFO|setup\.cfg"
+)
 NOT_RELEASED = {".gitignore"}  # and .ci: they serve the repository
 
 
 def tracked() -> list[str]:
-    """Files of the repository, as paths from its root."""
-    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True).stdout.split(
-        "\n"
-    )
-    return [name for name in listed if name and (ROOT / name).is_file()]
+    """Files of the repository, as paths from its root; of a tree without git, those that no tool has left there."""
+    if (ROOT / ".git").exists():
+        listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+        return [name for name in listed.split("\n") if name and (ROOT / name).is_file()]
+    found = [path.relative_to(ROOT) for path in ROOT.rglob("*") if path.is_file()]
+    return [str(path) for path in found if not any(LEFT.fullmatch(part) for part in path.parts)]
 
 
 def released(files: list[str]) -> set[str]:
