@@ -28,6 +28,20 @@ def test_identify_beam(capsys):
     assert "E = " in capsys.readouterr().out
 
 
+def test_scipys_minimisers(capsys):
+    found = example("identify/with_scipy").main()
+    assert all(one["worst"] < 0.02 for one in found.values())  # noise of 0.02 mm
+    np.testing.assert_allclose(found["L-BFGS-B"]["E"], found["Newton-CG"]["E"], rtol=1e-2)
+    assert found["L-BFGS-B"]["runs"] <= 60 and "Newton-CG: E =" in capsys.readouterr().out
+
+
+def test_tutorial(tmp_path):
+    run = subprocess.run([sys.executable, EXAMPLES / "tutorial.py"], cwd=tmp_path, capture_output=True, text=True)
+    assert run.returncode == 0 and not run.stderr, run.stderr
+    assert "friction" in run.stdout and "WRONG" not in run.stdout and "E = 4.5" in run.stdout
+    assert (tmp_path / "output" / "tutorial.png").stat().st_size > 20_000
+
+
 def test_indentation(capsys, monkeypatch):
     indentation = example("identify/indentation")
     monkeypatch.setattr(indentation, "STEPS", 4)
