@@ -1,6 +1,6 @@
 # %% [markdown]
 # A first walk through diffsim_ti, in cells: ten minutes in an editor that knows `# %%`, or `python examples/tutorial.py`.
-# A soft column falls; its gradient is checked, its modulus identified, its strain drawn. Lengths are metres, everything else is SI.
+# A soft column falls; its gradient is checked, its modulus identified, its stress drawn. Units are SI.
 
 # %% Start. float64 for looking at gradients; training is done in float32.
 from pathlib import Path

@@ -1,9 +1,8 @@
 """SciPy's minimisers on a rollout: stiffness of four slabs of a beam from how it hangs, by L-BFGS-B and by Newton-CG.
 
-What SciPy asks for are functions of a vector. `Rollout.forward` and `vjp` give the loss and its gradient;
-`verify.gauss_newton_product` gives Newton-CG its products with the Hessian, by a tangent and a reverse sweep, exact for what a
-least-squares loss has without the curvature of the frames. Both bounds and logarithms are SciPy's business here; `ds.identify`
-does all of this in one call, and says besides how far to trust each number.
+SciPy asks for functions of a vector. `Rollout.forward` and `vjp` give the loss and its gradient; Newton-CG gets products
+with the Hessian from `verify.gauss_newton_product`: a tangent and a reverse sweep, exact but for the curvature of the frames.
+Bounds and logarithms are written here by hand. `ds.identify` does all of this in one call, and says how far to trust a number.
 
     python examples/identify/with_scipy.py
 """
@@ -20,7 +19,7 @@ GUESS = 1.5e5  # [Pa]
 
 
 class Loss:
-    """Half the mean square of the misfit over the noise, of the logarithms p of SLABS moduli; it counts what SciPy asks for."""
+    """Half the mean square of the misfit over the noise, of the logarithms of moduli; it counts what SciPy asks for."""
 
     def __init__(self, rollout: ds.Rollout, slab: np.ndarray, seen: np.ndarray):
         self.rollout, self.slab, self.seen = rollout, slab, seen
