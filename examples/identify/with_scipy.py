@@ -1,8 +1,8 @@
 """SciPy's minimisers on a rollout: stiffness of four slabs of a beam from how it hangs, by L-BFGS-B and by Newton-CG.
 
 SciPy asks for functions of a vector. `Rollout.forward` and `vjp` give the loss and its gradient; Newton-CG gets products
-with the Hessian from `verify.gauss_newton_product`: a tangent and a reverse sweep, exact but for the curvature of the frames.
-Bounds and logarithms are written here by hand. `ds.identify` does all of this in one call, and says how far to trust a number.
+with the Hessian from `verify.gauss_newton_product`, by a tangent and a reverse sweep; the curvature of frames is left out.
+Bounds and logarithms are by hand here. `ds.identify` does all of this in one call, and says how far to trust a number.
 
     python examples/identify/with_scipy.py
 """
