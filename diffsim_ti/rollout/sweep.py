@@ -222,7 +222,7 @@ class Sweep:
             tangent.save_frame(self.num_frames - 1)
         self._current = run if current is run else None  # its frames and snapshots are untouched
         self.contact_change = tangent.contact_forces(self.frame_time) if self.contacts else None
-        self.chamber_change = tangent.chambers.changes(self.num_frames) if self.chambers else None
+        self.chamber_change = tangent.chamber_record.changes(self.num_frames) if self.chambers else None
         return tangent.collect()
 
     # ---- adjoints ---------------------------------------------------------------------------------------------------
@@ -255,7 +255,7 @@ class Sweep:
         if self.contacts:
             self._adjoint.seed_contacts(seed.contact_forces, self.frame_time)
         if self.chambers:
-            self._adjoint.chambers.adjoints = seed.chamber_pressures
+            self._adjoint.chamber_record.adjoints = seed.chamber_pressures
         self.health = []
         stop = 0 if self.truncate is None else self.solver.schedule.first(max(0, self.steps - self.truncate))
         kept, end = self._kept, checkpoints.num_segments
