@@ -270,11 +270,6 @@ MISTAKES = {
         lambda: ds.Rollout(ds.StaticSolver(hollow([gas()])), 1, outputs=ds.ChamberPressure("oil")),
         "this scene has no chamber 'oil'; it has 'gas'",
     ),
-    "work": (
-        lambda: ds.Rollout(ds.StaticSolver(filled()), 1, outputs=ds.WorkOfLoads()),
-        "between frames the pressure of a FilledChamber is not known",
-    ),
-    "explicit": (lambda: solver_of(ds.VelocityVerletSolver, filled()), "explicit steps cannot hold a volume"),
 }
 
 
