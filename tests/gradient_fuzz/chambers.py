@@ -34,7 +34,7 @@ def chamber(kind: str, rng, mesh, start: np.ndarray, steps: int, duration: float
     if name == "gas":
         outside, size = 0.3 * E, 0.3 * E
     else:
-        outside, size = 0.0, Enclosure(walls, len(walls), None).volume(start)
+        outside, size = 0.0, Enclosure(walls, [], None).volume(start)
 
     def around(*shape):
         return size * (1 + (0.1 if name == "gas" else 0.01) * rng.uniform(-1, 1, shape))
