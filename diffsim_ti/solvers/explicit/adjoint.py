@@ -128,6 +128,8 @@ class ExplicitAdjoint:
 
     def reverse_kick(self, j: int, base: int, num_passes: int) -> None:
         """Go back through the half kick that leads to the state which pass j shows."""
+        if self.held:
+            self.held.go_before_state()
         if np.any(self.ws.solver.weights(np.array([j]), num_passes, self.ws.rate).pre):
             for numbers in self.ws.launches(j, j + 1, num_passes, 0, 1):
                 self._launch(self._bound(num_passes), numbers, base, num_passes, 0, halt=-1, kick=1)
@@ -149,7 +151,7 @@ class ExplicitAdjoint:
         slot = numbers["first"] - base
         if self.held and not kick:
             self._complete(numbers, num_passes)
-            self.held.start(numbers["first"], slot, num_passes, save_every)
+            self.held.start(numbers["first"], slot, num_passes, save_every, numbers["first"] == halt)
             with ws.volumes.alone(history, slot + 1):
                 self._launch_rest(launch, numbers, base, num_passes, halt, kick)
             self.held.end()

@@ -38,14 +38,14 @@ class HeldPass:
         return self.now.alpha * (self.now.pre + self.now.post)
 
 
-def recorded(held: HeldVolumes, j: int, slot: int, num_passes: int, save_every: int) -> HeldPass:
-    """Pass j from a slot on."""
+def recorded(held: HeldVolumes, j: int, slot: int, num_passes: int, save_every: int, shows: bool = False) -> HeldPass:
+    """Pass j from a slot on; shows: its velocity between kicks is looked at also where it is no frame's."""
     ws, kept = held.ws, held.kept.get(slot + 1)
     now, history = ws.numbers_of(j, num_passes), ws.record
     u, v = held.rows(history.u, slot), held.rows(history.v, slot)
     walls, ends = held.walls(u), held.rest + held.rows(history.u, slot + 1)
     one = HeldPass(j, now, walls, ends, None if kept is None else kept[2], held.frame(j, save_every, now))
-    if one.frame >= 0:
+    if one.frame >= 0 or (shows and now.pre > 0):
         a, gravity = ws.arrays.values, ws.arrays.features().gravity
         weight = a.parameters[gravity:][:3] if gravity >= 0 else np.zeros(3)
         v = v + now.pre * walls.freed(walls.inverse * held.rows(history.f, slot) + weight)
@@ -98,12 +98,15 @@ class HeldAdjoint:
         """A reverse sweep begins."""
         n, values = len(self.held.nodes), self.held.ws.arrays.values
         self.rest, self.inverse, self.by_rate = np.zeros((n, 3)), np.zeros((n, 1)), 0.0
-        self.follower = np.zeros_like(values.follower)
+        self.follower, self.halted = np.zeros_like(values.follower), None
 
-    def start(self, j: int, slot: int, num_passes: int, save_every: int) -> None:
-        """Go back through the stage of pass j from a slot on; all of the adjoint after it is in `at`."""
+    def start(self, j: int, slot: int, num_passes: int, save_every: int, halts: bool) -> None:
+        """Go back through the stage of pass j from a slot on; all of the adjoint after it is in `at`.
+
+        halts: stop at the state that the pass shows, whose velocity is tangent.
+        """
         held, at, schedule = self.held, self.at, self.held.ws.solver.schedule
-        one = recorded(held, j, slot, num_passes, save_every)
+        one = recorded(held, j, slot, num_passes, save_every, halts)
         walls, self.by_x, rows = one.walls, np.zeros_like(self.rest), self.follower
         if one.s is not None:
             u_adj, v_adj = held.rows(at.u, 0), held.rows(at.v, 0)
@@ -117,17 +120,39 @@ class HeldAdjoint:
             schedule.add_pressure(rows, j, schedule.end(j), self._of_all(mu))
             self.by_rate += one.ratio_by_rate * float(one.s @ along(walls.d, v_adj))
             self.by_rate -= one.now.alpha_by_rate / one.now.alpha * float(by_pressure @ one.s)
-        if one.frame >= 0:
+        self.halted = one if halts and one.q is not None else None
+        if one.frame >= 0 and not halts:
             frame_adj = held.rows(at.frames.frames_v, one.frame)
-            mu = np.linalg.solve(slopes(walls.g, walls.d).T, along(walls.d, frame_adj))
-            z = -np.tensordot(mu, walls.g, 1)
-            self._push(walls, one.q, frame_adj + z)
-            self.by_x -= sum(m * e.gradient_jvp(walls.x, one.shown) for m, e in zip(mu, walls.enclosures))
-            held.put(at.frames.frames_v, one.frame, frame_adj + z)
-            rate = self._of_all(mu) / schedule.step_length(j - 1)
-            row = rows[schedule.load_row(rows, j - 1)]
-            row[:, 0] -= rate
-            row[:, 1] += rate
+            held.put(at.frames.frames_v, one.frame, frame_adj + self._show(one, frame_adj))
+
+    def _halt(self, one: HeldPass) -> None:
+        """From the state between the kicks of a pass to that with a tangent velocity, of which all later ones are functions
+        likewise."""
+        held, at = self.held, self.at
+        of_frame = held.rows(at.frames.frames_v, one.frame) if one.frame >= 0 else 0.0
+        self._push(one.walls, one.q, of_frame - held.rows(at.v, 0))
+
+    def go_before_state(self) -> None:
+        """Back from there."""
+        if self.halted is not None:
+            held, at, self.by_x = self.held, self.at, np.zeros_like(self.rest)
+            v_adj = held.rows(at.v, 0)
+            held.put(at.v, 0, v_adj + self._show(self.halted, v_adj))
+            self._add_places()
+        self.halted = None
+
+    def _show(self, one: HeldPass, frame_adj: np.ndarray) -> np.ndarray:
+        """What comes to the adjoint of a velocity that is shown, before it is made tangent; adds those of all else."""
+        walls, rows, schedule = one.walls, self.follower, self.held.ws.solver.schedule
+        mu = np.linalg.solve(slopes(walls.g, walls.d).T, along(walls.d, frame_adj))
+        z = -np.tensordot(mu, walls.g, 1)
+        self._push(walls, one.q, frame_adj + z)
+        self.by_x -= sum(m * e.gradient_jvp(walls.x, one.shown) for m, e in zip(mu, walls.enclosures))
+        rate = self._of_all(mu) / schedule.step_length(one.j - 1)
+        row = rows[schedule.load_row(rows, one.j - 1)]
+        row[:, 0] -= rate
+        row[:, 1] += rate
+        return z
 
     def _push(self, walls: Walls, s: np.ndarray, adjoint: np.ndarray) -> None:
         by_x, by_inverse = walls.pushed_vjp(s, adjoint)
@@ -141,6 +166,11 @@ class HeldAdjoint:
 
     def end(self) -> None:
         """The rest of the pass is reversed: add what its beginning was to the stage."""
+        if self.halted is not None:
+            self._halt(self.halted)
+        self._add_places()
+
+    def _add_places(self) -> None:
         self.rest += self.by_x
         self.held.put(self.at.u, 0, self.held.rows(self.at.u, 0) + self.by_x)
 
