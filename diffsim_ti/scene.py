@@ -24,7 +24,6 @@ from diffsim_ti.terms import (
     Chamber,
     Drag,
     ElasticFoundation,
-    FilledChamber,
     Gravity,
     Obstacle,
     Pressure,
@@ -112,6 +111,7 @@ class Scene(MadeAgain):
         self.dead_loads = tuple(t for t in self.ordered_terms if t.dead)
         self.pressures = tuple(t for t in self.ordered_terms if isinstance(t, Pressure))
         self.chambers = tuple(t for t in self.ordered_terms if isinstance(t, Chamber))
+        self.gases = tuple(t for t in self.chambers if not t.holds)
         self.following = (*self.pressures, *self.chambers)  # what presses on the surface as it is
         self.springs = tuple(t for t in self.ordered_terms if isinstance(t, Spring))
         self.cables = tuple(t for t in self.ordered_terms if isinstance(t, Cable))
@@ -240,7 +240,7 @@ class Scene(MadeAgain):
     @property
     def holds_volumes(self) -> bool:
         """Whether some chamber holds a given volume."""
-        return any(isinstance(term, FilledChamber) for term in self.chambers)
+        return len(self.gases) < len(self.chambers)
 
     def _listed(self, asked: Term | str, own: tuple, kind: str) -> int:
         """Place among some of its terms of one that is given by its name, or as the scene lists it."""

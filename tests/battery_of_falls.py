@@ -1,11 +1,11 @@
-"""Falls of bodies that nobody made for this: python tests/battery_of_falls.py [MESH ...] [--odd] [--cases 60] [--seed 0].
+"""Falls of bodies that nobody made for this: python tests/battery_of_falls.py [MESH ...] [--odd] [--order 2] [--cases 60].
 
 Each draw takes a mesh, a size, a modulus, a height and a solver, all else as `diffsim-ti simulate` has it, and runs until
 half a second after the first contact. A fall is good where it ends, nothing is ever below the floor, and the energy never
 rises above that of the start by more than 1 % of weight times height. What is refused before the first frame falls with the
 modulus that the error advises. A draw that takes longer than `--patience`
 seconds of processors is named and replaced. Prints a line for each, and what all of them come to; exit code 1 if one is bad.
---odd: of the bodies in odd_bodies.py.
+--odd: of the bodies in odd_bodies.py. --order 2: of ten-node tetrahedra.
 """
 
 import argparse
@@ -28,7 +28,7 @@ SIZES, MODULI, HEIGHTS, SOLVERS = (0.05, 0.2, 1.0, 5.0), (1e4, 1e5, 1e7), (0.1, 
 RHO, G = 1000.0, 9.81
 
 
-def draw(rng, meshes) -> dict:
+def draw(rng, meshes, order: int = 1) -> dict:
     """One fall."""
     return dict(
         mesh=str(meshes[rng.integers(len(meshes))]),
@@ -36,6 +36,7 @@ def draw(rng, meshes) -> dict:
         youngs_modulus=float(rng.choice(MODULI)),
         height=float(rng.choice(HEIGHTS)),
         solver=str(rng.choice(SOLVERS)),
+        order=order,
     )
 
 
@@ -49,6 +50,7 @@ def fall(case: dict) -> dict:
     ds.init()
     begin, height = time.perf_counter(), case["height"] * case["size"]
     body = load_body(Path(case["mesh"]), case["size"])
+    body = body.quadratic() if case.get("order") == 2 else body
     law = make_material("StableNeoHookean", case["youngs_modulus"], 0.4)
     scene, _ = fall_scene(body, law, RHO, height=height)
     out = dict(case, tetrahedra=body.num_tetrahedra)
@@ -122,12 +124,13 @@ def main() -> None:
     parser.add_argument("--odd", action="store_true", help="the bodies of odd_bodies.py instead")
     parser.add_argument("--cases", type=int, default=60)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--order", type=int, choices=(1, 2), default=1)
     parser.add_argument("--patience", type=float, default=120.0, help="seconds of processors for one")
     options = parser.parse_args()
     meshes = save_all(Path(tempfile.mkdtemp())) if options.odd else options.meshes
     rng, results, slow, draws = np.random.default_rng(options.seed), [], [], 0
     while len(results) < options.cases:
-        case, draws = draw(rng, meshes), draws + 1
+        case, draws = draw(rng, meshes, options.order), draws + 1
         result = within(case, options.patience)
         name = "{} of {size:g} m, E {youngs_modulus:g} Pa, from {height:g} sizes, {solver}".format(
             Path(case["mesh"]).stem, **case

@@ -1,9 +1,9 @@
 """Random impacts of small bodies on thin walls, needles, plates and balls, at rest and moving, judged by geometry alone.
 
-    python tests/battery_of_impacts.py --cases 200 --seed 0 [--turning] [--solver BDF2Solver] [--only 17 31]
+    python tests/battery_of_impacts.py --cases 200 --seed 0 [--turning] [--order 2] [--solver BDF2Solver] [--only 17 31]
 
 Each case runs once; where it raises, what the error advises is done and the case runs again, three times at most.
---turning: obstacles turn about a point near them as well.
+--turning: obstacles turn about a point near them as well. --order 2: of ten-node tetrahedra, on the same grids.
 """
 
 import argparse
@@ -49,6 +49,7 @@ class Case:
     thickness: float
     moving: bool
     turning: bool = False
+    order: int = 1
     stiffness: float | None = None  # per area [N/m^3]
     substeps: int = 1  # of explicit solvers: times what stability asks for
     substep: float = float("inf")  # what explicit ones were advised [s]
@@ -71,11 +72,11 @@ class Case:
             f"{self.number}: {self.solver} {self.kind} {self.precision} {self.speed:.3g} m/s dt {self.dt:.3g} s E "
             f"{self.youngs_modulus:.2g} size {self.size:.3g} m, {self.resolution} vertices a side, thickness "
             f"{self.thickness:.3g} m{', moving' if self.moving else ''}"
-            f"{', turning' if self.turning else ''}"
+            f"{', turning' if self.turning else ''}{', ten nodes' if self.order == 2 else ''}"
         )
 
 
-def draw(number: int, seed: int, solvers, turning: bool = False) -> Case:
+def draw(number: int, seed: int, solvers, turning: bool = False, order: int = 1) -> Case:
     rng, names = np.random.default_rng([seed, number]), list(solvers)
     log = lambda low, high: float(np.exp(rng.uniform(np.log(low), np.log(high))))  # noqa: E731
     return Case(
@@ -92,6 +93,7 @@ def draw(number: int, seed: int, solvers, turning: bool = False) -> Case:
         thickness=log(2e-3, 2e-2),
         moving=bool(rng.integers(2)),
         turning=turning,
+        order=order,
     )
 
 
@@ -109,6 +111,8 @@ def build(case: Case):
     gap = width * rng.uniform(0.3, 2.0) + case.speed * case.dt * rng.uniform(0, 2) * (not static)
     x = x + [-(x[:, 0].max() + half_depth(solid) + gap), *off]
     mesh = ds.TetrahedralMesh(x, mesh.tetrahedra)
+    mesh = mesh.quadratic() if case.order == 2 else mesh
+    x = mesh.vertices
     steps = int(np.clip(np.ceil((gap + 2 * case.size) / (case.speed * case.dt)), 6, 60 if case.explicit else 14))
     own = case.speed * (0.0 if case.moving else 1.0)
     speed = case.speed - own
@@ -273,10 +277,11 @@ def main() -> int:
     parser.add_argument("--solver", choices=list(SOLVERS), action="append")
     parser.add_argument("--only", type=int, nargs="*", help="numbers of cases")
     parser.add_argument("--turning", action="store_true")
+    parser.add_argument("--order", type=int, choices=(1, 2), default=1)
     given = parser.parse_args()
     warnings.simplefilter("ignore", UserWarning)
     ds.init("cpu", precision="f64")
-    cases = (draw(n, given.seed, SOLVERS, given.turning) for n in given.only or range(given.cases))
+    cases = (draw(n, given.seed, SOLVERS, given.turning, given.order) for n in given.only or range(given.cases))
     table = battery(c for c in cases if not given.solver or c.solver in given.solver)
     for name, row in table.items():
         print(f"{name:24s} " + ", ".join(f"{key} {row[key]}" for key in row))

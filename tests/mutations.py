@@ -31,14 +31,14 @@ from pathlib import Path
 from mutation_places import PACKAGE, ROOT, Mutation, all_mutations, drawn
 
 TESTS = """
-    test_every_adjoint.py test_loads.py test_springs.py test_chambers.py test_loads_together.py test_supports.py
-    test_torch_physics.py test_contact_gradients.py test_checkpoints.py test_gradient_clip.py test_gradient_faults.py
-    test_torch.py test_tape.py test_implicit_contact.py test_implicit_gradients.py test_self_contact_implicit.py
-    test_gradients.py test_term_order.py test_self_contact.py test_locking.py test_scene.py test_contact_force.py
-    test_reaction.py test_outputs.py test_tensor_outputs.py test_modes.py test_contact_stage.py test_contact_faces.py
-    test_face_friction.py test_poses.py test_self_contact_friction.py test_batch.py test_muscles.py test_growth.py
-    test_viscosity.py test_laws_with_state.py test_open_laws.py test_unequal_steps.py test_quadratic.py
-    test_quadratic_loads.py test_quadratic_outputs.py test_mass_scaling.py
+    test_every_adjoint.py test_loads.py test_springs.py test_chambers.py test_held_volumes.py test_loads_together.py
+    test_supports.py test_torch_physics.py test_contact_gradients.py test_checkpoints.py test_gradient_clip.py
+    test_gradient_faults.py test_torch.py test_tape.py test_implicit_contact.py test_implicit_gradients.py
+    test_self_contact_implicit.py test_gradients.py test_term_order.py test_self_contact.py test_locking.py
+    test_scene.py test_contact_force.py test_reaction.py test_outputs.py test_tensor_outputs.py test_modes.py
+    test_contact_stage.py test_contact_faces.py test_face_friction.py test_poses.py test_self_contact_friction.py
+    test_batch.py test_muscles.py test_growth.py test_viscosity.py test_laws_with_state.py test_open_laws.py
+    test_unequal_steps.py test_quadratic.py test_quadratic_loads.py test_quadratic_outputs.py test_mass_scaling.py
 """.split()
 
 WRONG_NUMBERS = ("AssertionError", "assert ", "Failed: ", "FloatingPointError")

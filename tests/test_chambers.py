@@ -109,7 +109,7 @@ def assert_tangents(rollout, keys, gate=1e-6) -> None:
                 for t in (s, s / 2)
             )  # fmt: off
             exact = (4 * fine - coarse) / 3
-            size = max(np.abs(exact).max(), 1e-5 * np.abs(frames[name]).max())  # a gas of held volume feels no modulus
+            size = max(np.abs(exact).max(), 3e-5 * np.abs(frames[name]).max())  # a gas of held volume feels no modulus
             assert tangents[name] == pytest.approx(exact, rel=gate, abs=gate * size), (key, name)
 
 
@@ -270,11 +270,6 @@ MISTAKES = {
         lambda: ds.Rollout(ds.StaticSolver(hollow([gas()])), 1, outputs=ds.ChamberPressure("oil")),
         "this scene has no chamber 'oil'; it has 'gas'",
     ),
-    "work": (
-        lambda: ds.Rollout(ds.StaticSolver(filled()), 1, outputs=ds.WorkOfLoads()),
-        "between frames the pressure of a FilledChamber is not known",
-    ),
-    "explicit": (lambda: solver_of(ds.VelocityVerletSolver, filled()), "explicit steps cannot hold a volume"),
 }
 
 

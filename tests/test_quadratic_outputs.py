@@ -66,6 +66,23 @@ def test_a_homogeneous_stretch_has_its_closed_form():
     assert frames["elastic_energy"][0] == pytest.approx(psi * shares, rel=1e-9)
 
 
+def test_stress_at_places_is_that_of_the_place():
+    """A displacement of second degree has linear strains, which are found anywhere in an element, not only their means."""
+    mesh, E, nu = ds.TetrahedralMesh.create_box((2, 2, 2), 1.0).quadratic(), 5e4, 0.3
+    x, y, z = mesh.vertices.T
+    u = 1e-3 * np.stack([x * x + y * z, x * y - z * z, y * y + x * z], 1)
+    places = np.random.default_rng(3).uniform(0.1, 0.9, (6, 3))
+    X, Y, Z = places.T
+    rows = [[2 * X, Z, Y], [Y, X, -2 * Z], [Z, 2 * Y, X]]
+    H = 1e-3 * np.moveaxis(np.array(rows), 2, 0)
+    strain, mu, lam = 0.5 * (H + np.swapaxes(H, 1, 2)), E / (2 * (1 + nu)), E * nu / ((1 + nu) * (1 - 2 * nu))
+    exact = 2 * mu * strain + lam * np.trace(strain, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    scene = ds.Scene(mesh, ds.LinearElastic(E, nu), initial_positions=mesh.vertices + u, precision="f64")
+    stress = ds.Stress(at=places, kind="first_piola")
+    frames = ds.Rollout(ds.VelocityVerletSolver(scene, dt=1e-6), 1, outputs=[stress]).forward()
+    assert frames["stress"][0] == pytest.approx(exact, abs=1e-8 * np.abs(exact).max())
+
+
 def test_volumes_are_of_whole_faces():
     mesh = body()
     scene = ds.Scene(mesh, ds.StableNeoHookean(5e4, 0.3))

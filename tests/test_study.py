@@ -13,7 +13,8 @@ import pytest
 import diffsim_ti as ds
 from diffsim_ti.solvers import SOLVERS
 from diffsim_ti.study import PROBLEMS, Problem, chart, charts, pareto_front, problem, problems, recommend
-from diffsim_ti.study.elements import refined
+from diffsim_ti.study.coarser import halved_grid
+from diffsim_ti.study.elements import ElementTrials, refined
 from diffsim_ti.study.work_precision import Point, choose_substeps, make_rollout, reference, run
 
 EXPLICIT = [kind for kind in SOLVERS if kind.explicit]
@@ -300,6 +301,23 @@ def test_advice_compares_elements_of_the_mesh():
         names.append(advice.element)
         assert "elements: " in str(advice) and "linear error" in str(advice)
     assert all(name.startswith("quadratic") for name in names)
+
+
+def test_ten_nodes_are_tried_on_half_the_cells():
+    mesh = ds.TetrahedralMesh.create_box((5, 3, 3), (1, 0.2, 0.2), "five").translated([0.1, 0, 0])
+    half = halved_grid(mesh)
+    assert half.num_vertices == 3 * 2 * 2 and half.volume == pytest.approx(mesh.volume, rel=1e-14)
+    assert len(half.vertex_sets["xmin"]) == 4 and len(half.surface_sets["ymax"]) == 4
+    turned = ds.TetrahedralMesh(mesh.vertices[:, [1, 0, 2]] * [-1, 1, 1], mesh.tetrahedra)
+    assert halved_grid(turned) is None is halved_grid(ds.TetrahedralMesh.create_box((4, 2, 2)))
+    start = mesh.vertices + 0.02 * mesh.vertices[:, [1, 0, 2]] * [0, 1, 0]
+    scene = ds.Scene(mesh, ds.StableNeoHookean(1e6, 0.3), terms=ds.Gravity(), fixed="xmin", initial_positions=start)
+    trials = ElementTrials(scene, 0.1, 2, 1e-3)
+    found = {trial.element: trial for trial in trials.run()}
+    own, coarse = (found[name] for name in ("linear", "quadratic, coarser mesh"))
+    assert coarse.error < 0.5 * own.error and not trials.notes
+    held = ElementTrials(scene.replace(fixed=mesh.vertex_sets["xmin"]), 0.1, 2, 1e-3)
+    assert "held by their indices are not those of a coarser mesh" in str(held.on_coarser_mesh() or held.notes)
 
 
 def test_a_refined_mesh_is_the_same_body():

@@ -214,6 +214,7 @@ def recommend(
     poissons_ratio: Poisson = 0.4,
     density: Density = 1000.0,
     fixed: Fixed = None,
+    coarser: Annotated[Path | None, typer.Option(help="a coarser mesh of the body, to try ten nodes on")] = None,
     backend: Backend = "cpu",
 ) -> None:
     """Name the cheapest solver, step, precision and checkpoints for a tolerance, from short trial runs."""
@@ -222,4 +223,5 @@ def recommend(
 
     runtime.init(backend)
     body = own_scene(scene, material, youngs_modulus, poissons_ratio, density, fixed)
-    print(advise(body, duration, tolerance, memory, gradients, 4.0 if quick else budget))
+    coarse = load_body(coarser) if coarser else None
+    print(advise(body, duration, tolerance, memory, gradients, 4.0 if quick else budget, coarser=coarse))

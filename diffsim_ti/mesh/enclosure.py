@@ -1,5 +1,6 @@
 """The volume that triangles of a surface enclose, with lids over what is open."""
 
+from copy import copy
 from itertools import combinations
 
 import numpy as np
@@ -100,9 +101,28 @@ class Enclosure:
         """dV/dx, shape (num_vertices, 3); what is held counts too."""
         y = self._corners(x)
         by = np.stack([np.cross(y[:, (a + 1) % 3], y[:, (a + 2) % 3]) for a in range(3)], 1)
+        return self._summed(by, len(x))
+
+    def _summed(self, by: np.ndarray, num_vertices: int) -> np.ndarray:
+        """What triangles' corners have, weighted, at the vertices."""
         by = (self.weights[:, None, None] * by).reshape(-1, 3) / -6
         at = self.triangles.ravel()
-        return np.stack([np.bincount(at, by[:, d], len(x)) for d in range(3)], 1)
+        return np.stack([np.bincount(at, by[:, d], num_vertices) for d in range(3)], 1)
+
+    def gradient_jvp(self, x: np.ndarray, dx: np.ndarray) -> np.ndarray:
+        """Change of `gradient` for that of x; as a function of dx symmetric, so its own adjoint."""
+        y, dy = self._corners(x), dx[self.triangles]
+        if self.point is None:
+            dy = dy - dx[self.triangles[0, 0]]
+        nexts = [((a + 1) % 3, (a + 2) % 3) for a in range(3)]
+        by = np.stack([np.cross(dy[:, b], y[:, c]) + np.cross(y[:, b], dy[:, c]) for b, c in nexts], 1)
+        return self._summed(by, len(x))
+
+    def of_nodes(self, nodes: np.ndarray) -> "Enclosure":
+        """The same for positions of these vertices alone, sorted indices with all of the triangles' among them."""
+        out = copy(self)
+        out.faces, out.triangles = np.searchsorted(nodes, self.faces), np.searchsorted(nodes, self.triangles)
+        return out
 
     def change(self, x: np.ndarray, step: np.ndarray) -> float:
         """V(x + step) - V(x), without the rounding of a difference: V is a cubic along a step."""

@@ -83,6 +83,8 @@ class EnergyBalance:
             runtime.fill(self.ws.contact.work, 0)
             if self.ws.faces:
                 runtime.fill(self.ws.faces.work, 0)
+        if self.ws.volumes:
+            self.ws.volumes.work = 0.0
         self.window = Window(first, num_passes, self.ws.changes, self.ws.substep, level)
         if level is None and self.ws.arrays.features().moving:
             self.ws.place_obstacles(first)
@@ -102,6 +104,8 @@ class EnergyBalance:
         work = float(runtime.fetch(self.ws.contact.work).astype(np.float64).sum()) if features.driven else 0.0
         if features.moving and self.ws.faces:
             work += float(runtime.fetch(self.ws.faces.work).astype(np.float64).sum())
+        if self.ws.volumes:
+            work += self.ws.volumes.work
         if window.level is None:
             window.level = self._level_at_start(window)
         level = self._level(now, num_passes)

@@ -111,7 +111,7 @@ def _squares_of_strains(mesh, derived) -> tuple[np.ndarray, np.ndarray]:
 def _gas_bound(scene: "Scene", values: dict, derived) -> float:
     """What gases in chambers add to omega^2 at most, at rest: n p_0 / V_0 sum |dV/dx|^2 / m of the free vertices each."""
     free, out = np.delete(np.arange(scene.mesh.num_vertices), scene.fixed), 0.0
-    for chamber in scene.chambers:
+    for chamber in scene.gases:
         names = scene.input_names(chamber)
         p = np.max(values[names[chamber.plain]])
         V, g = chamber.enclosure.volume(derived.rest), chamber.enclosure.gradient(derived.rest)

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from diffsim_ti.mesh.geometry import edge_matrices
-from diffsim_ti.mesh.reference_element import QUADRATIC
+from diffsim_ti.mesh.inverse_map import barycentric_in, solved
+from diffsim_ti.mesh.reference_element import QUADRATIC, barycentric
 
 
 @dataclass
@@ -53,6 +54,7 @@ class Deformation:
 
 
 _BY_XI = QUADRATIC.derivatives(QUADRATIC.points)
+_LINEAR = np.linalg.inv(barycentric(QUADRATIC.points))  # corners' values of what is 1 at one of the points, 0 at others
 
 
 def _edges(u: np.ndarray, elements: np.ndarray, order: int) -> np.ndarray:
@@ -100,6 +102,59 @@ class PointMeans:
         back = back.reshape(len(V), len(T), -1).swapaxes(0, 1).reshape(T.shape)
         kept = self._around.T @ (scaled * mean).reshape(len(T), len(total), -1).sum((0, 2))
         return back * _like(V, T), (back * T).reshape(len(T), len(V), -1).sum((0, 2)) - kept
+
+
+class PointInterpolation:
+    """Values at places in ten-node tetrahedra, of the linear functions that those at their four points make."""
+
+    def __init__(self, mesh, located):
+        self.located, self._start = located, barycentric_in(mesh.vertices[located.vertices], located.points)[:, 1:]
+
+    def _inner(self, X: np.ndarray) -> np.ndarray:
+        """xi of the places in rest positions X."""
+        xi, found = solved(X[self.located.vertices], self.located.points, self._start)
+        if not found.all():
+            k = int(np.argmin(found))
+            raise ValueError(
+                f"rest_positions carry tetrahedron {self.located.tetrahedra[k]} so far from point {k} at "
+                f"{self.located.points[k].tolist()} that it cannot be followed; take a smaller step in the rest shape"
+            )
+        return xi
+
+    def shares(self, X: np.ndarray) -> np.ndarray:
+        """Of the points in the value, shape (4 k,)."""
+        return (barycentric(self._inner(X)) @ _LINEAR).ravel()
+
+    def _slopes(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(N of the nodes at the places, change of the shares for that of a place in space, shape (k, 4, 3))."""
+        xi = self._inner(X)
+        D = np.einsum("pai,pak->pik", X[self.located.vertices], QUADRATIC.derivatives(xi))
+        return QUADRATIC.functions(xi), np.einsum("kq,pki->pqi", _LINEAR[1:] - _LINEAR[:1], np.linalg.inv(D))
+
+    def shares_jvp(self, X: np.ndarray, dX: np.ndarray) -> np.ndarray:
+        """Their change: places stay where they are in space."""
+        N, by = self._slopes(X)
+        return -np.einsum("pqi,pa,pai->pq", by, N, dX[self.located.vertices]).ravel()
+
+    def shares_vjp(self, X: np.ndarray, seed: np.ndarray) -> np.ndarray:
+        """Adjoint of X."""
+        (N, by), out = self._slopes(X), np.zeros_like(X)
+        np.add.at(out, self.located.vertices, -np.einsum("pqi,pa,pq->pai", by, N, seed.reshape(-1, 4)))
+        return out
+
+    @staticmethod
+    def value(T: np.ndarray, c: np.ndarray) -> np.ndarray:
+        """T: (frames, points, ...) -> (frames, places, ...)."""
+        return (T * _like(c, T)).reshape(len(T), -1, 4, *T.shape[2:]).sum(2)
+
+    def jvp(self, T, dT, c, dc) -> np.ndarray:
+        """Its change."""
+        return self.value(dT, c) + self.value(T, dc)
+
+    def vjp(self, T, c, seed) -> tuple[np.ndarray, np.ndarray]:
+        """(adjoint of T, of the shares)."""
+        every = np.repeat(seed, 4, 1)
+        return every * _like(c, T), (every * T).reshape(len(T), len(c), -1).sum((0, 2))
 
 
 def _ones(rows: np.ndarray, columns: np.ndarray, num_rows: int):

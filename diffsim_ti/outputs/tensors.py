@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffsim_ti.outputs.deformation import NUMBERS, Deformation, PointMeans
+from diffsim_ti.outputs.deformation import NUMBERS, Deformation, PointInterpolation, PointMeans
 from diffsim_ti.outputs.output import Change, Output
 from diffsim_ti.outputs.stresses import PatchStress, TetrahedronStress
 
@@ -19,8 +19,10 @@ if TYPE_CHECKING:
 class _Tensors(Output):
     """at: "tetrahedra", (frames, num_tetrahedra, 3, 3); "vertices", the means over the tetrahedra around by their volumes;
     or material points X [m], shape (k, 3), each with the tensor of its tetrahedron. That of a tetrahedron with ten nodes is
-    the mean over its points, by their volumes. numbers: what of them is given instead,
-    a name in deformation.NUMBERS, or None. name: how a loss calls it."""
+    the mean over its points, by their volumes; at X it is the linear function of place that these four make, which is more
+    accurate there than what X itself would feel. numbers: what of them is given instead, a name in deformation.NUMBERS, or
+    None. name: how a loss calls it. Barlow 1976, Optimal stress locations in finite element models,
+    doi:10.1002/nme.1620100202."""
 
     per_item = True  # whether there is a value for each tetrahedron or vertex
 
@@ -38,10 +40,13 @@ class _Tensors(Output):
         out, mesh = copy(self), scene.mesh
         out.scene, out.num_vertices, out.means, out.points = scene, mesh.num_vertices, None, mesh.reference.num_points
         every = isinstance(self.at, str)
-        out.chosen = np.arange(mesh.num_tetrahedra) if every else mesh.locate(self.at).tetrahedra
+        located = None if every else mesh.locate(self.at)
+        out.chosen = np.arange(mesh.num_tetrahedra) if every else located.tetrahedra
         out.read, out.count = out.chosen, len(out.chosen)  # read: whose deformation is looked at
         if every and self.at == "vertices":
             out.means, out.count = PointMeans.of_vertices(mesh), mesh.num_vertices
+        elif out.points > 1 and not every:
+            out.means = PointInterpolation(mesh, located)
         elif out.points > 1:
             out.means = PointMeans.of_tetrahedra(out.count, out.points)
         return out
@@ -65,11 +70,20 @@ class _Tensors(Output):
         derived = self.scene.inputs.derive(frames.inputs)
         deformation = Deformation.of(frames, derived, self.scene.mesh, self.read)
         T = self._tensors(deformation, derived)
-        return derived, deformation, T, T if self.means is None else self.means.value(T, self._volumes(derived))
+        return derived, deformation, T, T if self.means is None else self.means.value(T, self._shares(derived))
 
-    def _volumes(self, derived) -> np.ndarray:
-        """Of the points of the chosen tetrahedra."""
-        return derived.volumes[self.chosen].ravel()
+    @property
+    def _interpolated(self) -> bool:
+        return isinstance(self.means, PointInterpolation)
+
+    def _shares(self, derived) -> np.ndarray:
+        """Volumes of the points of the chosen tetrahedra, or their shares in values at places."""
+        return self.means.shares(derived.rest) if self._interpolated else derived.volumes[self.chosen].ravel()
+
+    def _shares_jvp(self, derived, moved) -> np.ndarray:
+        if self._interpolated:
+            return self.means.shares_jvp(derived.rest, moved.rest)
+        return moved.volumes[self.chosen].ravel()
 
     def value(self, frames: "Frames") -> np.ndarray:
         shown = self._start(frames)[3]
@@ -81,19 +95,23 @@ class _Tensors(Output):
         du = (np.zeros(frames.positions.shape) if change.positions is None else change.positions) - moved.rest
         dT = self._tensors_jvp(deformation, derived, deformation.jvp(du, moved.gradients[self.read]), moved)
         if self.means is not None:
-            dT = self.means.jvp(T, dT, self._volumes(derived), self._volumes(moved))
+            dT = self.means.jvp(T, dT, self._shares(derived), self._shares_jvp(derived, moved))
         return NUMBERS[self.numbers][2](shown, dT) if self.numbers else dT
 
     def vjp(self, frames: "Frames", seed: np.ndarray) -> Change:
         derived, deformation, T, shown = self._start(frames)
+        by_rest = 0.0
         adjoint, seed = derived.zeros(), NUMBERS[self.numbers][3](shown, seed) if self.numbers else seed
         if self.means is not None:
-            seed, by_volumes = self.means.vjp(T, self._volumes(derived), seed)
-            np.add.at(adjoint.volumes, self.chosen, by_volumes.reshape(-1, *adjoint.volumes.shape[1:]))
+            seed, by_shares = self.means.vjp(T, self._shares(derived), seed)
+            if self._interpolated:
+                by_rest = self.means.shares_vjp(derived.rest, by_shares)
+            else:
+                np.add.at(adjoint.volumes, self.chosen, by_shares.reshape(-1, *adjoint.volumes.shape[1:]))
         H_adj = self._tensors_vjp(deformation, derived, seed, adjoint)
         positions, by_B = deformation.vjp(H_adj, self.num_vertices)
         np.add.at(adjoint.gradients, self.read, by_B)
-        adjoint.rest = -positions.sum(0)
+        adjoint.rest = by_rest - positions.sum(0)
         inputs = self.scene.inputs.derive_vjp(frames.inputs, adjoint, tuple(frames.inputs))
         return Change(positions=positions, inputs=inputs)
 

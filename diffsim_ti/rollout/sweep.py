@@ -222,7 +222,7 @@ class Sweep:
             tangent.save_frame(self.num_frames - 1)
         self._current = run if current is run else None  # its frames and snapshots are untouched
         self.contact_change = tangent.contact_forces(self.frame_time) if self.contacts else None
-        self.chamber_change = tangent.chambers.changes(self.num_frames) if self.chambers else None
+        self.chamber_change = tangent.chamber_record.changes(self.num_frames) if self.chambers else None
         return tangent.collect()
 
     # ---- adjoints ---------------------------------------------------------------------------------------------------
@@ -241,7 +241,8 @@ class Sweep:
             if not self.careful:
                 self._reverse(seed, True)  # raises where it happens
             raise FloatingPointError("the adjoint is not finite at the start of the run")
-        self._warn_if_exploded(of_frames, of_start)
+        if not self.chambers or seed.chamber_pressures is None:  # which feel places by the square of the rate of steps
+            self._warn_if_exploded(of_frames, of_start)
         return derived
 
     def _reverse(self, seed: Seed, careful: bool) -> tuple[float, float]:
@@ -255,7 +256,7 @@ class Sweep:
         if self.contacts:
             self._adjoint.seed_contacts(seed.contact_forces, self.frame_time)
         if self.chambers:
-            self._adjoint.chambers.adjoints = seed.chamber_pressures
+            self._adjoint.chamber_record.adjoints = seed.chamber_pressures
         self.health = []
         stop = 0 if self.truncate is None else self.solver.schedule.first(max(0, self.steps - self.truncate))
         kept, end = self._kept, checkpoints.num_segments

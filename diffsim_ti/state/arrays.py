@@ -42,7 +42,7 @@ class SceneArrays:
         self.fixed, self.held, self.feels_faces = scene.fixed, scene.held, feels_faces
         self.supports = scene.supports
         self.pressures = scene.pressures if presses else ()  # that gather with the tetrahedra's corners
-        self.chambers = scene.chambers if presses else ()  # likewise
+        self.chambers = scene.gases if presses else ()  # likewise
         self.paths = scene.tie_paths if presses and scene.ties else None
         self.founded = scene.founded_vertices if presses else np.zeros(0, np.int64)
         self.mesh, self.precision, self.self_contact = mesh, precision, scene.term(SelfContact)

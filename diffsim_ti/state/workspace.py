@@ -34,6 +34,7 @@ class Workspace:
     first_step = 0  # steps that were done before this run, for reports
     potential = None  # of implicit steps
     chambers = None  # of explicit steps
+    volumes = None  # of chambers, that are held
     faces = None  # of explicit steps, that feel obstacles between their corners
     energy_watch = None  # counts energy that long steps add, for solvers that neither damp nor limit it
     changes = 0  # of the state from outside its passes

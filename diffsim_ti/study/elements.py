@@ -9,6 +9,7 @@ from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.scene import Scene
 from diffsim_ti.solvers import VelocityVerletSolver, stable_dt
+from diffsim_ti.study.coarser import halved_grid, on_coarser
 from diffsim_ti.study.problem import ELEMENTS
 
 SHARE = 0.8  # of the stable step at the start
@@ -17,8 +18,9 @@ HELD = "held, by indices"  # the set of what a scene holds so
 
 @dataclass
 class ElementTrial:
-    """A kind of element (ELEMENTS) on a scene's own mesh: the largest distance of its motion from that of finer elements at
-    the mesh's vertices over the largest displacement (NaN: not known), and the wall time [s] of the run."""
+    """A kind of element (ELEMENTS) on a scene's own mesh, or a coarser one: the largest distance of its motion from that of
+    finer elements at the scene's vertices over the largest displacement (NaN: not known), and the wall time [s] of the run.
+    """
 
     element: str
     error: float
@@ -75,9 +77,15 @@ def own_element(scene: Scene) -> str:
 
 
 class ElementTrials:
-    """Runs of a scene by kinds of elements over `duration` [s], for at most about `budget` [s] of wall time."""
+    """Runs of a scene by kinds of elements over `duration` [s], for at most about `budget` [s] of wall time.
 
-    def __init__(self, scene: Scene, duration: float, frames: int, budget: float):
+    coarser: another mesh for those of ten nodes; None: a grid of half the cells, where the scene's mesh is a grid.
+    """
+
+    def __init__(
+        self, scene: Scene, duration: float, frames: int, budget: float, coarser: TetrahedralMesh | None = None
+    ):
+        self.coarser = coarser or halved_grid(scene.mesh)
         self.scene, self.duration, self.frames, self.budget = scene.replace(precision="f64"), duration, frames, budget
         self.notes: list[str] = []
 
@@ -92,8 +100,12 @@ class ElementTrials:
         except ValueError as error:
             self.notes.append(f"ten-node tetrahedra were not tried: {error}")
             return []
-        for name, made in scenes.items():
+        coarser = self.on_coarser_mesh()
+        for name, made in (scenes | coarser).items():
             motions[name], seconds[name] = self._motion(made)
+        for name, made in coarser.items():  # as the scene's own vertices see it
+            at = made.mesh.locate(scene.mesh.vertices, nearest=True).matrix
+            motions[name] = np.stack([at @ u for u in motions[name]])
         finest, error_of_finest = self._finest(seconds["quadratic"])
         if finest is None:
             finest = motions["quadratic"]
@@ -101,9 +113,24 @@ class ElementTrials:
         found = []
         for name, moved in motions.items():
             apart = np.linalg.norm(moved[:, :n] - finest[:, :n], axis=2).max() / largest
-            unknown = name.startswith("quadratic") and not error_of_finest
+            unknown = name.startswith("quadratic") and name not in coarser and not error_of_finest
             found.append(ElementTrial(name, np.nan if unknown else float(apart), seconds[name]))
         return sorted(found, key=lambda trial: trial.seconds)
+
+    def on_coarser_mesh(self) -> dict[str, Scene]:
+        """Scenes of ten-node tetrahedra on the coarser mesh, by name."""
+        if self.coarser is None:
+            return {}
+        try:
+            made = on_coarser(self.scene, self.coarser)
+            kinds = {name: how for name, how in ELEMENTS.items() if how.get("order") == 2}
+            return {
+                f"{name}, coarser mesh": made.replace(volume=how.get("volume", "tetrahedra"))
+                for name, how in kinds.items()
+            }
+        except ValueError as error:
+            self.notes.append(f"a coarser mesh was not tried: {error}")
+            return {}
 
     def _scene(self, name: str) -> Scene:
         how = ELEMENTS[name]

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.scene import LOCKING_RATIO, Scene
 from diffsim_ti.solvers import SOLVERS, BDF2Solver, VelocityVerletSolver, stable_dt
@@ -27,6 +28,7 @@ def recommend(
     budget: float = 20.0,
     frames: int = 8,
     elements: bool = True,
+    coarser: TetrahedralMesh | None = None,
 ) -> Recommendation:
     """The cheapest way to run `scene` for `duration` [s] with a relative error of motion below `tolerance`.
 
@@ -35,8 +37,9 @@ def recommend(
     gradients: whether runs will be differentiated, which is then timed as well.
     budget [s]: wall time of the trials, compiling apart; if the reference of the whole duration would take more, trials
     cover a first part and errors grow with time from there.
-    elements: whether linear tetrahedra, patches and ten-node tetrahedra of the scene's mesh are compared too, by what the
-    mesh itself makes wrong; the advice's `element` is the cheapest that keeps to the tolerance.
+    elements: whether linear tetrahedra, patches and ten nodes are compared too, by what the mesh itself makes wrong; the
+    advice's `element` is the cheapest that keeps to the tolerance. coarser: a linear mesh of the body with the same
+    named sets, to try ten nodes on; None: half the cells of a mesh that `create_box` made.
 
     Raises ValueError for a duration or tolerance that is no such thing, FloatingPointError if nothing meets the tolerance.
     """
@@ -51,7 +54,7 @@ def recommend(
         trials = Trials(scene, duration, tolerance, memory, gradients, budget, frames)
         trials.run()
         if elements:
-            trials.compare_elements()
+            trials.compare_elements(coarser)
     return trials.advice()
 
 
@@ -79,9 +82,7 @@ class Trials:
 
     def _find_reference(self) -> None:
         """Converged motion in float64 over `self.span`: by velocity Verlet, over all of the duration if a tenth of the
-        budget allows; else by implicit steps over all of it; else, where these do not converge, by velocity Verlet over
-        the first part.
-        """
+        budget allows; else by implicit steps over all of it; else, where these do not converge, over the first part."""
         k = int(np.ceil(self.duration / self.frames / (SHARE * self.stable)))
         self.explicit_cost = self._seconds_per_substep()
         seconds = self.explicit_cost * k * self.frames
@@ -100,8 +101,7 @@ class Trials:
 
     def _converge(self, kind, k: int, limit: float = np.inf) -> bool:
         """Halve the steps of a second-order solver, from k per frame, until two agree to a tenth of the tolerance; the
-        reference is extrapolated from them, its error is their distance from it. False if that takes more than `limit` [s].
-        """
+        reference is extrapolated from them, its error is their distance from it. False beyond `limit` [s]."""
         coarse, self.own_error, begin = None, np.nan, None
         for _ in range(8):
             try:
@@ -185,7 +185,6 @@ class Trials:
 
     def run(self) -> None:
         """Every solver from its largest step to one that meets the tolerance; first the kind that made the reference.
-
         Explicit ones in float32, then in float64 at the same step, which costs little more on small meshes; implicit ones
         in float32, and in float64 where finer steps do not help.
         """
@@ -238,9 +237,9 @@ class Trials:
             return True
         return False
 
-    def compare_elements(self) -> None:
+    def compare_elements(self, coarser: TetrahedralMesh | None = None) -> None:
         """Try the kinds of elements over the span of the reference."""
-        compared = ElementTrials(self.scene, self.span, self.frames, 0.5 * self.budget)
+        compared = ElementTrials(self.scene, self.span, self.frames, 0.5 * self.budget, coarser)
         try:
             self.elements = compared.run()
         except FloatingPointError as error:

@@ -27,6 +27,7 @@ class Chamber(Term):
     inflates it. The forces are those of `Pressure`, p dV/dx, V the volume inside.
     """
 
+    holds = False  # whether it holds a volume
     shape = ()  # of what is given over time
     num_numbers = 0  # what is read of it lies in rows of its own
     row_names: tuple[str, ...] = ()  # of its numbers, each of which has a row in time
@@ -130,12 +131,15 @@ class FilledChamber(Chamber):
     Input with gradient: "chamber_volume" or "<name>.volume". The pressure is a result: `ChamberPressure`, with gradient.
     Implicit and static solvers hold V at the end of each substep (the midpoint rule in the middle of it), by a Lagrange
     multiplier: so a chamber is followed beyond the largest pressure that it bears. Statics go from the volume at rest in
-    load steps. Explicit solvers refuse it.
+    load steps. Explicit solvers hold V at the end of each substep too, as velocity Verlet does in the manner of SHAKE and
+    RATTLE: a stage after contact, on the host, to round-off and without a penalty, that no step is too large for. There a
+    volume that jumps is reached within one substep: give keyframes. A contact of the chamber's own wall is pushed after it.
     Raises ValueError for surfaces that enclose no volume, numbers that are not positive, and what does not fit.
-    Nocedal, Wright, Numerical Optimization, 2nd ed., 2006, 17.3 and 18.4, doi:10.1007/978-0-387-40065-5.
+    Nocedal, Wright, Numerical Optimization, 2nd ed., 2006, 17.3 and 18.4, doi:10.1007/978-0-387-40065-5; Leimkuhler, Reich,
+    Simulating Hamiltonian Dynamics, 2004, 7.2, doi:10.1017/CBO9780511614118.
     """
 
-    row_names = ("volume", "rest")
+    holds, row_names = True, ("volume", "rest")
 
     def __init__(self, volume: OverTime, surface: str | ArrayLike | None = None, name: str | None = None):
         super().__init__("volume", volume, "m^3", "chamber_volume", surface, name)

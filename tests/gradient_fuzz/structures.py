@@ -143,8 +143,6 @@ def structure(number: int) -> Structure:
         tuple(turn(LOADS, 3 * number + k, 12) for k in range(1 + number // 4 % 3)) if number % 4 == 3 else (),
         tuple(turn(TIES, 3 * number + k, 13) for k in range(1 + number // 4 % 3)) if number % 4 == 2 else (),
         fixed and not static and number % 5 in (0, 4),
-        turn(CHAMBERS[:3] if solver in EXPLICIT else CHAMBERS, number // 4, 13)
-        if number % 4 == 1 and not self_contact
-        else "",
+        turn(CHAMBERS, number // 4, 13) if number % 4 == 1 and not self_contact else "",
         turn((1, 1, 2), number, 14),
     )

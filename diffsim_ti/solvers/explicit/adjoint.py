@@ -1,4 +1,4 @@
-"""The reverse sweep and the tangent of a chain of kick-drift passes, along recorded states."""
+"""The reverse sweep of a chain of kick-drift passes, along recorded states."""
 
 import weakref
 from collections.abc import Callable
@@ -10,10 +10,11 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.inputs import Derived
-from diffsim_ti.solvers.explicit.felt_faces import FeltAdjoint, FeltTangent
+from diffsim_ti.solvers.explicit.felt_faces import FeltAdjoint
+from diffsim_ti.solvers.explicit.held_derivatives import HeldAdjoint
 from diffsim_ti.solvers.explicit.impulse_record import ImpulseRecord
 from diffsim_ti.state.history import copy_slot
-from diffsim_ti.state.numbers import OF_STEPS, Adjoint, Tangent
+from diffsim_ti.state.numbers import OF_STEPS, Adjoint
 from diffsim_ti.state.workspace import FrameArrays
 
 STEPS = [name for name in OF_STEPS if name != "path"]
@@ -55,6 +56,8 @@ class ExplicitAdjoint:
         self.tie_felt, self.tie_rest = (runtime.array(a.vector, *x.shape) for x in (a.ties, a.tie_segments))
         self.foundation_felt = runtime.array(a.vector, *a.foundation.shape)
         self.faces = FeltAdjoint(self, workspace.faces) if workspace.faces else None
+        self.held = HeldAdjoint(self, workspace.volumes) if workspace.volumes else None
+        self.chamber_record = self.held.chambers if self.held else None
         if workspace.impulses:
             self.impulses = ImpulseRecord(workspace)
             self.impulse, self.mass_adj = self.impulses.impulse, np.zeros(a.num_vertices)
@@ -100,8 +103,9 @@ class ExplicitAdjoint:
         runtime.clear(target for target in targets if target is not None)
         if self.ws.pairs:
             self.ws.pairs.clear_sums()
-        if self.faces:
-            self.faces.clear()
+        for further in (self.faces, self.held):
+            if further:
+                further.clear()
 
     @property
     def _steps(self) -> int:
@@ -120,13 +124,15 @@ class ExplicitAdjoint:
         most = self.ws.most_passes(2 * self.ws.arrays.num_tetrahedra)  # a pass costs twice as much as forward
         launch = self._bound(num_passes)
         for numbers in self.ws.launches(stop, last, num_passes, save_every, most, backwards=True):
-            self._launch(launch, numbers, base, num_passes, halt, kick=0)
+            self._launch(launch, numbers, base, num_passes, save_every, halt, kick=0)
 
     def reverse_kick(self, j: int, base: int, num_passes: int) -> None:
         """Go back through the half kick that leads to the state which pass j shows."""
+        if self.held:
+            self.held.go_before_state()
         if np.any(self.ws.solver.weights(np.array([j]), num_passes, self.ws.rate).pre):
             for numbers in self.ws.launches(j, j + 1, num_passes, 0, 1):
-                self._launch(self._bound(num_passes), numbers, base, num_passes, halt=-1, kick=1)
+                self._launch(self._bound(num_passes), numbers, base, num_passes, 0, halt=-1, kick=1)
 
     def _bound(self, num_passes: int) -> Callable:
         """The kernel of a pass, with what all passes of a run share."""
@@ -135,19 +141,36 @@ class ExplicitAdjoint:
         launch = ws.bound(ws.kernels(self.features).step_vjp, state=states, adjoint=own, table=ws.table)
         return partial(launch, num_passes=num_passes, steps=self._steps, num_parts=self.num_parts)
 
-    def _launch(self, launch: Callable, numbers: dict, base: int, num_passes: int, halt: int, kick: int) -> None:
+    def _launch(
+        self, launch: Callable, numbers: dict, base: int, num_passes: int, save_every: int, halt: int, kick: int
+    ) -> None:
         ws, history = self.ws, self.ws.record
-        if not (ws.pairs or ws.chambers or self.faces):
+        if not (ws.pairs or ws.chambers or self.faces or self.held):
             launch(**numbers, base=base, halt=halt, kick=kick)
             return
         slot = numbers["first"] - base
+        if self.held and not kick:
+            self._complete(numbers, num_passes)
+            self.held.start(numbers["first"], slot, num_passes, save_every, numbers["first"] == halt)
+            with ws.volumes.alone(history, slot + 1):
+                self._launch_rest(launch, numbers, base, num_passes, halt, kick)
+            self.held.end()
+            return
+        self._launch_rest(launch, numbers, base, num_passes, halt, kick)
+
+    def _complete(self, numbers: dict, num_passes: int) -> None:
+        """Gather what the pass after that of a launch has left."""
+        if numbers["first"] < num_passes - 1:
+            self._gather(self)
+            runtime.fill(self.corner, 0)
+            runtime.fill(self.rate_corner, 0)
+
+    def _launch_rest(self, launch: Callable, numbers: dict, base: int, num_passes: int, halt: int, kick: int) -> None:
+        ws, history, slot = self.ws, self.ws.record, numbers["first"] - base
         rubs = ws.pairs.friction if ws.pairs and not kick else None
         with self._rubbing(rubs, slot, numbers, num_passes), self._faces_of(slot + 1, kick) as alone:
             if alone:
-                if numbers["first"] < num_passes - 1:  # what comes first in the pass has to be there
-                    self._gather(self)
-                    runtime.fill(self.corner, 0)
-                    runtime.fill(self.rate_corner, 0)
+                self._complete(numbers, num_passes)
                 self._start_faces(alone, numbers)
             launch(**numbers, base=base, halt=halt, kick=kick)
             if alone:
@@ -246,6 +269,8 @@ class ExplicitAdjoint:
         out.rest = rest + out.rest
         if self.faces:
             self.faces.collect(out)
+        if self.held:
+            self.held.collect(out, self.features.drag)
         if self.ws.impulses:
             out.mass = out.mass + self.mass_adj
         return out
@@ -258,85 +283,9 @@ class ExplicitAdjoint:
         if a.pressures and self.features.shape:
             np.add.at(rest, a.pressed_nodes.ravel(), runtime.fetch(self.pressed_rest).astype(np.float64))
         if a.chambers:
-            out.follower[:, len(a.pressures) :] += runtime.fetch(self.chamber_felt).astype(np.float64)
+            rows = np.concatenate([np.arange(r.start, r.stop) for r in self.ws.chambers.rows])
+            out.follower[:, rows] += runtime.fetch(self.chamber_felt).astype(np.float64)
         if a.chambers and self.features.shape:
             corners = self.ws.chambers.triangles.ravel()
             np.add.at(rest, corners, runtime.fetch(self.chamber_rest).astype(np.float64))
         return rest
-
-
-class ExplicitTangent:
-    """The tangent of a run: changes of the state for changes of everything that kernels read."""
-
-    def __init__(self, workspace, tangent: Derived):
-        self.ws, self.tangent = weakref.proxy(workspace), tangent
-        a = workspace.arrays
-        self.features = a.features(density=True, shape=True)
-        self.u = runtime.upload(tangent.displacement[None], a.vector)
-        self.v = runtime.upload(tangent.velocity[None], a.vector)
-        self.frames = FrameArrays.of(a, *workspace.frames.frames_u.shape)
-        self.numbers, self.z = Tangent(a, tangent), a.law_states(1)
-        self.faces = FeltTangent(self, workspace.faces) if workspace.faces else None
-        if workspace.impulses:
-            self.impulses = ImpulseRecord(workspace)
-            self.impulse = self.impulses.impulse
-        if self.z is not None:
-            runtime.fill(self.z, 0)
-        self._rate_dot = float(tangent.parameters[self.features.drag]) if self.features.drag >= 0 else 0.0
-
-    def advance(self, first: int, last: int, num_passes: int, save_every: int) -> None:
-        """Tangent of passes first .. last - 1, recorded from slot 0."""
-        ws, a, history = self.ws, self.ws.arrays, self.ws.record
-        states, own = (history, ws.frames, ws.watch, ws.contact), (self, self.numbers, self.frames)
-        launch = ws.bound(ws.kernels(self.features).step_jvp, state=states, tangent=own, table=ws.table)
-        for numbers in ws.launches(first, last, num_passes, save_every, 1):
-            slot = numbers["first"] - first
-            if ws.pairs:
-                ws.pairs.ensure(history.u, slot)
-                if ws.pairs.friction:
-                    ws.pairs.friction.begin_jvp(history, slot, self.u, self.numbers)
-                of_contact = self.tangent.parameters[a.parameters_of_self_contact]
-                ws.pairs.product(history.u, slot, self.u, a.corner, self.numbers.rest, of_contact)
-            if ws.chambers:
-                ws.chambers.jvp(history, slot, numbers, self.u, self.numbers)
-            alone = ws.faces.alone(history, slot + 1) if ws.faces else None
-            with self._rubbing(slot, numbers, num_passes), nullcontext() if alone is None else alone:
-                if alone:
-                    self.faces.start(alone, numbers)
-                launch(**numbers, base=first, rate_dot=self._rate_dot)
-                if alone:
-                    self._end_faces(alone, numbers)
-
-    @contextmanager
-    def _rubbing(self, slot: int, numbers: dict, num_passes: int):
-        """The pass without friction of surfaces on each other, and then that."""
-        friction, history = self.ws.pairs.friction if self.ws.pairs else None, self.ws.record
-        now = self.ws.numbers_of(numbers["first"], num_passes) if friction else None
-        if now is None or not now.alpha > 0:
-            yield
-            return
-        with friction.alone(history, slot + 1):
-            yield
-            friction.slide_jvp(history, slot + 1, now, self._rate_dot, self.u, self.v, self.numbers)
-
-    def _end_faces(self, alone, numbers: dict) -> None:
-        """What faces do, whose impulse may be asked for."""
-        before = runtime.fetch_row(self.v, 0) if self.ws.impulses else None
-        self.faces.end(alone, numbers)
-        if before is not None:
-            change = runtime.fetch_row(self.v, 0) - before
-            self.impulses.add_jvp(numbers, alone.speed, change, self.tangent.mass)
-
-    def contact_forces(self, frame_time: np.ndarray) -> np.ndarray:
-        """Changes of the frames' contact forces."""
-        return self.impulses.collect() / frame_time
-
-    def save_frame(self, frame: int) -> None:
-        """Copy the current tangent to a frame."""
-        copy_slot(self.u, 0, self.frames.frames_u, frame)
-        copy_slot(self.v, 0, self.frames.frames_v, frame)
-
-    def collect(self) -> tuple[np.ndarray, np.ndarray]:
-        """Changes of the frames' positions and velocities, float64."""
-        du, dv = (runtime.fetch(x).astype(np.float64) for x in self.frames)
-        return du + self.tangent.rest, dv

@@ -15,12 +15,12 @@ from diffsim_ti.runtime import Kernel
 from diffsim_ti.state.pass_table import pass_at
 
 A = ti.template()
-CHAMBERS = dict.fromkeys(("triangles", "own", "chamber", "begins", "anchor"), "ints") | dict(
+CHAMBERS = dict.fromkeys(("triangles", "own", "chamber", "begins", "anchor", "first_row"), "ints") | dict(
     point="vectors", volume="scalars", felt="scalars"
 )
 SCENE = dict(rest="vectors", follower="vectors2")
 TABLE = dict(ints="ints", floats="scalars")
-NUMBERS = dict.fromkeys(("num_triangles", "num_sums", "pass_", "window", "slot", "first", "first_row"), "int")
+NUMBERS = dict.fromkeys(("num_triangles", "num_sums", "pass_", "window", "slot", "first"), "int")
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,7 @@ class ChamberKernels(StepNumbers):
                 now = pass_at(table, plan.pass_ - plan.window)
                 y = [self.place(t, a, at.u, plan.slot, scene, chambers) for a in ti.static(range(3))]
                 V = self.whole(c, chambers.volume)
-                p, absolute, grown, log, V0, n = self.law(plan.first_row + 4 * c, V, now, scene.follower)
+                p, absolute, grown, log, V0, n = self.law(chambers.first_row[c], V, now, scene.follower)
                 f = self.sixth() * p * self.cross(y[1] - y[0], y[2] - y[0])
             for a in ti.static(range(3)):
                 out.corner[plan.first + 3 * t + a] = f
@@ -143,7 +143,7 @@ class ChamberKernels(StepNumbers):
         for t in range(plan.num_triangles):
             c, df = chambers.chamber[t], self.vector(0)
             if chambers.own[t] > 0:
-                now, first = pass_at(table, plan.pass_ - plan.window), plan.first_row + 4 * c
+                now, first = pass_at(table, plan.pass_ - plan.window), chambers.first_row[c]
                 y = [self.place(t, a, at.u, plan.slot, scene, chambers) for a in ti.static(range(3))]
                 dy = [self.change(t, a, tangent, chambers) for a in ti.static(range(3))]
                 V, dV = self.whole(c, chambers.volume), self.whole(c, chambers.felt)
@@ -161,7 +161,7 @@ class ChamberKernels(StepNumbers):
             self.sums(q, "vjp", scene, at, adjoint, chambers, plan)
         ti.loop_config(serialize=not self.parallel)
         for t in range(plan.num_triangles):
-            c, first = chambers.chamber[t], plan.first_row + 4 * chambers.chamber[t]
+            c, first = chambers.chamber[t], chambers.first_row[chambers.chamber[t]]
             now = pass_at(table, plan.pass_ - plan.window)
             y = [self.place(t, a, at.u, plan.slot, scene, chambers) for a in ti.static(range(3))]
             V, felt = self.whole(c, chambers.volume), self.whole(c, chambers.felt)

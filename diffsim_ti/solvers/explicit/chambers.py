@@ -19,7 +19,8 @@ class Chambers:
 
     def __init__(self, workspace):
         self.ws, scene, a = weakref.proxy(workspace), workspace.scene, workspace.arrays
-        closed = [chamber.enclosure for chamber in scene.chambers]
+        closed = [chamber.enclosure for chamber in a.chambers]
+        self.rows = [workspace.following.rows[scene.chambers.index(chamber)] for chamber in a.chambers]
         counts = [len(enclosure.triangles) for enclosure in closed]
         own = [np.arange(len(e.triangles)) < e.num_own for e in closed]
         self.parts = 1 if runtime.runs_on_cpu() else PARTS
@@ -33,6 +34,7 @@ class Chambers:
             triangles=ints(self.triangles),
             own=ints(np.concatenate(own)),
             chamber=ints(np.repeat(np.arange(self.count), counts)),
+            first_row=ints([rows.start for rows in self.rows]),
             begins=ints(np.cumsum([0, *counts])),
             anchor=ints([e.triangles[0, 0] if e.point is None else -1 for e in closed]),
             point=runtime.upload(np.array([zero if e.point is None else e.point for e in closed]), a.vector),
@@ -49,7 +51,7 @@ class Chambers:
         per_step = len(a.values.follower) > 1
         kernels = kernels_of(self.kernels, a.precision, per_step, self.parts, ws.parallel, shape)
         sizes = dict(num_triangles=len(self.triangles), num_sums=self.count * self.parts, slot=slot)
-        sizes |= dict(first=a.first_chamber_corner, first_row=len(a.pressures))
+        sizes |= dict(first=a.first_chamber_corner)
         launch = ws.bound(getattr(kernels, name), chambers=self.arrays, table=ws.table, **records)
         launch(**sizes, pass_=numbers["first"], window=numbers["window"])
 

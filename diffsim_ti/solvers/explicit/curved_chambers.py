@@ -50,7 +50,7 @@ class CurvedChamberKernels(ChamberKernels):
             c, now = chambers.chamber[t], pass_at(table, plan.pass_ - plan.window)
             y = [self.place(t, a, at.u, plan.slot, scene, chambers) for a in ti.static(range(3))]
             V = self.whole(c, chambers.volume)
-            p, absolute, grown, log, V0, n = self.law(plan.first_row + 4 * c, V, now, scene.follower)
+            p, absolute, grown, log, V0, n = self.law(chambers.first_row[c], V, now, scene.follower)
             factor = self.sixth() * p * chambers.weight[t]
             for a in ti.static(range(3)):
                 out.corner[plan.first + 3 * t + a] = factor * self.cross(y[(a + 1) % 3], y[(a + 2) % 3])
@@ -63,7 +63,7 @@ class CurvedChamberKernels(ChamberKernels):
         ti.loop_config(serialize=not self.parallel)
         for t in range(plan.num_triangles):
             c, now = chambers.chamber[t], pass_at(table, plan.pass_ - plan.window)
-            first = plan.first_row + 4 * c
+            first = chambers.first_row[c]
             y = [self.place(t, a, at.u, plan.slot, scene, chambers) for a in ti.static(range(3))]
             dy = [self.change(t, a, tangent, chambers) for a in ti.static(range(3))]
             V, dV = self.whole(c, chambers.volume), self.whole(c, chambers.felt)
@@ -82,7 +82,7 @@ class CurvedChamberKernels(ChamberKernels):
             self.sums(q, "vjp", scene, at, adjoint, chambers, plan)
         ti.loop_config(serialize=not self.parallel)
         for t in range(plan.num_triangles):
-            c, first = chambers.chamber[t], plan.first_row + 4 * chambers.chamber[t]
+            c, first = chambers.chamber[t], chambers.first_row[chambers.chamber[t]]
             now = pass_at(table, plan.pass_ - plan.window)
             y = [self.place(t, a, at.u, plan.slot, scene, chambers) for a in ti.static(range(3))]
             w = [adjoint.w[0, chambers.triangles[3 * t + a]] for a in ti.static(range(3))]

@@ -15,12 +15,14 @@ from diffsim_ti.monitor.energy_balance import EnergyBalance
 from diffsim_ti.potential.attached import Attached
 from diffsim_ti.potential.chamber_pressure import following
 from diffsim_ti.potential.way import Way
-from diffsim_ti.solvers.explicit.adjoint import ExplicitAdjoint, ExplicitTangent
+from diffsim_ti.solvers.explicit.adjoint import ExplicitAdjoint
 from diffsim_ti.solvers.explicit.chambers import Chambers
 from diffsim_ti.solvers.explicit.contact_stage import ROWS
 from diffsim_ti.solvers.explicit.felt_faces import FeltFaces, feels_faces
+from diffsim_ti.solvers.explicit.held_volumes import HeldVolumes
 from diffsim_ti.solvers.explicit.impulse_record import ImpulseRecord
 from diffsim_ti.solvers.explicit.kernels import ExplicitKernels, explicit_kernels
+from diffsim_ti.solvers.explicit.tangent import ExplicitTangent
 from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.state.pass_table import PassTable
 from diffsim_ti.state.workspace import Workspace
@@ -71,12 +73,6 @@ class ExplicitSolver(Solver):
         if contact not in ("stage", "force"):
             raise ValueError(f'contact must be "stage" or "force", got {contact!r}')
         self.contact, self.contact_damping = contact, between("contact_damping", contact_damping, 0, 1, ends=True)
-        scene = arguments[0] if arguments else options.get("scene")
-        if getattr(scene, "holds_volumes", False):
-            raise ValueError(
-                "explicit steps cannot hold a volume (FilledChamber): take an implicit or static solver, or a "
-                "GasChamber whose pressure is high enough that its volume hardly changes"
-            )
         super().__init__(*arguments, **options)
 
     @property
@@ -129,13 +125,14 @@ class ExplicitWorkspace(Workspace):
         self.repeated = self.parallel and self.in_parallel > 1
         features, a = self.arrays.features(), self.arrays
         self.faces = FeltFaces(self) if a.feels_faces else None
+        self.following = following(self.scene)
         self.chambers = Chambers(self) if a.chambers else None
+        self.volumes = HeldVolumes(self) if self.scene.holds_volumes else None
         noted = ROWS * len(a.obstacles), a.num_vertices
         self.contact = SimpleNamespace(
             stage=runtime.array(a.vector, *(noted if features.staged else (1, 1))),
             work=runtime.array(a.fp, a.num_vertices if features.driven else 1),  # done on each vertex from outside [J]
         )
-        self.following = following(self.scene)
         self.attached = Attached.of(self.scene)  # springs, cables and foundations, for what looks between passes
         self.probe = None  # room for a pass that is not taken
         self.energy_watch = EnergyBalance(self) if EnergyBalance.knows(a.law) else None
@@ -166,6 +163,13 @@ class ExplicitWorkspace(Workspace):
         if a.feels_faces:
             way = self.kept("way", lambda: Way(a, self.parallel))
             way.check_apart(runtime.fetch_row(self.state.u, 0), runtime.fetch(a.offsets)[::3].astype(np.float64))
+
+    def chamber_pressures(self, num_frames: int, save_every: int) -> np.ndarray:
+        return self.volumes.of_all(num_frames)
+
+    def last_chamber_pressures(self) -> np.ndarray:
+        """Those of chambers whose volume is held after the last pass, shape (chambers,); zero before the first."""
+        return self.volumes.spread(self.volumes.last)
 
     def forces_at(self, j: int, num_passes: int) -> np.ndarray:
         """Forces [N] on each vertex in the current state, gravity and stages left out, as pass j of a run takes them."""
@@ -223,7 +227,7 @@ class ExplicitWorkspace(Workspace):
 
     def most_passes(self, work: int) -> int:
         """How many passes a launch may take; work: of a pass, in those of tetrahedra."""
-        if self.parallel or self.pairs or self.faces or self.chambers:
+        if self.parallel or self.pairs or self.faces or self.chambers or self.volumes:
             return self.in_parallel
         return max(1, self.work_per_launch // work)
 
@@ -273,6 +277,8 @@ class ExplicitWorkspace(Workspace):
                 self.chambers.forces(history, slot, numbers)
             if self.faces:
                 self.faces.before_pass(history, slot)
+            if self.volumes:
+                self.volumes.before_pass(history, slot)
             launch(**numbers, base=base, stride=stride)
             if self.faces:
                 change = self.faces.after_pass(history, slot + stride, numbers, recording, self.impulses is not None)
@@ -280,9 +286,11 @@ class ExplicitWorkspace(Workspace):
                     self.impulses.add(numbers, change)
             if pairs:
                 if pairs.friction:
-                    pairs.friction.slide(
-                        history, slot + stride, self.numbers_of(numbers["first"], num_passes), recording
-                    )
+                    now = self.numbers_of(numbers["first"], num_passes)
+                    pairs.friction.slide(history, slot + stride, now, recording)
+            if self.volumes:
+                self.volumes.after_pass(history, slot + stride, (numbers["first"], num_passes, save_every), recording)
+            if pairs:
                 try:
                     pairs.check_pass(history.u, slot + stride, float(self.solver.schedule.length(numbers["first"])))
                 except Tunnelling as error:

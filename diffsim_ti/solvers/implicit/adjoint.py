@@ -13,7 +13,7 @@ from diffsim_ti.inputs import Derived
 from diffsim_ti.potential.face_kernels import face_kernels
 from diffsim_ti.potential.face_lattice import rest_of_areas
 from diffsim_ti.potential.kernels import potential_kernels
-from diffsim_ti.solvers.implicit.chamber_record import ChamberRecord
+from diffsim_ti.solvers.chamber_record import ChamberRecord
 from diffsim_ti.solvers.implicit.contact_record import ContactRecord, SharesAdjoint
 from diffsim_ti.solvers.implicit.pressed import PressedAdjoint
 from diffsim_ti.solvers.implicit.recorded_passes import RecordedPasses
@@ -51,7 +51,7 @@ class ImplicitAdjoint(RecordedPasses):
             faces = face_kernels(self.features, a.precision, workspace.parallel)
             self.face_areas = runtime.array(a.fp, 3 * len(a.mesh.surface_triangles) if self.features.areas else 1)
             self._vjp_of_faces = p.faces.bind(faces.vjp, adjoint=(self, self.numbers))
-        self.chambers = ChamberRecord(workspace)
+        self.chamber_record = ChamberRecord(workspace.solver, workspace.held_chambers)
         self.contacts, areas = None, self.face_areas if p.faces else runtime.array(a.fp, 1)
         if workspace.impulses:
             self.contacts = ContactRecord(workspace)
@@ -136,7 +136,9 @@ class ImplicitAdjoint(RecordedPasses):
         by_star = self.solve(seed)
         nu = None
         if ws.volumes:
-            by_star, nu = ws.volumes.adjoint(self.places, by_star, self.chambers.adjoint(j, save_every), self.solve)
+            by_star, nu = ws.volumes.adjoint(
+                self.places, by_star, self.chamber_record.adjoint(j, save_every), self.solve
+            )
         runtime.fill(ws.potential.w, by_star[None])
         for target in (self.lag, self.walls, *[self.pressed] * ws.potential.presses):
             runtime.fill(target, 0)

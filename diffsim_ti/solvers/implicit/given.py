@@ -68,6 +68,11 @@ class GivenInPasses:
         free, rest = projectors_of(self.free), self.arrays.values.rest
         return following(self.scene, is_symmetric(*self.scene.pressed_faces, free, rest))
 
+    @property
+    def held_chambers(self) -> list[int]:
+        """Places of those that hold a volume among the scene's."""
+        return self.follower.held if self.volumes else []
+
     def held_volumes(self, eps: float) -> HeldVolumes | None:
         """The scene's chambers that hold a volume."""
         if not self.scene.holds_volumes:

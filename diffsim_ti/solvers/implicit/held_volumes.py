@@ -72,16 +72,30 @@ class HeldVolumes:
                 return False
         return True
 
+    def predicted(self, u: np.ndarray, R: np.ndarray, stiffness: np.ndarray) -> np.ndarray:
+        """R with pressures changed so that it is least, by the stiffness of each vertex [N/m], shape (num_vertices, 1).
+
+        `bordered` counts from there: what pressures balance anyway is not left to a rough solve, whose error would be larger
+        than the direction.
+        """
+        G = [g * self.free for g in self.gradients(u + self.rest)]
+        soft = np.divide(1.0, stiffness, out=np.zeros_like(stiffness), where=stiffness > 0)
+        S = np.array([[float((g * soft * h).sum()) for h in G] for g in G])
+        self._ahead = np.linalg.lstsq(S, -np.array([float((g * soft * R).sum()) for g in G]), rcond=None)[0]
+        return R + sum(m * g for m, g in zip(self._ahead, G))
+
     def bordered(self, u: np.ndarray, y: np.ndarray, solve) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(d, what comes to R, dp) from y; solve(g): K'^-1 g. The multipliers go to p + mu, for the line search."""
+        """(d, what comes to R, dp) from y = K'^-1 R, R as `predicted`; solve(g): K'^-1 g. The multipliers go to p + mu, for
+        the line search."""
         G = [g * self.free for g in self.gradients(self.rest + u)]
         Z = [solve(g) for g in G]
         S = np.array([[float((g * z).sum()) for z in Z] for g in G])
         r, self._before = self.missing, self.multipliers
         mu = np.linalg.lstsq(S, r - np.array([float((g * y).sum()) for g in G]), rcond=None)[0]
+        d, mu = y + sum(m * z for m, z in zip(mu, Z)), mu + self._ahead
         for law, more in zip(self.laws, mu):
             law.multiplier += more
-        d, change = y + sum(m * z for m, z in zip(mu, Z)), sum(m * g for m, g in zip(mu, G))
+        change = sum(m * g for m, g in zip(mu, G))
         return d, change, mu - np.array([law.gamma for law in self.laws]) * r
 
     # ---- derivatives -------------------------------------------------------------------------------------------------

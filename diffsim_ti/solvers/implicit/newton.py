@@ -199,7 +199,8 @@ class Newton:
     def _step(self, u, R, forcing):
         """(direction, R): Newton's, towards the volumes that are held, and the residual that it goes down by."""
         A = self.operator()
-        direction = self._direction(A, R, forcing)
+        balanced = self.volumes.predicted(u, R, self.stiffness) if self.volumes else R
+        direction = self._direction(A, balanced, forcing)
         if self.volumes:
             done = A.products
             least, limit = min(forcing, self.inexact), 10 * len(R)

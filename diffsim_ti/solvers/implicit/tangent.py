@@ -7,7 +7,7 @@ import numpy as np
 from diffsim_ti import runtime
 from diffsim_ti.inputs import Derived
 from diffsim_ti.potential.kernels import potential_kernels
-from diffsim_ti.solvers.implicit.chamber_record import ChamberRecord
+from diffsim_ti.solvers.chamber_record import ChamberRecord
 from diffsim_ti.solvers.implicit.contact_record import ContactRecord, Shares
 from diffsim_ti.solvers.implicit.pressed import PressedTangent
 from diffsim_ti.solvers.implicit.recorded_passes import RecordedPasses
@@ -39,7 +39,7 @@ class ImplicitTangent(RecordedPasses):
         self.contacts = ContactRecord(workspace) if workspace.impulses else None
         self._shares = Shares(workspace) if workspace.impulses else None
         self.rate_dot = float(tangent.parameters[a.features().drag]) if a.features().drag >= 0 else 0.0
-        self.frames, self.chambers = ([], []), ChamberRecord(workspace)
+        self.frames, self.chamber_record = ([], []), ChamberRecord(workspace.solver, workspace.held_chambers)
 
     @one_blas_thread
     def advance(self, first: int, last: int, num_passes: int, save_every: int) -> None:
@@ -106,7 +106,7 @@ class ImplicitTangent(RecordedPasses):
         if ws.volumes:
             targets = ws.volumes.targets_jvp(self.places, held + tangent.rest, dp)
             d_star, change = ws.volumes.tangent(self.places, d_star, targets, self.solve)
-            self.chambers.note(j, save_every, change)
+            self.chamber_record.note(j, save_every, change)
         d_star = held + d_star
         if self.contacts:
             self._note_contacts(j, save_every, d_star)

@@ -1,6 +1,4 @@
-"""Pressures of held volumes in the frames of an implicit run: their changes, and adjoints that a loss gives."""
-
-import weakref
+"""Pressures of held volumes in the frames of a run: their changes, and adjoints that a loss gives."""
 
 import numpy as np
 
@@ -8,19 +6,19 @@ import numpy as np
 class ChamberRecord:
     """The pressure of a frame is that of the pass that leads to it."""
 
-    def __init__(self, workspace):
-        self.ws = weakref.proxy(workspace)
+    def __init__(self, solver, held: list[int]):
+        self.solver, self.held = solver, held  # places of these chambers among the scene's
         self.adjoints: np.ndarray | None = None  # by the frames' chamber pressures, None: zero
         self._changes: dict[int, np.ndarray] = {}
 
     def _frame(self, j: int, save_every: int) -> int:
         """The frame that the state after pass j is, or -1."""
-        return int(self.ws.solver.schedule.shown(j + 1, save_every))
+        return int(self.solver.schedule.shown(j + 1, save_every))
 
     def adjoint(self, j: int, save_every: int) -> np.ndarray:
         """By the pressures of held volumes after pass j."""
-        held, frame = self.ws.follower.held, self._frame(j, save_every)
-        return np.zeros(len(held)) if self.adjoints is None or frame < 0 else self.adjoints[frame, held]
+        frame = self._frame(j, save_every)
+        return np.zeros(len(self.held)) if self.adjoints is None or frame < 0 else self.adjoints[frame, self.held]
 
     def note(self, j: int, save_every: int, change: np.ndarray) -> None:
         """Change of those after pass j."""
@@ -30,7 +28,7 @@ class ChamberRecord:
 
     def changes(self, num_frames: int) -> np.ndarray:
         """Of the frames, shape (frames, chambers)."""
-        out = np.zeros((num_frames, len(self.ws.scene.chambers)))
+        out = np.zeros((num_frames, len(self.solver.scene.chambers)))
         for frame, change in self._changes.items():
-            out[frame, self.ws.follower.held] = change
+            out[frame, self.held] = change
         return out
