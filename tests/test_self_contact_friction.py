@@ -173,6 +173,58 @@ def test_with_everything_else(solver, dt, tolerance):
     assert verify.dot_product_test(rollout) <= tolerance
 
 
+# ---- forces as a loss names them ---------------------------------------------------------------------------------------
+
+
+def test_forces_on_a_body_are_what_its_momentum_gains():
+    """Nothing else acts on the whole of it; all forces add up to zero; friction lies across the normal part."""
+    named = [ds.SelfContactForce("body_1"), ds.SelfContactForce(name="each", per_vertex=True)]
+    named += [ds.SelfContactForce("body_1", part, name=part) for part in ("normal", "friction")]
+    scene, dt = rubbing(), 1e-5
+    frames = ds.Rollout(ds.SemiImplicitSolver(scene, dt=dt), 300, save_every=1, outputs=named, gradients=[]).forward()
+    mass = scene.inputs.derive(scene.inputs.values).mass[4:, None]
+    gained = np.diff((mass * frames.velocities[:, 4:]).sum(1), axis=0) / dt
+    force = frames["self_contact_force"]
+    assert np.abs(force).max() > 10 and np.abs(frames["friction"]).max() > 1
+    np.testing.assert_allclose(gained.mean(0), force.mean(0), atol=5e-3 * np.abs(force).mean(0).max())
+    np.testing.assert_allclose(frames["each"][:, 4:].sum(1), force, atol=1e-12)
+    np.testing.assert_allclose(frames["each"].sum(1), 0, atol=1e-12)
+    np.testing.assert_allclose(frames["normal"] + frames["friction"], force, atol=1e-12)
+
+
+def test_forces_have_derivatives():
+    named = [
+        ds.SelfContactForce("body_1", name="on"),
+        ds.SelfContactForce("body_0", "normal", name="p", about=(0, 0.1, 0)),
+    ]
+    named += [ds.SelfContactForce(name="each", per_vertex=True, part="friction")]
+    solver, rng = ds.SemiImplicitSolver(rubbing(terms=[ds.Drag(2.0)]), dt=1e-4), np.random.default_rng(0)
+    rollout = ds.Rollout(solver, 20, save_every=10, outputs=named, gradients="all")
+    frames = rollout.forward()
+    seeds = {name: rng.normal(size=frames[name].shape) for name in rollout.computed}
+    gradients = {name: rollout.vjp(frames, **{name: seed}) for name, seed in seeds.items()}
+    for key, value in rollout.values.items():
+        way = rng.normal(size=np.shape(value)) * verify.input_scale(rollout, key)
+        tangents = rollout.tangents(frames, **{key: way})
+        ends = [rollout.forward(**{key: value + sign * 1e-5 * way}) for sign in (1, -1)]
+        for name, seed in seeds.items():
+            pushed, scale = (tangents[name] * seed).sum(), np.abs(tangents[name] * seed).sum()
+            assert abs(pushed - (gradients[name][key] * way).sum()) <= 1e-12 * scale, (key, name)
+            difference = ((ends[0][name] - ends[1][name]) * seed).sum() / 2e-5
+            floor = 1e-8 * np.abs(frames[name] * seed).sum()  # round-off of the difference
+            assert abs(pushed - difference) <= 1e-5 * scale + floor, (key, name)
+
+
+def test_forces_that_cannot_be():
+    with pytest.raises(ValueError, match="part must be normal, friction or total"):
+        ds.SelfContactForce("body_1", "all")
+    with pytest.raises(ValueError, match="give on=.*or per_vertex=True"):
+        ds.SelfContactForce()
+    with pytest.raises(ValueError, match="has no SelfContact"):
+        scene = ds.Scene(bodies(), ds.StableNeoHookean(5e4, 0.3), precision="f64")
+        ds.Rollout(ds.SemiImplicitSolver(scene, dt=1e-4), 1, outputs=ds.SelfContactForce("body_1"))
+
+
 # ---- pairs of sets, threads, checkpoints, refusals -------------------------------------------------------------------
 
 
