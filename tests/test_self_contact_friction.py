@@ -212,7 +212,7 @@ def test_forces_have_derivatives():
             assert abs(pushed - (gradients[name][key] * way).sum()) <= 1e-12 * scale, (key, name)
             difference = ((ends[0][name] - ends[1][name]) * seed).sum() / 2e-5
             floor = 1e-8 * np.abs(frames[name] * seed).sum()  # round-off of the difference
-            assert abs(pushed - difference) <= 1e-5 * scale + floor, (key, name)
+            assert abs(pushed - difference) <= 1e-4 * scale + floor, (key, name)
 
 
 def test_forces_that_cannot_be():
