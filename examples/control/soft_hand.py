@@ -61,7 +61,7 @@ def hand_scene(friction: float = FRICTION) -> ds.Scene:
         [
             ds.Gravity(),
             ds.Drag(5.0),
-            ds.SelfContact(2e3, WIDTH, friction=friction),
+            ds.SelfContact(2e3, WIDTH, friction=friction, friction_speed=3e-4),
             ds.Ground(stiffness=1e3, width=2 * WIDTH, friction=0.5),
         ],
         fixed=dict.fromkeys(ends, "xyz"),
@@ -153,7 +153,7 @@ def save_hands(path, runs, grip: Grip) -> None:
         positions,
         [colour] * len(times),
         fps=1 / (EVERY * DT),
-        size=(400, 240),
+        size=(400, 200),
         title=lambda k: f"t = {times[k]:.2f} s: as the hand turns at first, and as it found",
         colours="PuOr",
         limits=(-0.3, 1.4),
@@ -161,7 +161,8 @@ def save_hands(path, runs, grip: Grip) -> None:
         marks=[[replace(mark, through=True)] for mark in shown],
         wireframe=True,
         azimuth=12.0,
-        elevation=10.0,
+        elevation=8.0,
+        box=[[-0.06, 0.02, -0.03], [0.38, 0.16, 0.03]],
         backend="software",
     )
 
