@@ -99,6 +99,34 @@ def test_momentum(solver):
     assert kinetic[1] < 0.999 * kinetic[0]
 
 
+def turned(width, friction, solver, steps, **options):
+    """(|angular momentum gained|, |impulse of friction|) of the two bodies, as stiff as makes all scale with the width."""
+    places = bodies().vertices + np.repeat([0, 1.2 * width - 7e-3], 4)[:, None] * [0, 1, 0]
+    velocity = np.repeat([[0, 0, 0], [0.5, -3.0, 0.2]], 4, axis=0)
+    contact = ds.SelfContact(0.5 / width**2, width, friction=friction, friction_speed=0.05)
+    mesh = ds.TetrahedralMesh(places, bodies().tetrahedra)
+    scene = ds.Scene(
+        mesh, ds.StableNeoHookean(5e4, 0.3), 1000.0, [contact], initial_velocities=velocity, precision="f64"
+    )
+    rubbed, dt = ds.SelfContactForce(range(4, 8), "friction"), 1.6 * width / steps
+    frames = ds.Rollout(solver(scene, dt=dt, **options), steps, save_every=1, outputs=rubbed, gradients=[]).forward()
+    mass = scene.inputs.derive(scene.inputs.values).mass[:, None]
+    L = (mass * np.cross(frames.positions, frames.velocities)).sum(1)
+    return np.linalg.norm(L[-1] - L[0]), np.linalg.norm(frames["self_contact_force"].sum(0) * dt)
+
+
+@pytest.mark.parametrize(
+    "solver, steps, options", [(ds.SemiImplicitSolver, 200, {}), (ds.ImplicitMidpointSolver, 60, dict(tolerance=1e-11))]
+)
+def test_angular_momentum_but_for_the_couple_of_friction_across_the_gap(solver, steps, options):
+    """The couple's arm is the gap, half the width here; it falls with the width, and is none where nothing rubs."""
+    (wide, by_wide), (narrow, by_narrow) = (turned(width, 0.4, solver, steps, **options) for width in (4e-3, 2e-3))
+    assert narrow == pytest.approx(0.5 * wide, rel=0.05)
+    for gained, impulse, width in ((wide, by_wide, 4e-3), (narrow, by_narrow, 2e-3)):
+        assert 0.45 * width * impulse < gained < 0.65 * width * impulse
+    assert turned(4e-3, 0.0, solver, steps, **options)[0] < (1e-9 if options else 1e-15)
+
+
 def test_energy_never_grows_by_the_stage():
     """Whatever the velocities, the length of a pass, the coefficient and the friction speed."""
     low, up = (ds.TetrahedralMesh.create_box((3, 2, 3), size=(0.1, 0.05, 0.1)).rotated([0, 1, 0], a) for a in (0, 0.4))
