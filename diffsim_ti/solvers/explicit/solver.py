@@ -77,6 +77,11 @@ class ExplicitSolver(Solver):
                 "explicit steps cannot hold a volume (FilledChamber): take an implicit or static solver, or a "
                 "GasChamber whose pressure is high enough that its volume hardly changes"
             )
+        if getattr(scene, "reduced", False):
+            raise ValueError(
+                f"explicit steps move every vertex, and this scene moves some by few numbers ({scene.reduced.describe()}): "
+                "take ImplicitEulerSolver, BDF2Solver or ImplicitMidpointSolver, or leave reduced= out"
+            )
         super().__init__(*arguments, **options)
 
     @property
