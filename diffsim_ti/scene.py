@@ -18,6 +18,7 @@ from diffsim_ti.materials.patch_law import PatchLaw
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.paths import Paths
 from diffsim_ti.potential.assembled import body_stiffness
+from diffsim_ti.reduced import Reduced
 from diffsim_ti.supports import Fixed, Supports
 from diffsim_ti.terms import (
     Cable,
@@ -70,6 +71,10 @@ class Scene(MadeAgain):
         reactions grow by the share. By which factors vertices are heavier is found for the numbers given here, and kept
         whatever values a run takes; gradients by density and rest shape are those of such masses. `describe()` says how
         much was added. Implicit steps and statics add none.
+    reduced: {name of a tetrahedron or vertex set: "affine"}: its vertices move by twelve numbers, x = X + A X + t, a body
+        that is stiff against what it touches, or soft in stretch and shear alone, by its own material. Implicit steps and
+        statics solve for these numbers, with contact, friction and gradients as of all others; explicit steps refuse
+        (reduced.py). Of a start only the affine part counts.
 
     Raises ValueError with rule, value and remedy for anything that does not fit, before any kernel runs. Warns where
     tetrahedra lock, above Poisson's ratio 0.45.
@@ -88,6 +93,7 @@ class Scene(MadeAgain):
         precision: str | None = None,
         volume: str = "tetrahedra",
         mass_scaling: float | None = None,
+        reduced: Mapping[str, str] | None = None,
     ):
         self.arguments = {name: value for name, value in locals().items() if name != "self"}
         self.mesh = instance("Scene", "mesh", mesh, TetrahedralMesh, "a TetrahedralMesh")
@@ -101,6 +107,7 @@ class Scene(MadeAgain):
         self.terms = tuple([terms] if isinstance(terms, Term) else listed("terms", terms, "terms such as Gravity()"))
         self.supports = Supports(mesh, fixed)
         self.fixed, self.held = self.supports.fixed, self.supports.vertices  # in all directions; in some
+        self.reduced = Reduced(mesh, reduced, self.held)
         self.motion, (self.clamps, self.translates) = motion, self.supports.parts_of(motion)
         self._check_terms()
         self._given = self.arguments["terms"] = self.terms
@@ -341,6 +348,7 @@ class Scene(MadeAgain):
                 f"fixed vertices: {len(self.fixed)}"
                 + (f", in some directions {len(self.supports.guided)}" if len(self.supports.guided) else "")
                 + (", moving" if self.motion is not None else ""),
+                *([f"moving by few numbers: {self.reduced.describe()}"] if self.reduced else []),
                 *chosen,
                 "inputs: " + ", ".join(f"{name}{i.in_brackets}" for name, i in self.inputs.described.items()),
             ]

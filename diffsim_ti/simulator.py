@@ -189,7 +189,7 @@ class Simulator:
     def set_state(self, positions: ArrayLike | None = None, velocities: ArrayLike | None = None) -> None:
         """Put the body elsewhere: positions [m], velocities [m/s], shape (num_vertices, 3); None leaves a part as it is.
 
-        Fixed vertices keep no velocity. What the law remembers stays; `reset` clears it.
+        Fixed vertices keep no velocity, and of sets that are `reduced` what these can do is taken. What the law remembers stays; `reset` clears it.
         """
         state, shape = self.workspace.state, (self.scene.mesh.num_vertices, 3)
         for name, value, target, origin in (
@@ -203,7 +203,7 @@ class Simulator:
                 value = value - origin
                 if name == "velocities":
                     value = self.scene.supports.free(value)
-                runtime.fill(target, value[None])
+                runtime.fill(target, self.scene.reduced.of(value)[None])
         self.workspace.forget()
 
     def set_forces(self, forces: ArrayLike) -> None:

@@ -223,6 +223,9 @@ def test_the_command_draws_arrows(loaded, tmp_path, capsys):
     assert end.value.code == 2 and "arrows: 'wind' must be a vector of each vertex" in said and "reaction, left" in said
 
 
+FORCES = [word for name in ("reaction", "contact", "friction") for word in ("--arrows", name)]
+
+
 def test_a_simulation_of_the_command_line_writes_and_draws_forces(tmp_path, capsys):
     """A cube that hangs by one side: what holds it carries its weight once it rests, to what still swings."""
     TetrahedralMesh.create_cube(2, 0.1).save(tmp_path / "cube.vtu")
@@ -239,20 +242,24 @@ def test_a_simulation_of_the_command_line_writes_and_draws_forces(tmp_path, caps
         "0",
     ]
     command += ["--ground-stiffness", "1e3", "-o", str(tmp_path / "a.pvd"), "-o", str(tmp_path / "a.npz")]
-    command += ["-o", str(tmp_path / "a.png"), "--height", "0.0005"]
+    command += ["-o", str(tmp_path / "a.png"), "--height", "0.0005", "--ground-friction", "0.5", "--velocity", "0.2"]
+    command += ["0", "0"]
     with pytest.raises(SystemExit) as end:
-        app.main([*command, "--arrows", "reaction", "--arrows", "contact"])
+        app.main([*command, *FORCES])
     assert end.value.code == 0, capsys.readouterr().err
     arrays = np.load(tmp_path / "a.npz")
-    assert arrays["reaction"].shape == arrays["contact"].shape == (3, 8, 3)
+    assert arrays["reaction"].shape == arrays["contact"].shape == arrays["friction"].shape == (3, 8, 3)
     top = arrays["rest_positions"][:, 1] > 0.09
     assert np.abs(arrays["reaction"][-1, top]).max() > 0 and not arrays["reaction"][-1, ~top].any()
-    assert arrays["contact"][-1, ~top, 1].sum() > 0  # the floor presses from below
+    assert arrays["contact"][-1, ~top, 1].sum() > 0  # the floor presses from below and rubs
+    normal = (arrays["contact"] - arrays["friction"])[-1, ~top, 1]
+    rubbed = np.linalg.norm(arrays["friction"][-1, ~top], axis=1)
+    assert rubbed.max() > 0 and np.all(rubbed <= 0.5001 * normal)
     saved = SavedSeries(tmp_path / "a.pvd").frame(2).fields["contact"]  # in single precision
     assert saved == pytest.approx(arrays["contact"][2], rel=1e-6)
     with pytest.raises(SystemExit) as end:
         app.main([*command, "--arrows", "wind"])
-    assert end.value.code == 2 and "--arrows: must be reaction or contact" in capsys.readouterr().err
+    assert end.value.code == 2 and "--arrows: must be reaction, contact or friction" in capsys.readouterr().err
 
 
 def test_a_film_has_one_scale(tmp_path):

@@ -99,6 +99,34 @@ def test_momentum(solver):
     assert kinetic[1] < 0.999 * kinetic[0]
 
 
+def turned(width, friction, solver, steps, **options):
+    """(|angular momentum gained|, |impulse of friction|) of the two bodies, as stiff as makes all scale with the width."""
+    places = bodies().vertices + np.repeat([0, 1.2 * width - 7e-3], 4)[:, None] * [0, 1, 0]
+    velocity = np.repeat([[0, 0, 0], [0.5, -3.0, 0.2]], 4, axis=0)
+    contact = ds.SelfContact(0.5 / width**2, width, friction=friction, friction_speed=0.05)
+    mesh = ds.TetrahedralMesh(places, bodies().tetrahedra)
+    scene = ds.Scene(
+        mesh, ds.StableNeoHookean(5e4, 0.3), 1000.0, [contact], initial_velocities=velocity, precision="f64"
+    )
+    rubbed, dt = ds.SelfContactForce(range(4, 8), "friction"), 1.6 * width / steps
+    frames = ds.Rollout(solver(scene, dt=dt, **options), steps, save_every=1, outputs=rubbed, gradients=[]).forward()
+    mass = scene.inputs.derive(scene.inputs.values).mass[:, None]
+    L = (mass * np.cross(frames.positions, frames.velocities)).sum(1)
+    return np.linalg.norm(L[-1] - L[0]), np.linalg.norm(frames["self_contact_force"].sum(0) * dt)
+
+
+@pytest.mark.parametrize(
+    "solver, steps, options", [(ds.SemiImplicitSolver, 200, {}), (ds.ImplicitMidpointSolver, 60, dict(tolerance=1e-11))]
+)
+def test_angular_momentum_but_for_the_couple_of_friction_across_the_gap(solver, steps, options):
+    """The couple's arm is the gap, half the width here; it falls with the width, and is none where nothing rubs."""
+    (wide, by_wide), (narrow, by_narrow) = (turned(width, 0.4, solver, steps, **options) for width in (4e-3, 2e-3))
+    assert narrow == pytest.approx(0.5 * wide, rel=0.05)
+    for gained, impulse, width in ((wide, by_wide, 4e-3), (narrow, by_narrow, 2e-3)):
+        assert 0.45 * width * impulse < gained < 0.65 * width * impulse
+    assert turned(4e-3, 0.0, solver, steps, **options)[0] < (1e-9 if options else 1e-15)
+
+
 def test_energy_never_grows_by_the_stage():
     """Whatever the velocities, the length of a pass, the coefficient and the friction speed."""
     low, up = (ds.TetrahedralMesh.create_box((3, 2, 3), size=(0.1, 0.05, 0.1)).rotated([0, 1, 0], a) for a in (0, 0.4))
@@ -171,6 +199,58 @@ def test_with_everything_else(solver, dt, tolerance):
     )
     assert rollout.values["self_contact_friction"].shape == (2,)
     assert verify.dot_product_test(rollout) <= tolerance
+
+
+# ---- forces as a loss names them ---------------------------------------------------------------------------------------
+
+
+def test_forces_on_a_body_are_what_its_momentum_gains():
+    """Nothing else acts on the whole of it; all forces add up to zero; friction lies across the normal part."""
+    named = [ds.SelfContactForce("body_1"), ds.SelfContactForce(name="each", per_vertex=True)]
+    named += [ds.SelfContactForce("body_1", part, name=part) for part in ("normal", "friction")]
+    scene, dt = rubbing(), 1e-5
+    frames = ds.Rollout(ds.SemiImplicitSolver(scene, dt=dt), 300, save_every=1, outputs=named, gradients=[]).forward()
+    mass = scene.inputs.derive(scene.inputs.values).mass[4:, None]
+    gained = np.diff((mass * frames.velocities[:, 4:]).sum(1), axis=0) / dt
+    force = frames["self_contact_force"]
+    assert np.abs(force).max() > 10 and np.abs(frames["friction"]).max() > 1
+    np.testing.assert_allclose(gained.mean(0), force.mean(0), atol=5e-3 * np.abs(force).mean(0).max())
+    np.testing.assert_allclose(frames["each"][:, 4:].sum(1), force, atol=1e-12)
+    np.testing.assert_allclose(frames["each"].sum(1), 0, atol=1e-12)
+    np.testing.assert_allclose(frames["normal"] + frames["friction"], force, atol=1e-12)
+
+
+def test_forces_have_derivatives():
+    named = [
+        ds.SelfContactForce("body_1", name="on"),
+        ds.SelfContactForce("body_0", "normal", name="p", about=(0, 0.1, 0)),
+    ]
+    named += [ds.SelfContactForce(name="each", per_vertex=True, part="friction")]
+    solver, rng = ds.SemiImplicitSolver(rubbing(terms=[ds.Drag(2.0)]), dt=1e-4), np.random.default_rng(0)
+    rollout = ds.Rollout(solver, 20, save_every=10, outputs=named, gradients="all")
+    frames = rollout.forward()
+    seeds = {name: rng.normal(size=frames[name].shape) for name in rollout.computed}
+    gradients = {name: rollout.vjp(frames, **{name: seed}) for name, seed in seeds.items()}
+    for key, value in rollout.values.items():
+        way = rng.normal(size=np.shape(value)) * verify.input_scale(rollout, key)
+        tangents = rollout.tangents(frames, **{key: way})
+        ends = [rollout.forward(**{key: value + sign * 1e-5 * way}) for sign in (1, -1)]
+        for name, seed in seeds.items():
+            pushed, scale = (tangents[name] * seed).sum(), np.abs(tangents[name] * seed).sum()
+            assert abs(pushed - (gradients[name][key] * way).sum()) <= 1e-12 * scale, (key, name)
+            difference = ((ends[0][name] - ends[1][name]) * seed).sum() / 2e-5
+            floor = 1e-8 * np.abs(frames[name] * seed).sum()  # round-off of the difference
+            assert abs(pushed - difference) <= 1e-4 * scale + floor, (key, name)
+
+
+def test_forces_that_cannot_be():
+    with pytest.raises(ValueError, match="part must be normal, friction or total"):
+        ds.SelfContactForce("body_1", "all")
+    with pytest.raises(ValueError, match="give on=.*or per_vertex=True"):
+        ds.SelfContactForce()
+    with pytest.raises(ValueError, match="has no SelfContact"):
+        scene = ds.Scene(bodies(), ds.StableNeoHookean(5e4, 0.3), precision="f64")
+        ds.Rollout(ds.SemiImplicitSolver(scene, dt=1e-4), 1, outputs=ds.SelfContactForce("body_1"))
 
 
 # ---- pairs of sets, threads, checkpoints, refusals -------------------------------------------------------------------

@@ -309,6 +309,16 @@ def test_a_saved_series_is_not_pulled(series, make_viewer):
     assert view.held is None
 
 
+def test_forces_are_drawn_where_they_are_asked_for(series, make_viewer):
+    source = SavedFrames(series)
+    source.frame(0).fields["pull"] = np.ones(source.mesh.vertices.shape)
+    plain, arrowed = (make_viewer(source, arrows=names) for names in ((), ("pull",)))
+    more = len(arrowed[0].shown.corners) - len(plain[0].shown.corners)
+    assert more > 20 * source.mesh.num_vertices / 2 and any("pull, longest 1.73" in x for x in arrowed[1].panel.lines)
+    with pytest.raises(ValueError, match="arrows: 'push' must be a vector of each vertex that frames hold"):
+        make_viewer(source, arrows=("push",))
+
+
 def test_forces_are_refused_where_the_scene_has_none(live):
     sim = live.run.simulator
     with pytest.raises(ValueError, match="expected finite numbers of shape"):
@@ -334,12 +344,14 @@ def test_the_command_opens_a_series_or_a_live_run(series, tmp_path, monkeypatch)
     TetrahedralMesh.create_cube(3, 0.2).save(tmp_path / "cube.vtu")
     for arguments in (
         [str(series), "--ground", "-0.5", "-o", str(tmp_path / "seen.gif")],
-        [str(tmp_path / "cube.vtu"), "--colour", "J", "--fixed", "xmin"],
+        [str(tmp_path / "cube.vtu"), "--colour", "J", "--fixed", "xmin", "--arrows", "contact"],
     ):
         with pytest.raises(SystemExit) as stop:
             cli.main(["view", *arguments])
         assert stop.value.code == 0
-    (saved, _, playing, look), (live, colour, plays, _) = opened
+    (saved, _, playing, look), (live, colour, plays, other) = opened
+    assert list(other["arrows"]) == [force.name for force in live.run.outputs] == ["contact"]
+    assert live.frame(0).fields["contact"].shape == live.mesh.vertices.shape
     assert isinstance(saved, SavedFrames) and not playing and look["ground"] == -0.5
     assert look["output"].path.name == "seen.gif" and look["output"].view.ground == -0.5
     assert isinstance(live, LiveFrames) and plays and colour == "J" and live.can_drag and live.look["ground"] == 0.0

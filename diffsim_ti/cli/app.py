@@ -14,6 +14,7 @@ from diffsim_ti.adaptive_run import Interrupted
 from diffsim_ti.cli.identify import identify
 from diffsim_ti.cli.options import (
     SUFFIXES,
+    Arrows,
     Backend,
     Density,
     FixOrientation,
@@ -135,13 +136,9 @@ def simulate(
         float | None, typer.Option(help="of each vertex [N/m], instead of that per area")
     ] = None,
     ground_width: Annotated[float | None, typer.Option(help="[m]; default 1 % of the size")] = None,
+    ground_friction: Annotated[float, typer.Option(help="Coulomb's coefficient of the floor")] = 0.0,
     azimuth: Annotated[float, typer.Option(help="where pictures are taken from, about y [degrees]")] = 32.0,
-    arrows: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="forces to draw as arrows and to write: reaction (of what is held), contact; may be repeated"
-        ),
-    ] = None,
+    arrows: Arrows = None,
     backend: Backend = "cpu",
     precision: Precision = "f32",
     threads: Threads = None,
@@ -174,6 +171,7 @@ def simulate(
         ground_width,
         volume=volume,
         stiffness_per_area=ground_stiffness_per_area,
+        friction=ground_friction,
     )
     frames = max(1, round(duration * fps))
     run = ForwardRun(scene, kind, duration / frames, dt, forces_named(arrows or (), scene))

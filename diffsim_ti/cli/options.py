@@ -33,6 +33,13 @@ MaterialName = Annotated[str, typer.Option(help="the law, by class name; capital
 Youngs = Annotated[float, typer.Option("--youngs-modulus", "-E", help="Young's modulus [Pa]")]
 Poisson = Annotated[float, typer.Option("--poissons-ratio", "--nu", help="Poisson's ratio [-]")]
 Density = Annotated[float, typer.Option(help="[kg/m^3]")]
+Arrows = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="forces to draw as arrows and to write: reaction (of what is held), contact, friction (its part); of a saved "
+        "series what it holds; may be repeated"
+    ),
+]
 Volume = Annotated[
     str, typer.Option(help="where a change of volume is resisted: tetrahedra, or patches (near nu = 0.5)")
 ]
@@ -151,6 +158,7 @@ def make_ground(
     stiffness: float | None = None,
     width: float | None = None,
     stiffness_per_area: float | None = None,
+    friction: float = 0.0,
 ) -> Ground:
     """The floor y = 0 for a body that meets it at `speed` [m/s]: width 1 % of the size, stiffness per area [N/m^3] from the
     impact, unless that of each vertex is given [N/m]."""
@@ -160,7 +168,7 @@ def make_ground(
     width = 0.01 * np.ptp(mesh.bounding_box, 0).max() if width is None else width
     if stiffness is None and stiffness_per_area is None:
         stiffness_per_area = stiffness_of_impact(mesh, material, density, gravity, speed, width)
-    return Ground(0.0, stiffness, width, stiffness_per_area=stiffness_per_area)
+    return Ground(0.0, stiffness, width, stiffness_per_area=stiffness_per_area, friction=friction)
 
 
 def fall_scene(
@@ -178,10 +186,11 @@ def fall_scene(
     extra: Sequence[Term] = (),
     volume: str = "tetrahedra",
     stiffness_per_area: float | None = None,
+    friction: float = 0.0,
 ) -> tuple[Scene, TetrahedralMesh]:
     """(scene, body): a body let go above the floor y = 0, its lowest point at `height` [m], default a tenth of its size.
 
-    fixed: as `fixed_vertices` takes them; stiffness, stiffness_per_area, width: the floor's barrier, see `make_ground`;
+    fixed: as `fixed_vertices` takes them; stiffness, stiffness_per_area, width, friction: the floor's, see `make_ground`;
     extra: more terms; volume: as `Scene` takes it.
     """
     from diffsim_ti.scene import Scene
@@ -192,22 +201,26 @@ def fall_scene(
         low, height = body.bounding_box[0, 1], 0.1 * np.ptp(body.bounding_box, 0).max() if height is None else height
         body = body.translated([0, height - low, 0])
         speed = np.sqrt(min(velocity[1], 0) ** 2 + 2 * abs(gravity) * max(height, 0))
-        terms.append(make_ground(body, law, density, gravity, speed, stiffness, width, stiffness_per_area))
+        terms.append(make_ground(body, law, density, gravity, speed, stiffness, width, stiffness_per_area, friction))
     fixed = fixed_vertices(body, list(fixed or []))
     return Scene(body, law, density, terms + list(extra), fixed, initial_velocities=velocity, volume=volume), body
 
 
+FORCES = ("reaction", "contact", "friction")
+
+
 def forces_named(names: Sequence[str], scene: Scene) -> "list[Output]":
-    """Outputs of --arrows: what holds the body, what its obstacle does."""
+    """Outputs of --arrows: what holds the body, what its obstacle does, and what of that is friction."""
     from diffsim_ti.outputs import ContactForce, Reaction
 
     out = []
     for name in dict.fromkeys(names):
-        if name not in ("reaction", "contact"):
-            raise ValueError(f"--arrows: must be reaction or contact, got {name!r}")
-        if name == "contact" and not scene.obstacles:
-            raise ValueError("--arrows contact: there is no obstacle; leave --no-ground out")
-        own = dict(name=name, per_vertex=True)
+        if name not in FORCES:
+            raise ValueError(f"--arrows: must be {', '.join(FORCES[:-1])} or {FORCES[-1]}, got {name!r}")
+        if name != "reaction" and not scene.obstacles:
+            raise ValueError(f"--arrows {name}: there is no obstacle; leave --no-ground out")
+        part = dict(part="friction") if name == "friction" else {}
+        own = dict(name=name, per_vertex=True) | part
         out.append(Reaction(**own) if name == "reaction" else ContactForce(scene.obstacles[0], **own))
     return out
 

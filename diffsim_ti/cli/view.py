@@ -7,6 +7,7 @@ import typer
 
 from diffsim_ti.cli.options import (
     SUFFIXES,
+    Arrows,
     Density,
     FixOrientation,
     MaterialName,
@@ -16,6 +17,7 @@ from diffsim_ti.cli.options import (
     UpAxis,
     Youngs,
     fall_scene,
+    forces_named,
     load_body,
     make_material,
     solver_class,
@@ -89,6 +91,8 @@ def view(
         list[str] | None, typer.Option(help="vertex set, or xmin .. zmax, to hold; may be repeated")
     ] = None,
     floor: Annotated[bool, typer.Option(help="a floor at y = 0, the body above it")] = True,
+    friction: Annotated[float, typer.Option(help="Coulomb's coefficient of the floor")] = 0.0,
+    arrows: Arrows = None,
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help=f"file that the key S writes, by its suffix: {SUFFIXES}")
     ] = None,
@@ -103,7 +107,7 @@ def view(
 
     if not has_display():
         raise RuntimeError(NO_DISPLAY)
-    saving = None if output is None else writer_for(output, View(ground=ground))
+    saving = None if output is None else writer_for(output, View(ground=ground, arrows=tuple(arrows or ())))
     if source.suffix == ".pvd":
         frames = SavedFrames(source)
     else:
@@ -118,8 +122,9 @@ def view(
             drag,
             fixed=fixed,
             floor=floor,
+            friction=friction,
             extra=[ExternalForce([0.0, 0.0, 0.0])],
         )
-        frames = LiveFrames(ForwardRun(scene, solver_class(solver), 1 / fps))
+        frames = LiveFrames(ForwardRun(scene, solver_class(solver), 1 / fps, outputs=forces_named(arrows or (), scene)))
     look = {} if ground is None else dict(ground=ground)
-    Viewer(frames, colour, playing=source.suffix != ".pvd", output=saving, **look).run()
+    Viewer(frames, colour, playing=source.suffix != ".pvd", output=saving, arrows=arrows or (), **look).run()

@@ -131,8 +131,8 @@ class Inputs:
         mesh, scene, places = self.mesh, self.scene, {}
         out = [
             links.RestShape(mesh.tetrahedra) if mesh.order == 1 else CurvedShape(mesh.elements),
-            links.Displacement(),
-            links.FreeVelocity(scene.supports.free),
+            links.Displacement(scene.reduced.of),
+            links.FreeVelocity(lambda v: scene.reduced.of(scene.supports.free(v))),
             links.LumpedMass(mesh, scene.mass_scaling.factors if scene.mass_scaling else None),
             *([ElementMasses(mesh.elements)] if scene.consistent else []),
             *scene.material.links(),

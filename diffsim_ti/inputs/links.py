@@ -57,18 +57,22 @@ class RestShape(Link):
 
 
 class Displacement(Link):
-    """u = x - X."""
+    """u = of(x - X), `of` being a symmetric projection onto what the scene can do."""
 
     reads, writes = ("initial_positions", "rest"), ("displacement",)
 
+    def __init__(self, of: Callable):
+        self.of = of
+
     def value(self, x, X):
-        return (x - X,)
+        return (self.of(x - X),)
 
     def jvp(self, x, dx):
-        return (dx[0] - dx[1],)
+        return (self.of(dx[0] - dx[1]),)
 
     def vjp(self, x, y_adj):
-        return y_adj[0], -y_adj[0]
+        u_adj = self.of(y_adj[0])
+        return u_adj, -u_adj
 
 
 class FreeVelocity(Link):

@@ -8,6 +8,7 @@ from diffsim_ti.outputs.energies import ElasticEnergy, KineticEnergy
 from diffsim_ti.outputs.material_points import MaterialPoints
 from diffsim_ti.outputs.output import Change, Output
 from diffsim_ti.outputs.reaction import Reaction
+from diffsim_ti.outputs.self_contact_force import SelfContactForce
 from diffsim_ti.outputs.states import Displacements, Positions, Velocities
 from diffsim_ti.outputs.tensors import Strain, Stress
 from diffsim_ti.outputs.ties import TieLength, TieTension
@@ -26,6 +27,7 @@ __all__ = [
     "Output",
     "Positions",
     "Reaction",
+    "SelfContactForce",
     "Strain",
     "Stress",
     "TieLength",

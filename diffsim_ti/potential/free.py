@@ -41,6 +41,19 @@ class FreeDirections:
         return out
 
 
+class FreeBodies(FreeDirections):
+    """The same where some vertices go together (reduced.py): none of these is held."""
+
+    def __init__(self, mask: np.ndarray, guided: np.ndarray, guides: np.ndarray, reduced):
+        super().__init__(mask, guided, guides)
+        self.reduced = reduced
+
+    def __rmul__(self, x: np.ndarray) -> np.ndarray:
+        return self.reduced.of(super().__rmul__(x))
+
+    __mul__ = __rmul__
+
+
 Free = np.ndarray | FreeDirections  # numbers (num_vertices, 1) where no vertex is held in some directions alone
 
 

@@ -29,12 +29,14 @@ class Moment:
 @dataclass(frozen=True)
 class Arrows:
     """Arrows at points [m], shape (k, 3), of vectors of a unit, (k, 3). Those of one label have one scale in a picture,
-    whose longest is named in its key. onto: which end at their point, as what pushes, (k,) of bool; others begin there."""
+    whose longest is named in its key. onto: which end at their point, as what pushes, (k,) of bool; others begin there.
+    through: whether they are seen through bodies, as forces between two must be."""
 
     label: str
     points: np.ndarray
     vectors: np.ndarray
     onto: np.ndarray
+    through: bool = False
 
 
 @dataclass(frozen=True)

@@ -165,7 +165,7 @@ class LiveFrames(FrameSource):
 
     def _note(self, rate: float) -> None:
         sim, seen = self.run.simulator, self.run.seen
-        frame, energy = ShownFrame.of(sim), sim.compute_energy()
+        frame, energy = ShownFrame(**vars(self.run.frame())), sim.compute_energy()
         frame.fields["stiffness"] = field_of(sim, "stiffness")
         for name, values in frame.colours.items():
             shown = to_vertices(self.mesh, values)[self.mesh.surface_vertices]

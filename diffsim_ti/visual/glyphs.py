@@ -67,7 +67,7 @@ def glyphs(
             profile = [(0, 0), (0, radius), (long - head, radius), (long - head, 0.3 * head), (long, 0)]
         else:
             profile = [(0, 0), (0, radius), (long, radius), (long, 0)]
-        out.append(turned(both, profile, colour, camera, size, near))
+        out.append(turned(both, profile, colour, camera, size, near, isinstance(mark, Arrows) and mark.through))
     return [soup for soup in out if len(soup.corners)]
 
 
@@ -77,8 +77,9 @@ def cones(points: np.ndarray, axes: np.ndarray, height: float, camera: Camera, s
     return turned(np.stack([points, points + height * axes], 1), profile, MARK, camera, size, 0.2 * height)
 
 
-def turned(both, profile, colour, camera: Camera, size, near: float) -> Soup:
-    """Surfaces of revolution about the lines between two ends, shape (k, 2, 3), by (way along, radius), each per line."""
+def turned(both, profile, colour, camera: Camera, size, near: float, through: bool = False) -> Soup:
+    """Surfaces of revolution about the lines between two ends, shape (k, 2, 3), by (way along, radius), each per line.
+    through: in front of all else."""
     k = len(both)
     if not k:
         return Soup(np.zeros((0, 3, 3)), np.zeros((0, 3, 3)), np.zeros(0))
@@ -99,7 +100,7 @@ def turned(both, profile, colour, camera: Camera, size, near: float) -> Soup:
     seen = (sizes > 0) & ((normals * (camera.position - triangles[:, 0])).sum(1) > 0)
     triangles, normals = triangles[seen], normals[seen] / sizes[seen, None]
     corners = camera.project(triangles, size)
-    corners[..., 2] = np.maximum(corners[..., 2] - near, 1e-6)
+    corners[..., 2] = np.maximum((1e-3 if through else 1) * (corners[..., 2] - near), 1e-6)
     lit = np.repeat(shaded(np.broadcast_to(colour, normals.shape), normals)[:, None], 3, 1)
     return Soup(corners, lit, corners[..., 2].mean(1))
 

@@ -1,6 +1,7 @@
 """What is drawn of a scene's terms at a moment of a run, and of results as arrows."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -65,5 +66,5 @@ def results_as_arrows(frame: "Frame", mesh, names: Sequence[str]) -> list[Mark]:
             frame.fields[name],
             OF_A_RESULT,
         )
-        out.append(own)
+        out.append(replace(own, through=True))
     return [mark for mark in out if len(mark.points)]

@@ -6,6 +6,7 @@ are (`Drawing`), so the window shows what a film would.
 """
 
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -15,6 +16,7 @@ from diffsim_ti import runtime
 from diffsim_ti.visual.dragging import picked_vertex
 from diffsim_ti.visual.drawing import Drawing
 from diffsim_ti.visual.fields import field_named
+from diffsim_ti.visual.scene_marks import results_as_arrows
 from diffsim_ti.visual.surface import Soup, marks
 
 if TYPE_CHECKING:
@@ -32,7 +34,8 @@ class Viewer:
     """Shows a source's frames (frame_sources.py) in a Taichi window; RuntimeError where there is none to be had.
 
     colour: the field to begin with; playing: whether to play at once; output: what `save` writes the frames with
-    (writers/); look: what `Drawing` takes, instead of the source's.
+    (writers/); arrows: names of forces that frames hold, to be drawn as arrows; look: what `Drawing` takes, instead of
+    the source's. Raises ValueError for a force that they have not.
     """
 
     def __init__(
@@ -43,6 +46,7 @@ class Viewer:
         size: tuple[int, int] = (1024, 768),
         playing: bool = False,
         output: "Writer | None" = None,
+        arrows: Sequence[str] = (),
         **look,
     ):
         field_named(colour)
@@ -52,6 +56,7 @@ class Viewer:
         from diffsim_ti.visual.vulkan_painter import Canvas
 
         self.source, self.colour, self.size, self.output, self._saved = source, colour, tuple(size), output, ""
+        self.arrows, self._drawn = tuple(arrows), (None, [])
         look = source.look | look
         self.drawing, self._canvas = Drawing(source.mesh, size, backend="software", **look), Canvas(self.window)
         self._small = Drawing(source.mesh, tuple(n // STRIDE for n in size), backend="software", **look)
@@ -74,13 +79,19 @@ class Viewer:
         values = frame.colours.get(self.colour)
         if values is not None:
             drawing.colouring = self.source.colouring(self.colour)
-        soup, shapes = drawing.soup(frame.positions, values, None, frame.obstacles, frame.marks)
+        soup, shapes = drawing.soup(frame.positions, values, None, frame.obstacles, self._marks(frame))
         if self.held is not None:
             ends = np.stack([frame.positions[self.held], self._under_cursor()])
             soup = Soup.joined([soup, marks(ends, drawing.camera, self.size, 0.008 * self.size[1], 0.5 * self._depth)])
         self._canvas.draw(soup, self._behind(shapes, values is not None), self.size)
         self._panel(frame)
         self.window.show()
+
+    def _marks(self, frame) -> list:
+        """What is drawn of its loads and forces, made once."""
+        if self._drawn[0] is not frame:
+            self._drawn = frame, [*frame.marks, *results_as_arrows(frame, self.source.mesh, self.arrows)]
+        return self._drawn[1]
 
     def _behind(self, shapes, coloured: bool) -> np.ndarray:
         """The floor with its shadows, and the legend."""
@@ -179,7 +190,7 @@ class Viewer:
     def save(self) -> None:
         """Write the source's frames, with the present camera and colours if the format has such."""
         out, drawing, last = self.output, self.drawing, len(self.source) - 1
-        look = dict(colour=self.colour, camera=drawing.camera, wireframe=drawing.wireframe)
+        look = dict(colour=self.colour, camera=drawing.camera, wireframe=drawing.wireframe, arrows=self.arrows)
         if last:  # a film keeps the run's time
             look["fps"] = last / (self.source.frame(last).time - self.source.frame(0).time)
         out.view = replace(out.view, **look)
@@ -194,7 +205,7 @@ class Viewer:
     def _panel(self, frame) -> None:
         left, top, width = PANEL
         saving = self.output is not None
-        key = [text for text, _ in self.drawing.key(frame.marks)]
+        key = [text for text, _ in self.drawing.key(self._marks(frame))]
         notes = [*frame.notes, *key, *filter(None, [self._saved])]
         self._panel_height = 0.02 + 0.032 * (7 + saving + len(frame.colours)) + 0.024 * len(notes)
         with self.window.get_gui().sub_window("diffsim_ti", left, top, width, self._panel_height) as gui:

@@ -27,8 +27,8 @@ def slab_scene(friction: float, start=None, drag: float = 0.0) -> tuple[ds.Scene
     """A soft slab on a long soft board whose underside is held; and the slab's vertices."""
     board = ds.TetrahedralMesh.create_box((8, 2, 3), size=(2.1, 0.1, 0.3), pattern="five")
     slab = ds.TetrahedralMesh.create_box((3, 2, 3), size=(0.2, 0.08, 0.2), pattern="five")
-    mesh = ds.TetrahedralMesh.joined([board, slab.translated([0.13, 0.1032, 0.042])])
-    contact = ds.SelfContact(5e3, 4e-3, friction=friction, friction_speed=CREEP)
+    mesh = ds.TetrahedralMesh.joined([board, slab.translated([0.13, 0.1016, 0.042])])
+    contact = ds.SelfContact(4e4, 2e-3, friction=friction, friction_speed=CREEP)
     terms = [ds.Gravity(down_a_slope(0.5)), contact] + ([ds.Drag(drag)] if drag else [])
     material = ds.KelvinVoigt(ds.StableNeoHookean(1e6, 0.3), time=2e-3)
     held = np.flatnonzero(mesh.vertices[:, 1] == 0)

@@ -73,6 +73,12 @@ class ExplicitSolver(Solver):
         if contact not in ("stage", "force"):
             raise ValueError(f'contact must be "stage" or "force", got {contact!r}')
         self.contact, self.contact_damping = contact, between("contact_damping", contact_damping, 0, 1, ends=True)
+        scene = arguments[0] if arguments else options.get("scene")
+        if getattr(scene, "reduced", False):
+            raise ValueError(
+                f"explicit steps move every vertex, and this scene moves some by few numbers ({scene.reduced.describe()}): "
+                "take ImplicitEulerSolver, BDF2Solver or ImplicitMidpointSolver, or leave reduced= out"
+            )
         super().__init__(*arguments, **options)
 
     @property

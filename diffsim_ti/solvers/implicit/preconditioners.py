@@ -34,6 +34,34 @@ class BlockJacobi:
         return np.matmul(self._inverse, r[:, :, None])[:, :, 0]
 
 
+class BodyBlocks(BlockJacobi):
+    """The same, and of each set that moves by few numbers q the inverse of its own d2E/dq2, from as many products."""
+
+    def update(self, u: np.ndarray) -> None:
+        super().update(u)
+        self._bodies = []
+        for body in self.free.reduced.bodies:
+            k, m = body.basis.shape
+            G = np.zeros((m, 3, m, 3))
+            for j in range(m):
+                for d in range(3):
+                    w = np.zeros((len(self.mass), 3))
+                    w[body.vertices, d] = body.basis[:, j]
+                    G[:, :, j, d] = body.basis.T @ (self.mass * w + self.potential.product(w))[body.vertices]
+            G = G.reshape(3 * m, 3 * m)
+            values, vectors = np.linalg.eigh(0.5 * (G + G.T))
+            least = 1e-12 * np.abs(values).max() + self.least[body.vertices].min()
+            values = np.maximum(np.abs(values), least)
+            self._bodies.append((body, (vectors / values) @ vectors.T))
+
+    def __call__(self, r: np.ndarray) -> np.ndarray:
+        out = super().__call__(r)
+        for body, inverse in self._bodies:
+            q = inverse @ (body.basis.T @ r[body.vertices]).ravel()
+            out[body.vertices] = body.basis @ q.reshape(-1, 3)
+        return out
+
+
 def size_of(blocks: np.ndarray) -> np.ndarray:
     """Sum of the sizes of the diagonal of each block."""
     return np.abs(np.diagonal(blocks, axis1=1, axis2=2)).sum(1)

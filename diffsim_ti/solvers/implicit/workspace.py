@@ -11,7 +11,7 @@ from diffsim_ti.contact.surface_pairs import Tunnelling
 from diffsim_ti.inputs import ConsistentMass, Mass, diagonal_of, kinetic_energy
 from diffsim_ti.monitor.energy_watch import EnergyWatch
 from diffsim_ti.potential.attached import Attached
-from diffsim_ti.potential.free import FreeDirections, held_as, mask_of
+from diffsim_ti.potential.free import FreeBodies, FreeDirections, held_as, mask_of
 from diffsim_ti.potential.potential import Potential
 from diffsim_ti.potential.way import Way
 from diffsim_ti.solvers.implicit.approach import Approach
@@ -24,7 +24,7 @@ from diffsim_ti.solvers.implicit.multigrid import Multigrid
 from diffsim_ti.solvers.implicit.newton import Newton
 from diffsim_ti.solvers.implicit.noted import Noted
 from diffsim_ti.solvers.implicit.obstacle_ways import ObstacleWays
-from diffsim_ti.solvers.implicit.preconditioners import BlockJacobi
+from diffsim_ti.solvers.implicit.preconditioners import BlockJacobi, BodyBlocks
 from diffsim_ti.solvers.implicit.pressed import Pressed
 from diffsim_ti.solvers.implicit.stage import Stage
 from diffsim_ti.solvers.implicit.threads import one_blas_thread
@@ -68,7 +68,9 @@ class ImplicitWorkspace(ObstacleWays, Noted, GivenInPasses, Workspace):
         a = self.arrays
         self._mass = self.mass_of(derived)
         self.free = (runtime.fetch(a.inverse_mass)[:, None] > 0).astype(np.float64)
-        if a.features().guided:
+        if self.scene.reduced:
+            self.free = FreeBodies(self.free, a.supports.guided, a.supports.guides, self.scene.reduced)
+        elif a.features().guided:
             self.free = FreeDirections(self.free, a.supports.guided, a.supports.guides)
         eps = np.finfo(runtime.NUMPY[self.scene.precision]).eps
         tolerance, rounds = self.solver.tolerance, self.solver.max_iterations
@@ -183,7 +185,7 @@ class ImplicitWorkspace(ObstacleWays, Noted, GivenInPasses, Workspace):
             with self.potential.at_rest():
                 blocks, contact = self.potential.blocks(), self.potential.contact_blocks()
             size = np.abs(blocks if contact is None else blocks - contact).sum((1, 2))[:, None]
-            kind = Multigrid if self._wants_multigrid(size, mass) else BlockJacobi
+            kind = Multigrid if self._wants_multigrid(size, mass) else BodyBlocks if self.scene.reduced else BlockJacobi
             if len(self._preconditioners) > 5:
                 self._preconditioners.pop(next(iter(self._preconditioners)))
             self._preconditioners[key] = kind(self.potential, mass, self.free, size, self.parallel), size
@@ -198,6 +200,8 @@ class ImplicitWorkspace(ObstacleWays, Noted, GivenInPasses, Workspace):
         return inertia * (4.0 ** np.round(0.5 * np.log2(c)) / c)
 
     def _wants_multigrid(self, size: np.ndarray, mass: np.ndarray) -> bool:
+        if self.scene.reduced:
+            return False
         if self.solver.preconditioner != "auto":
             return self.solver.preconditioner == "multigrid"
         ratio = np.max(size[mass > 0] / mass[mass > 0], initial=0.0) if mass.any() else np.inf
@@ -251,6 +255,7 @@ class ImplicitWorkspace(ObstacleWays, Noted, GivenInPasses, Workspace):
         held = self.arrays.held
         place, speed = (u[held], v[held]) if place is None else (place, speed)
         u_next, v_next = self.with_held(u_next, place), self.with_held(v_next, speed)
+        u_next, v_next = self.scene.reduced.of(u_next), self.scene.reduced.of(v_next)  # without what rounding adds
         if stage.c0 != 1:
             self._check_end(j, u_star, u_next)
         if self.energy_watch:
