@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from diffsim_ti.mesh import gmsh1
+from diffsim_ti.mesh.filling import SURFACES, filled, read_surface
 
 DIMENSION = {"vertex": 0, "line": 1, "line3": 1, "triangle": 2, "triangle6": 2, "tetra": 3, "tetra10": 3}  # in a file
 TAGS = ("gmsh:physical", "medit:ref", "cell_tags", "avsucd:material")  # integer cell data that group cells
@@ -22,7 +23,16 @@ def read_mesh(path) -> tuple[np.ndarray, np.ndarray, dict, dict, dict]:
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"mesh file {path} does not exist (looked in {Path.cwd()})")
-    mesh = _read(path)
+    if path.suffix.lower() in SURFACES:
+        try:
+            return *filled(*read_surface(path)), {}, {}, {}
+        except ValueError as error:
+            raise ValueError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
+    return parts_of(_read(path), again=path.suffix == ".msh")
+
+
+def parts_of(mesh, again: bool = False) -> tuple[np.ndarray, np.ndarray, dict, dict, dict]:
+    """The same of meshio's mesh; again: it may list a tetrahedron once for each of its groups."""
     _check_cell_types(mesh)
     blocks = [k for k, block in enumerate(mesh.cells) if DIMENSION[block.type] == 3]
     offset = dict(zip(blocks, np.cumsum([0] + [len(mesh.cells[k].data) for k in blocks])))
@@ -45,7 +55,7 @@ def read_mesh(path) -> tuple[np.ndarray, np.ndarray, dict, dict, dict]:
             vertex_sets.setdefault(name.removeprefix(VERTEX_PREFIX), []).append(np.nonzero(values)[0])
     tetrahedra = np.concatenate([mesh.cells[k].data for k in blocks])
     join = {name: np.unique(np.concatenate(parts)).astype(np.int64) for name, parts in tetrahedron_sets.items()}
-    if path.suffix == ".msh":
+    if again:
         tetrahedra, join = _merge_repeated(tetrahedra, join)
     sets = {name: np.unique(np.concatenate(parts)).astype(np.int64) for name, parts in vertex_sets.items()}
     triangles = {name: np.concatenate(parts).astype(np.int64) for name, parts in triangles.items()}
@@ -89,7 +99,7 @@ def _check_cell_types(mesh) -> None:
     if not found.get("tetra", 0) and not found.get("tetra10", 0):
         raise ValueError(
             f"the file holds no tetrahedra; cell types found: {listing}; fill the surface with tetrahedra first, "
-            "for example with Gmsh, TetGen or fTetWild"
+            "for example by TetrahedralMesh.from_surface, Gmsh or fTetWild"
         )
     if other:
         raise ValueError(
@@ -146,14 +156,38 @@ def write_mesh(path, mesh) -> list[str]:
             f"cannot save {path}: ten-node tetrahedra go into {', '.join(KEEPS_TEN_NODES)}; use one of these, or save "
             "mesh.linear()"
         )
-    faces = {name: _cells_of(mesh, rows) for name, rows in mesh.surface_sets.items()}
-    vertex_sets = {n: rows for n, rows in mesh.vertex_sets.items() if not _same_vertices(rows, faces.get(n))}
-    tetrahedra = ("tetra" if mesh.order == 1 else "tetra10", mesh.elements)
+    faces, vertex_sets = named_parts(mesh)
     if path.suffix == ".msh":
+        tetrahedra = ("tetra" if mesh.order == 1 else "tetra10", mesh.elements)
         _write_gmsh(meshio, path, mesh.vertices, tetrahedra, vertex_sets, mesh.tetrahedron_sets, faces)
         return []
-    cells, point_data, cell_data, lost = [tetrahedra], {}, {}, [*vertex_sets, *mesh.tetrahedron_sets, *faces]
-    if path.suffix in KEEPS_SETS:
+    out, lost = as_meshio(mesh, bare=path.suffix not in KEEPS_SETS), []
+    if path.suffix == ".inp":
+        out.point_sets = mesh.vertex_sets
+        out.cell_sets = {name: [rows] for name, rows in mesh.tetrahedron_sets.items()}
+        lost = [name for name in faces if name not in mesh.vertex_sets]
+    elif path.suffix not in KEEPS_SETS:
+        lost = [*vertex_sets, *mesh.tetrahedron_sets, *faces]
+    try:
+        out.write(path)
+    except (meshio.WriteError, meshio.ReadError) as error:
+        raise ValueError(f"cannot save {path}: {error}; use one of {', '.join(KEEPS_SETS)}") from error
+    return lost
+
+
+def named_parts(mesh) -> tuple[dict, dict]:
+    """(cells of surface sets by name, vertex sets that are not those of these cells)"""
+    faces = {name: _cells_of(mesh, rows) for name, rows in mesh.surface_sets.items()}
+    return faces, {n: rows for n, rows in mesh.vertex_sets.items() if not _same_vertices(rows, faces.get(n))}
+
+
+def as_meshio(mesh, bare: bool = False):
+    """meshio's mesh, with sets as 0/1 arrays; bare: without."""
+    import meshio
+
+    cells, point_data, cell_data = [("tetra" if mesh.order == 1 else "tetra10", mesh.elements)], {}, {}
+    if not bare:
+        faces, vertex_sets = named_parts(mesh)
         members = [(CELL_PREFIXES[3] + name, 0, rows) for name, rows in mesh.tetrahedron_sets.items()]
         for kind in ("triangle", "triangle6"):
             own = {name: cells_of[kind] for name, cells_of in faces.items() if kind in cells_of}
@@ -166,13 +200,7 @@ def write_mesh(path, mesh) -> list[str]:
             masks = cell_data.setdefault(name, [np.zeros(len(data), np.int32) for _, data in cells])
             masks[block][rows] = 1
         point_data = {VERTEX_PREFIX + name: _mask(rows, mesh.num_vertices) for name, rows in vertex_sets.items()}
-        lost = []
-    out = meshio.Mesh(mesh.vertices, cells, point_data=point_data, cell_data=cell_data)
-    try:
-        out.write(path)
-    except (meshio.WriteError, meshio.ReadError) as error:
-        raise ValueError(f"cannot save {path}: {error}; use one of {', '.join(KEEPS_SETS)}") from error
-    return lost
+    return meshio.Mesh(mesh.vertices, cells, point_data=point_data, cell_data=cell_data)
 
 
 def _cells_of(mesh, rows: np.ndarray) -> dict[str, np.ndarray]:

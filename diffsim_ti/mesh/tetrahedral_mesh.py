@@ -2,10 +2,8 @@
 
 import copy
 import math
-import warnings
 from collections.abc import Iterable
 from functools import cached_property
-from os import PathLike
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,11 +12,11 @@ from diffsim_ti import runtime
 from diffsim_ti.mesh import checks, geometry
 from diffsim_ti.mesh.description import content_hash, describe
 from diffsim_ti.mesh.elements import Elements
-from diffsim_ti.mesh.files import KEEPS_SETS, read_mesh, write_mesh
+from diffsim_ti.mesh.exchange import Exchange
 from diffsim_ti.mesh.grid import box
 from diffsim_ti.mesh.locate import LocatedPoints, locate
 from diffsim_ti.mesh.named_sets import NamedSets
-from diffsim_ti.mesh.sets import checked_sets, join, pieces, rows_on_surface, without_unused
+from diffsim_ti.mesh.sets import checked_sets, join, pieces, rows_on_surface
 from diffsim_ti.mesh.ten_nodes import edges_of
 
 CONNECTIVITY = (  # what stays when vertices move
@@ -26,7 +24,7 @@ CONNECTIVITY = (  # what stays when vertices move
 )
 
 
-class TetrahedralMesh(NamedSets, Elements):
+class TetrahedralMesh(Exchange, NamedSets, Elements):
     """Tetrahedra of four or ten nodes at rest. Immutable: arrays are read-only float64 or int64, changes return a new mesh.
 
     vertices: positions [m], shape (num_vertices, 3).
@@ -99,56 +97,6 @@ class TetrahedralMesh(NamedSets, Elements):
         corners = mesh.surface_triangles
         rows = {name: np.isin(corners, side).all(1) for name, side in sides.items()}
         return mesh._changed(_surface_sets=checked_sets(rows, len(corners), "surface"))
-
-    @classmethod
-    def from_file(
-        cls, path: str | PathLike, fix_orientation: bool = False, drop_orphans: bool = False
-    ) -> "TetrahedralMesh":
-        """Load tetrahedra from any format that meshio reads: Gmsh .msh (2.2 and 4.x), .vtu, .vtk, MEDIT .mesh, .inp ...
-
-        Blocks of tetrahedra are joined. Named groups of tetrahedra become tetrahedron sets, groups of triangles, lines
-        or points the vertex sets of their vertices, and those triangles that lie on the surface a surface set too; integer
-        tags without a name become "tag_<n>", except 0 and a tag that all tetrahedra share. Other triangles, lines and
-        points are ignored. Ten-node tetrahedra keep their mid-edge vertices, and edges that are curved.
-        drop_orphans: leave out vertices that no tetrahedron uses (Gmsh writes some) and renumber; default: warn.
-
-        Raises FileNotFoundError, and ValueError for an unreadable file, one without tetrahedra or with both
-        kinds, other cells beside tetrahedra (cell types are named), and whatever the constructor refuses.
-        """
-        vertices, tetrahedra, vertex_sets, tetrahedron_sets, triangles = read_mesh(path)
-        if drop_orphans and tetrahedra.min() >= 0 and tetrahedra.max() < len(vertices):
-            vertices, tetrahedra, vertex_sets, triangles = without_unused(vertices, tetrahedra, vertex_sets, triangles)
-        try:
-            return cls(
-                vertices,
-                tetrahedra,
-                vertex_sets=vertex_sets,
-                tetrahedron_sets=tetrahedron_sets,
-                surface_sets=triangles,
-                fix_orientation=fix_orientation,
-            )
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from error
-
-    @classmethod
-    def load_from_msh(cls, path: str | PathLike, device: str | None = None) -> "TetrahedralMesh":
-        """`from_file(path)` in the seeds' spelling; device as for `create_cube`."""
-        runtime.use_device(device)
-        return cls.from_file(path)
-
-    def save(self, path: str | PathLike) -> None:
-        """Write the mesh through meshio, in the format that the suffix names.
-
-        Sets are kept in .msh (Gmsh 2.2 binary, as physical groups of points, surfaces and volumes) and in .vtu and .vtk (as
-        0/1 data arrays "vertex_set:<name>", "tetrahedron_set:<name>", "surface_set:<name>", with triangles as cells; .vtk
-        turns blanks in names into underscores); other formats lose them with a UserWarning. These three keep every digit.
-        Ten-node tetrahedra go into these three, .inp and .xdmf. ValueError for an unknown suffix, and in .msh for a name of
-        two sets (not a surface set and its own vertices).
-        """
-        lost = write_mesh(path, self)
-        if lost:
-            kept = ", ".join(KEEPS_SETS)
-            warnings.warn(f"{path} cannot keep the sets {', '.join(lost)}; these formats can: {kept}", stacklevel=2)
 
     @classmethod
     def joined(cls, meshes: Iterable["TetrahedralMesh"]) -> "TetrahedralMesh":

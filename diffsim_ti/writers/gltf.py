@@ -1,0 +1,114 @@
+"""Animated surfaces in one binary glTF file, for Blender and viewers of the web."""
+
+import json
+
+import numpy as np
+
+from diffsim_ti.visual.frame import Frame, Setting
+from diffsim_ti.writers.writer import Writer, register
+
+BODY, OBSTACLE = (0.33, 0.55, 0.80), (0.68, 0.68, 0.70)
+FLOAT, UNSIGNED, ARRAY, ELEMENTS = 5126, 5125, 34962, 34963  # numbers of glTF
+TYPES = {1: "SCALAR", 3: "VEC3"}
+
+
+@register
+class GltfWriter(Writer):
+    """Writes the body's surface and the obstacles when it is closed; until then their places are kept in memory.
+
+    Each frame is a morph target, whose weight the animation brings to 1 at the frame's time [s] and leads linearly to the
+    next. Places are those of the first frame and float32 differences to it [m], y upwards. A body has one colour: what a
+    field shows cannot move in glTF, .vtu and films have it.
+    Khronos Group 2021, glTF 2.0 Specification, sections 3.7.2 (morph targets) and 3.11 (animations).
+    """
+
+    suffixes = (".glb",)
+
+    def open(self, setting: Setting) -> None:
+        self.setting, self._times, self._places, self.count = setting, [], [], 0
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+
+    def write(self, frame: Frame) -> None:
+        standing = [points for points, _ in self.setting.obstacles]
+        places = [frame.positions[self.setting.mesh.surface_vertices], *(frame.obstacles or standing)]
+        self._times.append(frame.time)
+        self._places.append([np.asarray(x, np.float64) for x in places])
+        self.count += 1
+
+    def close(self) -> None:
+        if self._places:
+            self.path.write_bytes(self._file())
+
+    def _file(self) -> bytes:
+        mesh, content = self.setting.mesh, Content()
+        surfaces = [np.searchsorted(mesh.surface_vertices, mesh.surface_triangles)]
+        surfaces += [triangles for _, triangles in self.setting.obstacles]
+        names = ["body", *(f"obstacle {k}" for k in range(1, len(surfaces)))]
+        times = np.array(self._times) - self._times[0]
+        at = content.add(times, limits=True) if len(times) > 1 else None
+        for k, (name, triangles) in enumerate(zip(names, surfaces)):
+            places = [frame[k] for frame in self._places]
+            moves = any(np.any(x != places[0]) for x in places[1:])
+            content.add_surface(name, triangles, places if moves else places[:1], at, OBSTACLE if k else BODY)
+        return content.packed()
+
+
+class Content:
+    """What a file holds: the parts of its JSON, and the numbers that they name."""
+
+    def __init__(self):
+        self.parts = {name: [] for name in ("nodes", "meshes", "materials", "accessors", "bufferViews")}
+        self.channels, self.samplers, self.bytes = [], [], bytearray()
+
+    def add(self, numbers: np.ndarray, target: int | None = None, limits: bool = False) -> int:
+        """The accessor of an array, float32 or unsigned; limits: with its least and largest numbers."""
+        kind = FLOAT if np.issubdtype(numbers.dtype, np.floating) else UNSIGNED
+        data = np.ascontiguousarray(numbers, "<f4" if kind == FLOAT else "<u4")
+        view = dict(buffer=0, byteOffset=len(self.bytes), byteLength=data.nbytes)
+        self.bytes += data.tobytes()
+        self.parts["bufferViews"].append(view | (dict(target=target) if target else {}))
+        columns = data.shape[1] if data.ndim > 1 else 1
+        own = dict(
+            bufferView=len(self.parts["bufferViews"]) - 1, componentType=kind, count=len(data), type=TYPES[columns]
+        )
+        if limits:
+            rows = data.reshape(len(data), columns)
+            own |= dict(min=rows.min(0).tolist(), max=rows.max(0).tolist())
+        self.parts["accessors"].append(own)
+        return len(self.parts["accessors"]) - 1
+
+    def add_surface(self, name: str, triangles: np.ndarray, places: list, times: int | None, colour: tuple) -> None:
+        """Triangles that go through `places`, at the times of an accessor."""
+        first, changes = places[0], [x - places[0] for x in places[1:]]
+        shape = dict(
+            attributes=dict(POSITION=self.add(first, ARRAY, limits=True)),
+            indices=self.add(triangles.ravel().astype(np.uint32), ELEMENTS),
+            material=len(self.parts["materials"]),
+        )
+        if changes:
+            shape["targets"] = [dict(POSITION=self.add(x, ARRAY, limits=True)) for x in changes]
+        node = len(self.parts["nodes"])
+        self.parts["meshes"].append(
+            dict(name=name, primitives=[shape]) | (dict(weights=[0.0] * len(changes)) if changes else {})
+        )
+        self.parts["nodes"].append(dict(name=name, mesh=node))
+        look = dict(baseColorFactor=[*colour, 1.0], metallicFactor=0.0, roughnessFactor=0.8)
+        self.parts["materials"].append(dict(name=name, pbrMetallicRoughness=look, doubleSided=True))
+        if changes:
+            weights = np.eye(len(places))[:, 1:].astype(np.float32)  # the first frame is where all are zero
+            self.samplers.append(dict(input=times, output=self.add(weights.ravel()), interpolation="LINEAR"))
+            target = dict(node=node, path="weights")
+            self.channels.append(dict(sampler=len(self.samplers) - 1, target=target))
+
+    def packed(self) -> bytes:
+        """The file: a header, the JSON, the numbers."""
+        whole = dict(asset=dict(version="2.0", generator="diffsim_ti"), scene=0) | self.parts
+        whole["scenes"] = [dict(nodes=list(range(len(self.parts["nodes"]))))]
+        whole["buffers"] = [dict(byteLength=len(self.bytes))]
+        if self.channels:
+            whole["animations"] = [dict(name="run", channels=self.channels, samplers=self.samplers)]
+        text = json.dumps(whole, separators=(",", ":")).encode()
+        text += b" " * (-len(text) % 4)
+        numbers = bytes(self.bytes) + b"\0" * (-len(self.bytes) % 4)
+        chunks = b"".join(len(x).to_bytes(4, "little") + kind + x for kind, x in ((b"JSON", text), (b"BIN\0", numbers)))
+        return b"glTF" + (2).to_bytes(4, "little") + (12 + len(chunks)).to_bytes(4, "little") + chunks

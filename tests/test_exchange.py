@@ -1,0 +1,203 @@
+"""What comes in and goes out: surfaces, Abaqus files, objects of meshio and PyVista, animated glTF."""
+
+import builtins
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import diffsim_ti as ds
+from diffsim_ti.cli import app
+from diffsim_ti.writers import Frame, open_writer
+
+BOX = ds.TetrahedralMesh.create_box((4, 3, 3), (0.3, 0.2, 0.2))
+MESH = BOX.with_tetrahedron_set("core", BOX.centroids[:, 0] < 0.1)
+
+
+def same(a, b) -> bool:
+    sets = ("vertex_sets", "tetrahedron_sets", "surface_sets")
+    equal = np.array_equal(a.vertices, b.vertices) and np.array_equal(a.elements, b.elements)
+    return equal and all(
+        getattr(a, s).keys() == getattr(b, s).keys()
+        and all(np.array_equal(rows, getattr(b, s)[name]) for name, rows in getattr(a, s).items())
+        for s in sets
+    )
+
+
+# ---- surfaces ---------------------------------------------------------------------------------------------------------
+
+
+def saved_surface(path, mesh=MESH):
+    import meshio
+
+    meshio.Mesh(mesh.vertices, [("triangle", mesh.surface_triangles)]).write(path)
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".stl", ".obj", ".ply"])
+def test_surfaces_are_filled(tmp_path, suffix):
+    body = ds.TetrahedralMesh.from_file(saved_surface(tmp_path / f"body{suffix}"))
+    assert body.volume == pytest.approx(MESH.volume, rel=1e-6) and body.quality.min() > 0.1  # stl and ply in float32
+    found = {tuple(np.round(x, 6)) for x in body.vertices[body.surface_vertices]}
+    assert found == {tuple(np.round(x, 6)) for x in MESH.vertices[MESH.surface_vertices]}  # all points, and no other
+
+
+def test_size_and_parts():
+    coarse = ds.TetrahedralMesh.from_surface(MESH.vertices, MESH.surface_triangles)
+    fine = ds.TetrahedralMesh.from_surface(MESH.vertices, MESH.surface_triangles, size=0.03)
+    assert fine.num_tetrahedra > 5 * coarse.num_tetrahedra and np.median(fine.volumes) < 0.03**3 / 72**0.5
+    apart = MESH.translated((1, 0, 0))
+    points = np.concatenate([MESH.vertices, apart.vertices])
+    both = np.concatenate([MESH.surface_triangles, MESH.surface_triangles + MESH.num_vertices])
+    assert ds.TetrahedralMesh.from_surface(points, both).volume == pytest.approx(2 * MESH.volume)
+
+
+def test_surfaces_that_cannot_be_filled(tmp_path, monkeypatch):
+    fill = ds.TetrahedralMesh.from_surface
+    X, surface = MESH.vertices, MESH.surface_triangles
+    with pytest.raises(ValueError, match="not closed: 3 of .* edges .*the first is at"):
+        fill(X, surface[1:])
+    with pytest.raises(ValueError, match="TetGen cannot fill .*self-intersections.* mend it"):
+        fill(np.concatenate([X, X + 0.05]), np.concatenate([surface, surface + len(X)]))
+    with pytest.raises(ValueError, match="size must be a length above 0"):
+        fill(X, surface, size=-1.0)
+    with pytest.raises(ValueError, match=r"triangles must be indices of shape \(n, 3\)"):
+        fill(X, surface[:, :2])
+    with pytest.raises(ValueError, match="must name points from 0 to 35"):
+        fill(X, surface + 30)
+    with pytest.raises(ValueError, match="must be finite"):
+        fill(np.where(X == X.max(), np.nan, X), surface)
+    path = saved_surface(tmp_path / "body.stl")
+    (tmp_path / "empty.stl").write_text("solid\nendsolid\n")
+    with pytest.raises(ValueError, match=r"empty\.stl"):
+        ds.TetrahedralMesh.from_file(tmp_path / "empty.stl")
+    known = builtins.__import__
+
+    def without(name, *arguments):
+        if name == "tetgen":
+            raise ImportError(name)
+        return known(name, *arguments)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(ValueError, match=r"body\.stl: surfaces are filled by TetGen, .*pip install .*surfaces"):
+        ds.TetrahedralMesh.from_file(path)
+
+
+def test_a_surface_falls_from_the_shell(tmp_path, capsys):
+    out = [str(tmp_path / "fall.glb"), str(tmp_path / "fall.npz")]
+    path = saved_surface(tmp_path / "body.stl")
+    with pytest.raises(SystemExit) as end:
+        app.main(["simulate", str(path), "--duration", ".1", "-o", out[0], "-o", out[1]])
+    assert end.value.code == 0, capsys.readouterr().err
+    places, times = animated(tmp_path / "fall.glb")[0]
+    arrays = np.load(out[1])
+    assert places.shape[0] == len(times) == len(arrays["time"]) > 3
+
+
+# ---- files and objects -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mesh", [MESH, MESH.quadratic()], ids=["linear", "ten nodes"])
+def test_meshio_s_objects_and_back(mesh):
+    assert same(ds.TetrahedralMesh.from_meshio(mesh.to_meshio()), mesh)
+
+
+def test_abaqus_keeps_sets_of_vertices_and_tetrahedra(tmp_path):
+    with pytest.warns(UserWarning, match="cannot keep the sets lid"):
+        MESH.with_surface_set("lid", lambda x, n: n[:, 1] > 0.9).save(tmp_path / "body.inp")
+    back = ds.TetrahedralMesh.from_file(tmp_path / "body.inp")
+    assert np.array_equal(back.tetrahedra, MESH.tetrahedra) and back.tetrahedron_sets.keys() == {"core"}
+    assert all(np.array_equal(back.vertex_sets[name], rows) for name, rows in MESH.vertex_sets.items())
+
+
+def test_abaqus_files_of_others(tmp_path):
+    """Sets by ranges, as CAE writes them."""
+    corners = "\n".join(f"{k}, {x}, {y}, {z}" for k, (x, y, z) in enumerate(np.vstack([np.zeros(3), np.eye(3)]), 1))
+    (tmp_path / "part.inp").write_text(
+        f"*Heading\n** made by hand\n*Node\n{corners}\n*Element, type=C3D4, elset=ALL\n1, 1, 2, 3, 4\n"
+        "*Nset, nset=BASE, generate\n1, 3, 1\n*Elset, elset=CORE\n1\n"
+    )
+    part = ds.TetrahedralMesh.from_file(tmp_path / "part.inp")
+    assert part.vertex_sets["BASE"].tolist() == [0, 1, 2] and part.tetrahedron_sets["CORE"].tolist() == [0]
+
+
+def grid_of(mesh):
+    """What PyVista makes of meshio's mesh, as far as we look at it."""
+    numbers = {"tetra": 10, "tetra10": 24, "triangle": 5, "triangle6": 22}
+    kept = mesh.to_meshio()
+    order = [*range(1, len(kept.cells)), 0]  # PyVista does not sort cells by kind
+    kinds = np.concatenate([np.full(len(kept.cells[k].data), numbers[kept.cells[k].type]) for k in order])
+    cells = {numbers[block.type]: block.data for block in kept.cells}
+    cell_data = {name: np.concatenate([parts[k] for k in order]) for name, parts in kept.cell_data.items()}
+    return SimpleNamespace(
+        points=kept.points, cells_dict=cells, celltypes=kinds, point_data=kept.point_data, cell_data=cell_data
+    )
+
+
+@pytest.mark.parametrize("mesh", [MESH, MESH.quadratic()], ids=["linear", "ten nodes"])
+def test_grids_of_pyvista(mesh):
+    assert same(ds.TetrahedralMesh.from_pyvista(grid_of(mesh)), mesh)
+    hexahedra = SimpleNamespace(cells_dict={12: np.arange(8)[None]})
+    with pytest.raises(ValueError, match=r"types \[12\] cannot be read"):
+        ds.TetrahedralMesh.from_pyvista(hexahedra)
+
+
+def test_pyvista_itself():
+    pytest.importorskip("pyvista")
+    assert same(ds.TetrahedralMesh.from_pyvista(MESH.to_pyvista()), MESH)
+
+
+# ---- glTF ------------------------------------------------------------------------------------------------------------
+
+
+def animated(path) -> list[tuple[np.ndarray, np.ndarray]]:
+    """(places in each frame, times) of each node, by the specification."""
+    data = path.read_bytes()
+    assert data[:4] == b"glTF" and int.from_bytes(data[4:8], "little") == 2
+    assert int.from_bytes(data[8:12], "little") == len(data)
+    size = int.from_bytes(data[12:16], "little")
+    tree, numbers = json.loads(data[20 : 20 + size]), data[28 + size :]
+    assert data[16:20] == b"JSON" and data[24 + size : 28 + size] == b"BIN\0"
+
+    def read(k):
+        one = tree["accessors"][k]
+        view, columns = tree["bufferViews"][one["bufferView"]], {"SCALAR": 1, "VEC3": 3}[one["type"]]
+        kind = {5126: "<f4", 5125: "<u4"}[one["componentType"]]
+        out = np.frombuffer(numbers, kind, one["count"] * columns, view["byteOffset"])
+        assert view["byteOffset"] % 4 == 0 and view["byteLength"] == out.nbytes
+        out = out.reshape(one["count"], columns)
+        if "min" in one:
+            assert np.allclose(out.min(0), one["min"]) and np.allclose(out.max(0), one["max"])
+        return out
+
+    moves = {channel["target"]["node"]: channel["sampler"] for channel in tree["animations"][0]["channels"]}
+    found = []
+    for k, node in enumerate(tree["nodes"]):
+        (shape,) = tree["meshes"][node["mesh"]]["primitives"]
+        first, times = read(shape["attributes"]["POSITION"])[None], np.zeros(1)
+        assert read(shape["indices"]).max() == first.shape[1] - 1
+        if k in moves:
+            sampler = tree["animations"][0]["samplers"][moves[k]]
+            times, targets = read(sampler["input"])[:, 0], [read(t["POSITION"]) for t in shape["targets"]]
+            weights = read(sampler["output"]).reshape(len(times), len(targets))
+            first = first + np.einsum("ft,tni->fni", weights, np.stack(targets))
+        found.append((first, times))
+    return found
+
+
+def test_gltf_moves_as_the_run_does(tmp_path):
+    ball = ds.Sphere((0.5, 0.1, 0.1), 0.08, stiffness=1.0, width=0.01, path=lambda t: [0, t, 0])
+    wall = ds.Box((-0.5, 0.1, 0.1), (0.1, 0.1, 0.1), stiffness=1.0, width=0.01)
+    scene = ds.Scene(MESH, ds.StableNeoHookean(2e4, 0.3), terms=[ds.Gravity(), ball, wall], fixed="xmin")
+    simulator, places = ds.Simulator(ds.SemiImplicitSolver(scene, dt=0.02, substeps=20)), []
+    with open_writer(tmp_path / "run.glb", scene) as out:
+        for _ in range(4):
+            out.write(Frame.of(simulator))
+            places.append(simulator.positions[MESH.surface_vertices])
+            simulator.step()
+    body, ball, wall = animated(tmp_path / "run.glb")
+    np.testing.assert_allclose(body[0], places, atol=1e-6)
+    np.testing.assert_allclose(body[1], [0, 0.02, 0.04, 0.06], atol=1e-7)
+    np.testing.assert_allclose(np.ptp(ball[0], axis=0).max(0), [0, 0.06, 0], atol=1e-6)
+    assert len(wall[0]) == 1  # what stands has no targets
