@@ -33,7 +33,7 @@ class Exchange:
 
     @classmethod
     def from_file(cls, path: str | PathLike, fix_orientation: bool = False, drop_orphans: bool = False) -> "Self":
-        """Load tetrahedra from any format that meshio reads: Gmsh .msh (1, 2.2, 4.x), .vtu, .vtk, MEDIT .mesh, Abaqus .inp ...
+        """Load tetrahedra from any format that meshio reads: Gmsh .msh (1, 2.2, 4.x), .vtu, .vtk, MEDIT .mesh, .inp ...
         Surfaces, of .stl, .obj, .ply and .off, are filled (`from_surface`).
 
         Blocks of tetrahedra are joined. Named groups of tetrahedra become tetrahedron sets, groups of triangles, lines
@@ -61,8 +61,8 @@ class Exchange:
 
         Sets are kept in .msh (Gmsh 2.2 binary, as physical groups of points, surfaces and volumes) and in .vtu and .vtk (as
         0/1 data arrays "vertex_set:<name>", "tetrahedron_set:<name>", "surface_set:<name>", with triangles as cells; .vtk
-        turns blanks in names into underscores), but for surface sets in .inp; others lose them with a UserWarning. These keep
-        every digit.
+        turns blanks in names into underscores), all but surface sets in .inp; others lose them with a UserWarning. These
+        keep every digit.
         Ten-node tetrahedra go into these three, .inp and .xdmf. ValueError for an unknown suffix, and in .msh for a name of
         two sets (not a surface set and its own vertices).
         """
