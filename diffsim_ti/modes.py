@@ -150,6 +150,10 @@ def modes(scene: "Scene", k: int, displacements: ArrayLike | None = None) -> Mod
 
     if scene.precision != "f64":
         scene = scene.replace(precision="f64")
+    if scene.reduced:
+        raise ValueError(
+            "modes: a scene with sets that are reduced= has no modes here; leave it out for those of all vertices"
+        )
     u = scene.checked_displacements(displacements)
     scene = scene.with_consistent_mass()
     free = free_directions(scene)

@@ -1,0 +1,154 @@
+"""Bodies that move by few numbers: what they tend to, what they keep, contact and friction, derivatives, refusals."""
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+import diffsim_ti as ds
+from diffsim_ti import verify
+
+SHELL = {"shell": "affine"}
+
+
+@lru_cache
+def bar():
+    """A bar of six cells whose upper half is a set of tetrahedra."""
+    mesh = ds.TetrahedralMesh.create_box((4, 2, 2), size=(0.3, 0.1, 0.1), pattern="five")
+    far = np.flatnonzero(mesh.vertices[mesh.tetrahedra].mean(1)[:, 0] > 0.1)
+    return ds.TetrahedralMesh(
+        mesh.vertices, mesh.tetrahedra, vertex_sets=mesh.vertex_sets, tetrahedron_sets={"shell": far}
+    )
+
+
+def scene_of(reduced=SHELL, stiff=1e6, terms=None, precision="f64", **options):
+    E = np.full(bar().num_tetrahedra, 1e5)
+    E[bar().tetrahedron_sets["shell"]] = stiff
+    terms = [ds.Gravity()] if terms is None else terms
+    return ds.Scene(bar(), ds.StableNeoHookean(E, 0.3), 1000.0, terms, reduced=reduced, precision=precision, **options)
+
+
+def test_a_stiff_part_tends_to_what_moves_by_twelve_numbers():
+    ends = {}
+    for stiff in (1e6, 1e8):
+        tips = []
+        for reduced in (None, SHELL):
+            solver = ds.StaticSolver(scene_of(reduced, stiff, fixed="xmin"), tolerance=1e-9)
+            tips.append(ds.Rollout(solver, 1, gradients=[]).forward().positions[-1, :, 1].min())
+        ends[stiff] = abs(tips[1] / tips[0] - 1)
+    assert ends[1e8] < 1e-3 < 10 * ends[1e8] < ends[1e6]
+
+
+def test_one_body_alone_stretches_as_its_material_says():
+    """All of it is affine: a pull at both ends is a uniform stretch, and E its slope."""
+    mesh = ds.TetrahedralMesh.create_box((3, 2, 2), size=(0.2, 0.1, 0.1), pattern="five")
+    mesh = ds.TetrahedralMesh(mesh.vertices, mesh.tetrahedra, vertex_sets=mesh.vertex_sets | {"all": np.arange(12)})
+    pulls = [
+        ds.ExternalForce(np.tile([s * 0.25, 0, 0], (4, 1)), vertices=end) for end, s in (("xmin", -1), ("xmax", 1))
+    ]
+    bed = ds.ElasticFoundation(
+        1e5, 1e2, np.flatnonzero(np.all(mesh.vertices[mesh.surface_triangles, 0] < 1e-9, axis=1))
+    )
+    scene = ds.Scene(mesh, ds.LinearElastic(1e5, 0.3), terms=[*pulls, bed], reduced={"all": "affine"}, precision="f64")
+    end = ds.Rollout(ds.StaticSolver(scene, tolerance=1e-10), 1, gradients=[]).forward().positions[-1]
+    assert np.ptp(end[:, 0]) / 0.2 - 1 == pytest.approx(1.0 / 0.01 / 1e5, rel=1e-3)
+
+
+def test_tumbling_keeps_momentum():
+    """To the tolerance of the midpoint rule, whose rotations are affine motions."""
+    omega, X = np.array([2.0, -3.0, 5.0]), bar().vertices
+    spin = np.cross(omega, X - X.mean(0)) + [0.3, 0.2, 0.1]
+    scene = scene_of(terms=[], stiff=1e7, initial_velocities=spin)
+    solver = ds.ImplicitMidpointSolver(scene, dt=5e-3, tolerance=1e-12)
+    frames = ds.Rollout(solver, 60, save_every=20, gradients=[]).forward()
+    m = scene.inputs.derive(scene.inputs.values).mass[:, None]
+    P, L = (m * frames.velocities).sum(1), (m * np.cross(frames.positions, frames.velocities)).sum(1)
+    assert np.abs(P - P[0]).max() < 1e-10 and np.abs(L - L[0]).max() < 1e-9 * np.linalg.norm(L[0])
+    assert np.linalg.norm(frames.positions[-1] - frames.positions[0], axis=1).max() > 0.05
+    shell = np.unique(bar().tetrahedra[bar().tetrahedron_sets["shell"]])
+    u = frames.displacements[-1]
+    np.testing.assert_allclose(scene.reduced.of(u)[shell], u[shell], atol=1e-15)
+
+
+# ---- contact, friction, derivatives ----------------------------------------------------------------------------------
+
+
+def touching(**options):
+    """An affine box comes down askew on a soft one that slides on a rough floor."""
+    low = ds.TetrahedralMesh.create_box(2, size=0.1, origin=(-0.05, 0.004, -0.05))
+    up = ds.TetrahedralMesh.create_box(2, size=0.08, origin=(-0.03, 0, -0.03)).rotated([1, 0.3, 0.2], 0.5)
+    mesh = ds.TetrahedralMesh.joined([low, up.translated([0, 0.107 - up.bounding_box[0, 1], 0])])
+    velocity = np.repeat([[0.2, 0.0, 0.0], [0.3, -1.5, 0.1]], 8, axis=0)
+    floor = ds.Ground(stiffness=2e4, width=0.01, friction=0.3, friction_speed=0.3)
+    contact = ds.SelfContact(2e4, 5e-3, friction=0.4, friction_speed=0.3)
+    E = np.repeat([5e4, 5e6], [low.num_tetrahedra, up.num_tetrahedra])
+    given = dict(reduced={"body_1": "affine"}, precision="f64", initial_velocities=velocity) | options
+    return ds.Scene(mesh, ds.StableNeoHookean(E, 0.3), 1000.0, [contact, ds.Gravity(), floor], **given)
+
+
+@pytest.mark.parametrize("solver", [ds.ImplicitEulerSolver, ds.BDF2Solver, ds.ImplicitMidpointSolver])
+def test_tangent_and_adjoint_agree_with_contact_and_friction(solver):
+    force = ds.SelfContactForce("body_1")
+    rollout = ds.Rollout(solver(touching(), dt=2e-3, tolerance=1e-12), 4, save_every=2, gradients="all", outputs=force)
+    assert np.abs(rollout.forward()["self_contact_force"]).max() > 1
+    assert verify.dot_product_test(rollout) <= 1e-9
+
+
+def test_gradients():
+    """By the rest shape with the motions of the mesh as it was made."""
+    names = ["rest_positions", "self_contact_friction"]
+    solver = ds.ImplicitEulerSolver(touching(), dt=2e-3, tolerance=1e-12)
+    assert ds.check_gradients(ds.Rollout(solver, 1, gradients=names), verbose=False).passed
+
+
+def test_gradients_of_equilibria():
+    solver = ds.StaticSolver(scene_of(fixed="xmin"), tolerance=1e-12)
+    rollout = ds.Rollout(solver, 1, gradients=["youngs_modulus", "gravity", "rest_positions"])
+    assert verify.dot_product_test(rollout) <= 1e-9 and ds.check_gradients(rollout, verbose=False).passed
+
+
+def test_steps_one_by_one_and_single_precision():
+    solver = ds.ImplicitEulerSolver(scene_of(fixed="xmin"), dt=5e-3)
+    frames = ds.Rollout(solver, 4, gradients=[]).forward()
+    simulator = ds.Simulator(solver)
+    simulator.run(4)
+    np.testing.assert_allclose(simulator.positions, frames.positions[-1], atol=1e-9)
+    single = ds.Rollout(ds.ImplicitEulerSolver(scene_of(precision="f32", fixed="xmin"), dt=5e-3), 4, gradients=[])
+    np.testing.assert_allclose(single.forward().positions[-1], frames.positions[-1], atol=1e-5)
+    askew = simulator.positions + np.random.default_rng(0).normal(size=(16, 3)) * 1e-3
+    simulator.set_state(askew)
+    u = simulator.displacements
+    np.testing.assert_allclose(scene_of().reduced.of(u), u, atol=1e-15)
+
+
+# ---- refusals --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "reduced, options, words",
+    [
+        (["shell"], {}, 'must be {name of a set: "affine"}'),
+        ({"shell": "rigid"}, {}, "'shell' must be 'affine', got 'rigid'"),
+        ({"skin": "affine"}, {}, "no set 'skin' of tetrahedra or vertices; it has .*'shell'"),
+        ({"xmax": "affine"}, {}, "the 4 vertices of 'xmax' lie in a plane"),
+        (SHELL, dict(fixed="xmax"), "vertex .* of 'shell' is also in what is held"),
+        ({"half": "affine", "shell": "affine"}, {}, "of 'shell' is also in 'half'"),
+    ],
+)
+def test_refused(reduced, options, words):
+    mesh = ds.TetrahedralMesh(
+        bar().vertices,
+        bar().tetrahedra,
+        vertex_sets=bar().vertex_sets | {"half": np.arange(12)},
+        tetrahedron_sets=bar().tetrahedron_sets,
+    )
+    with pytest.raises(ValueError, match=words):
+        ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3), reduced=reduced, **options)
+
+
+def test_explicit_steps_refuse():
+    with pytest.raises(ValueError, match="explicit steps move every vertex.*'shell' 12 for 36"):
+        ds.SemiImplicitSolver(scene_of(), dt=1e-4)
+    with pytest.raises(ValueError, match="has no modes"):
+        ds.modes(scene_of(fixed="xmin"), 2)
+    assert "moving by few numbers: 'shell' 12 for 36" in scene_of().describe()
