@@ -13,7 +13,7 @@ KINDS = ("affine",)
 
 @dataclass(frozen=True)
 class Together:
-    """Vertices of a set, shape (k,), and an orthonormal basis of what each component of their displacements may be, (k, m)."""
+    """Vertices of a set, shape (k,), and an orthonormal basis of each component of their displacements, shape (k, m)."""
 
     name: str
     vertices: np.ndarray
@@ -59,7 +59,7 @@ class Reduced:
         X = (X - X.mean(0)) / max(float(np.ptp(X, axis=0).max(initial=0.0)), 1e-300)
         if len(X) < 4 or np.linalg.svd(X, compute_uv=False)[-1] < 1e-6 * np.sqrt(len(X)):
             raise ValueError(
-                f"reduced: the {len(X)} vertices of {name!r} lie in a plane, so that an affine motion is not one alone; name "
+                f"reduced: the {len(X)} vertices of {name!r} lie in a plane, which leaves an affine motion open; name "
                 "a set with tetrahedra"
             )
         return Together(name, vertices, np.linalg.qr(np.concatenate([np.ones((len(X), 1)), X], 1))[0])

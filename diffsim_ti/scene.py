@@ -1,6 +1,5 @@
 """Scene: what is simulated, and nothing about how."""
 
-import warnings
 from collections.abc import Iterable, Mapping
 from copy import copy
 
@@ -11,6 +10,7 @@ from diffsim_ti import runtime
 from diffsim_ti.checked import instance, listed
 from diffsim_ti.copies import MadeAgain
 from diffsim_ti.inputs import ConsistentMass, Inputs
+from diffsim_ti.locking import LOCKING_RATIO, warn_if_locking
 from diffsim_ti.mass_scaling import MassScaling
 from diffsim_ti.materials.material import Material
 from diffsim_ti.materials.moduli import youngs_poisson
@@ -36,14 +36,12 @@ from diffsim_ti.terms.motion import Motion
 from diffsim_ti.terms.obstacles.obstacle import PER_AREA
 from diffsim_ti.terms.pose import Pose, sampled_path
 
+__all__ = ["LOCKING_RATIO", "Scene"]
+
 
 def _kind(term) -> tuple:
     """What kernels go through terms by: obstacles last, each kind's together, so that the order of a list means nothing."""
     return term.acts_on_surface, type(term).__qualname__, type(term).__module__, term.variant
-
-
-LOCKING_RATIO = 0.45  # Poisson's ratio above which linear tetrahedra lock noticeably
-LOCKING_RATIO_OF_TEN_NODES = 0.49  # beyond it their mean dilatation is the better
 
 
 class Scene(MadeAgain):
@@ -71,10 +69,8 @@ class Scene(MadeAgain):
         reactions grow by the share. By which factors vertices are heavier is found for the numbers given here, and kept
         whatever values a run takes; gradients by density and rest shape are those of such masses. `describe()` says how
         much was added. Implicit steps and statics add none.
-    reduced: {name of a tetrahedron or vertex set: "affine"}: its vertices move by twelve numbers, x = X + A X + t, a body
-        that is stiff against what it touches, or soft in stretch and shear alone, by its own material. Implicit steps and
-        statics solve for these numbers, with contact, friction and gradients as of all others; explicit steps refuse
-        (reduced.py). Of a start only the affine part counts.
+    reduced: {name of a tetrahedron or vertex set: "affine"}: its vertices move by twelve numbers, x = X + A X + t, for which
+        implicit steps and statics solve; explicit ones refuse. Of a start only the affine part counts (reduced.py).
 
     Raises ValueError with rule, value and remedy for anything that does not fit, before any kernel runs. Warns where
     tetrahedra lock, above Poisson's ratio 0.45.
@@ -128,7 +124,7 @@ class Scene(MadeAgain):
         self.inputs = Inputs(self, density, initial_positions, initial_velocities)
         self._check_start()
         if volume == "tetrahedra":
-            self._warn_if_locking()
+            warn_if_locking(self)
 
     @property
     def law(self):
@@ -165,9 +161,9 @@ class Scene(MadeAgain):
         for k, term in enumerate(named):
             for other in (t for t in named[:k] if t.name == term.name):
                 raise ValueError(f"two terms have the name {term.name!r}: {other!r} and {term!r}; give each its own")
+        if self.motion is not None and len(self.held) == 0:
+            raise ValueError("motion moves the fixed vertices, but none is fixed; pass fixed=...")
         if self.motion is not None:
-            if len(self.held) == 0:
-                raise ValueError("motion moves the fixed vertices, but none is fixed; pass fixed=...")
             self.motion_rows([0.0])
 
     def _check_start(self) -> None:
@@ -181,18 +177,6 @@ class Scene(MadeAgain):
         values = self.inputs.values
         mu, lam = self.material.lame({name: values[name] for name in self.material.inputs})
         return float(np.max(youngs_poisson(mu, lam)[1]))
-
-    def _warn_if_locking(self) -> None:
-        nu, linear = self.largest_poissons_ratio(), self.mesh.order == 1
-        limit, kind = (LOCKING_RATIO, "linear") if linear else (LOCKING_RATIO_OF_TEN_NODES, "ten-node")
-        remedy = "take mesh.quadratic(), " if linear else ""
-        if nu > limit + 1e-12:
-            warnings.warn(
-                f"{self.material.name}: Poisson's ratio {nu:.6g} is above {limit}, where {kind} tetrahedra lock "
-                f'(bend too little): {remedy}pass volume="patches" to the Scene, cut cells with pattern="five", refine the '
-                "mesh, or lower the ratio",
-                stacklevel=3,
-            )
 
     @property
     def obstacles(self) -> tuple[Term, ...]:
@@ -331,8 +315,7 @@ class Scene(MadeAgain):
 
     def describe(self) -> str:
         """What is simulated, in a few lines."""
-        mass = self.inputs.derive(self.inputs.values).mass.sum()
-        terms = ", ".join(map(repr, self.terms)) or "none"
+        mass, terms = self.inputs.derive(self.inputs.values).mass.sum(), ", ".join(map(repr, self.terms)) or "none"
         chosen = [
             f"chosen from weight and speed: stiffness per area {float(t.values[PER_AREA]):.4g} N/m^3 of {type(t).__name__}"
             for t in self.terms

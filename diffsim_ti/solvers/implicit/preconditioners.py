@@ -35,23 +35,36 @@ class BlockJacobi:
 
 
 class BodyBlocks(BlockJacobi):
-    """The same, and of each set that moves by few numbers q the inverse of its own d2E/dq2, from as many products."""
+    """The same, and the inverse of d2E/dq2 of each set that moves by few numbers q: of the body at rest, turned with it, as
+    in multigrid.py, with inertia and contact as they are."""
+
+    def __init__(self, potential, mass: np.ndarray, free: Free, size: np.ndarray, parallel: bool = True):
+        super().__init__(potential, mass, free, size, parallel)
+        with potential.at_rest():
+            self._at_rest = [self._of_products(body) for body in free.reduced.bodies]
+
+    def _of_products(self, body) -> np.ndarray:
+        """B^T d2E/du2 B where the potential stands, shape (m, 3, m, 3)."""
+        m = body.basis.shape[1]
+        out = np.zeros((m, 3, m, 3))
+        for j in range(m):
+            for d in range(3):
+                w = np.zeros((len(self.mass), 3))
+                w[body.vertices, d] = body.basis[:, j]
+                out[:, :, j, d] = body.basis.T @ self.potential.product(w)[body.vertices]
+        return 0.5 * (out + out.transpose(2, 3, 0, 1))
 
     def update(self, u: np.ndarray) -> None:
         super().update(u)
-        self._bodies = []
-        for body in self.free.reduced.bodies:
-            k, m = body.basis.shape
-            G = np.zeros((m, 3, m, 3))
-            for j in range(m):
-                for d in range(3):
-                    w = np.zeros((len(self.mass), 3))
-                    w[body.vertices, d] = body.basis[:, j]
-                    G[:, :, j, d] = body.basis.T @ (self.mass * w + self.potential.product(w))[body.vertices]
-            G = G.reshape(3 * m, 3 * m)
-            values, vectors = np.linalg.eigh(0.5 * (G + G.T))
-            least = 1e-12 * np.abs(values).max() + self.least[body.vertices].min()
-            values = np.maximum(np.abs(values), least)
+        contact, rest, self._bodies = self.potential.contact_blocks(), self.potential.arrays.values.rest, []
+        for body, G in zip(self.free.reduced.bodies, self._at_rest):
+            own, Q = body.vertices, body.basis
+            R = turn_of(rest[own], rest[own] + u[own])
+            G = np.einsum("ia,jakb,lb->jikl", R, G, R, optimize=True)
+            own_blocks = self.mass[own, :, None] * np.eye(3) + (0.0 if contact is None else contact[own])
+            G += np.einsum("vj,vab,vk->jakb", Q, own_blocks, Q, optimize=True)
+            values, vectors = np.linalg.eigh(G.reshape(3 * Q.shape[1], -1))
+            values = np.maximum(np.abs(values), 1e-12 * np.abs(values).max() + self.least[own].min())
             self._bodies.append((body, (vectors / values) @ vectors.T))
 
     def __call__(self, r: np.ndarray) -> np.ndarray:
@@ -60,6 +73,13 @@ class BodyBlocks(BlockJacobi):
             q = inverse @ (body.basis.T @ r[body.vertices]).ravel()
             out[body.vertices] = body.basis @ q.reshape(-1, 3)
         return out
+
+
+def turn_of(X: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """The rotation that takes points X nearest to x, about their centres."""
+    U, _, Vt = np.linalg.svd((x - x.mean(0)).T @ (X - X.mean(0)))
+    U[:, 2] *= np.sign(np.linalg.det(U @ Vt)) or 1.0
+    return U @ Vt
 
 
 def size_of(blocks: np.ndarray) -> np.ndarray:

@@ -51,6 +51,10 @@ class ImplicitSolver(Solver):
     ):
         if preconditioner not in ("auto", "block_jacobi", "multigrid"):
             raise ValueError(f"preconditioner must be auto, block_jacobi or multigrid, got {preconditioner!r}")
+        if preconditioner == "multigrid" and getattr(scene, "reduced", False):
+            raise ValueError(
+                'preconditioner: a scene with reduced= takes "block_jacobi", with blocks of the bodies; or "auto"'
+            )
         self.preconditioner = preconditioner
         self.tolerance = between("tolerance", tolerance, 0, 1, ends=False)
         self.max_iterations = whole("max_iterations", max_iterations, 1)

@@ -1,0 +1,24 @@
+"""Where a scene's tetrahedra lock: they resist changes of volume, and so bend too little, as Poisson's ratio nears 0.5."""
+
+import warnings
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from diffsim_ti.scene import Scene
+
+LOCKING_RATIO = 0.45  # Poisson's ratio above which linear tetrahedra lock noticeably
+LOCKING_RATIO_OF_TEN_NODES = 0.49  # beyond it their mean dilatation is the better
+
+
+def warn_if_locking(scene: "Scene") -> None:
+    """Warn, as from where the scene is made."""
+    nu, linear = scene.largest_poissons_ratio(), scene.mesh.order == 1
+    limit, kind = (LOCKING_RATIO, "linear") if linear else (LOCKING_RATIO_OF_TEN_NODES, "ten-node")
+    remedy = "take mesh.quadratic(), " if linear else ""
+    if nu > limit + 1e-12:
+        warnings.warn(
+            f"{scene.material.name}: Poisson's ratio {nu:.6g} is above {limit}, where {kind} tetrahedra lock "
+            f'(bend too little): {remedy}pass volume="patches" to the Scene, cut cells with pattern="five", refine the '
+            "mesh, or lower the ratio",
+            stacklevel=4,
+        )
