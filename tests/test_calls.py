@@ -34,7 +34,10 @@ def calls() -> dict:
     steps = dict(scene=scene, dt=1e-4, substeps=1, parallel=None)
     optional = dict(density=1e3, terms=(), fixed=None, motion=None, initial_positions=None, initial_velocities=None)
     return {
-        "Scene": (ds.Scene, body | optional | dict(precision=None, volume="tetrahedra", mass_scaling=None)),
+        "Scene": (
+            ds.Scene,
+            body | optional | dict(precision=None, volume="tetrahedra", mass_scaling=None, reduced=None),
+        ),
         "create_cube": (ds.TetrahedralMesh.create_cube, dict(resolution=2, size=1.0, pattern="kuhn")),
         "TetrahedralMesh": (ds.TetrahedralMesh, dict(vertices=mesh.vertices, tetrahedra=mesh.tetrahedra)),
         "StableNeoHookean": (ds.StableNeoHookean, dict(youngs_modulus=1e5, poissons_ratio=0.3)),

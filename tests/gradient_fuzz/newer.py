@@ -22,6 +22,20 @@ def mass_scaling(kind, seed: int) -> float | None:
     return rng.uniform(0.005, 0.1) if kind.explicit and kind.order == 1 and rng.random() < 0.3 else None
 
 
+def reduced(kind, seed: int, mesh, fixed, deformed: bool) -> dict[str, str] | None:
+    """A set that moves by few numbers, where implicit runs have one of which nothing is held."""
+    if kind.explicit or deformed or np.random.default_rng([36, seed]).random() > 0.5:
+        return None
+    held = ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3), fixed=fixed).held
+    for name in ("part", "body_1"):
+        own = (
+            mesh.elements[mesh.tetrahedron_sets[name]] if name in mesh.tetrahedron_sets else mesh.vertex_sets.get(name)
+        )
+        if own is not None and not np.isin(own, held).any():
+            return {name: "affine"}
+    return None
+
+
 def muscles(kind, seed: int, mesh, steps: int, duration: float, E: float) -> list[ds.Muscle]:
     """In a fifth of the structures."""
     if np.random.default_rng([26, kind.number]).random() > 0.2:
