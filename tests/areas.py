@@ -14,7 +14,8 @@ AREAS = {
     "every adjoint, order, fuzz": "every_adjoint term_order gradient_fuzz",
     "gradients": "gradients batch gradient_clip gradient_faults checkpoints tape outputs "
     "contact_force reaction tensor_outputs work modes identification identify",
-    "implicit steps and equilibria": "implicit implicit_cycle implicit_gradients implicit_contact swept solve_report reduced",
+    "implicit steps and equilibria": "implicit implicit_cycle implicit_gradients implicit_contact swept solve_report "
+    "reduced",
     "patches against locking": "locking",
     "ten-node tetrahedra": "reference_element quadratic quadratic_mesh quadratic_loads quadratic_outputs quadratic_solvers "
     "quadratic_answers",
