@@ -116,7 +116,7 @@ def turned(width, friction, solver, steps, **options):
 
 
 @pytest.mark.parametrize(
-    "solver, steps, options", [(ds.SemiImplicitSolver, 200, {}), (ds.ImplicitMidpointSolver, 30, dict(tolerance=1e-11))]
+    "solver, steps, options", [(ds.SemiImplicitSolver, 200, {}), (ds.ImplicitMidpointSolver, 60, dict(tolerance=1e-11))]
 )
 def test_angular_momentum_but_for_the_couple_of_friction_across_the_gap(solver, steps, options):
     """The couple's arm is the gap, half the width here; it falls with the width, and is none where nothing rubs."""
