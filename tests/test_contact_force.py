@@ -31,6 +31,13 @@ def pressed(precision="f64", round_one=False, **options) -> ds.Scene:
     return ds.Scene(cube(), ds.StableNeoHookean(youngs_modulus=2e5, poissons_ratio=0.3), **given | options)
 
 
+def between() -> list:
+    """A ball below a cube and one above it, both smaller than its faces."""
+    floor = pressed(round_one=True).terms[1]
+    above = ds.Sphere((0.05, 0.17, 0.05), 0.06, stiffness_per_area=2e5, width=0.01, name="wall")
+    return [ds.Gravity(), floor, above]
+
+
 def outputs():
     return [
         ds.ContactForce("floor", name="held"),
@@ -69,6 +76,7 @@ def rollout_of(case: str) -> ds.Rollout:
     )
     held = dict(fixed="ymax", motion=lambda t: (0.001 * t, -0.001 * t, 0.0), initial_velocities=None)
     alone = dict(terms=pressed(round_one=True).terms[:2]) if "round" in more else {}
+    alone |= dict(terms=between()) if "between" in more else {}
     options = (moved if "moved" in more else {}) | alone | (held if kind == "static" else {})
     scene = pressed("f32" if "f32" in more else "f64", **options)
     solver = {
@@ -97,6 +105,7 @@ CASES = [
     "verlet belt",
     "semi round",
     "euler round",
+    "verlet between",
 ]
 
 
@@ -193,6 +202,19 @@ def test_what_faces_feel_counts(round_one):
     gained = 4e-3 * (frames["held"][1] + mass * np.array([0, -G, 0]))
     assert p[1] - p[0] == pytest.approx(gained, abs=1e-12 * np.abs(p).max()) and frames["held"][1, 1] > 1
     assert frames["each"].sum(1) == pytest.approx(frames["held"])
+
+
+def test_each_of_two_that_faces_feel_has_its_own_force():
+    scene = pressed(terms=between(), initial_velocities=(0, 0, 0))
+    solver = ds.VelocityVerletSolver(scene, dt=1e-3)
+    rollout = ds.Rollout(
+        solver, 4, outputs=[ds.ContactForce("floor", name="held"), ds.ContactForce("wall", name="top")]
+    )
+    frames = rollout.forward()
+    p, mass = momentum(scene, frames), scene.inputs.derive(scene.inputs.values).mass.sum()
+    below, above = frames["held"][1], frames["top"][1]
+    gained = 4e-3 * (below + above + mass * np.array([0, -G, 0]))
+    assert p[1] - p[0] == pytest.approx(gained, abs=1e-12 * mass) and below[1] > 1 and above[1] < -1
 
 
 @pytest.mark.executed_ptx
@@ -349,7 +371,7 @@ def test_what_does_not_fit_is_refused():
         ds.Sphere((x, -0.06, 0.05), 0.06, stiffness_per_area=3e5, name=f"ball{k}") for k, x in enumerate((0.02, 0.08))
     ]
     several = ds.Rollout(ds.SemiImplicitSolver(pressed(terms=balls), dt=1e-4), 1, outputs=ds.ContactForce(balls[1]))
-    with pytest.raises(ValueError, match="2 obstacles reach between the corners of faces"):
+    with pytest.raises(ValueError, match="Sphere and Sphere push on the faces around vertex . in one substep"):
         several.forward()
 
 

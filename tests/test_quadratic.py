@@ -1,11 +1,13 @@
 """Ten-node tetrahedra: forces of an energy, exact where fields are quadratic, gradients by all numbers, masses, steps."""
 
+import warnings
 from functools import cache
 
 import numpy as np
 import pytest
 import taichi as ti
 import torch
+from quadratic_meshes import ring
 from test_every_adjoint import assert_transposed
 from test_gradients import random_mesh
 
@@ -14,6 +16,7 @@ from diffsim_ti.diff_simulator import rollout_frames
 from diffsim_ti.inputs import StressPoints
 from diffsim_ti.inputs.surface_areas import SurfaceAreas
 from diffsim_ti.materials import MATERIALS
+from diffsim_ti.mesh.face_points import bow
 from diffsim_ti.mesh.reference_element import quadrature
 from diffsim_ti.potential.potential import Potential
 from diffsim_ti.state.arrays import SceneArrays
@@ -300,3 +303,18 @@ def test_torch_and_tape_give_the_same_gradients(options):
         size = np.abs(expected[name]).max()
         np.testing.assert_allclose(tensors[name].grad, expected[name], rtol=0, atol=1e-12 * size, err_msg=name)
         np.testing.assert_allclose(taped.gradients[name], expected[name], rtol=0, atol=1e-12 * size, err_msg=name)
+
+
+def test_what_contact_leaves_out_of_curved_faces_is_said():
+    """Four triangles stand for each: an edge that is a parabola of height b leaves b / 4."""
+    mesh, law = ring(1), ds.StableNeoHookean(1e5, 0.3)
+    corners = mesh.surface_faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 3, 2)
+    middles = mesh.vertices[mesh.surface_faces[:, 3:]] - mesh.vertices[corners].mean(2)
+    height = np.linalg.norm(middles, axis=2).max()
+    assert height / 4 * (1 - 1e-12) <= bow(mesh) <= height and bow(mesh.linear().quadratic()) < 1e-15
+    low = mesh.bounding_box[0, 1] - 1.0
+    with pytest.warns(UserWarning, match="Ground: faces of this mesh are curved, and lie up to"):
+        ds.Scene(mesh, law, terms=ds.Ground(low, stiffness=1.0, width=0.9 * bow(mesh)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        ds.Scene(mesh, law, terms=ds.Ground(low, stiffness=1.0, width=1.1 * bow(mesh)))

@@ -4,6 +4,7 @@ import numpy as np
 
 from diffsim_ti.mesh import reference_face
 from diffsim_ti.mesh.geometry import triangle_normals, triangle_normals_jvp, triangle_normals_vjp
+from diffsim_ti.mesh.ten_nodes import QUARTERS
 
 
 class LinearFaces:
@@ -80,3 +81,17 @@ class QuadraticFaces:
 def face_points(faces: np.ndarray) -> LinearFaces | QuadraticFaces:
     """Of faces of three or six nodes, shape (k, 3) or (k, 6)."""
     return QuadraticFaces(faces) if faces.shape[1] == 6 else LinearFaces(faces)
+
+
+def bow(mesh) -> float:
+    """How far curved faces lie from the four triangles that stand for each in contact, at most [m]: at the middles of their
+    sides and at their own."""
+    if mesh.order == 1:
+        return 0.0
+    corners = np.array([[0, 0], [1, 0], [0, 1], [0.5, 0], [0.5, 0.5], [0, 0.5]])[QUARTERS]
+    at = np.concatenate([corners.mean(1), (0.5 * (corners + np.roll(corners, 1, 1))).reshape(-1, 2)])
+    flat = np.zeros((4, 3, 6))  # the same places of the triangles: shares of the nodes
+    np.put_along_axis(flat, QUARTERS[:, :, None], 1.0, 2)
+    flat = np.concatenate([flat.mean(1), (0.5 * (flat + np.roll(flat, 1, 1))).reshape(-1, 6)])
+    off = np.einsum("ka,fai->fki", reference_face.functions(at) - flat, mesh.vertices[mesh.surface_faces])
+    return float(np.linalg.norm(off, axis=2).max(initial=0.0))

@@ -7,6 +7,7 @@ import numpy as np
 from diffsim_ti.checked import numbers
 from diffsim_ti.inputs import NOT_NEGATIVE, Input
 from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.terms.bow import warn_of_bow
 from diffsim_ti.terms.described import positive
 from diffsim_ti.terms.term import Term
 
@@ -90,6 +91,7 @@ class SelfContact(Term):
                 )
 
     def check(self, mesh: TetrahedralMesh) -> None:
+        warn_of_bow(mesh, self)
         if self.has_friction:
             self.labels(mesh)
 

@@ -196,14 +196,14 @@ class ExplicitAdjoint:
 
     def _start_faces(self, alone, numbers: dict) -> None:
         """Go back through the contact of faces, whose impulse may be asked for."""
-        by_speed = self.impulses.seed(numbers) if self.ws.impulses else None
+        by_speed = self.impulses.seed(numbers, alone.pushes) if self.ws.impulses else None
         if by_speed is None:
             self.faces.start(alone, numbers)
             return
         runtime.fill(self.v, runtime.fetch(self.v) + by_speed)
         self.faces.start(alone, numbers)
         runtime.fill(self.v, runtime.fetch(self.v) - by_speed)
-        self.mass_adj += self.impulses.by_mass(numbers, alone.speed)
+        self.mass_adj += self.impulses.by_mass(numbers, alone.speed, alone.pushes)
 
     def _faces_of(self, slot: int, kick: int):
         """The pass to a slot without contact within faces; nothing where there was none, or in a kick alone."""

@@ -32,7 +32,7 @@ FACES |= dict.fromkeys(("share", "whole", "shift", "offsets"), "vectors") | dict
     ("begin", "place", "speed"), "vectors2"
 )
 FACES |= dict(taken="scalars2") | dict.fromkeys(
-    ("reach", "weight", "least", "energy", "done", "work", "need", "load"), "scalars"
+    ("reach", "weight", "least", "energy", "done", "work", "need", "load", "pushed"), "scalars"
 )
 NUMBERS = dict.fromkeys(("slot", "first", "window", "num_vertices", "num_faces", "num_surface", "between"), "int")
 NUMBERS |= dict(n="int", k="int", h="float")
@@ -192,14 +192,24 @@ class FaceKernels(FaceWalls):
                     speed = self.speed(g, k, now, scene.path)
                     for a in ti.static(range(3)):
                         faces.done[f] = faces.done[f] + length * self.dot3(self.row_of(rows, a), speed)
-                faces.least[f * ti.static(self.num_obstacles) + g.number + k] = least
+                row = f * ti.static(self.num_obstacles) + g.number + k
+                faces.least[row] = least
+                for a in ti.static(range(3)):
+                    for m in ti.static(range(3)):
+                        faces.pushed[row] = faces.pushed[row] + ti.abs(rows[a, m])
         self.store(f, total, faces)
+
+    @ti.func
+    def clear_pushed(self, f, faces: A):
+        for o in range(ti.static(self.num_obstacles)):
+            faces.pushed[f * ti.static(self.num_obstacles) + o] = ti.cast(0, self.fp)
 
     @ti.func
     def all_forces(self, scene: A, faces: A, state: A, table: A, plan: A):
         ti.loop_config(serialize=not self.parallel)
         for f in range(plan.num_faces):
             now, u = pass_at(table, plan.first - plan.window), self.rows_at(f, state.u, plan.slot, faces)
+            self.clear_pushed(f, faces)
             self.force_of(f, u, ti.cast(0, self.fp), now, scene, faces, plan)
         ti.loop_config(serialize=not self.parallel)
         for s in range(plan.num_surface):
@@ -229,6 +239,7 @@ class FaceKernels(FaceWalls):
         ti.loop_config(serialize=not self.parallel)
         for f in range(plan.num_faces):
             faces.done[f] = ti.cast(0, self.fp)
+            self.clear_pushed(f, faces)
 
     @cached_property
     def begins(self) -> Kernel:

@@ -53,13 +53,17 @@ class FeltFaces:
         self.share, self.begin = runtime.array(a.vector, 3 * len(faces)), runtime.array(a.vector, 1, a.num_vertices)
         self.whole, self.shift = (runtime.array(a.vector, len(surface)) for _ in range(2))
         self.least, self.offsets = runtime.array(fp, len(faces) * len(a.contacts)), a.offsets
+        self.pushed = runtime.array(
+            fp, len(faces) * len(a.contacts)
+        )  # by each obstacle in a pass, more than 0 if at all
         self.near, self.load = runtime.array(ti.i32, len(faces)), runtime.array(fp, len(surface))
         # of each face: energy; work of moving obstacles in a pass, and in all (EnergyBalance); its way in widths
         self.energy, self.done, self.work, self.need = (runtime.array(fp, len(faces)) for _ in range(4))
         runtime.fill(self.work, 0)
         self.row, self.place = runtime.array(a.vector, 1, a.num_vertices), None
         self._make_room(1)
-        self.kept = {}  # of recorded passes in which faces came near, by slots: (parts, state without their contact)
+        self.kept = {}  # of recorded passes in which faces came near, by slots: (parts, state without their contact, pushes)
+        self.pushes = None  # in the last pass: whether each obstacle pushed on faces around each vertex
         self.saturated = False  # whether the last pass would have taken more parts than there may be
 
     def _make_room(self, n: int) -> None:
@@ -114,12 +118,21 @@ class FeltFaces:
             n = min(self.most_parts, n * _power_of_two(max(min(more, 64.0), 1.01)))
         if n:
             self.saturated = n >= self.most_parts
+            self.pushes = self._who_pushes() if asked else None
             if recording:
-                self.kept[slot] = n, runtime.fetch_row(history.u, slot), runtime.fetch_row(history.v, slot)
+                state = runtime.fetch_row(history.u, slot), runtime.fetch_row(history.v, slot)
+                self.kept[slot] = n, state, self.pushes
             before = runtime.fetch_row(history.v, slot) if asked else None
             self._run("ends", plan, history, slot, n, watch=self.ws.watch)
             return runtime.fetch_row(history.v, slot) - before if asked else None
         return None
+
+    def _who_pushes(self) -> np.ndarray:
+        """Whether each obstacle pushes on faces around each vertex, shape (obstacles, num_vertices)."""
+        out = np.zeros((len(self.a.contacts), self.a.num_vertices), bool)
+        for own, pushed in zip(out, _seen(self.pushed).reshape(-1, len(out)).T):
+            own[self.mesh.surface_triangles[pushed > 0].ravel()] = True
+        return out
 
     def _fewest_parts(self) -> int:
         """How many parts the ways of faces ask for; 0 if none comes near."""
@@ -167,7 +180,7 @@ class Alone:
 
     def __init__(self, faces: FeltFaces, history, slot: int):
         self.faces, self.history, self.slot = faces, history, slot
-        self.n, *self._state = faces.kept[slot]
+        self.n, self._state, self.pushes = faces.kept[slot]
 
     def __enter__(self) -> "Alone":
         self._whole = [runtime.fetch_row(x, self.slot) for x in (self.history.u, self.history.v)]

@@ -7,9 +7,9 @@ from diffsim_ti import runtime
 
 class ImpulseRecord:
     """Impulses [N s] of obstacles on vertices: those of the contact stage in `impulse` (contact_impulses.py), those of
-    points within faces, which are one obstacle's, in `of_faces`, shape (frames, num_vertices, 3).
+    points within faces in `of_faces`, shape (frames, obstacles that reach there, num_vertices, 3).
 
-    Raises ValueError where obstacles act as forces, or where faces could feel several of them.
+    Raises ValueError where obstacles act as forces, and while it runs where two of them push on the faces around one vertex.
     """
 
     def __init__(self, workspace):
@@ -21,12 +21,7 @@ class ImpulseRecord:
                 'to take some as forces: pass contact="stage", and obstacles with a distance'
             )
         reaching = [g.number + k for g in features.groups if not g.force.hollow for k in range(g.count)]
-        self.felt = reaching[0] if workspace.faces and reaching else None
-        if workspace.faces and len(reaching) > 1:
-            raise ValueError(
-                f"{len(reaching)} obstacles reach between the corners of faces, where explicit steps know only what they do "
-                "together: take an implicit solver, wider barriers, or a finer surface, for the force of each"
-            )
+        self.reaching = reaching if workspace.faces else []
         self.num_frames, self.num_obstacles = workspace.frames.frames_u.shape[0], len(a.obstacles)
         self.impulse = runtime.array(a.vector, 2 * self.num_frames * self.num_obstacles, a.num_vertices)
         self.clear()
@@ -37,18 +32,17 @@ class ImpulseRecord:
 
     def clear(self) -> None:
         runtime.fill(self.impulse, 0)
-        self.of_faces = np.zeros((self.num_frames, self.arrays.num_vertices, 3))
+        self.of_faces = np.zeros((self.num_frames, len(self.reaching), self.arrays.num_vertices, 3))
 
     def put(self, impulses: np.ndarray) -> None:
         """Set them; shape as `collect` gives."""
         runtime.fill(self.impulse, impulses.reshape(-1, *self._shape[3:]))
-        self.of_faces = np.zeros_like(self.of_faces) if self.felt is None else impulses[:, self.felt, 0].copy()
+        self.of_faces = impulses[:, self.reaching, 0].copy()
 
     def collect(self) -> np.ndarray:
         """Shape (frames, obstacles, 2: by push and by friction, num_vertices, 3), float64; the first frame has none."""
         out = runtime.fetch(self.impulse).astype(np.float64).reshape(self._shape)
-        if self.felt is not None:
-            out[:, self.felt, 0] += self.of_faces
+        out[:, self.reaching, 0] += self.of_faces
         return out
 
     # ---- of faces ----------------------------------------------------------------------------------------------------
@@ -57,24 +51,46 @@ class ImpulseRecord:
         """The frame that counts the pass of a launch, if one does."""
         return numbers["counted"] if numbers["counted"] >= 0 else None
 
-    def add(self, numbers: dict, change: np.ndarray) -> None:
+    def _shares(self, pushes: np.ndarray) -> np.ndarray:
+        """Of the obstacles that reach there in what faces do to each vertex, shape (obstacles, num_vertices, 1): all of it
+        is the one's that pushes.
+
+        pushes: as FeltFaces has it. Raises ValueError where two push on one vertex.
+        """
+        own = pushes[self.reaching]
+        if len(own) > 1 and np.any(own.sum(0) > 1):
+            i = int(np.argmax(own.sum(0)))
+            names = " and ".join(type(self.arrays.contacts[o]).__name__ for o in np.array(self.reaching)[own[:, i]])
+            raise ValueError(
+                f"{names} push on the faces around vertex {i} in one substep, where explicit steps know only what they do "
+                "together: take an implicit solver, narrower barriers, or a finer surface, for the force of each"
+            )
+        own = own.astype(float) if len(own) > 1 else np.ones((len(own), pushes.shape[1]))
+        return own[:, :, None]
+
+    def add(self, numbers: dict, change: np.ndarray, pushes: np.ndarray) -> None:
         """Add what faces did in a pass; change: of the velocity by them [m/s]."""
         frame = self.frame_of(numbers)
         if frame is not None:
-            self.of_faces[frame] += self.arrays.values.mass[:, None] * change
+            self.of_faces[frame] += self._shares(pushes) * self.arrays.values.mass[:, None] * change
 
-    def add_jvp(self, numbers: dict, speed: np.ndarray, change: np.ndarray, mass_dot: np.ndarray) -> None:
+    def add_jvp(
+        self, numbers: dict, speed: np.ndarray, change: np.ndarray, mass_dot: np.ndarray, pushes: np.ndarray
+    ) -> None:
         """Its change; speed: the change of velocity by faces, change: that of it."""
-        self.add(numbers, change)
+        self.add(numbers, change, pushes)
         frame = self.frame_of(numbers)
         if frame is not None:
-            self.of_faces[frame] += mass_dot[:, None] * speed
+            self.of_faces[frame] += self._shares(pushes) * mass_dot[:, None] * speed
 
-    def seed(self, numbers: dict) -> np.ndarray | None:
+    def seed(self, numbers: dict, pushes: np.ndarray) -> np.ndarray | None:
         """Adjoint of the velocity after faces, by their impulse; that before them has the opposite."""
         frame = self.frame_of(numbers)
-        return None if frame is None else self.arrays.values.mass[:, None] * self.of_faces[frame]
+        return None if frame is None else self.arrays.values.mass[:, None] * self._felt(frame, pushes)
 
-    def by_mass(self, numbers: dict, speed: np.ndarray) -> np.ndarray:
+    def _felt(self, frame: int, pushes: np.ndarray) -> np.ndarray:
+        return (self._shares(pushes) * self.of_faces[frame]).sum(0)
+
+    def by_mass(self, numbers: dict, speed: np.ndarray, pushes: np.ndarray) -> np.ndarray:
         """Adjoint of the masses."""
-        return (self.of_faces[self.frame_of(numbers)] * speed).sum(1)
+        return (self._felt(self.frame_of(numbers), pushes) * speed).sum(1)

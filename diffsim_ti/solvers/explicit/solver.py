@@ -289,7 +289,7 @@ class ExplicitWorkspace(Workspace):
             if self.faces:
                 change = self.faces.after_pass(history, slot + stride, numbers, recording, self.impulses is not None)
                 if change is not None:
-                    self.impulses.add(numbers, change)
+                    self.impulses.add(numbers, change, self.faces.pushes)
             if pairs:
                 if pairs.friction:
                     now = self.numbers_of(numbers["first"], num_passes)

@@ -82,7 +82,7 @@ class ExplicitTangent:
         self.faces.end(alone, numbers)
         if before is not None:
             change = runtime.fetch_row(self.v, 0) - before
-            self.impulses.add_jvp(numbers, alone.speed, change, self.tangent.mass)
+            self.impulses.add_jvp(numbers, alone.speed, change, self.tangent.mass, alone.pushes)
 
     def contact_forces(self, frame_time: np.ndarray) -> np.ndarray:
         """Changes of the frames' contact forces."""
