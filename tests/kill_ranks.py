@@ -1,0 +1,96 @@
+"""Kills ranks of an ensemble at random moments; the run must end with the bits of one process that nobody kills.
+
+    python tests/kill_ranks.py --kills 50
+"""
+
+import argparse
+import io
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import warnings
+from contextlib import redirect_stdout
+from pathlib import Path
+
+from diffsim_ti import TetrahedralMesh
+from diffsim_ti.optimization import load_state
+
+ROOT = Path(__file__).parent.parent
+SCRIPT = ROOT / "examples" / "identify" / "train_distributed.py"
+MESH = TetrahedralMesh.create_cube(3, 0.4)
+
+
+def workers(agent: int) -> list[int]:
+    """The ranks that an agent of ours has started."""
+    try:
+        return [int(pid) for pid in Path(f"/proc/{agent}/task/{agent}/children").read_text().split()]
+    except OSError:
+        return []
+
+
+def iteration(path: Path) -> int:
+    """The last one in a state file."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # looked at between two renames
+        state = load_state(path, MESH)
+    return 0 if state is None else state["iteration"]
+
+
+def run(folder: Path, kills: int, iterations: int, seed: int = 0, say=lambda line: None) -> tuple[dict, list[tuple]]:
+    """(the result, [(iteration of the last state, first one seen after the kill)]) of two ranks, one of which is killed."""
+    rng, seen, state = random.Random(seed), [], folder / "train_distributed.state"
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2", "--monitor-interval=.1"]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path]), "OMP_NUM_THREADS": "1"}
+    script = [f"--max-restarts={kills}", str(SCRIPT), f"--folder={folder}", f"--iterations={iterations}"]
+    printed, known, at = folder.with_suffix(".txt"), 0, None
+    with open(printed, "w") as out:
+        process = subprocess.Popen([*command, *script], stdout=out, stderr=subprocess.STDOUT, env=environment)
+        try:
+            while process.poll() is None:
+                time.sleep(0.02)
+                now = iteration(state)
+                if now <= known or now >= iterations:
+                    continue
+                if at is not None:
+                    seen.append((at, now))
+                    at = None
+                known = now
+                if len(seen) < kills and len(ranks := workers(process.pid)) == 2:
+                    time.sleep(rng.uniform(0, 0.05))
+                    known = at = iteration(state)
+                    os.kill(ranks[rng.randrange(2)], signal.SIGKILL)
+                    say(f"{len(seen) + 1}: killed after iteration {at}")
+        finally:
+            process.terminate()
+            process.wait()
+    assert process.returncode == 0, printed.read_text()
+    return json.loads(next(line for line in printed.read_text().splitlines() if line.startswith("{"))), seen
+
+
+def alone(iterations: int) -> dict:
+    """The result of one process."""
+    sys.path.insert(0, str(SCRIPT.parent))
+    import train_distributed
+
+    with redirect_stdout(io.StringIO()):
+        return train_distributed.main(None, iterations)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--kills", type=int, default=50)
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    length = 40 + 4 * options.kills
+    one = alone(length)
+    with tempfile.TemporaryDirectory() as place:
+        many, lost = run(Path(place) / "run", options.kills, length, options.seed, print)
+    same = all(one[name] == many[name] for name in ("E", "nu", "loss"))
+    done_twice = max((at + 1 - now for at, now in lost), default=0)
+    print(f"{many['restarts']} restarts, {len(lost)} seen to go on; same bits: {same}; iterations lost: {done_twice}")
+    sys.exit(not same or many["restarts"] < options.kills)
