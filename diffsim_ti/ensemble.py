@@ -1,4 +1,4 @@
-"""Scenes of different meshes, and batches, spread over processes and machines, with gradients whose bits know nothing of it."""
+"""Scenes of different meshes, and batches, spread over processes and machines; the bits of sums do not depend on how."""
 
 import pickle
 from collections.abc import Callable, Iterable, Sequence
@@ -33,13 +33,17 @@ class Ensemble:
     Raises ValueError for no members, and for costs that are not as many, or not > 0.
     """
 
-    def __init__(self, members: Iterable, make: Callable[[Any], Any] | None = None, costs: Sequence[float] | None = None):
+    def __init__(
+        self, members: Iterable, make: Callable[[Any], Any] | None = None, costs: Sequence[float] | None = None
+    ):
         self._given, self._make, self._made = list(members), make, {}
         if not self._given:
             raise ValueError("members: there are none; give rollouts, batches, or what `make` makes them from")
         costs = np.ones(len(self)) if costs is None else np.asarray(costs, np.float64)
         if costs.shape != (len(self),) or not (costs > 0).all() or not np.isfinite(costs).all():
-            raise ValueError(f"costs: expected {len(self)} finite numbers > 0, one for each member, got {costs.tolist()}")
+            raise ValueError(
+                f"costs: expected {len(self)} finite numbers > 0, one for each member, got {costs.tolist()}"
+            )
         self.rank, self.num_ranks, self.is_first = ranks.rank(), ranks.world(), ranks.rank() == 0
         self.own = shares(costs, self.num_ranks)[self.rank]
 

@@ -141,11 +141,7 @@ class Optimization:
         )
 
     def run(
-        self,
-        loss: Callable[[], torch.Tensor],
-        iterations: int,
-        after: Callable | None = None,
-        title: str | None = None,
+        self, loss: Callable[[], torch.Tensor], iterations: int, after: Callable | None = None, title: str | None = None
     ) -> "Optimization":
         """Go on until `iterations` iterations are done in all; loss() makes the graph anew each time.
 

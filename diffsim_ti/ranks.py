@@ -31,8 +31,20 @@ def _group():
     if not dist.is_available():
         return None
     if not dist.is_initialized() and _started_by_torchrun():
-        dist.init_process_group("gloo")  # numbers that are sent lie on the host, on cards too
+        _meet(dist)
     return dist if dist.is_initialized() and dist.get_world_size() > 1 else None
+
+
+def _meet(dist) -> None:
+    """Start the group. What is sent are numbers of the host, on cards too: gloo.
+
+    On one machine torchrun keeps its store over restarts, and with it the addresses of ranks that are dead: each start
+    writes under a name of its own. Several machines count their starts apart (README: a store for each start).
+    """
+    store, rank, world = next(dist.rendezvous("env://"))
+    if os.environ.get("GROUP_WORLD_SIZE") == "1":
+        store = dist.PrefixStore("start " + os.environ.get("TORCHELASTIC_RESTART_COUNT", "0"), store)
+    dist.init_process_group("gloo", store=store, rank=rank, world_size=world)
 
 
 def rank() -> int:

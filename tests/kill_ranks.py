@@ -1,6 +1,6 @@
 """Kills ranks of an ensemble at random moments; the run must end with the bits of one process that nobody kills.
 
-    python tests/kill_ranks.py --kills 50
+python tests/kill_ranks.py --kills 50
 """
 
 import argparse
@@ -14,7 +14,7 @@ import sys
 import tempfile
 import time
 import warnings
-from contextlib import redirect_stdout
+from contextlib import redirect_stdout, suppress
 from pathlib import Path
 
 from diffsim_ti import TetrahedralMesh
@@ -35,8 +35,9 @@ def workers(agent: int) -> list[int]:
 
 def iteration(path: Path) -> int:
     """The last one in a state file."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # looked at between two renames
+    state = None
+    with warnings.catch_warnings(), suppress(FileNotFoundError):  # looked at between two renames
+        warnings.simplefilter("ignore")
         state = load_state(path, MESH)
     return 0 if state is None else state["iteration"]
 
@@ -44,7 +45,14 @@ def iteration(path: Path) -> int:
 def run(folder: Path, kills: int, iterations: int, seed: int = 0, say=lambda line: None) -> tuple[dict, list[tuple]]:
     """(the result, [(iteration of the last state, first one seen after the kill)]) of two ranks, one of which is killed."""
     rng, seen, state = random.Random(seed), [], folder / "train_distributed.state"
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2", "--monitor-interval=.1"]
+    command = [
+        sys.executable,
+        "-m",
+        "torch.distributed.run",
+        "--standalone",
+        "--nproc_per_node=2",
+        "--monitor-interval=.1",
+    ]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path]), "OMP_NUM_THREADS": "1"}
     script = [f"--max-restarts={kills}", str(SCRIPT), f"--folder={folder}", f"--iterations={iterations}"]
     printed, known, at = folder.with_suffix(".txt"), 0, None

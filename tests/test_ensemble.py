@@ -25,14 +25,15 @@ def test_a_killed_rank_changes_no_bit(tmp_path):
     assert {name: result[name] for name in ("E", "nu", "loss")} == {name: one[name] for name in ("E", "nu", "loss")}
     assert result["E_error"] < 0.02 and result["nu_error"] < 0.03
     assert (tmp_path / "two" / "train_distributed.png").stat().st_size > 5000
-    assert "of 80" not in (tmp_path / "two.txt").read_text() or "train" in (tmp_path / "two.txt").read_text()
 
 
 def rollouts() -> list:
     out = []
     for n in (2, 3):
         mesh = ds.TetrahedralMesh.create_box(n, 0.1)
-        scene = ds.Scene(mesh, ds.StableNeoHookean(2e4, 0.3), 1000.0, terms=[ds.Gravity()], fixed="xmin", precision="f64")
+        scene = ds.Scene(
+            mesh, ds.StableNeoHookean(2e4, 0.3), 1000.0, terms=[ds.Gravity()], fixed="xmin", precision="f64"
+        )
         out.append(ds.Rollout(ds.SemiImplicitSolver(scene, dt=1e-3), 4))
     return out + [ds.Batch(out[0].solver, 4, 3)]
 

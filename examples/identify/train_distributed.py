@@ -1,6 +1,6 @@
 """E and nu from an ensemble of throws that processes share: how the work outgrows one machine.
 
-Each process simulates its share; losses and gradients are summed in the order of throws, so that the result has the same bits
+Each process simulates its share; losses and gradients are summed in the order of throws, so the result has the same bits
 on any number of processes. A process that dies is started again with the others, from the state of the last iteration.
 
     torchrun --nproc_per_node=2 --max-restarts=3 examples/identify/train_distributed.py
