@@ -16,7 +16,12 @@ from diffsim_ti.cli.own_scene import Fixed, own_scene
 
 
 @lru_cache(4)
-def _of_file(path: str) -> dict:
+def _of_file(path: str, precision: str) -> dict:
+    """Its names, in this process."""
+    from diffsim_ti import runtime
+
+    runtime.arch_name()  # starts Taichi where the parent of this process has it
+    runtime.set_precision(precision)
     return runpy.run_path(path)
 
 
@@ -25,10 +30,11 @@ class FromFile:
     """`rollout`, or else `scene`, of a Python file, which each process runs for itself."""
 
     path: str
+    precision: str
 
     @property
     def _made(self):
-        names = _of_file(self.path)
+        names = _of_file(self.path, self.precision)
         made = names.get("rollout", names.get("scene"))
         if made is None:
             raise ValueError(f"{self.path} must define scene or rollout, or functions that return one")
@@ -47,9 +53,10 @@ class ResultsOfFile:
     """`results` of a Python file."""
 
     path: str
+    precision: str
 
     def __call__(self, frames):
-        return _of_file(self.path)["results"](frames)
+        return _of_file(self.path, self.precision)["results"](frames)
 
 
 def axis(text: str) -> tuple[str, list[float]]:
@@ -81,9 +88,7 @@ def sweep(
     output: Folder = Path("output/sweep"),
     duration: Annotated[float, typer.Option(help="of a scene [s]")] = 0.2,
     frames: Annotated[int, typer.Option(help="of a scene")] = 20,
-    solver: Annotated[
-        str, typer.Option(help="of a scene: verlet, semi-implicit, implicit-euler, bdf2 or static")
-    ] = "verlet",
+    solver: Annotated[str, typer.Option(help="verlet, semi-implicit, implicit-euler, bdf2 or static")] = "verlet",
     workers: Annotated[int, typer.Option(help="processes")] = 1,
     precision: Precision = "f32",
     material: MaterialName = "StableNeoHookean",
@@ -116,9 +121,9 @@ def sweep(
     if scene.suffix == ".py":
         if not scene.exists():
             raise ValueError(f"{scene}: no such file; give a mesh, or a Python file that defines scene or rollout")
-        make = FromFile(str(scene))
-        if "results" in _of_file(str(scene)):
-            results = ResultsOfFile(str(scene))
+        make = FromFile(str(scene), precision)
+        if "results" in _of_file(str(scene), precision):
+            results = ResultsOfFile(str(scene), precision)
     else:
         make = own_scene(scene, material, youngs_modulus, poissons_ratio, density, fixed)
     with pool(workers) if workers > 1 else nullcontext() as executor:

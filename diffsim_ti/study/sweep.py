@@ -91,10 +91,10 @@ def sweep(
     """Run a scene at every point of the grid over = {"E": [1e4, 1e5], "speed": [1, 2, 4]} and gather numbers of each run.
 
     make: a Rollout, a Scene, or a function that returns one: numbers that it has arguments for go to it, all others are
-    inputs of the run: "youngs_modulus" (or E), "gravity", "youngs_modulus[soft]" of a named set. A scene is run as `settings`
-    say, in explicit steps that are stable at each point.
-    results: numbers by name from the frames of a run. A run that raises ValueError or FloatingPointError is a row of NaN that
-    says why; all others go on.
+    inputs of the run: "youngs_modulus" (or E), "drag_rate", "youngs_modulus[soft]" of a named set. A scene is run as
+    `settings` say, in explicit steps that are stable at each point.
+    results: numbers by name from the frames of a run. A run that raises ValueError or FloatingPointError is a row of NaN
+    that says why; all others go on.
     executor: any `concurrent.futures.Executor` (spawned processes, Dask's `client.get_executor()`), which needs `make` and
     `results` to pickle: functions of a module, scenes without functions of their own. The rows are the same, in the same
     order. Default: one after the other in this process.
