@@ -43,7 +43,8 @@ def iteration(path: Path) -> int:
 
 
 def run(folder: Path, kills: int, iterations: int, seed: int = 0, say=lambda line: None) -> tuple[dict, list[tuple]]:
-    """(the result, [(iteration of the last state, first one seen after the kill)]) of two ranks, one of which is killed."""
+    """The result of two ranks, one of which is killed again and again, and of each kill (iteration of the state that it left,
+    first one that was seen after it)."""
     rng, seen, state = random.Random(seed), [], folder / "train_distributed.state"
     command = [
         sys.executable,
@@ -55,24 +56,26 @@ def run(folder: Path, kills: int, iterations: int, seed: int = 0, say=lambda lin
     ]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path]), "OMP_NUM_THREADS": "1"}
     script = [f"--max-restarts={kills}", str(SCRIPT), f"--folder={folder}", f"--iterations={iterations}"]
-    printed, known, at = folder.with_suffix(".txt"), 0, None
+    printed, begun, killed, before = folder.with_suffix(".txt"), 0, 0, set()
     with open(printed, "w") as out:
         process = subprocess.Popen([*command, *script], stdout=out, stderr=subprocess.STDOUT, env=environment)
         try:
             while process.poll() is None:
                 time.sleep(0.02)
-                now = iteration(state)
-                if now <= known or now >= iterations:
+                ranks, now = workers(process.pid), iteration(state)
+                if not before.isdisjoint(ranks):
+                    continue  # those that are killed, or end since their neighbour is
+                if before:
+                    begun, before = now, set()  # nobody writes before the next ones have started
+                if now <= begun or now >= iterations or len(ranks) < 2:
                     continue
-                if at is not None:
-                    seen.append((at, now))
-                    at = None
-                known = now
-                if len(seen) < kills and len(ranks := workers(process.pid)) == 2:
-                    time.sleep(rng.uniform(0, 0.05))
-                    known = at = iteration(state)
+                if len(seen) < killed:
+                    seen.append((begun, now))
+                if killed < kills:
+                    time.sleep(rng.uniform(0, 0.1))
                     os.kill(ranks[rng.randrange(2)], signal.SIGKILL)
-                    say(f"{len(seen) + 1}: killed after iteration {at}")
+                    killed, before = killed + 1, set(ranks)
+                    say(f"{killed}: killed after iteration {now}")
         finally:
             process.terminate()
             process.wait()
@@ -99,6 +102,8 @@ if __name__ == "__main__":
     with tempfile.TemporaryDirectory() as place:
         many, lost = run(Path(place) / "run", options.kills, length, options.seed, print)
     same = all(one[name] == many[name] for name in ("E", "nu", "loss"))
-    done_twice = max((at + 1 - now for at, now in lost), default=0)
-    print(f"{many['restarts']} restarts, {len(lost)} seen to go on; same bits: {same}; iterations lost: {done_twice}")
+    next_one = sum(now == at + 1 for at, now in lost)
+    print(
+        f"{many['restarts']} restarts, {len(lost)} seen to go on, {next_one} with the next iteration; same bits: {same}"
+    )
     sys.exit(not same or many["restarts"] < options.kills)

@@ -2,6 +2,7 @@
 
 import inspect
 import itertools
+import threading
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
@@ -20,6 +21,7 @@ from diffsim_ti.study.executors import each
 
 ALIASES = {"E": "youngs_modulus", "nu": "poissons_ratio", "rho": "density"}
 SHARE = 0.8  # of the stable step
+TURN = threading.Lock()  # workers of one process take turns, as Taichi does
 
 
 @dataclass(frozen=True)
@@ -159,7 +161,7 @@ def _row(make, results: Callable, settings: Settings, point: dict) -> dict:
     """One point; in whichever process."""
     given, left = _split(make, point)
     try:
-        with warnings.catch_warnings():
+        with TURN, warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # said once for each point otherwise
             made = _built(make, given)
             values: dict = {}
