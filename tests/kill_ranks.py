@@ -43,8 +43,8 @@ def iteration(path: Path) -> int:
 
 
 def run(folder: Path, kills: int, iterations: int, seed: int = 0, say=lambda line: None) -> tuple[dict, list[tuple]]:
-    """The result of two ranks, one of which is killed again and again, and of each kill (iteration of the state that it left,
-    first one that was seen after it)."""
+    """The result of two ranks, one of which is killed again and again, and for each kill (iteration of the state that was
+    left, first one seen after it)."""
     rng, seen, state = random.Random(seed), [], folder / "train_distributed.state"
     command = [
         sys.executable,
