@@ -9,7 +9,7 @@ import pytest
 import diffsim_ti as ds
 from diffsim_ti.cli import main
 from diffsim_ti.cli.sweep import axis
-from diffsim_ti.study import Settings, stability_map, sweep
+from diffsim_ti.study import Problem, Settings, chart, stability_map, sweep
 from diffsim_ti.study.executors import each, pool
 from diffsim_ti.study.stability_map import AXES
 
@@ -60,16 +60,20 @@ def test_wrong_grids_are_refused(over, said):
 
 
 def test_executors_give_the_same():
-    """Two spawned processes: a sweep and a stability map, bit for bit."""
+    """Two spawned processes: a sweep, a stability map and a chart, bit for bit."""
+    asked = Problem.of_scene(scene(), 0.01, frames=2)
+    few = dict(solvers=(ds.SemiImplicitSolver,), precisions=("f64",), levels=2, repeats=1)
     share = dict(shares=(0.5, 1.05), steps=20)
     quantity = type(AXES["nu"])("nu", "-", (0.0, 0.3), AXES["nu"].scene)
     with pool(2) as executor:
         there, mapped = sweep(scene, OVER, executor=executor, settings=SHORT), None
         mapped = stability_map(ds.SemiImplicitSolver, quantity, executor=executor, **share)
+        charted = chart(asked, executor=executor, **few)
     here = sweep(scene, OVER, settings=SHORT)
     assert json.dumps(there.rows) == json.dumps(here.rows)
     alone = stability_map(ds.SemiImplicitSolver, quantity, **share)
     assert mapped.rows() == alone.rows()
+    assert [p.error for p in charted.points] == [p.error for p in chart(asked, **few).points]
 
 
 def test_dask():
