@@ -12,6 +12,7 @@ interrupts.guard_import()
 from diffsim_ti.adaptive_steps import adaptive_steps
 from diffsim_ti.batch import Batch, BatchFrames
 from diffsim_ti.contact.surface_pairs import Tunnelling
+from diffsim_ti.ensemble import Ensemble
 from diffsim_ti.identification import (
     Identification,
     Measurement,
@@ -157,6 +158,7 @@ __all__ = [
     "Rollout",
     "Batch",
     "BatchFrames",
+    "Ensemble",
     "UnequalSteps",
     "adaptive_steps",
     "Frames",

@@ -8,9 +8,12 @@ import os
 import time
 import warnings
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 
+from diffsim_ti import ranks
 from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.progress import progress
 from diffsim_ti.torch_bridge.autograd import torch
 
 KEYS = ("iteration", "losses", "seconds", "best_loss", "best", "module", "optimizer", "random")
@@ -89,7 +92,8 @@ class Optimization:
     """A loop around a torch optimiser that saves, resumes, and keeps the best.
 
     module: holds the parameters; path: state file, resumed from if it is there; None keeps nothing. A resumed run is
-    bitwise the uninterrupted one (parameters, optimiser, random numbers). `losses` has the loss before each iteration,
+    bitwise the uninterrupted one (parameters, optimiser, random numbers). `losses` has the loss before each iteration.
+    Of several ranks (`diffsim_ti.Ensemble`) the first one reads and writes the file, and all begin with what it has.
     clip: largest norm of the whole gradient, which is scaled back to it. patience: end where so many iterations brought no
     lower loss.
     `best_loss` the lowest, whose parameters `restore_best()` brings back; `seconds` counts all parts of the run.
@@ -108,25 +112,40 @@ class Optimization:
         self.clip, self.patience = clip, patience
         self.module, self.optimizer, self.mesh, self.path, self.save_every = module, optimizer, mesh, path, save_every
         self.iteration, self.losses, self.seconds = 0, [], 0.0
-        self.best_loss, self._best = math.inf, copy.deepcopy(module.state_dict())
-        state = None if path is None else load_state(path, mesh)
-        if state is not None:
-            missing = [name for name in KEYS if name not in state]
-            if missing:
-                raise ValueError(
-                    f"{path}: a state without {', '.join(missing)}; another program has written it: take another path, or "
-                    "delete the file to start anew"
-                )
+        state, error = ranks.from_first(self._found() if ranks.is_first() else None)
+        if error is not None:
+            raise error
+        module.load_state_dict(state["module"])
+        torch.set_rng_state(state["random"])
+        if "iteration" in state:
             self.iteration, self.losses, self.seconds = state["iteration"], state["losses"], state["seconds"]
             self.best_loss, self._best = state["best_loss"], state["best"]
-            module.load_state_dict(state["module"])
             optimizer.load_state_dict(state["optimizer"])
-            torch.set_rng_state(state["random"])
+        else:
+            self.best_loss, self._best = math.inf, copy.deepcopy(module.state_dict())
 
-    def run(self, loss: Callable[[], torch.Tensor], iterations: int, after: Callable | None = None) -> "Optimization":
+    def _found(self) -> tuple[dict, ValueError | None]:
+        """(the state of the file, or that of a new run; what is wrong with it)"""
+        try:
+            state = None if self.path is None else load_state(self.path, self.mesh)
+        except ValueError as error:
+            return {}, error
+        if state is None:
+            return dict(module=self.module.state_dict(), random=torch.get_rng_state()), None
+        missing = [name for name in KEYS if name not in state]
+        if not missing:
+            return state, None
+        return {}, ValueError(
+            f"{self.path}: a state without {', '.join(missing)}; another program has written it: take another path, or "
+            "delete the file to start anew"
+        )
+
+    def run(
+        self, loss: Callable[[], torch.Tensor], iterations: int, after: Callable | None = None, title: str | None = None
+    ) -> "Optimization":
         """Go on until `iterations` iterations are done in all; loss() makes the graph anew each time.
 
-        after(value): called after each iteration with the loss before it, for instance to draw.
+        after(value): called after each iteration with the loss before it, for instance to draw. title: of a bar on stderr.
 
         Raises FloatingPointError if the loss is not finite, and lets the simulator's errors through; the parameters are
         then the best ones so far.
@@ -143,23 +162,29 @@ class Optimization:
                 torch.nn.utils.clip_grad_norm_([p for group in groups for p in group["params"]], self.clip)
             return value
 
-        while self.iteration < iterations and not self.is_stuck():
-            start, before = time.perf_counter(), copy.deepcopy(self.module.state_dict())
-            try:
-                value = self.optimizer.step(closure).item()
-            except (ValueError, FloatingPointError):
-                self.restore_best()
-                raise
-            self.losses.append(value)
-            if value < self.best_loss:
-                self.best_loss, self._best = value, before
-            self.iteration += 1
-            self.seconds += time.perf_counter() - start
-            if after is not None:
-                after(value)
-            if self.path is not None and (self.iteration % self.save_every == 0 or self.iteration == iterations):
-                self.save()
+        with nullcontext(lambda *_: None) if title is None else progress(title, iterations) as show:
+            while self.iteration < iterations and not self.is_stuck():
+                value = self._iterate(closure)
+                show(self.iteration, f"loss {value:.4g}")
+                if after is not None:
+                    after(value)
+                if self.path is not None and (self.iteration % self.save_every == 0 or self.iteration == iterations):
+                    self.save()
         return self
+
+    def _iterate(self, closure: Callable) -> float:
+        start, before = time.perf_counter(), copy.deepcopy(self.module.state_dict())
+        try:
+            value = self.optimizer.step(closure).item()
+        except (ValueError, FloatingPointError):
+            self.restore_best()
+            raise
+        self.losses.append(value)
+        if value < self.best_loss:
+            self.best_loss, self._best = value, before
+        self.iteration += 1
+        self.seconds += time.perf_counter() - start
+        return value
 
     def is_stuck(self) -> bool:
         """Whether the last `patience` iterations brought no lower loss."""
@@ -167,7 +192,9 @@ class Optimization:
         return n is not None and len(self.losses) > n and min(self.losses[-n:]) >= min(self.losses[:-n])
 
     def save(self) -> None:
-        """Write the state file."""
+        """Write the state file; of several ranks the first one does."""
+        if not ranks.is_first():
+            return
         save_state(
             self.path,
             self.mesh,

@@ -5,12 +5,18 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from diffsim_ti import interrupts
+from diffsim_ti import interrupts, ranks
 
 
 @contextmanager
 def progress(title: str, total: int) -> Iterator[Callable[..., None]]:
-    """Yields a function to tell what is done; shows it on stderr after two seconds, as lines if that is no terminal."""
+    """Yields a function to tell what is done; shows it on stderr after two seconds, as lines if that is no terminal.
+
+    Of several ranks the first one shows it.
+    """
+    if not ranks.is_first():
+        yield lambda done, note="": interrupts.check()
+        return
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 

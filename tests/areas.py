@@ -22,8 +22,8 @@ AREAS = {
     "obstacles and friction": "contact contact_area contact_faces contact_stage contact_rollers contact_crossing "
     "contact_friction face_friction contact_gradients own_obstacle poses",
     "self-contact": "self_contact self_contact_implicit self_contact_near self_contact_pairs self_contact_friction",
-    "PyTorch, optimisations": "torch torch_physics torch_solvers seed_snippets step_sizes optimization designs",
-    "charts, maps, advice": "study study_stability peers",
+    "PyTorch, optimisations": "ensemble torch torch_physics torch_solvers seed_snippets step_sizes optimization designs",
+    "charts, maps, advice": "sweep study study_stability peers",
     "pictures, films, the window": "picture_drawing picture_film marks "
     "optimization_picture writers viewer viewer_window gallery",
     "examples and pages": "types release examples environment contact_examples static_examples torch_examples readme",

@@ -230,6 +230,56 @@ def test_a_control_loop_goes_on_from_its_ends():
     np.testing.assert_allclose(state["initial_velocities"], whole.velocities[:, -1], rtol=0, atol=1e-15)
 
 
+def test_scenes_start_anew():
+    batch = simple(4)
+    frames = batch.forward(youngs_modulus=[1e4, 1.5e4, 2e4, 3e4])
+    mask, there = np.array([False, True, False, True]), MESH.vertices + [0, 1, 0]
+    state = frames.reset(mask, velocities=np.stack([0 * there, 0 * there + 1]))
+    for name, value in frames.end.items():
+        np.testing.assert_array_equal(state[name][~mask], value[~mask])
+    np.testing.assert_array_equal(state["initial_positions"][mask], [MESH.vertices] * 2)
+    np.testing.assert_array_equal(state["initial_velocities"][[1, 3], 0, 0], [0, 1])
+    np.testing.assert_array_equal(frames.reset(mask, there)["initial_positions"][3], there)
+    np.testing.assert_array_equal(frames.reset()["initial_positions"], frames.end["initial_positions"])
+    with pytest.raises(ValueError, match="expected 4 booleans"):
+        frames.reset([1, 3])
+    with pytest.raises(ValueError, match="for the scenes that start anew"):
+        frames.reset(mask, np.zeros((3, *there.shape)))
+
+
+@pytest.mark.parametrize("lanes", [None, False], ids=["lanes", "by turns"])
+def test_numbers_by_named_sets(lanes):
+    m = MESH.num_tetrahedra
+    sets = dict(soft=np.arange(m // 2), stiff=np.arange(m // 2, m - 2))
+    mesh = ds.TetrahedralMesh(MESH.vertices, MESH.tetrahedra, tetrahedron_sets=sets)
+    scene = ds.Scene(
+        mesh, ds.StableNeoHookean(2e4, 0.3), 1000.0, terms=[ds.Gravity(-9.8)], fixed=[0, 1, 2, 3], precision="f64"
+    )
+    batch = ds.Batch(ds.SemiImplicitSolver(scene, dt=2e-3, substeps=4), 4, 3, gradients="all", lanes=lanes)
+    numbers = dict(soft=np.array([1e4, 1.5e4, 2e4]), stiff=3e4)
+    frames = batch.forward(youngs_modulus=numbers, poissons_ratio=dict(default=0.2))
+    seed = np.random.default_rng(0).normal(size=frames.positions.shape)
+    gradients, total = batch.vjp(frames, seed), 0.0
+    for b in range(3):
+        alone = batch.one.forward(
+            youngs_modulus=dict(soft=numbers["soft"][b], stiff=3e4), poissons_ratio=dict(default=0.2)
+        )
+        np.testing.assert_array_equal(alone.positions, frames.positions[b])
+        by = batch.one.vjp(alone, seed[b])
+        assert gradients["youngs_modulus"]["soft"][b] == pytest.approx(by["youngs_modulus"]["soft"], rel=1e-12)
+        total += by["youngs_modulus"]["stiff"]
+    assert gradients["youngs_modulus"]["stiff"] == pytest.approx(total, rel=1e-12)
+    along = dict(soft=np.array([1e3, -2e3, 5e2]), stiff=-4e3)
+    change = batch.tangents(frames, youngs_modulus=along, poissons_ratio=dict(default=0.01))["positions"]
+    here = sum((gradients["youngs_modulus"][key] * dot).sum() for key, dot in along.items())
+    here += 0.01 * gradients["poissons_ratio"]["default"]
+    assert (change * seed).sum() == pytest.approx(here, rel=1e-11)
+    with pytest.raises(ValueError, match=r"youngs_modulus\['soft'\]: expected shape \(\), or \(3,\) for 3 scenes"):
+        batch.forward(youngs_modulus=dict(soft=[1.0, 2.0]))
+    with pytest.raises(ValueError, match="the mesh has no tetrahedron set"):
+        batch.forward(youngs_modulus=dict(hard=1e4))
+
+
 @pytest.mark.parametrize("lanes", [None, False], ids=["lanes", "by turns"])
 def test_tensors(lanes):
     batch = simple(3, gradients="all", lanes=lanes)

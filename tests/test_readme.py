@@ -4,6 +4,7 @@ import contextlib
 import io
 import re
 import shlex
+from itertools import dropwhile
 from pathlib import Path
 
 import areas
@@ -68,7 +69,7 @@ def commands(text: str) -> list[str]:
 
 def check(command: str) -> None:
     """That the program, the files of this repository and the options of a command exist; nothing is run."""
-    words = [word for word in shlex.split(command) if not re.match(r"\w+=", word)]
+    words = list(dropwhile(lambda word: re.match(r"\w+=", word), shlex.split(command)))
     program, *words = Path(words[0]).name, *words[1:]
     if program == "diffsim-ti":
         name, *options = words

@@ -1,12 +1,13 @@
 """Many scenes of one mesh, law and list of terms, whose numbers differ: forward, gradients and tangents at once."""
 
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.batch.frames import BatchFrames
+from diffsim_ti.batch.set_values import gathered_scenes, spread_scenes
 from diffsim_ti.batch.sweep import LanesSweep, Own, value_of
 from diffsim_ti.batch.workspace import why_not
 from diffsim_ti.checked import whole
@@ -31,8 +32,10 @@ class Batch:
 
     Every input of `forward` is given once for all scenes, in a shape that `Rollout.forward` takes, or with one more axis of
     length `scenes` in front. Gradients and tangents of inputs that were given once have their shape, gradients being summed
-    over scenes in their order; of others they have the leading axis. At equal steps the states of a scene are, bit for bit,
-    those of a `Rollout` of it alone, whatever its neighbours, its place among them and the number of threads.
+    over scenes in their order; of others they have the leading axis. Numbers of tetrahedra may be given by named sets, each
+    set once or with the axis, `youngs_modulus={"soft": [1e4, 2e4], "stiff": 1e6}`; gradients have the same names. At equal
+    steps the states of a scene are, bit for bit, those of a `Rollout` of it alone, whatever its neighbours, its place among
+    them and the number of threads.
 
     Scenes fail alone (`BatchFrames.alive`): the gradient of one that did is zero, with a warning. In lanes a failure is a
     frame that is not finite or whose vertices cross the body within a substep, or a vertex behind an obstacle; gains of
@@ -77,6 +80,15 @@ class Batch:
 
     # ---- inputs ------------------------------------------------------------------------------------------------------
 
+    def _spread(self, given: dict, bases: dict) -> tuple[dict, dict]:
+        """(values as arrays, {input given by named sets: (tetrahedra of each, those that scenes have of their own)})"""
+        out, sets = dict(given), {}
+        for name, value in given.items():
+            if isinstance(value, Mapping):
+                base = bases.get(name)
+                out[name], *sets[name] = spread_scenes(self.scene, name, base, value, self.num_scenes)
+        return out, sets
+
     def _values(self, given: dict) -> dict:
         """All values of a run: what was given, checked, and the scene's own."""
         inputs, out = self.scene.inputs, dict(self.one.sweep.values)
@@ -116,8 +128,10 @@ class Batch:
 
     def forward(self, raise_errors: bool = False, **inputs: ArrayLike) -> BatchFrames:
         """Run all scenes, with some inputs replaced. raise_errors: raise what stopped the first one that died."""
+        inputs, sets = self._spread(inputs, self.one.sweep.values)
         values = self._values(inputs)
         run = (self._in_lanes if self.lanes else self._by_turns)(values)
+        run.sets = sets
         dead = np.flatnonzero(~run.alive)
         if raise_errors and dead.size:
             raise run.error(int(dead[0]))
@@ -208,7 +222,10 @@ class Batch:
         dead = np.flatnonzero(~frames.alive)
         if dead.size:
             warnings.warn(f"scenes {dead.tolist()} did not come to their end: their gradients are zero", stacklevel=2)
-        return (self._vjp_in_lanes if self.lanes else self._vjp_by_turns)(frames, given)
+        out = (self._vjp_in_lanes if self.lanes else self._vjp_by_turns)(frames, given)
+        for name in out.keys() & frames.sets.keys():
+            out[name] = gathered_scenes(out[name], frames.values[name], *frames.sets[name])
+        return out
 
     def _vjp_in_lanes(self, frames: BatchFrames, given: dict) -> dict[str, np.ndarray]:
         shape = (self.num_scenes, *frames.positions.shape[1:])
@@ -269,6 +286,8 @@ class Batch:
         unknown = [name for name in tangents if name not in self.inputs]
         if unknown:
             raise ValueError(f"tangents: no input named {unknown[0]!r}; this batch has {', '.join(self.inputs)}")
+        zero = {name: np.zeros_like(value_of(frames.values[name], 0)) for name in tangents}
+        tangents, _ = self._spread(tangents, zero)
         own = [
             {name: self._row(name, x, frames.values[name], b) for name, x in tangents.items()}
             for b in range(self.num_scenes)

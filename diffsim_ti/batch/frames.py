@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from diffsim_ti.rollout.frames import Frames
 from diffsim_ti.rollout.run import Run
@@ -37,6 +38,7 @@ class BatchFrames(Sequence):
         self.times, self.last_good = frames[0].times, last_good
         self.alive = last_good == len(self.times) - 1
         self.outputs = {name: np.stack([one.outputs[name] for one in frames]) for name in frames[0].outputs}
+        self.sets: dict = {}  # inputs that were given by named sets
         self._errors: dict[int, Exception] = errors or {}
 
     def __len__(self) -> int:
@@ -55,13 +57,38 @@ class BatchFrames(Sequence):
     def end(self) -> dict[str, np.ndarray]:
         """The last states as inputs of a run that goes on from there, in float64: initial_positions, initial_velocities.
 
-        A control loop replaces the rows of scenes that start anew.
+        `reset` starts some scenes anew.
         """
         rest = np.stack([one.inputs["rest_positions"] for one in self._frames])
         return dict(
             initial_positions=rest + self.displacements[:, -1].astype(np.float64),
             initial_velocities=self.velocities[:, -1].astype(np.float64),
         )
+
+    def reset(
+        self, mask: ArrayLike | None = None, positions: ArrayLike | None = None, velocities: ArrayLike | None = None
+    ) -> dict[str, np.ndarray]:
+        """`end`, where the scenes of a mask (scenes,), default those that did not come to their end, start anew.
+
+        positions [m], velocities [m/s]: where and how, (n, 3) for all of these or (how many they are, n, 3); default the
+        start of the scene. Raises ValueError for other shapes, and for numbers that are not finite.
+        """
+        mask = ~self.alive if mask is None else np.asarray(mask)
+        if mask.shape != (len(self),) or mask.dtype != bool:
+            raise ValueError(
+                f"mask: expected {len(self)} booleans, one for each scene, got {mask.dtype} of {mask.shape}"
+            )
+        out, start = self.end, self._batch.scene.inputs.values
+        for name, given in (("initial_positions", positions), ("initial_velocities", velocities)):
+            rows = np.asarray(start[name] if given is None else given, np.float64)
+            shape = out[name].shape[1:]
+            if rows.shape not in (shape, (int(mask.sum()), *shape)) or not np.isfinite(rows).all():
+                raise ValueError(
+                    f"{name.removeprefix('initial_')}: expected finite numbers of shape {shape} or "
+                    f"{(int(mask.sum()), *shape)}, for the scenes that start anew, got {rows.shape}"
+                )
+            out[name][mask] = rows
+        return out
 
     @property
     def contact_resolution(self) -> list[ContactResolution]:

@@ -15,6 +15,7 @@ import taichi as ti
 from taichi._lib import core as _core
 from taichi.lang import impl
 
+from diffsim_ti import ranks
 from diffsim_ti.runtime.device import count_cards
 from diffsim_ti.runtime.threads import LOCK, materialize
 
@@ -41,7 +42,7 @@ def init(arch: str = "cpu", precision: str = "f32", threads: int | None = None, 
 
     arch: "cpu", "cuda" or "vulkan"; a backend that is not there is an error, never a fall-back.
     precision: "f32" or "f64", what a Scene uses unless it says otherwise.
-    threads: CPU threads, default all.
+    threads: CPU threads, default all; of several ranks on one machine each takes its share.
     options: handed to `ti.init`. `fast_math` stays False because it erases NaNs before anyone can see them, and
     `default_fp` stays f64 so that both precisions can live in one process.
 
@@ -71,6 +72,7 @@ def init(arch: str = "cpu", precision: str = "f32", threads: int | None = None, 
         _settings["folder"] = folder  # until the end of this process
         options |= dict(offline_cache=False, offline_cache_file_path=folder)
         os.environ.pop("TI_OFFLINE_CACHE_FILE_PATH", None)
+    threads = ranks.share_of_cores() if threads is None else threads
     if threads is not None:
         options["cpu_max_num_threads"] = int(threads)
     set_precision(precision)

@@ -6,6 +6,7 @@ from diffsim_ti.study.problems import PROBLEMS, problem
 from diffsim_ti.study.recommend import recommend
 from diffsim_ti.study.recommendation import Recommendation
 from diffsim_ti.study.stability_map import StabilityMap, boundary, power_limit, stability_map
+from diffsim_ti.study.sweep import Settings, Sweep, sweep
 from diffsim_ti.study.work_precision import Chart, Point, chart, pareto_front
 
 __all__ = [
@@ -15,7 +16,9 @@ __all__ = [
     "Point",
     "Problem",
     "Recommendation",
+    "Settings",
     "StabilityMap",
+    "Sweep",
     "boundary",
     "chart",
     "growth",
@@ -24,4 +27,5 @@ __all__ = [
     "problem",
     "recommend",
     "stability_map",
+    "sweep",
 ]

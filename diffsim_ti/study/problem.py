@@ -1,11 +1,12 @@
 """Problem: a scene with a number to get right, to be run by many solvers, steps and meshes."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.copies import made_again
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.scene import Scene
 
@@ -64,6 +65,7 @@ class Problem:
     largest_step [s]: steps to start from, where the stable one does not say (contact to come).
     static: an equilibrium; only StaticSolver takes part.
     levels: steps per solver, each half the last.
+    origin: (function, arguments) that make it again in another process, where it does not pickle otherwise.
     """
 
     name: str
@@ -84,6 +86,14 @@ class Problem:
     largest_step: float = np.inf
     static: bool = False
     levels: int = 3
+    origin: tuple | None = None
+
+    def __reduce__(self):
+        given = {field.name: getattr(self, field.name) for field in fields(self)}
+        if self.origin is None:
+            return made_again, (Problem, given)
+        plain = ("duration", "frames", "cells", "patterns", "elements", "reference_cells", "largest_step", "levels")
+        return _again, (self.origin, {name: given[name] for name in plain})
 
     @property
     def differentiates(self) -> bool:
@@ -111,6 +121,7 @@ class Problem:
         """
         if not duration > 0:
             raise ValueError(f"duration must be > 0 [s], got {duration:g}")
+        origin = cls.of_scene, (scene, duration, name, frames, gradient)
         if gradient is not None and gradient not in scene.inputs.values:
             raise ValueError(f"no input named {gradient!r}; this scene has {', '.join(scene.inputs.values)}")
 
@@ -127,9 +138,8 @@ class Problem:
 
         title = f"{name}: {scene.mesh.num_tetrahedra} tetrahedra, {duration:g} s"
         if gradient is None:
-            return cls(
-                name, title, "error of motion", build, duration, moved, frames, cells=(0,), patterns=("own mesh",)
-            )
+            own = dict(cells=(0,), patterns=("own mesh",), origin=origin)
+            return cls(name, title, "error of motion", build, duration, moved, frames, **own)
         return cls(
             f"{name}-{gradient}",
             title,
@@ -142,7 +152,13 @@ class Problem:
             inputs=(gradient,),
             cells=(0,),
             patterns=("own mesh",),
+            origin=origin,
         )
+
+
+def _again(origin: tuple, changed: dict) -> Problem:
+    make, arguments = origin
+    return replace(make(*arguments), **changed)
 
 
 def distance(problem: Problem, quantity: ArrayLike, exact: ArrayLike) -> float:

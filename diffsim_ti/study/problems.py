@@ -1,6 +1,7 @@
 """The built-in problems: closed forms where there are some, else converged references."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -337,4 +338,4 @@ def problem(name: str) -> Problem:
     """A built-in problem by its name."""
     if name not in PROBLEMS:
         raise ValueError(f"no problem is called {name!r}; there are {', '.join(PROBLEMS)}")
-    return PROBLEMS[name]()
+    return replace(PROBLEMS[name](), origin=(problem, (name,)))

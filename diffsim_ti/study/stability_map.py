@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,7 @@ from diffsim_ti.simulator import Simulator
 from diffsim_ti.solvers import SOLVERS
 from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.solvers.stable_step import start_workspace
+from diffsim_ti.study.executors import each
 from diffsim_ti.terms import Ground, SelfContact, Term
 from diffsim_ti.terms.obstacles.obstacle import Obstacle
 from diffsim_ti.terms.obstacles.stiffness import stiffness_of_impact
@@ -309,21 +311,25 @@ def stability_map(
     steps: int | None = None,
     find_bounds: bool = False,
     show: Callable = lambda note: None,
+    executor: Executor | None = None,
 ) -> StabilityMap:
     """Judge a solver at every share of the explicit limit and every value of the axis.
 
     shares: of the explicit limit at the start of each scene; default SHARES. steps: per run, default 200, implicit 40.
     find_bounds: of explicit solvers also look by bisection where they stop being bounded.
+    executor: any `concurrent.futures.Executor`, which takes a value of the axis at a time; the map is the same.
     """
     shares = np.array(SHARES[kind.explicit] if shares is None else shares)
     steps = (200 if kind.explicit else 40) if steps is None else steps
-    limits, bounds, columns = [], [], []
-    for value in axis:
-        show(f"{kind.__name__}, {axis.name} {value:g}")
-        scene = axis.scene(value)
-        limits.append(power_limit(scene))
-        columns.append([judge(scene, kind, share * limits[-1], steps) for share in shares])
-        bounds.append(boundary(scene, kind) if find_bounds and kind.explicit else np.nan)
-    return StabilityMap(
-        kind.__name__, axis, shares, np.array(limits), [list(row) for row in zip(*columns)], np.array(bounds)
-    )
+    calls = [(axis.scene(value), kind, tuple(shares), steps, find_bounds and kind.explicit) for value in axis]
+    named = lambda done, note="": show(f"{kind.__name__}, {axis.name}: {done} of {len(calls)}")  # noqa: E731
+    limits, columns, bounds = zip(*each(executor, _column, calls, named))
+    rows = [list(row) for row in zip(*columns)]
+    return StabilityMap(kind.__name__, axis, shares, np.array(limits), rows, np.array(bounds))
+
+
+def _column(scene: Scene, kind: type[Solver], shares: tuple, steps: int, find_bound: bool) -> tuple:
+    """(limit [s], a Run for each share of it, where boundedness ends [s]) of a scene."""
+    limit = power_limit(scene)
+    runs = [judge(scene, kind, share * limit, steps) for share in shares]
+    return limit, runs, boundary(scene, kind) if find_bound else np.nan

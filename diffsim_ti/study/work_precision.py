@@ -3,6 +3,7 @@
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 
@@ -13,6 +14,7 @@ from diffsim_ti.rollout import Rollout
 from diffsim_ti.scene import Scene
 from diffsim_ti.solvers import SOLVERS, StaticSolver, VelocityVerletSolver, stable_dt
 from diffsim_ti.solvers.solver import Solver
+from diffsim_ti.study.executors import each
 from diffsim_ti.study.problem import ELEMENTS, Problem, distance
 
 # wall time per tetrahedron and substep, before anything was measured [s]; with gradients three times as much
@@ -299,12 +301,15 @@ def chart(
     limit: float = 1.0,
     quick: bool = False,
     say: Callable = lambda line: None,
+    executor: Executor | None = None,
 ) -> Chart:
     """Run a problem by every solver, step, precision and mesh, and measure time and error.
 
     solvers: classes; default all. levels: steps per solver, each half the last; default the problem's.
     repeats: timed rounds, the best counts.
     limit [s]: runs expected to take longer are left out, and named. quick: small meshes, float32.
+    executor: any `concurrent.futures.Executor`, which takes a mesh at a time; errors are the same, and times are comparable
+    where its workers do not share cores.
     say: called with what the chart will do and how long that takes. Raises ValueError for a problem no solver can do.
     """
     levels = levels or problem.levels
@@ -316,14 +321,25 @@ def chart(
     runs = Runs(problem, solvers, precisions, levels, repeats, limit)
     meshes = runs.meshes()
     say(f"{problem.title}: {len(meshes)} meshes, about {runs.estimate():.0f} s of runs, and compiling before them")
-    points, right, own_error = [], None, 0.0
+    right, own_error = None, 0.0
     with progress(problem.name, len(meshes) + 1) as show:
         show(0, "reference")
         if problem.exact is not None or problem.reference_cells:
             right, own_error = reference(problem)
-        for k, mesh in enumerate(meshes):
-            if problem.exact is None and not problem.reference_cells:
-                right, error = reference(problem, mesh[0], mesh[1])
-                own_error = max(own_error, error)
-            points += runs.measure(mesh, right, lambda note, k=k: show(k + 1, note))
-    return Chart(problem, [], own_error, runs.left_out).with_points(points)
+        if executor is None:
+            parts = [_of_mesh(runs, m, right, lambda note, k=k: show(k + 1, note)) for k, m in enumerate(meshes)]
+        else:
+            parts = each(executor, _of_mesh, [(runs, mesh, right) for mesh in meshes], show)
+    left_out = runs.left_out if executor is None else [line for *_, lines in parts for line in lines]
+    points = [point for part, *_ in parts for point in part]
+    return Chart(problem, [], max(own_error, *(error for _, error, _ in parts)), left_out).with_points(points)
+
+
+def _of_mesh(
+    runs: Runs, mesh: tuple, right: np.ndarray | None, show: Callable = lambda note: None
+) -> tuple[list[Point], float, list[str]]:
+    """(points of a mesh, its reference's own error, what was left out); right: numbers that do not depend on the mesh."""
+    error = 0.0
+    if right is None:
+        right, error = reference(runs.problem, mesh[0], mesh[1])
+    return runs.measure(mesh, right, show), error, runs.left_out

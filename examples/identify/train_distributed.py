@@ -1,28 +1,26 @@
-"""Gradients of an ensemble of rollouts, shared among processes: how the work outgrows one machine.
+"""E and nu from an ensemble of throws that processes share: how the work outgrows one machine.
 
-Each process simulates its share of an ensemble of throws and all average their gradients; every process then takes the same
-optimiser step. Rank 0 also computes the whole ensemble alone and compares; it keeps the state file, from which all ranks go
-on, and draws the picture.
+Each process simulates its share; losses and gradients are summed in the order of throws, so the result has the same bits
+on any number of processes. A process that dies is started again with the others, from the state of the last iteration.
 
-    torchrun --nproc_per_node=2 examples/identify/train_distributed.py
+    torchrun --nproc_per_node=2 --max-restarts=3 examples/identify/train_distributed.py
 """
 
 import argparse
 import json
 import os
-import time
 from pathlib import Path
 
 import torch
-import torch.distributed as dist
 
-from diffsim_ti import TetrahedralMesh
+import diffsim_ti as ds
 from diffsim_ti.diff_physics import DifferentiableMaterial, TorchMaterial
 from diffsim_ti.diff_simulator import DifferentiableSimulator, DifferentiableSolver
-from diffsim_ti.optimization import load_state, save_state
+from diffsim_ti.optimization import Optimization
 from diffsim_ti.picture import save_picture
 
-MEMBERS, TRUE_E, TRUE_NU = 4, 8e4, 0.35
+TRUE_E, TRUE_NU = 8e4, 0.35
+THROWS = [(3, 0), (3, 1), (4, 2), (2, 3)]  # vertices along an edge of the body, seed of its velocity
 
 
 class LogMaterial(TorchMaterial):
@@ -36,105 +34,65 @@ class LogMaterial(TorchMaterial):
         return self.log_E.exp()
 
 
-class Ensemble:
-    """Throws of one body held at its left, each member with its own velocity."""
+class Throw:
+    """A body held at its left, with a velocity of its own, and how it moved."""
 
-    def __init__(self, material):
-        self.mesh = TetrahedralMesh.create_cube(3, 0.4)
+    def __init__(self, material, resolution: int, seed: int):
+        self.mesh = ds.TetrahedralMesh.create_cube(resolution, 0.4)
+        random = torch.Generator().manual_seed(seed)
+        self.velocity = torch.randn(3, generator=random, dtype=torch.float64) * torch.tensor(self.mesh.vertices[:, :1])
         solver = DifferentiableSolver(dt=0.01, gravity=-9.8, damping=0.97, substeps=8)
         true = DifferentiableMaterial(torch.tensor(TRUE_E, dtype=torch.float64), TRUE_NU)
         options = dict(fixed_vertices="xmin", contact=False)
-        self.real, self.ours = (DifferentiableSimulator(self.mesh, m, solver, **options) for m in (true, material))
+        real, self.ours = (DifferentiableSimulator(self.mesh, m, solver, **options) for m in (true, material))
         with torch.no_grad():
-            self.targets = [self.motion(self.real, k) for k in range(MEMBERS)]
+            self.target = self.motion(real)
 
-    def motion(self, simulator, member: int) -> torch.Tensor:
-        random = torch.Generator().manual_seed(member)
-        velocity = torch.randn(3, generator=random, dtype=torch.float64) * torch.tensor(self.mesh.vertices[:, :1])
-        simulator.reset(velocities=velocity)
+    def motion(self, simulator=None) -> torch.Tensor:
+        simulator = simulator or self.ours
+        simulator.reset(velocities=self.velocity)
         return simulator.rollout(15, save_every=5).displacements
 
-    def loss(self, member: int) -> torch.Tensor:
-        target = self.targets[member]
-        return (self.motion(self.ours, member) - target).square().mean() / target.square().mean()
+    def loss(self) -> torch.Tensor:
+        return (self.motion() - self.target).square().mean() / self.target.square().mean() / len(THROWS)
 
 
 def main(folder="output", iterations: int = 80) -> dict:
-    dist.init_process_group("gloo")
-    rank, world = dist.get_rank(), dist.get_world_size()
     material = LogMaterial(1.5e5, 0.25)
-    ensemble, parameters = Ensemble(material), list(material.parameters())
-    optimizer = torch.optim.Adam(parameters, lr=0.05)
-
-    def gradients(members) -> list[torch.Tensor]:
-        optimizer.zero_grad()
-        sum(ensemble.loss(k) for k in members).backward()
-        return [p.grad.clone() / MEMBERS for p in parameters]
-
+    ensemble = ds.Ensemble(THROWS, lambda throw: Throw(material, *throw), costs=[n**3 for n, _ in THROWS])
     path = folder and Path(folder) / "train_distributed.state"
-    state = load_state(path, ensemble.mesh) if path else None  # every rank reads the same file
-    first, seconds, difference = 0, 0.0, 0.0
-    if state is not None:
-        first, seconds, difference = state["iteration"], state["seconds"], state["difference"]
-        material.load_state_dict(state["module"])
-        optimizer.load_state_dict(state["optimizer"])
-    dist.barrier()  # nobody writes before all have read
-
-    start = time.perf_counter()
-    for iteration in range(first, iterations):
-        shares = gradients(range(rank, MEMBERS, world))
-        for share in shares:
-            dist.all_reduce(share)
-        if rank == 0 and iteration % 10 == 0:
-            whole = gradients(range(MEMBERS))
-            difference = max(difference, *(abs(a / b - 1).item() for a, b in zip(shares, whole)))
-        for parameter, share in zip(parameters, shares):
-            parameter.grad = share
-        optimizer.step()
-        if path and rank == 0 and ((iteration + 1) % 10 == 0 or iteration + 1 == iterations):
-            save_state(
-                path,
-                ensemble.mesh,
-                dict(
-                    iteration=iteration + 1,
-                    seconds=seconds + time.perf_counter() - start,
-                    difference=difference,
-                    module=material.state_dict(),
-                    optimizer=optimizer.state_dict(),
-                ),
-            )
-    every = [torch.zeros(2, dtype=torch.float64) for _ in range(world)]
-    dist.all_gather(every, torch.stack([p.detach() for p in parameters]))
+    mesh = ds.TetrahedralMesh.create_cube(THROWS[0][0], 0.4)
+    optimization = Optimization(material, torch.optim.Adam(material.parameters(), lr=0.05), mesh, path)
+    optimization.run(lambda: ensemble.loss(Throw.loss, material), iterations, title="train")
     result = dict(
-        processes=world,
-        difference_from_serial=difference,
-        ranks_agree=all(torch.equal(every[0], x) for x in every),
+        processes=ensemble.num_ranks,
+        restarts=int(os.environ.get("TORCHELASTIC_RESTART_COUNT", 0)),
         E=material.E.item(),
         nu=material.nu.item(),
         E_error=abs(material.E.item() / TRUE_E - 1),
         nu_error=abs(material.nu.item() / TRUE_NU - 1),
+        loss=optimization.losses[-1],
         iterations=iterations,
-        seconds=seconds + time.perf_counter() - start,
+        seconds=optimization.seconds,
     )
-    dist.destroy_process_group()
-    if rank == 0:
+    if ensemble.is_first:
         print(json.dumps(result))
-        if folder:
-            with torch.no_grad():
-                u = ensemble.motion(ensemble.ours, 0)[-1]
-            save_picture(
-                Path(folder) / "train_distributed.png",
-                ensemble.mesh,
-                ensemble.mesh.vertices + u.numpy(),
-                u.norm(dim=1).numpy(),
-                "displacement [m]",
-                title=f"E = {result['E']:.4g} Pa, nu = {result['nu']:.3f}",
-            )
+    if ensemble.is_first and folder:
+        throw = ensemble.member(0)
+        with torch.no_grad():
+            u = throw.motion()[-1]
+        save_picture(
+            Path(folder) / "train_distributed.png",
+            throw.mesh,
+            throw.mesh.vertices + u.numpy(),
+            u.norm(dim=1).numpy(),
+            "displacement [m]",
+            title=f"E = {result['E']:.4g} Pa, nu = {result['nu']:.3f}",
+        )
     return result
 
 
 if __name__ == "__main__":
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--folder", default="output", help="where state and picture go")
     parser.add_argument("--iterations", type=int, default=80)
