@@ -103,7 +103,7 @@ def smoothed(mesh: TetrahedralMesh, gradient: ArrayLike, length: float) -> np.nd
 
 
 def rest_volume(mesh: TetrahedralMesh, positions: ArrayLike) -> tuple[float, np.ndarray]:
-    """(volume [m^3] of the mesh's linear tetrahedra at these positions, its gradient [m^2], (num_vertices, 3))."""
+    """(volume [m^3] of the mesh's linear tetrahedra at these positions [m], its gradient [m^2], (num_vertices, 3))."""
     positions = np.asarray(positions, np.float64)
     V = signed_volumes(edge_matrices(positions, mesh.tetrahedra))
     G = shape_gradients(inverse_edges(positions, mesh.tetrahedra)) * V[:, None, None]
@@ -113,7 +113,7 @@ def rest_volume(mesh: TetrahedralMesh, positions: ArrayLike) -> tuple[float, np.
 
 
 def smallest_ratio(mesh: TetrahedralMesh, positions: ArrayLike) -> float:
-    """Smallest J of the map from the mesh to these rest positions, by its linear tetrahedra; 1 for the mesh itself."""
+    """Smallest J of the map from the mesh to these rest positions [m], by its linear tetrahedra; 1 for the mesh itself."""
     ratios = signed_volumes(edge_matrices(np.asarray(positions, np.float64), mesh.tetrahedra))
     return float((ratios / signed_volumes(edge_matrices(mesh.vertices, mesh.tetrahedra))).min())
 

@@ -129,6 +129,7 @@ class DifferentiableSimulator:
 
     @property
     def dtype(self) -> torch.dtype:
+        """Precision of the material's tensors, in which states are given."""
         return next(iter(self.material.tensors(self.mesh).values())).dtype
 
     @property

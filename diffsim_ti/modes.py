@@ -20,7 +20,8 @@ SMALL, DENSE = 1e-8, 600  # of the largest eigenvalue: zero; unknowns up to whic
 class Modes:
     """frequencies [Hz], ascending, shape (k,), negative where the state is unstable (lambda < 0: -sqrt(-lambda) / 2 pi);
     eigenvalues lambda = (2 pi f)^2 [1/s^2]; shapes [1/sqrt(kg)], (k, num_vertices, 3), with shapes_i . M shapes_j = 1 where
-    i = j, else 0; groups: lists of modes whose frequencies coincide, whose mean alone has a gradient."""
+    i = j, else 0; groups: lists of modes whose frequencies coincide, whose mean alone has a gradient;
+    scene and displacements [m]: about what state they are."""
 
     frequencies: np.ndarray
     eigenvalues: np.ndarray

@@ -197,6 +197,7 @@ class GradientReport:
 
     @property
     def passed(self) -> bool:
+        """Whether every row did."""
         return all(row.passed for row in self.rows)
 
     def __str__(self) -> str:

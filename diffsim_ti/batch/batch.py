@@ -23,7 +23,7 @@ from diffsim_ti.state.schedule import UnequalSteps
 class Batch:
     """`scenes` runs of a solver's scene at once, with numbers of their own where they are given with a leading axis.
 
-    solver, steps, save_every, outputs, gradients, truncate, memory: as of `Rollout`; memory is that of all scenes.
+    solver, steps, save_every, outputs, gradients, truncate, memory: as of `Rollout`; memory [MB] is that of all scenes.
     scenes: how many, >= 1.
     lanes: None, eight scenes at once in the lanes of vector units where the scene allows it, else one after the other;
     True: ValueError, which says why, where it does not; False: one after the other. `lanes` then says which it is, and

@@ -177,10 +177,12 @@ class TetrahedralMesh(NamedSets, Elements):
 
     @property
     def num_vertices(self) -> int:
+        """How many vertices there are, those that no tetrahedron uses included."""
         return len(self._vertices)
 
     @property
     def num_tetrahedra(self) -> int:
+        """How many tetrahedra, of four or ten nodes, there are."""
         return len(self._tetrahedra)
 
     @property

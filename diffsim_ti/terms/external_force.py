@@ -17,6 +17,8 @@ class ExternalForce(Term):
     vertices: which k vertices, as indices or the name of a vertex set; None means all. A single vector of 3 is laid
     on each of them. Per-step forces hold during one step dt; a run longer than the list is an error.
     Input with gradient: "external_forces", of the shape given, or "<name>.forces". Several in a scene add up.
+    Raises ValueError for other shapes, unknown sets, and a run longer than the list.
+    Belytschko, Liu, Moran, Nonlinear Finite Elements for Continua and Structures, 2000, sec. 4.4.
     """
 
     dead = sums_itself = True

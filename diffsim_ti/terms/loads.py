@@ -15,7 +15,12 @@ from diffsim_ti.terms.term import Term
 
 
 class Load(Term):
-    """An amount per area or volume, over time. A scene may list several of a kind: they add up."""
+    """An amount per area or volume, over time. A scene may list several of a kind: they add up.
+
+    Subclasses say what it is: its `argument`, what was `given`, its `unit` and its plain name.
+    Bonet, Wood 2008, Nonlinear Continuum Mechanics for Finite Element Analysis, 2nd ed., 9.4,
+    doi:10.1017/CBO9780511755446.
+    """
 
     num_numbers = 0  # what kernels read of it lies in arrays of its own
     shape: tuple = ()  # of the amount

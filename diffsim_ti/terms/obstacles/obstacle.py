@@ -127,6 +127,7 @@ class Obstacle(Term):
 
     @property
     def has_friction(self) -> bool:
+        """Whether friction was given: without, none is compiled."""
         return "friction" in self.values
 
     def settled(self, scene, density, initial_positions, initial_velocities) -> "Obstacle":
