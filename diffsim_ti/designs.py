@@ -16,6 +16,13 @@ class Cage:
     shape: points of the lattice along x, y, z, at least 2 each, over the mesh's bounding box; d has shape (*shape, 3) [m].
     B are products of Bernstein polynomials. For meshes of any order; `vjp` takes gradients by rest_positions.
     Sederberg, Parry 1986, doi:10.1145/15886.15903.
+
+    >>> import diffsim_ti as ds
+    >>> import numpy as np
+    >>> from diffsim_ti.designs import Cage
+    >>> cage = Cage(ds.TetrahedralMesh.create_cube(resolution=2), (2, 2, 2))
+    >>> bool(np.allclose(cage.value(np.full((8, 3), 0.25)), cage.mesh.vertices + 0.25))  # all control points alike
+    True
     """
 
     def __init__(self, mesh: TetrahedralMesh, shape: tuple[int, int, int]):

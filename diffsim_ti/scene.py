@@ -78,6 +78,15 @@ class Scene(MadeAgain):
 
     Raises ValueError with rule, value and remedy for anything that does not fit, before any kernel runs. Warns where
     tetrahedra lock, above Poisson's ratio 0.45.
+
+    >>> import diffsim_ti as ds
+    >>> mesh = ds.TetrahedralMesh.create_cube(resolution=2)
+    >>> material = ds.StableNeoHookean(E=1e5, nu=0.3)
+    >>> scene = ds.Scene(mesh, material, density=1200.0, terms=[ds.Gravity(), ds.Drag(2.0)], fixed="ymin", precision="f64")
+    >>> list(scene.inputs.described)[2:]
+    ['youngs_modulus', 'poissons_ratio', 'density', 'gravity', 'drag_rate', 'rest_positions']
+    >>> print(f"{scene.mass_matrix().diagonal().sum() / 3:.1f} kg")
+    1200.0 kg
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Reference pages from the docstrings, by pdoc: python docs/make.py [FOLDER], default docs/html; not kept in the repository."""
+"""Reference pages from the docstrings, by pdoc: python docs/make.py [FOLDER], default docs/html, which git ignores."""
 
 import re
 import sys

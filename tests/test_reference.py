@@ -42,7 +42,14 @@ UNITS = {
 UNIT_OF = {name: unit for unit, names in UNITS.items() for name in names.split()}
 # these words mean something else, without a unit or with that of something else, in these places
 OTHERWISE = {
-    *("HalfSpace.normal", "square.normal", "Spring.start", "Unknown.start", "smooth_step.width", "Identifiability.eigenvalues"),
+    *(
+        "HalfSpace.normal",
+        "square.normal",
+        "Spring.start",
+        "Unknown.start",
+        "smooth_step.width",
+        "Identifiability.eigenvalues",
+    )
 }
 SOURCE = re.compile(r"doi:|arXiv|\b1[6-9]\d\d\b|\b20\d\d\b|sec(tion|\.) \d|ch(apter|\.) \d")
 
@@ -96,7 +103,9 @@ def test_every_name_has_a_docstring():
     for name, kind in PUBLIC.items():
         if inspect.isclass(kind):
             told = words(kind.__doc__ or "")  # a class may name its parts itself
-            missing += [f"{name}.{part}" for part in parts(kind) if not inspect.getdoc(getattr(kind, part)) and part not in told]
+            missing += [
+                f"{name}.{part}" for part in parts(kind) if not inspect.getdoc(getattr(kind, part)) and part not in told
+            ]
     assert not missing, f"{len(missing)}: {missing}"
 
 
@@ -181,8 +190,12 @@ def test_example(name):
 
 
 def test_chief_entries_have_an_example():
-    chief = "TetrahedralMesh Scene Simulator Rollout Batch identify check_gradients modes stable_dt UnequalSteps".split()
-    chief += "StableNeoHookean Gravity Traction Spring Ground VelocityVerletSolver ImplicitEulerSolver StaticSolver".split()
+    chief = (
+        "TetrahedralMesh Scene Simulator Rollout Batch identify check_gradients modes stable_dt UnequalSteps".split()
+    )
+    chief += (
+        "StableNeoHookean Gravity Traction Spring Ground VelocityVerletSolver ImplicitEulerSolver StaticSolver".split()
+    )
     chief += "Reaction Stress MaterialPoints EnclosedVolume Cage DifferentiableMaterial DifferentiableSimulator".split()
     assert {*chief} <= {*examples()}, {*chief} - {*examples()}
 

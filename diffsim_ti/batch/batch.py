@@ -40,6 +40,15 @@ class Batch:
 
     Freeman et al. 2021, Brax (leading axes of scenes), arXiv:2106.13281.
     Raises ValueError for shapes that fit neither, or both, saying which there are.
+
+    >>> import diffsim_ti as ds
+    >>> mesh = ds.TetrahedralMesh.create_cube(resolution=2)
+    >>> material = ds.StableNeoHookean(E=1e5, nu=0.3)
+    >>> scene = ds.Scene(mesh, material, terms=[ds.Gravity()], precision="f64")
+    >>> batch = ds.Batch(ds.VelocityVerletSolver(scene, dt=1e-3), steps=10, scenes=2)
+    >>> frames = batch.forward(gravity=[[0.0, -9.81, 0.0], [0.0, -1.62, 0.0]])  # on earth and on the moon
+    >>> frames.displacements[:, -1, 0, 1].round(7).tolist()
+    [-0.0004905, -8.1e-05]
     """
 
     def __init__(

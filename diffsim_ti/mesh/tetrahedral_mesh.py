@@ -44,6 +44,12 @@ class TetrahedralMesh(NamedSets, Elements):
     tetrahedron, flat, inside-out, repeated or overlapping tetrahedra, a face of more than two tetrahedra, curved elements
     that are not one to one, and mid-edge vertices in another order. Warns (UserWarning) of vertices that no tetrahedron
     uses and of slivers. All thresholds are relative to the tetrahedron.
+
+    >>> import diffsim_ti as ds
+    >>> corners = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
+    >>> mesh = ds.TetrahedralMesh(corners, [[0, 1, 2, 3]], vertex_sets={"floor": [0, 1, 3]})
+    >>> print(f"{mesh.volumes[0]:.4f} m^3, {len(mesh.surface_triangles)} faces, held: {mesh.vertex_indices('floor')}")
+    0.1667 m^3, 4 faces, held: [0 1 3]
     """
 
     def __init__(

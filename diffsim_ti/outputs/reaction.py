@@ -36,6 +36,14 @@ class Reaction(Output):
 
     Raises ValueError for a support that is not held, for a law with a state, or for about= and per_vertex=True together.
     Belytschko, Liu, Moran, Nonlinear Finite Elements for Continua and Structures, 2000, sec. 4.4.
+
+    >>> import diffsim_ti as ds
+    >>> mesh = ds.TetrahedralMesh.create_cube(resolution=2)
+    >>> material = ds.StableNeoHookean(E=1e5, nu=0.3)
+    >>> scene = ds.Scene(mesh, material, terms=[ds.Gravity()], fixed="ymin", precision="f64")
+    >>> frames = ds.Rollout(ds.StaticSolver(scene), steps=1, outputs=[ds.Reaction("ymin")]).forward()
+    >>> print(f"{frames['reaction'][-1, 1]:.3f} N")  # the weight
+    9810.000 N
     """
 
     unit, reads_chamber_pressures = "N", True

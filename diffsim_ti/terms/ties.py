@@ -139,6 +139,14 @@ class Spring(Tie):
     Raises ValueError for numbers of points that do not fit, points outside the body, stiffness or length below zero, and
     rest_length together with tension.
     Zienkiewicz, Taylor 2000, The Finite Element Method, vol. 2, 5th ed., sec. 10.2 (bars at large displacements).
+
+    >>> import diffsim_ti as ds
+    >>> mesh = ds.TetrahedralMesh.create_cube(resolution=2)
+    >>> material = ds.StableNeoHookean(E=1e5, nu=0.3)
+    >>> spring = ds.Spring(7, ds.Anchor([1.0, 1.0, 1.5]), stiffness=40.0, rest_length=0.25, name="tie")
+    >>> scene = ds.Scene(mesh, material, terms=[spring], fixed="ymin", precision="f64")
+    >>> print(mesh.vertices[7], scene.terms[0].values["spring_stiffness"])
+    [1. 1. 1.] 40.0
     """
 
     def __init__(
