@@ -80,8 +80,7 @@ class Scene(MadeAgain):
     tetrahedra lock, above Poisson's ratio 0.45.
 
     >>> import diffsim_ti as ds
-    >>> mesh = ds.TetrahedralMesh.create_cube(resolution=2)
-    >>> material = ds.StableNeoHookean(E=1e5, nu=0.3)
+    >>> mesh, material = ds.TetrahedralMesh.create_cube(resolution=2), ds.StableNeoHookean(E=1e5, nu=0.3)
     >>> scene = ds.Scene(mesh, material, density=1200.0, terms=[ds.Gravity(), ds.Drag(2.0)], fixed="ymin", precision="f64")
     >>> list(scene.inputs.described)[2:]
     ['youngs_modulus', 'poissons_ratio', 'density', 'gravity', 'drag_rate', 'rest_positions']

@@ -47,9 +47,7 @@ def main(folder: str = str(HERE / "html")) -> None:
 
     pdoc.doc._remove_collections_abc = short
     pdoc.docstrings.convert = lambda docstring, *_: literal(docstring)
-    pdoc.render.configure(
-        template_directory=HERE, show_source=False, include_undocumented=False, footer_text="SI units throughout"
-    )
+    pdoc.render.configure(template_directory=HERE, show_source=False, footer_text="SI units throughout")
     pdoc.pdoc(*MODULES, output_directory=Path(folder))
 
 
