@@ -3,6 +3,10 @@
 Nothing else in the package touches `taichi.lang.impl` or `taichi._lib`.
 """
 
+from diffsim_ti.runtime.quadrants import QUADRANTS, stand_in
+
+stand_in()
+
 from diffsim_ti.runtime.arrays import (
     allocated_megabytes,
     array,
@@ -22,7 +26,6 @@ from diffsim_ti.runtime.kernels import LANES, ROWS, Kernel, array_types, kernels
 from diffsim_ti.runtime.language import Bundle, assign, at, each_lane, let, spread, traced, variable
 from diffsim_ti.runtime.launch import Launch, TensorLaunch
 from diffsim_ti.runtime.repeated_loops import can_repeat
-from diffsim_ti.runtime.sources import trace_faster as _trace_faster
 from diffsim_ti.runtime.start import (
     NUMPY,
     PRECISIONS,
@@ -40,5 +43,8 @@ from diffsim_ti.runtime.start import (
 )
 from diffsim_ti.runtime.threads import take_turns as _take_turns
 
-_trace_faster()
+if not QUADRANTS:
+    from diffsim_ti.runtime.sources import trace_faster as _trace_faster
+
+    _trace_faster()
 _take_turns()

@@ -1,0 +1,28 @@
+"""Quadrants, a maintained fork of Taichi, in Taichi's place where DIFFSIM_TI_TAICHI=quadrants asks for it."""
+
+import importlib
+import os
+import sys
+
+
+QUADRANTS = os.environ.get("DIFFSIM_TI_TAICHI") == "quadrants"
+
+
+def stand_in() -> None:
+    """Make `import taichi`, here and in programs that import diffsim_ti first, mean the code that was chosen.
+
+    Raises ImportError for another name, and where Taichi was imported before.
+    """
+    chosen = os.environ.get("DIFFSIM_TI_TAICHI", "taichi")
+    if chosen == "taichi":
+        return
+    if chosen != "quadrants":
+        raise ImportError(f"DIFFSIM_TI_TAICHI must be taichi or quadrants, got {chosen!r}")
+    known = sys.modules.get("taichi")
+    if known is not None and known.__name__ != "quadrants":
+        raise ImportError("DIFFSIM_TI_TAICHI=quadrants: import diffsim_ti before taichi")
+    importlib.import_module("quadrants")
+    for name, module in [*sys.modules.items()]:
+        if name == "quadrants" or name.startswith("quadrants."):
+            sys.modules["taichi" + name.removeprefix("quadrants")] = module
+    sys.modules["taichi.lang.enums"] = importlib.import_module("quadrants.types.enums")  # where it has gone
