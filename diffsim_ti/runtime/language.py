@@ -9,7 +9,7 @@ from taichi.types import vector
 def traced(function):
     """Mark a plain Python function that kernels may call: it runs while the kernel is compiled and builds its code."""
     function._is_taichi_function = function._is_quadrants_function = True  # what Taichi, and Quadrants, looks at
-    function.func = SimpleNamespace(has_print=False)
+    function.func = function.wrapper = SimpleNamespace(has_print=False)
     return function
 
 

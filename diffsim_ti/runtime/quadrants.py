@@ -4,7 +4,6 @@ import importlib
 import os
 import sys
 
-
 QUADRANTS = os.environ.get("DIFFSIM_TI_TAICHI") == "quadrants"
 
 
@@ -26,3 +25,11 @@ def stand_in() -> None:
         if name == "quadrants" or name.startswith("quadrants."):
             sys.modules["taichi" + name.removeprefix("quadrants")] = module
     sys.modules["taichi.lang.enums"] = importlib.import_module("quadrants.types.enums")  # where it has gone
+
+
+def current_program():
+    """The program that runs, or None; Quadrants' own property raises where there is none."""
+    from taichi.lang import impl
+
+    runtime = impl.get_runtime()
+    return runtime._prog if QUADRANTS else runtime.prog
