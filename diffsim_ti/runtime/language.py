@@ -3,6 +3,7 @@
 from types import SimpleNamespace
 
 from taichi.lang import impl
+from taichi.lang.expr import Expr  # noqa: F401  what a number of a kernel is
 from taichi.types import vector
 
 
