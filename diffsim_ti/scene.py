@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
-from diffsim_ti.checked import instance, listed
+from diffsim_ti.checked import instance, listed, numbers
 from diffsim_ti.copies import MadeAgain
 from diffsim_ti.inputs import ConsistentMass, Inputs
 from diffsim_ti.mass_scaling import MassScaling
@@ -304,7 +304,7 @@ class Scene(MadeAgain):
     def checked_displacements(self, displacements: ArrayLike | None) -> np.ndarray:
         """Displacements from the rest shape [m], shape (num_vertices, 3); None: zero."""
         shape = self.mesh.vertices.shape
-        u = np.zeros(shape) if displacements is None else np.asarray(displacements, np.float64)
+        u = np.zeros(shape) if displacements is None else numbers("displacements [m]", displacements)
         if u.shape != shape or not np.all(np.isfinite(u)):
             raise ValueError(f"displacements: expected finite numbers [m] of shape {shape}, got shape {u.shape}")
         return u

@@ -199,7 +199,8 @@ class Simulator:
     def set_state(self, positions: ArrayLike | None = None, velocities: ArrayLike | None = None) -> None:
         """Put the body elsewhere: positions [m], velocities [m/s], shape (num_vertices, 3); None leaves a part as it is.
 
-        Fixed vertices keep no velocity, and of sets that are `reduced` what these can do is taken. What the law remembers stays; `reset` clears it.
+        Fixed vertices keep no velocity, and of sets that are `reduced` what these can do is taken. What the law remembers
+        stays; `reset` clears it.
         """
         state, shape = self.workspace.state, (self.scene.mesh.num_vertices, 3)
         for name, value, target, origin in (

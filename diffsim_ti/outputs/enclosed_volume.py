@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.checked import wholes
 from diffsim_ti.mesh.enclosure import weighted_triangles
 from diffsim_ti.outputs.output import Change, Output
 
@@ -38,7 +39,7 @@ class EnclosedVolume(Output):
     """
 
     def __init__(self, triangles: ArrayLike | None = None, name: str = "volume"):
-        self.triangles, self.name = None if triangles is None else np.array(triangles, np.int64), name
+        self.triangles, self.name = None if triangles is None else wholes("EnclosedVolume: triangles", triangles), name
         if self.triangles is not None and (self.triangles.ndim != 2 or self.triangles.shape[1] not in (3, 6)):
             raise ValueError(f"EnclosedVolume: triangles must have shape (k, 3) or (k, 6), got {self.triangles.shape}")
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
-from diffsim_ti.checked import instance, listed, shape_of
+from diffsim_ti.checked import instance, listed, shape_of, shown
 from diffsim_ti.copies import made_again
 from diffsim_ti.inputs import Derived
 from diffsim_ti.outputs import Change, Displacements, Output, Positions, Velocities
@@ -120,10 +120,15 @@ class Rollout:
         for output in outputs:
             if not isinstance(output, Output):
                 raise ValueError(f"outputs: expected an Output such as MaterialPoints(points), got {output!r}")
-            if not output.name.isidentifier() or output.name in out or output.name in self.inputs:
+            if (
+                not isinstance(output.name, str)
+                or not output.name.isidentifier()
+                or output.name in out
+                or output.name in self.inputs
+            ):
                 taken = ", ".join((*out, *self.inputs))
                 raise ValueError(
-                    f"outputs: need names of their own without blanks, got {output.name!r}; taken: {taken}"
+                    f"outputs: need names of their own without blanks, got {shown(output.name)}; taken: {taken}"
                 )
             out[output.name] = output.settled(self.scene)
         return out

@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.checked import present
 from diffsim_ti.inputs import Input
 from diffsim_ti.inputs.links import PerStep
 from diffsim_ti.inputs.loads import InTime
@@ -24,6 +25,7 @@ class ExternalForce(Term):
     dead = sums_itself = True
 
     def __init__(self, forces: ArrayLike, vertices: str | ArrayLike | None = None, name: str | None = None):
+        present("forces", forces)
         shapes = (3,), ("k", 3), ("steps", "k", 3)
         super().__init__(Input("forces", forces, shapes, "N", plain="external_forces", label="forces"), name=name)
         self.vertices = vertices

@@ -6,7 +6,7 @@ from copy import copy
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffsim_ti.checked import present
+from diffsim_ti.checked import numbers, present
 from diffsim_ti.inputs import Input, Link
 from diffsim_ti.inputs.description import Range, length
 from diffsim_ti.inputs.loads import InTime
@@ -33,7 +33,7 @@ class Anchor:
 
     def __init__(self, position: ArrayLike):
         given = position.detach().cpu().numpy() if hasattr(position, "detach") else position
-        value = np.asarray(given, np.float64)
+        value = numbers("Anchor: position [m]", given)
         if value.shape[-1:] != (3,) or value.ndim > 2 or not np.all(np.isfinite(value)):
             raise ValueError(f"Anchor: position must be finite, of shape (3,) or (k, 3) [m], got shape {value.shape}")
         self.given, self.position = position, value
