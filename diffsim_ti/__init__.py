@@ -9,6 +9,7 @@ from diffsim_ti import interrupts
 
 interrupts.guard_import()
 
+import diffsim_ti.runtime  # noqa: F401  before anything imports taichi: it chooses which
 from diffsim_ti.adaptive_steps import adaptive_steps
 from diffsim_ti.batch import Batch, BatchFrames
 from diffsim_ti.contact.surface_pairs import Tunnelling

@@ -70,6 +70,14 @@ def numbers(name: str, value) -> np.ndarray:
         raise ValueError(f"{name} must be numbers, got {shown(value)}") from None
 
 
+def wholes(name: str, value) -> np.ndarray:
+    """A new int64 array of whole numbers."""
+    out = numbers(name, value)
+    if not np.all(np.abs(out) < 2.0**53) or not np.all(out == np.rint(out)):
+        raise ValueError(f"{name} must be whole numbers, got {shown(value)}")
+    return out.astype(np.int64)
+
+
 def present(name: str, value) -> None:
     """Something, not None."""
     if value is None:

@@ -16,6 +16,13 @@ class Cage:
     shape: points of the lattice along x, y, z, at least 2 each, over the mesh's bounding box; d has shape (*shape, 3) [m].
     B are products of Bernstein polynomials. For meshes of any order; `vjp` takes gradients by rest_positions.
     Sederberg, Parry 1986, doi:10.1145/15886.15903.
+
+    >>> import diffsim_ti as ds
+    >>> import numpy as np
+    >>> from diffsim_ti.designs import Cage
+    >>> cage = Cage(ds.TetrahedralMesh.create_cube(resolution=2), (2, 2, 2))
+    >>> bool(np.allclose(cage.value(np.full((8, 3), 0.25)), cage.mesh.vertices + 0.25))  # all control points alike
+    True
     """
 
     def __init__(self, mesh: TetrahedralMesh, shape: tuple[int, int, int]):
@@ -103,7 +110,7 @@ def smoothed(mesh: TetrahedralMesh, gradient: ArrayLike, length: float) -> np.nd
 
 
 def rest_volume(mesh: TetrahedralMesh, positions: ArrayLike) -> tuple[float, np.ndarray]:
-    """(volume [m^3] of the mesh's linear tetrahedra at these positions, its gradient [m^2], (num_vertices, 3))."""
+    """(volume [m^3] of the mesh's linear tetrahedra at these positions [m], its gradient [m^2], (num_vertices, 3))."""
     positions = np.asarray(positions, np.float64)
     V = signed_volumes(edge_matrices(positions, mesh.tetrahedra))
     G = shape_gradients(inverse_edges(positions, mesh.tetrahedra)) * V[:, None, None]
@@ -113,7 +120,7 @@ def rest_volume(mesh: TetrahedralMesh, positions: ArrayLike) -> tuple[float, np.
 
 
 def smallest_ratio(mesh: TetrahedralMesh, positions: ArrayLike) -> float:
-    """Smallest J of the map from the mesh to these rest positions, by its linear tetrahedra; 1 for the mesh itself."""
+    """Smallest J of the map from the mesh to these rest positions [m], by its linear tetrahedra; 1 for the mesh itself."""
     ratios = signed_volumes(edge_matrices(np.asarray(positions, np.float64), mesh.tetrahedra))
     return float((ratios / signed_volumes(edge_matrices(mesh.vertices, mesh.tetrahedra))).min())
 

@@ -147,6 +147,15 @@ class DifferentiableMaterial(TorchMaterial):
     What an optimiser moves out of nu_range (default -0.9 to 0.49, or to the nu given) is taken at the bound, with a warning,
     and keeps the gradient that leads back. An optimiser whose lr exceeds what E or nu can move is refused before the first
     run.
+
+    >>> import torch
+    >>> from diffsim_ti.diff_physics import DifferentiableMaterial
+    >>> material = DifferentiableMaterial(E=1e5, nu=0.25)
+    >>> print(f"{material.mu.item():.0f} {material.lam.item():.0f}")  # E / 2.5
+    40000 40000
+    >>> material.mu.backward()
+    >>> print(f"{material.E.grad.item():.1f}")  # 1 / (2 (1 + nu))
+    0.4
     """
 
     def __init__(

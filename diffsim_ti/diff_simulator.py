@@ -87,6 +87,17 @@ class DifferentiableSimulator:
     device: where tensors live. "cuda" also starts Taichi on the card; RuntimeError if it runs elsewhere already.
     The precision follows the material's dtype. Raises Divergence if the run outgrows its substeps; the state is then as
     it was before that step.
+
+    >>> import diffsim_ti as ds
+    >>> import torch
+    >>> from diffsim_ti.diff_physics import DifferentiableMaterial
+    >>> from diffsim_ti.diff_simulator import DifferentiableSimulator, DifferentiableSolver
+    >>> mesh = ds.TetrahedralMesh.create_cube(resolution=2).translated((0, 1, 0))
+    >>> material = DifferentiableMaterial(torch.tensor(1e5, dtype=torch.float64), 0.3)
+    >>> simulator = DifferentiableSimulator(mesh, material, DifferentiableSolver(dt=0.01, damping=1.0), contact=False)
+    >>> simulator.step()
+    >>> print(f"{simulator.velocities[0, 1].item():.4f} m/s")
+    -0.0980 m/s
     """
 
     kept_rollouts = 8  # one for each length and way of saving that is in use
@@ -129,6 +140,7 @@ class DifferentiableSimulator:
 
     @property
     def dtype(self) -> torch.dtype:
+        """Precision of the material's tensors, in which states are given."""
         return next(iter(self.material.tensors(self.mesh).values())).dtype
 
     @property

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.checked import shown, whole
 from diffsim_ti.inputs import StressPoints
 from diffsim_ti.outputs.body_forces import BodyForces
 from diffsim_ti.potential.attached import Attached
@@ -20,7 +21,8 @@ SMALL, DENSE = 1e-8, 600  # of the largest eigenvalue: zero; unknowns up to whic
 class Modes:
     """frequencies [Hz], ascending, shape (k,), negative where the state is unstable (lambda < 0: -sqrt(-lambda) / 2 pi);
     eigenvalues lambda = (2 pi f)^2 [1/s^2]; shapes [1/sqrt(kg)], (k, num_vertices, 3), with shapes_i . M shapes_j = 1 where
-    i = j, else 0; groups: lists of modes whose frequencies coincide, whose mean alone has a gradient."""
+    i = j, else 0; groups: lists of modes whose frequencies coincide, whose mean alone has a gradient;
+    scene and displacements [m]: about what state they are."""
 
     frequencies: np.ndarray
     eigenvalues: np.ndarray
@@ -143,11 +145,22 @@ def modes(scene: "Scene", k: int, displacements: ArrayLike | None = None) -> Mod
 
     Raises ValueError for k outside 1 .. the number of free unknowns, shapes that do not fit, or a law with rates or a state.
     Bathe, Finite Element Procedures, 2nd ed., 2014, ch. 10.
+
+    >>> import diffsim_ti as ds
+    >>> mesh = ds.TetrahedralMesh.create_cube(resolution=2)
+    >>> material = ds.StableNeoHookean(E=1e5, nu=0.3)
+    >>> scene = ds.Scene(mesh, material, terms=[ds.Gravity()], precision="f64")
+    >>> frequencies = ds.modes(scene, 7).frequencies  # six rigid motions, and the first that strains
+    >>> print(abs(frequencies[:6]).max() < 1e-3, f"{frequencies[6]:.3f} Hz")
+    True 2.282 Hz
     """
     from scipy.linalg import eigh
     from scipy.sparse import diags
     from scipy.sparse.linalg import eigsh
 
+    k = whole("modes: k", k, 1)
+    if not hasattr(scene, "stiffness_matrix"):
+        raise ValueError(f"modes: scene must be a Scene, got {shown(scene)}")
     if scene.precision != "f64":
         scene = scene.replace(precision="f64")
     if scene.reduced:
@@ -158,9 +171,8 @@ def modes(scene: "Scene", k: int, displacements: ArrayLike | None = None) -> Mod
     scene = scene.with_consistent_mass()
     free = free_directions(scene)
     count = free.shape[1]
-    if int(k) != k or not 1 <= k <= count:
+    if k > count:
         raise ValueError(f"modes: k must be a whole number of 1 .. {count}, the free unknowns, got {k}")
-    k = int(k)
     mass = scene.mass_matrix()
     scale = 1 / np.sqrt(abs(free).T.power(2) @ mass.diagonal())
     K = free.T @ scene.stiffness_matrix(u) @ free

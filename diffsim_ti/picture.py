@@ -33,7 +33,7 @@ def draw(
     marks: Sequence[Mark] = (),
     **view,
 ) -> np.ndarray:
-    """The picture as RGB in [0, 1], shape (height, width, 3); arguments as in `save_picture`."""
+    """The picture as RGB in [0, 1], shape (height, width, 3); positions [m] and other arguments as in `save_picture`."""
     colouring = None
     if values is not None:
         values = to_vertices(mesh, values)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
-from diffsim_ti.checked import instance, listed
+from diffsim_ti.checked import instance, listed, numbers
 from diffsim_ti.copies import MadeAgain
 from diffsim_ti.inputs import ConsistentMass, Inputs
 from diffsim_ti.locking import LOCKING_RATIO, warn_if_locking
@@ -74,6 +74,14 @@ class Scene(MadeAgain):
 
     Raises ValueError with rule, value and remedy for anything that does not fit, before any kernel runs. Warns where
     tetrahedra lock, above Poisson's ratio 0.45.
+
+    >>> import diffsim_ti as ds
+    >>> mesh, material = ds.TetrahedralMesh.create_cube(resolution=2), ds.StableNeoHookean(E=1e5, nu=0.3)
+    >>> scene = ds.Scene(mesh, material, density=1200.0, terms=[ds.Gravity(), ds.Drag(2.0)], fixed="ymin", precision="f64")
+    >>> list(scene.inputs.described)[2:]
+    ['youngs_modulus', 'poissons_ratio', 'density', 'gravity', 'drag_rate', 'rest_positions']
+    >>> print(f"{scene.mass_matrix().diagonal().sum() / 3:.1f} kg")
+    1200.0 kg
     """
 
     def __init__(
@@ -280,7 +288,7 @@ class Scene(MadeAgain):
     def checked_displacements(self, displacements: ArrayLike | None) -> np.ndarray:
         """Displacements from the rest shape [m], shape (num_vertices, 3); None: zero."""
         shape = self.mesh.vertices.shape
-        u = np.zeros(shape) if displacements is None else np.asarray(displacements, np.float64)
+        u = np.zeros(shape) if displacements is None else numbers("displacements [m]", displacements)
         if u.shape != shape or not np.all(np.isfinite(u)):
             raise ValueError(f"displacements: expected finite numbers [m] of shape {shape}, got shape {u.shape}")
         return u

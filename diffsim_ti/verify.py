@@ -76,7 +76,15 @@ def taylor_test(
 ) -> TaylorResult:
     """Second-order remainders of f along a direction: they fall as eps^2 if and only if `gradient` is f's gradient at x.
 
-    direction: default random, of the size of x. Griewank, Walther 2008; Farrell et al. 2013, doi:10.1137/120873558.
+    direction: default random, of the size of x; epsilon: the first step along it, and how many halvings follow.
+    Griewank, Walther 2008; Farrell et al. 2013, doi:10.1137/120873558.
+
+    >>> import diffsim_ti as ds
+    >>> import numpy as np
+    >>> round(ds.taylor_test(lambda x: float(np.sin(x).sum()), np.ones(3), np.cos(np.ones(3))).rate)
+    2
+    >>> round(ds.taylor_test(lambda x: float(np.sin(x).sum()), np.ones(3), 1.1 * np.cos(np.ones(3))).rate)
+    1
     """
     x, gradient = np.asarray(x, np.float64), np.asarray(gradient, np.float64)
     if direction is None:
@@ -160,6 +168,14 @@ def dot_product_test(rollout: Rollout, inputs: Iterable[str] | None = None, seed
 
     Further outputs of the rollout are tried each by itself, since they have other units; the largest difference counts.
     Round-off alone (1e-13 in f64, 1e-5 in f32) if `vjp` is the transpose of the tangent.
+
+    >>> import diffsim_ti as ds
+    >>> mesh = ds.TetrahedralMesh.create_cube(resolution=2)
+    >>> material = ds.StableNeoHookean(E=1e5, nu=0.3)
+    >>> scene = ds.Scene(mesh, material, terms=[ds.Gravity()], precision="f64")
+    >>> rollout = ds.Rollout(ds.VelocityVerletSolver(scene, dt=1e-3), steps=10)
+    >>> ds.dot_product_test(rollout) < 1e-12
+    True
     """
     rng = np.random.default_rng(seed)
     frames = rollout.forward(**values)
@@ -197,6 +213,7 @@ class GradientReport:
 
     @property
     def passed(self) -> bool:
+        """Whether every row did."""
         return all(row.passed for row in self.rows)
 
     def __str__(self) -> str:
@@ -225,9 +242,18 @@ def check_gradients(
     loss(frames) -> (value, gradient by positions, gradient by velocities or None), and a dict {output: gradient by it}
     where it names further outputs; default `linear_loss`, which names all.
     Differences and Taylor rates are taken in float64, of an f32 scene too: differences in f32 see nothing.
-    tolerance: largest relative error, default 1e-6 in f64 (what differences resolve on a long run), 1e-3 in f32.
+    inputs: names, default all; verbose: whether to print. tolerance: largest relative error, default 1e-6 in f64 (what
+    differences resolve on a long run), 1e-3 in f32.
     A row passes if its error is within the tolerance and its Taylor rate reaches 1.9: over three neighbouring halvings of
     a step that is .1 to 1e-6 of the input's size.
+
+    >>> import diffsim_ti as ds
+    >>> mesh = ds.TetrahedralMesh.create_cube(resolution=2)
+    >>> material = ds.StableNeoHookean(E=1e5, nu=0.3)
+    >>> scene = ds.Scene(mesh, material, terms=[ds.Gravity()], precision="f64")
+    >>> rollout = ds.Rollout(ds.VelocityVerletSolver(scene, dt=1e-3), steps=10)
+    >>> ds.check_gradients(rollout, inputs=["gravity", "initial_velocities"], verbose=False).passed
+    True
     """
     single = rollout.scene.precision == "f32"
     double = rollout.with_scene(precision="f64") if single else rollout

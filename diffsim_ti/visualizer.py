@@ -40,6 +40,7 @@ class SimulationVisualizer:
 
     @property
     def has_window(self) -> bool:
+        """Whether a window shows the body; without one, `show` writes a picture."""
         return self.window is not None
 
     def update(self, positions: ArrayLike, marks: Sequence[Mark] = ()) -> None:

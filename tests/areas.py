@@ -26,7 +26,8 @@ AREAS = {
     "charts, maps, advice": "sweep study study_stability peers",
     "pictures, films, the window": "picture_drawing picture_film marks "
     "optimization_picture writers viewer viewer_window gallery",
-    "examples and pages": "types release examples environment contact_examples static_examples torch_examples readme",
+    "examples and pages": "types release reference examples environment contact_examples static_examples "
+    "torch_examples readme",
     "command line, resources, backends": "cli calls hard_use strength layout resources devices launch executed_ptx "
     "single_precision",
 }

@@ -54,6 +54,29 @@ def calls() -> dict:
         "Ground": (ds.Ground, dict(height=-1.0) | wall),
         "Sphere": (ds.Sphere, dict(center=[0, -3, 0], radius=1.0, inside=False) | wall),
         "Box": (ds.Box, dict(center=[0, -3, 0], size=[1, 1, 1]) | wall),
+        "HalfSpace": (ds.HalfSpace, dict(point=[0, -1, 0], normal=[0, 1, 0]) | wall),
+        "Capsule": (ds.Capsule, dict(start=[0, -3, 0], end=[1, -3, 0], radius=1.0) | wall),
+        "Cylinder": (ds.Cylinder, dict(start=[0, -3, 0], end=[1, -3, 0], radius=1.0) | wall),
+        "SelfContact": (ds.SelfContact, dict(stiffness=1e4, width=1e-3, name=None, friction=0.3, friction_speed=1e-3)),
+        "ExternalForce": (ds.ExternalForce, dict(forces=[0, 1, 0], vertices="xmax", name=None)),
+        "Traction": (ds.Traction, dict(traction=[0, 1, 0], surface="xmax", name=None)),
+        "BodyForce": (ds.BodyForce, dict(force=[0, 1, 0], tetrahedra=None, per="volume", name=None)),
+        "ElasticFoundation": (ds.ElasticFoundation, dict(surface="ymin", normal=1e4, tangential=1.0, name=None)),
+        "Anchor": (ds.Anchor, dict(position=[0, 0, 0])),
+        "Gent": (ds.Gent, dict(mu=1e4, limit=30.0, bulk_modulus=1e5)),
+        "Grown": (ds.Grown, dict(material=ds.StableNeoHookean(1e5, 0.3), growth=0.1)),
+        "Stress": (
+            output_of(ds.Stress),
+            dict(name="s", at="tetrahedra", principal=False, kind="cauchy", von_mises=False),
+        ),
+        "Reaction": (output_of(ds.Reaction), dict(support=None, name="r", about=None, per_vertex=False)),
+        "EnclosedVolume": (output_of(ds.EnclosedVolume), dict(triangles=None, name="v")),
+        "ElasticEnergy": (output_of(ds.ElasticEnergy), dict(sets=None, name="e")),
+        "Unknown": (ds.Unknown, dict(start=1.0, range=None, regions=None, input=None, scale=None, experiments=None)),
+        "Measurement": (ds.Measurement, dict(output="positions", values=[1.0], noise=1.0, at=None, times=None)),
+        "Batch": (ds.Batch, dict(solver=solver, steps=2, scenes=2, save_every=1, lanes=None)),
+        "stable_dt": (ds.stable_dt, dict(scene=scene)),
+        "modes": (ds.modes, dict(scene=scene, k=1, displacements=None)),
         "Spring": (ds.Spring, dict(start=0, end=7, stiffness=1.0, rest_length=None, tension=None, name=None)),
         "Cable": (ds.Cable, dict(points=[0, 7], tension=1.0, length=None, stiffness=None)),
         "Muscle": (ds.Muscle, dict(fibre=[1, 0, 0], stress=1.0, activation=1.0, tetrahedra=None, per="all")),
@@ -70,6 +93,16 @@ def calls() -> dict:
         "UnequalSteps": (ds.UnequalSteps, dict(lengths=[1e-3], substeps=1)),
         "MaterialPoints": (ds.MaterialPoints, dict(points=[[0.5, 0.5, 0.5]], name="x", nearest=False)),
     }
+
+
+def output_of(kind):
+    """An output as a rollout of a held body takes it, which looks at it."""
+
+    def make(**arguments):
+        held = ds.BDF2Solver(objects()["scene"].replace(fixed="xmin"), dt=1e-3)
+        return ds.Rollout(held, 1, outputs=[kind(**arguments)])
+
+    return make
 
 
 def made(make, arguments: dict):

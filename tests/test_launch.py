@@ -163,6 +163,7 @@ def not_to_be_compiled() -> float:
     return y + larger(y)
 
 
+@pytest.mark.skipif(runtime.QUADRANTS, reason="in words of its own")
 def test_errors_in_kernels_say_where():
     """Taichi asks the package where a node stands (runtime/sources.py), through functions and on several lines."""
     with pytest.raises(ti.TaichiNameError) as error:

@@ -24,7 +24,7 @@ from diffsim_ti.state.schedule import UnequalSteps
 class Batch:
     """`scenes` runs of a solver's scene at once, with numbers of their own where they are given with a leading axis.
 
-    solver, steps, save_every, outputs, gradients, truncate, memory: as of `Rollout`; memory is that of all scenes.
+    solver, steps, save_every, outputs, gradients, truncate, memory: as of `Rollout`; memory [MB] is that of all scenes.
     scenes: how many, >= 1.
     lanes: None, eight scenes at once in the lanes of vector units where the scene allows it, else one after the other;
     True: ValueError, which says why, where it does not; False: one after the other. `lanes` then says which it is, and
@@ -43,6 +43,15 @@ class Batch:
 
     Freeman et al. 2021, Brax (leading axes of scenes), arXiv:2106.13281.
     Raises ValueError for shapes that fit neither, or both, saying which there are.
+
+    >>> import diffsim_ti as ds
+    >>> mesh = ds.TetrahedralMesh.create_cube(resolution=2)
+    >>> material = ds.StableNeoHookean(E=1e5, nu=0.3)
+    >>> scene = ds.Scene(mesh, material, terms=[ds.Gravity()], precision="f64")
+    >>> batch = ds.Batch(ds.VelocityVerletSolver(scene, dt=1e-3), steps=10, scenes=2)
+    >>> frames = batch.forward(gravity=[[0.0, -9.81, 0.0], [0.0, -1.62, 0.0]])  # on earth and on the moon
+    >>> frames.displacements[:, -1, 0, 1].round(7).tolist()
+    [-0.0004905, -8.1e-05]
     """
 
     def __init__(

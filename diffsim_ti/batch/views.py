@@ -9,11 +9,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import taichi as ti
-from taichi.lang.expr import Expr
 
 from diffsim_ti.elements.items import Items
 from diffsim_ti.elements.tetrahedron import Tetrahedron
-from diffsim_ti.runtime import LANES, assign, at, let, traced
+from diffsim_ti.runtime import LANES, Expr, assign, at, let, traced
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
 

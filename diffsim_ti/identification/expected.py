@@ -45,7 +45,8 @@ def expected(
 ) -> Expectation:
     """Intervals to expect of an experiment, from one run and a tangent for each unknown: the Cramer-Rao bound.
 
-    Arguments as in `identify`; unknowns start at the numbers that are assumed. Of the data only shape, noise and NaN count;
+    Arguments (data, unknowns, noise, prior) as in `identify`; unknowns start at the numbers that are assumed. Of the
+    data only shape, noise and NaN count;
     a name, or a list of names, of outputs stands for complete data.
     Atkinson, Donev, Tobias, Optimum Experimental Designs, 2007, ch. 17.
     """
@@ -75,7 +76,8 @@ def compare(
 ) -> dict[str, Expectation]:
     """Expectations of several measurements of one experiment, the best first: least volume of the confidence region.
 
-    choices: {name: data as in `expected`}, such as Measurement("positions", zeros, noise, at=markers). One run and one
+    unknowns, noise, prior: as there. choices: {name: data as in `expected`}, such as Measurement("positions", zeros,
+    noise, at=markers). One run and one
     tangent per unknown serve all of them. For several loads, call `expected` with each one's rollout.
     D-optimality: Atkinson, Donev, Tobias, Optimum Experimental Designs, 2007, ch. 10.
     """

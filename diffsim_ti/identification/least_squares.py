@@ -137,13 +137,24 @@ def identify(
     rollout: one, or one per experiment. data: {output: values}, NaN where missing, with `noise` [the output's unit], one
     number or {output: number}; or a `Measurement`, or a list of those; for several experiments a list of all that.
     unknowns: {input: start, or Unknown}. prior: {unknown: Normal, Smooth, or a list of them}.
-    tolerance: stop when a step promises less than this share of a standard error per unknown. covariance: default up to 20
+    max_iterations: steps, after which it stops as it is. tolerance: stop when a step promises less than this share of
+    a standard error per unknown. covariance: default up to 20
     unknowns; costs a tangent run each. callback(report of the iteration, frames of each experiment),
     first of the start as iteration 0: return True to stop. progress: print it.
     resume: a result's `state`, or a path, written after each iteration and gone on from if it is there.
     Numbers that end a run (Divergence, NotConverged, ValueError) shorten the step.
     Raises ValueError for what does not fit, before any run, and what the first run raises.
     Marquardt 1963, doi:10.1137/0111030; Seber, Wild, Nonlinear Regression, 1989, ch. 5, on intervals.
+
+    >>> import diffsim_ti as ds
+    >>> mesh = ds.TetrahedralMesh.create_cube(resolution=2)
+    >>> material = ds.StableNeoHookean(E=1e5, nu=0.3)
+    >>> scene = ds.Scene(mesh, material, terms=[ds.Gravity()], fixed="ymin", precision="f64")
+    >>> rollout = ds.Rollout(ds.StaticSolver(scene), steps=1)
+    >>> seen = rollout.forward(youngs_modulus=8e4).positions
+    >>> found = ds.identify(rollout, {"positions": seen}, {"youngs_modulus": 1e5}, noise=1e-4)
+    >>> print(f"{found.estimates['youngs_modulus']:.0f} Pa")
+    80000 Pa
     """
     several = not isinstance(rollout, Rollout)
     rollouts = list(rollout) if several else [rollout]

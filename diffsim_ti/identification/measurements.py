@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.checked import numbers, wholes
 from diffsim_ti.rollout import Frames, Rollout
 
 
@@ -25,14 +26,20 @@ class Measurement:
         at: ArrayLike | None = None,
         times: ArrayLike | None = None,
     ):
-        self.output, self.values, self.noise = output, np.array(values, np.float64), np.asarray(noise, np.float64)
-        self.at = None if at is None else np.asarray(at, int)
-        self.times = None if times is None else np.asarray(times, np.float64)
+        self.output, self.values, self.noise = output, numbers("values", values), numbers("noise", noise)
+        self.at = None if at is None else wholes("at", at)
+        self.times = None if times is None else numbers("times [s]", times)
         if not np.all(self.noise > 0):
             raise ValueError(f"{output}: noise must be > 0, a standard deviation in the output's unit")
         self.seen = np.isfinite(self.values)
         if np.any(np.isinf(self.values)):
             raise ValueError(f"{output}: values must be finite, or NaN where a sample is missing")
+        if self.noise.ndim > self.values.ndim or any(
+            n not in (1, m) for n, m in zip(self.noise.shape[::-1], self.values.shape[::-1])
+        ):
+            raise ValueError(
+                f"{output}: noise of shape {self.noise.shape} does not fit values of shape {self.values.shape}"
+            )
         self.deviation = np.broadcast_to(self.noise, self.values.shape)[self.seen]
 
     def check(self, rollout: Rollout) -> None:

@@ -57,7 +57,8 @@ class Identification:
     estimates: {unknown: number or array}; covariance: of the numbers, in the order of `labels`, to first order;
     standard_errors, intervals (95 %, through the free variables): as estimates; unseen: see Information;
     chi_square, degrees, p_value: of the residuals, whose sum of squares is chi^2 distributed if model and noise are right;
-    iterations: a dict each; simulations: forward, tangent and reverse runs; stopped: why; state: for `resume`.
+    iterations: a dict each; simulations: forward, tangent and reverse runs; stopped: why, converged: whether because
+    of the tolerance; information: what the data tell; state: for `resume`.
     inputs: of each experiment, for rollout.forward(**inputs[k]). Covariance and what follows from it are None where
     it was not asked for (many unknowns).
     """

@@ -5,6 +5,7 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.checked import numbers, shape_of, shown
 from diffsim_ti.rollout import Rollout
 
 TIME_OFFSET = "time_offset"  # of measurements with times of their own [s]
@@ -34,8 +35,10 @@ class Unknown:
         scale: float | None = None,
         experiments: Iterable[int] | None = None,
     ):
-        self.start, self.range, self.regions, self.input = np.array(start, np.float64), range, regions, input
+        self.start, self.range, self.regions, self.input = numbers("Unknown: start", start), range, regions, input
         self.scale, self.experiments = scale, None if experiments is None else tuple(experiments)
+        if range is not None and (shape_of("Unknown: range", range) != (2,) or isinstance(range, str | dict)):
+            raise ValueError(f"Unknown: range must be two numbers (low, high), got {shown(range)}")
         if range is not None and not (range[0] < self.start.min() and self.start.max() < range[1]):
             raise ValueError(f"Unknown: start = {self.start} must lie inside range = {range}")
         if range is not None and scale is not None:

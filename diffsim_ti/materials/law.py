@@ -45,6 +45,7 @@ class Law:
 
     @property
     def fp(self):
+        """Taichi's type of its numbers."""
         return PRECISIONS[self.precision]
 
     @ti.func

@@ -17,7 +17,7 @@ class Material(ABC):
 
     (E, nu) or youngs_modulus= or E= [Pa], > 0, and poissons_ratio= or nu= [-], in (-1, 0.5): those of small strains,
     mu= > 0 and lam= > -2/3 mu [Pa], the Lame parameters,
-    or what `spellings` of a material lists beyond.
+    or what `spellings` of a material lists beyond. J_floor [-]: where a logarithm of J is continued (`StableNeoHookean`).
 
     Each number is one number, an array with one per tetrahedron, or a dict {tetrahedron set: number}, where the key
     "default" serves the tetrahedra in none of the sets named.

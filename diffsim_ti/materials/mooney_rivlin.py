@@ -69,6 +69,7 @@ class MooneyRivlin(Material):
 
     @property
     def from_own(self) -> np.ndarray:
+        """From (c10, c01, bulk_modulus) to the coefficients (c10, c01, lam), lam = K - 4/3 (c10 + c01)."""
         return np.array([[1, 0, 0], [0, 1, 0], [-4 / 3, -4 / 3, 1]])
 
     def check(self, values: dict) -> None:

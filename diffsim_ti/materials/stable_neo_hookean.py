@@ -45,6 +45,12 @@ class StableNeoHookean(Material):
 
     Arguments: see `Material`; J_floor in (0, 1), one number, part of the law (a change compiles kernels anew).
     Bonet, Wood, Nonlinear Continuum Mechanics for Finite Element Analysis, 2nd ed. 2008, sec. 6.4.3.
+
+    >>> import diffsim_ti as ds
+    >>> mesh = ds.TetrahedralMesh.create_cube(resolution=2)
+    >>> material = ds.StableNeoHookean(E=1e5, nu=0.25)  # mu = lam = E / 2.5
+    >>> print([round(float(x), 6) for x in material.lame(material.values(mesh))])
+    [40000.0, 40000.0]
     """
 
     def __init__(self, *numbers, J_floor: float = 0.01, **named):

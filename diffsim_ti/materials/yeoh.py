@@ -31,6 +31,12 @@ class Yeoh(Material):
     `Yeoh(c10, c20, c30, bulk_modulus)` [Pa]: small strains have the shear modulus 2 c10 and the bulk modulus K; c20, often
     negative, softens what follows, c30 > 0 stiffens large stretches. J must stay above 0.
     Yeoh 1993, Some forms of the strain energy function for rubber, doi:10.5254/1.3538343.
+
+    >>> import diffsim_ti as ds
+    >>> rubber = ds.Yeoh(c10=2e5, c20=-1e4, c30=500.0, bulk_modulus=1e8)
+    >>> mu, lam = rubber.lame(rubber.values(ds.TetrahedralMesh.create_cube(resolution=2)))
+    >>> print(f"{mu:.6g} {lam + 2 / 3 * mu:.6g}")
+    400000 1e+08
     """
 
     spellings = (("c10", "c20", "c30", "bulk_modulus"),)

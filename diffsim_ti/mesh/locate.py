@@ -5,6 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
+from diffsim_ti.checked import numbers
 from diffsim_ti.mesh.geometry import FACES, nearest_on_triangles
 from diffsim_ti.mesh.inverse_map import barycentric_in, nearest_on_face, reach
 from diffsim_ti.mesh.reference_face import functions
@@ -39,7 +40,7 @@ class LocatedPoints:
 
 def locate(mesh, points, nearest: bool = False) -> LocatedPoints:
     """See TetrahedralMesh.locate."""
-    points = np.asarray(points, np.float64)
+    points = numbers("points [m]", points)
     if points.ndim != 2 or points.shape[1] != 3 or not np.all(np.isfinite(points)):
         raise ValueError(f"points: expected finite numbers of shape (k, 3) [m], got shape {points.shape}")
     tetrahedra, L = _containing(mesh, points)

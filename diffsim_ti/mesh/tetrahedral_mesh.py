@@ -42,6 +42,12 @@ class TetrahedralMesh(Exchange, NamedSets, Elements):
     tetrahedron, flat, inside-out, repeated or overlapping tetrahedra, a face of more than two tetrahedra, curved elements
     that are not one to one, and mid-edge vertices in another order. Warns (UserWarning) of vertices that no tetrahedron
     uses and of slivers. All thresholds are relative to the tetrahedron.
+
+    >>> import diffsim_ti as ds
+    >>> corners = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
+    >>> mesh = ds.TetrahedralMesh(corners, [[0, 1, 2, 3]], vertex_sets={"floor": [0, 1, 3]})
+    >>> print(f"{mesh.volumes[0]:.4f} m^3, {len(mesh.surface_triangles)} faces, held: {mesh.vertex_indices('floor')}")
+    0.1667 m^3, 4 faces, held: [0 1 3]
     """
 
     def __init__(
@@ -125,10 +131,12 @@ class TetrahedralMesh(Exchange, NamedSets, Elements):
 
     @property
     def num_vertices(self) -> int:
+        """How many vertices there are, those that no tetrahedron uses included."""
         return len(self._vertices)
 
     @property
     def num_tetrahedra(self) -> int:
+        """How many tetrahedra, of four or ten nodes, there are."""
         return len(self._tetrahedra)
 
     @property

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.checked import wholes
 from diffsim_ti.mesh.enclosure import weighted_triangles
 from diffsim_ti.outputs.output import Change, Output
 
@@ -27,10 +28,18 @@ class EnclosedVolume(Output):
     name: how a loss calls it.
     Raises ValueError for a surface with an open edge, or one whose triangles are not turned one way.
     Mirtich 1996, Fast and accurate computation of polyhedral mass properties, doi:10.1080/10867651.1996.10487458.
+
+    >>> import diffsim_ti as ds
+    >>> mesh = ds.TetrahedralMesh.create_cube(resolution=2)
+    >>> material = ds.StableNeoHookean(E=1e5, nu=0.3)
+    >>> scene = ds.Scene(mesh, material, terms=[ds.Gravity()], fixed="ymin", precision="f64")
+    >>> frames = ds.Rollout(ds.StaticSolver(scene), steps=1, outputs=[ds.EnclosedVolume()]).forward()
+    >>> frames["volume"].round(4).tolist()  # before and under its weight
+    [1.0, 0.9691]
     """
 
     def __init__(self, triangles: ArrayLike | None = None, name: str = "volume"):
-        self.triangles, self.name = None if triangles is None else np.array(triangles, np.int64), name
+        self.triangles, self.name = None if triangles is None else wholes("EnclosedVolume: triangles", triangles), name
         if self.triangles is not None and (self.triangles.ndim != 2 or self.triangles.shape[1] not in (3, 6)):
             raise ValueError(f"EnclosedVolume: triangles must have shape (k, 3) or (k, 6), got {self.triangles.shape}")
 

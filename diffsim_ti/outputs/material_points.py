@@ -31,6 +31,15 @@ class MaterialPoints(Output):
     The tetrahedron stays that of the mesh, also where rest_positions carry its faces past the point.
     Raises ValueError for points outside, naming one and how far out it is, and for shapes that do not fit.
     Zienkiewicz, Taylor, The Finite Element Method, vol. 1, 5th ed., 2000, sec. 8.6, on volume coordinates.
+
+    >>> import diffsim_ti as ds
+    >>> mesh = ds.TetrahedralMesh.create_cube(resolution=2)
+    >>> material = ds.StableNeoHookean(E=1e5, nu=0.3)
+    >>> scene = ds.Scene(mesh, material, terms=[ds.Gravity()], fixed="ymin", precision="f64")
+    >>> top = ds.MaterialPoints([[0.5, 1.0, 0.5]], name="top")
+    >>> frames = ds.Rollout(ds.StaticSolver(scene), steps=1, outputs=[top]).forward()
+    >>> frames["top"][:, 0, 1].round(4).tolist()
+    [1.0, 0.9614]
     """
 
     def __init__(self, points: ArrayLike, name: str = "material_points", nearest: bool = False):

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.checked import numbers
 from diffsim_ti.outputs.body_forces import BodyForces
 from diffsim_ti.outputs.given_loads import GivenLoads
 from diffsim_ti.outputs.moments import moments, moments_jvp, moments_vjp
@@ -36,6 +37,14 @@ class Reaction(Output):
 
     Raises ValueError for a support that is not held, for a law with a state, or for about= and per_vertex=True together.
     Belytschko, Liu, Moran, Nonlinear Finite Elements for Continua and Structures, 2000, sec. 4.4.
+
+    >>> import diffsim_ti as ds
+    >>> mesh = ds.TetrahedralMesh.create_cube(resolution=2)
+    >>> material = ds.StableNeoHookean(E=1e5, nu=0.3)
+    >>> scene = ds.Scene(mesh, material, terms=[ds.Gravity()], fixed="ymin", precision="f64")
+    >>> frames = ds.Rollout(ds.StaticSolver(scene), steps=1, outputs=[ds.Reaction("ymin")]).forward()
+    >>> print(f"{frames['reaction'][-1, 1]:.3f} N")  # the weight
+    9810.000 N
     """
 
     unit, reads_chamber_pressures = "N", True
@@ -50,7 +59,7 @@ class Reaction(Output):
         if about is not None and per_vertex:
             raise ValueError("Reaction: a moment is of all vertices: give about= or per_vertex=True, not both")
         self.support, self.name, self.per_vertex = support, name, bool(per_vertex)
-        self.about = None if about is None else np.array(about, np.float64)
+        self.about = None if about is None else numbers("Reaction: about [m]", about)
         if self.about is not None and (self.about.shape != (3,) or not np.all(np.isfinite(self.about))):
             raise ValueError(f"Reaction: about must be 3 finite numbers [m], got {about!r}")
 

@@ -161,6 +161,14 @@ class Stress(_Tensors):
     Raises ValueError for another kind or `at`, both of these, or one of them of P, which is not symmetric, points outside
     the mesh, and laws that read more than the displacement gradient.
     Holzapfel, Nonlinear Solid Mechanics, 2000, sec. 3.1.
+
+    >>> import diffsim_ti as ds
+    >>> mesh = ds.TetrahedralMesh.create_cube(resolution=2)
+    >>> material = ds.StableNeoHookean(E=1e5, nu=0.3)
+    >>> scene = ds.Scene(mesh, material, terms=[ds.Gravity()], fixed="ymin", precision="f64")
+    >>> frames = ds.Rollout(ds.StaticSolver(scene), steps=1, outputs=[ds.Stress(von_mises=True)]).forward()
+    >>> frames["stress"].shape, bool((frames["stress"][-1] > 0).all())
+    ((2, 6), True)
     """
 
     def __init__(

@@ -22,7 +22,7 @@ class Frames:
     before, by its barrier and by friction; shape (frames, obstacles, 2, num_vertices, 3), obstacles as in
     `scene.obstacles`. The first frame has none.
 
-    `computed` are these outputs themselves, as settled for the scene.
+    `computed` are these outputs themselves, as settled for the scene; `sets`: those of inputs that were given by named sets.
 
     `chamber_pressures` [Pa], where an output reads them: those in chambers whose volume is held, shape (frames, chambers),
     of the substep that ends in the frame; others, and the first frame, have none (0).

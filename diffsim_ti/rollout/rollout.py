@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
-from diffsim_ti.checked import instance, listed, shape_of
+from diffsim_ti.checked import instance, listed, shape_of, shown
 from diffsim_ti.copies import made_again
 from diffsim_ti.inputs import Derived
 from diffsim_ti.outputs import Change, Displacements, Output, Positions, Velocities
@@ -45,6 +45,16 @@ class Rollout:
 
     Raises ValueError for inputs that do not fit, FloatingPointError if the run diverges or the adjoint is not finite.
     Griewank, Walther, Evaluating Derivatives, ch. 3 and 12, doi:10.1137/1.9780898717761.
+
+    >>> import diffsim_ti as ds
+    >>> mesh = ds.TetrahedralMesh.create_cube(resolution=2)
+    >>> material = ds.StableNeoHookean(E=1e5, nu=0.3)
+    >>> scene = ds.Scene(mesh, material, terms=[ds.Gravity()], precision="f64")
+    >>> rollout = ds.Rollout(ds.VelocityVerletSolver(scene, dt=1e-3), steps=10)
+    >>> frames = rollout.forward(gravity=(0.0, -1.62, 0.0))
+    >>> gradients = rollout.vjp(frames, positions=frames.positions[-1:].repeat(2, 0) * 0 + 1)
+    >>> print(f"{frames.displacements[-1, 0, 1]:.2e} {gradients['gravity'][1]:.2e}")  # g t^2 / 2, and 8 t^2 / 2
+    -8.10e-05 4.00e-04
     """
 
     def __init__(
@@ -110,10 +120,15 @@ class Rollout:
         for output in outputs:
             if not isinstance(output, Output):
                 raise ValueError(f"outputs: expected an Output such as MaterialPoints(points), got {output!r}")
-            if not output.name.isidentifier() or output.name in out or output.name in self.inputs:
+            if (
+                not isinstance(output.name, str)
+                or not output.name.isidentifier()
+                or output.name in out
+                or output.name in self.inputs
+            ):
                 taken = ", ".join((*out, *self.inputs))
                 raise ValueError(
-                    f"outputs: need names of their own without blanks, got {output.name!r}; taken: {taken}"
+                    f"outputs: need names of their own without blanks, got {shown(output.name)}; taken: {taken}"
                 )
             out[output.name] = output.settled(self.scene)
         return out

@@ -1,7 +1,25 @@
 """The one door to Taichi's runtime: start-up, precision, arrays that are freed, fields that are lent and returned.
 
-Nothing else in the package touches `taichi.lang.impl` or `taichi._lib`.
+Nothing else in the package imports from `taichi.lang` or `taichi._lib`, or reads private names (tests/test_layout.py).
+What is used of Taichi's internals, by which module, and what Quadrants has instead (quadrants.py, DIFFSIM_TI_TAICHI):
+
+| used | by | for | Quadrants |
+| --- | --- | --- | --- |
+| `impl.get_runtime()`: `prog`, `target_tape`, `materialize` | start, field_pool, threads, launch | whether Taichi runs, its tape, its program | `_prog` |
+| `impl.current_cfg`, `prog.config()` and its options | start, launch | backend, options of one kernel | the same |
+| `kernel._primal`, `ensure_compiled`, `compiled_kernels`, `prog.compile_kernel`, `launch_kernel`, launch contexts | launch | launches with bound arguments | plain calls, which keep their arguments |
+| two pointers in a launch context | argument_buffer | launches on CUDA | not used |
+| layout of a compiled kernel | repeated_loops | several substeps in a launch on CUDA | not used |
+| `Ndarray`, `VectorNdarray`, `ScalarNdarray`, `prog.create_ndarray`, `delete_ndarray`, `fill_uint`, `get_ndarray_data_ptr_as_int` | arrays | arrays that are freed, NumPy's view of them | its constructors |
+| `impl.expr_init`, `impl.subscript`, `Expr`, `_assign`, `_is_taichi_function` | language | functions that build code while kernels compile | `_is_quadrants_function`; dataclasses handed on whole |
+| `kernel_impl._get_tree_and_ctx`, `transform_tree`, `ASTTransformerContext` | sources | faster tracing | not used |
+| `kernel_impl.Kernel.__call__` | threads | threads take turns | the same |
+| `core.with_cuda`, `with_vulkan`, `arch_name` | start, device | which backends there are | the same |
 """
+
+from diffsim_ti.runtime.quadrants import QUADRANTS, stand_in
+
+stand_in()
 
 from diffsim_ti.runtime.arrays import (
     allocated_megabytes,
@@ -19,10 +37,9 @@ from diffsim_ti.runtime.arrays import (
 from diffsim_ti.runtime.device import device_name, use_device
 from diffsim_ti.runtime.field_pool import FieldPool, current_tape, fields
 from diffsim_ti.runtime.kernels import LANES, ROWS, Kernel, array_types, kernels_of
-from diffsim_ti.runtime.language import Bundle, assign, at, each_lane, let, spread, traced, variable
+from diffsim_ti.runtime.language import Bundle, Expr, assign, at, each_lane, let, spread, traced, variable
 from diffsim_ti.runtime.launch import Launch, TensorLaunch
 from diffsim_ti.runtime.repeated_loops import can_repeat
-from diffsim_ti.runtime.sources import trace_faster as _trace_faster
 from diffsim_ti.runtime.start import (
     NUMPY,
     PRECISIONS,
@@ -40,5 +57,8 @@ from diffsim_ti.runtime.start import (
 )
 from diffsim_ti.runtime.threads import take_turns as _take_turns
 
-_trace_faster()
+if not QUADRANTS:
+    from diffsim_ti.runtime.sources import trace_faster as _trace_faster
+
+    _trace_faster()
 _take_turns()

@@ -12,6 +12,7 @@ from taichi.lang.enums import Layout
 from taichi.lang.matrix import VectorNdarray
 
 from diffsim_ti.runtime import device
+from diffsim_ti.runtime.quadrants import QUADRANTS
 from diffsim_ti.runtime.start import arch_name, check_alive, is_alive, program, runs_on_cpu
 from diffsim_ti.runtime.threads import LOCK
 
@@ -49,14 +50,23 @@ class _Vectors(VectorNdarray):
     """An array of vectors."""
 
     def __init__(self, dtype, shape):
-        _describe(self, dtype, shape, Layout.AOS)
+        if QUADRANTS:
+            super().__init__(dtype.n, dtype.dtype, shape)
+        else:
+            _describe(self, dtype, shape, Layout.AOS)
+
+    def __del__(self):
+        pass  # `_free` frees it; Quadrants' own would, too
 
 
 class _Scalars(ti.ScalarNdarray):
     """An array of numbers that is freed like one of vectors, by `_free`."""
 
     def __init__(self, dtype, shape):
-        _describe(self, dtype, shape, Layout.NULL)
+        if QUADRANTS:
+            super().__init__(dtype, shape)
+        else:
+            _describe(self, dtype, shape, Layout.NULL)
 
     def __del__(self):
         pass  # Taichi's own frees whatever array of a later program has come to lie at the same address

@@ -6,7 +6,8 @@ from functools import cache
 
 import numpy as np
 from taichi._lib import core as _core
-from taichi.lang import impl
+
+from diffsim_ti.runtime.quadrants import current_program
 
 _DRIVERS = ("libcuda.so", "libcuda.so.1", "/usr/lib/wsl/lib/libcuda.so", "nvcuda.dll")
 
@@ -93,7 +94,7 @@ def use_device(device) -> None:
         )
     if name not in ("cuda", "cuda:0"):
         raise ValueError(f"device must be 'cpu' or 'cuda', got {name!r}")
-    if impl.get_runtime().prog is None:
+    if current_program() is None:
         init("cuda")
     elif arch_name() != "cuda":
         raise RuntimeError(

@@ -3,12 +3,14 @@
 from types import SimpleNamespace
 
 from taichi.lang import impl
+from taichi.lang.expr import Expr  # noqa: F401  what a number of a kernel is
 from taichi.types import vector
 
 
 def traced(function):
     """Mark a plain Python function that kernels may call: it runs while the kernel is compiled and builds its code."""
     function._is_taichi_function, function.func = True, SimpleNamespace(has_print=False)
+    function._is_quadrants_function = False  # that it has this attribute is enough for Quadrants to be silent
     return function
 
 

@@ -9,6 +9,7 @@ from taichi.types import primitive_types
 
 from diffsim_ti.runtime.argument_buffer import ArgumentBuffer
 from diffsim_ti.runtime.arrays import check_owner, full_shape
+from diffsim_ti.runtime.quadrants import QUADRANTS
 from diffsim_ti.runtime.repeated_loops import RepeatedLoops
 from diffsim_ti.runtime.start import arch_name, check_alive, program
 from diffsim_ti.runtime.threads import LOCK, materialize
@@ -65,6 +66,11 @@ class Launch:
             self._launch(numbers)
 
     def _launch(self, numbers: tuple) -> None:
+        if QUADRANTS:  # keeps what a kernel was compiled to, and its arguments, by itself
+            config = impl.get_runtime().prog.config()
+            with _settings(config, real_matrix_scalarize=not self._vectorized, advanced_optimization=False):
+                self._kernel(*self._arrays, *numbers)
+            return
         if self._setters is None:
             self._prepare(numbers)
         if self._buffer:
@@ -106,6 +112,9 @@ class TensorLaunch(Launch):
             self._launch(tensors)
 
     def _launch(self, tensors: tuple) -> None:
+        if QUADRANTS:
+            self._kernel(*tensors, *self._arrays)
+            return
         if self._setters is None:
             arrays = self._arrays
             self._arrays = (*tensors, *arrays)

@@ -17,6 +17,7 @@ from taichi.lang import impl
 
 from diffsim_ti import ranks
 from diffsim_ti.runtime.device import count_cards
+from diffsim_ti.runtime.quadrants import current_program
 from diffsim_ti.runtime.threads import LOCK, materialize
 
 PRECISIONS = {"f32": ti.f32, "f64": ti.f64}
@@ -105,7 +106,7 @@ def check_precision(precision: str | None) -> str:
 
 
 def _after_fork() -> None:
-    _settings["forked"] = impl.get_runtime().prog is not None
+    _settings["forked"] = current_program() is not None
 
 
 if hasattr(os, "register_at_fork"):
@@ -118,7 +119,7 @@ def _end_program() -> None:
     end it where anything, such as the callback above, still leads to it."""
     if _settings.get("forked"):
         return
-    if impl.get_runtime().prog is not None:
+    if current_program() is not None:
         ti.reset()
     if "folder" in _settings:
         shutil.rmtree(_settings["folder"], ignore_errors=True)
@@ -138,12 +139,12 @@ def program() -> weakref.ref:
     A weak reference: a program that is still held would outlive `ti.init`, and at its end free memory of the next one.
     """
     refuse_fork()
-    if impl.get_runtime().prog is None:
+    if current_program() is None:
         with LOCK:
-            if impl.get_runtime().prog is None:
+            if current_program() is None:
                 init(_arch_of_parent())
     _tell_workers()
-    return weakref.ref(impl.get_runtime().prog)
+    return weakref.ref(current_program())
 
 
 def _tell_workers() -> None:
@@ -164,7 +165,7 @@ def _arch_of_parent() -> str:
 def is_alive(owner: weakref.ref) -> bool:
     """Whether the program `owner` is the one that runs."""
     running = owner()
-    return running is not None and running is impl.get_runtime().prog
+    return running is not None and running is current_program()
 
 
 def check_host_init() -> None:
@@ -183,7 +184,7 @@ def check_host_init() -> None:
 def check_alive(owner: weakref.ref) -> None:
     """Raise if `ti.init` was called after the program `owner`, or if this process was forked since."""
     running = owner()  # looked up here, without calls: every look at an array comes by
-    if running is not None and running is impl.get_runtime().prog and not _settings.get("forked"):
+    if running is not None and running is current_program() and not _settings.get("forked"):
         return
     refuse_fork()
     if not is_alive(owner):

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 
+from diffsim_ti.checked import present
 from diffsim_ti.monitor.stability import StepLimit, element_limit, lanczos_limit
 from diffsim_ti.monitor.stiffest import stiffest
 from diffsim_ti.scene import Scene
@@ -17,7 +18,16 @@ def stable_dt(scene: Scene, tight: bool = True) -> StepLimit:
     tight: 2 / omega_max of the assembled system, self-contact included (`lanczos_limit`); else the element bound at rest,
     without contact (`element_limit`), which needs no kernels and is smaller. Obstacles limit no step unless a solver is told
     contact="force"; that solver's own `stable_dt(tight=True)` knows them.
+
+    >>> import diffsim_ti as ds
+    >>> mesh = ds.TetrahedralMesh.create_cube(resolution=2)
+    >>> material = ds.StableNeoHookean(E=1e5, nu=0.3)
+    >>> soft = ds.Scene(mesh, material, precision="f64")
+    >>> stiff = ds.Scene(mesh, ds.StableNeoHookean(E=4e5, nu=0.3), precision="f64")
+    >>> print(f"{ds.stable_dt(soft) / ds.stable_dt(stiff):.6f}")  # four times the stiffness, half of the step
+    2.000000
     """
+    present("scene", scene)
     return lanczos_limit(start_workspace(scene, stiffest)) if tight else element_limit(scene)
 
 

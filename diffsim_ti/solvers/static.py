@@ -20,7 +20,15 @@ class StaticSolver(ImplicitSolver):
 
     load_steps: in the first step loads and prescribed motion are laid on in so many parts, each starting from the last.
     Raises ValueError, which names the motions, if the supports leave a piece of the body free to move rigidly; NotConverged
-    otherwise.
+    otherwise. Nocedal, Wright, Numerical Optimization, 2nd ed., 2006, ch. 3 and 7, doi:10.1007/978-0-387-40065-5.
+
+    >>> import diffsim_ti as ds
+    >>> mesh = ds.TetrahedralMesh.create_cube(resolution=2)
+    >>> material = ds.StableNeoHookean(E=1e5, nu=0.3)
+    >>> scene = ds.Scene(mesh, material, terms=[ds.Gravity()], fixed="ymin", precision="f64")
+    >>> frames = ds.Rollout(ds.StaticSolver(scene), steps=1).forward()
+    >>> print(f"{frames.displacements[-1, :, 1].min():.3f} m")  # it settles under its own weight
+    -0.050 m
     """
 
     order = 0

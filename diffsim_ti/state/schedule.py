@@ -231,6 +231,15 @@ class UnequalSteps(Schedule):
     they keep, by the order of the solver. Hairer, Lubich, Wanner, Geometric Numerical Integration, VIII.1,
     doi:10.1007/3-540-30666-8.
     Raises ValueError for lengths that are not > 0, and for substeps that are not whole numbers >= 1.
+
+    >>> import diffsim_ti as ds
+    >>> mesh = ds.TetrahedralMesh.create_cube(resolution=2)
+    >>> material = ds.StableNeoHookean(E=1e5, nu=0.3)
+    >>> scene = ds.Scene(mesh, material, terms=[ds.Gravity()], precision="f64")
+    >>> steps = ds.UnequalSteps([1e-3, 2e-3, 7e-3], substeps=[1, 2, 7])
+    >>> frames = ds.Rollout(ds.VelocityVerletSolver(scene, dt=1e-3), steps).forward()
+    >>> print(f"{frames.times[-1]:.3f} s, {frames.displacements[-1, 0, 1]:.7f} m")
+    0.010 s, -0.0004905 m
     """
 
     varies = True

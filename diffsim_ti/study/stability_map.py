@@ -260,6 +260,7 @@ class StabilityMap:
 
     @property
     def explicit(self) -> bool:
+        """Whether it is a map of an explicit solver, whose stable steps end."""
         return self.solver in [kind.__name__ for kind in SOLVERS if kind.explicit]
 
     @property

@@ -48,6 +48,7 @@ class Point:
 
     @property
     def label(self) -> str:
+        """Mesh and step in words, as charts show them."""
         mesh = f"{self.cells} cells {self.pattern}" if self.cells > 1 else self.pattern
         mesh += "" if self.element == "linear" else f" {self.element}"
         step = "" if self.solver == "StaticSolver" else f", {1e3 * self.substep:.3g} ms"

@@ -25,6 +25,8 @@ class Chamber(Term):
     The surface is closed, or has rims that are held wholly or move in planes (supports by component), which close it there.
     Its triangles are those of the body, whose normals point out of the body and so into the chamber: a positive pressure
     inflates it. The forces are those of `Pressure`, p dV/dx, V the volume inside.
+    Subclasses say what is given over time: its `argument`, what was `given`, its `unit` and its plain name.
+    Rumpel, Schweizerhof 2003, Volume-dependent pressure loading, doi:10.1002/nme.561.
     """
 
     holds = False  # whether it holds a volume

@@ -2,20 +2,24 @@
 
 from numpy.typing import ArrayLike
 
+from diffsim_ti.checked import present
 from diffsim_ti.inputs import POSITIVE, Input
 from diffsim_ti.inputs.description import length
 
 
 def positive(argument: str, value: ArrayLike, unit: str, plain: str = "") -> Input:
     """One number > 0, which errors call by its argument."""
+    present(argument, value)
     return Input(argument, value, ((),), unit, POSITIVE, plain=plain, label=f"{argument} [{unit}]")
 
 
 def place(argument: str, value: ArrayLike, plain: str) -> Input:
     """A point of an obstacle's shape: 3 numbers [m]."""
+    present(argument, value)
     return Input(argument, value, ((3,),), "m", change=length, plain=plain)
 
 
 def extent(argument: str, value: ArrayLike, plain: str) -> Input:
     """A size of an obstacle's shape: one number > 0 [m]."""
+    present(argument, value)
     return Input(argument, value, ((),), "m", POSITIVE, plain=plain)

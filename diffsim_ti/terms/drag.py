@@ -8,7 +8,8 @@ class Drag(Term):
     """Damping by a rate c [1/s]: dv/dt = -c v, solved exactly, v <- v exp(-c h), whatever the step h.
 
     A free body's velocity falls as exp(-c t) for any step. Input with gradient: "drag_rate", shape (), or "<name>.rate".
-    Raises ValueError for a negative rate.
+    Raises ValueError for a negative rate. Hairer, Lubich, Wanner, Geometric Numerical Integration, 2006, II.5 (the
+    splitting).
     """
 
     def __init__(self, rate: float, name: str | None = None):

@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.checked import present
 from diffsim_ti.inputs import Input
 from diffsim_ti.inputs.links import PerStep
 from diffsim_ti.inputs.loads import InTime
@@ -17,11 +18,14 @@ class ExternalForce(Term):
     vertices: which k vertices, as indices or the name of a vertex set; None means all. A single vector of 3 is laid
     on each of them. Per-step forces hold during one step dt; a run longer than the list is an error.
     Input with gradient: "external_forces", of the shape given, or "<name>.forces". Several in a scene add up.
+    Raises ValueError for other shapes, unknown sets, and a run longer than the list.
+    Belytschko, Liu, Moran, Nonlinear Finite Elements for Continua and Structures, 2000, sec. 4.4.
     """
 
     dead = sums_itself = True
 
     def __init__(self, forces: ArrayLike, vertices: str | ArrayLike | None = None, name: str | None = None):
+        present("forces", forces)
         shapes = (3,), ("k", 3), ("steps", "k", 3)
         super().__init__(Input("forces", forces, shapes, "N", plain="external_forces", label="forces"), name=name)
         self.vertices = vertices

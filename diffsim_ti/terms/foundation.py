@@ -5,6 +5,7 @@ from copy import copy
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.checked import present
 from diffsim_ti.inputs import Input, Link
 from diffsim_ti.inputs.foundation import FoundationStiffness
 from diffsim_ti.mesh import TetrahedralMesh
@@ -39,6 +40,7 @@ class ElasticFoundation(Term):
         surface: str | ArrayLike | None = None,
         name: str | None = None,
     ):
+        present("normal", normal), present("tangential", tangential)
         both = [
             Input(argument, given, ((), ("k",)), "N/m^3", AT_LEAST_0, plain=f"foundation_{argument}", label=argument)
             for argument, given in (("normal", normal), ("tangential", tangential))

@@ -13,6 +13,11 @@ class Gravity(Term):
 
     acceleration: a vector of 3, or one number along y (so -9.81 pulls down). Default (0, -9.81, 0).
     Input with gradient: "gravity", shape (3,), or "<name>.acceleration".
+    Raises ValueError for other shapes and what is not finite. Goldstein, Classical Mechanics, 3rd ed., 2002, sec. 1.4.
+
+    >>> import diffsim_ti as ds
+    >>> ds.Gravity(-1.62).values["gravity"]  # on the moon
+    array([ 0.  , -1.62,  0.  ])
     """
 
     def __init__(self, acceleration: ArrayLike = (0.0, -9.81, 0.0), name: str | None = None):

@@ -15,7 +15,12 @@ from diffsim_ti.terms.term import Term
 
 
 class Load(Term):
-    """An amount per area or volume, over time. A scene may list several of a kind: they add up."""
+    """An amount per area or volume, over time. A scene may list several of a kind: they add up.
+
+    Subclasses say what it is: its `argument`, what was `given`, its `unit` and its plain name.
+    Bonet, Wood 2008, Nonlinear Continuum Mechanics for Finite Element Analysis, 2nd ed., 9.4,
+    doi:10.1017/CBO9780511755446.
+    """
 
     num_numbers = 0  # what kernels read of it lies in arrays of its own
     shape: tuple = ()  # of the amount
@@ -59,6 +64,15 @@ class Traction(Load):
     Raises ValueError for other shapes, what is not finite, and unknown sets.
     Bonet, Wood 2008, Nonlinear Continuum Mechanics for Finite Element Analysis, 2nd ed., 9.4,
     doi:10.1017/CBO9780511755446.
+
+    >>> import diffsim_ti as ds
+    >>> mesh = ds.TetrahedralMesh.create_cube(resolution=2)
+    >>> material = ds.StableNeoHookean(E=1e5, nu=0.3)
+    >>> load = ds.Traction((0.0, 0.0, 250.0), surface="xmax")
+    >>> scene = ds.Scene(mesh, material, terms=[load], fixed="xmin", precision="f64")
+    >>> frames = ds.Rollout(ds.StaticSolver(scene), steps=1, outputs=[ds.Reaction("xmin")]).forward()
+    >>> print(f"{frames['reaction'][-1, 2]:.3f} N")  # what holds the other side
+    -250.000 N
     """
 
     shape = (3,)

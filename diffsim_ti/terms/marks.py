@@ -61,7 +61,8 @@ Mark = Arrows | Lines | Points
 def arrows(
     label: str, mesh: TetrahedralMesh, positions: np.ndarray, vertices: ArrayLike, vectors: np.ndarray, most: int = MOST
 ) -> Arrows:
-    """Arrows at vertices of a body, at most so many, outside it: what points into the body ends at its vertex.
+    """Arrows at vertices of a body, whose positions are in [m], at most so many, outside it: what points into the
+    body ends at its vertex.
 
     vectors: shape (3,), or (k, 3) of each vertex; those below a thousandth of the largest are left out.
     """

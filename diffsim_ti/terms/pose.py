@@ -34,6 +34,7 @@ class Pose:
 
     @property
     def width(self) -> int:
+        """Numbers of a pose: 6 with a rotation vector, 7 with a quaternion."""
         return path_width(self.path)
 
     def rows(self, name: str, times: ArrayLike) -> np.ndarray:

@@ -133,6 +133,7 @@ class VertexForce(ABC):
 
     @property
     def fp(self):
+        """Taichi's type of its numbers."""
         return PRECISIONS[self.precision]
 
     @ti.func

@@ -6,7 +6,7 @@ from copy import copy
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffsim_ti.checked import present
+from diffsim_ti.checked import numbers, present
 from diffsim_ti.inputs import Input, Link
 from diffsim_ti.inputs.description import Range, length
 from diffsim_ti.inputs.loads import InTime
@@ -33,7 +33,7 @@ class Anchor:
 
     def __init__(self, position: ArrayLike):
         given = position.detach().cpu().numpy() if hasattr(position, "detach") else position
-        value = np.asarray(given, np.float64)
+        value = numbers("Anchor: position [m]", given)
         if value.shape[-1:] != (3,) or value.ndim > 2 or not np.all(np.isfinite(value)):
             raise ValueError(f"Anchor: position must be finite, of shape (3,) or (k, 3) [m], got shape {value.shape}")
         self.given, self.position = position, value
@@ -139,6 +139,14 @@ class Spring(Tie):
     Raises ValueError for numbers of points that do not fit, points outside the body, stiffness or length below zero, and
     rest_length together with tension.
     Zienkiewicz, Taylor 2000, The Finite Element Method, vol. 2, 5th ed., sec. 10.2 (bars at large displacements).
+
+    >>> import diffsim_ti as ds
+    >>> mesh = ds.TetrahedralMesh.create_cube(resolution=2)
+    >>> material = ds.StableNeoHookean(E=1e5, nu=0.3)
+    >>> spring = ds.Spring(7, ds.Anchor([1.0, 1.0, 1.5]), stiffness=40.0, rest_length=0.25, name="tie")
+    >>> scene = ds.Scene(mesh, material, terms=[spring], fixed="ymin", precision="f64")
+    >>> print(mesh.vertices[7], scene.terms[0].values["spring_stiffness"])
+    [1. 1. 1.] 40.0
     """
 
     def __init__(

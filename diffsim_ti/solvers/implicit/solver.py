@@ -29,6 +29,7 @@ class ImplicitSolver(Solver):
     tolerance: relative residual of the equation of motion; gradients are as exact as the solve.
     max_iterations: Newton rounds per substep, after which NotConverged is raised and the state stays as it was. Rounds whose
         direction an obstacle, or the surface itself, cuts short do not count, up to five times as many.
+    preconditioner: of the linear solves: "block_jacobi", "multigrid" (smoothed aggregation), or "auto", by the body's size.
 
     On the way from one state to the next no vertex or face meets an obstacle; what comes to the body, obstacles on their
     paths and held vertices, makes room for itself. Where there is none, Blocked (a NotConverged) says what stands there.
@@ -65,12 +66,15 @@ class ImplicitSolver(Solver):
         """The numbers of pass j; `fresh`: there is no state before the present one."""
 
     def workspace(self, derived):
+        """Arrays and launches for runs of this solver."""
         return ImplicitWorkspace(self, derived)
 
     def adjoint(self, workspace, density: bool, shape: bool):
+        """The reverse sweep of a run."""
         return ImplicitAdjoint(workspace, density, shape)
 
     def tangent(self, workspace, tangent):
+        """The tangent of a run."""
         return ImplicitTangent(workspace, tangent)
 
     def describe(self) -> str:

@@ -19,6 +19,14 @@ class Ground(Obstacle):
     Inputs with gradient: "ground_height", and those of every `Obstacle`.
     Raises ValueError for numbers out of range, or a body that starts on or below the floor.
     Li et al. 2020, Incremental Potential Contact, doi:10.1145/3386569.3392425.
+
+    >>> import diffsim_ti as ds
+    >>> mesh = ds.TetrahedralMesh.create_cube(resolution=2)
+    >>> material = ds.StableNeoHookean(E=1e5, nu=0.3)
+    >>> floor = ds.Ground(height=-0.1, friction=0.4, name="floor")
+    >>> scene = ds.Scene(mesh, material, terms=[ds.Gravity(), floor], precision="f64")
+    >>> [name for name in scene.inputs.described if name.startswith("floor.")]
+    ['floor.height', 'floor.stiffness_per_area', 'floor.width', 'floor.friction', 'floor.friction_speed']
     """
 
     def __init__(self, height: float = 0.0, stiffness: float | None = None, width: float = 0.01, **options):

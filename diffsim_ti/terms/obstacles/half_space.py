@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.checked import present
 from diffsim_ti.inputs import Input
 from diffsim_ti.runtime import traced
 from diffsim_ti.terms.described import place
@@ -37,6 +38,7 @@ class HalfSpace(Obstacle):
     twin = HalfSpaceForce
 
     def __init__(self, point: ArrayLike = (0.0, 0.0, 0.0), normal: ArrayLike = (0.0, 1.0, 0.0), **options):
+        present("normal", normal)
         turn = Input("normal", normal, ((3,),), plain="half_space_normal")
         super().__init__([place("point", point, "half_space_point"), turn], **options)
         if not np.linalg.norm(self.values["half_space_normal"]) > 0:

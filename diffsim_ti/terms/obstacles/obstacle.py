@@ -129,6 +129,7 @@ class Obstacle(Term):
 
     @property
     def has_friction(self) -> bool:
+        """Whether friction was given: without, none is compiled."""
         return "friction" in self.values
 
     def check(self, mesh: TetrahedralMesh) -> None:

@@ -8,7 +8,7 @@ Triangles = tuple[np.ndarray, np.ndarray]
 
 
 def revolved(center: ArrayLike, axis: ArrayLike, along: np.ndarray, radius: np.ndarray) -> Triangles:
-    """A surface of revolution: rings `along` the axis from `center`, closed where the radius ends in 0."""
+    """A surface of revolution: rings `along` the axis from `center` [m], closed where the radius ends in 0."""
     axis = unit(axis)
     first = unit(np.cross(axis, [0.0, 0.0, 1.0] if abs(axis[2]) < 0.9 else [1.0, 0.0, 0.0]))
     angle = np.arange(ROUND) * 2 * np.pi / ROUND
@@ -21,20 +21,21 @@ def revolved(center: ArrayLike, axis: ArrayLike, along: np.ndarray, radius: np.n
 
 
 def ball(center: ArrayLike, radius: float) -> Triangles:
-    """A ball, closed and facing outwards."""
+    """A ball, closed and facing outwards: center, radius [m]."""
     angle = np.linspace(-np.pi / 2, np.pi / 2, ROUND // 2 + 1)
     return revolved(center, (0.0, 1.0, 0.0), radius * np.sin(angle), radius * np.cos(angle))
 
 
 def bowl(center: ArrayLike, radius: float) -> Triangles:
-    """The lower half of a hollow ball: it faces inwards, so that the side near the eye is not drawn."""
+    """The lower half of a hollow ball, center and radius [m]: it faces inwards, so that the side near the eye is not
+    drawn."""
     angle = np.linspace(-np.pi / 2, 0, ROUND // 2 + 1)
     points, triangles = revolved(center, (0.0, 1.0, 0.0), radius * np.sin(angle), radius * np.cos(angle))
     return points, triangles[:, ::-1]
 
 
 def tube(start: ArrayLike, end: ArrayLike, radius: float, rounded: bool) -> Triangles:
-    """A cylinder, its ends flat or round."""
+    """A cylinder from start to end, of this radius [m], its ends flat or round."""
     length = np.linalg.norm(end - start)
     sides = np.linspace(0, length, 9)
     if rounded:
@@ -47,7 +48,7 @@ def tube(start: ArrayLike, end: ArrayLike, radius: float, rounded: bool) -> Tria
 
 
 def box(center: ArrayLike, size: ArrayLike, quaternion: ArrayLike) -> Triangles:
-    """A box turned by a quaternion (w, x, y, z), its sides in small squares."""
+    """A box, center and size [m], turned by a quaternion (w, x, y, z), its sides in small squares."""
     from scipy.spatial.transform import Rotation
 
     points, triangles = [], []
