@@ -12,6 +12,7 @@ from diffsim_ti.checked import instance, listed
 from diffsim_ti.copies import MadeAgain
 from diffsim_ti.inputs import ConsistentMass, Inputs
 from diffsim_ti.mass_scaling import MassScaling
+from diffsim_ti.materials.grown import grown
 from diffsim_ti.materials.material import Material
 from diffsim_ti.materials.moduli import youngs_poisson
 from diffsim_ti.materials.patch_law import PatchLaw
@@ -26,6 +27,7 @@ from diffsim_ti.terms import (
     ElasticFoundation,
     FilledChamber,
     Gravity,
+    Growth,
     Obstacle,
     Pressure,
     SelfContact,
@@ -111,6 +113,9 @@ class Scene(MadeAgain):
         self.moving = tuple(t for t in self.ordered_terms if t.path is not None)
         self.dead_loads = tuple(t for t in self.ordered_terms if t.dead)
         self.pressures = tuple(t for t in self.ordered_terms if isinstance(t, Pressure))
+        self.growing = tuple(t for t in self.ordered_terms if isinstance(t, Growth))
+        if self.growing:
+            self.material = grown(self.material, volume)
         self.chambers = tuple(t for t in self.ordered_terms if isinstance(t, Chamber))
         self.following = (*self.pressures, *self.chambers)  # what presses on the surface as it is
         self.springs = tuple(t for t in self.ordered_terms if isinstance(t, Spring))

@@ -31,6 +31,7 @@ class SceneArrays:
         mesh, precision = scene.mesh, scene.precision
         fp = runtime.PRECISIONS[precision]
         self.fp, self.vector, self.lanes = fp, ti.types.vector(4, fp), ti.types.vector(LANES, fp)
+        self.in_steps = in_steps
         self.law = scene.law.in_steps() if in_steps else scene.law  # as implicit passes take it
         self.nodes, self.points = mesh.reference.num_nodes, mesh.reference.num_points  # of each element
         self._order_tetrahedra(scene)
@@ -173,12 +174,15 @@ class SceneArrays:
         return self._known_features[density, shape]
 
     def _make_features(self, density: bool, shape: bool) -> Features:
-        forces, follower = self.values.forces, self.values.follower
+        forces, follower, growth = self.values.forces, self.values.follower, self.values.growths
         return Features(
             **self._features,
             forces_per_step=forces is not None and len(forces) > 1,
             pressure_per_step=self._features["pressed"] and len(follower) > 1,
             ties_per_step=self.paths is not None and len(self.values.ties) > 1,
+            growing=growth is not None,
+            growth_per_step=growth is not None and len(growth) > 1 and not self.in_steps,
+            growth_uniform=growth is None or growth.shape[2] == 1,
             uniform=self.values.coefficients.ndim == 1,
             density=density,
             shape=shape,
@@ -188,7 +192,7 @@ class SceneArrays:
         """Bring values to the device; True if array shapes or kernels changed, so that launches must be bound anew."""
         old, before = self.values, None if self.values is None else self.features()
         self.values, self._known_features = values, {}
-        self.rows = {name: getattr(values, name) for name in ("motion", "path", "forces", "follower", "ties")}
+        self.rows = {name: getattr(values, name) for name in ("motion", "path", "forces", "follower", "ties", "growths")}
         moved = before != self.features()
         sources = {name: on_device(self, name, values) for name in PARTS if name != "mass"}
         sources["parameters"] = np.concatenate([values.parameters, self.tables]), self.fp
@@ -212,7 +216,7 @@ class SceneArrays:
     def load_rows(self, **rows: np.ndarray) -> None:
         """Other rows of motion, path, forces, pressure or ties, by name: those of the steps to come."""
         for name, data in rows.items():
-            runtime.fill(getattr(self, name), data)
+            runtime.fill(getattr(self, name), self.growth_blocks(data) if name == "growths" else data)
             self.rows[name] = data
 
     # ---- the stiffness of obstacles ----------------------------------------------------------------------------------
@@ -289,6 +293,24 @@ class SceneArrays:
         """Blocks of coefficients, shape (K,) or (num_tetrahedra, K); a single block serves all if they are uniform."""
         uniform = np.zeros(LANES, int) if coefficients.ndim == 1 else None
         return self.to_blocks(np.atleast_2d(coefficients), uniform)
+
+    def growth_blocks(self, growth: np.ndarray | None):
+        """Blocks of growths (rows, 2, 1 or num_tetrahedra), (rows, 2 blocks, LANES), beginning and end of a step in turn;
+        implicit passes have a single row, that of their moment (`hold_growth`)."""
+        if growth is None:
+            return None
+        rows = growth[:1] if self.in_steps else growth
+        order = np.zeros(LANES, int) if growth.shape[2] == 1 else self.order
+        return np.stack([self.to_blocks(row.T, order) for row in rows])
+
+    def from_growth_blocks(self, blocks: np.ndarray) -> np.ndarray:
+        """The inverse, for adjoints, which each tetrahedron has its own of."""
+        out = np.stack([self.from_blocks(row, 2).T for row in blocks])
+        return out.sum(2, keepdims=True) if self.values.growths.shape[2] == 1 else out
+
+    def hold_growth(self, growth: np.ndarray) -> None:
+        """What an implicit pass takes, shape (1 or num_tetrahedra,)."""
+        runtime.fill(self.growths, self.growth_blocks(np.stack([growth, growth])[None]))
 
     def volume_blocks(self, volumes: np.ndarray) -> np.ndarray:
         """Blocks of volumes; repetitions in a patch have none."""

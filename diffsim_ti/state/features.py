@@ -58,6 +58,9 @@ class Features:
     tied: bool = False  # whether there are springs or cables
     ties_per_step: bool = False
     cabled: bool = False
+    growing: bool = False  # whether tetrahedra grow over time
+    growth_per_step: bool = False
+    growth_uniform: bool = True
     founded: bool = False  # whether vertices lie on an elastic foundation
     motion: bool = False
     guided: bool = False  # whether vertices are held in some directions alone

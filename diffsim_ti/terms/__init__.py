@@ -5,6 +5,7 @@ from diffsim_ti.terms.drag import Drag
 from diffsim_ti.terms.external_force import ExternalForce
 from diffsim_ti.terms.foundation import ElasticFoundation
 from diffsim_ti.terms.gravity import Gravity
+from diffsim_ti.terms.growth import Growth
 from diffsim_ti.terms.loads import BodyForce, Load, Pressure, Traction
 from diffsim_ti.terms.muscle import Muscle
 from diffsim_ti.terms.obstacles.ball import Capsule, Sphere
@@ -29,6 +30,7 @@ LOADS = (
     Spring,
     Cable,
     Muscle,
+    Growth,
     ElasticFoundation,
 )
 TERMS = (Gravity, Drag, *LOADS, *OBSTACLES, SelfContact)
@@ -47,6 +49,7 @@ __all__ = [
     "GasChamber",
     "Gravity",
     "Ground",
+    "Growth",
     "HalfSpace",
     "Load",
     "MeshObstacle",

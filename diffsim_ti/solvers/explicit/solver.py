@@ -138,7 +138,7 @@ class ExplicitWorkspace(Workspace):
         self.following = following(self.scene)
         self.attached = Attached.of(self.scene)  # springs, cables and foundations, for what looks between passes
         self.probe = None  # room for a pass that is not taken
-        self.energy_watch = EnergyBalance(self) if EnergyBalance.knows(a.law) else None
+        self.energy_watch = EnergyBalance(self) if EnergyBalance.knows(a.law) and not self.scene.growing else None
 
     def load(self, derived: Derived) -> None:
         super().load(derived)

@@ -79,6 +79,7 @@ class ImplicitAdjoint(RecordedPasses):
         self.mass_adj, self.gravity, self.rate = np.zeros(len(self.p)), np.zeros(3), 0.0
         masses = a.values.element_masses
         self.element_masses = None if masses is None else np.zeros_like(masses)
+        self.growth = None if a.values.growths is None else np.zeros_like(a.values.growths)
         self.attached = a.values.zeros()  # of springs, cables and foundations
         self.pressure = None if a.values.follower is None else np.zeros_like(a.values.follower)
         self.rest_by_pressure = np.zeros_like(self.p)
@@ -104,10 +105,18 @@ class ImplicitAdjoint(RecordedPasses):
             if self.z is not None:
                 self._pull_back_law(j, j - base)
             self._pull_back(j, save_every)
+            if self.growth is not None:
+                self._pull_back_growth(j)
             frame = int(self.ws.solver.schedule.shown(j, save_every))
             if 0 <= frame < len(self.frames[0]) - 1:
                 self.p += self.frames[0][frame]
                 self.q += self.frames[1][frame]
+
+    def _pull_back_growth(self, j: int) -> None:
+        """What tetrahedra felt of growth in pass j goes to its step."""
+        felt = self.ws.arrays.from_growth_blocks(runtime.fetch(self.numbers.growths).astype(np.float64))
+        self.ws.growth_vjp(self.growth, j, self.stage, felt[0].sum(0))
+        runtime.fill(self.numbers.growths, 0)
 
     def _pull_back_law(self, j: int, slot: int) -> None:
         """The state of the law after pass j comes from that before, in a slot of the record, and from where it ends."""
@@ -257,6 +266,7 @@ class ImplicitAdjoint(RecordedPasses):
             by_areas = runtime.fetch(self.face_areas).astype(np.float64)
             rest = rest + rest_of_areas(a.mesh, a.values.rest, by_areas)
         out.rest = rest + self.rest_by_pressure + out.rest
+        out.growths = self.growth
         out.forces, out.motion, out.path, out.follower = self.forces, self.motion, self.path, self.pressure
         for name in ("ties", "tie_segments", "foundation"):
             setattr(out, name, getattr(self.attached, name))

@@ -72,6 +72,9 @@ class ImplicitTangent(RecordedPasses):
         runtime.fill(ws.potential.w, held[None])
         if ws.potential.has_friction:
             runtime.fill(self.lag, np.stack([self.du, dx]))
+        if tangent.growths is not None:
+            moved = ws.growth_of(tangent.growths, j, s)
+            runtime.fill(self.numbers.growths, a.growth_blocks(np.stack([moved, moved])[None]))
         walls = None if tangent.path is None else ws.walls_jvp(tangent.path, j, s)
         if walls is not None:
             runtime.fill(self.walls, walls)

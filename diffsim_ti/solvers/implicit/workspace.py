@@ -50,7 +50,7 @@ class ImplicitWorkspace(ObstacleWays, Noted, GivenInPasses, Workspace):
 
     def __init__(self, solver, derived):
         self.potential, self._length = None, solver.substep
-        self.energy_watch = EnergyWatch(self) if solver.may_gain_energy else None
+        self.energy_watch = EnergyWatch(self) if solver.may_gain_energy and not solver.scene.growing else None
         super().__init__(solver, derived)
 
     def history(self, num_slots, record=False):
@@ -315,6 +315,7 @@ class ImplicitWorkspace(ObstacleWays, Noted, GivenInPasses, Workspace):
             self.pressed.begin(u, self._walls)
         self.press(j, stage)
         self.attach(j, stage)
+        self.grow(j, stage)
 
     def moment(self, j: int, stage: Stage) -> Moment:
         """Where pass j lies for obstacles; a chord of two passes about its end for a solver of two steps."""
