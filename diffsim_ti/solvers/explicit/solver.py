@@ -235,8 +235,8 @@ class ExplicitWorkspace(Workspace):
         a, solver, schedule = self.arrays, self.solver, self.solver.schedule
         num_rows = max((len(x) for x in (a.values.path, a.values.motion) if x is not None), default=1)
         # they ask in which step a pass lies
-        if num_rows == 1 and (a.features().pressed or a.paths or a.features().forces_keyed):
-            given = a.values.forces, a.values.follower, a.values.ties
+        if num_rows == 1 and (a.features().pressed or a.paths or a.features().forces_keyed or a.features().growing):
+            given = a.values.forces, a.values.follower, a.values.ties, a.values.growths
             num_rows = max(1 + len(x) for x in given if x is not None)
         run = num_passes, num_rows, save_every, self.rate, schedule
         turn, sizes = -1 if backwards else 1, dict(num_items=a.num_items, num_vertices=a.num_vertices)
