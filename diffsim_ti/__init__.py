@@ -96,6 +96,7 @@ from diffsim_ti.terms import (
     SelfContact,
     Sphere,
     Spring,
+    SurfaceDrag,
     Traction,
 )
 from diffsim_ti.verify import check_gradients, dot_product_test, taylor_test
@@ -124,6 +125,7 @@ __all__ = [
     "FilledChamber",
     "BodyForce",
     "Spring",
+    "SurfaceDrag",
     "Cable",
     "Anchor",
     "ElasticFoundation",

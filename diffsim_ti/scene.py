@@ -32,6 +32,7 @@ from diffsim_ti.terms import (
     Pressure,
     SelfContact,
     Spring,
+    SurfaceDrag,
     Term,
 )
 from diffsim_ti.terms.motion import Motion
@@ -113,6 +114,7 @@ class Scene(MadeAgain):
         self.moving = tuple(t for t in self.ordered_terms if t.path is not None)
         self.dead_loads = tuple(t for t in self.ordered_terms if t.dead)
         self.pressures = tuple(t for t in self.ordered_terms if isinstance(t, Pressure))
+        self.fluids = tuple(t for t in self.ordered_terms if isinstance(t, SurfaceDrag))
         self.growing = tuple(t for t in self.ordered_terms if isinstance(t, Growth))
         if self.growing:
             self.material = grown(self.material, volume)

@@ -45,6 +45,7 @@ class SceneArrays:
         self.pressures = scene.pressures if presses else ()  # that gather with the tetrahedra's corners
         self.chambers = scene.chambers if presses else ()  # likewise
         self.paths = scene.tie_paths if presses and scene.ties else None
+        self.fluids = scene.fluids if presses else ()  # likewise
         self.founded = scene.founded_vertices if presses else np.zeros(0, np.int64)
         self.mesh, self.precision, self.self_contact = mesh, precision, scene.term(SelfContact)
         self._upload_topology(scene)
@@ -63,6 +64,7 @@ class SceneArrays:
             tied=self.paths is not None,
             cabled=self.paths is not None and bool(scene.cables),
             founded=bool(len(self.founded)),
+            dragged=self.num_dragged > 0,
             motion=scene.motion is not None,
             guided=bool(len(scene.supports.guided)),
             num_parameters=rows.total,
@@ -114,6 +116,7 @@ class SceneArrays:
             closed = np.concatenate([chamber.enclosure.triangles for chamber in self.chambers])
             start, corner_of = with_more_corners(start, corner_of, closed.ravel(), num_corners)
             num_corners += closed.size
+        start, corner_of, num_corners = self._upload_fluids(scene, start, corner_of, num_corners)
         self.start, self.corner_of = runtime.upload(start, ti.i32), runtime.upload(corner_of, ti.i32)
         self.corner = runtime.array(self.vector, num_corners)
         self.force_slot = self.motion_slot = runtime.array(ti.i32, 1)
@@ -142,6 +145,20 @@ class SceneArrays:
         self.point_weight = runtime.upload(paths.weights, self.fp)
         self.tie_one_sided = runtime.upload(scene.one_sided_ties, ti.i32)
         return start, corner_of, num_corners + len(paths.vertices)
+
+    def _upload_fluids(self, scene, start, corner_of, num_corners: int) -> tuple:
+        """(start, corner_of, number of corners), with those of triangles in a fluid."""
+        self.num_dragged, self.first_dragged = 0, num_corners
+        if not self.fluids:
+            return start, corner_of, num_corners
+        parts = [term.triangles(self.mesh) for term in self.fluids]
+        first = [np.full(len(p), scene.inputs.parameters.first(t)) for t, p in zip(self.fluids, parts)]
+        self.dragged_nodes, self.dragged_first = np.concatenate(parts), np.concatenate(first)
+        self.num_dragged = len(self.dragged_nodes)
+        self.dragged = runtime.upload(self.dragged_nodes.ravel(), ti.i32)
+        self.dragged_numbers = runtime.upload(self.dragged_first, ti.i32)
+        start, corner_of = with_more_corners(start, corner_of, self.dragged_nodes.ravel(), num_corners)
+        return start, corner_of, num_corners + self.dragged_nodes.size
 
     def _twins(self, scene) -> list[tuple]:
         """(compile-time twin, first parameter, column of the path or -1) of the obstacles; their tables stand behind the
@@ -196,7 +213,7 @@ class SceneArrays:
         moved = before != self.features()
         sources = {name: on_device(self, name, values) for name in PARTS if name != "mass"}
         sources["parameters"] = np.concatenate([values.parameters, self.tables]), self.fp
-        if not (self.contacts or self.self_contact or self.pressures or self.chambers):
+        if not (self.contacts or self.self_contact or self.pressures or self.chambers or self.fluids):
             sources["rest"] = np.zeros((1, 3)), self.vector
         sources["inverse_mass"] = self.inverse_of(values.mass), self.fp
         for name, (data, dtype) in sources.items():
@@ -210,7 +227,7 @@ class SceneArrays:
 
     def clear_corners_of_loads(self) -> None:
         """No forces at corners of springs, pressed triangles and chambers, where tetrahedra alone are to be gathered."""
-        if self.pressures or self.chambers or self.num_ties:
+        if self.pressures or self.chambers or self.num_ties or self.num_dragged:
             clear_from(self.corner, self.first_tied)
 
     def load_rows(self, **rows: np.ndarray) -> None:

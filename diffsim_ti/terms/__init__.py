@@ -16,6 +16,7 @@ from diffsim_ti.terms.obstacles.mesh_obstacle import MeshObstacle
 from diffsim_ti.terms.obstacles.obstacle import Obstacle
 from diffsim_ti.terms.pose import Pose
 from diffsim_ti.terms.self_contact import SelfContact
+from diffsim_ti.terms.surface_drag import SurfaceDrag
 from diffsim_ti.terms.term import Term, VertexForce
 from diffsim_ti.terms.ties import Anchor, Cable, Spring
 
@@ -33,7 +34,7 @@ LOADS = (
     Growth,
     ElasticFoundation,
 )
-TERMS = (Gravity, Drag, *LOADS, *OBSTACLES, SelfContact)
+TERMS = (Gravity, Drag, SurfaceDrag, *LOADS, *OBSTACLES, SelfContact)
 __all__ = [
     "Anchor",
     "BodyForce",
@@ -61,6 +62,7 @@ __all__ = [
     "SelfContact",
     "Sphere",
     "Spring",
+    "SurfaceDrag",
     "Term",
     "TERMS",
     "Traction",

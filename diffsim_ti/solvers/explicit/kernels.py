@@ -279,7 +279,7 @@ class ExplicitKernels:
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.num_vertices):
             adjoint.u[0, i] = adjoint.u[0, i] + self.element.gather(i, scene, adjoint.corner)
-            if ti.static(self.element.reads_rates):
+            if ti.static(self.vertex.reads_rates):
                 adjoint.v[0, i] = adjoint.v[0, i] + self.element.gather(i, scene, adjoint.rate_corner)
 
     @cached_property

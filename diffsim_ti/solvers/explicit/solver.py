@@ -14,6 +14,7 @@ from diffsim_ti.inputs import Derived
 from diffsim_ti.monitor.energy_balance import EnergyBalance
 from diffsim_ti.potential.attached import Attached
 from diffsim_ti.potential.chamber_pressure import following
+from diffsim_ti.potential.fluid import Fluid
 from diffsim_ti.potential.way import Way
 from diffsim_ti.solvers.explicit.adjoint import ExplicitAdjoint, ExplicitTangent
 from diffsim_ti.solvers.explicit.chambers import Chambers
@@ -193,6 +194,9 @@ class ExplicitWorkspace(Workspace):
             out[self.scene.loaded_vertices] = sum(w * schedule.load(a.rows["forces"], *k, keyed) for w, k in kicks)
         if self.following is not None:
             out += self.following.at(self.numbers_at(j, num_passes)).forces(a.values.rest + u)
+        if self.scene.fluids:
+            v = runtime.fetch_row(self.state.v, 0)
+            out += Fluid.of(self.scene).at(a.values.parameters, a.values.rest + u - v, 1.0).forces(a.values.rest + u)
         if a.features().cabled:
             both = [[w * part for part in schedule.ties(a.rows["ties"], *k)] for w, k in kicks]
             numbers = (begin + end for begin, end in zip(*both))
@@ -241,6 +245,7 @@ class ExplicitWorkspace(Workspace):
         run = num_passes, num_rows, save_every, self.rate, schedule
         turn, sizes = -1 if backwards else 1, dict(num_items=a.num_items, num_vertices=a.num_vertices)
         sizes |= dict(contact_damping=solver.contact_damping, num_pressed=a.num_pressed, first_pressed=a.first_pressed)
+        sizes |= dict(num_dragged=a.num_dragged, first_dragged=a.first_dragged)
         sizes |= dict(num_ties=a.num_ties, first_tied=a.first_tied, first_load=a.first_load)
         for window, begin, end in self.table.windows(first, last)[::turn]:
             self.table.show(window, run, lambda first, last: solver.pass_table(first, last, *run[:4]))

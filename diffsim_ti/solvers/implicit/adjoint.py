@@ -83,6 +83,7 @@ class ImplicitAdjoint(RecordedPasses):
         self.attached = a.values.zeros()  # of springs, cables and foundations
         self.pressure = None if a.values.follower is None else np.zeros_like(a.values.follower)
         self.rest_by_pressure = np.zeros_like(self.p)
+        self.fluid = np.zeros(len(a.values.parameters))
         self.forces = None if a.values.forces is None else np.zeros_like(a.values.forces)
         self.motion = None if a.values.motion is None else np.zeros_like(a.values.motion)
         self.path = None if a.values.path is None else np.zeros_like(a.values.path)
@@ -111,6 +112,13 @@ class ImplicitAdjoint(RecordedPasses):
             if 0 <= frame < len(self.frames[0]) - 1:
                 self.p += self.frames[0][frame]
                 self.q += self.frames[1][frame]
+
+    def _pull_back_fluid(self, by_star: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Adjoints of u*, and of x, from which velocities are measured; adds those of a fluid's numbers."""
+        fluid = self.ws.fluid
+        by_place, by_speed, numbers = fluid.vjp_of_all(self.places, by_star, len(self.fluid))
+        self.rest_by_pressure, self.fluid = self.rest_by_pressure + by_place, self.fluid + numbers
+        return by_place + by_speed / fluid.gamma, -by_speed / fluid.gamma
 
     def _pull_back_growth(self, j: int) -> None:
         """What tetrahedra felt of growth in pass j goes to its step."""
@@ -157,9 +165,12 @@ class ImplicitAdjoint(RecordedPasses):
             reaction = reaction + self._vjp_of_faces()
         reaction = reaction + by_contacts
         by_x, by_lag = 0.0, np.zeros_like(p)
-        if ws.potential.rubbing:
-            by_place, by_x, by_lag = ws.potential.rubbing.vjp(ws.potential.held_at, by_star)
+        if ws.fluid:
+            by_place, by_x = self._pull_back_fluid(by_star)
             reaction = reaction + by_place
+        if ws.potential.rubbing:
+            by_place, by_rub, by_lag = ws.potential.rubbing.vjp(ws.potential.held_at, by_star)
+            reaction, by_x = reaction + by_place, by_x + by_rub
         if ws.attached:
             reaction = reaction + ws.attached.vjp(ws.potential.held_at, by_star, self.attached, *ws.time_of(j, s))
         share = ws.load_share(j, s)
@@ -181,8 +192,8 @@ class ImplicitAdjoint(RecordedPasses):
             reaction = reaction - inertial  # held vertices are felt by their neighbours' inertia too
         x_adj, by_begin = inertial - s.e0 / s.gamma * q_free + by_x, 0.0
         if ws.potential.has_friction:
-            by_first, by_x = runtime.fetch(self.lag).astype(np.float64) + (0.0 if seen is None else seen[1])
-            by_lag, x_adj = by_lag + by_first, x_adj + by_x
+            by_first, by_first_x = runtime.fetch(self.lag).astype(np.float64) + (0.0 if seen is None else seen[1])
+            by_lag, x_adj = by_lag + by_first, x_adj + by_first_x
         if self._by_pressed:
             by_pressed = runtime.fetch(self.pressed).astype(np.float64) + (0.0 if seen is None else seen[2])
             by_place, by_begin = self._by_pressed.pull_back(by_pressed)
@@ -258,6 +269,7 @@ class ImplicitAdjoint(RecordedPasses):
             out.parameters[features.gravity :][:3] = self.gravity
         if features.drag >= 0:
             out.parameters[features.drag] = self.rate
+        out.parameters += self.fluid
         rest = self.frames[0].sum(0)
         if self.ws.pairs:
             out.parameters[a.parameters_of_self_contact], by_pairs = self.ws.pairs.collect()

@@ -103,6 +103,9 @@ class ImplicitTangent(RecordedPasses):
         if tangent.follower is not None:
             dp = ws.solver.schedule.pressure(tangent.follower, j, ws.share_at_stage(j, s))
             dR += ws.follower.jvp(self.places, held + tangent.rest, dp)
+        if ws.fluid:
+            dv = (held - dx) / s.gamma
+            dR += ws.fluid.jvp_of_all(self.places, held + tangent.rest, dv, tangent.parameters)
         if ws.attached:
             dR += ws.attached.jvp(ws.potential.held_at, held, tangent, *ws.time_of(j, s))
         d_star = self.solve(dR + self.mass * (dx + s.gamma * dy - held))
