@@ -90,6 +90,7 @@ from diffsim_ti.terms import (
     GasChamber,
     Gravity,
     Ground,
+    Growth,
     HalfSpace,
     MeshObstacle,
     Muscle,
@@ -98,6 +99,7 @@ from diffsim_ti.terms import (
     SelfContact,
     Sphere,
     Spring,
+    SurfaceDrag,
     Traction,
 )
 from diffsim_ti.verify import check_gradients, dot_product_test, taylor_test
@@ -126,10 +128,12 @@ __all__ = [
     "FilledChamber",
     "BodyForce",
     "Spring",
+    "SurfaceDrag",
     "Cable",
     "Anchor",
     "ElasticFoundation",
     "Ground",
+    "Growth",
     "HalfSpace",
     "Sphere",
     "Box",

@@ -12,6 +12,7 @@ from diffsim_ti.copies import MadeAgain
 from diffsim_ti.inputs import ConsistentMass, Inputs
 from diffsim_ti.locking import LOCKING_RATIO, warn_if_locking
 from diffsim_ti.mass_scaling import MassScaling
+from diffsim_ti.materials.grown import grown
 from diffsim_ti.materials.material import Material
 from diffsim_ti.materials.moduli import youngs_poisson
 from diffsim_ti.materials.patch_law import PatchLaw
@@ -26,10 +27,12 @@ from diffsim_ti.terms import (
     Drag,
     ElasticFoundation,
     Gravity,
+    Growth,
     Obstacle,
     Pressure,
     SelfContact,
     Spring,
+    SurfaceDrag,
     Term,
 )
 from diffsim_ti.terms.motion import Motion
@@ -121,6 +124,10 @@ class Scene(MadeAgain):
         self.moving = tuple(t for t in self.ordered_terms if t.path is not None)
         self.dead_loads = tuple(t for t in self.ordered_terms if t.dead)
         self.pressures = tuple(t for t in self.ordered_terms if isinstance(t, Pressure))
+        self.fluids = tuple(t for t in self.ordered_terms if isinstance(t, SurfaceDrag))
+        self.growing = tuple(t for t in self.ordered_terms if isinstance(t, Growth))
+        if self.growing:
+            self.material = grown(self.material, volume)
         self.chambers = tuple(t for t in self.ordered_terms if isinstance(t, Chamber))
         self.gases = tuple(t for t in self.chambers if not t.holds)
         self.following = (*self.pressures, *self.chambers)  # what presses on the surface as it is

@@ -128,7 +128,8 @@ class Simulator:
         inputs = self.scene.inputs
         if inputs.makes_rows:
             now = inputs.derive(inputs.at_step(self.step_count, self.solver.dt, self._set))
-            made = dict(forces=now.forces if inputs.sums_loads else None, follower=now.follower, ties=now.ties)
+            made = dict(forces=now.forces if inputs.sums_loads else None)
+            made |= dict(follower=now.follower, ties=now.ties, growths=now.growths)
             arrays.load_rows(**{name: rows for name, rows in made.items() if rows is not None})
         if not inputs.sums_loads and values.forces is not None and len(values.forces) > 1:
             rows = values.forces

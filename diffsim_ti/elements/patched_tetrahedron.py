@@ -27,7 +27,8 @@ MOST = 6  # numbers of an item that its patch sums up
 def functions_of(law, features, lanes: bool) -> Tetrahedron:
     """The element of a law and a scene's features; patches for a PatchLaw."""
     kind = PatchedTetrahedron if isinstance(law, PatchLaw) else Tetrahedron
-    return kind(law, features.uniform, lanes, features.order)
+    growth = (features.growth_per_step, features.growth_uniform) if features.growing else None
+    return kind(law, features.uniform, lanes, features.order, growth)
 
 
 @dataclass(frozen=True)

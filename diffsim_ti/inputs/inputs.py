@@ -15,6 +15,7 @@ from diffsim_ti.inputs.consistent_mass import ElementMasses
 from diffsim_ti.inputs.curved_shape import CurvedShape, StressPoints
 from diffsim_ti.inputs.description import POSITIVE, Input, frozen, length, length_per_step, speed
 from diffsim_ti.inputs.foundation import FoundationRows
+from diffsim_ti.inputs.growing import GrowthRows
 from diffsim_ti.inputs.loads import PressureRows, SumOfForces
 from diffsim_ti.inputs.poses import PoseColumns
 from diffsim_ti.inputs.surface_areas import SurfaceAreas
@@ -46,6 +47,7 @@ class Derived:
     ties: np.ndarray | None = None  # numbers of springs and cables (inputs/ties.py), (1 or steps, 2 ties, 3)
     tie_segments: np.ndarray | None = None  # between their points at rest, (points, 3) [m]
     element_masses: np.ndarray | None = None  # consistent, of ten nodes, (num_tetrahedra, 10, 10) [kg]
+    growths: np.ndarray | None = None  # as each step begins and ends, (1 or steps, 2, 1 or num_tetrahedra) [-]
     foundation: np.ndarray | None = None  # rows of the stiffness of vertices on foundations, (3 k, 3) [N/m]
 
     def zeros(self, but=()) -> "Derived":
@@ -173,6 +175,9 @@ class Inputs:
         if self.scene.ties:
             out.append(JoinedRows([f"{own[t]} rows" for t in self.scene.ties], "ties"))
             out.append(JoinedSegments([f"{own[t]} segments" for t in self.scene.ties], "tie_segments"))
+        if growing := self.scene.growing:
+            groups = [(None, None) if t.everywhere else t.groups(self.mesh) for t in growing]
+            out.append(GrowthRows([f"{own[t]} in time" for t in growing], *zip(*groups), self.mesh.num_tetrahedra))
         if founded := self.scene.foundations:
             indices = [term.indices(self.mesh) for term in founded]
             out.append(FoundationRows([f"{own[t]} matrices" for t in founded], indices, "foundation"))
@@ -181,7 +186,7 @@ class Inputs:
     @property
     def makes_rows(self) -> bool:
         """Whether what changes from step to step is made of inputs together."""
-        return self.sums_loads or bool(self.scene.following or self.scene.cables)
+        return self.sums_loads or bool(self.scene.following or self.scene.cables or self.scene.growing)
 
     @property
     def keyed_forces(self) -> bool:

@@ -81,7 +81,7 @@ class Grown(Around):
     growth [-], > -1: growth or swelling (shrinkage below zero) as strain along each edge; of heat alpha (T - T_0). One
     number, one for each tetrahedron, or by named sets as all numbers of materials; an input with gradient, "growth". A free
     body with uniform growth takes its new size without stress. Mass stays that of the rest shape.
-    It holds during a run; what changes in time takes it as an input of each step.
+    It holds during a run; a term `Growth` adds what changes in time.
     volume="patches" does not know it.
     Rodriguez, Hoger, McCulloch 1994, Stress-dependent finite growth, doi:10.1016/0021-9290(94)90021-3.
     Raises ValueError for growth of -1 or less, and for a material that has a state or depends on the velocity.
@@ -114,3 +114,15 @@ class Grown(Around):
 
     def law(self, precision):
         return GrownLaw(precision, self.material.law(precision))
+
+
+def grown(material: Material, volume: str) -> Material:
+    """The material if it is Grown, or has a growth within, else `Grown(material, 0)`; for terms that grow it over time."""
+    if volume == "patches":
+        raise ValueError('Growth: volume="patches" does not know it; take volume="tetrahedra" or mesh.quadratic()')
+    if "growth" in material.law("f64").coefficient_names:
+        return material
+    try:
+        return Grown(material, 0.0)
+    except ValueError as error:
+        raise ValueError(f"Growth: {error}: {material.name}(Grown(material, 0), ...)") from None

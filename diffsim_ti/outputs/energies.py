@@ -38,6 +38,7 @@ class ElasticEnergy(Output):
                 f"ElasticEnergy knows laws of the displacement gradient, not {type(law).__name__}: take a law without rates "
                 "and state"
             )
+        self.refuse_growth("ElasticEnergy", scene)
         out = copy(self)
         out.scene, out.all = scene, np.arange(mesh.num_tetrahedra)
         out.patched = scene.volume == "patches"

@@ -53,6 +53,14 @@ class Output(ABC):
     reads_contact_forces = False  # whether runs must note frames.contact_forces for it
     reads_chamber_pressures = False  # the same of frames.chamber_pressures
 
+    @staticmethod
+    def refuse_growth(output: str, scene: "Scene") -> None:
+        """Raise ValueError where tetrahedra grow over time: an output knows frames, not what they had grown by."""
+        if scene.growing:
+            raise ValueError(
+                f"{output} evaluates the law and does not know Growth over time; take Grown(material, growth), or strains"
+            )
+
     def settled(self, scene: "Scene") -> "Output":
         """This output for a scene: checked, with what depends on the scene alone; raises ValueError if it does not fit."""
         return self

@@ -67,6 +67,8 @@ class Reaction(Output):
         return f"Reaction({self.support!r}, name={self.name!r})"
 
     def settled(self, scene: "Scene") -> "Reaction":
+        if scene.fluids:
+            raise ValueError("Reaction does not know SurfaceDrag; leave the one or the other out")
         out = copy(self)
         out.vertices = scene.held if self.support is None else scene.mesh.vertex_indices(self.support)
         loose = np.setdiff1d(out.vertices, scene.held)

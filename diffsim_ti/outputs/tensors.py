@@ -193,6 +193,7 @@ class Stress(_Tensors):
                 f"Stress knows laws of the displacement gradient, not {type(law).__name__}: take a law without rates and "
                 "state"
             )
+        self.refuse_growth("Stress", scene)
         out = super().settled(scene)
         out.stresses = (TetrahedronStress if scene.volume == "tetrahedra" else PatchStress)(scene, out.chosen)
         out.read = out.stresses.read

@@ -45,6 +45,8 @@ class StaticSolver(ImplicitSolver):
         preconditioner: str = "auto",
     ):
         self.check_scene(scene)
+        if scene.fluids:
+            raise ValueError("SurfaceDrag is of velocities, and an equilibrium has none; take a solver with inertia")
         law = scene.law
         if law.state_names:
             raise ValueError(

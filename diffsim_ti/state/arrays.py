@@ -31,6 +31,7 @@ class SceneArrays:
         mesh, precision = scene.mesh, scene.precision
         fp = runtime.PRECISIONS[precision]
         self.fp, self.vector, self.lanes = fp, ti.types.vector(4, fp), ti.types.vector(LANES, fp)
+        self.in_steps = in_steps
         self.law = scene.law.in_steps() if in_steps else scene.law  # as implicit passes take it
         self.nodes, self.points = mesh.reference.num_nodes, mesh.reference.num_points  # of each element
         self._order_tetrahedra(scene)
@@ -44,6 +45,7 @@ class SceneArrays:
         self.pressures = scene.pressures if presses else ()  # that gather with the tetrahedra's corners
         self.chambers = scene.gases if presses else ()  # likewise
         self.paths = scene.tie_paths if presses and scene.ties else None
+        self.fluids = scene.fluids if presses else ()  # likewise
         self.founded = scene.founded_vertices if presses else np.zeros(0, np.int64)
         self.mesh, self.precision, self.self_contact = mesh, precision, scene.term(SelfContact)
         self._upload_topology(scene)
@@ -62,6 +64,7 @@ class SceneArrays:
             tied=self.paths is not None,
             cabled=self.paths is not None and bool(scene.cables),
             founded=bool(len(self.founded)),
+            dragged=self.num_dragged > 0,
             motion=scene.motion is not None,
             guided=bool(len(scene.supports.guided)),
             num_parameters=rows.total,
@@ -113,6 +116,7 @@ class SceneArrays:
             closed = np.concatenate([chamber.enclosure.triangles for chamber in self.chambers])
             start, corner_of = with_more_corners(start, corner_of, closed.ravel(), num_corners)
             num_corners += closed.size
+        start, corner_of, num_corners = self._upload_fluids(scene, start, corner_of, num_corners)
         self.start, self.corner_of = runtime.upload(start, ti.i32), runtime.upload(corner_of, ti.i32)
         self.corner = runtime.array(self.vector, num_corners)
         self.force_slot = self.motion_slot = runtime.array(ti.i32, 1)
@@ -141,6 +145,20 @@ class SceneArrays:
         self.point_weight = runtime.upload(paths.weights, self.fp)
         self.tie_one_sided = runtime.upload(scene.one_sided_ties, ti.i32)
         return start, corner_of, num_corners + len(paths.vertices)
+
+    def _upload_fluids(self, scene, start, corner_of, num_corners: int) -> tuple:
+        """(start, corner_of, number of corners), with those of triangles in a fluid."""
+        self.num_dragged, self.first_dragged = 0, num_corners
+        if not self.fluids:
+            return start, corner_of, num_corners
+        parts = [term.triangles(self.mesh) for term in self.fluids]
+        first = [np.full(len(p), scene.inputs.parameters.first(t)) for t, p in zip(self.fluids, parts)]
+        self.dragged_nodes, self.dragged_first = np.concatenate(parts), np.concatenate(first)
+        self.num_dragged = len(self.dragged_nodes)
+        self.dragged = runtime.upload(self.dragged_nodes.ravel(), ti.i32)
+        self.dragged_numbers = runtime.upload(self.dragged_first, ti.i32)
+        start, corner_of = with_more_corners(start, corner_of, self.dragged_nodes.ravel(), num_corners)
+        return start, corner_of, num_corners + self.dragged_nodes.size
 
     def _twins(self, scene) -> list[tuple]:
         """(compile-time twin, first parameter, column of the path or -1) of the obstacles; their tables stand behind the
@@ -173,12 +191,15 @@ class SceneArrays:
         return self._known_features[density, shape]
 
     def _make_features(self, density: bool, shape: bool) -> Features:
-        forces, follower = self.values.forces, self.values.follower
+        forces, follower, growth = self.values.forces, self.values.follower, self.values.growths
         return Features(
             **self._features,
             forces_per_step=forces is not None and len(forces) > 1,
             pressure_per_step=self._features["pressed"] and len(follower) > 1,
             ties_per_step=self.paths is not None and len(self.values.ties) > 1,
+            growing=growth is not None,
+            growth_per_step=growth is not None and len(growth) > 1 and not self.in_steps,
+            growth_uniform=growth is None or growth.shape[2] == 1,
             uniform=self.values.coefficients.ndim == 1,
             density=density,
             shape=shape,
@@ -188,11 +209,13 @@ class SceneArrays:
         """Bring values to the device; True if array shapes or kernels changed, so that launches must be bound anew."""
         old, before = self.values, None if self.values is None else self.features()
         self.values, self._known_features = values, {}
-        self.rows = {name: getattr(values, name) for name in ("motion", "path", "forces", "follower", "ties")}
+        self.rows = {
+            name: getattr(values, name) for name in ("motion", "path", "forces", "follower", "ties", "growths")
+        }
         moved = before != self.features()
         sources = {name: on_device(self, name, values) for name in PARTS if name != "mass"}
         sources["parameters"] = np.concatenate([values.parameters, self.tables]), self.fp
-        if not (self.contacts or self.self_contact or self.pressures or self.chambers):
+        if not (self.contacts or self.self_contact or self.pressures or self.chambers or self.fluids):
             sources["rest"] = np.zeros((1, 3)), self.vector
         sources["inverse_mass"] = self.inverse_of(values.mass), self.fp
         for name, (data, dtype) in sources.items():
@@ -206,13 +229,13 @@ class SceneArrays:
 
     def clear_corners_of_loads(self) -> None:
         """No forces at corners of springs, pressed triangles and chambers, where tetrahedra alone are to be gathered."""
-        if self.pressures or self.chambers or self.num_ties:
+        if self.pressures or self.chambers or self.num_ties or self.num_dragged:
             clear_from(self.corner, self.first_tied)
 
     def load_rows(self, **rows: np.ndarray) -> None:
         """Other rows of motion, path, forces, pressure or ties, by name: those of the steps to come."""
         for name, data in rows.items():
-            runtime.fill(getattr(self, name), data)
+            runtime.fill(getattr(self, name), self.growth_blocks(data) if name == "growths" else data)
             self.rows[name] = data
 
     # ---- the stiffness of obstacles ----------------------------------------------------------------------------------
@@ -289,6 +312,24 @@ class SceneArrays:
         """Blocks of coefficients, shape (K,) or (num_tetrahedra, K); a single block serves all if they are uniform."""
         uniform = np.zeros(LANES, int) if coefficients.ndim == 1 else None
         return self.to_blocks(np.atleast_2d(coefficients), uniform)
+
+    def growth_blocks(self, growth: np.ndarray | None):
+        """Blocks of growths (rows, 2, 1 or num_tetrahedra), (rows, 2 blocks, LANES), beginning and end of a step in turn;
+        implicit passes have a single row, that of their moment (`hold_growth`)."""
+        if growth is None:
+            return None
+        rows = growth[:1] if self.in_steps else growth
+        order = np.zeros(LANES, int) if growth.shape[2] == 1 else self.order
+        return np.stack([self.to_blocks(row.T, order) for row in rows])
+
+    def from_growth_blocks(self, blocks: np.ndarray) -> np.ndarray:
+        """The inverse, for adjoints, which each tetrahedron has its own of."""
+        out = np.stack([self.from_blocks(row, 2).T for row in blocks])
+        return out.sum(2, keepdims=True) if self.values.growths.shape[2] == 1 else out
+
+    def hold_growth(self, growth: np.ndarray) -> None:
+        """What an implicit pass takes, shape (1 or num_tetrahedra,)."""
+        runtime.fill(self.growths, self.growth_blocks(np.stack([growth, growth])[None]))
 
     def volume_blocks(self, volumes: np.ndarray) -> np.ndarray:
         """Blocks of volumes; repetitions in a patch have none."""

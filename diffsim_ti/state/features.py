@@ -58,7 +58,11 @@ class Features:
     tied: bool = False  # whether there are springs or cables
     ties_per_step: bool = False
     cabled: bool = False
+    growing: bool = False  # whether tetrahedra grow over time
+    growth_per_step: bool = False
+    growth_uniform: bool = True
     founded: bool = False  # whether vertices lie on an elastic foundation
+    dragged: bool = False  # whether triangles are in a fluid
     motion: bool = False
     guided: bool = False  # whether vertices are held in some directions alone
     moving: int = 0  # columns of the paths that obstacles follow
@@ -91,7 +95,7 @@ class Features:
     @property
     def loaded_corners(self) -> bool:
         """Whether vertices gather loads: of pressures, or of cables."""
-        return self.pressed or self.cabled
+        return self.pressed or self.cabled or self.dragged
 
     @property
     def pressing(self) -> tuple[ObstacleGroup, ...]:

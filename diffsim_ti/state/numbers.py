@@ -12,6 +12,7 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.inputs import Derived
+from diffsim_ti.runtime import LANES
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,7 @@ PARTS = {
     "coefficients": Part(
         "blocks", lambda a, d: a.coefficient_blocks(d.coefficients), lambda a, x: a.from_blocks(x, a.num_coefficients)
     ),
+    "growths": Part("blocks2", lambda a, d: a.growth_blocks(d.growths), lambda a, x: a.from_growth_blocks(x)),
     "mass": Part("scalars", _given("mass")),
     "parameters": Part("scalars", _given("parameters")),
     "rest": Part("vectors", _given("rest")),
@@ -68,7 +70,7 @@ TOPOLOGY = dict.fromkeys(("tets", "start", "corner_of", "force_slot", "motion_sl
 TANGENT = {name: part.kind for name, part in PARTS.items() if name not in ALONE}
 SCENE = TOPOLOGY | TANGENT | dict(inverse_mass="scalars", corner="vectors")  # all that a kernel may read of a scene
 del SCENE["mass"]
-OF_TETRAHEDRA = {name: PARTS[name].kind for name in ("gradients", "volumes", "coefficients")}
+OF_TETRAHEDRA = {name: PARTS[name].kind for name in ("gradients", "volumes", "coefficients", "growths")}
 OF_STEPS = {name: PARTS[name].kind for name in ("forces", "motion", "anchor", "path")}
 ADJOINT = OF_TETRAHEDRA | dict(sums="scalars2")
 
@@ -93,10 +95,10 @@ def with_held(arrays: dict, law) -> dict:
 def on_device(arrays, name: str, derived: Derived):
     """(data, element type) of a part; a single zero where the scene has no such thing."""
     kind = PARTS[name].kind
-    element = {"blocks": arrays.lanes, "scalars": arrays.fp}.get(kind, arrays.vector)
+    element = {"blocks": arrays.lanes, "blocks2": arrays.lanes, "scalars": arrays.fp}.get(kind, arrays.vector)
     data = PARTS[name].pack(arrays, derived)
     if data is None:
-        data = np.zeros({"vectors2": (1, 1, 3), "scalars": (1,)}.get(kind, (1, 3)))
+        data = np.zeros({"vectors2": (1, 1, 3), "blocks2": (1, 1, LANES), "scalars": (1,)}.get(kind, (1, 3)))
     return data, element
 
 
@@ -120,6 +122,7 @@ class Adjoint:
         shape = a.points * blocks if features.shape else 0
         self.coefficients = runtime.array(a.lanes, a.num_coefficients * blocks)
         self.gradients, self.volumes = runtime.array(a.lanes, 9 * shape), runtime.array(a.lanes, shape)
+        self.growths = runtime.array(a.lanes, *((a.growths.shape[0], 2 * blocks) if features.growing else (1, 1)))
         self.sums = runtime.array(a.fp, features.sums().total, a.num_vertices)
         for name in more:
             setattr(self, name, runtime.array(a.vector, *getattr(a, name).shape))
@@ -128,7 +131,8 @@ class Adjoint:
     def fits(self, arrays, features) -> bool:
         """Whether kernels and shapes are still those of the run."""
         same = (getattr(self, name).shape == getattr(arrays, name).shape for name in self._names if name in OF_STEPS)
-        return self._features == features and all(same)
+        same = all(same) and (not features.growing or self.growths.shape[0] == arrays.growths.shape[0])
+        return self._features == features and same
 
     def clear(self) -> None:
         """All zero."""

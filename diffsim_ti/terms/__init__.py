@@ -5,6 +5,7 @@ from diffsim_ti.terms.drag import Drag
 from diffsim_ti.terms.external_force import ExternalForce
 from diffsim_ti.terms.foundation import ElasticFoundation
 from diffsim_ti.terms.gravity import Gravity
+from diffsim_ti.terms.growth import Growth
 from diffsim_ti.terms.loads import BodyForce, Load, Pressure, Traction
 from diffsim_ti.terms.muscle import Muscle
 from diffsim_ti.terms.obstacles.ball import Capsule, Sphere
@@ -15,6 +16,7 @@ from diffsim_ti.terms.obstacles.mesh_obstacle import MeshObstacle
 from diffsim_ti.terms.obstacles.obstacle import Obstacle
 from diffsim_ti.terms.pose import Pose
 from diffsim_ti.terms.self_contact import SelfContact
+from diffsim_ti.terms.surface_drag import SurfaceDrag
 from diffsim_ti.terms.term import Term, VertexForce
 from diffsim_ti.terms.ties import Anchor, Cable, Spring
 
@@ -29,9 +31,10 @@ LOADS = (
     Spring,
     Cable,
     Muscle,
+    Growth,
     ElasticFoundation,
 )
-TERMS = (Gravity, Drag, *LOADS, *OBSTACLES, SelfContact)
+TERMS = (Gravity, Drag, SurfaceDrag, *LOADS, *OBSTACLES, SelfContact)
 __all__ = [
     "Anchor",
     "BodyForce",
@@ -47,6 +50,7 @@ __all__ = [
     "GasChamber",
     "Gravity",
     "Ground",
+    "Growth",
     "HalfSpace",
     "Load",
     "MeshObstacle",
@@ -58,6 +62,7 @@ __all__ = [
     "SelfContact",
     "Sphere",
     "Spring",
+    "SurfaceDrag",
     "Term",
     "TERMS",
     "Traction",

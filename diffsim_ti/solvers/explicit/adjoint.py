@@ -34,7 +34,7 @@ class ExplicitAdjoint:
         self.numbers = Adjoint(a, self.features, more=STEPS)
         self.u, self.v, self.w = (runtime.array(a.vector, 1, a.num_vertices) for _ in range(3))
         self.corner = runtime.array(a.vector, *a.corner.shape)  # products with the stiffness, still to be gathered
-        rates = "H_dot" in a.law.reads
+        rates = "H_dot" in a.law.reads or self.features.dragged
         self.rate_corner = runtime.array(a.vector, *(a.corner.shape if rates else (1,)))
         whole = [runtime.array(a.vector, 1, a.num_vertices) for _ in range(1 + rates)]
         self.whole = SimpleNamespace(u=whole[0], v=whole[-1] if rates else self.v)  # with what is still to be gathered
@@ -48,6 +48,9 @@ class ExplicitAdjoint:
         # of pressures by each triangle and of the places of its corners
         self.pressed_felt = runtime.array(a.vector, a.follower.shape[0], max(a.num_pressed, 1))
         self.pressed_rest = runtime.array(a.vector, a.pressed_nodes.size * self.features.shape)
+        # of numbers of a fluid by each triangle, two vectors, and of the places of its corners
+        self.dragged_felt = runtime.array(a.vector, 2 * a.num_dragged)
+        self.dragged_rest = runtime.array(a.vector, 3 * a.num_dragged * self.features.shape)
         # of numbers of chambers, by steps, and of the places of their corners
         corners = workspace.chambers.triangles.size if workspace.chambers else 0
         self.chamber_felt = runtime.array(a.vector, a.follower.shape[0], 4 * len(a.chambers))
@@ -97,6 +100,7 @@ class ExplicitAdjoint:
         self.numbers.clear()
         has, pressed = self.features, (self.pressed_felt, self.pressed_rest)
         pressed += (self.chamber_felt, self.chamber_rest) if self.ws.chambers else ()
+        pressed += (self.dragged_felt, self.dragged_rest) if has.dragged else ()
         pressed += (self.tie_felt, self.tie_rest) if has.tied else ()
         pressed += (self.foundation_felt,) if has.founded else ()
         targets = self.felt, self.path, self.u, self.v, self.w, self.z, *pressed
@@ -257,6 +261,8 @@ class ExplicitAdjoint:
             out.path += path.reshape(len(path), self.features.moving, self.num_parts, 3).sum(2)
         if self.features.pressed:
             rest = rest + self._collect_pressures(out)
+        if self.features.dragged:
+            rest = rest + self._collect_fluids(out)
         for name, felt in (
             ("ties", self.tie_felt),
             ("tie_segments", self.tie_rest),
@@ -274,6 +280,15 @@ class ExplicitAdjoint:
         if self.ws.impulses:
             out.mass = out.mass + self.mass_adj
         return out
+
+    def _collect_fluids(self, out: Derived):
+        """Adds the adjoints of a fluid's numbers; returns those of the rest shape."""
+        a, rest = self.ws.arrays, np.zeros((self.ws.arrays.num_vertices, 3))
+        felt = runtime.fetch(self.dragged_felt).astype(np.float64).reshape(-1, 6)
+        np.add.at(out.parameters, a.dragged_first[:, None] + np.arange(6), felt)
+        if self.features.shape:
+            np.add.at(rest, a.dragged_nodes.ravel(), runtime.fetch(self.dragged_rest).astype(np.float64))
+        return rest
 
     def _collect_pressures(self, out: Derived):
         """Adds the adjoints of pressures; returns those of the rest shape."""

@@ -6,6 +6,7 @@ from functools import cached_property
 
 import taichi as ti
 
+from diffsim_ti.elements.dragged_triangle import DRAGGED, DraggedTriangle
 from diffsim_ti.elements.pressed_face import pressed_element
 from diffsim_ti.elements.pressed_triangle import PRESSED, PressedTriangle
 from diffsim_ti.elements.tie import TIED, TieElement
@@ -27,7 +28,7 @@ class FurtherElements:
 
     @property
     def any(self) -> bool:
-        return self.pressed or self.tied
+        return self.pressed or self.tied or self.dragged
 
     @property
     def pressed(self) -> bool:
@@ -36,6 +37,14 @@ class FurtherElements:
     @property
     def tied(self) -> bool:
         return self.features.tied
+
+    @property
+    def dragged(self) -> bool:
+        return self.features.dragged
+
+    @cached_property
+    def in_fluid(self) -> DraggedTriangle:
+        return DraggedTriangle(self.precision, self.features.shape)
 
     @cached_property
     def triangle(self) -> PressedTriangle:
@@ -49,6 +58,8 @@ class FurtherElements:
     @traced
     def after(self, plan):
         """Number of items of tetrahedra and of these."""
+        if self.dragged:
+            return let(plan.num_items + plan.num_pressed + plan.num_ties + plan.num_dragged)
         if self.tied:
             return let(plan.num_items + plan.num_pressed + plan.num_ties)
         return let(plan.num_items + plan.num_pressed) if self.pressed else plan.num_items
@@ -57,7 +68,8 @@ class FurtherElements:
     def arrays(self) -> dict:
         """What kernels read of the scene for all of that."""
         has, out = self.features, {}
-        for some, own in ((has.pressed, PRESSED), (has.tied, TIED), (has.founded, FOUNDED), (has.guided, GUIDED)):
+        given = (has.pressed, PRESSED), (has.dragged, DRAGGED)
+        for some, own in (*given, (has.tied, TIED), (has.founded, FOUNDED), (has.guided, GUIDED)):
             out |= own if some else {}
         return out
 
@@ -70,6 +82,7 @@ class FurtherElements:
     def adjoint(self) -> dict:
         """Where their adjoints are added."""
         out = dict(pressed_felt="vectors2", pressed_rest="vectors") if self.pressed else {}
+        out |= dict(dragged_felt="vectors", dragged_rest="vectors") if self.dragged else {}
         out |= dict(tie_felt="vectors2", tie_rest="vectors") if self.tied else {}
         return out | (dict(foundation_felt="vectors") if self.features.founded else {})
 
@@ -78,8 +91,16 @@ class FurtherElements:
         """The numbers that kernels take."""
         out = ["num_pressed"] if self.any else []
         out += ["first_pressed"] if self.pressed else []
-        out += ["num_ties", "first_tied"] if self.tied else []
+        out += ["num_ties"] if self.tied or self.dragged else []
+        out += ["first_tied"] if self.tied else []
+        out += ["num_dragged", "first_dragged"] if self.dragged else []
         return dict.fromkeys([*out, *(["first_load"] if self.features.loaded_corners else [])], "int")
+
+    @traced
+    def is_tie(self, k, plan):
+        """Whether item k is a spring or a cable."""
+        after = k >= plan.num_pressed
+        return let(after & (k < plan.num_pressed + plan.num_ties)) if self.dragged else after
 
     @ti.func
     def forces(self, k, now: A, scene: A, state: A, s, plan: A):
@@ -87,8 +108,12 @@ class FurtherElements:
             if k < plan.num_pressed:
                 self.triangle.forces(k, now, scene, state, s, plan.first_pressed)
         if ti.static(self.tied):
-            if k >= plan.num_pressed:
+            if self.is_tie(k, plan):
                 self.tie.forces(k - plan.num_pressed, now, scene, state, s, plan.first_tied)
+        if ti.static(self.dragged):
+            t = k - plan.num_pressed - plan.num_ties
+            if t >= 0:
+                self.in_fluid.forces(t, scene, state, s, plan.first_dragged)
 
     @ti.func
     def forces_jvp(self, k, now: A, scene: A, state: A, s, tangent: A, plan: A):
@@ -96,8 +121,12 @@ class FurtherElements:
             if k < plan.num_pressed:
                 self.triangle.forces_jvp(k, now, scene, state, s, tangent, plan.first_pressed)
         if ti.static(self.tied):
-            if k >= plan.num_pressed:
+            if self.is_tie(k, plan):
                 self.tie.forces_jvp(k - plan.num_pressed, now, scene, state, s, tangent, plan.first_tied)
+        if ti.static(self.dragged):
+            t = k - plan.num_pressed - plan.num_ties
+            if t >= 0:
+                self.in_fluid.forces_jvp(t, scene, state, s, tangent, plan.first_dragged)
 
     @ti.func
     def forces_vjp(self, k, now: A, scene: A, state: A, s, adjoint: A, plan: A):
@@ -105,5 +134,9 @@ class FurtherElements:
             if k < plan.num_pressed:
                 self.triangle.forces_vjp(k, now, scene, state, s, adjoint, plan.first_pressed)
         if ti.static(self.tied):
-            if k >= plan.num_pressed:
+            if self.is_tie(k, plan):
                 self.tie.forces_vjp(k - plan.num_pressed, now, scene, state, s, adjoint, plan.first_tied)
+        if ti.static(self.dragged):
+            t = k - plan.num_pressed - plan.num_ties
+            if t >= 0:
+                self.in_fluid.forces_vjp(t, scene, state, s, adjoint, plan.first_dragged)

@@ -85,6 +85,11 @@ class ExplicitKernels:
         """Pass j."""
         return self.counted(pass_at(table, j - plan.window))
 
+    @traced
+    def told(self, of, j, table, plan):
+        """The scene, or changes of it, that knows pass j, where tetrahedra grow."""
+        return Bundle(**vars(of), now=pass_at(table, j - plan.window)) if self.vertex.features.growing else of
+
     @ti.func
     def turn_of_first(self, item, table: A):
         """Which time this is that the first loop is gone through."""
@@ -121,10 +126,11 @@ class ExplicitKernels:
     @ti.func
     def tetrahedra(self, e, j, scene: A, state: A, table: A, plan: A):
         s = (j - plan.base) * plan.stride
-        self.element.forces(e, scene, state, s, scene.corner)
+        of = self.told(scene, j, table, plan)
+        self.element.forces(e, of, state, s, scene.corner)
         if ti.static(self.element.has_state):
             now = pass_at(table, j - plan.window)
-            self.element.move_on(e, scene, state, s, s + plan.stride, self.onwards(now))
+            self.element.move_on(e, of, state, s, s + plan.stride, self.onwards(now))
 
     @ti.func
     def passes(self, scene: A, state: A, table: A, plan: A):
@@ -170,10 +176,11 @@ class ExplicitKernels:
     @ti.func
     def tetrahedra_jvp(self, e, scene: A, state: A, tangent: A, table: A, plan: A):
         s = plan.first - plan.base
-        self.element.forces_jvp(e, scene, state, s, tangent, scene.corner, tangent)
+        of, dots = self.told(scene, plan.first, table, plan), self.told(tangent, plan.first, table, plan)
+        self.element.forces_jvp(e, of, state, s, tangent, scene.corner, dots)
         if ti.static(self.element.has_state):
             now = pass_at(table, plan.first - plan.window)
-            self.element.move_on_jvp(e, scene, state, s, tangent, tangent, self.onwards(now))
+            self.element.move_on_jvp(e, of, state, s, tangent, dots, self.onwards(now))
 
     @ti.func
     def passes_jvp(self, scene: A, state: A, tangent: A, table: A, plan: A):
@@ -206,13 +213,13 @@ class ExplicitKernels:
 
     @ti.func
     def tetrahedra_vjp(self, e, j, scene: A, state: A, adjoint: A, table: A, plan: A):
-        s = j - plan.base
+        s, of = j - plan.base, self.told(scene, j, table, plan)
         if ti.static(self.element.has_state):
             now = reversed_pass(pass_at(table, j - plan.window), j, plan)
             on = self.onwards(now)
-            self.element.move_on_vjp(e, scene, state, s, on, adjoint.corner, adjoint, self.vertex.features.shape)
+            self.element.move_on_vjp(e, of, state, s, on, adjoint.corner, adjoint, self.vertex.features.shape)
         self.element.forces_vjp(
-            e, scene, state, s, adjoint.w, adjoint.corner, adjoint, self.vertex.features.shape, self.element.has_state
+            e, of, state, s, adjoint.w, adjoint.corner, adjoint, self.vertex.features.shape, self.element.has_state
         )
 
     @traced
@@ -272,7 +279,7 @@ class ExplicitKernels:
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.num_vertices):
             adjoint.u[0, i] = adjoint.u[0, i] + self.element.gather(i, scene, adjoint.corner)
-            if ti.static(self.element.reads_rates):
+            if ti.static(self.vertex.reads_rates):
                 adjoint.v[0, i] = adjoint.v[0, i] + self.element.gather(i, scene, adjoint.rate_corner)
 
     @cached_property

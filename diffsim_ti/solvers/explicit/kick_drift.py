@@ -52,6 +52,11 @@ class KickDrift:
     def element(self):
         return functions_of(self.law, self.features, self.lanes)
 
+    @property
+    def reads_rates(self) -> bool:
+        """Whether forces at corners are of velocities too."""
+        return self.element.reads_rates or self.features.dragged
+
     @cached_property
     def obstacles(self) -> ObstacleStages:
         return ObstacleStages(self.features, self.law.precision)
@@ -272,7 +277,7 @@ class KickDrift:
         p, q = adjoint.u[0, i], adjoint.v[0, i]
         if j < plan.num_passes - 1:
             p += self.element.gather(i, scene, adjoint.corner)
-            if ti.static(self.element.reads_rates):
+            if ti.static(self.reads_rates):
                 q += self.element.gather(i, scene, adjoint.rate_corner)
         # prescribed motion: the state after the pass comes from the motion alone
         k, by_u_held, by_v_held = self.prescribed(i, scene), self.vector(0), self.vector(0)

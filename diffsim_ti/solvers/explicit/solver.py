@@ -14,6 +14,7 @@ from diffsim_ti.inputs import Derived
 from diffsim_ti.monitor.energy_balance import EnergyBalance
 from diffsim_ti.potential.attached import Attached
 from diffsim_ti.potential.chamber_pressure import following
+from diffsim_ti.potential.fluid import Fluid
 from diffsim_ti.potential.way import Way
 from diffsim_ti.solvers.explicit.adjoint import ExplicitAdjoint
 from diffsim_ti.solvers.explicit.chambers import Chambers
@@ -141,7 +142,7 @@ class ExplicitWorkspace(Workspace):
         )
         self.attached = Attached.of(self.scene)  # springs, cables and foundations, for what looks between passes
         self.probe = None  # room for a pass that is not taken
-        self.energy_watch = EnergyBalance(self) if EnergyBalance.knows(a.law) else None
+        self.energy_watch = EnergyBalance(self) if EnergyBalance.knows(a.law) and not self.scene.growing else None
 
     def load(self, derived: Derived) -> None:
         super().load(derived)
@@ -203,6 +204,9 @@ class ExplicitWorkspace(Workspace):
             out[self.scene.loaded_vertices] = sum(w * schedule.load(a.rows["forces"], *k, keyed) for w, k in kicks)
         if self.following is not None:
             out += self.following.at(self.numbers_at(j, num_passes)).forces(a.values.rest + u)
+        if self.scene.fluids:
+            v = runtime.fetch_row(self.state.v, 0)
+            out += Fluid.of(self.scene).at(a.values.parameters, a.values.rest + u - v, 1.0).forces(a.values.rest + u)
         if a.features().cabled:
             both = [[w * part for part in schedule.ties(a.rows["ties"], *k)] for w, k in kicks]
             numbers = (begin + end for begin, end in zip(*both))
@@ -245,12 +249,13 @@ class ExplicitWorkspace(Workspace):
         a, solver, schedule = self.arrays, self.solver, self.solver.schedule
         num_rows = max((len(x) for x in (a.values.path, a.values.motion) if x is not None), default=1)
         # they ask in which step a pass lies
-        if num_rows == 1 and (a.features().pressed or a.paths or a.features().forces_keyed):
-            given = a.values.forces, a.values.follower, a.values.ties
+        if num_rows == 1 and (a.features().pressed or a.paths or a.features().forces_keyed or a.features().growing):
+            given = a.values.forces, a.values.follower, a.values.ties, a.values.growths
             num_rows = max(1 + len(x) for x in given if x is not None)
         run = num_passes, num_rows, save_every, self.rate, schedule
         turn, sizes = -1 if backwards else 1, dict(num_items=a.num_items, num_vertices=a.num_vertices)
         sizes |= dict(contact_damping=solver.contact_damping, num_pressed=a.num_pressed, first_pressed=a.first_pressed)
+        sizes |= dict(num_dragged=a.num_dragged, first_dragged=a.first_dragged)
         sizes |= dict(num_ties=a.num_ties, first_tied=a.first_tied, first_load=a.first_load)
         for window, begin, end in self.table.windows(first, last)[::turn]:
             self.table.show(window, run, lambda first, last: solver.pass_table(first, last, *run[:4]))

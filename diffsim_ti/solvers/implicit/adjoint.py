@@ -79,9 +79,11 @@ class ImplicitAdjoint(RecordedPasses):
         self.mass_adj, self.gravity, self.rate = np.zeros(len(self.p)), np.zeros(3), 0.0
         masses = a.values.element_masses
         self.element_masses = None if masses is None else np.zeros_like(masses)
+        self.growth = None if a.values.growths is None else np.zeros_like(a.values.growths)
         self.attached = a.values.zeros()  # of springs, cables and foundations
         self.pressure = None if a.values.follower is None else np.zeros_like(a.values.follower)
         self.rest_by_pressure = np.zeros_like(self.p)
+        self.fluid = np.zeros(len(a.values.parameters))
         self.forces = None if a.values.forces is None else np.zeros_like(a.values.forces)
         self.motion = None if a.values.motion is None else np.zeros_like(a.values.motion)
         self.path = None if a.values.path is None else np.zeros_like(a.values.path)
@@ -104,10 +106,25 @@ class ImplicitAdjoint(RecordedPasses):
             if self.z is not None:
                 self._pull_back_law(j, j - base)
             self._pull_back(j, save_every)
+            if self.growth is not None:
+                self._pull_back_growth(j)
             frame = int(self.ws.solver.schedule.shown(j, save_every))
             if 0 <= frame < len(self.frames[0]) - 1:
                 self.p += self.frames[0][frame]
                 self.q += self.frames[1][frame]
+
+    def _pull_back_fluid(self, by_star: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Adjoints of u*, and of x, from which velocities are measured; adds those of a fluid's numbers."""
+        fluid = self.ws.fluid
+        by_place, by_speed, numbers = fluid.vjp_of_all(self.places, by_star, len(self.fluid))
+        self.rest_by_pressure, self.fluid = self.rest_by_pressure + by_place, self.fluid + numbers
+        return by_place + by_speed / fluid.gamma, -by_speed / fluid.gamma
+
+    def _pull_back_growth(self, j: int) -> None:
+        """What tetrahedra felt of growth in pass j goes to its step."""
+        felt = self.ws.arrays.from_growth_blocks(runtime.fetch(self.numbers.growths).astype(np.float64))
+        self.ws.growth_vjp(self.growth, j, self.stage, felt[0].sum(0))
+        runtime.fill(self.numbers.growths, 0)
 
     def _pull_back_law(self, j: int, slot: int) -> None:
         """The state of the law after pass j comes from that before, in a slot of the record, and from where it ends."""
@@ -150,9 +167,12 @@ class ImplicitAdjoint(RecordedPasses):
             reaction = reaction + self._vjp_of_faces()
         reaction = reaction + by_contacts
         by_x, by_lag = 0.0, np.zeros_like(p)
-        if ws.potential.rubbing:
-            by_place, by_x, by_lag = ws.potential.rubbing.vjp(ws.potential.held_at, by_star)
+        if ws.fluid:
+            by_place, by_x = self._pull_back_fluid(by_star)
             reaction = reaction + by_place
+        if ws.potential.rubbing:
+            by_place, by_rub, by_lag = ws.potential.rubbing.vjp(ws.potential.held_at, by_star)
+            reaction, by_x = reaction + by_place, by_x + by_rub
         if ws.attached:
             reaction = reaction + ws.attached.vjp(ws.potential.held_at, by_star, self.attached, *ws.time_of(j, s))
         share = ws.load_share(j, s)
@@ -174,8 +194,8 @@ class ImplicitAdjoint(RecordedPasses):
             reaction = reaction - inertial  # held vertices are felt by their neighbours' inertia too
         x_adj, by_begin = inertial - s.e0 / s.gamma * q_free + by_x, 0.0
         if ws.potential.has_friction:
-            by_first, by_x = runtime.fetch(self.lag).astype(np.float64) + (0.0 if seen is None else seen[1])
-            by_lag, x_adj = by_lag + by_first, x_adj + by_x
+            by_first, by_first_x = runtime.fetch(self.lag).astype(np.float64) + (0.0 if seen is None else seen[1])
+            by_lag, x_adj = by_lag + by_first, x_adj + by_first_x
         if self._by_pressed:
             by_pressed = runtime.fetch(self.pressed).astype(np.float64) + (0.0 if seen is None else seen[2])
             by_place, by_begin = self._by_pressed.pull_back(by_pressed)
@@ -251,6 +271,7 @@ class ImplicitAdjoint(RecordedPasses):
             out.parameters[features.gravity :][:3] = self.gravity
         if features.drag >= 0:
             out.parameters[features.drag] = self.rate
+        out.parameters += self.fluid
         rest = self.frames[0].sum(0)
         if self.ws.pairs:
             out.parameters[a.parameters_of_self_contact], by_pairs = self.ws.pairs.collect()
@@ -259,6 +280,7 @@ class ImplicitAdjoint(RecordedPasses):
             by_areas = runtime.fetch(self.face_areas).astype(np.float64)
             rest = rest + rest_of_areas(a.mesh, a.values.rest, by_areas)
         out.rest = rest + self.rest_by_pressure + out.rest
+        out.growths = self.growth
         out.forces, out.motion, out.path, out.follower = self.forces, self.motion, self.path, self.pressure
         for name in ("ties", "tie_segments", "foundation"):
             setattr(out, name, getattr(self.attached, name))

@@ -59,6 +59,24 @@ class GivenInPasses:
             values, rows = self.arrays.values, self.arrays.rows["ties"]
             self.attached.at(values, rows, *self.time_of(j, stage))
 
+    def growth_of(self, rows: np.ndarray, j: int, stage: Stage) -> np.ndarray:
+        """What tetrahedra have grown by in pass j, of rows (steps, 2, m); linear in these."""
+        schedule, share = self.solver.schedule, self.share_at_stage(j, stage)
+        begin, end = rows[schedule.load_row(rows, j)]
+        return self.load_share(j, stage) * (begin + share * (end - begin))
+
+    def growth_vjp(self, rows_adj: np.ndarray, j: int, stage: Stage, adjoint: np.ndarray) -> None:
+        """Add the adjoint of rows for that of `growth_of`."""
+        schedule, share = self.solver.schedule, self.share_at_stage(j, stage)
+        row, by = rows_adj[schedule.load_row(rows_adj, j)], self.load_share(j, stage) * adjoint
+        row[0] += (1 - share) * by
+        row[1] += share * by
+
+    def grow(self, j: int, stage: Stage) -> None:
+        """Set what tetrahedra have grown by in pass j."""
+        if self.arrays.values.growths is not None:
+            self.arrays.hold_growth(self.growth_of(self.arrays.rows["growths"], j, stage))
+
     def time_of(self, j: int, stage: Stage) -> tuple:
         """(schedule, pass, share of its step, share of the loads), which attached things are told."""
         return self.solver.schedule, j, self.share_at_stage(j, stage), self.load_share(j, stage)

@@ -31,7 +31,7 @@ class RecordedPasses:
             ws.strains.hold(stage, self.u, self.before)
         ws.potential.hold(ws.record, j - base)
         ws.potential.place(self.u_star)
-        self.operator = Operator(ws.potential, self.mass, ws.free, ws.follower, self.transposed)
+        self.operator = Operator(ws.potential, self.mass, ws.free, ws.on_surface, self.transposed)
         self.places = ws.arrays.values.rest + ws.potential.held_at
         ws.take_multipliers(j, ws.potential.held_at)
         self._preconditioner = None

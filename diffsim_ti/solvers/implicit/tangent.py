@@ -72,6 +72,9 @@ class ImplicitTangent(RecordedPasses):
         runtime.fill(ws.potential.w, held[None])
         if ws.potential.has_friction:
             runtime.fill(self.lag, np.stack([self.du, dx]))
+        if tangent.growths is not None:
+            moved = ws.growth_of(tangent.growths, j, s)
+            runtime.fill(self.numbers.growths, a.growth_blocks(np.stack([moved, moved])[None]))
         walls = None if tangent.path is None else ws.walls_jvp(tangent.path, j, s)
         if walls is not None:
             runtime.fill(self.walls, walls)
@@ -100,6 +103,9 @@ class ImplicitTangent(RecordedPasses):
         if tangent.follower is not None:
             dp = ws.solver.schedule.pressure(tangent.follower, j, ws.share_at_stage(j, s))
             dR += ws.follower.jvp(self.places, held + tangent.rest, dp)
+        if ws.fluid:
+            dv = (held - dx) / s.gamma
+            dR += ws.fluid.jvp_of_all(self.places, held + tangent.rest, dv, tangent.parameters)
         if ws.attached:
             dR += ws.attached.jvp(ws.potential.held_at, held, tangent, *ws.time_of(j, s))
         d_star = self.solve(dR + self.mass * (dx + s.gamma * dy - held))

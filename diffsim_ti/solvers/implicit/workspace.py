@@ -11,6 +11,7 @@ from diffsim_ti.contact.surface_pairs import Tunnelling
 from diffsim_ti.inputs import ConsistentMass, Mass, diagonal_of, kinetic_energy
 from diffsim_ti.monitor.energy_watch import EnergyWatch
 from diffsim_ti.potential.attached import Attached
+from diffsim_ti.potential.fluid import Fluid, Together
 from diffsim_ti.potential.free import FreeBodies, FreeDirections, held_as, mask_of
 from diffsim_ti.potential.potential import Potential
 from diffsim_ti.potential.way import Way
@@ -50,7 +51,7 @@ class ImplicitWorkspace(ObstacleWays, Noted, GivenInPasses, Workspace):
 
     def __init__(self, solver, derived):
         self.potential, self._length = None, solver.substep
-        self.energy_watch = EnergyWatch(self) if solver.may_gain_energy else None
+        self.energy_watch = EnergyWatch(self) if solver.may_gain_energy and not solver.scene.growing else None
         super().__init__(solver, derived)
 
     def history(self, num_slots, record=False):
@@ -78,7 +79,10 @@ class ImplicitWorkspace(ObstacleWays, Noted, GivenInPasses, Workspace):
         way, preconditioner = (lambda *step: me.way_past_obstacles(*step)), (lambda mass: me.preconditioner(mass))
         self.follower = self.follower_pressure()
         self.volumes, self.multipliers = self.held_volumes(eps), {}  # the pressures [Pa] that each pass ended with
-        followers = self.follower, self.volumes
+        self.fluid = Fluid.of(self.scene)
+        given = [part for part in (self.follower, self.fluid) if part is not None]
+        self.on_surface = Together(*given) if self.fluid else self.follower
+        followers = self.on_surface, self.volumes
         self.attached = self.potential.attached = Attached.of(self.scene)
         self.newton = Newton(self.potential, self.free, way, preconditioner, tolerance, rounds, eps, *followers)
         self._preconditioners = {}
@@ -318,8 +322,12 @@ class ImplicitWorkspace(ObstacleWays, Noted, GivenInPasses, Workspace):
         self.potential.begin(u, x, 1 / stage.gamma, self._walls)
         if self.pressed:
             self.pressed.begin(u, self._walls)
+        if self.fluid:
+            a = self.arrays.values
+            self.fluid.at(a.parameters, a.rest + x, stage.gamma)
         self.press(j, stage)
         self.attach(j, stage)
+        self.grow(j, stage)
 
     def moment(self, j: int, stage: Stage) -> Moment:
         """Where pass j lies for obstacles; a chord of two passes about its end for a solver of two steps."""

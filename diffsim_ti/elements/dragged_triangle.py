@@ -1,0 +1,132 @@
+"""The triangle in a fluid (terms/surface_drag.py): corner forces, their differential and adjoint.
+
+With v the mean velocity of the corners against the stream, N = (x_1 - x_0) x (x_2 - x_0), L = |N|, s = v . N, a corner has
+
+    G = -rho / 12 |v| B,    B = c_t L v + (c_n - c_t) (s / L) N.
+
+Corner a of triangle t writes corner `first + 3 t + a`, and vertices gather it with those of tetrahedra.
+"""
+
+from dataclasses import dataclass
+
+import taichi as ti
+
+from diffsim_ti.runtime import PRECISIONS
+
+A = ti.template()  # an array or Bundle handed to a Taichi function
+DRAGGED = dict(dragged="ints", dragged_numbers="ints")  # corners of each, where its numbers stand in the parameters
+
+
+@dataclass(frozen=True)
+class DraggedTriangle:
+    """Functions of one triangle in a pass; shape: of adjoints."""
+
+    precision: str
+    shape: bool
+
+    @property
+    def fp(self):
+        return PRECISIONS[self.precision]
+
+    @property
+    def vector(self):
+        return ti.types.vector(4, self.fp)
+
+    @ti.func
+    def number(self, x: ti.template()):
+        return ti.cast(x, self.fp)
+
+    @ti.func
+    def cross(self, a, b):
+        zero = ti.cast(0, self.fp)
+        return self.vector(a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0], zero)
+
+    @ti.func
+    def edges(self, t, x: A, rest: A, s, scene: A):
+        """x_1 - x_0 and x_2 - x_0 of rest + x in slot s."""
+        i, j, k = scene.dragged[3 * t], scene.dragged[3 * t + 1], scene.dragged[3 * t + 2]
+        return (rest[j] - rest[i]) + (x[s, j] - x[s, i]), (rest[k] - rest[i]) + (x[s, k] - x[s, i])
+
+    @ti.func
+    def speed(self, t, v: A, s, parameters: A, scene: A):
+        """Mean velocity of the corners in slot s, less the stream."""
+        first = scene.dragged_numbers[t] + 3
+        stream = self.vector(parameters[first], parameters[first + 1], parameters[first + 2], ti.cast(0, self.fp))
+        total = v[s, scene.dragged[3 * t]] + v[s, scene.dragged[3 * t + 1]] + v[s, scene.dragged[3 * t + 2]]
+        return total * self.number(1.0 / 3.0) - stream
+
+    @ti.func
+    def numbers(self, t, parameters: A, scene: A):
+        """(rho / 12, c_t, c_n - c_t)"""
+        k = scene.dragged_numbers[t]
+        return parameters[k] * self.number(1.0 / 12.0), parameters[k + 2], parameters[k + 1] - parameters[k + 2]
+
+    @ti.func
+    def inverse(self, x):
+        out = ti.cast(0, self.fp)
+        if x > 0:
+            out = ti.cast(1, self.fp) / x
+        return out
+
+    @ti.func
+    def known(self, t, scene: A, state: A, s):
+        """(e, f, v, |v|, N, L, s, B)"""
+        e, f = self.edges(t, state.u, scene.rest, s, scene)
+        v = self.speed(t, state.v, s, scene.parameters, scene)
+        rho, c, k = self.numbers(t, scene.parameters, scene)
+        N = self.cross(e, f)
+        L, along = ti.sqrt(N.dot(N)), v.dot(N)
+        return e, f, v, ti.sqrt(v.dot(v)), N, L, along, c * L * v + k * along * self.inverse(L) * N
+
+    @ti.func
+    def store(self, t, first, force, corner: A):
+        for a in ti.static(range(3)):
+            corner[first + 3 * t + a] = force
+
+    @ti.func
+    def forces(self, t, scene: A, state: A, s, first):
+        rho, c, k = self.numbers(t, scene.parameters, scene)
+        e, f, v, size, N, L, along, B = self.known(t, scene, state, s)
+        self.store(t, first, -rho * size * B, scene.corner)
+
+    @ti.func
+    def forces_jvp(self, t, scene: A, state: A, s, tangent: A, first):
+        rho, c, k = self.numbers(t, scene.parameters, scene)
+        drho, dc, dk = self.numbers(t, tangent.parameters, scene)
+        e, f, v, size, N, L, along, B = self.known(t, scene, state, s)
+        de, df = self.edges(t, tangent.u, tangent.rest, 0, scene)
+        dv = self.speed(t, tangent.v, 0, tangent.parameters, scene)
+        dN, over = self.cross(de, f) + self.cross(e, df), self.inverse(L)
+        dL, dalong, dsize = N.dot(dN) * over, dv.dot(N) + v.dot(dN), v.dot(dv) * self.inverse(size)
+        dB = c * (dL * v + L * dv) + dc * L * v + dk * along * over * N
+        dB += k * over * ((dalong - along * dL * over) * N + along * dN)
+        change = rho * (dsize * B + size * dB) + drho * size * B
+        self.store(t, first, self.number(-1) * change, scene.corner)
+
+    @ti.func
+    def forces_vjp(self, t, scene: A, state: A, s, adjoint: A, first):
+        """Products of the transposed derivatives with adjoint.w, to corners; adds the adjoints of numbers to
+        adjoint.dragged_felt and, if `shape`, those of places to adjoint.dragged_rest."""
+        rho, c, k = self.numbers(t, scene.parameters, scene)
+        e, f, v, size, N, L, along, B = self.known(t, scene, state, s)
+        w = adjoint.w[0, scene.dragged[3 * t]]
+        for a in ti.static((1, 2)):
+            w += adjoint.w[0, scene.dragged[3 * t + a]]
+        over, a_B, b = self.inverse(L), -rho * w, -rho * size * w
+        across, straight = b.dot(N), b.dot(v)
+        by_along = k * over * across
+        by_L = c * straight - by_along * along * over
+        by_v = c * L * b + by_along * N + a_B.dot(B) * self.inverse(size) * v
+        by_N = k * along * over * b + by_along * v + by_L * over * N
+        by_e, by_f = self.cross(f, by_N), self.cross(by_N, e)
+        balance = self.number(-1) * (by_e + by_f)
+        for a, by in ti.static(enumerate((balance, by_e, by_f))):
+            adjoint.corner[first + 3 * t + a] = by
+            adjoint.rate_corner[first + 3 * t + a] = by_v * self.number(1.0 / 3.0)
+            if ti.static(self.shape):
+                adjoint.dragged_rest[3 * t + a] = adjoint.dragged_rest[3 * t + a] + by
+        by_k, by_c = along * over * across, L * straight
+        by_rho = -size * w.dot(B) * self.number(1.0 / 12.0)
+        felt = self.vector(by_rho, by_k, by_c - by_k, self.number(0))
+        adjoint.dragged_felt[2 * t] = adjoint.dragged_felt[2 * t] + felt
+        adjoint.dragged_felt[2 * t + 1] = adjoint.dragged_felt[2 * t + 1] - by_v

@@ -1,0 +1,98 @@
+"""Growth over time: what each tetrahedron's rest state has grown by, while a run goes on."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from diffsim_ti.inputs import Input, Link, Range
+from diffsim_ti.inputs.loads import InTime
+from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.terms.over_time import OverTime, amount, is_keyed, rows_at
+from diffsim_ti.terms.term import Term
+
+PER = ("all", "set", "tetrahedron")
+
+
+def _beyond(x: np.ndarray) -> np.ndarray:
+    return x > -1
+
+
+BEYOND = Range("> -1, which leaves nothing of the body", _beyond)
+
+
+class Growth(Term):
+    """Growth, swelling or thermal strain over time, added to that of the material `Grown`: F_g = (1 + g) I and
+
+        psi = det(F_g) psi_material(F F_g^-1) [J/m^3],    g = growth of `Grown` + sum of all Growth terms,
+
+    felt in every substep and every Newton iteration. Forces sum to zero in each tetrahedron, and a free body with uniform
+    growth takes its new size without stress. A scene makes its material `Grown(material, 0)` if it is not Grown itself.
+
+    growth [-], > -1, over time: one number, one for each step (shape (steps,)), a function of time [s], or keyframes
+    (times, values), a tuple, linear between; of heat alpha (T - T_0). per: what has a growth of its own: "all" together;
+    each "set" of those that `tetrahedra` names; each "tetrahedron": shape (n,), or (steps, n) by steps.
+    tetrahedra: a tetrahedron set's name, several, indices or a mask; None: all.
+    In load steps of statics growth is laid on with the loads. Mass stays that of the rest shape. stiffness_matrix, modes and
+    stable_dt take the growth of `Grown` alone; outputs that evaluate the law by frames, and volume="patches", refuse it.
+    Input with gradient: "growth_over_time" or "<name>.growth", of the shape given, (steps + 1, ...) of what is linear within
+    steps.
+    Raises ValueError for other shapes, another `per`, an empty set, and a material that Grown does not take.
+    Rodriguez, Hoger, McCulloch 1994, Stress-dependent finite growth, doi:10.1016/0021-9290(94)90021-3.
+    """
+
+    num_numbers = 0  # what kernels read of it lies in an array of its own
+
+    def __init__(
+        self,
+        growth: OverTime,
+        tetrahedra: str | Sequence[str] | ArrayLike | None = None,
+        per: str = "all",
+        name: str | None = None,
+    ):
+        if per not in PER:
+            raise ValueError(f"Growth: per must be one of {', '.join(map(repr, PER))}, got {per!r}")
+        if per == "set" and (isinstance(tetrahedra, str) or not all(isinstance(s, str) for s in tetrahedra or [0])):
+            raise ValueError(f'Growth: per="set" takes tetrahedra=["left", "right"], names of sets, got {tetrahedra!r}')
+        shape = () if per == "all" else (len(tetrahedra),) if per == "set" else ("k",)
+        self.given, self.keyed, self.per, self.tetrahedra = growth, is_keyed(growth), per, tetrahedra
+        self.plain, self.ndim = "growth_over_time", len(shape) + 1
+        described = amount("growth", growth, shape, "-", self.plain)
+        own = {name: getattr(described, name) for name in ("name", "value", "shapes", "unit", "plain", "label")}
+        super().__init__(Input(**own, range=BEYOND), name=name)
+        if self.keyed:
+            if not np.all(_beyond(self.rows([0.0]))):
+                raise ValueError(f"Growth: growth must be {BEYOND.words}")
+
+    def rows(self, times: ArrayLike) -> np.ndarray:
+        at = self.given(0.0) if callable(self.given) else np.asarray(self.given[1])[0]
+        return rows_at("Growth: growth", self.given, times, np.shape(at))
+
+    def groups(self, mesh: TetrahedralMesh) -> tuple[np.ndarray, np.ndarray]:
+        """(tetrahedra, which number each has)"""
+        if self.per == "set":
+            each = [mesh.tetrahedron_indices(own) for own in self.tetrahedra]
+            return np.concatenate(each), np.repeat(np.arange(len(each)), [len(own) for own in each])
+        every = np.arange(mesh.num_tetrahedra)
+        chosen = every if self.tetrahedra is None else mesh.tetrahedron_indices(self.tetrahedra)
+        return chosen, np.arange(len(chosen)) if self.per == "tetrahedron" else np.zeros(len(chosen), np.int64)
+
+    @property
+    def everywhere(self) -> bool:
+        """Whether all grow alike."""
+        return self.per == "all" and self.tetrahedra is None
+
+    def check(self, mesh: TetrahedralMesh) -> None:
+        chosen, _ = self.groups(mesh)
+        if len(chosen) == 0:
+            raise ValueError("Growth acts on nothing: the set is empty; name a set that has members")
+        if len(np.unique(chosen)) < len(chosen):
+            raise ValueError("Growth: a tetrahedron is in two of its sets; list two Growth terms, which add up")
+        count = () if self.per == "all" else (len(self.tetrahedra) if self.per == "set" else len(chosen),)
+        given = None if self.keyed else self.described[0].value
+        last = self.rows([0.0]).shape[1:] if self.keyed else given.shape[given.ndim - len(count) :]
+        if last != count:
+            raise ValueError(f'Growth: per="{self.per}" takes growth of shape {count} here, got {last}')
+
+    def links(self, names: dict[str, str], own: str) -> list[Link]:
+        return [InTime(names[self.plain], f"{own} in time", self.ndim, self.keyed)]
