@@ -6,7 +6,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from diffsim_ti.cli.options import Backend, Density, Folder, MaterialName, Poisson, Precision, Youngs
+from diffsim_ti.cli.options import Backend, Density, Folder, MaterialName, Poisson, Precision, Youngs, load_body
 from diffsim_ti.cli.own_scene import Fixed, own_scene
 from diffsim_ti.cli.sweep import sweep
 from diffsim_ti.progress import progress
