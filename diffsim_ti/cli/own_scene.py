@@ -11,6 +11,7 @@ from diffsim_ti.cli.options import fixed_vertices, load_body, make_material
 from diffsim_ti.scene import Scene
 
 Fixed = Annotated[list[str] | None, typer.Option(help="vertex set, or xmin .. zmax, to hold; may be repeated")]
+Workers = Annotated[int, typer.Option(help="processes that share the work")]
 
 
 def own_scene(

@@ -7,7 +7,7 @@ import numpy as np
 import typer
 
 from diffsim_ti.cli.options import Backend, Density, Folder, MaterialName, Poisson, Precision, Youngs, load_body
-from diffsim_ti.cli.own_scene import Fixed, own_scene
+from diffsim_ti.cli.own_scene import Fixed, Workers, own_scene
 from diffsim_ti.cli.sweep import sweep
 from diffsim_ti.progress import progress
 
@@ -44,6 +44,7 @@ def chart(
     fixed: Fixed = None,
     limit: Annotated[float, typer.Option(help="leave out runs expected to take longer than this [s]")] = 1.0,
     repeats: Annotated[int, typer.Option(help="timed rounds, of which the best counts")] = 3,
+    workers: Workers = 1,
     backend: Backend = "cpu",
 ) -> None:
     """Measure time against error for every solver, step, precision and mesh; draw the work-precision diagram."""
@@ -51,6 +52,7 @@ def chart(
     from diffsim_ti.study import PROBLEMS, Problem, charts
     from diffsim_ti.study import chart as measure
     from diffsim_ti.study import problem as built_in
+    from diffsim_ti.study.executors import workers_of
 
     if problem in PROBLEMS:
         runtime.init(backend)
@@ -61,7 +63,8 @@ def chart(
         asked = Problem.of_scene(scene, duration, Path(problem).stem, gradient=gradient)
     else:
         raise ValueError(f"no problem is called {problem!r}; there are {', '.join(PROBLEMS)}, or give a file")
-    result = measure(asked, repeats=repeats, limit=limit, quick=quick, say=print)
+    with workers_of(workers) as executor:
+        result = measure(asked, repeats=repeats, limit=limit, quick=quick, say=print, executor=executor)
     unit = "s" if asked.static else "s per simulated s"
     for p in result.front:
         print(f"  {p.seconds:9.3g} {unit}   error {p.error:.2e}   {p.label}")
@@ -85,6 +88,7 @@ def stability(
     solver: Annotated[list[str] | None, typer.Option(help="class name; may be repeated; default all")] = None,
     output: Folder = Path("output/stability"),
     quick: Quick = False,
+    workers: Workers = 1,
     backend: Backend = "cpu",
 ) -> None:
     """Map where each solver is accurate, bounded, loses energy, raises, or is wrong silently. Exit code 1 if one is."""
@@ -93,6 +97,7 @@ def stability(
     from diffsim_ti import runtime
     from diffsim_ti.solvers import SOLVERS
     from diffsim_ti.study import map_picture
+    from diffsim_ti.study.executors import workers_of
     from diffsim_ti.study.stability_map import AXES, stability_map
 
     names = {kind.__name__: kind for kind in SOLVERS}
@@ -106,7 +111,7 @@ def stability(
         axes = {name: replace(a, values=a.values[:: max(1, len(a.values) - 1)]) for name, a in axes.items()}
     kinds = [names[name] for name in solver or (list(names)[:2] if quick else names)]
     silent, done = [], 0
-    with progress("stability", len(axes) * len(kinds)) as show:
+    with workers_of(workers) as executor, progress("stability", len(axes) * len(kinds)) as show:
         for name, quantity in axes.items():
             results = []
             for kind in kinds:
@@ -116,6 +121,7 @@ def stability(
                     steps=60 if quick else None,
                     find_bounds=not quick,
                     show=lambda note: show(done, note),
+                    executor=executor,
                 )
                 done += 1
                 results.append(result)
@@ -177,6 +183,7 @@ def recommend(
     gradients: Annotated[bool, typer.Option(help="whether the run will be differentiated")] = True,
     budget: Annotated[float, typer.Option(help="wall time for trial runs [s]")] = 20.0,
     quick: Annotated[bool, typer.Option("--quick", help="the same as --budget 4")] = False,
+    workers: Workers = 1,
     material: MaterialName = "StableNeoHookean",
     youngs_modulus: Youngs = 1e5,
     poissons_ratio: Poisson = 0.4,
@@ -188,8 +195,21 @@ def recommend(
     """Name the cheapest solver, step, precision and checkpoints for a tolerance, from short trial runs."""
     from diffsim_ti import runtime
     from diffsim_ti.study import recommend as advise
+    from diffsim_ti.study.executors import workers_of
 
     runtime.init(backend)
     body = own_scene(scene, material, youngs_modulus, poissons_ratio, density, fixed)
     coarse = load_body(coarser) if coarser else None
-    print(advise(body, duration, tolerance, memory, gradients, 4.0 if quick else budget, coarser=coarse))
+    with workers_of(workers) as executor:
+        print(
+            advise(
+                body,
+                duration,
+                tolerance,
+                memory,
+                gradients,
+                4.0 if quick else budget,
+                coarser=coarse,
+                executor=executor,
+            )
+        )

@@ -2,7 +2,6 @@
 
 import inspect
 import runpy
-from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 import typer
 
 from diffsim_ti.cli.options import Backend, Density, Folder, MaterialName, Poisson, Precision, Youngs, solver_class
-from diffsim_ti.cli.own_scene import Fixed, own_scene
+from diffsim_ti.cli.own_scene import Fixed, Workers, own_scene
 
 
 @lru_cache(4)
@@ -89,7 +88,7 @@ def sweep(
     duration: Annotated[float, typer.Option(help="of a scene [s]")] = 0.2,
     frames: Annotated[int, typer.Option(help="of a scene")] = 20,
     solver: Annotated[str, typer.Option(help="verlet, semi-implicit, implicit-euler, bdf2 or static")] = "verlet",
-    workers: Annotated[int, typer.Option(help="processes")] = 1,
+    workers: Workers = 1,
     precision: Precision = "f32",
     material: MaterialName = "StableNeoHookean",
     youngs_modulus: Youngs = 1e5,
@@ -105,7 +104,7 @@ def sweep(
     """
     from diffsim_ti import runtime
     from diffsim_ti.solvers import StaticSolver
-    from diffsim_ti.study.executors import pool
+    from diffsim_ti.study.executors import workers_of
     from diffsim_ti.study.sweep import Settings, largest_motion
     from diffsim_ti.study.sweep import sweep as run
     from diffsim_ti.study.sweep_picture import write_sweep
@@ -114,8 +113,8 @@ def sweep(
     kind = StaticSolver if solver == "static" else solver_class(solver)
     if not duration > 0 or not np.isfinite(duration):
         raise ValueError(f"--duration must be > 0 and finite [s], got {duration:g}")
-    if workers < 1 or frames < 1:
-        raise ValueError(f"--workers and --frames must be >= 1, got {workers} and {frames}")
+    if frames < 1:
+        raise ValueError(f"--frames must be >= 1, got {frames}")
     runtime.init(backend, precision)
     results = largest_motion
     if scene.suffix == ".py":
@@ -126,7 +125,7 @@ def sweep(
             results = ResultsOfFile(str(scene), precision)
     else:
         make = own_scene(scene, material, youngs_modulus, poissons_ratio, density, fixed)
-    with pool(workers) if workers > 1 else nullcontext() as executor:
+    with workers_of(workers) as executor:
         done = run(make, axes, results, executor, Settings(kind, duration, frames))
     refused = [row for row in done.rows if row["said"]]
     print(f"{len(done.rows)} runs, {len(refused)} refused" + (f"; the first: {refused[0]['said']}" if refused else ""))

@@ -3,11 +3,19 @@
 import multiprocessing
 from collections.abc import Callable, Iterable
 from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
+from contextlib import nullcontext
 
 
 def pool(workers: int) -> ProcessPoolExecutor:
     """Processes that start by spawn, for Taichi's threads do not survive a fork."""
     return ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"))
+
+
+def workers_of(count: int):
+    """A context with `pool(count)`, or with None for one process. Raises ValueError for less."""
+    if count < 1:
+        raise ValueError(f"--workers must be >= 1, got {count}")
+    return pool(count) if count > 1 else nullcontext()
 
 
 def each(

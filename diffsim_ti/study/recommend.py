@@ -1,22 +1,14 @@
 """Advice: the cheapest solver, step, precision and checkpoints that meet a tolerance, from trial runs and the theory."""
 
-import time
 import warnings
-from dataclasses import replace
+from concurrent.futures import Executor
 
 import numpy as np
 
 from diffsim_ti.mesh import TetrahedralMesh
-from diffsim_ti.rollout import Rollout
-from diffsim_ti.scene import LOCKING_RATIO, Scene
-from diffsim_ti.solvers import SOLVERS, BDF2Solver, VelocityVerletSolver, stable_dt
-from diffsim_ti.study.elements import ElementTrial, ElementTrials, own_element
-from diffsim_ti.study.problem import Problem, distance
-from diffsim_ti.study.recommendation import Option, Recommendation
-from diffsim_ti.terms import Drag
-
-SAFETY = 0.7  # of the tolerance: what a trial run must keep, for the error of the whole run is predicted
-SHARE = 0.8  # of the stable step at the start, which may fall on the way
+from diffsim_ti.scene import Scene
+from diffsim_ti.study.recommendation import Recommendation
+from diffsim_ti.study.trials import Trials
 
 
 def recommend(
@@ -29,6 +21,7 @@ def recommend(
     frames: int = 8,
     elements: bool = True,
     coarser: TetrahedralMesh | None = None,
+    executor: Executor | None = None,
 ) -> Recommendation:
     """The cheapest way to run `scene` for `duration` [s] with a relative error of motion below `tolerance`.
 
@@ -40,6 +33,8 @@ def recommend(
     elements: whether linear tetrahedra, patches and ten nodes are compared too, by what the mesh itself makes wrong; the
     advice's `element` is the cheapest that keeps to the tolerance. coarser: a linear mesh of the body with the same
     named sets, to try ten nodes on; None: half the cells of a mesh that `create_box` made.
+    executor: any `concurrent.futures.Executor`, which takes a solver at a time, each with the budget, and the elements;
+    those near the best are timed again here.
 
     Raises ValueError for a duration or tolerance that is no such thing, FloatingPointError if nothing meets the tolerance.
     """
@@ -52,298 +47,6 @@ def recommend(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of trials with coarse steps, whose errors are measured
         trials = Trials(scene, duration, tolerance, memory, gradients, budget, frames)
-        trials.run()
-        if elements:
-            trials.compare_elements(coarser)
+        trials.coarser = coarser
+        trials.run(elements, executor)
     return trials.advice()
-
-
-class Trials:
-    """Trial runs of a scene: a reference, then each solver at the steps that its order of convergence suggests."""
-
-    def __init__(
-        self,
-        scene: Scene,
-        duration: float,
-        tolerance: float,
-        memory: float | None,
-        gradients: bool,
-        budget: float,
-        frames: int,
-    ):
-        self.scene, self.duration, self.tolerance, self.frames = scene, duration, tolerance, frames
-        self.memory, self.gradients, self.budget = memory, gradients, budget
-        self.stable = stable_dt(scene).dt
-        self.tried: list[Option] = []
-        self.notes: list[str] = []
-        self.spent = 0.0  # [s] of the trials, compile time apart
-        self.elements: list[ElementTrial] = []
-        self._find_reference()
-
-    def _find_reference(self) -> None:
-        """Converged motion in float64 over `self.span`: by velocity Verlet, over all of the duration if a tenth of the
-        budget allows; else by implicit steps over all of it; else, where these do not converge, over the first part."""
-        k = int(np.ceil(self.duration / self.frames / (SHARE * self.stable)))
-        self.explicit_cost = self._seconds_per_substep()
-        seconds = self.explicit_cost * k * self.frames
-        self.span, part = self.duration, min(1.0, 0.1 * self.budget / max(3 * seconds, 1e-9))
-        self.problem = replace(Problem.of_scene(self.scene, self.span), frames=self.frames)
-        if part < 1 and self._converge(BDF2Solver, 1, 0.5 * self.budget):
-            self.reference_by = BDF2Solver
-            return
-        self.span, self.reference_by = part * self.duration, VelocityVerletSolver
-        self.problem = replace(Problem.of_scene(self.scene, self.span), frames=self.frames)
-        if not self._converge(VelocityVerletSolver, max(1, int(np.ceil(k * part)))):
-            raise FloatingPointError(
-                f"the motion does not converge: with ever more steps in {self.span:.3g} s the last halving still changed it "
-                f"by {self.own_error:.1g} of the largest displacement; shorten the duration"
-            )
-
-    def _converge(self, kind, k: int, limit: float = np.inf) -> bool:
-        """Halve the steps of a second-order solver, from k per frame, until two agree to a tenth of the tolerance; the
-        reference is extrapolated from them, its error is their distance from it. False beyond `limit` [s]."""
-        coarse, self.own_error, begin = None, np.nan, None
-        for _ in range(8):
-            try:
-                fine = self._motion(kind, "f64", k)[0]
-            except FloatingPointError:  # the stable step falls on the way, or Newton's method does not converge
-                fine = None
-            if coarse is not None and fine is not None:
-                self.reference = fine + (fine - coarse) / 3
-                self.own_error = distance(self.problem, fine, self.reference)
-                if self.own_error < 0.1 * self.tolerance:
-                    return True
-            begin = begin or time.perf_counter()  # the first run compiles
-            if time.perf_counter() - begin > limit:
-                return False
-            coarse, k = fine, 2 * k
-        return False
-
-    def _seconds_per_substep(self) -> float:
-        """Wall time of a substep of velocity Verlet [s], the cost of starting a run taken off."""
-        times = []
-        for substeps in (40, 400):
-            rollout = self._rollout(VelocityVerletSolver, "f64", substeps, frames=1, span=0.1 * substeps * self.stable)
-            rollout.forward()
-            begin = time.perf_counter()
-            rollout.forward()
-            times.append(time.perf_counter() - begin)
-        return max((times[1] - times[0]) / 360, 0.1 * times[1] / 400)
-
-    def _rollout(self, kind, precision, substeps, frames=None, span=None) -> Rollout:
-        frames, span = frames or self.frames, span or self.span
-        solver = kind(self.scene.replace(precision=precision), dt=span / frames, substeps=substeps)
-        return Rollout(solver, frames, save_every=1, memory=self.memory)
-
-    def _motion(self, kind, precision, substeps, timed: bool = False):
-        """(displacements from the start at the frames, wall time [s], `timed`, with the gradient if one is wanted)."""
-        rollout = self._rollout(kind, precision, substeps)
-        frames = rollout.forward()
-        moved = frames.displacements.astype(np.float64) - frames.displacements[0]
-        if not timed:
-            return moved, np.nan
-        self._time(rollout, moved)  # compiles
-        seconds = self._time(rollout, moved)
-        self.spent += 3 * seconds
-        return moved, seconds
-
-    def _time(self, rollout, adjoint) -> float:
-        """Wall time of a run [s], with its gradient if one is wanted."""
-        start = time.perf_counter()
-        frames = rollout.forward()
-        if self.gradients:
-            rollout.vjp(frames, adjoint)
-        return time.perf_counter() - start
-
-    def _compare(self, rounds: int = 5) -> None:
-        """Time the good options that are near the best once more, back to back, for the machine may have been busy."""
-        best = self._best()
-        good = [o for o in self.tried if o.error <= SAFETY * self.tolerance]
-        near = [o for o in good if o.seconds < max(12 * best.seconds, 1e-3 * self.budget)]
-        rollouts = [self._rollout(o.solver, o.precision, o.substeps) for o in near]
-        times, longer = [[] for _ in near], self.duration / self.span
-        for _ in range(rounds):
-            for k, (option, rollout) in enumerate(zip(near, rollouts)):
-                if not times[k] or option.seconds / longer < 0.02 * self.budget:
-                    times[k].append(self._time(rollout, self.reference))
-        for option, seconds in zip(near, times):
-            option.seconds = longer * min(seconds[1:] or seconds)
-
-    def _try(self, kind, precision, substeps) -> Option:
-        """Run an option over the span; its error and time are carried on to the whole duration."""
-        longer = self.duration / self.span
-        total = int(np.ceil(substeps * self.frames * longer))
-        option = Option(kind, precision, self.duration / total, total, substeps=substeps)
-        try:
-            moved, seconds = self._motion(kind, precision, substeps, timed=True)
-            option.error = distance(self.problem, moved, self.reference) * longer
-            option.seconds = seconds * longer
-        except FloatingPointError as error:
-            self.notes.append(f"{option.label}: {type(error).__name__}")
-        self.tried.append(option)
-        return option
-
-    def run(self) -> None:
-        """Every solver from its largest step to one that meets the tolerance; first the kind that made the reference.
-        Explicit ones in float32, then in float64 at the same step, which costs little more on small meshes; implicit ones
-        in float32, and in float64 where finer steps do not help.
-        """
-        first = max(1, int(np.ceil(self.span / self.frames / (SHARE * self.stable))))
-        other = lambda kind: (kind.explicit != self.reference_by.explicit, kind is not BDF2Solver)  # noqa: E731
-        for kind in sorted(SOLVERS, key=other):
-            stuck = self._refine(kind, "f32", first if kind.explicit else 1)
-            if not kind.explicit and stuck:
-                self._refine(kind, "f64", 1)
-        for kind in [kind for kind in SOLVERS if kind.explicit]:
-            known = [o for o in self.tried if o.solver is kind and np.isfinite(o.error)]
-            if known and not self._too_dear(kind, "f64", known[-1].substeps):
-                self._try(kind, "f64", min(known, key=lambda o: o.error).substeps)
-        if self._best() is not None:
-            self._compare()
-
-    def _refine(self, kind, precision: str, substeps: int) -> bool:
-        """Try ever more substeps a frame, as many as the order of convergence suggests, until the tolerance is met or
-        that is too dear; whether it got stuck, a finer step being no better (rounding, or the solver's tolerance)."""
-        before = np.inf
-        for _ in range(5):
-            if self._too_dear(kind, precision, substeps):
-                return False
-            option = self._try(kind, precision, substeps)
-            if option.error <= SAFETY * self.tolerance:
-                return False
-            if option.error > 0.9 * before:
-                return True
-            before = np.fmin(option.error, before)
-            finer = (option.error / (0.5 * self.tolerance)) ** (1 / kind.order) if np.isfinite(option.error) else 4
-            substeps = int(np.ceil(substeps * np.clip(finer, 1.3, 16)))
-        return True
-
-    def _too_dear(self, kind, precision: str, substeps: int) -> bool:
-        """Whether a trial would take longer than twelve times the best so far, or than the budget's rest."""
-        best = self._best()
-        known = [o for o in self.tried if o.solver is kind and np.isfinite(o.seconds)]
-        if not known and not kind.explicit:
-            return self.spent > self.budget
-        longer = self.duration / self.span
-        seconds = (
-            min(o.seconds / o.substeps for o in known) * substeps
-            if known
-            else self.explicit_cost * substeps * self.frames * longer * (3 if self.gradients else 1)
-        )
-        trial, dearer = 3 * seconds / longer, best is not None and seconds > 12 * best.seconds
-        if dearer or (self.spent + trial > self.budget and (known or best is not None)):
-            step = self.span / self.frames / substeps
-            self.notes.append(f"{kind.__name__} with a step of {step:.3g} s, {precision}, was not tried: too dear")
-            return True
-        return False
-
-    def compare_elements(self, coarser: TetrahedralMesh | None = None) -> None:
-        """Try the kinds of elements over the span of the reference."""
-        compared = ElementTrials(self.scene, self.span, self.frames, 0.5 * self.budget, coarser)
-        try:
-            self.elements = compared.run()
-        except FloatingPointError as error:
-            self.notes.append(f"elements were not compared: {type(error).__name__}")
-        self.notes += compared.notes
-
-    def _best(self) -> Option | None:
-        good = [o for o in self.tried if o.error <= SAFETY * self.tolerance]
-        return min(good, key=lambda o: o.seconds, default=None)
-
-    # ---- what follows from it -------------------------------------------------------------------------------------------
-
-    def advice(self) -> Recommendation:
-        """The cheapest option that met the tolerance, in words as well."""
-        best = self._best()
-        if best is None:
-            closest = min(self.tried, key=lambda o: np.nan_to_num(o.error, nan=np.inf))
-            raise FloatingPointError(
-                f"nothing tried meets a tolerance of {self.tolerance:g}: the closest is {closest.label} with an error of "
-                f"{closest.error:.2g}; loosen the tolerance, raise budget= ({self.budget:g} s), or shorten the duration"
-            )
-        plan = Rollout(
-            best.solver(
-                self.scene.replace(precision=best.precision),
-                dt=self.duration / self.frames,
-                substeps=-(-best.steps // self.frames),
-            ),
-            self.frames,
-            memory=self.memory,
-        )
-        return Recommendation(
-            best,
-            self.duration,
-            self.gradients,
-            self.memory,
-            plan.memory if self.gradients else 0.0,
-            max(best.error, self.own_error),
-            self._element(),
-            self._reasons(best, plan),
-            self._left_out(best),
-            self.tried,
-            self.elements,
-        )
-
-    def _element(self) -> str:
-        """The cheapest kind that keeps to the tolerance, or the one that is nearest; the scene's own if none was tried."""
-        known = [trial for trial in self.elements if np.isfinite(trial.error)]
-        good = [trial for trial in known if trial.error <= self.tolerance]
-        if good:
-            return min(good, key=lambda trial: trial.seconds).element
-        if any(np.isnan(trial.error) for trial in self.elements):
-            return "quadratic"
-        return min(known, key=lambda trial: trial.error).element if known else own_element(self.scene)
-
-    def _reasons(self, best, plan) -> list[str]:
-        others = {}
-        for o in self.tried:
-            if o.solver is not best.solver and o.error <= SAFETY * self.tolerance:
-                others[o.solver.__name__] = min(others.get(o.solver.__name__, np.inf), o.seconds / best.seconds)
-        beaten = ", ".join(
-            f"{name} {times:.1f} times as long" for name, times in sorted(others.items(), key=lambda x: x[1])
-        )
-        share = best.substep / self.stable
-        limit = (
-            f"its step is {share:.2g} of the stable step {self.stable:.3g} s"
-            if best.solver.explicit
-            else f"its step is {share:.2g} times the explicit limit {self.stable:.3g} s"
-        )
-        kept = plan.checkpoints
-        again = "each step runs once more in the reverse sweep" if kept.num_segments > 1 else "all steps are kept"
-        return [
-            f"accuracy: error {best.error:.2g} against a converged run (itself good to {self.own_error:.1g}), order "
-            f"{best.solver.order}; {limit}",
-            f"time: {beaten or 'no other solver met the tolerance'}",
-            f"memory: {plan.memory:.3g} MB in {kept.num_segments} segments, {again}"
-            if self.gradients
-            else "memory: without gradients no state is kept",
-        ]
-
-    def _left_out(self, best) -> list[str]:
-        out = []
-        if best.precision == "f32":
-            out.append("float64: float32's rounding stays below the tolerance")
-        implicit = [o for o in self.tried if not o.solver.explicit and np.isfinite(o.error)]
-        if best.solver.explicit and implicit:
-            close = min(implicit, key=lambda o: o.error)
-            times = close.seconds / best.seconds
-            out.append(
-                f"implicit solvers: {close.solver.__name__} takes {times:.2g} times as long, error {close.error:.2g}"
-            )
-        if self.scene.term(Drag) is None:
-            out.append("damping: none in the scene")
-        if not any(getattr(t, "acts_on_surface", False) for t in self.scene.terms):
-            out.append("contact: none in the scene")
-        given = self.scene.dead_loads or self.scene.following or self.scene.cables
-        if not given and self.scene.motion is None:
-            out.append("forces and motion per step")
-        nu = self.scene.largest_poissons_ratio()
-        if nu > LOCKING_RATIO + 1e-12:
-            if self.scene.volume == "tetrahedra":
-                out.append(
-                    f'nothing against locking, though nu = {nu:.4g}: volume="patches" of a Scene is advised, or ten-node '
-                    "tetrahedra, mesh.quadratic()"
-                )
-        else:
-            out.append(f"elements against locking: nu = {nu:.4g} is at most {LOCKING_RATIO}")
-        return out + self.notes

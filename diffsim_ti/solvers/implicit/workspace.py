@@ -8,7 +8,7 @@ import numpy as np
 from diffsim_ti import runtime
 from diffsim_ti.contact.implicit_pairs import ImplicitPairs
 from diffsim_ti.contact.surface_pairs import Tunnelling
-from diffsim_ti.inputs import ConsistentMass, Mass, diagonal_of, kinetic_energy
+from diffsim_ti.inputs import ConsistentMass, Mass, kinetic_energy
 from diffsim_ti.monitor.energy_watch import EnergyWatch
 from diffsim_ti.potential.attached import Attached
 from diffsim_ti.potential.fluid import Fluid, Together
@@ -21,11 +21,10 @@ from diffsim_ti.solvers.implicit.held_strains import HeldStrains
 from diffsim_ti.solvers.implicit.laid_on import LaidOn
 from diffsim_ti.solvers.implicit.law_state import law_state_kernels
 from diffsim_ti.solvers.implicit.linear import NotConverged
-from diffsim_ti.solvers.implicit.multigrid import Multigrid
 from diffsim_ti.solvers.implicit.newton import Newton
 from diffsim_ti.solvers.implicit.noted import Noted
 from diffsim_ti.solvers.implicit.obstacle_ways import ObstacleWays
-from diffsim_ti.solvers.implicit.preconditioners import BlockJacobi, BodyBlocks
+from diffsim_ti.solvers.implicit.preconditioned import Preconditioned
 from diffsim_ti.solvers.implicit.pressed import Pressed
 from diffsim_ti.solvers.implicit.stage import Stage
 from diffsim_ti.solvers.implicit.threads import one_blas_thread
@@ -43,7 +42,7 @@ class TwoStepHistory(History):
         self.fresh = [True] * num_slots
 
 
-class ImplicitWorkspace(ObstacleWays, Noted, GivenInPasses, Workspace):
+class ImplicitWorkspace(Preconditioned, ObstacleWays, Noted, GivenInPasses, Workspace):
     """A run of an implicit solver. Vectors of vertices are worked on in float64 on the host, tetrahedra on the device."""
 
     pairs_kind = ImplicitPairs
@@ -179,38 +178,6 @@ class ImplicitWorkspace(ObstacleWays, Noted, GivenInPasses, Workspace):
         kernel = getattr(law_state_kernels(a.law, features, self.parallel, a.in_lanes), name)
         sizes = dict(num_items=a.num_items, num_vertices=a.num_vertices, slot=slot, end=end)
         self.bound(kernel, **records)(**sizes, h=float(self.solver.schedule.length(j)))
-
-    def preconditioner(self, mass: Mass) -> tuple:
-        """(preconditioner for c M + K with mass = c m, size of the diagonal of that at rest [N/m])."""
-        mass = diagonal_of(mass)
-        size_of, mass = mass, self._rounded(mass)
-        key = float(mass.sum())
-        if key not in self._preconditioners:
-            with self.potential.at_rest():
-                blocks, contact = self.potential.blocks(), self.potential.contact_blocks()
-            size = np.abs(blocks if contact is None else blocks - contact).sum((1, 2))[:, None]
-            kind = Multigrid if self._wants_multigrid(size, mass) else BodyBlocks if self.scene.reduced else BlockJacobi
-            if len(self._preconditioners) > 5:
-                self._preconditioners.pop(next(iter(self._preconditioners)))
-            self._preconditioners[key] = kind(self.potential, mass, self.free, size, self.parallel), size
-        kept, size = self._preconditioners[key]
-        return kept, size + size_of
-
-    def _rounded(self, inertia: np.ndarray) -> np.ndarray:
-        """c m, of unequal steps for the nearest power of four of c, so that some preconditioners serve all steps."""
-        if not (self.solver.schedule.varies and inertia.any()):
-            return inertia
-        c = float(inertia.sum() / diagonal_of(self.mass).sum())
-        return inertia * (4.0 ** np.round(0.5 * np.log2(c)) / c)
-
-    def _wants_multigrid(self, size: np.ndarray, mass: np.ndarray) -> bool:
-        if self.scene.reduced:
-            return False
-        if self.solver.preconditioner != "auto":
-            return self.solver.preconditioner == "multigrid"
-        ratio = np.max(size[mass > 0] / mass[mass > 0], initial=0.0) if mass.any() else np.inf
-        most = 1000 if self.scene.mesh.order == 1 else 200  # vertices up to which blocks alone take less time
-        return len(size) > most and ratio > 1000
 
     def read(self, history, slot: int) -> tuple:
         """(u, v, (u-, v-) or None) of a slot, in float64."""
