@@ -15,6 +15,7 @@ from types import SimpleNamespace
 
 import taichi as ti
 
+from diffsim_ti.elements.growing import Growing
 from diffsim_ti.elements.items import Block, Single
 from diffsim_ti.elements.nodes import Nodes, nodes_of
 from diffsim_ti.materials.calculus.tensor import Tensor, inner, sum_of
@@ -34,7 +35,7 @@ class Onwards(Bundle):
 
 
 @dataclass(frozen=True)
-class Tetrahedron:
+class Tetrahedron(Growing):
     """Functions of one item for a law; `uniform`: one set of coefficients serves all; `lanes`: items are blocks; `order`: 1
     or 2, of the functions between nodes."""
 
@@ -109,47 +110,6 @@ class Tetrahedron:
         """The law's coefficients (the first block holds them for all if they are uniform)."""
         K = len(self.law.coefficient_names)
         return self.items.numbers(array, 0, K, K, 0 if self.uniform else item)
-
-    # Growth has its value at the beginning and at the end of each step; a pass takes the mean over its kicks. Where no pass
-    # is told (`scene.now`), the first row holds, as at the end of its step.
-
-    @property
-    def growth_at(self) -> int:
-        """Place of growth among the law's coefficients."""
-        return self.law.coefficient_names.index("growth")
-
-    @traced
-    def _growth_weights(self, of) -> list:
-        """(row, weight of its beginning, of its end) for each part."""
-        one, out = ti.cast(1, self.fp), []
-        if not hasattr(of, "now"):
-            return [(0, let(one - one), let(one))]
-        now = of.now
-        for force, weight in ((now.force0, now.share0), (now.force1, now.share1)):
-            share = let(ti.select(force == now.row, now.begin, one))
-            out.append((force if self.growth[0] else 0, let(weight * (one - share)), let(weight * share)))
-        return out
-
-    @traced
-    def grown(self, item, p: list, array, of) -> list:
-        """Coefficients p with the growth in an array, at the pass of a Bundle."""
-        if self.growth is None:
-            return p
-        total = p[self.growth_at]
-        for row, begin, end in self._growth_weights(of):
-            first, last = self.items.row(array, row, 0, 2, 2, 0 if self.growth[1] else item)
-            total = total + first * begin + last * end
-        return [let(total) if k == self.growth_at else x for k, x in enumerate(p)]
-
-    @traced
-    def _add_growth(self, item, adjoint, by_p: list, of) -> None:
-        """Add the adjoint of growth, that of its coefficient."""
-        if self.growth is None:
-            return
-        by = by_p[self.growth_at]
-        for row, *weights in self._growth_weights(of):
-            known = self.items.row(adjoint.growths, row, 0, 2, 2, item)
-            self.items.put_row(adjoint.growths, row, 0, 2, item, [a + by * w for a, w in zip(known, weights)])
 
     @traced
     def state_of(self, item, z, s, q: int = 0) -> list:
@@ -297,7 +257,7 @@ class Tetrahedron:
         if self.reads_rates:
             self.store(item, adjoint.rate_corner, rates)
         self.items.add(adjoint.coefficients, len(by_p), item, by_p)
-        self._add_growth(item, adjoint, by_p, scene)
+        self.add_growth(item, adjoint, by_p, scene)
 
     @traced
     def _add_shape(self, item, adjoint, q, by_B: Tensor, by_V) -> None:
@@ -356,7 +316,7 @@ class Tetrahedron:
             held = [onwards.pick(o, x) for x, o in zip(later, zero)]
             self.put_state(item, adjoint.z, 0, [a + b for a, b in zip(by_z, held)], q)
             self.items.add(adjoint.coefficients, len(by_p), item, by_p)
-            self._add_growth(item, adjoint, by_p, scene)
+            self.add_growth(item, adjoint, by_p, scene)
             pushes.append((by_H * ti.cast(-1, self.fp)) @ B.transpose())
             if shape:
                 self.items.add(adjoint.gradients, 9 * points, item, (D.transpose() @ by_H).numbers, 9 * q)

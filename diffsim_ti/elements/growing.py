@@ -1,0 +1,51 @@
+"""Tetrahedra that grow over time, as an explicit pass and an implicit one take it."""
+
+import taichi as ti
+
+from diffsim_ti.runtime import let, traced
+
+
+class Growing:
+    """A part of Tetrahedron, whose `growth` says whether there are rows for each step and whether all grow alike.
+
+    Growth has its value at the beginning and at the end of each step; a pass takes the mean over its kicks. Where no pass
+    is told (`scene.now`), the first row holds, as at the end of its step.
+    """
+
+    @property
+    def growth_at(self) -> int:
+        """Place of growth among the law's coefficients."""
+        return self.law.coefficient_names.index("growth")
+
+    @traced
+    def _growth_weights(self, of) -> list:
+        """(row, weight of its beginning, of its end) for each part."""
+        one, out = ti.cast(1, self.fp), []
+        if not hasattr(of, "now"):
+            return [(0, let(one - one), let(one))]
+        now = of.now
+        for force, weight in ((now.force0, now.share0), (now.force1, now.share1)):
+            share = let(ti.select(force == now.row, now.begin, one))
+            out.append((force if self.growth[0] else 0, let(weight * (one - share)), let(weight * share)))
+        return out
+
+    @traced
+    def grown(self, item, p: list, array, of) -> list:
+        """Coefficients p with the growth in an array, at the pass of a Bundle."""
+        if self.growth is None:
+            return p
+        total = p[self.growth_at]
+        for row, begin, end in self._growth_weights(of):
+            first, last = self.items.row(array, row, 0, 2, 2, 0 if self.growth[1] else item)
+            total = total + first * begin + last * end
+        return [let(total) if k == self.growth_at else x for k, x in enumerate(p)]
+
+    @traced
+    def add_growth(self, item, adjoint, by_p: list, of) -> None:
+        """Add the adjoint of growth, that of its coefficient."""
+        if self.growth is None:
+            return
+        by = by_p[self.growth_at]
+        for row, *weights in self._growth_weights(of):
+            known = self.items.row(adjoint.growths, row, 0, 2, 2, item)
+            self.items.put_row(adjoint.growths, row, 0, 2, item, [a + by * w for a, w in zip(known, weights)])
