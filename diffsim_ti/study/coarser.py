@@ -6,6 +6,8 @@ from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.grid import PATTERNS, box
 from diffsim_ti.scene import Scene
 
+HELD = "held, by indices"  # the set of what a scene holds so
+
 
 def halved_grid(mesh: TetrahedralMesh) -> TetrahedralMesh | None:
     """A mesh of `create_box`, moved or stretched, with every other plane of each direction that has an even number of cells;
@@ -41,21 +43,28 @@ def _pattern(mesh: TetrahedralMesh, axes: list[np.ndarray], counts: list[int]) -
 
 def on_coarser(scene: Scene, mesh: TetrahedralMesh) -> Scene:
     """The scene with ten-node tetrahedra of another linear mesh of its body, which has the named sets that the scene names.
+    What is held by indices is held where the other mesh's vertices lie between such vertices alone.
 
-    Raises ValueError for what cannot be carried over: numbers for each tetrahedron, and sets given by indices.
+    Raises ValueError for what cannot be carried over: numbers for each tetrahedron, terms on vertices by their indices.
     """
     given = dict(scene.arguments)
     several = [n for n in (*scene.material.inputs, "density") if np.ndim(scene.inputs.values[n])]
     if several:
         raise ValueError(f"{several[0]} is given for each tetrahedron")
-    fixed = given["fixed"]
+    fixed, at = given["fixed"], scene.mesh.locate(mesh.vertices, nearest=True).matrix
     if (
         fixed is not None
         and not isinstance(fixed, (str, dict))
         and any(not isinstance(n, str) for n in np.ravel(fixed))
     ):
-        raise ValueError("vertices that are held by their indices are not those of a coarser mesh: name them as a set")
-    nodes, at = mesh.quadratic(), scene.mesh.locate(mesh.vertices, nearest=True).matrix
+        held = np.zeros(scene.mesh.num_vertices)
+        held[scene.mesh.vertex_indices(fixed)] = 1
+        if not np.any(own := at @ held > 1 - 1e-6):
+            raise ValueError(
+                "none of its vertices lies between vertices that are held by their indices: name them as a set"
+            )
+        mesh, given["fixed"] = mesh.with_vertex_set(HELD, own), HELD
+    nodes = mesh.quadratic()
     for name, origin in (("initial_positions", scene.mesh.vertices), ("initial_velocities", 0.0)):
         if np.ndim(given[name]) == 2:
             own = at @ (np.asarray(given[name], np.float64) - origin)

@@ -9,11 +9,10 @@ from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.scene import Scene
 from diffsim_ti.solvers import VelocityVerletSolver, stable_dt
-from diffsim_ti.study.coarser import halved_grid, on_coarser
+from diffsim_ti.study.coarser import HELD, halved_grid, on_coarser
 from diffsim_ti.study.problem import ELEMENTS
 
 SHARE = 0.8  # of the stable step at the start
-HELD = "held, by indices"  # the set of what a scene holds so
 
 
 @dataclass
