@@ -1,5 +1,6 @@
 """Many scenes at once: each is, bit for bit, the scene alone; gradients, tangents, scenes that die, tensors."""
 
+import pickle
 import warnings
 
 import numpy as np
@@ -230,6 +231,13 @@ def test_a_control_loop_goes_on_from_its_ends():
     np.testing.assert_allclose(state["initial_velocities"], whole.velocities[:, -1], rtol=0, atol=1e-15)
 
 
+def test_batches_are_copied_by_pickle():
+    batch = simple(3, lanes=False)
+    again = pickle.loads(pickle.dumps(batch))
+    assert again.num_scenes == 3 and not again.lanes
+    np.testing.assert_array_equal(again.forward().positions, batch.forward().positions)
+
+
 def test_scenes_start_anew():
     batch = simple(4)
     frames = batch.forward(youngs_modulus=[1e4, 1.5e4, 2e4, 3e4])
@@ -269,6 +277,11 @@ def test_numbers_by_named_sets(lanes):
         assert gradients["youngs_modulus"]["soft"][b] == pytest.approx(by["youngs_modulus"]["soft"], rel=1e-12)
         total += by["youngs_modulus"]["stiff"]
     assert gradients["youngs_modulus"]["stiff"] == pytest.approx(total, rel=1e-12)
+    tensors = {key: torch.tensor(x, dtype=torch.float64, requires_grad=True) for key, x in numbers.items()}
+    moved = rollout_frames(batch, youngs_modulus=tensors, poissons_ratio=dict(default=0.2)).positions
+    (moved * torch.as_tensor(seed)).sum().backward()
+    for key, tensor in tensors.items():
+        np.testing.assert_allclose(tensor.grad, gradients["youngs_modulus"][key], rtol=1e-12)
     along = dict(soft=np.array([1e3, -2e3, 5e2]), stiff=-4e3)
     change = batch.tangents(frames, youngs_modulus=along, poissons_ratio=dict(default=0.01))["positions"]
     here = sum((gradients["youngs_modulus"][key] * dot).sum() for key, dot in along.items())

@@ -11,6 +11,7 @@ from diffsim_ti.batch.set_values import gathered_scenes, spread_scenes
 from diffsim_ti.batch.sweep import LanesSweep, Own, value_of
 from diffsim_ti.batch.workspace import why_not
 from diffsim_ti.checked import whole
+from diffsim_ti.copies import made_again
 from diffsim_ti.inputs import Derived
 from diffsim_ti.inputs.description import frozen
 from diffsim_ti.outputs import Output
@@ -69,6 +70,7 @@ class Batch:
         self.num_scenes = whole("scenes", scenes, 1)
         options = dict(save_every=save_every, gradients=gradients, truncate=truncate, memory=memory)
         self.one = Rollout(solver, steps, outputs=outputs, **options)
+        self._lanes_asked = lanes
         self.solver, self.scene, self.inputs, self.wanted = (
             self.one.solver,
             self.one.scene,
@@ -81,6 +83,13 @@ class Batch:
             raise ValueError(f"scenes cannot be computed in lanes: {self.why_not}; leave out lanes=True")
         self.lanes = self.why_not is None if lanes is None else bool(lanes)
         self.sweep = LanesSweep(self.solver, self.steps, self.num_scenes, **options) if self.lanes else None
+
+    def __reduce__(self):
+        """As it was made; frames are not in it."""
+        given = self.one.__reduce__()[1][1]
+        names = ("solver", "steps", "save_every", "outputs", "gradients", "truncate", "memory")
+        own = {name: given[name] for name in names} | dict(scenes=self.num_scenes, lanes=self._lanes_asked)
+        return made_again, (Batch, own)
 
     @property
     def outputs(self) -> dict[str, Output]:

@@ -30,13 +30,13 @@ class Growing:
         return out
 
     @traced
-    def grown(self, item, p: list, array, of) -> list:
-        """Coefficients p with the growth in an array, at the pass of a Bundle."""
+    def grown(self, item, p: list, of) -> list:
+        """Coefficients p with the growths of a Bundle, at its pass; one of scenes in lanes has none."""
         if self.growth is None:
             return p
         total = p[self.growth_at]
         for row, begin, end in self._growth_weights(of):
-            first, last = self.items.row(array, row, 0, 2, 2, 0 if self.growth[1] else item)
+            first, last = self.items.row(of.growths, row, 0, 2, 2, 0 if self.growth[1] else item)
             total = total + first * begin + last * end
         return [let(total) if k == self.growth_at else x for k, x in enumerate(p)]
 

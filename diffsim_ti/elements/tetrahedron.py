@@ -125,7 +125,7 @@ class Tetrahedron(Growing):
     def numbers_at(self, item, scene, at, s, q: int = 0) -> list:
         """What the law takes besides tensors at point q and slot s: its coefficients, its state, and what is held in an
         implicit pass."""
-        p = self.grown(item, self.coefficients_of(item, scene.coefficients), scene.growths, scene)
+        p = self.grown(item, self.coefficients_of(item, scene.coefficients), scene)
         p = [*p, *self.state_of(item, at.z, s, q)] if self.has_state else p
         return [*p, *self.held_of(item, at.held, q), self.rate_of(at)] if self.holds(at) else p
 
@@ -219,7 +219,7 @@ class Tetrahedron(Growing):
 
     @traced
     def _numbers_jvp(self, item, change, dots, q) -> list:
-        dp = self.grown(item, self.coefficients_of(item, dots.coefficients), dots.growths, dots)
+        dp = self.grown(item, self.coefficients_of(item, dots.coefficients), dots)
         dp = [*dp, *self.state_of(item, change.z, 0, q)] if self.has_state else dp
         return [*dp, *self.held_of(item, change.held, q), let(0 * dp[0])] if self.holds(change) else dp
 

@@ -1,9 +1,12 @@
 """A batch of scenes as a node of torch's graph; all goes through the host."""
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from diffsim_ti.batch import Batch
 from diffsim_ti.torch_bridge.autograd import first_order_only, torch
+from diffsim_ti.torch_bridge.set_tensors import spread_tensors
 
 STATES = "positions", "velocities", "displacements"
 
@@ -60,7 +63,15 @@ def batch_frames(batch: Batch, tensors: dict) -> TorchBatchFrames:
     """Run a batch with some inputs given as tensors, see `rollout_frames`."""
     if "rest_positions" in tensors and "initial_displacements" in tensors:
         raise ValueError("with rest_positions, give initial_positions: initial_displacements are those from the mesh")
-    tensors = {name: x if isinstance(x, torch.Tensor) else torch.as_tensor(x) for name, x in tensors.items()}
+    known, scenes = batch.one.values, batch.num_scenes
+    tensors = {
+        name: spread_tensors(batch.scene, name, known.get(name), x, scenes) if isinstance(x, Mapping) else x
+        for name, x in tensors.items()
+    }
+    tensors = {
+        name: x if isinstance(x, torch.Tensor) else torch.as_tensor(x, dtype=torch.float64)
+        for name, x in tensors.items()
+    }
     for name, tensor in tensors.items():
         known = "initial_positions" if name == "initial_displacements" else name
         if not tensor.is_floating_point():

@@ -7,9 +7,9 @@ import numpy as np
 
 from diffsim_ti.batch import Batch
 from diffsim_ti.rollout import Rollout
-from diffsim_ti.rollout.set_values import per_tetrahedron, rows_of_sets
 from diffsim_ti.torch_bridge.autograd import first_order_only, refuse_transforms, torch, uncompiled
 from diffsim_ti.torch_bridge.batch_node import TorchBatchFrames, batch_frames
+from diffsim_ti.torch_bridge.set_tensors import spread_tensors
 from diffsim_ti.torch_bridge.tensors import TensorRollout
 
 REMEDY = "use verify.hessian_product or verify.gauss_newton_product"
@@ -91,18 +91,6 @@ def _as_tensors(gradients: dict, names, tensors, needed) -> list:
     return out
 
 
-def _spread(rollout: Rollout, name: str, numbers: Mapping) -> torch.Tensor:
-    """The values of all tetrahedra from tensors of named sets, whose gradients torch sums."""
-    rows = rows_of_sets(rollout.scene, name, numbers)
-    numbers = {key: x if isinstance(x, torch.Tensor) else torch.as_tensor(x) for key, x in numbers.items()}
-    like = next((x for x in numbers.values() if x.is_floating_point()), torch.zeros((), dtype=torch.float64))
-    out = torch.as_tensor(per_tetrahedron(rollout.scene, name, rollout.values[name])).to(like)
-    for key, own in rows.items():
-        at = torch.tensor(own.tolist(), device=out.device)
-        out = out.index_copy(0, at, numbers[key].to(out).expand(len(at), *out.shape[1:]))
-    return out
-
-
 @uncompiled
 def rollout_frames(rollout: Rollout | Batch, **tensors: torch.Tensor) -> TorchFrames | TorchBatchFrames:
     """Functional face: run a Rollout with some inputs given as tensors; one autograd node, gradients to all of them.
@@ -129,7 +117,10 @@ def rollout_frames(rollout: Rollout | Batch, **tensors: torch.Tensor) -> TorchFr
         raise ValueError("initial_positions and initial_displacements are two spellings of one input: give one")
     if "rest_positions" in tensors and "initial_displacements" in tensors:
         raise ValueError("with rest_positions, give initial_positions: initial_displacements are those from the mesh")
-    tensors = {name: _spread(rollout, name, x) if isinstance(x, Mapping) else x for name, x in tensors.items()}
+    tensors = {
+        name: spread_tensors(rollout.scene, name, rollout.values.get(name), x) if isinstance(x, Mapping) else x
+        for name, x in tensors.items()
+    }
     for name, value in rollout.scene.given_tensors().items():
         tensors.setdefault(name, value.expand(rollout.values[name].shape))
     for name, value in tensors.items():
