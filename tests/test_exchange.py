@@ -53,13 +53,26 @@ def test_size_and_parts():
     assert ds.TetrahedralMesh.from_surface(points, both).volume == pytest.approx(2 * MESH.volume)
 
 
+@pytest.mark.parametrize("turned", [False, True])
+def test_parts_within_others_are_cavities(turned):
+    X, surface, middle = MESH.vertices, MESH.surface_triangles, MESH.vertices.mean(0)
+    points = np.concatenate([X, middle + 0.5 * (X - middle), middle + 0.25 * (X - middle), X + (1, 0, 0)])
+    inner = surface[:, ::-1] if turned else surface
+    parts = [surface, inner + len(X), surface + 2 * len(X), surface + 3 * len(X)]
+    body = ds.TetrahedralMesh.from_surface(points, np.concatenate(parts))
+    assert body.volume == pytest.approx((2 - 1 / 8 + 1 / 64) * MESH.volume, rel=1e-12)
+    assert len(body.surface_triangles) == 4 * len(surface)
+
+
 def test_surfaces_that_cannot_be_filled(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     fill = ds.TetrahedralMesh.from_surface
     X, surface = MESH.vertices, MESH.surface_triangles
     with pytest.raises(ValueError, match="not closed: 3 of .* edges .*the first is at"):
         fill(X, surface[1:])
     with pytest.raises(ValueError, match="TetGen cannot fill .*self-intersections.* mend it"):
         fill(np.concatenate([X, X + 0.05]), np.concatenate([surface, surface + len(X)]))
+    assert not any(tmp_path.iterdir())  # TetGen leaves no files of its own
     with pytest.raises(ValueError, match="size must be a length above 0"):
         fill(X, surface, size=-1.0)
     with pytest.raises(ValueError, match=r"triangles must be indices of shape \(n, 3\)"):

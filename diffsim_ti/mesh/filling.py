@@ -31,7 +31,8 @@ def read_surface(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def filled(points: np.ndarray, triangles: np.ndarray, size: float | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """(vertices, tetrahedra) within a closed surface, all of whose points and triangles stay.
+    """(vertices, tetrahedra) within a closed surface, all of whose points and triangles stay; closed parts within others
+    bound cavities.
 
     size: edge length that tetrahedra reach at most, about [m]; default as large as their quality allows.
     Raises ValueError for a surface that is open, meets itself or is not finite, and where TetGen is missing.
@@ -47,14 +48,43 @@ def filled(points: np.ndarray, triangles: np.ndarray, size: float | None = None)
     except ImportError as error:
         raise ValueError(f"surfaces are filled by TetGen, which is missing: {INSTALL}, {ELSEWHERE}") from error
     mesher = tetgen.TetGen(points, triangles.astype(np.int32))
-    try:
-        made = mesher.tetrahedralize(quality=True, minratio=MEAN_RATIO, mindihedral=10.0, nobisect=True, **volume)
+    shape = dict(quality=True, minratio=MEAN_RATIO, mindihedral=10.0)
+    try:  # without nofacewritten, TetGen leaves files of refused triangles in the working folder
+        made = mesher.tetrahedralize(nobisect=True, nofacewritten=True, **shape, **volume)
     except RuntimeError as error:
         raise ValueError(
             f"TetGen cannot fill the surface ({' '.join(str(error).split())}): its triangles may meet each other; mend it, "
             f"with MeshLab say, {ELSEWHERE}"
         ) from error
-    return np.asarray(made[0], np.float64), np.asarray(made[1], np.int64)
+    return _without_cavities(np.asarray(made[0], np.float64), np.asarray(made[1], np.int64), points, triangles)
+
+
+def _without_cavities(vertices, tetrahedra, points, triangles) -> tuple[np.ndarray, np.ndarray]:
+    """Without tetrahedra of closed parts of the surface that lie within another: there, a ray leaves by an even number of
+    triangles. A surface in one piece has none."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    ends = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]]])
+    graph = coo_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(len(points),) * 2)
+    if len(np.unique(connected_components(graph, directed=False)[1][triangles[:, 0]])) == 1:
+        return vertices, tetrahedra
+    turn, _ = np.linalg.qr(np.array([[0.31, 0.77, 0.13], [0.59, 0.23, 0.83], [0.47, 0.91, 0.37]]))  # rays miss edges
+    a, b, c = (points @ turn)[triangles].transpose(1, 0, 2)
+    normal = np.cross(b - a, c - a)
+    centers, inside = vertices[tetrahedra].mean(1) @ turn, []
+    for center in np.array_split(centers, 1 + len(centers) * len(triangles) // 1_000_000):
+        at = center[:, None]
+        sides = [np.sign(_cross(q - p, at - p)) for p, q in ((a, b), (b, c), (c, a))]
+        above = np.einsum("ij,kij->ki", normal, at - a) * np.sign(normal[:, 2]) < 0
+        inside.append((((sides[0] == sides[1]) & (sides[1] == sides[2]) & above).sum(1) % 2) == 1)
+    tetrahedra = tetrahedra[np.concatenate(inside)]
+    used, corners = np.unique(tetrahedra, return_inverse=True)
+    return vertices[used], corners.reshape(tetrahedra.shape).astype(np.int64)
+
+
+def _cross(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    return u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
 
 
 def welded(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
