@@ -267,15 +267,9 @@ class Trials:
             )
         others, why = alternatives(self, best)
         self.notes += why
-        plan = Rollout(
-            best.solver(
-                self.scene.replace(precision=best.precision),
-                dt=self.duration / self.frames,
-                substeps=-(-best.steps // self.frames),
-            ),
-            self.frames,
-            memory=self.memory,
-        )
+        k = -(-best.steps // self.frames)
+        solver = best.solver(self.scene.replace(precision=best.precision), dt=self.duration / self.frames, substeps=k)
+        plan = Rollout(solver, self.frames, memory=self.memory)
         return Recommendation(
             best,
             self.duration,
@@ -334,9 +328,8 @@ class Trials:
         if best.solver.explicit and implicit:
             close = min(implicit, key=lambda o: o.error)
             times = close.seconds / best.seconds
-            out.append(
-                f"implicit solvers: {close.solver.__name__} takes {times:.2g} times as long, error {close.error:.2g}"
-            )
+            name = close.solver.__name__
+            out.append(f"implicit solvers: {name} takes {times:.2g} times as long, error {close.error:.2g}")
         if self.scene.term(Drag) is None:
             out.append("damping: none in the scene")
         if not any(getattr(t, "acts_on_surface", False) for t in self.scene.terms):
