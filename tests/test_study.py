@@ -337,3 +337,18 @@ def test_advice_takes_a_scene_of_ten_nodes_as_it_is():
     advice = recommend(scene, 0.02, 0.05, gradients=False, budget=1.0)
     assert advice.element == "quadratic" and not advice.elements
     assert "elements were not compared: the mesh has ten nodes already" in str(advice)
+
+
+def test_advice_offers_mass_scaling_and_steps_where_they_are_needed():
+    box = ds.TetrahedralMesh.create_cube(6, 0.1)
+    x, rows = box.vertices.copy(), box.tetrahedra
+    inner = np.setdiff1d(np.arange(box.num_vertices), box.surface_triangles)[0]
+    own = rows[(rows == inner).any(1)][0]
+    x[inner] += 0.98 * (x[own[own != inner]].mean(0) - x[inner])
+    scene = ds.Scene(ds.TetrahedralMesh(x, rows), ds.StableNeoHookean(1e5, 0.3), terms=ds.Gravity(), fixed=inner)
+    scene = scene.replace(fixed=np.unique(box.surface_triangles)[:40])
+    advice = recommend(scene, 0.03, 0.3, gradients=False, budget=1.0, elements=False)
+    ways = {way.how.split("=")[0].split("(")[0]: way for way in advice.alternatives}
+    assert "mass_scaling" in ways or "mass_scaling" in str(advice.left_out)
+    assert "adaptive_steps" in ways and ways["adaptive_steps"].search > 0
+    assert all(way.error <= 0.3 and way.seconds > 0 and str(way) in str(advice) for way in advice.alternatives)

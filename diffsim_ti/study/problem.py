@@ -17,6 +17,7 @@ ELEMENTS = {
     "quadratic": {"order": 2},
     "quadratic, mean dilatation": {"order": 2, "volume": "patches"},
 }
+VARIANTS = ELEMENTS | {"mass scaling": {"mass_scaling": 0.01}}  # of a chart: linear tetrahedra, their mass scaled
 
 
 def of_order(mesh: TetrahedralMesh, order: int) -> TetrahedralMesh:
@@ -59,7 +60,7 @@ class Problem:
     exact: the closed form's numbers, or None: a converged reference is computed, with its own error.
     scale: what errors are divided by; default the largest of the exact numbers.
     adjoint(frames, mesh) -> the loss's gradient by the frames' positions, such as a `FrameLoss`; `inputs`: those asked for.
-    cells, patterns, elements: the meshes of the chart, and the kinds of elements (ELEMENTS) to try on each.
+    cells, patterns, elements: the meshes of the chart, and the kinds of elements (VARIANTS) to try on each.
     reference_cells: those that the reference is extrapolated from, of ten-node tetrahedra (it then includes the mesh's
         error); None: the reference is of each mesh with linear elements by itself (the error of steps and precision).
     largest_step [s]: steps to start from, where the stable one does not say (contact to come).

@@ -6,6 +6,7 @@ import numpy as np
 
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.scene import Scene
+from diffsim_ti.study.alternatives import Alternative
 from diffsim_ti.study.elements import ElementTrial
 
 
@@ -33,6 +34,7 @@ class Recommendation:
 
     `reasons`: three lines; `left_out`: what the scene does without, and why. `rollout(scene)` makes it, of the scene as it
     is. `elements`: what its mesh makes wrong by each kind of element; `element`: the cheapest that keeps to the tolerance.
+    `alternatives`: mass scaling and adaptive steps beside it, where they keep to the tolerance.
     """
 
     option: Option
@@ -46,6 +48,7 @@ class Recommendation:
     left_out: list[str]
     tried: list[Option] = field(repr=False, default_factory=list)
     elements: list[ElementTrial] = field(repr=False, default_factory=list)
+    alternatives: list[Alternative] = field(repr=False, default_factory=list)
 
     solver = property(lambda self: self.option.solver)
     precision = property(lambda self: self.option.precision)
@@ -69,6 +72,7 @@ class Recommendation:
                 f"error {self.error:.2g} of the largest displacement",
                 *(f"- {line}" for line in self.reasons),
                 *([f"- elements: {'; '.join(map(str, self.elements))}, of the mesh alone"] if self.elements else []),
+                *(f"- beside it: {other}" for other in self.alternatives),
                 "left out: " + "; ".join(self.left_out),
             ]
         )

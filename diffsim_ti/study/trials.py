@@ -12,6 +12,7 @@ from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.scene import LOCKING_RATIO, Scene
 from diffsim_ti.solvers import SOLVERS, BDF2Solver, VelocityVerletSolver, stable_dt
+from diffsim_ti.study.alternatives import alternatives
 from diffsim_ti.study.elements import ElementTrial, ElementTrials, own_element
 from diffsim_ti.study.executors import each
 from diffsim_ti.study.problem import Problem, distance
@@ -110,18 +111,21 @@ class Trials:
         moved = frames.displacements.astype(np.float64) - frames.displacements[0]
         if not timed:
             return moved, np.nan
-        self._time(rollout, moved)  # compiles
-        seconds = self._time(rollout, moved)
+        self.time(rollout, moved)  # compiles
+        seconds = self.time(rollout, moved)
         self.spent += 3 * seconds
         return moved, seconds
 
-    def _time(self, rollout, adjoint) -> float:
+    def time(self, rollout, adjoint) -> float:
         """Wall time of a run [s], with its gradient if one is wanted."""
         start = time.perf_counter()
         frames = rollout.forward()
         if self.gradients:
             rollout.vjp(frames, adjoint)
         return time.perf_counter() - start
+
+    def error(self, moved) -> float:
+        return distance(self.problem, moved, self.reference)
 
     def _compare(self, rounds: int = 5) -> None:
         """Time the good options that are near the best once more, back to back, for the machine may have been busy."""
@@ -133,7 +137,7 @@ class Trials:
         for _ in range(rounds):
             for k, (option, rollout) in enumerate(zip(near, rollouts)):
                 if not times[k] or option.seconds / longer < 0.02 * self.budget:
-                    times[k].append(self._time(rollout, self.reference))
+                    times[k].append(self.time(rollout, self.reference))
         for option, seconds in zip(near, times):
             option.seconds = longer * min(seconds[1:] or seconds)
 
@@ -144,7 +148,7 @@ class Trials:
         option = Option(kind, precision, self.duration / total, total, substeps=substeps)
         try:
             moved, seconds = self._motion(kind, precision, substeps, timed=True)
-            option.error = distance(self.problem, moved, self.reference) * longer
+            option.error = self.error(moved) * longer
             option.seconds = seconds * longer
         except FloatingPointError as error:
             self.notes.append(f"{option.label}: {type(error).__name__}")
@@ -244,15 +248,11 @@ class Trials:
                 f"nothing tried meets a tolerance of {self.tolerance:g}: the closest is {closest.label} with an error of "
                 f"{closest.error:.2g}; loosen the tolerance, raise budget= ({self.budget:g} s), or shorten the duration"
             )
-        plan = Rollout(
-            best.solver(
-                self.scene.replace(precision=best.precision),
-                dt=self.duration / self.frames,
-                substeps=-(-best.steps // self.frames),
-            ),
-            self.frames,
-            memory=self.memory,
-        )
+        others, why = alternatives(self, best)
+        self.notes += why
+        k = -(-best.steps // self.frames)
+        solver = best.solver(self.scene.replace(precision=best.precision), dt=self.duration / self.frames, substeps=k)
+        plan = Rollout(solver, self.frames, memory=self.memory)
         return Recommendation(
             best,
             self.duration,
@@ -265,6 +265,7 @@ class Trials:
             self._left_out(best),
             self.tried,
             self.elements,
+            others,
         )
 
     def _element(self) -> str:
@@ -310,9 +311,8 @@ class Trials:
         if best.solver.explicit and implicit:
             close = min(implicit, key=lambda o: o.error)
             times = close.seconds / best.seconds
-            out.append(
-                f"implicit solvers: {close.solver.__name__} takes {times:.2g} times as long, error {close.error:.2g}"
-            )
+            name = close.solver.__name__
+            out.append(f"implicit solvers: {name} takes {times:.2g} times as long, error {close.error:.2g}")
         if self.scene.term(Drag) is None:
             out.append("damping: none in the scene")
         if not any(getattr(t, "acts_on_surface", False) for t in self.scene.terms):

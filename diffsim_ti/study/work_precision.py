@@ -15,7 +15,7 @@ from diffsim_ti.scene import Scene
 from diffsim_ti.solvers import SOLVERS, StaticSolver, VelocityVerletSolver, stable_dt
 from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.study.executors import each
-from diffsim_ti.study.problem import ELEMENTS, Problem, distance
+from diffsim_ti.study.problem import VARIANTS, Problem, distance
 
 # wall time per tetrahedron and substep, before anything was measured [s]; with gradients three times as much
 GUESS = {True: 6e-8, False: 1e-5}
@@ -44,7 +44,7 @@ class Point:
     @property
     def order(self) -> int:
         """Of the elements."""
-        return ELEMENTS[self.element].get("order", 1)
+        return VARIANTS[self.element].get("order", 1)
 
     @property
     def label(self) -> str:
@@ -153,7 +153,7 @@ def reference(
     if problem.exact is not None:
         return problem.exact, 0.0
     if problem.reference_cells is None or cells is not None:
-        scene = problem.scene(cells or problem.cells[0], pattern, "f64", **ELEMENTS[element])
+        scene = problem.scene(cells or problem.cells[0], pattern, "f64", **VARIANTS[element])
         k = substeps * choose_substeps(problem, scene, VelocityVerletSolver, 1)[0]
         coarse, fine = (run(problem, make_rollout(problem, scene, VelocityVerletSolver, s))[1] for s in (k, 2 * k))
         best = fine + (fine - coarse) / 3
@@ -209,7 +209,7 @@ class Runs:
         """(point, solver class, scene) of everything to run on a mesh."""
         out = []
         for precision in self.precisions:
-            scene = self.problem.scene(cells, pattern, precision, **ELEMENTS[element])
+            scene = self.problem.scene(cells, pattern, precision, **VARIANTS[element])
             for kind in self.solvers:
                 for k in choose_substeps(self.problem, scene, kind, self.levels):
                     total = k * self.problem.frames

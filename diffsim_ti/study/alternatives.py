@@ -1,0 +1,89 @@
+"""Beside equal steps of the scene as it is: mass scaling, and steps where they are needed."""
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from diffsim_ti.adaptive_steps import adaptive_steps
+from diffsim_ti.rollout import Rollout
+
+SHARES = (0.01,)  # of the mass
+GAIN = 1.5  # in the stable step, below which mass scaling is not tried
+TOLERANCES = (1.0, 0.3)  # of adaptive steps, in shares of what the advice may be off
+
+
+@dataclass
+class Alternative:
+    """A way to run the advised solver otherwise: `how` to ask for it, `steps` of the whole duration, its error relative to
+    the largest displacement, wall time [s] with its gradient if asked for, and that of finding its steps once, `search`
+    [s], which `seconds` leaves out. `times`: seconds over those of the advice, timed back to back."""
+
+    how: str
+    steps: int
+    error: float
+    seconds: float
+    times: float
+    search: float = 0.0
+
+    def __str__(self) -> str:
+        once = f", once {self.search:.2g} s to find them" if self.search else ""
+        return f"{self.how}: {self.steps} steps, error {self.error:.2g}, {self.times:.2g} times as long{once}"
+
+
+def alternatives(trials, best) -> tuple[list[Alternative], list[str]]:
+    """(what keeps to the tolerance, why the others are left out), of the advised option `best` of `Trials`."""
+    found, notes = [], []
+    longer, scene = trials.duration / trials.span, trials.scene.replace(precision=best.precision)
+    plain = best.solver(scene, dt=trials.span / trials.frames, substeps=best.substeps, check_start=False)
+    base = Rollout(plain, trials.frames, save_every=1, memory=trials.memory)
+    tried = [lambda how=how: how for how in _scaled(trials, best, scene, notes)]
+    tried += [lambda share=share: _adaptive(trials, best, scene, share) for share in TOLERANCES]
+    for make in tried:
+        try:
+            how, rollout, search = make()
+            moved = rollout.forward().displacements.astype(np.float64)
+            error = trials.error(moved - moved[0]) * longer
+        except (FloatingPointError, ValueError) as problem:
+            notes.append(f"a trial beside equal steps: {type(problem).__name__}")
+            continue
+        if not error <= trials.tolerance:
+            notes.append(f"{how}: error {error:.2g}")
+            continue
+        own, other = [], []
+        for _ in range(3):
+            other.append(trials.time(base, trials.reference))
+            own.append(trials.time(rollout, trials.reference))
+        steps = int(np.ceil((rollout.sweep.num_passes - 1) * longer))
+        times = min(own) / min(other)
+        found.append(Alternative(how, steps, error, best.seconds * times, times, search * longer))
+        if search:
+            break
+    return found, notes
+
+
+def _scaled(trials, best, scene, notes):
+    """Runs with mass added, at as many steps fewer as the stable step allows."""
+    if not best.solver.explicit or scene.mass_scaling or scene.mesh.order > 1:
+        return
+    for share in SHARES:
+        heavier = scene.replace(mass_scaling=share)
+        gain = heavier.mass_scaling.gain
+        if gain < GAIN:
+            notes.append(f"mass_scaling={share:g}: steps only {gain:.2g} times as long, the mesh has no slivers")
+            continue
+        substeps = int(np.ceil(best.substeps / gain))
+        solver = best.solver(heavier, dt=trials.span / trials.frames, substeps=substeps, check_start=False)
+        yield f"mass_scaling={share:g}", Rollout(solver, trials.frames, save_every=1, memory=trials.memory), 0.0
+
+
+def _adaptive(trials, best, scene, share):
+    """A run over steps that are found by looking."""
+    solver = best.solver(scene, dt=trials.span / trials.frames, check_start=False)
+    size = np.linalg.norm(trials.reference, axis=-1).max()
+    tolerance = float(f"{share * trials.tolerance * size * trials.span / trials.duration:.2g}")
+    begin = time.perf_counter()
+    steps = adaptive_steps(solver, trials.frames, tolerance)
+    search = time.perf_counter() - begin
+    how = f"adaptive_steps(solver, steps={trials.frames}, tolerance={tolerance:g})"
+    return how, Rollout(solver, steps, save_every=1, memory=trials.memory), search
