@@ -35,7 +35,7 @@ def alternatives(trials, best) -> tuple[list[Alternative], list[str]]:
     """(what keeps to the tolerance, why the others are left out), of the advised option `best` of `Trials`."""
     found, notes = [], []
     longer, scene = trials.duration / trials.span, trials.scene.replace(precision=best.precision)
-    plain = best.solver(scene, dt=trials.span / trials.frames, substeps=best.substeps, check_start=False)
+    plain = best.solver(scene, dt=trials.span / trials.frames, substeps=best.substeps, **_unchecked(best))
     base = Rollout(plain, trials.frames, save_every=1, memory=trials.memory)
     tried = [lambda how=how: how for how in _scaled(trials, best, scene, notes)]
     tried += [lambda share=share: _adaptive(trials, best, scene, share) for share in TOLERANCES]
@@ -73,13 +73,13 @@ def _scaled(trials, best, scene, notes):
             notes.append(f"mass_scaling={share:g}: steps only {gain:.2g} times as long, the mesh has no slivers")
             continue
         substeps = int(np.ceil(best.substeps / gain))
-        solver = best.solver(heavier, dt=trials.span / trials.frames, substeps=substeps, check_start=False)
+        solver = best.solver(heavier, dt=trials.span / trials.frames, substeps=substeps, **_unchecked(best))
         yield f"mass_scaling={share:g}", Rollout(solver, trials.frames, save_every=1, memory=trials.memory), 0.0
 
 
 def _adaptive(trials, best, scene, share):
     """A run over steps that are found by looking."""
-    solver = best.solver(scene, dt=trials.span / trials.frames, check_start=False)
+    solver = best.solver(scene, dt=trials.span / trials.frames, **_unchecked(best))
     size = np.linalg.norm(trials.reference, axis=-1).max()
     tolerance = float(f"{share * trials.tolerance * size * trials.span / trials.duration:.2g}")
     begin = time.perf_counter()
@@ -87,3 +87,8 @@ def _adaptive(trials, best, scene, share):
     search = time.perf_counter() - begin
     how = f"adaptive_steps(solver, steps={trials.frames}, tolerance={tolerance:g})"
     return how, Rollout(solver, steps, save_every=1, memory=trials.memory), search
+
+
+def _unchecked(best) -> dict:
+    """Options of a solver whose step is chosen by trials."""
+    return {"check_start": False} if best.solver.explicit else {}
