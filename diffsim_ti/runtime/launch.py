@@ -28,7 +28,6 @@ class Launch:
             check_owner(array)
         self._kernel, self._arrays, self._vectorized, self._loops = kernel._primal, arrays, vectorized, loops
         self._setters, self._buffer, self._repeated, self._owner = None, None, None, program()
-        self._set = ()  # the numbers of the launch before
 
     def _prepare(self, numbers: tuple) -> None:
         prog = impl.get_runtime().prog
@@ -58,7 +57,6 @@ class Launch:
             ((self._context.set_arg_float if is_float else self._context.set_arg_int), (k,))
             for k, is_float in enumerate(floats, start=len(self._arrays))
         ]
-        self._set = (None,) * len(floats)
 
     def __call__(self, *numbers) -> None:
         check_alive(self._owner)
@@ -75,10 +73,8 @@ class Launch:
             self._prepare(numbers)
         if self._buffer:
             self._buffer.restore()
-        for (setter, index), number, before in zip(self._setters, numbers, self._set):
-            if number is not before:
-                setter(index, number)
-        self._set = numbers
+        for (setter, index), number in zip(self._setters, numbers):
+            setter(index, number)
         if self._repeated:
             with self._repeated.times(numbers[-1]):
                 self._owner().launch_kernel(self._code, self._context)
