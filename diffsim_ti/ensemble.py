@@ -29,7 +29,7 @@ class Ensemble:
     starts all of them again from that state, and at most one iteration is done twice. Random numbers: from a generator
     seeded by the member, for ranks draw apart. Each rank takes its share of the machine's cores.
 
-    PyTorch, torchrun (elastic launch), docs.pytorch.org/docs/stable/elastic/run.html.
+    Paszke et al. 2019, PyTorch, arXiv:1912.01703; torchrun: docs.pytorch.org/docs/stable/elastic/run.html.
     Raises ValueError for no members, and for costs that are not as many, or not > 0.
     """
 

@@ -17,7 +17,7 @@ from diffsim_ti.solvers import Solver
 from diffsim_ti.terms import Term
 
 ROOT = Path(__file__).parent.parent
-sys.path.insert(0, str(ROOT / "docs"))
+sys.path.insert(0, str(ROOT / "assets" / "reference"))
 
 from make import MODULES, literal, main, short  # noqa: E402
 
@@ -44,6 +44,8 @@ UNIT_OF = {name: unit for unit, names in UNITS.items() for name in names.split()
 OTHERWISE = {
     *(
         "HalfSpace.normal",
+        "SurfaceDrag.normal",
+        "SurfaceDrag.tangential",
         "square.normal",
         "Spring.start",
         "Unknown.start",

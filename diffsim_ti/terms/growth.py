@@ -65,6 +65,7 @@ class Growth(Term):
                 raise ValueError(f"Growth: growth must be {BEYOND.words}")
 
     def rows(self, times: ArrayLike) -> np.ndarray:
+        """Growth [-] at times [s], a row for each."""
         at = self.given(0.0) if callable(self.given) else np.asarray(self.given[1])[0]
         return rows_at("Growth: growth", self.given, times, np.shape(at))
 

@@ -1,4 +1,4 @@
-"""Reference pages from the docstrings, by pdoc: python docs/make.py [FOLDER], default docs/html, which git ignores."""
+"""Reference pages by pdoc: python assets/reference/make.py [FOLDER], default html beside it, which git ignores."""
 
 import re
 import sys
