@@ -20,5 +20,5 @@ def warn_if_locking(scene: "Scene") -> None:
             f"{scene.material.name}: Poisson's ratio {nu:.6g} is above {limit}, where {kind} tetrahedra lock "
             f'(bend too little): {remedy}pass volume="patches" to the Scene, cut cells with pattern="five", refine the '
             "mesh, or lower the ratio",
-            stacklevel=4,
+            stacklevel=3,
         )

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffsim_ti.checked import shown, whole
+from diffsim_ti.checked import shown
 from diffsim_ti.inputs import StressPoints
 from diffsim_ti.outputs.body_forces import BodyForces
 from diffsim_ti.potential.attached import Attached
@@ -158,7 +158,6 @@ def modes(scene: "Scene", k: int, displacements: ArrayLike | None = None) -> Mod
     from scipy.sparse import diags
     from scipy.sparse.linalg import eigsh
 
-    k = whole("modes: k", k, 1)
     if not hasattr(scene, "stiffness_matrix"):
         raise ValueError(f"modes: scene must be a Scene, got {shown(scene)}")
     if scene.precision != "f64":
@@ -171,8 +170,9 @@ def modes(scene: "Scene", k: int, displacements: ArrayLike | None = None) -> Mod
     scene = scene.with_consistent_mass()
     free = free_directions(scene)
     count = free.shape[1]
-    if k > count:
-        raise ValueError(f"modes: k must be a whole number of 1 .. {count}, the free unknowns, got {k}")
+    if k not in range(1, count + 1) or isinstance(k, bool):
+        raise ValueError(f"modes: k must be a whole number of 1 .. {count}, the free unknowns, got {shown(k)}")
+    k = int(k)
     mass = scene.mass_matrix()
     scale = 1 / np.sqrt(abs(free).T.power(2) @ mass.diagonal())
     K = free.T @ scene.stiffness_matrix(u) @ free
