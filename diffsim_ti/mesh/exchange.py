@@ -76,13 +76,8 @@ class Exchange:
         """The body within a closed surface, filled by TetGen (`pip install "diffsim-ti[surfaces]"`).
 
         points [m], shape (n, 3), and triangles, shape (k, 3), of the surface, which all stay; points that coincide become
-<<<<<<< HEAD
         one, and closed parts within others bound cavities. size: largest edge of tetrahedra [m], about; default as large as
         their quality allows. `from_file` does this for .stl, .obj, .ply and .off.
-=======
-        one, and closed parts within others bound cavities. size: largest edge of tetrahedra [m], about; default as large
-        as their quality allows. `from_file` does this for .stl, .obj, .ply and .off.
->>>>>>> exchange
 
         Raises ValueError for a surface that is open or meets itself, and where TetGen is missing.
         Si 2015, TetGen, a Delaunay-Based Quality Tetrahedral Mesh Generator, doi:10.1145/2629697.
