@@ -126,7 +126,7 @@ class Adjoint:
         self.sums = runtime.array(a.fp, features.sums().total, a.num_vertices)
         for name in more:
             setattr(self, name, runtime.array(a.vector, *getattr(a, name).shape))
-        self._names = (*ADJOINT, *more)
+        self._names = tuple(x for x in (*ADJOINT, *more) if x != "growths" or features.growing)
 
     def fits(self, arrays, features) -> bool:
         """Whether kernels and shapes are still those of the run."""
