@@ -35,6 +35,13 @@ def test_scipys_minimisers(capsys):
     assert found["L-BFGS-B"]["runs"] <= 60 and "Newton-CG: E =" in capsys.readouterr().out
 
 
+def test_walker(tmp_path, capsys):
+    """Six of its 25 iterations."""
+    numbers = example("control/walker").main(tmp_path, iterations=6)
+    assert numbers["way_before"] + 0.003 < numbers["way"] and "walker, a second" in capsys.readouterr().out
+    assert (tmp_path / "walker.gif").stat().st_size > 100_000
+
+
 def test_tutorial(tmp_path):
     run = subprocess.run([sys.executable, EXAMPLES / "tutorial.py"], cwd=tmp_path, capture_output=True, text=True)
     assert run.returncode == 0 and not run.stderr, run.stderr
