@@ -8,6 +8,7 @@ import io
 import json
 import os
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -44,8 +45,8 @@ def iteration(path: Path) -> int:
 
 def run(folder: Path, kills: int, iterations: int, seed: int = 0, say=lambda line: None) -> tuple[dict, list[tuple]]:
     """The result of two ranks, one of which is killed again and again, and for each kill (iteration of the state that was
-    left, first one seen after it)."""
-    rng, seen, state = random.Random(seed), [], folder / "train_distributed.state"
+    left, the one after which the next ranks said that they go on)."""
+    rng, left, state = random.Random(seed), [], folder / "train_distributed.state"
     command = [
         sys.executable,
         "-m",
@@ -56,7 +57,7 @@ def run(folder: Path, kills: int, iterations: int, seed: int = 0, say=lambda lin
     ]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path]), "OMP_NUM_THREADS": "1"}
     script = [f"--max-restarts={kills}", str(SCRIPT), f"--folder={folder}", f"--iterations={iterations}"]
-    printed, begun, killed, before = folder.with_suffix(".txt"), 0, 0, set()
+    printed, killed, before = folder.with_suffix(".txt"), 0, set()
     with open(printed, "w") as out:
         process = subprocess.Popen([*command, *script], stdout=out, stderr=subprocess.STDOUT, env=environment)
         try:
@@ -66,12 +67,9 @@ def run(folder: Path, kills: int, iterations: int, seed: int = 0, say=lambda lin
                 if not before.isdisjoint(ranks):
                     continue  # those that are killed, or end since their neighbour is
                 if before:
-                    begun, before = now, set()  # nobody writes before the next ones have started
-                if now <= begun or now >= iterations or len(ranks) < 2:
-                    continue
-                if len(seen) < killed:
-                    seen.append((begun, now))
-                if killed < kills:
+                    left.append(now)  # nobody writes before the next ones have started
+                    before = set()
+                if killed < kills and (left[-1] if left else 0) < now < iterations and len(ranks) == 2:
                     time.sleep(rng.uniform(0, 0.1))
                     os.kill(ranks[rng.randrange(2)], signal.SIGKILL)
                     killed, before = killed + 1, set(ranks)
@@ -79,8 +77,10 @@ def run(folder: Path, kills: int, iterations: int, seed: int = 0, say=lambda lin
         finally:
             process.terminate()
             process.wait()
-    assert process.returncode == 0, printed.read_text()
-    return json.loads(next(line for line in printed.read_text().splitlines() if line.startswith("{"))), seen
+    said = printed.read_text()
+    assert process.returncode == 0, said
+    gone_on = [int(n) for n in re.findall(r"goes on after iteration (\d+)", said)]
+    return json.loads(next(line for line in said.splitlines() if line.startswith("{"))), list(zip(left, gone_on))
 
 
 def alone(iterations: int) -> dict:
@@ -100,10 +100,8 @@ if __name__ == "__main__":
     length = 40 + 4 * options.kills
     one = alone(length)
     with tempfile.TemporaryDirectory() as place:
-        many, lost = run(Path(place) / "run", options.kills, length, options.seed, print)
+        many, starts = run(Path(place) / "run", options.kills, length, options.seed, print)
     same = all(one[name] == many[name] for name in ("E", "nu", "loss"))
-    next_one = sum(now == at + 1 for at, now in lost)
-    print(
-        f"{many['restarts']} restarts, {len(lost)} seen to go on, {next_one} with the next iteration; same bits: {same}"
-    )
-    sys.exit(not same or many["restarts"] < options.kills)
+    from_last = sum(begin == left for left, begin in starts)
+    print(f"{many['restarts']} restarts, {from_last} went on from the state that was left; same bits: {same}")
+    sys.exit(not same or not many["restarts"] == len(starts) == from_last == options.kills)

@@ -18,10 +18,10 @@ def test_shares_of_ranks():
 
 def test_a_killed_rank_changes_no_bit(tmp_path):
     """Two ranks, of which one dies on the way, against one process."""
-    result, seen = run(tmp_path / "two", kills=1, iterations=80)
+    result, starts = run(tmp_path / "two", kills=1, iterations=80)
     one = alone(80)
     assert result["processes"] == 2 and one["processes"] == 1 and result["restarts"] == 1
-    assert all(now <= at + 2 for at, now in seen)  # from the last state, not from the start
+    assert len(starts) == 1 and all(begin == left > 0 for left, begin in starts)  # no whole iteration is lost
     assert {name: result[name] for name in ("E", "nu", "loss")} == {name: one[name] for name in ("E", "nu", "loss")}
     assert result["E_error"] < 0.02 and result["nu_error"] < 0.03
     assert (tmp_path / "two" / "train_distributed.png").stat().st_size > 5000

@@ -63,6 +63,8 @@ def main(folder="output", iterations: int = 80) -> dict:
     path = folder and Path(folder) / "train_distributed.state"
     mesh = ds.TetrahedralMesh.create_cube(THROWS[0][0], 0.4)
     optimization = Optimization(material, torch.optim.Adam(material.parameters(), lr=0.05), mesh, path)
+    if ensemble.is_first and optimization.iteration:
+        print(f"goes on after iteration {optimization.iteration}", flush=True)
     optimization.run(lambda: ensemble.loss(Throw.loss, material), iterations, title="train")
     result = dict(
         processes=ensemble.num_ranks,
