@@ -103,15 +103,18 @@ def test_films_of_odd_speeds_are_refused(capsys, tmp_path, fps):
 @pytest.mark.parametrize("delay", [0.3, 0.9, 1.6, 2.4])
 def test_interrupts_at_any_moment_end_in_one_line(tmp_path, delay):
     CUBE.save(tmp_path / "cube.vtu")
-    command = [sys.executable, "-m", "diffsim_ti", "simulate", "cube.vtu", "--duration", "1000"]
+    (tmp_path / "sitecustomize.py").write_text("print('started', flush=True)")
+    paths = [str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])]
     run = subprocess.Popen(
-        command,
+        [sys.executable, "-m", "diffsim_ti", "simulate", "cube.vtu", "--duration", "1000"],
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)},
         cwd=tmp_path,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
+    assert run.stdout.readline() == "started\n"  # Python itself takes its time on a busy machine
     time.sleep(delay)
     run.send_signal(signal.SIGINT)
     said = run.communicate(timeout=60)[1]
