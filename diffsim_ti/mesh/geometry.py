@@ -39,16 +39,22 @@ def shape_gradients(inverse_D: np.ndarray) -> np.ndarray:
     return np.concatenate([-inverse_D.sum(1, keepdims=True), inverse_D], 1)
 
 
+def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """a x b of rows of three, with the bits of np.cross in half of its time."""
+    (ax, ay, az), (bx, by, bz) = a.T, b.T
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], 1)
+
+
 def triangle_normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """Normals of triangles, as long as the area [m^2], shape (num_triangles, 3)."""
     a, b, c = (vertices[triangles[:, k]] for k in range(3))
-    return np.cross(b - a, c - a) / 2
+    return cross(b - a, c - a) / 2
 
 
 def triangle_normals_jvp(vertices: np.ndarray, triangles: np.ndarray, change: np.ndarray) -> np.ndarray:
     """Change of the normals for one of the vertices."""
-    (a, b, c), (da, db, dc) = (np.moveaxis(x[triangles], 1, 0) for x in (vertices, change))
-    return (np.cross(db - da, c - a) + np.cross(b - a, dc - da)) / 2
+    (a, b, c), (da, db, dc) = (x[triangles].transpose(1, 0, 2) for x in (vertices, change))
+    return (cross(db - da, c - a) + cross(b - a, dc - da)) / 2
 
 
 def triangle_normals_vjp(vertices: np.ndarray, triangles: np.ndarray, normals_adj: np.ndarray) -> np.ndarray:

@@ -17,6 +17,8 @@ class Ties:
         self.paths, self.one_sided, self.cables = paths, one_sided, cables
         places, starts = paths.matrix(num_vertices), paths.starts
         self.parted = (places[starts + 1] - places[starts]).tocsr()  # C
+        self.together = self.parted.T.tocsr()  # its transpose, built once
+        self._squared = self.together.multiply(self.together).tocsr()
         entries = self.parted.tocoo()
         self._entries = entries.row, entries.data
         pairs, self._pair = np.unique(paths.path_of[entries.row] * num_vertices + entries.col, return_inverse=True)
@@ -72,12 +74,12 @@ class Ties:
         """On vertices [N], shape (num_vertices, 3); cables: theirs alone."""
         t, *_, T = self._state(u)
         T = T * self.cables if cables else T
-        return -(self.parted.T @ (T[self.paths.path_of, None] * t))
+        return -(self.together @ (T[self.paths.path_of, None] * t))
 
     def sizes(self, u: np.ndarray) -> np.ndarray:
         """Sum of the sizes of the forces that meet at each vertex [N]."""
         T = np.abs(self._state(u)[5])[self.paths.path_of]
-        return abs(self.parted).T @ T
+        return abs(self.together) @ T
 
     def product(self, u: np.ndarray, w: np.ndarray, convex: bool = False) -> np.ndarray:
         """d2E/du2 w [N]; convex: without what pushes, which has negative curvature."""
@@ -85,7 +87,7 @@ class Ties:
         dd = self.parted @ w
         along = (k * self._sums((t * dd).sum(1)))[self.paths.path_of]
         across = self._across(t, length, np.maximum(T, 0) if convex else T, dd)
-        return self.parted.T @ (along[:, None] * t + across)
+        return self.together @ (along[:, None] * t + across)
 
     def blocks(self, u: np.ndarray) -> np.ndarray:
         """3x3 diagonal blocks of d2E/du2 [N/m], shape (num_vertices, 3, 3)."""
@@ -95,8 +97,7 @@ class Ties:
         out = np.zeros((self.num_vertices, 3, 3))
         np.add.at(out, self._pair_vertex, k[self._pair_path, None, None] * g[:, :, None] * g[:, None, :])
         bare = np.stack([self._across(t, length, T, np.tile(axis, (len(t), 1))) for axis in np.eye(3)], 2)
-        squared = self.parted.multiply(self.parted).T.tocsr()
-        return out + (squared @ bare.reshape(-1, 9)).reshape(-1, 3, 3)
+        return out + (self._squared @ bare.reshape(-1, 9)).reshape(-1, 3, 3)
 
     def turning(self, u: np.ndarray, w: np.ndarray) -> float:
         """The largest |C w| / |d| of segments that have a length."""
@@ -135,7 +136,7 @@ class Ties:
     def lengths_vjp(self, u, L_adj) -> tuple[np.ndarray, np.ndarray]:
         """Adjoints of u and segments for that of the lengths."""
         d_adj = L_adj[self.paths.path_of, None] * self._state(u)[0]
-        return self.parted.T @ d_adj, self._of_points(d_adj)
+        return self.together @ d_adj, self._of_points(d_adj)
 
     def tensions_jvp(self, u, du, segments_dot, tension_dot, slack_dot, stiffness_dot) -> np.ndarray:
         """Change of T for changes of everything."""
@@ -150,7 +151,7 @@ class Ties:
         e_adj = T_adj * k
         of_segments = e_adj[self.paths.path_of, None]
         segments = self._of_points(of_segments * (t - directions(self.D)))
-        return self.parted.T @ (of_segments * t), segments, (T_adj, e_adj, T_adj * e)
+        return self.together @ (of_segments * t), segments, (T_adj, e_adj, T_adj * e)
 
     def _of_points(self, of_segments) -> np.ndarray:
         """As rows of the points where segments begin."""
@@ -163,7 +164,7 @@ class Ties:
         t, length, *_, T = self._state(u)
         dd = segments_dot[self.paths.starts] + self.parted @ du
         dT = self.tensions_jvp(u, du, segments_dot, tension_dot, slack_dot, stiffness_dot)[self.paths.path_of]
-        return -(self.parted.T @ (dT[:, None] * t + self._across(t, length, T, dd)))
+        return -(self.together @ (dT[:, None] * t + self._across(t, length, T, dd)))
 
     def vjp(self, u: np.ndarray, w: np.ndarray) -> tuple:
         """Adjoints of (u, segments, (a, s, k)) for the adjoint w of the forces."""
@@ -171,4 +172,4 @@ class Ties:
         w = -(self.parted @ w)
         by_u, segments, numbers = self.tensions_vjp(u, self._sums((t * w).sum(1)))
         across = self._across(t, length, T, w)
-        return by_u + self.parted.T @ across, segments + self._of_points(across), numbers
+        return by_u + self.together @ across, segments + self._of_points(across), numbers
