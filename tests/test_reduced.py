@@ -4,6 +4,7 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
+import taichi as ti
 
 import diffsim_ti as ds
 from diffsim_ti import verify
@@ -105,6 +106,48 @@ def test_gradients_of_equilibria():
     solver = ds.StaticSolver(scene_of(fixed="xmin"), tolerance=1e-12)
     rollout = ds.Rollout(solver, 1, gradients=["youngs_modulus", "gravity", "rest_positions"])
     assert verify.dot_product_test(rollout) <= 1e-9 and ds.check_gradients(rollout, verbose=False).passed
+
+
+@pytest.mark.parametrize("name", ["initial_velocities", "initial_positions", "initial_displacements"])
+def test_a_start_from_a_field_is_what_the_sets_can_do(name):
+    """A field's start that no affine motion follows: the frames and gradients of `forward` and `vjp`."""
+    start = 0.01 * np.random.default_rng(4).standard_normal(bar().vertices.shape)
+    solver = ds.ImplicitEulerSolver(scene_of(), dt=0.01)
+    rollout, other = ds.Rollout(solver, 2), ds.Rollout(solver, 2)
+    plain = {"initial_displacements": "initial_positions"}.get(name, name)
+    frames = rollout.forward(**{plain: start + (bar().vertices if plain == "initial_positions" else 0)})
+    other.field(name).from_numpy(start + (bar().vertices if name == "initial_positions" else 0))
+    loss = ti.field(ti.f64, (), needs_grad=True)
+    x = other.positions
+
+    @ti.kernel
+    def weigh():
+        for k, i in x:
+            loss[None] += x[k, i].sum() * (1 + k + i)
+
+    with ti.ad.Tape(loss):
+        other.run()
+        weigh()
+    assert np.abs(other.positions.to_numpy() - frames.positions).max() < 1e-14
+    k, i = np.indices(frames.positions.shape[:2])
+    seed = np.repeat((1.0 + k + i)[..., None], 3, 2)
+    expected = rollout.vjp(frames, seed)[plain]
+    assert np.abs(other.field(name).grad.to_numpy() - expected).max() < 1e-9 * np.abs(expected).max()
+
+
+def test_clip_measures_what_the_sets_can_do():
+    """An adjoint that no affine motion has is no reason to scale back."""
+    seed = np.zeros((3, bar().num_vertices, 3))
+    body = bar().tetrahedra[bar().tetrahedron_sets["shell"]]
+    noise = np.random.default_rng(5).standard_normal(seed.shape[1:])
+    noise[np.setdiff1d(np.arange(bar().num_vertices), body)] = 0
+    solver = ds.ImplicitEulerSolver(scene_of(), dt=0.01)
+    seed[1] = 1e6 * (noise - solver.scene.reduced.of(noise))
+    seed[2] = noise
+    plain, clipped = (ds.Rollout(solver, 2, save_every=1, **more) for more in ({}, dict(clip=1e4, health=True)))
+    expected, found = (r.vjp(r.forward(), seed)["density"] for r in (plain, clipped))
+    assert all(h["scaled"] == 1.0 for h in clipped.health)
+    assert found == pytest.approx(expected, rel=1e-12)
 
 
 def test_steps_one_by_one_and_single_precision():

@@ -171,7 +171,8 @@ class TapeFace:
         if self._fields:
             runtime.check_alive(self._program)
         start = [name for name in (*START, *SPELLING) if name in self._fields]
-        simple = rollout.scene.motion is None and not len(rollout.scene.supports.guided)
+        scene = rollout.scene
+        simple = scene.motion is None and not len(scene.supports.guided) and not scene.reduced
         direct = simple and "rest_positions" not in self._fields
         out = {}
         for name, field in self._fields.items():

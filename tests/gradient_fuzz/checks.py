@@ -12,13 +12,16 @@ from .structures import CELL
 RIGHT = "right"
 
 
-def differs(found: dict, expected: dict, gate: float, names=None) -> str:
-    """Where two sets of gradients differ by more than a share of their size, 0 for the same bits; "right" if nowhere."""
-    said = []
+def differs(found: dict, expected: dict, gate: float, names=None, floors=None) -> str:
+    """Where two sets of gradients differ by more than a share of their size, 0 for the same bits; "right" if nowhere.
+
+    floors: sizes below which a gradient is rounding.
+    """
+    said, floors = [], floors or {}
     for name in expected if names is None else names:
         a, b = (np.asarray(x[name], np.float64) for x in (found, expected))
         off, size = np.abs(a - b).max(initial=0.0), np.abs(b).max(initial=0.0)
-        if a.shape != b.shape or not off <= gate * size:
+        if a.shape != b.shape or not off <= gate * max(size, floors.get(name, 0.0)):
             said.append(f"{name}: off by {off:.3g} of {size:.3g}")
     return "; ".join(said) or RIGHT
 
@@ -154,8 +157,10 @@ class Chain:
         """Whether a step depends on the state before it alone."""
         kind, solver = self.configuration.structure, self.configuration.solver
         shared = kind.solver is ds.VelocityVerletSolver and self.per_step
-        sees_held = kind.rollers or self.configuration.scene.law.reads != ("H",)
-        if kind.motion and sees_held:  # a start has no velocity in what is held: friction and viscosity would see it
+        # a start has no velocity in what is held, which friction, viscosity and a mass matrix with couplings would see
+        couples = kind.order == 2 and not kind.explicit
+        sees_held = kind.rollers or couples or self.configuration.scene.law.reads != ("H",)
+        if kind.motion and sees_held:
             return False
         if self.configuration.scene.law.state_names:  # which a start has not
             return False
@@ -181,7 +186,8 @@ def clip(it) -> str:
             p, q = part["initial_positions"], part["initial_velocities"]
             if k % save == 0:
                 p, q = p + it.w[k // save], q + it.z[k // save]
-                q = configuration.scene.supports.free(q)  # what is held has no velocity
+                scene = configuration.scene  # what is held has no velocity, what is reduced no other motions
+                p, q = scene.reduced.of(p), scene.reduced.of(scene.supports.free(q))
             norms.append(float(np.hypot(np.linalg.norm(p), np.linalg.norm(q))))
             share = min(1.0, limit / norms[-1]) if norms[-1] > 0 else 1.0
             p, q = share * p, share * q
@@ -196,7 +202,7 @@ def clip(it) -> str:
     seen = [float(np.hypot(h["norm_position"], h["norm_velocity"])) for h in rollout.health]
     if not np.allclose(seen, clipped, rtol=10 * chain.gate()):
         return f"norms {np.array(seen)} for {np.array(clipped)}"
-    return differs(found, expected, 10 * chain.gate(), [n for n in expected if n != "rest_positions"])
+    return differs(found, expected, 10 * chain.gate(), [n for n in expected if n != "rest_positions"], it.floors)
 
 
 def truncate(it) -> str:
@@ -224,7 +230,7 @@ def truncate(it) -> str:
     own = part.vjp(frames, w, z)
     expected = chain.zeros()
     chain.add(expected, own, cut, steps - cut)
-    return differs(found, expected, chain.gate(), [n for n in expected if n != "rest_positions"])
+    return differs(found, expected, chain.gate(), [n for n in expected if n != "rest_positions"], it.floors)
 
 
 ALWAYS = (repeats, schedules)

@@ -25,7 +25,8 @@ PASSED, ZERO, REFUSED, UNRESOLVED, INACCURATE, KINK, FAILED = CLASSES = (
     "FAILED",
 )
 GATES = {("f64", True): (1e-10, 1e-6), ("f64", False): (1e-7, 1e-5)}  # (precision, explicit): (tangent, differences)
-SINGLE = (2e-4, 2e-3)
+GATES["f32", True] = 2e-4, 2e-3
+GATES["f32", False] = 2e-4, 5e-3  # stiffest contact by softest motion, times rounding: 4e-3 where a run in f64 has 1e-9
 ROUNDING = {"f64": 1e-12, "f32": 1e-4}  # a derivative this much smaller than the largest of a configuration is rounding
 TINY = {"f64": 1e-16, "f32": 1e-8}  # what is left of terms that cancel, against the same
 REFUSALS = (ValueError, FloatingPointError, RuntimeError)
@@ -120,11 +121,18 @@ class Judge:
         if kind.precision == "f32":  # as the adjoints of its frames are stored
             self.w, self.z = (x.astype(np.float32).astype(np.float64) for x in (self.w, self.z))
         self.gradients = self.rollout.vjp(self.frames, self.w, self.z)
-        self.gates = GATES.get((kind.precision, kind.explicit), SINGLE)
+        self.gates = GATES[kind.precision, kind.explicit]
         self.directions = {
             name: scale_of(name, value, self.duration) * rng.standard_normal(value.shape)
             for name, value in self.rollout.values.items()
         }
+
+    @property
+    def floors(self) -> dict[str, float]:
+        """What is rounding in each gradient: its own size at which it would matter this little beside the largest."""
+        of = {name: np.abs(d).max() for name, d in self.directions.items()}
+        largest = max(of[name] * np.abs(g).max(initial=0.0) for name, g in self.gradients.items())
+        return {name: ROUNDING[self.configuration.structure.precision] * largest / of[name] for name in of}
 
     def weighed(self, dx: np.ndarray, dv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return self.w * dx, self.z * dv

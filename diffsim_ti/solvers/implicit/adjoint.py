@@ -251,10 +251,11 @@ class ImplicitAdjoint(RecordedPasses):
     def norm(self) -> tuple[float, float]:
         """Euclidean norms of the adjoints of displacement and velocity where the sweep stands.
 
-        Held vertices have no velocity.
+        Held vertices have no velocity, and sets that are `reduced` only the motions that they can do.
         """
-        q = self.ws.arrays.supports.free(self.q)
-        return float(np.linalg.norm(self.p)), float(np.linalg.norm(q))
+        reduced = self.ws.scene.reduced
+        p, q = reduced.of(self.p), reduced.of(self.ws.arrays.supports.free(self.q))
+        return float(np.linalg.norm(p)), float(np.linalg.norm(q))
 
     def scale(self, factor: float) -> None:
         """Multiply the running adjoint."""
