@@ -88,6 +88,23 @@ def test_least_compliance(tmp_path, capsys):
     assert "times less" in capsys.readouterr().out
 
 
+def test_cantilever_shape(tmp_path, capsys):
+    """Twice the load, no more drop, no more material, within the envelope; the gradient by twelve numbers."""
+    module = example("design/cantilever_shape")
+    for numbers in module.main(tmp_path, quick=True).values():
+        assert numbers["ratio"] < 1 and abs(numbers["volume"]) < 1e-6
+        assert numbers["deeper"] < 1.35 + 1e-6 and numbers["wider"] < 1 + 1e-6
+        assert numbers["smallest_J"] > 0.2 and numbers["simulations"] <= 60
+    assert (tmp_path / "cantilever_shape.png").stat().st_size > 10_000
+    assert (tmp_path / "cantilever_shape_ten_nodes.png").stat().st_size > 10_000
+    assert "twice the load" in capsys.readouterr().out
+    beam, rng = module.Beam((5, 2, 2), 2), np.random.default_rng(3)
+    x, change = 0.1 * rng.standard_normal((2, 2 * module.STATIONS))
+    for f, gate in ((lambda x: beam.drop(x, 2.0), 1e-5), (beam.swell, 1e-8)):
+        difference = (f(x + 1e-3 * change)[0] - f(x - 1e-3 * change)[0]) / 2e-3
+        assert f(x)[1] @ change == pytest.approx(difference, rel=gate)
+
+
 def test_pneumatic_finger(tmp_path, capsys):
     """Newton's method with derivatives of the equilibrium: few steps, the last of them quadratic."""
     numbers = example("control/pneumatic_finger").main(tmp_path, quick=True)

@@ -15,7 +15,7 @@ def tie(kind: str, rng, mesh, steps: int, duration: float, mass: np.ndarray, bea
     stiff, pull = rng.uniform(0.005, 0.02) * mass.min() / beat**2, 9.81 * mass.mean() * rng.uniform(1, 10)
     if name == "ElasticFoundation":
         some = some_faces(rng, mesh)
-        each = stiff / CELL**2 * rng.uniform(0.2, 1.0, (2, len(some)))
+        each = stiff / CELL**2 * rng.uniform(0.2, 1.0, (2, len(mesh.faces_of(some))))
         return ds.ElasticFoundation(each[0] if how == "each" else each[0, 0], each[1, 0], some)
     places = [_point(rng, mesh) for _ in range(int(rng.integers(2, 5)))]
     if name == "Spring":
