@@ -33,6 +33,7 @@ EXAMPLES = {
     "design/inverse_rest_shape": ("output", "inverse_rest_shape.png"),
     "design/tuning_fork": ("output", "tuning_fork.png"),
     "design/cantilever_shape": ("output", "cantilever_shape.png"),
+    "design/finger_shape": ("output", "finger_shape.png"),
     "control/gripper": ("output", "gripper.gif"),
     "control/soft_hand": ("output", "soft_hand.gif"),
     "control/pneumatic_finger": ("output", "pneumatic_finger.png"),

@@ -105,6 +105,22 @@ def test_cantilever_shape(tmp_path, capsys):
         assert f(x)[1] @ change == pytest.approx(difference, rel=gate)
 
 
+def test_finger_shape(tmp_path, capsys):
+    """The same pull, a harder grip; the gradient of a contact force by ten numbers of a shape."""
+    module = example("design/finger_shape")
+    for order, numbers in module.main(tmp_path, quick=True).items():
+        assert numbers["ratio"] > 1.4 and numbers["volume"] < 1e-3, order
+        assert numbers["deeper"] < 1.75 + 1e-6 and numbers["wider"] < 1 + 1e-6 and numbers["smallest_J"] > 0.2
+    assert (tmp_path / "finger_shape.png").stat().st_size > 10_000
+    assert "times" in capsys.readouterr().out
+    finger, rng = module.Finger((6, 2, 2), 1), np.random.default_rng(3)
+    x, change = 0.1 * rng.standard_normal((2, 2 * module.STATIONS))
+    slope = finger.grip(x)[1] @ change
+    assert slope == pytest.approx(
+        (finger.grip(x + 1e-3 * change)[0] - finger.grip(x - 1e-3 * change)[0]) / 2e-3, rel=1e-4
+    )
+
+
 def test_pneumatic_finger(tmp_path, capsys):
     """Newton's method with derivatives of the equilibrium: few steps, the last of them quadratic."""
     numbers = example("control/pneumatic_finger").main(tmp_path, quick=True)
