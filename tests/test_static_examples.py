@@ -91,8 +91,9 @@ def test_least_compliance(tmp_path, capsys):
 def test_cantilever_shape(tmp_path, capsys):
     """Twice the load, no more drop, no more material, within the envelope; the gradient by twelve numbers."""
     module = example("design/cantilever_shape")
-    for numbers in module.main(tmp_path, quick=True).values():
-        assert numbers["ratio"] < 1 and abs(numbers["volume"]) < 1e-6
+    for order, numbers in module.main(tmp_path, quick=True).items():
+        held = 1e-6 if order == 1 else 3e-3  # the volume of straight tetrahedra is; edges of six long cells are curved
+        assert numbers["ratio"] < 1 and abs(numbers["volume"]) < held
         assert numbers["deeper"] < 1.35 + 1e-6 and numbers["wider"] < 1 + 1e-6
         assert numbers["smallest_J"] > 0.2 and numbers["simulations"] <= 60
     assert (tmp_path / "cantilever_shape.png").stat().st_size > 10_000

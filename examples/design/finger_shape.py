@@ -80,9 +80,10 @@ def draw(path: Path, finger: Finger, before: ds.Frames, after: ds.Frames, ratio:
     bars = [(points + k * up, triangles) for k in (1, 0) for points, triangles in obstacle_surfaces(finger.scene)]
     places = [frames.positions[-1] + k * up for k, frames in zip((1, 0), (before, after))]
     moved = [1e3 * np.linalg.norm(frames.displacements[-1], axis=1) for frames in (before, after)]
+    both = ds.TetrahedralMesh.joined([finger.mesh] * 2)
     save_picture(
         path,
-        ds.TetrahedralMesh.joined([finger.mesh] * 2),
+        both,
         np.concatenate(places),
         np.concatenate(moved),
         "displacement [mm]",
@@ -90,7 +91,7 @@ def draw(path: Path, finger: Finger, before: ds.Frames, after: ds.Frames, ratio:
         azimuth=25,
         elevation=12,
         obstacles=bars,
-        fixed=np.tile(np.isin(np.arange(finger.mesh.num_vertices), finger.mesh.vertex_sets["xmin"]), 2),
+        fixed=both.vertex_sets["xmin"],
     )
 
 
@@ -122,7 +123,7 @@ def main(folder="output", quick: bool = False) -> dict:
             "before": before,
             "after": after,
             "ratio": after / before,
-            "volume": -finger.room(found.x)[0],
+            "volume": ds.TetrahedralMesh(rest, finger.mesh.elements).volume / finger.mesh.volume - 1,
             "deeper": extent[1],
             "wider": extent[2],
             "smallest_J": smallest_ratio(finger.mesh, rest),

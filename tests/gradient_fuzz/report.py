@@ -2,7 +2,7 @@
 
 from collections import Counter, defaultdict
 
-from .judge import CLASSES, FAILED, INACCURATE, KINK, PASSED, REFUSED, UNRESOLVED, ZERO, Result
+from .judge import CLASSES, FAILED, INACCURATE, KINK, PASSED, REFUSED, SINGLE_ROUNDING, UNRESOLVED, ZERO, Result
 
 ENOUGH = 10  # non-zero derivatives that passed, of every law, solver and input
 SHARES = {"obstacle": 0.5, "sticks": 0.2, "slides": 0.2, "self_contact": 0.2, "static_contact": 0.1, "faces": 0.05}
@@ -69,7 +69,7 @@ class Report:
         """What keeps a long run from being enough."""
         counts, out = self.counts(), []
         total = max(sum(counts.values()), 1)
-        explained = sum(counts[k] for k in (REFUSED, UNRESOLVED, INACCURATE, KINK)) / total
+        explained = sum(counts[k] for k in (REFUSED, UNRESOLVED, INACCURATE, KINK, SINGLE_ROUNDING)) / total
         if self.failures:
             out.append(f"{len(self.failures)} configurations failed")
         if explained > LARGEST_EXPLAINED:
