@@ -17,6 +17,7 @@ from diffsim_ti.ensemble import Ensemble
 from diffsim_ti.identification import (
     Identification,
     Measurement,
+    ModalTest,
     Normal,
     Smooth,
     Unknown,
@@ -186,6 +187,7 @@ __all__ = [
     "identify",
     "Unknown",
     "Measurement",
+    "ModalTest",
     "Normal",
     "Smooth",
     "Identification",

@@ -31,6 +31,10 @@ class Modes:
     scene: "Scene" = field(repr=False)
     displacements: np.ndarray = field(repr=False)
 
+    def __getitem__(self, name: str) -> np.ndarray:
+        """What `Frames` call outputs: frequencies."""
+        return getattr(self, name)
+
     def gradients(self, by_frequency: ArrayLike) -> dict[str, np.ndarray]:
         """Gradients of a loss by every input of the scene, for its gradient by the frequencies, shape (k,).
 
@@ -135,12 +139,13 @@ def free_directions(scene: "Scene"):
     return out
 
 
-def modes(scene: "Scene", k: int, displacements: ArrayLike | None = None) -> Modes:
+def modes(scene: "Scene", k: int, displacements: ArrayLike | None = None, **values) -> Modes:
     """The k lowest modes of small vibrations of a body about a state: K phi = lambda M phi, f = sqrt(lambda) / 2 pi.
 
     K: `scene.stiffness_matrix(displacements)`, of the body's stress, springs, cables and foundations at displacements [m]
     from the rest shape, default none; M: `scene.mass_matrix()`, lumped, or consistent of ten-node tetrahedra; vertices do
     not move where they are held, and obstacles and pressures are not in K.
+    values: of the scene's inputs, instead of its own, such as youngs_modulus=2e5 or rest_positions=X.
     A body that is not fixed has six frequencies of 0, its rigid motions, with k counting them. Everything is in float64.
 
     Raises ValueError for k outside 1 .. the number of free unknowns, shapes that do not fit, or a law with rates or a state.
@@ -167,7 +172,7 @@ def modes(scene: "Scene", k: int, displacements: ArrayLike | None = None) -> Mod
             "modes: a scene with sets that are reduced= has no modes here; leave it out for those of all vertices"
         )
     u = scene.checked_displacements(displacements)
-    scene = scene.with_consistent_mass()
+    scene = scene.with_consistent_mass().with_values(values)
     free = free_directions(scene)
     count = free.shape[1]
     if k not in range(1, count + 1) or isinstance(k, bool):

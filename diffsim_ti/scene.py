@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
-from diffsim_ti.checked import instance, listed, numbers
+from diffsim_ti.checked import instance, listed
 from diffsim_ti.copies import MadeAgain
 from diffsim_ti.inputs import ConsistentMass, Inputs
 from diffsim_ti.locking import LOCKING_RATIO, warn_if_locking
@@ -17,7 +17,6 @@ from diffsim_ti.materials.material import Material
 from diffsim_ti.materials.moduli import youngs_poisson
 from diffsim_ti.materials.patch_law import PatchLaw
 from diffsim_ti.mesh import TetrahedralMesh
-from diffsim_ti.mesh.paths import Paths
 from diffsim_ti.potential.assembled import body_stiffness
 from diffsim_ti.reduced import Reduced
 from diffsim_ti.supports import Fixed, Supports
@@ -38,6 +37,7 @@ from diffsim_ti.terms import (
 from diffsim_ti.terms.motion import Motion
 from diffsim_ti.terms.obstacles.obstacle import PER_AREA
 from diffsim_ti.terms.pose import Pose, sampled_path
+from diffsim_ti.terms_of_scene import TermsOfScene
 
 __all__ = ["LOCKING_RATIO", "Scene"]
 
@@ -47,7 +47,7 @@ def _kind(term) -> tuple:
     return term.acts_on_surface, type(term).__qualname__, type(term).__module__, term.variant
 
 
-class Scene(MadeAgain):
+class Scene(TermsOfScene, MadeAgain):
     """A body, its material and what acts on it. Frozen: build another scene instead of changing one.
 
     mesh: TetrahedralMesh, the rest shape.
@@ -147,6 +147,11 @@ class Scene(MadeAgain):
         law = self.material.law(self.precision)
         return PatchLaw(self.precision, law) if self.volume == "patches" else law
 
+    def _twin(self) -> "Scene":
+        out = Scene.__new__(Scene)
+        vars(out).update(vars(self))
+        return out
+
     consistent = False  # whether masses and weight are consistent
 
     def with_consistent_mass(self) -> "Scene":
@@ -154,10 +159,18 @@ class Scene(MadeAgain):
         no mass that was added for the sake of an explicit step."""
         if (self.mesh.order == 1 or self.consistent) and self.mass_scaling is None:
             return self
-        out, names = Scene.__new__(Scene), ("density", "initial_positions", "initial_velocities")
-        vars(out).update(vars(self))
+        out, names = self._twin(), ("density", "initial_positions", "initial_velocities")
         out.consistent, out.mass_scaling = self.mesh.order > 1, None
         out.inputs = Inputs(out, *(self.arguments[name] for name in names))
+        return out
+
+    def with_values(self, values: Mapping[str, ArrayLike]) -> "Scene":
+        """The scene with other numbers of inputs, for what is asked of it once; `replace` goes back to its own."""
+        if not values:
+            return self
+        out = self._twin()
+        out.inputs = copy(self.inputs)
+        out.inputs.values = self.inputs.values | self.inputs.check(values)
         return out
 
     def replace(self, **changes) -> "Scene":
@@ -193,19 +206,6 @@ class Scene(MadeAgain):
         mu, lam = self.material.lame({name: values[name] for name in self.material.inputs})
         return float(np.max(youngs_poisson(mu, lam)[1]))
 
-    @property
-    def obstacles(self) -> tuple[Term, ...]:
-        """What the surface feels by distance, in the order of frames' contact forces."""
-        return tuple(t for t in self.ordered_terms if t.acts_on_surface)
-
-    def place_of(self, obstacle: Term | str) -> int:
-        """Place in `obstacles` of one that is given by its name, or as the scene lists it."""
-        return self._listed(obstacle, self.obstacles, "obstacle")
-
-    def term(self, kind: type) -> Term | None:
-        """The scene's first term of a kind, or None."""
-        return next((t for t in self.terms if isinstance(t, kind)), None)
-
     def input_names(self, term: Term) -> dict[str, str]:
         """{plain name of a term's input: its name in this scene}, paths included: a second obstacle's end in _2, those of
         a term with a name begin with it."""
@@ -231,74 +231,11 @@ class Scene(MadeAgain):
         names = self.inputs.paths
         return {name: sampled_path(name, t.path, times) for name, t in zip(names, self.moving)}
 
-    @property
-    def loaded_vertices(self) -> np.ndarray:
-        """Sorted indices of the vertices that dead loads act on."""
-        return np.unique(np.concatenate([np.zeros(0, np.int64), *(t.indices(self.mesh) for t in self.dead_loads)]))
-
-    @property
-    def pressed_faces(self) -> tuple[np.ndarray, np.ndarray]:
-        """(faces that pressures act on, shape (k, 3) or (k, 6), which of `pressures` each belongs to)."""
-        none = self.mesh.surface_faces[:0]
-        faces = [none, *(term.faces(self.mesh) for term in self.pressures)]
-        return np.concatenate(faces), np.repeat(np.arange(len(faces)) - 1, [len(rows) for rows in faces])
-
-    @property
-    def holds_volumes(self) -> bool:
-        """Whether some chamber holds a given volume."""
-        return len(self.gases) < len(self.chambers)
-
-    def _listed(self, asked: Term | str, own: tuple, kind: str) -> int:
-        """Place among some of its terms of one that is given by its name, or as the scene lists it."""
-        for k, term in enumerate(own):
-            if asked is term or asked is self._given[self.terms.index(term)] or asked == (term.name or term):
-                return k
-        known = ", ".join(repr(t.name or t) for t in own) or "none"
-        raise ValueError(f"this scene has no {kind} {asked!r}; it has {known}: give them a name=")
-
-    def places_of_tie(self, tie: Term | str) -> slice:
-        """Places of a spring's or cable's own in `tie_paths`."""
-        ends = np.cumsum([0, *(len(own.paths(self.mesh)) for own in self.ties)])
-        return slice(*map(int, ends[self._listed(tie, self.ties, "spring or cable") :][:2]))
-
-    def place_of_chamber(self, chamber: Term | str) -> int:
-        """Place of one in `chambers`."""
-        return self._listed(chamber, self.chambers, "chamber")
-
-    def chamber_volume(self, chamber: Term | str, positions: ArrayLike | None = None) -> float:
-        """Volume [m^3] of a chamber, given by its name or as the scene lists it, at positions [m], default at rest."""
-        u = None if positions is None else np.asarray(positions, np.float64) - self.mesh.vertices
-        own = self.chambers[self.place_of_chamber(chamber)]
-        return own.enclosure.volume(self.mesh.vertices + self.checked_displacements(u))
-
-    @property
-    def tie_paths(self) -> Paths:
-        """Where springs run and, after them, cables."""
-        return Paths.joined([term.paths(self.mesh) for term in self.ties])
-
-    @property
-    def one_sided_ties(self) -> np.ndarray:
-        """Of each tie whether it pulls only."""
-        return np.concatenate([np.full(len(term.paths(self.mesh)), term.one_sided) for term in self.ties])
-
-    @property
-    def founded_vertices(self) -> np.ndarray:
-        """Sorted indices of the vertices that foundations hold."""
-        return np.unique(np.concatenate([np.zeros(0, np.int64), *(t.indices(self.mesh) for t in self.foundations)]))
-
     def places(self, time: float) -> dict[Term, np.ndarray]:
         """Displacement or pose of each moving obstacle at a time [s], shape (3,), (6,) or (7,) [m]."""
         return {term: rows[0] for term, rows in zip(self.moving, self.path_rows([time]).values())}
 
     # ---- matrices ----------------------------------------------------------------------------------------------------
-
-    def checked_displacements(self, displacements: ArrayLike | None) -> np.ndarray:
-        """Displacements from the rest shape [m], shape (num_vertices, 3); None: zero."""
-        shape = self.mesh.vertices.shape
-        u = np.zeros(shape) if displacements is None else numbers("displacements [m]", displacements)
-        if u.shape != shape or not np.all(np.isfinite(u)):
-            raise ValueError(f"displacements: expected finite numbers [m] of shape {shape}, got shape {u.shape}")
-        return u
 
     def stiffness_matrix(self, displacements: ArrayLike | None = None):
         """K = d2E/du2 [N/m] of the body's stress, springs, cables and elastic foundations at displacements [m] from the rest

@@ -21,6 +21,21 @@ def test_throw_at_target(capsys):
     assert "throw with" in capsys.readouterr().out
 
 
+def test_stiffness_field(tmp_path):
+    """Every tetrahedron is told right, and to a per cent in the median, from noise of 20 micrometres."""
+    result = example("identify/stiffness_field").main(tmp_path)
+    assert result["median_error"] < 0.005 and result["worst_tenth"] < 0.02 and result["classified"] == 1
+    assert result["simulations"] < 400 and (tmp_path / "stiffness_field.png").stat().st_size > 5000
+
+
+def test_costs_of_identification():
+    """On a field of 144 unknowns: fewer simulations than differences, whose share grows with the unknowns."""
+    told = example("benchmarks/identify_costs").main(cells=(4, 2, 3), most=1500, rates=(0.1,))
+    for found in told.values():
+        best, theirs = found["Levenberg-Marquardt"][0], found["SciPy, differences"]
+        assert theirs is None or best <= theirs[0]
+
+
 def test_identify_beam(capsys):
     numbers = example("identify/identify_beam").main()
     assert numbers["error"] <= 1e-3 and numbers["evaluations"] <= 20

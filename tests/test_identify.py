@@ -87,7 +87,7 @@ def test_regions_missing_samples_and_two_experiments(swing, dense, monkeypatch):
     other = body(terms=[ds.Gravity((0.0, 0.0, -9.8))])
     rng, data = np.random.default_rng(4), []
     if not dense:
-        monkeypatch.setattr("diffsim_ti.identification.least_squares.DENSE", 1)
+        monkeypatch.setattr("diffsim_ti.identification.levenberg_marquardt.DENSE", 1)
     for rollout in (swing, other):
         x = rollout.forward(youngs_modulus=E[regions]).positions
         x = x + 1e-4 * rng.standard_normal(x.shape)

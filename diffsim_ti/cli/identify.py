@@ -1,4 +1,4 @@
-"""The command identify: numbers of a body from a CSV of marker tracks."""
+"""The command identify: numbers of a body from a CSV of marker tracks, or of a force curve."""
 
 import csv
 from pathlib import Path
@@ -7,9 +7,10 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from diffsim_ti.cli.options import Density, MaterialName, MeshFile, Size, fixed_vertices, load_body, make_material
+from diffsim_ti.cli.options import Density, MaterialName, MeshFile, Size, Up, fixed_vertices, load_body, make_material
 
 COLUMNS = ("time", "marker", "x", "y", "z")
+CURVE = ("displacement", "force")
 
 
 def read_tracks(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -29,11 +30,45 @@ def read_tracks(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return np.array(times), places
 
 
+def read_curve(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """(displacements [m], forces [N], NaN where missing) of a CSV."""
+    with open(path, newline="") as file:
+        rows = [[float(row[name] or "nan") for name in CURVE] for row in csv.DictReader(file)]
+    ways, forces = np.array(rows).reshape(-1, 2).T
+    if len(ways) == 0 or not np.isfinite(ways).all():
+        raise ValueError(f"{path}: needs a displacement [m] in each of one row or more")
+    return ways, forces
+
+
+def is_curve(path: Path) -> bool:
+    """Whether a CSV has the columns of a force curve."""
+    with open(path, newline="") as file:
+        return set(CURVE) <= set(csv.DictReader(file).fieldnames or ())
+
+
+def numbers_of(unknown: list[str]) -> dict[str, float]:
+    """{input: guess} of texts such as youngs_modulus=1e5."""
+    guesses = {}
+    for text in unknown:
+        name, _, value = text.partition("=")
+        try:
+            guesses[name] = float(value)
+        except ValueError:
+            raise ValueError(f"--unknown: expected input=guess, such as youngs_modulus=1e5, got {text!r}") from None
+    return guesses
+
+
 def identify(
     mesh: MeshFile,
-    data: Annotated[Path, typer.Argument(help="CSV with columns time, marker, x, y, z [s, m]; all markers at time 0")],
+    data: Annotated[
+        Path,
+        typer.Argument(
+            help="CSV with columns time, marker, x, y, z [s, m], all markers at time 0; or displacement, force [m, N], in "
+            "equilibrium, without the weight"
+        ),
+    ],
     unknown: Annotated[list[str], typer.Option(help="input=guess, such as youngs_modulus=1e5; may be repeated")],
-    noise: Annotated[float, typer.Option(help="standard deviation of a coordinate [m]")],
+    noise: Annotated[float, typer.Option(help="standard deviation of a coordinate [m], or of a force [N]")],
     material: MaterialName = "StableNeoHookean",
     youngs_modulus: Annotated[float, typer.Option("--youngs-modulus", "-E", help="where it is known [Pa]")] = 1e5,
     poissons_ratio: Annotated[float, typer.Option("--poissons-ratio", "--nu", help="where it is known [-]")] = 0.4,
@@ -42,38 +77,66 @@ def identify(
     gravity: Annotated[float, typer.Option(help="along y [m/s^2]")] = -9.81,
     drag: Annotated[float, typer.Option(help="rate at which velocities fall [1/s]; a guess if unknown")] = 0.0,
     fixed: Annotated[list[str] | None, typer.Option(help="vertex set, or xmin .. zmax, to hold")] = None,
+    pull: Annotated[
+        str | None, typer.Option(help="of a force curve: vertex set, or xmin .. zmax, that is moved")
+    ] = None,
+    along: Annotated[Up, typer.Option(help="of a force curve: where the displacement and the force point")] = Up.y,
     output: Annotated[Path, typer.Option("--output", "-o", help="picture")] = Path("output/identify.png"),
 ) -> None:
-    """Find numbers of a body from tracks of markers on it, with 95 % intervals; write a picture of data and fit."""
+    """Find numbers of a body, with 95 % intervals, from tracks of markers on it or a force curve; draw data and fit."""
     import diffsim_ti as ds
     from diffsim_ti.identification.picture import save_picture
 
-    times, places = read_tracks(data)
-    guesses = {}
-    for text in unknown:
-        name, _, value = text.partition("=")
-        try:
-            guesses[name] = float(value)
-        except ValueError:
-            raise ValueError(f"--unknown: expected input=guess, such as youngs_modulus=1e5, got {text!r}") from None
-    body = load_body(mesh, size)
+    guesses, body = numbers_of(unknown), load_body(mesh, size)
     law = make_material(
         material, guesses.get("youngs_modulus", youngs_modulus), guesses.get("poissons_ratio", poissons_ratio)
     )
     ds.init(precision="f64")
-    terms = [
-        ds.Gravity((0.0, gravity, 0.0)),
-        *([ds.Drag(guesses.get("drag", drag))] if drag or "drag" in guesses else []),
-    ]
-    scene = ds.Scene(body, law, density, terms, fixed_vertices(body, fixed or []), precision="f64")
+    curve = is_curve(data)
+    if curve != (pull is not None):
+        raise ValueError(
+            "--pull: which vertices the machine moves; it belongs to a CSV with columns displacement, force"
+        )
+    terms = [ds.Gravity((0.0, gravity, 0.0))] if gravity and not curve else []
+    terms += [ds.Drag(guesses.get("drag", drag))] if (drag or "drag" in guesses) and not curve else []
+    if curve:
+        rollout, measured, ways = _pulled(ds, body, law, density, fixed or [], pull, along, read_curve(data), noise)
+    else:
+        scene = ds.Scene(body, law, density, terms, fixed_vertices(body, fixed or []), precision="f64")
+        (rollout, measured), ways = _tracked(ds, scene, *read_tracks(data), noise), None
+    found = ds.identify(rollout, measured, guesses, progress=True)
+    print(found)
+    more = {} if ways is None else dict(at=ways, at_label="displacement [m]")
+    save_picture(output, found, measured, rollout.forward(**found.inputs[0]), **more)
+    print(f"picture written to {output}")
+
+
+def _tracked(ds, scene, times: np.ndarray, places: np.ndarray, noise: float):
+    """The rollout that markers were seen in, and what was seen."""
     frame = float(np.median(np.diff(times)))
     substeps = int(np.ceil(frame / (0.4 * ds.stable_dt(scene))))  # stable up to six times the stiffness guessed
     steps = max(4, int(np.ceil(times[-1] / frame - 1e-9)))
     solver = ds.VelocityVerletSolver(scene, dt=frame, substeps=substeps)
     markers = ds.MaterialPoints(places[0], nearest=True)
     rollout = ds.Rollout(solver, steps, save_every=1, outputs=[markers])
-    measured = ds.Measurement(markers.name, places[1:], noise, times=np.minimum(times[1:], rollout.times[-1]))
-    found = ds.identify(rollout, measured, guesses, progress=True)
-    print(found)
-    save_picture(output, found, measured, rollout.forward(**found.inputs[0]))
-    print(f"picture written to {output}")
+    return rollout, ds.Measurement(markers.name, places[1:], noise, times=np.minimum(times[1:], rollout.times[-1]))
+
+
+def _pulled(ds, body, law, density, fixed: list[str], pull: str, along: Up, curve, noise: float):
+    """The equilibria in which a force was read, what was read, and the displacements of all frames [m]."""
+    ways, forces = (np.concatenate([[start], x]) for start, x in zip((0.0, np.nan), curve))
+    axis, sign = "xyz".index(along.value[-1]), -1.0 if along.value.startswith("-") else 1.0
+    rows = np.zeros((len(ways), 3))
+    rows[:, axis] = sign * ways
+    held, moved = fixed_vertices(body, fixed), fixed_vertices(body, [pull])
+    both = np.union1d(held, moved)
+    if len(np.intersect1d(held, moved)):
+        raise ValueError(f"--pull {pull}: shares vertices with what is --fixed")
+    of_each = rows[:, None] * np.isin(both, moved)[:, None]
+    motion = np.arange(float(len(ways))), of_each
+    scene = ds.Scene(body, law, density, fixed=both, motion=motion, precision="f64")
+    grip = ds.Reaction(moved, name="force")
+    rollout = ds.Rollout(ds.StaticSolver(scene), len(ways) - 1, save_every=1, outputs=[grip])
+    read = np.full((len(ways), 3), np.nan)
+    read[:, axis] = sign * forces
+    return rollout, ds.Measurement("force", read, noise), ways

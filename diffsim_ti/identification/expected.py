@@ -7,12 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffsim_ti.identification.least_squares import described
 from diffsim_ti.identification.measurements import measurements
 from diffsim_ti.identification.priors import Priors
-from diffsim_ti.identification.problem import Problem
-from diffsim_ti.identification.result import Information
-from diffsim_ti.rollout import Rollout
+from diffsim_ti.identification.problem import Experiment, Problem, is_experiment
+from diffsim_ti.identification.result import Information, described
 
 
 @dataclass
@@ -37,7 +35,7 @@ class Expectation:
 
 
 def expected(
-    rollout: Rollout | Iterable[Rollout],
+    rollout: Experiment | Iterable[Experiment],
     data: Any,
     unknowns: dict,
     noise: ArrayLike | None = None,
@@ -50,7 +48,7 @@ def expected(
     a name, or a list of names, of outputs stands for complete data.
     Atkinson, Donev, Tobias, Optimum Experimental Designs, 2007, ch. 17.
     """
-    several = not isinstance(rollout, Rollout)
+    several = not is_experiment(rollout)
     rollouts = list(rollout) if several else [rollout]
     given = list(data) if several else [data]
     filled = [measurements(_complete(x, r), noise) for x, r in zip(given, rollouts)]
@@ -63,7 +61,7 @@ def expected(
     return Expectation(problem.numbers(t), **described(problem, t, found))
 
 
-def _complete(data, rollout: Rollout):
+def _complete(data, rollout: Experiment):
     if isinstance(data, str):
         data = [data]
     if isinstance(data, list | tuple) and all(isinstance(name, str) for name in data):
@@ -72,7 +70,7 @@ def _complete(data, rollout: Rollout):
 
 
 def compare(
-    rollout: Rollout, choices: dict, unknowns: dict, noise: ArrayLike | None = None, prior: dict | None = None
+    rollout: Experiment, choices: dict, unknowns: dict, noise: ArrayLike | None = None, prior: dict | None = None
 ) -> dict[str, Expectation]:
     """Expectations of several measurements of one experiment, the best first: least volume of the confidence region.
 

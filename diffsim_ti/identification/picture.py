@@ -9,8 +9,16 @@ from diffsim_ti.identification.result import Identification
 from diffsim_ti.rollout import Frames
 
 
-def save_picture(path: str | Path, found: Identification, measurement: Measurement, frames: Frames) -> None:
-    """Write the picture of one experiment's measurement; frames: of the run with the numbers found."""
+def save_picture(
+    path: str | Path,
+    found: Identification,
+    measurement: Measurement,
+    frames: Frames,
+    at: np.ndarray | None = None,
+    at_label: str = "time [s]",
+) -> None:
+    """Write the picture of one experiment's measurement; frames: of the run with the numbers found; at: what the values'
+    rows are drawn over, default their times."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -19,18 +27,17 @@ def save_picture(path: str | Path, found: Identification, measurement: Measureme
     r = measurement.residual(frames, float(found.estimates.get("time_offset", 0.0)))
     seen = measurement.seen
     times = frames.times if measurement.times is None else measurement.times
+    times = times if at is None else at
     t = np.broadcast_to(times.reshape(-1, *[1] * (seen.ndim - 1)), seen.shape)[seen]
     fit = measurement.values[seen] + r * measurement.deviation
     figure, axes = plt.subplots(1, 3, figsize=(12, 3.6), layout="constrained")
     axes[0].plot(t, measurement.values[seen], "o", mfc="none", ms=4, label="data")
     axes[0].plot(t, fit, ".", ms=4, label="fit")
-    axes[0].set(xlabel="time [s]", ylabel=measurement.output)
+    axes[0].set(xlabel=at_label, ylabel=measurement.output)
     axes[0].legend()
     axes[1].plot(t, r, ".", ms=4)
     axes[1].axhspan(-1.96, 1.96, alpha=0.15)
-    axes[1].set(
-        xlabel="time [s]", ylabel="residual / noise", title=f"chi² {found.chi_square:.4g} of {found.degrees:.4g}"
-    )
+    axes[1].set(xlabel=at_label, ylabel="residual / noise", title=f"chi² {found.chi_square:.4g} of {found.degrees:.4g}")
     for i, label in enumerate(found.labels if found.intervals else []):
         low, high = np.concatenate([np.atleast_2d(x) for x in found.intervals.values()])[i] / found.numbers[i]
         axes[2].plot([low, high], [i, i], "|-")

@@ -6,8 +6,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from diffsim_ti.identification.measurements import Measurement
+from diffsim_ti.identification.modal_test import ModalTest
 from diffsim_ti.identification.unknowns import TIME_OFFSET, Free, Unknown
+from diffsim_ti.modes import Modes
 from diffsim_ti.rollout import Frames, Rollout
+
+Experiment = Rollout | ModalTest
+
+
+def is_experiment(given) -> bool:
+    """Whether this is one, and no list of several."""
+    return isinstance(given, Experiment)
 
 
 @dataclass
@@ -15,14 +24,14 @@ class Point:
     """Free variables t, the frames of each experiment there, and the residuals of all, in deviations."""
 
     t: np.ndarray
-    frames: list[Frames]
+    frames: list[Frames | Modes]
     residual: np.ndarray
 
 
 class Problem:
     """r(t): what is measured less what is simulated, over the noise, of all experiments; counts its simulations."""
 
-    def __init__(self, rollouts: list[Rollout], data: list[list[Measurement]], unknowns: dict):
+    def __init__(self, rollouts: list[Experiment], data: list[list[Measurement]], unknowns: dict):
         if len(rollouts) != len(data):
             raise ValueError(f"identify: {len(rollouts)} rollouts need as many data, got {len(data)}")
         if not unknowns:

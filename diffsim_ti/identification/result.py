@@ -1,8 +1,12 @@
 """What an identification found and how well: estimates, intervals, what the data do not see, a test of the residuals."""
 
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from diffsim_ti.identification.problem import Problem
 
 
 @dataclass
@@ -118,3 +122,18 @@ class Identification:
             f"{len(self.iterations)} iterations, {self.simulations} simulations; {self.stopped}"
         )
         return "\n".join(lines)
+
+
+def described(problem: "Problem", t: np.ndarray, found: Information) -> dict:
+    """Covariance, standard errors and intervals of the numbers, from the information on the free variables."""
+    slopes = np.concatenate([free.slopes(t[part]) for free, part in zip(problem.unknowns, problem.parts)])
+    errors, intervals = {}, {}
+    with np.errstate(over="ignore"):
+        for free, part in zip(problem.unknowns, problem.parts):
+            s = found.deviations[part]
+            ends = np.stack([free.numbers(t[part] - 1.959964 * s), free.numbers(t[part] + 1.959964 * s)], -1)
+            error = np.abs(slopes[part]) * s
+            errors[free.label] = float(error[0]) if free.size == 1 else error
+            intervals[free.label] = tuple(ends[0].tolist()) if free.size == 1 else ends
+    covariance = slopes[:, None] * found.covariance * slopes
+    return dict(information=found, covariance=covariance, standard_errors=errors, intervals=intervals)

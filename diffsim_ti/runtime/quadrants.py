@@ -43,11 +43,3 @@ def _hand_dataclasses_on() -> None:
         return spread(context, arguments, *more, **named)
 
     calls._expand_Call_dataclass_args = staticmethod(whole)
-
-
-def current_program():
-    """The program that runs, or None; Quadrants' own property raises where there is none."""
-    from taichi.lang import impl
-
-    runtime = impl.get_runtime()
-    return runtime._prog if QUADRANTS else runtime.prog

@@ -16,8 +16,8 @@ from taichi._lib import core as _core
 from taichi.lang import impl
 
 from diffsim_ti import ranks
+from diffsim_ti.runtime.current_program import current_program
 from diffsim_ti.runtime.device import count_cards
-from diffsim_ti.runtime.quadrants import current_program
 from diffsim_ti.runtime.threads import LOCK, materialize
 
 PRECISIONS = {"f32": ti.f32, "f64": ti.f64}

@@ -1,0 +1,96 @@
+"""Where a search for numbers is, what it costs there, and its report; the ways to go on are in the modules beside it."""
+
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from diffsim_ti.identification.priors import Priors
+from diffsim_ti.identification.problem import Point, Problem
+from diffsim_ti.solvers import NotConverged
+
+FAILURES = (ValueError, ArithmeticError, NotConverged)  # of a run whose numbers went too far
+
+
+class Ended(Exception):
+    """A search stops here, with the reason as its text."""
+
+
+class Search:
+    """The best point so far, its cost sum r^2 + prior, and a report of each iteration, written to `path` if there is one."""
+
+    def __init__(self, problem: Problem, priors: Priors, resume: dict | str | Path | None):
+        self.problem, self.priors, self.damping, self.report = problem, priors, 1e-3, []
+        self.path = Path(resume) if isinstance(resume, str | Path) else None
+        state = resume
+        if self.path is not None:
+            state = json.loads(self.path.read_text()) if self.path.exists() else None
+        self.is_resumed, t = state is not None, np.zeros(problem.size)
+        if state is not None:
+            if state["labels"] != problem.labels:
+                raise ValueError(f"resume: the state is of {state['labels']}, these unknowns are {problem.labels}")
+            t, self.damping, self.report = np.array(state["t"]), state["damping"], list(state["report"])
+            problem.simulations = state["simulations"]
+        self.began = time.perf_counter()
+        self.point = problem.run(t)
+        self.cost = self.cost_of(self.point)
+        self.J = None  # dr/dt at the point, where it was made
+
+    def cost_of(self, point: Point) -> float:
+        return float(point.residual @ point.residual) + self.priors.cost(point.t)
+
+    def half_gradient(self, point: Point) -> np.ndarray:
+        """Half the cost's gradient by t, from a reverse sweep of each experiment."""
+        return self.problem.transposed(point, point.residual) + self.priors.gradient(point.t)
+
+    def keep(self, point: Point, cost: float) -> None:
+        """Go to a point whose cost is lower."""
+        self.point, self.cost, self.J = point, cost, None
+
+    @property
+    def state(self) -> dict:
+        return dict(
+            labels=self.problem.labels,
+            t=self.point.t.tolist(),
+            damping=self.damping,
+            report=self.report,
+            simulations=self.problem.simulations,
+        )
+
+    def row(self, iteration: int, promised: float | None = None, why: str | None = None) -> dict:
+        """The report of an iteration: what its step promised, why it was not taken."""
+        return dict(
+            iteration=iteration,
+            cost=self.cost,
+            chi_square=float(self.point.residual @ self.point.residual),
+            promised=promised,
+            damping=self.damping,
+            rejected=why,
+            simulations=self.problem.simulations,
+            seconds=time.perf_counter() - self.began,
+            numbers=self.problem.all_numbers(self.point.t).tolist(),
+        )
+
+    def record(
+        self,
+        most: int,
+        show: Callable,
+        callback: Callable | None,
+        promised: float | None = None,
+        why: str | None = None,
+    ) -> None:
+        """Note an iteration, write the state, show and tell it. Raises Ended after the last one, or if the callback asks."""
+        done = self.row(len(self.report) + 1, promised, why)
+        self.report.append(done)
+        if self.path:
+            temporary = self.path.with_name(self.path.name + ".tmp")
+            temporary.write_text(json.dumps(self.state))
+            temporary.replace(self.path)
+        shown = ", ".join(f"{label} {x:.5g}" for label, x in list(zip(self.problem.labels, done["numbers"]))[:4])
+        show(done["iteration"], f"chi^2 {done['chi_square']:.5g} of {self.problem.num_data}, {shown}")
+        if callback is not None and callback(done, self.point.frames) is True:
+            raise Ended("stopped by the callback")
+        if len(self.report) >= most:
+            raise Ended(f"stopped after {most} iterations")
