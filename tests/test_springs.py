@@ -175,6 +175,20 @@ def test_lengths_and_tensions_have_gradients(kind):
         assert all(row.relative_error < 1e-5 for row in table.rows), table
 
 
+def test_one_anchor_that_holds_many():
+    """Its gradient is the sum of those by an anchor of each, which stand at one place."""
+    mesh, place, many = ds.TetrahedralMesh.create_cube(2, 1.0), np.array([0.3, 2.0, 0.4]), [2, 3, 6]
+    found = []
+    for anchors in (place, np.tile(place, (3, 1))):
+        terms = [ds.Spring(many, ds.Anchor(anchors), 900.0, rest_length=0.4, name="ropes"), ds.Gravity()]
+        made = ds.Scene(mesh, ds.StableNeoHookean(1e4, 0.3), terms=terms, precision="f64")
+        rollout = ds.Rollout(ds.SemiImplicitSolver(made, dt=1e-3), 5, gradients="all")
+        frames = rollout.forward()
+        found.append(rollout.vjp(frames, positions=np.cos(3 * frames.positions))["ropes.anchors"])
+    assert found[0].shape == (3,) and found[1].shape == (3, 3) and np.abs(found[1]).min() > 0
+    np.testing.assert_allclose(found[0], found[1].sum(0), rtol=1e-12)
+
+
 def test_tension_is_what_holds_an_anchor():
     """A spring's pull is k (L - l), and by direction what its ends feel; a term may be named by itself."""
     mesh, place = lidded(), np.array([0.5, 2.0, 0.4])
