@@ -173,3 +173,28 @@ def test_a_force_curve_tells_two_numbers_of_a_law(tmp_path, capsys):
     assert end.value.code == 0 and (tmp_path / "fit.png").stat().st_size > 10_000
     lines = {line.split()[0]: line.split() for line in capsys.readouterr().out.splitlines() if " = " in line}
     assert float(lines["youngs_modulus"][2]) == pytest.approx(2e5, rel=0.03)
+
+
+def pulled_bar(cells, material, pattern) -> ds.Rollout:
+    """A bar whose sides are free, drawn to 2.2 times its length in equilibria; it gives the force [N]."""
+    mesh = ds.TetrahedralMesh.create_box([c + 1 for c in cells], [0.1, 0.02, 0.02], pattern=pattern)
+    ways = np.linspace(0, 0.12, 25)[:, None] * [1.0, 0.0, 0.0]
+    held, motion = {"xmin": "x", "ymin": "y", "zmin": "z", "xmax": "x"}, {"xmax": (np.arange(25.0), ways)}
+    scene = ds.Scene(mesh, material, fixed=held, motion=motion, precision="f64")
+    return ds.Rollout(ds.StaticSolver(scene), 24, save_every=1, outputs=[ds.Reaction("xmax", name="force")])
+
+
+def test_two_numbers_of_a_law_from_a_force_stretch_curve():
+    """Gent's modulus and limit, on data of another, finer mesh with noise of half a per cent of the largest force."""
+    truth = dict(mu=3e4, limit=8.0)
+    force = pulled_bar((6, 2, 2), ds.Gent(**truth, bulk_modulus=1.5e5), "five").forward()["force"]
+    noise = 5e-3 * np.abs(force).max()
+    fitted = pulled_bar((3, 1, 1), ds.Gent(2e4, 12.0, 1.5e5), "kuhn")
+    for seed in range(3):
+        seen = force + noise * np.random.default_rng(seed).standard_normal(force.shape)
+        seen[:, 1:] = np.nan  # the machine reads one direction
+        found = ds.identify(fitted, {"force": seen}, dict(mu=2e4, limit=12.0), noise)
+        for name, exact in truth.items():
+            error = found.standard_errors[name]
+            assert abs(found.estimates[name] - exact) < 3 * error < 3 * 0.03 * exact
+        assert found.converged and found.residuals_fit
