@@ -29,11 +29,11 @@ def test_stiffness_field(tmp_path):
 
 
 def test_costs_of_identification():
-    """On a field of 144 unknowns: fewer simulations than differences, whose share grows with the unknowns."""
-    told = example("benchmarks/identify_costs").main(cells=(4, 2, 3), most=1500, rates=(0.1,))
+    """On a field of 72 unknowns: fewer simulations than differences, whose share grows with the unknowns."""
+    told = example("benchmarks/identify_costs").main(cells=(3, 2, 2), most=400, rates=(0.1,))
     for found in told.values():
-        best, theirs = found["Levenberg-Marquardt"][0], found["SciPy, differences"]
-        assert theirs is None or best <= theirs[0]
+        for best, theirs in zip(found["Levenberg-Marquardt"], found["SciPy, differences"]):
+            assert theirs is None or best[0] <= theirs[0]
 
 
 def test_identify_beam(capsys):
