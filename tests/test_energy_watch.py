@@ -8,6 +8,8 @@ import pytest
 import diffsim_ti as ds
 from diffsim_ti.monitor.energy_watch import EnergyGained
 from diffsim_ti.monitor.stability import lanczos_limit
+from diffsim_ti.study.stability_axes import AXES
+from diffsim_ti.study.stability_map import given_by_muscles
 
 MESH = ds.TetrahedralMesh.create_box(4, size=0.1)
 ABOVE = MESH.translated([0, 0.02 - MESH.bounding_box[0, 1], 0])
@@ -76,6 +78,10 @@ WORK = {
     "drag": lambda: body([ds.Drag(30.0), ds.Gravity()], initial_velocities=0.1 * NOISE, fixed="xmin"),
     "motion": lambda: body([ds.Gravity()], **SHAKEN),
     "motion, drag": lambda: body([ds.Drag(10.0)], **SHAKEN),
+    "a muscle": lambda: body([ds.Muscle([0, 1, 0], 2e4, 1.0)], fixed="xmin"),
+    "a muscle of steps": lambda: body(
+        [ds.Muscle([0, 1, 0], 3e4, 0.5 + 0.5 * np.sin(0.3 * np.arange(80)))], fixed="xmin"
+    ),
     "a ball": lambda: body(
         [
             ds.Sphere(
@@ -101,6 +107,22 @@ def test_work_from_outside_is_counted(kind, work):
             seen.append(float(run.compute_energy()))
     watch = run.workspace.energy_watch
     assert np.ptp(seen) > 0.5 * watch.moving and watch.share < 5e-3, (np.ptp(seen), watch.moving, watch.share)
+
+
+@pytest.mark.parametrize("kind", EXPLICIT)
+def test_what_a_steady_muscle_makes_unstable_is_a_gain(kind):
+    """As the kinetic and stored energy rise beyond what it gives; when its pull changes it is taken for a load."""
+    scene = AXES["activation"].scene(1.0)
+    pulls = np.where(np.arange(202) < 200, 1.0, 0.5)
+    scene = scene.replace(terms=[ds.Muscle([0, 1, 0], 1e5, pulls)])
+    run = ds.Simulator(kind(scene, dt=0.4 * ds.stable_dt(scene).dt))
+    with pytest.warns(EnergyGained):
+        run.run(200)
+    watch, given = run.workspace.energy_watch, given_by_muscles(run)
+    assert watch.steady and given > 0
+    assert watch.gained == pytest.approx(float(run.compute_energy()) - given, rel=0.5)
+    run.run(2)
+    assert not watch.steady
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.5])

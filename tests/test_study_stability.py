@@ -10,7 +10,8 @@ import diffsim_ti as ds
 from diffsim_ti.solvers import SOLVERS
 from diffsim_ti.solvers.implicit.obstacle_ways import ObstacleWays
 from diffsim_ti.study import boundary, growth, map_picture, power_limit, stability_map
-from diffsim_ti.study.stability_map import AXES, OUTCOMES, body, judge
+from diffsim_ti.study.stability_axes import AXES, body
+from diffsim_ti.study.stability_map import OUTCOMES, judge
 
 EXPLICIT = [kind for kind in SOLVERS if kind.explicit]
 
@@ -51,6 +52,7 @@ def test_no_explicit_solver_is_wrong_silently(kind, axis):
     [
         ("impact", (2.0,)),
         ("compression", (0.7,)),
+        ("activation", (0.3,)),
         pytest.param("viscosity", (0.01, 1.0, 20.0), marks=pytest.mark.thorough),
     ],
 )
@@ -61,6 +63,18 @@ def test_no_solver_is_wrong_silently_where_steps_meet_their_end(kind, axis, valu
         result = stability_map(kind, replace(AXES[axis], values=values), shares=(0.3, 0.9, 3.0), steps=40)
     assert not result.silent, result.silent
     assert kind.explicit or kind is ds.ImplicitMidpointSolver or "raises" not in np.array(OUTCOMES)[result.outcomes]
+
+
+@pytest.mark.parametrize("kind", EXPLICIT)
+def test_no_muscle_outgrows_an_explicit_step_in_silence(kind):
+    """Pulls of once and twice Young's modulus squeeze the cube, which calms at small steps and blows up at others."""
+    strong = replace(AXES["activation"], values=(1.0, 2.0))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        result = stability_map(kind, strong, shares=(0.1, 0.2, 0.4, 0.6, 0.9, 0.99))
+    assert not result.silent, result.silent
+    outcomes = np.array(OUTCOMES)[result.outcomes]
+    assert set(outcomes[0]) == {"bounded"} and set(outcomes[2:, 1]) == {"raises"} and outcomes[1, 0] == "bounded"
 
 
 def test_a_map_would_show_what_is_wrong_silently():

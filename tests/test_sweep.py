@@ -11,7 +11,7 @@ from diffsim_ti.cli import main
 from diffsim_ti.cli.sweep import axis
 from diffsim_ti.study import Problem, Settings, chart, stability_map, sweep
 from diffsim_ti.study.executors import each, pool
-from diffsim_ti.study.stability_map import AXES
+from diffsim_ti.study.stability_axes import AXES
 
 FILE = """
 import diffsim_ti as ds

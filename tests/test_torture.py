@@ -7,7 +7,7 @@ import pytest
 import torture
 
 import diffsim_ti as ds
-from diffsim_ti.study.stability_map import body, power_limit
+from diffsim_ti.study.stability_axes import body, power_limit
 
 
 def test_named_tests_exist():

@@ -83,7 +83,7 @@ def chart(
 
 def stability(
     axis: Annotated[
-        str, typer.Argument(help="stiffness, nu, impact, quality, compression, viscosity, friction, or all")
+        str, typer.Argument(help="stiffness, nu, impact, quality, compression, viscosity, activation, friction, or all")
     ] = "all",
     solver: Annotated[list[str] | None, typer.Option(help="class name; may be repeated; default all")] = None,
     output: Folder = Path("output/stability"),
@@ -98,7 +98,8 @@ def stability(
     from diffsim_ti.solvers import SOLVERS
     from diffsim_ti.study import map_picture
     from diffsim_ti.study.executors import workers_of
-    from diffsim_ti.study.stability_map import AXES, stability_map
+    from diffsim_ti.study.stability_axes import AXES
+    from diffsim_ti.study.stability_map import stability_map
 
     names = {kind.__name__: kind for kind in SOLVERS}
     for asked, known in (([axis], ["all", *AXES]), (solver or [], names)):

@@ -28,8 +28,9 @@ class Window:
 class EnergyBalance:
     """Follows T + V less the work of what is outside, as it is at looks, every few hundred passes.
 
-    T is the kinetic energy of free vertices, V that of strains, weight and contacts. Both swap within an oscillation, by a
-    quarter of (omega h)^2, which is no gain. So the velocity v- of half a substep before u is taken together with u:
+    T is the kinetic energy of free vertices, V that of strains, weight, contacts, and of cables and muscles that pull
+    steadily. Both swap within an oscillation, by a quarter of (omega h)^2, which is no gain. So the velocity v- of half a
+    substep before u is taken together with u:
 
         T(v-) + V(u) + h/2 v- . f(u)         or, with v of the same time as u,    T(v) + V(u) - h^2/8 f(u)^2 / m
 
@@ -43,6 +44,7 @@ class EnergyBalance:
     """
 
     usual = 800  # passes from look to look at least; a look costs about as much as six of them
+    first = 20  # where cables and muscles set a body in motion; twice as many from look to look
     small, seldom = 1000, 2.5  # tetrahedra below which a look costs more than that, and comes up to so much more seldom
 
     def __init__(self, workspace: Workspace):
@@ -60,6 +62,8 @@ class EnergyBalance:
     def clear(self) -> None:
         """Forget what was seen."""
         self.window: Window | None = None
+        self.steady, self._rows = True, None  # whether cables pull as they did at first, and with what (their rows)
+        self._soon = self.first if self.ws.scene.cables else np.inf
         self.gained, self.moving = 0.0, 0.0  # [J]
         self._risen, self._lowest = 0.0, 0.0  # the level against that of the first look
 
@@ -71,12 +75,28 @@ class EnergyBalance:
     def before(self, first: int, num_passes: int) -> None:
         """Passes from `first` on come next; whatever was done to the state since the last ones is outside the balance."""
         ws, window = self.ws, self.window
+        if not self._pulls_stay():
+            window = None
         if window and (window.changes, window.substep) == (ws.changes, ws.substep):
             return
         if self._start is None:
             self._start = ws.history(1)
         ws.save(self._start, 0)
         self._begin(first, num_passes, None)
+
+    def _pulls_stay(self) -> bool:
+        """Whether cables pull with what they pulled with at first: once that changes they are loads, until `clear`."""
+        rows = self.ws.arrays.rows["ties"] if self.ws.scene.cables else None
+        if not self.steady or rows is None or rows is self._rows:
+            return True
+        ends = rows.reshape(len(rows), -1, 2, 3)[
+            ..., :2
+        ]  # tension and slack as a step begins and ends (inputs/ties.py)
+        self.steady = bool(
+            (ends == ends[0, :, :, :1]).all() and (self._rows is None or np.array_equal(rows, self._rows))
+        )
+        self._rows = rows
+        return self.steady
 
     def _begin(self, first: int, num_passes: int, level: float | None) -> None:
         if self.ws.arrays.features().driven:
@@ -94,14 +114,15 @@ class EnergyBalance:
         """`count` passes are done, up to pass `now`, by the run alone."""
         window = self.window
         window.passes, window.changes = window.passes + count, self.ws.changes
-        if window.passes >= self.every:
+        if window.passes >= min(self.every, self._soon):
             self._look(now, num_passes)
+            self._soon *= 2
             window.changes = self.ws.changes
 
     @np.errstate(all="ignore")  # of a run that blows up
     def _look(self, now: int, num_passes: int) -> None:
         window, features = self.window, self.ws.arrays.features()
-        work = float(runtime.fetch(self.ws.contact.work).astype(np.float64).sum()) if features.driven else 0.0
+        work = self._noted_work() if features.driven else 0.0
         if features.moving and self.ws.faces:
             work += float(runtime.fetch(self.ws.faces.work).astype(np.float64).sum())
         if self.ws.volumes:
@@ -114,6 +135,11 @@ class EnergyBalance:
             self._lowest = min(self._lowest, self._risen)
             self.gained = max(self.gained, self._risen - self._lowest)
         self._begin(now, num_passes, level)
+
+    def _noted_work(self) -> float:
+        """By passes, of loads, walls and what holds the body [J]."""
+        accounts = runtime.fetch(self.ws.contact.work).reshape(-1, self.ws.arrays.num_vertices).astype(np.float64)
+        return float(accounts[-1 if self.steady else 0].sum())
 
     def _level_at_start(self, window: Window) -> float | None:
         """The level of the state that was kept; None where forces there cannot be had any more."""
@@ -149,7 +175,10 @@ class EnergyBalance:
             stored += ws.pairs.look(ws.state.u)[0]
         self.moving = max(self.moving, kinetic + stored)
         j = min(now, num_passes - 1)
-        forces = ws.forces_at(j, num_passes) - ws.loads_at(j, num_passes) + weight
+        if features.cabled and self.steady:
+            ties = ws.attached.at(values, a.rows["ties"], ws.solver.schedule, 0, 0.0).ties
+            stored += float(ties.energies(runtime.fetch_row(ws.state.u, 0))[ties.cables].sum())
+        forces = ws.forces_at(j, num_passes) - ws.loads_at(j, num_passes, pulls=not self.steady) + weight
         if ws.solver.lags(now, num_passes):
             swapped = 0.5 * h * float((v * forces).sum())
         else:

@@ -52,7 +52,7 @@ class Guard:
     within a tenth of the stable one it looks more often, for beyond it a motion soon grows e-fold in ten passes.
     """
 
-    usual, close, first = 400, 50, 10  # passes between two looks; the first one of a deformed start
+    usual, close, first = 400, 50, 10  # passes between two looks; the first one where a start is deformed or pulled
 
     def __init__(self, workspace: Workspace):
         self.ws = workspace
@@ -62,11 +62,14 @@ class Guard:
         self.restart()
 
     def restart(self) -> None:
-        """A new run: looks come at the same passes whatever ran before, and sooner where it starts deformed."""
+        """A new run: looks come at the same passes whatever ran before, and sooner where it starts deformed or pulled."""
         solver = self.ws.solver
         if solver.explicit and self.ws.energy_watch:
             self.ws.energy_watch.clear()
-        self._passes, self.every = 0, self.first if solver.explicit and solver.starts_deformed() else self.usual
+        soon = solver.explicit and (
+            solver.starts_deformed() or self.ws.scene.cables
+        )  # what pulls squeezes a calm start
+        self._passes, self.every = 0, self.first if soon else self.usual
 
     def mark(self, now: int) -> None:
         """The current state, before pass `now`, is good: keep it."""

@@ -7,141 +7,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from diffsim_ti.materials import KelvinVoigt, SmithNeoHookean
-from diffsim_ti.mesh import TetrahedralMesh
-from diffsim_ti.monitor.stability import Stiffness
+from diffsim_ti.potential.attached import Attached
 from diffsim_ti.scene import Scene
 from diffsim_ti.simulator import Simulator
 from diffsim_ti.solvers import SOLVERS
 from diffsim_ti.solvers.solver import Solver
-from diffsim_ti.solvers.stable_step import start_workspace
 from diffsim_ti.study.executors import each
-from diffsim_ti.terms import Ground, SelfContact, Term
+from diffsim_ti.study.stability_axes import Axis, power_limit
 from diffsim_ti.terms.obstacles.obstacle import Obstacle
-from diffsim_ti.terms.obstacles.stiffness import stiffness_of_impact
 
 OUTCOMES = ("accurate", "bounded", "loses energy", "raises", "wrong silently")  # "raises": or warns
 ACCURATE = 0.01  # change of the total energy, over the energy that moves
 LOSES = 0.10
 GAINS = 0.20  # less may be the error of a nonlinear swap of energy, which comes and goes
-
-
-@dataclass(frozen=True)
-class Axis:
-    """A quantity that a map runs over: its values and the scene that each makes."""
-
-    name: str
-    unit: str
-    values: tuple
-    scene: Callable  # value -> Scene
-
-    def __iter__(self):
-        return iter(self.values)
-
-
-def body(
-    cells: int = 2,
-    squeeze: float = 1.0,
-    flat: float = 1.0,
-    E: float = 1e5,
-    nu: float = 0.3,
-    terms: Sequence[Term] = (),
-    lift: float = 0.0,
-    speed: float = 0.0,
-    viscous_time: float = 0.0,
-) -> Scene:
-    """A cube of 0.2 m, its elements flattened to `flat` of their height, the body squeezed to `squeeze` along y, and
-    shaken by random velocities of 0.1 % of the speed of sound so that every mode takes part."""
-    mesh = TetrahedralMesh.create_box(cells + 1, (0.2, 0.2 * flat, 0.2), "five").translated((0, lift, 0))
-    shake = 1e-3 * np.sqrt(E / 1000.0) * np.random.default_rng(0).standard_normal(mesh.vertices.shape)
-    start, material = mesh.vertices * [1, squeeze, 1], SmithNeoHookean(E, nu)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # nu near 1/2 and slivers are what is looked at
-        return Scene(
-            mesh,
-            KelvinVoigt(material, time=viscous_time) if viscous_time else material,
-            1000.0,
-            terms,
-            initial_positions=start,
-            initial_velocities=shake - [0, speed, 0],
-            precision="f64",
-        )
-
-
-def impact(speed: float) -> Scene:
-    """The cube 2 mm above a barrier 5 mm wide that is as stiff as the impact asks for, moving down."""
-    still = body()
-    stiffness = stiffness_of_impact(still.mesh, still.material, 1000.0, 0.0, speed, 0.005)
-    return body(lift=0.007, speed=speed, terms=[Ground(0.0, width=0.005, stiffness_per_area=stiffness)])
-
-
-def viscous(ratio: float) -> Scene:
-    """The cube, its fastest motion having that damping ratio xi = tau omega / 2."""
-    return body(viscous_time=ratio * power_limit(body()))
-
-
-def rubbing(friction: float) -> Scene:
-    """A soft cube that comes down askew on another one and slides on it, as far as they rub."""
-    mesh = TetrahedralMesh.create_box(3, 0.2, "five")
-    velocity = 0.05 * np.random.default_rng(0).standard_normal((2 * mesh.num_vertices, 3))
-    velocity[mesh.num_vertices :] += [1.0, -0.5, 0.2]
-    upper = mesh.rotated([0, 1, 0], 0.3, center=(0.1, 0.1, 0.1)).translated((0.03, 0.206, 0.02))
-    contact = SelfContact(1e3, 5e-3, friction=friction, friction_speed=0.01)
-    both, material = TetrahedralMesh.joined([mesh, upper]), SmithNeoHookean(1e5, 0.3)
-    return Scene(both, material, 1000.0, [contact], initial_velocities=velocity, precision="f64")
-
-
-AXES = {
-    "stiffness": Axis("Young's modulus", "Pa", tuple(10.0 ** np.arange(3, 8.1, 1.0)), lambda E: body(E=E)),
-    "nu": Axis(
-        "Poisson's ratio", "-", (0.0, 0.1, 0.2, 0.3, 0.4, 0.45, 0.48, 0.49, 0.495, 0.499), lambda nu: body(nu=nu)
-    ),
-    "impact": Axis("speed of impact", "m/s", (0.1, 0.2, 0.5, 1.0, 2.0, 3.0, 5.0, 8.0), impact),
-    "quality": Axis(
-        "height of the elements over their width",
-        "-",
-        (1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01),
-        lambda flat: body(flat=flat),
-    ),
-    "compression": Axis(
-        "stretch at the start", "-", (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3), lambda s: body(squeeze=s)
-    ),
-    "viscosity": Axis("damping ratio of the fastest motion", "-", (0.01, 0.1, 0.3, 1.0, 3.0, 20.0), viscous),
-    "friction": Axis("friction of soft on soft", "-", (0.0, 0.1, 0.3, 0.6, 1.0, 10.0), rubbing),
-}
-
-
-def power_limit(scene: Scene, rounds: int = 3000, tolerance: float = 1e-7) -> float:
-    """The explicit limit 2 / omega_max [s] at the scene's start, by plain power iteration on the assembled stiffness.
-
-    Independent of the Lanczos iteration by which solvers look at their steps; converges from above. With viscosity, the step
-    whose rate 2 / dt makes omega_max as large (`Stiffness`), by bisection.
-    """
-    stiffness = Stiffness(start_workspace(scene))
-    low = 2 / np.sqrt(_largest(scene, stiffness, rounds, tolerance))
-    if not stiffness.viscous:
-        return low
-    low, high = 0.0, low
-    while high - low > 1e-4 * high:
-        middle = 0.5 * (low + high)
-        stiffness.set_rate(2 / middle)
-        fits = _largest(scene, stiffness, rounds, tolerance) <= (2 / middle) ** 2
-        low, high = (middle, high) if fits else (low, middle)
-    return low
-
-
-def _largest(scene: Scene, stiffness: Stiffness, rounds: int, tolerance: float) -> float:
-    """The largest eigenvalue."""
-    x = np.random.default_rng(5).standard_normal((scene.mesh.num_vertices, 3)) * (stiffness.root > 0)
-    value = 0.0
-    for k in range(rounds):
-        x /= np.linalg.norm(x)
-        y = stiffness.product(x)
-        before, value = value, float((x * y).sum())
-        if abs(value - before) < tolerance * abs(value) and k > 20:
-            break
-        x = y + 0.05 * abs(value) * x  # negative eigenvalues of a squeezed body do not compete
-    return value
 
 
 @dataclass
@@ -166,12 +44,13 @@ def judge(scene: Scene, kind: type[Solver], dt: float, steps: int = 200, overrid
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
             simulator = Simulator(kind(scene, dt=dt, **options))
-            first, moving, kept = measure(simulator)
-            rise, change, behind = 0.0, 0.0, 0.0
+            first, moving, kept, _ = measure(simulator)
+            rise, change, behind, most = 0.0, 0.0, 0.0, 0.0
             for _ in range(20):
                 simulator.run(max(1, steps // 20))
-                total, now, still_kept = measure(simulator)
-                scale = max(moving, min(now, 100 * moving))
+                total, now, still_kept, given = measure(simulator)
+                most = max(most, given)
+                scale = max(moving, min(now, 100 * moving), most)
                 gain = still_kept - kept
                 if scene.law.viscous:  # whose stress is a part of the neighbouring one, and fades
                     gain = min(gain, total - first)
@@ -201,17 +80,28 @@ def depth_behind(simulator: Simulator) -> float:
     return -float(min(gaps, default=np.inf))
 
 
-def measure(simulator: Simulator) -> tuple[float, float, float]:
-    """(total energy, its parts that move, the energy that the solver keeps) [J] at the present state; takes a step."""
+def measure(simulator: Simulator) -> tuple[float, float, float, float]:
+    """(total energy less what muscles have given, its parts that move, the energy that the solver keeps, what muscles have
+    given) [J] at the present state; takes a step."""
     solver, mass = simulator.solver, simulator.scene.inputs.derive(simulator.scene.inputs.values).mass[:, None]
     u, v = simulator.displacements.astype(float), simulator.velocities.astype(float)
     with np.errstate(over="ignore", invalid="ignore"):
-        energy = simulator.compute_energy()
+        energy, given = simulator.compute_energy(), given_by_muscles(simulator)
         simulator.step()
-        kept = float(energy)
+        total = kept = float(energy) - given
         if solver.explicit:
             kept += kept_energy(solver, mass, u, v, simulator.displacements - u, simulator.velocities - v)
-        return float(energy), float(sum(part for name, part in energy.parts.items() if name != "gravity")), kept
+        moving = float(sum(part for name, part in energy.parts.items() if name != "gravity"))
+        return total, moving, kept, given
+
+
+def given_by_muscles(simulator: Simulator) -> float:
+    """What muscles and cables with steady pulls have given the body since it was at rest [J]."""
+    attached = Attached.of(simulator.scene)
+    if not attached or not attached.ties:
+        return 0.0
+    ties = attached.at_start(simulator.scene.inputs.derive(simulator.values)).ties
+    return -float(ties.energies(simulator.displacements.astype(float))[ties.cables].sum())
 
 
 def kept_energy(

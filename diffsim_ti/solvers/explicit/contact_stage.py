@@ -21,7 +21,7 @@ import taichi as ti
 from diffsim_ti.solvers.explicit.contact_friction import ContactFriction
 from diffsim_ti.solvers.explicit.contact_impulses import note_impulses, note_pushes_jvp, seed_impulses
 from diffsim_ti.solvers.explicit.obstacle_stages import FELT, PLANE, PUSH, ROWS, SEED, WALL
-from diffsim_ti.solvers.explicit.wall_work import work_of_lead, work_of_stage
+from diffsim_ti.solvers.explicit.outside_work import add_work, work_of_lead, work_of_stage
 from diffsim_ti.terms.obstacles import secant, stage
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
@@ -143,9 +143,9 @@ class ContactStage(ContactFriction):
                 if ti.static(self.features.recorded):
                     note_impulses(self, i, v_plus, z, ratio, now, scene, state)
                 if ti.static(self.features.moving > 0):
-                    state.work[i] = state.work[i] + work_of_stage(self, i, v_plus, now, scene, state)
+                    add_work(self, i, work_of_stage(self, i, v_plus, now, scene, state), state, plan)
                 if ti.static(self.features.guided and self.features.motion):
-                    state.work[i] = state.work[i] + work_of_lead(self, i, lead, state)
+                    add_work(self, i, work_of_lead(self, i, lead, state), state, plan)
         pressed = self.blend(plan) * delta
         return u + now.alpha * (v + pressed), now.decay * v + delta - (1 - now.decay) * pressed
 

@@ -94,7 +94,8 @@ class FurtherElements:
         out += ["num_ties"] if self.tied or self.dragged else []
         out += ["first_tied"] if self.tied else []
         out += ["num_dragged", "first_dragged"] if self.dragged else []
-        return dict.fromkeys([*out, *(["first_load"] if self.features.loaded_corners else [])], "int")
+        out += ["first_load"] if self.features.loaded_corners else []
+        return dict.fromkeys([*out, *(["first_push"] if self.features.cabled else [])], "int")
 
     @traced
     def is_tie(self, k, plan):

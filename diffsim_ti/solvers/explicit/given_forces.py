@@ -60,11 +60,13 @@ class GivenForces:
         return begin + self.share_of_step(step, now) * (end - begin)
 
     @ti.func
-    def gathered(self, i, scene: A, plan: A):
-        """What pressures and cables do at vertex i, of what it gathers."""
-        f = self.vector(0)
+    def gathered(self, i, scene: A, plan: A, pulls: A):
+        """What pressures do at vertex i, and what pulls, cables, of what it gathers."""
+        f, first = self.vector(0), plan.first_load
+        if ti.static(self.features.cabled and not pulls):
+            first = plan.first_push
         for c in range(scene.start[i], scene.start[i + 1]):
-            if scene.corner_of[c] >= plan.first_load:
+            if scene.corner_of[c] >= first:
                 f = f + scene.corner[scene.corner_of[c]]
         return f
 

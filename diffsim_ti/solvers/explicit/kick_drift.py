@@ -27,6 +27,7 @@ from diffsim_ti.solvers.explicit.foundations import Foundations
 from diffsim_ti.solvers.explicit.given_forces import GivenForces
 from diffsim_ti.solvers.explicit.guides import Guides
 from diffsim_ti.solvers.explicit.obstacle_stages import ObstacleStages
+from diffsim_ti.solvers.explicit.outside_work import add_work_of_pass
 from diffsim_ti.state.features import Features
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
@@ -160,51 +161,11 @@ class KickDrift:
             if scene.surface[i] > 0:
                 self.obstacles.note(i, u, u_next, now, scene, state)
         if ti.static(self.features.driven):
-            state.work[i] = state.work[i] + self.work(i, u, v, f, u_next, v_next, now, scene, plan)
+            add_work_of_pass(self, i, u, v, f, u_next, v_next, now, scene, state, plan)
         if plan.stride > 0:
             state.f[s, i] = f
         state.u[t, i] = u_next
         state.v[t, i] = v_next
-
-    @ti.func
-    def work(self, i, u, v, f, u_next, v_next, now: A, scene: A, plan: A):
-        """Work [J] done on vertex i in the pass, less what drag takes, for the energy that monitor/energy_balance.py
-        follows. What a contact stage does is not in it (contact_stage.py)."""
-        done, inverse, load = ti.cast(0, self.fp), scene.inverse_mass[i], self.vector(0)
-        half, pre, post = self.half(), now.pre, now.post
-        if post >= now.h:  # a whole kick is two halves
-            pre, post = half * now.h, half * now.h
-        _, v_plus = self.kicked(i, v, f, now, scene)
-        if ti.static(self.features.forces):
-            load = self.given.force(i, now, scene, scene.forces)
-        if ti.static(self.features.loaded_corners):
-            load += self.given.gathered(i, scene, plan)
-        own = f - load  # the body's
-        if inverse > 0:
-            if ti.static(self.features.gravity >= 0):
-                own += self.gravity(scene.parameters) / inverse
-            if ti.static(self.features.guided):  # what holds it takes what the body does there
-                done += -own.dot(self.guides.held(i, pre * v + post * v_next, scene))
-                own, v, v_plus = (
-                    self.guides.free(i, own, scene),
-                    self.guides.free(i, v, scene),
-                    self.guides.free(i, v_plus, scene),
-                )
-                u_next, v_next = u + self.guides.free(i, u_next - u, scene), self.guides.free(i, v_next, scene)
-            if ti.static(self.features.forces or self.features.loaded_corners):
-                done += half * load.dot((pre + post) * (v + v_plus) + (pre * pre - post * post) * inverse * own)
-            if ti.static(self.features.drag >= 0):
-                kept = ti.exp(-now.h * scene.parameters[ti.static(self.features.drag)])
-                done += half * (1 - kept) * own.dot(now.post * v_plus - now.pre / kept * v)
-                if now.alpha > 0:
-                    drift = (u_next - u) / now.alpha
-                    done += -(1 - kept) * drift.dot(v_next + half * (1 - kept) * drift) / inverse
-        elif ti.static(self.features.motion):
-            done += -own.dot(pre * v + post * v_next)
-        if ti.static(self.features.moving > 0 and len(self.features.pressing) > 0):
-            if now.alpha > 0 and scene.surface[i] > 0:
-                done += self.obstacles.work_of_forces(i, u, v_plus, now, scene)
-        return done
 
     # ---- its tangent -------------------------------------------------------------------------------------------------
 

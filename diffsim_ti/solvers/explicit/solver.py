@@ -138,7 +138,8 @@ class ExplicitWorkspace(Workspace):
         noted = ROWS * len(a.obstacles), a.num_vertices
         self.contact = SimpleNamespace(
             stage=runtime.array(a.vector, *(noted if features.staged else (1, 1))),
-            work=runtime.array(a.fp, a.num_vertices if features.driven else 1),  # done on each vertex from outside [J]
+            # done on each vertex from outside [J] (outside_work.py)
+            work=runtime.array(a.fp, a.num_vertices * (1 + features.cabled) if features.driven else 1),
         )
         self.attached = Attached.of(self.scene)  # springs, cables and foundations, for what looks between passes
         self.probe = None  # room for a pass that is not taken
@@ -195,8 +196,8 @@ class ExplicitWorkspace(Workspace):
         self.watch.put(seen)
         return runtime.fetch(self.probe.f)[0].astype(np.float64)
 
-    def loads_at(self, j: int, num_passes: int) -> np.ndarray:
-        """External forces [N] on each vertex, as pass j of a run takes them."""
+    def loads_at(self, j: int, num_passes: int, pulls: bool = True) -> np.ndarray:
+        """External forces [N] on each vertex, as pass j of a run takes them; pulls: those of cables too."""
         a, schedule, u = self.arrays, self.solver.schedule, runtime.fetch_row(self.state.u, 0)
         out, kicks = np.zeros_like(u, np.float64), self._kicks(j, num_passes)
         if a.rows["forces"] is not None:
@@ -207,7 +208,7 @@ class ExplicitWorkspace(Workspace):
         if self.scene.fluids:
             v = runtime.fetch_row(self.state.v, 0)
             out += Fluid.of(self.scene).at(a.values.parameters, a.values.rest + u - v, 1.0).forces(a.values.rest + u)
-        if a.features().cabled:
+        if a.features().cabled and pulls:
             both = [[w * part for part in schedule.ties(a.rows["ties"], *k)] for w, k in kicks]
             numbers = (begin + end for begin, end in zip(*both))
             out += self.attached.ties.at(a.values.tie_segments, *numbers).forces(u, cables=True)
@@ -256,7 +257,7 @@ class ExplicitWorkspace(Workspace):
         turn, sizes = -1 if backwards else 1, dict(num_items=a.num_items, num_vertices=a.num_vertices)
         sizes |= dict(contact_damping=solver.contact_damping, num_pressed=a.num_pressed, first_pressed=a.first_pressed)
         sizes |= dict(num_dragged=a.num_dragged, first_dragged=a.first_dragged)
-        sizes |= dict(num_ties=a.num_ties, first_tied=a.first_tied, first_load=a.first_load)
+        sizes |= dict(num_ties=a.num_ties, first_tied=a.first_tied, first_load=a.first_load, first_push=a.first_pressed)
         for window, begin, end in self.table.windows(first, last)[::turn]:
             self.table.show(window, run, lambda first, last: solver.pass_table(first, last, *run[:4]))
             number = -(-(end - begin) // most)
