@@ -57,6 +57,13 @@ def test_walker(tmp_path, capsys):
     assert (tmp_path / "walker.gif").stat().st_size > 100_000
 
 
+def test_swimmer(tmp_path, capsys):
+    """Three iterations bring it more than three times as far as it came by random strokes."""
+    numbers = example("control/swimmer").main(tmp_path, iterations=3)
+    assert numbers["way"] > 3 * numbers["way_before"] > 0.01 and abs(numbers["aside"]) < 0.02
+    assert "swimmer, five seconds" in capsys.readouterr().out and (tmp_path / "swimmer.gif").stat().st_size > 100_000
+
+
 def test_tutorial(tmp_path):
     run = subprocess.run([sys.executable, EXAMPLES / "tutorial.py"], cwd=tmp_path, capture_output=True, text=True)
     assert run.returncode == 0 and not run.stderr, run.stderr

@@ -50,7 +50,8 @@ ROWS = {
         "the worst tetrahedron sets the limit and is named": "step_limit:worst_tetrahedron_is_named",
         "damping decays by its rate whatever the step": "reference_motion:drag_is_a_rate",
         "no step, stiffness, Poisson's ratio or element is wrong without a word": "study_stability:no_explicit_solver_is_wrong_silently "
-        "study_stability:no_solver_is_wrong_silently_where_steps_meet_their_end",
+        "study_stability:no_solver_is_wrong_silently_where_steps_meet_their_end "
+        "study_stability:no_muscle_outgrows_an_explicit_step_in_silence",
     },
     "Implicit steps": {
         "where a body hangs at last does not depend on the step": "implicit:where_a_hanging_body_comes_to_rest_does_not_depend_on_the_step",
