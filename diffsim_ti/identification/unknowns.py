@@ -18,7 +18,8 @@ class Unknown:
         bounded    x = low + (high - low) / (1 + e^-s),  s = t + s(start)        (with `range`)
         linear     x = start + scale t                   (with `scale`, and where start <= 0)
 
-    start: a guess, one number or one per group. range: (low, high). scale: a change that matters, in the input's unit.
+    start: a guess, one number or one per group, or of the input's shape, which then are numbers of their own. range: (low,
+    high). scale: a change that matters, in the input's unit, one or one for each number.
     regions: names of the mesh's sets of tetrahedra, a number for each, what lies in none keeps the scene's value; "each" for
     one per tetrahedron; or whole numbers of the input's shape, equal ones for what changes together, -1 for what is held.
     input: its name; default the unknown's own. "time_offset" [s] is added to the times of measurements.
@@ -32,7 +33,7 @@ class Unknown:
         range: tuple[float, float] | None = None,
         regions: str | Iterable[str] | ArrayLike | None = None,
         input: str | None = None,
-        scale: float | None = None,
+        scale: ArrayLike | None = None,
         experiments: Iterable[int] | None = None,
     ):
         self.start, self.range, self.regions, self.input = numbers("Unknown: start", start), range, regions, input
@@ -58,10 +59,17 @@ class Free:
         self.rows = {k: self._groups(rollouts[k]) for k in self.experiments}
         self.is_offset = self.input == TIME_OFFSET
         self.size = 1 + max(int(rows.max(initial=0)) for rows in self.rows.values())
-        if unknown.start.shape not in ((), (self.size,)):
-            raise ValueError(f"{label}: start has shape {unknown.start.shape}, expected one number or {self.size}")
-        self.start = np.broadcast_to(unknown.start, (self.size,)).astype(float)
+        given = unknown.start.ravel()
+        if given.shape not in ((1,), (self.size,)):
+            shapes = {rollouts[k].values[self.input].shape for k in self.experiments if not self.is_offset}
+            each = self.size if unknown.regions is not None else f"the input's shape, {shapes.pop()}" if shapes else 1
+            raise ValueError(f"{label}: start has shape {unknown.start.shape}, expected one number or {each}")
+        self.start = np.broadcast_to(given, (self.size,)).astype(float)
         scale, is_log = unknown.scale, unknown.scale is None and unknown.range is None and np.all(self.start > 0)
+        if scale is not None:
+            if np.size(scale) not in (1, self.size):
+                raise ValueError(f"{label}: scale has shape {np.shape(scale)}, expected one number or {self.size}")
+            self.scale = np.broadcast_to(np.ravel(np.asarray(scale, float)), (self.size,))
         self.kind = "bounded" if unknown.range is not None else "log" if is_log else "linear"
         if self.kind == "linear" and scale is None:
             raise ValueError(
@@ -77,7 +85,9 @@ class Free:
                 f"{self.label}: no input named {self.input!r}; this rollout has {', '.join(rollout.inputs)}"
             )
         if regions is None:
-            return np.zeros(rollout.values[self.input].shape, int)
+            shape = rollout.values[self.input].shape
+            each = self.unknown.start.ndim > 0 and self.unknown.start.shape == shape
+            return np.arange(self.unknown.start.size).reshape(shape) if each else np.zeros(shape, int)
         if isinstance(regions, str) and regions == "each":
             return np.arange(mesh.num_tetrahedra)
         named = [regions] if isinstance(regions, str) else list(regions) if not isinstance(regions, np.ndarray) else []
@@ -101,7 +111,7 @@ class Free:
         if self.kind == "log":
             return self.start * np.exp(t)
         if self.kind == "linear":
-            return self.start + self.unknown.scale * t
+            return self.start + self.scale * t
         low, high = self.unknown.range
         at = np.log((self.start - low) / (high - self.start))
         return low + (high - low) / (1 + np.exp(-(t + at)))
@@ -112,7 +122,7 @@ class Free:
         if self.kind == "log":
             return x
         if self.kind == "linear":
-            return np.full(self.size, float(self.unknown.scale))
+            return self.scale
         low, high = self.unknown.range
         return (x - low) * (high - x) / (high - low)
 
@@ -122,7 +132,7 @@ class Free:
         if self.kind == "log":
             return np.log(x / self.start)
         if self.kind == "linear":
-            return (x - self.start) / self.unknown.scale
+            return (x - self.start) / self.scale
         low, high = self.unknown.range
         return np.log((x - low) / (high - x)) - np.log((self.start - low) / (high - self.start))
 
