@@ -163,40 +163,53 @@ class ExplicitKernels:
     # ---- tangent -----------------------------------------------------------------------------------------------------
 
     @ti.func
-    def elements_jvp(self, e, scene: A, state: A, tangent: A, table: A, plan: A):
+    def elements_jvp(self, e, j, scene: A, state: A, tangent: A, table: A, plan: A):
         if ti.static(self.further.any):
             if e < plan.num_items:
-                self.tetrahedra_jvp(e, scene, state, tangent, table, plan)
+                self.tetrahedra_jvp(e, j, scene, state, tangent, table, plan)
             else:
-                now, s = pass_at(table, plan.first - plan.window), plan.first - plan.base
+                now, s = pass_at(table, j - plan.window), j - plan.base
                 self.further.forces_jvp(e - plan.num_items, now, scene, state, s, tangent, plan)
         else:
-            self.tetrahedra_jvp(e, scene, state, tangent, table, plan)
+            self.tetrahedra_jvp(e, j, scene, state, tangent, table, plan)
 
     @ti.func
-    def tetrahedra_jvp(self, e, scene: A, state: A, tangent: A, table: A, plan: A):
-        s = plan.first - plan.base
-        of, dots = self.told(scene, plan.first, table, plan), self.told(tangent, plan.first, table, plan)
+    def tetrahedra_jvp(self, e, j, scene: A, state: A, tangent: A, table: A, plan: A):
+        s = j - plan.base
+        of, dots = self.told(scene, j, table, plan), self.told(tangent, j, table, plan)
         self.element.forces_jvp(e, of, state, s, tangent, scene.corner, dots)
         if ti.static(self.element.has_state):
-            now = pass_at(table, plan.first - plan.window)
+            now = pass_at(table, j - plan.window)
             self.element.move_on_jvp(e, of, state, s, tangent, dots, self.onwards(now))
 
     @ti.func
     def passes_jvp(self, scene: A, state: A, tangent: A, table: A, plan: A):
-        ti.loop_config(serialize=not self.parallel)
-        for e in range(self.further.after(plan)):
-            self.elements_jvp(e, scene, state, tangent, table, plan)
-        ti.loop_config(serialize=not self.parallel)
-        for i in range(plan.num_vertices):
-            now = self.pass_of(plan.first, table, plan)
-            self.vertex.step_jvp(i, plan.first, now, scene, state, tangent, plan)
+        if ti.static(self.parallel):
+            num_items, num_vertices = self.further.after(plan), plan.num_vertices
+            for e in range(num_items):
+                turn = self.turn_of_first(e, table)
+                if turn < plan.count:
+                    self.elements_jvp(e, plan.first + turn, scene, state, tangent, table, plan)
+            for i in range(num_vertices):
+                turn = self.turn_of_second(i, table, plan)
+                if turn < plan.count:
+                    j = plan.first + turn
+                    self.vertex.step_jvp(i, j, self.pass_of(j, table, plan), scene, state, tangent, plan)
+        else:
+            ti.loop_config(serialize=True)
+            for j in range(plan.first, plan.first + plan.count):
+                for e in range(self.further.after(plan)):
+                    self.elements_jvp(e, j, scene, state, tangent, table, plan)
+                now = self.pass_of(j, table, plan)
+                for i in range(plan.num_vertices):
+                    self.vertex.step_jvp(i, j, now, scene, state, tangent, plan)
 
     @cached_property
     def step_jvp(self) -> Kernel:
-        """The tangent of pass `first` along recorded slots; the change of the state is advanced in place."""
+        """The tangent of passes first .. first + count - 1 along recorded slots; the change of the state is advanced in
+        place."""
         own = dict(state=self.state(), tangent=self.with_record(CHANGE) | TANGENT | self.further.tangent)
-        return self._kernel("step_jvp", self.passes_jvp, own, False, rate_dot="float")
+        return self._kernel("step_jvp", self.passes_jvp, own, self.repeated, rate_dot="float")
 
     # ---- adjoint -----------------------------------------------------------------------------------------------------
 

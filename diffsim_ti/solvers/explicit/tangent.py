@@ -41,7 +41,8 @@ class ExplicitTangent:
         ws, a, history = self.ws, self.ws.arrays, self.ws.record
         states, own = (history, ws.frames, ws.watch, ws.contact), (self, self.numbers, self.frames)
         launch = ws.bound(ws.kernels(self.features).step_jvp, state=states, tangent=own, table=ws.table)
-        for numbers in ws.launches(first, last, num_passes, save_every, 1):
+        most = ws.most_passes(2 * a.num_tetrahedra)
+        for numbers in ws.launches(first, last, num_passes, save_every, most):
             slot = numbers["first"] - first
             if ws.pairs:
                 ws.pairs.ensure(history.u, slot)
