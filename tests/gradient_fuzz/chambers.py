@@ -27,6 +27,12 @@ def cavity(mesh) -> np.ndarray:
     return mesh.surface_faces[np.isin(mesh.surface_faces[:, :3], INNER).all(1)]
 
 
+def outer_triangles(mesh) -> np.ndarray:
+    """Triangles of the surface, as vertex indices, but for those of the cavity."""
+    outer = ~np.isin(mesh.surface_faces[:, :3], INNER).all(1)
+    return mesh.surface_triangles[np.repeat(outer, len(mesh.surface_triangles) // len(outer))]
+
+
 def chamber(kind: str, rng, mesh, start: np.ndarray, steps: int, duration: float, E: float):
     """One of structures.CHAMBERS: a gas whose pressure is a share of the modulus, or a volume near that of the start."""
     name, how = kind.split(" ", 1)

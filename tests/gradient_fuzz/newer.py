@@ -60,12 +60,12 @@ def grown(kind, seed: int, law, mesh):
     return ds.Grown(law, rng.uniform(-0.01, 0.02, () if rng.random() < 0.5 else mesh.num_tetrahedra))
 
 
-def pose(kind, seed: int, number: int, path, x, duration: float) -> dict:
+def pose(kind, seed: int, number: int, path, x, duration: float, calm: float) -> dict:
     """Arguments of obstacle `number` that follows a path: in two fifths of the structures it turns too, about a point near
     the points x, by rotation vectors or quaternions."""
     if path is None or np.random.default_rng([30, kind.number]).random() > 0.4:
         return dict(path=path)
-    rng, size = np.random.default_rng([31, seed, number]), 0.1
+    rng, size = np.random.default_rng([31, seed, number]), 0.1 * calm
     about = x[rng.integers(len(x))] + 0.1 * np.ptp(x, 0).max() * rng.standard_normal(3)
     vectors, start = rng.random() < 0.5, np.array([1.0, 0, 0, 0]) * rng.uniform(0.5, 2.0)
     a, b = size * rng.standard_normal((2, 3))

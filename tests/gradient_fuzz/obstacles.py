@@ -64,8 +64,11 @@ def push_direction(name: str, rng) -> np.ndarray:
     return v / np.linalg.norm(v)
 
 
-def place(kind: ObstacleKind, rng, x: np.ndarray, n: np.ndarray, width: float, options: dict, p=None) -> Placed:
-    """An obstacle that pushes the points x along n and begins a part of its width below the lowest of them, or below p."""
+def place(
+    kind: ObstacleKind, rng, x: np.ndarray, n: np.ndarray, width: float, options: dict, p=None, calm=1.0
+) -> Placed:
+    """An obstacle that pushes the points x along n and begins a part of its width below the lowest of them, or below p.
+    calm: share of a blade that is there."""
     p, gap = x[np.argmin(x @ n)] if p is None else p, width * rng.uniform(0.3, 0.8)
     foot, turned = p - gap * n, frame(n, rng)
     aside = turned[:, 0] * rng.uniform(-1, 1) + turned[:, 2] * rng.uniform(-1, 1)
@@ -87,7 +90,7 @@ def place(kind: ObstacleKind, rng, x: np.ndarray, n: np.ndarray, width: float, o
         term = ds.Sphere(center=center, radius=around, inside=True, **options)
         distance = lambda y: around - np.linalg.norm(y - center, axis=1)  # noqa: E731
     elif kind.name == "Box":
-        size = CELL * rng.uniform(2.0, 6.0, 3) * ([0.05, 1.0, 1.0] if kind.narrow else 1.0)
+        size = CELL * rng.uniform(2.0, 6.0, 3) * ([0.05, calm, calm] if kind.narrow else 1.0)
         center = foot - size[1] / 2 * n + 0.5 * aside * size[[0, 2]].min() * 0.9
         turn = Rotation.from_matrix(turned)
         term = ds.Box(center=center, size=size, rotation=turn.as_rotvec(), **options)

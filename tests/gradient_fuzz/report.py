@@ -90,7 +90,9 @@ class Report:
         total = max(sum(counts.values()), 1)
         refused = len(self.results) - len(self.judged)
         structures = len({r.structure for r in self.results})
-        lines = [f"{len(self.results)} configurations over {structures} structures, {refused} refused", ""]
+        calmed = sum(r.calm < 1 for r in self.judged)
+        lines = [f"{len(self.results)} configurations over {structures} structures, {refused} refused"]
+        lines += [f"{calmed} of the others made calmer than they were drawn, for so they were refused", ""]
         lines += [f"{verdict:32s} {counts[verdict]:6d} {counts[verdict] / total:7.2%}" for verdict in CLASSES]
         lines += ["", "other ways to the same gradient"]
         for name, counter in sorted(self.checks().items()):

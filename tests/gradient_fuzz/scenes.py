@@ -8,7 +8,7 @@ import diffsim_ti as ds
 from diffsim_ti.inputs.surface_areas import SurfaceAreas
 
 from . import bodies, newer
-from .chambers import chamber, hollow
+from .chambers import chamber, hollow, outer_triangles
 from .loads import load, rollers
 from .obstacles import MESH_WIDTH, Placed, place, push_direction
 from .open_materials import open_material
@@ -29,6 +29,7 @@ class Configuration:
     schedule: ds.UnequalSteps | None  # of steps that are not all dt
     paths: list  # of the obstacles in `placed`, None for those that stand still
     terms: list
+    calm: float  # what moves it and presses is that share of what was drawn
 
     @property
     def scene(self):
@@ -88,8 +89,8 @@ def material(kind: Structure, rng, mesh):
     return kind.law(E=spread(E, 1.0), nu=spread(nu, 0.1) if rng.random() < 0.5 else nu), E
 
 
-def build(seed: int, precision: str | None = None) -> Configuration:
-    """The configuration of a seed, or the same in another precision; raises what the package raises."""
+def build(seed: int, precision: str | None = None, calm: float = 1.0) -> Configuration:
+    """The configuration of a seed, or the same in another precision or calmer; raises what the package raises."""
     kind, rng = structure(seed // PER_STRUCTURE), np.random.default_rng([10, seed])
     kind = replace(kind, precision=precision or kind.precision)
     way = None
@@ -125,17 +126,17 @@ def build(seed: int, precision: str | None = None) -> Configuration:
     mass = np.bincount(mesh.elements.ravel(), np.outer(density * mesh.volumes, mesh.reference.lumped).ravel())
     beat = 2e-3 if kind.static else dt / substeps if kind.explicit else duration / 25
     stiff = mass.min() * (rng.uniform(0.15, 0.4) / beat) ** 2 / 35  # omega dt at a fifth of the width
-    placed, paths, push = _obstacles(kind, seed, rng, mesh, start, fixed, stiff, duration)
+    placed, paths, push = _obstacles(kind, seed, rng, mesh, start, fixed, stiff, duration, calm)
 
     terms = [p.term for p in placed]
     if kind.gravity:
-        terms.append(ds.Gravity(9.81 * (rng.uniform(0.5, 1.5) * -push + 0.3 * rng.standard_normal(3))))
+        terms.append(ds.Gravity(calm * 9.81 * (rng.uniform(0.5, 1.5) * -push + 0.3 * rng.standard_normal(3))))
     if kind.drag:
         terms.append(ds.Drag(rng.uniform(0.2, 5.0)))
     if kind.forces != "none":
         terms.append(_forces(kind, rng, mesh, steps, mass.mean()))
     if kind.self_contact:
-        stiffness, rough = stiff * rng.uniform(0.05, 0.3), newer.rubbing(kind, seed, mesh, duration)
+        stiffness, rough = calm * stiff * rng.uniform(0.05, 0.3), newer.rubbing(kind, seed, mesh, duration)
         terms.append(ds.SelfContact(stiffness=stiffness, width=bodies.SELF_WIDTH, **rough))
     terms = [terms[k] for k in rng.permutation(len(terms))]
     more = np.random.default_rng([21, seed])
@@ -153,11 +154,11 @@ def build(seed: int, precision: str | None = None) -> Configuration:
 
     velocities = None
     if not kind.static and rng.random() < 0.9:
-        speed = 0.05 * CELL / duration * rng.uniform(0.3, 1.5)
+        speed = calm * 0.05 * CELL / duration * rng.uniform(0.3, 1.5)
         velocities = speed * (rng.standard_normal(3) - push + 0.3 * rng.standard_normal(start.shape))
         if way is not None and mesh.num_pieces == 2:
             velocities[mesh.vertex_sets["body_1"]] -= speed * way
-    motion = smooth_path(rng, 0.05 * CELL, duration) if kind.motion else None
+    motion = smooth_path(rng, calm * 0.05 * CELL, duration) if kind.motion else None
     deformed = start if np.any(start != mesh.vertices) else None
     scene = ds.Scene(
         mesh,
@@ -175,7 +176,7 @@ def build(seed: int, precision: str | None = None) -> Configuration:
     )
     options = dict(save_every=int(rng.choice([k for k in range(1, steps + 1) if steps % k == 0])), gradients="all")
     solver = _solver(kind, scene, dt, substeps)
-    return Configuration(seed, kind, solver, steps, options, placed, schedule, paths, terms)
+    return Configuration(seed, kind, solver, steps, options, placed, schedule, paths, terms, calm)
 
 
 def _fixed(kind, rng, mesh):
@@ -204,7 +205,7 @@ def _schedule(kind, rng, mesh, E, density, bent) -> tuple[int, int, float]:
     return steps, substeps, float(5 * substep * substeps)
 
 
-def _obstacles(kind, seed, rng, mesh, start, fixed, stiff, duration) -> tuple[list, list, np.ndarray]:
+def _obstacles(kind, seed, rng, mesh, start, fixed, stiff, duration, calm) -> tuple[list, list, np.ndarray]:
     """(obstacles, their paths, the direction in which the first of them pushes)."""
     free = np.setdiff1d(np.arange(len(start)), [] if fixed is None else fixed)
     placed, paths, push = [], [], None
@@ -215,7 +216,7 @@ def _obstacles(kind, seed, rng, mesh, start, fixed, stiff, duration) -> tuple[li
                 break
         below = None
         if o.narrow:  # a face of free corners, if there is one
-            faces = mesh.surface_triangles
+            faces = outer_triangles(mesh) if kind.chamber else mesh.surface_triangles
             loose = faces[np.isin(faces, free).all(1)] if np.isin(faces, free).all(1).any() else faces
             corners = start[loose[rng.integers(0, len(loose))]]
             across = np.cross(corners[1] - corners[0], corners[2] - corners[0])
@@ -229,9 +230,9 @@ def _obstacles(kind, seed, rng, mesh, start, fixed, stiff, duration) -> tuple[li
         if o.friction:
             typical = 0.05 * CELL / duration
             options |= dict(friction=rng.uniform(0.1, 0.8), friction_speed=typical * 10 ** rng.uniform(-1.0, 0.8))
-        path = smooth_path(rng, 0.05 * CELL, duration) if o.path else None
-        moved = newer.pose(kind, seed, len(placed), path, start, duration)
-        placed.append(place(o, rng, start, n, width, options | moved, below))
+        path = smooth_path(rng, calm * 0.05 * CELL, duration) if o.path else None
+        moved = newer.pose(kind, seed, len(placed), path, start, duration, calm)
+        placed.append(place(o, rng, start, n, width, options | moved, below, calm))
         paths.append(moved["path"])
     return placed, paths, rng.standard_normal(3) if push is None else push
 
