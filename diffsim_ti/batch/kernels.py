@@ -38,7 +38,9 @@ NUMBERS = dict.fromkeys((*SIZES, "window", "first", "count", "base"), "int") | d
 
 @dataclass(frozen=True)
 class KickDriftOfScenes(KickDrift):
-    """As KickDrift, whose tetrahedra are those of eight scenes."""
+    """As KickDrift, whose tetrahedra are those of eight scenes, and whose energy nobody follows."""
+
+    counts_work = False
 
     @cached_property
     def element(self):
@@ -314,7 +316,8 @@ class BatchKernels:
 
     def _kernel(self, name: str, body, arrays: dict, **numbers) -> Kernel:
         arrays = dict(scene=self.scene()) | arrays | dict(table=self.table())
-        return Kernel(f"batch_{name}", body, self.law.precision, arrays, NUMBERS | numbers)
+        few = not self.features.groups
+        return Kernel(f"batch_{name}", body, self.law.precision, arrays, NUMBERS | numbers, polished=few)
 
 
 @lru_cache(maxsize=None)

@@ -7,5 +7,4 @@ from diffsim_ti.runtime.quadrants import QUADRANTS
 
 def current_program():
     """The program that runs, or None; Quadrants' own property raises where there is none."""
-    runtime = impl.get_runtime()
-    return runtime._prog if QUADRANTS else runtime.prog
+    return impl.get_runtime()._prog if QUADRANTS else impl.pytaichi.prog

@@ -45,6 +45,7 @@ class Kernel:
     arrays: {bundle: {array: kind}}, kinds as in `array_types`; each bundle reaches the body as a `Bundle` of its arrays,
     and `numbers`, {name: "int" or "float"}, as one more.
     loops: so many of its first loops are gone through as often as the last number says (repeated_loops.py); 0: once.
+    polished: also by Taichi's own passes (Launch).
     """
 
     def __init__(
@@ -55,8 +56,9 @@ class Kernel:
         arrays: dict[str, dict],
         numbers: dict[str, str],
         loops: int = 0,
+        polished: bool = False,
     ):
-        self.arrays, self.numbers, self.loops = arrays, tuple(numbers), loops
+        self.arrays, self.numbers, self.options = arrays, tuple(numbers), dict(loops=loops, polished=polished)
         types = array_types(precision)
         arguments = [(f"{b}_{a}", types[kind]) for b, own in arrays.items() for a, kind in own.items()]
         arguments += [(n, types[kind]) for n, kind in numbers.items()]
@@ -79,7 +81,7 @@ class Kernel:
         records: for each bundle the object whose attributes its arrays are, or a tuple of objects that share them.
         """
         arrays = [_found(records[bundle], name) for bundle, own in self.arrays.items() for name in own]
-        launch, names = Launch(self.kernel, *arrays, vectorized=vectorized, loops=self.loops), self.numbers
+        launch, names = Launch(self.kernel, *arrays, vectorized=vectorized, **self.options), self.numbers
         return lambda **numbers: launch(*map(numbers.__getitem__, names))
 
 

@@ -20,19 +20,23 @@ class Launch:
 
     A plain call looks at every argument anew: 5 us for each array, 130 us for the kernels of a step; this takes 12 us.
     vectorized: compile vectors as they are, to vector instructions, instead of number by number (CPU only).
+    polished: also by Taichi's own passes, whose time grows with the square of a kernel's length. LLVM repeats most of what
+    they do: without them the same bits, and a third of the compile time for scenes with many terms; but short kernels that
+    run all the time are a tenth faster with them.
     loops: so many of its first loops are gone through as often as the last number says (repeated_loops.py); 0: once.
     """
 
-    def __init__(self, kernel, *arrays, vectorized: bool = False, loops: int = 0):
+    def __init__(self, kernel, *arrays, vectorized: bool = False, polished: bool = False, loops: int = 0):
         for array in arrays:
             check_owner(array)
-        self._kernel, self._arrays, self._vectorized, self._loops = kernel._primal, arrays, vectorized, loops
+        self._kernel, self._arrays, self._loops = kernel._primal, arrays, loops
+        self._options = dict(real_matrix_scalarize=not vectorized, advanced_optimization=polished)
         self._setters, self._buffer, self._repeated, self._owner = None, None, None, program()
 
     def _prepare(self, numbers: tuple) -> None:
         prog = impl.get_runtime().prog
         config, kernel = prog.config(), self._kernel
-        with _settings(config, real_matrix_scalarize=not self._vectorized, advanced_optimization=False):
+        with _settings(config, **self._options):
             materialize()
             compiled = kernel.compiled_kernels[kernel.ensure_compiled(*self._arrays, *numbers)]
             self._code = prog.compile_kernel(config, prog.get_device_caps(), compiled)
@@ -66,7 +70,7 @@ class Launch:
     def _launch(self, numbers: tuple) -> None:
         if QUADRANTS:  # keeps what a kernel was compiled to, and its arguments, by itself
             config = impl.get_runtime().prog.config()
-            with _settings(config, real_matrix_scalarize=not self._vectorized, advanced_optimization=False):
+            with _settings(config, **self._options):
                 self._kernel(*self._arrays, *numbers)
             return
         if self._setters is None:
@@ -84,11 +88,7 @@ class Launch:
 
 @contextlib.contextmanager
 def _settings(config, **values):
-    """Taichi's options while one kernel is compiled.
-
-    advanced_optimization: Taichi's own passes, whose time grows with the square of a kernel's length. LLVM repeats what they
-    do: the same bits and speed without them, in a third of the time for the kernels of a scene with many terms.
-    """
+    """Taichi's options while one kernel is compiled."""
     before = {name: getattr(config, name) for name in values}
     try:
         for name, value in values.items():

@@ -1,5 +1,7 @@
 """States of a run on the device, in slots."""
 
+import math
+
 import numpy as np
 import taichi as ti
 
@@ -18,10 +20,17 @@ class History:
         self.f = runtime.array(arrays.vector, num_slots, n) if record else runtime.array(arrays.vector, 1, 1)
         self.z = arrays.law_states(num_slots) if remembers else None
 
+        self._state = (self.u, self.v) if self.z is None else (self.u, self.v, self.z)
+        self._views = [runtime.view(array) for array in self._state]
+
     def copy(self, slot: int, target: "History", to: int) -> None:
-        """Copy the state in a slot to one of another history."""
-        for name in ("u", "v") if self.z is None else ("u", "v", "z"):
-            copy_slot(getattr(self, name), slot, getattr(target, name), to)
+        """Copy the state in a slot to one of another history; on the CPU without the cost of launches."""
+        runtime.check_alive(self.u.owner)
+        for k, view in enumerate(self._views):
+            if view is None:
+                _copy_slot(self._state[k], slot, target._state[k], to)
+            else:
+                target._views[k][to] = view[slot]
 
 
 @ti.kernel
@@ -55,7 +64,7 @@ def first_bad_vertex(history: History) -> int | None:
     u, v = runtime.view(history.u), runtime.view(history.v)
     if u is not None:
         with np.errstate(all="ignore"):
-            if np.isfinite(u[0].sum() + v[0].sum()):
+            if math.isfinite(np.add.reduce(u[0], None) + np.add.reduce(v[0], None)):
                 return None
             bad = np.nonzero(~np.isfinite(u[0].sum(1) + v[0].sum(1)))[0]
         return int(bad[0]) if bad.size else None

@@ -6,9 +6,10 @@ from functools import cached_property, lru_cache
 import taichi as ti
 
 from diffsim_ti.elements.tetrahedron import Onwards
-from diffsim_ti.runtime import Bundle, Kernel, let, traced
+from diffsim_ti.runtime import Bundle, Kernel, let, runs_on_cpu, traced
 from diffsim_ti.solvers.explicit.further_elements import FurtherElements
 from diffsim_ti.solvers.explicit.kick_drift import KickDrift
+from diffsim_ti.solvers.explicit.outside_work import with_drag
 from diffsim_ti.state.numbers import ADJOINT, OF_STEPS, SCENE, TANGENT, with_state
 from diffsim_ti.state.pass_table import pass_at, reversed_pass
 
@@ -86,6 +87,11 @@ class ExplicitKernels:
         return self.counted(pass_at(table, j - plan.window))
 
     @traced
+    def pass_on(self, j, scene, table, plan):
+        """Pass j on the way forward."""
+        return with_drag(self.vertex, self.pass_of(j, table, plan), scene)
+
+    @traced
     def told(self, of, j, table, plan):
         """The scene, or changes of it, that knows pass j, where tetrahedra grow."""
         return Bundle(**vars(of), now=pass_at(table, j - plan.window)) if self.vertex.features.growing else of
@@ -145,13 +151,13 @@ class ExplicitKernels:
                 turn = self.turn_of_second(i, table, plan)
                 if turn < plan.count:
                     j = plan.first + turn
-                    self.vertex.step(i, j, self.pass_of(j, table, plan), scene, state, plan)
+                    self.vertex.step(i, j, self.pass_on(j, scene, table, plan), scene, state, plan)
         else:
             ti.loop_config(serialize=True)
             for j in range(plan.first, plan.first + plan.count):
                 for e in range(self.further.after(plan)):
                     self.elements(e, j, scene, state, table, plan)
-                now = self.pass_of(j, table, plan)
+                now = self.pass_on(j, scene, table, plan)
                 for i in range(plan.num_vertices):
                     self.vertex.step(i, j, now, scene, state, plan)
 
@@ -307,7 +313,8 @@ class ExplicitKernels:
         numbers = NUMBERS | self.further.counts | numbers
         if repeated:
             arrays["table"], numbers = PLAN | TURNS, numbers | dict(times="int")
-        return Kernel(name, body, self.vertex.law.precision, arrays, numbers, loops=2 * repeated)
+        few = runs_on_cpu() and not self.vertex.features.groups and not self.further.any
+        return Kernel(name, body, self.vertex.law.precision, arrays, numbers, loops=2 * repeated, polished=few)
 
 
 @lru_cache(maxsize=None)

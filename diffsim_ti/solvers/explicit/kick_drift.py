@@ -58,6 +58,11 @@ class KickDrift:
         """Whether forces at corners are of velocities too."""
         return self.element.reads_rates or self.features.dragged
 
+    @property
+    def counts_work(self) -> bool:
+        """Whether work from outside is counted, for who follows the energy."""
+        return self.features.driven
+
     @cached_property
     def obstacles(self) -> ObstacleStages:
         return ObstacleStages(self.features, self.law.precision)
@@ -133,6 +138,7 @@ class KickDrift:
             f += self.foundations.force(i, u, scene, scene.foundation)
         # kick, frame, kick
         v_mid, v_plus = self.kicked(i, v, f, now, scene)
+        v_kicked = v_plus
         if now.frame >= 0:
             state.frames_u[now.frame, i] = u
             state.frames_v[now.frame, i] = v_mid
@@ -160,8 +166,8 @@ class KickDrift:
         if ti.static(len(self.features.groups) > 0):
             if scene.surface[i] > 0:
                 self.obstacles.note(i, u, u_next, now, scene, state)
-        if ti.static(self.features.driven):
-            add_work_of_pass(self, i, u, v, f, u_next, v_next, now, scene, state, plan)
+        if ti.static(self.counts_work):
+            add_work_of_pass(self, i, u, v, v_kicked, f, u_next, v_next, now, scene, state, plan)
         if plan.stride > 0:
             state.f[s, i] = f
         state.u[t, i] = u_next

@@ -6,6 +6,7 @@ that of forces which are the body's own.
 
 import taichi as ti
 
+from diffsim_ti.runtime import Bundle, at, let, traced
 from diffsim_ti.solvers.explicit.obstacle_stages import PLANE, PUSH, ROWS, WALL
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
@@ -20,24 +21,32 @@ def add_work(step: A, i, done, state: A, plan: A):
         state.work[own] = state.work[own] + done
 
 
+@traced
+def with_drag(step, now, scene):
+    """A pass with `kept`, what drag leaves of a velocity of 1 in its time, where work is counted: once for all vertices."""
+    if not step.counts_work or step.features.drag < 0:
+        return now
+    return Bundle(**vars(now), kept=let(ti.exp(-now.h * at(scene.parameters, step.features.drag))))
+
+
 @ti.func
-def add_work_of_pass(step: A, i, u, v, f, u_next, v_next, now: A, scene: A, state: A, plan: A):
+def add_work_of_pass(step: A, i, u, v, v_plus, f, u_next, v_next, now: A, scene: A, state: A, plan: A):
     """That of all but contact stages, to each account what is its own."""
-    state.work[i] = state.work[i] + work_of_pass(step, i, u, v, f, u_next, v_next, now, scene, plan, True)
+    state.work[i] = state.work[i] + work_of_pass(step, i, u, v, v_plus, f, u_next, v_next, now, scene, plan, True)
     if ti.static(step.features.cabled):
         own = plan.num_vertices + i
-        state.work[own] = state.work[own] + work_of_pass(step, i, u, v, f, u_next, v_next, now, scene, plan, False)
+        done = work_of_pass(step, i, u, v, v_plus, f, u_next, v_next, now, scene, plan, False)
+        state.work[own] = state.work[own] + done
 
 
 @ti.func
-def work_of_pass(step: A, i, u, v, f, u_next, v_next, now: A, scene: A, plan: A, pulls: A):
-    """Work [J] done on vertex i in the pass, less what drag takes, but for a contact stage's. pulls: whether cables are
-    loads, or forces of the body's own."""
+def work_of_pass(step: A, i, u, v, v_plus, f, u_next, v_next, now: A, scene: A, plan: A, pulls: A):
+    """Work [J] done on vertex i in the pass, less what drag takes, but for a contact stage's. v_plus: its velocity after the
+    kick alone. pulls: whether cables are loads, or forces of the body's own."""
     done, inverse, load = ti.cast(0, step.fp), scene.inverse_mass[i], step.vector(0)
     half, pre, post = step.half(), now.pre, now.post
     if post >= now.h:  # a whole kick is two halves
         pre, post = half * now.h, half * now.h
-    _, v_plus = step.kicked(i, v, f, now, scene)
     if ti.static(step.features.forces):
         load = step.given.force(i, now, scene, scene.forces)
     if ti.static(step.features.loaded_corners):
@@ -57,11 +66,11 @@ def work_of_pass(step: A, i, u, v, f, u_next, v_next, now: A, scene: A, plan: A,
         if ti.static(step.features.forces or step.features.loaded_corners):
             done += half * load.dot((pre + post) * (v + v_plus) + (pre * pre - post * post) * inverse * own)
         if ti.static(step.features.drag >= 0):
-            kept = ti.exp(-now.h * scene.parameters[ti.static(step.features.drag)])
-            done += half * (1 - kept) * own.dot(now.post * v_plus - now.pre / kept * v)
+            lost = 1 - now.kept
+            done += half * lost * own.dot(now.post * v_plus - now.pre / now.kept * v)
             if now.alpha > 0:
                 drift = (u_next - u) / now.alpha
-                done += -(1 - kept) * drift.dot(v_next + half * (1 - kept) * drift) / inverse
+                done += -lost * drift.dot(v_next + half * lost * drift) / inverse
     elif ti.static(step.features.motion):
         done += -own.dot(pre * v + post * v_next)
     if ti.static(step.features.moving > 0 and len(step.features.pressing) > 0):
