@@ -139,11 +139,12 @@ class Adjoint:
         runtime.clear(getattr(self, name) for name in self._names)
 
     def collect(self) -> Derived:
-        """All of them in float64 on the host, those of the state being zero."""
+        """All of them in float64 on the host, those of the state being zero; without the shape, None for what it makes."""
         a, features, rows = self._arrays, self._features, self._features.sums()
-        read = self._names if features.shape else tuple(x for x in self._names if x not in ("gradients", "volumes"))
-        read = [name for name in read if name in PARTS and getattr(a.values, name, None) is not None]
-        out, sums = a.values.zeros(but=read), runtime.fetch(self.sums).astype(np.float64)
+        unknown = () if features.shape else ("gradients", "volumes")
+        read = [name for name in self._names if name in PARTS and getattr(a.values, name, None) is not None]
+        read = [name for name in read if name not in unknown]
+        out, sums = a.values.zeros(but=(*read, *unknown)), runtime.look(self.sums).astype(np.float64)
         out.parameters[: features.num_parameters] = sums[rows.of("parameters")].sum(1)
         if features.density:
             out.mass = sums[rows.first("mass")]

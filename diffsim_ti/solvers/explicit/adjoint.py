@@ -58,6 +58,7 @@ class ExplicitAdjoint:
         # of springs, cables and foundations
         self.tie_felt, self.tie_rest = (runtime.array(a.vector, *x.shape) for x in (a.ties, a.tie_segments))
         self.foundation_felt = runtime.array(a.vector, *a.foundation.shape)
+        self._sums = self._summed()
         self.faces = FeltAdjoint(self, workspace.faces) if workspace.faces else None
         self.held = HeldAdjoint(self, workspace.volumes) if workspace.volumes else None
         self.chamber_record = self.held.chambers if self.held else None
@@ -92,19 +93,24 @@ class ExplicitAdjoint:
         if forces_adj is not None:
             self.impulses.put(forces_adj / frame_time)
 
+    def _summed(self) -> list:
+        """What passes add to, besides the numbers of the scene."""
+        has, out = self.features, [self.u, self.v, self.w]
+        out += [self.z] if self.z is not None else []
+        out += [self.felt, self.path] if has.moving else []
+        out += [self.pressed_felt, self.pressed_rest] if has.pressed else []
+        out += [self.chamber_felt, self.chamber_rest] if self.ws.chambers else []
+        out += [self.dragged_felt, self.dragged_rest] if has.dragged else []
+        out += [self.tie_felt, self.tie_rest] if has.tied else []
+        return out + ([self.foundation_felt] if has.founded else [])
+
     def clear(self) -> None:
         """All adjoints zero, but those of the frames."""
         if self.ws.impulses:
             self.impulses.clear()
             self.mass_adj[:] = 0
         self.numbers.clear()
-        has, pressed = self.features, (self.pressed_felt, self.pressed_rest)
-        pressed += (self.chamber_felt, self.chamber_rest) if self.ws.chambers else ()
-        pressed += (self.dragged_felt, self.dragged_rest) if has.dragged else ()
-        pressed += (self.tie_felt, self.tie_rest) if has.tied else ()
-        pressed += (self.foundation_felt,) if has.founded else ()
-        targets = self.felt, self.path, self.u, self.v, self.w, self.z, *pressed
-        runtime.clear(target for target in targets if target is not None)
+        runtime.clear(self._sums)
         if self.ws.pairs:
             self.ws.pairs.clear_sums()
         for further in (self.faces, self.held):

@@ -234,13 +234,25 @@ class ExplicitWorkspace(Workspace):
 
     def kernels(self, features) -> ExplicitKernels:
         """The kernels for some features of the scene."""
-        return explicit_kernels(self.arrays.law, features, self.parallel, self.arrays.in_lanes, self.repeated)
+        options = self.parallel, self.arrays.in_lanes, self.repeated
+        name = "kernels", features.density, features.shape  # the rest is the scene's
+        return self.kept(name, lambda: explicit_kernels(self.arrays.law, features, *options))
 
     def most_passes(self, work: int) -> int:
         """How many passes a launch may take; work: of a pass, in those of tetrahedra."""
         if self.parallel or self.pairs or self.faces or self.chambers or self.volumes:
             return self.in_parallel
         return max(1, self.work_per_launch // work)
+
+    def _sizes(self) -> dict:
+        """Numbers that all launches take."""
+        a = self.arrays
+        out = dict(num_items=a.num_items, num_vertices=a.num_vertices)
+        out |= dict(num_pressed=a.num_pressed, first_pressed=a.first_pressed)
+        out |= dict(num_dragged=a.num_dragged, first_dragged=a.first_dragged)
+        return out | dict(
+            num_ties=a.num_ties, first_tied=a.first_tied, first_load=a.first_load, first_push=a.first_pressed
+        )
 
     def launches(self, first: int, last: int, num_passes: int, save_every: int, most: int, backwards=False) -> Iterator:
         """Numbers of the launches that passes first .. last - 1 take, for each of which their table is shown.
@@ -254,10 +266,8 @@ class ExplicitWorkspace(Workspace):
             given = a.values.forces, a.values.follower, a.values.ties, a.values.growths
             num_rows = max(1 + len(x) for x in given if x is not None)
         run = num_passes, num_rows, save_every, self.rate, schedule
-        turn, sizes = -1 if backwards else 1, dict(num_items=a.num_items, num_vertices=a.num_vertices)
-        sizes |= dict(contact_damping=solver.contact_damping, num_pressed=a.num_pressed, first_pressed=a.first_pressed)
-        sizes |= dict(num_dragged=a.num_dragged, first_dragged=a.first_dragged)
-        sizes |= dict(num_ties=a.num_ties, first_tied=a.first_tied, first_load=a.first_load, first_push=a.first_pressed)
+        turn, sizes = -1 if backwards else 1, self.kept("sizes", self._sizes)
+        sizes = sizes | dict(contact_damping=solver.contact_damping)
         for window, begin, end in self.table.windows(first, last)[::turn]:
             self.table.show(window, run, lambda first, last: solver.pass_table(first, last, *run[:4]))
             number = -(-(end - begin) // most)
