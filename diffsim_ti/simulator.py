@@ -102,7 +102,7 @@ class Simulator:
                 self.workspace.forget_contacts()
             raise
         self.step_count += 1
-        self.workspace.place_obstacles(self.solver.substeps)
+        self.workspace.place_obstacles(int(self.solver.schedule.first(1)))
 
     def run(self, steps: int) -> None:
         """Advance by so many steps."""

@@ -154,7 +154,7 @@ class Guard:
             return
         self.ws.place_obstacles(now)
         if self._stiffness is None:
-            self._stiffness = stability.Stiffness(self.ws)
+            self._stiffness = stability.stiffness_of(self.ws)
         omega2 = self._stiffness.lower_bound()
         apart = self._flies_apart()
         if np.isfinite(omega2) and omega2 * self.ws.substep**2 <= 4 and not apart:

@@ -13,10 +13,13 @@ from diffsim_ti.monitor.stiffest import stiffest
 from diffsim_ti.potential.attached import Attached
 from diffsim_ti.potential.kernels import potential_kernels
 from diffsim_ti.state.schedule import EqualSteps
+from diffsim_ti.state.viscous_stages import ViscousStages
 from diffsim_ti.state.workspace import Workspace
 
 if TYPE_CHECKING:
     from diffsim_ti.scene import Scene
+
+ONE = ViscousStages()
 
 
 class StepLimit(float):
@@ -42,14 +45,14 @@ class StepLimit(float):
         return f"{self.dt:.4g} s ({self.method}, set by tetrahedron {self.tetrahedron})"
 
 
-def element_limit(scene: "Scene", values: dict | None = None) -> StepLimit:
+def element_limit(scene: "Scene", values: dict | None = None, kicks: ViscousStages = ONE) -> StepLimit:
     """A step that is safe at rest, from each tetrahedron by itself, without contact.
 
         omega^2 <= (4 / rho) [max(lam, 0) sum_a |grad N_a|^2 + 2 mu lambda_max(sum_a grad N_a (x) grad N_a)]
         dt = 2 / omega, or with viscosity (sqrt(c^2 + 4 omega^2) - c) / omega^2,
 
     c [1/s] being the same bound with eta, lam_v in the place of mu, lam: with x the eigenvector of a step, of unit mass,
-    its eigenvalues are those of an oscillator of stiffness x . K x and damping x . C x.
+    its eigenvalues are those of an oscillator of stiffness x . K x and damping x . C x; for kicks in stages see there.
     mu, lam are the law's small-strain moduli; with volume="patches" lam is the patch's mean. The eigenvalues of the
     assembled system never exceed the largest of its elements (Hughes, The Finite Element Method, 9.1); lumped vertex masses
     are at least those of the element. With mass scaling another bound counts where it is lower (mass_scaling.py). Gases and
@@ -69,7 +72,7 @@ def element_limit(scene: "Scene", values: dict | None = None) -> StepLimit:
         return (np.maximum(lam, 0) * dilatation + 2 * mu * largest) / values["density"]
 
     def largest_of(omega2, c):
-        each = with_damping(omega2, c)
+        each = kicks.squared_rate(omega2, c)
         return omega2[worst := int(np.argmax(each))], c[worst] if np.ndim(c) else c, worst
 
     omega2, c, worst = largest_of(bound_of(mu, lam), 0.0 if viscous is None else bound_of(*viscous))
@@ -83,16 +86,10 @@ def element_limit(scene: "Scene", values: dict | None = None) -> StepLimit:
         rows = row_sums(scene, mu, lam, scene.volume == "patches") / mass
         damped = 0.0 if viscous is None else row_sums(scene, *viscous, False) / mass
         *of_rows, vertex = largest_of(rows, damped)
-        if with_damping(*of_rows) < with_damping(omega2, c):
+        if kicks.squared_rate(*of_rows) < kicks.squared_rate(omega2, c):
             omega2, c = of_rows
         worst = int(np.argmax((scene.mesh.tetrahedra == vertex).any(1)))
-    return StepLimit(float(2 / np.sqrt(with_damping(omega2 + more, c))), worst, "element bound")
-
-
-def with_damping(omega2, c):
-    """(2 / h)^2 for the longest step h of an oscillator u'' + c u' + omega^2 u = 0 whose damping is taken from the velocity
-    before the kick: h = (2 / omega) (sqrt(1 + xi^2) - xi), xi = c / (2 omega)."""
-    return (0.5 * (c + np.sqrt(c * c + 4 * omega2))) ** 2
+    return StepLimit(float(2 / np.sqrt(kicks.squared_rate(omega2 + more, c))), worst, "element bound")
 
 
 def _squares_of_strains(mesh, derived) -> tuple[np.ndarray, np.ndarray]:
@@ -192,7 +189,7 @@ class Stiffness:
         for rate in (0.0, s):
             self.set_rate(rate)
             parts.append(float((x * self.product(x)).sum()))
-        s2 = float(with_damping(parts[0], (parts[1] - parts[0]) / s))
+        s2 = float(ONE.squared_rate(parts[0], (parts[1] - parts[0]) / s))
         self.set_rate(np.sqrt(s2))
         return s2
 
@@ -252,12 +249,59 @@ class Stiffness:
         return int(np.argmax((strain**2).sum((1, 2)) * points.volumes)) // a.points
 
 
+class Damping(Stiffness):
+    """Products of M^-1/2 (-df/dv) M^-1/2 [1/s]."""
+
+    def __init__(self, workspace: Workspace):
+        super().__init__(workspace)
+        self.viscous = False  # this is a stiffness like others
+        self._rate = 2 / workspace.substep
+
+    def product(self, x: np.ndarray) -> np.ndarray:
+        self.set_rate(0.0)
+        elastic = super().product(x)
+        self.set_rate(self._rate)
+        return (super().product(x) - elastic) / self._rate
+
+
+class StagedStiffness:
+    """A stiffness and a damping by themselves, for kicks in stages (state/viscous_stages.py); calls as of `Stiffness`."""
+
+    def __init__(self, workspace: Workspace):
+        self.kicks = workspace.solver.kicks
+        self.elastic, self.damping = Stiffness(workspace), Damping(workspace)
+        self.elastic.viscous, self._worst = False, self.elastic
+
+    def _squared_rate(self, omega2: float, c: float) -> float:
+        parts = [float(self.kicks.squared_rate(*x)) for x in ((omega2, 0.0), (0.0, c))]
+        self._worst = self.damping if parts[1] > parts[0] else self.elastic
+        return max(parts)
+
+    def largest(self, tolerance: float = 1e-3) -> tuple[float, float]:
+        """((2 / h)^2 of the longest stable substep h, what it may be off)."""
+        (omega2, of_omega2), (c, of_c) = (part.largest(tolerance) for part in (self.elastic, self.damping))
+        value = self._squared_rate(omega2, c)
+        return value, self._squared_rate(omega2 + of_omega2, c + of_c) - value
+
+    def lower_bound(self) -> float:
+        """A lower bound of it at the present state."""
+        return self._squared_rate(self.elastic.lower_bound(), self.damping.lower_bound())
+
+    def worst_tetrahedron(self) -> int:
+        return self._worst.worst_tetrahedron()
+
+
+def stiffness_of(workspace: Workspace) -> Stiffness | StagedStiffness:
+    """What tells how long a substep of the workspace's solver may be."""
+    return Stiffness(workspace) if workspace.solver.kicks == ONE else StagedStiffness(workspace)
+
+
 def lanczos_limit(workspace: Workspace, tolerance: float = 1e-3) -> StepLimit:
     """The tight stable step 2 / omega_max at the workspace's present state, contact included.
 
     A residual bound is added to omega^2, so the step errs on the safe side.
     """
-    stiffness = Stiffness(workspace)
+    stiffness = stiffness_of(workspace)
     value, residual = stiffness.largest(tolerance)
     if value <= 0:
         return StepLimit(np.inf, 0, "Lanczos")

@@ -141,7 +141,7 @@ class Rollout:
     @property
     def schedule(self) -> UnequalSteps | None:
         """The steps, where they are not equal."""
-        return self.solver.schedule if self.solver.schedule.varies else None
+        return self.solver.unequal_steps
 
     @property
     def times(self) -> np.ndarray:

@@ -2,10 +2,16 @@
 
 from typing import overload
 
+import numpy as np
+
+from diffsim_ti.checked import whole
 from diffsim_ti.materials.material import Material
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.scene import Scene
 from diffsim_ti.solvers.explicit.solver import ExplicitSolver, Weights
+from diffsim_ti.state.schedule import Schedule
+from diffsim_ti.state.staged_steps import StagedSteps
+from diffsim_ti.state.viscous_stages import MOST, ViscousStages
 from diffsim_ti.terms import Gravity
 
 
@@ -15,15 +21,22 @@ class SemiImplicitSolver(ExplicitSolver):
     First order, one force evaluation per substep, keeps linear and angular momentum to round-off; stable for
     h <= 2 / omega_max. Hairer, Lubich, Wanner, Geometric Numerical Integration, I.1.2, doi:10.1007/3-540-30666-8.
 
+    viscous_stages: kicks of each substep, 1 to 32, which cost a force evaluation each. Viscosity then limits the substep by
+    the square of their number: strongly damped bodies (KelvinVoigt, damping ratio xi of the fastest motion) take steps that
+    cost, with the best number, 1 / 2.1 as much at xi = 5, 1 / 4 at 20, 1 / 9 at 100, and no less at 1 (ViscousStages).
+
     `SemiImplicitSolver(scene, dt=...)` takes dt as it is and refuses an unstable one, as every explicit solver does.
 
     `SemiImplicitSolver(mesh, material, dt=...)`, or `SemiImplicitSolver(dt=...)` for `Simulator(mesh, material, solver)`,
     makes the scene itself, with density [kg/m^3] and gravity [m/s^2, along y] and nothing else, and takes `substeps` as the
     least number: it raises it to what stability asks for and says so.
+    Raises ValueError for `viscous_stages` beyond 32, or without viscosity, or with a FilledChamber.
     """
 
     order = 1
     last_frame_is_state = True
+    viscous_stages = 1
+    arguments = (*ExplicitSolver.arguments, "viscous_stages")
 
     @overload
     def __init__(
@@ -34,6 +47,7 @@ class SemiImplicitSolver(ExplicitSolver):
         parallel: bool | None = None,
         allow_unstable: bool = False,
         check_start: bool = True,
+        viscous_stages: int = 1,
     ): ...
 
     @overload
@@ -49,8 +63,12 @@ class SemiImplicitSolver(ExplicitSolver):
         allow_unstable: bool = False,
     ): ...
 
-    def __init__(self, *arguments, **options):
+    def __init__(self, *arguments, viscous_stages: int = 1, **options):
         self.simulator = lambda: None
+        self.viscous_stages = whole("viscous_stages", viscous_stages, 1)
+        if self.viscous_stages > MOST:
+            raise ValueError(f"viscous_stages must be at most {MOST}, got {viscous_stages}; take more substeps")
+        self.kicks = ViscousStages(self.viscous_stages)
         if isinstance(arguments[0] if arguments else options.get("scene"), Scene):
             super().__init__(*arguments, **options)
             return
@@ -89,9 +107,29 @@ class SemiImplicitSolver(ExplicitSolver):
             raise RuntimeError("no simulator runs this solver yet: make Simulator(solver) first")
         return torch.from_numpy(simulator.positions)
 
+    def check_scene(self, scene):
+        super().check_scene(scene)
+        if self.viscous_stages > 1 and not scene.law.viscous:
+            raise ValueError(
+                f"viscous_stages={self.viscous_stages}: {scene.material.name} has no viscosity, so that further kicks of a "
+                "substep do nothing; put KelvinVoigt around it, or leave viscous_stages out"
+            )
+        if self.viscous_stages > 1 and scene.holds_volumes:
+            raise ValueError(
+                "viscous_stages: a FilledChamber knows one kick for each substep; take substeps, or an implicit solver"
+            )
+
+    def passes_of(self, steps: Schedule) -> Schedule:
+        return StagedSteps(steps, self.viscous_stages) if self.viscous_stages > 1 else steps
+
     def lags(self, j, num_passes):
         return True
 
     def weights(self, j, num_passes, rate):
         h, decay = self.lengths(j, rate)
-        return Weights(0, 0, 0.5, 0.5, 0.0, h, h * decay, decay, -h * h * decay, -h * decay)
+        if self.viscous_stages == 1:
+            return Weights(0, 0, 0.5, 0.5, 0.0, h, h * decay, decay, -h * h * decay, -h * decay)
+        k = np.asarray(j) % self.viscous_stages
+        drifts = lambda x, none=0.0: np.where(k == self.viscous_stages - 1, x, none)  # noqa: E731
+        of_drift = drifts(h * decay), drifts(decay, 1.0), drifts(-h * h * decay), drifts(-h * decay)
+        return Weights(0, 0, 0.5, 0.5, 0.0, h * self.kicks.kicks[k], *of_drift)

@@ -35,6 +35,7 @@ class Solver(ABC):
     serial_limit = 3_000
     serial_limit_in_lanes = 10_000
     arguments = ("dt", "substeps", "parallel", "allow_unstable", "check_start")  # of the constructor, besides the scene
+    kicks = stability.ONE  # of a substep
     stages_contact = False  # whether obstacles act as a stage of its passes, not as a force
 
     def __init__(
@@ -82,14 +83,26 @@ class Solver(ABC):
     @property
     def schedule(self) -> Schedule:
         """Where each pass lies in time."""
-        if self._schedule is None and self._equal != (self.dt, self.substeps):
-            self._equal, self._equal_steps = (self.dt, self.substeps), EqualSteps(self.dt, self.substeps)
-        return self._equal_steps if self._schedule is None else self._schedule
+        if self._schedule is not None:
+            return self._unequal
+        if self._equal != (self.dt, self.substeps):
+            self._equal = self.dt, self.substeps
+            self._equal_steps = self.passes_of(EqualSteps(self.dt, self.substeps))
+        return self._equal_steps
+
+    @property
+    def unequal_steps(self) -> UnequalSteps | None:
+        """The steps, where they are not equal."""
+        return self._schedule
+
+    def passes_of(self, steps: Schedule) -> Schedule:
+        """The passes of this solver on these steps: one for each substep, or more."""
+        return steps
 
     def on(self, schedule: UnequalSteps) -> "Solver":
         """The same solver on other steps. Raises ValueError for steps that it cannot take."""
         out = self.for_scene(self.scene)
-        out._schedule = schedule
+        out._schedule, out._unequal = schedule, out.passes_of(schedule)
         out.check_schedule(schedule)
         return out
 
@@ -129,7 +142,7 @@ class Solver(ABC):
         """Largest stable substep at the start: the safe element bound or, `tight`, the Lanczos value. Pressures of gases,
         tensions and lengths of cables are the stiffest of all keyframes and steps; functions of time are known at 0."""
         if not tight:
-            return stability.element_limit(self.scene)
+            return stability.element_limit(self.scene, kicks=self.kicks)
         if self._tight is None:
             self._tight = self._tight_limit(self.scene.inputs.at_times([0.0, self.dt]))
         return self._tight
@@ -158,7 +171,7 @@ class Solver(ABC):
         """Raise ValueError where the substep is beyond what gases and cables over time ask for, which a run samples."""
         if not self.explicit or not self.check_start or self.allow_unstable or not sampled_by_runs(self.scene):
             return
-        if self.substep > stability.element_limit(self.scene, values).dt:
+        if self.substep > stability.element_limit(self.scene, values, self.kicks).dt:
             self._refuse_beyond(self._tight_limit(values))
 
     def _refuse_beyond(self, tight: stability.StepLimit) -> None:
