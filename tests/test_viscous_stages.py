@@ -129,6 +129,7 @@ def test_unequal_steps_and_checkpoints():
 def test_steps_and_batches_are_those_of_a_rollout():
     body = case("time")
     solver = ds.SemiImplicitSolver(body, dt=4e-3, substeps=2, viscous_stages=STAGES)
+    assert solver.describe().endswith("3 kicks in each substep")
     want = ds.Rollout(solver, 3).forward()
     simulator = ds.Simulator(solver)
     simulator.run(3)

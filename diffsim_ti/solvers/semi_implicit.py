@@ -119,6 +119,10 @@ class SemiImplicitSolver(ExplicitSolver):
                 "viscous_stages: a FilledChamber knows one kick for each substep; take substeps, or an implicit solver"
             )
 
+    def describe(self):
+        kicks = f"; {self.viscous_stages} kicks in each substep" if self.viscous_stages > 1 else ""
+        return super().describe() + kicks
+
     def passes_of(self, steps: Schedule) -> Schedule:
         return StagedSteps(steps, self.viscous_stages) if self.viscous_stages > 1 else steps
 
