@@ -18,6 +18,7 @@ class Together:
     all three together, (3 k, m)."""
 
     name: str
+    kind: str
     vertices: np.ndarray
     basis: np.ndarray
 
@@ -96,7 +97,7 @@ class Reduced:
             known = sorted({*mesh.tetrahedron_sets, *mesh.vertex_sets})
             raise ValueError(f"reduced: the mesh has no set {name!r} of tetrahedra or vertices; it has {known}")
         if not isinstance(kind, str):
-            return Together(name, vertices, _orthonormal(mesh, name, vertices, kind))
+            return Together(name, "basis", vertices, _orthonormal(mesh, name, vertices, kind))
         X = mesh.vertices[vertices]
         X = (X - X.mean(0)) / max(float(np.ptp(X, axis=0).max(initial=0.0)), 1e-300)
         if len(X) < 4 or np.linalg.svd(X, compute_uv=False)[-1] < 1e-6 * np.sqrt(len(X)):
@@ -104,7 +105,7 @@ class Reduced:
                 f"reduced: the {len(X)} vertices of {name!r} lie in a plane, which leaves an affine motion open; name "
                 "a set with tetrahedra"
             )
-        return Together(name, vertices, np.linalg.qr(np.concatenate([np.ones((len(X), 1)), X], 1))[0])
+        return Together(name, kind, vertices, np.linalg.qr(np.concatenate([np.ones((len(X), 1)), X], 1))[0])
 
     def __bool__(self) -> bool:
         return bool(self.bodies)
