@@ -73,7 +73,8 @@ class Scene(TermsOfScene, MadeAgain):
         whatever values a run takes; gradients by density and rest shape are those of such masses. `describe()` says how
         much was added. Implicit steps and statics add none.
     reduced: {name of a tetrahedron or vertex set: "affine"}: its vertices move by twelve numbers, x = X + A X + t, for which
-        implicit steps and statics solve; explicit ones refuse. Of a start only the affine part counts (reduced.py).
+        implicit steps and statics solve; explicit ones refuse. Of a start only the affine part counts. Or a basis instead:
+        the weights of a `designs.Cage`, the shapes of `modes`, see reduced.py.
 
     Raises ValueError with rule, value and remedy for anything that does not fit, before any kernel runs. Warns where
     tetrahedra lock, above Poisson's ratio 0.45.
@@ -100,7 +101,7 @@ class Scene(TermsOfScene, MadeAgain):
         precision: str | None = None,
         volume: str = "tetrahedra",
         mass_scaling: float | None = None,
-        reduced: Mapping[str, str] | None = None,
+        reduced: Mapping[str, str | ArrayLike] | None = None,
     ):
         self.arguments = {name: value for name, value in locals().items() if name != "self"}
         self.mesh = instance("Scene", "mesh", mesh, TetrahedralMesh, "a TetrahedralMesh")

@@ -36,6 +36,7 @@ EXAMPLES = {
     "design/finger_shape": ("output", "finger_shape.png"),
     "control/gripper": ("output", "gripper.gif"),
     "control/soft_hand": ("output", "soft_hand.gif"),
+    "control/arm": ("output", "arm.png"),
     "control/swimmer": ("", "swimmer.gif"),
     "control/pneumatic_finger": ("output", "pneumatic_finger.png"),
     "control/train_controller": ("", "train_controller.gif"),

@@ -102,3 +102,16 @@ def test_soft_hand_holds_for_two_seconds(capsys, tmp_path):
     assert numbers["before"] < 0.01 and numbers["after"] > 0.07 and numbers["creep"] < 4e-3
     assert numbers["evaluations"] <= 15 and min(numbers["presses"]) > 1.0
     assert (tmp_path / "soft_hand.gif").stat().st_size > 10_000 and "lifted by" in capsys.readouterr().out
+
+
+@pytest.mark.thorough
+def test_rough_blocks(tmp_path, capsys):
+    """Slabs hold or go as far as Coulomb's law says; a rough tower leans and stands where a smooth one slides apart."""
+    numbers = example("contact/rough_blocks").main(tmp_path, duration=0.5)
+    for friction, off in ((0.49, 0.1), (0.3, 0.01)):
+        way, law, _ = numbers["slides"][friction]
+        assert way == pytest.approx(law, rel=off)
+    assert 0 < numbers["slides"][0.51][0] < 1e-3 * 0.5
+    # after 1 s and .3 s: a lean that is elastic; what slides freely would have gone .27 m and 26 mm
+    assert 0.005 < numbers["rough"] < 0.02 < numbers["smooth"]
+    assert (tmp_path / "rough_blocks.png").stat().st_size > 10_000 and "tower" in capsys.readouterr().out

@@ -1,15 +1,22 @@
 """Paths that are poses: obstacles that turn, and held vertices that do."""
 
+import imageio.v2 as imageio
 import numpy as np
 import pytest
 from contact_scenes import G, points, resting_gap, tetrahedron, with_options
+from matplotlib.image import imread
 
 import diffsim_ti as ds
 from diffsim_ti import rotations
+from diffsim_ti.adaptive_run import ForwardRun, run_and_write
+from diffsim_ti.film import render_series
 from diffsim_ti.inputs.poses import PoseColumns
 from diffsim_ti.obstacles import obstacle_surfaces
 from diffsim_ti.terms.pose import as_pose, sampled_path
 from diffsim_ti.visual.frame import Frame
+from diffsim_ti.visual.frame_sources import LiveFrames
+from diffsim_ti.visual.series import SavedSeries
+from diffsim_ti.writers import View, writer_for
 
 MU, CREEP, DT = 0.5, 1e-4, 5e-4
 SOLVERS = with_options(ds.SemiImplicitSolver, contact_damping=1.0), ds.ImplicitEulerSolver
@@ -206,6 +213,39 @@ def test_obstacles_are_drawn_turned():
     (solid, _), (square, _) = obstacle_surfaces(scene, np.pi / 2)
     assert np.abs(square[:, 0]).max() < 1e-12 and np.abs(square[:, 1]).max() > 0.1
     assert np.allclose(solid.mean(0), [1, np.pi / 2 - 5, 0])
+
+
+def test_what_turns_moves_by_few_numbers_and_presses_is_written_and_shown(tmp_path):
+    """A cube that moves affinely on a table that turns about its middle: series, arrays, picture, film and live frames."""
+    cube = ds.TetrahedralMesh.create_cube(3, 0.2).translated([-0.1, 0.008, -0.1])
+    cube = ds.TetrahedralMesh(cube.vertices, cube.tetrahedra, vertex_sets={"all": np.arange(cube.num_vertices)})
+    contact = dict(width=0.01, friction=0.5)
+    table = ds.Box((0.0, -0.05, 0.0), (0.6, 0.1, 0.6), path=lambda t: [0, 0, 0, 0, 4 * t, 0], **contact)
+    law, reduced = ds.StableNeoHookean(1e5, 0.3), {"all": "affine"}
+    scene = ds.Scene(cube, law, 500.0, [ds.Gravity(), table], reduced=reduced, precision="f64")
+    run = ForwardRun(scene, ds.BDF2Solver, 0.05, outputs=[ds.ContactForce(table, name="contact", per_vertex=True)])
+    view = View(size=(160, 120), colour="speed", arrows=("contact",))
+    run_and_write(run, 3, [writer_for(tmp_path / name, view) for name in ("a.pvd", "a.npz", "a.gif", "a.png")])
+    arrays, saved = np.load(tmp_path / "a.npz"), SavedSeries(tmp_path / "a.pvd")
+    at_rest = obstacle_surfaces(scene, 0.0)[0][0]
+    live = LiveFrames(run)
+    live.advance()
+    for frame in (*map(saved.frame, range(4)), live.frame(len(live) - 1)):
+        turned = rotations.turned(rotations.quaternion(np.array([0, 4 * frame.time, 0])), at_rest)
+        np.testing.assert_allclose(frame.obstacles[0], turned, atol=1e-7)
+        np.testing.assert_allclose(scene.reduced.of(frame.displacements), frame.displacements, atol=1e-7)
+    assert frame.time == pytest.approx(0.2) and frame.fields["contact"][:, 1].sum() > 10  # of 39 N
+    np.testing.assert_allclose(saved.frame(3).fields["contact"], arrays["contact"][3], rtol=1e-6)
+    spin = np.cross(frame.positions, frame.velocities)[:, 1].mean() / (frame.positions[:, [0, 2]] ** 2).sum(1).mean()
+    assert 0.5 < spin < 4.2  # friction takes it along
+    film = imageio.mimread(tmp_path / "a.gif")
+    assert len(film) == 4 and np.abs(film[0].astype(float) - film[-1]).max() > 100
+    render_series(
+        tmp_path / "a.pvd", tmp_path / "again.png", "speed", size=(160, 120), backend="software", arrows=["contact"]
+    )
+    render_series(tmp_path / "a.pvd", tmp_path / "bare.png", "speed", size=(160, 120), backend="software")
+    first, again, bare = (imread(tmp_path / f"{name}.png")[..., :3] for name in ("a", "again", "bare"))
+    assert np.abs(first - again).mean() < 1e-3 < np.abs(again - bare).mean()
 
 
 def test_a_tensor_of_poses_has_gradients_and_is_drawn():

@@ -8,8 +8,20 @@ import taichi as ti
 
 import diffsim_ti as ds
 from diffsim_ti import verify
+from diffsim_ti.designs import Cage
 
 SHELL = {"shell": "affine"}
+KINDS = ("affine", "functions", "fields")
+
+
+def motions(kind, mesh):
+    """A kind of motions, or a basis of these: of each component, or of fields; both can move and turn rigidly."""
+    X = mesh.vertices - mesh.vertices.mean(0)
+    if kind == "functions":
+        return np.column_stack([np.ones(len(X)), X, X[:, 0] * X[:, 1] / 0.1])
+    turns = [np.cross(axis, X) for axis in np.eye(3)]
+    bends = 0.03 * np.random.default_rng(6).standard_normal((3, *X.shape))
+    return kind if kind == "affine" else np.stack([*(0 * X + axis for axis in np.eye(3)), *turns, *bends])
 
 
 @lru_cache
@@ -55,27 +67,54 @@ def test_one_body_alone_stretches_as_its_material_says():
     assert np.ptp(end[:, 0]) / 0.2 - 1 == pytest.approx(1.0 / 0.01 / 1e5, rel=1e-3)
 
 
-def test_tumbling_keeps_momentum():
-    """To the tolerance of the midpoint rule, whose rotations are affine motions."""
+@pytest.mark.parametrize("kind", KINDS)
+def test_tumbling_keeps_momentum(kind):
+    """To the tolerance of the midpoint rule, whose rotations are affine motions; fields know small ones alone."""
     omega, X = np.array([2.0, -3.0, 5.0]), bar().vertices
     spin = np.cross(omega, X - X.mean(0)) + [0.3, 0.2, 0.1]
-    scene = scene_of(terms=[], stiff=1e7, initial_velocities=spin)
+    scene = scene_of({"shell": motions(kind, bar())}, terms=[], stiff=1e7, initial_velocities=spin)
     solver = ds.ImplicitMidpointSolver(scene, dt=5e-3, tolerance=1e-12)
     frames = ds.Rollout(solver, 60, save_every=20, gradients=[]).forward()
     m = scene.inputs.derive(scene.inputs.values).mass[:, None]
     P, L = (m * frames.velocities).sum(1), (m * np.cross(frames.positions, frames.velocities)).sum(1)
-    assert np.abs(P - P[0]).max() < 1e-10 and np.abs(L - L[0]).max() < 1e-9 * np.linalg.norm(L[0])
+    assert np.abs(P - P[0]).max() < 1e-10 and "tied" not in scene.describe()
+    assert (np.abs(L - L[0]).max() < 1e-9 * np.linalg.norm(L[0])) == (kind != "fields")
     assert np.linalg.norm(frames.positions[-1] - frames.positions[0], axis=1).max() > 0.05
     shell = np.unique(bar().tetrahedra[bar().tetrahedron_sets["shell"]])
     u = frames.displacements[-1]
     np.testing.assert_allclose(scene.reduced.of(u)[shell], u[shell], atol=1e-15)
 
 
+def test_a_body_is_less_stiff_the_more_its_cage_can_do():
+    """Bernstein's polynomials hold those of lower degree, so that the work of the weight grows with them (Ritz)."""
+    drops = []
+    for basis in (*(Cage(bar(), shape).weights for shape in ((2, 2, 2), (3, 2, 2))), None):
+        scene = scene_of(basis if basis is None else {"shell": basis}, 1e5, fixed="xmin")
+        u = ds.Rollout(ds.StaticSolver(scene, tolerance=1e-9), 1, gradients=[]).forward().displacements[-1]
+        drops.append(-(scene.mass_matrix().diagonal()[1::3] * u[:, 1]).sum())
+    assert 0 < drops[0] < drops[1] - 1e-9 and drops[1] == pytest.approx(drops[2], rel=1e-6)
+
+
+def test_modes_ring_as_the_whole_body_does():
+    """Three modes of a held bar, which nothing else moves: what starts in them stays in them (Galerkin)."""
+    free = np.setdiff1d(np.arange(16), bar().vertex_sets["xmin"])
+    mesh = ds.TetrahedralMesh(bar().vertices, bar().tetrahedra, vertex_sets=bar().vertex_sets | {"free": free})
+    scene = ds.Scene(mesh, ds.LinearElastic(1e5, 0.3), fixed="xmin", precision="f64")
+    shapes = ds.modes(scene, 3).shapes
+    scene = scene.replace(initial_velocities=0.02 * shapes.sum(0))
+    ends = []
+    for reduced in (None, {"free": shapes}):
+        solver = ds.ImplicitMidpointSolver(scene.replace(reduced=reduced), dt=5e-3, tolerance=1e-12)
+        ends.append(ds.Rollout(solver, 20, gradients=[]).forward().displacements[-1])
+    assert np.abs(ends[1] - ends[0]).max() < 1e-9 * np.abs(ends[0]).max()
+    assert "'free' 3 for 36, tied to its place" in solver.scene.describe()
+
+
 # ---- contact, friction, derivatives ----------------------------------------------------------------------------------
 
 
-def touching(**options):
-    """An affine box comes down askew on a soft one that slides on a rough floor."""
+def touching(kind="affine", **options):
+    """A box of few numbers comes down askew on a soft one that slides on a rough floor."""
     low = ds.TetrahedralMesh.create_box(2, size=0.1, origin=(-0.05, 0.004, -0.05))
     up = ds.TetrahedralMesh.create_box(2, size=0.08, origin=(-0.03, 0, -0.03)).rotated([1, 0.3, 0.2], 0.5)
     mesh = ds.TetrahedralMesh.joined([low, up.translated([0, 0.107 - up.bounding_box[0, 1], 0])])
@@ -83,27 +122,40 @@ def touching(**options):
     floor = ds.Ground(stiffness=2e4, width=0.01, friction=0.3, friction_speed=0.3)
     contact = ds.SelfContact(2e4, 5e-3, friction=0.4, friction_speed=0.3)
     E = np.repeat([5e4, 5e6], [low.num_tetrahedra, up.num_tetrahedra])
-    given = dict(reduced={"body_1": "affine"}, precision="f64", initial_velocities=velocity) | options
+    given = dict(reduced={"body_1": motions(kind, mesh)}, precision="f64", initial_velocities=velocity) | options
     return ds.Scene(mesh, ds.StableNeoHookean(E, 0.3), 1000.0, [contact, ds.Gravity(), floor], **given)
 
 
-@pytest.mark.parametrize("solver", [ds.ImplicitEulerSolver, ds.BDF2Solver, ds.ImplicitMidpointSolver])
-def test_tangent_and_adjoint_agree_with_contact_and_friction(solver):
+@pytest.mark.parametrize(
+    "solver, kind",
+    [
+        (ds.ImplicitEulerSolver, "affine"),
+        (ds.BDF2Solver, "affine"),
+        (ds.ImplicitMidpointSolver, "affine"),
+        (ds.ImplicitMidpointSolver, "functions"),
+        (ds.BDF2Solver, "fields"),
+    ],
+)
+def test_tangent_and_adjoint_agree_with_contact_and_friction(solver, kind):
     force = ds.SelfContactForce("body_1")
-    rollout = ds.Rollout(solver(touching(), dt=2e-3, tolerance=1e-12), 4, save_every=2, gradients="all", outputs=force)
+    rollout = ds.Rollout(
+        solver(touching(kind), dt=2e-3, tolerance=1e-12), 4, save_every=2, gradients="all", outputs=force
+    )
     assert np.abs(rollout.forward()["self_contact_force"]).max() > 1
     assert verify.dot_product_test(rollout) <= 1e-9
 
 
-def test_gradients():
+@pytest.mark.parametrize("kind", KINDS)
+def test_gradients(kind):
     """By the rest shape with the motions of the mesh as it was made."""
     names = ["rest_positions", "self_contact_friction"]
-    solver = ds.ImplicitEulerSolver(touching(), dt=2e-3, tolerance=1e-12)
+    solver = ds.ImplicitEulerSolver(touching(kind), dt=2e-3, tolerance=1e-12)
     assert ds.check_gradients(ds.Rollout(solver, 1, gradients=names), verbose=False).passed
 
 
-def test_gradients_of_equilibria():
-    solver = ds.StaticSolver(scene_of(fixed="xmin"), tolerance=1e-12)
+@pytest.mark.parametrize("kind", KINDS)
+def test_gradients_of_equilibria(kind):
+    solver = ds.StaticSolver(scene_of({"shell": motions(kind, bar())}, fixed="xmin"), tolerance=1e-12)
     rollout = ds.Rollout(solver, 1, gradients=["youngs_modulus", "gravity", "rest_positions"])
     assert verify.dot_product_test(rollout) <= 1e-9 and ds.check_gradients(rollout, verbose=False).passed
 
@@ -170,8 +222,19 @@ def test_steps_one_by_one_and_single_precision():
 @pytest.mark.parametrize(
     "reduced, options, words",
     [
-        (["shell"], {}, 'must be {name of a set: "affine"}'),
-        ({"shell": "rigid"}, {}, "'shell' must be 'affine', got 'rigid'"),
+        (["shell"], {}, 'must be {name of a set: "affine" or a basis}'),
+        ({"shell": "rigid"}, {}, "'shell' must be 'affine' or a basis, got 'rigid'"),
+        ({"shell": None}, {}, "or a basis, got None"),
+        ({"shell": Cage}, {}, "the basis of 'shell' must be numbers"),
+        ({"shell": np.ones((16, 0))}, {}, r"shape \(16, m\).* or \(m, 16, 3\).*got \(16, 0\)"),
+        ({"shell": np.ones((12, 1))}, {}, "at all vertices of the mesh; got"),
+        ({"shell": np.full((16, 1), np.nan)}, {}, "must be finite"),
+        (
+            {"shell": np.vander(np.arange(16.0), 13)},
+            {},
+            "of the 13 columns .* combinations of the others at its 12 vert",
+        ),
+        ({"shell": np.zeros((1, 16, 3))}, {}, "of the 1 columns of the basis of 'shell' 1 are"),
         ({"skin": "affine"}, {}, "no set 'skin' of tetrahedra or vertices; it has .*'shell'"),
         ({"xmax": "affine"}, {}, "the 4 vertices of 'xmax' lie in a plane"),
         (SHELL, dict(fixed="xmax"), "vertex .* of 'shell' is also in what is held"),

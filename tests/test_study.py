@@ -13,6 +13,7 @@ import pytest
 import diffsim_ti as ds
 from diffsim_ti.solvers import SOLVERS
 from diffsim_ti.study import PROBLEMS, Problem, chart, charts, pareto_front, problem, problems, recommend
+from diffsim_ti.study.alternatives import stiff_sets
 from diffsim_ti.study.coarser import halved_grid
 from diffsim_ti.study.elements import ElementTrials, refined
 from diffsim_ti.study.work_precision import Point, choose_substeps, make_rollout, reference, run
@@ -352,3 +353,27 @@ def test_advice_offers_mass_scaling_and_steps_where_they_are_needed():
     assert "mass_scaling" in ways or "mass_scaling" in str(advice.left_out)
     assert "adaptive_steps" in ways and ways["adaptive_steps"].search > 0
     assert all(way.error <= 0.3 and way.seconds > 0 and str(way) in str(advice) for way in advice.alternatives)
+
+
+def stiff_bar(stiff):
+    """A bar whose outer half is a set of other stiffness; a third set is soft."""
+    mesh = ds.TetrahedralMesh.create_box((4, 2, 2), size=(0.3, 0.1, 0.1), pattern="five")
+    x = mesh.vertices[mesh.tetrahedra].mean(1)[:, 0]
+    for name, rows in (("shell", x > 0.2), ("grip", (x > 0.1) & (x < 0.2)), ("all", x > 0)):
+        mesh = mesh.with_tetrahedron_set(name, np.flatnonzero(rows))
+    E = np.where(x > 0.2, stiff, 1e5)
+    return ds.Scene(mesh, ds.StableNeoHookean(E, 0.3), terms=ds.Gravity(), fixed="xmin")
+
+
+def test_stiff_sets_are_those_a_hundred_times_stiffer_than_all_else():
+    assert stiff_sets(stiff_bar(1e7)) == ["shell"] and not stiff_sets(stiff_bar(9.9e6))
+    scene = stiff_bar(1e9)
+    E = scene.material.values(scene.mesh)["youngs_modulus"].copy()
+    E[scene.mesh.tetrahedron_sets["grip"]] = 1e10
+    assert sorted(stiff_sets(scene.replace(material=ds.StableNeoHookean(E, 0.3)))) == ["grip", "shell"]
+
+
+def test_advice_offers_stiff_parts_that_move_affinely():
+    advice = recommend(stiff_bar(1e8), 0.03, 0.1, gradients=False, budget=1.0, elements=False)
+    (way, *_) = [way for way in advice.alternatives if "reduced={'shell': 'affine'}" in way.how]
+    assert way.error <= 0.1 and 1 <= way.steps < 200 and str(way) in str(advice)

@@ -1,4 +1,4 @@
-"""Beside equal steps of the scene as it is: mass scaling, and steps where they are needed."""
+"""Beside equal steps of the scene as it is: mass scaling, stiff parts that move affinely, steps where they are needed."""
 
 import time
 from dataclasses import dataclass
@@ -7,15 +7,17 @@ import numpy as np
 
 from diffsim_ti.adaptive_steps import adaptive_steps
 from diffsim_ti.rollout import Rollout
+from diffsim_ti.solvers import stable_dt
 
 SHARES = (0.01,)  # of the mass
 GAIN = 1.5  # in the stable step, below which mass scaling is not tried
+STIFFER = 100.0  # times the rest, from which on a named set is tried as one that moves affinely
 TOLERANCES = (1.0, 0.3)  # of adaptive steps, in shares of what the advice may be off
 
 
 @dataclass
 class Alternative:
-    """A way to run the advised solver otherwise: `how` to ask for it, `steps` of the whole duration, its error relative to
+    """A way to run the scene otherwise: `how` to ask for it, `steps` of the whole duration, its error relative to
     the largest displacement, wall time [s] with its gradient if asked for, and that of finding its steps once, `search`
     [s], which `seconds` leaves out. `times`: seconds over those of the advice, timed back to back."""
 
@@ -38,6 +40,7 @@ def alternatives(trials, best) -> tuple[list[Alternative], list[str]]:
     plain = best.solver(scene, dt=trials.span / trials.frames, substeps=best.substeps, **_unchecked(best))
     base = Rollout(plain, trials.frames, save_every=1, memory=trials.memory)
     tried = [lambda how=how: how for how in _scaled(trials, best, scene, notes)]
+    tried += _affine(trials, best, notes)
     tried += [lambda share=share: _adaptive(trials, best, scene, share) for share in TOLERANCES]
     for make in tried:
         try:
@@ -54,7 +57,7 @@ def alternatives(trials, best) -> tuple[list[Alternative], list[str]]:
         for _ in range(3):
             other.append(trials.time(base, trials.reference))
             own.append(trials.time(rollout, trials.reference))
-        steps = int(np.ceil((rollout.sweep.num_passes - 1) * longer))
+        steps = int(np.ceil((rollout.sweep.num_passes - rollout.solver.explicit) * longer))  # explicit: one pass more
         times = min(own) / min(other)
         found.append(Alternative(how, steps, error, best.seconds * times, times, search * longer))
         if search:
@@ -75,6 +78,56 @@ def _scaled(trials, best, scene, notes):
         substeps = int(np.ceil(best.substeps / gain))
         solver = best.solver(heavier, dt=trials.span / trials.frames, substeps=substeps, **_unchecked(best))
         yield f"mass_scaling={share:g}", Rollout(solver, trials.frames, save_every=1, memory=trials.memory), 0.0
+
+
+def stiff_sets(scene) -> list[str]:
+    """Named sets of tetrahedra that are at least a hundred times stiffer, by their shear modulus, than all outside them."""
+    mesh, material = scene.mesh, scene.material
+    mu = np.broadcast_to(material.lame(material.values(mesh))[0], mesh.num_tetrahedra)
+    softest = {name: mu[rows].min() for name, rows in mesh.tetrahedron_sets.items() if len(rows)}
+    for least in sorted(softest.values()):
+        names = [name for name, own in softest.items() if own >= least]
+        rest = np.delete(mu, np.concatenate([mesh.tetrahedron_sets[name] for name in names]))
+        if len(rest) and least >= STIFFER * rest.max():
+            return names
+    return []
+
+
+def _affine(trials, best, notes):
+    """What makes runs whose stiff parts move by twelve numbers: of the advised solver, and of an implicit one."""
+    names = [] if trials.scene.reduced else stiff_sets(trials.scene)
+    options = [best] if names else []
+    known = [o for o in trials.tried if not o.solver.explicit and np.isfinite(o.error)]
+    if options and best.solver.explicit and known:
+        good = [o for o in known if o.error <= trials.tolerance]
+        options.append(min(good, key=lambda o: o.seconds) if good else min(known, key=lambda o: o.error))
+    for option in options:
+        reduced = dict.fromkeys(names, "affine")
+        how = ("" if option is best else f"{option.solver.__name__}, ") + f"reduced={reduced}"
+        try:
+            scene = trials.scene.replace(precision=option.precision, reduced=reduced)
+            option.solver(scene, dt=trials.span, **_unchecked(option))
+        except ValueError as error:
+            notes.append(f"{how} was not tried: {error}")
+            continue
+        yield lambda how=how, scene=scene, option=option: (how, _affine_run(trials, scene, option), 0.0)
+
+
+def _affine_run(trials, scene, option) -> Rollout:
+    """A run at as many steps as its stable step allows; an implicit one at as many as its order asks for."""
+    substeps, longer = option.substeps, trials.duration / trials.span
+    if option.solver.explicit:
+        substeps = int(np.ceil(substeps * trials.stable / stable_dt(scene).dt))
+    for _ in range(4):
+        solver = option.solver(scene, dt=trials.span / trials.frames, substeps=substeps, **_unchecked(option))
+        rollout = Rollout(solver, trials.frames, save_every=1, memory=trials.memory)
+        moved = rollout.forward().displacements.astype(np.float64)
+        error = trials.error(moved - moved[0]) * longer
+        if error <= trials.tolerance:
+            break
+        finer = np.clip((2 * error / trials.tolerance) ** (1 / option.solver.order), 1.3, 8)
+        substeps = int(np.ceil(finer * substeps))
+    return rollout
 
 
 def _adaptive(trials, best, scene, share):

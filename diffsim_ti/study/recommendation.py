@@ -34,7 +34,8 @@ class Recommendation:
 
     `reasons`: three lines; `left_out`: what the scene does without, and why. `rollout(scene)` makes it, of the scene as it
     is. `elements`: what its mesh makes wrong by each kind of element; `element`: the cheapest that keeps to the tolerance.
-    `alternatives`: mass scaling and adaptive steps beside it, where they keep to the tolerance.
+    `alternatives`: mass scaling, stiff parts that move affinely and adaptive steps beside it, where these keep to the
+    tolerance.
     """
 
     option: Option

@@ -22,8 +22,9 @@ def mass_scaling(kind, seed: int) -> float | None:
     return rng.uniform(0.005, 0.1) if kind.explicit and kind.order == 1 and rng.random() < 0.3 else None
 
 
-def reduced(kind, seed: int, mesh, fixed, deformed: bool) -> dict[str, str] | None:
-    """A set that moves by few numbers, where implicit runs have one of which nothing is held."""
+def reduced(kind, seed: int, mesh, fixed, deformed: bool) -> dict | None:
+    """A set that moves by few numbers, where implicit runs have one of which nothing is held: affinely, by functions of each
+    component, or by fields."""
     if kind.explicit or deformed or np.random.default_rng([36, seed]).random() > 0.5:
         return None
     held = ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3), fixed=fixed).held
@@ -32,8 +33,20 @@ def reduced(kind, seed: int, mesh, fixed, deformed: bool) -> dict[str, str] | No
             mesh.elements[mesh.tetrahedron_sets[name]] if name in mesh.tetrahedron_sets else mesh.vertex_sets.get(name)
         )
         if own is not None and not np.isin(own, held).any():
-            return {name: "affine"}
+            return {name: motions(np.random.default_rng([40, seed]), mesh, len(np.unique(own)))}
     return None
+
+
+def motions(rng, mesh, count: int):
+    """Rigid translations and a little more, at random, for a set of so many vertices."""
+    n, more = mesh.num_vertices, int(rng.integers(1, max(2, min(6, count - 1))))
+    which = rng.integers(3)
+    if which == 0:
+        return "affine"
+    if which == 1:
+        return np.column_stack([np.ones(n), rng.standard_normal((n, more))])
+    rigid = np.eye(3)[:, None] * np.ones((n, 1))
+    return np.concatenate([rigid, 0.3 * rng.standard_normal((more, n, 3))])
 
 
 def muscles(kind, seed: int, mesh, steps: int, duration: float, E: float) -> list[ds.Muscle]:

@@ -35,8 +35,8 @@ class BlockJacobi:
 
 
 class BodyBlocks(BlockJacobi):
-    """The same, and the inverse of d2E/dq2 of each set that moves by few numbers q: of the body at rest, turned with it, as
-    in multigrid.py, with inertia and contact as they are."""
+    """The same, and the inverse of d2E/dq2 of each set that moves by few numbers q: of the body at rest, with inertia and
+    contact as they are; where its basis is of each component turned with it, as in multigrid.py."""
 
     def __init__(self, potential, mass: np.ndarray, free: Free, size: np.ndarray, parallel: bool = True):
         super().__init__(potential, mass, free, size, parallel)
@@ -44,34 +44,34 @@ class BodyBlocks(BlockJacobi):
             self._at_rest = [self._of_products(body) for body in free.reduced.bodies]
 
     def _of_products(self, body) -> np.ndarray:
-        """B^T d2E/du2 B where the potential stands, shape (m, 3, m, 3)."""
-        m = body.basis.shape[1]
-        out = np.zeros((m, 3, m, 3))
-        for j in range(m):
-            for d in range(3):
-                w = np.zeros((len(self.mass), 3))
-                w[body.vertices, d] = body.basis[:, j]
-                out[:, :, j, d] = body.basis.T @ self.potential.product(w)[body.vertices]
-        return 0.5 * (out + out.transpose(2, 3, 0, 1))
+        """B^T d2E/du2 B where the potential stands, shape (count, count)."""
+        out, fields = np.zeros((body.count, body.count)), body.fields()
+        for j in range(body.count):
+            w = np.zeros((len(self.mass), 3))
+            w[body.vertices] = fields[:, :, j]
+            out[:, j] = body.numbers(self.potential.product(w)).ravel()
+        return 0.5 * (out + out.T)
 
     def update(self, u: np.ndarray) -> None:
         super().update(u)
         contact, rest, self._bodies = self.potential.contact_blocks(), self.potential.arrays.values.rest, []
         for body, G in zip(self.free.reduced.bodies, self._at_rest):
-            own, Q = body.vertices, body.basis
-            R = turn_of(rest[own], rest[own] + u[own])
-            G = np.einsum("ia,jakb,lb->jikl", R, G, R, optimize=True)
-            own_blocks = self.mass[own, :, None] * np.eye(3) + (0.0 if contact is None else contact[own])
-            G += np.einsum("vj,vab,vk->jakb", Q, own_blocks, Q, optimize=True)
-            values, vectors = np.linalg.eigh(G.reshape(3 * Q.shape[1], -1))
+            own, n = body.vertices, body.count
+            if body.per_component:
+                R, m = turn_of(rest[own], rest[own] + u[own]), n // 3
+                G = np.einsum("ia,jakb,lb->jikl", R, G.reshape(m, 3, m, 3), R, optimize=True).reshape(n, n)
+            blocks = self.mass[own, :, None] * np.eye(3) + (0.0 if contact is None else contact[own])
+            fields = body.fields()
+            G = G + fields.reshape(-1, n).T @ np.matmul(blocks, fields).reshape(-1, n)
+            values, vectors = np.linalg.eigh(0.5 * (G + G.T))
             values = np.maximum(np.abs(values), 1e-12 * np.abs(values).max() + self.least[own].min())
             self._bodies.append((body, (vectors / values) @ vectors.T))
 
     def __call__(self, r: np.ndarray) -> np.ndarray:
         out = super().__call__(r)
         for body, inverse in self._bodies:
-            q = inverse @ (body.basis.T @ r[body.vertices]).ravel()
-            out[body.vertices] = body.basis @ q.reshape(-1, 3)
+            q = body.numbers(r)
+            out[body.vertices] = body.motion((inverse @ q.ravel()).reshape(q.shape))
         return out
 
 
