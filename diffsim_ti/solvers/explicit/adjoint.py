@@ -59,6 +59,8 @@ class ExplicitAdjoint:
         self.tie_felt, self.tie_rest = (runtime.array(a.vector, *x.shape) for x in (a.ties, a.tie_segments))
         self.foundation_felt = runtime.array(a.vector, *a.foundation.shape)
         self.faces = FeltAdjoint(self, workspace.faces) if workspace.faces else None
+        self.felt_by_bodies = a.bodies.adjoint() if a.bodies else {}
+        vars(self).update(self.felt_by_bodies)
         self.held = HeldAdjoint(self, workspace.volumes) if workspace.volumes else None
         self.chamber_record = self.held.chambers if self.held else None
         if workspace.impulses:
@@ -103,6 +105,7 @@ class ExplicitAdjoint:
         pressed += (self.dragged_felt, self.dragged_rest) if has.dragged else ()
         pressed += (self.tie_felt, self.tie_rest) if has.tied else ()
         pressed += (self.foundation_felt,) if has.founded else ()
+        pressed += tuple(self.felt_by_bodies.values())
         targets = self.felt, self.path, self.u, self.v, self.w, self.z, *pressed
         runtime.clear(target for target in targets if target is not None)
         if self.ws.pairs:
@@ -273,6 +276,8 @@ class ExplicitAdjoint:
         if self.features.shape:
             rest = rest + runtime.fetch(self.frames.frames_u).astype(np.float64).sum(0)
         out.rest = rest + out.rest
+        if self.felt_by_bodies:
+            self.ws.arrays.bodies.collect(self.felt_by_bodies, out)
         if self.faces:
             self.faces.collect(out)
         if self.held:

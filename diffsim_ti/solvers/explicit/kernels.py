@@ -7,6 +7,7 @@ import taichi as ti
 
 from diffsim_ti.elements.tetrahedron import Onwards
 from diffsim_ti.runtime import Bundle, Kernel, let, traced
+from diffsim_ti.solvers.explicit.body_stage import BodyStage
 from diffsim_ti.solvers.explicit.further_elements import FurtherElements
 from diffsim_ti.solvers.explicit.kick_drift import KickDrift
 from diffsim_ti.state.numbers import ADJOINT, OF_STEPS, SCENE, TANGENT, with_state
@@ -52,6 +53,14 @@ class ExplicitKernels:
     @cached_property
     def further(self) -> FurtherElements:
         return FurtherElements(self.vertex.features, self.vertex.law.precision)
+
+    @cached_property
+    def bodies(self) -> BodyStage:
+        return BodyStage(self.vertex)
+
+    @property
+    def reduced(self) -> bool:
+        return self.vertex.features.reduced
 
     @traced
     def onwards(self, now) -> Onwards:
@@ -146,6 +155,10 @@ class ExplicitKernels:
                 if turn < plan.count:
                     j = plan.first + turn
                     self.vertex.step(i, j, self.pass_of(j, table, plan), scene, state, plan)
+            if ti.static(self.reduced):
+                for b in range(plan.num_bodies):
+                    now = self.pass_of(plan.first, table, plan)
+                    self.bodies.step(b, plan.first, now, scene, state, plan)
         else:
             ti.loop_config(serialize=True)
             for j in range(plan.first, plan.first + plan.count):
@@ -154,6 +167,9 @@ class ExplicitKernels:
                 now = self.pass_of(j, table, plan)
                 for i in range(plan.num_vertices):
                     self.vertex.step(i, j, now, scene, state, plan)
+                if ti.static(self.reduced):
+                    for b in range(plan.num_bodies):
+                        self.bodies.step(b, j, now, scene, state, plan)
 
     @cached_property
     def step(self) -> Kernel:
@@ -195,6 +211,10 @@ class ExplicitKernels:
                 if turn < plan.count:
                     j = plan.first + turn
                     self.vertex.step_jvp(i, j, self.pass_of(j, table, plan), scene, state, tangent, plan)
+            if ti.static(self.reduced):
+                for b in range(plan.num_bodies):
+                    now = self.pass_of(plan.first, table, plan)
+                    self.bodies.step_jvp(b, plan.first, now, scene, state, tangent, plan)
         else:
             ti.loop_config(serialize=True)
             for j in range(plan.first, plan.first + plan.count):
@@ -203,6 +223,9 @@ class ExplicitKernels:
                 now = self.pass_of(j, table, plan)
                 for i in range(plan.num_vertices):
                     self.vertex.step_jvp(i, j, now, scene, state, tangent, plan)
+                if ti.static(self.reduced):
+                    for b in range(plan.num_bodies):
+                        self.bodies.step_jvp(b, j, now, scene, state, tangent, plan)
 
     @cached_property
     def step_jvp(self) -> Kernel:
@@ -247,6 +270,10 @@ class ExplicitKernels:
         moving = ti.static(self.vertex.features.moving)
         if ti.static(self.parallel):
             num_items, num_vertices, parts = self.further.after(plan), plan.num_vertices, moving * plan.num_parts
+            if ti.static(self.reduced):
+                for b in range(plan.num_bodies):
+                    now = self.pass_back(plan.first, table, plan)
+                    self.bodies.step_vjp(b, plan.first, now, scene, state, adjoint, plan)
             for i in range(num_vertices):
                 turn = self.turn_of_first(i, table)
                 if turn < plan.count:
@@ -266,6 +293,9 @@ class ExplicitKernels:
             for back in range(plan.count):
                 j = plan.first + plan.count - 1 - back
                 now = self.pass_back(j, table, plan)
+                if ti.static(self.reduced):
+                    for b in range(plan.num_bodies):
+                        self.bodies.step_vjp(b, j, now, scene, state, adjoint, plan)
                 for i in range(plan.num_vertices):
                     self.vertex.step_vjp(i, j, now, scene, state, adjoint, plan)
                 for e in range(self.further.after(plan)):

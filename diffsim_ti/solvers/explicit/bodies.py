@@ -1,0 +1,193 @@
+"""Bodies of few numbers in explicit passes: a stage after the vertices', with its tangent and adjoint in body_tangent.py and
+body_stage.py.
+
+A vertex of a body only gathers its force. The body then goes on as its vertices would on average: with the fields nearest to
+displacements u, velocities v and forces f (body_sums.py),
+
+    v+ = v + (pre + post) f,    v+ += what friction of obstacles does (terms/obstacles/grip.py),
+    u' = u + alpha v+,    v' = decay v+,
+
+of an affine body, and of a rigid one with the rotation that body_motion.py says. Frames show v + pre f, of a rigid body its
+rigid part: velocity Verlet is SHAKE there, with the velocities of RATTLE, and symplectic Euler shows (x' - x) / h. Sums m v
+and sum m x x v change by the loads alone, to round-off.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import taichi as ti
+
+from diffsim_ti.runtime import at, let, traced
+from diffsim_ti.solvers.explicit import body_motion
+from diffsim_ti.solvers.explicit.body_friction import BodyFriction
+from diffsim_ti.solvers.explicit.body_motion import VECTOR
+from diffsim_ti.solvers.explicit.body_sums import INVERSE, BodySums
+from diffsim_ti.solvers.explicit.outside_work import add_work_of_pass
+from diffsim_ti.state.bodies import NUMBERS
+
+A = ti.template()  # an array or Bundle handed to a Taichi function
+
+
+@dataclass(frozen=True)
+class Bodies(BodySums):
+    """Taichi functions of body b in pass j, whose numbers are `now`."""
+
+    @cached_property
+    def friction(self) -> BodyFriction:
+        return BodyFriction(self.vertex.features, self.vertex.law.precision)
+
+    @property
+    def rough(self) -> bool:
+        return len(self.vertex.features.rough) > 0
+
+    @property
+    def rigid(self) -> bool:
+        """Whether there are rigid ones."""
+        return self.vertex.features.rigid
+
+    # ---- what a rigid body makes of a field ----------------------------------------------------------------------------
+
+    @traced
+    def spun(self, b, u, v, scene):
+        """Of velocities those that are rigid."""
+        return self.field(v.o, *self.spun_columns(b, u.x, u.y, u.z, v.x, v.y, v.z, scene))
+
+    @ti.func
+    def spun_columns(self, b, ux, uy, uz, vx, vy, vz, scene: A):
+        x, y, z = vx, vy, vz
+        if ti.static(self.rigid):
+            if scene.body_kind[b] > 0:
+                x, y, z = self.spin(b, ux, uy, uz, vx, vy, vz, scene)
+        return x, y, z
+
+    @traced
+    def spin(self, b, ux, uy, uz, vx, vy, vz, scene):
+        return tuple(body_motion.spun([ux, uy, uz], [vx, vy, vz], self.spread_numbers(b, scene)).values())
+
+    @traced
+    def shown(self, b, u, v, f, pre, scene):
+        """Velocities at the time of the displacements, whose kick took `pre`; before it they are those of the state."""
+        w = self.kicked(v, pre, f)
+        return self.field(w.o, *self.shown_columns(b, pre, u.x, u.y, u.z, w.x, w.y, w.z, scene))
+
+    @ti.func
+    def shown_columns(self, b, pre, ux, uy, uz, vx, vy, vz, scene: A):
+        x, y, z = vx, vy, vz
+        if ti.static(self.rigid):
+            if pre > 0 and scene.body_kind[b] > 0:
+                x, y, z = self.spin(b, ux, uy, uz, vx, vy, vz, scene)
+        return x, y, z
+
+    @traced
+    def moved(self, b, u, v, now, scene):
+        """(displacements, velocities) after the pass, for velocities v+."""
+        alpha, decay = let(self.double(now.alpha)), let(self.double(now.decay))
+        x = self.moved_columns(b, u.x, u.y, u.z, v.x, v.y, v.z, alpha, decay, scene)
+        return self.field(u.o + alpha * v.o, *x[:3]), self.field(decay * v.o, *x[3:])
+
+    @ti.func
+    def moved_columns(self, b, ux, uy, uz, vx, vy, vz, alpha, decay, scene: A):
+        x, y, z = ux + alpha * vx, uy + alpha * vy, uz + alpha * vz
+        p, q, r = decay * vx, decay * vy, decay * vz
+        if ti.static(self.rigid):
+            if scene.body_kind[b] > 0:
+                if alpha > 0:
+                    x, y, z, p, q, r = self.turn(b, ux, uy, uz, vx, vy, vz, alpha, decay, scene)
+                else:
+                    p, q, r = self.spin(b, ux, uy, uz, vx, vy, vz, scene)
+        return x, y, z, p, q, r
+
+    @traced
+    def turn(self, b, ux, uy, uz, vx, vy, vz, alpha, decay, scene):
+        J = self.spread_numbers(b, scene)
+        return tuple(body_motion.turned([ux, uy, uz], [vx, vy, vz], J, alpha, decay).values())
+
+    # ---- friction ------------------------------------------------------------------------------------------------------
+
+    @ti.func
+    def reach(self, b, y, scene: A):
+        """w = 1 / M + y . J^-1 y [1/kg]: what an impulse does at a vertex, of a rigid body at the most."""
+        z = self.solve_arm(b, y, scene)
+        return 1 / scene.body_numbers[NUMBERS * b] + z.dot(y)
+
+    @traced
+    def solve_arm(self, b, y, scene):
+        """J^-1 y"""
+        K = self.matrix(b, INVERSE, scene)
+        parts = [let(at(y, k)) for k in range(3)]
+        rows = [K[k][0] * parts[0] + K[k][1] * parts[1] + K[k][2] * parts[2] for k in range(3)]
+        return let(VECTOR(*rows, ti.cast(0, ti.f64)))
+
+    @ti.func
+    def total(self, b, source: A, s, now: A, scene: A):
+        """C [m/s]"""
+        out = ti.cast(0, ti.f64)
+        for m in range(scene.body_first[b], scene.body_first[b + 1]):
+            i = scene.body_vertex[m]
+            if scene.surface[i] > 0:
+                load = self.double(self.friction.load(i, source[s, i], now, scene))
+                out += load * self.reach(b, self.arm(m, b, scene), scene)
+        return out
+
+    @ti.func
+    def pushes(self, b, source: A, s, w: A, total, now: A, scene: A):
+        """Sums of the impulses of friction, for velocities w before it."""
+        o, p, q, r = VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0)
+        if total > 0 and now.alpha > 0:
+            for m in range(scene.body_first[b], scene.body_first[b + 1]):
+                i = scene.body_vertex[m]
+                if scene.surface[i] > 0:
+                    y, small = self.arm(m, b, scene), ti.cast(total, self.fp)
+                    v = self.narrow(self.at_arm(w, y))
+                    x = self.wide(self.friction.impulse(i, source[s, i], v, small, now, scene))
+                    o += x
+                    p += y.x * x
+                    q += y.y * x
+                    r += y.z * x
+        return o, p, q, r
+
+    @traced
+    def rubbed(self, b, u, v, source, s, now, scene):
+        """Velocities after friction."""
+        if not self.rough:
+            return v
+        total, w = let(self.total(b, source, s, now, scene)), self.spun(b, u, v, scene)
+        p = self.solved(b, self.pushes(b, source, s, w, total, now, scene), scene)
+        return self.field(v.o + p.o, v.x + p.x, v.y + p.y, v.z + p.z)
+
+    # ---- the pass ------------------------------------------------------------------------------------------------------
+
+    @ti.func
+    def step(self, b, j, now: A, scene: A, state: A, plan: A):
+        s, t = (j - plan.base) * plan.stride, (j - plan.base + 1) * plan.stride
+        u, v = self.nearest(b, state.u, s, True, scene), self.nearest(b, state.v, s, True, scene)
+        f = self.pulled(b, scene.body_force, 0, scene, scene.parameters)
+        if now.frame >= 0:
+            seen = self.shown(b, u, v, f, now.pre, scene)
+            for m in range(scene.body_first[b], scene.body_first[b + 1]):
+                i = scene.body_vertex[m]
+                state.frames_u[now.frame, i] = state.u[s, i]
+                state.frames_v[now.frame, i] = self.narrow(self.at_arm(seen, self.arm(m, b, scene)))
+        after = self.rubbed(b, u, self.kicked(v, now.pre + now.post, f), state.u, s, now, scene)
+        displaced, moving = self.moved(b, u, after, now, scene)
+        for m in range(scene.body_first[b], scene.body_first[b + 1]):
+            self.go(m, b, displaced, moving, s, t, now, scene, state, plan)
+
+    @ti.func
+    def go(self, m, b, displaced: A, moving: A, s, t, now: A, scene: A, state: A, plan: A):
+        """Vertex m of all bodies to where the body takes it."""
+        i, y = scene.body_vertex[m], self.arm(m, b, scene)
+        u, v = state.u[s, i], state.v[s, i]
+        u_next, v_next = self.narrow(self.at_arm(displaced, y)), self.narrow(self.at_arm(moving, y))
+        if now.alpha <= 0:
+            u_next = u
+        if ti.static(len(self.vertex.features.groups) > 0):
+            if scene.surface[i] > 0:
+                self.vertex.obstacles.note(i, u, u_next, now, scene, state)
+        if ti.static(self.vertex.features.driven):
+            felt = (v_next / now.decay - v) / ((now.pre + now.post) * scene.inverse_mass[i])  # with what holds it
+            if ti.static(self.vertex.features.gravity >= 0):
+                felt += -1 * self.vertex.gravity(scene.parameters) / scene.inverse_mass[i]
+            add_work_of_pass(self.vertex, i, u, v, felt, u_next, v_next, now, scene, state, plan)
+        state.u[t, i] = u_next
+        state.v[t, i] = v_next

@@ -1,0 +1,284 @@
+"""The adjoint of the stage of bodies of few numbers (bodies.py), along recorded passes."""
+
+from dataclasses import dataclass
+
+import taichi as ti
+
+from diffsim_ti.runtime import let, traced
+from diffsim_ti.solvers.explicit import body_motion
+from diffsim_ti.solvers.explicit.body_tangent import BodyTangent
+from diffsim_ti.solvers.explicit.body_motion import VECTOR, vectors
+from diffsim_ti.state.bodies import NUMBERS, PAIRS, SUMS
+
+A = ti.template()  # an array or Bundle handed to a Taichi function
+
+
+@dataclass(frozen=True)
+class BodyStage(BodyTangent):
+    """Taichi functions of body b in pass j."""
+
+    @traced
+    def sum_of(self, a, b):
+        return self.field(a.o + b.o, a.x + b.x, a.y + b.y, a.z + b.z)
+
+    @traced
+    def add_J(self, b, six, adjoint):
+        for k, x in enumerate(six):
+            self.add(adjoint.body_sums, b * SUMS + 1 + k, x)
+
+    @traced
+    def spun_vjp(self, b, pre, u, v, by, scene, adjoint):
+        """(adjoint of u, of v) as fields, for that of the rigid part of velocities v, where pre > 0; adds that of J."""
+        zero = let(VECTOR(0, 0, 0, 0))
+        x = self.spun_columns_vjp(b, pre, *self._all(u, v, by), scene, adjoint)
+        return self.field(zero, *x[:3]), self.field(by.o, *x[3:])
+
+    @ti.func
+    def spun_columns_vjp(self, b, pre, ux, uy, uz, vx, vy, vz, ax, ay, az, scene: A, adjoint: A):
+        x, y, z, p, q, r = 0 * ax, 0 * ax, 0 * ax, ax, ay, az
+        if ti.static(self.rigid):
+            if pre > 0 and scene.body_kind[b] > 0:
+                x, y, z, p, q, r = self.spin_vjp(b, [ux, uy, uz], [vx, vy, vz], [ax, ay, az], scene, adjoint)
+        return x, y, z, p, q, r
+
+    @traced
+    def spin_vjp(self, b, u, v, by, scene, adjoint):
+        adjoints = body_motion.spun(u, v, self.spread_numbers(b, scene)).adjoints(by)
+        self.add_J(b, adjoints[18:], adjoint)
+        return tuple(vectors(adjoints[:18]))
+
+    @traced
+    def moved_vjp(self, b, u, v, by_u, by_v, now, scene, adjoint):
+        """(adjoint of u, of v+) for those of the displacements and velocities after the pass; adds those of all else."""
+        alpha, decay = let(self.double(now.alpha)), let(self.double(now.decay))
+        x = self.moved_columns_vjp(b, *self._all(u, v, by_u, by_v), alpha, decay, scene, adjoint)
+        if self.vertex.features.drag >= 0:
+            by_alpha, by_decay = let(x[6] + self.dot(by_u.o, v.o)), let(x[7] + self.dot(by_v.o, v.o))
+            self.add_rate(b, by_alpha, by_decay, now, scene, adjoint)
+        return self.field(by_u.o, *x[:3]), self.field(alpha * by_u.o + decay * by_v.o, *x[3:6])
+
+    @ti.func
+    def add_rate(self, b, by_alpha, by_decay, now: A, scene: A, adjoint: A):
+        row, i = ti.static(self.vertex.features.drag), scene.body_vertex[scene.body_first[b]]
+        by_rate = now.alpha_by_rate * by_alpha + now.decay_by_rate * by_decay
+        adjoint.sums[row, i] = adjoint.sums[row, i] + ti.cast(by_rate, self.fp)
+
+    @ti.func
+    def moved_columns_vjp(
+        self, b, ux, uy, uz, vx, vy, vz, ax, ay, az, cx, cy, cz, alpha, decay, scene: A, adjoint: A
+    ):
+        x, y, z = ax, ay, az
+        p, q, r = alpha * ax + decay * cx, alpha * ay + decay * cy, alpha * az + decay * cz
+        by_alpha, by_decay = ax.dot(vx) + ay.dot(vy) + az.dot(vz), cx.dot(vx) + cy.dot(vy) + cz.dot(vz)
+        if ti.static(self.rigid):
+            if scene.body_kind[b] > 0:
+                if alpha > 0:
+                    x, y, z, p, q, r, by_alpha, by_decay = self.turn_vjp(
+                        b, [ux, uy, uz], [vx, vy, vz], [ax, ay, az, cx, cy, cz], alpha, decay, scene, adjoint
+                    )
+                else:
+                    x, y, z, p, q, r = self.spin_vjp(b, [ux, uy, uz], [vx, vy, vz], [cx, cy, cz], scene, adjoint)
+        return x, y, z, p, q, r, by_alpha, by_decay
+
+    @traced
+    def turn_vjp(self, b, u, v, by, alpha, decay, scene, adjoint):
+        adjoints = body_motion.turned(u, v, self.spread_numbers(b, scene), alpha, decay).adjoints(by)
+        self.add_J(b, adjoints[18:24], adjoint)
+        return (*vectors(adjoints[:18]), *map(let, adjoints[24:]))
+
+    # ---- friction ------------------------------------------------------------------------------------------------------
+
+    @ti.func
+    def add_reach(self, m, b, y, by_reach, scene: A, adjoint: A):
+        """Add what the adjoint of w at vertex m of all bodies says of y, M and J."""
+        z, mass = self.solve_arm(b, y, scene), scene.body_numbers[b * NUMBERS]
+        self.add_felt(m, 2 * by_reach * z, ti.cast(0, ti.f64), adjoint)
+        self.add(adjoint.body_sums, b * SUMS, -by_reach / (mass * mass))
+        for k in ti.static(range(6)):
+            r, c = ti.static(PAIRS[k][0]), ti.static(PAIRS[k][1])
+            self.add(adjoint.body_sums, b * SUMS + 1 + k, -ti.static(1.0 if r == c else 2.0) * by_reach * z[r] * z[c])
+
+    @ti.func
+    def total_of_pushes(self, b, source: A, s, w: A, total, by: A, now: A, scene: A):
+        """Adjoint of C for those of the sums of impulses."""
+        out = ti.cast(0, ti.f64)
+        if total > 0 and now.alpha > 0:
+            small = ti.cast(total, self.fp)
+            for m in range(scene.body_first[b], scene.body_first[b + 1]):
+                i = scene.body_vertex[m]
+                if scene.surface[i] > 0:
+                    y = self.arm(m, b, scene)
+                    v, p_adj = self.narrow(self.at_arm(w, y)), self.narrow(self.at_arm(by, y))
+                    out += self.double(self.friction.total_vjp(i, source[s, i], v, small, p_adj, now, scene))
+        return out
+
+    @ti.func
+    def pushes_vjp(self, b, source: A, s, w: A, total, by_total, by: A, now: A, scene: A, adjoint: A):
+        """Sums of the adjoints of w; adds those of all else, of u to adjoint.u."""
+        o, p, q, r = VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0)
+        if total > 0 and now.alpha > 0:
+            small = ti.cast(total, self.fp)
+            for m in range(scene.body_first[b], scene.body_first[b + 1]):
+                i = scene.body_vertex[m]
+                if scene.surface[i] > 0:
+                    y, u = self.arm(m, b, scene), source[s, i]
+                    v, p_adj = self.narrow(self.at_arm(w, y)), self.narrow(self.at_arm(by, y))
+                    x = self.wide(self.friction.impulse(i, u, v, small, now, scene))
+                    load = self.double(self.friction.load(i, u, now, scene))
+                    by_load = ti.cast(by_total * self.reach(b, y, scene), self.fp)
+                    by_u, by_v = self.friction.vjp(i, u, v, small, p_adj, by_load, now, scene, adjoint)
+                    adjoint.u[0, i] = adjoint.u[0, i] + by_u
+                    wide = self.wide(by_v)
+                    o += wide
+                    p += y.x * wide
+                    q += y.y * wide
+                    r += y.z * wide
+                    self.add_felt(m, self.along(by, x) + self.along(w, wide), ti.cast(0, ti.f64), adjoint)
+                    self.add_reach(m, b, y, load * by_total, scene, adjoint)
+        return o, p, q, r
+
+    @traced
+    def rubbed_vjp(self, b, u, v, by_after, source, s, now, scene, adjoint):
+        """(adjoint of u, of v) for that of the velocities after friction."""
+        if not self.rough:
+            return self.field(*[let(VECTOR(0, 0, 0, 0))] * 4), by_after
+        total, w = let(self.total(b, source, s, now, scene)), self.spun(b, u, v, scene)
+        p = self.solved(b, self.pushes(b, source, s, w, total, now, scene), scene)
+        by = self.solved_vjp(b, p, by_after, scene, adjoint)
+        by_total = let(self.total_of_pushes(b, source, s, w, total, by, now, scene))
+        sums = self.pushes_vjp(b, source, s, w, total, by_total, by, now, scene, adjoint)
+        by_u, by_v = self.spun_vjp(b, 1, u, v, self.field(*sums), scene, adjoint)
+        return by_u, self.sum_of(by_after, by_v)
+
+    # ---- the pass ------------------------------------------------------------------------------------------------------
+
+    @ti.func
+    def gather(self, b, j, scene: A, adjoint: A, plan: A):
+        """What the pass after this one has left at corners of tetrahedra."""
+        if j < plan.num_passes - 1:
+            for m in range(scene.body_first[b], scene.body_first[b + 1]):
+                i = scene.body_vertex[m]
+                adjoint.u[0, i] = adjoint.u[0, i] + self.vertex.element.gather(i, scene, adjoint.corner)
+                if ti.static(self.vertex.reads_rates):
+                    of_rates = self.vertex.element.gather(i, scene, adjoint.rate_corner)
+                    adjoint.v[0, i] = adjoint.v[0, i] + of_rates
+
+    @ti.func
+    def spread_vjp(self, b, slot, source: A, q: A, scene: A, adjoint: A):
+        """Sums of the adjoints of a field at the vertices, source[slot]; adds those of y."""
+        o, x, y, z = VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0)
+        for m in range(scene.body_first[b], scene.body_first[b + 1]):
+            arm, by = self.arm(m, b, scene), self.wide(source[slot, scene.body_vertex[m]])
+            o += by
+            x += arm.x * by
+            y += arm.y * by
+            z += arm.z * by
+            self.add_felt(m, self.along(q, by), ti.cast(0, ti.f64), adjoint)
+        return o, x, y, z
+
+    @ti.func
+    def leave(self, b, s, by_u: A, by_v: A, by_f: A, seen: A, halts, state: A, scene: A, adjoint: A):
+        """Adjoints of each vertex, for those of the sums over displacements, velocities and forces."""
+        for m in range(scene.body_first[b], scene.body_first[b + 1]):
+            i, y, mass = scene.body_vertex[m], self.arm(m, b, scene), self.double(scene.body_mass[m])
+            u, v, f = self.wide(state.u[s, i]), self.wide(state.v[s, i]), self.wide(state.f[s, i])
+            if halts:
+                v = self.at_arm(seen, y)
+            of_u, of_v, of_f = self.at_arm(by_u, y), self.at_arm(by_v, y), self.at_arm(by_f, y)
+            by_y = mass * (self.along(by_u, u) + self.along(by_v, v)) + self.along(by_f, f)
+            self.add_felt(m, by_y, u.dot(of_u) + v.dot(of_v), adjoint)
+            adjoint.u[0, i] = adjoint.u[0, i] + self.narrow(mass * of_u)
+            adjoint.v[0, i] = self.narrow(mass * of_v)
+            adjoint.w[0, i] = self.narrow(of_f)
+
+    @ti.func
+    def start_u(self, b, now: A, scene: A, adjoint: A):
+        """What of adjoint.u is of the displacements before the pass themselves."""
+        for m in range(scene.body_first[b], scene.body_first[b + 1]):
+            i = scene.body_vertex[m]
+            if now.alpha > 0:
+                adjoint.u[0, i] = self.vertex.vector(0)
+            if now.frame >= 0:
+                adjoint.u[0, i] = adjoint.u[0, i] + adjoint.frames_u[now.frame, i]
+
+    @ti.func
+    def add_gravity(self, b, by_f: A, scene: A, adjoint: A):
+        if ti.static(self.vertex.features.gravity >= 0):
+            i = scene.body_vertex[scene.body_first[b]]
+            for d in ti.static(range(3)):
+                row = ti.static(self.vertex.features.gravity + d)
+                adjoint.sums[row, i] = adjoint.sums[row, i] + ti.cast(by_f.o[d], self.fp)
+
+    @traced
+    def times(self, share, q):
+        s = let(self.double(share))
+        return self.field(s * q.o, s * q.x, s * q.y, s * q.z)
+
+    @ti.func
+    def either(self, condition, a, b):
+        out = a
+        if not condition:
+            out = b
+        return out
+
+    @traced
+    def chosen(self, condition, p, q):
+        """p where the condition holds, else q."""
+        return self.field(*(self.either(condition, getattr(p, k), getattr(q, k)) for k in "oxyz"))
+
+    @ti.func
+    def step_vjp(self, b, j, now: A, scene: A, state: A, adjoint: A, plan: A):
+        """Back through the stage: leaves adjoints of u and v before the pass and of forces in adjoint.u, .v and .w."""
+        s = j - plan.base
+        self.gather(b, j, scene, adjoint, plan)
+        u, v = self.nearest(b, state.u, s, True, scene), self.nearest(b, state.v, s, True, scene)
+        f = self.pulled(b, state.f, s, scene, scene.parameters)
+        halts = now.pre_adj < now.pre  # at the state that the pass shows
+        seen = self.shown(b, u, v, f, now.pre, scene)
+        start, share = self.chosen(halts, seen, v), now.pre_adj + now.post
+        kicked = self.kicked(start, share, f)
+        after = self.rubbed(b, u, kicked, state.u, s, now, scene)
+        displaced, moving = self.moved(b, u, after, now, scene)
+        by_v = self.field_of(self.spread_vjp(b, 0, adjoint.v, moving, scene, adjoint))
+        by_u = self.field_of(self.spread_u(b, displaced, now, scene, adjoint))
+        self.start_u(b, now, scene, adjoint)
+        of_u, of_after = self.moved_vjp(b, u, after, by_u, by_v, now, scene, adjoint)
+        more_u, of_kicked = self.rubbed_vjp(b, u, kicked, of_after, state.u, s, now, scene, adjoint)
+        of_seen = self.field_of(self.spread_frame(b, seen, now, scene, adjoint))
+        w = self.kicked(v, now.pre, f)
+        shown_u, of_w = self.spun_vjp(b, self.unless(halts, now.pre), u, w, of_seen, scene, adjoint)
+        by_field_v, by_field_u = self.sum_of(of_kicked, of_w), self.sum_of(self.sum_of(of_u, more_u), shown_u)
+        of_f = self.sum_of(self.times(share, of_kicked), self.times(self.unless(halts, now.pre), of_w))
+        plain = self.nearest(b, state.f, s, False, scene)
+        self.add_gravity(b, of_f, scene, adjoint)
+        sums_u = self.solved_vjp(b, u, by_field_u, scene, adjoint)
+        sums_v = self.solved_vjp(b, start, by_field_v, scene, adjoint)
+        sums_f = self.solved_vjp(b, plain, of_f, scene, adjoint)
+        self.leave(b, s, sums_u, sums_v, sums_f, seen, halts, state, scene, adjoint)
+
+    @traced
+    def field_of(self, sums):
+        return self.field(*sums)
+
+    @ti.func
+    def unless(self, condition, x):
+        out = x
+        if condition:
+            out = 0 * x
+        return out
+
+    @ti.func
+    def spread_u(self, b, q: A, now: A, scene: A, adjoint: A):
+        """The same of displacements; a pass that only kicks leaves these as they are."""
+        o, x, y, z = VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0)
+        if now.alpha > 0:
+            o, x, y, z = self.spread_vjp(b, 0, adjoint.u, q, scene, adjoint)
+        return o, x, y, z
+
+    @ti.func
+    def spread_frame(self, b, q: A, now: A, scene: A, adjoint: A):
+        """The same of what a frame shows."""
+        o, x, y, z = VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0)
+        if now.frame >= 0:
+            o, x, y, z = self.spread_vjp(b, now.frame, adjoint.frames_v, q, scene, adjoint)
+        return o, x, y, z

@@ -1,0 +1,182 @@
+"""The tangent of the stage of bodies of few numbers (bodies.py), along recorded passes."""
+
+from dataclasses import dataclass
+
+import taichi as ti
+
+from diffsim_ti.runtime import at, let, traced
+from diffsim_ti.solvers.explicit import body_motion
+from diffsim_ti.solvers.explicit.bodies import Bodies
+from diffsim_ti.solvers.explicit.body_motion import VECTOR
+from diffsim_ti.state.bodies import NUMBERS, PAIRS
+
+A = ti.template()  # an array or Bundle handed to a Taichi function
+
+
+@traced
+def numbers_of(*columns) -> list:
+    """Components of columns, one after the other."""
+    return [let(at(column, d)) for column in columns for d in range(3)]
+
+
+@dataclass(frozen=True)
+class BodyTangent(Bodies):
+    """Taichi functions of body b in pass j."""
+
+    @traced
+    def spun_jvp(self, b, u, v, du, dv, scene, tangent):
+        """Change of the rigid part of velocities."""
+        return self.field(dv.o, *self.spun_columns_jvp(b, 1, *self._all(u, v, du, dv), scene, tangent))
+
+    @traced
+    def shown_jvp(self, b, u, v, f, du, dv, df, pre, scene, tangent):
+        w, dw = self.kicked(v, pre, f), self.kicked(dv, pre, df)
+        return self.field(dw.o, *self.spun_columns_jvp(b, pre, *self._all(u, w, du, dw), scene, tangent))
+
+    @traced
+    def _all(self, *fields):
+        return [x for q in fields for x in self.columns(q)]
+
+    @ti.func
+    def spun_columns_jvp(
+        self, b, pre, ux, uy, uz, vx, vy, vz, dux, duy, duz, dvx, dvy, dvz, scene: A, tangent: A
+    ):
+        x, y, z = dvx, dvy, dvz
+        if ti.static(self.rigid):
+            if pre > 0 and scene.body_kind[b] > 0:
+                x, y, z = self.spin_jvp(
+                    b, [ux, uy, uz], [vx, vy, vz], [dux, duy, duz], [dvx, dvy, dvz], scene, tangent
+                )
+        return x, y, z
+
+    @traced
+    def spin_jvp(self, b, u, v, du, dv, scene, tangent):
+        record = body_motion.spun(u, v, self.spread_numbers(b, scene))
+        return tuple(record.changes([*numbers_of(*du, *dv), *self.spread_numbers(b, tangent)]))
+
+    @traced
+    def moved_jvp(self, b, u, v, du, dv, dalpha, ddecay, now, scene, tangent):
+        """Changes of the displacements and velocities after the pass."""
+        alpha, decay = let(self.double(now.alpha)), let(self.double(now.decay))
+        dalpha, ddecay = let(self.double(dalpha)), let(self.double(ddecay))
+        x = self.moved_columns_jvp(b, *self._all(u, v, du, dv), alpha, decay, dalpha, ddecay, scene, tangent)
+        displaced = du.o + alpha * dv.o + dalpha * v.o
+        return self.field(displaced, *x[:3]), self.field(decay * dv.o + ddecay * v.o, *x[3:])
+
+    @ti.func
+    def moved_columns_jvp(
+        self, b, ux, uy, uz, vx, vy, vz, dux, duy, duz, dvx, dvy, dvz, alpha, decay, da, dd, scene: A, tangent: A
+    ):
+        x, y, z = dux + alpha * dvx + da * vx, duy + alpha * dvy + da * vy, duz + alpha * dvz + da * vz
+        p, q, r = decay * dvx + dd * vx, decay * dvy + dd * vy, decay * dvz + dd * vz
+        if ti.static(self.rigid):
+            if scene.body_kind[b] > 0:
+                if alpha > 0:
+                    x, y, z, p, q, r = self.turn_jvp(
+                        b,
+                        [ux, uy, uz],
+                        [vx, vy, vz],
+                        [dux, duy, duz],
+                        [dvx, dvy, dvz],
+                        alpha,
+                        decay,
+                        da,
+                        dd,
+                        scene,
+                        tangent,
+                    )
+                else:
+                    p, q, r = self.spin_jvp(
+                        b, [ux, uy, uz], [vx, vy, vz], [dux, duy, duz], [dvx, dvy, dvz], scene, tangent
+                    )
+        return x, y, z, p, q, r
+
+    @traced
+    def turn_jvp(self, b, u, v, du, dv, alpha, decay, da, dd, scene, tangent):
+        record = body_motion.turned(u, v, self.spread_numbers(b, scene), alpha, decay)
+        return tuple(record.changes([*numbers_of(*du, *dv), *self.spread_numbers(b, tangent), da, dd]))
+
+    @ti.func
+    def reach_jvp(self, b, y, dy, scene: A, tangent: A):
+        z, mass = self.solve_arm(b, y, scene), scene.body_numbers[b * NUMBERS]
+        out = 2 * z.dot(dy) - tangent.body_numbers[b * NUMBERS] / (mass * mass)
+        for k in ti.static(range(6)):
+            r, c = ti.static(PAIRS[k][0]), ti.static(PAIRS[k][1])
+            out += -ti.static(1.0 if r == c else 2.0) * z[r] * z[c] * tangent.body_numbers[b * NUMBERS + 10 + k]
+        return out
+
+    @ti.func
+    def total_jvp(self, b, source: A, s, now: A, scene: A, tangent: A):
+        out = ti.cast(0, ti.f64)
+        for m in range(scene.body_first[b], scene.body_first[b + 1]):
+            i = scene.body_vertex[m]
+            if scene.surface[i] > 0:
+                y, u = self.arm(m, b, scene), source[s, i]
+                load = self.double(self.friction.load(i, u, now, scene))
+                dload = self.double(self.friction.load_jvp(i, u, tangent.u[0, i], now, scene, tangent))
+                dy = self.wide(tangent.body_place[m])
+                out += dload * self.reach(b, y, scene) + load * self.reach_jvp(b, y, dy, scene, tangent)
+        return out
+
+    @ti.func
+    def pushes_jvp(self, b, source: A, s, w: A, dw: A, total, dtotal, now: A, scene: A, tangent: A):
+        o, p, q, r = VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0)
+        if total > 0 and now.alpha > 0:
+            small, dsmall = ti.cast(total, self.fp), ti.cast(dtotal, self.fp)
+            for m in range(scene.body_first[b], scene.body_first[b + 1]):
+                i = scene.body_vertex[m]
+                if scene.surface[i] > 0:
+                    y, dy, u = self.arm(m, b, scene), self.wide(tangent.body_place[m]), source[s, i]
+                    v, dv = self.narrow(self.at_arm(w, y)), self.narrow(self.at_arm(dw, y) + self.slope_at(w, dy))
+                    x = self.wide(self.friction.impulse(i, u, v, small, now, scene))
+                    du = tangent.u[0, i]
+                    dx = self.wide(self.friction.impulse_jvp(i, u, v, small, du, dv, dsmall, now, scene, tangent))
+                    o += dx
+                    p += y.x * dx + dy.x * x
+                    q += y.y * dx + dy.y * x
+                    r += y.z * dx + dy.z * x
+        return o, p, q, r
+
+    @traced
+    def rubbed_jvp(self, b, u, v, du, dv, source, s, now, scene, tangent):
+        """Change of the velocities after friction."""
+        if not self.rough:
+            return dv
+        total, w = let(self.total(b, source, s, now, scene)), self.spun(b, u, v, scene)
+        dtotal = let(self.total_jvp(b, source, s, now, scene, tangent))
+        dw = self.spun_jvp(b, u, v, du, dv, scene, tangent)
+        p = self.solved(b, self.pushes(b, source, s, w, total, now, scene), scene)
+        sums = self.pushes_jvp(b, source, s, w, dw, total, dtotal, now, scene, tangent)
+        dp = self.solved_jvp(b, p, sums, scene, tangent)
+        return self.field(dv.o + dp.o, dv.x + dp.x, dv.y + dp.y, dv.z + dp.z)
+
+    @ti.func
+    def step_jvp(self, b, j, now: A, scene: A, state: A, tangent: A, plan: A):
+        s = j - plan.base
+        u, v = self.nearest(b, state.u, s, True, scene), self.nearest(b, state.v, s, True, scene)
+        f = self.pulled(b, state.f, s, scene, scene.parameters)
+        du = self.nearest_jvp(b, u, state.u, s, tangent.u, True, scene, tangent)
+        dv = self.nearest_jvp(b, v, state.v, s, tangent.v, True, scene, tangent)
+        plain = self.nearest(b, state.f, s, False, scene)  # without gravity
+        df = self.with_gravity(
+            self.nearest_jvp(b, plain, state.f, s, tangent.body_force, False, scene, tangent), tangent.parameters
+        )
+        if now.frame >= 0:
+            seen = self.shown(b, u, v, f, now.pre, scene)
+            dseen = self.shown_jvp(b, u, v, f, du, dv, df, now.pre, scene, tangent)
+            for m in range(scene.body_first[b], scene.body_first[b + 1]):
+                i, y, dy = scene.body_vertex[m], self.arm(m, b, scene), self.wide(tangent.body_place[m])
+                tangent.frames_u[now.frame, i] = tangent.u[0, i]
+                tangent.frames_v[now.frame, i] = self.narrow(self.at_arm(dseen, y) + self.slope_at(seen, dy))
+        share = now.pre + now.post
+        kicked, dkicked = self.kicked(v, share, f), self.kicked(dv, share, df)
+        after = self.rubbed(b, u, kicked, state.u, s, now, scene)
+        dafter = self.rubbed_jvp(b, u, kicked, du, dkicked, state.u, s, now, scene, tangent)
+        displaced, moving = self.moved(b, u, after, now, scene)
+        dalpha, ddecay = now.alpha_by_rate * plan.rate_dot, now.decay_by_rate * plan.rate_dot
+        ddisplaced, dmoving = self.moved_jvp(b, u, after, du, dafter, dalpha, ddecay, now, scene, tangent)
+        for m in range(scene.body_first[b], scene.body_first[b + 1]):
+            i, y, dy = scene.body_vertex[m], self.arm(m, b, scene), self.wide(tangent.body_place[m])
+            if now.alpha > 0:
+                tangent.u[0, i] = self.narrow(self.at_arm(ddisplaced, y) + self.slope_at(displaced, dy))
+            tangent.v[0, i] = self.narrow(self.at_arm(dmoving, y) + self.slope_at(moving, dy))
