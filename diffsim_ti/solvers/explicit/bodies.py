@@ -18,7 +18,7 @@ from functools import cached_property
 import taichi as ti
 
 from diffsim_ti.runtime import at, let, traced
-from diffsim_ti.solvers.explicit import body_motion
+from diffsim_ti.solvers.explicit import body_motion as motion
 from diffsim_ti.solvers.explicit.body_friction import BodyFriction
 from diffsim_ti.solvers.explicit.body_motion import VECTOR
 from diffsim_ti.solvers.explicit.body_sums import INVERSE, BodySums
@@ -48,59 +48,50 @@ class Bodies(BodySums):
     # ---- what a rigid body makes of a field ----------------------------------------------------------------------------
 
     @traced
-    def spun(self, b, u, v, scene):
-        """Of velocities those that are rigid."""
-        return self.field(v.o, *self.spun_columns(b, u.x, u.y, u.z, v.x, v.y, v.z, scene))
+    def spun(self, b, u, v, scene, pre=1):
+        """Of velocities those that are rigid, where pre > 0."""
+        return self.field(v.o, *self.spun_columns(b, u, v, pre, scene))
 
     @ti.func
-    def spun_columns(self, b, ux, uy, uz, vx, vy, vz, scene: A):
-        x, y, z = vx, vy, vz
+    def spun_columns(self, b, u: A, v: A, pre, scene: A):
+        x, y, z = v.x, v.y, v.z
         if ti.static(self.rigid):
-            if scene.body_kind[b] > 0:
-                x, y, z = self.spin(b, ux, uy, uz, vx, vy, vz, scene)
+            if pre > 0 and scene.body_kind[b] > 0:
+                R = motion.rotation(u)
+                w = motion.spin(R, v, self.J(b, scene))
+                x, y, z = motion.cross(w, R.x), motion.cross(w, R.y), motion.cross(w, R.z)
         return x, y, z
-
-    @traced
-    def spin(self, b, ux, uy, uz, vx, vy, vz, scene):
-        return tuple(body_motion.spun([ux, uy, uz], [vx, vy, vz], self.spread_numbers(b, scene)).values())
 
     @traced
     def shown(self, b, u, v, f, pre, scene):
         """Velocities at the time of the displacements, whose kick took `pre`; before it they are those of the state."""
-        w = self.kicked(v, pre, f)
-        return self.field(w.o, *self.shown_columns(b, pre, u.x, u.y, u.z, w.x, w.y, w.z, scene))
-
-    @ti.func
-    def shown_columns(self, b, pre, ux, uy, uz, vx, vy, vz, scene: A):
-        x, y, z = vx, vy, vz
-        if ti.static(self.rigid):
-            if pre > 0 and scene.body_kind[b] > 0:
-                x, y, z = self.spin(b, ux, uy, uz, vx, vy, vz, scene)
-        return x, y, z
+        return self.spun(b, u, self.kicked(v, pre, f), scene, pre)
 
     @traced
-    def moved(self, b, u, v, now, scene):
-        """(displacements, velocities) after the pass, for velocities v+."""
+    def moved(self, b, u, v, seen, now, scene):
+        """(displacements, velocities) after the pass, for velocities v+ and those that are shown, with which a run ends."""
         alpha, decay = let(self.double(now.alpha)), let(self.double(now.decay))
-        x = self.moved_columns(b, u.x, u.y, u.z, v.x, v.y, v.z, alpha, decay, scene)
+        x = self.moved_columns(b, u, v, seen, alpha, decay, scene)
         return self.field(u.o + alpha * v.o, *x[:3]), self.field(decay * v.o, *x[3:])
 
     @ti.func
-    def moved_columns(self, b, ux, uy, uz, vx, vy, vz, alpha, decay, scene: A):
-        x, y, z = ux + alpha * vx, uy + alpha * vy, uz + alpha * vz
-        p, q, r = decay * vx, decay * vy, decay * vz
+    def moved_columns(self, b, u: A, v: A, seen: A, alpha, decay, scene: A):
+        x, y, z = u.x + alpha * v.x, u.y + alpha * v.y, u.z + alpha * v.z
+        p, q, r = decay * v.x, decay * v.y, decay * v.z
         if ti.static(self.rigid):
             if scene.body_kind[b] > 0:
+                p, q, r = seen.x, seen.y, seen.z
                 if alpha > 0:
-                    x, y, z, p, q, r = self.turn(b, ux, uy, uz, vx, vy, vz, alpha, decay, scene)
-                else:
-                    p, q, r = self.spin(b, ux, uy, uz, vx, vy, vz, scene)
+                    R, J = motion.rotation(u), self.J(b, scene)
+                    a = alpha * motion.back(R, motion.momentum(R, v, J))
+                    phi, rate = motion.times(R, motion.half_turn(J, a)), decay / alpha
+                    p, q, r = motion.gained(phi, R.x), motion.gained(phi, R.y), motion.gained(phi, R.z)
+                    x, y, z = R.x + p, R.y + q, R.z + r
+                    x[0] += -1
+                    y[1] += -1
+                    z[2] += -1
+                    p, q, r = rate * p, rate * q, rate * r
         return x, y, z, p, q, r
-
-    @traced
-    def turn(self, b, ux, uy, uz, vx, vy, vz, alpha, decay, scene):
-        J = self.spread_numbers(b, scene)
-        return tuple(body_motion.turned([ux, uy, uz], [vx, vy, vz], J, alpha, decay).values())
 
     # ---- friction ------------------------------------------------------------------------------------------------------
 
@@ -162,14 +153,14 @@ class Bodies(BodySums):
         s, t = (j - plan.base) * plan.stride, (j - plan.base + 1) * plan.stride
         u, v = self.nearest(b, state.u, s, True, scene), self.nearest(b, state.v, s, True, scene)
         f = self.pulled(b, scene.body_force, 0, scene, scene.parameters)
+        seen = self.shown(b, u, v, f, now.pre, scene)
         if now.frame >= 0:
-            seen = self.shown(b, u, v, f, now.pre, scene)
             for m in range(scene.body_first[b], scene.body_first[b + 1]):
                 i = scene.body_vertex[m]
                 state.frames_u[now.frame, i] = state.u[s, i]
                 state.frames_v[now.frame, i] = self.narrow(self.at_arm(seen, self.arm(m, b, scene)))
         after = self.rubbed(b, u, self.kicked(v, now.pre + now.post, f), state.u, s, now, scene)
-        displaced, moving = self.moved(b, u, after, now, scene)
+        displaced, moving = self.moved(b, u, after, seen, now, scene)
         for m in range(scene.body_first[b], scene.body_first[b + 1]):
             self.go(m, b, displaced, moving, s, t, now, scene, state, plan)
 

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import taichi as ti
 
 from diffsim_ti.runtime import let, traced
-from diffsim_ti.solvers.explicit import body_motion
+from diffsim_ti.solvers.explicit import body_motion as motion
 from diffsim_ti.solvers.explicit.body_tangent import BodyTangent
-from diffsim_ti.solvers.explicit.body_motion import VECTOR, vectors
+from diffsim_ti.solvers.explicit.body_motion import VECTOR
 from diffsim_ti.state.bodies import NUMBERS, PAIRS, SUMS
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
@@ -21,41 +21,92 @@ class BodyStage(BodyTangent):
     def sum_of(self, a, b):
         return self.field(a.o + b.o, a.x + b.x, a.y + b.y, a.z + b.z)
 
+    @ti.func
+    def add_J(self, b, p, q, adjoint: A):
+        """Add p q^T + q p^T to the adjoint of J."""
+        for k in ti.static(range(6)):
+            r = ti.static(PAIRS[k][0])
+            c = ti.static(PAIRS[k][1])
+            if ti.static(r == c):
+                self.add(adjoint.body_sums, b * SUMS + 1 + k, 2 * p[r] * q[r])
+            else:
+                self.add(adjoint.body_sums, b * SUMS + 1 + k, 2 * (p[r] * q[c] + q[r] * p[c]))
+
+    @ti.func
+    def add_trace(self, b, t, adjoint: A):
+        """Add t times the unit matrix."""
+        for k in ti.static(range(3)):
+            self.add(adjoint.body_sums, b * SUMS + 1 + k, t)
+
+    @ti.func
+    def momentum_vjp(self, b, R: A, v: A, J: A, by, scene: A, adjoint: A):
+        """(adjoint of theta, columns of that of v) for that of L; adds that of J."""
+        theta, x, y, z = motion.momentum_vjp(R, v, J, by)
+        for k in ti.static(range(6)):
+            r = ti.static(PAIRS[k][0])
+            c = ti.static(PAIRS[k][1])
+            both = self.column(v, r).dot(self.pick(c, x, y, z))
+            if ti.static(r != c):
+                both += self.column(v, c).dot(self.pick(r, x, y, z))
+            self.add(adjoint.body_sums, b * SUMS + 1 + k, both)
+        return theta, self.mixed(J.x, x, y, z), self.mixed(J.y, x, y, z), self.mixed(J.z, x, y, z)
+
     @traced
-    def add_J(self, b, six, adjoint):
-        for k, x in enumerate(six):
-            self.add(adjoint.body_sums, b * SUMS + 1 + k, x)
+    def pick(self, k, x, y, z):
+        return (x, y, z)[k]
+
+    @traced
+    def column(self, q, k):
+        return (q.x, q.y, q.z)[k]
+
+    @ti.func
+    def mixed(self, a, x, y, z):
+        return a.x * x + a.y * y + a.z * z
 
     @traced
     def spun_vjp(self, b, pre, u, v, by, scene, adjoint):
         """(adjoint of u, of v) as fields, for that of the rigid part of velocities v, where pre > 0; adds that of J."""
-        zero = let(VECTOR(0, 0, 0, 0))
-        x = self.spun_columns_vjp(b, pre, *self._all(u, v, by), scene, adjoint)
-        return self.field(zero, *x[:3]), self.field(by.o, *x[3:])
+        x = self.spun_columns_vjp(b, pre, u, v, by, scene, adjoint)
+        return self.field(VECTOR(0, 0, 0, 0), *x[:3]), self.field(by.o, *x[3:])
 
     @ti.func
-    def spun_columns_vjp(self, b, pre, ux, uy, uz, vx, vy, vz, ax, ay, az, scene: A, adjoint: A):
-        x, y, z, p, q, r = 0 * ax, 0 * ax, 0 * ax, ax, ay, az
+    def spun_columns_vjp(self, b, pre, u: A, v: A, by: A, scene: A, adjoint: A):
+        x, y, z, p, q, r = 0 * by.x, 0 * by.x, 0 * by.x, by.x, by.y, by.z
         if ti.static(self.rigid):
             if pre > 0 and scene.body_kind[b] > 0:
-                x, y, z, p, q, r = self.spin_vjp(b, [ux, uy, uz], [vx, vy, vz], [ax, ay, az], scene, adjoint)
+                R, J = motion.rotation(u), self.J(b, scene)
+                omega = motion.solved(motion.inertia(J), motion.back(R, motion.momentum(R, v, J)))
+                w = motion.times(R, omega)
+                s = motion.cross(R.x, by.x) + motion.cross(R.y, by.y) + motion.cross(R.z, by.z)
+                theta = motion.cross(motion.cross(w, R.x), by.x) + motion.cross(motion.cross(w, R.y), by.y)
+                theta += motion.cross(motion.cross(w, R.z), by.z)
+                of_L = motion.solved(motion.inertia(J), motion.back(R, s))
+                self.add_trace(b, -of_L.dot(omega), adjoint)
+                self.add_J(b, 0.5 * of_L, omega, adjoint)
+                more, p_, q_, r_ = self.momentum_vjp(b, R, v, J, of_L, scene, adjoint)
+                p, q, r = p_, q_, r_
+                x, y, z = self.turning_vjp(R, theta + more)
         return x, y, z, p, q, r
 
-    @traced
-    def spin_vjp(self, b, u, v, by, scene, adjoint):
-        adjoints = body_motion.spun(u, v, self.spread_numbers(b, scene)).adjoints(by)
-        self.add_J(b, adjoints[18:], adjoint)
-        return tuple(vectors(adjoints[:18]))
+    @ti.func
+    def turning_vjp(self, R: A, theta):
+        """Columns of the adjoint of the displacement's gradient."""
+        return 0.5 * motion.cross(theta, R.x), 0.5 * motion.cross(theta, R.y), 0.5 * motion.cross(theta, R.z)
 
     @traced
     def moved_vjp(self, b, u, v, by_u, by_v, now, scene, adjoint):
-        """(adjoint of u, of v+) for those of the displacements and velocities after the pass; adds those of all else."""
+        """(adjoint of u, of v+, of what is shown) for those of the displacements and velocities after the pass; adds those of
+        all else."""
         alpha, decay = let(self.double(now.alpha)), let(self.double(now.decay))
-        x = self.moved_columns_vjp(b, *self._all(u, v, by_u, by_v), alpha, decay, scene, adjoint)
+        x = self.moved_columns_vjp(b, u, v, by_u, by_v, alpha, decay, scene, adjoint)
         if self.vertex.features.drag >= 0:
             by_alpha, by_decay = let(x[6] + self.dot(by_u.o, v.o)), let(x[7] + self.dot(by_v.o, v.o))
             self.add_rate(b, by_alpha, by_decay, now, scene, adjoint)
-        return self.field(by_u.o, *x[:3]), self.field(alpha * by_u.o + decay * by_v.o, *x[3:6])
+        return (
+            self.field(by_u.o, *x[:3]),
+            self.field(alpha * by_u.o + decay * by_v.o, *x[3:6]),
+            self.field(VECTOR(0, 0, 0, 0), *x[8:]),
+        )
 
     @ti.func
     def add_rate(self, b, by_alpha, by_decay, now: A, scene: A, adjoint: A):
@@ -64,27 +115,39 @@ class BodyStage(BodyTangent):
         adjoint.sums[row, i] = adjoint.sums[row, i] + ti.cast(by_rate, self.fp)
 
     @ti.func
-    def moved_columns_vjp(
-        self, b, ux, uy, uz, vx, vy, vz, ax, ay, az, cx, cy, cz, alpha, decay, scene: A, adjoint: A
-    ):
-        x, y, z = ax, ay, az
-        p, q, r = alpha * ax + decay * cx, alpha * ay + decay * cy, alpha * az + decay * cz
-        by_alpha, by_decay = ax.dot(vx) + ay.dot(vy) + az.dot(vz), cx.dot(vx) + cy.dot(vy) + cz.dot(vz)
+    def moved_columns_vjp(self, b, u: A, v: A, by_u: A, by_v: A, alpha, decay, scene: A, adjoint: A):
+        x, y, z = by_u.x, by_u.y, by_u.z
+        p, q, r = alpha * x + decay * by_v.x, alpha * y + decay * by_v.y, alpha * z + decay * by_v.z
+        by_alpha = x.dot(v.x) + y.dot(v.y) + z.dot(v.z)
+        by_decay = by_v.x.dot(v.x) + by_v.y.dot(v.y) + by_v.z.dot(v.z)
+        l, m, n = 0 * x, 0 * x, 0 * x
         if ti.static(self.rigid):
             if scene.body_kind[b] > 0:
+                l, m, n = by_v.x, by_v.y, by_v.z
+                p, q, r = 0 * x, 0 * x, 0 * x
                 if alpha > 0:
-                    x, y, z, p, q, r, by_alpha, by_decay = self.turn_vjp(
-                        b, [ux, uy, uz], [vx, vy, vz], [ax, ay, az, cx, cy, cz], alpha, decay, scene, adjoint
-                    )
-                else:
-                    x, y, z, p, q, r = self.spin_vjp(b, [ux, uy, uz], [vx, vy, vz], [cx, cy, cz], scene, adjoint)
-        return x, y, z, p, q, r, by_alpha, by_decay
-
-    @traced
-    def turn_vjp(self, b, u, v, by, alpha, decay, scene, adjoint):
-        adjoints = body_motion.turned(u, v, self.spread_numbers(b, scene), alpha, decay).adjoints(by)
-        self.add_J(b, adjoints[18:24], adjoint)
-        return (*vectors(adjoints[:18]), *map(let, adjoints[24:]))
+                    l, m, n = 0 * x, 0 * x, 0 * x
+                    R, J = motion.rotation(u), self.J(b, scene)
+                    L = motion.back(R, motion.momentum(R, v, J))
+                    f, rate = motion.half_turn(J, alpha * L), decay / alpha
+                    phi = motion.times(R, f)
+                    theta, of_phi, of_rate = 0 * x, 0 * x, ti.cast(0, ti.f64)
+                    for k in ti.static(range(3)):
+                        own, of_u, of_v = self.column(R, k), self.column(by_u, k), self.column(by_v, k)
+                        c, of_c = motion.gained(phi, own), of_u + rate * of_v
+                        theta += motion.cross(own, of_u) + motion.cross(c, of_c)
+                        of_phi += motion.gained_vjp(phi, own, of_c)
+                        of_rate += of_v.dot(c)
+                    mu = motion.half_turn_vjp(J, f, alpha * L, motion.back(R, of_phi))
+                    of_a, nu = 0.5 * (1 + f.dot(f)) * mu, mu + motion.cross(mu, f)
+                    self.add_trace(b, -nu.dot(f), adjoint)
+                    self.add_J(b, 0.5 * nu, f, adjoint)
+                    by_alpha = of_a.dot(L) - of_rate * rate / alpha
+                    by_decay = of_rate / alpha
+                    more, p_, q_, r_ = self.momentum_vjp(b, R, v, J, alpha * of_a, scene, adjoint)
+                    p, q, r = p_, q_, r_
+                    x, y, z = self.turning_vjp(R, theta + more)
+        return x, y, z, p, q, r, by_alpha, by_decay, l, m, n
 
     # ---- friction ------------------------------------------------------------------------------------------------------
 
@@ -95,7 +158,8 @@ class BodyStage(BodyTangent):
         self.add_felt(m, 2 * by_reach * z, ti.cast(0, ti.f64), adjoint)
         self.add(adjoint.body_sums, b * SUMS, -by_reach / (mass * mass))
         for k in ti.static(range(6)):
-            r, c = ti.static(PAIRS[k][0]), ti.static(PAIRS[k][1])
+            r = ti.static(PAIRS[k][0])
+            c = ti.static(PAIRS[k][1])
             self.add(adjoint.body_sums, b * SUMS + 1 + k, -ti.static(1.0 if r == c else 2.0) * by_reach * z[r] * z[c])
 
     @ti.func
@@ -238,13 +302,13 @@ class BodyStage(BodyTangent):
         start, share = self.chosen(halts, seen, v), now.pre_adj + now.post
         kicked = self.kicked(start, share, f)
         after = self.rubbed(b, u, kicked, state.u, s, now, scene)
-        displaced, moving = self.moved(b, u, after, now, scene)
+        displaced, moving = self.moved(b, u, after, seen, now, scene)
         by_v = self.field_of(self.spread_vjp(b, 0, adjoint.v, moving, scene, adjoint))
         by_u = self.field_of(self.spread_u(b, displaced, now, scene, adjoint))
         self.start_u(b, now, scene, adjoint)
-        of_u, of_after = self.moved_vjp(b, u, after, by_u, by_v, now, scene, adjoint)
+        of_u, of_after, at_end = self.moved_vjp(b, u, after, by_u, by_v, now, scene, adjoint)
         more_u, of_kicked = self.rubbed_vjp(b, u, kicked, of_after, state.u, s, now, scene, adjoint)
-        of_seen = self.field_of(self.spread_frame(b, seen, now, scene, adjoint))
+        of_seen = self.sum_of(at_end, self.field_of(self.spread_frame(b, seen, now, scene, adjoint)))
         w = self.kicked(v, now.pre, f)
         shown_u, of_w = self.spun_vjp(b, self.unless(halts, now.pre), u, w, of_seen, scene, adjoint)
         by_field_v, by_field_u = self.sum_of(of_kicked, of_w), self.sum_of(self.sum_of(of_u, more_u), shown_u)

@@ -9,12 +9,12 @@ from dataclasses import dataclass
 import taichi as ti
 
 from diffsim_ti.runtime import Bundle, at, let, traced
-from diffsim_ti.solvers.explicit.body_motion import VECTOR
+from diffsim_ti.solvers.explicit.body_motion import VECTOR, columns
 from diffsim_ti.solvers.explicit.kick_drift import KickDrift
 from diffsim_ti.state.bodies import FELT, NUMBERS, PAIRS, SUMS
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
-INVERSE, J = 4, 10  # where they begin among a body's numbers
+INVERSE, MOMENTS = 4, 10  # where they begin among a body's numbers
 
 
 @dataclass(frozen=True)
@@ -58,9 +58,10 @@ class BodySums:
         return out
 
     @traced
-    def spread_numbers(self, b, scene):
-        """The six of J."""
-        return [self.number(b, J + k, scene) for k in range(6)]
+    def J(self, b, scene):
+        """Columns of J, or of its change."""
+        zero = ti.cast(0, ti.f64)
+        return columns(*(let(VECTOR(*column, zero)) for column in self.matrix(b, MOMENTS, scene)))
 
     @ti.func
     def arm(self, m, b, scene: A):
@@ -157,7 +158,7 @@ class BodySums:
     @traced
     def solved_jvp(self, b, q, sums, scene, tangent):
         """Change of a field q for those of its sums."""
-        dJ, Q = self.matrix(b, J, tangent), self.columns(q)
+        dJ, Q = self.matrix(b, MOMENTS, tangent), self.columns(q)
         left = [s - sum((dJ[k][n] * Q[n] for n in (1, 2)), dJ[k][0] * Q[0]) for k, s in enumerate(sums[1:])]
         return self.solved(b, [sums[0] - self.number(b, 0, tangent) * q.o, *map(let, left)], scene)
 

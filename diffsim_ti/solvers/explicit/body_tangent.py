@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import taichi as ti
 
-from diffsim_ti.runtime import at, let, traced
-from diffsim_ti.solvers.explicit import body_motion
+from diffsim_ti.runtime import let, traced
+from diffsim_ti.solvers.explicit import body_motion as motion
 from diffsim_ti.solvers.explicit.bodies import Bodies
 from diffsim_ti.solvers.explicit.body_motion import VECTOR
 from diffsim_ti.state.bodies import NUMBERS, PAIRS
@@ -13,95 +13,77 @@ from diffsim_ti.state.bodies import NUMBERS, PAIRS
 A = ti.template()  # an array or Bundle handed to a Taichi function
 
 
-@traced
-def numbers_of(*columns) -> list:
-    """Components of columns, one after the other."""
-    return [let(at(column, d)) for column in columns for d in range(3)]
-
-
 @dataclass(frozen=True)
 class BodyTangent(Bodies):
     """Taichi functions of body b in pass j."""
 
     @traced
-    def spun_jvp(self, b, u, v, du, dv, scene, tangent):
+    def spun_jvp(self, b, u, v, du, dv, scene, tangent, pre=1):
         """Change of the rigid part of velocities."""
-        return self.field(dv.o, *self.spun_columns_jvp(b, 1, *self._all(u, v, du, dv), scene, tangent))
-
-    @traced
-    def shown_jvp(self, b, u, v, f, du, dv, df, pre, scene, tangent):
-        w, dw = self.kicked(v, pre, f), self.kicked(dv, pre, df)
-        return self.field(dw.o, *self.spun_columns_jvp(b, pre, *self._all(u, w, du, dw), scene, tangent))
-
-    @traced
-    def _all(self, *fields):
-        return [x for q in fields for x in self.columns(q)]
+        return self.field(dv.o, *self.spun_columns_jvp(b, u, v, du, dv, pre, scene, tangent))
 
     @ti.func
-    def spun_columns_jvp(
-        self, b, pre, ux, uy, uz, vx, vy, vz, dux, duy, duz, dvx, dvy, dvz, scene: A, tangent: A
-    ):
-        x, y, z = dvx, dvy, dvz
+    def spun_columns_jvp(self, b, u: A, v: A, du: A, dv: A, pre, scene: A, tangent: A):
+        x, y, z = dv.x, dv.y, dv.z
         if ti.static(self.rigid):
             if pre > 0 and scene.body_kind[b] > 0:
-                x, y, z = self.spin_jvp(
-                    b, [ux, uy, uz], [vx, vy, vz], [dux, duy, duz], [dvx, dvy, dvz], scene, tangent
-                )
+                R = motion.rotation(u)
+                theta = motion.turning(R, du)
+                x, y, z = motion.spin_jvp(R, v, self.J(b, scene), theta, dv, self.J(b, tangent))
         return x, y, z
 
     @traced
-    def spin_jvp(self, b, u, v, du, dv, scene, tangent):
-        record = body_motion.spun(u, v, self.spread_numbers(b, scene))
-        return tuple(record.changes([*numbers_of(*du, *dv), *self.spread_numbers(b, tangent)]))
+    def shown_jvp(self, b, u, v, f, du, dv, df, pre, scene, tangent):
+        return self.spun_jvp(b, u, self.kicked(v, pre, f), du, self.kicked(dv, pre, df), scene, tangent, pre)
 
     @traced
-    def moved_jvp(self, b, u, v, du, dv, dalpha, ddecay, now, scene, tangent):
+    def moved_jvp(self, b, u, v, du, dv, dseen, dalpha, ddecay, now, scene, tangent):
         """Changes of the displacements and velocities after the pass."""
         alpha, decay = let(self.double(now.alpha)), let(self.double(now.decay))
         dalpha, ddecay = let(self.double(dalpha)), let(self.double(ddecay))
-        x = self.moved_columns_jvp(b, *self._all(u, v, du, dv), alpha, decay, dalpha, ddecay, scene, tangent)
+        x = self.moved_columns_jvp(b, u, v, du, dv, dseen, alpha, decay, dalpha, ddecay, scene, tangent)
         displaced = du.o + alpha * dv.o + dalpha * v.o
         return self.field(displaced, *x[:3]), self.field(decay * dv.o + ddecay * v.o, *x[3:])
 
     @ti.func
     def moved_columns_jvp(
-        self, b, ux, uy, uz, vx, vy, vz, dux, duy, duz, dvx, dvy, dvz, alpha, decay, da, dd, scene: A, tangent: A
+        self, b, u: A, v: A, du: A, dv: A, dseen: A, alpha, decay, da, dd, scene: A, tangent: A
     ):
-        x, y, z = dux + alpha * dvx + da * vx, duy + alpha * dvy + da * vy, duz + alpha * dvz + da * vz
-        p, q, r = decay * dvx + dd * vx, decay * dvy + dd * vy, decay * dvz + dd * vz
+        x, y, z = (
+            du.x + alpha * dv.x + da * v.x,
+            du.y + alpha * dv.y + da * v.y,
+            du.z + alpha * dv.z + da * v.z,
+        )
+        p, q, r = decay * dv.x + dd * v.x, decay * dv.y + dd * v.y, decay * dv.z + dd * v.z
         if ti.static(self.rigid):
             if scene.body_kind[b] > 0:
+                p, q, r = dseen.x, dseen.y, dseen.z
                 if alpha > 0:
-                    x, y, z, p, q, r = self.turn_jvp(
-                        b,
-                        [ux, uy, uz],
-                        [vx, vy, vz],
-                        [dux, duy, duz],
-                        [dvx, dvy, dvz],
-                        alpha,
-                        decay,
-                        da,
-                        dd,
-                        scene,
-                        tangent,
-                    )
-                else:
-                    p, q, r = self.spin_jvp(
-                        b, [ux, uy, uz], [vx, vy, vz], [dux, duy, duz], [dvx, dvy, dvz], scene, tangent
-                    )
+                    R, J, dJ = motion.rotation(u), self.J(b, scene), self.J(b, tangent)
+                    theta, L = motion.turning(R, du), motion.back(R, motion.momentum(R, v, J))
+                    dL, f = motion.momentum_jvp(R, v, J, theta, dv, dJ), motion.half_turn(J, alpha * L)
+                    df = motion.half_turn_jvp(J, f, alpha * L, alpha * dL + da * L, dJ)
+                    phi, dphi, rate = motion.times(R, f), motion.times(R, df), decay / alpha
+                    drate = dd / alpha - rate * da / alpha
+                    x, p = self.gained_jvp(R.x, phi, theta, dphi, rate, drate)
+                    y, q = self.gained_jvp(R.y, phi, theta, dphi, rate, drate)
+                    z, r = self.gained_jvp(R.z, phi, theta, dphi, rate, drate)
         return x, y, z, p, q, r
 
-    @traced
-    def turn_jvp(self, b, u, v, du, dv, alpha, decay, da, dd, scene, tangent):
-        record = body_motion.turned(u, v, self.spread_numbers(b, scene), alpha, decay)
-        return tuple(record.changes([*numbers_of(*du, *dv), *self.spread_numbers(b, tangent), da, dd]))
+    @ti.func
+    def gained_jvp(self, k, phi, theta, dphi, rate, drate):
+        """Changes of a column of the displacement's and of the velocity's gradient."""
+        c = motion.gained(phi, k)
+        dc = motion.cross(theta, c) + motion.gained_jvp(phi, dphi, k)
+        return motion.cross(theta, k) + dc, rate * dc + drate * c
 
     @ti.func
     def reach_jvp(self, b, y, dy, scene: A, tangent: A):
         z, mass = self.solve_arm(b, y, scene), scene.body_numbers[b * NUMBERS]
         out = 2 * z.dot(dy) - tangent.body_numbers[b * NUMBERS] / (mass * mass)
         for k in ti.static(range(6)):
-            r, c = ti.static(PAIRS[k][0]), ti.static(PAIRS[k][1])
+            r = ti.static(PAIRS[k][0])
+            c = ti.static(PAIRS[k][1])
             out += -ti.static(1.0 if r == c else 2.0) * z[r] * z[c] * tangent.body_numbers[b * NUMBERS + 10 + k]
         return out
 
@@ -161,9 +143,9 @@ class BodyTangent(Bodies):
         df = self.with_gravity(
             self.nearest_jvp(b, plain, state.f, s, tangent.body_force, False, scene, tangent), tangent.parameters
         )
+        seen = self.shown(b, u, v, f, now.pre, scene)
+        dseen = self.shown_jvp(b, u, v, f, du, dv, df, now.pre, scene, tangent)
         if now.frame >= 0:
-            seen = self.shown(b, u, v, f, now.pre, scene)
-            dseen = self.shown_jvp(b, u, v, f, du, dv, df, now.pre, scene, tangent)
             for m in range(scene.body_first[b], scene.body_first[b + 1]):
                 i, y, dy = scene.body_vertex[m], self.arm(m, b, scene), self.wide(tangent.body_place[m])
                 tangent.frames_u[now.frame, i] = tangent.u[0, i]
@@ -172,9 +154,9 @@ class BodyTangent(Bodies):
         kicked, dkicked = self.kicked(v, share, f), self.kicked(dv, share, df)
         after = self.rubbed(b, u, kicked, state.u, s, now, scene)
         dafter = self.rubbed_jvp(b, u, kicked, du, dkicked, state.u, s, now, scene, tangent)
-        displaced, moving = self.moved(b, u, after, now, scene)
+        displaced, moving = self.moved(b, u, after, seen, now, scene)
         dalpha, ddecay = now.alpha_by_rate * plan.rate_dot, now.decay_by_rate * plan.rate_dot
-        ddisplaced, dmoving = self.moved_jvp(b, u, after, du, dafter, dalpha, ddecay, now, scene, tangent)
+        ddisplaced, dmoving = self.moved_jvp(b, u, after, du, dafter, dseen, dalpha, ddecay, now, scene, tangent)
         for m in range(scene.body_first[b], scene.body_first[b + 1]):
             i, y, dy = scene.body_vertex[m], self.arm(m, b, scene), self.wide(tangent.body_place[m])
             if now.alpha > 0:
