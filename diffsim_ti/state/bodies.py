@@ -117,6 +117,12 @@ class BodyArrays:
 
     # ---- on the host, for what looks between passes --------------------------------------------------------------------
 
+    def pulled(self, forces: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """Forces [N] on all vertices with those that hold the bodies together, at displacements u."""
+        mass = np.ones(len(forces))
+        mass[self.vertices] = self.mass
+        return mass[:, None] * self.projected(forces / mass[:, None], u, mass)
+
     def projected(self, x: np.ndarray, u: np.ndarray | None, weights: np.ndarray) -> np.ndarray:
         """The nearest of x, shape (num_vertices, 3), that the bodies can do as a velocity at displacements u, where weights,
         shape (num_vertices,), are the masses by which it is near."""

@@ -152,7 +152,7 @@ class Bodies(BodySums):
     def step(self, b, j, now: A, scene: A, state: A, plan: A):
         s, t = (j - plan.base) * plan.stride, (j - plan.base + 1) * plan.stride
         u, v = self.nearest(b, state.u, s, True, scene), self.nearest(b, state.v, s, True, scene)
-        f = self.pulled(b, scene.body_force, 0, scene, scene.parameters)
+        f = self.with_gravity(self.nearest(b, scene.body_force, 0, False, scene), scene.parameters)
         seen = self.shown(b, u, v, f, now.pre, scene)
         if now.frame >= 0:
             for m in range(scene.body_first[b], scene.body_first[b + 1]):

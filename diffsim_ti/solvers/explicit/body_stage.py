@@ -296,7 +296,8 @@ class BodyStage(BodyTangent):
         s = j - plan.base
         self.gather(b, j, scene, adjoint, plan)
         u, v = self.nearest(b, state.u, s, True, scene), self.nearest(b, state.v, s, True, scene)
-        f = self.pulled(b, state.f, s, scene, scene.parameters)
+        plain = self.nearest(b, state.f, s, False, scene)  # without gravity
+        f = self.with_gravity(plain, scene.parameters)
         halts = now.pre_adj < now.pre  # at the state that the pass shows
         seen = self.shown(b, u, v, f, now.pre, scene)
         start, share = self.chosen(halts, seen, v), now.pre_adj + now.post
@@ -313,7 +314,6 @@ class BodyStage(BodyTangent):
         shown_u, of_w = self.spun_vjp(b, self.unless(halts, now.pre), u, w, of_seen, scene, adjoint)
         by_field_v, by_field_u = self.sum_of(of_kicked, of_w), self.sum_of(self.sum_of(of_u, more_u), shown_u)
         of_f = self.sum_of(self.times(share, of_kicked), self.times(self.unless(halts, now.pre), of_w))
-        plain = self.nearest(b, state.f, s, False, scene)
         self.add_gravity(b, of_f, scene, adjoint)
         sums_u = self.solved_vjp(b, u, by_field_u, scene, adjoint)
         sums_v = self.solved_vjp(b, start, by_field_v, scene, adjoint)

@@ -126,13 +126,8 @@ class BodySums:
         return self.solved(b, self.moments(b, source, slot, weighted, scene), scene)
 
     @traced
-    def pulled(self, b, source, slot, scene, parameters):
-        """Accelerations, gravity included; parameters: the scene's, or their change."""
-        f = self.nearest(b, source, slot, False, scene)
-        return self.with_gravity(f, parameters)
-
-    @traced
     def with_gravity(self, f, parameters):
+        """Accelerations with that of gravity; parameters: the scene's, or their change."""
         if self.vertex.features.gravity < 0:
             return f
         return self.field(f.o + self.wide(self.vertex.gravity(parameters)), f.x, f.y, f.z)

@@ -136,10 +136,10 @@ class BodyTangent(Bodies):
     def step_jvp(self, b, j, now: A, scene: A, state: A, tangent: A, plan: A):
         s = j - plan.base
         u, v = self.nearest(b, state.u, s, True, scene), self.nearest(b, state.v, s, True, scene)
-        f = self.pulled(b, state.f, s, scene, scene.parameters)
+        plain = self.nearest(b, state.f, s, False, scene)  # without gravity
+        f = self.with_gravity(plain, scene.parameters)
         du = self.nearest_jvp(b, u, state.u, s, tangent.u, True, scene, tangent)
         dv = self.nearest_jvp(b, v, state.v, s, tangent.v, True, scene, tangent)
-        plain = self.nearest(b, state.f, s, False, scene)  # without gravity
         df = self.with_gravity(
             self.nearest_jvp(b, plain, state.f, s, tangent.body_force, False, scene, tangent), tangent.parameters
         )
