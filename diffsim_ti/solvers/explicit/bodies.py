@@ -17,7 +17,7 @@ from functools import cached_property
 
 import taichi as ti
 
-from diffsim_ti.runtime import at, let, traced
+from diffsim_ti.runtime import Bundle, at, let, traced
 from diffsim_ti.solvers.explicit import body_motion as motion
 from diffsim_ti.solvers.explicit.body_friction import BodyFriction
 from diffsim_ti.solvers.explicit.body_motion import VECTOR
@@ -45,6 +45,13 @@ class Bodies(BodySums):
         """Whether there are rigid ones."""
         return self.vertex.features.rigid
 
+    @traced
+    def placed(self, b, u, scene):
+        """Displacements with R and J (body_motion.py), where there are rigid bodies."""
+        if not self.rigid:
+            return u
+        return Bundle(**vars(u), R=motion.rotation(u), J=self.J(b, scene))
+
     # ---- what a rigid body makes of a field ----------------------------------------------------------------------------
 
     @traced
@@ -57,9 +64,8 @@ class Bodies(BodySums):
         x, y, z = v.x, v.y, v.z
         if ti.static(self.rigid):
             if pre > 0 and scene.body_kind[b] > 0:
-                R = motion.rotation(u)
-                w = motion.spin(R, v, self.J(b, scene))
-                x, y, z = motion.cross(w, R.x), motion.cross(w, R.y), motion.cross(w, R.z)
+                w = motion.spin(u.R, v, u.J)
+                x, y, z = motion.cross(w, u.R.x), motion.cross(w, u.R.y), motion.cross(w, u.R.z)
         return x, y, z
 
     @traced
@@ -68,25 +74,43 @@ class Bodies(BodySums):
         return self.spun(b, u, self.kicked(v, pre, f), scene, pre)
 
     @traced
-    def moved(self, b, u, v, seen, now, scene):
+    def turn(self, b, u, v, now, scene):
+        """L, f and R f of a pass with velocities v+."""
+        if not self.rigid:
+            return None
+        L, f = self.turned(b, u, v, let(self.double(now.alpha)), scene)
+        return Bundle(L=let(L), f=let(f), phi=let(motion.times(u.R, f)))
+
+    @ti.func
+    def turned(self, b, u: A, v: A, alpha, scene: A):
+        L, f = VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0)
+        if alpha > 0 and scene.body_kind[b] > 0:
+            L = motion.back(u.R, motion.momentum(u.R, v, u.J))
+            f = motion.half_turn(u.J, alpha * L)
+        return L, f
+
+    @traced
+    def moved(self, b, u, v, seen, turn, now, scene):
         """(displacements, velocities) after the pass, for velocities v+ and those that are shown, with which a run ends."""
         alpha, decay = let(self.double(now.alpha)), let(self.double(now.decay))
-        x = self.moved_columns(b, u, v, seen, alpha, decay, scene)
+        x = self.moved_columns(b, u, v, seen, turn, alpha, decay, scene)
         return self.field(u.o + alpha * v.o, *x[:3]), self.field(decay * v.o, *x[3:])
 
     @ti.func
-    def moved_columns(self, b, u: A, v: A, seen: A, alpha, decay, scene: A):
+    def moved_columns(self, b, u: A, v: A, seen: A, turn: A, alpha, decay, scene: A):
         x, y, z = u.x + alpha * v.x, u.y + alpha * v.y, u.z + alpha * v.z
         p, q, r = decay * v.x, decay * v.y, decay * v.z
         if ti.static(self.rigid):
             if scene.body_kind[b] > 0:
                 p, q, r = seen.x, seen.y, seen.z
                 if alpha > 0:
-                    R, J = motion.rotation(u), self.J(b, scene)
-                    a = alpha * motion.back(R, motion.momentum(R, v, J))
-                    phi, rate = motion.times(R, motion.half_turn(J, a)), decay / alpha
-                    p, q, r = motion.gained(phi, R.x), motion.gained(phi, R.y), motion.gained(phi, R.z)
-                    x, y, z = R.x + p, R.y + q, R.z + r
+                    rate = decay / alpha
+                    p, q, r = (
+                        motion.gained(turn.phi, u.R.x),
+                        motion.gained(turn.phi, u.R.y),
+                        motion.gained(turn.phi, u.R.z),
+                    )
+                    x, y, z = u.R.x + p, u.R.y + q, u.R.z + r
                     x[0] += -1
                     y[1] += -1
                     z[2] += -1
@@ -138,29 +162,36 @@ class Bodies(BodySums):
         return o, p, q, r
 
     @traced
-    def rubbed(self, b, u, v, source, s, now, scene):
-        """Velocities after friction."""
+    def sum_of(self, a, b):
+        return self.field(a.o + b.o, a.x + b.x, a.y + b.y, a.z + b.z)
+
+    @traced
+    def rub(self, b, u, v, source, s, now, scene):
+        """Velocities after friction, with C, the velocities w that it sees, and what it adds, p."""
         if not self.rough:
-            return v
+            return Bundle(after=v)
         total, w = let(self.total(b, source, s, now, scene)), self.spun(b, u, v, scene)
         p = self.solved(b, self.pushes(b, source, s, w, total, now, scene), scene)
-        return self.field(v.o + p.o, v.x + p.x, v.y + p.y, v.z + p.z)
+        return Bundle(after=self.sum_of(v, p), total=total, w=w, p=p)
 
     # ---- the pass ------------------------------------------------------------------------------------------------------
 
     @ti.func
     def step(self, b, j, now: A, scene: A, state: A, plan: A):
         s, t = (j - plan.base) * plan.stride, (j - plan.base + 1) * plan.stride
-        u, v = self.nearest(b, state.u, s, True, scene), self.nearest(b, state.v, s, True, scene)
-        f = self.with_gravity(self.nearest(b, scene.body_force, 0, False, scene), scene.parameters)
+        plain_u, v, plain = self.nearest(b, state, s, scene.body_force, 0, scene)
+        u = self.placed(b, plain_u, scene)
+        f = self.with_gravity(plain, scene.parameters)
         seen = self.shown(b, u, v, f, now.pre, scene)
         if now.frame >= 0:
             for m in range(scene.body_first[b], scene.body_first[b + 1]):
                 i = scene.body_vertex[m]
                 state.frames_u[now.frame, i] = state.u[s, i]
                 state.frames_v[now.frame, i] = self.narrow(self.at_arm(seen, self.arm(m, b, scene)))
-        after = self.rubbed(b, u, self.kicked(v, now.pre + now.post, f), state.u, s, now, scene)
-        displaced, moving = self.moved(b, u, after, seen, now, scene)
+        rub = self.rub(b, u, self.kicked(v, now.pre + now.post, f), state.u, s, now, scene)
+        displaced, moving = self.moved(
+            b, u, rub.after, seen, self.turn(b, u, rub.after, now, scene), now, scene
+        )
         for m in range(scene.body_first[b], scene.body_first[b + 1]):
             self.go(m, b, displaced, moving, s, t, now, scene, state, plan)
 

@@ -108,22 +108,24 @@ class BodyFriction(ObstacleStages):
 
     @ti.func
     def vjp(self, i, u, v, total, w, load_adj, now: A, scene: A, adjoint: A):
-        """Adjoints of u and v for those of the impulse and of the load; adds those of all else."""
-        u_adj, v_adj = self.vector(0), self.vector(0)
+        """(adjoint of u, of v, the impulse with the load as a fourth component) for the adjoints of the impulse and of the load;
+        adds those of all else."""
+        u_adj, v_adj, felt = self.vector(0), self.vector(0), self.vector(0)
         for g in ti.static(self.features.rough):
             for k in range(g.count):
                 first, X = g.first + k * g.size, self.seen_now(g, k, scene.rest[i], now, scene)
                 if g.force.touches(scene.parameters, first, X, u):
                     wall = self.wall(g, k, X, u, now, scene)
                     time = self.time(g, i, now, scene)
-                    by_place, by_v, by_wall, by_time, by = grip.vjp(
+                    by_place, by_v, by_wall, by_time, by, own = grip.vjp(
                         g.force, scene.parameters, first, X, u, v, wall, time, total, w, load_adj
                     )
                     by_u = self.spread(g, k, i, X, u, by_place, by_wall, now, scene, adjoint, adjoint)
                     u_adj += by_u
                     v_adj += by_v
+                    felt += own
                     for m in ti.static(range(g.size)):
                         adjoint.sums[first + m, i] = adjoint.sums[first + m, i] + by[m]
                     self.add_to_area(g, i, now.h * by_time, adjoint)
                     self.add_to_rest(i, by_u, adjoint)
-        return u_adj, v_adj
+        return u_adj, v_adj, felt

@@ -198,17 +198,17 @@ def gained(phi, k):
 
 
 @ti.func
-def gained_jvp(phi, dphi, k):
-    """Its change by phi alone."""
+def gained_jvp(phi, dphi, k, c):
+    """The change of such a column c by phi alone."""
     way, dway, scale = cross(phi, k), cross(dphi, k), 2 / (1 + phi.dot(phi))
-    return scale * (dway + cross(dphi, way) + cross(phi, dway) - phi.dot(dphi) * gained(phi, k))
+    return scale * (dway + cross(dphi, way) + cross(phi, dway) - phi.dot(dphi) * c)
 
 
 @ti.func
-def gained_vjp(phi, k, by):
+def gained_vjp(phi, k, c, by):
     """Adjoint of phi."""
     way, scale = cross(phi, k), 2 / (1 + phi.dot(phi))
-    return scale * (cross(k, by) + cross(way, by) + cross(k, cross(by, phi)) - gained(phi, k).dot(by) * phi)
+    return scale * (cross(k, by) + cross(way, by) + cross(k, cross(by, phi)) - c.dot(by) * phi)
 
 
 @ti.func

@@ -17,10 +17,6 @@ A = ti.template()  # an array or Bundle handed to a Taichi function
 class BodyStage(BodyTangent):
     """Taichi functions of body b in pass j."""
 
-    @traced
-    def sum_of(self, a, b):
-        return self.field(a.o + b.o, a.x + b.x, a.y + b.y, a.z + b.z)
-
     @ti.func
     def add_J(self, b, p, q, adjoint: A):
         """Add p q^T + q p^T to the adjoint of J."""
@@ -74,7 +70,7 @@ class BodyStage(BodyTangent):
         x, y, z, p, q, r = 0 * by.x, 0 * by.x, 0 * by.x, by.x, by.y, by.z
         if ti.static(self.rigid):
             if pre > 0 and scene.body_kind[b] > 0:
-                R, J = motion.rotation(u), self.J(b, scene)
+                R, J = u.R, u.J
                 omega = motion.solved(motion.inertia(J), motion.back(R, motion.momentum(R, v, J)))
                 w = motion.times(R, omega)
                 s = motion.cross(R.x, by.x) + motion.cross(R.y, by.y) + motion.cross(R.z, by.z)
@@ -94,11 +90,11 @@ class BodyStage(BodyTangent):
         return 0.5 * motion.cross(theta, R.x), 0.5 * motion.cross(theta, R.y), 0.5 * motion.cross(theta, R.z)
 
     @traced
-    def moved_vjp(self, b, u, v, by_u, by_v, now, scene, adjoint):
+    def moved_vjp(self, b, u, v, turn, by_u, by_v, now, scene, adjoint):
         """(adjoint of u, of v+, of what is shown) for those of the displacements and velocities after the pass; adds those of
         all else."""
         alpha, decay = let(self.double(now.alpha)), let(self.double(now.decay))
-        x = self.moved_columns_vjp(b, u, v, by_u, by_v, alpha, decay, scene, adjoint)
+        x = self.moved_columns_vjp(b, u, v, turn, by_u, by_v, alpha, decay, scene, adjoint)
         if self.vertex.features.drag >= 0:
             by_alpha, by_decay = let(x[6] + self.dot(by_u.o, v.o)), let(x[7] + self.dot(by_v.o, v.o))
             self.add_rate(b, by_alpha, by_decay, now, scene, adjoint)
@@ -115,7 +111,7 @@ class BodyStage(BodyTangent):
         adjoint.sums[row, i] = adjoint.sums[row, i] + ti.cast(by_rate, self.fp)
 
     @ti.func
-    def moved_columns_vjp(self, b, u: A, v: A, by_u: A, by_v: A, alpha, decay, scene: A, adjoint: A):
+    def moved_columns_vjp(self, b, u: A, v: A, turn: A, by_u: A, by_v: A, alpha, decay, scene: A, adjoint: A):
         x, y, z = by_u.x, by_u.y, by_u.z
         p, q, r = alpha * x + decay * by_v.x, alpha * y + decay * by_v.y, alpha * z + decay * by_v.z
         by_alpha = x.dot(v.x) + y.dot(v.y) + z.dot(v.z)
@@ -127,16 +123,13 @@ class BodyStage(BodyTangent):
                 p, q, r = 0 * x, 0 * x, 0 * x
                 if alpha > 0:
                     l, m, n = 0 * x, 0 * x, 0 * x
-                    R, J = motion.rotation(u), self.J(b, scene)
-                    L = motion.back(R, motion.momentum(R, v, J))
-                    f, rate = motion.half_turn(J, alpha * L), decay / alpha
-                    phi = motion.times(R, f)
+                    R, J, L, f, phi, rate = u.R, u.J, turn.L, turn.f, turn.phi, decay / alpha
                     theta, of_phi, of_rate = 0 * x, 0 * x, ti.cast(0, ti.f64)
                     for k in ti.static(range(3)):
                         own, of_u, of_v = self.column(R, k), self.column(by_u, k), self.column(by_v, k)
                         c, of_c = motion.gained(phi, own), of_u + rate * of_v
                         theta += motion.cross(own, of_u) + motion.cross(c, of_c)
-                        of_phi += motion.gained_vjp(phi, own, of_c)
+                        of_phi += motion.gained_vjp(phi, own, c, of_c)
                         of_rate += of_v.dot(c)
                     mu = motion.half_turn_vjp(J, f, alpha * L, motion.back(R, of_phi))
                     of_a, nu = 0.5 * (1 + f.dot(f)) * mu, mu + motion.cross(mu, f)
@@ -187,30 +180,27 @@ class BodyStage(BodyTangent):
                 if scene.surface[i] > 0:
                     y, u = self.arm(m, b, scene), source[s, i]
                     v, p_adj = self.narrow(self.at_arm(w, y)), self.narrow(self.at_arm(by, y))
-                    x = self.wide(self.friction.impulse(i, u, v, small, now, scene))
-                    load = self.double(self.friction.load(i, u, now, scene))
                     by_load = ti.cast(by_total * self.reach(b, y, scene), self.fp)
-                    by_u, by_v = self.friction.vjp(i, u, v, small, p_adj, by_load, now, scene, adjoint)
+                    by_u, by_v, felt = self.friction.vjp(i, u, v, small, p_adj, by_load, now, scene, adjoint)
                     adjoint.u[0, i] = adjoint.u[0, i] + by_u
                     wide = self.wide(by_v)
                     o += wide
                     p += y.x * wide
                     q += y.y * wide
                     r += y.z * wide
-                    self.add_felt(m, self.along(by, x) + self.along(w, wide), ti.cast(0, ti.f64), adjoint)
-                    self.add_reach(m, b, y, load * by_total, scene, adjoint)
+                    by_y = self.along(by, self.wide(felt)) + self.along(w, wide)
+                    self.add_felt(m, by_y, ti.cast(0, ti.f64), adjoint)
+                    self.add_reach(m, b, y, self.double(felt.w) * by_total, scene, adjoint)
         return o, p, q, r
 
     @traced
-    def rubbed_vjp(self, b, u, v, by_after, source, s, now, scene, adjoint):
+    def rub_vjp(self, b, rub, u, v, by_after, source, s, now, scene, adjoint):
         """(adjoint of u, of v) for that of the velocities after friction."""
         if not self.rough:
-            return self.field(*[let(VECTOR(0, 0, 0, 0))] * 4), by_after
-        total, w = let(self.total(b, source, s, now, scene)), self.spun(b, u, v, scene)
-        p = self.solved(b, self.pushes(b, source, s, w, total, now, scene), scene)
-        by = self.solved_vjp(b, p, by_after, scene, adjoint)
-        by_total = let(self.total_of_pushes(b, source, s, w, total, by, now, scene))
-        sums = self.pushes_vjp(b, source, s, w, total, by_total, by, now, scene, adjoint)
+            return self.field(*[VECTOR(0, 0, 0, 0)] * 4), by_after
+        by = self.solved_vjp(b, rub.p, by_after, scene, adjoint)
+        by_total = let(self.total_of_pushes(b, source, s, rub.w, rub.total, by, now, scene))
+        sums = self.pushes_vjp(b, source, s, rub.w, rub.total, by_total, by, now, scene, adjoint)
         by_u, by_v = self.spun_vjp(b, 1, u, v, self.field(*sums), scene, adjoint)
         return by_u, self.sum_of(by_after, by_v)
 
@@ -295,20 +285,21 @@ class BodyStage(BodyTangent):
         """Back through the stage: leaves adjoints of u and v before the pass and of forces in adjoint.u, .v and .w."""
         s = j - plan.base
         self.gather(b, j, scene, adjoint, plan)
-        u, v = self.nearest(b, state.u, s, True, scene), self.nearest(b, state.v, s, True, scene)
-        plain = self.nearest(b, state.f, s, False, scene)  # without gravity
+        plain_u, v, plain = self.nearest(b, state, s, state.f, s, scene)
+        u = self.placed(b, plain_u, scene)
         f = self.with_gravity(plain, scene.parameters)
         halts = now.pre_adj < now.pre  # at the state that the pass shows
         seen = self.shown(b, u, v, f, now.pre, scene)
         start, share = self.chosen(halts, seen, v), now.pre_adj + now.post
         kicked = self.kicked(start, share, f)
-        after = self.rubbed(b, u, kicked, state.u, s, now, scene)
-        displaced, moving = self.moved(b, u, after, seen, now, scene)
+        rub = self.rub(b, u, kicked, state.u, s, now, scene)
+        turn = self.turn(b, u, rub.after, now, scene)
+        displaced, moving = self.moved(b, u, rub.after, seen, turn, now, scene)
         by_v = self.field_of(self.spread_vjp(b, 0, adjoint.v, moving, scene, adjoint))
         by_u = self.field_of(self.spread_u(b, displaced, now, scene, adjoint))
         self.start_u(b, now, scene, adjoint)
-        of_u, of_after, at_end = self.moved_vjp(b, u, after, by_u, by_v, now, scene, adjoint)
-        more_u, of_kicked = self.rubbed_vjp(b, u, kicked, of_after, state.u, s, now, scene, adjoint)
+        of_u, of_after, at_end = self.moved_vjp(b, u, rub.after, turn, by_u, by_v, now, scene, adjoint)
+        more_u, of_kicked = self.rub_vjp(b, rub, u, kicked, of_after, state.u, s, now, scene, adjoint)
         of_seen = self.sum_of(at_end, self.field_of(self.spread_frame(b, seen, now, scene, adjoint)))
         w = self.kicked(v, now.pre, f)
         shown_u, of_w = self.spun_vjp(b, self.unless(halts, now.pre), u, w, of_seen, scene, adjoint)

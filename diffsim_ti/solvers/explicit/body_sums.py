@@ -103,18 +103,18 @@ class BodySums:
     # ---- the nearest field ---------------------------------------------------------------------------------------------
 
     @ti.func
-    def moments(self, b, source: A, slot, weighted: A, scene: A):
-        """sum m x, sum m y_k x"""
-        o, p, q, r = VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0)
+    def moments(self, b, state: A, s, forces: A, slot, scene: A):
+        """sum m x, sum m y_k x of displacements and velocities, and the same of forces without m."""
+        ao, ax, ay, az = VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0)
+        co, cx, cy, cz = VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0)
+        fo, fx, fy, fz = VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0)
         for m in range(scene.body_first[b], scene.body_first[b + 1]):
-            y, x = self.arm(m, b, scene), self.wide(source[slot, scene.body_vertex[m]])
-            if ti.static(weighted):
-                x = self.double(scene.body_mass[m]) * x
-            o += x
-            p += y.x * x
-            q += y.y * x
-            r += y.z * x
-        return o, p, q, r
+            i, y, mass = scene.body_vertex[m], self.arm(m, b, scene), self.double(scene.body_mass[m])
+            u, v, f = mass * self.wide(state.u[s, i]), mass * self.wide(state.v[s, i]), self.wide(forces[slot, i])
+            ao, ax, ay, az = ao + u, ax + y.x * u, ay + y.y * u, az + y.z * u
+            co, cx, cy, cz = co + v, cx + y.x * v, cy + y.y * v, cz + y.z * v
+            fo, fx, fy, fz = fo + f, fx + y.x * f, fy + y.y * f, fz + y.z * f
+        return ao, ax, ay, az, co, cx, cy, cz, fo, fx, fy, fz
 
     @traced
     def solved(self, b, sums, scene):
@@ -122,8 +122,10 @@ class BodySums:
         return self.field(o, *(K[k][0] * sums[1] + K[k][1] * sums[2] + K[k][2] * sums[3] for k in range(3)))
 
     @traced
-    def nearest(self, b, source, slot, weighted, scene):
-        return self.solved(b, self.moments(b, source, slot, weighted, scene), scene)
+    def nearest(self, b, state, s, forces, slot, scene):
+        """Fields of displacements, velocities and accelerations without gravity."""
+        sums = self.moments(b, state, s, forces, slot, scene)
+        return tuple(self.solved(b, sums[k : k + 4], scene) for k in (0, 4, 8))
 
     @traced
     def with_gravity(self, f, parameters):
@@ -135,20 +137,21 @@ class BodySums:
     # ---- its tangent ---------------------------------------------------------------------------------------------------
 
     @ti.func
-    def moments_jvp(self, b, source: A, slot, change: A, weighted: A, scene: A, tangent: A):
-        o, p, q, r = VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0)
+    def moments_jvp(self, b, state: A, s, scene: A, tangent: A):
+        ao, ax, ay, az = VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0)
+        co, cx, cy, cz = VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0)
+        fo, fx, fy, fz = VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0)
         for m in range(scene.body_first[b], scene.body_first[b + 1]):
             i, y, dy = scene.body_vertex[m], self.arm(m, b, scene), self.wide(tangent.body_place[m])
-            x, dx = self.wide(source[slot, i]), self.wide(change[0, i])
-            if ti.static(weighted):
-                mass = self.double(scene.body_mass[m])
-                dx = mass * dx + self.double(tangent.body_mass[m]) * x
-                x = mass * x
-            o += dx
-            p += y.x * dx + dy.x * x
-            q += y.y * dx + dy.y * x
-            r += y.z * dx + dy.z * x
-        return o, p, q, r
+            mass, dm = self.double(scene.body_mass[m]), self.double(tangent.body_mass[m])
+            u, v, f = self.wide(state.u[s, i]), self.wide(state.v[s, i]), self.wide(state.f[s, i])
+            du = mass * self.wide(tangent.u[0, i]) + dm * u
+            dv, df = mass * self.wide(tangent.v[0, i]) + dm * v, self.wide(tangent.body_force[0, i])
+            u, v = mass * u, mass * v
+            ao, ax, ay, az = ao + du, ax + y.x * du + dy.x * u, ay + y.y * du + dy.y * u, az + y.z * du + dy.z * u
+            co, cx, cy, cz = co + dv, cx + y.x * dv + dy.x * v, cy + y.y * dv + dy.y * v, cz + y.z * dv + dy.z * v
+            fo, fx, fy, fz = fo + df, fx + y.x * df + dy.x * f, fy + y.y * df + dy.y * f, fz + y.z * df + dy.z * f
+        return ao, ax, ay, az, co, cx, cy, cz, fo, fx, fy, fz
 
     @traced
     def solved_jvp(self, b, q, sums, scene, tangent):
@@ -158,9 +161,10 @@ class BodySums:
         return self.solved(b, [sums[0] - self.number(b, 0, tangent) * q.o, *map(let, left)], scene)
 
     @traced
-    def nearest_jvp(self, b, q, source, slot, change, weighted, scene, tangent):
-        sums = self.moments_jvp(b, source, slot, change, weighted, scene, tangent)
-        return self.solved_jvp(b, q, sums, scene, tangent)
+    def nearest_jvp(self, b, u, v, f, state, s, scene, tangent):
+        """Changes of these fields."""
+        sums = self.moments_jvp(b, state, s, scene, tangent)
+        return tuple(self.solved_jvp(b, q, sums[4 * k : 4 * k + 4], scene, tangent) for k, q in enumerate((u, v, f)))
 
     # ---- its adjoint ---------------------------------------------------------------------------------------------------
 

@@ -27,9 +27,8 @@ class BodyTangent(Bodies):
         x, y, z = dv.x, dv.y, dv.z
         if ti.static(self.rigid):
             if pre > 0 and scene.body_kind[b] > 0:
-                R = motion.rotation(u)
-                theta = motion.turning(R, du)
-                x, y, z = motion.spin_jvp(R, v, self.J(b, scene), theta, dv, self.J(b, tangent))
+                theta = motion.turning(u.R, du)
+                x, y, z = motion.spin_jvp(u.R, v, u.J, theta, dv, self.J(b, tangent))
         return x, y, z
 
     @traced
@@ -37,17 +36,17 @@ class BodyTangent(Bodies):
         return self.spun_jvp(b, u, self.kicked(v, pre, f), du, self.kicked(dv, pre, df), scene, tangent, pre)
 
     @traced
-    def moved_jvp(self, b, u, v, du, dv, dseen, dalpha, ddecay, now, scene, tangent):
+    def moved_jvp(self, b, u, v, turn, du, dv, dseen, dalpha, ddecay, now, scene, tangent):
         """Changes of the displacements and velocities after the pass."""
         alpha, decay = let(self.double(now.alpha)), let(self.double(now.decay))
         dalpha, ddecay = let(self.double(dalpha)), let(self.double(ddecay))
-        x = self.moved_columns_jvp(b, u, v, du, dv, dseen, alpha, decay, dalpha, ddecay, scene, tangent)
+        x = self.moved_columns_jvp(b, u, v, turn, du, dv, dseen, alpha, decay, dalpha, ddecay, scene, tangent)
         displaced = du.o + alpha * dv.o + dalpha * v.o
         return self.field(displaced, *x[:3]), self.field(decay * dv.o + ddecay * v.o, *x[3:])
 
     @ti.func
     def moved_columns_jvp(
-        self, b, u: A, v: A, du: A, dv: A, dseen: A, alpha, decay, da, dd, scene: A, tangent: A
+        self, b, u: A, v: A, turn: A, du: A, dv: A, dseen: A, alpha, decay, da, dd, scene: A, tangent: A
     ):
         x, y, z = (
             du.x + alpha * dv.x + da * v.x,
@@ -59,22 +58,20 @@ class BodyTangent(Bodies):
             if scene.body_kind[b] > 0:
                 p, q, r = dseen.x, dseen.y, dseen.z
                 if alpha > 0:
-                    R, J, dJ = motion.rotation(u), self.J(b, scene), self.J(b, tangent)
-                    theta, L = motion.turning(R, du), motion.back(R, motion.momentum(R, v, J))
-                    dL, f = motion.momentum_jvp(R, v, J, theta, dv, dJ), motion.half_turn(J, alpha * L)
-                    df = motion.half_turn_jvp(J, f, alpha * L, alpha * dL + da * L, dJ)
-                    phi, dphi, rate = motion.times(R, f), motion.times(R, df), decay / alpha
-                    drate = dd / alpha - rate * da / alpha
-                    x, p = self.gained_jvp(R.x, phi, theta, dphi, rate, drate)
-                    y, q = self.gained_jvp(R.y, phi, theta, dphi, rate, drate)
-                    z, r = self.gained_jvp(R.z, phi, theta, dphi, rate, drate)
+                    theta, dJ, rate = motion.turning(u.R, du), self.J(b, tangent), decay / alpha
+                    dL = motion.momentum_jvp(u.R, v, u.J, theta, dv, dJ)
+                    df = motion.half_turn_jvp(u.J, turn.f, alpha * turn.L, alpha * dL + da * turn.L, dJ)
+                    dphi, drate = motion.times(u.R, df), dd / alpha - rate * da / alpha
+                    x, p = self.gained_jvp(u.R.x, turn.phi, theta, dphi, rate, drate)
+                    y, q = self.gained_jvp(u.R.y, turn.phi, theta, dphi, rate, drate)
+                    z, r = self.gained_jvp(u.R.z, turn.phi, theta, dphi, rate, drate)
         return x, y, z, p, q, r
 
     @ti.func
     def gained_jvp(self, k, phi, theta, dphi, rate, drate):
         """Changes of a column of the displacement's and of the velocity's gradient."""
         c = motion.gained(phi, k)
-        dc = motion.cross(theta, c) + motion.gained_jvp(phi, dphi, k)
+        dc = motion.cross(theta, c) + motion.gained_jvp(phi, dphi, k, c)
         return motion.cross(theta, k) + dc, rate * dc + drate * c
 
     @ti.func
@@ -120,43 +117,37 @@ class BodyTangent(Bodies):
         return o, p, q, r
 
     @traced
-    def rubbed_jvp(self, b, u, v, du, dv, source, s, now, scene, tangent):
+    def rub_jvp(self, b, rub, u, v, du, dv, source, s, now, scene, tangent):
         """Change of the velocities after friction."""
         if not self.rough:
             return dv
-        total, w = let(self.total(b, source, s, now, scene)), self.spun(b, u, v, scene)
         dtotal = let(self.total_jvp(b, source, s, now, scene, tangent))
         dw = self.spun_jvp(b, u, v, du, dv, scene, tangent)
-        p = self.solved(b, self.pushes(b, source, s, w, total, now, scene), scene)
-        sums = self.pushes_jvp(b, source, s, w, dw, total, dtotal, now, scene, tangent)
-        dp = self.solved_jvp(b, p, sums, scene, tangent)
-        return self.field(dv.o + dp.o, dv.x + dp.x, dv.y + dp.y, dv.z + dp.z)
+        sums = self.pushes_jvp(b, source, s, rub.w, dw, rub.total, dtotal, now, scene, tangent)
+        return self.sum_of(dv, self.solved_jvp(b, rub.p, sums, scene, tangent))
 
     @ti.func
     def step_jvp(self, b, j, now: A, scene: A, state: A, tangent: A, plan: A):
         s = j - plan.base
-        u, v = self.nearest(b, state.u, s, True, scene), self.nearest(b, state.v, s, True, scene)
-        plain = self.nearest(b, state.f, s, False, scene)  # without gravity
-        f = self.with_gravity(plain, scene.parameters)
-        du = self.nearest_jvp(b, u, state.u, s, tangent.u, True, scene, tangent)
-        dv = self.nearest_jvp(b, v, state.v, s, tangent.v, True, scene, tangent)
-        df = self.with_gravity(
-            self.nearest_jvp(b, plain, state.f, s, tangent.body_force, False, scene, tangent), tangent.parameters
-        )
+        plain_u, v, plain = self.nearest(b, state, s, state.f, s, scene)
+        u = self.placed(b, plain_u, scene)
+        du, dv, df = self.nearest_jvp(b, u, v, plain, state, s, scene, tangent)
+        f, pulled = self.with_gravity(plain, scene.parameters), self.with_gravity(df, tangent.parameters)
         seen = self.shown(b, u, v, f, now.pre, scene)
-        dseen = self.shown_jvp(b, u, v, f, du, dv, df, now.pre, scene, tangent)
+        dseen = self.shown_jvp(b, u, v, f, du, dv, pulled, now.pre, scene, tangent)
         if now.frame >= 0:
             for m in range(scene.body_first[b], scene.body_first[b + 1]):
                 i, y, dy = scene.body_vertex[m], self.arm(m, b, scene), self.wide(tangent.body_place[m])
                 tangent.frames_u[now.frame, i] = tangent.u[0, i]
                 tangent.frames_v[now.frame, i] = self.narrow(self.at_arm(dseen, y) + self.slope_at(seen, dy))
         share = now.pre + now.post
-        kicked, dkicked = self.kicked(v, share, f), self.kicked(dv, share, df)
-        after = self.rubbed(b, u, kicked, state.u, s, now, scene)
-        dafter = self.rubbed_jvp(b, u, kicked, du, dkicked, state.u, s, now, scene, tangent)
-        displaced, moving = self.moved(b, u, after, seen, now, scene)
+        kicked, dkicked = self.kicked(v, share, f), self.kicked(dv, share, pulled)
+        rub = self.rub(b, u, kicked, state.u, s, now, scene)
+        dafter = self.rub_jvp(b, rub, u, kicked, du, dkicked, state.u, s, now, scene, tangent)
+        turn = self.turn(b, u, rub.after, now, scene)
+        displaced, moving = self.moved(b, u, rub.after, seen, turn, now, scene)
         dalpha, ddecay = now.alpha_by_rate * plan.rate_dot, now.decay_by_rate * plan.rate_dot
-        ddisplaced, dmoving = self.moved_jvp(b, u, after, du, dafter, dseen, dalpha, ddecay, now, scene, tangent)
+        ddisplaced, dmoving = self.moved_jvp(b, u, rub.after, turn, du, dafter, dseen, dalpha, ddecay, now, scene, tangent)
         for m in range(scene.body_first[b], scene.body_first[b + 1]):
             i, y, dy = scene.body_vertex[m], self.arm(m, b, scene), self.wide(tangent.body_place[m])
             if now.alpha > 0:

@@ -9,6 +9,8 @@ so that C is the most by which all friction of a pass may slow the body. The mat
 the diagonal one of w_i C / (h mu N_i w_i), for C is the sum of these weights: no pass gains energy by friction.
 """
 
+import taichi as ti
+
 from diffsim_ti.runtime import at, let, traced
 from diffsim_ti.terms.obstacles import friction
 from diffsim_ti.terms.obstacles.turning import changes
@@ -70,8 +72,10 @@ def total_vjp(force, parameters, first, X, u, v, wall, time, total, w):
 
 @traced
 def vjp(force, parameters, first, X, u, v, wall, time, total, w, load_adj):
-    """(adjoints of u, v, wall as vectors, of time, and of the obstacle's numbers, a tuple) for those of p and of h mu N."""
+    """(adjoints of u, v, wall as vectors, of time, of the obstacle's numbers, a tuple, and (p, h mu N) as a vector) for those of
+    p and of h mu N."""
     g, p, moved, before, walls, numbers, loaded, out = _record(force, parameters, first, X, u, v, wall, time, total)
     seeds = [(loaded, load_adj), *((k, let(at(w, d))) for d, k in enumerate(out))]
     adjoints, count = g.reverse(seeds, [*moved, *before, *walls, numbers[0], *p]), len(moved)
-    return (*force.parted(adjoints, count), adjoints[count + 6], tuple(adjoints[count + 7 :]))
+    felt = let(ti.types.vector(4, force.fp)(*(x.value for x in out), loaded.value))
+    return (*force.parted(adjoints, count), adjoints[count + 6], tuple(adjoints[count + 7 :]), felt)
