@@ -9,13 +9,13 @@ from numpy.typing import ArrayLike
 from diffsim_ti.checked import numbers, shown
 from diffsim_ti.mesh import TetrahedralMesh
 
-KINDS = ("affine",)
+KINDS = {"affine": 12, "rigid": 6}  # numbers that each moves by
 
 
 @dataclass(frozen=True)
 class Together:
     """Vertices of a set, shape (k,), and an orthonormal basis: of each component of their displacements, shape (k, m), or of
-    all three together, (3 k, m)."""
+    all three together, (3 k, m); that of a rigid one is of affine motions."""
 
     name: str
     kind: str
@@ -31,14 +31,22 @@ class Together:
         return (self.basis @ q).reshape(-1, 3)
 
     @property
+    def rigid(self) -> bool:
+        return self.kind == "rigid"
+
+    @property
     def per_component(self) -> bool:
         """Whether the basis is of each component, so that what it can do turns with a turn of it."""
         return len(self.basis) == len(self.vertices)
 
     @property
     def count(self) -> int:
-        """How many numbers q are."""
-        return self.basis.shape[1] * (3 if self.per_component else 1)
+        """How many numbers it moves by."""
+        return KINDS.get(self.kind) or self.basis.shape[1] * (3 if self.per_component else 1)
+
+    def apart(self, x: np.ndarray) -> np.ndarray:
+        """Places or velocities of the set's vertices without their mean."""
+        return x[self.vertices] - x[self.vertices].mean(0)
 
     def fields(self) -> np.ndarray:
         """Displacements of each number, shape (k, 3, count)."""
@@ -54,13 +62,15 @@ class Together:
 
 
 class Reduced:
-    """The sets of a scene that move by few numbers, u = B q.
+    """The sets of a scene that move by few numbers.
 
-    affine: displacements A X + t of the mesh's places X, twelve numbers; `x -> of(x)` is the nearest such to any x, a
-    projection. B is that of the mesh, whatever rest_positions a run takes.
-    a basis, of all the mesh's vertices, of which those of the set count: m functions for each component, shape
-    (num_vertices, m), such as the `weights` of a `designs.Cage`, 3 m numbers; or m fields of displacements, (m,
-    num_vertices, 3), such as the `shapes` of `modes`, m numbers. Neither need be orthonormal.
+    affine: displacements A X + t of the mesh's places X, twelve numbers, u = B q; `x -> of(x)` is the nearest such to any
+    x, a projection. B is that of the mesh, whatever rest_positions a run takes.
+    rigid: places R X + t of the rest positions X of a run, six numbers, in explicit steps. A start is the nearest such
+    (inputs/rigid_start.py).
+    a basis, in implicit steps and statics, of all the mesh's vertices, of which those of the set count: m functions for
+    each component, shape (num_vertices, m), such as the `weights` of a `designs.Cage`, 3 m numbers; or m fields of
+    displacements, (m, num_vertices, 3), such as the `shapes` of `modes`, m numbers. Neither need be orthonormal.
 
     The set moves by u = B q alone, so that forces do what B^T f says, and what B lacks is held as by a support. Linear
     momentum is kept where B has the rigid translations (constant functions); angular momentum, in the midpoint rule, where
@@ -73,7 +83,7 @@ class Reduced:
 
     def __init__(self, mesh: TetrahedralMesh, given: Mapping[str, str | ArrayLike] | None, held: np.ndarray):
         if not isinstance(given, Mapping | None):
-            raise ValueError(f'reduced: must be {{name of a set: "affine" or a basis}}, got {shown(given)}')
+            raise ValueError(f'reduced: must be {{name of a set: "affine", "rigid" or a basis}}, got {shown(given)}')
         self.bodies = tuple(self._body(mesh, name, kind) for name, kind in (given or {}).items())
         taken = {int(i): "what is held (fixed=)" for i in held}
         for body in self.bodies:
@@ -110,14 +120,32 @@ class Reduced:
     def __bool__(self) -> bool:
         return bool(self.bodies)
 
+    @property
+    def rigid(self) -> tuple[Together, ...]:
+        """Sets that do not deform."""
+        return tuple(body for body in self.bodies if body.rigid)
+
+    def refuse_rigid(self, what: str) -> None:
+        """Raise ValueError where a set does not deform."""
+        for body in self.rigid:
+            raise ValueError(
+                f"{what}: the set {body.name!r} is rigid, which SemiImplicitSolver and VelocityVerletSolver alone know; take "
+                'one of these, or "affine" in place of "rigid" and a stiff material'
+            )
+
+    def elements(self, elements: np.ndarray) -> list[np.ndarray]:
+        """Which elements, rows of vertices, lie wholly in each set."""
+        return [np.flatnonzero(np.isin(elements, body.vertices).all(1)) for body in self.bodies]
+
     def of(self, x: np.ndarray) -> np.ndarray:
-        """Vectors of all vertices, shape (num_vertices, 3), those of the sets as near as the sets can do; x where there are
-        none."""
+        """Vectors of all vertices, shape (num_vertices, 3), those of sets that deform as near as the sets can do; x where
+        there are none."""
         if not self.bodies:
             return x
         out = np.array(x)
         for body in self.bodies:
-            out[body.vertices] = body.motion(body.numbers(x))
+            if not body.rigid:
+                out[body.vertices] = body.motion(body.numbers(x))
         return out
 
     def describe(self) -> str:

@@ -204,18 +204,18 @@ class Simulator:
         stays; `reset` clears it.
         """
         state, shape = self.workspace.state, (self.scene.mesh.num_vertices, 3)
-        for name, value, target, origin in (
-            ("positions", positions, state.u, self._start.rest),
-            ("velocities", velocities, state.v, 0.0),
-        ):
+        displaced, moving = self.scene.inputs.start_links()
+        for name, value in (("positions", positions), ("velocities", velocities)):
             if value is not None:
                 value = numbers(name, value)
                 if value.shape != shape or not np.all(np.isfinite(value)):
                     raise ValueError(f"{name}: expected finite numbers of shape {shape}, got shape {value.shape}")
-                value = value - origin
-                if name == "velocities":
-                    value = self.scene.supports.free(value)
-                runtime.fill(target, self.scene.reduced.of(value)[None])
+                if name == "positions":
+                    runtime.fill(state.u, displaced.value(value, self._start.rest)[0][None])
+                else:
+                    given = dict(initial_velocities=value, rest=self._start.rest)
+                    given["displacement"] = runtime.fetch_row(state.u, 0)
+                    runtime.fill(state.v, moving.value(*(given[part] for part in moving.reads))[0][None])
         self.workspace.forget()
 
     def set_forces(self, forces: ArrayLike) -> None:

@@ -18,6 +18,7 @@ from diffsim_ti.inputs.foundation import FoundationRows
 from diffsim_ti.inputs.growing import GrowthRows
 from diffsim_ti.inputs.loads import PressureRows, SumOfForces
 from diffsim_ti.inputs.poses import PoseColumns
+from diffsim_ti.inputs.rigid_start import RigidDisplacement, RigidVelocity
 from diffsim_ti.inputs.surface_areas import SurfaceAreas
 from diffsim_ti.inputs.ties import JoinedRows, JoinedSegments
 from diffsim_ti.rows import Rows
@@ -128,13 +129,20 @@ class Inputs:
             out.append(Input("prescribed_motion", None, (shape,), "m", change=length))
         return out
 
+    def start_links(self) -> tuple[Link, Link]:
+        """Of displacements and velocities, as the scene can have them."""
+        scene, rigid = self.scene, self.scene.reduced.rigid
+        free = lambda v: scene.reduced.of(scene.supports.free(v))  # noqa: E731
+        if rigid:
+            return RigidDisplacement(scene.reduced.of, rigid), RigidVelocity(free, rigid)
+        return links.Displacement(scene.reduced.of), links.FreeVelocity(free)
+
     def _links(self, named: dict) -> list[Link]:
         """Those of the body, of its material, of the terms, and what joins the terms' numbers and paths."""
         mesh, scene, places = self.mesh, self.scene, {}
         out = [
             links.RestShape(mesh.tetrahedra) if mesh.order == 1 else CurvedShape(mesh.elements),
-            links.Displacement(scene.reduced.of),
-            links.FreeVelocity(lambda v: scene.reduced.of(scene.supports.free(v))),
+            *self.start_links(),
             links.LumpedMass(mesh, scene.mass_scaling.factors if scene.mass_scaling else None),
             *([ElementMasses(mesh.elements)] if scene.consistent else []),
             *scene.material.links(),

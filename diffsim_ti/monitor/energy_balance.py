@@ -179,6 +179,8 @@ class EnergyBalance:
             ties = ws.attached.at(values, a.rows["ties"], ws.solver.schedule, 0, 0.0).ties
             stored += float(ties.energies(runtime.fetch_row(ws.state.u, 0))[ties.cables].sum())
         forces = ws.forces_at(j, num_passes) - ws.loads_at(j, num_passes, pulls=not self.steady) + weight
+        if a.bodies:  # without what holds them together
+            forces = a.bodies.pulled(forces, u)
         if ws.solver.lags(now, num_passes):
             swapped = 0.5 * h * float((v * forces).sum())
         else:

@@ -9,6 +9,7 @@ from diffsim_ti import runtime
 from diffsim_ti.inputs import StressPoints
 from diffsim_ti.mass_scaling import row_sums
 from diffsim_ti.mesh.patches import volume_patches
+from diffsim_ti.monitor.reduced_bounds import affine_bound
 from diffsim_ti.monitor.stiffest import stiffest
 from diffsim_ti.potential.attached import Attached
 from diffsim_ti.potential.kernels import potential_kernels
@@ -66,16 +67,25 @@ def element_limit(scene: "Scene", values: dict | None = None, kicks: ViscousStag
         means = np.bincount(patches, lam * derived.volumes) / np.bincount(patches, derived.volumes)
         lam = means[patches]
     dilatation, largest = _squares_of_strains(scene.mesh, derived)
+    within = scene.reduced.elements(scene.mesh.elements) if scene.reduced else []
+    for own in within:  # move together
+        dilatation[own] = largest[own] = 0.0
     viscous = material.viscosities({name: values[name] for name in material.inputs})
 
     def bound_of(mu, lam):
-        return (np.maximum(lam, 0) * dilatation + 2 * mu * largest) / values["density"]
+        return (np.maximum(lam, 0) * dilatation + 2 * mu * largest) / values["density"]  # one of each tetrahedron
 
     def largest_of(omega2, c):
         each = kicks.squared_rate(omega2, c)
         return omega2[worst := int(np.argmax(each))], c[worst] if np.ndim(c) else c, worst
 
-    omega2, c, worst = largest_of(bound_of(mu, lam), 0.0 if viscous is None else bound_of(*viscous))
+    omega2, c = bound_of(mu, lam), 0.0 if viscous is None else bound_of(*viscous)
+    for body, own in zip(scene.reduced.bodies, within):
+        if len(own) and not body.rigid:
+            omega2[own[0]] = affine_bound(scene.mesh, derived.volumes, own, mu, lam, values["density"])
+            if viscous is not None:
+                c[own[0]] = affine_bound(scene.mesh, derived.volumes, own, *viscous, values["density"])
+    omega2, c, worst = largest_of(omega2, c)
     attached = Attached.of(scene)
     more = _gas_bound(scene, values, derived) if scene.chambers else 0.0
     if attached:  # what all of its parts add at the most
@@ -89,7 +99,8 @@ def element_limit(scene: "Scene", values: dict | None = None, kicks: ViscousStag
         if kicks.squared_rate(*of_rows) < kicks.squared_rate(omega2, c):
             omega2, c = of_rows
         worst = int(np.argmax((scene.mesh.tetrahedra == vertex).any(1)))
-    return StepLimit(float(2 / np.sqrt(kicks.squared_rate(omega2 + more, c))), worst, "element bound")
+    total = kicks.squared_rate(omega2 + more, c)
+    return StepLimit(float(2 / np.sqrt(total)) if total > 0 else np.inf, worst, "element bound")
 
 
 def _squares_of_strains(mesh, derived) -> tuple[np.ndarray, np.ndarray]:
@@ -139,6 +150,16 @@ class Stiffness:
         self.vector, self._random = None, np.random.default_rng(1)
         self.attached = Attached.of(workspace.scene)  # springs, cables and foundations
 
+        self.bodies = workspace.arrays.bodies
+
+    def possible(self, x: np.ndarray, root: np.ndarray) -> np.ndarray:
+        """What of vectors, times the roots of the masses, sets that move by few numbers can do."""
+        if self.bodies is None:
+            return x
+        values = self.ws.arrays.values
+        free, u = np.where(root > 0, root, 1.0), runtime.fetch_row(self.ws.state.u, 0)
+        return self.bodies.projected(x * free, u, values.mass) / free
+
     @property
     def root(self) -> np.ndarray:
         """Roots of the inverse masses as they are now, shape (num_vertices, 1)."""
@@ -147,7 +168,7 @@ class Stiffness:
     def product(self, x: np.ndarray) -> np.ndarray:
         """The product with x, shape (num_vertices, 3), float64."""
         root = self.root
-        w = root * x
+        w = root * self.possible(x, root)
         scale = np.abs(w).max() or 1.0  # f32 keeps its digits whatever the masses
         runtime.fill(self.w, (w / scale)[None])
         if self.ws.pairs:
@@ -162,7 +183,14 @@ class Stiffness:
             now = runtime.fetch_row(self.ws.state.u, 0)
             at = self.attached.stiffest(a.values, a.rows["ties"], self.ws.solver.schedule)
             y += root * at.product(now, w)
-        return y
+        return self.possible(y, root)
+
+    def _stiffest(self, x: np.ndarray) -> float:
+        """The size of the product with x of the same body without sets that move by few numbers."""
+        bodies, self.bodies = self.bodies, None
+        size = np.linalg.norm(self.product(x))
+        self.bodies = bodies
+        return float(size)
 
     def largest(self, tolerance: float = 1e-3) -> tuple[float, float]:
         """(largest eigenvalue omega^2 [1/s^2], residual bound) by Lanczos; keeps the vector for `lower_bound`. With
@@ -202,6 +230,8 @@ class Stiffness:
             return 0.0, 0.0
         with np.errstate(over="ignore", invalid="ignore"):
             size = np.linalg.norm(self.product(start))
+        if self.bodies is not None and not size > 1e-5 * self._stiffest(start):  # rounding: none of them deforms
+            return 0.0, 0.0
         if not 0 < size < np.inf:
             raise FloatingPointError(
                 f"the stiffness of this state is {'zero' if size == 0 else 'not finite'} in this precision: look at Young's "

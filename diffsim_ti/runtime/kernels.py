@@ -32,6 +32,7 @@ def array_types(precision: str) -> dict:
         "vectors2_f32": ndarray(ti.types.vector(4, ti.f32), 2),
         "vectors2_f64": ndarray(ti.types.vector(4, ti.f64), 2),
         "singles": ndarray(ti.f32, 1),
+        "doubles": ndarray(ti.f64, 1),
         "rows3": ndarray(ROWS[3], 1),
         "rows6": ndarray(ROWS[6], 1),
         "int": ti.i32,

@@ -30,7 +30,7 @@ class SemiImplicitSolver(ExplicitSolver):
     `SemiImplicitSolver(mesh, material, dt=...)`, or `SemiImplicitSolver(dt=...)` for `Simulator(mesh, material, solver)`,
     makes the scene itself, with density [kg/m^3] and gravity [m/s^2, along y] and nothing else, and takes `substeps` as the
     least number: it raises it to what stability asks for and says so.
-    Raises ValueError for `viscous_stages` beyond 32, or without viscosity, or with a FilledChamber.
+    Raises ValueError for `viscous_stages` beyond 32, without viscosity, and with a FilledChamber or reduced sets.
     """
 
     order = 1
@@ -114,10 +114,9 @@ class SemiImplicitSolver(ExplicitSolver):
                 f"viscous_stages={self.viscous_stages}: {scene.material.name} has no viscosity, so that further kicks of a "
                 "substep do nothing; put KelvinVoigt around it, or leave viscous_stages out"
             )
-        if self.viscous_stages > 1 and scene.holds_volumes:
-            raise ValueError(
-                "viscous_stages: a FilledChamber knows one kick for each substep; take substeps, or an implicit solver"
-            )
+        if self.viscous_stages > 1 and (scene.holds_volumes or scene.reduced):
+            what = "a FilledChamber knows" if scene.holds_volumes else "reduced sets know"
+            raise ValueError(f"viscous_stages: {what} one kick for each substep; take substeps, or an implicit solver")
 
     def describe(self):
         kicks = f"; {self.viscous_stages} kicks in each substep" if self.viscous_stages > 1 else ""

@@ -9,6 +9,7 @@ from diffsim_ti import runtime
 from diffsim_ti.inputs import Derived, poses
 from diffsim_ti.mesh.patches import in_eights, volume_patches
 from diffsim_ti.runtime import LANES
+from diffsim_ti.state.bodies import BodyArrays
 from diffsim_ti.state.corners import clear_from, slots, vertex_corners, with_more_corners, with_own_corner
 from diffsim_ti.state.features import Features, grouped
 from diffsim_ti.state.numbers import PARTS, on_device
@@ -68,7 +69,11 @@ class SceneArrays:
             motion=scene.motion is not None,
             guided=bool(len(scene.supports.guided)),
             num_parameters=rows.total,
+            reduced=presses and bool(scene.reduced),
+            rigid=presses and bool(scene.reduced.rigid),
         )
+        self.bodies = BodyArrays(scene, fp, self.vector) if self._features["reduced"] else None
+        vars(self).update(self.bodies.arrays if self.bodies else {})
         # walls (potential/) as one looks between passes
         self.walls = Walls(self.obstacles)
         self.offsets = runtime.array(self.vector, self.walls.size)
@@ -225,6 +230,8 @@ class SceneArrays:
                 moved = True
             elif old is None or getattr(old, name, None) is not getattr(values, name, data):
                 runtime.fill(current, data)
+        if self.bodies:
+            self.bodies.load(values, sources["inverse_mass"][0])
         return moved
 
     def clear_corners_of_loads(self) -> None:

@@ -65,6 +65,8 @@ class Features:
     dragged: bool = False  # whether triangles are in a fluid
     motion: bool = False
     guided: bool = False  # whether vertices are held in some directions alone
+    reduced: bool = False  # whether explicit passes take sets of vertices by few numbers
+    rigid: bool = False
     moving: int = 0  # columns of the paths that obstacles follow
     num_parameters: int = 0  # numbers of all terms
     uniform: bool = True  # one set of coefficients for all tetrahedra

@@ -58,8 +58,10 @@ class ExplicitAdjoint:
         # of springs, cables and foundations
         self.tie_felt, self.tie_rest = (runtime.array(a.vector, *x.shape) for x in (a.ties, a.tie_segments))
         self.foundation_felt = runtime.array(a.vector, *a.foundation.shape)
-        self._sums = self._summed()
         self.faces = FeltAdjoint(self, workspace.faces) if workspace.faces else None
+        self.felt_by_bodies = a.bodies.adjoint() if a.bodies else {}
+        vars(self).update(self.felt_by_bodies)
+        self._sums = self._summed()
         self.held = HeldAdjoint(self, workspace.volumes) if workspace.volumes else None
         self.chamber_record = self.held.chambers if self.held else None
         if workspace.impulses:
@@ -102,6 +104,7 @@ class ExplicitAdjoint:
         out += [self.chamber_felt, self.chamber_rest] if self.ws.chambers else []
         out += [self.dragged_felt, self.dragged_rest] if has.dragged else []
         out += [self.tie_felt, self.tie_rest] if has.tied else []
+        out += self.felt_by_bodies.values()
         return out + ([self.foundation_felt] if has.founded else [])
 
     def clear(self) -> None:
@@ -279,6 +282,8 @@ class ExplicitAdjoint:
         if self.features.shape:
             rest = rest + runtime.fetch(self.frames.frames_u).astype(np.float64).sum(0)
         out.rest = rest + out.rest
+        if self.felt_by_bodies:
+            self.ws.arrays.bodies.collect(self.felt_by_bodies, out)
         if self.faces:
             self.faces.collect(out)
         if self.held:

@@ -13,9 +13,11 @@ from diffsim_ti.elements.tie import TIED, TieElement
 from diffsim_ti.runtime import let, traced
 from diffsim_ti.solvers.explicit.foundations import FOUNDED
 from diffsim_ti.solvers.explicit.guides import GUIDED
+from diffsim_ti.state.bodies import BODIES
 from diffsim_ti.state.features import Features
 from diffsim_ti.state.numbers import ALONE
 
+OF_BODIES = "body_place", "body_mass", "body_numbers", "body_force"  # of which there are changes
 A = ti.template()  # an array or Bundle handed to a Taichi function
 
 
@@ -69,14 +71,15 @@ class FurtherElements:
         """What kernels read of the scene for all of that."""
         has, out = self.features, {}
         given = (has.pressed, PRESSED), (has.dragged, DRAGGED)
-        for some, own in (*given, (has.tied, TIED), (has.founded, FOUNDED), (has.guided, GUIDED)):
+        for some, own in (*given, (has.tied, TIED), (has.founded, FOUNDED), (has.guided, GUIDED), (has.reduced, BODIES)):
             out |= own if some else {}
         return out
 
     @property
     def tangent(self) -> dict:
         """Those of which there are changes."""
-        return {name: kind for name, kind in self.arrays.items() if name in ALONE}
+        own = {name: kind for name, kind in self.arrays.items() if name in ALONE}
+        return own | ({name: BODIES[name] for name in OF_BODIES} if self.features.reduced else {})
 
     @property
     def adjoint(self) -> dict:
@@ -84,6 +87,7 @@ class FurtherElements:
         out = dict(pressed_felt="vectors2", pressed_rest="vectors") if self.pressed else {}
         out |= dict(dragged_felt="vectors", dragged_rest="vectors") if self.dragged else {}
         out |= dict(tie_felt="vectors2", tie_rest="vectors") if self.tied else {}
+        out |= dict(body_felt="doubles", body_sums="doubles") if self.features.reduced else {}
         return out | (dict(foundation_felt="vectors") if self.features.founded else {})
 
     @property
@@ -94,6 +98,7 @@ class FurtherElements:
         out += ["num_ties"] if self.tied or self.dragged else []
         out += ["first_tied"] if self.tied else []
         out += ["num_dragged", "first_dragged"] if self.dragged else []
+        out += ["num_bodies"] if self.features.reduced else []
         out += ["first_load"] if self.features.loaded_corners else []
         return dict.fromkeys([*out, *(["first_push"] if self.features.cabled else [])], "int")
 

@@ -7,6 +7,7 @@ import taichi as ti
 
 from diffsim_ti.elements.tetrahedron import Onwards
 from diffsim_ti.runtime import Bundle, Kernel, let, runs_on_cpu, traced
+from diffsim_ti.solvers.explicit.body_stage import BodyStage
 from diffsim_ti.solvers.explicit.further_elements import FurtherElements
 from diffsim_ti.solvers.explicit.kick_drift import KickDrift
 from diffsim_ti.solvers.explicit.outside_work import with_drag
@@ -53,6 +54,14 @@ class ExplicitKernels:
     @cached_property
     def further(self) -> FurtherElements:
         return FurtherElements(self.vertex.features, self.vertex.law.precision)
+
+    @cached_property
+    def bodies(self) -> BodyStage:
+        return BodyStage(self.vertex)
+
+    @property
+    def reduced(self) -> bool:
+        return self.vertex.features.reduced
 
     @traced
     def onwards(self, now) -> Onwards:
@@ -152,6 +161,10 @@ class ExplicitKernels:
                 if turn < plan.count:
                     j = plan.first + turn
                     self.vertex.step(i, j, self.pass_on(j, scene, table, plan), scene, state, plan)
+            if ti.static(self.reduced):
+                for b in range(plan.num_bodies):
+                    now = self.pass_on(plan.first, scene, table, plan)
+                    self.bodies.step(b, plan.first, now, scene, state, plan)
         else:
             ti.loop_config(serialize=True)
             for j in range(plan.first, plan.first + plan.count):
@@ -160,6 +173,9 @@ class ExplicitKernels:
                 now = self.pass_on(j, scene, table, plan)
                 for i in range(plan.num_vertices):
                     self.vertex.step(i, j, now, scene, state, plan)
+                if ti.static(self.reduced):
+                    for b in range(plan.num_bodies):
+                        self.bodies.step(b, j, now, scene, state, plan)
 
     @cached_property
     def step(self) -> Kernel:
@@ -201,6 +217,10 @@ class ExplicitKernels:
                 if turn < plan.count:
                     j = plan.first + turn
                     self.vertex.step_jvp(i, j, self.pass_of(j, table, plan), scene, state, tangent, plan)
+            if ti.static(self.reduced):
+                for b in range(plan.num_bodies):
+                    now = self.pass_of(plan.first, table, plan)
+                    self.bodies.step_jvp(b, plan.first, now, scene, state, tangent, plan)
         else:
             ti.loop_config(serialize=True)
             for j in range(plan.first, plan.first + plan.count):
@@ -209,6 +229,9 @@ class ExplicitKernels:
                 now = self.pass_of(j, table, plan)
                 for i in range(plan.num_vertices):
                     self.vertex.step_jvp(i, j, now, scene, state, tangent, plan)
+                if ti.static(self.reduced):
+                    for b in range(plan.num_bodies):
+                        self.bodies.step_jvp(b, j, now, scene, state, tangent, plan)
 
     @cached_property
     def step_jvp(self) -> Kernel:
@@ -253,6 +276,10 @@ class ExplicitKernels:
         moving = ti.static(self.vertex.features.moving)
         if ti.static(self.parallel):
             num_items, num_vertices, parts = self.further.after(plan), plan.num_vertices, moving * plan.num_parts
+            if ti.static(self.reduced):
+                for b in range(plan.num_bodies):
+                    now = self.pass_back(plan.first, table, plan)
+                    self.bodies.step_vjp(b, plan.first, now, scene, state, adjoint, plan)
             for i in range(num_vertices):
                 turn = self.turn_of_first(i, table)
                 if turn < plan.count:
@@ -272,6 +299,9 @@ class ExplicitKernels:
             for back in range(plan.count):
                 j = plan.first + plan.count - 1 - back
                 now = self.pass_back(j, table, plan)
+                if ti.static(self.reduced):
+                    for b in range(plan.num_bodies):
+                        self.bodies.step_vjp(b, j, now, scene, state, adjoint, plan)
                 for i in range(plan.num_vertices):
                     self.vertex.step_vjp(i, j, now, scene, state, adjoint, plan)
                 for e in range(self.further.after(plan)):

@@ -125,7 +125,7 @@ class KickDrift:
 
     @ti.func
     def step(self, i, j, now: A, scene: A, state: A, plan: A):
-        s, t = (j - plan.base) * plan.stride, (j - plan.base + 1) * plan.stride
+        s = (j - plan.base) * plan.stride
         u, v = state.u[s, i], state.v[s, i]
         # forces
         f = self.element.gather(i, scene, scene.corner)
@@ -136,6 +136,20 @@ class KickDrift:
             f += self.given.force(i, now, scene, scene.forces)
         if ti.static(self.features.founded):
             f += self.foundations.force(i, u, scene, scene.foundation)
+        if ti.static(self.features.reduced):
+            if scene.body_of[i] < 0:
+                self.go_on(i, j, u, v, f, now, scene, state, plan)
+            else:  # the body's stage goes on (bodies.py)
+                scene.body_force[0, i] = f
+                if plan.stride > 0:
+                    state.f[s, i] = f
+        else:
+            self.go_on(i, j, u, v, f, now, scene, state, plan)
+
+    @ti.func
+    def go_on(self, i, j, u, v, f, now: A, scene: A, state: A, plan: A):
+        """The pass, for the force f."""
+        s, t = (j - plan.base) * plan.stride, (j - plan.base + 1) * plan.stride
         # kick, frame, kick
         v_mid, v_plus = self.kicked(i, v, f, now, scene)
         v_kicked = v_plus
@@ -177,7 +191,7 @@ class KickDrift:
 
     @ti.func
     def step_jvp(self, i, j, now: A, scene: A, state: A, tangent: A, plan: A):
-        s, t = j - plan.base, j - plan.base + 1
+        s = j - plan.base
         u, v, du, dv = state.u[s, i], state.v[s, i], tangent.u[0, i], tangent.v[0, i]
         # forces
         df = self.element.gather(i, scene, scene.corner)
@@ -189,6 +203,19 @@ class KickDrift:
         if ti.static(self.features.founded):
             df += self.foundations.force(i, du, scene, scene.foundation)
             df += self.foundations.force(i, u, scene, tangent.foundation)
+        if ti.static(self.features.reduced):
+            if scene.body_of[i] < 0:
+                self.go_on_jvp(i, j, df, now, scene, state, tangent, plan)
+            else:
+                tangent.body_force[0, i] = df
+        else:
+            self.go_on_jvp(i, j, df, now, scene, state, tangent, plan)
+
+    @ti.func
+    def go_on_jvp(self, i, j, df, now: A, scene: A, state: A, tangent: A, plan: A):
+        """Its change for that of the force."""
+        s, t = j - plan.base, j - plan.base + 1
+        u, v, du, dv = state.u[s, i], state.v[s, i], tangent.u[0, i], tangent.v[0, i]
         inverse = scene.inverse_mass[i]
         da = inverse * (df - inverse * tangent.mass[i] * state.f[s, i])
         if ti.static(self.features.gravity >= 0):
@@ -239,6 +266,18 @@ class KickDrift:
     @ti.func
     def step_vjp(self, i, j, now: A, scene: A, state: A, adjoint: A, plan: A):
         """Complete the adjoint of the displacement after pass j, then go back through the vertex part of pass j."""
+        if ti.static(self.features.reduced):
+            if scene.body_of[i] < 0:
+                self.go_on_vjp(i, j, now, scene, state, adjoint, plan)
+            else:  # the body's stage is gone back through
+                s = j - plan.base
+                p, q, f_adj = adjoint.u[0, i], adjoint.v[0, i], adjoint.w[0, i]
+                self.forces_vjp(i, p, q, state.u[s, i], state.v[s, i], f_adj, now, scene, adjoint)
+        else:
+            self.go_on_vjp(i, j, now, scene, state, adjoint, plan)
+
+    @ti.func
+    def go_on_vjp(self, i, j, now: A, scene: A, state: A, adjoint: A, plan: A):
         s, t = j - plan.base, j - plan.base + 1
         u, v = state.u[s, i], state.v[s, i]
         p, q = adjoint.u[0, i], adjoint.v[0, i]
@@ -303,6 +342,11 @@ class KickDrift:
                 for d in ti.static(range(3)):
                     row = ti.static(self.features.gravity + d)
                     adjoint.sums[row, i] = adjoint.sums[row, i] + a_adj[d]
+        self.forces_vjp(i, p, q, u, v, f_adj, now, scene, adjoint)
+
+    @ti.func
+    def forces_vjp(self, i, p, q, u, v, f_adj, now: A, scene: A, adjoint: A):
+        """Back through the forces that are no element's; p and q: the adjoints of u and v so far."""
         if ti.static(self.features.forces):
             self.given.add_vjp(i, f_adj, now, scene, adjoint)
         if ti.static(self.features.founded):

@@ -9,7 +9,7 @@ from functools import cached_property
 
 import taichi as ti
 
-from diffsim_ti.runtime import Bundle, let, traced
+from diffsim_ti.runtime import Bundle, at, let, traced
 from diffsim_ti.solvers.explicit.guides import Guides
 from diffsim_ti.solvers.explicit.obstacle_places import ObstaclePlaces
 from diffsim_ti.state.pass_table import pass_at
@@ -86,10 +86,15 @@ class ObstacleStages(ObstaclePlaces):
             reached = ti.min(d, d + approach)
             if reached < width:
                 rigidity = self.on_area(g, i, g.force.rigidity(scene.parameters, first, X, u), scene)
-                omega2 = scene.inverse_mass[i] * rigidity
+                omega2 = self.felt_by(i, scene) * rigidity
                 state.seen[at, i] = ti.min(state.seen[at, i], reached)
                 state.seen[at + 1, i] = ti.max(state.seen[at + 1, i], now.h * now.h * omega2)
                 state.seen[at + 2, i] = ti.max(state.seen[at + 2, i], ti.abs(approach) / width)
+
+    @traced
+    def felt_by(self, i, scene):
+        """An inverse mass [1/kg] as a push on vertex i feels it, of a body's at the most."""
+        return let(at(scene.body_reach if self.features.reduced else scene.inverse_mass, i))
 
     # ---- forces ------------------------------------------------------------------------------------------------------
 

@@ -17,6 +17,7 @@ from diffsim_ti.potential.chamber_pressure import following
 from diffsim_ti.potential.fluid import Fluid
 from diffsim_ti.potential.way import Way
 from diffsim_ti.solvers.explicit.adjoint import ExplicitAdjoint
+from diffsim_ti.solvers.explicit.body_checks import check_bodies
 from diffsim_ti.solvers.explicit.chambers import Chambers
 from diffsim_ti.solvers.explicit.contact_stage import ROWS
 from diffsim_ti.solvers.explicit.felt_faces import FeltFaces, feels_faces
@@ -76,10 +77,7 @@ class ExplicitSolver(Solver):
         self.contact, self.contact_damping = contact, between("contact_damping", contact_damping, 0, 1, ends=True)
         scene = arguments[0] if arguments else options.get("scene")
         if getattr(scene, "reduced", False):
-            raise ValueError(
-                f"explicit steps move every vertex, and this scene moves some by few numbers ({scene.reduced.describe()}): "
-                "take ImplicitEulerSolver, BDF2Solver or ImplicitMidpointSolver, or leave reduced= out"
-            )
+            check_bodies(scene, contact)
         super().__init__(*arguments, **options)
 
     @property
@@ -89,7 +87,7 @@ class ExplicitSolver(Solver):
     def passes_per_launch(self) -> int:
         """How many passes one launch does at most where they run in parallel (runtime/repeated_loops.py)."""
         alone = (
-            self.scene.term(SelfContact) or feels_faces(self.scene) or self.scene.chambers
+            self.scene.term(SelfContact) or feels_faces(self.scene) or self.scene.chambers or self.scene.reduced
         )  # which act between passes
         return 1 if alone or runtime.runs_on_cpu() or not runtime.can_repeat() else MOST_PASSES
 
@@ -250,6 +248,7 @@ class ExplicitWorkspace(Workspace):
         out = dict(num_items=a.num_items, num_vertices=a.num_vertices)
         out |= dict(num_pressed=a.num_pressed, first_pressed=a.first_pressed)
         out |= dict(num_dragged=a.num_dragged, first_dragged=a.first_dragged)
+        out |= dict(num_bodies=len(self.scene.reduced.bodies))
         return out | dict(
             num_ties=a.num_ties, first_tied=a.first_tied, first_load=a.first_load, first_push=a.first_pressed
         )

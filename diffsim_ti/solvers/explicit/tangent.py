@@ -32,6 +32,8 @@ class ExplicitTangent:
         if workspace.impulses:
             self.impulses = ImpulseRecord(workspace)
             self.impulse = self.impulses.impulse
+        if a.bodies:
+            vars(self).update(a.bodies.tangent(tangent))
         if self.z is not None:
             runtime.fill(self.z, 0)
         self._rate_dot = float(tangent.parameters[self.features.drag]) if self.features.drag >= 0 else 0.0

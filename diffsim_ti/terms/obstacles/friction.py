@@ -23,6 +23,16 @@ def keeps(g, speed, c, eps):
     return g.select(sticks, stuck, sliding)
 
 
+def lost_per(g, speed, c, eps):
+    """(1 - keeps) / c, with all its digits where c is small; tends to f(s / eps) / s."""
+    sticks = speed.value < eps.value + c.value
+    inside = g.minimum(speed, eps + c)
+    both = eps + c * 2
+    root = g.sqrt(both * both - c * inside * 4)
+    stuck = (2 + 4 * (c + eps - inside) / (root + eps)) / (both + root)
+    return g.select(sticks, stuck, 1 / g.maximum(speed, eps + c))
+
+
 def normal_force(g, n, push):
     """(unit normal, N) of a barrier's force push n: the gradient n of a sampled distance is not quite of length one, and
     what is left of a velocity without its part along n would then not lie across it."""

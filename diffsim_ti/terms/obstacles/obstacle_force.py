@@ -85,7 +85,7 @@ class ObstacleForce(VertexForce):
         return [*moved, *theta], d, rows
 
     @traced
-    def _push(self, g, p, d):
+    def push(self, g, p, d):
         """Size N of the barrier's force."""
         stiffness, width = p[self.count], p[self.count + 1]
         s, fp = d / width, self.fp
@@ -95,11 +95,11 @@ class ObstacleForce(VertexForce):
     @traced
     def _record_force(self, parameters, first, X, u):
         g, p, moved, d, n = self.record(parameters, first, X, u)
-        push = self._push(g, p, d)
+        push = self.push(g, p, d)
         return g, p, moved, [push * k for k in n]
 
     @traced
-    def _vector(self, numbers):
+    def vector_of(self, numbers):
         if len(numbers) == 6:
             return let(ti.types.vector(6, self.fp)(*numbers))
         return let(ti.types.vector(4, self.fp)(*numbers, ti.cast(0, self.fp)))
@@ -201,16 +201,16 @@ class ObstacleForce(VertexForce):
             return by_u
         f = let(self.force(parameters, first, X, u, v))
         by_theta = cross([at(f, d) for d in range(3)], [at(w, d) for d in range(3)])
-        return self._vector([*(at(by_u, d) for d in range(3)), *by_theta])
+        return self.vector_of([*(at(by_u, d) for d in range(3)), *by_theta])
 
     @traced
     def _force(self, parameters, first, X, u):
-        return self._vector([k.value for k in self._record_force(parameters, first, X, u)[3]])
+        return self.vector_of([k.value for k in self._record_force(parameters, first, X, u)[3]])
 
     @traced
     def _force_jvp(self, parameters, first, X, u, du):
         g, _, moved, f = self._record_force(parameters, first, X, u)
-        return self._vector(g.forward(changes(moved, du), f))
+        return self.vector_of(g.forward(changes(moved, du), f))
 
     @traced
     def _zeros(self, u):
@@ -221,7 +221,7 @@ class ObstacleForce(VertexForce):
         g, p, _, f = self._record_force(parameters, first, X, u)
         rows = [g.reverse([(f[d], g.one())], p) for d in range(3)]
         for m, target in enumerate(by):
-            assign(target, self._vector([row[m] for row in rows]))
+            assign(target, self.vector_of([row[m] for row in rows]))
 
     # ---- friction as a stage of explicit passes ----------------------------------------------------------------------
 
@@ -230,13 +230,13 @@ class ObstacleForce(VertexForce):
         g, p, moved, d, n = self.record(parameters, first, X, u)
         before, mu, eps = [g.leaf(at(v, d)) for d in range(3)], p[self.count + 2], p[self.count + 3]
         ratio, wall = g.leaf(h_over_m), [g.leaf(at(wall, d)) for d in range(3)]
-        after = friction.slide(g, n, self._push(g, p, d), before, wall, mu, ratio, eps)
+        after = friction.slide(g, n, self.push(g, p, d), before, wall, mu, ratio, eps)
         return g, p, moved, before, wall, ratio, after
 
     @traced
     def slide(self, parameters, first, X, u, v, wall, h_over_m):
         """Velocity after friction in the time h on a vertex of mass m that touches; `wall`: the obstacle's velocity."""
-        return self._vector([k.value for k in self._record_slide(parameters, first, X, u, v, wall, h_over_m)[-1]])
+        return self.vector_of([k.value for k in self._record_slide(parameters, first, X, u, v, wall, h_over_m)[-1]])
 
     @traced
     def slide_jvp(self, parameters, first, X, u, v, wall, h_over_m, parameters_dot, du, dv, dwall, dh_over_m):
@@ -245,14 +245,14 @@ class ObstacleForce(VertexForce):
         dots = [(ratio, dh_over_m)] + [(q, at(parameters_dot, first + k)) for k, q in enumerate(p)]
         for leaves, change in ((moved, du), (before, dv), (walls, dwall)):
             dots += changes(leaves, change)
-        return self._vector(g.forward(dots, after))
+        return self.vector_of(g.forward(dots, after))
 
     @traced
     def slide_vjp(self, parameters, first, X, u, v, wall, h_over_m, w):
         """(adjoints of u, v, wall as vectors, of h_over_m, and of the obstacle's numbers, a tuple) for the adjoint w."""
         g, p, moved, before, walls, ratio, after = self._record_slide(parameters, first, X, u, v, wall, h_over_m)
         adjoints = g.reverse([(k, let(at(w, d))) for d, k in enumerate(after)], [*moved, *before, *walls, ratio, *p])
-        return (*self._parted(adjoints, len(moved)), adjoints[len(moved) + 6], tuple(adjoints[len(moved) + 7 :]))
+        return (*self.parted(adjoints, len(moved)), adjoints[len(moved) + 6], tuple(adjoints[len(moved) + 7 :]))
 
     # ---- friction as a force of implicit passes, at the velocity v; felt: (X, u), the place where N and n are those of the
     # barrier, or (None, N n), the normal force itself [N] -----------------------------------------------------------------
@@ -269,7 +269,7 @@ class ObstacleForce(VertexForce):
             n = [x / push for x in place]
         else:
             g, p, place, d, n = self.record(parameters, first, X, u)
-            n, push = friction.normal_force(g, n, self._push(g, p, d))
+            n, push = friction.normal_force(g, n, self.push(g, p, d))
         speed, wall = ([g.leaf(at(vector, d)) for d in range(3)] for vector in (v, wall))
         return g, p, place, speed, wall, n, push
 
@@ -291,13 +291,13 @@ class ObstacleForce(VertexForce):
     @traced
     def rub(self, parameters, first, felt, v, wall):
         """Force of friction [N]; `wall`: the obstacle's velocity."""
-        return self._vector([k.value for k in self._rubbed(parameters, first, felt, v, wall)[-1]])
+        return self.vector_of([k.value for k in self._rubbed(parameters, first, felt, v, wall)[-1]])
 
     @traced
     def rub_product(self, parameters, first, felt, v, wall, dv):
         """Its change for a change of the velocity alone."""
         g, _, _, speed, _, f = self._rubbed(parameters, first, felt, v, wall)
-        return self._vector(g.forward([(x, at(dv, d)) for d, x in enumerate(speed)], f))
+        return self.vector_of(g.forward([(x, at(dv, d)) for d, x in enumerate(speed)], f))
 
     @traced
     def rub_jvp(self, parameters, first, felt, v, wall, parameters_dot, du, dv, dwall):
@@ -306,16 +306,16 @@ class ObstacleForce(VertexForce):
         dots = [(q, at(parameters_dot, first + k)) for k, q in enumerate(p)]
         for leaves, change in ((moved, du), (speed, dv), (walls, dwall)):
             dots += changes(leaves, change)
-        return self._vector(g.forward(dots, f))
+        return self.vector_of(g.forward(dots, f))
 
     @traced
     def rub_vjp(self, parameters, first, felt, v, wall, w):
         """(adjoints of u, v, wall as vectors, and of the obstacle's numbers, a tuple) for the adjoint w of the force."""
         g, p, moved, speed, walls, f = self._rubbed(parameters, first, felt, v, wall)
         adjoints = g.reverse([(k, let(at(w, d))) for d, k in enumerate(f)], [*moved, *speed, *walls, *p])
-        return (*self._parted(adjoints, len(moved)), tuple(adjoints[len(moved) + 6 :]))
+        return (*self.parted(adjoints, len(moved)), tuple(adjoints[len(moved) + 6 :]))
 
     @traced
-    def _parted(self, adjoints, count):
+    def parted(self, adjoints, count):
         """Those of `count` numbers of a place, and of two vectors after them."""
-        return [self._vector(adjoints[a:b]) for a, b in ((0, count), (count, count + 3), (count + 3, count + 6))]
+        return [self.vector_of(adjoints[a:b]) for a, b in ((0, count), (count, count + 3), (count + 3, count + 6))]

@@ -1,0 +1,81 @@
+"""Friction of an obstacle at a vertex of a body of few numbers, as an impulse in an explicit pass.
+
+Many vertices slow the same body. With velocities v before friction and 1 / w_i a bound of the mass that vertex i feels, each
+takes the impulse of backward Euler (friction.py) as if it had the share of its load in the body,
+
+    p_i = -h mu N_i g(|t_i|) t_i,    g = (1 - keeps(|t_i|, C, eps)) / C,    C = sum_j h mu N_j w_j,
+
+so that C is the most by which all friction of a pass may slow the body. The matrix of what impulses do to velocities is at most
+the diagonal one of w_i C / (h mu N_i w_i), for C is the sum of these weights: no pass gains energy by friction.
+"""
+
+import taichi as ti
+
+from diffsim_ti.runtime import at, let, traced
+from diffsim_ti.terms.obstacles import friction
+from diffsim_ti.terms.obstacles.turning import changes
+
+
+@traced
+def _record(force, parameters, first, X, u, v, wall, time, total):
+    """(graph, the obstacle's numbers, leaves of u, v, wall, [time, total], h mu N, impulse)"""
+    g, p, moved, d, n = force.record(parameters, first, X, u)
+    before, walls = ([g.leaf(at(x, d)) for d in range(3)] for x in (v, wall))
+    time, total, mu, eps = g.leaf(time), g.leaf(total), p[force.count + 2], p[force.count + 3]
+    n, push = friction.normal_force(g, n, force.push(g, p, d))
+    t, speed = friction.tangential(g, n, before, walls)
+    load = time * mu * push
+    factor = 0 - load * friction.lost_per(g, speed, total, eps)
+    return g, p, moved, before, walls, [time, total], load, [factor * x for x in t]
+
+
+@traced
+def load(force, parameters, first, X, u, time):
+    """h mu N [N s]; time: h, on the area of the vertex where the stiffness is per area."""
+    g, p, _, d, n = force.record(parameters, first, X, u)
+    _, push = friction.normal_force(g, n, force.push(g, p, d))
+    return let((g.leaf(time) * p[force.count + 2] * push).value)
+
+
+@traced
+def impulse(force, parameters, first, X, u, v, wall, time, total):
+    """p; total: C [m/s]."""
+    return force.vector_of([x.value for x in _record(force, parameters, first, X, u, v, wall, time, total)[-1]])
+
+
+@traced
+def load_jvp(force, parameters, first, X, u, time, parameters_dot, du, dtime):
+    """Change of h mu N."""
+    g, p, moved, d, n = force.record(parameters, first, X, u)
+    _, push = friction.normal_force(g, n, force.push(g, p, d))
+    time = g.leaf(time)
+    dots = [(time, dtime), *((q, at(parameters_dot, first + k)) for k, q in enumerate(p)), *changes(moved, du)]
+    return g.forward(dots, [time * p[force.count + 2] * push])[0]
+
+
+@traced
+def impulse_jvp(force, parameters, first, X, u, v, wall, time, total, parameters_dot, du, dv, dwall, dtime, dtotal):
+    """Change of p."""
+    g, p, moved, before, walls, numbers, _, out = _record(force, parameters, first, X, u, v, wall, time, total)
+    dots = [(numbers[0], dtime), (numbers[1], dtotal), *((q, at(parameters_dot, first + k)) for k, q in enumerate(p))]
+    for leaves, change in ((moved, du), (before, dv), (walls, dwall)):
+        dots += changes(leaves, change)
+    return force.vector_of(g.forward(dots, out))
+
+
+@traced
+def total_vjp(force, parameters, first, X, u, v, wall, time, total, w):
+    """Adjoint of C for that of p."""
+    g, _, _, _, _, numbers, _, out = _record(force, parameters, first, X, u, v, wall, time, total)
+    return g.reverse([(k, let(at(w, d))) for d, k in enumerate(out)], numbers[1:])[0]
+
+
+@traced
+def vjp(force, parameters, first, X, u, v, wall, time, total, w, load_adj):
+    """(adjoints of u, v, wall as vectors, of time, of the obstacle's numbers, a tuple, and (p, h mu N) as a vector) for those of
+    p and of h mu N."""
+    g, p, moved, before, walls, numbers, loaded, out = _record(force, parameters, first, X, u, v, wall, time, total)
+    seeds = [(loaded, load_adj), *((k, let(at(w, d))) for d, k in enumerate(out))]
+    adjoints, count = g.reverse(seeds, [*moved, *before, *walls, numbers[0], *p]), len(moved)
+    felt = let(ti.types.vector(4, force.fp)(*(x.value for x in out), loaded.value))
+    return (*force.parted(adjoints, count), adjoints[count + 6], tuple(adjoints[count + 7 :]), felt)
