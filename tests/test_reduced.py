@@ -222,8 +222,8 @@ def test_steps_one_by_one_and_single_precision():
 @pytest.mark.parametrize(
     "reduced, options, words",
     [
-        (["shell"], {}, 'must be {name of a set: "affine" or a basis}'),
-        ({"shell": "rigid"}, {}, "'shell' must be 'affine' or a basis, got 'rigid'"),
+        (["shell"], {}, 'must be {name of a set: "affine", "rigid" or a basis}'),
+        ({"shell": "modal"}, {}, "'shell' must be 'affine' or 'rigid' or a basis, got 'modal'"),
         ({"shell": None}, {}, "or a basis, got None"),
         ({"shell": Cage}, {}, "the basis of 'shell' must be numbers"),
         ({"shell": np.ones((16, 0))}, {}, r"shape \(16, m\).* or \(m, 16, 3\).*got \(16, 0\)"),
