@@ -87,6 +87,11 @@ class TermsOfScene:
         return np.concatenate([np.full(len(term.paths(self.mesh)), term.one_sided) for term in self.ties])
 
     @property
+    def given_tensions(self) -> np.ndarray:
+        """Of each tie whether it pulls with a tension that is given, however long it is."""
+        return np.concatenate([np.full(len(term.paths(self.mesh)), term.by_tension) for term in self.ties])
+
+    @property
     def founded_vertices(self) -> np.ndarray:
         """Sorted indices of the vertices that foundations hold."""
         return np.unique(np.concatenate([np.zeros(0, np.int64), *(t.indices(self.mesh) for t in self.foundations)]))

@@ -13,7 +13,7 @@ import taichi as ti
 from diffsim_ti.elements.step_numbers import StepNumbers
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
-TIED = dict.fromkeys(("tie_start", "point_start", "point_vertex", "tie_one_sided"), "ints") | dict(
+TIED = dict.fromkeys(("tie_start", "point_start", "point_vertex", "tie_sides"), "ints") | dict(
     point_weight="scalars", tie_segments="vectors", ties="vectors2"
 )
 
@@ -72,10 +72,23 @@ class TieElement(StepNumbers):
     @ti.func
     def pull(self, t, n, u: A, s, scene: A):
         """(T, e as far as it pulls, k as far as e does)"""
-        e, k = self.stretch(t, u, s, scene) + n[1], n[2]
-        if scene.tie_one_sided[t] > 0 and e <= 0:
-            e, k = ti.cast(0, self.fp), ti.cast(0, self.fp)
-        return self.vector(n[0] + n[2] * e, e, k, ti.cast(0, self.fp))
+        e, k, zero = ti.cast(0, self.fp), n[2], ti.cast(0, self.fp)
+        if scene.tie_sides[t] >= 0:
+            e = self.stretch(t, u, s, scene) + n[1]
+            if scene.tie_sides[t] > 0 and e <= 0:
+                e, k = zero, zero
+        return self.vector(n[0] + n[2] * e, e, k, zero)
+
+    @ti.func
+    def is_single(self, t, scene: A):
+        """Whether it runs through two points, as springs and muscles do."""
+        return scene.tie_start[t + 1] - scene.tie_start[t] == 2
+
+    @ti.func
+    def store_both(self, p, f, first, scene: A, corner: A):
+        """The force of a segment on its ends, p and the next point."""
+        self.store(p, f, first, scene, corner)
+        self.store(p + 1, self.vector(0) - f, first, scene, corner)
 
     @ti.func
     def store(self, p, f, first, scene: A, corner: A):
@@ -95,13 +108,17 @@ class TieElement(StepNumbers):
     @ti.func
     def forces(self, t, now: A, scene: A, state: A, s, first):
         T = self.pull(t, self.numbers(t, now, scene.ties), state.u, s, scene)[0]
-        before, last = self.vector(0), scene.tie_start[t + 1] - 1
-        for p in range(scene.tie_start[t], last + 1):
-            after = self.vector(0)
-            if p < last:
-                after = T * self.unit(scene.tie_segments[p] + self.parted(p, state.u, s, scene))
-            self.store(p, after - before, first, scene, scene.corner)
-            before = after
+        before, begin, last = self.vector(0), scene.tie_start[t], scene.tie_start[t + 1] - 1
+        if self.is_single(t, scene):
+            f = T * self.unit(scene.tie_segments[begin] + self.parted(begin, state.u, s, scene))
+            self.store_both(begin, f, first, scene, scene.corner)
+        else:
+            for p in range(begin, last + 1):
+                after = self.vector(0)
+                if p < last:
+                    after = T * self.unit(scene.tie_segments[p] + self.parted(p, state.u, s, scene))
+                self.store(p, after - before, first, scene, scene.corner)
+                before = after
 
     @ti.func
     def forces_jvp(self, t, now: A, scene: A, state: A, s, tangent: A, first):
@@ -128,21 +145,30 @@ class TieElement(StepNumbers):
         """Products of the derivative, which is symmetric, with adjoint.w, to corners; adds the adjoints of a tie's numbers
         to adjoint.tie_felt and those of its segments at rest to adjoint.tie_rest."""
         n, zero = self.numbers(t, now, scene.ties), ti.cast(0, self.fp)
-        pulled, T_adj = self.pull(t, n, state.u, s, scene), zero
-        last = scene.tie_start[t + 1] - 1
-        for p in range(scene.tie_start[t], last):
-            d = scene.tie_segments[p] + self.parted(p, state.u, s, scene)
-            T_adj += self.unit(d).dot(self.vector(0) - self.parted(p, adjoint.w, 0, scene))
-        e_adj, before = T_adj * pulled[2], self.vector(0)
-        for p in range(scene.tie_start[t], last + 1):
-            after = self.vector(0)
-            if p < last:
-                D = scene.tie_segments[p]
-                d, w = D + self.parted(p, state.u, s, scene), self.vector(0) - self.parted(p, adjoint.w, 0, scene)
-                after = e_adj * self.unit(d) + self.across(pulled[0], n[2], d, w)
-                adjoint.tie_rest[p] = adjoint.tie_rest[p] + after - e_adj * self.unit(D)
-            self.store(p, before - after, first, scene, adjoint.corner)
-            before = after
+        pulled, T_adj, e_adj = self.pull(t, n, state.u, s, scene), zero, zero
+        begin, last, before = scene.tie_start[t], scene.tie_start[t + 1] - 1, self.vector(0)
+        if self.is_single(t, scene):
+            D = scene.tie_segments[begin]
+            d, w = D + self.parted(begin, state.u, s, scene), self.vector(0) - self.parted(begin, adjoint.w, 0, scene)
+            T_adj = self.unit(d).dot(w)
+            e_adj = T_adj * pulled[2]
+            push = e_adj * self.unit(d) + self.across(pulled[0], n[2], d, w)
+            adjoint.tie_rest[begin] = adjoint.tie_rest[begin] + push - e_adj * self.unit(D)
+            self.store_both(begin, self.vector(0) - push, first, scene, adjoint.corner)
+        else:
+            for p in range(begin, last):
+                d = scene.tie_segments[p] + self.parted(p, state.u, s, scene)
+                T_adj += self.unit(d).dot(self.vector(0) - self.parted(p, adjoint.w, 0, scene))
+            e_adj = T_adj * pulled[2]
+            for p in range(begin, last + 1):
+                after = self.vector(0)
+                if p < last:
+                    D = scene.tie_segments[p]
+                    d, w = D + self.parted(p, state.u, s, scene), self.vector(0) - self.parted(p, adjoint.w, 0, scene)
+                    after = e_adj * self.unit(d) + self.across(pulled[0], n[2], d, w)
+                    adjoint.tie_rest[p] = adjoint.tie_rest[p] + after - e_adj * self.unit(D)
+                self.store(p, before - after, first, scene, adjoint.corner)
+                before = after
         for force, weight in ti.static(((now.force0, now.share0), (now.force1, now.share1))):
             share, r = self.share(force, now), self.row(force)
             by_a, by_s = weight * T_adj, weight * e_adj

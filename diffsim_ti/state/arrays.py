@@ -148,7 +148,8 @@ class SceneArrays:
         self.point_start = runtime.upload(paths.first_corner, ti.i32)
         self.point_vertex = runtime.upload(paths.vertices, ti.i32)
         self.point_weight = runtime.upload(paths.weights, self.fp)
-        self.tie_one_sided = runtime.upload(scene.one_sided_ties, ti.i32)
+        # 1 what pulls only, 0 what pushes too, -1 what pulls as it is told, whose length nobody asks for
+        self.tie_sides = runtime.upload(np.where(scene.given_tensions, -1, scene.one_sided_ties), ti.i32)
         return start, corner_of, num_corners + len(paths.vertices)
 
     def _upload_fluids(self, scene, start, corner_of, num_corners: int) -> tuple:

@@ -50,6 +50,7 @@ class Tie(Term):
 
     num_numbers = 0  # what kernels read of it lies in arrays of its own
     one_sided = False  # whether it pulls only
+    by_tension = False  # whether it pulls with a tension that is given, however long it is
 
     def paths(self, mesh: TetrahedralMesh) -> Paths:
         """Where its ties run."""
@@ -226,7 +227,7 @@ class Cable(Tie):
             raise ValueError("Cable: give tension [N], or length [m] together with stiffness [N/m]")
         if len(points) < 2:
             raise ValueError(f"Cable: runs through two points at least, got {len(points)}")
-        by_tension = length is None
+        self.by_tension = by_tension = length is None
         argument, self.given = ("tension", tension) if by_tension else ("length", length)
         self.plain = f"cable_{argument}"
         inputs = [amount(argument, self.given, (), "N" if by_tension else "m", self.plain)]
