@@ -2,7 +2,7 @@
 
 Of a face and an obstacle, corner a feels
 
-    f_a = -c k w sum_q s_a ((F_s - F_t) n + F_t n_a)
+    f_a = -c k w sum_q s_a ((F_s - F_t) n + F_t n_a)    (curved: -c k w sum_q N_a (F_s - F_t) n + s_a F_t n_a)
 
 q: points of the lattice, s_a: their shares of the corners; n, n_a: normals at the point and at the corner; F(s, t):
 potential/face_lattice.py. Beside it stands
@@ -10,13 +10,14 @@ potential/face_lattice.py. Beside it stands
     D_a = c k sum_q s_a beta''(s) phi(t)    [N/m]
 
 whose sum over the faces around a vertex is no less than the stiffness that they have there, for s (x) s <= diag(s) where
-shares s sum up to 1. It says in how many parts a pass is to be gone (face_kernels.py).
+shares s sum up to 1; of curved faces with 5/3 |N_a|, since N (x) N <= diag(|N|) sum |N|. It says in how many parts a pass is to be gone (face_kernels.py).
 """
 
 from dataclasses import dataclass
 
 import taichi as ti
 
+from diffsim_ti.potential.curved_faces import MOST_SHARES
 from diffsim_ti.potential.face_lattice import FLAT, fade, point_curvatures, point_energy, point_slopes
 from diffsim_ti.solvers.explicit.face_rows import FaceRows
 from diffsim_ti.terms.obstacles import barrier
@@ -41,13 +42,11 @@ class FaceForces(FaceRows):
         """
         found, first, row = self.rows(0), g.first + k * g.size, f * ti.static(self.num_obstacles) + g.number + k
         reach, width = faces.reach[row], g.force.width(scene.parameters, first)
-        one = ti.cast(1 / 3, self.fp)
-        third = ti.Vector([one, one, one])
-        Xm, um, around = self.mix(third, X), self.mix(third, u), self.rows(0)
-        for a in ti.static(range(3)):
+        Xm, um, around = self.middle_of(f, X), self.middle_of(f, u), self.rows(0)
+        for a in ti.static(range(self.nodes)):
             for m in ti.static(range(3)):
                 around[a, m] = (X[a, m] - Xm[m]) + (u[a, m] - um[m])
-        middle, size = g.force.clearance(scene.parameters, first, Xm, um), self.size_of_rows(around)
+        middle, size = g.force.clearance(scene.parameters, first, Xm, um), self.size_of_rows(f, around)
         least = middle[3] - size - reach
         if least < width:
             least = ti.cast(1e30, self.fp)  # unless points are told apart, corners speak for them
@@ -59,8 +58,10 @@ class FaceForces(FaceRows):
                     for b in ti.static(range(3)):
                         corners[b, m] = ti.select(a == b, seen[m], corners[b, m])
             # a convex obstacle is never nearer than the tangent plane at the middle says
-            if ti.static(g.force.convex):
-                bent = ti.cast(0, self.fp)
+            if ti.static(g.force.hollow):  # nor one that is flat or hollow than the corners do, but by the arch
+                bent = self.arch(around, self.inner(f))
+            elif ti.static(g.force.convex):
+                bent = self.arch(around, self.inner(f))
                 for a in ti.static(range(3)):
                     along = self.dot3(middle, self.row_of(around, a))
                     bent = ti.max(bent, corners[a, 3] - middle[3] - along)
@@ -87,14 +88,18 @@ class FaceForces(FaceRows):
         for m in ti.static(range(3)):
             edge[0, m] = per * ((X[2, m] - X[0, m]) + (u[2, m] - u[0, m]))
         # distances change by no more than the way: where a point is far away, the next ones are not looked at
-        step = ti.max(ti.cast(1.01, self.fp) * self.size_of_rows(edge), ti.cast(1e-30, self.fp))
+        length = self.longest(edge)
+        if ti.static(self.features.curved):
+            length += 6 * per * self.arch(X + u, self.inner(f))
+        step = ti.max(ti.cast(1.01, self.fp) * length, ti.cast(1e-30, self.fp))
         for x in range(parts + 1):
             onwards = 0
             for y in range(parts + 1 - x):
                 if y >= onwards:
                     s1, s2 = x * per, y * per
                     s = ti.Vector([1 - s1 - s2, s1, s2])
-                    Xs, us = self.mix(s, X), self.mix(s, u)
+                    N = self.node_weights(s, self.inner(f))
+                    Xs, us = self.mix(N, X), self.mix(N, u)
                     now = g.force.outlook(scene.parameters, first, Xs, us)
                     far = now[3]
                     if ti.static(g.force.grain > 0):  # splines are steeper than distances, and end with their grid
@@ -112,7 +117,7 @@ class FaceForces(FaceRows):
                     if inner and sigma < 1 and t > ti.cast(FLAT, self.fp):
                         turned, mixed = self.vector(0), self.vector(0)
                         if ti.static(what in ("jvp", "vjp")):
-                            mixed = self.mix(s, w)
+                            mixed = self.mix(N, w)
                             turned = self.turn(what, g, first, Xs, us, mixed, scene, out)
                         if ti.static(what == "force"):
                             value = point_energy(sigma, t, g.force, self.fp)
@@ -123,6 +128,7 @@ class FaceForces(FaceRows):
                             g,
                             first,
                             s,
+                            N,
                             sigma,
                             t,
                             now,
@@ -172,6 +178,7 @@ class FaceForces(FaceRows):
         g: A,
         first,
         s,
+        N,
         sigma,
         t,
         now,
@@ -196,6 +203,11 @@ class FaceForces(FaceRows):
                 for m in ti.static(range(3)):
                     found[a, m] = scale * s[a] * ((Fs - Ft) * now[m] + Ft * corners[a, m])
                 found[a, 3] = stiff * s[a] * G
+            if ti.static(self.features.curved):
+                for a in ti.static(range(6)):
+                    for m in ti.static(range(3)):
+                        found[a, m] += scale * self.besides(N, s, a) * (Fs - Ft) * now[m]
+                    found[a, 3] = ti.cast(MOST_SHARES, self.fp) * stiff * ti.abs(N[a]) * G
         else:
             Fss, Fst, Ftt = point_curvatures(sigma, t, g.force, self.fp)
             ds, zero = dn[3] / width, ti.cast(0, self.fp)
@@ -212,7 +224,20 @@ class FaceForces(FaceRows):
                     found[a, m] += scale * s[a] * (dFt * corners[a, m] + Ft * turns[a, m])
                     if ti.static(what == "jvp"):
                         found[a, m] += (dk + dw) * scale * s[a] * ((Fs - Ft) * now[m] + Ft * corners[a, m])
+            if ti.static(self.features.curved):
+                for a in ti.static(range(6)):
+                    more = scale * self.besides(N, s, a)
+                    for m in ti.static(range(3)):
+                        found[a, m] += more * ((dFs - dFt + (dk + dw) * (Fs - Ft)) * now[m] + (Fs - Ft) * dn[m])
         return found
+
+    @ti.func
+    def besides(self, N, s, a: A):
+        """What node a of a curved face has of a point besides its share as a corner."""
+        more = N[a]
+        if ti.static(a < 3):
+            more -= s[a]
+        return more
 
     @ti.func
     def numbers(self, g: A, first, f, s, sigma, t, now, Xs, us, mixed, w, corners, weight, width, scene: A, out: A):
