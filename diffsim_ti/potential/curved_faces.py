@@ -1,15 +1,19 @@
 """Points within curved faces, which lie on them by their six nodes (mesh/curved_triangles.py), in the energy of faces.py.
 
-d_a stay the distances of a triangle's own corners, so that t is what the bow of the face adds as well: a plane feels a face
-that is bent towards it. Before what is smooth itself (flat or hollow obstacles, which reach nowhere but into curved faces)
-r = 0, c is 1 at most, and phi does not grow: with a stiffness per area the sum tends to the integral over the curved face.
+d_a stay the distances of a triangle's own corners, so that t is what the bow of the face adds as well. Obstacles that are
+flat or hollow, to which no point of a flat triangle is nearer than its corners, are felt by
+
+    E = k c w^2 beta(s) h(1 - r),    r = sum_a s_a beta(d_a / w) / beta(s),    h(x) = x^3 (6 - 8 x + 3 x^2) for x > 0
+
+what the corners' barriers do not say already: nothing on a flat triangle, for beta is convex, all of it where no corner
+is near, and C2 between. There r of the distances is 0, c is 1 at most, and lattices are as fine as the arch asks for.
 """
 
 from dataclasses import dataclass
 
 import taichi as ti
 
-from diffsim_ti.potential.face_lattice import FLAT, point_curvatures, point_energy, point_slopes
+from diffsim_ti.potential.face_lattice import FLAT, felt, point_curvatures, point_energy, point_slopes
 from diffsim_ti.state.obstacle_functions import ObstacleFunctions
 
 A = ti.template()
@@ -72,8 +76,7 @@ class CurvedPoints(ObstacleFunctions):
 
     @ti.func
     def may_be_nearer(self, g: A, first, X, u, corners, inner, scene: A):
-        """How much nearer to an obstacle than its corners let expect a point of the triangle may be [m], whose corners have
-        the rows `corners` of (normal, distance)."""
+        """More than 0 if a point of a triangle may have some energy, whose corners say the rows `corners`."""
         out, arch, one = ti.cast(1e30, self.fp), self.arch(X + u, inner), ti.cast(1 / 3, self.fp)
         if ti.static(g.force.hollow):
             out = arch  # to what is flat or hollow, no point of the flat triangle is
@@ -86,7 +89,7 @@ class CurvedPoints(ObstacleFunctions):
                 for m in ti.static(range(3)):
                     along += middle[m] * ((X[a, m] - Xm[m]) + (u[a, m] - um[m]))
                 out = ti.max(out, corners[a, 3] - middle[3] - along)
-            out += arch
+            out += arch - ti.cast(FLAT, self.fp) * g.force.width(scene.parameters, first)
         return out
 
     @ti.func
@@ -99,14 +102,15 @@ class CurvedPoints(ObstacleFunctions):
         stiffness, width = scene.parameters[first + g.force.count], g.force.width(scene.parameters, first)
         corners, turns, wi = self.rows(0), self.rows(0), self.row_of(w, spot)
         for a in range(3):
-            seen = g.force.outlook(scene.parameters, first, self.row_of(X, a), self.row_of(u, a))
+            seen = self.corner(g, first, self.row_of(X, a), self.row_of(u, a), scene)
             for m in ti.static(range(4)):
                 for b in ti.static(range(3)):
                     corners[b, m] = ti.select(a == b, seen[m], corners[b, m])
-        if self.may_be_nearer(g, first, X, u, corners, inner, scene) > ti.cast(FLAT, self.fp) * width:
+        if self.may_be_nearer(g, first, X, u, corners, inner, scene) > 0:
             if ti.static(what in ("product", "column", "jvp")):
                 for a in range(3):
-                    t = self.turn(what, g, first, self.row_of(X, a), self.row_of(u, a), self.row_of(w, a), scene, more)
+                    x, y, z = self.row_of(X, a), self.row_of(u, a), self.row_of(w, a)
+                    t = self.corner_turn(what, g, first, x, y, z, scene, more)
                     for m in ti.static(range(4)):
                         for b in ti.static(range(3)):
                             turns[b, m] = ti.select(a == b, t[m], turns[b, m])
@@ -124,8 +128,9 @@ class CurvedPoints(ObstacleFunctions):
                     Xs, us = self.mix(W, X), self.mix(W, u)
                     now = g.force.outlook(scene.parameters, first, Xs, us)
                     sigma = (now[3] - reach) / width
-                    t = (s[0] * corners[0, 3] + s[1] * corners[1, 3] + s[2] * corners[2, 3] - now[3]) / width
-                    if x < parts and y < parts and x + y > 0 and sigma < 1 and t > ti.cast(FLAT, self.fp):
+                    said = s[0] * corners[0, 3] + s[1] * corners[1, 3] + s[2] * corners[2, 3]
+                    t = self.besides(g, said, now[3]) / width
+                    if x < parts and y < parts and x + y > 0 and felt(sigma, t, g.force, self.fp):
                         weight = one
                         if ti.static(g.force.per_area):  # the face beyond an edge has its own half
                             weight = ti.select(x > 0 and y > 0 and x + y < parts, one + one, one)
@@ -136,15 +141,16 @@ class CurvedPoints(ObstacleFunctions):
                             )
                         elif ti.static(what == "force"):
                             Fs, Ft = point_slopes(sigma, t, g.force, self.fp)
-                            out += scale * ((Fs - Ft) * own * now + Ft * of_corner * ni)
+                            out += scale * (self.besides(g, Fs, Ft) * own * now + Ft * of_corner * ni)
                         elif ti.static(what == "numbers"):
                             Fs, Ft = point_slopes(sigma, t, g.force, self.fp)
                             Fss, Fst, Ftt = point_curvatures(sigma, t, g.force, self.fp)
                             along, across = own * self.dot3(now, wi), of_corner * self.dot3(ni, wi)
-                            by_s = scale * ((Fss - Fst) * along + Fst * across)
-                            by_t = scale * ((Fst - Ftt) * along + Ftt * across)
-                            f, by_now = scale * ((Fs - Ft) * along + Ft * across), scale * (Fs - Ft) * own * wi
-                            by_now[3] = (by_s - by_t) / width
+                            by_s = scale * (self.besides(g, Fss, Fst) * along + Fst * across)
+                            by_t = scale * (self.besides(g, Fst, Ftt) * along + Ftt * across)
+                            push = self.besides(g, Fs, Ft)
+                            f, by_now = scale * (push * along + Ft * across), scale * push * own * wi
+                            by_now[3] = self.besides(g, by_s, by_t) / width
                             g.force.outlook_vjp(scene.parameters, first, Xs, us, by_now, more.sums, i)
                             for a in ti.static(range(3)):
                                 of_a = ti.select(spot == a, scale * Ft * s[a], ti.cast(0, self.fp))
@@ -160,14 +166,15 @@ class CurvedPoints(ObstacleFunctions):
                             Fss, Fst, Ftt = point_curvatures(sigma, t, g.force, self.fp)
                             dn = self.turn(what, g, first, Xs, us, self.mix(W, w), scene, more)
                             ds = dn[3] / width
-                            dt = (s[0] * turns[0, 3] + s[1] * turns[1, 3] + s[2] * turns[2, 3] - dn[3]) / width
+                            said = s[0] * turns[0, 3] + s[1] * turns[1, 3] + s[2] * turns[2, 3]
+                            dt = self.besides(g, said, dn[3]) / width
                             grown = ti.cast(0, self.fp)
                             if ti.static(what == "jvp"):
                                 dwidth = more.parameters[first + g.force.count + 1] / width
                                 ds, dt = ds - sigma * dwidth, dt - t * dwidth
                                 grown = thicker + more.parameters[first + g.force.count] / stiffness + dwidth
                             dFs, dFt = Fss * ds + Fst * dt + grown * Fs, Fst * ds + Ftt * dt + grown * Ft
-                            out += scale * own * ((dFs - dFt) * now + (Fs - Ft) * dn)
+                            out += scale * own * (self.besides(g, dFs, dFt) * now + self.besides(g, Fs, Ft) * dn)
                             out += scale * of_corner * (dFt * ni + Ft * ti_)
         if ti.static(what == "numbers"):
             self.corners_vjp(g, first, X, u, by, scene, more, i)

@@ -24,9 +24,8 @@ def rise(t, fp: ti.template()):
 
 
 def firmer(force) -> bool:
-    """Whether points are the firmer, the narrower their obstacle is; a spline's t ends with its grid, and what reaches into
-    curved faces alone is wide."""
-    return force.per_area and not force.grain and not force.hollow
+    """Whether points are the firmer, the narrower their obstacle is; a spline's t ends with its grid."""
+    return force.per_area and not force.grain
 
 
 @ti.func
@@ -41,22 +40,80 @@ def fade(t, force: ti.template(), fp: ti.template()):
     return value, slope, curvature
 
 
-# F = beta(s) phi(t), or per area (beta(s) - beta(s + t)) phi(t), and its derivatives
+# F = beta(s) phi(t), or per area (beta(s) - beta(s + t)) phi(t), and its derivatives; before hollow obstacles what
+# curved_faces.py says, in which t is what corners say
+
+
+@ti.func
+def felt(s, t, force: ti.template(), fp: ti.template()):
+    """Whether a point has some energy."""
+    out = s < 1
+    if ti.static(force.hollow):
+        if out:
+            out = t < barrier.value(s, fp)
+    else:
+        out = out and t > ti.cast(FLAT, fp)
+    return out
 
 
 @ti.func
 def point_energy(s, t, force: ti.template(), fp: ti.template()):
     """F"""
-    b = barrier.value(s, fp)
-    if ti.static(force.per_area):
-        b -= barrier.value(s + t, fp)
-    p, _, _ = fade(t, force, fp)
+    b, p = barrier.value(s, fp), ti.cast(0, fp)
+    if ti.static(force.hollow):
+        p, _, _ = unsaid(t / b, fp)
+    else:
+        if ti.static(force.per_area):
+            b -= barrier.value(s + t, fp)
+        p, _, _ = fade(t, force, fp)
     return b * p
+
+
+@ti.func
+def unsaid(r, fp: ti.template()):
+    """h and its two derivatives by x = 1 - r."""
+    x = ti.max(1 - r, ti.cast(0, fp))
+    value, slope = x * x * x * (6 + x * (3 * x - 8)), x * x * (18 + x * (15 * x - 32))
+    return value, slope, 12 * x * (3 + x * (5 * x - 8))
+
+
+@ti.func
+def hollow_slopes(s, t, fp: ti.template()):
+    b = barrier.value(s, fp)
+    h, h1, _ = unsaid(t / b, fp)
+    return (h + t / b * h1) * barrier.slope(s, fp), 0 - h1
+
+
+@ti.func
+def hollow_curvatures(s, t, fp: ti.template()):
+    b, b1 = barrier.value(s, fp), barrier.slope(s, fp)
+    h, h1, h2 = unsaid(t / b, fp)
+    r, by_b = t / b, b1 / b
+    return (h + r * h1) * barrier.curvature(s, fp) + r * r * h2 * by_b * b1, 0 - r * h2 * by_b, h2 / b
+
+
+@ti.func
+def hollow_stiffness(s, t, fp: ti.template()):
+    """What d2F does not exceed, of the point's distance and, times b1^2, of each corner's."""
+    b, b1 = barrier.value(s, fp), barrier.slope(s, fp)
+    h, h1, h2 = unsaid(t / b, fp)
+    r, steep = t / b, 2 * ti.max(h2, ti.cast(0, fp)) / b
+    return (h + r * h1) * barrier.curvature(s, fp) + r * r * steep * b1 * b1, steep
 
 
 @ti.func
 def point_slopes(s, t, force: ti.template(), fp: ti.template()):
     """dF/ds, dF/dt"""
+    by_s, by_t = ti.cast(0, fp), ti.cast(0, fp)
+    if ti.static(force.hollow):
+        by_s, by_t = hollow_slopes(s, t, fp)
+    else:
+        by_s, by_t = solid_slopes(s, t, force, fp)
+    return by_s, by_t
+
+
+@ti.func
+def solid_slopes(s, t, force: ti.template(), fp: ti.template()):
     b, b1 = barrier.value(s, fp), barrier.slope(s, fp)
     p, p1, _ = fade(t, force, fp)
     by_s, by_t = b1 * p, b * p1
@@ -69,6 +126,16 @@ def point_slopes(s, t, force: ti.template(), fp: ti.template()):
 @ti.func
 def point_curvatures(s, t, force: ti.template(), fp: ti.template()):
     """d2F/ds2, d2F/dsdt, d2F/dt2"""
+    ss, st, tt = ti.cast(0, fp), ti.cast(0, fp), ti.cast(0, fp)
+    if ti.static(force.hollow):
+        ss, st, tt = hollow_curvatures(s, t, fp)
+    else:
+        ss, st, tt = solid_curvatures(s, t, force, fp)
+    return ss, st, tt
+
+
+@ti.func
+def solid_curvatures(s, t, force: ti.template(), fp: ti.template()):
     b, b1, b2 = barrier.value(s, fp), barrier.slope(s, fp), barrier.curvature(s, fp)
     p, p1, p2 = fade(t, force, fp)
     ss, st, tt = b2 * p, b1 * p1, b * p2

@@ -15,7 +15,7 @@ from functools import cached_property, lru_cache
 import taichi as ti
 
 from diffsim_ti.potential.curved_faces import MOST_SHARES
-from diffsim_ti.runtime import Kernel, let, traced
+from diffsim_ti.runtime import Kernel, traced
 from diffsim_ti.state.features import Features
 from diffsim_ti.state.numbers import SCENE
 from diffsim_ti.state.obstacle_functions import ObstacleFunctions
@@ -136,7 +136,11 @@ class SweptKernels(ObstacleFunctions):
     @traced
     def part_of(self, part, M, inner):
         """Corners of a part of a face whose nodes have the rows M."""
-        return self.part_of_curved(part, M, inner) if self.features.curved else let(part @ M)
+        return self.part_of_curved(part, M, inner) if self.features.curved else self.part_of_flat(part, M)
+
+    @ti.func
+    def part_of_flat(self, part, M):
+        return part @ M
 
     @ti.func
     def part_of_curved(self, part, M, inner):

@@ -10,6 +10,7 @@ from diffsim_ti.mesh.curved_triangles import EDGES
 from diffsim_ti.runtime import PRECISIONS, at, let, traced
 from diffsim_ti.state.features import Features
 from diffsim_ti.state.turned import Turned
+from diffsim_ti.terms.obstacles import barrier
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
 
@@ -144,9 +145,51 @@ class ObstacleFunctions:
             t = g.force.outlook_jvp(scene.parameters, first, X, u, w)
         return t
 
+    # What corners say is their distance, to which that of a point is compared: (normal, distance). Before hollow obstacles,
+    # which only curved faces feel within, it is their barrier (potential/curved_faces.py): its gradient, and w beta(d / w).
+
+    @traced
+    def besides(self, g, of_corners, of_point):
+        """What the corners say, less what the point does."""
+        return of_corners if g.force.hollow else of_corners - of_point
+
+    @ti.func
+    def corner(self, g: A, first, X, u, scene: A):
+        said = g.force.outlook(scene.parameters, first, X, u)
+        if ti.static(g.force.hollow):
+            width = g.force.width(scene.parameters, first)
+            s = said[3] / width
+            said = barrier.slope(s, self.fp) * said
+            said[3] = width * barrier.value(s, self.fp)
+        return said
+
+    @ti.func
+    def corner_turn(self, what: A, g: A, first, X, u, w, scene: A, more: A):
+        """Its change, as of `turn`."""
+        t = self.turn(what, g, first, X, u, w, scene, more)
+        if ti.static(g.force.hollow):
+            seen, width = g.force.outlook(scene.parameters, first, X, u), g.force.width(scene.parameters, first)
+            s, dwidth = seen[3] / width, ti.cast(0, self.fp)
+            if ti.static(what == "jvp"):
+                dwidth = more.parameters[first + g.force.count + 1]
+            slope, ds = barrier.slope(s, self.fp), (t[3] - s * dwidth) / width
+            of_distance = slope * t[3] + (barrier.value(s, self.fp) - s * slope) * dwidth
+            t = barrier.curvature(s, self.fp) * ds * seen + slope * t
+            t[3] = of_distance
+        return t
+
     @ti.func
     def corners_vjp(self, g: A, first, X, u, by, scene: A, adjoint: A, i):
-        """Add to column i of the sums what adjoints `by` of (normal, distance) at its corners say of an obstacle."""
+        """Add to column i of the sums what adjoints `by` of what its corners say have for an obstacle."""
         for a in range(3):
             x, y, w = self.row_of(X, a), self.row_of(u, a), self.row_of(by, a)
+            if ti.static(g.force.hollow):
+                seen, width = g.force.outlook(scene.parameters, first, x, y), g.force.width(scene.parameters, first)
+                s, at_w = seen[3] / width, first + g.force.count + 1
+                slope, of_value = barrier.slope(s, self.fp), w[3]
+                by_s = barrier.curvature(s, self.fp) * self.dot3(seen, w) / width
+                more = (barrier.value(s, self.fp) - s * slope) * of_value - s * by_s
+                adjoint.sums[at_w, i] = adjoint.sums[at_w, i] + more
+                w = slope * w
+                w[3] = by_s + slope * of_value
             g.force.outlook_vjp(scene.parameters, first, x, y, w, adjoint.sums, i)

@@ -148,7 +148,7 @@ class FaceKernels(FaceWalls):
                     bent = ti.cast(0, self.fp)
                     for c in range(3):
                         bent = ti.max(bent, self.bent(g, first, f, X, u + ti.cast(0.5, self.fp) * c * move, scene))
-                    if bent > ti.cast(FLAT, self.fp) * width:
+                    if bent > ti.cast(0 if g.force.hollow else FLAT, self.fp) * width:
                         near, need = 1, ti.max(need, travel / width)
         if now.alpha <= 0:
             near = 0
