@@ -16,6 +16,7 @@ from diffsim_ti.mesh.face_points import bow
 SIX = np.array([[0, 3, 5, 1, 4, 2], [1, 4, 3, 2, 5, 0], [2, 5, 4, 0, 3, 1], [3, 4, 5, 0, 2, 1]])
 # (end, middle, end) of the edges that are parallel to their sides, of the three triangles and of the inner one
 EDGES = ((0, 1, 3), (0, 2, 5), (3, 4, 5)), ((3, 2, 4), (3, 0, 5), (5, 1, 4))
+STRAIGHT = 1e-5  # of its length: what an edge may be off that is straight, in files of single precision too
 FELT = 0.02  # of a barrier's width: how far curved faces lie from their triangles before obstacles feel it
 
 
@@ -32,6 +33,14 @@ def arches(mesh) -> np.ndarray:
         for p, y, q in EDGES[k // 3]:
             out[:, k] = np.maximum(out[:, k], np.linalg.norm(x[:, y] - (x[:, p] + x[:, q]) / 2, axis=1))
     return out.ravel() / 3
+
+
+def curved_faces(mesh) -> np.ndarray:
+    """Whether a face of ten-node tetrahedra has an edge that is not straight, Booleans, shape (len(surface_faces),)."""
+    x = mesh.vertices[mesh.surface_faces]
+    off = np.linalg.norm(x[:, 3:] - (x[:, :3] + np.roll(x[:, :3], -1, 1)) / 2, axis=2).max(1, initial=0)
+    longest = np.linalg.norm(x[:, :3] - np.roll(x[:, :3], -1, 1), axis=2).max(1, initial=0)
+    return off > STRAIGHT * longest
 
 
 def are_felt(mesh, terms) -> bool:

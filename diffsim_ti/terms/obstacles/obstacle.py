@@ -8,7 +8,6 @@ from numpy.typing import ArrayLike
 from diffsim_ti.inputs import NOT_NEGATIVE, Input
 from diffsim_ti.inputs.description import length_per_step
 from diffsim_ti.mesh import TetrahedralMesh
-from diffsim_ti.terms.bow import warn_of_bow
 from diffsim_ti.terms.described import place, positive
 from diffsim_ti.terms.gravity import Gravity
 from diffsim_ti.terms.motion import Motion
@@ -131,9 +130,6 @@ class Obstacle(Term):
     def has_friction(self) -> bool:
         """Whether friction was given: without, none is compiled."""
         return "friction" in self.values
-
-    def check(self, mesh: TetrahedralMesh) -> None:
-        warn_of_bow(mesh, self)
 
     def settled(self, scene, density, initial_positions, initial_velocities) -> "Obstacle":
         """With the stiffness per area that the fall from the start, or the start's velocity, asks for."""
