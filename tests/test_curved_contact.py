@@ -4,7 +4,7 @@ import warnings
 
 import numpy as np
 import pytest
-from quadratic_meshes import ball, turned_by, with_vertices
+from quadratic_meshes import ball, turned_by
 from test_every_adjoint import assert_transposed
 
 import diffsim_ti as ds
@@ -94,7 +94,9 @@ def test_energy_is_that_of_the_formula_and_all_solvers_feel_it(kind):
     potential, u = theirs.workspace.potential, theirs.displacements
     potential.place(u)
     energy, forces = potential.faces.energies().sum(), potential.faces.forces()
-    assert energy == pytest.approx(energy_by_the_formula(scene, x, theirs.workspace.arrays), rel=1e-10) and energy > 1e-2
+    assert (
+        energy == pytest.approx(energy_by_the_formula(scene, x, theirs.workspace.arrays), rel=1e-10) and energy > 1e-2
+    )
     assert ours.compute_energy().parts["contact"] == pytest.approx(theirs.compute_energy().parts["contact"], rel=1e-12)
     expected = potential.forces()[0]
     ours.step()
@@ -112,22 +114,18 @@ def test_energy_is_that_of_the_formula_and_all_solvers_feel_it(kind):
 
 
 def test_gaps_of_a_ball_converge_to_those_of_the_sphere():
-    """Where it is pressed down by the integral of the barrier over a sphere; corners alone are off by their bow."""
-    off, flat = {}, {}
+    """Where it is pressed down by the integral of the barrier over a sphere, whichever way it is turned."""
+    off = {}
     for cells in (2, 4, 8):
-        per_area, off[cells], flat[cells] = 1e8, [], []
+        per_area, off[cells] = 1e8, []
         for turn in ((0.3, -1, 0.2), (1, 0.4, -0.6), (0, -1, 0)):
             mesh = turned_by(ball(cells), np.array(turn) / np.linalg.norm(turn), (0, -1, 0))
             scene = scene_of(mesh, ds.Ground(-R - 2 * W, stiffness_per_area=per_area, width=W))
             simulator = ds.Simulator(IMPLICIT(scene, dt=1e-3))
             for gap in (0.5 * W, 0.2 * W):
-                off[cells].append(_gap(simulator.workspace.potential, force_of_a_sphere(gap, per_area)) - gap)
-                faces, simulator.workspace.potential.faces = simulator.workspace.potential.faces, None
-                flat[cells].append(_gap(simulator.workspace.potential, force_of_a_sphere(gap, per_area)) - gap)
-                simulator.workspace.potential.faces = faces
-    off, flat = ({n: np.abs(x).max() / W for n, x in each.items()} for each in (off, flat))
-    assert off[2] < 0.15 and off[4] < 0.08 and off[8] < 0.02
-    assert flat[2] > 0.3
+                found = _gap(simulator.workspace.potential, force_of_a_sphere(gap, per_area))
+                off[cells].append(abs(found - gap) / W)
+    assert max(off[2]) < 0.2 and max(off[4]) < 0.05 and max(off[8]) < 0.005
 
 
 def _gap(potential, target) -> float:
@@ -161,8 +159,8 @@ PER_AREA, OF_VERTICES = dict(stiffness_per_area=1e6), dict(stiffness=100.0)
 def test_the_adjoint_is_the_transpose_of_the_tangent(solver, kind, options, precision):
     made = obstacle(kind, path=wobbling, **options)
     scene = scene_of(face_down(ball(2)), made, ds.Gravity(), precision=precision, initial_velocities=(0.1, -0.1, 0.02))
-    rollout = ds.Rollout(solver(scene, dt=1e-4 if solver.explicit else 2e-3), 4, gradients="all")
-    assert_transposed(rollout, (1e-11 if solver.explicit else 1e-7) if precision == "f64" else 1e-3)
+    made = solver(scene, dt=1e-4) if solver.explicit else solver(scene, dt=2e-3, tolerance=1e-12)
+    assert_transposed(ds.Rollout(made, 4, gradients="all"), 1e-9 if precision == "f64" else 1e-3)
 
 
 @pytest.mark.parametrize("solver", [EXPLICIT, ds.BDF2Solver])
@@ -171,7 +169,13 @@ def test_gradients_agree_with_differences(solver):
     rollout = ds.Rollout(
         solver(scene, dt=1e-4 if solver.explicit else 2e-3),
         4,
-        gradients=["rest_positions", "barrier_stiffness_per_area", "barrier_width", "half_space_normal", "youngs_modulus"],
+        gradients=[
+            "rest_positions",
+            "barrier_stiffness_per_area",
+            "barrier_width",
+            "half_space_normal",
+            "youngs_modulus",
+        ],
     )
     assert ds.check_gradients(rollout, verbose=False).passed
 

@@ -136,8 +136,13 @@ class CurvedPoints(ObstacleFunctions):
                             weight = ti.select(x > 0 and y > 0 and x + y < parts, one + one, one)
                         scale = 0 - weight * stiffness * width
                         if ti.static(what == "energy"):
-                            out[0] += of_corner * weight * stiffness * width * width * point_energy(
-                                sigma, t, g.force, self.fp
+                            out[0] += (
+                                of_corner
+                                * weight
+                                * stiffness
+                                * width
+                                * width
+                                * point_energy(sigma, t, g.force, self.fp)
                             )
                         elif ti.static(what == "force"):
                             Fs, Ft = point_slopes(sigma, t, g.force, self.fp)

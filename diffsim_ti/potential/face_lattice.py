@@ -164,7 +164,7 @@ def lattices(arrays) -> tuple[np.ndarray, ...]:
 
 
 def nodes_of_faces(arrays) -> np.ndarray:
-    """The vertices on which points of each triangle of the surface depend, shape (k, 3), or (k, 6) where faces are curved."""
+    """The vertices on which points of each triangle of the surface depend, shape (k, 3), of curved faces (k, 6)."""
     return nodes_of_triangles(arrays.mesh) if arrays.curved else arrays.mesh.surface_triangles
 
 

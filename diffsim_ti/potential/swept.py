@@ -6,7 +6,7 @@ A face is as near as its nearest point, which lies between bounds: the distance 
 far its corners lie from there; for a convex obstacle, which lies on one side of each tangent plane, also d plus the least
 way of a corner along the normal. Faces are cut in four, and their parts again, until the bounds are near each other.
 To a hollow obstacle (the ground is one) a face is as near as its corners, and a part of a curved one nearer than its own
-corners by no more than its arch, a fourth of that of the part that it was cut from. Vertices are faces whose corners are one.
+corners by its arch at most, a fourth of that of the part that it was cut from. Vertices are faces whose corners are one.
 """
 
 from dataclasses import dataclass

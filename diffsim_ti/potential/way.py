@@ -97,7 +97,9 @@ class Way:
         j = int(found.argmin())
         self.met = None
         if blocker[j] >= 0:
-            self.met = Met(tuple(int(i) for i in dict.fromkeys(self.corners_of[j, :3])), int(blocker[j]), float(found[j]))
+            self.met = Met(
+                tuple(int(i) for i in dict.fromkeys(self.corners_of[j, :3])), int(blocker[j]), float(found[j])
+            )
 
     @property
     def widths(self) -> list[float]:

@@ -1,4 +1,4 @@
-"""What contact makes of curved faces: four triangles each."""
+"""What self-contact makes of curved faces: four flat triangles each."""
 
 import warnings
 

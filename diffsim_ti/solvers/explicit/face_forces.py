@@ -10,7 +10,8 @@ potential/face_lattice.py. Beside it stands
     D_a = c k sum_q s_a beta''(s) phi(t)    [N/m]
 
 whose sum over the faces around a vertex is no less than the stiffness that they have there, for s (x) s <= diag(s) where
-shares s sum up to 1; of curved faces with 5/3 |N_a|, since N (x) N <= diag(|N|) sum |N|. It says in how many parts a pass is to be gone (face_kernels.py).
+shares s sum up to 1; of curved faces with 5/3 |N_a|, since N (x) N <= diag(|N|) sum |N|. It says in how many parts a pass is
+to be gone (face_kernels.py).
 """
 
 from dataclasses import dataclass

@@ -25,7 +25,9 @@ def feels_faces(scene) -> bool:
     x = scene.mesh.vertices[scene.mesh.surface_triangles]
     longest = 1.2 * np.linalg.norm(x - np.roll(x, 1, axis=1), axis=2).max(initial=0)
     obstacles = [t for t in scene.terms if t.acts_on_surface and "barrier_width" in t.values]
-    return are_felt(scene.mesh, obstacles) or any(longest**2 > 6 * t.least_radius() * BENT * float(t.values["barrier_width"]) for t in obstacles)
+    return are_felt(scene.mesh, obstacles) or any(
+        longest**2 > 6 * t.least_radius() * BENT * float(t.values["barrier_width"]) for t in obstacles
+    )
 
 
 class FeltFaces:
