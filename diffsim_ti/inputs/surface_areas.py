@@ -20,7 +20,7 @@ class SurfaceAreas(Link):
     Of ten-node tetrahedra, whose faces are four triangles each, a face's corners hand on nearly all of their shares to its
     three middles: under an even pressure a quadratic face pushes its middles alone (A / 3 each, corners 0), and what its
     corners have beyond that makes stresses below uneven. They keep a twentieth, so that they are stopped too. Where a face
-    of the mesh is curved, its corners keep their shares: pressure is uneven there anyway, and any of its nodes may be lowest.
+    of the mesh is curved, its corners keep their shares: pressure is uneven there, and any node may be the lowest.
     """
 
     reads, writes = ("rest",), ("surface",)
