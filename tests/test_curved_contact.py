@@ -1,4 +1,4 @@
-"""Obstacles feel the faces of ten-node tetrahedra as curved as they are."""
+"""Obstacles, and surfaces that meet each other, feel the faces of ten-node tetrahedra as curved as they are."""
 
 import warnings
 
@@ -9,7 +9,10 @@ from test_every_adjoint import assert_transposed
 
 import diffsim_ti as ds
 from diffsim_ti import runtime
+from diffsim_ti.contact.curved_pairs import CurvedPairs
+from diffsim_ti.contact.surface_pairs import SurfacePairs
 from diffsim_ti.mesh import curved_triangles, reference_face
+from diffsim_ti.mesh.collision_surface import CollisionSurface, cuts_of
 from diffsim_ti.mesh.ten_nodes import QUARTERS
 from diffsim_ti.potential.face_lattice import lattices
 from diffsim_ti.terms.obstacles.barrier import beta
@@ -215,3 +218,91 @@ def test_obstacles_warn_of_no_bow():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         scene_of(ball(2), ds.Ground(-1.0, stiffness=1.0, width=1e-4))
+
+
+# ---- surfaces that meet each other -----------------------------------------------------------------------------------
+
+
+def test_the_collision_surface_is_closed_and_tends_to_the_curved_one():
+    mesh = ball(2)
+    missing = []
+    for cuts in range(3):
+        surface = CollisionSurface(mesh, cuts)
+        triangles, x = surface.surface_triangles, surface.vertices
+        edges, twice = np.unique(
+            np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1), axis=0, return_counts=True
+        )
+        assert len(triangles) == 4 ** (cuts + 1) * len(mesh.surface_faces) and np.all(twice == 2)
+        assert len(surface.surface_vertices) - len(edges) + len(triangles) == 2
+        np.testing.assert_allclose(surface.matrix @ np.ones(mesh.num_vertices), 1, rtol=0, atol=1e-15)
+        np.testing.assert_array_equal(x[: mesh.num_vertices], mesh.vertices)
+        missing.append(mesh.volume - np.linalg.det(x[triangles]).sum() / 6)
+    assert 3.9 < missing[0] / missing[1] < 4.1 and 3.9 < missing[1] / missing[2] < 4.1
+
+
+def balls_face_to_face(gap=0.5 * W, precision="f64", **options) -> ds.Scene:
+    """Whose curved faces are the width's half apart, and the flat triangles twice of it."""
+    mesh = ball(2)
+    n = mesh.vertices[mesh.surface_faces[7, :3]].mean(0)
+    low, top = (turned_by(mesh, n / np.linalg.norm(n), (0, side, 0)) for side in (1, -1))
+    high = -2 * lowest(top, top.vertices) + gap
+    both = ds.TetrahedralMesh.joined([low.rotated([0, 1, 0], 0.3), top.translated([0.003, high, 0.002])])
+    velocity = np.zeros((both.num_vertices, 3))
+    velocity[both.vertex_sets["body_1"]] = [0.02, -0.5, 0]
+    options = dict(initial_velocities=velocity) | options
+    return scene_of(both, ds.SelfContact(2e3, W), E=5e4, precision=precision, **options)
+
+
+@pytest.mark.parametrize("solver, precision", [(EXPLICIT, "f64"), (ds.BDF2Solver, "f64"), (EXPLICIT, "f32")])
+def test_curved_faces_press_on_each_other(solver, precision):
+    scene = balls_face_to_face(precision=precision)
+    tolerance = {} if solver.explicit else dict(tolerance=1e-12)
+    rollout = ds.Rollout(solver(scene, dt=5e-5 if solver.explicit else 2e-3, **tolerance), 4, gradients="all")
+    simulator = ds.Simulator(rollout.solver)
+    assert isinstance(simulator.workspace.pairs, CurvedPairs)
+    assert 0.4 * W < simulator.smallest_gap() < 0.6 * W and simulator.compute_energy().parts["contact"] > 0.1
+    assert_transposed(rollout, {"f64": 1e-11 if solver.explicit else 1e-9, "f32": 1e-3}[precision])
+    if solver.explicit and precision == "f64":
+        names = ["rest_positions", "self_contact_width", "self_contact_stiffness", "youngs_modulus"]
+        assert ds.check_gradients(rollout, inputs=names, verbose=False).passed
+        frames, mass = rollout.forward(), simulator.workspace.arrays.values.mass[:, None]
+        p, q = ((mass * frames.velocities[k]).sum(0) for k in (0, -1))
+        np.testing.assert_allclose(q, p, rtol=0, atol=1e-12 * np.abs(p).max())
+
+
+def test_forces_of_curved_faces_are_the_slope_of_their_energy():
+    simulator = ds.Simulator(ds.BDF2Solver(balls_face_to_face(), dt=2e-3))
+    potential, n = simulator.workspace.potential, simulator.scene.mesh.num_vertices
+    d, e = 1e-2 * np.random.default_rng(0).standard_normal((2, n, 3))
+    at = {}
+    for step in (-1e-6, 1e-6, 0):
+        potential.place(step * d)
+        at[step] = potential.pairs.energies().sum(), _of_pairs(simulator)
+    found = (at[1e-6][0] - at[-1e-6][0]) / 2e-6
+    assert found == pytest.approx(-(at[0][1] * d).sum(), rel=1e-6) and abs(found) > 1e-3
+    runtime.fill(potential.w, d[None])
+    potential.pairs.hessian_product(potential.u, potential.w, convex=False)
+    np.testing.assert_allclose(
+        ((at[1e-6][1] - at[-1e-6][1]) * e).sum() / 2e-6, (_at_corners(simulator) * e).sum(), rtol=1e-5
+    )
+
+
+def _of_pairs(simulator):
+    simulator.workspace.potential.pairs.place(simulator.workspace.potential.u)
+    return _at_corners(simulator)
+
+
+def _at_corners(simulator):
+    a = simulator.workspace.arrays
+    out, surface = np.zeros((a.num_vertices, 3)), a.mesh.surface_vertices
+    out[surface] = runtime.fetch(a.corner)[a.first_contact_corner :][: len(surface)]
+    return out
+
+
+def test_triangles_are_cut_only_where_curvature_asks():
+    mesh, contact = ball(2), ds.SelfContact(1.0, W)
+    assert [cuts_of(mesh, ds.SelfContact(1.0, width)) for width in (0.1, 0.01, W, 1e-4)] == [0, 1, 2, 3]
+    assert cuts_of(mesh.linear(), contact) == cuts_of(mesh.linear().quadratic(), contact) == 0
+    assert cuts_of(mesh, ds.SelfContact(1.0, W, friction=0.2)) == 0
+    straight = scene_of(mesh.linear().quadratic(), contact)
+    assert type(ds.Simulator(EXPLICIT(straight, dt=1e-5)).workspace.pairs) is SurfacePairs
