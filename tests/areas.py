@@ -19,7 +19,7 @@ AREAS = {
     "reduced",
     "patches against locking": "locking",
     "ten-node tetrahedra": "reference_element quadratic quadratic_mesh quadratic_loads quadratic_outputs quadratic_solvers "
-    "quadratic_answers",
+    "quadratic_answers curved_contact",
     "obstacles and friction": "contact contact_area contact_faces contact_stage contact_rollers contact_crossing "
     "contact_friction face_friction contact_gradients own_obstacle poses",
     "self-contact": "self_contact self_contact_implicit self_contact_near self_contact_pairs self_contact_friction",
@@ -38,7 +38,7 @@ LONGEST = (
     "loads_together static_examples contact_examples examples implicit_contact swept hertz implicit "
     "contact_gradients contact_stage contact_faces outputs locking chambers springs quadratic_solvers torch_physics "
     "quadratic_loads self_contact_implicit contact_rollers unequal_steps open_laws laws_with_state quadratic "
-    "contact_area seed_snippets quadratic_answers"
+    "contact_area seed_snippets quadratic_answers curved_contact"
 ).split()
 AREA_OF = {name: area for area, names in AREAS.items() for name in names.split()}
 

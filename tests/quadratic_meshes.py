@@ -45,6 +45,27 @@ def ring(cells: int) -> TetrahedralMesh:
     return with_vertices(box, np.stack([r * np.cos(angle), r * np.sin(angle), z], 1))
 
 
+def ball(cells: int, radius=0.1) -> TetrahedralMesh:
+    """From a cube; the surface's vertices, mid-edge ones too, lie on the sphere."""
+    cube = TetrahedralMesh.create_box(cells + 1, 2.0, "five", (-1, -1, -1))
+    x = np.array(cube.vertices)
+    length = np.linalg.norm(x, axis=1)
+    x *= (radius * np.abs(x).max(1) / np.where(length > 0, length, 1))[:, None]
+    mesh = TetrahedralMesh(x, cube.tetrahedra).quadratic()
+    x, surface = np.array(mesh.vertices), mesh.surface_vertices
+    x[surface] *= radius / np.linalg.norm(x[surface], axis=1)[:, None]
+    return with_vertices(mesh, x)
+
+
+def turned_by(mesh, old, new) -> TetrahedralMesh:
+    """Turned so that one unit vector becomes another."""
+    old, new = np.asarray(old, float), np.asarray(new, float)
+    across = np.cross(old, new)
+    if not across.any():
+        return mesh
+    return mesh.rotated(across, np.arctan2(np.linalg.norm(across), old @ new))
+
+
 def with_vertices(mesh, vertices) -> TetrahedralMesh:
     triangles = {name: mesh.surface_triangles[rows] for name, rows in mesh.surface_sets.items()}
     return TetrahedralMesh(

@@ -305,16 +305,16 @@ def test_torch_and_tape_give_the_same_gradients(options):
         np.testing.assert_allclose(taped.gradients[name], expected[name], rtol=0, atol=1e-12 * size, err_msg=name)
 
 
-def test_what_contact_leaves_out_of_curved_faces_is_said():
+def test_what_self_contact_leaves_out_of_curved_faces_is_said():
     """Four triangles stand for each: an edge that is a parabola of height b leaves b / 4."""
     mesh, law = ring(1), ds.StableNeoHookean(1e5, 0.3)
     corners = mesh.surface_faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 3, 2)
     middles = mesh.vertices[mesh.surface_faces[:, 3:]] - mesh.vertices[corners].mean(2)
     height = np.linalg.norm(middles, axis=2).max()
     assert height / 4 * (1 - 1e-12) <= bow(mesh) <= height and bow(mesh.linear().quadratic()) < 1e-15
-    low = mesh.bounding_box[0, 1] - 1.0
-    with pytest.warns(UserWarning, match="Ground: faces of this mesh are curved, and lie up to"):
-        ds.Scene(mesh, law, terms=ds.Ground(low, stiffness=1.0, width=0.9 * bow(mesh)))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        ds.Scene(mesh, law, terms=ds.Ground(low, stiffness=1.0, width=1.1 * bow(mesh)))
+    for width, options in ((0.9 / 64, {}), (0.9, dict(friction=0.1))):  # which cuts triangles no further, or not at all
+        with pytest.warns(UserWarning, match="SelfContact: faces of this mesh are curved, and lie up to"):
+            ds.Scene(mesh, law, terms=ds.SelfContact(stiffness=1.0, width=width * bow(mesh), **options))
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            ds.Scene(mesh, law, terms=ds.SelfContact(stiffness=1.0, width=1.2 * width * bow(mesh), **options))

@@ -3,6 +3,7 @@
 import numpy as np
 
 from diffsim_ti.inputs.chain import Link
+from diffsim_ti.mesh.curved_triangles import curved_faces
 from diffsim_ti.mesh.geometry import triangle_normals
 
 
@@ -18,7 +19,8 @@ class SurfaceAreas(Link):
 
     Of ten-node tetrahedra, whose faces are four triangles each, a face's corners hand on nearly all of their shares to its
     three middles: under an even pressure a quadratic face pushes its middles alone (A / 3 each, corners 0), and what its
-    corners have beyond that makes stresses below uneven. They keep a twentieth, so that they are stopped too.
+    corners have beyond that makes stresses below uneven. They keep a twentieth, so that they are stopped too. Where a face
+    of the mesh is curved, its corners keep their shares: pressure is uneven there, and any node may be the lowest.
     """
 
     reads, writes = ("rest",), ("surface",)
@@ -27,7 +29,9 @@ class SurfaceAreas(Link):
 
     def __init__(self, mesh):
         self.triangles, self.num_vertices = mesh.surface_triangles, mesh.num_vertices
-        self.at_corner = np.isin(self.triangles, mesh.tetrahedra) if mesh.order == 2 else None
+        self.at_corner = None
+        if mesh.order == 2:
+            self.at_corner = np.isin(self.triangles, mesh.tetrahedra) & ~np.repeat(curved_faces(mesh), 4)[:, None]
 
     def value(self, X):
         return (self._areas(self._moments(*self._shapes(X)[:2])),)

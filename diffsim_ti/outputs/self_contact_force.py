@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
+from diffsim_ti.contact.curved_pairs import pairs_of
 from diffsim_ti.contact.implicit_pairs import ImplicitPairs
 from diffsim_ti.outputs.moments import moments, moments_jvp, moments_vjp
 from diffsim_ti.outputs.output import Change, Output
@@ -73,7 +74,7 @@ class SelfContactForce(Output):
         out = copy(self)
         out.scene, out.arrays, n = scene, SceneArrays(scene), scene.mesh.num_vertices
         out.vertices = np.arange(n) if self.on is None else np.unique(scene.mesh.vertex_indices(self.on))
-        out.pairs, out.surface = ImplicitPairs(out.arrays, False), scene.mesh.surface_vertices
+        out.pairs, out.surface = pairs_of(ImplicitPairs, out.arrays, False), scene.mesh.surface_vertices
         out.rubs = None if self.part == "normal" else out.pairs.friction
         return out
 

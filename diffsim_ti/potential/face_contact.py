@@ -17,11 +17,11 @@ class FaceContact:
     @staticmethod
     def is_felt(arrays) -> bool:
         """Whether the scene has obstacles that could reach into a face between its corners."""
-        return any(not group.force.hollow for group in arrays.features().groups)
+        return any(arrays.features().reaches(group) for group in arrays.features().groups)
 
     def __init__(self, potential, parallel: bool):
         self.p, self.a = weakref.proxy(potential), potential.arrays  # which holds this: no circle
-        a, (*rows, reach, weight) = self.a, face_rows(self.a.mesh, self.a.contacts)
+        a, (*rows, reach, weight) = self.a, face_rows(self.a)
         self.face_start, self.face_next, self.face_parts = (runtime.upload(x.ravel(), ti.i32) for x in rows)
         self.face_reach, self.face_weight = (runtime.upload(x.ravel(), a.fp) for x in (reach, weight))
         self.kernels, self.parallel = face_kernels(a.features(), a.precision, parallel), parallel

@@ -88,7 +88,7 @@ class FaceKernels(FacePoints):
         for i in range(plan.num_vertices):
             out.y[0, i] = self.vector(0)
             for g in ti.static(self.features.groups):
-                if ti.static(not g.force.hollow):
+                if ti.static(self.features.reaches(g)):
                     for k in range(g.count):
                         by_u = self.around_one("product", g, k, i, scene, pass_, at, at)
                         self.around_one("numbers", g, k, i, scene, pass_, at, adjoint)

@@ -4,10 +4,12 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti.mesh import geometry
+from diffsim_ti.mesh.curved_triangles import FELT, arches, nodes_of_triangles
 from diffsim_ti.terms.obstacles import barrier
 
-FLAT, BENT, GROWTH = 0.02, 0.12, 8
+FLAT, BENT, GROWTH = FELT, 0.12, 8
 PER_WIDTH, MOST_PARTS = 4, 64  # lattice points along a width; along the side of a face
+SMOOTH = 0.05  # of a width: how far a curved face is from the triangles of its lattice, before what is smooth
 REACH = 0.65  # of the distance of lattice points: from what lies between them to the nearest, faces being stretched a little
 
 
@@ -38,22 +40,80 @@ def fade(t, force: ti.template(), fp: ti.template()):
     return value, slope, curvature
 
 
-# F = beta(s) phi(t), or per area (beta(s) - beta(s + t)) phi(t), and its derivatives
+# F = beta(s) phi(t), or per area (beta(s) - beta(s + t)) phi(t), and its derivatives; before hollow obstacles what
+# curved_faces.py says, in which t is what corners say
+
+
+@ti.func
+def felt(s, t, force: ti.template(), fp: ti.template()):
+    """Whether a point has some energy."""
+    out = s < 1
+    if ti.static(force.hollow):
+        if out:
+            out = t < barrier.value(s, fp)
+    else:
+        out = out and t > ti.cast(FLAT, fp)
+    return out
 
 
 @ti.func
 def point_energy(s, t, force: ti.template(), fp: ti.template()):
     """F"""
-    b = barrier.value(s, fp)
-    if ti.static(force.per_area):
-        b -= barrier.value(s + t, fp)
-    p, _, _ = fade(t, force, fp)
+    b, p = barrier.value(s, fp), ti.cast(0, fp)
+    if ti.static(force.hollow):
+        p, _, _ = unsaid(t / b, fp)
+    else:
+        if ti.static(force.per_area):
+            b -= barrier.value(s + t, fp)
+        p, _, _ = fade(t, force, fp)
     return b * p
+
+
+@ti.func
+def unsaid(r, fp: ti.template()):
+    """h and its two derivatives by x = 1 - r."""
+    x = ti.max(1 - r, ti.cast(0, fp))
+    value, slope = x * x * x * (6 + x * (3 * x - 8)), x * x * (18 + x * (15 * x - 32))
+    return value, slope, 12 * x * (3 + x * (5 * x - 8))
+
+
+@ti.func
+def hollow_slopes(s, t, fp: ti.template()):
+    b = barrier.value(s, fp)
+    h, h1, _ = unsaid(t / b, fp)
+    return (h + t / b * h1) * barrier.slope(s, fp), 0 - h1
+
+
+@ti.func
+def hollow_curvatures(s, t, fp: ti.template()):
+    b, b1 = barrier.value(s, fp), barrier.slope(s, fp)
+    h, h1, h2 = unsaid(t / b, fp)
+    r, by_b = t / b, b1 / b
+    return (h + r * h1) * barrier.curvature(s, fp) + r * r * h2 * by_b * b1, 0 - r * h2 * by_b, h2 / b
+
+
+@ti.func
+def hollow_stiffness(s, t, fp: ti.template()):
+    """What d2F does not exceed, of the point's distance and, times b1^2, of each corner's."""
+    b, b1 = barrier.value(s, fp), barrier.slope(s, fp)
+    h, h1, h2 = unsaid(t / b, fp)
+    r, steep = t / b, 2 * ti.max(h2, ti.cast(0, fp)) / b
+    return (h + r * h1) * barrier.curvature(s, fp) + r * r * steep * b1 * b1, steep
 
 
 @ti.func
 def point_slopes(s, t, force: ti.template(), fp: ti.template()):
     """dF/ds, dF/dt"""
+    by_s, by_t = ti.cast(0, fp), ti.cast(0, fp)
+    if ti.static(force.hollow):
+        by_s, by_t = hollow_slopes(s, t, fp)
+    else:
+        by_s, by_t = solid_slopes(s, t, force, fp)
+    return by_s, by_t
+
+
+@ti.func
+def solid_slopes(s, t, force: ti.template(), fp: ti.template()):
     b, b1 = barrier.value(s, fp), barrier.slope(s, fp)
     p, p1, _ = fade(t, force, fp)
     by_s, by_t = b1 * p, b * p1
@@ -66,6 +126,16 @@ def point_slopes(s, t, force: ti.template(), fp: ti.template()):
 @ti.func
 def point_curvatures(s, t, force: ti.template(), fp: ti.template()):
     """d2F/ds2, d2F/dsdt, d2F/dt2"""
+    ss, st, tt = ti.cast(0, fp), ti.cast(0, fp), ti.cast(0, fp)
+    if ti.static(force.hollow):
+        ss, st, tt = hollow_curvatures(s, t, fp)
+    else:
+        ss, st, tt = solid_curvatures(s, t, force, fp)
+    return ss, st, tt
+
+
+@ti.func
+def solid_curvatures(s, t, force: ti.template(), fp: ti.template()):
     b, b1, b2 = barrier.value(s, fp), barrier.slope(s, fp), barrier.curvature(s, fp)
     p, p1, p2 = fade(t, force, fp)
     ss, st, tt = b2 * p, b1 * p1, b * p2
@@ -75,24 +145,52 @@ def point_curvatures(s, t, force: ti.template(), fp: ti.template()):
     return ss, st, tt
 
 
-def face_rows(mesh, terms) -> tuple[np.ndarray, ...]:
-    """(start, next, parts, reach, weight): the faces around vertex i are start[i] .. start[i + 1]; of each, its two other
-    corners and, for each obstacle, in how many parts the lattice cuts its sides, r [m] and c (faces.py)."""
-    faces, n = mesh.surface_triangles, mesh.num_vertices
-    corner, own = np.argsort(faces.ravel(), kind="stable"), np.sort(faces.ravel(), kind="stable")
-    f, a = corner // 3, corner % 3
-    x = mesh.vertices[faces]
+def lattices(arrays) -> tuple[np.ndarray, ...]:
+    """(parts, reach, weight) of each triangle of the surface and each obstacle: in how many parts the lattice cuts its
+    sides, r [m] and c (faces.py)."""
+    mesh = arrays.mesh
+    x = mesh.vertices[mesh.surface_triangles]
     longest = np.linalg.norm(x - np.roll(x, 1, axis=1), axis=2).max(1)
-    widths = np.array([float(t.values["barrier_width"]) for t in terms])
+    widths = np.array([float(t.values["barrier_width"]) for t in arrays.contacts])
     parts = np.clip(np.ceil(PER_WIDTH * longest[:, None] / widths), 2, MOST_PARTS).astype(int)
-    start = np.searchsorted(own, np.arange(n + 1))
+    smooth = np.array([arrays.curved and twin.hollow for twin, *_ in arrays.obstacles], bool)
+    if smooth.any():
+        fewest = np.ceil(np.sqrt(arches(mesh)[:, None] / (SMOOTH * widths[smooth]))).astype(int)
+        parts[:, smooth] = np.minimum(parts[:, smooth], np.clip(fewest, 3, MOST_PARTS))
     apart = longest[:, None] / parts
     reach, weight = REACH * apart, (apart / widths) ** 2
-    return start, np.stack([faces[f, (a + 1) % 3], faces[f, (a + 2) % 3]], 1), parts[f], reach[f], weight[f]
+    reach[:, smooth], weight[:, smooth] = 0, np.minimum(weight[:, smooth], 1)
+    return parts, reach, weight
 
 
-def rest_of_areas(mesh, rest, by_rows) -> np.ndarray:
-    """Adjoint of the rest positions, shape (num_vertices, 3), for adjoints of the faces' areas by the rows above."""
-    faces = mesh.surface_triangles
-    by_faces = np.bincount(np.argsort(faces.ravel(), kind="stable") // 3, by_rows, len(faces))
-    return geometry.triangle_areas_vjp(rest, faces, by_faces)
+def nodes_of_faces(arrays) -> np.ndarray:
+    """The vertices on which points of each triangle of the surface depend, shape (k, 3), of curved faces (k, 6)."""
+    return nodes_of_triangles(arrays.mesh) if arrays.curved else arrays.mesh.surface_triangles
+
+
+def around_vertices(nodes: np.ndarray, num_vertices: int) -> tuple[np.ndarray, ...]:
+    """(start, face, place): the triangles around vertex i are face[start[i]] .. face[start[i + 1] - 1], as whose node
+    number `place` it stands."""
+    entries = np.argsort(nodes.ravel(), kind="stable")
+    start = np.searchsorted(nodes.ravel()[entries], np.arange(num_vertices + 1))
+    return start, *np.divmod(entries, nodes.shape[1])
+
+
+def face_rows(arrays) -> tuple[np.ndarray, ...]:
+    """(start, next, parts, reach, weight): the triangles around vertex i are start[i] .. start[i + 1]; of each, its two
+    other corners, where faces are curved its six nodes, the place of i among them and whether it is the inner triangle; and
+    its lattice before each obstacle."""
+    nodes = nodes_of_faces(arrays)
+    start, f, a = around_vertices(nodes, arrays.mesh.num_vertices)
+    if arrays.curved:
+        following = np.concatenate([nodes[f], a[:, None], (f % 4 == 3)[:, None]], 1)
+    else:
+        following = np.stack([nodes[f, (a + 1) % 3], nodes[f, (a + 2) % 3]], 1)
+    return start, following, *(x[f] for x in lattices(arrays))
+
+
+def rest_of_areas(arrays, rest, by_rows) -> np.ndarray:
+    """Adjoint of the rest positions, shape (num_vertices, 3), for adjoints of the triangles' areas by the rows above."""
+    faces = arrays.mesh.surface_triangles
+    _, f, _ = around_vertices(nodes_of_faces(arrays), arrays.mesh.num_vertices)
+    return geometry.triangle_areas_vjp(rest, faces, np.bincount(f, by_rows, len(faces)))

@@ -28,9 +28,9 @@ from dataclasses import dataclass
 
 import taichi as ti
 
+from diffsim_ti.potential.curved_faces import CurvedPoints
 from diffsim_ti.potential.face_lattice import FLAT, point_curvatures, point_energy, point_slopes
 from diffsim_ti.runtime import at, let, traced
-from diffsim_ti.state.obstacle_functions import ObstacleFunctions
 from diffsim_ti.state.walls import MORE
 from diffsim_ti.terms.obstacles import turning
 
@@ -38,7 +38,7 @@ A = ti.template()
 
 
 @dataclass(frozen=True)
-class FacePoints(ObstacleFunctions):
+class FacePoints(CurvedPoints):
     """Sums over the points of the faces around vertex i, each with what it says of that vertex."""
 
     @ti.func
@@ -57,16 +57,21 @@ class FacePoints(ObstacleFunctions):
         "column" `more` of the product's matrix; "jvp" for changes `more` besides."""
         out = self.vector(0)
         for g in ti.static(self.features.groups):
-            if ti.static(not g.force.hollow):
+            if ti.static(self.features.reaches(g)):
                 for k in range(g.count):
                     found = self.around_one(what, g, k, i, scene, pass_, at, more)
                     out += self.with_turn(what, g, k, i, found, scene, pass_, at, more)
         return out
 
-    @ti.func
-    def around_one(self, what: A, g: A, k, i, scene: A, pass_: A, at: A, more: A):
+    @traced
+    def around_one(self, what, g, k, i, scene, pass_, at, more):
         """The same of obstacle k of group g alone; of "numbers" nothing, but their adjoints for the adjoint at.w of the
         force go to `more`."""
+        around = self.around_curved if self.features.curved else self.around_flat
+        return around(what, g, k, i, scene, pass_, at, more)
+
+    @ti.func
+    def around_flat(self, what: A, g: A, k, i, scene: A, pass_: A, at: A, more: A):
         out, first, n = self.vector(0), g.first + k * g.size, g.number + k
         wall, width, q = pass_.walls[3 * n], g.force.width(scene.parameters, first), self.turn_of(g, k, pass_)
         X0, u0 = self.made(g, first, q, scene.rest[i] - wall, at.u[0, i], scene)

@@ -123,7 +123,7 @@ class FaceShares(FacePoints):
         """What `around_one` gives of that obstacle."""
         f = self.vector(0)
         for g in ti.static(self.features.groups):
-            if ti.static(not g.force.hollow):
+            if ti.static(self.features.reaches(g)):
                 k = plan.which - g.number
                 if 0 <= k and k < g.count:
                     found = self.around_one(what, g, k, i, scene, pass_, at, more)
@@ -156,7 +156,7 @@ class FaceShares(FacePoints):
         for i in range(plan.num_vertices):
             by_u = self.vector(0)
             for g in ti.static(self.features.groups):
-                if ti.static(not g.force.hollow):
+                if ti.static(self.features.reaches(g)):
                     k = plan.which - g.number
                     if 0 <= k and k < g.count:
                         by_u = self.around_one("product", g, k, i, scene, pass_, at, at)

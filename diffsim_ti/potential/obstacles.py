@@ -91,7 +91,7 @@ class ObstaclePotential(ObstacleFunctions):
 
     def reaches(self, g) -> bool:
         """Whether friction of a group takes its normal force from `pressed`."""
-        return g.force.friction and not g.force.hollow
+        return g.force.friction and self.features.reaches(g)
 
     @ti.func
     def velocity(self, i, u, pass_: A, plan: A):

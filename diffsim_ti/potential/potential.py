@@ -30,7 +30,7 @@ class Potential:
         self.lag = runtime.array(a.vector, 2, n if self.has_friction else 1)  # as obstacles.py says, like the walls
         self.walls = runtime.array(a.vector, a.walls.size)
         self.faces = FaceContact(self, parallel) if FaceContact.is_felt(arrays) else None
-        self.presses = any(g.force.friction and not g.force.hollow for g in a.features().groups)
+        self.presses = any(g.force.friction and a.features().reaches(g) for g in a.features().groups)
         self.pressed = runtime.array(a.vector, num_obstacles if self.presses else 1, n if self.presses else 1)
         self.per_gamma, self.held_at = 1.0, np.zeros((n, 3))
         self.size, self.contact = runtime.array(a.fp, n), runtime.array(a.fp, n)

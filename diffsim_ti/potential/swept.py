@@ -5,7 +5,8 @@ and again from there: conservative advancement (Mirtich 1996, Impulse-based Dyna
 A face is as near as its nearest point, which lies between bounds: the distance d of its middle, and d - r, where r is how
 far its corners lie from there; for a convex obstacle, which lies on one side of each tangent plane, also d plus the least
 way of a corner along the normal. Faces are cut in four, and their parts again, until the bounds are near each other.
-To a hollow obstacle (the ground is one) a face is as near as its corners. Vertices are faces whose corners are one.
+To a hollow obstacle (the ground is one) a face is as near as its corners, and a part of a curved one nearer than its own
+corners by its arch at most, a fourth of that of the part that it was cut from. Vertices are faces whose corners are one.
 """
 
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ from functools import cached_property, lru_cache
 
 import taichi as ti
 
+from diffsim_ti.potential.curved_faces import MOST_SHARES
 from diffsim_ti.runtime import Kernel, traced
 from diffsim_ti.state.features import Features
 from diffsim_ti.state.numbers import SCENE
@@ -34,10 +36,6 @@ class SweptKernels(ObstacleFunctions):
     """Of each vertex and face: the free `shares` of a step, and `distances`; with the obstacle that they come from."""
 
     parallel: bool
-
-    @property
-    def rows(self):
-        return ti.types.matrix(3, 4, self.fp)
 
     def _kernel(self, name: str, body) -> Kernel:
         own = dict(scene=SCENE, way=WAY, at=dict(u="vectors2"), out=FOUND)
@@ -83,18 +81,20 @@ class SweptKernels(ObstacleFunctions):
         return out
 
     @ti.func
-    def face_clearance(self, g: A, first, X, u, scene: A, wanted):
+    def face_clearance(self, g: A, first, X, u, inner, scene: A, wanted):
         """A distance [m] that a face keeps: `wanted` or more if it is that far away, else half of its own or more; not
-        positive if a point of it was found to be in the obstacle. X, u: rows of its corners."""
+        positive if a point of it was found to be in the obstacle. X, u: rows of its nodes."""
         code, level, far, half = 0, 0, ti.cast(1e30, self.fp), ti.cast(0.5, self.fp)
-        nearest, least = far, far
+        nearest, least, arch = far, far, self.arch(X + u, inner)
         while level >= 0 and nearest > 0:
             part = self.part_of_face(code, level)
-            Xs, us, third = part @ X, part @ u, ti.cast(1 / 3, self.fp)
+            Xs, us, third = self.part_of(part, X, inner), self.part_of(part, u, inner), ti.cast(1 / 3, self.fp)
             X0, u0 = self.vector(0), self.vector(0)
             for n in ti.static(range(4)):
                 X0[n] = third * (Xs[0, n] + Xs[1, n] + Xs[2, n])
                 u0[n] = third * (us[0, n] + us[1, n] + us[2, n])
+            if ti.static(self.features.curved):
+                X0, u0 = self.middle_of_part(part, X, inner), self.middle_of_part(part, u, inner)
             seen = self.clearance(g, first, X0, u0, scene)
             d, r, along = seen[3], ti.cast(0, self.fp), far
             for c in ti.static(range(3)):
@@ -103,7 +103,18 @@ class SweptKernels(ObstacleFunctions):
                     edge[n] = (Xs[c, n] - X0[n]) + (us[c, n] - u0[n])
                 r = ti.max(r, self.length(edge))
                 along = ti.min(along, seen.dot(edge))
+            if ti.static(self.features.curved):
+                bow = arch / ti.cast(1 << (2 * level), self.fp)
+                r += bow
+                along -= bow
             nearest, low = ti.min(nearest, d), d - r
+            if ti.static(self.features.curved and g.force.hollow):
+                of_corners = far
+                for c in ti.static(range(3)):
+                    x, y = self.row_of(Xs, c), self.row_of(us, c)
+                    of_corners = ti.min(of_corners, self.clearance(g, first, x, y, scene)[3])
+                nearest = ti.min(nearest, of_corners)
+                low = ti.max(low, of_corners - arch / ti.cast(1 << (2 * level), self.fp))
             if ti.static(g.force.convex):
                 low = ti.max(low, d + along)
             last = level == LEVELS or r <= ti.cast(ti.static(g.force.grain), self.fp)
@@ -122,12 +133,42 @@ class SweptKernels(ObstacleFunctions):
                 level += 1
         return ti.select(nearest <= 0, nearest, least)
 
+    @traced
+    def part_of(self, part, M, inner):
+        """Corners of a part of a face whose nodes have the rows M."""
+        return self.part_of_curved(part, M, inner) if self.features.curved else self.part_of_flat(part, M)
+
+    @ti.func
+    def part_of_flat(self, part, M):
+        return part @ M
+
+    @ti.func
+    def part_of_curved(self, part, M, inner):
+        out = self.rows(0)
+        for c in ti.static(range(3)):
+            x = self.mix(self.node_weights(ti.Vector([part[c, 0], part[c, 1], part[c, 2]]), inner), M)
+            for m in ti.static(range(3)):
+                out[c, m] = x[m]
+        return out
+
+    @ti.func
+    def middle_of_part(self, part, M, inner):
+        s = ti.Vector.zero(self.fp, 3)
+        for c in ti.static(range(3)):
+            s[c] = ti.cast(1 / 3, self.fp) * (part[0, c] + part[1, c] + part[2, c])
+        return self.mix(self.node_weights(s, inner), M)
+
+    @ti.func
+    def is_inner(self, j, plan: A):
+        """Whether a face is the triangle between the three others of a curved one; of vertices it does not matter."""
+        return j >= plan.num_vertices and (j - plan.num_vertices) % 4 == 3
+
     @ti.func
     def corners_at(self, g: A, k, j, t, scene: A, way: A, at: A):
-        """(X, u) of a face, relative to obstacle n, when the share t of the step is done: rows of its corners."""
+        """(X, u) of a face, relative to obstacle n, when the share t of the step is done: rows of its nodes."""
         X, u, n = self.rows(0), self.rows(0), g.number + k
-        for a in ti.static(range(3)):
-            i = way.corners[3 * j + a]
+        for a in ti.static(range(self.nodes)):
+            i = way.corners[self.nodes * j + a]
             x, y = scene.rest[i] - way.places[n], at.u[0, i] + t * (way.step[0, i] - way.drifts[n])
             if ti.static(g.force.turns):
                 c, q = self.turned.about(g, g.first + k * g.size, scene.parameters), self.rotation(g, k, t, way)
@@ -155,8 +196,8 @@ class SweptKernels(ObstacleFunctions):
         Of one that turns by psi, w = step - drift and r the arm: |w - psi x r| + most |psi| |w|, for r goes on by w.
         """
         speed, n = ti.cast(0, self.fp), g.number + k
-        for a in ti.static(range(3)):
-            i = way.corners[3 * j + a]
+        for a in ti.static(range(self.nodes)):
+            i = way.corners[self.nodes * j + a]
             w = way.step[0, i] - way.drifts[n]
             if ti.static(g.force.turns):
                 c = self.turned.about(g, g.first + k * g.size, scene.parameters)
@@ -166,10 +207,12 @@ class SweptKernels(ObstacleFunctions):
                 speed = ti.max(speed, across)
             else:
                 speed = ti.max(speed, self.length(w))
+        if ti.static(self.features.curved):
+            speed *= ti.cast(MOST_SHARES, self.fp)
         return speed
 
     @ti.func
-    def share_of_one(self, g: A, k, j, scene: A, way: A, at: A, most, kept):
+    def share_of_one(self, g: A, k, j, inner, scene: A, way: A, at: A, most, kept):
         """The free share of the step of vertex or face j before obstacle k of group g; all of it from within. Where the
         obstacle is met, the share `kept` of the distance, or of the width if that is less, is kept."""
         first = g.first + k * g.size
@@ -179,7 +222,7 @@ class SweptKernels(ObstacleFunctions):
         for m in range(MARCHES):
             left = speed * (most - t)
             X, u = self.corners_at(g, k, j, t, scene, way, at)
-            d = self.face_clearance(g, first, X, u, scene, left)
+            d = self.face_clearance(g, first, X, u, inner, scene, left)
             if m == 0:
                 near = ti.min(d, width)
                 halt = ti.cast(TINY, self.fp) * near
@@ -209,9 +252,9 @@ class SweptKernels(ObstacleFunctions):
         for j in range(plan.count):
             share, blocker = plan.most, -1
             for g in ti.static(self.features.groups):
-                if ti.static(not g.force.hollow) or j < plan.num_vertices:
+                if ti.static(self.features.reaches(g)) or j < plan.num_vertices:
                     for k in range(g.count):
-                        s = self.share_of_one(g, k, j, scene, way, at, plan.most, plan.kept)
+                        s = self.share_of_one(g, k, j, self.is_inner(j, plan), scene, way, at, plan.most, plan.kept)
                         if s < share:
                             share = s
                             blocker = g.number + k
@@ -230,10 +273,10 @@ class SweptKernels(ObstacleFunctions):
         for j in range(plan.count):
             least, blocker, none = plan.most, -1, ti.cast(0, self.fp)
             for g in ti.static(self.features.groups):
-                if ti.static(not g.force.hollow) or j < plan.num_vertices:
+                if ti.static(self.features.reaches(g)) or j < plan.num_vertices:
                     for k in range(g.count):
                         X, u = self.corners_at(g, k, j, none, scene, way, at)
-                        d = self.face_clearance(g, g.first + k * g.size, X, u, scene, plan.most)
+                        d = self.face_clearance(g, g.first + k * g.size, X, u, self.is_inner(j, plan), scene, plan.most)
                         if d < least:
                             least = d
                             blocker = g.number + k

@@ -8,6 +8,7 @@ import taichi as ti
 
 from diffsim_ti import runtime
 from diffsim_ti.contact.surface_pairs import Overlap
+from diffsim_ti.potential.face_lattice import nodes_of_faces
 from diffsim_ti.potential.swept import swept_kernels
 
 
@@ -38,9 +39,10 @@ class Way:
         self.a, a = arrays, arrays
         self.terms, mesh = a.contacts, a.mesh
         self._kernels = swept_kernels(a.features(), a.precision, parallel)
-        vertices = np.repeat(mesh.surface_vertices, 3).reshape(-1, 3)
-        hollow = all(group.force.hollow for group in a.features().groups)
-        self.corners_of = np.concatenate([vertices, mesh.surface_triangles[: 0 if hollow else None]])
+        faces = nodes_of_faces(a)
+        vertices = np.repeat(mesh.surface_vertices[:, None], faces.shape[1], 1)
+        any_reaches = any(a.features().reaches(group) for group in a.features().groups)
+        self.corners_of = np.concatenate([vertices, faces if any_reaches else faces[:0]])
         self.num_vertices, self.count = len(vertices), len(self.corners_of)
         self._way = SimpleNamespace(
             corners=runtime.upload(self.corners_of.ravel(), ti.i32),
@@ -95,7 +97,9 @@ class Way:
         j = int(found.argmin())
         self.met = None
         if blocker[j] >= 0:
-            self.met = Met(tuple(int(i) for i in dict.fromkeys(self.corners_of[j])), int(blocker[j]), float(found[j]))
+            self.met = Met(
+                tuple(int(i) for i in dict.fromkeys(self.corners_of[j, :3])), int(blocker[j]), float(found[j])
+            )
 
     @property
     def widths(self) -> list[float]:

@@ -7,6 +7,7 @@ import taichi as ti
 
 from diffsim_ti import runtime
 from diffsim_ti.inputs import Derived, poses
+from diffsim_ti.mesh.curved_triangles import are_felt
 from diffsim_ti.mesh.patches import in_eights, volume_patches
 from diffsim_ti.runtime import LANES
 from diffsim_ti.state.bodies import BodyArrays
@@ -52,8 +53,10 @@ class SceneArrays:
         self._upload_topology(scene)
         rows = scene.inputs.parameters
         self.obstacles = self._twins(scene)
+        self.curved = are_felt(mesh, self.contacts)
         self._features = dict(
             order=mesh.order,
+            curved=self.curved,
             groups=grouped(self.obstacles),
             stages=stages_contact,
             moving=sum(poses.columns_of(term.path_width) for term in scene.moving),

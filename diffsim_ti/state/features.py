@@ -70,6 +70,7 @@ class Features:
     moving: int = 0  # columns of the paths that obstacles follow
     num_parameters: int = 0  # numbers of all terms
     uniform: bool = True  # one set of coefficients for all tetrahedra
+    curved: bool = False  # whether faces are curved, as obstacles feel (mesh/curved_triangles.py)
     recorded: bool = False  # whether a loss names what a contact stage does
     density: bool = False  # the last two: adjoints that cost extra, only if asked for
     shape: bool = False
@@ -121,6 +122,10 @@ class Features:
     def areas(self) -> bool:
         """Whether adjoints of the surface's areas are wanted: the rest shape decides about them."""
         return self.shape and any(group.force.per_area for group in self.groups)
+
+    def reaches(self, group: ObstacleGroup) -> bool:
+        """Whether obstacles may be nearer to a point within a face than to its corners."""
+        return self.curved or not group.force.hollow
 
     def sums(self) -> Rows:
         """Rows of the per-vertex adjoint sums: those of the parameters stand as the parameters do."""

@@ -7,6 +7,7 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
+from diffsim_ti.contact.curved_pairs import pairs_of
 from diffsim_ti.contact.surface_pairs import SurfacePairs
 from diffsim_ti.inputs import Derived, Mass
 from diffsim_ti.runtime import Kernel
@@ -50,7 +51,7 @@ class Workspace:
             self.scene, solver.stages_contact, self.feels_faces(self.scene), explicit, in_steps=not explicit
         )
         self.parallel = solver.runs_parallel()
-        self.pairs = self.pairs_kind(self.arrays, self.parallel) if self.arrays.self_contact else None
+        self.pairs = pairs_of(self.pairs_kind, self.arrays, self.parallel) if self.arrays.self_contact else None
         self.state = self.history(1)
         self.record: History | None = None
         self.frames = FrameArrays.of(self.arrays, 1, 1)

@@ -53,8 +53,8 @@ class FaceDerivatives(FaceKernels):
     @ti.func
     def turned_jvp(self, g: A, o, f, u, du, then: A, scene: A, faces: A, tangent: A):
         place, w, theta = self.place(g, o, then, scene.path), self.rows(0), ti.Vector.zero(self.fp, 3)
-        for a in ti.static(range(3)):
-            i = faces.corners[3 * f + a]
+        for a in ti.static(range(self.nodes)):
+            i = faces.corners[self.nodes * f + a]
             X, dr = self.seen(g, scene.rest[i], place), self.row_of(du, a) + tangent.rest[i]
             moved = self.moved(g, o, X, self.row_of(u, a), dr, then, scene, tangent)
             theta = self.turned.short(moved, 3)
@@ -65,7 +65,7 @@ class FaceDerivatives(FaceKernels):
         change, _ = self.face("jvp", g, o, f, X, made, w, scene, faces, placed)
         push, _ = self.face("push", g, o, f, X, made, made, scene, faces, scene)
         rows, pushes = self.turned_rows(g, place, 1, change), self.turned_rows(g, place, 1, push)
-        for a in ti.static(range(3)):
+        for a in ti.static(range(self.nodes)):
             x = theta.cross(self.turned.short(self.row_of(pushes, a)))
             for m in ti.static(range(3)):
                 rows[a, m] += x[m]
@@ -83,11 +83,11 @@ class FaceDerivatives(FaceKernels):
         found, _ = self.face("vjp", g, o, f, X, made, self.turned_rows(g, place, -1, w), scene, faces, out)
         push, _ = self.face("push", g, o, f, X, made, made, scene, faces, scene)
         rows, pushes = self.turned_rows(g, place, 1, found), self.turned_rows(g, place, 1, push)
-        for a in ti.static(range(3)):
+        for a in ti.static(range(self.nodes)):
             turned = self.turned.short(self.row_of(pushes, a)).cross(self.turned.short(self.row_of(w, a)))
             by, seen = (
                 self.turned.joined(self.row_of(rows, a), turned),
-                self.seen(g, scene.rest[faces.corners[3 * f + a]], place),
+                self.seen(g, scene.rest[faces.corners[self.nodes * f + a]], place),
             )
             self.spread(g, o, f, seen, self.row_of(u, a), by, self.vector(0), then, scene, out, out)
         return rows
@@ -139,8 +139,8 @@ class FaceDerivatives(FaceKernels):
     @ti.func
     def seed_rows(self, f, own: A, faces: A):
         out = self.rows(0)
-        for a in ti.static(range(3)):
-            x = own.seed[faces.own[3 * f + a]]
+        for a in ti.static(range(self.nodes)):
+            x = own.seed[faces.own[self.nodes * f + a]]
             for m in ti.static(range(4)):
                 out[a, m] = x[m]
         return out
@@ -177,6 +177,8 @@ class FaceDerivatives(FaceKernels):
                         rows, _ = self.face("vjp", g, o, f, X, u, w, scene, faces, out)
                         total += rows
                         by_X = self.row_of(rows, 0) + self.row_of(rows, 1) + self.row_of(rows, 2)
+                        for a in ti.static(range(3, self.nodes)):
+                            by_X += self.row_of(rows, a)
                         self.add_to_path(g, o, f, then, by_X, self.vector(0), out)
             self.store(f, total, faces)
 

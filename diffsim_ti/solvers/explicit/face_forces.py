@@ -2,7 +2,7 @@
 
 Of a face and an obstacle, corner a feels
 
-    f_a = -c k w sum_q s_a ((F_s - F_t) n + F_t n_a)
+    f_a = -c k w sum_q s_a ((F_s - F_t) n + F_t n_a)    (curved: -c k w sum_q N_a (F_s - F_t) n + s_a F_t n_a)
 
 q: points of the lattice, s_a: their shares of the corners; n, n_a: normals at the point and at the corner; F(s, t):
 potential/face_lattice.py. Beside it stands
@@ -10,14 +10,24 @@ potential/face_lattice.py. Beside it stands
     D_a = c k sum_q s_a beta''(s) phi(t)    [N/m]
 
 whose sum over the faces around a vertex is no less than the stiffness that they have there, for s (x) s <= diag(s) where
-shares s sum up to 1. It says in how many parts a pass is to be gone (face_kernels.py).
+shares s sum up to 1; of curved faces with 5/3 |N_a|, since N (x) N <= diag(|N|) sum |N|. It says in how many parts a pass is
+to be gone (face_kernels.py).
 """
 
 from dataclasses import dataclass
 
 import taichi as ti
 
-from diffsim_ti.potential.face_lattice import FLAT, fade, point_curvatures, point_energy, point_slopes
+from diffsim_ti.potential.curved_faces import MOST_SHARES
+from diffsim_ti.potential.face_lattice import (
+    FLAT,
+    fade,
+    felt,
+    hollow_stiffness,
+    point_curvatures,
+    point_energy,
+    point_slopes,
+)
 from diffsim_ti.solvers.explicit.face_rows import FaceRows
 from diffsim_ti.terms.obstacles import barrier
 
@@ -41,35 +51,35 @@ class FaceForces(FaceRows):
         """
         found, first, row = self.rows(0), g.first + k * g.size, f * ti.static(self.num_obstacles) + g.number + k
         reach, width = faces.reach[row], g.force.width(scene.parameters, first)
-        one = ti.cast(1 / 3, self.fp)
-        third = ti.Vector([one, one, one])
-        Xm, um, around = self.mix(third, X), self.mix(third, u), self.rows(0)
-        for a in ti.static(range(3)):
+        Xm, um, around = self.middle_of(f, X), self.middle_of(f, u), self.rows(0)
+        for a in ti.static(range(self.nodes)):
             for m in ti.static(range(3)):
                 around[a, m] = (X[a, m] - Xm[m]) + (u[a, m] - um[m])
-        middle, size = g.force.clearance(scene.parameters, first, Xm, um), self.size_of_rows(around)
+        middle, size = g.force.clearance(scene.parameters, first, Xm, um), self.size_of_rows(f, around)
         least = middle[3] - size - reach
         if least < width:
             least = ti.cast(1e30, self.fp)  # unless points are told apart, corners speak for them
             corners, turns = self.rows(0), self.rows(0)  # (normal, distance) there, and its change
             bent = ti.cast(1e30, self.fp)
             for a in range(3):
-                seen = g.force.outlook(scene.parameters, first, self.row_of(X, a), self.row_of(u, a))
+                seen = self.corner(g, first, self.row_of(X, a), self.row_of(u, a), scene)
                 for m in ti.static(range(4)):
                     for b in ti.static(range(3)):
                         corners[b, m] = ti.select(a == b, seen[m], corners[b, m])
             # a convex obstacle is never nearer than the tangent plane at the middle says
-            if ti.static(g.force.convex):
-                bent = ti.cast(0, self.fp)
+            flat = ti.cast(FLAT, self.fp) * width
+            if ti.static(g.force.hollow):  # nor one that is flat or hollow than the corners do, but by the arch
+                bent, flat = self.arch(around, self.inner(f)), ti.cast(0, self.fp)
+            elif ti.static(g.force.convex):
+                bent = self.arch(around, self.inner(f))
                 for a in ti.static(range(3)):
                     along = self.dot3(middle, self.row_of(around, a))
                     bent = ti.max(bent, corners[a, 3] - middle[3] - along)
-            if bent > ti.cast(FLAT, self.fp) * width:
+            if bent > flat:
                 if ti.static(what in ("jvp", "vjp")):
                     for a in range(3):
-                        t = self.turn(
-                            what, g, first, self.row_of(X, a), self.row_of(u, a), self.row_of(w, a), scene, out
-                        )
+                        x, y, z = self.row_of(X, a), self.row_of(u, a), self.row_of(w, a)
+                        t = self.corner_turn(what, g, first, x, y, z, scene, out)
                         for m in ti.static(range(4)):
                             for b in ti.static(range(3)):
                                 turns[b, m] = ti.select(a == b, t[m], turns[b, m])
@@ -87,14 +97,18 @@ class FaceForces(FaceRows):
         for m in ti.static(range(3)):
             edge[0, m] = per * ((X[2, m] - X[0, m]) + (u[2, m] - u[0, m]))
         # distances change by no more than the way: where a point is far away, the next ones are not looked at
-        step = ti.max(ti.cast(1.01, self.fp) * self.size_of_rows(edge), ti.cast(1e-30, self.fp))
+        length = self.longest(edge)
+        if ti.static(self.features.curved):
+            length += 6 * per * self.arch(X + u, self.inner(f))
+        step = ti.max(ti.cast(1.01, self.fp) * length, ti.cast(1e-30, self.fp))
         for x in range(parts + 1):
             onwards = 0
             for y in range(parts + 1 - x):
                 if y >= onwards:
                     s1, s2 = x * per, y * per
                     s = ti.Vector([1 - s1 - s2, s1, s2])
-                    Xs, us = self.mix(s, X), self.mix(s, u)
+                    N = self.node_weights(s, self.inner(f))
+                    Xs, us = self.mix(N, X), self.mix(N, u)
                     now = g.force.outlook(scene.parameters, first, Xs, us)
                     far = now[3]
                     if ti.static(g.force.grain > 0):  # splines are steeper than distances, and end with their grid
@@ -104,15 +118,16 @@ class FaceForces(FaceRows):
                     ahead = ti.min((far - reach - width) / step, ti.cast(parts, self.fp))
                     onwards = y + 1 + ti.cast(ti.max(ahead, ti.cast(0, self.fp)), ti.i32)
                     sigma = (now[3] - reach) / width
-                    t = (s[0] * corners[0, 3] + s[1] * corners[1, 3] + s[2] * corners[2, 3] - now[3]) / width
+                    said = s[0] * corners[0, 3] + s[1] * corners[1, 3] + s[2] * corners[2, 3]
+                    t = self.besides(g, said, now[3]) / width
                     inner = x < parts and y < parts and x + y > 0
                     weight = one
                     if ti.static(g.force.per_area):
                         weight = ti.select(x > 0 and y > 0 and x + y < parts, one + one, one)  # edges have two faces
-                    if inner and sigma < 1 and t > ti.cast(FLAT, self.fp):
+                    if inner and felt(sigma, t, g.force, self.fp):
                         turned, mixed = self.vector(0), self.vector(0)
                         if ti.static(what in ("jvp", "vjp")):
-                            mixed = self.mix(s, w)
+                            mixed = self.mix(N, w)
                             turned = self.turn(what, g, first, Xs, us, mixed, scene, out)
                         if ti.static(what == "force"):
                             value = point_energy(sigma, t, g.force, self.fp)
@@ -123,6 +138,7 @@ class FaceForces(FaceRows):
                             g,
                             first,
                             s,
+                            N,
                             sigma,
                             t,
                             now,
@@ -172,6 +188,7 @@ class FaceForces(FaceRows):
         g: A,
         first,
         s,
+        N,
         sigma,
         t,
         now,
@@ -189,30 +206,56 @@ class FaceForces(FaceRows):
         found, stiffness = self.rows(0), scene.parameters[first + g.force.count]
         scale, stiff = 0 - weight * stiffness * width, weight * stiffness
         Fs, Ft = point_slopes(sigma, t, g.force, self.fp)
+        push = self.besides(g, Fs, Ft)
         if ti.static(what in ("force", "push")):
             phi, _, _ = fade(t, g.force, self.fp)
-            G = barrier.curvature(sigma, self.fp) * phi
+            G, of_corners = barrier.curvature(sigma, self.fp) * phi, ti.cast(0, self.fp)
+            if ti.static(g.force.hollow):
+                G, of_corners = hollow_stiffness(sigma, t, self.fp)
             for a in ti.static(range(3)):
                 for m in ti.static(range(3)):
-                    found[a, m] = scale * s[a] * ((Fs - Ft) * now[m] + Ft * corners[a, m])
+                    found[a, m] = scale * s[a] * (push * now[m] + Ft * corners[a, m])
                 found[a, 3] = stiff * s[a] * G
+            if ti.static(self.features.curved):
+                for a in ti.static(range(6)):
+                    for m in ti.static(range(3)):
+                        found[a, m] += scale * self.beyond(N, s, a) * push * now[m]
+                    found[a, 3] = ti.cast(MOST_SHARES, self.fp) * stiff * ti.abs(N[a]) * G
+                    if ti.static(a < 3):
+                        size = self.dot3(self.row_of(corners, a), self.row_of(corners, a))
+                        found[a, 3] += stiff * s[a] * of_corners * size
         else:
             Fss, Fst, Ftt = point_curvatures(sigma, t, g.force, self.fp)
             ds, zero = dn[3] / width, ti.cast(0, self.fp)
-            dt = (s[0] * turns[0, 3] + s[1] * turns[1, 3] + s[2] * turns[2, 3] - dn[3]) / width
+            said = s[0] * turns[0, 3] + s[1] * turns[1, 3] + s[2] * turns[2, 3]
+            dt = self.besides(g, said, dn[3]) / width
             dk, dw = zero, zero
             if ti.static(what == "jvp"):
                 dk = thicker + out.parameters[first + g.force.count] / stiffness
                 dw = out.parameters[first + g.force.count + 1] / width
                 ds, dt = ds - sigma * dw, dt - t * dw
             dFs, dFt = Fss * ds + Fst * dt, Fst * ds + Ftt * dt
+            dpush = self.besides(g, dFs, dFt)
             for a in ti.static(range(3)):
                 for m in ti.static(range(3)):
-                    found[a, m] = scale * s[a] * ((dFs - dFt) * now[m] + (Fs - Ft) * dn[m])
+                    found[a, m] = scale * s[a] * (dpush * now[m] + push * dn[m])
                     found[a, m] += scale * s[a] * (dFt * corners[a, m] + Ft * turns[a, m])
                     if ti.static(what == "jvp"):
-                        found[a, m] += (dk + dw) * scale * s[a] * ((Fs - Ft) * now[m] + Ft * corners[a, m])
+                        found[a, m] += (dk + dw) * scale * s[a] * (push * now[m] + Ft * corners[a, m])
+            if ti.static(self.features.curved):
+                for a in ti.static(range(6)):
+                    more = scale * self.beyond(N, s, a)
+                    for m in ti.static(range(3)):
+                        found[a, m] += more * ((dpush + (dk + dw) * push) * now[m] + push * dn[m])
         return found
+
+    @ti.func
+    def beyond(self, N, s, a: A):
+        """What node a of a curved face has of a point besides its share as a corner."""
+        more = N[a]
+        if ti.static(a < 3):
+            more -= s[a]
+        return more
 
     @ti.func
     def numbers(self, g: A, first, f, s, sigma, t, now, Xs, us, mixed, w, corners, weight, width, scene: A, out: A):
@@ -224,10 +267,11 @@ class FaceForces(FaceRows):
         along, across = self.dot3(now, mixed), ti.cast(0, self.fp)
         for a in ti.static(range(3)):
             across += s[a] * (corners[a, 0] * w[a, 0] + corners[a, 1] * w[a, 1] + corners[a, 2] * w[a, 2])
-        by_s = scale * ((Fss - Fst) * along + Fst * across)
-        by_t = scale * ((Fst - Ftt) * along + Ftt * across)
-        of_force, by_now = scale * ((Fs - Ft) * along + Ft * across), scale * (Fs - Ft) * mixed
-        by_now[3] = (by_s - by_t) / width
+        push = self.besides(g, Fs, Ft)
+        by_s = scale * (self.besides(g, Fss, Fst) * along + Fst * across)
+        by_t = scale * (self.besides(g, Fst, Ftt) * along + Ftt * across)
+        of_force, by_now = scale * (push * along + Ft * across), scale * push * mixed
+        by_now[3] = self.besides(g, by_s, by_t) / width
         g.force.outlook_vjp(scene.parameters, first, Xs, us, by_now, out.sums, f)
         for a in ti.static(range(3)):
             for m in ti.static(range(3)):

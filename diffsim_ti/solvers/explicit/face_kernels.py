@@ -70,11 +70,11 @@ class FaceKernels(FaceWalls):
 
     @ti.func
     def store(self, f, rows, faces: A):
-        for a in ti.static(range(3)):
+        for a in ti.static(range(self.nodes)):
             x = self.vector(0)
             for m in ti.static(range(4)):
                 x[m] = rows[a, m]
-            faces.share[3 * f + a] = x
+            faces.share[self.nodes * f + a] = x
 
     @ti.func
     def share_of(self, k, plan: A):
@@ -93,14 +93,14 @@ class FaceKernels(FaceWalls):
     # ---- which faces come near ---------------------------------------------------------------------------------------
 
     @ti.func
-    def bent(self, g: A, first, X, u, scene: A):
+    def bent(self, g: A, first, f, X, u, scene: A):
         """How much nearer than its corners a point of the face may be [m]."""
         out = ti.cast(1e30, self.fp)
-        if ti.static(g.force.convex):
-            one = ti.cast(1 / 3, self.fp)
-            third = ti.Vector([one, one, one])
-            Xm, um = self.mix(third, X), self.mix(third, u)
-            middle, out = g.force.outlook(scene.parameters, first, Xm, um), ti.cast(0, self.fp)
+        if ti.static(g.force.hollow):
+            out = self.arch(X + u, self.inner(f))
+        elif ti.static(g.force.convex):
+            Xm, um = self.middle_of(f, X), self.middle_of(f, u)
+            middle, out = g.force.outlook(scene.parameters, first, Xm, um), self.arch(X + u, self.inner(f))
             for a in range(3):
                 Xa, ua = self.row_of(X, a), self.row_of(u, a)
                 edge = (Xa - Xm) + (ua - um)
@@ -110,15 +110,13 @@ class FaceKernels(FaceWalls):
     @ti.func
     def bound(self, g: A, k, f, X, u, travel, scene: A, faces: A):
         """What the distance of a face's points less r is not below, before they have moved by `travel` or after."""
-        one, around = ti.cast(1 / 3, self.fp), self.rows(0)
-        third = ti.Vector([one, one, one])
-        Xm, um = self.mix(third, X), self.mix(third, u)
-        for a in ti.static(range(3)):
+        Xm, um, around = self.middle_of(f, X), self.middle_of(f, u), self.rows(0)
+        for a in ti.static(range(self.nodes)):
             for m in ti.static(range(3)):
                 around[a, m] = (X[a, m] - Xm[m]) + (u[a, m] - um[m])
         middle = g.force.clearance(scene.parameters, g.first + k * g.size, Xm, um)
         reach = faces.reach[f * ti.static(self.num_obstacles) + g.number + k]
-        return middle[3] - self.size_of_rows(around) - reach - travel
+        return middle[3] - self.size_of_rows(f, around) - reach - travel
 
     @ti.func
     def way_of(self, g: A, k, f, u0, begin, u1, end, now: A, scene: A, faces: A):
@@ -128,7 +126,7 @@ class FaceKernels(FaceWalls):
             move = self.way_between(g, k, f, u0, begin, u1, end, now, scene, faces)
         else:
             drift = self.place_at(g, k, end, now, scene.path) - self.place_at(g, k, begin, now, scene.path)
-            for a in ti.static(range(3)):
+            for a in ti.static(range(self.nodes)):
                 for m in ti.static(range(3)):
                     move[a, m] -= drift[m]
         return move
@@ -145,12 +143,12 @@ class FaceKernels(FaceWalls):
                     self.place(g, k, now, scene.path),
                 )
                 X, width = self.made_rows(g, k, f, place, scene, faces), g.force.width(scene.parameters, first)
-                travel, u = self.size_of_rows(move), self.turned_rows(g, place, -1, u0)
+                travel, u = self.size_of_rows(f, move), self.turned_rows(g, place, -1, u0)
                 if self.bound(g, k, f, X, u, travel, scene, faces) < width:
                     bent = ti.cast(0, self.fp)
                     for c in range(3):
-                        bent = ti.max(bent, self.bent(g, first, X, u + ti.cast(0.5, self.fp) * c * move, scene))
-                    if bent > ti.cast(FLAT, self.fp) * width:
+                        bent = ti.max(bent, self.bent(g, first, f, X, u + ti.cast(0.5, self.fp) * c * move, scene))
+                    if bent > ti.cast(0 if g.force.hollow else FLAT, self.fp) * width:
                         near, need = 1, ti.max(need, travel / width)
         if now.alpha <= 0:
             near = 0
@@ -184,17 +182,17 @@ class FaceKernels(FaceWalls):
                 rows = self.turned_rows(g, place, 1, found)
                 total += rows
                 if ti.static(g.force.turns):
-                    for a in ti.static(range(3)):
-                        x, i = self.row_of(u, a), faces.corners[3 * f + a]
+                    for a in ti.static(range(self.nodes)):
+                        x, i = self.row_of(u, a), faces.corners[self.nodes * f + a]
                         speed = self.wall(g, k, self.seen(g, scene.rest[i], place), x, now, scene)
                         faces.done[f] = faces.done[f] + length * self.dot3(self.row_of(rows, a), speed)
                 elif ti.static(g.path >= 0):
                     speed = self.speed(g, k, now, scene.path)
-                    for a in ti.static(range(3)):
+                    for a in ti.static(range(self.nodes)):
                         faces.done[f] = faces.done[f] + length * self.dot3(self.row_of(rows, a), speed)
                 row = f * ti.static(self.num_obstacles) + g.number + k
                 faces.least[row] = least
-                for a in ti.static(range(3)):
+                for a in ti.static(range(self.nodes)):
                     for m in ti.static(range(3)):
                         faces.pushed[row] = faces.pushed[row] + ti.abs(rows[a, m])
         self.store(f, total, faces)
@@ -297,8 +295,8 @@ class FaceKernels(FaceWalls):
     def look_at(self, f, now: A, scene: A, faces: A, state: A, plan: A, watch: A):
         """Note how near a face came in each part, and d^2 D / m (state/watch.py)."""
         load, column, before = ti.cast(0, self.fp), plan.num_vertices + f, self.rows_at(f, faces.begin, 0, faces)
-        for a in ti.static(range(3)):
-            load = ti.max(load, faces.load[faces.own[3 * f + a]])
+        for a in ti.static(range(self.nodes)):
+            load = ti.max(load, faces.load[faces.own[self.nodes * f + a]])
         began, count = now.begin + ti.cast(0, self.fp), ti.static(self.num_obstacles)
         for k in range(plan.n + 1):
             end, u = now.end + ti.cast(0, self.fp), self.rows_at(f, state.u, plan.slot, faces)
@@ -316,7 +314,7 @@ class FaceKernels(FaceWalls):
                         g.force.width(scene.parameters, g.first + o * g.size),
                     )
                     made = self.turned_rows(g, place, -1, u)
-                    if self.bound(g, o, f, X, made, self.size_of_rows(move), scene, faces) < width:
+                    if self.bound(g, o, f, X, made, self.size_of_rows(f, move), scene, faces) < width:
                         least, reach = self.nearest(g, o, f, X, made, move, scene, faces), faces.reach[f * count + n]
                         if least < width + reach:
                             watch.seen[3 * n, column] = ti.min(watch.seen[3 * n, column], least)

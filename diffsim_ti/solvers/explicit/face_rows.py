@@ -1,4 +1,4 @@
-"""Faces against obstacles in an explicit pass: their corners as rows of a matrix, and how near they are."""
+"""Faces against obstacles in an explicit pass: their nodes as rows of a matrix, and how near they are."""
 
 from dataclasses import dataclass
 
@@ -23,7 +23,7 @@ class FaceRows(HeldBack):
     @property
     def groups(self):
         """Obstacles that can reach into a face between its corners."""
-        return tuple(group for group in self.features.groups if group.force.watched and not group.force.hollow)
+        return tuple(group for group in self.features.groups if group.force.watched and self.features.reaches(group))
 
     @ti.func
     def where(self, g: A, k, now: A, scene: A, faces: A, plan: A):
@@ -41,7 +41,12 @@ class FaceRows(HeldBack):
         s = self.turned.short(at(faces.offsets, 3 * self.num_obstacles + MORE * (g.turning + k)))
         return self.turned.joined(shift, turning.from_rodrigues(s, self.fp), 4)
 
-    # ---- corners as an obstacle that turns was made; others are seen as they are ---------------------------------------
+    @traced
+    def inner(self, f):
+        """Whether a triangle is the one between the three others of a curved face."""
+        return let(f % 4 == 3) if self.features.curved else None
+
+    # ---- nodes as an obstacle that turns was made; others are seen as they are ---------------------------------------
 
     @traced
     def made_rows(self, g, k, f, place, scene, faces):
@@ -54,7 +59,7 @@ class FaceRows(HeldBack):
     def made_of(self, g: A, k, f, place, scene: A, faces: A):
         c, q = self.turned.about(g, g.first + k * g.size, scene.parameters), self.turned.quaternion(place)
         out = self.rest_rows(f, scene.rest, self.turned.long(place), faces)
-        for a in ti.static(range(3)):
+        for a in ti.static(range(self.nodes)):
             x = c + turning.turned(q, -1, self.turned.short(self.row_of(out, a)) - c, self.fp)
             for m in ti.static(range(3)):
                 out[a, m] = x[m]
@@ -68,7 +73,7 @@ class FaceRows(HeldBack):
     @ti.func
     def all_turned(self, q, sign: ti.template(), rows):
         out = rows
-        for a in ti.static(range(3)):
+        for a in ti.static(range(self.nodes)):
             x = turning.turned(q, sign, self.turned.short(self.row_of(rows, a)), self.fp)
             for m in ti.static(range(3)):
                 out[a, m] = x[m]
@@ -82,39 +87,53 @@ class FaceRows(HeldBack):
         return (X1 - X0) + (self.turned_rows(g, after, -1, u1) - self.turned_rows(g, before, -1, u0))
 
     @ti.func
-    def size_of_rows(self, M):
-        """Length of the longest row."""
+    def middle_of(self, f, M):
+        """The row of the middle of a face."""
+        one = ti.cast(1 / 3, self.fp)
+        return self.mix(self.node_weights(ti.Vector([one, one, one]), self.inner(f)), M)
+
+    @ti.func
+    def longest(self, M):
+        """Length of the longest of the first three rows."""
         most = ti.cast(0, self.fp)
         for a in ti.static(range(3)):
             most = ti.max(most, M[a, 0] * M[a, 0] + M[a, 1] * M[a, 1] + M[a, 2] * M[a, 2])
         return ti.sqrt(most)
 
     @ti.func
+    def size_of_rows(self, f, M):
+        """How long what rows say of the nodes of face f is at most at a point of it."""
+        size = self.longest(M)
+        if ti.static(self.features.curved):
+            size += self.arch(M, self.inner(f))
+        return size
+
+    @ti.func
     def rows_at(self, f, array: A, slot, faces: A):
-        """array[slot, i] at the corners of a face."""
+        """array[slot, i] at the nodes of a face."""
         out = self.rows(0)
-        for a in ti.static(range(3)):
-            x = array[slot, faces.corners[3 * f + a]]
+        for a in ti.static(range(self.nodes)):
+            x = array[slot, faces.corners[self.nodes * f + a]]
             for m in ti.static(range(4)):
                 out[a, m] = x[m]
         return out
 
     @ti.func
     def rows_of(self, f, array: A, k, faces: A):
-        """array[k, s] of the surface vertices that are the corners of a face."""
+        """array[k, s] of the surface vertices that are the nodes of a face."""
         out = self.rows(0)
-        for a in ti.static(range(3)):
-            x = array[k, faces.own[3 * f + a]]
+        for a in ti.static(range(self.nodes)):
+            x = array[k, faces.own[self.nodes * f + a]]
             for m in ti.static(range(4)):
                 out[a, m] = x[m]
         return out
 
     @ti.func
     def rest_rows(self, f, rest: A, place, faces: A):
-        """rest[i] - place at the corners of a face."""
+        """rest[i] - place at the nodes of a face."""
         out = self.rows(0)
-        for a in ti.static(range(3)):
-            x = rest[faces.corners[3 * f + a]] - place
+        for a in ti.static(range(self.nodes)):
+            x = rest[faces.corners[self.nodes * f + a]] - place
             for m in ti.static(range(3)):
                 out[a, m] = x[m]
         return out
@@ -139,8 +158,9 @@ class FaceRows(HeldBack):
             for y in range(parts + 1 - x):
                 s1, s2 = x * per, y * per
                 s = ti.Vector([1 - s1 - s2, s1, s2])
-                now = g.force.outlook(scene.parameters, first, self.mix(s, X), self.mix(s, u))
-                d, before = now[3], now[3] - self.dot3(now, self.mix(s, move))
+                N = self.node_weights(s, self.inner(f))
+                now = g.force.outlook(scene.parameters, first, self.mix(N, X), self.mix(N, u))
+                d, before = now[3], now[3] - self.dot3(now, self.mix(N, move))
                 bent = s.dot(gaps) - d > ti.cast(BENT, self.fp) * width
                 if bent and d <= reach:
                     d -= reach

@@ -5,7 +5,8 @@ import taichi as ti
 
 from diffsim_ti import runtime
 from diffsim_ti.mesh import geometry
-from diffsim_ti.potential.face_lattice import BENT, face_rows
+from diffsim_ti.mesh.curved_triangles import are_felt
+from diffsim_ti.potential.face_lattice import BENT, lattices, nodes_of_faces
 from diffsim_ti.solvers.explicit.face_derivatives import face_derivatives
 from diffsim_ti.solvers.explicit.face_kernels import face_kernels
 from diffsim_ti.state.history import copy_slot
@@ -19,12 +20,14 @@ def feels_faces(scene) -> bool:
 
     A ball of radius R that touches a face, whose longest edge is L, is nearer to it than its corners say by L^2 / 6 R at
     most. Where that is less than what points within faces feel in full, BENT widths (potential/face_lattice.py), corners
-    speak for the face. L is that at rest, a fifth longer.
+    speak for the face. L is that at rest, a fifth longer. Curved faces are felt as are_felt says.
     """
     x = scene.mesh.vertices[scene.mesh.surface_triangles]
     longest = 1.2 * np.linalg.norm(x - np.roll(x, 1, axis=1), axis=2).max(initial=0)
-    obstacles = (t for t in scene.terms if t.acts_on_surface and "barrier_width" in t.values)
-    return any(longest**2 > 6 * t.least_radius() * BENT * float(t.values["barrier_width"]) for t in obstacles)
+    obstacles = [t for t in scene.terms if t.acts_on_surface and "barrier_width" in t.values]
+    return are_felt(scene.mesh, obstacles) or any(
+        longest**2 > 6 * t.least_radius() * BENT * float(t.values["barrier_width"]) for t in obstacles
+    )
 
 
 class FeltFaces:
@@ -39,18 +42,17 @@ class FeltFaces:
     def __init__(self, workspace):
         self.ws, a = workspace, workspace.arrays
         self.a, self.mesh, fp = a, a.mesh, a.fp
-        faces, surface = self.mesh.surface_triangles, self.mesh.surface_vertices
+        faces, surface = nodes_of_faces(a), self.mesh.surface_vertices
         self.num_faces, self.num_surface = len(faces), len(surface)
         own = np.searchsorted(surface, faces.ravel())
         entries = np.argsort(own, kind="stable")
         start = np.searchsorted(own[entries], np.arange(len(surface) + 1))
-        *_, parts, reach, weight = face_rows(self.mesh, a.contacts)  # a row for each corner of a face
-        first = np.argsort(np.argsort(faces.ravel(), kind="stable"))[::3]
-        ints = dict(corners=faces.ravel(), own=own, start=start, entries=entries, vertices=surface, parts=parts[first])
+        parts, reach, weight = lattices(a)
+        ints = dict(corners=faces, own=own, start=start, entries=entries, vertices=surface, parts=parts)
         for name, data in ints.items():
             setattr(self, name, runtime.upload(data.ravel(), ti.i32))
-        self.reach, self.weight = (runtime.upload(x[first].ravel(), fp) for x in (reach, weight))
-        self.share, self.begin = runtime.array(a.vector, 3 * len(faces)), runtime.array(a.vector, 1, a.num_vertices)
+        self.reach, self.weight = (runtime.upload(x.ravel(), fp) for x in (reach, weight))
+        self.share, self.begin = runtime.array(a.vector, faces.size), runtime.array(a.vector, 1, a.num_vertices)
         self.whole, self.shift = (runtime.array(a.vector, len(surface)) for _ in range(2))
         self.least, self.offsets = runtime.array(fp, len(faces) * len(a.contacts)), a.offsets
         self.pushed = runtime.array(

@@ -20,7 +20,7 @@ class ImpulseRecord:
                 f"explicit solvers know the forces of obstacles that act as a stage of their passes, and {solver} was told "
                 'to take some as forces: pass contact="stage", and obstacles with a distance'
             )
-        reaching = [g.number + k for g in features.groups if not g.force.hollow for k in range(g.count)]
+        reaching = [g.number + k for g in features.groups if features.reaches(g) for k in range(g.count)]
         self.reaching = reaching if workspace.faces else []
         self.num_frames, self.num_obstacles = workspace.frames.frames_u.shape[0], len(a.obstacles)
         self.impulse = runtime.array(a.vector, 2 * self.num_frames * self.num_obstacles, a.num_vertices)

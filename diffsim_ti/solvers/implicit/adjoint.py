@@ -11,7 +11,7 @@ import numpy as np
 from diffsim_ti import runtime
 from diffsim_ti.inputs import Derived
 from diffsim_ti.potential.face_kernels import face_kernels
-from diffsim_ti.potential.face_lattice import rest_of_areas
+from diffsim_ti.potential.face_lattice import nodes_of_faces, rest_of_areas
 from diffsim_ti.potential.kernels import potential_kernels
 from diffsim_ti.solvers.chamber_record import ChamberRecord
 from diffsim_ti.solvers.implicit.contact_record import ContactRecord, SharesAdjoint
@@ -49,7 +49,7 @@ class ImplicitAdjoint(RecordedPasses):
         self._vjp = self.kernels.vjp.bind(a.in_lanes, **own)
         if p.faces:
             faces = face_kernels(self.features, a.precision, workspace.parallel)
-            self.face_areas = runtime.array(a.fp, 3 * len(a.mesh.surface_triangles) if self.features.areas else 1)
+            self.face_areas = runtime.array(a.fp, nodes_of_faces(a).size if self.features.areas else 1)
             self._vjp_of_faces = p.faces.bind(faces.vjp, adjoint=(self, self.numbers))
         self.chamber_record = ChamberRecord(workspace.solver, workspace.held_chambers)
         self.contacts, areas = None, self.face_areas if p.faces else runtime.array(a.fp, 1)
@@ -279,7 +279,7 @@ class ImplicitAdjoint(RecordedPasses):
             rest = rest + by_pairs
         if self.ws.potential.faces and features.areas:
             by_areas = runtime.fetch(self.face_areas).astype(np.float64)
-            rest = rest + rest_of_areas(a.mesh, a.values.rest, by_areas)
+            rest = rest + rest_of_areas(a, a.values.rest, by_areas)
         out.rest = rest + self.rest_by_pressure + out.rest
         out.growths = self.growth
         out.forces, out.motion, out.path, out.follower = self.forces, self.motion, self.path, self.pressure

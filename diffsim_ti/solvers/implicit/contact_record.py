@@ -22,7 +22,7 @@ class Shares:
         self.num_obstacles = len(a.obstacles)
         self.force = runtime.array(a.vector, 2 * self.num_obstacles, a.num_vertices)
         self.y = runtime.array(a.vector, 1, a.num_vertices)
-        self.reaching = [g.number + k for g in features.groups if not g.force.hollow for k in range(g.count)]
+        self.reaching = [g.number + k for g in features.groups if features.reaches(g) for k in range(g.count)]
         self._launches = {}
 
     def _sizes(self, **more) -> dict:

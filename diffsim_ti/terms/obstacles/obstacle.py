@@ -7,8 +7,6 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti.inputs import NOT_NEGATIVE, Input
 from diffsim_ti.inputs.description import length_per_step
-from diffsim_ti.mesh import TetrahedralMesh
-from diffsim_ti.terms.bow import warn_of_bow
 from diffsim_ti.terms.described import place, positive
 from diffsim_ti.terms.gravity import Gravity
 from diffsim_ti.terms.motion import Motion
@@ -32,6 +30,8 @@ class Obstacle(Term):
     scene choose it from density, wave speed, weight and impact (stiffness.py). Or
     stiffness [N/m]: k of every vertex alike, however many there are.
     width [m]: how far the obstacle is felt.
+    Faces of ten-node tetrahedra that are curved in the mesh, by .02 widths or more, are felt as curved as they move, by
+    points on them (potential/curved_faces.py); friction of explicit steps takes its normal force from vertices alone.
     friction [-]: Coulomb's coefficient (friction.py); 0 compiles none. friction_speed [m/s]: the speed below which
     friction is smoothed, and with which a vertex that is held may creep.
     path: the obstacle's displacement over time [m], a function of time [s] that returns 3 numbers, or keyframes
@@ -131,9 +131,6 @@ class Obstacle(Term):
     def has_friction(self) -> bool:
         """Whether friction was given: without, none is compiled."""
         return "friction" in self.values
-
-    def check(self, mesh: TetrahedralMesh) -> None:
-        warn_of_bow(mesh, self)
 
     def settled(self, scene, density, initial_positions, initial_velocities) -> "Obstacle":
         """With the stiffness per area that the fall from the start, or the start's velocity, asks for."""
