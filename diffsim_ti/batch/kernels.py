@@ -11,7 +11,7 @@ from functools import cached_property, lru_cache
 import taichi as ti
 
 from diffsim_ti.batch.free_vertices import FreeVertices
-from diffsim_ti.batch.views import Corners, Item, Scratch, Shared, TetrahedronOfScenes, Uniform, Vectors, View
+from diffsim_ti.batch.views import Corners, Item, Scratch, Shared, TetrahedronOfEight, Uniform, Vectors, View
 from diffsim_ti.elements.tetrahedron import Onwards
 from diffsim_ti.runtime import LANES, Bundle, Kernel, at, let, traced
 from diffsim_ti.solvers.explicit.kick_drift import KickDrift
@@ -37,12 +37,12 @@ NUMBERS = dict.fromkeys((*SIZES, "window", "first", "count", "base"), "int") | d
 
 
 @dataclass(frozen=True)
-class KickDriftOfScenes(KickDrift):
+class KickDriftOfEight(KickDrift):
     """As KickDrift, whose tetrahedra are those of eight scenes."""
 
     @cached_property
     def element(self):
-        return TetrahedronOfScenes(self.law, self.features.uniform, True, self.features.order)
+        return TetrahedronOfEight(self.law, self.features.uniform, True, self.features.order)
 
 
 @dataclass(frozen=True)
@@ -54,15 +54,15 @@ class BatchKernels:
     own: frozenset
 
     @cached_property
-    def vertex(self) -> KickDriftOfScenes:
-        return KickDriftOfScenes(self.law, self.features, True)
+    def vertex(self) -> KickDriftOfEight:
+        return KickDriftOfEight(self.law, self.features, True)
 
     @cached_property
     def free(self) -> FreeVertices:
         return FreeVertices(self.law, self.features, self.own)
 
     @property
-    def element(self) -> TetrahedronOfScenes:
+    def element(self) -> TetrahedronOfEight:
         return self.vertex.element
 
     # ---- arrays ------------------------------------------------------------------------------------------------------
