@@ -98,6 +98,36 @@ def test_other_matter(material, order, solver):
     check(batch, own, rng, True)
 
 
+def push(t):
+    return np.array([0.0, 0.3 * t, 0.2 * t])
+
+
+@pytest.mark.backends
+@pytest.mark.parametrize("law", ["elastic", "relaxing"])
+def test_backends(law):
+    """Scenes side by side, in lanes or innermost, with what kernels of a vertex have; float32, which Vulkan has alone."""
+    wall = ds.HalfSpace((0, LOW - 0.008, 0), (0.1, 1, 0), path=push, friction=0.2, stiffness_per_area=2e5)
+    force = 0.05 * np.random.default_rng(1).normal(size=(3, MESH.num_vertices, 3))
+    elastic = law == "elastic"
+    terms = [ds.Gravity(-9.8), ds.Drag(0.5), *([wall, ds.ExternalForce(force)] if elastic else [])]
+    material = ELASTIC if elastic else ds.Prony(ELASTIC, [0.3, 0.2], [1e-2, 1e-1])
+    held = dict(fixed={"xmin": "x", "xmax": "xyz"}, motion=lambda t: np.array([0.1 * t, 0.0, 0.0])) if elastic else {}
+    scene = ds.Scene(MESH, material, 1000.0, terms=terms, precision="f32", **held)
+    batch = ds.Batch(ds.VelocityVerletSolver(scene, dt=2e-3, substeps=4), 3, 5, gradients="all", lanes=True)
+    rng = np.random.default_rng(0)
+    own = dict(youngs_modulus=rng.uniform(1e4, 3e4, 5), drag_rate=rng.uniform(0.1, 1, 5))
+    own["initial_velocities"] = 0.1 * rng.normal(size=(5, MESH.num_vertices, 3)) + [0, -1, 0]
+    if elastic:
+        own["friction"] = rng.uniform(0.1, 0.4, 5)
+        own["rest_positions"] = MESH.vertices + 1e-3 * rng.normal(size=(5, *MESH.vertices.shape))
+    check(batch, own, rng, True)
+    frames = batch.forward(**own)
+    seed = np.ones_like(frames.positions)
+    first, again = batch.vjp(frames, seed), batch.vjp(frames, seed)
+    for name, by in first.items():
+        np.testing.assert_array_equal(by, again[name], err_msg=name)
+
+
 def check(batch, own, rng, tangents: bool):
     B = batch.num_scenes
     frames = batch.forward(**own)

@@ -55,6 +55,9 @@ class BatchTapeFace(TapeFace):
         """Values of inputs from their fields, as `Batch.forward` takes them, those of scenes as `Own`."""
         if self._fields:
             runtime.check_alive(self._program)
+        for name in {split_name(name)[0] for name in self._fields if split_name(name)[1] is not None}:
+            if name in self._fields:
+                raise ValueError(f"{name}: fields of the whole and of named sets were asked for; use one of both")
         out: dict = {}
         for name, field in self._fields.items():
             plain, key = split_name(name)
@@ -69,9 +72,6 @@ class BatchTapeFace(TapeFace):
             if name == "initial_displacements":
                 value = value + self.rollout.one.values["rest_positions"]
             out[SPELLING.get(name, name)] = value if self._shared[name] else Own(value)
-        for name in {split_name(name)[0] for name in self._fields if split_name(name)[1] is not None}:
-            if name in self._fields:
-                raise ValueError(f"{name}: fields of the whole and of named sets were asked for; use one of both")
         return out
 
     def forward(self, k: int | None) -> "BatchFrames":
