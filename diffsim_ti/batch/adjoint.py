@@ -137,9 +137,6 @@ class BatchTangent:
             mass=[d.mass for d in tangents],
             parameters=[np.concatenate([d.parameters, 0 * a.tables]) for d in tangents],
             surface=[np.zeros(a.num_vertices) if d.surface is None else d.surface for d in tangents],
-            rate=[
-                np.atleast_1d(d.parameters[self.features.drag] if self.features.drag >= 0 else 0.0) for d in tangents
-            ],
         )
         for name, arrays in flat.items():
             setattr(self, name, runtime.upload(layout.pack(np.stack([x.ravel() for x in arrays])), layout.number))

@@ -27,7 +27,7 @@ SCENE = dict.fromkeys(("tets", "start", "corner_of", "force_slot", "motion_slot"
 SCENE |= dict.fromkeys(("gradients", "volumes", "coefficients", "parameters", "inverse_mass", "surface"), "scalars")
 SCENE |= dict(rest="vectors", corner="vectors")
 OF_STEPS = dict(forces="vectors2", motion="vectors2", path="vectors2", anchor="vectors")
-CHANGED = dict.fromkeys(("coefficients", "gradients", "volumes", "mass", "parameters", "surface", "rate"), "scalars")
+CHANGED = dict.fromkeys(("coefficients", "gradients", "volumes", "mass", "parameters", "surface"), "scalars")
 ADJOINT = dict.fromkeys(("coefficients", "gradients", "volumes"), "scalars")
 ADJOINT |= dict(corner="vectors", rate_corner="vectors", w="vectors2", sums="scalars2", felt="vectors2")
 SIZES = ("num_items", "num_rows", "num_scenes", "num_vertices")
@@ -163,7 +163,9 @@ class InnermostKernels(ExplicitKernels):
     @traced
     def rated(self, b, tangent, plan):
         """The numbers of a kernel with the change of a scene's drag rate."""
-        return Bundle(**{**vars(plan), "rate_dot": let(at(tangent.rate, b))})
+        drag = self.vertex.features.drag
+        rate = at(tangent.parameters, drag * plan.num_scenes + b) if drag >= 0 else ti.cast(0, self.vertex.fp)
+        return Bundle(**{**vars(plan), "rate_dot": let(rate)})
 
     @ti.func
     def passes_jvp(self, scene: A, state: A, tangent: A, table: A, plan: A):

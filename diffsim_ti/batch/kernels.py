@@ -246,7 +246,11 @@ class BatchKernels:
     @traced
     def rated(self, b, lane, tangent, plan):
         """The numbers of a kernel with the change of a scene's drag rate."""
-        return Bundle(**vars(plan), rate_dot=let(at(at(tangent.rate, b), lane)))
+        drag = self.features.drag
+        rate = (
+            at(at(tangent.parameters, b * plan.num_parameters + drag), lane) if drag >= 0 else ti.cast(0, self.free.fp)
+        )
+        return Bundle(**vars(plan), rate_dot=let(rate))
 
     @ti.func
     def was_calm(self, s, b, i, state: A, plan: A):
@@ -258,7 +262,7 @@ class BatchKernels:
     @cached_property
     def step_jvp(self) -> Kernel:
         """The tangent of pass `first` along recorded slots; the change of the state is advanced in place."""
-        tangent = self.with_state(CHANGE) | CHANGED | OF_STEPS | dict(rate="blocks")
+        tangent = self.with_state(CHANGE) | CHANGED | OF_STEPS
         return self._kernel("step_jvp", self.passes_jvp, dict(state=self.with_state(STATE), tangent=tangent))
 
     # ---- adjoint -----------------------------------------------------------------------------------------------------
