@@ -1,19 +1,20 @@
 """Many scenes of one mesh, law and list of terms, whose numbers differ: forward, gradients and tangents at once."""
 
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.batch.frames import BatchFrames
-from diffsim_ti.batch.set_values import gathered_scenes, spread_scenes
-from diffsim_ti.batch.sweep import LanesSweep, Own, value_of
+from diffsim_ti.batch.given import change_of, checked_values, spread_given
+from diffsim_ti.batch.set_values import gathered_scenes
+from diffsim_ti.batch.sweep import BatchSweep, Own, value_of
+from diffsim_ti.batch.taped import BatchTapeFace
 from diffsim_ti.batch.workspace import why_not
 from diffsim_ti.checked import whole
 from diffsim_ti.copies import made_again
 from diffsim_ti.inputs import Derived
-from diffsim_ti.inputs.description import frozen
 from diffsim_ti.outputs import Output
 from diffsim_ti.rollout.frames import Frames, check_finite
 from diffsim_ti.rollout.rollout import Rollout
@@ -27,9 +28,11 @@ class Batch:
 
     solver, steps, save_every, outputs, gradients, truncate, memory: as of `Rollout`; memory [MB] is that of all scenes.
     scenes: how many, >= 1.
-    lanes: None, eight scenes at once in the lanes of vector units where the scene allows it, else one after the other;
-    True: ValueError, which says why, where it does not; False: one after the other. `lanes` then says which it is, and
-    `why_not` what keeps the scene from lanes.
+    lanes: None, side by side where the scene allows it, else one after the other: eight scenes at once in the lanes of
+    vector units on CPUs, each on threads of its own on GPUs, neighbouring scenes on neighbouring ones. True: ValueError,
+    which says why, where it does not; False: one after the other. `lanes` then says which it is, and `why_not` what keeps
+    the scene from it.
+    runs: as of `Rollout`, for `run` under `ti.ad.Tape`.
 
     Every input of `forward` is given once for all scenes, in a shape that `Rollout.forward` takes, or with one more axis of
     length `scenes` in front. Gradients and tangents of inputs that were given once have their shape, gradients being summed
@@ -66,6 +69,7 @@ class Batch:
         truncate: int | None = None,
         memory: float | None = None,
         lanes: bool | None = None,
+        runs: int | None = None,
     ):
         self.num_scenes = whole("scenes", scenes, 1)
         options = dict(save_every=save_every, gradients=gradients, truncate=truncate, memory=memory)
@@ -77,18 +81,22 @@ class Batch:
             self.one.inputs,
             self.one.wanted,
         )
+        self.frames: BatchFrames | None = None  # of the last `run`
+        self.gradients: dict[str, np.ndarray] = {}
+        self.tape_face = BatchTapeFace(self, runs)
         self.steps, self.save_every, self.num_frames = self.one.steps, self.one.save_every, self.one.num_frames
         self.why_not = why_not(self.solver) or ("an output reads forces of contact" if self.one.sweep.noted else None)
         if lanes and self.why_not:
-            raise ValueError(f"scenes cannot be computed in lanes: {self.why_not}; leave out lanes=True")
+            raise ValueError(f"scenes cannot be computed side by side: {self.why_not}; leave out lanes=True")
         self.lanes = self.why_not is None if lanes is None else bool(lanes)
-        self.sweep = LanesSweep(self.solver, self.steps, self.num_scenes, **options) if self.lanes else None
+        self.sweep = BatchSweep(self.solver, self.steps, self.num_scenes, **options) if self.lanes else None
 
     def __reduce__(self):
-        """As it was made; frames are not in it."""
+        """As it was made; frames and values of its fields are not in it."""
         given = self.one.__reduce__()[1][1]
         names = ("solver", "steps", "save_every", "outputs", "gradients", "truncate", "memory")
         own = {name: given[name] for name in names} | dict(scenes=self.num_scenes, lanes=self._lanes_asked)
+        own["runs"] = self.tape_face.runs
         return made_again, (Batch, own)
 
     @property
@@ -96,58 +104,12 @@ class Batch:
         """What a loss may name, of one scene."""
         return self.one.outputs
 
-    # ---- inputs ------------------------------------------------------------------------------------------------------
-
-    def _spread(self, given: dict, bases: dict) -> tuple[dict, dict]:
-        """(values as arrays, {input given by named sets: (tetrahedra of each, those that scenes have of their own)})"""
-        out, sets = dict(given), {}
-        for name, value in given.items():
-            if isinstance(value, Mapping):
-                base = bases.get(name)
-                out[name], *sets[name] = spread_scenes(self.scene, name, base, value, self.num_scenes)
-        return out, sets
-
-    def _values(self, given: dict) -> dict:
-        """All values of a run: what was given, checked, and the scene's own."""
-        inputs, out = self.scene.inputs, dict(self.one.sweep.values)
-        unknown = [name for name in given if name not in self.inputs]
-        if unknown:
-            raise ValueError(f"no input named {unknown[0]!r}; this batch has {', '.join(self.inputs)}")
-        for name, value in given.items():
-            if self._is_own(name, value := np.asarray(value, np.float64)):
-                rows = [frozen(row) for row in value.copy()]
-                out[name] = Own(inputs.check({name: row})[name] for row in rows)
-            else:
-                known = out[name]
-                same = value.shape == known.shape and np.array_equal(value, known)
-                out[name] = known if same else inputs.check({name: value.copy()})[name]
-            for row in out[name] if isinstance(out[name], Own) else (out[name],):
-                inputs.check_steps({name: row}, self.steps)
-        return out
-
-    def _is_own(self, name: str, value: np.ndarray) -> bool:
-        """Whether a value has the axis of scenes in front."""
-        described, sizes, B = self.scene.inputs.described[name], self.scene.inputs.sizes, self.num_scenes
-        shared = described.fits(value.shape, sizes)
-        own = value.ndim > 0 and len(value) == B and described.fits(value.shape[1:], sizes)
-        exact = sizes | {"steps": self.steps, "steps + 1": self.steps + 1}  # and no rows of forces that no step takes
-        if own and described.fits(value.shape, exact):
-            raise ValueError(
-                f"{name}: shape {value.shape} may be one value for all scenes or one for each of {B}: give the leading axis "
-                f"also if all scenes share it, as np.broadcast_to(x, ({B}, *x.shape))"
-            )
-        if not shared and not own:
-            raise ValueError(
-                f"{name}: expected {described.expected(sizes)}, or the same behind an axis of {B} scenes, got {value.shape}"
-            )
-        return own
-
     # ---- forward -----------------------------------------------------------------------------------------------------
 
     def forward(self, raise_errors: bool = False, **inputs: ArrayLike) -> BatchFrames:
         """Run all scenes, with some inputs replaced. raise_errors: raise what stopped the first one that died."""
-        inputs, sets = self._spread(inputs, self.one.sweep.values)
-        values = self._values(inputs)
+        inputs, sets = spread_given(self.scene, inputs, self.one.values, self.num_scenes)
+        values = checked_values(self.one, inputs, self.num_scenes)
         run = (self._in_lanes if self.lanes else self._by_turns)(values)
         run.sets = sets
         dead = np.flatnonzero(~run.alive)
@@ -305,9 +267,9 @@ class Batch:
         if unknown:
             raise ValueError(f"tangents: no input named {unknown[0]!r}; this batch has {', '.join(self.inputs)}")
         zero = {name: np.zeros_like(value_of(frames.values[name], 0)) for name in tangents}
-        tangents, _ = self._spread(tangents, zero)
+        tangents, _ = spread_given(self.scene, tangents, zero, self.num_scenes)
         own = [
-            {name: self._row(name, x, frames.values[name], b) for name, x in tangents.items()}
+            {name: change_of(x, frames.values[name], b, self.num_scenes) for name, x in tangents.items()}
             for b in range(self.num_scenes)
         ]
         if not self.lanes:
@@ -319,9 +281,31 @@ class Batch:
             rows = [self.one.changes_of(frames[b], du[b], dv[b], own[b]) for b in range(self.num_scenes)]
         return {name: np.stack([row[name] for row in rows]) for name in self.outputs}
 
-    def _row(self, name: str, tangent, value, b: int) -> np.ndarray:
-        """The change of scene b's value: that of the shared one, or its own."""
-        tangent, shape = np.asarray(tangent, np.float64), np.shape(value_of(value, b))
-        if isinstance(value, Own) or tangent.shape == (self.num_scenes, *shape):
-            return np.broadcast_to(tangent, (self.num_scenes, *shape))[b]
-        return np.broadcast_to(tangent, shape)
+    # ---- under ti.ad.Tape --------------------------------------------------------------------------------------------
+
+    def field(self, name: str, shared: bool = False):
+        """The Taichi field of an input or of an output ("positions", "velocities", ...), with .grad, as of `Rollout.field`.
+
+        Fields of outputs have shape (scenes, frames, num_vertices), and (runs, scenes, ...) in a Batch of several `runs`;
+        those of inputs have the axis of scenes in front, or are `shared` by all, whose .grad is then the sum over scenes.
+        Raises ValueError for a field that is already there in the other way.
+        """
+        return self.tape_face.field(name, shared)
+
+    @property
+    def positions(self):
+        """Taichi field of the frames' positions [m], (scenes, frames, num_vertices) of 3-vectors, with .grad."""
+        return self.field("positions")
+
+    @property
+    def velocities(self):
+        """Taichi field of the frames' velocities [m/s], (scenes, frames, num_vertices) of 3-vectors, with .grad."""
+        return self.field("velocities")
+
+    def run(self, k: int | None = None) -> None:
+        """Run all scenes from the input fields and fill those of outputs, also in a `ti.ad.Tape`, as `Rollout.run` does.
+
+        `frames` are then those of this run, which say what is `alive`; `gradients` has sums over the runs of a tape, those
+        by named sets under their fields' names, "youngs_modulus[soft]".
+        """
+        self.tape_face.run(k)

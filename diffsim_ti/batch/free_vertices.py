@@ -247,7 +247,7 @@ class FreeVertices:
         du_next = [let(x + now.alpha * y) for x, y in zip(du, dv_plus)]
         dv_next = [let(now.decay * y) for y in dv_plus]
         if F.drag >= 0:
-            rate = let(at(tangent.rate, b))
+            rate = let(at(tangent.parameters, b * plan.num_parameters + F.drag))
             v_plus = [let(x / now.decay) for x in self.read(state.v, let(s + 1), first)]
             du_next = [let(x + now.alpha_by_rate * rate * y) for x, y in zip(du_next, v_plus)]
             dv_next = [let(x + now.decay_by_rate * rate * y) for x, y in zip(dv_next, v_plus)]

@@ -11,7 +11,7 @@ from functools import cached_property, lru_cache
 import taichi as ti
 
 from diffsim_ti.batch.free_vertices import FreeVertices
-from diffsim_ti.batch.views import Corners, Item, Scratch, Shared, TetrahedronOfScenes, Uniform, Vectors, View
+from diffsim_ti.batch.views import Corners, Item, Scratch, Shared, TetrahedronOfEight, Uniform, Vectors, View
 from diffsim_ti.elements.tetrahedron import Onwards
 from diffsim_ti.runtime import LANES, Bundle, Kernel, at, let, traced
 from diffsim_ti.solvers.explicit.kick_drift import KickDrift
@@ -37,14 +37,14 @@ NUMBERS = dict.fromkeys((*SIZES, "window", "first", "count", "base"), "int") | d
 
 
 @dataclass(frozen=True)
-class KickDriftOfScenes(KickDrift):
+class KickDriftOfEight(KickDrift):
     """As KickDrift, whose tetrahedra are those of eight scenes, and whose energy nobody follows."""
 
     counts_work = False
 
     @cached_property
     def element(self):
-        return TetrahedronOfScenes(self.law, self.features.uniform, True, self.features.order)
+        return TetrahedronOfEight(self.law, self.features.uniform, True, self.features.order)
 
 
 @dataclass(frozen=True)
@@ -56,15 +56,15 @@ class BatchKernels:
     own: frozenset
 
     @cached_property
-    def vertex(self) -> KickDriftOfScenes:
-        return KickDriftOfScenes(self.law, self.features, True)
+    def vertex(self) -> KickDriftOfEight:
+        return KickDriftOfEight(self.law, self.features, True)
 
     @cached_property
     def free(self) -> FreeVertices:
         return FreeVertices(self.law, self.features, self.own)
 
     @property
-    def element(self) -> TetrahedronOfScenes:
+    def element(self) -> TetrahedronOfEight:
         return self.vertex.element
 
     # ---- arrays ------------------------------------------------------------------------------------------------------
@@ -248,7 +248,11 @@ class BatchKernels:
     @traced
     def rated(self, b, lane, tangent, plan):
         """The numbers of a kernel with the change of a scene's drag rate."""
-        return Bundle(**vars(plan), rate_dot=let(at(at(tangent.rate, b), lane)))
+        drag = self.features.drag
+        rate = (
+            at(at(tangent.parameters, b * plan.num_parameters + drag), lane) if drag >= 0 else ti.cast(0, self.free.fp)
+        )
+        return Bundle(**vars(plan), rate_dot=let(rate))
 
     @ti.func
     def was_calm(self, s, b, i, state: A, plan: A):
@@ -260,7 +264,7 @@ class BatchKernels:
     @cached_property
     def step_jvp(self) -> Kernel:
         """The tangent of pass `first` along recorded slots; the change of the state is advanced in place."""
-        tangent = self.with_state(CHANGE) | CHANGED | OF_STEPS | dict(rate="blocks")
+        tangent = self.with_state(CHANGE) | CHANGED | OF_STEPS
         return self._kernel("step_jvp", self.passes_jvp, dict(state=self.with_state(STATE), tangent=tangent))
 
     # ---- adjoint -----------------------------------------------------------------------------------------------------

@@ -1,11 +1,10 @@
-"""n steps of many scenes in lanes: forward, in reverse from kept states, and in tangents."""
+"""n steps of many scenes side by side: forward, in reverse from kept states, and in tangents."""
 
 import numpy as np
 
 from diffsim_ti import runtime
-from diffsim_ti.batch.adjoint import LanesAdjoint, LanesTangent
-from diffsim_ti.batch.lanes import vectors
-from diffsim_ti.batch.workspace import LanesWorkspace
+from diffsim_ti.batch.adjoint import BatchAdjoint, BatchTangent
+from diffsim_ti.batch.workspace import BatchWorkspace
 from diffsim_ti.inputs import Derived
 from diffsim_ti.rollout.checkpoints import choose_checkpoints
 from diffsim_ti.rollout.run import Run
@@ -25,7 +24,7 @@ def value_of(value, b: int) -> np.ndarray:
 class FrameByFrame:
     """Takes scenes from frame to frame and notes when one of them gets onto or behind an obstacle."""
 
-    def __init__(self, workspace: LanesWorkspace):
+    def __init__(self, workspace: BatchWorkspace):
         self.ws = workspace
         self.restart()
 
@@ -45,21 +44,21 @@ class FrameByFrame:
                 stop = max(stop, first + 1)
             ws.advance(first, stop, num_passes, save_every, 0 if recording else None)
             if contacts:
-                gaps = ws.seen()[:, ::3].min((1, 2))
-                for b in np.flatnonzero(gaps <= 0):
+                for b in np.flatnonzero(ws.smallest_gaps() <= 0):
                     self.crossed.setdefault(int(b), first)
             first = stop
         if recording:
             ws.restore(ws.record, last)
 
 
-class LanesSweep(Sweep):
+class BatchSweep(Sweep):
     """Runs of many scenes; values are arrays that all share, or `Own`."""
 
     def __init__(self, solver, steps: int, num_scenes: int, memory: float | None = None, **options):
         super().__init__(solver, steps, memory=memory, **options)
         self.num_scenes = num_scenes
-        held = runtime.LANES * -(-num_scenes // runtime.LANES) / 4 * 3  # vectors of three, of whole blocks
+        whole = -(-num_scenes // runtime.LANES) * runtime.LANES  # in blocks, of vectors of three; else of four
+        held = whole / 4 * 3 if runtime.runs_on_cpu() else num_scenes
         self.checkpoints = choose_checkpoints(
             self.num_passes, int(self.state_bytes * held), None, memory, self.checkpoints.law_state
         )
@@ -75,16 +74,16 @@ class LanesSweep(Sweep):
         return [self.scene.inputs.derive(self.values_of(values, b)) for b in range(self.num_scenes)]
 
     def _make_workspace(self, derived):
-        return LanesWorkspace(self.solver, derived)
+        return BatchWorkspace(self.solver, derived)
 
     def _make_guard(self):
         return FrameByFrame(self.workspace)
 
     def _make_adjoint(self, density: bool, shape: bool):
-        return LanesAdjoint(self.workspace, density, shape)
+        return BatchAdjoint(self.workspace, density, shape)
 
     def _make_tangent(self, change):
-        return LanesTangent(self.workspace, change)
+        return BatchTangent(self.workspace, change)
 
     def run(self, values: dict, start=None) -> Run:
         """Run from values that are complete and checked."""
@@ -94,8 +93,8 @@ class LanesSweep(Sweep):
 
     def states(self) -> tuple[np.ndarray, np.ndarray]:
         """Displacements and velocities of the frames of the last run, (scenes, frames, n, 3)."""
-        frames = self.workspace.frames
-        return vectors(frames.frames_u, self.num_scenes), vectors(frames.frames_v, self.num_scenes)
+        ws = self.workspace
+        return ws.layout.unpack_vectors(ws.frames.frames_u), ws.layout.unpack_vectors(ws.frames.frames_v)
 
     def crossed(self) -> dict[int, int]:
         """{scene: the step in which it got behind an obstacle}"""
@@ -117,7 +116,7 @@ class LanesSweep(Sweep):
             out.displacement[:], out.velocity[:] = 0, 0
         return out
 
-    def put(self, adjoint: LanesAdjoint, last_frame_is_state: bool) -> tuple[float, float]:
+    def put(self, adjoint: BatchAdjoint, last_frame_is_state: bool) -> tuple[float, float]:
         """Set the adjoint to the seed."""
         adjoint.start(*self._seed, last_frame_is_state)
         return 0.0, 0.0

@@ -1,8 +1,6 @@
-"""One scene of a batch as Taichi functions of a single scene see it, and the tetrahedra of eight scenes at once.
+"""One scene of a batch as Taichi functions of a single scene see it, and the tetrahedra of a batch.
 
-Numbers that scenes have of their own lie in lanes: element b n + k of an array of vectors of eight holds number k of the
-scenes 8 b .. 8 b + 7, of which each has n. Vectors of vertices are three such numbers. What all scenes share lies as it
-does for one scene.
+Numbers that scenes have of their own lie as batch/layouts.py says; what all scenes share lies as it does for one scene.
 """
 
 from dataclasses import dataclass
@@ -10,6 +8,7 @@ from functools import cached_property
 
 import taichi as ti
 
+from diffsim_ti.batch.layouts import APART
 from diffsim_ti.elements.items import Items
 from diffsim_ti.elements.tetrahedron import Tetrahedron
 from diffsim_ti.runtime import LANES, Expr, assign, at, let, traced
@@ -65,17 +64,12 @@ class Vectors(View):
 
 @traced
 class Scratch:
-    """What is noted of one vertex while it is worked on: `array[row, i]` for any i, in a column of its block.
-
-    Columns lie APART from each other, so that threads do not wait for each other's cache lines.
-    """
-
-    APART = 16
+    """What is noted of one vertex while it is worked on: `array[row, i]` for any i, in a column of its block."""
 
     _data_oriented = True
 
     def __init__(self, array, b):
-        self._array, self._column = array, let(b * self.APART)
+        self._array, self._column = array, let(b * APART)
 
     def __getitem__(self, index):
         return at(self._array, *([index[0]] if isinstance(index, tuple) else []), self._column)
@@ -91,9 +85,65 @@ class Item:
         self.e, self.b, self.vertices, self.tetrahedra = e, b, vertices, tetrahedra
 
 
+@traced
+class ItemOfScene:
+    """Tetrahedron e of scene b, of `count` scenes."""
+
+    _data_oriented = True
+
+    def __init__(self, e, b, count):
+        self.e, self.b, self.count = e, b, count
+
+
+@traced
+class Column:
+    """Numbers or vectors of scene b where scenes are innermost, `count` of them: `array[k]`, or `array[slot, k]`."""
+
+    _data_oriented = True
+
+    def __init__(self, array, b, count):
+        self._array, self._b, self._count = array, b, count
+
+    def __getitem__(self, index):
+        *slot, k = index if isinstance(index, tuple) else (index,)
+        return at(self._array, *slot, k * self._count + self._b)
+
+
 @dataclass(frozen=True)
-class Scenes(Items):
-    """Tetrahedra of eight scenes at once; an item is an `Item`."""
+class ItemsOfScenes(Items):
+    """Tetrahedra whose numbers scenes share (`Shared`), have one set of for all (`Uniform`), or have of their own.
+
+    place(rows, item, k): where number k of the `rows` that the item has lies; uniform_place: likewise of one set for all.
+    """
+
+    def numbers(self, array, first: int, count: int, rows: int, item):
+        wanted = range(first, first + count)
+        if isinstance(array, Shared):
+            return [self.broadcast(let(at(array.array, rows * item.e + k))) for k in wanted]
+        place = self.uniform_place if isinstance(array, Uniform) else self.place
+        array = array.array if isinstance(array, Uniform) else array
+        return [let(at(array, place(rows, item, k))) for k in wanted]
+
+    def row(self, array, slot, first: int, count: int, rows: int, item):
+        return [let(at(array, slot, self.place(rows, item, k))) for k in range(first, first + count)]
+
+    def put_row(self, array, slot, first: int, rows: int, item, numbers):
+        for k, number in enumerate(numbers, first):
+            assign(at(array, slot, self.place(rows, item, k)), number)
+
+    def put(self, array, rows: int, item, first, numbers):
+        for k, number in enumerate(numbers, first):
+            assign(at(array, self.place(rows, item, k)), number)
+
+    def add(self, array, rows: int, item, numbers, first: int = 0):
+        for k, number in enumerate(numbers, first):
+            target = at(array, self.place(rows, item, k))
+            assign(target, target + number)
+
+
+@dataclass(frozen=True)
+class EightScenes(ItemsOfScenes):
+    """A tetrahedron of eight scenes at once; an item is an `Item`."""
 
     @cached_property
     def lanes(self):
@@ -102,19 +152,11 @@ class Scenes(Items):
     def broadcast(self, number):
         return let(self.lanes(*[number] * LANES))
 
-    def numbers(self, array, first: int, count: int, rows: int, item):
-        if isinstance(array, Shared):
-            return [self.broadcast(let(at(array.array, rows * item.e + first + k))) for k in range(count)]
-        if isinstance(array, Uniform):
-            return [let(at(array.array, rows * item.b + first + k)) for k in range(count)]
-        return [let(at(array, rows * (item.tetrahedra + item.e) + first + k)) for k in range(count)]
+    def place(self, rows: int, item, k):
+        return rows * (item.tetrahedra + item.e) + k
 
-    def row(self, array, slot, first: int, count: int, rows: int, item):
-        return [let(at(array, slot, rows * (item.tetrahedra + item.e) + first + k)) for k in range(count)]
-
-    def put_row(self, array, slot, first: int, rows: int, item, numbers):
-        for k, number in enumerate(numbers):
-            assign(at(array, slot, rows * (item.tetrahedra + item.e) + first + k), number)
+    def uniform_place(self, rows: int, item, k):
+        return rows * item.b + k
 
     def places(self, tets, item):
         """Where the vector of each node begins."""
@@ -130,14 +172,29 @@ class Scenes(Items):
                 target = at(corner.array, place + d)
                 assign(target, target + force[d])
 
-    def put(self, array, rows: int, item, first, numbers):
-        for k, number in enumerate(numbers):
-            assign(at(array, rows * (item.tetrahedra + item.e) + first + k), number)
 
-    def add(self, array, rows: int, item, numbers, first: int = 0):
-        for k, number in enumerate(numbers):
-            target = at(array, rows * (item.tetrahedra + item.e) + first + k)
-            assign(target, target + number)
+@dataclass(frozen=True)
+class OneScene(ItemsOfScenes):
+    """A tetrahedron of one scene, where scenes are innermost; an item is an `ItemOfScene`."""
+
+    def broadcast(self, number):
+        return number
+
+    def place(self, rows: int, item, k):
+        return (rows * item.e + k) * item.count + item.b
+
+    def uniform_place(self, rows: int, item, k):
+        return k * item.count + item.b
+
+    def corners(self, vectors, slot, tets, item):
+        nodes = (let(at(tets, self.nodes * item.e + a)) for a in range(self.nodes))
+        whole = [let(at(vectors, slot, node * item.count + item.b)) for node in nodes]
+        return [[let(at(w, d)) for d in range(3)] for w in whole]
+
+    def store(self, corner, item, forces, zero, add: bool = False):
+        """To corners of their own, which vertices gather: other threads work on the same scene."""
+        for a in range(self.nodes):
+            self.put_force(at(corner, self.place(self.nodes, item, a)), self.vector(*forces[a], zero), add)
 
 
 @traced
@@ -172,16 +229,21 @@ class Corners:
 
 @dataclass(frozen=True)
 class TetrahedronOfScenes(Tetrahedron):
-    """Functions of one tetrahedron of eight scenes."""
+    """Functions of one tetrahedron: of eight scenes in lanes, or of one."""
 
     @cached_property
-    def items(self) -> Scenes:
-        return Scenes(self.fp, self.nodes.count)
+    def items(self) -> ItemsOfScenes:
+        return (EightScenes if self.lanes else OneScene)(self.fp, self.nodes.count)
 
     @traced
     def coefficients_of(self, item, array) -> list:
         K = len(self.law.coefficient_names)
         return self.items.numbers(array, 0, K, K, item)
+
+
+@dataclass(frozen=True)
+class TetrahedronOfEight(TetrahedronOfScenes):
+    """The same, which adds to vertices themselves."""
 
     @ti.func
     def gather(self, i, scene: A, corner: A):

@@ -1,4 +1,4 @@
-"""A run of many scenes in lanes: their numbers and states on the device, and the launches that take them on."""
+"""A run of many scenes side by side: their numbers and states on the device, and the launches that take them on."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -9,9 +9,10 @@ import taichi as ti
 
 from diffsim_ti import runtime
 from diffsim_ti.batch.free_vertices import NEAR, SPECIAL
+from diffsim_ti.batch.history import BatchHistory
+from diffsim_ti.batch.innermost_kernels import InnermostKernels, innermost_kernels
 from diffsim_ti.batch.kernels import SHARED, BatchKernels, batch_kernels
-from diffsim_ti.batch.lanes import LanesHistory, in_slots, num_blocks, pack, unpack
-from diffsim_ti.batch.views import Scratch
+from diffsim_ti.batch.layouts import Innermost, Lanes, in_slots
 from diffsim_ti.inputs import Derived
 from diffsim_ti.solvers.explicit.contact_stage import ROWS
 from diffsim_ti.solvers.explicit.felt_faces import feels_faces
@@ -21,17 +22,13 @@ from diffsim_ti.state.pass_table import FLOATS, INTS, PassTable
 from diffsim_ti.state.solve_report import SolveReport
 from diffsim_ti.terms import SelfContact
 
-SPREAD = 1024  # items of a loop at least, for Taichi keeps fewer on one thread
-
 
 def why_not(solver) -> str | None:
-    """What keeps scenes of a solver from being computed in lanes, or None if nothing does."""
+    """What keeps scenes of a solver from being computed side by side, or None if nothing does."""
     scene = solver.scene
     if not solver.explicit:
         return "the solver is not explicit"
-    if not runtime.runs_on_cpu():
-        return "lanes are for CPUs"
-    if not scene.law.lanes:
+    if runtime.runs_on_cpu() and not scene.law.lanes:
         return f"the law of {type(scene.material).__name__} does not come in lanes"
     if scene.volume != "tetrahedra":
         return f"volume = {scene.volume!r}"
@@ -48,13 +45,13 @@ def _tables(scene) -> bool:
 
 
 class ScenesTable(PassTable):
-    """Tables of passes; where scenes have drag of their own, `floats` are those of one scene after the other in lanes."""
+    """Tables of passes; where scenes have drag of their own, `floats` are numbers of scenes."""
 
-    def __init__(self, fp, own: bool, blocks: int):
+    def __init__(self, fp, own: bool, layout: Lanes | Innermost):
         super().__init__(fp)
-        self.own, self._numbers = own, None
+        self.own, self._layout, self._numbers = own, layout, None
         if own:
-            self.floats = runtime.array(ti.types.vector(runtime.LANES, fp), blocks * self.size * len(FLOATS))
+            self.floats = layout.numbers(self.size * len(FLOATS))
 
     def show_scenes(self, window: int, run: tuple, rates: tuple, make: Callable) -> None:
         """As `show`, for the drag rates of all scenes [1/s]."""
@@ -69,29 +66,28 @@ class ScenesTable(PassTable):
             for row, (_, numbers) in zip(floats, tables):
                 row[: numbers.size] = numbers.ravel()
             runtime.fill(self.ints, ints)
-            runtime.fill(self.floats, pack(floats))
+            runtime.fill(self.floats, self._layout.pack(floats))
 
 
-class LanesWorkspace:
-    """Scenes of one mesh, law and list of terms, eight in the lanes of a block; numbers may differ from scene to scene."""
+class BatchWorkspace:
+    """Scenes of one mesh, law and list of terms, side by side in a layout; numbers may differ from scene to scene."""
 
     first_step = 0
 
     def __init__(self, solver, derived: list[Derived]):
         self.solver, self.scene, self.report = solver, solver.scene, SolveReport()
-        self.num_scenes, self.num_blocks = len(derived), num_blocks(len(derived))
-        self.arrays = SceneArrays(self.scene, solver.stages_contact, False, True)
-        self.lanes, self.fp, self.substep = self.arrays.lanes, self.arrays.fp, solver.substep
-        self.num_rows = self.num_blocks * self.arrays.num_vertices
+        self.num_scenes, self.arrays = len(derived), SceneArrays(self.scene, solver.stages_contact, False, True)
+        self.layout = (Lanes if runtime.runs_on_cpu() else Innermost)(self.scene.precision, self.num_scenes)
+        self.fp, self.substep = self.arrays.fp, solver.substep
+        self.in_parallel = 1 if self.layout.in_lanes else solver.passes_per_launch()
         self.numbers, self.frames, self.record, self._launches = None, None, None, {}
         self.load(derived, start=False)
-        self.state = LanesHistory(self, 1)
-        contacts = len(self.arrays.contacts)
-        rows = self.num_rows if contacts else 1
+        self.state = BatchHistory(self, 1)
+        contacts, n = len(self.arrays.contacts), self.arrays.num_vertices
         self.met = SimpleNamespace(
-            seen=runtime.array(self.lanes, 3 * contacts, rows),
-            stage=runtime.array(self.arrays.vector, ROWS * contacts, Scratch.APART * self.num_blocks),
-            work=runtime.array(self.fp, Scratch.APART * self.num_blocks),
+            seen=self.layout.numbers(3 * contacts, n if contacts else 1),
+            stage=runtime.array(self.arrays.vector, *self.layout.scratch(ROWS * contacts, n if contacts else 1)),
+            work=runtime.array(self.fp, self.layout.scratch(1, n)[1]),
         )
         self.restart()
 
@@ -120,7 +116,7 @@ class LanesWorkspace:
         self.own, self.kernels_of_run = frozenset(own), None
         sources = self._sources(derived)
         if self.numbers is None:
-            self.numbers = SimpleNamespace(corner=runtime.array(self.lanes, 3 * self.num_rows))
+            self.numbers = SimpleNamespace(corner=self.room_for_corners())
             runtime.fill(self.numbers.corner, 0)
         for name, (data, dtype) in sources.items():
             current = getattr(self.numbers, name, None)
@@ -130,7 +126,7 @@ class LanesWorkspace:
             else:
                 runtime.fill(current, data)
         if getattr(self, "table", None) is None or self.table.own != ("table" in own):
-            self.table = ScenesTable(self.fp, "table" in own, self.num_blocks)
+            self.table = ScenesTable(self.fp, "table" in own, self.layout)
             self._launches.clear()
         if start:
             self.restart()
@@ -147,22 +143,16 @@ class LanesWorkspace:
 
     def _sources(self, derived: list[Derived]) -> dict:
         """{name: (data, element type)} of what kernels read of the scenes."""
-        a, own, first = self.arrays, self.own, derived[0]
+        a, own, first, layout = self.arrays, self.own, derived[0], self.layout
         numbers = [np.concatenate([d.parameters, a.tables]) for d in derived]
         out = dict(
             tets=(a.mesh.elements.ravel(), ti.i32),
-            special=(self._special(), ti.i32),
-            coefficients=(pack(np.stack([d.coefficients.ravel() for d in derived])), self.lanes),
-            parameters=(pack(np.stack(numbers)), self.lanes),
+            coefficients=(layout.pack(np.stack([d.coefficients.ravel() for d in derived])), layout.number),
+            parameters=(layout.pack(np.stack(numbers)), layout.number),
         )
+        if layout.in_lanes:
+            out["special"] = self._special(), ti.i32
         self.num_parameters = len(numbers[0])
-        if a.features().guided:
-            out["guide_slot"], out["guides"] = (
-                (runtime.fetch(a.guide_slot), ti.i32),
-                (runtime.fetch(a.guides), a.vector),
-            )
-        out["force_slot"] = runtime.fetch(a.force_slot), ti.i32
-        out["motion_slot"] = runtime.fetch(a.motion_slot), ti.i32
         each = dict(
             gradients=[d.gradients for d in derived],
             volumes=[d.volumes for d in derived],
@@ -172,21 +162,28 @@ class LanesWorkspace:
         )
         for name, arrays in each.items():
             if name in own:
-                out[name] = pack(np.stack([x.ravel() for x in arrays])), self.lanes
+                out[name] = self._packed(arrays, SHARED[name])
             else:
                 plain = SHARED[name] == "scalars"
                 out[name] = (arrays[0].ravel(), self.fp) if plain else (arrays[0], a.vector)
         none = np.zeros((1, 1, 3))
         anchors = [d.displacement[a.held] if d.motion is not None else none[0] for d in derived]
-        out["anchor"] = pack(np.stack([x.ravel() for x in anchors])), self.lanes
+        out["anchor"] = self._packed(anchors, "vectors")
         self.counts = {}
         for name in ("forces", "motion", "path"):
             rows = [none if getattr(d, name) is None else getattr(d, name) for d in derived]
-            out[name], self.counts[name] = (pack(in_slots(rows)), self.lanes), rows[0].shape[1]
+            out[name], self.counts[name] = (layout.pack_vectors(in_slots(rows)), layout.vector), rows[0].shape[1]
         self.num_step_rows = max((len(x) for x in (first.path, first.motion) if x is not None), default=1)
         if self.num_step_rows == 1 and (a.features().forces_keyed or a.features().moving):
             self.num_step_rows = max(1 + len(d.forces) for d in derived if d.forces is not None)
         return out
+
+    def _packed(self, arrays: list[np.ndarray], kind: str) -> tuple:
+        """(data, element type) of what each scene has: vectors, or else numbers."""
+        whole, layout = np.stack(arrays), self.layout
+        if kind == "vectors":
+            return layout.pack_vectors(whole), layout.vector
+        return layout.pack(whole.reshape(len(whole), -1)), layout.number
 
     def _special(self) -> np.ndarray:
         a, features = self.arrays, self.arrays.features()
@@ -204,31 +201,39 @@ class LanesWorkspace:
     def some_special(self) -> bool:
         return self.kernels(self.arrays.features()).free.some_special
 
-    def kernels(self, features) -> BatchKernels:
-        return batch_kernels(self.arrays.law, features, self.own)
+    def kernels(self, features) -> BatchKernels | InnermostKernels:
+        law = self.arrays.law
+        if self.layout.in_lanes:
+            return batch_kernels(law, features, self.own)
+        return innermost_kernels(law, features, self.own, self.in_parallel > 1)
 
     @property
     def law_rows(self) -> int:
-        """How many rows of lanes the law's states take."""
+        """How many numbers of its tetrahedra the law of a scene remembers."""
         a = self.arrays
-        return len(a.law.state_names) * a.points * a.num_tetrahedra * self.num_blocks
+        return len(a.law.state_names) * a.points * a.num_tetrahedra
 
     def initial_states(self) -> np.ndarray:
         law = self.arrays.law
         initial = law.initial_state or (0.0,) * len(law.state_names)
         rows = np.tile(initial, self.law_rows // len(initial))
-        return np.repeat(rows[:, None], runtime.LANES, 1)[None]
+        return self.layout.pack(np.broadcast_to(rows, (self.num_scenes, 1, len(rows))))
+
+    def room_for_corners(self):
+        """For forces that tetrahedra hand to vertices: at these, or, where threads share scenes, at their own corners."""
+        a = self.arrays
+        return self.layout.vectors(a.num_vertices if self.layout.in_lanes else a.nodes * a.num_tetrahedra)
 
     # ---- states ------------------------------------------------------------------------------------------------------
 
-    def history(self, num_slots: int) -> LanesHistory:
-        return LanesHistory(self, num_slots)
+    def history(self, num_slots: int) -> BatchHistory:
+        return BatchHistory(self, num_slots)
 
     def restart(self) -> None:
         """Set the states to the start."""
         for target, name in ((self.state.u, "displacement"), (self.state.v, "velocity")):
-            starts = np.stack([getattr(d, name).ravel() for d in self.derived])
-            runtime.fill(target, pack(starts)[None])
+            starts = np.stack([getattr(d, name) for d in self.derived])
+            runtime.fill(target, self.layout.pack_vectors(starts[:, None]))
         if self.state.z is not None:
             runtime.fill(self.state.z, self.initial_states())
         seen = np.zeros(runtime.full_shape(self.met.seen))
@@ -240,22 +245,22 @@ class LanesWorkspace:
         self._launches.clear()
 
     def room_for_frames(self, count: int) -> SimpleNamespace:
-        u, v = (runtime.array(self.lanes, count, 3 * self.num_rows) for _ in range(2))
+        u, v = (self.layout.vectors(count, self.arrays.num_vertices) for _ in range(2))
         return SimpleNamespace(frames_u=u, frames_v=v)
 
-    def make_record(self, num_slots: int) -> LanesHistory:
+    def make_record(self, num_slots: int) -> BatchHistory:
         if self.record is None or self.record.num_slots < num_slots:
-            self.record = LanesHistory(self, num_slots, record=True)
+            self.record = BatchHistory(self, num_slots, record=True)
             self._launches.clear()
         return self.record
 
     def restore_to_record(self) -> None:
         self.save(self.record, 0)
 
-    def save(self, target: LanesHistory, slot: int) -> None:
+    def save(self, target: BatchHistory, slot: int) -> None:
         self.state.copy(0, target, slot)
 
-    def restore(self, source: LanesHistory, slot: int) -> None:
+    def restore(self, source: BatchHistory, slot: int) -> None:
         source.copy(slot, self.state, 0)
 
     def save_frame(self, frame: int) -> None:
@@ -266,7 +271,16 @@ class LanesWorkspace:
         """What each scene's contacts did: (scenes, 3 contacts, vertices), as in state/watch.py."""
         if not self.arrays.contacts:
             return np.zeros((self.num_scenes, 0, 0))
-        return unpack(runtime.fetch(self.met.seen), self.num_scenes)
+        return self.layout.unpack(self.met.seen)
+
+    def smallest_gaps(self) -> np.ndarray:
+        """Of each scene, to any obstacle so far, (scenes,) [m]."""
+        host = runtime.view(self.met.seen)
+        if host is not None:
+            return self.seen()[:, ::3].min((1, 2))
+        gaps = runtime.array(self.fp, self.num_scenes)
+        _smallest_gaps(self.met.seen, gaps)
+        return runtime.fetch(gaps)
 
     # ---- launches ----------------------------------------------------------------------------------------------------
 
@@ -274,26 +288,29 @@ class LanesWorkspace:
         parts = [part for record in records.values() for part in (record if type(record) is tuple else (record,))]
         key = (kernel, *map(id, parts))
         if key not in self._launches:
-            self._launches[key] = kernel.bind(True, scene=self.numbers, table=self.table, **records), parts
+            records |= dict(table=self.table) if "table" in kernel.arrays else {}
+            scene = (self.numbers, self.arrays)  # what is topology alone
+            self._launches[key] = kernel.bind(self.layout.in_lanes, scene=scene, **records), parts
         return self._launches[key][0]
 
     def launches(self, first: int, last: int, num_passes: int, save_every: int, backwards: bool = False) -> Iterator:
         """Numbers of the launches that passes first .. last - 1 take, for each of which their table is shown."""
         a, solver, schedule = self.arrays, self.solver, self.solver.schedule
-        spread = max(1, -(-SPREAD // self.num_blocks))
-        sizes = dict(
-            num_tetrahedra=a.num_tetrahedra, num_vertices=a.num_vertices, num_blocks=self.num_blocks, spread=spread
-        )
+        sizes = dict(num_tetrahedra=a.num_tetrahedra, num_vertices=a.num_vertices)
+        sizes |= self.layout.counts(a.num_tetrahedra, a.num_vertices)
         sizes |= dict(num_loaded=self.counts["forces"], num_held=self.counts["motion"])
         sizes |= dict(num_parameters=self.num_parameters, num_passes_shown=self.table.size)
         sizes |= dict(contact_damping=solver.contact_damping)
         run, turn = (num_passes, self.num_step_rows, save_every, schedule), -1 if backwards else 1
-        most = max(1, 16_000_000 // (a.num_tetrahedra * runtime.LANES * self.num_blocks))
+        most = (
+            max(1, 16_000_000 // (a.num_tetrahedra * self.layout.width)) if self.layout.in_lanes else self.in_parallel
+        )
         for window, begin, end in self.table.windows(first, last)[::turn]:
             self.table.show_scenes(window, run, self.rates, lambda f, l, rate: solver.pass_table(f, l, *run[:3], rate))
-            stops = [*range(end, begin, -most), begin][::-1] if backwards else [*range(begin, end, most), end]
+            chunk = -(-(end - begin) // -(-(end - begin) // most))  # launches of one size
+            stops = [*range(end, begin, -chunk), begin][::-1] if backwards else [*range(begin, end, chunk), end]
             for start, stop in list(zip(stops, stops[1:]))[::turn]:
-                yield sizes | dict(window=window, first=start, count=stop - start)
+                yield sizes | dict(window=window, first=start, count=stop - start, times=chunk)
 
     def advance(self, first: int, last: int, num_passes: int, save_every: int = 0, base: int | None = None) -> None:
         """Passes first .. last - 1 from the current states; or recorded: slot j - base holds those before pass j."""
@@ -302,6 +319,17 @@ class LanesWorkspace:
         launch = self.bound(self.kernels(self.arrays.features()).step, state=(history, self.frames, self.met))
         for numbers in self.launches(first, last, num_passes, save_every):
             launch(**numbers, base=base, stride=stride)
+
+
+@ti.kernel
+def _smallest_gaps(seen: ti.types.ndarray(ndim=2), gaps: ti.types.ndarray(ndim=1)):
+    """Rows 0, 3, 6, ... of what contacts did, scenes innermost."""
+    for b in range(gaps.shape[0]):
+        least = seen[0, b]
+        for row in range(seen.shape[0] // 3):
+            for i in range(seen.shape[1] // gaps.shape[0]):
+                least = ti.min(least, seen[3 * row, i * gaps.shape[0] + b])
+        gaps[b] = least
 
 
 def _differ(derived: list[Derived], name: str) -> bool:

@@ -23,7 +23,7 @@ SPELLING = {"initial_displacements": "initial_positions"}  # less the rest posit
 
 
 class TapeFace:
-    """Fields of inputs and outputs of a Rollout, and which of its runs the present tape holds.
+    """Fields of inputs and outputs of a Rollout, and which of its runs the present tape holds (of a Batch: batch/taped.py).
 
     Frames (but not on Vulkan) and, where nothing else depends on them, initial positions and velocities are copied on the
     device; so are, with explicit solvers, the gradients by frames. All other inputs are small: they are checked and prepared
@@ -44,6 +44,11 @@ class TapeFace:
     def rollout(self):
         return self._rollout()
 
+    @property
+    def word(self) -> str:
+        """What it is, in words."""
+        return type(self.rollout).__name__.lower()
+
     # ---- fields -----------------------------------------------------------------------------------------------------
 
     def field(self, name: str):
@@ -54,8 +59,8 @@ class TapeFace:
         if name not in self._fields:
             rollout = self.rollout
             if name in rollout.outputs:
-                rows = () if self.runs is None else (self.runs,)
-                self._fields[name] = self._take((*rows, *rollout.outputs[name].shape(rollout.num_frames)))
+                shape = tuple(rollout.outputs[name].shape(rollout.num_frames))
+                self._fields[name] = self._take(shape, self._output_rows())
             elif split_name(name)[1] is not None:
                 self._fields[name] = self._field_of_set(name)
             elif SPELLING.get(name, name) in rollout.inputs:
@@ -67,11 +72,9 @@ class TapeFace:
                     raise ValueError(
                         "with rest_positions, use initial_positions: displacements are those from the mesh"
                     )
-                value = self._loaded(name)
-                self._fields[name] = self._take(value.shape)
-                self._fields[name].from_numpy(np.asarray(value, self.number))
+                self._fields[name] = self._filled(name, self._loaded(name))
             else:
-                raise ValueError(f"no input named {name!r}; this rollout has {', '.join(rollout.inputs)}")
+                raise ValueError(f"no input named {name!r}; this {self.word} has {', '.join(rollout.inputs)}")
         return self._fields[name]
 
     def _field_of_set(self, name: str):
@@ -79,9 +82,7 @@ class TapeFace:
         plain, key = split_name(name)
         rows = rows_of_sets(self.rollout.scene, plain, [*self._sets().get(plain, ()), key])[key]
         value = per_tetrahedron(self.rollout.scene, plain, self._loaded(plain))[rows[:1]].reshape(-1)
-        field = self._take(value.shape if value.size > 1 else ())
-        field.from_numpy(np.asarray(value if value.size > 1 else value[0], self.number))
-        return field
+        return self._filled(name, value if value.size > 1 else value[0])
 
     def _sets(self) -> dict:
         """{input: {set: tetrahedra}} of the fields of named sets."""
@@ -106,9 +107,19 @@ class TapeFace:
             return values["initial_positions"] - values["rest_positions"]
         return values[name]
 
-    def _take(self, shape: tuple):
+    def _filled(self, name: str, value):
+        """The field of an input, with its value."""
+        field = self._take(np.shape(value))
+        field.from_numpy(np.asarray(value, self.number))
+        return field
+
+    def _output_rows(self) -> tuple:
+        """The axes in front of an output's own."""
+        return () if self.runs is None else (self.runs,)
+
+    def _take(self, shape: tuple, rows: tuple = ()):
         components = 3 if shape[-1:] == (3,) else 0
-        return runtime.fields.take(self, self.fp, shape[:-1] if components else shape, components)
+        return runtime.fields.take(self, self.fp, (*rows, *(shape[:-1] if components else shape)), components)
 
     def add_gradients(self, gradients: dict) -> None:
         """Add to the .grad of the inputs' fields."""
@@ -146,12 +157,12 @@ class TapeFace:
         """See `Rollout.run`."""
         if (k is None) != (self.runs is None) or k is not None and not (int(k) == k and 0 <= k < self.runs):
             rule = (
-                "make the Rollout with runs=..."
+                f"make the {type(self.rollout).__name__} with runs=..."
                 if self.runs is None
                 else f"give a whole number of 0 .. {self.runs - 1}"
             )
             raise ValueError(
-                f"run({'' if k is None else k}): this rollout has {self.runs or 'no numbered'} runs: {rule}"
+                f"run({'' if k is None else k}): this {self.word} has {self.runs or 'no numbered'} runs: {rule}"
             )
         tape = runtime.current_tape()
         if tape is None or self._tape is None or self._tape() is not tape:
@@ -159,8 +170,9 @@ class TapeFace:
             self._summed = False
         elif k in self._held:
             raise RuntimeError(
-                f"{'this rollout' if k is None else f'run {k}'} already ran in this tape and would overwrite its frames: "
-                "make a second Rollout, or one with runs=... whose run(k) has frames of its own"
+                f"{f'this {self.word}' if k is None else f'run {k}'} already ran in this tape and would overwrite its "
+                f"frames: make a second {type(self.rollout).__name__}, or one with runs=... whose run(k) has frames of its "
+                "own"
             )
         self._held.add(k)
         TapedRun(self.rollout, k).forward()
@@ -224,6 +236,30 @@ class TapeFace:
             self._constants[name] = source, array
         return self._constants[name][1]
 
+    def forward(self, k: int | None):
+        """Run from the fields and fill those of the outputs; what `backward` needs of it."""
+        rollout = self.rollout
+        values, direct = self.values()
+        run, frames = rollout.sweep.run(values, FieldStart(self) if direct else None), None
+        self.show(k, run)
+        if rollout.computed:
+            frames = rollout.frames_of(run)
+            for name in rollout.computed:
+                self.fill_row(k, name, frames[name])
+        return run, frames
+
+    def backward(self, k: int | None, ran) -> dict:
+        """Gradients by the inputs, from those by outputs in their fields."""
+        rollout, (run, frames) = self.rollout, ran
+        seeds = {name: self.row(k, name) for name in rollout.computed}
+        change = rollout.pulled_to_frames(frames, {name: x for name, x in seeds.items() if x.any()})
+        if "rest_positions" in rollout.wanted:  # what displacements say of it directly
+            by_rest = rollout.outputs["displacements"].vjp(None, self.row(k, "displacements"))
+            change.add(Change(inputs=by_rest.inputs))
+        derived = rollout.sweep.pull_back(run, field_seed(self, k, change))
+        gradients = rollout.gradients_of(run, derived, change)
+        return gradients | self.by_sets(gradients)
+
     def sum_up(self, gradients: dict) -> None:
         """Add the gradients of a run to those of the other runs of this tape."""
         rollout = self.rollout
@@ -255,32 +291,17 @@ class TapedRun:
 
     def __init__(self, rollout: "Rollout", k: int | None):
         self.rollout, self.face, self.k = rollout, rollout.tape_face, k
-        self.run = self.frames = None
+        self.ran = None
 
     @ti.ad.grad_replaced
     def forward(self):
-        face, rollout = self.face, self.rollout
-        values, direct = face.values()
-        self.run = rollout.sweep.run(values, FieldStart(face) if direct else None)
-        face.show(self.k, self.run)
-        if rollout.computed:
-            self.frames = rollout.frames_of(self.run)
-            for name in rollout.computed:
-                face.fill_row(self.k, name, self.frames[name])
+        self.ran = self.face.forward(self.k)
 
     @ti.ad.grad_for(forward)
     def backward(self):
         """Adds to the .grad of the input fields and sets the rollout's `gradients`."""
-        if self.run is None:  # the run failed, and its error is on its way
+        if self.ran is None:  # the run failed, and its error is on its way
             return
-        face, rollout = self.face, self.rollout
-        seeds = {name: face.row(self.k, name) for name in rollout.computed}
-        change = rollout.pulled_to_frames(self.frames, {name: x for name, x in seeds.items() if x.any()})
-        if "rest_positions" in rollout.wanted:  # what displacements say of it directly
-            by_rest = rollout.outputs["displacements"].vjp(None, face.row(self.k, "displacements"))
-            change.add(Change(inputs=by_rest.inputs))
-        derived = rollout.sweep.pull_back(self.run, field_seed(face, self.k, change))
-        gradients = rollout.gradients_of(self.run, derived, change)
-        gradients |= face.by_sets(gradients)
-        face.add_gradients(gradients)
-        face.sum_up(gradients)
+        gradients = self.face.backward(self.k, self.ran)
+        self.face.add_gradients(gradients)
+        self.face.sum_up(gradients)

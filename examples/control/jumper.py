@@ -43,33 +43,56 @@ def pressing(mesh: ds.TetrahedralMesh) -> np.ndarray:
 
 
 class SoftJumpers(gym.vector.VectorEnv):
-    """`num_envs` cubes. One that ends starts anew in the same step; its last observation is in info["final_obs"]."""
+    """`num_envs` cubes. One that ends starts anew in the same step; its last observation is in info["final_obs"].
+
+    Other bodies and tasks: their scene, actions and progress (examples/control/crawler.py).
+    """
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
+    gradients = ("initial_positions", "initial_velocities", "external_forces")
 
     def __init__(self, num_envs: int = 32):
-        self.scene, self.num_envs = cube_scene(), num_envs
+        self.scene, self.num_envs = self.make_scene(), num_envs
         solver = ds.SemiImplicitSolver(self.scene, dt=STEP, substeps=20)
-        self.batch = ds.Batch(solver, 1, num_envs)
-        self.pressing = pressing(self.scene.mesh)
+        self.batch = ds.Batch(solver, 1, num_envs, gradients=self.gradients)
+        self.pressing, self.corners = self.forces(self.scene.mesh), self._corners()
         self.single_observation_space = gym.spaces.Box(-np.inf, np.inf, (OBSERVED,), np.float64)
-        self.single_action_space = gym.spaces.Box(-1.0, 1.0, (2,), np.float64)
+        self.single_action_space = gym.spaces.Box(-1.0, 1.0, (len(self.pressing),), np.float64)
         self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, num_envs)
         self.action_space = gym.vector.utils.batch_space(self.single_action_space, num_envs)
+
+    make_scene = staticmethod(cube_scene)
+    forces = staticmethod(pressing)
+
+    @staticmethod
+    def progress(positions):
+        """What counts, of positions (scenes, n, 3), NumPy's or torch's: the centre's height [m]."""
+        return positions[:, :, 1].mean(1)
+
+    def reward(self, progress: np.ndarray, before: np.ndarray) -> np.ndarray:
+        return np.maximum(progress - self.highest, 0)
+
+    @staticmethod
+    def goal(progress):
+        """What an episode is worth, of progress (steps, scenes) in torch: a smooth maximum in its second half."""
+        late = progress[len(progress) // 2 :]
+        return (late * (200.0 * late).softmax(0)).sum(0)
 
     def _start(self, rows: np.ndarray) -> None:
         """Put the cubes of some rows where an episode begins."""
         lifts = self.np_random.uniform(0.0, 0.02, len(rows))
         self.positions[rows] = self.scene.mesh.vertices + lifts[:, None, None] * np.array([0.0, 1.0, 0.0])
         self.velocities[rows], self.steps[rows] = 0.0, 0
-        self.highest[rows] = self.positions[rows, :, 1].mean(1)
+        self.highest[rows] = self.progress(self.positions[rows])
+
+    def seen(self, positions, velocities, left) -> list:
+        """Parts of what is observed, (scenes, ...), NumPy's or torch's, from states and shares that are left."""
+        centre = positions.mean(1)
+        corners = positions[:, self.corners] - centre[:, None]
+        return [centre[:, 1:2], velocities.mean(1), corners.reshape(len(centre), -1), left[:, None]]
 
     def _observe(self) -> np.ndarray:
-        centre, n = self.positions.mean(1), self.num_envs
-        corners = self.positions[:, self._corners()] - centre[:, None]
-        left = 1 - self.steps / HORIZON
-        parts = centre[:, 1:2], self.velocities.mean(1), corners.reshape(n, -1), left[:, None]
-        return np.concatenate(parts, 1)
+        return np.concatenate(self.seen(self.positions, self.velocities, 1 - self.steps / HORIZON), 1)
 
     def _corners(self) -> np.ndarray:
         X = self.scene.mesh.vertices
@@ -84,15 +107,16 @@ class SoftJumpers(gym.vector.VectorEnv):
         return self._observe(), {}
 
     def step(self, actions: np.ndarray) -> tuple:
+        before = self.progress(self.positions)
         forces = np.einsum("bk,kni->bni", np.clip(actions, -1, 1), self.pressing)[:, None]
         frames = self.batch.forward(
             initial_positions=self.positions, initial_velocities=self.velocities, external_forces=forces
         )
         self.positions, self.velocities = frames.end["initial_positions"], frames.end["initial_velocities"]
         self.steps += 1
-        height = self.positions[:, :, 1].mean(1)
-        rewards = np.maximum(height - self.highest, 0)
-        self.highest = np.maximum(height, self.highest)
+        after = self.progress(self.positions)
+        rewards = self.reward(after, before)
+        self.highest = np.maximum(after, self.highest)
         observed, terminated, truncated = self._observe(), ~frames.alive, self.steps >= HORIZON
         ended, info = terminated | truncated, {}
         if ended.any():
@@ -105,10 +129,10 @@ class SoftJumpers(gym.vector.VectorEnv):
 class SoftJumper(gym.Env):
     """One cube."""
 
-    metadata = {"render_modes": []}
+    metadata, many = {"render_modes": []}, SoftJumpers
 
     def __init__(self):
-        self.all = SoftJumpers(1)
+        self.all = self.many(1)
         self.observation_space, self.action_space = self.all.single_observation_space, self.all.single_action_space
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:

@@ -1,0 +1,65 @@
+"""Inputs of a batch as they are given: which scenes have of their own, and which they share."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from diffsim_ti.batch.set_values import spread_scenes
+from diffsim_ti.batch.sweep import Own, value_of
+from diffsim_ti.inputs.description import frozen
+from diffsim_ti.rollout.rollout import Rollout
+from diffsim_ti.scene import Scene
+
+
+def spread_given(scene: Scene, given: dict, bases: dict, scenes: int) -> tuple[dict, dict]:
+    """(values as arrays, {input given by named sets: (tetrahedra of each, those that scenes have of their own)})"""
+    out, sets = dict(given), {}
+    for name, value in given.items():
+        if isinstance(value, Mapping):
+            out[name], *sets[name] = spread_scenes(scene, name, bases.get(name), value, scenes)
+    return out, sets
+
+
+def checked_values(one: Rollout, given: dict, scenes: int) -> dict:
+    """All values of a run: what was given, checked, those of scenes as `Own`, and the rollout's own."""
+    inputs, out = one.scene.inputs, dict(one.values)
+    unknown = [name for name in given if name not in one.inputs]
+    if unknown:
+        raise ValueError(f"no input named {unknown[0]!r}; this batch has {', '.join(one.inputs)}")
+    for name, value in given.items():
+        if isinstance(value, Own) or _is_own(one, name, value := np.asarray(value, np.float64), scenes):
+            rows = [frozen(np.array(row, np.float64)) for row in value]
+            out[name] = Own(inputs.check({name: row})[name] for row in rows)
+        else:
+            known = out[name]
+            same = value.shape == known.shape and np.array_equal(value, known)
+            out[name] = known if same else inputs.check({name: value.copy()})[name]
+        for row in out[name] if isinstance(out[name], Own) else (out[name],):
+            inputs.check_steps({name: row}, one.steps)
+    return out
+
+
+def _is_own(one: Rollout, name: str, value: np.ndarray, scenes: int) -> bool:
+    """Whether a value has the axis of scenes in front."""
+    described, sizes = one.scene.inputs.described[name], one.scene.inputs.sizes
+    shared = described.fits(value.shape, sizes)
+    own = value.ndim > 0 and len(value) == scenes and described.fits(value.shape[1:], sizes)
+    exact = sizes | {"steps": one.steps, "steps + 1": one.steps + 1}  # and no rows of forces that no step takes
+    if own and described.fits(value.shape, exact):
+        raise ValueError(
+            f"{name}: shape {value.shape} may be one value for all scenes or one for each of {scenes}: give the leading "
+            f"axis also if all scenes share it, as np.broadcast_to(x, ({scenes}, *x.shape))"
+        )
+    if not shared and not own:
+        raise ValueError(
+            f"{name}: expected {described.expected(sizes)}, or the same behind an axis of {scenes} scenes, got {value.shape}"
+        )
+    return own
+
+
+def change_of(tangent, value, b: int, scenes: int) -> np.ndarray:
+    """The change of scene b's value: that of the shared one, or its own."""
+    tangent, shape = np.asarray(tangent, np.float64), np.shape(value_of(value, b))
+    if isinstance(value, Own) or tangent.shape == (scenes, *shape):
+        return np.broadcast_to(tangent, (scenes, *shape))[b]
+    return np.broadcast_to(tangent, shape)
