@@ -1,10 +1,10 @@
 """Random impacts of small bodies on thin walls, needles, plates and balls, at rest and moving, judged by geometry alone.
 
-    python tests/battery_of_impacts.py --cases 200 --seed 0 [--turning] [--reduced] [--order 2] [--solver NAME] [--only 17]
+    python tests/battery_of_impacts.py --cases 200 --seed 0 [--turning] [--rough] [--reduced] [--order 2] [--solver NAME]
 
 Each case runs once; where it raises, what the error advises is done and the case runs again, three times at most.
---turning: obstacles turn about a point near them as well. --reduced: the body, or what comes first of it and is stiffer,
-moves by few numbers, in implicit steps and statics. --order 2: of ten-node tetrahedra, on the same grids.
+--turning: obstacles turn about a point near them as well. --rough: they rub. --reduced: the body, or what comes first of it
+and is stiffer, moves by few numbers, in implicit steps and statics. --order 2: of ten-node tetrahedra, on the same grids.
 """
 
 import argparse
@@ -50,6 +50,7 @@ class Case:
     thickness: float
     moving: bool
     turning: bool = False
+    rough: bool = False
     reduced: str | None = None  # how a part of the body moves
     order: int = 1
     stiffness: float | None = None  # per area [N/m^3]
@@ -70,7 +71,13 @@ class Case:
         return self.speed < self.wave_speed
 
     def __str__(self) -> str:
-        words = [self.moving and "moving", self.turning and "turning", self.reduced, self.order == 2 and "ten nodes"]
+        words = [
+            self.moving and "moving",
+            self.turning and "turning",
+            self.rough and "rough",
+            self.reduced,
+            self.order == 2 and "ten nodes",
+        ]
         return (
             f"{self.number}: {self.solver} {self.kind} {self.precision} {self.speed:.3g} m/s dt {self.dt:.3g} s E "
             f"{self.youngs_modulus:.2g} size {self.size:.3g} m, {self.resolution} vertices a side, thickness "
@@ -78,7 +85,9 @@ class Case:
         )
 
 
-def draw(number: int, seed: int, solvers, turning: bool = False, order: int = 1, reduced: bool = False) -> Case:
+def draw(
+    number: int, seed: int, solvers, turning: bool = False, order: int = 1, reduced: bool = False, rough: bool = False
+) -> Case:
     rng, names = np.random.default_rng([seed, number]), list(solvers)
     log = lambda low, high: float(np.exp(rng.uniform(np.log(low), np.log(high))))  # noqa: E731
     return Case(
@@ -95,6 +104,7 @@ def draw(number: int, seed: int, solvers, turning: bool = False, order: int = 1,
         thickness=log(2e-3, 2e-2),
         moving=bool(rng.integers(2)),
         turning=turning,
+        rough=rough,
         reduced=("affine", "by functions", "by fields")[number % 3] if reduced else None,
         order=order,
     )
@@ -132,6 +142,8 @@ def build(case: Case):
         path, more = (lambda t: [-speed * t, 0, 0]), dict(initial_velocities=(own, 0, 0))
     stiffness = case.stiffness or natural_stiffness(case, mesh, width)
     given, back = turning(case, path) if case.turning else (dict(path=path), lambda x, t: x - path(t))
+    if case.rough:
+        given |= dict(friction=0.5, friction_speed=0.01 * case.speed)
     obstacle = obstacle(width=width, stiffness_per_area=stiffness, **given)
     E = case.youngs_modulus
     if case.reduced:
@@ -302,6 +314,7 @@ def main() -> int:
     parser.add_argument("--solver", choices=list(SOLVERS), action="append")
     parser.add_argument("--only", type=int, nargs="*", help="numbers of cases")
     parser.add_argument("--turning", action="store_true")
+    parser.add_argument("--rough", action="store_true")
     parser.add_argument("--reduced", action="store_true")
     parser.add_argument("--order", type=int, choices=(1, 2), default=1)
     given = parser.parse_args()
@@ -310,7 +323,7 @@ def main() -> int:
     # by few numbers: dealt in turn to those that solve for them
     solvers = {name: kind for name, kind in SOLVERS.items() if not (given.reduced and kind.explicit)}
     cases = (
-        draw(n, given.seed, solvers, given.turning, given.order, given.reduced)
+        draw(n, given.seed, solvers, given.turning, given.order, given.reduced, given.rough)
         for n in given.only or range(given.cases)
     )
     table = battery(c for c in cases if not given.solver or c.solver in given.solver)

@@ -114,7 +114,8 @@ class Judge:
 
     Overlap at the end of a step is "impaled". "passed": on straight ways from step to step the surface goes through the
     solid's core. In a step that is longer than half the body a body may well go round a solid that is not wider than it,
-    so that straight ways say nothing; a wall (wider than five bodies) is never gone round.
+    so that straight ways say nothing; a wall (wider than five bodies) is never gone round, unless the body ends beyond its
+    rim, as one does that a turning wall has flung off.
     """
 
     def __init__(self, triangles: np.ndarray, solid: dict, positions: np.ndarray, by=(0.0, 0.0, 0.0)):
@@ -133,9 +134,17 @@ class Judge:
         start, end = self.before - self.by, x - by  # as the solid sees it
         self.before, self.by = x, by
         travel = np.linalg.norm(end - start, axis=1).max()
-        if self.is_wall or travel < 0.5 * self.size:
+        if self.is_wall and not self._beyond_rim(end) or travel < 0.5 * self.size:
             halts = min(200, 1 + int(np.ceil(2 * travel / thickness(self.core))))
             for share in np.linspace(0, 1, halts + 1)[1:-1]:
                 if overlaps(((1 - share) * start + share * end)[self.triangles], self.core):
                     return "passed"
         return None
+
+    def _beyond_rim(self, x: np.ndarray) -> bool:
+        """Whether a part of the body, as the solid sees it, is not over the wall."""
+        if self.solid["kind"] != "box":
+            return False
+        along = np.abs((x - self.solid["center"]) @ self.solid["axes"].T)
+        wide = np.argsort(self.solid["half"])[1:]
+        return bool((along[:, wide] > self.solid["half"][wide]).any())
