@@ -170,8 +170,8 @@ def test_steps_one_by_one_and_single_precision():
 @pytest.mark.parametrize(
     "reduced, options, words",
     [
-        (["shell"], {}, 'must be {name of a set: "affine"}'),
-        ({"shell": "rigid"}, {}, "'shell' must be 'affine', got 'rigid'"),
+        (["shell"], {}, 'must be {name of a set: "affine" or "rigid"}'),
+        ({"shell": "stiff"}, {}, "'shell' must be 'affine' or 'rigid', got 'stiff'"),
         ({"skin": "affine"}, {}, "no set 'skin' of tetrahedra or vertices; it has .*'shell'"),
         ({"xmax": "affine"}, {}, "the 4 vertices of 'xmax' lie in a plane"),
         (SHELL, dict(fixed="xmax"), "vertex .* of 'shell' is also in what is held"),
@@ -189,9 +189,7 @@ def test_refused(reduced, options, words):
         ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3), reduced=reduced, **options)
 
 
-def test_explicit_steps_refuse():
-    with pytest.raises(ValueError, match="explicit steps move every vertex.*'shell' 12 for 36"):
-        ds.SemiImplicitSolver(scene_of(), dt=1e-4)
+def test_modes_refuse():
     with pytest.raises(ValueError, match="has no modes"):
         ds.modes(scene_of(fixed="xmin"), 2)
     assert "moving by few numbers: 'shell' 12 for 36" in scene_of().describe()
