@@ -129,8 +129,8 @@ class Reduced:
         """Raise ValueError where a set does not deform."""
         for body in self.rigid:
             raise ValueError(
-                f"{what}: the set {body.name!r} is rigid, which SemiImplicitSolver and VelocityVerletSolver alone know; take "
-                'one of these, or "affine" in place of "rigid" and a stiff material'
+                f"{what}: the set {body.name!r} is rigid, which SemiImplicitSolver and VelocityVerletSolver alone know; "
+                'take one of these, or "affine" in place of "rigid" and a stiff material'
             )
 
     def elements(self, elements: np.ndarray) -> list[np.ndarray]:

@@ -1,6 +1,6 @@
 """Links of the start of sets that do not deform: the rigid motion that is nearest to what is given.
 
-Of places x and rest positions X of k vertices, y and D being these without their means: x' = mean x + R D with the rotation R
+Of places x and rest positions X, y and D being these without their means: x' = mean x + R D with the rotation R that is
 nearest to A = sum y D^T = R S (polar decomposition), which is that of the least squares (Kabsch 1976,
 doi:10.1107/S0567739476001873). Of velocities v: v' = mean v + omega x R D, I omega = sum R D x v, likewise.
 """
@@ -39,7 +39,9 @@ class Nearest:
         s[-1] *= np.sign(np.linalg.det(U) * np.linalg.det(Vt)) or 1.0
         self.R = U @ np.diag([1, 1, np.sign(s[-1]) or 1.0]) @ Vt
         S = self.R.T @ (self.y.T @ self.D)
-        self._lever = np.trace(S) * np.eye(3) - 0.5 * (S + S.T)  # R S' - its change is R [delta]x, (tr S - S) delta = axial
+        self._lever = np.trace(S) * np.eye(3) - 0.5 * (
+            S + S.T
+        )  # R S' - its change is R [delta]x, (tr S - S) delta = axial
 
     def jvp(self, dy: np.ndarray, dD: np.ndarray) -> np.ndarray:
         dA = dy.T @ self.D + self.y.T @ dD

@@ -285,6 +285,9 @@ class Guard:
             if not self.ws.substep <= stable
             else f"the stable step {state} is {stable:.4g} s, so look at forces, contacts, inputs and inverted tetrahedra"
         )
+        bodies = ws.arrays.bodies
+        if bodies is not None and vertex in bodies.vertices[bodies.rigid[bodies.owner]]:
+            why += "; a rigid set turns by a radian in a substep at the most"
         raise Divergence(
             f"{self.ws.when(step)}: {bad} of vertex {vertex} is not finite; smallest J around it "
             f"= {J_around.min():.3g} in tetrahedron {tet}; {why}; the last good state is kept",

@@ -230,8 +230,10 @@ class Stiffness:
             return 0.0, 0.0
         with np.errstate(over="ignore", invalid="ignore"):
             size = np.linalg.norm(self.product(start))
-        if self.bodies is not None and not size > 1e-5 * self._stiffest(start):  # rounding: none of them deforms
-            return 0.0, 0.0
+        if self.bodies is not None:
+            rounding = 1e-6 if self.ws.arrays.precision == "f32" else 1e-12
+            if not size > rounding * self._stiffest(start):  # nothing deforms
+                return 0.0, 0.0
         if not 0 < size < np.inf:
             raise FloatingPointError(
                 f"the stiffness of this state is {'zero' if size == 0 else 'not finite'} in this precision: look at Young's "
@@ -259,7 +261,7 @@ class Stiffness:
             size = np.linalg.norm(x)
             for q in basis:
                 x = x - (q * x).sum() * q
-            if np.linalg.norm(x) < 1e-4 * size:  # few vertices are free: all of their motions are in the basis
+            if np.linalg.norm(x) <= 1e-4 * size:  # few vertices are free: all of their motions are in the basis
                 break
             basis.append(x / np.linalg.norm(x))
             x = self.product(basis[-1])

@@ -343,6 +343,6 @@ class SceneArrays:
         runtime.fill(self.growths, self.growth_blocks(np.stack([growth, growth])[None]))
 
     def volume_blocks(self, volumes: np.ndarray) -> np.ndarray:
-        """Blocks of volumes; repetitions in a patch have none."""
-        blocks = self.to_blocks(volumes)
+        """Blocks of volumes; repetitions in a patch have none, nor what is rigid."""
+        blocks = self.to_blocks(self.bodies.of_soft(volumes) if self.bodies else volumes)
         return blocks if isinstance(self.place, slice) else blocks * self._alone.reshape(-1, LANES)

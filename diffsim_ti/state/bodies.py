@@ -13,7 +13,6 @@ import taichi as ti
 
 from diffsim_ti import runtime
 from diffsim_ti.inputs import Derived
-from diffsim_ti.state.corners import slots
 
 PAIRS = ((0, 0), (1, 1), (2, 2), (1, 2), (2, 0), (0, 1))  # entries of J in their order
 NUMBERS = 16  # of each body: M, X_, J^-1, J
@@ -37,6 +36,9 @@ class BodyArrays:
         self.rigid = np.array([body.rigid for body in self.bodies])
         self._mesh_places = mesh.vertices[self.vertices]
         self._rounded = np.float32 if fp == ti.f32 else np.float64
+        self._soft = np.ones(len(mesh.elements))
+        for body, own in zip(self.bodies, scene.reduced.elements(mesh.elements)):
+            self._soft[own] = not body.rigid or scene.volume != "tetrahedra"  # patches need volumes
         owner = np.full(mesh.num_vertices, -1)
         owner[self.vertices] = self.owner
         ints = dict(body_first=self.first, body_vertex=self.vertices, body_kind=self.rigid, body_of=owner)
@@ -46,6 +48,10 @@ class BodyArrays:
         self.arrays["body_mass"] = runtime.array(fp, len(self.vertices))
         self.arrays["body_numbers"] = runtime.array(ti.f64, NUMBERS * len(members))
         self.arrays["body_reach"] = runtime.array(fp, mesh.num_vertices)
+
+    def of_soft(self, volumes: np.ndarray) -> np.ndarray:
+        """Volumes without those of elements that have no stress: what rounding makes of it would turn a rigid body."""
+        return (volumes.reshape(len(self._soft), -1) * self._soft[:, None]).reshape(volumes.shape)
 
     def load(self, values: Derived, inverse_mass: np.ndarray) -> None:
         """Numbers for values of a run."""

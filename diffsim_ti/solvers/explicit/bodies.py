@@ -189,9 +189,7 @@ class Bodies(BodySums):
                 state.frames_u[now.frame, i] = state.u[s, i]
                 state.frames_v[now.frame, i] = self.narrow(self.at_arm(seen, self.arm(m, b, scene)))
         rub = self.rub(b, u, self.kicked(v, now.pre + now.post, f), state.u, s, now, scene)
-        displaced, moving = self.moved(
-            b, u, rub.after, seen, self.turn(b, u, rub.after, now, scene), now, scene
-        )
+        displaced, moving = self.moved(b, u, rub.after, seen, self.turn(b, u, rub.after, now, scene), now, scene)
         for m in range(scene.body_first[b], scene.body_first[b + 1]):
             self.go(m, b, displaced, moving, s, t, now, scene, state, plan)
 

@@ -14,11 +14,12 @@ def check_bodies(scene: "Scene", contact: str) -> None:
     said = f"reduced sets ({scene.reduced.describe()})"
     if contact == "stage" and any(term.acts_on_surface for term in scene.terms):
         raise ValueError(
-            f'{said} feel obstacles as a force in explicit steps, for a stage moves every vertex by itself: pass contact="force"'
+            f"{said} feel obstacles as a force in explicit steps, for a stage moves every vertex by itself: pass "
+            'contact="force"'
         )
     if feels_faces(scene):
         raise ValueError(
-            f"{said} feel obstacles at their vertices alone in explicit steps, and an obstacle could reach into a face here: "
+            f"{said} feel obstacles at their vertices alone in explicit steps, and one could reach into a face here: "
             "take a finer mesh, a wider barrier, or an implicit solver"
         )
     if scene.holds_volumes:
@@ -26,6 +27,6 @@ def check_bodies(scene: "Scene", contact: str) -> None:
     rubbing = scene.term(SelfContact)
     if rubbing and rubbing.has_friction:
         raise ValueError(
-            f"{said} have no friction in SelfContact in explicit steps, which slows every vertex by itself: leave it out, or "
-            "take an implicit solver"
+            f"{said} have no friction in SelfContact in explicit steps, which slows every vertex by itself: leave it "
+            "out, or take an implicit solver"
         )

@@ -58,9 +58,7 @@ class BodyFriction(ObstacleStages):
                 if g.force.touches(scene.parameters, first, X, u):
                     moved = self.moved(g, k, X, u, du + tangent.rest[i], now, scene, tangent)
                     time, dtime = self.time(g, i, now, scene), self.dtime(g, i, now, tangent)
-                    out += grip.load_jvp(
-                        g.force, scene.parameters, first, X, u, time, tangent.parameters, moved, dtime
-                    )
+                    out += grip.load_jvp(g.force, scene.parameters, first, X, u, time, tangent.parameters, moved, dtime)
         return out
 
     @ti.func
@@ -108,8 +106,8 @@ class BodyFriction(ObstacleStages):
 
     @ti.func
     def vjp(self, i, u, v, total, w, load_adj, now: A, scene: A, adjoint: A):
-        """(adjoint of u, of v, the impulse with the load as a fourth component) for the adjoints of the impulse and of the load;
-        adds those of all else."""
+        """(adjoint of u, of v, the impulse with the load as a fourth component) for the adjoints of the impulse and of the
+        load; adds those of all else."""
         u_adj, v_adj, felt = self.vector(0), self.vector(0), self.vector(0)
         for g in ti.static(self.features.rough):
             for k in range(g.count):

@@ -3,15 +3,15 @@
 A body is x = c + R y with y and J = sum m y y^T as state/bodies.py has them. U, the gradient of its displacements by y, is
 R - 1. Its vertices would go with velocities of gradient G by y; what of that is a spin omega, in the body's own axes, is
 
-    I omega = L = R^T l,    l = sum_b R_b x (G J_b),    I = tr J - J;    the columns of the spin's gradient are (R omega) x R_b.
+    I omega = L = R^T l,    l = sum_b R_b x (G J_b),    I = tr J - J;    its gradient's columns are (R omega) x R_b.
 
 The pass is the discrete rigid body of Moser and Veselov, which is SHAKE: the new rotation R F is that for which the momentum
 sum m R y x (R F y) / alpha is the old one. With F = 1 + 2 ([f]x + [f]x^2) / (1 + f^2), f = tan(angle / 2) times the axis,
 
     I f + f x I f = (1 + f^2) alpha L / 2.
 
-R is one step of Newton's method from 1 + U to a rotation, so that what rounding adds is lost again; its change is theta x R_b,
-theta = sum_b R_b x dU_b / 2. Matrices are columns x, y, z; all vectors have a fourth component, zero.
+R is one step of Newton's method from 1 + U to a rotation, so that what rounding adds is lost again; its change is
+theta x R_b, theta = sum_b R_b x dU_b / 2. Matrices are columns x, y, z; all vectors have a fourth component, zero.
 Moser, Veselov 1991, doi:10.1007/BF02352494; McLachlan, Zanna 2005, The discrete Moser-Veselov algorithm for the free rigid
 body, revisited, doi:10.1007/s10208-004-0118-6.
 """
@@ -144,7 +144,7 @@ def spin_jvp(R: A, G: A, J: A, theta, dG: A, dJ: A):
     )
 
 
-# ---- the turn of a pass ----------------------------------------------------------------------------------------------------
+# ---- the turn of a pass --------------------------------------------------------------------------------------------------
 
 
 @ti.func

@@ -6,8 +6,8 @@ import taichi as ti
 
 from diffsim_ti.runtime import let, traced
 from diffsim_ti.solvers.explicit import body_motion as motion
-from diffsim_ti.solvers.explicit.body_tangent import BodyTangent
 from diffsim_ti.solvers.explicit.body_motion import VECTOR
+from diffsim_ti.solvers.explicit.body_tangent import BodyTangent
 from diffsim_ti.state.bodies import NUMBERS, PAIRS, SUMS
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
@@ -91,8 +91,8 @@ class BodyStage(BodyTangent):
 
     @traced
     def moved_vjp(self, b, u, v, turn, by_u, by_v, now, scene, adjoint):
-        """(adjoint of u, of v+, of what is shown) for those of the displacements and velocities after the pass; adds those of
-        all else."""
+        """(adjoint of u, of v+, of what is shown) for those of the displacements and velocities after the pass; adds those
+        of all else."""
         alpha, decay = let(self.double(now.alpha)), let(self.double(now.decay))
         x = self.moved_columns_vjp(b, u, v, turn, by_u, by_v, alpha, decay, scene, adjoint)
         if self.vertex.features.drag >= 0:

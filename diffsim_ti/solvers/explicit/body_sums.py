@@ -1,7 +1,8 @@
 """Sums over the vertices of bodies of few numbers, and fields that are affine in y (state/bodies.py), with derivatives.
 
 A field is q + Q y at a vertex: `o` is q, and x, y, z are the columns of Q. That nearest to vectors x by the masses has
-q = sum m x / M and Q = sum m x y^T J^-1; of forces f in their place, without the masses, it is the acceleration. All in float64.
+q = sum m x / M and Q = sum m x y^T J^-1; of forces f in their place, without the masses, it is the acceleration. All of it
+is float64.
 """
 
 from dataclasses import dataclass
@@ -67,9 +68,7 @@ class BodySums:
     def arm(self, m, b, scene: A):
         """y of vertex m of all bodies."""
         first = b * NUMBERS
-        centre = VECTOR(
-            scene.body_numbers[first + 1], scene.body_numbers[first + 2], scene.body_numbers[first + 3], 0
-        )
+        centre = VECTOR(scene.body_numbers[first + 1], scene.body_numbers[first + 2], scene.body_numbers[first + 3], 0)
         return self.wide(scene.body_place[m]) - centre
 
     @traced

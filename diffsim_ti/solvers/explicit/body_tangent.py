@@ -48,11 +48,7 @@ class BodyTangent(Bodies):
     def moved_columns_jvp(
         self, b, u: A, v: A, turn: A, du: A, dv: A, dseen: A, alpha, decay, da, dd, scene: A, tangent: A
     ):
-        x, y, z = (
-            du.x + alpha * dv.x + da * v.x,
-            du.y + alpha * dv.y + da * v.y,
-            du.z + alpha * dv.z + da * v.z,
-        )
+        x, y, z = (du.x + alpha * dv.x + da * v.x, du.y + alpha * dv.y + da * v.y, du.z + alpha * dv.z + da * v.z)
         p, q, r = decay * dv.x + dd * v.x, decay * dv.y + dd * v.y, decay * dv.z + dd * v.z
         if ti.static(self.rigid):
             if scene.body_kind[b] > 0:
@@ -147,7 +143,9 @@ class BodyTangent(Bodies):
         turn = self.turn(b, u, rub.after, now, scene)
         displaced, moving = self.moved(b, u, rub.after, seen, turn, now, scene)
         dalpha, ddecay = now.alpha_by_rate * plan.rate_dot, now.decay_by_rate * plan.rate_dot
-        ddisplaced, dmoving = self.moved_jvp(b, u, rub.after, turn, du, dafter, dseen, dalpha, ddecay, now, scene, tangent)
+        ddisplaced, dmoving = self.moved_jvp(
+            b, u, rub.after, turn, du, dafter, dseen, dalpha, ddecay, now, scene, tangent
+        )
         for m in range(scene.body_first[b], scene.body_first[b + 1]):
             i, y, dy = scene.body_vertex[m], self.arm(m, b, scene), self.wide(tangent.body_place[m])
             if now.alpha > 0:

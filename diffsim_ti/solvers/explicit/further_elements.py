@@ -71,7 +71,13 @@ class FurtherElements:
         """What kernels read of the scene for all of that."""
         has, out = self.features, {}
         given = (has.pressed, PRESSED), (has.dragged, DRAGGED)
-        for some, own in (*given, (has.tied, TIED), (has.founded, FOUNDED), (has.guided, GUIDED), (has.reduced, BODIES)):
+        for some, own in (
+            *given,
+            (has.tied, TIED),
+            (has.founded, FOUNDED),
+            (has.guided, GUIDED),
+            (has.reduced, BODIES),
+        ):
             out |= own if some else {}
         return out
 

@@ -148,7 +148,6 @@ class KickDrift:
 
     @ti.func
     def go_on(self, i, j, u, v, f, now: A, scene: A, state: A, plan: A):
-        """The pass, for the force f."""
         s, t = (j - plan.base) * plan.stride, (j - plan.base + 1) * plan.stride
         # kick, frame, kick
         v_mid, v_plus = self.kicked(i, v, f, now, scene)
@@ -246,10 +245,8 @@ class KickDrift:
         if ti.static(self.features.guided):
             k = self.prescribed(i, scene)
             u_held, v_held = self.guides.given(k, du, dv, now, tangent)
-            du_next, dv_next = (
-                self.guides.end(i, k, du_next, u_held, scene),
-                self.guides.end(i, k, dv_next, v_held, scene),
-            )
+            du_next = self.guides.end(i, k, du_next, u_held, scene)
+            dv_next = self.guides.end(i, k, dv_next, v_held, scene)
         elif ti.static(self.features.motion):
             k = self.prescribed(i, scene)
             if k >= 0:
@@ -270,9 +267,8 @@ class KickDrift:
             if scene.body_of[i] < 0:
                 self.go_on_vjp(i, j, now, scene, state, adjoint, plan)
             else:  # the body's stage is gone back through
-                s = j - plan.base
-                p, q, f_adj = adjoint.u[0, i], adjoint.v[0, i], adjoint.w[0, i]
-                self.forces_vjp(i, p, q, state.u[s, i], state.v[s, i], f_adj, now, scene, adjoint)
+                s, p, q = j - plan.base, adjoint.u[0, i], adjoint.v[0, i]
+                self.forces_vjp(i, p, q, state.u[s, i], state.v[s, i], adjoint.w[0, i], now, scene, adjoint)
         else:
             self.go_on_vjp(i, j, now, scene, state, adjoint, plan)
 

@@ -5,8 +5,8 @@ takes the impulse of backward Euler (friction.py) as if it had the share of its 
 
     p_i = -h mu N_i g(|t_i|) t_i,    g = (1 - keeps(|t_i|, C, eps)) / C,    C = sum_j h mu N_j w_j,
 
-so that C is the most by which all friction of a pass may slow the body. The matrix of what impulses do to velocities is at most
-the diagonal one of w_i C / (h mu N_i w_i), for C is the sum of these weights: no pass gains energy by friction.
+so that C is the most by which all friction of a pass may slow the body. The matrix of what impulses do to velocities is at
+most the diagonal one of w_i C / (h mu N_i w_i), for C is the sum of these weights: no pass gains energy by friction.
 """
 
 import taichi as ti
@@ -72,8 +72,8 @@ def total_vjp(force, parameters, first, X, u, v, wall, time, total, w):
 
 @traced
 def vjp(force, parameters, first, X, u, v, wall, time, total, w, load_adj):
-    """(adjoints of u, v, wall as vectors, of time, of the obstacle's numbers, a tuple, and (p, h mu N) as a vector) for those of
-    p and of h mu N."""
+    """(adjoints of u, v, wall as vectors, of time, of the obstacle's numbers, a tuple, and (p, h mu N) as a vector) for
+    those of p and of h mu N."""
     g, p, moved, before, walls, numbers, loaded, out = _record(force, parameters, first, X, u, v, wall, time, total)
     seeds = [(loaded, load_adj), *((k, let(at(w, d))) for d, k in enumerate(out))]
     adjoints, count = g.reverse(seeds, [*moved, *before, *walls, numbers[0], *p]), len(moved)
