@@ -204,10 +204,11 @@ class Bodies(BodySums):
         if ti.static(len(self.vertex.features.groups) > 0):
             if scene.surface[i] > 0:
                 self.vertex.obstacles.note(i, u, u_next, now, scene, state)
-        if ti.static(self.vertex.features.driven):
-            felt = (v_next / now.decay - v) / ((now.pre + now.post) * scene.inverse_mass[i])  # with what holds it
+        if ti.static(self.vertex.counts_work):
+            kicked = v_next / now.decay
+            felt = (kicked - v) / ((now.pre + now.post) * scene.inverse_mass[i])  # with what holds it
             if ti.static(self.vertex.features.gravity >= 0):
                 felt += -1 * self.vertex.gravity(scene.parameters) / scene.inverse_mass[i]
-            add_work_of_pass(self.vertex, i, u, v, felt, u_next, v_next, now, scene, state, plan)
+            add_work_of_pass(self.vertex, i, u, v, kicked, felt, u_next, v_next, now, scene, state, plan)
         state.u[t, i] = u_next
         state.v[t, i] = v_next

@@ -15,16 +15,8 @@ from diffsim_ti.state.numbers import ADJOINT, OF_STEPS, SCENE, TANGENT, with_sta
 from diffsim_ti.state.pass_table import pass_at, reversed_pass
 
 A = ti.template()
-STATE = dict(
-    u="vectors2",
-    v="vectors2",
-    f="vectors2",
-    frames_u="vectors2",
-    frames_v="vectors2",
-    seen="scalars2",
-    stage="vectors2",
-    work="scalars",
-)
+STATE = dict.fromkeys(("u", "v", "f", "frames_u", "frames_v"), "vectors2")
+STATE |= dict(seen="scalars2", stage="vectors2", work="scalars")
 CHANGE = dict(u="vectors2", v="vectors2", frames_u="vectors2", frames_v="vectors2")  # of a state, or its adjoint
 CORNERS = dict(corner="vectors", rate_corner="vectors")  # adjoints of u and v, still to be gathered
 PLAN = dict(ints="ints", floats="scalars")  # the tables of the passes, from pass `window` on

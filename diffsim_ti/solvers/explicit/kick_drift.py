@@ -16,72 +16,18 @@ each pass writes the next slot, which is what the adjoint reads.
 """
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import taichi as ti
 
-from diffsim_ti.elements.patched_tetrahedron import functions_of
-from diffsim_ti.runtime import PRECISIONS
-from diffsim_ti.solvers.explicit.contact_stage import ContactStage
-from diffsim_ti.solvers.explicit.foundations import Foundations
-from diffsim_ti.solvers.explicit.given_forces import GivenForces
-from diffsim_ti.solvers.explicit.guides import Guides
-from diffsim_ti.solvers.explicit.obstacle_stages import ObstacleStages
 from diffsim_ti.solvers.explicit.outside_work import add_work_of_pass
-from diffsim_ti.state.features import Features
+from diffsim_ti.solvers.explicit.vertex_parts import VertexParts
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
 
 
 @dataclass(frozen=True)
-class KickDrift:
+class KickDrift(VertexParts):
     """Taichi functions of one vertex i in pass j, whose numbers are `now` (state/schedule.py)."""
-
-    law: object
-    features: Features
-    lanes: bool
-
-    @property
-    def fp(self):
-        return PRECISIONS[self.law.precision]
-
-    @property
-    def vector(self):
-        return ti.types.vector(4, self.fp)
-
-    @cached_property
-    def element(self):
-        return functions_of(self.law, self.features, self.lanes)
-
-    @property
-    def reads_rates(self) -> bool:
-        """Whether forces at corners are of velocities too."""
-        return self.element.reads_rates or self.features.dragged
-
-    @property
-    def counts_work(self) -> bool:
-        """Whether work from outside is counted, for who follows the energy."""
-        return self.features.driven
-
-    @cached_property
-    def obstacles(self) -> ObstacleStages:
-        return ObstacleStages(self.features, self.law.precision)
-
-    @cached_property
-    def contact(self) -> ContactStage:
-        return ContactStage(self.features, self.law.precision)
-
-    @cached_property
-    def given(self) -> GivenForces:
-        return GivenForces(self.features, self.law.precision)
-
-    @cached_property
-    def foundations(self) -> Foundations:
-        return Foundations(self.law.precision)
-
-    @cached_property
-    def guides(self) -> Guides:
-        return Guides(self.law.precision, self.features.motion)
 
     @ti.func
     def half(self):
