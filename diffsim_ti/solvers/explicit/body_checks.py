@@ -12,6 +12,12 @@ if TYPE_CHECKING:
 def check_bodies(scene: "Scene", contact: str) -> None:
     """Raise ValueError for what these bodies do not have in explicit steps."""
     said = f"reduced sets ({scene.reduced.describe()})"
+    for body in scene.reduced.bodies:
+        if body.kind == "basis":
+            raise ValueError(
+                f"reduced: explicit steps know affine and rigid sets, and {body.name!r} moves by a basis: take an implicit "
+                "solver"
+            )
     if contact == "stage" and any(term.acts_on_surface for term in scene.terms):
         raise ValueError(
             f"{said} feel obstacles as a force in explicit steps, for a stage moves every vertex by itself: pass "
