@@ -252,6 +252,13 @@ def test_refused(reduced, options, words):
         ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3), reduced=reduced, **options)
 
 
+@pytest.mark.parametrize("kind", ["functions", "fields"])
+@pytest.mark.parametrize("solver", [ds.SemiImplicitSolver, ds.VelocityVerletSolver])
+def test_explicit_steps_refuse_bases(solver, kind):
+    with pytest.raises(ValueError, match="explicit steps .* implicit solver|explicit steps .*take ImplicitEulerSolver"):
+        solver(scene_of({"shell": motions(kind, bar())}), dt=1e-5)
+
+
 def test_explicit_steps_refuse():
     with pytest.raises(ValueError, match="explicit steps move every vertex.*'shell' 12 for 36"):
         ds.SemiImplicitSolver(scene_of(), dt=1e-4)
