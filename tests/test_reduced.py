@@ -252,6 +252,13 @@ def test_refused(reduced, options, words):
         ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3), reduced=reduced, **options)
 
 
+@pytest.mark.parametrize("kind", ["functions", "fields"])
+@pytest.mark.parametrize("solver", [ds.SemiImplicitSolver, ds.VelocityVerletSolver])
+def test_explicit_steps_refuse_bases(solver, kind):
+    with pytest.raises(ValueError, match="explicit steps know affine and rigid sets.*take an implicit solver"):
+        solver(scene_of({"shell": motions(kind, bar())}), dt=1e-5)
+
+
 def test_modes_refuse():
     with pytest.raises(ValueError, match="has no modes"):
         ds.modes(scene_of(fixed="xmin"), 2)

@@ -99,6 +99,17 @@ def test_momentum(solver):
     assert kinetic[1] < 0.999 * kinetic[0]
 
 
+@pytest.mark.parametrize("solver", [ds.ImplicitEulerSolver, ds.BDF2Solver, ds.ImplicitMidpointSolver])
+def test_momentum_of_implicit_steps(solver):
+    """Linear momentum is kept to the tolerance of the solves."""
+    for tolerance in (1e-4, 1e-10):
+        simulator = ds.Simulator(solver(rubbing(0.4), dt=5e-4, tolerance=tolerance))
+        mass, before = simulator._start.mass[:, None], simulator.velocities
+        simulator.run(8)
+        lost = np.abs((mass * (simulator.velocities - before)).sum(0)).max() / (mass * np.abs(before)).sum()
+        assert lost <= tolerance
+
+
 def turned(width, friction, solver, steps, **options):
     """(|angular momentum gained|, |impulse of friction|) of the two bodies, as stiff as makes all scale with the width."""
     places = bodies().vertices + np.repeat([0, 1.2 * width - 7e-3], 4)[:, None] * [0, 1, 0]
