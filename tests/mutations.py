@@ -40,6 +40,7 @@ TESTS = """
     test_batch.py test_muscles.py test_growth.py test_viscosity.py test_laws_with_state.py test_open_laws.py
     test_unequal_steps.py test_quadratic.py test_quadratic_loads.py test_quadratic_outputs.py test_mass_scaling.py
     test_designs.py test_identify.py test_identify_experiments.py test_surface_drag.py test_reduced.py
+    test_reduced_explicit.py
 """.split()
 
 WRONG_NUMBERS = ("AssertionError", "assert ", "Failed: ", "FloatingPointError")

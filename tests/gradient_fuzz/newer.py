@@ -3,6 +3,7 @@
 import numpy as np
 
 import diffsim_ti as ds
+from diffsim_ti.solvers.explicit.body_checks import check_bodies
 
 from .loads import over_time
 from .structures import CELL
@@ -23,17 +24,29 @@ def mass_scaling(kind, seed: int) -> float | None:
 
 
 def reduced(kind, seed: int, mesh, fixed, deformed: bool) -> dict[str, str] | None:
-    """A set that moves by few numbers, where implicit runs have one of which nothing is held."""
-    if kind.explicit or deformed or np.random.default_rng([36, seed]).random() > 0.5:
+    """A set that moves by few numbers, where runs have one of which nothing is held; explicit ones where obstacles push."""
+    rng = np.random.default_rng([36, seed])
+    if deformed or rng.random() > 0.5 or kind.explicit and (kind.obstacles and kind.contact == "stage"):
         return None
+    how = ("affine", "rigid")[rng.integers(2)] if kind.explicit else "affine"
     held = ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3), fixed=fixed).held
     for name in ("part", "body_1"):
         own = (
             mesh.elements[mesh.tetrahedron_sets[name]] if name in mesh.tetrahedron_sets else mesh.vertex_sets.get(name)
         )
         if own is not None and not np.isin(own, held).any():
-            return {name: "affine"}
+            return {name: how}
     return None
+
+
+def accepted(kind, scene):
+    """The scene, without reduced sets where explicit steps refuse them: by chambers, narrow obstacles, surfaces that rub."""
+    if kind.explicit and scene.reduced:
+        try:
+            check_bodies(scene, kind.contact)
+        except ValueError:
+            return scene.replace(reduced=None)
+    return scene
 
 
 def muscles(kind, seed: int, mesh, steps: int, duration: float, E: float) -> list[ds.Muscle]:
