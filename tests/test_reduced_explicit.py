@@ -6,6 +6,8 @@ from functools import lru_cache
 import numpy as np
 import pytest
 import scipy.linalg
+import scipy.spatial
+from example_files import example
 from test_reduced import bar, scene_of
 
 import diffsim_ti as ds
@@ -338,6 +340,20 @@ def test_starts_that_a_body_cannot_have_are_brought_near(kind):
             sum((seed * (getattr(ends[0], x) - getattr(ends[1], x))).sum() for x in ("positions", "velocities")) / 2e-6
         )
         assert (gradient[name] * way).sum() == pytest.approx(change, rel=1e-6)
+
+
+def test_batches_take_them_one_after_the_other():
+    batch = ds.Batch(ds.VelocityVerletSolver(scene_of({"shell": "rigid"}), dt=1e-3), steps=2, scenes=2)
+    assert "reduced sets" in batch.why_not
+    alone = ds.Rollout(batch.solver, 2, gradients=[]).forward().positions[-1]
+    np.testing.assert_array_equal(batch.forward().positions[1, -1], alone)
+
+
+def test_the_benchmark_of_a_stiff_part():
+    found = example("benchmarks/reduced_steps").main(2)
+    plain, affine, rigid = found.values()
+    assert rigid[0] > 5 * plain[0] and affine[0] > 1.2 * plain[0]
+    assert rigid[3] == pytest.approx(plain[3], rel=0.01) and affine[3] == pytest.approx(plain[3], rel=2e-3)
 
 
 # ---- refusals --------------------------------------------------------------------------------------------------------
