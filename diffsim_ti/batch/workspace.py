@@ -36,6 +36,7 @@ def why_not(solver) -> str | None:
     terms |= dict(springs_or_cables=scene.ties, foundations=len(scene.founded_vertices))
     terms |= dict(contact_within_faces=feels_faces(scene), mesh_obstacles=_tables(scene))
     terms |= dict(unequal_steps=solver.schedule.varies, growth_over_time=scene.growing, surface_drag=scene.fluids)
+    terms |= dict(reduced_sets=scene.reduced)
     there = [name.replace("_", " ") for name, some in terms.items() if some]
     return f"it has {' and '.join(there)}" if there else None
 

@@ -172,6 +172,8 @@ def clip(it) -> str:
     chain, configuration = Chain(it), it.configuration
     if not chain.comparable() or configuration.structure.static or configuration.structure.motion:
         return RIGHT  # a prescribed vertex is no state
+    if configuration.scene.reduced.rigid:
+        return RIGHT  # whose adjoints are those of its vertices, of which a start takes a part
     steps, save = configuration.steps, configuration.options["save_every"]
 
     def sweep(limit: float) -> tuple[dict, list]:

@@ -3,6 +3,7 @@
 import numpy as np
 
 import diffsim_ti as ds
+from diffsim_ti.solvers.explicit.body_checks import check_bodies
 
 from .loads import over_time
 from .structures import CELL
@@ -23,16 +24,20 @@ def mass_scaling(kind, seed: int) -> float | None:
 
 
 def reduced(kind, seed: int, mesh, fixed, deformed: bool) -> dict | None:
-    """A set that moves by few numbers, where implicit runs have one of which nothing is held: affinely, by functions of each
-    component, or by fields."""
-    if kind.explicit or deformed or np.random.default_rng([36, seed]).random() > 0.5:
+    """A set that moves by few numbers, where runs have one of which nothing is held: affinely or rigidly in explicit ones where
+    obstacles push; affinely, by functions of each component, or by fields in implicit ones."""
+    rng = np.random.default_rng([36, seed])
+    if deformed or rng.random() > 0.5 or kind.explicit and (kind.obstacles and kind.contact == "stage"):
         return None
+    how = ("affine", "rigid")[rng.integers(2)]
     held = ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3), fixed=fixed).held
     for name in ("part", "body_1"):
         own = (
             mesh.elements[mesh.tetrahedron_sets[name]] if name in mesh.tetrahedron_sets else mesh.vertex_sets.get(name)
         )
         if own is not None and not np.isin(own, held).any():
+            if kind.explicit:
+                return {name: how}
             return {name: motions(np.random.default_rng([40, seed]), mesh, len(np.unique(own)))}
     return None
 
@@ -47,6 +52,16 @@ def motions(rng, mesh, count: int):
         return np.column_stack([np.ones(n), rng.standard_normal((n, more))])
     rigid = np.eye(3)[:, None] * np.ones((n, 1))
     return np.concatenate([rigid, 0.3 * rng.standard_normal((more, n, 3))])
+
+
+def accepted(kind, scene):
+    """The scene, without reduced sets where explicit steps refuse them: by chambers, narrow obstacles, surfaces that rub."""
+    if kind.explicit and scene.reduced:
+        try:
+            check_bodies(scene, kind.contact)
+        except ValueError:
+            return scene.replace(reduced=None)
+    return scene
 
 
 def muscles(kind, seed: int, mesh, steps: int, duration: float, E: float) -> list[ds.Muscle]:

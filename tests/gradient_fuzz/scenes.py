@@ -174,6 +174,7 @@ def build(seed: int, precision: str | None = None, calm: float = 1.0) -> Configu
         mass_scaling=newer.mass_scaling(kind, seed),
         reduced=newer.reduced(kind, seed, mesh, supports if kind.rollers else fixed, deformed is not None),
     )
+    scene = newer.accepted(kind, scene)
     options = dict(save_every=int(rng.choice([k for k in range(1, steps + 1) if steps % k == 0])), gradients="all")
     solver = _solver(kind, scene, dt, substeps)
     return Configuration(seed, kind, solver, steps, options, placed, schedule, paths, terms, calm)

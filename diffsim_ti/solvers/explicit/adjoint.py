@@ -236,14 +236,15 @@ class ExplicitAdjoint:
     def norm(self) -> tuple[float, float]:
         """Euclidean norms of the adjoints of displacement and velocity where the sweep stands.
 
-        Held vertices have no velocity.
+        Held vertices have no velocity, and affine sets only the motions that they can do.
         """
         copy_slot(self.u, 0, self.whole.u, 0)
         if self.whole.v is not self.v:
             copy_slot(self.v, 0, self.whole.v, 0)
         self._gather(self.whole)
         u, v = (runtime.fetch(x)[0].astype(np.float64) for x in (self.whole.u, self.whole.v))
-        v = self.ws.arrays.supports.free(v)
+        reduced = self.ws.scene.reduced
+        u, v = reduced.of(u), reduced.of(self.ws.arrays.supports.free(v))
         return float(np.linalg.norm(u)), float(np.linalg.norm(v))
 
     def scale(self, factor: float) -> None:

@@ -7,9 +7,9 @@ displacements u, velocities v and forces f (body_sums.py),
     v+ = v + (pre + post) f,    v+ += what friction of obstacles does (terms/obstacles/grip.py),
     u' = u + alpha v+,    v' = decay v+,
 
-of an affine body, and of a rigid one with the rotation that body_motion.py says. Frames show v + pre f, of a rigid body its
-rigid part: velocity Verlet is SHAKE there, with the velocities of RATTLE, and symplectic Euler shows (x' - x) / h. Sums m v
-and sum m x x v change by the loads alone, to round-off.
+of an affine body, and of a rigid one with the rotation that body_motion.py says and velocities v' that are rigid there, with
+the momentum of v+. Frames show v + pre f, of a rigid body its rigid part: velocity Verlet is SHAKE, with the velocities of
+RATTLE. Sums m v and m x x v change by the loads alone, to round-off.
 """
 
 from dataclasses import dataclass
@@ -75,46 +75,43 @@ class Bodies(BodySums):
 
     @traced
     def turn(self, b, u, v, now, scene):
-        """L, f and R f of a pass with velocities v+."""
+        """Of a pass with velocities v+: momentum l, f, R f, what columns of R gain, N = R F, and the spin in both axes."""
         if not self.rigid:
             return None
-        L, f = self.turned(b, u, v, let(self.double(now.alpha)), scene)
-        return Bundle(L=let(L), f=let(f), phi=let(motion.times(u.R, f)))
+        momentum = let(motion.momentum(u.R, v, u.J))
+        f = let(self.half_turn(b, u, momentum, let(self.double(now.alpha)), scene))
+        phi = let(motion.times(u.R, f))
+        c = motion.columns(*(motion.gained(phi, k) for k in (u.R.x, u.R.y, u.R.z)))
+        N = motion.columns(u.R.x + c.x, u.R.y + c.y, u.R.z + c.z)
+        omega = let(motion.solved(motion.inertia(u.J), motion.back(N, momentum)))
+        return Bundle(l=momentum, f=f, phi=phi, c=c, N=N, omega=omega, w=let(motion.times(N, omega)))
 
     @ti.func
-    def turned(self, b, u: A, v: A, alpha, scene: A):
-        L, f = VECTOR(0, 0, 0, 0), VECTOR(0, 0, 0, 0)
+    def half_turn(self, b, u: A, momentum, alpha, scene: A):
+        f = VECTOR(0, 0, 0, 0)
         if alpha > 0 and scene.body_kind[b] > 0:
-            L = motion.back(u.R, motion.momentum(u.R, v, u.J))
-            f = motion.half_turn(u.J, alpha * L)
-        return L, f
+            f = motion.half_turn(u.J, alpha * motion.back(u.R, momentum))
+        return f
 
     @traced
-    def moved(self, b, u, v, seen, turn, now, scene):
-        """(displacements, velocities) after the pass, for velocities v+ and those that are shown, with which a run ends."""
+    def moved(self, b, u, v, turn, now, scene):
+        """(displacements, velocities) after the pass, for velocities v+."""
         alpha, decay = let(self.double(now.alpha)), let(self.double(now.decay))
-        x = self.moved_columns(b, u, v, seen, turn, alpha, decay, scene)
+        x = self.moved_columns(b, u, v, turn, alpha, decay, scene)
         return self.field(u.o + alpha * v.o, *x[:3]), self.field(decay * v.o, *x[3:])
 
     @ti.func
-    def moved_columns(self, b, u: A, v: A, seen: A, turn: A, alpha, decay, scene: A):
+    def moved_columns(self, b, u: A, v: A, turn: A, alpha, decay, scene: A):
         x, y, z = u.x + alpha * v.x, u.y + alpha * v.y, u.z + alpha * v.z
         p, q, r = decay * v.x, decay * v.y, decay * v.z
         if ti.static(self.rigid):
             if scene.body_kind[b] > 0:
-                p, q, r = seen.x, seen.y, seen.z
-                if alpha > 0:
-                    rate = decay / alpha
-                    p, q, r = (
-                        motion.gained(turn.phi, u.R.x),
-                        motion.gained(turn.phi, u.R.y),
-                        motion.gained(turn.phi, u.R.z),
-                    )
-                    x, y, z = u.R.x + p, u.R.y + q, u.R.z + r
-                    x[0] += -1
-                    y[1] += -1
-                    z[2] += -1
-                    p, q, r = rate * p, rate * q, rate * r
+                x, y, z = turn.N.x, turn.N.y, turn.N.z
+                p, q, r = motion.cross(turn.w, x), motion.cross(turn.w, y), motion.cross(turn.w, z)
+                p, q, r = decay * p, decay * q, decay * r
+                x[0] += -1
+                y[1] += -1
+                z[2] += -1
         return x, y, z, p, q, r
 
     # ---- friction ------------------------------------------------------------------------------------------------------
@@ -182,14 +179,14 @@ class Bodies(BodySums):
         plain_u, v, plain = self.nearest(b, state, s, scene.body_force, 0, scene)
         u = self.placed(b, plain_u, scene)
         f = self.with_gravity(plain, scene.parameters)
-        seen = self.shown(b, u, v, f, now.pre, scene)
         if now.frame >= 0:
+            seen = self.shown(b, u, v, f, now.pre, scene)
             for m in range(scene.body_first[b], scene.body_first[b + 1]):
                 i = scene.body_vertex[m]
                 state.frames_u[now.frame, i] = state.u[s, i]
                 state.frames_v[now.frame, i] = self.narrow(self.at_arm(seen, self.arm(m, b, scene)))
         rub = self.rub(b, u, self.kicked(v, now.pre + now.post, f), state.u, s, now, scene)
-        displaced, moving = self.moved(b, u, rub.after, seen, self.turn(b, u, rub.after, now, scene), now, scene)
+        displaced, moving = self.moved(b, u, rub.after, self.turn(b, u, rub.after, now, scene), now, scene)
         for m in range(scene.body_first[b], scene.body_first[b + 1]):
             self.go(m, b, displaced, moving, s, t, now, scene, state, plan)
 

@@ -104,20 +104,17 @@ def momentum(R: A, G: A, J: A):
 
 @ti.func
 def momentum_jvp(R: A, G: A, J: A, theta, dG: A, dJ: A):
-    """Change of L, in the body's axes."""
-    dl = momentum(R, dG, J) + momentum(R, G, dJ)
+    """Change of l."""
     turned = columns(cross(theta, R.x), cross(theta, R.y), cross(theta, R.z))
-    return back(R, dl + momentum(turned, G, J) - cross(theta, momentum(R, G, J)))
+    return momentum(R, dG, J) + momentum(R, G, dJ) + momentum(turned, G, J)
 
 
 @ti.func
 def momentum_vjp(R: A, G: A, J: A, by):
-    """(adjoint of theta, columns of those of G, and of what J_b is multiplied with) for that of L."""
-    L = times(R, by)
-    theta = cross(L, momentum(R, G, J))
-    theta += cross(R.x, cross(times(G, J.x), L)) + cross(R.y, cross(times(G, J.y), L))
-    theta += cross(R.z, cross(times(G, J.z), L))
-    return theta, cross(L, R.x), cross(L, R.y), cross(L, R.z)
+    """(adjoint of theta, columns of what those of G are J times, and those of J the products of G with) for that of l."""
+    theta = cross(R.x, cross(times(G, J.x), by)) + cross(R.y, cross(times(G, J.y), by))
+    theta += cross(R.z, cross(times(G, J.z), by))
+    return theta, cross(by, R.x), cross(by, R.y), cross(by, R.z)
 
 
 # ---- the spin ------------------------------------------------------------------------------------------------------------
@@ -132,8 +129,9 @@ def spin(R: A, G: A, J: A):
 @ti.func
 def spin_jvp(R: A, G: A, J: A, theta, dG: A, dJ: A):
     """Columns of the change of the spin's gradient."""
-    omega = solved(inertia(J), back(R, momentum(R, G, J)))
-    dL = momentum_jvp(R, G, J, theta, dG, dJ)
+    l = momentum(R, G, J)
+    omega = solved(inertia(J), back(R, l))
+    dL = back(R, momentum_jvp(R, G, J, theta, dG, dJ) - cross(theta, l))
     change = times(R, solved(inertia(J), dL - inertia_times(dJ, omega)))
     w = times(R, omega)
     x, y, z = cross(w, R.x), cross(w, R.y), cross(w, R.z)

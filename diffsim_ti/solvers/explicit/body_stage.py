@@ -36,7 +36,7 @@ class BodyStage(BodyTangent):
 
     @ti.func
     def momentum_vjp(self, b, R: A, v: A, J: A, by, scene: A, adjoint: A):
-        """(adjoint of theta, columns of that of v) for that of L; adds that of J."""
+        """(adjoint of theta, columns of that of v) for that of l; adds that of J."""
         theta, x, y, z = motion.momentum_vjp(R, v, J, by)
         for k in ti.static(range(6)):
             r = ti.static(PAIRS[k][0])
@@ -70,19 +70,25 @@ class BodyStage(BodyTangent):
         x, y, z, p, q, r = 0 * by.x, 0 * by.x, 0 * by.x, by.x, by.y, by.z
         if ti.static(self.rigid):
             if pre > 0 and scene.body_kind[b] > 0:
-                R, J = u.R, u.J
-                omega = motion.solved(motion.inertia(J), motion.back(R, motion.momentum(R, v, J)))
-                w = motion.times(R, omega)
-                s = motion.cross(R.x, by.x) + motion.cross(R.y, by.y) + motion.cross(R.z, by.z)
-                theta = motion.cross(motion.cross(w, R.x), by.x) + motion.cross(motion.cross(w, R.y), by.y)
-                theta += motion.cross(motion.cross(w, R.z), by.z)
-                of_L = motion.solved(motion.inertia(J), motion.back(R, s))
-                self.add_trace(b, -of_L.dot(omega), adjoint)
-                self.add_J(b, 0.5 * of_L, omega, adjoint)
-                more, p_, q_, r_ = self.momentum_vjp(b, R, v, J, of_L, scene, adjoint)
+                l = motion.momentum(u.R, v, u.J)
+                omega = motion.solved(motion.inertia(u.J), motion.back(u.R, l))
+                theta, of_l = self.swept_vjp(b, u.R, u.J, motion.times(u.R, omega), omega, l, by, adjoint)
+                more, p_, q_, r_ = self.momentum_vjp(b, u.R, v, u.J, of_l, scene, adjoint)
                 p, q, r = p_, q_, r_
-                x, y, z = self.turning_vjp(R, theta + more)
+                x, y, z = self.turning_vjp(u.R, theta + more)
         return x, y, z, p, q, r
+
+    @ti.func
+    def swept_vjp(self, b, R: A, J: A, w, omega, l, by: A, adjoint: A):
+        """(adjoint of theta, of l) for those of columns w x R_k of the spin R omega; adds that of J."""
+        s = motion.cross(R.x, by.x) + motion.cross(R.y, by.y) + motion.cross(R.z, by.z)
+        theta = motion.cross(motion.cross(w, R.x), by.x) + motion.cross(motion.cross(w, R.y), by.y)
+        theta += motion.cross(motion.cross(w, R.z), by.z)
+        own = motion.solved(motion.inertia(J), motion.back(R, s))
+        self.add_trace(b, -own.dot(omega), adjoint)
+        self.add_J(b, 0.5 * own, omega, adjoint)
+        of_l = motion.times(R, own)
+        return theta + motion.cross(of_l, l), of_l
 
     @ti.func
     def turning_vjp(self, R: A, theta):
@@ -91,18 +97,13 @@ class BodyStage(BodyTangent):
 
     @traced
     def moved_vjp(self, b, u, v, turn, by_u, by_v, now, scene, adjoint):
-        """(adjoint of u, of v+, of what is shown) for those of the displacements and velocities after the pass; adds those
-        of all else."""
+        """(adjoint of u, of v+) for those of the displacements and velocities after the pass; adds those of all else."""
         alpha, decay = let(self.double(now.alpha)), let(self.double(now.decay))
         x = self.moved_columns_vjp(b, u, v, turn, by_u, by_v, alpha, decay, scene, adjoint)
         if self.vertex.features.drag >= 0:
             by_alpha, by_decay = let(x[6] + self.dot(by_u.o, v.o)), let(x[7] + self.dot(by_v.o, v.o))
             self.add_rate(b, by_alpha, by_decay, now, scene, adjoint)
-        return (
-            self.field(by_u.o, *x[:3]),
-            self.field(alpha * by_u.o + decay * by_v.o, *x[3:6]),
-            self.field(VECTOR(0, 0, 0, 0), *x[8:]),
-        )
+        return self.field(by_u.o, *x[:3]), self.field(alpha * by_u.o + decay * by_v.o, *x[3:6])
 
     @ti.func
     def add_rate(self, b, by_alpha, by_decay, now: A, scene: A, adjoint: A):
@@ -116,31 +117,30 @@ class BodyStage(BodyTangent):
         p, q, r = alpha * x + decay * by_v.x, alpha * y + decay * by_v.y, alpha * z + decay * by_v.z
         by_alpha = x.dot(v.x) + y.dot(v.y) + z.dot(v.z)
         by_decay = by_v.x.dot(v.x) + by_v.y.dot(v.y) + by_v.z.dot(v.z)
-        l, m, n = 0 * x, 0 * x, 0 * x
         if ti.static(self.rigid):
             if scene.body_kind[b] > 0:
-                l, m, n = by_v.x, by_v.y, by_v.z
-                p, q, r = 0 * x, 0 * x, 0 * x
-                if alpha > 0:
-                    l, m, n = 0 * x, 0 * x, 0 * x
-                    R, J, L, f, phi, rate = u.R, u.J, turn.L, turn.f, turn.phi, decay / alpha
-                    theta, of_phi, of_rate = 0 * x, 0 * x, ti.cast(0, ti.f64)
-                    for k in ti.static(range(3)):
-                        own, of_u, of_v = self.column(R, k), self.column(by_u, k), self.column(by_v, k)
-                        c, of_c = motion.gained(phi, own), of_u + rate * of_v
-                        theta += motion.cross(own, of_u) + motion.cross(c, of_c)
-                        of_phi += motion.gained_vjp(phi, own, c, of_c)
-                        of_rate += of_v.dot(c)
-                    mu = motion.half_turn_vjp(J, f, alpha * L, motion.back(R, of_phi))
-                    of_a, nu = 0.5 * (1 + f.dot(f)) * mu, mu + motion.cross(mu, f)
-                    self.add_trace(b, -nu.dot(f), adjoint)
-                    self.add_J(b, 0.5 * nu, f, adjoint)
-                    by_alpha = of_a.dot(L) - of_rate * rate / alpha
-                    by_decay = of_rate / alpha
-                    more, p_, q_, r_ = self.momentum_vjp(b, R, v, J, alpha * of_a, scene, adjoint)
-                    p, q, r = p_, q_, r_
-                    x, y, z = self.turning_vjp(R, theta + more)
-        return x, y, z, p, q, r, by_alpha, by_decay, l, m, n
+                swept = motion.columns(decay * by_v.x, decay * by_v.y, decay * by_v.z)
+                after, of_l = self.swept_vjp(b, turn.N, u.J, turn.w, turn.omega, turn.l, swept, adjoint)
+                theta, of_phi = 0 * x, 0 * x
+                by_decay = ti.cast(0, ti.f64)
+                for k in ti.static(range(3)):
+                    own, c, N = self.column(u.R, k), self.column(turn.c, k), self.column(turn.N, k)
+                    of_N = self.column(by_u, k) + 0.5 * motion.cross(after, N)
+                    theta += motion.cross(N, of_N)
+                    of_phi += motion.gained_vjp(turn.phi, own, c, of_N)
+                    by_decay += self.column(by_v, k).dot(motion.cross(turn.w, N))
+                L = motion.back(u.R, turn.l)
+                mu = motion.half_turn_vjp(u.J, turn.f, alpha * L, motion.back(u.R, of_phi))
+                of_a, nu = 0.5 * (1 + turn.f.dot(turn.f)) * mu, mu + motion.cross(mu, turn.f)
+                self.add_trace(b, -nu.dot(turn.f), adjoint)
+                self.add_J(b, 0.5 * nu, turn.f, adjoint)
+                by_alpha = of_a.dot(L)
+                of_L = alpha * motion.times(u.R, of_a)
+                theta += motion.cross(of_L, turn.l)
+                more, p_, q_, r_ = self.momentum_vjp(b, u.R, v, u.J, of_L + of_l, scene, adjoint)
+                p, q, r = p_, q_, r_
+                x, y, z = self.turning_vjp(u.R, theta + more)
+        return x, y, z, p, q, r, by_alpha, by_decay
 
     # ---- friction ------------------------------------------------------------------------------------------------------
 
@@ -294,13 +294,13 @@ class BodyStage(BodyTangent):
         kicked = self.kicked(start, share, f)
         rub = self.rub(b, u, kicked, state.u, s, now, scene)
         turn = self.turn(b, u, rub.after, now, scene)
-        displaced, moving = self.moved(b, u, rub.after, seen, turn, now, scene)
+        displaced, moving = self.moved(b, u, rub.after, turn, now, scene)
         by_v = self.field_of(self.spread_vjp(b, 0, adjoint.v, moving, scene, adjoint))
         by_u = self.field_of(self.spread_u(b, displaced, now, scene, adjoint))
         self.start_u(b, now, scene, adjoint)
-        of_u, of_after, at_end = self.moved_vjp(b, u, rub.after, turn, by_u, by_v, now, scene, adjoint)
+        of_u, of_after = self.moved_vjp(b, u, rub.after, turn, by_u, by_v, now, scene, adjoint)
         more_u, of_kicked = self.rub_vjp(b, rub, u, kicked, of_after, state.u, s, now, scene, adjoint)
-        of_seen = self.sum_of(at_end, self.field_of(self.spread_frame(b, seen, now, scene, adjoint)))
+        of_seen = self.field_of(self.spread_frame(b, seen, now, scene, adjoint))
         w = self.kicked(v, now.pre, f)
         shown_u, of_w = self.spun_vjp(b, self.unless(halts, now.pre), u, w, of_seen, scene, adjoint)
         by_field_v, by_field_u = self.sum_of(of_kicked, of_w), self.sum_of(self.sum_of(of_u, more_u), shown_u)

@@ -36,39 +36,41 @@ class BodyTangent(Bodies):
         return self.spun_jvp(b, u, self.kicked(v, pre, f), du, self.kicked(dv, pre, df), scene, tangent, pre)
 
     @traced
-    def moved_jvp(self, b, u, v, turn, du, dv, dseen, dalpha, ddecay, now, scene, tangent):
+    def moved_jvp(self, b, u, v, turn, du, dv, dalpha, ddecay, now, scene, tangent):
         """Changes of the displacements and velocities after the pass."""
         alpha, decay = let(self.double(now.alpha)), let(self.double(now.decay))
         dalpha, ddecay = let(self.double(dalpha)), let(self.double(ddecay))
-        x = self.moved_columns_jvp(b, u, v, turn, du, dv, dseen, alpha, decay, dalpha, ddecay, scene, tangent)
+        x = self.moved_columns_jvp(b, u, v, turn, du, dv, alpha, decay, dalpha, ddecay, scene, tangent)
         displaced = du.o + alpha * dv.o + dalpha * v.o
         return self.field(displaced, *x[:3]), self.field(decay * dv.o + ddecay * v.o, *x[3:])
 
     @ti.func
-    def moved_columns_jvp(
-        self, b, u: A, v: A, turn: A, du: A, dv: A, dseen: A, alpha, decay, da, dd, scene: A, tangent: A
-    ):
-        x, y, z = (du.x + alpha * dv.x + da * v.x, du.y + alpha * dv.y + da * v.y, du.z + alpha * dv.z + da * v.z)
+    def moved_columns_jvp(self, b, u: A, v: A, turn: A, du: A, dv: A, alpha, decay, da, dd, scene: A, tangent: A):
+        x, y, z = du.x + alpha * dv.x + da * v.x, du.y + alpha * dv.y + da * v.y, du.z + alpha * dv.z + da * v.z
         p, q, r = decay * dv.x + dd * v.x, decay * dv.y + dd * v.y, decay * dv.z + dd * v.z
         if ti.static(self.rigid):
             if scene.body_kind[b] > 0:
-                p, q, r = dseen.x, dseen.y, dseen.z
-                if alpha > 0:
-                    theta, dJ, rate = motion.turning(u.R, du), self.J(b, tangent), decay / alpha
-                    dL = motion.momentum_jvp(u.R, v, u.J, theta, dv, dJ)
-                    df = motion.half_turn_jvp(u.J, turn.f, alpha * turn.L, alpha * dL + da * turn.L, dJ)
-                    dphi, drate = motion.times(u.R, df), dd / alpha - rate * da / alpha
-                    x, p = self.gained_jvp(u.R.x, turn.phi, theta, dphi, rate, drate)
-                    y, q = self.gained_jvp(u.R.y, turn.phi, theta, dphi, rate, drate)
-                    z, r = self.gained_jvp(u.R.z, turn.phi, theta, dphi, rate, drate)
+                theta, dJ = motion.turning(u.R, du), self.J(b, tangent)
+                dl = motion.momentum_jvp(u.R, v, u.J, theta, dv, dJ)
+                L, dL = motion.back(u.R, turn.l), motion.back(u.R, dl - motion.cross(theta, turn.l))
+                df = motion.half_turn_jvp(u.J, turn.f, alpha * L, alpha * dL + da * L, dJ)
+                dphi = motion.times(u.R, df)
+                x = motion.cross(theta, turn.N.x) + motion.gained_jvp(turn.phi, dphi, u.R.x, turn.c.x)
+                y = motion.cross(theta, turn.N.y) + motion.gained_jvp(turn.phi, dphi, u.R.y, turn.c.y)
+                z = motion.cross(theta, turn.N.z) + motion.gained_jvp(turn.phi, dphi, u.R.z, turn.c.z)
+                after = 0.5 * (motion.cross(turn.N.x, x) + motion.cross(turn.N.y, y) + motion.cross(turn.N.z, z))
+                own = motion.back(turn.N, dl - motion.cross(after, turn.l)) - motion.inertia_times(dJ, turn.omega)
+                change = motion.times(turn.N, motion.solved(motion.inertia(u.J), own))
+                p = self.swept_jvp(turn.N.x, turn.w, after, change, decay, dd)
+                q = self.swept_jvp(turn.N.y, turn.w, after, change, decay, dd)
+                r = self.swept_jvp(turn.N.z, turn.w, after, change, decay, dd)
         return x, y, z, p, q, r
 
     @ti.func
-    def gained_jvp(self, k, phi, theta, dphi, rate, drate):
-        """Changes of a column of the displacement's and of the velocity's gradient."""
-        c = motion.gained(phi, k)
-        dc = motion.cross(theta, c) + motion.gained_jvp(phi, dphi, k, c)
-        return motion.cross(theta, k) + dc, rate * dc + drate * c
+    def swept_jvp(self, k, w, theta, change, decay, dd):
+        """Change of decay w x k, all of which turns by theta, and w by a change besides."""
+        way = motion.cross(w, k)
+        return decay * (motion.cross(theta, way) + motion.cross(change, k)) + dd * way
 
     @ti.func
     def reach_jvp(self, b, y, dy, scene: A, tangent: A):
@@ -129,9 +131,9 @@ class BodyTangent(Bodies):
         u = self.placed(b, plain_u, scene)
         du, dv, df = self.nearest_jvp(b, u, v, plain, state, s, scene, tangent)
         f, pulled = self.with_gravity(plain, scene.parameters), self.with_gravity(df, tangent.parameters)
-        seen = self.shown(b, u, v, f, now.pre, scene)
-        dseen = self.shown_jvp(b, u, v, f, du, dv, pulled, now.pre, scene, tangent)
         if now.frame >= 0:
+            seen = self.shown(b, u, v, f, now.pre, scene)
+            dseen = self.shown_jvp(b, u, v, f, du, dv, pulled, now.pre, scene, tangent)
             for m in range(scene.body_first[b], scene.body_first[b + 1]):
                 i, y, dy = scene.body_vertex[m], self.arm(m, b, scene), self.wide(tangent.body_place[m])
                 tangent.frames_u[now.frame, i] = tangent.u[0, i]
@@ -141,11 +143,9 @@ class BodyTangent(Bodies):
         rub = self.rub(b, u, kicked, state.u, s, now, scene)
         dafter = self.rub_jvp(b, rub, u, kicked, du, dkicked, state.u, s, now, scene, tangent)
         turn = self.turn(b, u, rub.after, now, scene)
-        displaced, moving = self.moved(b, u, rub.after, seen, turn, now, scene)
+        displaced, moving = self.moved(b, u, rub.after, turn, now, scene)
         dalpha, ddecay = now.alpha_by_rate * plan.rate_dot, now.decay_by_rate * plan.rate_dot
-        ddisplaced, dmoving = self.moved_jvp(
-            b, u, rub.after, turn, du, dafter, dseen, dalpha, ddecay, now, scene, tangent
-        )
+        ddisplaced, dmoving = self.moved_jvp(b, u, rub.after, turn, du, dafter, dalpha, ddecay, now, scene, tangent)
         for m in range(scene.body_first[b], scene.body_first[b + 1]):
             i, y, dy = scene.body_vertex[m], self.arm(m, b, scene), self.wide(tangent.body_place[m])
             if now.alpha > 0:

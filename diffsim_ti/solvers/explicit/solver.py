@@ -59,7 +59,8 @@ class ExplicitSolver(Solver):
 
     contact: "stage", the default: obstacles act in a stage of each pass (contact_stage.py), which no step is too large
         for; or "force": their barriers are one more force, which the step has to follow. A vertex that is driven with more
-        than a barrier holds, 7 stiffness width^2, crosses in either and raises Crossing, unless much is damped.
+        than a barrier holds, 7 stiffness width^2, crosses in either and raises Crossing, unless much is damped. Sets that
+        are `reduced` feel obstacles by "force" alone (bodies.py); their friction is a stage that slows the whole set.
         Points within faces feel what is narrower than they are in either by a stage of its own, which goes the way of the
         pass again in as many parts as barrier and speed ask for (face_kernels.py). No friction acts there.
     contact_damping: of the stage, from 0, which keeps the energy of a contact, to 1, which damps what the step does not
