@@ -41,8 +41,8 @@ class BatchFrames(Sequence):
     `frames[b]` are those of scene b (`Frames`), `frames["name"]` any output of all scenes, (scenes, ...). alive: (scenes,),
     whether the scene came to its end; the frames of one that did not hold its last good state from there on, and
     `error(b)` is what a run of it alone raises. `contact_resolution`: one for each scene.
-    Made by a `batch`, from `values` of its inputs, `frames`, `errors` and `last_good` frames of each scene, and `states`, the
-    three above, where they are known of all together.
+    Made by a `batch`, from `values` of its inputs, `frames`, `errors` and `last_good` frames of each scene, and `states`,
+    the three above, where they are known of all together.
     """
 
     def __init__(
