@@ -4,8 +4,8 @@
 
 Each part runs in a process of its own with a time limit, prints one JSON line, and is a row of the table at the end: the
 device; copies and launches; correctness against the CPU, in float64 and float32; time per substep by size beside what
-copying the same bytes takes; many scenes at once; the same work by peers that are installed (compare_peers.py), on the same device. What does
-not fit the time or the memory is left out, and said so.
+copying the same bytes takes; many scenes at once; the same work by peers that are installed (compare_peers.py), on the same
+device. What does not fit the time or the memory is left out, and said so.
 """
 
 import argparse
