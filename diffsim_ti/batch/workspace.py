@@ -15,12 +15,12 @@ from diffsim_ti.batch.history import BatchHistory
 from diffsim_ti.batch.innermost_kernels import InnermostKernels, innermost_kernels
 from diffsim_ti.batch.kernels import SHARED, BatchKernels, batch_kernels
 from diffsim_ti.batch.layouts import Innermost, Lanes, in_slots
+from diffsim_ti.batch.table import ScenesTable
 from diffsim_ti.inputs import Derived
 from diffsim_ti.solvers.explicit.contact_stage import ROWS
 from diffsim_ti.solvers.explicit.felt_faces import feels_faces
 from diffsim_ti.state.arrays import SceneArrays
 from diffsim_ti.state.history import copy_slot
-from diffsim_ti.state.pass_table import FLOATS, INTS, PassTable
 from diffsim_ti.state.solve_report import SolveReport
 from diffsim_ti.terms import SelfContact
 
@@ -44,31 +44,6 @@ def why_not(solver) -> str | None:
 
 def _tables(scene) -> bool:
     return any(term.table.size for term in scene.ordered_terms if term.acts_on_surface)
-
-
-class ScenesTable(PassTable):
-    """Tables of passes; where scenes have drag of their own, `floats` are numbers of scenes."""
-
-    def __init__(self, fp, own: bool, layout: Lanes | Innermost):
-        super().__init__(fp)
-        self.own, self._layout, self._numbers = own, layout, None
-        if own:
-            self.floats = layout.numbers(self.size * len(FLOATS))
-
-    def show_scenes(self, window: int, run: tuple, rates: tuple, make: Callable) -> None:
-        """As `show`, for the drag rates of all scenes [1/s]."""
-        if not self.own:
-            self.show(window, (*run, rates[0]), lambda first, last: make(first, last, rates[0]))
-        elif self._numbers != (window, run, rates):
-            self._numbers = window, run, rates
-            tables = [make(window, min(window + self.size, run[0]), rate) for rate in rates]
-            ints = np.zeros(self.size * len(INTS))
-            ints[: tables[0][0].size] = tables[0][0].ravel()
-            floats = np.zeros((len(rates), self.size * len(FLOATS)))
-            for row, (_, numbers) in zip(floats, tables):
-                row[: numbers.size] = numbers.ravel()
-            runtime.fill(self.ints, ints)
-            runtime.fill(self.floats, self._layout.pack(floats))
 
 
 class BatchWorkspace:
