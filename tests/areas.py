@@ -13,7 +13,7 @@ AREAS = {
     "laws_with_state viscosity viscous_stages",
     "motion against closed forms": "reference_motion step_limit mass_scaling unequal_steps energy_watch hertz torture",
     "every adjoint, order, fuzz": "every_adjoint term_order gradient_fuzz",
-    "gradients": "gradients batch gradient_clip gradient_faults checkpoints tape outputs "
+    "gradients": "gradients batch batch_tape gradient_clip gradient_faults checkpoints tape outputs "
     "contact_force reaction tensor_outputs work modes identification identify identify_experiments",
     "implicit steps and equilibria": "implicit implicit_cycle implicit_gradients implicit_contact swept solve_report "
     "reduced reduced_explicit",

@@ -123,11 +123,6 @@ def test_backends(law):
         own["friction"] = rng.uniform(0.1, 0.4, 5)
         own["rest_positions"] = MESH.vertices + 1e-3 * rng.normal(size=(5, *MESH.vertices.shape))
     check(batch, own, rng, True)
-    frames = batch.forward(**own)
-    seed = np.ones_like(frames.positions)
-    first, again = batch.vjp(frames, seed), batch.vjp(frames, seed)
-    for name, by in first.items():
-        np.testing.assert_array_equal(by, again[name], err_msg=name)
 
 
 def check(batch, own, rng, tangents: bool):
@@ -136,6 +131,8 @@ def check(batch, own, rng, tangents: bool):
     assert frames.alive.all()
     seeds = [rng.normal(size=frames.positions.shape), 0.01 * rng.normal(size=frames.positions.shape)]
     gradients, total = batch.vjp(frames, *seeds), {}
+    for name, again in batch.vjp(frames, *seeds).items():
+        np.testing.assert_array_equal(gradients[name], again, err_msg=name)
     for b in range(B):
         alone = batch.one.forward(**{name: x[b] for name, x in own.items()})
         np.testing.assert_array_equal(frames.displacements[b], alone.displacements)

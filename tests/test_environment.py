@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from example_files import example
+from example_files import EXAMPLES, example
 
 gym = pytest.importorskip("gymnasium")
 
@@ -47,6 +47,32 @@ def test_an_end_starts_anew_and_shows_its_last_observation(jumper):
     assert info["_final_obs"].tolist() == [True, False] and info["final_obs"][0, -1] == 0
     assert observed[0, -1] == 1 and observed[1, -1] < 1
     np.testing.assert_array_equal(info["final_obs"][1], observed[1])
+
+
+@pytest.fixture
+def against_ppo(monkeypatch):
+    monkeypatch.syspath_prepend(EXAMPLES / "control")
+    return example("control/against_ppo")
+
+
+@pytest.mark.filterwarnings("ignore:.*A Box observation space")
+def test_a_crawler_passes_them_too_and_pushes_nothing_but_itself(against_ppo):
+    import crawler
+    from gymnasium.utils.env_checker import check_env
+
+    one = crawler.SoftCrawler()
+    check_env(one, skip_render_check=True)
+    pulls, X = one.all.pressing, one.all.scene.mesh.vertices
+    np.testing.assert_allclose(pulls.sum(1), 0, atol=1e-12)
+    np.testing.assert_allclose(np.cross(X, pulls).sum(1), 0, atol=1e-12)
+
+
+@pytest.mark.parametrize("method", ["gradient", "PPO"])
+def test_a_crawler_learns_by_gradients_and_ppo_takes_as_many_samples(against_ppo, method):
+    curve = against_ppo.train("crawler", method, 2, scenes=4)
+    assert [row[0] for row in curve] == [0, 200, 400] and np.isfinite(curve).all()
+    if method == "gradient":
+        assert curve[-1][2] > curve[0][2] + 0.003
 
 
 @pytest.mark.filterwarnings("error:scenes")

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffsim_ti.batch.frames import BatchFrames
+from diffsim_ti.batch.frames import BatchFrames, LazyFrames
 from diffsim_ti.batch.given import change_of, checked_values, spread_given
 from diffsim_ti.batch.set_values import gathered_scenes
 from diffsim_ti.batch.sweep import BatchSweep, Own, value_of
@@ -128,9 +128,16 @@ class Batch:
             last_good[b] = max(0, int(np.argmin(good)) - 1) if not good.all() else last_good[b]
         for b in np.flatnonzero(last_good < self.num_frames - 1):
             u[b, last_good[b] + 1 :], v[b, last_good[b] + 1 :] = u[b, last_good[b]], v[b, last_good[b]]
-        resolutions = self.sweep.resolutions()
-        frames = [self._frames_of(values, b, u[b], v[b], times, resolutions[b]) for b in range(self.num_scenes)]
-        return BatchFrames(self, values, frames, last_good, run)
+        resolution = self.sweep.resolutions()
+        states = self._positions(values, u), v, u
+        frames = LazyFrames(self.num_scenes, lambda b: self._frames_of(values, b, states, times, resolution(b)))
+        return BatchFrames(self, values, frames, last_good, run, states=states)
+
+    def _positions(self, values: dict, u: np.ndarray) -> np.ndarray:
+        """Those of all scenes from displacements (scenes, frames, n, 3)."""
+        rest = values["rest_positions"]
+        rest = np.stack(rest)[:, None] if isinstance(rest, Own) else rest
+        return (rest + u).astype(u.dtype)
 
     def _sound(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Whether states (k, n, 3) are finite and no vertex crosses the body within a substep."""
@@ -138,10 +145,9 @@ class Batch:
             spread = np.ptp(v, axis=1).max(1) * self.solver.substep
             return np.isfinite(u.sum((1, 2))) & (spread <= 2 * np.ptp(self.scene.mesh.vertices, axis=0).max())
 
-    def _frames_of(self, values: dict, b: int, u, v, times, resolution) -> Frames:
+    def _frames_of(self, values: dict, b: int, states: tuple, times, resolution) -> Frames:
         own = self.sweep.values_of(values, b)
-        positions = (own["rest_positions"] + u).astype(u.dtype)
-        frames = Frames(positions, v, u, times, own, resolution, run=Run(own))
+        frames = Frames(*(x[b] for x in states), times, own, resolution, run=Run(own))
         frames.computed, frames.steps = self.one.computed, np.arange(self.num_frames) * self.save_every
         for name, output in self.one.computed.items():
             frames.outputs[name] = np.asarray(output.value(frames))
@@ -208,9 +214,14 @@ class Batch:
         return out
 
     def _vjp_in_lanes(self, frames: BatchFrames, given: dict) -> dict[str, np.ndarray]:
-        shape = (self.num_scenes, *frames.positions.shape[1:])
+        shape, alive = (self.num_scenes, *frames.positions.shape[1:]), frames.alive
         by_u, by_v, direct = np.zeros(shape), np.zeros(shape), []
-        for b in np.flatnonzero(frames.alive):
+        of_states = given.keys() <= {"positions", "velocities"}  # which say nothing of inputs but by the states
+        if of_states:
+            for name, target in (("positions", by_u), ("velocities", by_v)):
+                if name in given:
+                    target[alive] = given[name][alive]
+        for b in () if of_states else np.flatnonzero(alive):
             change = self.one.pulled_to_frames(frames[b], {name: x[b] for name, x in given.items()})
             direct.append((b, change.inputs))
             for target, part in ((by_u, change.positions), (by_v, change.velocities)):
@@ -235,7 +246,9 @@ class Batch:
             out |= inputs.derive_vjp(self.sweep.values_of(values, 0), total, tuple(n for n in wanted if n in alike))
         if each:
             rows = [
-                inputs.derive_vjp(frames[b].inputs, Derived(*(None if x is None else x[b] for x in parts)), each)
+                inputs.derive_vjp(
+                    self.sweep.values_of(values, b), Derived(*(None if x is None else x[b] for x in parts)), each
+                )
                 for b in range(self.num_scenes)
             ]
             out |= self._joined(values, rows, each)

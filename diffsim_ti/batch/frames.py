@@ -1,6 +1,6 @@
 """Saved states of many scenes."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,31 +14,54 @@ if TYPE_CHECKING:
     from diffsim_ti.batch.batch import Batch
 
 
+class LazyFrames(Sequence):
+    """Frames of each scene, made by `make(b)` when they are asked for."""
+
+    def __init__(self, count: int, make: Callable[[int], Frames]):
+        self._made: list[Frames | None] = [None] * count
+        self._make = make
+
+    def __len__(self) -> int:
+        return len(self._made)
+
+    def __getitem__(self, b):
+        if isinstance(b, slice):
+            return [self[k] for k in range(len(self))[b]]
+        if self._made[b] is None:
+            self._made[b] = self._make(range(len(self))[b])
+        return self._made[b]
+
+    def __reduce__(self):
+        return list, (list(self),)
+
+
 class BatchFrames(Sequence):
     """Saved states of many scenes: positions [m], velocities [m/s], displacements [m], (scenes, frames, n, 3).
 
     `frames[b]` are those of scene b (`Frames`), `frames["name"]` any output of all scenes, (scenes, ...). alive: (scenes,),
     whether the scene came to its end; the frames of one that did not hold its last good state from there on, and
     `error(b)` is what a run of it alone raises. `contact_resolution`: one for each scene.
-    Made by a `batch`, from `values` of its inputs, `frames`, `errors` and `last_good` frames of each scene.
+    Made by a `batch`, from `values` of its inputs, `frames`, `errors` and `last_good` frames of each scene, and `states`,
+    the three above, where they are known of all together.
     """
 
     def __init__(
         self,
         batch: "Batch",
         values: dict,
-        frames: list[Frames],
+        frames: Sequence[Frames],
         last_good: np.ndarray,
         run: Run | None,
         errors: dict | list | None = None,
+        states: tuple | None = None,
     ):
         self._batch, self.values, self._frames, self.run = batch, values, frames, run
-        self.positions = np.stack([one.positions for one in frames])
-        self.velocities = np.stack([one.velocities for one in frames])
-        self.displacements = np.stack([one.displacements for one in frames])
-        self.times, self.last_good = frames[0].times, last_good
+        names = "positions", "velocities", "displacements"
+        states = states or tuple(np.stack([getattr(one, name) for one in frames]) for name in names)
+        self.positions, self.velocities, self.displacements = states
+        self.times, self.last_good = batch.one.times, last_good
         self.alive = last_good == len(self.times) - 1
-        self.outputs = {name: np.stack([one.outputs[name] for one in frames]) for name in frames[0].outputs}
+        self.outputs = {name: np.stack([one.outputs[name] for one in frames]) for name in batch.one.computed}
         self.sets: dict = {}  # inputs that were given by named sets
         self._errors: dict[int, Exception] = errors or {}
 
@@ -60,7 +83,8 @@ class BatchFrames(Sequence):
 
         `reset` starts some scenes anew.
         """
-        rest = np.stack([one.inputs["rest_positions"] for one in self._frames])
+        rest = self.values["rest_positions"]
+        rest = np.stack(rest) if isinstance(rest, tuple) else rest
         return dict(
             initial_positions=rest + self.displacements[:, -1].astype(np.float64),
             initial_velocities=self.velocities[:, -1].astype(np.float64),

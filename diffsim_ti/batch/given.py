@@ -5,8 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from diffsim_ti.batch.set_values import spread_scenes
-from diffsim_ti.batch.sweep import Own, value_of
-from diffsim_ti.inputs.description import frozen
+from diffsim_ti.batch.sweep import BatchValues, Own, value_of
 from diffsim_ti.rollout.rollout import Rollout
 from diffsim_ti.scene import Scene
 
@@ -22,20 +21,24 @@ def spread_given(scene: Scene, given: dict, bases: dict, scenes: int) -> tuple[d
 
 def checked_values(one: Rollout, given: dict, scenes: int) -> dict:
     """All values of a run: what was given, checked, those of scenes as `Own`, and the rollout's own."""
-    inputs, out = one.scene.inputs, dict(one.values)
+    inputs, out = one.scene.inputs, BatchValues(one.values)
     unknown = [name for name in given if name not in one.inputs]
     if unknown:
         raise ValueError(f"no input named {unknown[0]!r}; this batch has {', '.join(one.inputs)}")
     for name, value in given.items():
         if isinstance(value, Own) or _is_own(one, name, value := np.asarray(value, np.float64), scenes):
-            rows = [frozen(np.array(row, np.float64)) for row in value]
-            out[name] = Own(inputs.check({name: row})[name] for row in rows)
+            whole = np.array(value, np.float64)
+            whole.flags.writeable = False
+            described = inputs.described[name]
+            if not described.allows(whole) or not described.fits(whole.shape[1:], inputs.sizes):
+                for row in whole:  # says what is wrong
+                    inputs.check({name: row})
+            out[name] = Own(whole)
         else:
             known = out[name]
             same = value.shape == known.shape and np.array_equal(value, known)
             out[name] = known if same else inputs.check({name: value.copy()})[name]
-        for row in out[name] if isinstance(out[name], Own) else (out[name],):
-            inputs.check_steps({name: row}, one.steps)
+        inputs.check_steps({name: value_of(out[name], 0)}, one.steps)  # rows of scenes have one shape
     return out
 
 

@@ -18,7 +18,12 @@ APART = 16  # numbers between what threads note, so that they do not wait for ea
 
 def in_slots(arrays: list[np.ndarray]) -> np.ndarray:
     """(rows, k, 3) of each scene as (scenes, rows, k, 3); one row serves all where others have more."""
+    first = arrays[0]
+    if all(x is first for x in arrays):
+        return np.broadcast_to(first, (len(arrays), *first.shape))
     rows = max(len(x) for x in arrays)
+    if all(len(x) == rows for x in arrays):
+        return np.stack(arrays)
     return np.stack([np.broadcast_to(x, (rows, *x.shape[1:])) for x in arrays])
 
 

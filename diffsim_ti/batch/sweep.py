@@ -1,5 +1,7 @@
 """n steps of many scenes side by side: forward, in reverse from kept states, and in tangents."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 from diffsim_ti import runtime
@@ -14,6 +16,12 @@ from diffsim_ti.state.watch import ContactResolution, ContactWatch, limits
 
 class Own(tuple):
     """The values of an input, one array for each scene."""
+
+
+class BatchValues(dict):
+    """Values of all inputs, those of scenes as `Own`; `derived` is what kernels read of each scene, once it is known."""
+
+    derived: list[Derived] | None = None
 
 
 def value_of(value, b: int) -> np.ndarray:
@@ -70,8 +78,12 @@ class BatchSweep(Sweep):
     def _checked(self, values: dict) -> dict:
         return values
 
-    def _derive(self, values: dict) -> list[Derived]:
-        return [self.scene.inputs.derive(self.values_of(values, b)) for b in range(self.num_scenes)]
+    def _derive(self, values: BatchValues) -> list[Derived]:
+        if values.derived is None:
+            own = {name: x for name, x in values.items() if isinstance(x, Own)}
+            changed = [{name: x[b] for name, x in own.items()} for b in range(self.num_scenes)]
+            values.derived = self.scene.inputs.derive_each(self.values_of(values, 0), changed)
+        return values.derived
 
     def _make_workspace(self, derived):
         return BatchWorkspace(self.solver, derived)
@@ -100,11 +112,11 @@ class BatchSweep(Sweep):
         """{scene: the step in which it got behind an obstacle}"""
         return {b: int(self.solver.schedule.row(j)) for b, j in self._guard.crossed.items()}
 
-    def resolutions(self) -> list[ContactResolution]:
-        """What contacts of each scene did in the last run."""
-        ws, seen = self.workspace, self.workspace.seen()
-        watch, largest = ContactWatch(ws), limits(self.solver)
-        return [watch.resolution_of(rows, d, ws.substep, largest) for rows, d in zip(seen, ws.derived)]
+    def resolutions(self) -> Callable[[int], ContactResolution]:
+        """What contacts of scene b did in the last run, worked out when it is asked for."""
+        ws, seen, derived = self.workspace, self.workspace.seen(), self.workspace.derived
+        watch, largest, h = ContactWatch(ws), limits(self.solver), ws.substep
+        return lambda b: watch.resolution_of(seen[b], derived[b], h, largest)
 
     def pull_back(self, run: Run, positions_adj: np.ndarray, velocities_adj: np.ndarray) -> Derived:
         """Adjoints, from those of the frames, of what kernels read at the start; the scenes are their first axis."""

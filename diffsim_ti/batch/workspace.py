@@ -2,6 +2,8 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
+from operator import is_
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,12 +15,12 @@ from diffsim_ti.batch.history import BatchHistory
 from diffsim_ti.batch.innermost_kernels import InnermostKernels, innermost_kernels
 from diffsim_ti.batch.kernels import SHARED, BatchKernels, batch_kernels
 from diffsim_ti.batch.layouts import Innermost, Lanes, in_slots
+from diffsim_ti.batch.table import ScenesTable
 from diffsim_ti.inputs import Derived
 from diffsim_ti.solvers.explicit.contact_stage import ROWS
 from diffsim_ti.solvers.explicit.felt_faces import feels_faces
 from diffsim_ti.state.arrays import SceneArrays
 from diffsim_ti.state.history import copy_slot
-from diffsim_ti.state.pass_table import FLOATS, INTS, PassTable
 from diffsim_ti.state.solve_report import SolveReport
 from diffsim_ti.terms import SelfContact
 
@@ -45,31 +47,6 @@ def _tables(scene) -> bool:
     return any(term.table.size for term in scene.ordered_terms if term.acts_on_surface)
 
 
-class ScenesTable(PassTable):
-    """Tables of passes; where scenes have drag of their own, `floats` are numbers of scenes."""
-
-    def __init__(self, fp, own: bool, layout: Lanes | Innermost):
-        super().__init__(fp)
-        self.own, self._layout, self._numbers = own, layout, None
-        if own:
-            self.floats = layout.numbers(self.size * len(FLOATS))
-
-    def show_scenes(self, window: int, run: tuple, rates: tuple, make: Callable) -> None:
-        """As `show`, for the drag rates of all scenes [1/s]."""
-        if not self.own:
-            self.show(window, (*run, rates[0]), lambda first, last: make(first, last, rates[0]))
-        elif self._numbers != (window, run, rates):
-            self._numbers = window, run, rates
-            tables = [make(window, min(window + self.size, run[0]), rate) for rate in rates]
-            ints = np.zeros(self.size * len(INTS))
-            ints[: tables[0][0].size] = tables[0][0].ravel()
-            floats = np.zeros((len(rates), self.size * len(FLOATS)))
-            for row, (_, numbers) in zip(floats, tables):
-                row[: numbers.size] = numbers.ravel()
-            runtime.fill(self.ints, ints)
-            runtime.fill(self.floats, self._layout.pack(floats))
-
-
 class BatchWorkspace:
     """Scenes of one mesh, law and list of terms, side by side in a layout; numbers may differ from scene to scene."""
 
@@ -81,7 +58,7 @@ class BatchWorkspace:
         self.layout = (Lanes if runtime.runs_on_cpu() else Innermost)(self.scene.precision, self.num_scenes)
         self.fp, self.substep = self.arrays.fp, solver.substep
         self.in_parallel = 1 if self.layout.in_lanes else solver.passes_per_launch()
-        self.numbers, self.frames, self.record, self._launches = None, None, None, {}
+        self.numbers, self.frames, self.record, self._launches, self._made_of = None, None, None, {}, {}
         self.load(derived, start=False)
         self.state = BatchHistory(self, 1)
         contacts, n = len(self.arrays.contacts), self.arrays.num_vertices
@@ -119,7 +96,12 @@ class BatchWorkspace:
         if self.numbers is None:
             self.numbers = SimpleNamespace(corner=self.room_for_corners())
             runtime.fill(self.numbers.corner, 0)
-        for name, (data, dtype) in sources.items():
+        for name, (parts, make) in sources.items():
+            before = self._made_of.get(name)
+            if before is not None and len(before) == len(parts) and all(map(is_, before, parts)):
+                continue  # they are there
+            data, dtype = make()
+            self._made_of[name] = parts
             current = getattr(self.numbers, name, None)
             if current is None or runtime.full_shape(current) != self._shape(data, dtype):
                 setattr(self.numbers, name, runtime.upload(data, dtype))
@@ -143,41 +125,46 @@ class BatchWorkspace:
         return float(derived.parameters[at]) if at >= 0 else 0.0
 
     def _sources(self, derived: list[Derived]) -> dict:
-        """{name: (data, element type)} of what kernels read of the scenes."""
+        """{name: (arrays, what makes (data, element type) of them)} of what kernels read of the scenes."""
         a, own, first, layout = self.arrays, self.own, derived[0], self.layout
-        numbers = [np.concatenate([d.parameters, a.tables]) for d in derived]
+        each = lambda name: tuple(getattr(d, name) for d in derived)  # noqa: E731
+        coefficients, parameters = each("coefficients"), each("parameters")
+        with_tables = lambda: [np.concatenate([x, a.tables]) for x in parameters]  # noqa: E731
         out = dict(
-            tets=(a.mesh.elements.ravel(), ti.i32),
-            coefficients=(layout.pack(np.stack([d.coefficients.ravel() for d in derived])), layout.number),
-            parameters=(layout.pack(np.stack(numbers)), layout.number),
+            tets=((), lambda: (a.mesh.elements.ravel(), ti.i32)),
+            coefficients=(coefficients, lambda: self._packed(coefficients, "scalars")),
+            parameters=(parameters, lambda: self._packed(with_tables(), "scalars")),
         )
         if layout.in_lanes:
-            out["special"] = self._special(), ti.i32
-        self.num_parameters = len(numbers[0])
-        each = dict(
-            gradients=[d.gradients for d in derived],
-            volumes=[d.volumes for d in derived],
-            inverse_mass=[a.inverse_of(d.mass) for d in (derived if "inverse_mass" in own else derived[:1])],
-            rest=[d.rest for d in derived],
-            surface=[np.zeros(1) if d.surface is None else d.surface for d in derived],
-        )
-        for name, arrays in each.items():
-            if name in own:
-                out[name] = self._packed(arrays, SHARED[name])
-            else:
-                plain = SHARED[name] == "scalars"
-                out[name] = (arrays[0].ravel(), self.fp) if plain else (arrays[0], a.vector)
-        none = np.zeros((1, 1, 3))
-        anchors = [d.displacement[a.held] if d.motion is not None else none[0] for d in derived]
-        out["anchor"] = self._packed(anchors, "vectors")
+            out["special"] = (first.surface,), lambda: (self._special(), ti.i32)
+        self.num_parameters = len(parameters[0]) + len(a.tables)
+        for name, kind in SHARED.items():
+            known = each("mass" if name == "inverse_mass" else name)
+            out[name] = (name in own, *known), partial(self._of_scenes, name, kind, known)
+        none, moves = np.zeros((1, 3)), first.motion is not None
+        starts = each("displacement") if moves else (None,)
+        anchors = lambda: [none if x is None else x[a.held] for x in starts]  # noqa: E731
+        out["anchor"] = starts, lambda: self._packed(anchors() if moves else [none] * self.num_scenes, "vectors")
         self.counts = {}
         for name in ("forces", "motion", "path"):
-            rows = [none if getattr(d, name) is None else getattr(d, name) for d in derived]
-            out[name], self.counts[name] = (layout.pack_vectors(in_slots(rows)), layout.vector), rows[0].shape[1]
+            rows = [_NONE if x is None else x for x in each(name)]
+            out[name], self.counts[name] = (tuple(rows), partial(self._in_slots, rows)), rows[0].shape[1]
         self.num_step_rows = max((len(x) for x in (first.path, first.motion) if x is not None), default=1)
         if self.num_step_rows == 1 and (a.features().forces_keyed or a.features().moving):
             self.num_step_rows = max(1 + len(d.forces) for d in derived if d.forces is not None)
         return out
+
+    def _of_scenes(self, name: str, kind: str, arrays: tuple) -> tuple:
+        """(data, element type) of numbers that scenes share or not."""
+        arrays = [np.zeros(1) if x is None else x for x in (arrays if name in self.own else arrays[:1])]
+        if name == "inverse_mass":
+            arrays = [self.arrays.inverse_of(x) for x in arrays]
+        if name in self.own:
+            return self._packed(arrays, kind)
+        return (arrays[0].ravel(), self.fp) if kind == "scalars" else (arrays[0], self.arrays.vector)
+
+    def _in_slots(self, rows: list[np.ndarray]) -> tuple:
+        return self.layout.pack_vectors(in_slots(rows)), self.layout.vector
 
     def _packed(self, arrays: list[np.ndarray], kind: str) -> tuple:
         """(data, element type) of what each scene has: vectors, or else numbers."""
@@ -320,6 +307,9 @@ class BatchWorkspace:
         launch = self.bound(self.kernels(self.arrays.features()).step, state=(history, self.frames, self.met))
         for numbers in self.launches(first, last, num_passes, save_every):
             launch(**numbers, base=base, stride=stride)
+
+
+_NONE = np.zeros((1, 1, 3))  # rows of what a scene has not
 
 
 @ti.kernel

@@ -56,6 +56,7 @@ class Chain:
             raise ValueError(f"no link reads the input {sorted(unread)[0]!r}: give its term or material one that does")
         self._kept: dict[Link, tuple[Arrays, Arrays]] = {}  # (what it read, what it wrote)
         self._ways: dict[tuple[str, ...], tuple[list[Link], list[Link]]] = {}
+        self._after: dict[tuple[str, ...], list[Link]] = {}
 
     def value(self, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """The values and what all links write; links that miss something are left out."""
@@ -79,6 +80,26 @@ class Chain:
         if not any(part.flags.writeable for part in x):  # what may be written to may change and stay the same array
             self._kept[link] = x, y
         return y
+
+    def again(self, known: Mapping[str, np.ndarray], changed: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Some changed inputs, and what links write that these lead to; known: inputs and what links wrote before."""
+        out = dict(changed)
+        for link in self._led_to(tuple(changed)):
+            x = [out[name] if name in out else known.get(name) for name in link.reads]
+            if not any(part is None for part in x):
+                out.update(zip(link.writes, map(frozen, link.value(*x))))
+        return out
+
+    def _led_to(self, names: tuple[str, ...]) -> list[Link]:
+        """The links that some inputs lead to."""
+        if names not in self._after:
+            reached, after = set(names), []
+            for link in self.links:
+                if not reached.isdisjoint(link.reads):
+                    reached.update(link.writes)
+                    after.append(link)
+            self._after[names] = after
+        return self._after[names]
 
     def jvp(self, values: Mapping[str, np.ndarray], tangents: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Tangents of what links write, of those alone that change."""

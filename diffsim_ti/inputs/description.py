@@ -128,6 +128,11 @@ class Input:
             raise ValueError(f"{name} must be {self.range.words}{self.in_brackets}, got {value.min():g}")
         return value
 
+    def allows(self, values: np.ndarray) -> bool:
+        """Whether all numbers are such that `checked` has nothing against them but, perhaps, their shape."""
+        held = self.range is None or not self.range.in_runs or self.range.holds(values).all()
+        return bool(np.isfinite(values).all() and held)
+
     def fits(self, shape: tuple[int, ...], sizes: Mapping[str, int]) -> bool:
         """Whether a shape is among those allowed."""
         return shape in self.shapes or any(

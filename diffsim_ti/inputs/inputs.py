@@ -247,6 +247,15 @@ class Inputs:
         known = self.chain.value(values)
         return Derived(*map(known.get, READ))
 
+    def derive_each(self, values: dict, changed: list[dict]) -> list[Derived]:
+        """The same for values that differ in some inputs, `changed`, which are the same ones in each."""
+        known = self.chain.value(values)
+        first, out = Derived(*map(known.get, READ)), []
+        for own in changed:
+            new = self.chain.again(known, own)
+            out.append(Derived(*(new[name] if name in new else getattr(first, name) for name in READ)))
+        return out
+
     @property
     def stress_points(self) -> StressPoints:
         """Of the mesh's own rest shape."""

@@ -4,8 +4,8 @@
 
 Each part runs in a process of its own with a time limit, prints one JSON line, and is a row of the table at the end: the
 device; copies and launches; correctness against the CPU, in float64 and float32; time per substep by size beside what
-copying the same bytes takes; the same work by peers that are installed (compare_peers.py), on the same device. What does
-not fit the time or the memory is left out, and said so.
+copying the same bytes takes; many scenes at once; the same work by peers that are installed (compare_peers.py), on the same
+device. What does not fit the time or the memory is left out, and said so.
 """
 
 import argparse
@@ -20,7 +20,7 @@ import numpy as np
 import taichi as ti
 from compare_peers import common_jobs
 from peers import work
-from speed import SUBSTEPS, common_rollout
+from speed import BATCH_STEPS, SUBSTEPS, batch_work, common_rollout
 
 import diffsim_ti as ds
 from diffsim_ti import runtime, verify
@@ -179,6 +179,28 @@ def speed(options, tetrahedra: int) -> dict:
     )
 
 
+def batch(options, scenes: int) -> dict:
+    """Many scenes of 750 tetrahedra, with contact: time of a substep of one, forward and with its reverse; some against
+    what they are alone."""
+    if 750 * scenes > max(options.largest, 6_000):
+        return dict(left_out="beyond --largest")
+    many, one, values = batch_work(6, scenes, "f32", contact=True)
+    frames, per_scene = many.forward(**values), BATCH_STEPS * SUBSTEPS * scenes
+    seeds, off = np.ones_like(frames.positions), 0.0
+    for b in {0, scenes // 2, scenes - 1}:
+        alone = one.forward(**{name: x[b] for name, x in values.items()}).displacements
+        off = max(off, float(np.abs(frames.displacements[b] - alone).max() / np.abs(alone).max()))
+    many.vjp(frames, seeds)
+    forward = seconds(lambda: many.forward(**values), 2) / per_scene
+    both = seconds(lambda: many.vjp(many.forward(**values), seeds), 2) / per_scene
+    return dict(
+        forward_us=round(1e6 * forward, 3),
+        with_reverse_us=round(1e6 * both, 3),
+        off=off,
+        passed=bool(many.lanes and frames.alive.all() and off <= GATES["f32"]["motion"]),
+    )
+
+
 def peers(options, who: str) -> dict:
     """The work of 48 000 tetrahedra by another code: time of a substep, forward and with its reverse."""
     if who not in work.installed(sys.executable):
@@ -201,6 +223,7 @@ for _kind in ("explicit", "implicit", "self-contact"):
         PARTS[f"{_kind} {_precision}"] = lambda options, k=_kind, p=_precision: correctness(options, k, p)
 PARTS |= {"divergence": divergence, "torch": torch_streams}
 PARTS |= {f"{n:,} tetrahedra": lambda options, n=n: speed(options, n) for n in SIZES}
+PARTS |= {f"{n:,} scenes": lambda options, n=n: batch(options, n) for n in (1, 64, 4096)}
 PARTS |= {f"{who}, 48,000": lambda options, who=who: peers(options, who) for who in work.PEERS}
 
 

@@ -24,8 +24,8 @@ def mass_scaling(kind, seed: int) -> float | None:
 
 
 def reduced(kind, seed: int, mesh, fixed, deformed: bool) -> dict | None:
-    """A set that moves by few numbers, where runs have one of which nothing is held: affinely or rigidly in explicit ones where
-    obstacles push; affinely, by functions of each component, or by fields in implicit ones."""
+    """A set that moves by few numbers, where runs have one of which nothing is held: affinely or rigidly in explicit ones,
+    where obstacles push; affinely, by functions of each component, or by fields in implicit ones."""
     rng = np.random.default_rng([36, seed])
     if deformed or rng.random() > 0.5 or kind.explicit and (kind.obstacles and kind.contact == "stage"):
         return None

@@ -252,7 +252,7 @@ def _solver(kind, scene, dt, substeps):
         return ds.StaticSolver(scene, load_steps=substeps, tolerance=tolerance, parallel=kind.parallel)
     if kind.explicit:
         how = dict(contact=kind.contact, contact_damping=kind.contact_damping)
-        if kind.solver is ds.SemiImplicitSolver and scene.law.viscous and not scene.holds_volumes:
+        if kind.solver is ds.SemiImplicitSolver and scene.law.viscous and not (scene.holds_volumes or scene.reduced):
             how["viscous_stages"] = 1 + kind.number % 4
         return kind.solver(scene, dt=dt, substeps=substeps, parallel=kind.parallel, **how)
     return kind.solver(scene, dt=dt, substeps=substeps, tolerance=tolerance, parallel=kind.parallel)
