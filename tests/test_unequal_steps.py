@@ -187,9 +187,22 @@ def test_the_search_puts_substeps_where_the_impact_is(solver):
     assert ds.Rollout(plain, finer).forward().contact_resolution.substep <= 4e-3
 
 
+def test_what_bodies_do_between_impacts_needs_no_fine_steps(monkeypatch):
+    """Two sizes of steps, and what lies between them as they change; a search of at most three runs of what it finds."""
+    solver, passes = ds.VelocityVerletSolver(falling(), dt=4e-3, check_start=False), []
+    set_substeps = ds.Simulator.set_substeps
+    monkeypatch.setattr(ds.Simulator, "set_substeps", lambda self, n: (passes.append(n), set_substeps(self, n)))
+    vertices, bodies = (ds.adaptive_steps(solver, 25, 1e-3, of=of).substeps for of in ("vertices", "bodies"))
+    assert sum(passes) <= 3 * (vertices.sum() + bodies.sum())
+    stable = int(np.ceil(4e-3 / (0.7 * solver.stable_dt(tight=True).dt)))
+    assert np.all(bodies[15:] == stable) and np.all(vertices[15:] > stable)
+    fine = np.flatnonzero(bodies == bodies.max())
+    assert fine[0] >= 2 and fine[-1] <= 12 and np.array_equal(fine, np.arange(fine[0], fine[-1] + 1))
+
+
 def test_the_benchmark_of_an_impact(capsys):
     """One start: a finer tolerance takes more substeps, and the finest gradient is the best of those."""
-    found = example("benchmarks/impact_steps").main(1)["adaptive"]
+    found = example("benchmarks/impact_steps").main(1, ("block",))["block"]["adaptive"]
     assert "| adaptive |" in capsys.readouterr().out
     substeps, errors = (np.array(column) for column in zip(*((n, e) for n, e, _ in found)))
     assert np.all(np.diff(substeps) > 0) and errors[-1] < 0.02 and errors[-1] <= errors.max()
@@ -225,6 +238,8 @@ def test_a_search_goes_on_where_a_solve_does_not_converge():
         (lambda s: ds.Rollout(ds.BDF2Solver(s), 2.5), "whole number >= 0, got 2.5; or pass lengths"),
         (lambda s: ds.adaptive_steps(ds.BDF2Solver(s), 3, 0.0), "tolerance"),
         (lambda s: ds.adaptive_steps(ds.BDF2Solver(s), 0, 1.0), "steps"),
+        (lambda s: ds.adaptive_steps(ds.BDF2Solver(s), 3, 1.0, of="tips"), 'must be "vertices" or "bodies"'),
+        (lambda s: ds.adaptive_steps(ds.VelocityVerletSolver(s, dt=1e-4), 3, 1e-300), "4096 substeps"),
         (lambda s: ds.adaptive_steps(ds.StaticSolver(s), 3, 1.0), "equilibria"),
     ],
 )
