@@ -27,11 +27,12 @@ def reduced(kind, seed: int, mesh, fixed, deformed: bool) -> dict | None:
     """A set that moves by few numbers, where runs have one of which nothing is held: affinely or rigidly in explicit ones,
     where obstacles push; affinely, by functions of each component, or by fields in implicit ones."""
     rng = np.random.default_rng([36, seed])
-    if deformed or rng.random() > 0.5 or kind.explicit and (kind.obstacles and kind.contact == "stage"):
+    stages = kind.explicit and kind.obstacles and kind.contact == "stage"
+    if deformed or stages or rng.random() > (1.0 if kind.explicit else 0.5):
         return None
     how = ("affine", "rigid")[rng.integers(2)]
     held = ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3), fixed=fixed).held
-    for name in ("part", "body_1"):
+    for name in ("part", "body_1", *(("body_0",) if kind.explicit else ())):
         own = (
             mesh.elements[mesh.tetrahedron_sets[name]] if name in mesh.tetrahedron_sets else mesh.vertex_sets.get(name)
         )
