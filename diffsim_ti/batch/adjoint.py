@@ -156,13 +156,8 @@ class BatchTangent:
         """Tangents of passes first .. last - 1, recorded from slot 0."""
         ws = self.ws
         launch = ws.bound(ws.kernels(self.features).step_jvp, state=(ws.record, ws.frames, ws.met), tangent=self)
-        if not ws.layout.in_lanes:
-            for numbers in ws.launches(first, last, num_passes, save_every):
-                launch(**numbers, base=first)
-            return
-        for j in range(first, last):
-            for numbers in ws.launches(j, j + 1, num_passes, save_every):
-                launch(**numbers, base=first)
+        for numbers in ws.launches(first, last, num_passes, save_every):
+            launch(**numbers, base=first)
 
     def save_frame(self, frame: int) -> None:
         """Copy the current change to a frame."""

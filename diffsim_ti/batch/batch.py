@@ -41,8 +41,8 @@ class Batch:
     steps the states of a scene are, bit for bit, those of a `Rollout` of it alone, whatever its neighbours, its place among
     them and the number of threads.
 
-    Scenes fail alone (`BatchFrames.alive`): the gradient of one that did is zero, with a warning. In lanes a failure is a
-    frame that is not finite or whose vertices cross the body within a substep, or a vertex behind an obstacle; gains of
+    Scenes fail alone (`BatchFrames.alive`): the gradient of one that did is zero, with a warning. Side by side a failure is
+    a frame that is not finite or whose vertices cross the body within a substep, or a vertex behind an obstacle; gains of
     energy that a `Rollout` warns of are not looked for.
 
     Freeman et al. 2021, Brax (leading axes of scenes), arXiv:2106.13281.
@@ -110,14 +110,14 @@ class Batch:
         """Run all scenes, with some inputs replaced. raise_errors: raise what stopped the first one that died."""
         inputs, sets = spread_given(self.scene, inputs, self.one.values, self.num_scenes)
         values = checked_values(self.one, inputs, self.num_scenes)
-        run = (self._in_lanes if self.lanes else self._by_turns)(values)
+        run = (self._side_by_side if self.lanes else self._by_turns)(values)
         run.sets = sets
         dead = np.flatnonzero(~run.alive)
         if raise_errors and dead.size:
             raise run.error(int(dead[0]))
         return run
 
-    def _in_lanes(self, values: dict) -> BatchFrames:
+    def _side_by_side(self, values: dict) -> BatchFrames:
         run, times = self.sweep.run(values), self.one.times
         u, v = self.sweep.states()
         last_good, crossed = np.full(self.num_scenes, self.num_frames - 1), self.sweep.crossed()
@@ -208,12 +208,12 @@ class Batch:
         dead = np.flatnonzero(~frames.alive)
         if dead.size:
             warnings.warn(f"scenes {dead.tolist()} did not come to their end: their gradients are zero", stacklevel=2)
-        out = (self._vjp_in_lanes if self.lanes else self._vjp_by_turns)(frames, given)
+        out = (self._vjp_side_by_side if self.lanes else self._vjp_by_turns)(frames, given)
         for name in out.keys() & frames.sets.keys():
             out[name] = gathered_scenes(out[name], frames.values[name], *frames.sets[name])
         return out
 
-    def _vjp_in_lanes(self, frames: BatchFrames, given: dict) -> dict[str, np.ndarray]:
+    def _vjp_side_by_side(self, frames: BatchFrames, given: dict) -> dict[str, np.ndarray]:
         shape, alive = (self.num_scenes, *frames.positions.shape[1:]), frames.alive
         by_u, by_v, direct = np.zeros(shape), np.zeros(shape), []
         of_states = given.keys() <= {"positions", "velocities"}  # which say nothing of inputs but by the states
@@ -231,7 +231,7 @@ class Batch:
         parts, dead = derived.parts().values(), ~frames.alive
         for part in parts:
             if part is not None:
-                part[dead] = 0  # lanes of their own: they have left no trace in others
+                part[dead] = 0  # they have left no trace in others
         return self._by_inputs(frames, [None if x is None else np.asarray(x) for x in parts], direct)
 
     def _by_inputs(self, frames: BatchFrames, parts: list, direct: list) -> dict[str, np.ndarray]:

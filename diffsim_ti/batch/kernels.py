@@ -215,11 +215,12 @@ class BatchKernels:
     def passes_jvp(self, scene: A, state: A, tangent: A, table: A, plan: A):
         for t in range(plan.spread * plan.num_blocks):
             if t % plan.spread == 0:
-                self.one_pass_jvp(t // plan.spread, scene, state, tangent, table, plan)
+                for j in range(plan.first, plan.first + plan.count):
+                    self.one_pass_jvp(t // plan.spread, j, scene, state, tangent, table, plan)
 
     @ti.func
-    def one_pass_jvp(self, b, scene: A, state: A, tangent: A, table: A, plan: A):
-        s, now = plan.first - plan.base, self.pass_of(b, plan.first, table, plan)
+    def one_pass_jvp(self, b, j, scene: A, state: A, tangent: A, table: A, plan: A):
+        s, now = j - plan.base, self.pass_of(b, j, table, plan)
         tetrahedra, changed = self.tetrahedra_of(scene, scene.corner), self.changed_of(tangent)
         for e in range(plan.num_tetrahedra):
             item = self.item(e, b, plan)
@@ -236,7 +237,7 @@ class BatchKernels:
                         own, at_ = self.scene_of(b, lane, scene, plan), self.state_of(b, lane, state, plan)
                         change = self.change_of(b, lane, tangent, plan)
                         rated = self.rated(b, lane, tangent, plan)
-                        self.vertex.step_jvp(i, plan.first, self.one(now, lane), own, at_, change, rated)
+                        self.vertex.step_jvp(i, j, self.one(now, lane), own, at_, change, rated)
             self.free.clear(b, i, scene.corner, plan)
 
     @traced
@@ -263,7 +264,7 @@ class BatchKernels:
 
     @cached_property
     def step_jvp(self) -> Kernel:
-        """The tangent of pass `first` along recorded slots; the change of the state is advanced in place."""
+        """The tangent of these passes along recorded slots; the change of the state is advanced in place."""
         tangent = self.with_state(CHANGE) | CHANGED | OF_STEPS
         return self._kernel("step_jvp", self.passes_jvp, dict(state=self.with_state(STATE), tangent=tangent))
 
