@@ -26,6 +26,7 @@ from diffsim_ti import (
     SemiImplicitSolver,
     SmithNeoHookean,
     Spring,
+    StaticSolver,
     TetrahedralMesh,
     Traction,
     VelocityVerletSolver,
@@ -165,6 +166,27 @@ def test_implicit_steps_stay_below_their_ceilings(driver, cube):
         driver.restart()
         potential.product(w)
     check_counts(driver.counts(), PRODUCT)
+
+
+def test_ten_iterations_on_the_device_bring_eight_numbers_to_the_host(driver):
+    """Besides arguments of launches nothing goes to the card."""
+    mesh = TetrahedralMesh.create_box((9, 4, 4), (0.8, 0.3, 0.3))
+    held = Scene(mesh, SmithNeoHookean(1e5, 0.4), 1000.0, [Gravity()], fixed="xmin", precision="f64")
+    solver = StaticSolver(held, preconditioner="multigrid")
+    workspace, found = solver.workspace(solver.start_values()), {}
+    none, b = np.zeros((mesh.num_vertices, 1)), np.random.default_rng(0).standard_normal((mesh.num_vertices, 3))
+    workspace.potential.place(0 * b)
+    multigrid, _ = workspace.preconditioner(none)
+    multigrid.update(0 * b)
+    for iterations in (10, 10, 20):
+        driver.restart()
+        _, _, count, _ = multigrid.solver(none, workspace.free, b * workspace.free, 1e-30, iterations, 1e-16)
+        assert count == iterations
+        found[iterations] = driver.counts()
+    more = {name: found[20][name] - found[10][name] for name in found[10]}
+    assert more["copies_to_host"] == 1 and more["bytes_to_host"] <= 64 and more["synchronisations"] == 0
+    assert more["fills"] == more["copies_on_device"] == 0
+    assert more["bytes_to_device"] <= 1024 * more["launches"]
 
 
 def test_every_kernel_is_launched_again_and_again(driver, cube):

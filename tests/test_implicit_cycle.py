@@ -59,6 +59,22 @@ def test_conjugate_gradients_on_the_device_are_those_of_the_host(static):
     np.testing.assert_allclose(here[0], there[0], atol=1e-5 * np.abs(there[0]).max())
 
 
+@pytest.mark.backends
+def test_single_precision_takes_as_many_iterations_on_every_backend():
+    """On Vulkan vectors have float32 and elsewhere float64; on the host they always have float64."""
+    solver = ds.StaticSolver(beam("f32"), preconditioner="multigrid")
+    workspace = solver.workspace(solver.start_values())
+    u = 0.05 * np.sin(3 * workspace.scene.mesh.vertices[:, [1, 0, 2]]) * workspace.free
+    M, b = preconditioner_at(workspace, u), np.random.default_rng(2).standard_normal(u.shape) * workspace.free
+    counts = []
+    for how in (M, lambda r: M(r)):
+        A = Operator(workspace.potential, np.zeros((len(u), 1)), workspace.free)
+        _, residual, count, negative = conjugate_gradients(A, b, how, 1e-4, 500, 1e-7)
+        assert negative is None and residual <= 1e-4
+        counts.append(count)
+    assert counts[0] <= 1.1 * counts[1]
+
+
 def test_conjugate_gradients_stop_at_negative_curvature(static):
     M = preconditioner_at(static, 0 * static.u_star)
     mass = np.full((len(static.u_star), 1), -1e3)  # far below the stiffness of slow motions
