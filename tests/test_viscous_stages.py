@@ -101,7 +101,6 @@ def test_gradients_by_every_number(name):
     gates(r, 1e-12, *own, "drag_rate", "floor.stiffness", "external_forces", "initial_velocities", "rest_positions")
 
 
-@pytest.mark.backends
 def test_single_precision_gradients():
     """Against those of double precision where there is any, and by a dot product."""
     from diffsim_ti import verify
