@@ -276,7 +276,6 @@ def test_sweeps_that_stop_between_steps_and_checkpoints_give_the_same(kind):
             np.testing.assert_allclose(found[name], value, rtol=1e-9, atol=1e-9 * np.abs(value).max())
 
 
-@pytest.mark.backends
 @pytest.mark.filterwarnings("ignore:gradients through contacts")
 @pytest.mark.parametrize("kind", KINDS)
 def test_all_threads_do_what_one_does(kind):
