@@ -12,7 +12,7 @@ import diffsim_ti as ds
 from diffsim_ti import verify
 from diffsim_ti.materials.stable_neo_hookean import StableNeoHookeanLaw
 from diffsim_ti.runtime import traced
-from diffsim_ti.solvers.explicit import kick_drift
+from diffsim_ti.solvers.explicit import vertex_parts
 from diffsim_ti.solvers.explicit.adjoint import ExplicitAdjoint
 from diffsim_ti.solvers.explicit.contact_stage import ContactStage
 from diffsim_ti.terms.obstacles.ground import GroundForce
@@ -163,7 +163,7 @@ def test_mutated_stage(monkeypatch, stage):
     """The adjoint of the move that obstacles push, and that of the pushes."""
     own = type(f"Ground{stage.__name__}", (GroundForce,), {})  # compiles anew
     monkeypatch.setattr(ds.Ground, "kernel", lambda self, precision: own(precision))
-    monkeypatch.setattr(kick_drift, "ContactStage", stage)
+    monkeypatch.setattr(vertex_parts, "ContactStage", stage)
     assert gates_passed(rollout_of(full_scene(), steps=3)) == (False, False)
 
 
