@@ -5,7 +5,7 @@ contact. The gradient is that of the height of the centre of mass 0.16 s later b
 error against substeps of 5 us is not monotone in the substep for any one start, so twenty starts and the median are taken.
 Between impacts a centre of mass goes its way whatever the step is, so steps are sought by the error of bodies.
 
-    python examples/benchmarks/impact_steps.py          # prints both tables; two minutes
+    python examples/benchmarks/impact_steps.py          # prints both tables; minutes
     python examples/benchmarks/impact_steps.py --quick  # three starts
 """
 
