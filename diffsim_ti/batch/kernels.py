@@ -321,7 +321,7 @@ class BatchKernels:
 
     def _kernel(self, name: str, body, arrays: dict, **numbers) -> Kernel:
         arrays = dict(scene=self.scene()) | arrays | dict(table=self.table())
-        few = not self.features.groups
+        few = self.law.short and self.features.order == 1 and not self.features.groups
         return Kernel(f"batch_{name}", body, self.law.precision, arrays, NUMBERS | numbers, polished=few)
 
 

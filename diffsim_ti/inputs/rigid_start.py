@@ -39,9 +39,8 @@ class Nearest:
         s[-1] *= np.sign(np.linalg.det(U) * np.linalg.det(Vt)) or 1.0
         self.R = U @ np.diag([1, 1, np.sign(s[-1]) or 1.0]) @ Vt
         S = self.R.T @ (self.y.T @ self.D)
-        self._lever = np.trace(S) * np.eye(3) - 0.5 * (
-            S + S.T
-        )  # R S' - its change is R [delta]x, (tr S - S) delta = axial
+        # R changes by R [delta]x, where (tr S - S) delta is the axial vector of R^T dA
+        self._lever = np.trace(S) * np.eye(3) - 0.5 * (S + S.T)
 
     def jvp(self, dy: np.ndarray, dD: np.ndarray) -> np.ndarray:
         dA = dy.T @ self.D + self.y.T @ dD

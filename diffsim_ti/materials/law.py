@@ -41,6 +41,7 @@ class Law:
     last_without_lam = ()  # factors f: with lam = 0 the last coefficient is sum_k f_k p_k; empty: zero
     viscous = False  # whether it has a `viscous_differential`
     held_names = ()  # numbers of each tetrahedron that are held in an implicit pass, and a rate, see `in_steps`
+    short = False  # whether its kernels are so short that Taichi's own passes over them pay (runtime/launch.py)
     lanes = True  # written with + - * / and max alone, so that a number may be a vector of lanes
 
     @property

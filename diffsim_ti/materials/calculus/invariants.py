@@ -27,6 +27,8 @@ class InvariantLaw(Law):
     Bonet, Wood, Nonlinear Continuum Mechanics for Finite Element Analysis, 2nd ed. 2008, ch. 6.
     """
 
+    short = True
+
     uses_q = False
     couples_s = True
 

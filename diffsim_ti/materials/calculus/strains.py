@@ -21,6 +21,8 @@ class StrainLaw(Law):
     it is finite but means nothing (see `polar.spin`).
     """
 
+    short = True
+
     rotates = False
 
     @ti.func
