@@ -110,6 +110,8 @@ def test_gradients_are_those_of_differences(kind):
             dx = (one - other) / (2 * s) + (d if name == "rest_positions" else 0)
             found, size = (w * dx).sum(), np.linalg.norm(w * dx)
             off.append(abs(found - got) / size)
+            if off[-1] < 2e-5:
+                break
         assert min(off) < 2e-5, (name, off)
 
 
