@@ -116,10 +116,10 @@ def test_benchmark(precision):
 def test_gpu_gate():
     """Parts of the script for the day a card is there, each in a process of its own, on whatever this run is on."""
     arch = os.environ.get("DIFFSIM_TI_ARCH", "cpu")
-    only = ["device", "reference", "explicit f32", "1 scenes", "Warp, 48,000"]
+    only = ["device", "reference", "explicit f32", "Warp, 48,000"]
     command = [sys.executable, str(EXAMPLES / "benchmarks/gpu_gate.py"), f"--arch={arch}", "--largest=6000", "--only"]
     out = subprocess.run([*command, *only], capture_output=True, text=True)
     rows = {row["part"]: row for row in (json.loads(line) for line in out.stdout.splitlines() if line.startswith("{"))}
     assert out.returncode == 0 and list(rows) == only, out.stdout + out.stderr
-    assert rows["device"]["arch"] == arch and rows["explicit f32"]["passed"] and rows["1 scenes"]["passed"]
+    assert rows["device"]["arch"] == arch and rows["explicit f32"]["passed"]
     assert "left_out" in rows["Warp, 48,000"] and "| explicit f32 | motion" in out.stdout

@@ -9,9 +9,9 @@ from gradient_fuzz.judge import PASSED, ZERO, judge
 from gradient_fuzz.report import Report, failure_text
 
 # Seven compiled structures: Euler, Verlet and statics; f32; patches; one launch per pass; self-contact
-EXPLICIT = (36, 34, 39, 43, 47, 60, 91, 93, 131, 211)
+EXPLICIT = (36, 34, 39, 47, 60, 91, 93, 131, 211)
 IMPLICIT = (52,)
-LONGER = (40, 58, 90, 132, 208, 212, 61, 135, 57, 4, 5, 0, 49, 50)  # minutes, most of them compiling
+LONGER = (40, 43, 58, 90, 132, 208, 212, 61, 135, 57, 4, 5, 0, 49, 50)  # minutes, most of them compiling
 
 
 @lru_cache(maxsize=None)

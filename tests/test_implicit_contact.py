@@ -115,7 +115,15 @@ def test_gradients_through_friction_on_a_moving_obstacle(solver):
 
 
 @pytest.mark.executed_ptx
-@pytest.mark.parametrize("shape", ["half_space", "sphere", pytest.param("box", marks=pytest.mark.thorough), "mesh"])
+@pytest.mark.parametrize(
+    "shape",
+    [
+        "half_space",
+        "sphere",
+        pytest.param("box", marks=pytest.mark.thorough),
+        pytest.param("mesh", marks=pytest.mark.thorough),
+    ],
+)
 def test_reverse_sweep_against_tangent_on_every_shape(shape):
     assert ds.dot_product_test(rubbing(ds.ImplicitEulerSolver, shape)) < 1e-9
 

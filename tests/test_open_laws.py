@@ -225,7 +225,7 @@ def coincident() -> np.ndarray:
     return np.stack(out)
 
 
-@pytest.mark.parametrize("precision, in_lanes", [("f64", True), ("f32", True)])
+@pytest.mark.parametrize("precision, in_lanes", [("f64", True), pytest.param("f32", True, marks=pytest.mark.thorough)])
 def test_stretches_may_coincide(precision, in_lanes):
     """Stress, its change and both derivatives by moduli and exponents, against differences of fifty digits."""
     H, (_, dH), (_, psi, p) = coincident(), states(), OWN["ogden"]

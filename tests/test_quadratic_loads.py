@@ -277,7 +277,7 @@ def test_chambers_have_the_volume_of_their_curved_faces(make):
     assert (push * w).sum() == pytest.approx(gradient, rel=1e-11)
 
 
-@pytest.mark.parametrize("make", [hollow, pitted])
+@pytest.mark.parametrize("make", [pytest.param(hollow, marks=pytest.mark.thorough), pitted])
 @pytest.mark.parametrize("solver", [ds.VelocityVerletSolver, ds.ImplicitMidpointSolver], ids=lambda s: s.__name__)
 def test_every_number_of_a_gas(make, solver):
     scene = make([ds.GasChamber(**GAS | dict(pressure=1.1 * 101325 * np.array([1.0, 1.1])))])
