@@ -82,9 +82,9 @@ ELASTIC = ds.StableNeoHookean(2e4, 0.3)
     "material, order, solver",
     [
         (ds.KelvinVoigt(ELASTIC, time=1e-3), 1, ds.VelocityVerletSolver),
-        pytest.param(
+        pytest.param(  # in single precision: test_backends
             ds.Prony(ELASTIC, [0.3, 0.2], [1e-2, 1e-1]), 1, ds.SemiImplicitSolver, marks=pytest.mark.thorough
-        ),  # test_backends
+        ),
         pytest.param(ELASTIC, 2, ds.SemiImplicitSolver, marks=pytest.mark.thorough),  # compiles for ten seconds
     ],
     ids=["viscous", "relaxing", "ten nodes"],

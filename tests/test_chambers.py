@@ -140,8 +140,7 @@ def test_the_pressure_is_a_result_with_gradient(kind):
     """Of a held volume beside a gas in one cavity: by moduli, volume, gas, rest shape."""
     steps = 1 if kind is ds.StaticSolver else 2
     rollout = rollout_of(kind, filled(pitted, gas(), grown=(1.02, 1.05)[-steps:]), steps=steps)
-    keys = ("youngs_modulus", "oil.volume", "gas.pressure", "gas.outside", "rest_positions")
-    assert_tangents(rollout, keys[1::3] if kind is ds.StaticSolver else keys)
+    assert_tangents(rollout, ("youngs_modulus", "oil.volume", "gas.pressure", "gas.outside", "rest_positions"))
 
 
 def test_a_gas_pressure_is_a_result_with_gradient():
@@ -236,7 +235,7 @@ def closed_form(la: float, B=1.2) -> float:
     return 2 / lb + 1 / (2 * lb**4) - 2 / la - 1 / (2 * la**4)
 
 
-@pytest.mark.parametrize("la", [pytest.param(1.47, marks=pytest.mark.thorough), 1.8])
+@pytest.mark.parametrize("la", [1.47, 1.8])
 def test_a_sphere_at_and_beyond_its_largest_pressure(la):
     """By its volume: no pressure alone leads there. The largest is at la = 1.470."""
     assert closed_form(1.47) == pytest.approx(0.22514, rel=1e-4) and closed_form(1.8) < closed_form(1.47)

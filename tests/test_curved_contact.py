@@ -156,7 +156,7 @@ PER_AREA, OF_VERTICES = dict(stiffness_per_area=1e6), dict(stiffness=100.0)
         (EXPLICIT, "plane", PER_AREA, "f64"),
         (EXPLICIT, "capsule", OF_VERTICES, "f32"),
         pytest.param(IMPLICIT, "plane", PER_AREA | dict(friction=0.3), "f64", marks=pytest.mark.thorough),
-        (ds.BDF2Solver, "bowl", OF_VERTICES, "f64"),
+        (ds.BDF2Solver, "bowl", OF_VERTICES | dict(friction=0.3), "f64"),
     ],
 )
 def test_the_adjoint_is_the_transpose_of_the_tangent(solver, kind, options, precision):

@@ -118,7 +118,7 @@ def test_gradients_are_those_of_differences(solver):
 def test_gradients_where_supports_guide_and_move():
     """Held neighbours are felt by inertia: rollers along directions that are no axes, moved."""
     rollout = rollout_of(ds.ImplicitMidpointSolver, fixed={"xmin": (1, 1, 0), "xmax": (0, 1, 2)})
-    report = ds.verify.check_gradients(rollout, ds.verify.linear_loss(rollout), BY_MASS[-1:])
+    report = ds.verify.check_gradients(rollout, ds.verify.linear_loss(rollout), BY_MASS)
     assert report.passed, str(report)
     assert_transposed(rollout, 1e-8)
 

@@ -184,7 +184,7 @@ def test_tape(precision):
 def test_torch(dtype):
     """A simulator, whose own ground comes before the terms that it is given; tensors for every number of a term."""
     names, expected = ("drag", "sphere", "force", "slope", "pairs", "wall"), None
-    for order in orders(names, 3):
+    for order in orders(names, 4):
         contact = DifferentiableBarrierContact(300.0, 0.2, ground_height=0.0)
         material = DifferentiableMaterial(E=torch.tensor(2e4, dtype=dtype), nu=torch.tensor(0.3, dtype=dtype))
         simulator = DifferentiableSimulator(
