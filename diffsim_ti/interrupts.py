@@ -6,6 +6,7 @@ handler. In the first hundredths of a second Python has not come here yet, and s
 """
 
 import _thread
+import contextlib
 import os
 import signal
 import sys
@@ -34,8 +35,9 @@ def commands_may_run() -> None:
 
 def command_ended() -> bool:
     """Whether the signal came since `commands_may_run`, even if something swallowed it. From now on it does nothing."""
-    if _is_command:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    while _is_command and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+        with contextlib.suppress(KeyboardInterrupt):  # of a signal that came just before
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
     return _seen["interrupted"]
 
 
