@@ -43,38 +43,44 @@ class Block(Items):
 
     def numbers(self, array, first: int, count: int, rows: int, item):
         """`count` numbers from `first` on, of the `rows` that each block has."""
-        return [let(at(array, rows * item + first + k)) for k in range(count)]
+        begin = let(rows * item + first)
+        return [let(at(array, begin + k if k else begin)) for k in range(count)]
 
     def row(self, array, slot, first: int, count: int, rows: int, item):
         """The same in a slot of an array of slots."""
-        return [let(at(array, slot, rows * item + first + k)) for k in range(count)]
+        begin = let(rows * item + first)
+        return [let(at(array, slot, begin + k if k else begin)) for k in range(count)]
 
     def put_row(self, array, slot, first: int, rows: int, item, numbers):
+        begin = let(rows * item + first)
         for k, number in enumerate(numbers):
-            assign(at(array, slot, rows * item + first + k), number)
+            assign(at(array, slot, begin + k), number)
 
     def corners(self, vectors, slot, tets, item):
         """[a][d]: component d of the vector at node a."""
-        out = []
+        out, begin = [], let(self.nodes * LANES * item)
         for a in range(self.nodes):
-            places = (self.nodes * LANES * item + LANES * a + lane for lane in range(LANES))
+            places = (begin + (LANES * a + lane) for lane in range(LANES))
             whole = [let(at(vectors, slot, at(tets, place))) for place in places]
             out.append([let(self.lanes(*(at(w, d) for w in whole))) for d in range(3)])
         return out
 
     def store(self, corner, item, forces, zero, add: bool = False):
+        begin = let(self.nodes * LANES * item)
         for a in range(self.nodes):
             for lane in range(LANES):
                 force = self.vector(*(at(forces[a][d], lane) for d in range(3)), zero)
-                self.put_force(at(corner, self.nodes * (LANES * item + lane) + a), force, add)
+                self.put_force(at(corner, begin + (self.nodes * lane + a)), force, add)
 
     def put(self, array, rows: int, item, first, numbers):
+        begin = let(rows * item + first)
         for k, number in enumerate(numbers):
-            assign(at(array, rows * item + first + k), number)
+            assign(at(array, begin + k), number)
 
     def add(self, array, rows: int, item, numbers, first: int = 0):
+        begin = let(rows * item + first)
         for k, number in enumerate(numbers):
-            target = at(array, rows * item + first + k)
+            target = at(array, begin + k)
             assign(target, target + number)
 
 
@@ -84,31 +90,41 @@ class Single(Items):
     def broadcast(self, number):
         return number
 
+    def _place(self, rows: int, item, first: int = 0) -> tuple:
+        """(where the block's numbers begin, lane)"""
+        return let(rows * (item // LANES) + first), let(item % LANES)
+
     def numbers(self, array, first: int, count: int, rows: int, item):
-        return [let(at(at(array, rows * (item // LANES) + first + k), item % LANES)) for k in range(count)]
+        begin, lane = self._place(rows, item, first)
+        return [let(at(at(array, begin + k if k else begin), lane)) for k in range(count)]
 
     def row(self, array, slot, first: int, count: int, rows: int, item):
-        return [let(at(at(array, slot, rows * (item // LANES) + first + k), item % LANES)) for k in range(count)]
+        begin, lane = self._place(rows, item, first)
+        return [let(at(at(array, slot, begin + k if k else begin), lane)) for k in range(count)]
 
     def put_row(self, array, slot, first: int, rows: int, item, numbers):
+        begin, lane = self._place(rows, item, first)
         for k, number in enumerate(numbers):
-            assign(at(at(array, slot, rows * (item // LANES) + first + k), item % LANES), number)
+            assign(at(at(array, slot, begin + k), lane), number)
 
     def corners(self, vectors, slot, tets, item):
-        block, lane = item // LANES, item % LANES
-        places = (self.nodes * LANES * block + LANES * a + lane for a in range(self.nodes))
+        begin, lane = self._place(self.nodes * LANES, item)
+        places = (begin + (lane + LANES * a) for a in range(self.nodes))
         whole = [let(at(vectors, slot, at(tets, place))) for place in places]
         return [[let(at(w, d)) for d in range(3)] for w in whole]
 
     def store(self, corner, item, forces, zero, add: bool = False):
+        begin = let(self.nodes * item)
         for a in range(self.nodes):
-            self.put_force(at(corner, self.nodes * item + a), self.vector(*forces[a], zero), add)
+            self.put_force(at(corner, begin + a), self.vector(*forces[a], zero), add)
 
     def put(self, array, rows: int, item, first, numbers):
+        begin, lane = self._place(rows, item)
         for k, number in enumerate(numbers):
-            assign(at(at(array, rows * (item // LANES) + first + k), item % LANES), number)
+            assign(at(at(array, begin + first + k), lane), number)
 
     def add(self, array, rows: int, item, numbers, first: int = 0):
+        begin, lane = self._place(rows, item, first)
         for k, number in enumerate(numbers):
-            target = at(at(array, rows * (item // LANES) + first + k), item % LANES)
+            target = at(at(array, begin + k), lane)
             assign(target, target + number)

@@ -12,7 +12,7 @@ import taichi as ti
 
 from diffsim_ti.materials.calculus.tensor import Tensor, sum_of
 from diffsim_ti.mesh.reference_element import LINEAR, MID_EDGES, QUADRATIC, ReferenceElement
-from diffsim_ti.runtime import let, traced
+from diffsim_ti.runtime import let, spread, traced
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class LinearNodes(Nodes):
     @traced
     def forces(self, pushes) -> list:
         (Q,) = pushes
-        minus = ti.cast(-1, self.fp)
+        minus = spread(ti.cast(-1, self.fp), Q[0, 0])
         forces = [[let(minus * Q[d, a]) for d in range(3)] for a in range(3)]
         return [[let(sum_of(Q[d, a] for a in range(3))) for d in range(3)], *forces]  # node 0 balances them
 
@@ -73,12 +73,14 @@ class QuadraticNodes(Nodes):
 
     reference = QUADRATIC
 
-    def _factors(self) -> tuple:
-        return ti.cast(4 * FAR, self.fp), ti.cast(4 * (NEAR - FAR), self.fp)
+    @traced
+    def _factors(self, like) -> tuple:
+        """Variables: Taichi writes a constant anew for each lane wherever it stands."""
+        return tuple(spread(ti.cast(factor, self.fp), like) for factor in (4 * FAR, 4 * (NEAR - FAR), -1))
 
     @traced
     def edges(self, x) -> list[Tensor]:
-        far, near = self._factors()
+        far, near, _ = self._factors(x[0][0])
         # differences first: whatever is the same at all nodes leaves no trace of rounding
         r = [[let(0 * v) for v in x[0]]] + [[let(v - o) for v, o in zip(x[a], x[0])] for a in range(1, 10)]
         s = [[let(far * sum_of(r[BETWEEN[b, c]][d] for b in range(4)) - r[c][d]) for d in range(3)] for c in range(4)]
@@ -90,8 +92,7 @@ class QuadraticNodes(Nodes):
 
     @traced
     def forces(self, pushes) -> list:
-        far, near = self._factors()
-        minus = ti.cast(-1, self.fp)
+        far, near, minus = self._factors(pushes[0][0, 0])
         by_L = [  # [q][c][d]: what works on minus dx/dL_c at point q
             [[let(sum_of(Q[d, k] for k in range(3))) for d in range(3)]]
             + [[let(minus * Q[d, k]) for d in range(3)] for k in range(3)]

@@ -2,15 +2,25 @@
 
 Taichi traces a function anew wherever it is called. Each time it reads and parses the file, and for each node it wraps
 lines to 80 columns for a message that only an error shows: more than half of its time before LLVM starts.
+
+A number cast to a float type is a constant of that type. Taichi makes a constant of another and a cast, and takes each such
+pair out again by a walk through the whole kernel: its time grows with the square of a kernel's length.
 """
 
 import ast
 import textwrap
 
-from taichi.lang import kernel_impl
+import taichi as ti
+from taichi._lib import core
+from taichi.lang import kernel_impl, ops
 from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
+from taichi.lang.expr import Expr
+from taichi.lang.util import cook_dtype
+from taichi.types import primitive_types
 
-_of_kernels, _trace = kernel_impl._get_tree_and_ctx, kernel_impl.transform_tree
+from diffsim_ti.runtime.language import traced
+
+_of_kernels, _trace, _any_cast = kernel_impl._get_tree_and_ctx, kernel_impl.transform_tree, ops.cast
 _sources: dict = {}  # by code: functions that a factory makes share theirs
 
 
@@ -82,7 +92,16 @@ def _place(context, node) -> str:
     return place
 
 
+@traced
+def _cast(obj, dtype):
+    dtype = cook_dtype(dtype)
+    if type(obj) in (int, float) and dtype in primitive_types.real_types:
+        return Expr(core.make_const_expr_fp(dtype, float(obj)))
+    return _any_cast(obj, dtype)
+
+
 def trace_faster() -> None:
     """Give Taichi these answers, in all of this process."""
     kernel_impl._get_tree_and_ctx, kernel_impl.transform_tree = _tree_and_context, _transform
+    ti.cast = ops.cast = _cast
     ASTTransformerContext.get_pos_info = _place

@@ -45,9 +45,9 @@ class StrainLaw(Law):
     def rotation_and_strain(self, H):
         """(R, eps), found once for each Tensor; R is None without rotation."""
         if self.rotates:
-            if H.polar is None:
-                H.polar = polar(H, self.fp)
-            return H.polar
+            if "polar" not in H.known:
+                H.known["polar"] = polar(H, self.fp)
+            return H.known["polar"]
         return None, (H + H.transpose()) * self.real(0.5)
 
     @traced

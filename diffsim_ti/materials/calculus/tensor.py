@@ -10,25 +10,47 @@ from diffsim_ti.runtime import at, let, traced
 
 @traced
 class Tensor:
-    """Nine numbers of the kernel that is being compiled; operators give new ones. Numbers multiply from the right."""
+    """Nine numbers of the kernel that is being compiled; operators give new ones. Numbers multiply from the right.
+
+    Sums and multiples wait: what is used once, in one more of them, is part of its expression and becomes no variable. A
+    kernel's compile time grows with the square of how many it has.
+    """
 
     _data_oriented = True  # Taichi hands it on as it is
 
-    def __init__(self, numbers):
-        self.numbers = [let(x) for x in numbers]
-        self.polar = None  # its polar decomposition, once some law has asked for it
+    def __init__(self, numbers, waits: bool = False):
+        self._numbers, self._waits, self._used = list(numbers), True, False
+        self.known = {}  # what some law has found of it, by the function's name
+        if not waits:
+            self.numbers  # noqa: B018  variables, from here on
+
+    @property
+    def numbers(self) -> list:
+        """As variables, for any number of uses."""
+        if self._waits:
+            self._numbers, self._waits = [let(x) for x in self._numbers], False
+        return self._numbers
+
+    @traced
+    def used_once(self) -> list:
+        """For one use of each; from the second on they are variables."""
+        if self._waits and self._used:
+            return self.numbers
+        self._used = True
+        return self._numbers
 
     def __getitem__(self, index):
         return self.numbers[3 * index[0] + index[1]]
 
     def __add__(self, other):
-        return Tensor(a + b for a, b in zip(self.numbers, other.numbers))
+        return Tensor([a + b for a, b in zip(self.used_once(), other.used_once())], waits=True)
 
     def __sub__(self, other):
-        return Tensor(a - b for a, b in zip(self.numbers, other.numbers))
+        return Tensor([a - b for a, b in zip(self.used_once(), other.used_once())], waits=True)
 
     def __mul__(self, number):
-        return Tensor(a * number for a in self.numbers)
+        number = _shared(number)
+        return Tensor([a * number for a in self.used_once()], waits=True)
 
     def __matmul__(self, other):
         return Tensor(sum_of(self[i, k] * other[k, j] for k in range(3)) for i in range(3) for j in range(3))
@@ -52,6 +74,11 @@ class Tensor:
         return ti.Matrix([[self[i, j] for j in range(3)] for i in range(3)])
 
 
+def _shared(number):
+    """For several uses."""
+    return number if isinstance(number, (int, float)) else let(number)
+
+
 def sum_of(terms):
     """Sum from left to right, without a leading zero."""
     first, *others = terms
@@ -69,7 +96,7 @@ def tensor(matrix) -> Tensor:
 @traced
 def inner(A, B):
     """A : B"""
-    return let(sum_of(a * b for a, b in zip(A.numbers, B.numbers)))
+    return let(sum_of(a * b for a, b in zip(A.used_once(), B.used_once())))
 
 
 def _cyclic():
@@ -94,12 +121,19 @@ def cofactor_differential(A, dA) -> Tensor:
 @traced
 def add_to_diagonal(A, x) -> Tensor:
     """A + x I"""
-    return Tensor(A[i, j] + x if i == j else A[i, j] for i in range(3) for j in range(3))
+    x = _shared(x)
+    return Tensor([a + x if k % 4 == 0 else a for k, a in enumerate(A.used_once())], waits=True)
 
 
 @traced
 def invariants(H):
     """(K, j, s) of F = I + H without cancellation: K = cof F - I, j = det F - 1, s = |F|^2 - 3 - 2 j."""
+    if "invariants" not in H.known:
+        H.known["invariants"] = _invariants(H)
+    return H.known["invariants"]
+
+
+def _invariants(H):
     C, trace = cofactor(H), H.trace()
     minors = let(C.trace() + H[0, 0] * C[0, 0] + H[0, 1] * C[0, 1] + H[0, 2] * C[0, 2])
     K = add_to_diagonal(C - H.transpose(), trace)
