@@ -13,6 +13,7 @@ import pytest
 from test_cli import fails
 
 import diffsim_ti as ds
+from diffsim_ti import interrupts
 from diffsim_ti.film import render_series
 from diffsim_ti.visual.frame import Frame, Setting
 from diffsim_ti.visual.series import SavedSeries
@@ -136,6 +137,26 @@ def test_interrupts_at_any_moment_end_in_one_line(tmp_path, delay):
     said = run.communicate(timeout=60)[1]
     assert run.returncode == 130 and "Traceback" not in said
     assert said.splitlines()[-1].startswith("error: interrupted")
+
+
+def test_a_signal_just_before_a_command_has_ended_is_no_traceback(monkeypatch):
+    """Python raises what it was sent while the handler is taken away."""
+    kept, tries = signal.getsignal(signal.SIGINT), []
+
+    def set_handler(*choice):
+        tries.append(choice)
+        if len(tries) < 3:
+            raise KeyboardInterrupt
+        return taken(*choice)
+
+    taken = signal.signal
+    monkeypatch.setattr(interrupts, "_is_command", True)
+    monkeypatch.setattr(interrupts.signal, "signal", set_handler)
+    try:
+        interrupts.command_ended()
+        assert len(tries) == 3 and signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        taken(signal.SIGINT, kept)
 
 
 # ---- threads, restarts of Taichi, copies ------------------------------------------------------------------------------

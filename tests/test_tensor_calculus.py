@@ -26,7 +26,7 @@ USES = {  # of a sum S that waits
 def test_waiting_sums_are_used_in_any_order(lanes):
     """Each use stands first, second and third: a first use takes the expression itself, later ones its variables."""
     names = list(USES)
-    orders = [(names[n], names[n - 1], names[n - 4]) for n in range(len(names))] + [(name,) * 3 for name in names[:4]]
+    orders = [(names[n], names[n - 1], names[n - 4]) for n in range(len(names))] + [(name,) * 3 for name in names]
     number = ti.types.vector(LANES, ti.f64) if lanes else ti.f64
     kind = ti.types.ndarray(number, 1)
 

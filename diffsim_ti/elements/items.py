@@ -90,8 +90,8 @@ class Single(Items):
     def broadcast(self, number):
         return number
 
-    def _place(self, rows: int, item, first: int = 0) -> tuple:
-        """(where the block's numbers begin, lane)"""
+    def _place(self, rows: int, item, first=0) -> tuple:
+        """(where the block's numbers from `first` on begin, lane)"""
         return let(rows * (item // LANES) + first), let(item % LANES)
 
     def numbers(self, array, first: int, count: int, rows: int, item):
@@ -119,9 +119,9 @@ class Single(Items):
             self.put_force(at(corner, begin + a), self.vector(*forces[a], zero), add)
 
     def put(self, array, rows: int, item, first, numbers):
-        begin, lane = self._place(rows, item)
+        begin, lane = self._place(rows, item, first)
         for k, number in enumerate(numbers):
-            assign(at(at(array, begin + first + k), lane), number)
+            assign(at(at(array, begin + k), lane), number)
 
     def add(self, array, rows: int, item, numbers, first: int = 0):
         begin, lane = self._place(rows, item, first)

@@ -31,6 +31,11 @@ class Nodes(ABC):
     def points(self) -> int:
         return self.reference.num_points
 
+    @traced
+    def constant(self, number: float, like):
+        """For many uses: Taichi writes a bare one anew for each lane wherever it stands."""
+        return spread(ti.cast(number, self.fp), like)
+
     @abstractmethod
     def edges(self, x) -> list[Tensor]:
         """dx/dxi at each point, for x[a][d] at the nodes a."""
@@ -52,7 +57,7 @@ class LinearNodes(Nodes):
     @traced
     def forces(self, pushes) -> list:
         (Q,) = pushes
-        minus = spread(ti.cast(-1, self.fp), Q[0, 0])
+        minus = self.constant(-1, Q[0, 0])
         forces = [[let(minus * Q[d, a]) for d in range(3)] for a in range(3)]
         return [[let(sum_of(Q[d, a] for a in range(3))) for d in range(3)], *forces]  # node 0 balances them
 
@@ -75,12 +80,11 @@ class QuadraticNodes(Nodes):
 
     @traced
     def _factors(self, like) -> tuple:
-        """Variables: Taichi writes a constant anew for each lane wherever it stands."""
-        return tuple(spread(ti.cast(factor, self.fp), like) for factor in (4 * FAR, 4 * (NEAR - FAR), -1))
+        return self.constant(4 * FAR, like), self.constant(4 * (NEAR - FAR), like)
 
     @traced
     def edges(self, x) -> list[Tensor]:
-        far, near, _ = self._factors(x[0][0])
+        far, near = self._factors(x[0][0])
         # differences first: whatever is the same at all nodes leaves no trace of rounding
         r = [[let(0 * v) for v in x[0]]] + [[let(v - o) for v, o in zip(x[a], x[0])] for a in range(1, 10)]
         s = [[let(far * sum_of(r[BETWEEN[b, c]][d] for b in range(4)) - r[c][d]) for d in range(3)] for c in range(4)]
@@ -92,7 +96,8 @@ class QuadraticNodes(Nodes):
 
     @traced
     def forces(self, pushes) -> list:
-        far, near, minus = self._factors(pushes[0][0, 0])
+        like = pushes[0][0, 0]
+        (far, near), minus = self._factors(like), self.constant(-1, like)
         by_L = [  # [q][c][d]: what works on minus dx/dL_c at point q
             [[let(sum_of(Q[d, k] for k in range(3))) for d in range(3)]]
             + [[let(minus * Q[d, k]) for d in range(3)] for k in range(3)]

@@ -19,10 +19,8 @@ class Tensor:
     _data_oriented = True  # Taichi hands it on as it is
 
     def __init__(self, numbers, waits: bool = False):
-        self._numbers, self._waits, self._used = list(numbers), True, False
+        self._numbers, self._waits, self._used = [x if waits else let(x) for x in numbers], waits, False
         self.known = {}  # what some law has found of it, by the function's name
-        if not waits:
-            self.numbers  # noqa: B018  variables, from here on
 
     @property
     def numbers(self) -> list:
