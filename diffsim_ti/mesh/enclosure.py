@@ -6,6 +6,7 @@ from itertools import combinations
 import numpy as np
 
 from diffsim_ti.mesh import reference_face
+from diffsim_ti.mesh.geometry import cross
 
 FLAT = 1e-6  # of the size of a surface: how far its rim may lie off the planes that hold it
 
@@ -95,12 +96,12 @@ class Enclosure:
     def volume(self, x: np.ndarray) -> float:
         """V at positions x, shape (num_vertices, 3)."""
         a, b, c = np.moveaxis(self._corners(x), 1, 0)
-        return float((self.weights[:, None] * a * np.cross(b, c)).sum()) / -6
+        return float((self.weights[:, None] * a * cross(b, c)).sum()) / -6
 
     def gradient(self, x: np.ndarray) -> np.ndarray:
         """dV/dx, shape (num_vertices, 3); what is held counts too."""
         y = self._corners(x)
-        by = np.stack([np.cross(y[:, (a + 1) % 3], y[:, (a + 2) % 3]) for a in range(3)], 1)
+        by = np.stack([cross(y[:, (a + 1) % 3], y[:, (a + 2) % 3]) for a in range(3)], 1)
         return self._summed(by, len(x))
 
     def _summed(self, by: np.ndarray, num_vertices: int) -> np.ndarray:
@@ -115,7 +116,7 @@ class Enclosure:
         if self.point is None:
             dy = dy - dx[self.triangles[0, 0]]
         nexts = [((a + 1) % 3, (a + 2) % 3) for a in range(3)]
-        by = np.stack([np.cross(dy[:, b], y[:, c]) + np.cross(y[:, b], dy[:, c]) for b, c in nexts], 1)
+        by = np.stack([cross(dy[:, b], y[:, c]) + cross(y[:, b], dy[:, c]) for b, c in nexts], 1)
         return self._summed(by, len(x))
 
     def of_nodes(self, nodes: np.ndarray) -> "Enclosure":

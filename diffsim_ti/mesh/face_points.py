@@ -7,10 +7,18 @@ from diffsim_ti.mesh.geometry import triangle_normals, triangle_normals_jvp, tri
 from diffsim_ti.mesh.ten_nodes import QUARTERS
 
 
+def _crossing(v: np.ndarray) -> np.ndarray:
+    """The matrices of w -> v x w, shape (..., 3, 3)."""
+    out = np.zeros((*v.shape, 3))
+    for k in range(3):
+        out[..., (k + 2) % 3, (k + 1) % 3], out[..., (k + 1) % 3, (k + 2) % 3] = v[..., k], -v[..., k]
+    return out
+
+
 class LinearFaces:
     """Triangles: one point each, of which each corner has a third; exact for what is constant on them."""
 
-    points = 1
+    points, shares = 1, np.full((1, 3), 1 / 3)  # of the integrals over a face, of each point for each node
 
     def __init__(self, faces: np.ndarray):
         self.faces = faces
@@ -26,6 +34,11 @@ class LinearFaces:
     def normals_vjp(self, x: np.ndarray, normals_adj: np.ndarray) -> np.ndarray:
         """Adjoint of x, shape (num_vertices, 3), for that of the normals."""
         return triangle_normals_vjp(x, self.faces, normals_adj)
+
+    def normals_by_nodes(self, x: np.ndarray) -> np.ndarray:
+        """Derivative of each normal by the nodes of its face, shape (faces, points, nodes, 3, 3)."""
+        corners = x[self.faces]
+        return _crossing(np.roll(corners, -2, 1) - np.roll(corners, -1, 1))[:, None] / 2
 
     def to_nodes(self, of_points: np.ndarray) -> np.ndarray:
         """Integrals of the shape functions times what points have (times their areas), shape (faces, nodes, ...)."""
@@ -43,7 +56,7 @@ class QuadraticFaces:
 
     def __init__(self, faces: np.ndarray):
         self.faces = faces
-        self._N = reference_face.functions(reference_face.POINTS)
+        self.shares = reference_face.functions(reference_face.POINTS)
         self._by = reference_face.derivatives(reference_face.POINTS)
 
     def _tangents(self, x):
@@ -69,12 +82,17 @@ class QuadraticFaces:
         np.add.at(out, self.faces, by_nodes)
         return out
 
+    def normals_by_nodes(self, x):
+        e, f = (_crossing(t * (reference_face.WEIGHTS / 2)[:, None])[:, :, None] for t in self._tangents(x))
+        by_s, by_t = self._by[None, ..., 0, None, None], self._by[None, ..., 1, None, None]
+        return e * by_t - f * by_s
+
     def to_nodes(self, of_points):
         by_face = of_points.reshape(len(self.faces), self.points, *of_points.shape[1:])
-        return np.einsum("qa,fq...->fa...", self._N, by_face, optimize=True)
+        return np.einsum("qa,fq...->fa...", self.shares, by_face, optimize=True)
 
     def from_nodes(self, of_nodes):
-        at = np.einsum("qa,fa...->fq...", self._N, of_nodes, optimize=True)
+        at = np.einsum("qa,fa...->fq...", self.shares, of_nodes, optimize=True)
         return at.reshape(-1, *of_nodes.shape[2:])
 
 

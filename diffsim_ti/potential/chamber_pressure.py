@@ -3,7 +3,7 @@
 import numpy as np
 
 from diffsim_ti.potential.chamber_laws import law_of
-from diffsim_ti.potential.follower_pressure import FollowerPressure
+from diffsim_ti.potential.follower_pressure import FollowerPressure, Tangent
 
 
 class ChamberPressure(FollowerPressure):
@@ -75,6 +75,16 @@ class ChamberPressure(FollowerPressure):
             return super().jvp(x, dx, dp)
         finally:
             self.share = share
+
+    def tangent(self, x: np.ndarray) -> Tangent:
+        slopes = [law.slope(V) for law, V in zip(self.laws, self.volumes(x))]
+        pairs = [
+            (slope * self.unit_forces(x, k), enclosure.gradient(x))
+            for k, (slope, enclosure) in enumerate(zip(slopes, self.enclosures))
+            if slope
+        ]
+        self._place(x)
+        return Tangent(super().tangent(x).K, pairs)
 
     def _felt(self, x: np.ndarray, w: np.ndarray) -> np.ndarray:
         """Adjoints of the pressures of all triangles' loads and chambers, for that of the forces."""

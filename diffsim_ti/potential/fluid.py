@@ -70,6 +70,10 @@ class Fluid:
         """Sum of the sizes of the forces that meet at each vertex [N]."""
         return self._to_vertices(np.linalg.norm(self._corner(x), axis=1, keepdims=True))[:, 0]
 
+    def tangent(self, x: np.ndarray) -> "_At":
+        """Change of the forces for many changes of x."""
+        return _At(self, x)
+
     def jvp(self, x: np.ndarray, dx: np.ndarray) -> np.ndarray:
         """Change of the forces for a change of x, and of velocities with it."""
         return self.jvp_of_all(x, dx, dx / self.gamma)
@@ -116,6 +120,32 @@ class Fluid:
         return float(((self.forces(x) + middle + self.forces(x + step)) * step).sum()) / 6
 
 
+class _At:
+    """Change of a fluid's forces around one place, as `Tangent` has it of pressures."""
+
+    def __init__(self, fluid: Fluid, x: np.ndarray, transposed: bool = False):
+        self.fluid, self.x, self.change = fluid, x, fluid.vjp if transposed else fluid.jvp
+
+    def __call__(self, dx: np.ndarray) -> np.ndarray:
+        return self.change(self.x, dx)
+
+    @property
+    def T(self) -> "_At":
+        return _At(self.fluid, self.x, transposed=True)
+
+
+class _Sum:
+    def __init__(self, parts: list):
+        self.parts = parts
+
+    def __call__(self, dx):
+        return sum(part(dx) for part in self.parts)
+
+    @property
+    def T(self) -> "_Sum":
+        return _Sum([part.T for part in self.parts])
+
+
 class Together:
     """Pressures that follow and a fluid, as Newton's method takes them."""
 
@@ -130,11 +160,8 @@ class Together:
     def sizes(self, x):
         return sum(part.sizes(x) for part in self.parts)
 
-    def jvp(self, x, dx):
-        return sum(part.jvp(x, dx) for part in self.parts)
-
-    def vjp(self, x, w):
-        return sum(part.vjp(x, w) for part in self.parts)
+    def tangent(self, x):
+        return _Sum([part.tangent(x) for part in self.parts])
 
     def work(self, x, step):
         return sum(part.work(x, step) for part in self.parts)

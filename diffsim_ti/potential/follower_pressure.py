@@ -11,6 +11,23 @@ from diffsim_ti.mesh.enclosure import open_edges, spanned_by_edges
 from diffsim_ti.mesh.face_points import face_points
 
 
+class Tangent:
+    """dx -> K dx + sum of u (g . dx) over pairs (u, g), which are few; K a sparse matrix, all of them (num_vertices, 3)."""
+
+    def __init__(self, K, pairs: list[tuple[np.ndarray, np.ndarray]]):
+        self.K, self.pairs = K, pairs
+
+    def __call__(self, dx: np.ndarray) -> np.ndarray:
+        out = (self.K @ dx.ravel()).reshape(-1, 3)
+        for u, g in self.pairs:
+            out += float(np.vdot(g, dx)) * u
+        return out
+
+    @property
+    def T(self) -> "Tangent":
+        return Tangent(self.K.T.tocsr(), [(g, u) for u, g in self.pairs])
+
+
 class FollowerPressure:
     """Of faces (m, 3) or (m, 6), each of which belongs to a load; `at` says how large the pressures of loads are [Pa].
 
@@ -52,6 +69,17 @@ class FollowerPressure:
         if pressures_dot is not None:
             part += self._pushes(self.share * pressures_dot) * self.points.normals(x)
         return self._to_vertices(part)
+
+    def tangent(self, x: np.ndarray) -> Tangent:
+        """Change of the forces for many changes of x."""
+        from scipy.sparse import coo_matrix
+
+        points, n = self.points, 3 * self.num_vertices
+        pushes = self._pushes(self.pressure).reshape(len(points.faces), -1)
+        blocks = np.einsum("qa,fq,fqbij->faibj", points.shares, pushes, points.normals_by_nodes(x), optimize=True)
+        at = 3 * points.faces[:, :, None] + np.arange(3)
+        rows, columns = np.broadcast_arrays(at[:, :, :, None, None], at[:, None, None])
+        return Tangent(coo_matrix((blocks.ravel(), (rows.ravel(), columns.ravel())), (n, n)).tocsr(), [])
 
     def vjp(self, x: np.ndarray, w: np.ndarray) -> np.ndarray:
         """Adjoint of x for the adjoint w of the forces."""

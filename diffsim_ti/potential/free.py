@@ -17,8 +17,10 @@ class FreeDirections:
 
     def __rmul__(self, x: np.ndarray) -> np.ndarray:
         out = x * self.mask
+        guided = out[self.guided, :, None]
         for _ in range(2):  # where next to nothing is free, once leaves as much rounding of what is held
-            out[self.guided] -= np.einsum("kij,kj->ki", self.guides, out[self.guided])
+            guided = guided - self.guides @ guided
+        out[self.guided] = guided[..., 0]
         return out
 
     __mul__ = __rmul__

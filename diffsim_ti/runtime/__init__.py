@@ -13,6 +13,7 @@ What is used of Taichi's internals, by which module, and what Quadrants has inst
 | `Ndarray`, `VectorNdarray`, `ScalarNdarray`, `prog.create_ndarray`, `delete_ndarray`, `fill_uint`, `get_ndarray_data_ptr_as_int` | arrays | arrays that are freed, NumPy's view of them | its constructors |
 | `impl.expr_init`, `impl.subscript`, `Expr`, `_assign`, `_is_taichi_function` | language | functions that build code while kernels compile | `_is_quadrants_function`; dataclasses handed on whole |
 | `kernel_impl._get_tree_and_ctx`, `transform_tree`, `ASTTransformerContext`, `ops.cast`, `core.make_const_expr_fp` | sources | faster tracing | not used |
+| `ASTTransformer.build_Assign`, annotations of a function's parameters | variables | fewer variables | not used |
 | `kernel_impl.Kernel.__call__` | threads | threads take turns | the same |
 | `core.with_cuda`, `with_vulkan`, `arch_name` | start, device | which backends there are | the same |
 """

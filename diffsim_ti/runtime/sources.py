@@ -18,6 +18,7 @@ from taichi.lang.expr import Expr
 from taichi.lang.util import cook_dtype
 from taichi.types import primitive_types
 
+from diffsim_ti.runtime import variables
 from diffsim_ti.runtime.language import traced
 
 _of_kernels, _trace, _any_cast = kernel_impl._get_tree_and_ctx, kernel_impl.transform_tree, ops.cast
@@ -31,7 +32,10 @@ class _Source:
         lines, self.start = kernel_impl.getsourcelines(function)
         self.file = kernel_impl.getsourcefile(function)
         self.lines = [textwrap.fill(line, tabsize=4, width=9999) for line in lines]
-        self.free = []
+        self.free, self.changed = [], None
+        if variables.may_share(self.file):
+            self.free.append(self.take())
+            self.changed = variables.changed_names(self.free[0].body[0])
 
     def take(self) -> ast.Module:
         if self.free:
@@ -59,16 +63,20 @@ def _tree_and_context(function, *args, is_kernel: bool = True, is_real_function:
     source = _sources.get((code.co_filename, code))
     if source is None:
         source = _sources[code.co_filename, code] = _Source(function.func)
-    return source.take(), ASTTransformerContext(
+    context = ASTTransformerContext(
         is_kernel=False,
         func=function,
         global_vars=kernel_impl._get_global_vars(function.func),
-        argument_data=more["args"],
+        argument_data=more["args"]
+        if source.changed is None
+        else variables.arguments(function, more["args"], source.changed),
         src=source.lines,
         start_lineno=source.start,
         file=source.file,
         ast_builder=more["ast_builder"],
     )
+    context.changed = source.changed
+    return source.take(), context
 
 
 def _transform(tree: ast.Module, context: ASTTransformerContext):
@@ -105,3 +113,4 @@ def trace_faster() -> None:
     kernel_impl._get_tree_and_ctx, kernel_impl.transform_tree = _tree_and_context, _transform
     ti.cast = ops.cast = _cast
     ASTTransformerContext.get_pos_info = _place
+    variables.make_fewer()

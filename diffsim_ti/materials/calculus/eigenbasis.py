@@ -2,7 +2,7 @@
 
 import taichi as ti
 
-from diffsim_ti.runtime import Bundle, assign, let, traced
+from diffsim_ti.runtime import Bundle, assign, let, traced, variable
 
 
 @traced
@@ -15,9 +15,9 @@ def eigenbasis(A: list, fp) -> list:
     size = let(A[0] * 0 + ti.cast(1e-30, fp))
     for x in A:
         size = let(ti.max(size, ti.max(x, 0 - x)))
-    scaled = [let(x / size) for x in A]
+    scaled = [variable(x / size) for x in A]
     zero, one = let(size * 0), let(size * 0 + 1)
-    n = [let(one + zero if k % 4 == 0 else zero + zero) for k in range(9)]
+    n = [variable(one if k % 4 == 0 else zero) for k in range(9)]
     # off[k] is the entry in the two rows other than k
     turning = Bundle(diagonal=scaled[::4], off=[scaled[5], scaled[2], scaled[1]], n=n)
     _turn(turning, fp)
@@ -50,5 +50,5 @@ def _rotate(m, p: int, q: int, r: int, fp) -> None:
     for x, y in [(m.off[q], m.off[p]), *((m.n[3 * k + p], m.n[3 * k + q]) for k in range(3))]:
         changes += [(x, c * x - s * y), (y, s * x + c * y)]
     values = [let(value) for _, value in changes]
-    for (variable, _), value in zip(changes, values):
-        assign(variable, value)
+    for (number, _), value in zip(changes, values):
+        assign(number, value)

@@ -17,7 +17,7 @@ import taichi as ti
 from diffsim_ti.differentiation import Graph, Number, log1p
 from diffsim_ti.materials.calculus.eigenbasis import eigenbasis
 from diffsim_ti.materials.calculus.tensor import Tensor, sum_of
-from diffsim_ti.runtime import Bundle, assign, let, spread, traced
+from diffsim_ti.runtime import Bundle, assign, let, spread, traced, variable
 
 # where rounding of the difference is as large as the quadrature's error, as a share of the mean of 1 + 2 e
 NEAR = {ti.f64: 0.007, ti.f32: 0.1}
@@ -77,7 +77,7 @@ def divided_difference(graph: Graph, f: Callable, a: tuple, b: tuple):
     gap, mean = let(a[0] - b[0]), let(1 + a[0] + b[0])
     is_far = let(gap * gap > mean * mean * graph.constant(NEAR[graph.fp] ** 2))
     far = (a[1] - b[1]) / ti.select(is_far, gap, mean)
-    job = Bundle(graph=graph, f=f, middle=let((a[0] + b[0]) * graph.constant(0.5)), gap=gap, total=let(0 * gap))
+    job = Bundle(graph=graph, f=f, middle=let((a[0] + b[0]) * graph.constant(0.5)), gap=gap, total=variable(0 * gap))
     _add_curvatures(job)
     return let(ti.select(is_far, far, job.total))
 

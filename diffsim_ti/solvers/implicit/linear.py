@@ -26,7 +26,7 @@ class Operator:
     def __init__(self, potential, mass: np.ndarray, free: Free, follower=None, transposed: bool = False):
         self.potential, self.mass, self.free = potential, mass, free
         self.products, self.correction = 0, None
-        self.follower, self.transposed = follower, transposed
+        self.follower, self.transposed, self._pressing = follower, transposed, None
 
     @property
     def symmetric(self) -> bool:
@@ -44,9 +44,10 @@ class Operator:
         if self.correction is not None:
             y += self.correction(w)
         if self.follower is not None:
-            x = self.potential.arrays.values.rest + self.potential.held_at
-            w = w * self.free
-            y -= self.follower.vjp(x, w) if self.transposed else self.follower.jvp(x, w)
+            if self._pressing is None:
+                at = self.follower.tangent(self.potential.arrays.values.rest + self.potential.held_at)
+                self._pressing = at.T if self.transposed else at
+            y -= self._pressing(w * self.free)
         return y * self.free
 
 
