@@ -4,6 +4,7 @@ DIFFSIM_TI_FORM=gpu: arrays, kernels and launches take the form for a GPU, on th
 DIFFSIM_TI_DEBUG=1: kernels check the bounds of every array; slow, in one process: `DIFFSIM_TI_DEBUG=1 python -m pytest`.
 """
 
+import gc
 import os
 
 import areas
@@ -16,6 +17,7 @@ import diffsim_ti
 def taichi():
     debug = dict(debug=True) if os.environ.get("DIFFSIM_TI_DEBUG") else {}
     diffsim_ti.init(os.environ.get("DIFFSIM_TI_ARCH", "cpu"), precision="f64", **debug)
+    gc.freeze()  # all modules: tracing kernels makes many objects, and each thousand of them would look through these
 
 
 @pytest.fixture(scope="module", autouse=True)

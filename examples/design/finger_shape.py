@@ -95,11 +95,13 @@ def draw(path: Path, finger: Finger, before: ds.Frames, after: ds.Frames, ratio:
     )
 
 
-def main(folder="output", quick: bool = False) -> dict:
+def main(folder="output", quick: bool = False, orders=(1, 2)) -> dict:
     """For linear and for ten-node tetrahedra: forces [N] before and after, their ratio, the volume's change, how deep and
     wide it is by the finger, the smallest J of the map, simulations, seconds."""
     out = {}
-    for order, resolution in ((1, (10, 3, 3) if quick else (31, 5, 5)), (2, (6, 2, 2) if quick else (16, 3, 3))):
+    resolutions = {1: (10, 3, 3), 2: (6, 2, 2)} if quick else {1: (31, 5, 5), 2: (16, 3, 3)}
+    for order in orders:
+        resolution = resolutions[order]
         finger, begin = Finger(resolution, order), time.perf_counter()
         plain = np.zeros(2 * STATIONS)
         before, _, first = finger.grip(plain)
