@@ -203,6 +203,19 @@ def test_forces_of_a_chamber_add_up_to_nothing():
     assert pressures.jvp(x, v) == pytest.approx(difference, rel=1e-6, abs=1e-6 * np.abs(difference).max())
 
 
+@pytest.mark.parametrize("holds", [False, True])
+def test_the_tangent_that_products_use_is_the_derivative_both_ways(holds):
+    of = filled(pitted, grown=(1.2,)) if holds else hollow([gas(), ds.Pressure(500.0, "cavity")])
+    rng = np.random.default_rng(3)
+    x, v = of.mesh.vertices + 0.01 * rng.normal(size=(2, *of.mesh.vertices.shape))
+    pressures = ChamberPressure(of).at(of.inputs.derive(of.inputs.values).follower[0, :, 0])
+    for k in pressures.held:
+        pressures.laws[k].gamma = 3e4
+    tangent = pressures.tangent(x)
+    for found, expected in ((tangent(v), pressures.jvp(x, v)), (tangent.T(v), pressures.vjp(x, v))):
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13 * np.abs(expected).max())
+
+
 # ---- closed forms ----------------------------------------------------------------------------------------------------
 
 

@@ -5,6 +5,7 @@ import pytest
 from contact_scenes import SHAPES, G, points, resting_gap, tetrahedron
 
 import diffsim_ti as ds
+from diffsim_ti.solvers.implicit.newton import Newton
 
 SOLVERS = (ds.ImplicitEulerSolver, ds.BDF2Solver)
 solvers = pytest.mark.parametrize("solver", SOLVERS, ids=lambda s: s.__name__)
@@ -60,6 +61,33 @@ def test_a_moving_floor_drags(solver):
     scene = points(tetrahedron(resting_gap(G)), floor, terms=[ds.Gravity(-G)], precision="f64")
     frames = ds.Rollout(solver(scene, dt=5e-3), 200, save_every=10).forward()
     np.testing.assert_allclose(frames.velocities[:, 0, 0], np.minimum(0.3 * G * frames.times, 1.5), atol=2e-2)
+
+
+def met_at_five_metres_per_second(solver) -> ds.Rollout:
+    """A nearly incompressible cube, by a plane that rises through a third of it in one step of 10 ms."""
+    plane = ds.HalfSpace(
+        [0, -0.012, 0], [0, 1, 0], stiffness_per_area=1e7, width=0.005, friction=0.3, path=lambda t: [0, 5 * t, 0]
+    )
+    mesh, law = ds.TetrahedralMesh.create_cube(5, 0.1), ds.StableNeoHookean(1e5, 0.499)
+    scene = ds.Scene(mesh, law, 1000.0, [ds.Gravity(), plane], precision="f64", volume="patches")
+    return ds.Rollout(solver(scene, dt=0.01), 3, save_every=1)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_fast_plane_lifts_in_long_steps(monkeypatch):
+    """With more rounds of Newton's method than asked for, as long as they gain."""
+    rollout = met_at_five_metres_per_second(ds.BDF2Solver)
+    frames = rollout.forward()
+    above = frames.positions[:, :, 1].min(1) - (-0.012 + 0.05 * np.arange(4))
+    assert above.min() > 0 and frames.velocities[-1, :, 1].mean() > 5
+    monkeypatch.setattr(Newton, "steady", 0)
+    with pytest.raises(ds.NotConverged):
+        rollout.forward()
+
+
+def test_midpoints_refuse_a_fast_plane_in_terms_of_it():
+    with pytest.raises(ds.Tunnelling, match="HalfSpace.* m/s: take a solver whose steps end where forces are taken"):
+        met_at_five_metres_per_second(ds.ImplicitMidpointSolver).forward()
 
 
 def test_a_rising_floor_lifts():

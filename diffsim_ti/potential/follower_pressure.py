@@ -5,6 +5,8 @@ six nodes minus the integral of p N_a dx/ds x dx/dt. Over a closed surface that 
 open one a part is left at its edge that no potential has.
 """
 
+from functools import cached_property
+
 import numpy as np
 
 from diffsim_ti.mesh.enclosure import open_edges, spanned_by_edges
@@ -25,7 +27,7 @@ class Tangent:
 
     @property
     def T(self) -> "Tangent":
-        return Tangent(self.K.T.tocsr(), [(g, u) for u, g in self.pairs])
+        return Tangent(self.K.T, [(g, u) for u, g in self.pairs])
 
 
 class FollowerPressure:
@@ -70,16 +72,27 @@ class FollowerPressure:
             part += self._pushes(self.share * pressures_dot) * self.points.normals(x)
         return self._to_vertices(part)
 
+    @cached_property
+    def _blocks(self):
+        """(what adds up the blocks of all pairs of nodes of each face, columns of the sums, where rows begin)."""
+        from scipy.sparse import csr_matrix
+
+        n, faces = self.num_vertices, self.points.faces
+        pairs, place = np.unique(n * faces[:, :, None] + faces[:, None], return_inverse=True)
+        rows, columns = np.divmod(pairs, n)
+        each = np.arange(place.size + 1)
+        sums = csr_matrix((np.ones(place.size), place.ravel(), each), (place.size, len(pairs))).T.tocsr()
+        return sums, columns, np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=n))])
+
     def tangent(self, x: np.ndarray) -> Tangent:
         """Change of the forces for many changes of x."""
-        from scipy.sparse import coo_matrix
+        from scipy.sparse import bsr_matrix
 
-        points, n = self.points, 3 * self.num_vertices
+        points, (sums, columns, start) = self.points, self._blocks
         pushes = self._pushes(self.pressure).reshape(len(points.faces), -1)
-        blocks = np.einsum("qa,fq,fqbij->faibj", points.shares, pushes, points.normals_by_nodes(x), optimize=True)
-        at = 3 * points.faces[:, :, None] + np.arange(3)
-        rows, columns = np.broadcast_arrays(at[:, :, :, None, None], at[:, None, None])
-        return Tangent(coo_matrix((blocks.ravel(), (rows.ravel(), columns.ravel())), (n, n)).tocsr(), [])
+        parts = np.einsum("qa,fq,fqbij->fabij", points.shares, pushes, points.normals_by_nodes(x), optimize=True)
+        blocks = (sums @ parts.reshape(-1, 9)).reshape(-1, 3, 3)
+        return Tangent(bsr_matrix((blocks, columns, start), (3 * self.num_vertices,) * 2), [])
 
     def vjp(self, x: np.ndarray, w: np.ndarray) -> np.ndarray:
         """Adjoint of x for the adjoint w of the forces."""

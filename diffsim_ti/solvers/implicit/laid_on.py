@@ -33,7 +33,7 @@ class LaidOn:
         done, share, place = 0.0, self.first, u
         if not np.all(np.isfinite(out_of_balance)):
             raise error
-        newton.max_iterations = min(self.rounds, most)
+        newton.max_iterations, newton.steady = min(self.rounds, most), 0  # a smaller part costs less than more rounds
         try:
             while done < 1:
                 s = min(done + share, 1.0)
@@ -48,6 +48,7 @@ class LaidOn:
                         raise NotConverged(self._why(error, place, done), error.residuals) from None
         finally:
             newton.max_iterations = most
+            del newton.steady
         return place
 
     def _why(self, error: NotConverged, place: np.ndarray, done: float) -> str:

@@ -57,7 +57,8 @@ class Newton:
     # before at most (`_forcing`)
     inexact, rough = 1e-3, 0.1
     roughly = 0.03
-    patience = 6  # times as many rounds as asked for, at most, where obstacles cut directions short
+    patience = 6  # times as many rounds as asked for, at most, where obstacles cut directions short, or while ...
+    steady = 10  # ... so many rounds halve the residual; 0: no more than asked for
     by_work = 30  # rounds in which work may stand for a potential that is not there; later it might lead in circles
     shortest = 2.0**-40  # fraction of a direction below which a line search gives up
 
@@ -110,7 +111,7 @@ class Newton:
         E, size, norm, rough, solved = self._evaluate(u), 0.0, np.inf, False, False
         self.upright = bool(np.all(E[2] > 0))
         most = self.max_iterations if rounds is None else rounds
-        while len(report.residuals) < min(most + report.cuts, self.patience * most):
+        while self._goes_on(most, rounds is None):
             R, now = self._residual(u)
             size, before = max(size, now), norm
             floor = 4 * self.eps * np.linalg.norm(self._rigidity() * np.abs(u).max(1, keepdims=True) * self.moves)
@@ -158,6 +159,13 @@ class Newton:
             "motion to the next one instead, by ImplicitEulerSolver with Drag",
             report.residuals,
         )
+
+    def _goes_on(self, most: int, to_the_end: bool) -> bool:
+        done, many = self.report.residuals, len(self.report.residuals)
+        if many < min(most + self.report.cuts, self.patience * most):
+            return True
+        slow = self.steady and to_the_end and self.steady < many < self.patience * most
+        return bool(slow and done[-1] < 0.5 * done[-1 - self.steady])
 
     def is_unstable(self) -> bool:
         """Whether Phi falls in some direction where the potential stands."""

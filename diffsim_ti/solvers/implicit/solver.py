@@ -28,7 +28,8 @@ class ImplicitSolver(Solver):
 
     tolerance: relative residual of the equation of motion; gradients are as exact as the solve.
     max_iterations: Newton rounds per substep, after which NotConverged is raised and the state stays as it was. Rounds whose
-        direction an obstacle, or the surface itself, cuts short do not count, up to five times as many.
+        direction an obstacle, or the surface itself, cuts short do not count, up to five times as many, nor do those that
+        come after while ten of them halve the residual.
     preconditioner: of the linear solves: "block_jacobi", "multigrid" (smoothed aggregation), or "auto", by the body's size.
 
     On the way from one state to the next no vertex or face meets an obstacle; what comes to the body, obstacles on their
