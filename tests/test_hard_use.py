@@ -150,6 +150,7 @@ def test_a_signal_just_before_a_command_has_ended_is_no_traceback(monkeypatch):
         return taken(*choice)
 
     taken = signal.signal
+    taken(signal.SIGINT, signal.default_int_handler)  # a shell starts what it does not wait for without
     monkeypatch.setattr(interrupts, "_is_command", True)
     monkeypatch.setattr(interrupts.signal, "signal", set_handler)
     try:
