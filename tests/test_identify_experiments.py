@@ -210,6 +210,7 @@ def stretched_block(material, ways: dict, held=()) -> ds.Rollout:
     return ds.Rollout(ds.StaticSolver(scene), 20, save_every=1, outputs=[ds.Reaction("xmax", name="force")])
 
 
+@pytest.mark.thorough
 @pytest.mark.filterwarnings("ignore:Ogden. Poisson")  # strains are the same everywhere: nothing locks
 def test_the_curve_of_three_ogden_pairs_from_uniaxial_and_biaxial_data():
     """Ogden's rubber of 1972, noise of half a per cent: found are both curves, to 1 %, and so is pure shear, which was not

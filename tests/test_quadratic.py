@@ -148,7 +148,9 @@ def test_explicit_adjoints_are_the_transposes_of_tangents(solver, volume):
     assert_transposed(rollout_of(solver, volume), 1e-12)
 
 
-@pytest.mark.parametrize("parallel", [False, pytest.param(True, marks=pytest.mark.backends)])
+@pytest.mark.parametrize(
+    "parallel", [pytest.param(False, marks=pytest.mark.thorough), pytest.param(True, marks=pytest.mark.backends)]
+)
 def test_explicit_adjoints_in_single_precision(parallel):
     made = ds.VelocityVerletSolver(loaded(precision="f32"), dt=2e-3, substeps=4, parallel=parallel)
     assert_transposed(ds.Rollout(made, STEPS, save_every=2, gradients="all"), 2e-4)
