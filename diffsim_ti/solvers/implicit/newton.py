@@ -57,8 +57,8 @@ class Newton:
     # before at most (`_forcing`)
     inexact, rough = 1e-3, 0.1
     roughly = 0.03
-    patience = 6  # times as many rounds as asked for, at most, where obstacles cut directions short, or while ...
-    steady = 10  # ... so many rounds halve the residual; 0: no more than asked for
+    patience = 6  # times as many rounds as asked for, at most (`_goes_on`)
+    steady = 10  # rounds that halve the residual while more than asked for are taken; 0: none are
     by_work = 30  # rounds in which work may stand for a potential that is not there; later it might lead in circles
     shortest = 2.0**-40  # fraction of a direction below which a line search gives up
 
@@ -161,6 +161,8 @@ class Newton:
         )
 
     def _goes_on(self, most: int, to_the_end: bool) -> bool:
+        """Whether there is another round: those that obstacles cut short do not count, and those that gain are not the last
+        where the solve is to reach its tolerance."""
         done, many = self.report.residuals, len(self.report.residuals)
         if many < min(most + self.report.cuts, self.patience * most):
             return True
