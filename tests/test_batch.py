@@ -6,12 +6,15 @@ import warnings
 import numpy as np
 import pytest
 import torch
+from gradient_fuzz.loads import load, over_time
+from gradient_fuzz.ties import tie
 
 import diffsim_ti as ds
 from diffsim_ti.diff_simulator import rollout_frames
 
 MESH = ds.TetrahedralMesh.create_box(3, 0.1)
 LOW = MESH.vertices[:, 1].min()
+HOW = "constant", "per step", "keyed"
 EXPLICIT = ds.SemiImplicitSolver, ds.VelocityVerletSolver
 ROUND_OFF = {"f32": 2e-6, "f64": 1e-13}  # of sums, in another order
 
@@ -73,6 +76,49 @@ def drawn(seed: int) -> tuple[ds.Batch, dict]:
 def test_scenes_are_bit_for_bit_those_alone(seed):
     batch, own = drawn(seed)
     check(batch, own, np.random.default_rng(100 + seed), seed % 3 == 0)
+
+
+ACTING = (
+    *("Spring within", "Spring anchored", "ElasticFoundation one", "ElasticFoundation each"),
+    *(f"{what} {how}" for what in ("Cable tension", "Cable length", "Pressure") for how in HOW),
+    *(f"Muscle {how}" for how in HOW),
+    "SurfaceDrag",
+)
+
+
+def acting(name: str, rng, steps: int, dt: float):
+    """A term that acts on a body of MESH besides tetrahedra, of random numbers."""
+    kind, how = name.split(" ")[0], name.split(" ", 1)[-1]
+    if kind == "SurfaceDrag":
+        return ds.SurfaceDrag(
+            500.0, normal=2.0, tangential=0.1, stream=rng.normal(size=3), surface=("xmax", None)[rng.integers(2)]
+        )
+    if kind == "Pressure":
+        return load(name, rng, MESH, steps, steps * dt, 1.0)
+    if kind != "Muscle":
+        return tie(name, rng, MESH, steps, steps * dt, np.full(len(MESH.vertices), 0.01), dt)
+    activation, some = over_time(rng, steps, steps * dt, how)(1.0), np.sort(rng.permutation(MESH.num_tetrahedra)[:40])
+    return ds.Muscle(rng.normal(size=(40, 3)), 5e3, activation, some)
+
+
+@pytest.mark.parametrize("seed", [*range(4), *(pytest.param(k, marks=pytest.mark.thorough) for k in range(4, 60))])
+def test_what_acts_on_bodies(seed):
+    """Springs, cables, muscles, pressures, fluids and foundations, one to three of them, of scenes side by side."""
+    rng = np.random.default_rng([1, seed])
+    steps, B, dt = int(rng.integers(2, 5)), int(rng.choice([5, 9, 11])), 1e-3
+    first = ACTING[4 * seed % len(ACTING)]  # all come, in turn
+    terms = [acting(name, rng, steps, dt) for name in (first, *rng.choice(ACTING, rng.integers(0, 3)))]
+    terms += [floor()] if seed % 3 == 0 else []
+    scene = ds.Scene(MESH, ELASTIC, 1000.0, terms=[ds.Gravity(-9.8), *terms], precision=("f64", "f32")[seed % 2])
+    batch = ds.Batch(
+        EXPLICIT[seed % 2](scene, dt=dt, substeps=int(rng.integers(2, 5))), steps, B, gradients="all", lanes=True
+    )
+    own = {name: x * rng.uniform(0.9, 1.1, (B, *x.shape)) for name, x in batch.one.values.items() if rng.random() < 0.6}
+    own = {name: x for name, x in own.items() if name not in ("rest_positions", "initial_positions", "poissons_ratio")}
+    if rng.random() < 0.5:
+        own["rest_positions"] = MESH.vertices + 1e-3 * rng.normal(size=(B, *MESH.vertices.shape))
+    own["initial_velocities"] = 0.1 * rng.normal(size=(B, *MESH.vertices.shape))
+    check(batch, own, rng, True)
 
 
 ELASTIC = ds.StableNeoHookean(2e4, 0.3)
@@ -380,7 +426,11 @@ def test_what_could_be_either_is_refused():
     batch = ds.Batch(ds.SemiImplicitSolver(scene, dt=1e-3), 1, m)
     with pytest.raises(ValueError, match=rf"one value for all scenes or one for each of {m}"):
         batch.forward(youngs_modulus=np.full(m, 1e4))
-    batch.forward(youngs_modulus=np.full((m, m), 1e4))
+    E, full = np.linspace(1e4, 2e4, m), (m, m)
+    shared, own = np.broadcast_to(E, full), np.broadcast_to(E[:, None], full)
+    ends = [batch.forward(youngs_modulus=x).positions[:, -1] for x in (shared, own)]
+    np.testing.assert_array_equal(ends[0], np.broadcast_to(ends[0][0], ends[0].shape))
+    np.testing.assert_array_equal(ends[1][3], batch.one.forward(youngs_modulus=E[3]).positions[-1])
 
 
 def test_wrong_seeds_and_counts_are_refused():

@@ -2,9 +2,11 @@
 
 import copy
 import pickle
+import re
 
 import numpy as np
 import pytest
+from gradient_fuzz import scenes as random_scenes
 
 import diffsim_ti as ds
 from diffsim_ti import verify
@@ -392,6 +394,26 @@ def test_values_that_do_not_fit(name, value, message):
     rollout = ds.Rollout(ds.SemiImplicitSolver(everything(), dt=1e-4), 3)
     with pytest.raises(ValueError, match=message):
         rollout.forward(**{name: value})
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_numbers_too_many_or_too_few_are_refused(seed):
+    """Of springs, muscles, loads and all else that random scenes have, an entry more or less along each axis."""
+    checked = set()
+    for structure in range(seed, 40, 4):
+        try:
+            rollout = random_scenes.build(8 * structure + seed).rollout()
+        except ValueError:  # a body that starts on an obstacle
+            continue
+        for name, value in rollout.values.items():
+            for axis in range(value.ndim):
+                more = np.concatenate([value, value.take([-1], axis)], axis)
+                over_time = rollout.scene.inputs.described[name].is_per_step and axis == 0
+                for wrong in ([] if over_time else [more]) + ([value.take(range(value.shape[axis] - 1), axis)]):
+                    with pytest.raises(ValueError, match=f"^{re.escape(name)}: (expected|.* steps? needs?)"):
+                        rollout.forward(**{name: wrong})
+                    checked.add(name)
+    assert len(checked) > 12
 
 
 def test_inputs_that_do_not_fit_what_kernels_read():

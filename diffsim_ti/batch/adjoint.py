@@ -23,7 +23,8 @@ class BatchAdjoint:
         layout, n, m = ws.layout, a.num_vertices, a.num_tetrahedra
         self.u, self.v, self.w = (layout.vectors(1, n) for _ in range(3))
         self.corner = ws.room_for_corners()
-        self.rate_corner = ws.room_for_corners() if "H_dot" in a.law.reads else runtime.array(layout.vector, 1)
+        self.reads_rates = "H_dot" in a.law.reads or self.features.dragged
+        self.rate_corner = ws.room_for_corners() if self.reads_rates else runtime.array(layout.vector, 1)
         self.z = layout.numbers(1, ws.law_rows) if ws.law_rows else None
         self.coefficients = layout.numbers(a.num_coefficients * m)
         self.gradients = layout.numbers(9 * a.points * m * shape)
@@ -33,8 +34,28 @@ class BatchAdjoint:
         self.felt = layout.vectors(2 * moving * self._steps, n if moving else 1)
         for name in (*OF_STEPS, "anchor"):
             setattr(self, name, runtime.array(layout.vector, *getattr(ws.numbers, name).shape))
+        self.further = self._further(shape)
+        vars(self).update(self.further)
         frames = ws.room_for_frames(ws.frames.frames_u.shape[0])
         self.frames_u, self.frames_v = frames.frames_u, frames.frames_v
+
+    def _further(self, shape: bool) -> dict:
+        """Adjoints of springs, cables, muscles, pressures, fluids and foundations, as of a single scene."""
+        ws, has, vectors = self.ws, self.features, self.ws.layout.vectors
+        a, numbers, out = ws.arrays, ws.numbers, {}
+        if has.pressed:
+            out["pressed_felt"] = vectors(numbers.follower.shape[0], a.num_pressed)
+            out["pressed_rest"] = vectors(a.pressed_nodes.size * shape)
+        if has.tied:
+            out["tie_felt"], out["tie_rest"] = (
+                runtime.array(ws.layout.vector, *x.shape) for x in (numbers.ties, numbers.tie_segments)
+            )
+        if has.dragged:
+            out["dragged_felt"] = vectors(2 * a.num_dragged)
+            out["dragged_rest"] = vectors(3 * a.num_dragged * shape)
+        if has.founded:
+            out["foundation_felt"] = runtime.array(ws.layout.vector, *numbers.foundation.shape)
+        return out
 
     @property
     def _steps(self) -> int:
@@ -47,15 +68,18 @@ class BatchAdjoint:
         a, ws = workspace.arrays, workspace
         same = self.features == a.features(self.features.density, self.features.shape) and self.own == ws.own
         names = (*OF_STEPS, "anchor")
-        return same and all(getattr(self, name).shape == getattr(ws.numbers, name).shape for name in names)
+        same = same and all(getattr(self, name).shape == getattr(ws.numbers, name).shape for name in names)
+        return same and {n: x.shape for n, x in self.further.items()} == {
+            n: x.shape for n, x in self._further(self.features.shape).items()
+        }
 
     def start(self, positions_adj: np.ndarray, velocities_adj: np.ndarray, last_frame_is_input: bool) -> None:
         """Set the adjoints of the frames, shape (scenes, frames, n, 3), and clear the rest."""
         layout = self.ws.layout
         for name in CLEARED:
             runtime.fill(getattr(self, name), 0)
-        if self.z is not None:
-            runtime.fill(self.z, 0)
+        for array in (*self.further.values(), *([] if self.z is None else [self.z])):
+            runtime.fill(array, 0)
         for target, state, adjoint in ((self.frames_u, self.u, positions_adj), (self.frames_v, self.v, velocities_adj)):
             runtime.fill(target, layout.pack_vectors(adjoint))
             if last_frame_is_input:
@@ -80,7 +104,7 @@ class BatchAdjoint:
             return
         u, corner = runtime.fetch(self.u), runtime.fetch(self.corner)
         runtime.fill(self.u, u + corner[None])
-        if "H_dot" in ws.arrays.law.reads:
+        if self.reads_rates:
             runtime.fill(self.v, runtime.fetch(self.v) + runtime.fetch(self.rate_corner)[None])
 
     def collect(self) -> Derived:
@@ -106,7 +130,27 @@ class BatchAdjoint:
         out.displacement, out.velocity = (vectors(x)[:, 0] for x in (self.u, self.v))
         if one.motion is not None:
             out.displacement[:, a.held] += vectors(self.anchor)
+        self._collect_further(out)
         return out
+
+    def _collect_further(self, out: Derived) -> None:
+        a, found = self.ws.arrays, {name: self._vectors(x) for name, x in self.further.items()}
+        scenes = np.arange(self.ws.num_scenes)[:, None]
+        if "tie_felt" in found:
+            out.ties, out.tie_segments = found["tie_felt"], found["tie_rest"]
+        if "foundation_felt" in found:
+            out.foundation = found["foundation_felt"]
+        if "pressed_felt" in found:
+            np.add.at(out.follower, (slice(None), slice(None), a.load_of), found["pressed_felt"])
+        if "dragged_felt" in found:
+            numbers = a.dragged_first[:, None] + np.arange(6)
+            felt = found["dragged_felt"].reshape(-1, numbers.size)
+            np.add.at(out.parameters, (scenes, numbers.ravel()), felt)
+        if self.features.shape:
+            for what in ("pressed", "dragged"):
+                if f"{what}_rest" in found:
+                    nodes = getattr(a, f"{what}_nodes").ravel()
+                    np.add.at(out.rest, (scenes, nodes), found[f"{what}_rest"])
 
     def _of(self, array) -> np.ndarray:
         return self.ws.layout.unpack(array).astype(np.float64)
@@ -144,9 +188,12 @@ class BatchTangent:
             rest=[d.rest for d in tangents],
             anchor=[np.zeros((1, 3)) if d.motion is None else d.displacement[a.held] for d in tangents],
         )
+        for name in ("tie_segments", "foundation"):
+            if getattr(tangents[0], name) is not None:
+                vectors[name] = [getattr(d, name) for d in tangents]
         for name, arrays in vectors.items():
             setattr(self, name, runtime.upload(layout.pack_vectors(np.stack(arrays)), layout.vector))
-        for name in OF_STEPS:
+        for name in (*OF_STEPS, "follower", "ties"):
             rows = [np.zeros((1, 1, 3)) if getattr(d, name) is None else getattr(d, name) for d in tangents]
             setattr(self, name, runtime.upload(layout.pack_vectors(in_slots(rows)), layout.vector))
         frames = ws.room_for_frames(ws.frames.frames_u.shape[0])

@@ -54,7 +54,8 @@ class FreeVertices:
     @property
     def some_special(self) -> bool:
         """Whether something else may act at a vertex."""
-        return bool(self.features.groups) or self.features.motion or self.features.guided
+        has = self.features
+        return bool(has.groups) or has.motion or has.guided or has.founded
 
     # ---- reading and writing -----------------------------------------------------------------------------------------
 
@@ -284,7 +285,7 @@ class FreeVertices:
         first, F, n = self.first_of(i, b, plan), self.features, let(b * plan.num_vertices + i)
         p = [let(x + y) for x, y in zip(self.read(adjoint.u, 0, first), self.read(adjoint.corner, first))]
         q = self.read(adjoint.v, 0, first)
-        if "H_dot" in self.law.reads:
+        if "H_dot" in self.law.reads or F.dragged:
             q = [let(x + y) for x, y in zip(q, self.read(adjoint.rate_corner, first))]
         v_plus_adj = [let(now.alpha * x + now.decay * y) for x, y in zip(p, q)]
         if F.drag >= 0:

@@ -50,8 +50,9 @@ def _is_own(one: Rollout, name: str, value: np.ndarray, scenes: int) -> bool:
     exact = sizes | {"steps": one.steps, "steps + 1": one.steps + 1}  # and no rows of forces that no step takes
     if own and described.fits(value.shape, exact):
         raise ValueError(
-            f"{name}: shape {value.shape} may be one value for all scenes or one for each of {scenes}: give the leading "
-            f"axis also if all scenes share it, as np.broadcast_to(x, ({scenes}, *x.shape))"
+            f"{name}: shape {value.shape} may be one value for all scenes or one for each of {scenes}: give "
+            f"np.broadcast_to(x, {(scenes, *value.shape)}) if all share it, np.broadcast_to(x[:, None], "
+            f"{(scenes, *value.shape)}) if each has its own"
         )
     if not shared and not own:
         raise ValueError(

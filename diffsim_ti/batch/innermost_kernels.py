@@ -16,6 +16,7 @@ from diffsim_ti.runtime import Bundle, Kernel, at, let, traced
 from diffsim_ti.solvers.explicit.kernels import PLAN, TURNS, ExplicitKernels
 from diffsim_ti.solvers.explicit.kick_drift import KickDrift
 from diffsim_ti.state.features import Features
+from diffsim_ti.state.numbers import ALONE
 from diffsim_ti.state.pass_table import pass_at, reversed_pass
 
 A = ti.template()
@@ -64,7 +65,7 @@ class InnermostKernels(ExplicitKernels):
     def scene_of(self, b, scene, plan):
         """Scene b for functions of vertices."""
         own = [name for name in ("inverse_mass", "surface", "rest") if name in self.own]
-        own += ["parameters", "corner", *OF_STEPS]
+        own += ["parameters", "corner", *OF_STEPS, *self.alone]
         return Bundle(**{**vars(scene), **self.columns(scene, own, b, plan)})
 
     @traced
@@ -92,6 +93,23 @@ class InnermostKernels(ExplicitKernels):
     def item(self, t, plan):
         return ItemOfScene(let(t // plan.num_scenes), let(t % plan.num_scenes), plan.num_scenes)
 
+    @property
+    def alone(self) -> dict:
+        """Numbers of springs, cables, muscles and pressures, of which each scene has its own."""
+        return {name: kind for name, kind in self.further.arrays.items() if name in ALONE}
+
+    @traced
+    def after(self, plan):
+        """Number of tetrahedra of all scenes, and of what else acts on their bodies."""
+        one = let(self.further.after(Bundle(**{**vars(plan), "num_items": 0})))
+        return let(plan.num_items + one * plan.num_scenes) if self.further.any else plan.num_items
+
+    @traced
+    def further_of(self, t, plan) -> tuple:
+        """(item of what else acts on bodies, its scene)"""
+        k = let(t - plan.num_items)
+        return let(k // plan.num_scenes), let(k % plan.num_scenes)
+
     @traced
     def pass_of_scene(self, b, j, table, plan):
         """Pass j of scene b."""
@@ -114,6 +132,12 @@ class InnermostKernels(ExplicitKernels):
             self.element.move_on(item, of, state, s, s + plan.stride, self.onwards(now))
 
     @ti.func
+    def act(self, t, j, scene: A, state: A, table: A, plan: A):
+        k, b = self.further_of(t, plan)
+        now, s = self.pass_of_scene(b, j, table, plan), (j - plan.base) * plan.stride
+        self.further.forces(k, now, self.scene_of(b, scene, plan), self.record_of(b, state, plan), s, plan)
+
+    @ti.func
     def vertex_step(self, t, j, scene: A, state: A, table: A, plan: A):
         i, b = t // plan.num_scenes, t % plan.num_scenes
         now, own, at_ = (
@@ -125,11 +149,14 @@ class InnermostKernels(ExplicitKernels):
 
     @ti.func
     def passes(self, scene: A, state: A, table: A, plan: A):
-        num_items, num_rows = plan.num_items, plan.num_rows  # both bounds are read by one task
+        num_items, num_rows = self.after(plan), plan.num_rows  # both bounds are read by one task
         for t in range(num_items):
             turn = self.turn_of_first(t, table)
             if turn < plan.count:
-                self.tetrahedron(t, plan.first + turn, scene, state, table, plan)
+                if t < plan.num_items:
+                    self.tetrahedron(t, plan.first + turn, scene, state, table, plan)
+                elif ti.static(self.further.any):
+                    self.act(t, plan.first + turn, scene, state, table, plan)
         for t in range(num_rows):
             turn = self.turn_of_second(t, table, plan)
             if turn < plan.count:
@@ -152,6 +179,16 @@ class InnermostKernels(ExplicitKernels):
             self.element.move_on_jvp(item, of, state, s, tangent, dots, self.onwards(now))
 
     @ti.func
+    def act_jvp(self, t, j, scene: A, state: A, tangent: A, table: A, plan: A):
+        k, b = self.further_of(t, plan)
+        now, own, at_ = (
+            self.pass_of_scene(b, j, table, plan),
+            self.scene_of(b, scene, plan),
+            self.record_of(b, state, plan),
+        )
+        self.further.forces_jvp(k, now, own, at_, j - plan.base, self.record_of(b, tangent, plan), plan)
+
+    @ti.func
     def vertex_step_jvp(self, t, j, scene: A, state: A, tangent: A, table: A, plan: A):
         i, b = t // plan.num_scenes, t % plan.num_scenes
         now, own, at_ = (
@@ -171,11 +208,14 @@ class InnermostKernels(ExplicitKernels):
 
     @ti.func
     def passes_jvp(self, scene: A, state: A, tangent: A, table: A, plan: A):
-        num_items, num_rows = plan.num_items, plan.num_rows
+        num_items, num_rows = self.after(plan), plan.num_rows
         for t in range(num_items):
             turn = self.turn_of_first(t, table)
             if turn < plan.count:
-                self.tetrahedron_jvp(t, plan.first + turn, scene, state, tangent, table, plan)
+                if t < plan.num_items:
+                    self.tetrahedron_jvp(t, plan.first + turn, scene, state, tangent, table, plan)
+                elif ti.static(self.further.any):
+                    self.act_jvp(t, plan.first + turn, scene, state, tangent, table, plan)
         for t in range(num_rows):
             turn = self.turn_of_second(t, table, plan)
             if turn < plan.count:
@@ -184,7 +224,7 @@ class InnermostKernels(ExplicitKernels):
     @cached_property
     def step_jvp(self) -> Kernel:
         """The tangent of these passes along recorded slots; the change of the state is advanced in place."""
-        tangent = self.with_state(CHANGE) | CHANGED | OF_STEPS | dict(rest="vectors")
+        tangent = self.with_state(CHANGE) | CHANGED | OF_STEPS | dict(rest="vectors") | self.alone
         own = dict(state=self.with_state(STATE), tangent=tangent)
         return self._kernel("step_jvp", self.passes_jvp, own, self.repeated)
 
@@ -201,6 +241,16 @@ class InnermostKernels(ExplicitKernels):
         )
 
     @ti.func
+    def act_vjp(self, t, j, scene: A, state: A, adjoint: A, table: A, plan: A):
+        k, b = self.further_of(t, plan)
+        now, own, at_ = (
+            self.pass_of_scene(b, j, table, plan),
+            self.scene_of(b, scene, plan),
+            self.record_of(b, state, plan),
+        )
+        self.further.forces_vjp(k, now, own, at_, j - plan.base, self.record_of(b, adjoint, plan), plan)
+
+    @ti.func
     def vertex_step_vjp(self, t, j, scene: A, state: A, adjoint: A, table: A, plan: A):
         i, b = t // plan.num_scenes, t % plan.num_scenes
         now = self.pass_of_scene_back(b, j, table, plan)
@@ -211,7 +261,7 @@ class InnermostKernels(ExplicitKernels):
     def passes_vjp(self, scene: A, state: A, adjoint: A, table: A, plan: A):
         """The gather of K w is left to the next call (or to `finish_vjp`), as in a single scene."""
         moving = ti.static(self.vertex.features.moving)
-        num_items, num_rows, paths = plan.num_items, plan.num_rows, moving * plan.num_scenes
+        num_items, num_rows, paths = self.after(plan), plan.num_rows, moving * plan.num_scenes
         for t in range(num_rows):
             turn = self.turn_of_first(t, table)
             if turn < plan.count:
@@ -219,7 +269,10 @@ class InnermostKernels(ExplicitKernels):
         for t in range(num_items):
             turn = self.turn_of_second(t, table, plan)
             if turn < plan.count:
-                self.tetrahedron_vjp(t, plan.first + plan.count - 1 - turn, scene, state, adjoint, table, plan)
+                if t < plan.num_items:
+                    self.tetrahedron_vjp(t, plan.first + plan.count - 1 - turn, scene, state, adjoint, table, plan)
+                elif ti.static(self.further.any):
+                    self.act_vjp(t, plan.first + plan.count - 1 - turn, scene, state, adjoint, table, plan)
         if ti.static(moving > 0):
             for t in range(paths):
                 by = self.record_of(t % plan.num_scenes, adjoint, plan)
@@ -230,7 +283,8 @@ class InnermostKernels(ExplicitKernels):
     def step_vjp(self) -> Kernel:
         """The adjoint of passes first + count - 1 .. first; numbers as of a single scene (explicit/kernels.py)."""
         numbers = dict.fromkeys(("num_passes", "halt", "kick", "steps", "num_parts"), "int")
-        arrays = dict(state=self.with_state(STATE), adjoint=self.with_state(CHANGE) | ADJOINT | OF_STEPS)
+        adjoint = self.with_state(CHANGE) | ADJOINT | OF_STEPS | self.further.adjoint
+        arrays = dict(state=self.with_state(STATE), adjoint=adjoint)
         return self._kernel("step_vjp", self.passes_vjp, arrays, self.repeated, **numbers)
 
     @ti.func
@@ -240,7 +294,7 @@ class InnermostKernels(ExplicitKernels):
             i, b = t // plan.num_scenes, t % plan.num_scenes
             by = self.record_of(b, adjoint, plan)
             by.u[0, i] = by.u[0, i] + self.element.gather(i, scene, by.corner)
-            if ti.static(self.element.reads_rates):
+            if ti.static(self.vertex.reads_rates):
                 by.v[0, i] = by.v[0, i] + self.element.gather(i, scene, by.rate_corner)
 
     @cached_property
@@ -255,9 +309,8 @@ class InnermostKernels(ExplicitKernels):
         return arrays | dict(z="scalars2") if self.vertex.law.state_names else arrays
 
     def _kernel(self, name: str, body, arrays: dict, repeated: bool, **numbers) -> Kernel:
-        guided = dict(guide_slot="ints", guides="vectors") if self.vertex.features.guided else {}
-        arrays = dict(scene=SCENE | OF_STEPS | guided) | arrays | dict(table=PLAN)
-        numbers = NUMBERS | numbers
+        arrays = dict(scene=SCENE | OF_STEPS | self.further.arrays) | arrays | dict(table=PLAN)
+        numbers = NUMBERS | numbers | self.further.counts
         if repeated:
             arrays["table"], numbers = PLAN | TURNS, numbers | dict(times="int")
         return Kernel(f"batch_{name}", body, self.vertex.law.precision, arrays, numbers, loops=2 * repeated)

@@ -62,6 +62,27 @@ class Vectors(View):
         return Place([self._number(slot, first + d) for d in range(3)], self._vector, self._zero)
 
 
+class Sum(Place):
+    """Such a vector that is added to by assigning to it."""
+
+    def _assign(self, value):
+        for d, component in enumerate(self._components):
+            assign(component, component + at(value, d))
+
+
+@traced
+class AtVertices(Vectors):
+    """Forces at corners of one scene: `array[corner] = force` adds it to the vertex there, which no other thread does."""
+
+    def __init__(self, array, first, lane, vector, zero, vertices):
+        super().__init__(array, first, lane, vector, zero)
+        self._vertices = vertices
+
+    def __getitem__(self, corner):
+        first = let(3 * at(self._vertices, corner))
+        return Sum([self._number((), first + d) for d in range(3)], self._vector, self._zero)
+
+
 @traced
 class Scratch:
     """What is noted of one vertex while it is worked on: `array[row, i]` for any i, in a column of its block."""

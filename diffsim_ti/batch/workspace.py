@@ -10,10 +10,11 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
+from diffsim_ti.batch.block_views import SHARED
 from diffsim_ti.batch.free_vertices import NEAR, SPECIAL
 from diffsim_ti.batch.history import BatchHistory
 from diffsim_ti.batch.innermost_kernels import InnermostKernels, innermost_kernels
-from diffsim_ti.batch.kernels import SHARED, BatchKernels, batch_kernels
+from diffsim_ti.batch.kernels import BatchKernels, batch_kernels
 from diffsim_ti.batch.layouts import Innermost, Lanes, in_slots
 from diffsim_ti.batch.table import ScenesTable
 from diffsim_ti.inputs import Derived
@@ -34,11 +35,9 @@ def why_not(solver) -> str | None:
         return f"the law of {type(scene.material).__name__} does not come in lanes"
     if scene.volume != "tetrahedra":
         return f"volume = {scene.volume!r}"
-    terms = dict(self_contact=scene.term(SelfContact), pressures=scene.pressures, chambers=scene.chambers)
-    terms |= dict(springs_or_cables=scene.ties, foundations=len(scene.founded_vertices))
+    terms = dict(self_contact=scene.term(SelfContact), chambers=scene.chambers)
     terms |= dict(contact_within_faces=feels_faces(scene), mesh_obstacles=_tables(scene))
-    terms |= dict(unequal_steps=solver.schedule.varies, growth_over_time=scene.growing, surface_drag=scene.fluids)
-    terms |= dict(reduced_sets=scene.reduced)
+    terms |= dict(unequal_steps=solver.schedule.varies, growth_over_time=scene.growing, reduced_sets=scene.reduced)
     there = [name.replace("_", " ") for name, some in terms.items() if some]
     return f"it has {' and '.join(there)}" if there else None
 
@@ -137,6 +136,7 @@ class BatchWorkspace:
         )
         if layout.in_lanes:
             out["special"] = (first.surface,), lambda: (self._special(), ti.i32)
+            out["vertex_of_corner"] = (), lambda: (self._vertex_of_corner(), ti.i32)
         self.num_parameters = len(parameters[0]) + len(a.tables)
         for name, kind in SHARED.items():
             known = each("mass" if name == "inverse_mass" else name)
@@ -146,12 +146,26 @@ class BatchWorkspace:
         anchors = lambda: [none if x is None else x[a.held] for x in starts]  # noqa: E731
         out["anchor"] = starts, lambda: self._packed(anchors() if moves else [none] * self.num_scenes, "vectors")
         self.counts = {}
-        for name in ("forces", "motion", "path"):
+        for name in ("forces", "motion", "path", "follower", "ties"):
             rows = [_NONE if x is None else x for x in each(name)]
             out[name], self.counts[name] = (tuple(rows), partial(self._in_slots, rows)), rows[0].shape[1]
+        for name in ("tie_segments", "foundation"):
+            own = [_NONE[0] if x is None else x for x in each(name)]
+            out[name], self.counts[name] = (tuple(own), partial(self._packed, own, "vectors")), len(own[0])
         self.num_step_rows = max((len(x) for x in (first.path, first.motion) if x is not None), default=1)
-        if self.num_step_rows == 1 and (a.features().forces_keyed or a.features().moving):
-            self.num_step_rows = max(1 + len(d.forces) for d in derived if d.forces is not None)
+        has = a.features()
+        if self.num_step_rows == 1 and (
+            has.forces_keyed or has.pressed or has.tied
+        ):  # they ask in which step a pass lies
+            given = (x for d in derived for x in (d.forces, d.follower, d.ties) if x is not None)
+            self.num_step_rows = max(1 + len(x) for x in given)
+        return out
+
+    def _vertex_of_corner(self) -> np.ndarray:
+        """The vertex at which each corner is."""
+        start, corner_of = runtime.fetch(self.arrays.start), runtime.fetch(self.arrays.corner_of)
+        out = np.zeros(self.arrays.corner.shape[0], np.int32)
+        out[corner_of] = np.repeat(np.arange(len(start) - 1), np.diff(start))
         return out
 
     def _of_scenes(self, name: str, kind: str, arrays: tuple) -> tuple:
@@ -183,6 +197,8 @@ class BatchWorkspace:
             out[a.held] = SPECIAL
         if features.guided:
             out[self.scene.supports.guided] = SPECIAL
+        if features.founded:
+            out[a.founded] = SPECIAL
         return out
 
     @property
@@ -210,7 +226,7 @@ class BatchWorkspace:
     def room_for_corners(self):
         """For forces that tetrahedra hand to vertices: at these, or, where threads share scenes, at their own corners."""
         a = self.arrays
-        return self.layout.vectors(a.num_vertices if self.layout.in_lanes else a.nodes * a.num_tetrahedra)
+        return self.layout.vectors(a.num_vertices if self.layout.in_lanes else a.corner.shape[0])
 
     # ---- states ------------------------------------------------------------------------------------------------------
 
@@ -288,6 +304,9 @@ class BatchWorkspace:
         sizes |= self.layout.counts(a.num_tetrahedra, a.num_vertices)
         sizes |= dict(num_loaded=self.counts["forces"], num_held=self.counts["motion"])
         sizes |= dict(num_parameters=self.num_parameters, num_passes_shown=self.table.size)
+        sizes |= dict(num_follower=self.counts["follower"], num_points=self.counts["tie_segments"])
+        sizes |= dict(num_foundation=self.counts["foundation"])
+        sizes |= a.counts_of_further()
         sizes |= dict(contact_damping=solver.contact_damping)
         run, turn = (num_passes, self.num_step_rows, save_every, schedule), -1 if backwards else 1
         most = (

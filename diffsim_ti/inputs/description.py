@@ -1,6 +1,7 @@
 """What an input is, said once: its value, the shapes it may have, unit, range, and how large a change of it matters."""
 
 from collections.abc import Callable, Mapping
+from copy import copy
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -70,7 +71,7 @@ class Input:
     name: of the argument that gives it. plain: the input's name where its term has none; default `name`.
     value: float64; None if it is sampled at the steps of each run.
     shapes: those it may have, () for one number; default that of the value alone. A length "steps" means a run's number of
-        steps at least, "steps + 1" exactly; other words that the mesh does not know stand for any length.
+        steps at least, "steps + 1" exactly; other words stand for any length until a scene says it (`Term.sizes`).
     change: (value, RunSize) -> how large a change of it matters, for `verify`.
     unit: "-" of a number without dimension, "" where it is not said.
     label: how errors of a constructor call it; default `plain`. The unit stands behind if not in it.
@@ -114,6 +115,13 @@ class Input:
             raise ValueError(f"{label} must be {_counted(self.shapes[0])}{unit}, got shape {value.shape}")
         if self.range and not np.all(self.range.holds(value)):
             raise ValueError(f"{label} must be {self.range.words}{unit}, got {value.min():g}")
+
+    def known(self, sizes: Mapping[str, int]) -> "Input":
+        """The same, with numbers for the words of lengths that `sizes` knows."""
+        out = copy(self)
+        shapes = tuple(tuple(sizes.get(a, a) if isinstance(a, str) else a for a in rule) for rule in self.shapes)
+        object.__setattr__(out, "shapes", shapes)
+        return out
 
     def checked(self, name: str, value: ArrayLike, sizes: Mapping[str, int]) -> np.ndarray:
         """A value for a run as a float64 array, or ValueError; sizes: what the words for lengths mean."""

@@ -87,9 +87,10 @@ class Inputs:
         self._names = []  # {a term's own name: its name here}, for each term in the order of the scene's list
         for term in scene.terms:
             self._names.append({})
+            sizes = term.sizes(self.mesh)
             for i in term.described:
                 name = self._names[-1][i.plain] = _free_name(term, i, self.described.keys() | last.keys())
-                self.described[name] = i
+                self.described[name] = i.known(sizes)
         self.described |= last
         self.values = self.check({name: i.value for name, i in self.described.items() if i.value is not None})
         named = dict(zip(scene.terms, self._names))

@@ -56,6 +56,9 @@ class ElasticFoundation(Term):
         """Vertices that it holds."""
         return np.unique(self.faces(mesh))
 
+    def sizes(self, mesh):
+        return {"k": len(self.faces(mesh))}
+
     def check(self, mesh: TetrahedralMesh) -> None:
         count, kind = len(self.faces(mesh)), "triangles" if mesh.order == 1 else "faces"
         if count == 0:

@@ -83,6 +83,9 @@ class Growth(Term):
         """Whether all grow alike."""
         return self.per == "all" and self.tetrahedra is None
 
+    def sizes(self, mesh):
+        return {"k": len(self.groups(mesh)[0])}
+
     def check(self, mesh: TetrahedralMesh) -> None:
         chosen, _ = self.groups(mesh)
         if len(chosen) == 0:

@@ -90,6 +90,9 @@ class Muscle(Cable):
         chosen = every if self.tetrahedra is None else mesh.tetrahedron_indices(self.tetrahedra)
         return chosen, np.arange(len(chosen)) if self.per == "tetrahedron" else np.zeros(len(chosen), np.int64)
 
+    def sizes(self, mesh):
+        return {"k": len(self.groups(mesh)[0])}
+
     def check(self, mesh: TetrahedralMesh) -> None:
         chosen, group = self.groups(mesh)
         if len(chosen) == 0:

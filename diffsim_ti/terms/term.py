@@ -79,6 +79,10 @@ class Term(ABC):
         """
         return []
 
+    def sizes(self, mesh: TetrahedralMesh) -> dict[str, int]:
+        """What words for lengths in the shapes of its inputs mean."""
+        return {}
+
     def check(self, mesh: TetrahedralMesh) -> None:
         """Raise ValueError if the term does not fit the mesh."""
 

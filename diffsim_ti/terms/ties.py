@@ -83,6 +83,10 @@ class Tie(Term):
                 out.append(InTime(name, made[part], self.ndim, self.keyed))
         return [*out, TieRows(paths, segments, f"{own} rows", self._named(names, "stiffness"), **made)]
 
+    def sizes(self, mesh):
+        anchors = next((len(np.atleast_2d(i.value)) for i in self.described if i.name == "anchors"), 0)
+        return {"k": len(self.paths(mesh)), "anchors": anchors}
+
     def _named(self, names: dict[str, str], part: str) -> str | None:
         """Name in the scene of what gives a part of it."""
         plain = next((i.plain for i in self.described if i.name == self.parts.get(part, part)), None)
@@ -98,7 +102,8 @@ def _anchors(given: Sequence[Point], plain: str) -> list[Input]:
     if not own:
         return []
     value = own[0].given if len(own) == 1 else np.concatenate([np.atleast_2d(point.position) for point in own])
-    return [Input("anchors", value, ((3,), ("k", 3)), "m", change=length, plain=plain, label="anchors")]
+    shapes = (("anchors", 3),) if np.ndim(value) == 2 else ((3,), ("anchors", 3))
+    return [Input("anchors", value, shapes, "m", change=length, plain=plain, label="anchors")]
 
 
 def _points(mesh: TetrahedralMesh, given: Point, kind: str) -> list[tuple]:

@@ -7,6 +7,7 @@ from diffsim_ti import verify
 from diffsim_ti.terms import Cable, Chamber, Load
 
 from . import faces
+from .at_once import scenes_at_once
 from .structures import CELL
 
 RIGHT = "right"
@@ -236,7 +237,7 @@ def truncate(it) -> str:
 
 
 ALWAYS = (repeats, schedules)
-IN_TURN = (faces.tape, faces.torch_frames, truncate, clip, subset, products, truncate, faces.torch_simulator)
+IN_TURN = (faces.tape, faces.torch_frames, truncate, clip, subset, products, scenes_at_once, faces.torch_simulator)
 
 
 def run_checks(it) -> dict[str, str]:

@@ -246,13 +246,8 @@ class ExplicitWorkspace(Workspace):
     def _sizes(self) -> dict:
         """Numbers that all launches take."""
         a = self.arrays
-        out = dict(num_items=a.num_items, num_vertices=a.num_vertices)
-        out |= dict(num_pressed=a.num_pressed, first_pressed=a.first_pressed)
-        out |= dict(num_dragged=a.num_dragged, first_dragged=a.first_dragged)
-        out |= dict(num_bodies=len(self.scene.reduced.bodies))
-        return out | dict(
-            num_ties=a.num_ties, first_tied=a.first_tied, first_load=a.first_load, first_push=a.first_pressed
-        )
+        out = dict(num_items=a.num_items, num_vertices=a.num_vertices, num_bodies=len(self.scene.reduced.bodies))
+        return out | a.counts_of_further()
 
     def launches(self, first: int, last: int, num_passes: int, save_every: int, most: int, backwards=False) -> Iterator:
         """Numbers of the launches that passes first .. last - 1 take, for each of which their table is shown.
