@@ -20,6 +20,7 @@ from diffsim_ti.batch.table import ScenesTable
 from diffsim_ti.inputs import Derived
 from diffsim_ti.solvers.explicit.contact_stage import ROWS
 from diffsim_ti.solvers.explicit.felt_faces import feels_faces
+from diffsim_ti.solvers.explicit.further_elements import counts_of_further
 from diffsim_ti.state.arrays import SceneArrays
 from diffsim_ti.state.history import copy_slot
 from diffsim_ti.state.solve_report import SolveReport
@@ -306,7 +307,7 @@ class BatchWorkspace:
         sizes |= dict(num_parameters=self.num_parameters, num_passes_shown=self.table.size)
         sizes |= dict(num_follower=self.counts["follower"], num_points=self.counts["tie_segments"])
         sizes |= dict(num_foundation=self.counts["foundation"])
-        sizes |= a.counts_of_further()
+        sizes |= counts_of_further(a)
         sizes |= dict(contact_damping=solver.contact_damping)
         run, turn = (num_passes, self.num_step_rows, save_every, schedule), -1 if backwards else 1
         most = (

@@ -238,11 +238,6 @@ class SceneArrays:
             self.bodies.load(values, sources["inverse_mass"][0])
         return moved
 
-    def counts_of_further(self) -> dict:
-        """What passes go through besides tetrahedra: how many there are, and where their corners begin."""
-        names = "num_ties", "first_tied", "first_load", "num_pressed", "first_pressed", "num_dragged", "first_dragged"
-        return {name: getattr(self, name) for name in names} | dict(first_push=self.first_pressed)
-
     def clear_corners_of_loads(self) -> None:
         """No forces at corners of springs, pressed triangles and chambers, where tetrahedra alone are to be gathered."""
         if self.pressures or self.chambers or self.num_ties or self.num_dragged:

@@ -21,6 +21,12 @@ OF_BODIES = "body_place", "body_mass", "body_numbers", "body_force"  # of which 
 A = ti.template()  # an array or Bundle handed to a Taichi function
 
 
+def counts_of_further(arrays) -> dict:
+    """How many there are, and where their corners begin."""
+    names = "num_ties", "first_tied", "first_load", "num_pressed", "first_pressed", "num_dragged", "first_dragged"
+    return {name: getattr(arrays, name) for name in names} | dict(first_push=arrays.first_pressed)
+
+
 @dataclass(frozen=True)
 class FurtherElements:
     """Functions of item k of those after the tetrahedra: pressed triangles first."""

@@ -21,6 +21,7 @@ from diffsim_ti.solvers.explicit.body_checks import check_bodies
 from diffsim_ti.solvers.explicit.chambers import Chambers
 from diffsim_ti.solvers.explicit.contact_stage import ROWS
 from diffsim_ti.solvers.explicit.felt_faces import FeltFaces, feels_faces
+from diffsim_ti.solvers.explicit.further_elements import counts_of_further
 from diffsim_ti.solvers.explicit.held_volumes import HeldVolumes
 from diffsim_ti.solvers.explicit.impulse_record import ImpulseRecord
 from diffsim_ti.solvers.explicit.kernels import ExplicitKernels, explicit_kernels
@@ -247,7 +248,7 @@ class ExplicitWorkspace(Workspace):
         """Numbers that all launches take."""
         a = self.arrays
         out = dict(num_items=a.num_items, num_vertices=a.num_vertices, num_bodies=len(self.scene.reduced.bodies))
-        return out | a.counts_of_further()
+        return out | counts_of_further(a)
 
     def launches(self, first: int, last: int, num_passes: int, save_every: int, most: int, backwards=False) -> Iterator:
         """Numbers of the launches that passes first .. last - 1 take, for each of which their table is shown.
