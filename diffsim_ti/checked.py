@@ -64,8 +64,23 @@ def listed(name: str, value, of: str) -> Iterable:
 
 def numbers(name: str, value) -> np.ndarray:
     """A new float64 array."""
+    return np.array(as_numbers(name, value), np.float64)
+
+
+def as_numbers(name: str, value) -> np.ndarray:
+    """A float64 array, the value itself if it is one."""
+    if type(value) is np.ndarray and value.dtype == np.float64:
+        return value
+    if getattr(value, "requires_grad", False):
+        raise ValueError(
+            f"{name} is a tensor with a graph, which arrays would cut off: take diff_simulator.rollout_frames, through "
+            f"which gradients flow, or give {name}.detach()"
+        )
     try:
-        return np.array(value, np.float64)
+        array = np.asarray(value)
+        if array.dtype.kind in "cSUVMm":  # NumPy would drop what is imaginary, and read letters
+            raise ValueError
+        return array.astype(np.float64)
     except (TypeError, ValueError, OverflowError):
         raise ValueError(f"{name} must be numbers, got {shown(value)}") from None
 

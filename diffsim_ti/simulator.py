@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
-from diffsim_ti.checked import instance, numbers
+from diffsim_ti.checked import instance, numbers, whole
 from diffsim_ti.inputs.poses import PoseColumns
 from diffsim_ti.monitor import quantities
 from diffsim_ti.monitor.guard import Guard
@@ -106,14 +106,12 @@ class Simulator:
 
     def run(self, steps: int) -> None:
         """Advance by so many steps."""
-        for _ in range(steps):
+        for _ in range(whole("steps", steps)):
             self.step()
 
     def set_substeps(self, substeps: int) -> None:
         """Divide the steps to come into so many substeps; a step that is too long then raises Divergence."""
-        if int(substeps) != substeps or substeps < 1:
-            raise ValueError(f"substeps must be a whole number >= 1, got {substeps}")
-        self.solver.substeps = int(substeps)
+        self.solver.substeps = whole("substeps", substeps, 1)
 
     def _load_step(self) -> None:
         """Bring what depends on the step to the device: motion of fixed vertices, forces per step."""
@@ -220,7 +218,7 @@ class Simulator:
 
     def set_forces(self, forces: ArrayLike) -> None:
         """Other external forces [N] from now on, in the shape of the scene's constant ExternalForce, until a reset."""
-        term, forces = self.scene.term(ExternalForce), np.asarray(forces, np.float64)
+        term, forces = self.scene.term(ExternalForce), numbers("forces", forces)
         given = None if term is None else term.values.get("external_forces")
         if given is None or given.ndim == 3:
             raise ValueError(

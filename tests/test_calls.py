@@ -1,4 +1,4 @@
-"""Wrong calls of public constructors: only ValueError and TypeError come out, raised by the package, in one line."""
+"""Wrong calls: of public constructors, and wrong numbers of runs. Only errors of the package come out, in one line."""
 
 import traceback
 from functools import lru_cache
@@ -6,9 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 import diffsim_ti as ds
 from diffsim_ti.checked import shown
+from diffsim_ti.diff_simulator import rollout_frames
 from diffsim_ti.materials import Material
 
 PACKAGE = str(Path(ds.__file__).parent)
@@ -95,6 +97,41 @@ def calls() -> dict:
     }
 
 
+# also of what runs take: letters, what is imaginary, tensors, and arrays of frames
+OF_RUNS = WRONG + (
+    *(np.full((8, 3), 1j), np.full((8, 3), "1"), np.array([1, "a"], object), torch.zeros(8, 3, requires_grad=True)),
+    *(np.full((3, 8, 3), np.nan), np.zeros((2, 3, 8, 3)), [[[1]]], torch.zeros(3)),
+)
+
+
+@lru_cache
+def runs() -> dict:
+    """{name: what is called with one wrong argument}"""
+    mesh = objects()["mesh"]
+    terms = [ds.Gravity(), ds.Ground(-0.1, friction=0.3), ds.Muscle((0, 1, 0), 1e3, np.ones(2))]
+    terms += [ds.ExternalForce(np.zeros((8, 3))), ds.Spring([0, 1], [5, 7], 9.0)]
+    scene = ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3), terms=terms, precision="f64")
+    solver = ds.SemiImplicitSolver(scene, dt=1e-3)
+    simulator, out = ds.Simulator(solver.for_scene(scene)), {}
+    for run in (ds.Rollout(solver, 2, 1, gradients="all"), ds.Batch(solver, 2, 2, 1, gradients="all")):
+        kind, frames = type(run).__name__, run.forward()
+        for name in run.inputs:
+            out[f"{kind}.forward({name})"] = lambda x, run=run, name=name: run.forward(**{name: x})
+            out[f"{kind}.tangents({name})"] = lambda x, f=frames, run=run, name=name: run.tangents(f, **{name: x})
+            out[f"rollout_frames({kind}, {name})"] = lambda x, run=run, name=name: rollout_frames(run, **{name: x})
+        for name in ("positions", "velocities"):
+            out[f"{kind}.vjp({name})"] = lambda x, f=frames, run=run, name=name: run.vjp(f, **{name: x})
+        out[f"{kind}.vjp(frames)"] = lambda x, run=run, seed=0 * frames.positions: run.vjp(x, seed)
+        out[f"{kind}.tangents(frames)"] = lambda x, run=run: run.tangents(x, density=1.0)
+        out[f"{kind}.field"] = run.field
+    for name in ("positions", "velocities"):
+        out[f"set_state({name})"] = lambda x, name=name: simulator.set_state(**{name: x})
+    out |= dict(set_forces=simulator.set_forces, set_substeps=simulator.set_substeps, simulator_run=simulator.run)
+    for name in ("translated", "scaled", "rotated", "locate", "vertex_indices", "tetrahedron_indices", "faces_of"):
+        out[f"mesh.{name}"] = getattr(mesh, name)
+    return out | dict(joined=ds.TetrahedralMesh.joined, from_file=ds.TetrahedralMesh.from_file)
+
+
 def output_of(kind):
     """An output as a rollout of a held body takes it, which looks at it."""
 
@@ -121,7 +158,7 @@ def complaint(make, arguments: dict) -> str | None:
     """What is wrong with how a call fails; None if it does not, or as it should."""
     try:
         made(make, arguments)
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, FloatingPointError) as error:  # the last: a run that such numbers break
         last = traceback.extract_tb(error.__traceback__)[-1].filename
         if not last.startswith(PACKAGE):
             return f"{type(error).__name__} of {last}: {error}"
@@ -143,6 +180,35 @@ def test_wrong_arguments(name):
         if (said := complaint(make, right | {argument: wrong})) is not None
     ]
     assert not bad, "\n".join(bad)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_wrong_arguments_of_runs():
+    """Numbers of a run, seeds, tangents, states: refused by the package, with a ValueError, before anything runs."""
+    bad = [
+        f"{name}({shown(wrong)}): {said}"
+        for name, call in runs().items()
+        for wrong in OF_RUNS
+        if (said := complaint(lambda x: call(x), dict(x=wrong))) is not None and "does not exist" not in said
+    ]
+    assert not bad, "\n".join(bad)
+
+
+@pytest.mark.parametrize("wrong", [np.full((8, 3), 1j), np.full((8, 3), "1")], ids=["imaginary", "letters"])
+def test_numbers_are_not_read_from_what_is_none(wrong):
+    for name in (
+        "Rollout.forward(initial_velocities)",
+        "Batch.forward(rest_positions)",
+        "set_state(positions)",
+        "set_forces",
+    ):
+        with pytest.raises(ValueError, match="must be numbers"):
+            runs()[name](wrong)
+
+
+def test_tensors_with_a_graph_are_not_cut_off():
+    with pytest.raises(ValueError, match=r"youngs_modulus is a tensor with a graph.*rollout_frames"):
+        runs()["Rollout.forward(youngs_modulus)"](torch.tensor(1e5, requires_grad=True))
 
 
 @pytest.mark.filterwarnings("ignore")

@@ -12,7 +12,7 @@ from diffsim_ti.batch.set_values import gathered_scenes
 from diffsim_ti.batch.sweep import BatchSweep, Own, value_of
 from diffsim_ti.batch.taped import BatchTapeFace
 from diffsim_ti.batch.workspace import why_not
-from diffsim_ti.checked import whole
+from diffsim_ti.checked import as_numbers, instance, whole
 from diffsim_ti.copies import made_again
 from diffsim_ti.inputs import Derived
 from diffsim_ti.outputs import Output
@@ -196,8 +196,9 @@ class Batch:
         self, frames: BatchFrames, positions: ArrayLike | None = None, velocities: ArrayLike | None = None, **seeds
     ) -> dict[str, np.ndarray]:
         """Gradients of a loss by every wanted input, from its gradients by outputs of all scenes, (scenes, ...)."""
+        instance("Batch.vjp", "frames", frames, BatchFrames, "what forward returned")
         seeds = {"positions": positions, "velocities": velocities} | seeds
-        given = {name: np.asarray(x) for name, x in seeds.items() if x is not None}
+        given = {name: as_numbers(f"gradient by the frames' {name}", x) for name, x in seeds.items() if x is not None}
         for name, x in given.items():
             if name not in self.outputs:
                 raise ValueError(f"no output named {name!r}; this batch has {', '.join(self.outputs)}")
@@ -279,10 +280,11 @@ class Batch:
         unknown = [name for name in tangents if name not in self.inputs]
         if unknown:
             raise ValueError(f"tangents: no input named {unknown[0]!r}; this batch has {', '.join(self.inputs)}")
+        instance("Batch.tangents", "frames", frames, BatchFrames, "what forward returned")
         zero = {name: np.zeros_like(value_of(frames.values[name], 0)) for name in tangents}
         tangents, _ = spread_given(self.scene, tangents, zero, self.num_scenes)
         own = [
-            {name: change_of(x, frames.values[name], b, self.num_scenes) for name, x in tangents.items()}
+            {name: change_of(name, x, frames.values[name], b, self.num_scenes) for name, x in tangents.items()}
             for b in range(self.num_scenes)
         ]
         if not self.lanes:

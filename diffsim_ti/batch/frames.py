@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.checked import as_numbers
 from diffsim_ti.rollout.frames import Frames
 from diffsim_ti.rollout.run import Run
 from diffsim_ti.state.watch import ContactResolution
@@ -105,7 +106,7 @@ class BatchFrames(Sequence):
             )
         out, start = self.end, self._batch.scene.inputs.values
         for name, given in (("initial_positions", positions), ("initial_velocities", velocities)):
-            rows = np.asarray(start[name] if given is None else given, np.float64)
+            rows = as_numbers(name, start[name] if given is None else given)
             shape = out[name].shape[1:]
             if rows.shape not in (shape, (int(mask.sum()), *shape)) or not np.isfinite(rows).all():
                 raise ValueError(

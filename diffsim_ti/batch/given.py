@@ -6,7 +6,9 @@ import numpy as np
 
 from diffsim_ti.batch.set_values import spread_scenes
 from diffsim_ti.batch.sweep import BatchValues, Own, value_of
+from diffsim_ti.checked import as_numbers
 from diffsim_ti.rollout.rollout import Rollout
+from diffsim_ti.rollout.set_values import change_like
 from diffsim_ti.scene import Scene
 
 
@@ -26,7 +28,7 @@ def checked_values(one: Rollout, given: dict, scenes: int) -> dict:
     if unknown:
         raise ValueError(f"no input named {unknown[0]!r}; this batch has {', '.join(one.inputs)}")
     for name, value in given.items():
-        if isinstance(value, Own) or _is_own(one, name, value := np.asarray(value, np.float64), scenes):
+        if isinstance(value, Own) or _is_own(one, name, value := as_numbers(name, value), scenes):
             whole = np.array(value, np.float64)
             whole.flags.writeable = False
             described = inputs.described[name]
@@ -61,9 +63,9 @@ def _is_own(one: Rollout, name: str, value: np.ndarray, scenes: int) -> bool:
     return own
 
 
-def change_of(tangent, value, b: int, scenes: int) -> np.ndarray:
+def change_of(name: str, tangent, value, b: int, scenes: int) -> np.ndarray:
     """The change of scene b's value: that of the shared one, or its own."""
-    tangent, shape = np.asarray(tangent, np.float64), np.shape(value_of(value, b))
+    tangent, shape = as_numbers(f"change of {name}", tangent), np.shape(value_of(value, b))
     if isinstance(value, Own) or tangent.shape == (scenes, *shape):
-        return np.broadcast_to(tangent, (scenes, *shape))[b]
-    return np.broadcast_to(tangent, shape)
+        return change_like(name, tangent, (scenes, *shape))[b]
+    return change_like(name, tangent, shape)

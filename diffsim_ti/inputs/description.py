@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffsim_ti.checked import numbers
+from diffsim_ti.checked import as_numbers, numbers
 
 # lengths: numbers, or "vertices", "tetrahedra" of the mesh, "steps", "steps + 1" of a run
 Shape = tuple[int | str, ...]
@@ -125,7 +125,7 @@ class Input:
 
     def checked(self, name: str, value: ArrayLike, sizes: Mapping[str, int]) -> np.ndarray:
         """A value for a run as a float64 array, or ValueError; sizes: what the words for lengths mean."""
-        value = frozen(value)
+        value = frozen(as_numbers(name, value))
         finite = np.isfinite(value)
         if not finite.all():
             unit = f"; its unit is {self.unit}" if self.unit else ""

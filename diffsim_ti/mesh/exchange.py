@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
+from diffsim_ti.checked import instance
 from diffsim_ti.mesh.files import KEEPS_SETS, as_meshio, parts_of, read_mesh, write_mesh
 from diffsim_ti.mesh.filling import filled
 from diffsim_ti.mesh.sets import without_unused
@@ -45,6 +46,7 @@ class Exchange:
         Raises FileNotFoundError, and ValueError for an unreadable file, one without tetrahedra or with both
         kinds, other cells beside tetrahedra (cell types are named), and whatever the constructor refuses.
         """
+        instance("from_file", "path", path, str | PathLike, "that of a mesh file")
         try:
             return cls._of_parts(read_mesh(path), fix_orientation, drop_orphans)
         except ValueError as error:

@@ -23,6 +23,8 @@ def read_mesh(path) -> tuple[np.ndarray, np.ndarray, dict, dict, dict]:
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"mesh file {path} does not exist (looked in {Path.cwd()})")
+    if path.is_dir():
+        raise ValueError(f"{path} is a folder: name a mesh file")
     if path.suffix.lower() in SURFACES:
         try:
             return *filled(*read_surface(path)), {}, {}, {}

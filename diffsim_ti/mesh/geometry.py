@@ -4,6 +4,8 @@ import math
 
 import numpy as np
 
+from diffsim_ti.checked import numbers, shown
+
 # Corner a's opposite face, seen from outside of a tetrahedron of positive volume.
 FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
 EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
@@ -92,21 +94,21 @@ def rotation_matrix(rotation, angle: float | None) -> np.ndarray:
 
     R = I + sin(angle) K + (1 - cos(angle)) K^2, K the cross product with the unit axis (Rodrigues).
     """
-    R = np.asarray(rotation, np.float64)
+    R = numbers("rotation", rotation)
     if angle is not None:
         axis = three("axis", rotation)
         if not np.linalg.norm(axis) > 0:
-            raise ValueError(f"a rotation needs an axis of positive length, got {rotation!r}")
+            raise ValueError(f"a rotation needs an axis of positive length, got {shown(rotation)}")
         K = np.cross(np.eye(3), axis / np.linalg.norm(axis))
         R = np.eye(3) + math.sin(angle) * K + (1 - math.cos(angle)) * K @ K
     if R.shape != (3, 3) or not np.allclose(R @ R.T, np.eye(3), rtol=0, atol=1e-9) or np.linalg.det(R) < 0:
-        raise ValueError(f"a rotation is a matrix (3, 3) with det +1, or an axis and an angle; got {rotation!r}")
+        raise ValueError(f"a rotation is a matrix (3, 3) with det +1, or an axis and an angle; got {shown(rotation)}")
     return R
 
 
 def three(name: str, given, one_will_do: bool = False) -> np.ndarray:
     """Three finite numbers, or one for all three where `one_will_do`; otherwise ValueError."""
-    values = np.asarray(given, np.float64)
+    values = numbers(name, given)
     if not np.all(np.isfinite(values)) or values.shape != (3,) and not (one_will_do and values.shape == ()):
-        raise ValueError(f"{name} must be {'one or ' if one_will_do else ''}three finite numbers, got {given!r}")
+        raise ValueError(f"{name} must be {'one or ' if one_will_do else ''}three finite numbers, got {shown(given)}")
     return np.broadcast_to(values, (3,))

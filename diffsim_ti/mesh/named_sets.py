@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti.checked import shape_of
 from diffsim_ti.mesh.geometry import triangle_normals
-from diffsim_ti.mesh.sets import checked_sets, chosen_indices, rows_of
+from diffsim_ti.mesh.sets import array_of, checked_sets, chosen_indices, rows_of
 
 if TYPE_CHECKING:
     from diffsim_ti.mesh.tetrahedral_mesh import TetrahedralMesh
@@ -57,7 +57,7 @@ class NamedSets:
         if chosen is None:
             return np.arange(count)
         if not isinstance(chosen, str) and len(shape_of("surface", chosen)) == 2:
-            triangles = np.asarray(chosen)
+            triangles = array_of("surface", chosen)
             if triangles.shape[1] not in (3, self._surface_faces.shape[1]) or triangles.dtype.kind not in "iu":
                 raise ValueError(f"triangles must be vertex indices of shape (k, 3), got shape {triangles.shape}")
             chosen, none = rows_of(triangles[:, :3], self.surface_triangles, self._surface_faces)

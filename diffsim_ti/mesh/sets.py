@@ -27,10 +27,19 @@ def chosen_indices(chosen, sets: dict, count: int, what: str) -> np.ndarray:
     return indices_of(chosen, count, what)
 
 
+def array_of(what: str, chosen) -> np.ndarray:
+    """What indices are given as, as an array; ValueError where it is none."""
+    shape_of(what, chosen)
+    if getattr(chosen, "requires_grad", False):
+        raise ValueError(
+            f"{what}: indices must be integers, got a tensor with a graph; give whole numbers, such as [0, 3]"
+        )
+    return np.asarray(chosen)
+
+
 def indices_of(chosen, count: int, what: str) -> np.ndarray:
     """Sorted unique int64 indices from indices or a Boolean mask of length count; ValueError if they do not fit."""
-    shape_of(what, chosen)
-    chosen = np.asarray(chosen)
+    chosen = array_of(what, chosen)
     if chosen.dtype.kind == "b":
         if chosen.shape != (count,):
             raise ValueError(f"{what}: a mask must have shape ({count},), got {chosen.shape}")

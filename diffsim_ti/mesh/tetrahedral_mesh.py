@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
+from diffsim_ti.checked import instance, listed
 from diffsim_ti.mesh import checks, geometry
 from diffsim_ti.mesh.description import content_hash, describe
 from diffsim_ti.mesh.elements import Elements
@@ -111,7 +112,10 @@ class TetrahedralMesh(Exchange, NamedSets, Elements):
         Sets of the same name become one; each body's vertices, tetrahedra and surface are sets "body_0", "body_1", ... too.
         ValueError for an empty list, and for meshes that have a set of such a name already.
         """
-        meshes = list(meshes)
+        meshes = [
+            instance("joined", "each of the meshes", mesh, TetrahedralMesh, "a TetrahedralMesh")
+            for mesh in listed("meshes", meshes, "TetrahedralMesh")
+        ]
         if not meshes:
             raise ValueError("joined needs at least one mesh, got none")
         vertices, tetrahedra, sets = join(meshes)

@@ -6,14 +6,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
-from diffsim_ti.checked import instance, listed, shape_of, shown
+from diffsim_ti.checked import as_numbers, instance, listed, shape_of, shown
 from diffsim_ti.copies import made_again
 from diffsim_ti.inputs import Derived
 from diffsim_ti.outputs import Change, Displacements, Output, Positions, Velocities
 from diffsim_ti.rollout.checkpoints import Checkpoints
 from diffsim_ti.rollout.frames import Frames, HostSeed, check_finite
 from diffsim_ti.rollout.run import Run
-from diffsim_ti.rollout.set_values import gathered, spread_all
+from diffsim_ti.rollout.set_values import change_like, gathered, spread_all
 from diffsim_ti.rollout.sweep import Sweep
 from diffsim_ti.rollout.taped import TapeFace
 from diffsim_ti.solvers.solver import Solver
@@ -220,11 +220,13 @@ class Rollout:
     def pulled_to_frames(self, frames: Frames, seeds: dict) -> Change:
         """Gradients of a loss by the frames' states and, directly, by inputs, from those by outputs."""
         out = Change()
+        instance("Rollout.vjp", "frames", frames, Frames, "what forward returned")
         for name, seed in seeds.items():
             if name not in self.outputs:
                 raise ValueError(f"no output named {name!r}; this rollout has {', '.join(self.outputs)}")
             if seed is not None:
-                seed, shape = np.asarray(seed), tuple(self.outputs[name].shape(self.num_frames))
+                seed = as_numbers(f"gradient by the frames' {name}", seed)
+                shape = tuple(self.outputs[name].shape(self.num_frames))
                 if seed.shape != shape:
                     raise ValueError(f"gradient by the frames' {name}: expected shape {shape}, got {seed.shape}")
                 check_finite(name, seed, self.save_every)
@@ -260,10 +262,10 @@ class Rollout:
         unknown = [name for name in tangents if name not in self.inputs]
         if unknown:
             raise ValueError(f"jvp: no input named {unknown[0]!r}; this rollout has {', '.join(self.inputs)}")
-        values = frames.inputs
+        values = instance("Rollout.tangents", "frames", frames, Frames, "what forward returned").inputs
         zero = {name: np.zeros_like(values[name]) for name in tangents}
         tangents, _ = spread_all(self.scene, zero, tangents, frames.sets)
-        tangents = {k: np.broadcast_to(np.asarray(x, np.float64), values[k].shape) for k, x in tangents.items()}
+        tangents = {name: change_like(name, x, values[name].shape) for name, x in tangents.items()}
         derived = self.scene.inputs.derive_jvp(values, tangents)
         moved = self.sweep.push_forward(frames.run, derived)
         return Change(*moved, tangents, self.sweep.contact_change, self.sweep.chamber_change)

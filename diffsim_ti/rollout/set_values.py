@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from diffsim_ti.checked import shown
+from diffsim_ti.checked import as_numbers, instance, shown
 from diffsim_ti.scene import Scene
 
 Rows = dict[str, np.ndarray]  # tetrahedra of each set
@@ -20,8 +20,7 @@ def rows_of_sets(scene: Scene, name: str, sets: Iterable[str]) -> Rows:
     mesh, described = scene.mesh, scene.inputs.described.get(name)
     if described is None:
         raise ValueError(f"no input named {name!r}; this scene has {', '.join(scene.inputs.described)}")
-    if not any(rule[:1] == ("tetrahedra",) for rule in described.shapes):
-        raise ValueError(f"{name}: has no numbers per tetrahedron, so give an array or a number instead of named sets")
+    _rule(scene, name)
     out, owner = {}, np.full(mesh.num_tetrahedra, -1)
     named = [key for key in sets if key != "default"]
     for k, key in enumerate(named):
@@ -39,9 +38,17 @@ def rows_of_sets(scene: Scene, name: str, sets: Iterable[str]) -> Rows:
     return out
 
 
+def _rule(scene: Scene, name: str) -> tuple:
+    """The shape of an input that has a row for each tetrahedron."""
+    for rule in scene.inputs.described[name].shapes:
+        if rule[:1] == ("tetrahedra",):
+            return rule
+    raise ValueError(f"{name}: has no numbers per tetrahedron, so give an array or a number instead of named sets")
+
+
 def per_tetrahedron(scene: Scene, name: str, value: np.ndarray) -> np.ndarray:
     """A copy of an input's value with a row for each tetrahedron."""
-    rule = next(rule for rule in scene.inputs.described[name].shapes if rule[:1] == ("tetrahedra",))
+    rule = _rule(scene, name)
     tail = value.shape[1:] if value.ndim == len(rule) else value.shape
     return np.array(np.broadcast_to(value, (scene.mesh.num_tetrahedra, *tail)), np.float64)
 
@@ -50,7 +57,7 @@ def spread(scene: Scene, name: str, base: np.ndarray, numbers: Mapping, rows: Ro
     """The values of all tetrahedra: `base` where no set is named."""
     out = per_tetrahedron(scene, name, base)
     for key, own in rows.items():
-        number = np.asarray(numbers[key], np.float64)
+        number = as_numbers(f"{name}[{key!r}]", numbers[key])
         if number.shape != out.shape[1:]:
             raise ValueError(f"{name}[{key!r}]: expected shape {out.shape[1:]}, got {number.shape}")
         out[own] = number
@@ -75,7 +82,18 @@ def gathered(gradient: np.ndarray, rows: Rows) -> dict[str, np.ndarray]:
     return {key: gradient[own].sum(0) for key, own in rows.items()}
 
 
+def change_like(name: str, change, shape: tuple) -> np.ndarray:
+    """A change of an input as a finite array of the input's shape, to which smaller ones are spread."""
+    change = as_numbers(f"change of {name}", change)
+    if not np.all(np.isfinite(change)):
+        raise ValueError(f"change of {name} must be finite, got {shown(change)}")
+    try:
+        return np.broadcast_to(change, shape)
+    except ValueError:
+        raise ValueError(f"change of {name}: expected the input's shape {shape}, got {change.shape}") from None
+
+
 def split_name(name: str) -> tuple[str, str | None]:
     """ "youngs_modulus[soft]" as (input, set); a plain name as (name, None)."""
-    plain, bracket, rest = name.partition("[")
+    plain, bracket, rest = instance("field", "name", name, str, "that of an input or output").partition("[")
     return (plain, rest[:-1]) if bracket and rest.endswith("]") else (name, None)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 from diffsim_ti import runtime
-from diffsim_ti.checked import listed, number, whole
+from diffsim_ti.checked import as_numbers, listed, number, whole
 from diffsim_ti.inputs import Derived
 from diffsim_ti.monitor.guard import Guard
 from diffsim_ti.rollout.checkpoints import choose_checkpoints
@@ -143,7 +143,7 @@ class Sweep:
             raise ValueError(f"no input named {unknown[0]!r}; this rollout has {', '.join(self.inputs)}")
         known, given = self._loaded or self.values, {}
         for name, value in values.items():
-            value = np.asarray(value, np.float64)
+            value = as_numbers(name, value)
             same = value is known[name] or value.shape == known[name].shape and np.array_equal(value, known[name])
             given[name] = known[name] if same else value.copy()
         out = self.values | self.scene.inputs.check(given)

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from diffsim_ti.batch import Batch
+from diffsim_ti.checked import numbers
 from diffsim_ti.torch_bridge.autograd import first_order_only, torch
 from diffsim_ti.torch_bridge.set_tensors import spread_tensors
 
@@ -69,8 +70,7 @@ def batch_frames(batch: Batch, tensors: dict) -> TorchBatchFrames:
         for name, x in tensors.items()
     }
     tensors = {
-        name: x if isinstance(x, torch.Tensor) else torch.as_tensor(x, dtype=torch.float64)
-        for name, x in tensors.items()
+        name: x if isinstance(x, torch.Tensor) else torch.from_numpy(numbers(name, x)) for name, x in tensors.items()
     }
     for name, tensor in tensors.items():
         known = "initial_positions" if name == "initial_displacements" else name

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from diffsim_ti.batch import Batch
+from diffsim_ti.checked import numbers
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.torch_bridge.autograd import first_order_only, refuse_transforms, torch, uncompiled
 from diffsim_ti.torch_bridge.batch_node import TorchBatchFrames, batch_frames
@@ -124,7 +125,7 @@ def rollout_frames(rollout: Rollout | Batch, **tensors: torch.Tensor) -> TorchFr
     for name, value in rollout.scene.given_tensors().items():
         tensors.setdefault(name, value.expand(rollout.values[name].shape))
     for name, value in tensors.items():
-        tensors[name] = value if isinstance(value, torch.Tensor) else torch.as_tensor(value, dtype=torch.float64)
+        tensors[name] = value if isinstance(value, torch.Tensor) else torch.from_numpy(numbers(name, value))
         if not tensors[name].is_floating_point():
             raise ValueError(f"{name}: expected a floating point tensor, got {tensors[name].dtype}")
         costs_extra = name in ("density", "rest_positions") and name not in rollout.wanted
