@@ -208,6 +208,7 @@ class Rollout:
         Float64 arrays of the inputs' shapes; None for a part that the loss does not name. Further seeds of the same
         frames cost a reverse sweep each: no pass runs forward again unless too few states are kept.
         """
+        instance("Rollout.vjp", "frames", frames, Frames, "what forward returned")
         change = self.pulled_to_frames(frames, dict(positions=positions, velocities=velocities) | seeds)
         zero = np.zeros(frames.positions.shape)
         at_frames = [zero if x is None else x for x in (change.positions, change.velocities)]
@@ -220,7 +221,6 @@ class Rollout:
     def pulled_to_frames(self, frames: Frames, seeds: dict) -> Change:
         """Gradients of a loss by the frames' states and, directly, by inputs, from those by outputs."""
         out = Change()
-        instance("Rollout.vjp", "frames", frames, Frames, "what forward returned")
         for name, seed in seeds.items():
             if name not in self.outputs:
                 raise ValueError(f"no output named {name!r}; this rollout has {', '.join(self.outputs)}")
