@@ -48,6 +48,23 @@ answer_all(work)
 """
 
 
+def test_many_bodies_are_pieces_of_one(tmp_path):
+    asked = problem("lame-gradient")
+    scene = asked.scene(asked.cells[0], asked.patterns[0], "f64")
+    np.savez(tmp_path / "a.job.npz", **work.problem_job(asked, scene, 3), worlds=3)
+    one = Job(str(tmp_path / "a.job.npz"))
+    all_of_them, n = one.in_one(), len(one.vertices)
+    for b in range(3):
+        piece = slice(b * n, (b + 1) * n)
+        np.testing.assert_array_equal(all_of_them.start[piece], one.start)
+        np.testing.assert_array_equal(all_of_them.masses[piece], one.masses)
+        own = all_of_them.tetrahedra[b * len(one.tetrahedra) :][: len(one.tetrahedra)]
+        np.testing.assert_array_equal(own, one.tetrahedra + b * n)
+    np.testing.assert_array_equal(all_of_them.edges(all_of_them.start)[: len(one.tetrahedra)], one.edges(one.start))
+    positions = np.tile(one.start, (one.frames + 1, 3, 1))
+    assert all_of_them.adjoints(positions).shape == positions.shape
+
+
 @pytest.mark.parametrize("name", ["lame-gradient", "identify", "bounce-gradient"])
 def test_a_job_is_the_problem(name, tmp_path):
     """Masses, moduli and the loss's gradient by the frames, from the file alone, are ours."""

@@ -1,8 +1,9 @@
 """Common work on whatever of torch-diffsim, NVIDIA Warp and JAX is installed, next to ours, in one run.
 
-    python examples/benchmarks/compare_peers.py [--peer-python PATH] [--part common|accuracy|charts|all] [--quick]
+    python examples/benchmarks/compare_peers.py [--peer-python PATH] [--part common|batch|accuracy|charts|all] [--quick]
 
 common: the work of speed.py, equal steps; prints ns per tetrahedron and substep.
+batch: many bodies at once, as worlds of Warp (pieces of one mesh), by JAX's vmap, and ds.Batch.
 accuracy: time to a given error, with and without gradients, of a Lamé mode against its closed form and of a bunny that falls
     on a floor against its own converged motion; draws peers.png and prints the times to 1e-2 and 1e-3.
 charts: the work-precision diagrams of `diffsim-ti chart` with torch-diffsim's runs in them.
@@ -19,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 from peers import work
-from speed import SUBSTEPS, H, common_rollout, measure
+from speed import BATCH_STEPS, SUBSTEPS, H, common_rollout, measure, measure_batch
 
 import diffsim_ti as ds
 from diffsim_ti.study import chart, charts, pareto_front, problem, problems
@@ -65,16 +66,38 @@ def common_jobs(vertices_a_side: int, repeats: int = 5, **more) -> tuple[list[di
     return [job, both], scene.mesh.num_tetrahedra
 
 
+BATCHES = (6, 64), (11, 16)  # vertices a side, bodies
+
+
+def at_once(python: str, rounds: int) -> dict:
+    """{(who, "bodies x tetrahedra"): [forward, forward and gradient]} in ns per tetrahedron, substep and body."""
+    best: dict = {}
+    for _ in range(rounds):
+        for n, worlds in BATCHES:
+            row = measure_batch(n, worlds, "f32", False, 5)
+            size = f"{worlds} x {row['tets']}"
+            found = {"diffsim_ti": [row["forward_ns"], row["forward_backward_ns"]]}
+            for who in work.installed(python):
+                if who != "torch-diffsim":
+                    jobs, tets = common_jobs(n, worlds=worlds, substeps=BATCH_STEPS * SUBSTEPS)
+                    answers = work.ask(who, python, jobs)
+                    scale = 1e9 / (BATCH_STEPS * SUBSTEPS * tets * worlds)
+                    found[who] = [np.inf if a is None else float(a["seconds"]) * scale for a in answers]
+            for who, numbers in found.items():
+                best[who, size] = np.minimum(best.get((who, size), np.inf), numbers).tolist()
+    return best
+
+
 def common_table(best: dict) -> str:
     """Markdown: forward and forward + gradient by size, and how many times as long as ours."""
-    sizes = sorted({tets for _, tets in best})
-    head = " | ".join(f"forward, {s:,} | + gradient" for s in sizes)
+    sizes = list(dict.fromkeys(size for _, size in best))
+    head = " | ".join(f"forward, {s if isinstance(s, str) else format(s, ',')} | + gradient" for s in sizes)
     lines = [f"| | {head} |", "| --- |" + " --- | --- |" * len(sizes)]
     for who in dict.fromkeys(w for w, _ in best):
         cells = []
         for s in sizes:
             for value, own in zip(best.get((who, s), [np.nan] * 2), best["diffsim_ti", s]):
-                cells.append(f"{value:.0f}" + ("" if who == "diffsim_ti" else f" ({value / own:.1f}x)"))
+                cells.append(f"{value:.3g}" + ("" if who == "diffsim_ti" else f" ({value / own:.1f}x)"))
         lines.append(f"| {who} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
@@ -245,7 +268,7 @@ def charted(python: str, quick: bool, folder) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--peer-python", default=sys.executable, help="interpreter with the peers")
-    parser.add_argument("--part", default="all", choices=["common", "accuracy", "charts", "all"])
+    parser.add_argument("--part", default="all", choices=["common", "batch", "accuracy", "charts", "all"])
     parser.add_argument("--sizes", type=int, nargs="+", default=[6, 11, 21], help="vertices a side of the common work")
     parser.add_argument("--rounds", type=int, default=3, help="of the common work")
     parser.add_argument("--quick", action="store_true", help="small meshes, few steps")
@@ -255,6 +278,8 @@ def main() -> None:
     print("peers:", ", ".join(work.installed(options.peer_python)) or "none is installed; see --peer-python")
     if options.part in ("common", "all"):
         print(common_table(common(options.peer_python, options.sizes, options.rounds)))
+    if options.part in ("batch", "all"):
+        print(common_table(at_once(options.peer_python, options.rounds)))
     if options.part in ("accuracy", "all"):
         print(accuracy_table(accuracy(options.peer_python, options.quick, options.output)))
     if options.part in ("charts", "all"):

@@ -6,6 +6,7 @@ peer answers with its frames, its gradients if asked for, and its best time.
 
 import sys
 import time
+from copy import copy
 
 import numpy as np
 
@@ -13,7 +14,8 @@ import numpy as np
 class Job:
     """vertices (n, 3) [m], tetrahedra (m, 4); start, velocities (n, 3); fixed: indices; E [Pa], nu, density,
     gravity [m/s^2]; h [s], substeps per frame, frames; keep: what is left of the velocity after a substep;
-    ground: (stiffness [N/m], width [m]) of the barrier of y = 0, or nothing; repeats: timed runs; device: "cpu" or "cuda".
+    ground: (stiffness [N/m], width [m]) of the barrier of y = 0, or nothing; repeats: timed runs; device: "cpu" or "cuda";
+    worlds: how many such bodies at once, of which the first one is answered.
 
     With `weights` (n, 3) a gradient is wanted, of the loss sum_f [linear_f q_f + square_f (q_f - target_f)^2 / 2],
     q_f = sum(weights * displacements_f); the three are of length frames + 1.
@@ -22,9 +24,10 @@ class Job:
     def __init__(self, path: str):
         self.path = path
         with np.load(path) as file:
-            self.__dict__.update(dict(device="cpu") | {name: value[()] for name, value in file.items()})
+            self.__dict__.update(dict(device="cpu", worlds=1) | {name: value[()] for name, value in file.items()})
         self.device = str(self.device)
         self.frames, self.substeps, self.repeats = int(self.frames), int(self.substeps), int(self.repeats)
+        self.worlds = int(self.worlds)
         self.rest_edges = np.moveaxis(self.edges(self.vertices), 1, 2)
         self.volumes = np.linalg.det(self.rest_edges) / 6
         self.masses = np.bincount(
@@ -32,6 +35,18 @@ class Job:
         )
         self.mu = self.E / (2 * (1 + self.nu))
         self.lam = self.E * self.nu / ((1 + self.nu) * (1 - 2 * self.nu))
+
+    def in_one(self) -> "Job":
+        """All worlds as one body of so many pieces."""
+        out, n = copy(self), len(self.vertices)
+        shift = n * np.arange(self.worlds)
+        for name in ("vertices", "start", "velocities", *(["weights"] if self.differentiates else [])):
+            setattr(out, name, np.tile(getattr(self, name), (self.worlds, 1)))
+        out.tetrahedra = (self.tetrahedra + shift[:, None, None]).reshape(-1, 4)
+        out.fixed = (self.fixed + shift[:, None]).ravel()
+        out.rest_edges = np.tile(self.rest_edges, (self.worlds, 1, 1))
+        out.volumes, out.masses = (np.tile(x, self.worlds) for x in (self.volumes, self.masses))
+        return out
 
     @property
     def differentiates(self) -> bool:

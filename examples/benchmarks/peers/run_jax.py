@@ -54,18 +54,19 @@ def make_rollout(job):
 
 
 def work(job):
-    rollout = make_rollout(job)
-    start, velocities = jnp.asarray(job.start, jnp.float32), jnp.asarray(job.velocities, jnp.float32)
-    moduli = tuple(jnp.full(len(job.tetrahedra), a, jnp.float32) for a in (job.mu, job.lam))
+    rollout, worlds = make_rollout(job), job.worlds
+    start, velocities = (jnp.asarray(np.tile(x, (worlds, 1, 1)), jnp.float32) for x in (job.start, job.velocities))
+    moduli = tuple(jnp.full((worlds, len(job.tetrahedra)), a, jnp.float32) for a in (job.mu, job.lam))
     if not job.differentiates:
-        compiled = jax.jit(rollout)
+        compiled = jax.jit(jax.vmap(rollout))
         seconds, positions = timed(lambda: np.asarray(compiled(start, velocities, moduli)), job.repeats)
-        return seconds, positions, {}
+        return seconds, positions[0], {}
     weights, linear, square, target, rest = (
         jnp.asarray(a, jnp.float32) for a in (job.weights, job.linear, job.square, job.target, job.vertices)
     )
 
     @jax.jit
+    @jax.vmap
     def both(start, velocities, moduli):
         positions, back = jax.vjp(lambda x, m: rollout(x, velocities, m), start, moduli)
         q = jnp.tensordot(positions - rest, weights, 2)
@@ -75,11 +76,11 @@ def work(job):
     seconds, (positions, (by_start, by_moduli)) = timed(
         lambda: jax.block_until_ready(both(start, velocities, moduli)), job.repeats
     )
-    by_mu, by_lam = (float(np.asarray(a, float).sum()) for a in by_moduli)
+    by_mu, by_lam = (float(np.asarray(a[0], float).sum()) for a in by_moduli)
     return (
         seconds,
-        positions,
-        dict(youngs_modulus=job.by_youngs_modulus(by_mu, by_lam), initial_positions=np.asarray(by_start, float)),
+        positions[0],
+        dict(youngs_modulus=job.by_youngs_modulus(by_mu, by_lam), initial_positions=np.asarray(by_start[0], float)),
     )
 
 
