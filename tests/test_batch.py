@@ -146,6 +146,28 @@ def test_other_matter(material, order, solver):
     check(batch, own, rng, True)
 
 
+@pytest.mark.parametrize(
+    "order, precision, law",
+    [
+        (1, "f64", ds.StableNeoHookean),
+        pytest.param(1, "f32", ds.SmithNeoHookean, marks=pytest.mark.thorough),
+        pytest.param(2, "f64", ds.StableNeoHookean, marks=pytest.mark.thorough),
+    ],
+)
+def test_patches(order, precision, law):
+    """Sums over patches, whose places repeat some tetrahedra: linear ones, or of ten nodes, patches by themselves."""
+    mesh = MESH if order == 1 else ds.TetrahedralMesh.create_box(2, 0.1).quadratic()
+    terms = [ds.Gravity(-9.8), ds.Muscle((0, 1, 0), 2e3, 1.0), floor()]
+    scene = ds.Scene(mesh, law(2e4, 0.45), 1000.0, terms=terms, precision=precision, volume="patches")
+    batch = ds.Batch(ds.SemiImplicitSolver(scene, dt=5e-4, substeps=3), 3, 3, gradients="all", lanes=True)
+    rng, shape = np.random.default_rng(0), (3, *mesh.vertices.shape)
+    own = dict(poissons_ratio=rng.uniform(0.4, 0.48, 3), activation=rng.uniform(0.5, 1.5, 3))
+    own |= dict(youngs_modulus=rng.uniform(1e4, 3e4, (3, mesh.num_tetrahedra)))
+    own |= dict(rest_positions=mesh.vertices + 1e-3 * rng.normal(size=shape))
+    own |= dict(initial_velocities=0.3 * rng.normal(size=shape) + [0, -1, 0])
+    check(batch, own, rng, True)
+
+
 def push(t):
     return np.array([0.0, 0.3 * t, 0.2 * t])
 

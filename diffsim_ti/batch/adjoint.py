@@ -6,6 +6,7 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.batch.layouts import in_slots
+from diffsim_ti.batch.side_by_side import placed
 from diffsim_ti.inputs import Derived
 
 OF_STEPS = "forces", "motion", "path"
@@ -20,7 +21,7 @@ class BatchAdjoint:
         self.ws = weakref.proxy(workspace)
         ws, a = workspace, workspace.arrays
         self.features, self.own = a.features(density, shape), workspace.own
-        layout, n, m = ws.layout, a.num_vertices, a.num_tetrahedra
+        layout, n, m = ws.layout, a.num_vertices, a.num_places
         self.u, self.v, self.w = (layout.vectors(1, n) for _ in range(3))
         self.corner = ws.room_for_corners()
         self.reads_rates = "H_dot" in a.law.reads or self.features.dragged
@@ -113,15 +114,15 @@ class BatchAdjoint:
         a, features, rows = ws.arrays, self.features, self.features.sums()
         one, sums, vectors = ws.derived[0], self._of(self.sums), self._vectors
         out = Derived(*(None if x is None else np.zeros((B, *x.shape)) for x in one.parts().values()))
-        out.coefficients = self._of(self.coefficients).reshape(B, a.num_tetrahedra, -1)
+        out.coefficients = self._of_tetrahedra(self.coefficients, -1)
         out.parameters[:, : features.num_parameters] = sums[:, rows.of("parameters")].sum(2)
         if features.density:
             out.mass = sums[:, rows.first("mass")]
         if features.shape:
             frames = vectors(self.frames_u).sum(1)
             out.rest = sums[:, rows.of("rest")].swapaxes(1, 2) + frames
-            out.gradients = self._of(self.gradients).reshape(B, *one.gradients.shape)
-            out.volumes = self._of(self.volumes).reshape(B, *one.volumes.shape)
+            out.gradients = self._of_tetrahedra(self.gradients, *one.gradients.shape[1:])
+            out.volumes = self._of_tetrahedra(self.volumes, *one.volumes.shape[1:])
         if features.areas:
             out.surface = sums[:, rows.first("surface")]
         for name in OF_STEPS:
@@ -151,6 +152,10 @@ class BatchAdjoint:
                 if f"{what}_rest" in found:
                     nodes = getattr(a, f"{what}_nodes").ravel()
                     np.add.at(out.rest, (scenes, nodes), found[f"{what}_rest"])
+
+    def _of_tetrahedra(self, array, *shape: int) -> np.ndarray:
+        a = self.ws.arrays
+        return self._of(array).reshape(self.ws.num_scenes, a.num_places, *shape)[:, a.place]
 
     def _of(self, array) -> np.ndarray:
         return self.ws.layout.unpack(array).astype(np.float64)
@@ -183,7 +188,8 @@ class BatchTangent:
             surface=[np.zeros(a.num_vertices) if d.surface is None else d.surface for d in tangents],
         )
         for name, arrays in flat.items():
-            setattr(self, name, runtime.upload(layout.pack(np.stack([x.ravel() for x in arrays])), layout.number))
+            rows = np.stack([placed(a, name, x).ravel() for x in arrays])
+            setattr(self, name, runtime.upload(layout.pack(rows), layout.number))
         vectors = dict(
             rest=[d.rest for d in tangents],
             anchor=[np.zeros((1, 3)) if d.motion is None else d.displacement[a.held] for d in tangents],

@@ -9,9 +9,9 @@ from numpy.typing import ArrayLike
 from diffsim_ti.batch.frames import BatchFrames, LazyFrames
 from diffsim_ti.batch.given import change_of, checked_values, spread_given
 from diffsim_ti.batch.set_values import gathered_scenes
+from diffsim_ti.batch.side_by_side import why_not
 from diffsim_ti.batch.sweep import BatchSweep, Own, value_of
 from diffsim_ti.batch.taped import BatchTapeFace
-from diffsim_ti.batch.workspace import why_not
 from diffsim_ti.checked import as_numbers, instance, whole
 from diffsim_ti.copies import made_again
 from diffsim_ti.inputs import Derived

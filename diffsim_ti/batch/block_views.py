@@ -6,17 +6,8 @@ from functools import cached_property
 import taichi as ti
 
 from diffsim_ti.batch.free_vertices import FreeVertices
-from diffsim_ti.batch.views import (
-    AtVertices,
-    Corners,
-    Item,
-    Scratch,
-    Shared,
-    TetrahedronOfEight,
-    Uniform,
-    Vectors,
-    View,
-)
+from diffsim_ti.batch.tetrahedra import TetrahedronOfEight, element_of_eight
+from diffsim_ti.batch.views import AtVertices, Corners, Item, Scratch, Shared, Uniform, Vectors, View
 from diffsim_ti.elements.tetrahedron import Onwards
 from diffsim_ti.materials.calculus.tensor import sum_of
 from diffsim_ti.runtime import Bundle, at, let, traced
@@ -40,7 +31,7 @@ class KickDriftOfEight(KickDrift):
 
     @cached_property
     def element(self):
-        return TetrahedronOfEight(self.law, self.features.uniform, True, self.features.order)
+        return element_of_eight(self.law, self.features)
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,8 @@ from functools import cached_property, lru_cache
 
 import taichi as ti
 
-from diffsim_ti.batch.views import Column, ItemOfScene, Shared, TetrahedronOfScenes, Uniform
+from diffsim_ti.batch.tetrahedra import element_of_scenes
+from diffsim_ti.batch.views import Column, ItemOfScene, Shared, Uniform
 from diffsim_ti.runtime import Bundle, Kernel, at, let, traced
 from diffsim_ti.solvers.explicit.kernels import PLAN, TURNS, ExplicitKernels
 from diffsim_ti.solvers.explicit.kick_drift import KickDrift
@@ -43,7 +44,7 @@ class KickDriftOfScene(KickDrift):
 
     @cached_property
     def element(self):
-        return TetrahedronOfScenes(self.law, self.features.uniform, False, self.features.order)
+        return element_of_scenes(self.law, self.features)
 
 
 @dataclass(frozen=True)

@@ -53,9 +53,10 @@ class BatchKernels(BlockViews):
     @ti.func
     def one_pass(self, b, j, scene: A, state: A, table: A, plan: A):
         s, now = (j - plan.base) * plan.stride, self.pass_of(b, j, table, plan)
-        tetrahedra = self.tetrahedra_of(scene, scene.corner)
+        tetrahedra, sums = self.tetrahedra_of(scene, scene.corner), self.element.room_for_sums()
         for e in range(plan.num_tetrahedra):
             item = self.item(e, b, plan)
+            self.element.sum_up(item, sums, tetrahedra, state, s)
             self.element.forces(item, tetrahedra, state, s, tetrahedra.corner)
             if ti.static(self.element.has_state):
                 self.element.move_on(item, tetrahedra, state, s, s + plan.stride, self.onwards(now))
@@ -93,8 +94,10 @@ class BatchKernels(BlockViews):
     def one_pass_jvp(self, b, j, scene: A, state: A, tangent: A, table: A, plan: A):
         s, now = j - plan.base, self.pass_of(b, j, table, plan)
         tetrahedra, changed = self.tetrahedra_of(scene, scene.corner), self.changed_of(tangent)
+        sums = self.element.room_for_sums()
         for e in range(plan.num_tetrahedra):
             item = self.item(e, b, plan)
+            self.element.sum_up(item, sums, tetrahedra, state, s, tangent.u, changed)
             self.element.forces_jvp(item, tetrahedra, state, s, tangent, tetrahedra.corner, changed)
             if ti.static(self.element.has_state):
                 self.element.move_on_jvp(item, tetrahedra, state, s, tangent, changed, self.onwards(now))
@@ -162,8 +165,10 @@ class BatchKernels(BlockViews):
             if ti.static(self.vertex.reads_rates):
                 self.free.clear(b, i, adjoint.rate_corner, plan)
         tetrahedra, by_tetrahedra = self.tetrahedra_of(scene, adjoint.corner), self.of_tetrahedra(scene, adjoint)
+        sums = self.element.room_for_sums()
         for e in range(plan.num_tetrahedra):
             item, corner = self.item(e, b, plan), tetrahedra.corner
+            self.element.sum_up(item, sums, tetrahedra, state, s, adjoint.w)
             if ti.static(self.element.has_state):
                 self.element.move_on_vjp(
                     item, tetrahedra, state, s, self.onwards(now), corner, by_tetrahedra, self.features.shape

@@ -1,4 +1,4 @@
-"""One scene of a batch as Taichi functions of a single scene see it, and the tetrahedra of a batch.
+"""One scene of a batch as Taichi functions of a single scene see it, and numbers of the tetrahedra of a batch.
 
 Numbers that scenes have of their own lie as batch/layouts.py says; what all scenes share lies as it does for one scene.
 """
@@ -10,7 +10,6 @@ import taichi as ti
 
 from diffsim_ti.batch.layouts import APART
 from diffsim_ti.elements.items import Items
-from diffsim_ti.elements.tetrahedron import Tetrahedron
 from diffsim_ti.runtime import LANES, Expr, assign, at, let, traced
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
@@ -105,6 +104,11 @@ class Item:
     def __init__(self, e, b, vertices, tetrahedra):
         self.e, self.b, self.vertices, self.tetrahedra = e, b, vertices, tetrahedra
 
+    @traced
+    def other(self, e):
+        """Another tetrahedron of the block."""
+        return Item(e, self.b, self.vertices, self.tetrahedra)
+
 
 @traced
 class ItemOfScene:
@@ -114,6 +118,11 @@ class ItemOfScene:
 
     def __init__(self, e, b, count):
         self.e, self.b, self.count = e, b, count
+
+    @traced
+    def other(self, e):
+        """Another tetrahedron of the scene."""
+        return ItemOfScene(e, self.b, self.count)
 
 
 @traced
@@ -246,27 +255,3 @@ class Corners:
 
     def __init__(self, array, tets):
         self.array, self.tets = array, tets
-
-
-@dataclass(frozen=True)
-class TetrahedronOfScenes(Tetrahedron):
-    """Functions of one tetrahedron: of eight scenes in lanes, or of one."""
-
-    @cached_property
-    def items(self) -> ItemsOfScenes:
-        return (EightScenes if self.lanes else OneScene)(self.fp, self.nodes.count)
-
-    @traced
-    def coefficients_of(self, item, array) -> list:
-        K = len(self.law.coefficient_names)
-        return self.items.numbers(array, 0, K, K, item)
-
-
-@dataclass(frozen=True)
-class TetrahedronOfEight(TetrahedronOfScenes):
-    """The same, which adds to vertices themselves."""
-
-    @ti.func
-    def gather(self, i, scene: A, corner: A):
-        """What the tetrahedra have added at vertex i."""
-        return corner[i]

@@ -16,35 +16,14 @@ from diffsim_ti.batch.history import BatchHistory
 from diffsim_ti.batch.innermost_kernels import InnermostKernels, innermost_kernels
 from diffsim_ti.batch.kernels import BatchKernels, batch_kernels
 from diffsim_ti.batch.layouts import Innermost, Lanes, in_slots
+from diffsim_ti.batch.side_by_side import placed
 from diffsim_ti.batch.table import ScenesTable
 from diffsim_ti.inputs import Derived
 from diffsim_ti.solvers.explicit.contact_stage import ROWS
-from diffsim_ti.solvers.explicit.felt_faces import feels_faces
 from diffsim_ti.solvers.explicit.further_elements import counts_of_further
 from diffsim_ti.state.arrays import SceneArrays
 from diffsim_ti.state.history import copy_slot
 from diffsim_ti.state.solve_report import SolveReport
-from diffsim_ti.terms import SelfContact
-
-
-def why_not(solver) -> str | None:
-    """What keeps scenes of a solver from being computed side by side, or None if nothing does."""
-    scene = solver.scene
-    if not solver.explicit:
-        return "the solver is not explicit"
-    if runtime.runs_on_cpu() and not scene.law.lanes:
-        return f"the law of {type(scene.material).__name__} does not come in lanes"
-    if scene.volume != "tetrahedra":
-        return f"volume = {scene.volume!r}"
-    terms = dict(self_contact=scene.term(SelfContact), chambers=scene.chambers)
-    terms |= dict(contact_within_faces=feels_faces(scene), mesh_obstacles=_tables(scene))
-    terms |= dict(unequal_steps=solver.schedule.varies, growth_over_time=scene.growing, reduced_sets=scene.reduced)
-    there = [name.replace("_", " ") for name, some in terms.items() if some]
-    return f"it has {' and '.join(there)}" if there else None
-
-
-def _tables(scene) -> bool:
-    return any(term.table.size for term in scene.ordered_terms if term.acts_on_surface)
 
 
 class BatchWorkspace:
@@ -131,8 +110,11 @@ class BatchWorkspace:
         coefficients, parameters = each("coefficients"), each("parameters")
         with_tables = lambda: [np.concatenate([x, a.tables]) for x in parameters]  # noqa: E731
         out = dict(
-            tets=((), lambda: (a.mesh.elements.ravel(), ti.i32)),
-            coefficients=(coefficients, lambda: self._packed(coefficients, "scalars")),
+            tets=((), lambda: (placed(a, "elements", a.mesh.elements).ravel(), ti.i32)),
+            coefficients=(
+                coefficients,
+                lambda: self._packed([placed(a, "coefficients", x) for x in coefficients], "scalars"),
+            ),
             parameters=(parameters, lambda: self._packed(with_tables(), "scalars")),
         )
         if layout.in_lanes:
@@ -174,6 +156,7 @@ class BatchWorkspace:
         arrays = [np.zeros(1) if x is None else x for x in (arrays if name in self.own else arrays[:1])]
         if name == "inverse_mass":
             arrays = [self.arrays.inverse_of(x) for x in arrays]
+        arrays = [placed(self.arrays, name, x) for x in arrays]
         if name in self.own:
             return self._packed(arrays, kind)
         return (arrays[0].ravel(), self.fp) if kind == "scalars" else (arrays[0], self.arrays.vector)
@@ -216,7 +199,7 @@ class BatchWorkspace:
     def law_rows(self) -> int:
         """How many numbers of its tetrahedra the law of a scene remembers."""
         a = self.arrays
-        return len(a.law.state_names) * a.points * a.num_tetrahedra
+        return len(a.law.state_names) * a.points * a.num_places
 
     def initial_states(self) -> np.ndarray:
         law = self.arrays.law
@@ -301,8 +284,8 @@ class BatchWorkspace:
     def launches(self, first: int, last: int, num_passes: int, save_every: int, backwards: bool = False) -> Iterator:
         """Numbers of the launches that passes first .. last - 1 take, for each of which their table is shown."""
         a, solver, schedule = self.arrays, self.solver, self.solver.schedule
-        sizes = dict(num_tetrahedra=a.num_tetrahedra, num_vertices=a.num_vertices)
-        sizes |= self.layout.counts(a.num_tetrahedra, a.num_vertices)
+        sizes = dict(num_tetrahedra=a.num_places, num_vertices=a.num_vertices)
+        sizes |= self.layout.counts(a.num_places, a.num_vertices)
         sizes |= dict(num_loaded=self.counts["forces"], num_held=self.counts["motion"])
         sizes |= dict(num_parameters=self.num_parameters, num_passes_shown=self.table.size)
         sizes |= dict(num_follower=self.counts["follower"], num_points=self.counts["tie_segments"])

@@ -91,8 +91,8 @@ class SceneArrays:
         if self.patches is not None and scene.mesh.order == 1:
             self.order, self.place = in_eights(self.patches)
             self.num_places = len(self.order)
-            self._alone = np.zeros(self.num_places)  # 1 where a lane is no repetition
-            self._alone[self.place] = 1
+            self.alone = np.zeros(self.num_places)  # 1 where a lane is no repetition
+            self.alone[self.place] = 1
             return
         self.order = np.zeros(-(-m // LANES) * LANES, np.int64)  # the last block is filled up with tetrahedron 0
         self.order[:m] = np.arange(m)
@@ -105,6 +105,7 @@ class SceneArrays:
         start, corner_of = vertex_corners(mesh.elements, n)
         if not isinstance(self.place, slice):
             corner_of = self.nodes * self.place[corner_of // self.nodes] + corner_of % self.nodes
+            corner_of = corner_of[np.lexsort((corner_of, np.repeat(np.arange(n), np.diff(start))))]
         if self.self_contact:  # each surface vertex gathers one corner more, after those of its tetrahedra
             self.parameters_of_self_contact = scene.inputs.parameters.of(self.self_contact)
             start, corner_of = with_own_corner(start, corner_of, mesh.surface_vertices, num_corners)
@@ -345,4 +346,4 @@ class SceneArrays:
     def volume_blocks(self, volumes: np.ndarray) -> np.ndarray:
         """Blocks of volumes; repetitions in a patch have none, nor what is rigid."""
         blocks = self.to_blocks(self.bodies.of_soft(volumes) if self.bodies else volumes)
-        return blocks if isinstance(self.place, slice) else blocks * self._alone.reshape(-1, LANES)
+        return blocks if isinstance(self.place, slice) else blocks * self.alone.reshape(-1, LANES)

@@ -1,0 +1,35 @@
+"""Which scenes can be computed side by side, and the order in which kernels go through their tetrahedra."""
+
+import numpy as np
+
+from diffsim_ti import runtime
+from diffsim_ti.solvers.explicit.felt_faces import feels_faces
+from diffsim_ti.terms import SelfContact
+
+
+def why_not(solver) -> str | None:
+    """What keeps scenes of a solver from being computed side by side, or None if nothing does."""
+    scene = solver.scene
+    if not solver.explicit:
+        return "the solver is not explicit"
+    if runtime.runs_on_cpu() and not scene.law.lanes:
+        return f"the law of {type(scene.material).__name__} does not come in lanes"
+    terms = dict(self_contact=scene.term(SelfContact), chambers=scene.chambers)
+    terms |= dict(contact_within_faces=feels_faces(scene), mesh_obstacles=_tables(scene))
+    terms |= dict(unequal_steps=solver.schedule.varies, growth_over_time=scene.growing, reduced_sets=scene.reduced)
+    there = [name.replace("_", " ") for name, some in terms.items() if some]
+    return f"it has {' and '.join(there)}" if there else None
+
+
+def _tables(scene) -> bool:
+    return any(term.table.size for term in scene.ordered_terms if term.acts_on_surface)
+
+
+def placed(arrays, name: str, x: np.ndarray) -> np.ndarray:
+    """Numbers `name` of a scene, those of tetrahedra in the order of places: by patches, where there are some, whose
+    repetitions have no volume."""
+    of_all = name == "coefficients" and x.ndim == 1
+    if isinstance(arrays.place, slice) or name not in ("elements", "coefficients", "gradients", "volumes") or of_all:
+        return x
+    rows = x[arrays.order]
+    return rows * arrays.alone.reshape(-1, *[1] * (x.ndim - 1)) if name == "volumes" else rows
