@@ -159,7 +159,7 @@ def test_patches(order, precision, law):
     mesh = MESH if order == 1 else ds.TetrahedralMesh.create_box(2, 0.1).quadratic()
     terms = [ds.Gravity(-9.8), ds.Muscle((0, 1, 0), 2e3, 1.0), floor()]
     scene = ds.Scene(mesh, law(2e4, 0.45), 1000.0, terms=terms, precision=precision, volume="patches")
-    batch = ds.Batch(ds.SemiImplicitSolver(scene, dt=5e-4, substeps=3), 3, 3, gradients="all", lanes=True)
+    batch = ds.Batch(ds.SemiImplicitSolver(scene, dt=5e-4, substeps=3), 2, 3, gradients="all", lanes=True)
     rng, shape = np.random.default_rng(0), (3, *mesh.vertices.shape)
     own = dict(poissons_ratio=rng.uniform(0.4, 0.48, 3), activation=rng.uniform(0.5, 1.5, 3))
     own |= dict(youngs_modulus=rng.uniform(1e4, 3e4, (3, mesh.num_tetrahedra)))
