@@ -112,33 +112,49 @@ class FreeVertices:
         return [let(share * x) for x in self.read(rows, row, place)]
 
     @traced
+    def slot(self, i, b, scene, plan) -> tuple:
+        """(where the force of vertex i begins in a row, 1 or 0 if it has none)"""
+        k, width = let(at(scene.force_slot, i)), (2 if self.features.forces_keyed else 1)
+        loaded = let(ti.select(k >= 0, ti.cast(1, self.fp), ti.cast(0, self.fp)))
+        return let(3 * (let(b * plan.num_loaded) + width * ti.max(k, 0))), loaded
+
+    @traced
+    def kicks(self, i, b, now, scene, plan) -> list:
+        """(row, place, how far in the step, weight) of both kicks, where forces change within steps."""
+        (place, loaded), out = self.slot(i, b, scene, plan), []
+        for step, weight in ((now.force0, now.share0), (now.force1, now.share1)):
+            share = let(ti.select(step == now.row, now.begin, ti.cast(1, self.fp)))
+            out.append((step if self.features.forces_per_step else 0, place, share, let(weight * loaded)))
+        return out
+
+    @traced
     def load_terms(self, i, b, now, scene, plan) -> list:
         """(row, place, weight) of the rows of forces that vertex i takes; a weight of zero where it takes none."""
-        F, k = self.features, let(at(scene.force_slot, i))
-        loaded = let(ti.select(k >= 0, ti.cast(1, self.fp), ti.cast(0, self.fp)))
-        first, width = let(b * plan.num_loaded), (2 if F.forces_keyed else 1)
-        place = let(3 * (first + width * ti.max(k, 0)))
+        F = self.features
         if F.forces_keyed:
             out = []
-            for step, weight in ((now.force0, now.share0), (now.force1, now.share1)):
-                row, share = (
-                    (step if F.forces_per_step else 0),
-                    ti.select(step == now.row, now.begin, ti.cast(1, self.fp)),
-                )
-                share, weight = let(share), let(weight * loaded)
+            for row, place, share, weight in self.kicks(i, b, now, scene, plan):
                 out += [(row, place, let(weight * (1 - share))), (row, let(place + 3), let(weight * share))]
             return out
+        place, loaded = self.slot(i, b, scene, plan)
         if F.forces_per_step:
             return [(now.force0, place, let(now.share0 * loaded)), (now.force1, place, let(now.share1 * loaded))]
         return [(0, place, loaded)]
 
     @traced
     def load(self, i, b, now, scene, forces, plan) -> list:
-        out = None
-        for row, place, weight in self.load_terms(i, b, now, scene, plan):
-            force = self.force_at(forces, row, place, weight)
-            out = force if out is None else [let(x + y) for x, y in zip(out, force)]
-        return out
+        """The force of a pass, with the operations of GivenForces in their order."""
+        if self.features.forces_keyed:
+            parts = [self.keyed_force(forces, *kick) for kick in self.kicks(i, b, now, scene, plan)]
+        else:
+            parts = [self.force_at(forces, *part) for part in self.load_terms(i, b, now, scene, plan)]
+        return parts[0] if len(parts) == 1 else [let(x + y) for x, y in zip(*parts)]
+
+    @traced
+    def keyed_force(self, forces, row, place, share, weight) -> list:
+        """weight times a force of a step that changes from its beginning to its end."""
+        begin, end = self.read(forces, row, place), self.read(forces, row, let(place + 3))
+        return [let(weight * (x + share * (y - x))) for x, y in zip(begin, end)]
 
     # ---- forward -------------------------------------------------------------------------------------------------------
 

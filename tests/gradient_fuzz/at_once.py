@@ -18,10 +18,9 @@ def solver_of(configuration):
     def taken(**parts) -> bool:
         return ds.Batch(solver.for_scene(plain.replace(**parts)), 1, 1).lanes
 
-    material = ds.StableNeoHookean(1e4, 0.3)
-    plain = scene.replace(volume="tetrahedra", reduced=None, material=material, terms=())
-    if taken(material=scene.material):
-        plain = plain.replace(material=scene.material)
+    plain = scene.replace(reduced=None, terms=())
+    if not taken():
+        plain = plain.replace(material=ds.StableNeoHookean(1e4, 0.3))
     return solver.for_scene(plain.replace(terms=[term for term in scene.terms if taken(terms=[term])]))
 
 
