@@ -419,6 +419,26 @@ def test_a_run_between_a_tapes_runs():
     assert np.array_equal(E.grad.to_numpy(), expected[0]) and np.array_equal(x0.grad.to_numpy(), expected[1])
 
 
+@pytest.mark.backends
+@by_solver
+def test_other_work_in_a_tape_is_not_taped(solver):
+    """Runs, gradients, tangents, steps and looks between kernels of a user leave nothing that a tape would go through."""
+    scene = full_scene(precision="f32", steps=4)
+    rollout = rollout_of(scene, solver, 4, save_every=2, outputs=[ds.Stress(), ds.ElasticEnergy()])
+    simulator, batch = ds.Simulator(rollout.solver.for_scene(scene)), ds.Batch(rollout.solver, 4, 2)
+    with ti.ad.Tape(scalar_field()) as tape:
+        frames = rollout.forward()
+        rollout.vjp(frames, np.ones_like(frames.positions), stress=np.ones_like(frames["stress"]))
+        rollout.tangents(frames, density=1.0)
+        rollout_frames(rollout, youngs_modulus=torch.tensor(1e4))
+        simulator.step()
+        simulator.compute_energy(), simulator.output(ds.Stress()), simulator.describe()
+        many = batch.forward()
+        batch.vjp(many, np.ones_like(many.positions))
+        rollout.field("density")
+        assert len(tape.calls) == 0
+
+
 # ---- misuse -----------------------------------------------------------------------------------------------------------
 
 

@@ -45,7 +45,7 @@ class BatchTapeFace(TapeFace):
     def _filled(self, name: str, value):
         shape, scenes = np.shape(value), () if self._shared[name] else (self.rollout.num_scenes,)
         field = self._take(shape, scenes)
-        field.from_numpy(np.array(np.broadcast_to(value, (*scenes, *shape)), self.number))
+        runtime.untaped(field.from_numpy)(np.array(np.broadcast_to(value, (*scenes, *shape)), self.number))
         return field
 
     def _output_rows(self) -> tuple:

@@ -15,6 +15,7 @@ def _kernel(law):
     matrices = ti.types.ndarray(ti.types.matrix(3, 3, law.fp), 1)
     vectors, scalars = ti.types.ndarray(ti.types.vector(K, law.fp), 1), ti.types.ndarray(law.fp, 1)
 
+    @runtime.untaped
     @ti.kernel
     def evaluate_law(H: matrices, p: vectors, psi: scalars, P: matrices, by_coefficient: vectors):
         for i in range(H.shape[0]):

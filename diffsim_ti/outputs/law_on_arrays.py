@@ -15,6 +15,7 @@ def _kernel(law, what: str):
     matrices = ti.types.ndarray(ti.types.matrix(3, 3, law.fp), 1)
     vectors = ti.types.ndarray(ti.types.vector(K, law.fp), 1)
 
+    @runtime.untaped
     @ti.kernel
     def law_on_arrays(H: matrices, W: matrices, p: vectors, dp: vectors, P: matrices, by_p: vectors):
         for i in range(H.shape[0]):

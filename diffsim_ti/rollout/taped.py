@@ -110,7 +110,7 @@ class TapeFace:
     def _filled(self, name: str, value):
         """The field of an input, with its value."""
         field = self._take(np.shape(value))
-        field.from_numpy(np.asarray(value, self.number))
+        runtime.untaped(field.from_numpy)(np.asarray(value, self.number))
         return field
 
     def _output_rows(self) -> tuple:

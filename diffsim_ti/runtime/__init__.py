@@ -5,7 +5,7 @@ What is used of Taichi's internals, by which module, and what Quadrants has inst
 
 | used | by | for | Quadrants |
 | --- | --- | --- | --- |
-| `impl.get_runtime()`: `prog`, `target_tape`, `materialize` | start, field_pool, threads, launch | whether Taichi runs, its tape, its program | `_prog` |
+| `impl.get_runtime()`: `prog`, `target_tape`, `grad_replaced`, `materialize` | start, field_pool, threads, launch | whether Taichi runs, its tape, its program | `_prog` |
 | `impl.current_cfg`, `prog.config()` and its options | start, launch | backend, options of one kernel | the same |
 | `kernel._primal`, `ensure_compiled`, `compiled_kernels`, `prog.compile_kernel`, `launch_kernel`, launch contexts | launch | launches with bound arguments | plain calls, which keep their arguments |
 | two pointers in a launch context | argument_buffer | launches on CUDA | not used |
@@ -57,6 +57,7 @@ from diffsim_ti.runtime.start import (
     set_precision,
 )
 from diffsim_ti.runtime.threads import take_turns as _take_turns
+from diffsim_ti.runtime.threads import untaped
 
 if not QUADRANTS:
     from diffsim_ti.runtime.sources import trace_faster as _trace_faster

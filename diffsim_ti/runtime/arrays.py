@@ -14,7 +14,7 @@ from taichi.lang.matrix import VectorNdarray
 from diffsim_ti.runtime import device
 from diffsim_ti.runtime.quadrants import QUADRANTS
 from diffsim_ti.runtime.start import arch_name, check_alive, is_alive, program, runs_on_cpu
-from diffsim_ti.runtime.threads import LOCK
+from diffsim_ti.runtime.threads import LOCK, untaped
 
 _allocated = {"bytes": 0}
 _MOST_NUMBERS = 2**31 - 1
@@ -170,7 +170,7 @@ def fill(target, data) -> None:
         device.copy_to_card(_address(target), whole)
     else:
         with LOCK:
-            target.from_numpy(whole)
+            untaped(target.from_numpy)(whole)
 
 
 def fetch(source, row: int | None = None) -> np.ndarray:
@@ -192,7 +192,8 @@ def look(source) -> np.ndarray:
 def _copied(source, row: int | None = None) -> np.ndarray:
     """All of an array whose memory is not the host's, or a row of it."""
     if arch_name() != "cuda":
-        return source.to_numpy() if row is None else source.to_numpy()[row]
+        whole = untaped(source.to_numpy)()
+        return whole if row is None else whole[row]
     shape = full_shape(source)
     out = np.empty(shape if row is None else shape[1:], to_numpy_dtype(source.dtype))
     before = 0 if row is None else range(shape[0])[row] * out.nbytes

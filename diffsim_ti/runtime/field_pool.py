@@ -9,7 +9,7 @@ from taichi.lang import impl
 
 from diffsim_ti.runtime.arrays import to_numpy_dtype
 from diffsim_ti.runtime.start import program
-from diffsim_ti.runtime.threads import LOCK, materialize
+from diffsim_ti.runtime.threads import LOCK, materialize, untaped
 
 
 class FieldPool:
@@ -26,7 +26,9 @@ class FieldPool:
             materialize()
         weakref.finalize(owner, self._free[key].append, field)
         for part in (field, field.grad):
-            part.from_numpy(np.zeros(tuple(shape) + ((components,) if components else ()), to_numpy_dtype(dtype)))
+            untaped(part.from_numpy)(
+                np.zeros(tuple(shape) + ((components,) if components else ()), to_numpy_dtype(dtype))
+            )
         return field
 
     @staticmethod

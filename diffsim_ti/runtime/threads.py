@@ -24,6 +24,22 @@ def take_turns() -> None:
     kernel_impl.Kernel.__call__ = one_call
 
 
+def untaped(call):
+    """The same function, whose kernels an open `ti.ad.Tape` does not note down: copies and looks of ours, which have no
+    derivative that it could ask for."""
+
+    @functools.wraps(call)
+    def quiet(*args, **kwargs):
+        taichi = impl.get_runtime()
+        before, taichi.grad_replaced = taichi.grad_replaced, True
+        try:
+            return call(*args, **kwargs)
+        finally:
+            taichi.grad_replaced = before
+
+    return quiet
+
+
 def materialize() -> None:
     """Place what fields were declared. Raises RuntimeError in a thread that cannot."""
     try:

@@ -33,6 +33,7 @@ def slots(indices: np.ndarray, num_vertices: int) -> np.ndarray:
     return out
 
 
+@runtime.untaped
 @ti.kernel
 def _clear_from(corner: ti.types.ndarray(ndim=1), first: ti.i32):
     for c in range(first, corner.shape[0]):

@@ -33,12 +33,14 @@ class History:
                 target._views[k][to] = view[slot]
 
 
+@runtime.untaped
 @ti.kernel
 def _copy_slot(source: ti.types.ndarray(ndim=2), s: ti.i32, target: ti.types.ndarray(ndim=2), t: ti.i32):
     for i in range(source.shape[1]):
         target[t, i] = source[s, i]
 
 
+@runtime.untaped
 @ti.kernel
 def _find_bad(u: ti.types.ndarray(ndim=2), v: ti.types.ndarray(ndim=2), bad: ti.types.ndarray(ti.i32, 1)):
     for i in range(u.shape[1]):

@@ -26,6 +26,7 @@ def _copy_kernel(way: str, serial: bool):
     """Copies two tensors (k, n, 3) "in" to two arrays of four-vectors (k, n), whose last component stays, or "out"."""
     tensors, arrays = ti.types.ndarray(ndim=3), ti.types.ndarray(ndim=2)
 
+    @runtime.untaped
     @ti.kernel
     def copy(p: tensors, q: tensors, u: arrays, v: arrays):
         ti.loop_config(serialize=serial)
