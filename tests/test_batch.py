@@ -81,7 +81,7 @@ def test_scenes_are_bit_for_bit_those_alone(seed):
 ACTING = (
     *("Spring within", "Spring anchored", "ElasticFoundation one", "ElasticFoundation each"),
     *(f"{what} {how}" for what in ("Cable tension", "Cable length", "Pressure", "BodyForce") for how in HOW),
-    *(f"Muscle {how}" for how in HOW),
+    *(f"{what} {how}" for what in ("Muscle", "Growth") for how in HOW),
     "SurfaceDrag",
 )
 
@@ -95,20 +95,22 @@ def acting(name: str, rng, steps: int, dt: float):
         )
     if kind in ("Pressure", "BodyForce"):
         return load(name, rng, MESH, steps, steps * dt, 1.0)
+    some = np.sort(rng.permutation(MESH.num_tetrahedra)[:40])
+    if kind == "Growth":
+        return ds.Growth(over_time(rng, steps, steps * dt, how)(0.02), (None, some)[rng.integers(2)])
     if kind != "Muscle":
         return tie(name, rng, MESH, steps, steps * dt, np.full(len(MESH.vertices), 0.01), dt)
-    activation, some = over_time(rng, steps, steps * dt, how)(1.0), np.sort(rng.permutation(MESH.num_tetrahedra)[:40])
-    return ds.Muscle(rng.normal(size=(40, 3)), 5e3, activation, some)
+    return ds.Muscle(rng.normal(size=(40, 3)), 5e3, over_time(rng, steps, steps * dt, how)(1.0), some)
 
 
 @pytest.mark.parametrize("seed", [*range(5), *(pytest.param(k, marks=pytest.mark.thorough) for k in range(5, 60))])
 def test_what_acts_on_bodies(seed):
-    """Springs, cables, muscles, foundations, pressures, fluids, forces over time: one to four, of scenes side by side."""
+    """Springs, cables, muscles, foundations, pressures, fluids, growth, forces over time, some of them, side by side."""
     rng = np.random.default_rng([1, seed])
     steps, B, dt = int(rng.integers(2, 5)), int(rng.choice([5, 9, 11])), 1e-3
     names = rng.choice(ACTING, rng.integers(1, 5))
     if seed < 5:  # all come
-        names = np.random.default_rng(0).permutation(ACTING)[4 * seed :][:4]
+        names = np.random.default_rng(0).permutation(ACTING)[5 * seed :][:5]
     terms = [acting(name, rng, steps, dt) for name in names]
     terms += [floor()] if seed % 3 == 0 else []
     scene = ds.Scene(MESH, ELASTIC, 1000.0, terms=[ds.Gravity(-9.8), *terms], precision=("f64", "f32")[seed % 2])

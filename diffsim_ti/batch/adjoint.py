@@ -6,7 +6,7 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.batch.layouts import in_slots
-from diffsim_ti.batch.side_by_side import placed
+from diffsim_ti.batch.side_by_side import growths_placed, placed
 from diffsim_ti.inputs import Derived
 
 OF_STEPS = "forces", "motion", "path"
@@ -41,7 +41,7 @@ class BatchAdjoint:
         self.frames_u, self.frames_v = frames.frames_u, frames.frames_v
 
     def _further(self, shape: bool) -> dict:
-        """Adjoints of springs, cables, muscles, pressures, fluids and foundations, as of a single scene."""
+        """Adjoints of what some scenes alone have: springs, cables, muscles, pressures, fluids, foundations, growth."""
         ws, has, vectors = self.ws, self.features, self.ws.layout.vectors
         a, numbers, out = ws.arrays, ws.numbers, {}
         if has.pressed:
@@ -54,6 +54,8 @@ class BatchAdjoint:
         if has.dragged:
             out["dragged_felt"] = vectors(2 * a.num_dragged)
             out["dragged_rest"] = vectors(3 * a.num_dragged * shape)
+        if has.growing:
+            out["growths"] = runtime.array(ws.layout.number, *numbers.growths.shape)
         if has.founded:
             out["foundation_felt"] = runtime.array(ws.layout.vector, *numbers.foundation.shape)
         return out
@@ -135,10 +137,14 @@ class BatchAdjoint:
         return out
 
     def _collect_further(self, out: Derived) -> None:
-        a, found = self.ws.arrays, {name: self._vectors(x) for name, x in self.further.items()}
+        a, found = self.ws.arrays, {name: self._vectors(x) for name, x in self.further.items() if name != "growths"}
         scenes = np.arange(self.ws.num_scenes)[:, None]
         if "tie_felt" in found:
             out.ties, out.tie_segments = found["tie_felt"], found["tie_rest"]
+        if self.features.growing:
+            rows = self._of(self.growths).reshape(*out.growths.shape[:2], a.num_places, 2)[:, :, a.place]
+            own = np.swapaxes(rows, 2, 3)
+            out.growths = own.sum(3, keepdims=True) if out.growths.shape[3] == 1 else own
         if "foundation_felt" in found:
             out.foundation = found["foundation_felt"]
         if "pressed_felt" in found:
@@ -190,6 +196,8 @@ class BatchTangent:
         for name, arrays in flat.items():
             rows = np.stack([placed(a, name, x).ravel() for x in arrays])
             setattr(self, name, runtime.upload(layout.pack(rows), layout.number))
+        growths = growths_placed(a, [d.growths for d in tangents])
+        self.growths = runtime.upload(layout.pack(growths), layout.number)
         vectors = dict(
             rest=[d.rest for d in tangents],
             anchor=[np.zeros((1, 3)) if d.motion is None else d.displacement[a.held] for d in tangents],

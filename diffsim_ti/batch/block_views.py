@@ -61,10 +61,14 @@ class BlockViews:
         lanes = dict.fromkeys(("coefficients", "parameters", "corner"), "blocks") | OF_STEPS
         topology = dict.fromkeys(("tets", "force_slot", "motion_slot", "special"), "ints")
         further = self.further.arrays | self.alone | (dict(vertex_of_corner="ints") if self.further.any else {})
-        return topology | kinds | lanes | further
+        return topology | kinds | lanes | further | self.growing
 
     def table(self) -> dict:
         return TABLE | (dict(floats="blocks") if "table" in self.own else {})
+
+    @property
+    def growing(self) -> dict:
+        return dict(growths="blocks2") if self.features.growing else {}
 
     def with_state(self, arrays: dict) -> dict:
         return arrays | dict(z="blocks2") if self.law.state_names else arrays
@@ -76,16 +80,22 @@ class BlockViews:
         return Item(e, b, let(3 * b * plan.num_vertices), let(b * plan.num_tetrahedra))
 
     @traced
-    def tetrahedra_of(self, scene, corner):
-        """The scene for functions of tetrahedra."""
+    def tetrahedra_of(self, scene, corner, now):
+        """The scene in a pass, for functions of tetrahedra."""
         coefficients = Uniform(scene.coefficients) if self.features.uniform else scene.coefficients
         shape = {n: getattr(scene, n) if n in self.own else Shared(getattr(scene, n)) for n in ("gradients", "volumes")}
-        return Bundle(tets=scene.tets, coefficients=coefficients, corner=Corners(corner, scene.tets), **shape)
+        own = dict(coefficients=coefficients, corner=Corners(corner, scene.tets)) | self.growth_of(scene, now)
+        return Bundle(tets=scene.tets, **own, **shape)
+
+    @traced
+    def growth_of(self, record, now) -> dict:
+        """What tetrahedra that grow read."""
+        return dict(growths=record.growths, now=now) if self.features.growing else {}
 
     @traced
     def of_tetrahedra(self, scene, adjoint):
         """Adjoints that functions of tetrahedra add to."""
-        names = ("coefficients", "gradients", "volumes", *(("z",) if self.law.state_names else ()))
+        names = "coefficients", "gradients", "volumes", *self.with_state({}), *self.growing
         corner = Corners(adjoint.rate_corner, scene.tets)
         return Bundle(rate_corner=corner, **{name: getattr(adjoint, name) for name in names})
 
@@ -157,10 +167,11 @@ class BlockViews:
         return pass_at(table, k, let(b * plan.num_passes_shown + k) if "table" in self.own else None)
 
     @traced
-    def changed_of(self, tangent):
+    def changed_of(self, tangent, now):
         """Changes of what functions of tetrahedra read."""
-        coefficients = Uniform(tangent.coefficients) if self.features.uniform else tangent.coefficients
-        return Bundle(coefficients=coefficients, gradients=tangent.gradients, volumes=tangent.volumes)
+        own = dict(coefficients=Uniform(tangent.coefficients) if self.features.uniform else tangent.coefficients)
+        own |= self.growth_of(tangent, now)
+        return Bundle(gradients=tangent.gradients, volumes=tangent.volumes, **own)
 
     @traced
     def rated(self, b, lane, tangent, plan):

@@ -75,20 +75,26 @@ class InnermostKernels(ExplicitKernels):
         return Bundle(**self.columns(record, vars(record), b, plan))
 
     @traced
-    def tetrahedra_of(self, scene):
-        """The scenes for functions of tetrahedra."""
+    def tetrahedra_of(self, b, j, scene, table, plan):
+        """The scenes in pass j, as scene b has it, for functions of tetrahedra."""
         shape = {n: getattr(scene, n) if n in self.own else Shared(getattr(scene, n)) for n in ("gradients", "volumes")}
-        return Bundle(tets=scene.tets, **self.coefficients_of(scene), **shape)
+        return Bundle(tets=scene.tets, **self.coefficients_of(b, j, scene, table, plan), **shape)
 
     @traced
-    def coefficients_of(self, record) -> dict:
-        uniform = self.vertex.features.uniform
-        return dict(coefficients=Uniform(record.coefficients) if uniform else record.coefficients)
+    def coefficients_of(self, b, j, record, table, plan) -> dict:
+        out = dict(coefficients=Uniform(record.coefficients) if self.vertex.features.uniform else record.coefficients)
+        if self.vertex.features.growing:
+            out |= dict(growths=record.growths, now=self.pass_of_scene(b, j, table, plan))
+        return out
 
     @traced
-    def changed(self, tangent):
+    def changed(self, b, j, tangent, table, plan):
         """Changes of what functions of tetrahedra read."""
-        return Bundle(**{**vars(tangent), **self.coefficients_of(tangent)})
+        return Bundle(**{**vars(tangent), **self.coefficients_of(b, j, tangent, table, plan)})
+
+    @property
+    def growing(self) -> dict:
+        return dict(growths="scalars2") if self.vertex.features.growing else {}
 
     @traced
     def item(self, t, plan):
@@ -126,7 +132,8 @@ class InnermostKernels(ExplicitKernels):
 
     @ti.func
     def tetrahedron(self, t, j, scene: A, state: A, table: A, plan: A):
-        item, s, of = self.item(t, plan), (j - plan.base) * plan.stride, self.tetrahedra_of(scene)
+        item, s = self.item(t, plan), (j - plan.base) * plan.stride
+        of = self.tetrahedra_of(item.b, j, scene, table, plan)
         self.element.forces(item, of, state, s, scene.corner)
         if ti.static(self.element.has_state):
             now = self.pass_of_scene(item.b, j, table, plan)
@@ -173,7 +180,7 @@ class InnermostKernels(ExplicitKernels):
     @ti.func
     def tetrahedron_jvp(self, t, j, scene: A, state: A, tangent: A, table: A, plan: A):
         item, s = self.item(t, plan), j - plan.base
-        of, dots = self.tetrahedra_of(scene), self.changed(tangent)
+        of, dots = self.tetrahedra_of(item.b, j, scene, table, plan), self.changed(item.b, j, tangent, table, plan)
         self.element.forces_jvp(item, of, state, s, tangent, scene.corner, dots)
         if ti.static(self.element.has_state):
             now = self.pass_of_scene(item.b, j, table, plan)
@@ -225,7 +232,7 @@ class InnermostKernels(ExplicitKernels):
     @cached_property
     def step_jvp(self) -> Kernel:
         """The tangent of these passes along recorded slots; the change of the state is advanced in place."""
-        tangent = self.with_state(CHANGE) | CHANGED | OF_STEPS | dict(rest="vectors") | self.alone
+        tangent = self.with_state(CHANGE) | CHANGED | OF_STEPS | dict(rest="vectors") | self.alone | self.growing
         own = dict(state=self.with_state(STATE), tangent=tangent)
         return self._kernel("step_jvp", self.passes_jvp, own, self.repeated)
 
@@ -233,7 +240,8 @@ class InnermostKernels(ExplicitKernels):
 
     @ti.func
     def tetrahedron_vjp(self, t, j, scene: A, state: A, adjoint: A, table: A, plan: A):
-        item, s, of = self.item(t, plan), j - plan.base, self.tetrahedra_of(scene)
+        item, s = self.item(t, plan), j - plan.base
+        of = self.tetrahedra_of(item.b, j, scene, table, plan)
         if ti.static(self.element.has_state):
             on = self.onwards(self.pass_of_scene_back(item.b, j, table, plan))
             self.element.move_on_vjp(item, of, state, s, on, adjoint.corner, adjoint, self.vertex.features.shape)
@@ -284,7 +292,7 @@ class InnermostKernels(ExplicitKernels):
     def step_vjp(self) -> Kernel:
         """The adjoint of passes first + count - 1 .. first; numbers as of a single scene (explicit/kernels.py)."""
         numbers = dict.fromkeys(("num_passes", "halt", "kick", "steps", "num_parts"), "int")
-        adjoint = self.with_state(CHANGE) | ADJOINT | OF_STEPS | self.further.adjoint
+        adjoint = self.with_state(CHANGE) | ADJOINT | OF_STEPS | self.further.adjoint | self.growing
         arrays = dict(state=self.with_state(STATE), adjoint=adjoint)
         return self._kernel("step_vjp", self.passes_vjp, arrays, self.repeated, **numbers)
 
@@ -310,7 +318,7 @@ class InnermostKernels(ExplicitKernels):
         return arrays | dict(z="scalars2") if self.vertex.law.state_names else arrays
 
     def _kernel(self, name: str, body, arrays: dict, repeated: bool, **numbers) -> Kernel:
-        arrays = dict(scene=SCENE | OF_STEPS | self.further.arrays) | arrays | dict(table=PLAN)
+        arrays = dict(scene=SCENE | OF_STEPS | self.further.arrays | self.growing) | arrays | dict(table=PLAN)
         numbers = NUMBERS | numbers | self.further.counts
         if repeated:
             arrays["table"], numbers = PLAN | TURNS, numbers | dict(times="int")

@@ -53,7 +53,7 @@ class BatchKernels(BlockViews):
     @ti.func
     def one_pass(self, b, j, scene: A, state: A, table: A, plan: A):
         s, now = (j - plan.base) * plan.stride, self.pass_of(b, j, table, plan)
-        tetrahedra, sums = self.tetrahedra_of(scene, scene.corner), self.element.room_for_sums()
+        tetrahedra, sums = self.tetrahedra_of(scene, scene.corner, now), self.element.room_for_sums()
         for e in range(plan.num_tetrahedra):
             item = self.item(e, b, plan)
             self.element.sum_up(item, sums, tetrahedra, state, s)
@@ -93,7 +93,7 @@ class BatchKernels(BlockViews):
     @ti.func
     def one_pass_jvp(self, b, j, scene: A, state: A, tangent: A, table: A, plan: A):
         s, now = j - plan.base, self.pass_of(b, j, table, plan)
-        tetrahedra, changed = self.tetrahedra_of(scene, scene.corner), self.changed_of(tangent)
+        tetrahedra, changed = self.tetrahedra_of(scene, scene.corner, now), self.changed_of(tangent, now)
         sums = self.element.room_for_sums()
         for e in range(plan.num_tetrahedra):
             item = self.item(e, b, plan)
@@ -130,7 +130,7 @@ class BatchKernels(BlockViews):
     @cached_property
     def step_jvp(self) -> Kernel:
         """The tangent of these passes along recorded slots; the change of the state is advanced in place."""
-        tangent = self.with_state(CHANGE) | CHANGED | OF_STEPS | self.alone
+        tangent = self.with_state(CHANGE) | CHANGED | OF_STEPS | self.alone | self.growing
         return self._kernel("step_jvp", self.passes_jvp, dict(state=self.with_state(STATE), tangent=tangent))
 
     # ---- adjoint -----------------------------------------------------------------------------------------------------
@@ -164,8 +164,8 @@ class BatchKernels(BlockViews):
             self.free.clear(b, i, adjoint.corner, plan)
             if ti.static(self.vertex.reads_rates):
                 self.free.clear(b, i, adjoint.rate_corner, plan)
-        tetrahedra, by_tetrahedra = self.tetrahedra_of(scene, adjoint.corner), self.of_tetrahedra(scene, adjoint)
-        sums = self.element.room_for_sums()
+        tetrahedra = self.tetrahedra_of(scene, adjoint.corner, self.pass_of(b, j, table, plan))
+        by_tetrahedra, sums = self.of_tetrahedra(scene, adjoint), self.element.room_for_sums()
         for e in range(plan.num_tetrahedra):
             item, corner = self.item(e, b, plan), tetrahedra.corner
             self.element.sum_up(item, sums, tetrahedra, state, s, adjoint.w)
@@ -189,7 +189,7 @@ class BatchKernels(BlockViews):
     def step_vjp(self) -> Kernel:
         """The adjoint of passes first + count - 1 .. first; numbers as of a single scene (explicit/kernels.py)."""
         numbers = dict.fromkeys(("num_passes", "halt", "kick", "steps", "num_parts"), "int")
-        adjoint = self.with_state(CHANGE) | ADJOINT | OF_STEPS | in_blocks(self.further.adjoint)
+        adjoint = self.with_state(CHANGE) | ADJOINT | OF_STEPS | in_blocks(self.further.adjoint) | self.growing
         arrays = dict(state=self.with_state(STATE), adjoint=adjoint)
         return self._kernel("step_vjp", self.passes_vjp, arrays, **numbers)
 

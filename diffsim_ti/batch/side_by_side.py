@@ -16,7 +16,7 @@ def why_not(solver) -> str | None:
         return f"the law of {type(scene.material).__name__} does not come in lanes"
     terms = dict(self_contact=scene.term(SelfContact), chambers=scene.chambers)
     terms |= dict(contact_within_faces=feels_faces(scene), mesh_obstacles=_tables(scene))
-    terms |= dict(unequal_steps=solver.schedule.varies, growth_over_time=scene.growing, reduced_sets=scene.reduced)
+    terms |= dict(unequal_steps=solver.schedule.varies, reduced_sets=scene.reduced)
     there = [name.replace("_", " ") for name, some in terms.items() if some]
     return f"it has {' and '.join(there)}" if there else None
 
@@ -33,3 +33,13 @@ def placed(arrays, name: str, x: np.ndarray) -> np.ndarray:
         return x
     rows = x[arrays.order]
     return rows * arrays.alone.reshape(-1, *[1] * (x.ndim - 1)) if name == "volumes" else rows
+
+
+def growths_placed(arrays, growths: list[np.ndarray | None]) -> np.ndarray:
+    """Growths of scenes, (rows, 2, 1 or num_tetrahedra) each, as (scenes, rows, 2 places): beginning and end of a step of
+    each tetrahedron in turn. Zeros of one place where none grows over time."""
+    if growths[0] is None:
+        return np.zeros((len(growths), 1, 2))
+    whole = np.stack([np.broadcast_to(x, (*x.shape[:2], arrays.num_tetrahedra)) for x in growths])
+    each = whole if isinstance(arrays.place, slice) else whole[..., arrays.order]
+    return np.swapaxes(each, 2, 3).reshape(*whole.shape[:2], -1)

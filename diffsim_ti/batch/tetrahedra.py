@@ -102,9 +102,14 @@ class PatchOfScenes(TetrahedronOfScenes, PatchedTetrahedron):
 
 def element_of_eight(law, features) -> TetrahedronOfEight:
     kind = PatchOfEight if isinstance(law, PatchLaw) else TetrahedronOfEight
-    return kind(law, features.uniform, True, features.order)
+    return kind(law, features.uniform, True, features.order, _growth(features))
 
 
 def element_of_scenes(law, features) -> TetrahedronOfScenes:
     kind = PatchOfScenes if isinstance(law, PatchLaw) else TetrahedronOfScenes
-    return kind(law, features.uniform, False, features.order)
+    return kind(law, features.uniform, False, features.order, _growth(features))
+
+
+def _growth(features) -> tuple | None:
+    """As Tetrahedron has it; each tetrahedron of each scene has its own."""
+    return (features.growth_per_step, False) if features.growing else None

@@ -16,7 +16,7 @@ from diffsim_ti.batch.history import BatchHistory
 from diffsim_ti.batch.innermost_kernels import InnermostKernels, innermost_kernels
 from diffsim_ti.batch.kernels import BatchKernels, batch_kernels
 from diffsim_ti.batch.layouts import Innermost, Lanes, in_slots
-from diffsim_ti.batch.side_by_side import placed
+from diffsim_ti.batch.side_by_side import growths_placed, placed
 from diffsim_ti.batch.table import ScenesTable
 from diffsim_ti.inputs import Derived
 from diffsim_ti.solvers.explicit.contact_stage import ROWS
@@ -135,12 +135,13 @@ class BatchWorkspace:
         for name in ("tie_segments", "foundation"):
             own = [_NONE[0] if x is None else x for x in each(name)]
             out[name], self.counts[name] = (tuple(own), partial(self._packed, own, "vectors")), len(own[0])
+        growths = each("growths")
+        out["growths"] = growths, lambda: (self.layout.pack(growths_placed(a, growths)), self.layout.number)
         self.num_step_rows = max((len(x) for x in (first.path, first.motion) if x is not None), default=1)
         has = a.features()
-        if self.num_step_rows == 1 and (
-            has.forces_keyed or has.pressed or has.tied
-        ):  # they ask in which step a pass lies
-            given = (x for d in derived for x in (d.forces, d.follower, d.ties) if x is not None)
+        asked = has.forces_keyed or has.pressed or has.tied or has.growing  # in which step a pass lies
+        if self.num_step_rows == 1 and asked:
+            given = (x for d in derived for x in (d.forces, d.follower, d.ties, d.growths) if x is not None)
             self.num_step_rows = max(1 + len(x) for x in given)
         return out
 
