@@ -1,11 +1,14 @@
 """Substeps for each step of a run, found by running it once and looking at the error of each step."""
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from diffsim_ti.checked import instance, number, shown, whole
+from diffsim_ti.checked import as_numbers, instance, number, shown, whole
 from diffsim_ti.mesh.sets import pieces
+from diffsim_ti.scene import Scene
 from diffsim_ti.simulator import Simulator
 from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.state.schedule import UnequalSteps
@@ -16,7 +19,9 @@ MOST = 4096  # substeps of a step
 LEVELS = 65  # from which that between fine and coarse steps is chosen
 
 
-def adaptive_steps(solver: Solver, steps: int, tolerance: float, of: str = "vertices") -> UnequalSteps:
+def adaptive_steps(
+    solver: Solver, steps: int, tolerance: float, of: str = "vertices", values: Mapping[str, ArrayLike] | None = None
+) -> UnequalSteps:
     """`steps` steps of solver.dt, each in as many substeps as keep the run's error of positions near `tolerance` [m].
 
     A run from the scene's start takes each step twice, in n and in 2 n substeps. From the differences of both in the
@@ -39,6 +44,9 @@ def adaptive_steps(solver: Solver, steps: int, tolerance: float, of: str = "vert
 
         rollout = ds.Rollout(solver, ds.adaptive_steps(solver, steps=40, tolerance=1e-3))
 
+    values: of the scenes of a `Batch`, inputs with their axis in front, {"youngs_modulus": [1e4, 2e4]}. Each is run, one
+    after the other, and a step has the substeps of the scene that needs most.
+
     Raises ValueError for a solver without time, for another `of`, and for a tolerance that is not > 0 or that 4096 substeps
     of a step do not meet.
     Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, II.4, doi:10.1007/978-3-540-78862-1.
@@ -49,12 +57,30 @@ def adaptive_steps(solver: Solver, steps: int, tolerance: float, of: str = "vert
     tolerance, steps = number("tolerance", tolerance, unit="m"), whole("steps", steps, 1)
     if of not in ("vertices", "bodies"):
         raise ValueError(f'of must be "vertices" or "bodies", got {shown(of)}')
-    search = _Search(solver, steps, tolerance, of == "bodies")
+    found = [_substeps(solver, scene, steps, tolerance, of == "bodies") for scene in _scenes(solver.scene, values)]
+    return UnequalSteps(np.full(steps, solver.dt), np.max(found, 0))
+
+
+def _scenes(scene: Scene, values: Mapping[str, ArrayLike] | None) -> list[Scene]:
+    """The scene, or those of a batch."""
+    if not values:
+        return [scene]
+    own = {name: as_numbers(name, x) for name, x in values.items()}
+    lengths = {name: len(x) if x.ndim else 0 for name, x in own.items()}
+    if min(lengths.values()) == 0 or len(set(lengths.values())) > 1:
+        said = ", ".join(f"{name} {x.shape}" for name, x in own.items())
+        raise ValueError(f"values: expected arrays with one axis of scenes in front, got shapes {said}")
+    return [scene.with_values({name: x[b] for name, x in own.items()}) for b in range(next(iter(lengths.values())))]
+
+
+def _substeps(solver: Solver, scene: Scene, steps: int, tolerance: float, by_body: bool) -> np.ndarray:
+    """Those of each step of one scene."""
+    search = _Search(solver, scene, steps, tolerance, by_body)
     constants, fewest = (np.array(column) for column in zip(*(search.advance() for _ in range(steps))))
     substeps = _smooth(_shared(constants, fewest, tolerance, solver.order))
     if substeps.max() > MOST:
         raise search.too_fine(int(np.argmax(substeps)))
-    return UnequalSteps(np.full(steps, solver.dt), substeps)
+    return substeps
 
 
 def _shared(constants: np.ndarray, fewest: np.ndarray, tolerance: float, order: int) -> np.ndarray:
@@ -106,17 +132,14 @@ class _Search:
     fewest: substeps of a step that stability asks for.
     """
 
-    def __init__(self, solver: Solver, steps: int, tolerance: float, by_body: bool):
+    def __init__(self, solver: Solver, scene: Scene, steps: int, tolerance: float, by_body: bool):
         options = {name: getattr(solver, name) for name in solver.arguments}
-        if solver.explicit:
-            options["check_start"] = False
-            self.fewest = math.ceil(solver.dt / (SHARE * solver.stable_dt(tight=True).dt))
-        else:
-            self.fewest = 1
-        self.simulator = Simulator(type(solver)(solver.scene, **options))
+        own = type(solver)(scene, **options | (dict(check_start=False) if solver.explicit else {}))
+        self.fewest = math.ceil(own.dt / (SHARE * own.stable_dt(tight=True).dt)) if own.explicit else 1
+        self.simulator = Simulator(own)
         self.start = self.simulator.workspace.history(1)
         self.mass, self.by_body = self.simulator.workspace.arrays.values.mass, by_body
-        self.body = pieces(solver.scene.mesh)
+        self.body = pieces(scene.mesh)
         self.steps, self.allowed, self.last = steps, tolerance / (steps * self.fewest), self.fewest
 
     def advance(self) -> tuple[float, int]:

@@ -187,6 +187,27 @@ def test_the_search_puts_substeps_where_the_impact_is(solver):
     assert ds.Rollout(plain, finer).forward().contact_resolution.substep <= 4e-3
 
 
+def test_a_batch_takes_the_steps_of_the_scene_that_needs_most():
+    solver = ds.VelocityVerletSolver(falling(), dt=4e-3, check_start=False)
+    values = dict(youngs_modulus=[1e5, 2e5, 5e4], initial_velocities=np.zeros((3, solver.scene.mesh.num_vertices, 3)))
+    values["initial_velocities"][:, :, 1] = np.array([-1.0, -0.5, -1.5])[:, None]
+    each = []
+    for b in range(3):
+        own = solver.scene.with_values({name: x[b] for name, x in values.items()})
+        each.append(ds.adaptive_steps(ds.VelocityVerletSolver(own, dt=4e-3, check_start=False), 15, 1e-3).substeps)
+    shared = ds.adaptive_steps(solver, 15, 1e-3, values=values)
+    assert np.array_equal(shared.substeps, np.max(each, 0)) and len({tuple(x) for x in each}) == 3
+    batch = ds.Batch(solver, shared, 3)
+    frames = batch.forward(**values)
+    assert frames.alive.all() and batch.lanes
+    alone = batch.one.forward(**{name: np.asarray(x)[2] for name, x in values.items()})
+    assert np.array_equal(frames.displacements[2], alone.displacements)
+    with pytest.raises(
+        ValueError, match=r"one axis of scenes in front, got shapes youngs_modulus \(3,\), density \(2,\)"
+    ):
+        ds.adaptive_steps(solver, 15, 1e-3, values=dict(youngs_modulus=[1e5] * 3, density=[1e3] * 2))
+
+
 def test_what_bodies_do_between_impacts_needs_no_fine_steps(monkeypatch):
     """Two sizes of steps, and what lies between them as they change; a search of at most three runs of what it finds."""
     solver, passes = ds.VelocityVerletSolver(falling(), dt=4e-3, check_start=False), []

@@ -16,7 +16,7 @@ def why_not(solver) -> str | None:
         return f"the law of {type(scene.material).__name__} does not come in lanes"
     terms = dict(self_contact=scene.term(SelfContact), chambers=scene.chambers)
     terms |= dict(contact_within_faces=feels_faces(scene), mesh_obstacles=_tables(scene))
-    terms |= dict(unequal_steps=solver.schedule.varies, reduced_sets=scene.reduced)
+    terms |= dict(reduced_sets=scene.reduced)
     there = [name.replace("_", " ") for name, some in terms.items() if some]
     return f"it has {' and '.join(there)}" if there else None
 

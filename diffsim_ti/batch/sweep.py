@@ -11,7 +11,7 @@ from diffsim_ti.inputs import Derived
 from diffsim_ti.rollout.checkpoints import choose_checkpoints
 from diffsim_ti.rollout.run import Run
 from diffsim_ti.rollout.sweep import Sweep
-from diffsim_ti.state.watch import ContactResolution, ContactWatch, limits
+from diffsim_ti.state.watch import ContactResolution, ContactWatch, limits, worst
 
 
 class Own(tuple):
@@ -40,6 +40,15 @@ class FrameByFrame:
         self.crossed: dict[int, int] = {}  # {scene: pass before which it was seen}
 
     def advance(self, first: int, last: int, num_passes: int, save_every: int = 0, recording: bool = False) -> None:
+        schedule = self.ws.solver.schedule
+        for begin, end in schedule.stretches(first, last):
+            self.ws.substep = float(schedule.length(begin))
+            self._advance(begin, end, num_passes, save_every, recording)
+            if schedule.varies:
+                self.ws.close(self.ws.substep)
+
+    def _advance(self, first: int, last: int, num_passes: int, save_every: int, recording: bool) -> None:
+        """The same where all passes have one length."""
         ws, contacts = self.ws, bool(self.ws.arrays.contacts)
         if recording:
             ws.save(ws.record, first)
@@ -47,8 +56,10 @@ class FrameByFrame:
             stop = last
             if contacts:
                 schedule = ws.solver.schedule
-                step = int(schedule.row(first))
-                stop = min(last, int(schedule.first((step // max(save_every, 1) + 1) * max(save_every, 1))))
+                every = max(save_every, 1)
+                frame = (int(schedule.row(first)) // every + 1) * every
+                if frame <= int(schedule.row(num_passes - 1)):
+                    stop = min(last, int(schedule.first(frame)))
                 stop = max(stop, first + 1)
             ws.advance(first, stop, num_passes, save_every, 0 if recording else None)
             if contacts:
@@ -114,9 +125,14 @@ class BatchSweep(Sweep):
 
     def resolutions(self) -> Callable[[int], ContactResolution]:
         """What contacts of scene b did in the last run, worked out when it is asked for."""
-        ws, seen, derived = self.workspace, self.workspace.seen(), self.workspace.derived
-        watch, largest, h = ContactWatch(ws), limits(self.solver), ws.substep
-        return lambda b: watch.resolution_of(seen[b], derived[b], h, largest)
+        ws, derived = self.workspace, self.workspace.derived
+        watch, largest, parts = ContactWatch(ws), limits(self.solver), [*ws.parts, (ws.seen(), ws.substep)]
+
+        def of(b: int) -> ContactResolution:
+            seen = [watch.resolution_of(rows[b], derived[b], h, largest) for rows, h in parts]
+            return worst(seen) if watch.contacts else seen[-1]
+
+        return of
 
     def pull_back(self, run: Run, positions_adj: np.ndarray, velocities_adj: np.ndarray) -> Derived:
         """Adjoints, from those of the frames, of what kernels read at the start; the scenes are their first axis."""

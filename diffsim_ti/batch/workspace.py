@@ -225,9 +225,20 @@ class BatchWorkspace:
             runtime.fill(target, self.layout.pack_vectors(starts[:, None]))
         if self.state.z is not None:
             runtime.fill(self.state.z, self.initial_states())
+        self.parts: list[tuple[np.ndarray, float]] = []  # what was seen in passes of other lengths, and these [s]
+        self._clear_seen()
+
+    def _clear_seen(self) -> None:
         seen = np.zeros(runtime.full_shape(self.met.seen))
         seen[::3] = np.inf
         runtime.fill(self.met.seen, seen)
+
+    def close(self, h: float) -> None:
+        """Passes of length h [s] are over: keep what was seen in them apart from what is seen next."""
+        rows = self.seen()
+        if np.isfinite(rows[:, ::3]).any():
+            self.parts.append((rows, h))
+            self._clear_seen()
 
     def make_frames(self, count: int) -> None:
         self.frames = self.room_for_frames(count)
