@@ -112,10 +112,11 @@ class InnermostKernels(ExplicitKernels):
         return let(plan.num_items + one * plan.num_scenes) if self.further.any else plan.num_items
 
     @traced
-    def further_of(self, t, plan) -> tuple:
-        """(item of what else acts on bodies, its scene)"""
-        k = let(t - plan.num_items)
-        return let(k // plan.num_scenes), let(k % plan.num_scenes)
+    def acting(self, t, j, scene, state, table, plan) -> tuple:
+        """(item of what else acts on bodies, its scene's number, pass, scene and state)"""
+        k, b = let((t - plan.num_items) // plan.num_scenes), let((t - plan.num_items) % plan.num_scenes)
+        now, own = self.pass_of_scene(b, j, table, plan), self.scene_of(b, scene, plan)
+        return k, b, now, own, self.record_of(b, state, plan)
 
     @traced
     def pass_of_scene(self, b, j, table, plan):
@@ -141,9 +142,8 @@ class InnermostKernels(ExplicitKernels):
 
     @ti.func
     def act(self, t, j, scene: A, state: A, table: A, plan: A):
-        k, b = self.further_of(t, plan)
-        now, s = self.pass_of_scene(b, j, table, plan), (j - plan.base) * plan.stride
-        self.further.forces(k, now, self.scene_of(b, scene, plan), self.record_of(b, state, plan), s, plan)
+        k, b, now, own, at_ = self.acting(t, j, scene, state, table, plan)
+        self.further.forces(k, now, own, at_, (j - plan.base) * plan.stride, plan)
 
     @ti.func
     def vertex_step(self, t, j, scene: A, state: A, table: A, plan: A):
@@ -188,12 +188,7 @@ class InnermostKernels(ExplicitKernels):
 
     @ti.func
     def act_jvp(self, t, j, scene: A, state: A, tangent: A, table: A, plan: A):
-        k, b = self.further_of(t, plan)
-        now, own, at_ = (
-            self.pass_of_scene(b, j, table, plan),
-            self.scene_of(b, scene, plan),
-            self.record_of(b, state, plan),
-        )
+        k, b, now, own, at_ = self.acting(t, j, scene, state, table, plan)
         self.further.forces_jvp(k, now, own, at_, j - plan.base, self.record_of(b, tangent, plan), plan)
 
     @ti.func
@@ -251,12 +246,7 @@ class InnermostKernels(ExplicitKernels):
 
     @ti.func
     def act_vjp(self, t, j, scene: A, state: A, adjoint: A, table: A, plan: A):
-        k, b = self.further_of(t, plan)
-        now, own, at_ = (
-            self.pass_of_scene(b, j, table, plan),
-            self.scene_of(b, scene, plan),
-            self.record_of(b, state, plan),
-        )
+        k, b, now, own, at_ = self.acting(t, j, scene, state, table, plan)
         self.further.forces_vjp(k, now, own, at_, j - plan.base, self.record_of(b, adjoint, plan), plan)
 
     @ti.func
