@@ -37,6 +37,8 @@ class Paths:
     @classmethod
     def joined(cls, parts: Sequence["Paths"]) -> "Paths":
         """Those of several, one after the other."""
+        if len(parts) == 1:
+            return parts[0]
         return cls.of([path for part in parts for path in part.points()])
 
     def points(self) -> list[list[tuple[np.ndarray, np.ndarray]]]:

@@ -115,7 +115,7 @@ class Muscle(Cable):
         q = mesh.reference.num_points
         return (self.groups(mesh)[0][:, None] * q + np.arange(q)).ravel()
 
-    def paths(self, mesh: TetrahedralMesh) -> Paths:
+    def found_paths(self, mesh: TetrahedralMesh) -> Paths:
         """At each point of the stresses from a point at rest in the origin to h F a, a sum of places whose weights add up to
         zero: half the work of a path from one point of the fibre to another."""
         reference, (chosen, _) = mesh.reference, self.groups(mesh)

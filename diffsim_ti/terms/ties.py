@@ -52,8 +52,16 @@ class Tie(Term):
     one_sided = False  # whether it pulls only
     by_tension = False  # whether it pulls with a tension that is given, however long it is
 
+    _found: tuple[TetrahedralMesh, Paths] | None = None
+
     def paths(self, mesh: TetrahedralMesh) -> Paths:
-        """Where its ties run."""
+        """Where its ties run, found once."""
+        if self._found is None or self._found[0] is not mesh:
+            self._found = mesh, self.found_paths(mesh)
+        return self._found[1]
+
+    def found_paths(self, mesh: TetrahedralMesh) -> Paths:
+        """Where its ties run; ValueError for what does not fit the mesh."""
         raise NotImplementedError
 
     def check(self, mesh: TetrahedralMesh) -> None:
@@ -84,8 +92,7 @@ class Tie(Term):
         return [*out, TieRows(paths, segments, f"{own} rows", self._named(names, "stiffness"), **made)]
 
     def sizes(self, mesh):
-        anchors = next((len(np.atleast_2d(i.value)) for i in self.described if i.name == "anchors"), 0)
-        return {"k": len(self.paths(mesh)), "anchors": anchors}
+        return {"anchors": len(np.atleast_2d(i.value)) for i in self.described if i.name == "anchors"}
 
     def _named(self, names: dict[str, str], part: str) -> str | None:
         """Name in the scene of what gives a part of it."""
@@ -182,7 +189,10 @@ class Spring(Tie):
 
     parts = {"length": "rest_length"}
 
-    def paths(self, mesh: TetrahedralMesh) -> Paths:
+    def sizes(self, mesh):
+        return super().sizes(mesh) | {"k": len(self.paths(mesh))}
+
+    def found_paths(self, mesh: TetrahedralMesh) -> Paths:
         start, end = (_points(mesh, points, "Spring") for points in (self.start, self.end))
         count = max(len(start), len(end))
         if count == 0 or any(len(points) not in (1, count) for points in (start, end)):
@@ -250,7 +260,7 @@ class Cable(Tie):
         """Its tension or length at each time [s], where it is keyed."""
         return rows_at(f"Cable: {self.plain}", self.given, times, ())
 
-    def paths(self, mesh: TetrahedralMesh) -> Paths:
+    def found_paths(self, mesh: TetrahedralMesh) -> Paths:
         points, places = [], []
         for given in self.points:
             own = _points(mesh, given, "Cable")
