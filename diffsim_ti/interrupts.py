@@ -16,7 +16,7 @@ from os import _exit as end_process  # at once
 _is_command = os.path.basename(sys.argv[0] if sys.argv else "").startswith("diffsim-ti") or (
     sys.argv[:1] == ["-m"] and "diffsim_ti" in getattr(sys, "orig_argv", ())
 )
-_seen = {"interrupted": False}
+_seen = {"interrupted": False, "ended": False}
 
 
 def guard_import() -> None:
@@ -27,7 +27,7 @@ def guard_import() -> None:
 
 def commands_may_run() -> None:
     """From now on the signal raises KeyboardInterrupt."""
-    _seen["interrupted"] = False
+    _seen.update(interrupted=False, ended=False)
     if _is_command and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # of jobs in the background
         signal.signal(signal.SIGINT, _raise)
         sys.unraisablehook = _raise_again
@@ -35,9 +35,13 @@ def commands_may_run() -> None:
 
 def command_ended() -> bool:
     """Whether the signal came since `commands_may_run`, even if something swallowed it. From now on it does nothing."""
-    while _is_command and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+    _seen["ended"] = True
+    while _is_command:
         with contextlib.suppress(KeyboardInterrupt):  # of a signal that came just before
+            if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+                break
             signal.signal(signal.SIGINT, signal.SIG_IGN)
+    exec("pass")  # Python notes an interrupt within exec of text (dataclasses), and would end by it what has caught it
     return _seen["interrupted"]
 
 
@@ -54,7 +58,8 @@ def _end(*_) -> None:
 
 def _raise(*_) -> None:
     _seen["interrupted"] = True
-    raise KeyboardInterrupt
+    if not _seen["ended"]:
+        raise KeyboardInterrupt
 
 
 def _raise_again(unraisable) -> None:

@@ -160,6 +160,63 @@ def test_a_signal_just_before_a_command_has_ended_is_no_traceback(monkeypatch):
         taken(signal.SIGINT, kept)
 
 
+ENDS_WITHIN_EXEC = """
+import sys
+sys.argv = ["diffsim-ti", "x"]
+from diffsim_ti import interrupts
+
+interrupts.commands_may_run()
+try:
+    exec("import os, signal; os.kill(os.getpid(), signal.SIGINT); [None for _ in range(10**6)]")
+except KeyboardInterrupt:
+    interrupts.command_ended()
+    sys.exit(130)
+"""
+
+
+def test_a_signal_while_text_is_executed_ends_by_the_exit_code_too(tmp_path):
+    """As while a dataclass is made, of a command that runs as a module."""
+    (tmp_path / "ends.py").write_text(ENDS_WITHIN_EXEC)
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
+    reset = lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)  # noqa: E731
+    run = [sys.executable, "-m", "ends"]
+    assert subprocess.run(run, env=environment, preexec_fn=reset).returncode == 130
+
+
+def test_a_signal_at_any_line_of_a_command_is_exit_code_130(monkeypatch, capsys):
+    """Of what begins and ends a command; what happens within is another matter (above)."""
+    from diffsim_ti.cli import app
+
+    now = [signal.default_int_handler]
+    monkeypatch.setattr(interrupts, "_is_command", True)
+    monkeypatch.setattr(interrupts.signal, "getsignal", lambda _: now[0])
+    monkeypatch.setattr(interrupts.signal, "signal", lambda _, handler: now.__setitem__(0, handler))
+    lines, wanted = [0], [0]
+
+    def watch(frame, event, _):
+        if frame.f_code.co_name in ("main", "_ran", "command_ended") and "diffsim_ti" in frame.f_code.co_filename:
+            if event == "line" and now[0] is interrupts._raise:
+                lines[0] += 1
+                if lines[0] == wanted[0]:
+                    interrupts._raise()
+            return watch
+
+    codes, before = [], sys.gettrace()
+    for wanted[0] in range(1, 100):
+        lines[0], now[0] = 0, signal.default_int_handler
+        sys.settrace(watch)
+        try:
+            app.main(["simulate", "no.msh"])
+        except SystemExit as end:
+            codes.append(end.code)
+        finally:
+            sys.settrace(before)
+        if lines[0] < wanted[0]:
+            break
+    assert len(codes) > 8 and codes[-1] == 2 and set(codes[:-1]) == {130}
+    assert "Traceback" not in capsys.readouterr().err
+
+
 # ---- threads, restarts of Taichi, copies ------------------------------------------------------------------------------
 
 IN_THREADS = """

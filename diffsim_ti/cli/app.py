@@ -63,6 +63,18 @@ def options(
 def main(arguments: list[str] | None = None) -> None:
     """Run a command and exit: 0 done, 2 an error, 130 interrupted."""
     arguments = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
+    try:
+        said, code = _ran(arguments)
+    except KeyboardInterrupt:  # of a signal that came just as the command ended
+        interrupts.command_ended()
+        said, code = "interrupted", 130
+    if code in (2, 130):
+        print("error: " + " ".join(said.split()), file=sys.stderr)
+    sys.exit(code)
+
+
+def _ran(arguments: list[str]) -> tuple[str, int]:
+    """(what to say, exit code) of a command."""
     wants_traceback = "--traceback" in arguments  # wherever it stands
     with warnings.catch_warnings():
         warnings.simplefilter("default", UserWarning)
@@ -85,10 +97,7 @@ def main(arguments: list[str] | None = None) -> None:
             stopped = interrupts.command_ended()
     if stopped and code != 130:
         said, code = "interrupted", 130  # swallowed on its way
-    code = code if isinstance(code, int) else 0
-    if code in (2, 130):
-        print("error: " + " ".join(said.split()), file=sys.stderr)
-    sys.exit(code)
+    return said, code if isinstance(code, int) else 0
 
 
 # ---- commands ---------------------------------------------------------------------------------------------------------

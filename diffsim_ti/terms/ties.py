@@ -92,7 +92,7 @@ class Tie(Term):
         return [*out, TieRows(paths, segments, f"{own} rows", self._named(names, "stiffness"), **made)]
 
     def sizes(self, mesh):
-        return {"anchors": len(np.atleast_2d(i.value)) for i in self.described if i.name == "anchors"}
+        return {i.name: len(np.atleast_2d(i.value)) for i in self.described if i.name == "anchors"}
 
     def _named(self, names: dict[str, str], part: str) -> str | None:
         """Name in the scene of what gives a part of it."""
