@@ -6,7 +6,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffsim_ti.checked import as_numbers, instance, number, shown, whole
+from diffsim_ti.checked import instance, number, shown, whole
 from diffsim_ti.mesh.sets import pieces
 from diffsim_ti.scene import Scene
 from diffsim_ti.simulator import Simulator
@@ -57,20 +57,8 @@ def adaptive_steps(
     tolerance, steps = number("tolerance", tolerance, unit="m"), whole("steps", steps, 1)
     if of not in ("vertices", "bodies"):
         raise ValueError(f'of must be "vertices" or "bodies", got {shown(of)}')
-    found = [_substeps(solver, scene, steps, tolerance, of == "bodies") for scene in _scenes(solver.scene, values)]
+    found = [_substeps(solver, scene, steps, tolerance, of == "bodies") for scene in solver.scene.with_each(values)]
     return UnequalSteps(np.full(steps, solver.dt), np.max(found, 0))
-
-
-def _scenes(scene: Scene, values: Mapping[str, ArrayLike] | None) -> list[Scene]:
-    """The scene, or those of a batch."""
-    if not values:
-        return [scene]
-    own = {name: as_numbers(name, x) for name, x in values.items()}
-    lengths = {name: len(x) if x.ndim else 0 for name, x in own.items()}
-    if min(lengths.values()) == 0 or len(set(lengths.values())) > 1:
-        said = ", ".join(f"{name} {x.shape}" for name, x in own.items())
-        raise ValueError(f"values: expected arrays with one axis of scenes in front, got shapes {said}")
-    return [scene.with_values({name: x[b] for name, x in own.items()}) for b in range(next(iter(lengths.values())))]
 
 
 def _substeps(solver: Solver, scene: Scene, steps: int, tolerance: float, by_body: bool) -> np.ndarray:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
-from diffsim_ti.checked import instance, listed
+from diffsim_ti.checked import as_numbers, instance, listed
 from diffsim_ti.copies import MadeAgain
 from diffsim_ti.inputs import ConsistentMass, Inputs
 from diffsim_ti.locking import LOCKING_RATIO, warn_if_locking
@@ -173,6 +173,18 @@ class Scene(TermsOfScene, MadeAgain):
         out.inputs = copy(self.inputs)
         out.inputs.values = self.inputs.values | self.inputs.check(values)
         return out
+
+    def with_each(self, values: Mapping[str, ArrayLike] | None) -> list["Scene"]:
+        """The scenes of a `Batch`, whose inputs `values` have the axis of scenes in front; this one alone without any."""
+        if not values:
+            return [self]
+        own = {name: as_numbers(name, x) for name, x in values.items()}
+        lengths = {name: len(x) if x.ndim else 0 for name, x in own.items()}
+        if min(lengths.values()) == 0 or len(set(lengths.values())) > 1:
+            said = ", ".join(f"{name} {x.shape}" for name, x in own.items())
+            raise ValueError(f"values: expected arrays with one axis of scenes in front, got shapes {said}")
+        count = next(iter(lengths.values()))
+        return [self.with_values({name: x[b] for name, x in own.items()}) for b in range(count)]
 
     def replace(self, **changes) -> "Scene":
         """A scene with some arguments replaced."""

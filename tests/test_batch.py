@@ -329,6 +329,22 @@ def test_a_control_loop_goes_on_from_its_ends():
     np.testing.assert_allclose(state["initial_velocities"], whole.velocities[:, -1], rtol=0, atol=1e-15)
 
 
+def test_substeps_follow_the_stiffest_scene():
+    E = np.array([2e4, 8e6, 4e4])
+    solver = ds.SemiImplicitSolver(simple(1).scene, dt=2e-3, substeps=1)
+    with pytest.warns(UserWarning, match="the stable step of scene 1, the stiffest of 3, is"):
+        solver.choose_substeps(values=dict(youngs_modulus=E))
+    alone = ds.SemiImplicitSolver(
+        simple(1).scene.with_values(dict(youngs_modulus=8e6)), dt=2e-3, check_start=False
+    ).stable_dt(tight=True)
+    assert solver.substeps == np.ceil(2e-3 / (0.7 * alone.dt))
+    frames = ds.Batch(solver, 20, 3).forward(youngs_modulus=E, initial_velocities=0.1 * MESH.vertices)
+    assert frames.alive.all()
+    with warnings.catch_warnings():  # it is chosen, and stays
+        warnings.simplefilter("error")
+        solver.choose_substeps(values=dict(youngs_modulus=E))
+
+
 def test_batches_are_copied_by_pickle():
     batch = simple(3, lanes=False)
     again = pickle.loads(pickle.dumps(batch))

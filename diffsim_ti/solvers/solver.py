@@ -3,6 +3,7 @@
 import math
 import warnings
 from abc import ABC
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -184,14 +185,23 @@ class Solver(ABC):
                 "solver, or pass allow_unstable=True"
             )
 
-    def choose_substeps(self, share: float = 0.7) -> None:
-        """Raise `substeps` to what stability asks for, with a margin, and say so once if that is more than given."""
-        needed = math.ceil(self.dt / (share * self.stable_dt(tight=True).dt))
+    def choose_substeps(self, share: float = 0.7, values: Mapping[str, ArrayLike] | None = None) -> None:
+        """Raise `substeps` to what stability asks for, with a margin, and say so once if that is more than given.
+
+        values: of the scenes of a `Batch`, inputs with their axis in front; the stiffest scene decides, which is named.
+        """
+        stable, of = self.stable_dt(tight=True), ""
+        if values:
+            options = {name: getattr(self, name) for name in self.arguments} | dict(check_start=False)
+            each = [type(self)(scene, **options).stable_dt(tight=True) for scene in self.scene.with_each(values)]
+            b = min(range(len(each)), key=lambda b: each[b].dt)
+            stable, of = each[b], f" of scene {b}, the stiffest of {len(each)},"
+        needed = math.ceil(self.dt / (share * stable.dt))
         if needed > self.substeps:
             warnings.warn(
                 f"dt = {self.dt:g} s is divided into {needed} substeps (asked for at least {self.substeps}): "
-                f"the stable step is {self.stable_dt(tight=True)}",
-                stacklevel=4,  # through bind and a constructor to the user's line
+                f"the stable step{of} is {stable}",
+                stacklevel=2 if values else 4,  # through bind and a constructor to the user's line
             )
             self.substeps = needed
 
