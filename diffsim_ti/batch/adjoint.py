@@ -35,7 +35,7 @@ class BatchAdjoint:
         self.felt = layout.vectors(2 * moving * self._steps, n if moving else 1)
         for name in (*OF_STEPS, "anchor"):
             setattr(self, name, runtime.array(layout.vector, *getattr(ws.numbers, name).shape))
-        self.further = self._further(shape)
+        self.further, self.made_for = self._further(shape), self._shapes()
         vars(self).update(self.further)
         frames = ws.room_for_frames(ws.frames.frames_u.shape[0])
         self.frames_u, self.frames_v = frames.frames_u, frames.frames_v
@@ -70,11 +70,12 @@ class BatchAdjoint:
         """Whether kernels and shapes are still those of the run."""
         a, ws = workspace.arrays, workspace
         same = self.features == a.features(self.features.density, self.features.shape) and self.own == ws.own
-        names = (*OF_STEPS, "anchor")
-        same = same and all(getattr(self, name).shape == getattr(ws.numbers, name).shape for name in names)
-        return same and {n: x.shape for n, x in self.further.items()} == {
-            n: x.shape for n, x in self._further(self.features.shape).items()
-        }
+        return same and self.made_for == self._shapes()
+
+    def _shapes(self) -> dict:
+        """Of the scenes' arrays that adjoints have the shapes of."""
+        names = *OF_STEPS, "anchor", "follower", "ties", "tie_segments", "foundation", "growths"
+        return {name: tuple(getattr(self.ws.numbers, name).shape) for name in names}
 
     def start(self, positions_adj: np.ndarray, velocities_adj: np.ndarray, last_frame_is_input: bool) -> None:
         """Set the adjoints of the frames, shape (scenes, frames, n, 3), and clear the rest."""
