@@ -12,7 +12,7 @@ from diffsim_ti.runtime.arrays import check_owner, full_shape
 from diffsim_ti.runtime.quadrants import QUADRANTS
 from diffsim_ti.runtime.repeated_loops import RepeatedLoops
 from diffsim_ti.runtime.start import arch_name, check_alive, program
-from diffsim_ti.runtime.threads import LOCK, materialize
+from diffsim_ti.runtime.threads import LOCK, materialize, untaped
 
 
 class Launch:
@@ -71,7 +71,7 @@ class Launch:
         if QUADRANTS:  # keeps what a kernel was compiled to, and its arguments, by itself
             config = impl.get_runtime().prog.config()
             with _settings(config, **self._options):
-                self._kernel(*self._arrays, *numbers)
+                untaped(self._kernel)(*self._arrays, *numbers)
             return
         if self._setters is None:
             self._prepare(numbers)
@@ -109,7 +109,7 @@ class TensorLaunch(Launch):
 
     def _launch(self, tensors: tuple) -> None:
         if QUADRANTS:
-            self._kernel(*tensors, *self._arrays)
+            untaped(self._kernel)(*tensors, *self._arrays)
             return
         if self._setters is None:
             arrays = self._arrays
