@@ -121,8 +121,7 @@ class _Search:
     """
 
     def __init__(self, solver: Solver, scene: Scene, steps: int, tolerance: float, by_body: bool):
-        options = {name: getattr(solver, name) for name in solver.arguments}
-        own = type(solver)(scene, **options | (dict(check_start=False) if solver.explicit else {}))
+        own = solver.unchecked_for(scene)
         self.fewest = math.ceil(own.dt / (SHARE * own.stable_dt(tight=True).dt)) if own.explicit else 1
         self.simulator = Simulator(own)
         self.start = self.simulator.workspace.history(1)

@@ -117,7 +117,7 @@ def test_what_acts_on_bodies(seed):
     solver = EXPLICIT[seed % 2](scene, dt=dt, substeps=int(rng.integers(2, 5)))
     if seed % 3 == 1:  # unequal steps
         steps = ds.UnequalSteps(dt * rng.uniform(0.6, 1.2, steps), rng.integers(2, 5, steps))
-    batch = ds.Batch(solver, steps, B, gradients="all", lanes=True)
+    batch = ds.Batch(solver, steps, B, gradients="all", lanes=True, memory=(None, 0.1 * B)[seed % 2])
     own = {name: x * rng.uniform(0.9, 1.1, (B, *x.shape)) for name, x in batch.one.values.items() if rng.random() < 0.6}
     own = {name: x for name, x in own.items() if name not in ("rest_positions", "initial_positions", "poissons_ratio")}
     if rng.random() < 0.5:

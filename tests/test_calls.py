@@ -184,7 +184,7 @@ def test_wrong_arguments(name):
 
 @pytest.mark.filterwarnings("ignore")
 def test_wrong_arguments_of_runs():
-    """Numbers of a run, seeds, tangents, states: refused by the package, with a ValueError, before anything runs."""
+    """Numbers of a run, seeds, tangents, states: refused by the package in one message, or a run that says where it ends."""
     bad = [
         f"{name}({shown(wrong)}): {said}"
         for name, call in runs().items()

@@ -72,7 +72,7 @@ def test_vertices_of_no_tetrahedron_count_for_nothing():
         more = ds.TetrahedralMesh(apart, mesh.tetrahedra)
     one, other = scene(0.01, mesh).mass_scaling, scene(0.01, more).mass_scaling
     np.testing.assert_array_equal(other.factors, np.append(one.factors, [1, 1]))
-    assert other.share == pytest.approx(one.share, rel=1e-14)
+    assert other.share == pytest.approx(one.share, rel=1e-14)  # sums over arrays of two lengths
 
 
 def test_free_fall_stays_as_it_is():

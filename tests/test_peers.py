@@ -48,6 +48,14 @@ answer_all(work)
 """
 
 
+def test_tables_have_whole_numbers_where_they_are_large():
+    best = {("diffsim_ti", 750): [3.217, 68.4], ("JAX", 750): [1260.2, 684.0]}
+    assert compare_peers.common_table(best).splitlines()[2:] == [
+        "| diffsim_ti | 3.22 | 68.4 |",
+        "| JAX | 1260 (391.7x) | 684 (10.0x) |",
+    ]
+
+
 def test_many_bodies_are_pieces_of_one(tmp_path):
     asked = problem("lame-gradient")
     scene = asked.scene(asked.cells[0], asked.patterns[0], "f64")

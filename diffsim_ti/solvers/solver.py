@@ -81,6 +81,11 @@ class Solver(ABC):
         """The same solver for another scene."""
         return type(self)(scene, **{name: getattr(self, name) for name in self.arguments})
 
+    def unchecked_for(self, scene: "Scene") -> "Solver":
+        """The same for another scene, in which an explicit step may be too long."""
+        options = {name: getattr(self, name) for name in self.arguments}
+        return type(self)(scene, **options | (dict(check_start=False) if self.explicit else {}))
+
     @property
     def schedule(self) -> Schedule:
         """Where each pass lies in time."""
@@ -190,12 +195,14 @@ class Solver(ABC):
 
         values: of the scenes of a `Batch`, inputs with their axis in front; the stiffest scene decides, which is named.
         """
-        stable, of = self.stable_dt(tight=True), ""
-        if values:
-            options = {name: getattr(self, name) for name in self.arguments} | dict(check_start=False)
-            each = [type(self)(scene, **options).stable_dt(tight=True) for scene in self.scene.with_each(values)]
-            b = min(range(len(each)), key=lambda b: each[b].dt)
-            stable, of = each[b], f" of scene {b}, the stiffest of {len(each)},"
+        each = (
+            [self.unchecked_for(scene).stable_dt(tight=True) for scene in self.scene.with_each(values)]
+            if values
+            else []
+        )
+        b = min(range(len(each)), key=lambda b: each[b].dt, default=None)
+        stable = self.stable_dt(tight=True) if b is None else each[b]
+        of = f" of scene {b}, the stiffest of {len(each)}," if values else ""
         needed = math.ceil(self.dt / (share * stable.dt))
         if needed > self.substeps:
             warnings.warn(

@@ -97,7 +97,8 @@ def common_table(best: dict) -> str:
         cells = []
         for s in sizes:
             for value, own in zip(best.get((who, s), [np.nan] * 2), best["diffsim_ti", s]):
-                cells.append(f"{value:.3g}" + ("" if who == "diffsim_ti" else f" ({value / own:.1f}x)"))
+                cells.append(f"{value:.0f}" if value >= 100 else f"{value:.3g}")
+                cells[-1] += "" if who == "diffsim_ti" else f" ({value / own:.1f}x)"
         lines.append(f"| {who} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
