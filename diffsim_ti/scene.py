@@ -133,7 +133,8 @@ class Scene(TermsOfScene, MadeAgain):
         self.gases = tuple(t for t in self.chambers if not t.holds)
         self.following = (*self.pressures, *self.chambers)  # what presses on the surface as it is
         self.springs = tuple(t for t in self.ordered_terms if isinstance(t, Spring))
-        self.cables = tuple(t for t in self.ordered_terms if isinstance(t, Cable))
+        cables = (t for t in self.ordered_terms if isinstance(t, Cable))
+        self.cables = tuple(sorted(cables, key=lambda t: t.of_fibres))  # which come last, for kernels
         self.ties = self.springs + self.cables
         self.foundations = tuple(t for t in self.ordered_terms if isinstance(t, ElasticFoundation))
         self.mass_scaling = None if mass_scaling is None else MassScaling.of(self, density, mass_scaling)

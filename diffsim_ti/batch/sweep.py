@@ -47,6 +47,8 @@ class FrameByFrame:
             if schedule.varies:
                 self.ws.close(self.ws.substep)
 
+    advance_again = advance
+
     def _advance(self, first: int, last: int, num_passes: int, save_every: int, recording: bool) -> None:
         """The same where all passes have one length."""
         ws, contacts = self.ws, bool(self.ws.arrays.contacts)

@@ -1,6 +1,7 @@
 """Noticing that a run goes wrong, and saying where, when and why."""
 
 import warnings
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -79,12 +80,32 @@ class Guard:
 
     def advance(self, first: int, last: int, num_passes: int, save_every: int = 0, recording: bool = False) -> None:
         """Passes first .. last - 1, looked after; recording, slot j of the record holds the state before pass j."""
+        for begin, end in self._stretches(first, last):
+            self._advance(begin, end, num_passes, save_every, recording)
+
+    def advance_again(
+        self, first: int, last: int, num_passes: int, save_every: int = 0, recording: bool = False
+    ) -> None:
+        """The same of a run that was looked after before, and came to its end: it takes the same way again."""
+        for begin, end in self._stretches(first, last):
+            self._pass(begin, end, num_passes, save_every, recording)
+
+    def _stretches(self, first: int, last: int) -> Iterator[tuple[int, int]]:
+        """Parts of passes first .. last - 1 of one length; each is gone through before the next is asked for."""
         schedule = self.ws.solver.schedule
         for begin, end in schedule.stretches(first, last):
             self.ws.substep = float(schedule.length(begin))
-            self._advance(begin, end, num_passes, save_every, recording)
+            yield begin, end
             if schedule.varies:
                 self.ws.watch.close(self.ws.substep)
+
+    def _pass(self, first: int, last: int, num_passes: int, save_every: int, recording: bool) -> None:
+        """Passes first .. last - 1."""
+        if recording:
+            self.ws.save(self.ws.record, first)
+        self.ws.advance(first, last, num_passes, save_every, 0 if recording else None)
+        if recording:
+            self.ws.restore(self.ws.record, last)
 
     def _advance(self, first: int, last: int, num_passes: int, save_every: int, recording: bool) -> None:
         """The same where all have one length."""
@@ -94,11 +115,7 @@ class Guard:
             if balance:
                 balance.before(first, num_passes)
             self.mark(first)
-            if recording:
-                self.ws.save(self.ws.record, first)
-            self.ws.advance(first, stop, num_passes, save_every, 0 if recording else None)
-            if recording:
-                self.ws.restore(self.ws.record, stop)
+            self._pass(first, stop, num_passes, save_every, recording)
             if self.ws.watch.crossing() is not None and self.ws.solver.explicit:
                 self._diagnose_crossing(stop, num_passes)
             if self.ws.first_bad_vertex() is not None:
@@ -157,9 +174,10 @@ class Guard:
             self._stiffness = stability.stiffness_of(self.ws)
         omega2 = self._stiffness.lower_bound()
         apart = self._flies_apart()
-        if np.isfinite(omega2) and omega2 * self.ws.substep**2 <= 4 and not apart:
-            near = omega2 * self.ws.substep**2 > 0.9**2 * 4
-            self.every = min(2 * self.every, self.close if near else self.usual)
+        stiff = omega2 * self.ws.substep**2  # stable up to 4
+        if np.isfinite(omega2) and stiff <= 4 and not apart:
+            longer = 4 if stiff < 1 else 2  # the body has to become four times as stiff first
+            self.every = min(longer * self.every, self.close if stiff > 0.9**2 * 4 else self.usual)
             return
         step, limit = self.ws.step_of(now - 1, num_passes), 2 / np.sqrt(omega2)
         tet = self._stiffness.worst_tetrahedron()

@@ -18,12 +18,14 @@ class Run:
     contacts: what it noted of them, worked out when asked for.
     start: called with the workspace after the values are loaded; sets another start there, the same each time.
     first_step: steps that came before, for reports.
+    seen_by: the guard that looked after it to its end.
     """
 
     values: dict
     start: Callable | None = None
     first_step: int = 0
     contacts: Callable[[], ContactResolution] | None = None
+    seen_by: object | None = None
 
     @cached_property
     def contact_resolution(self) -> ContactResolution:

@@ -62,7 +62,7 @@ class Sweep:
         places = -(-self.scene.mesh.num_tetrahedra // runtime.LANES) * runtime.LANES
         law_state = places * len(self.scene.law.state_names) / (4 * self.scene.mesh.num_vertices)
         self.checkpoints = choose_checkpoints(self.num_passes, self.state_bytes, every, memory, law_state)
-        self.workspace = None  # made by the first run
+        self.workspace = self._guard = None  # made by the first run
         self._loaded = None  # the values that are on the device
         self._current = None  # the run whose frames and snapshots the workspace holds
         self._adjoint = None  # the solver's, made by the first pull-back
@@ -133,8 +133,9 @@ class Sweep:
     def bring_back(self, run: Run) -> None:
         """See to it that frames and kept states are those of a run."""
         if self._current is not run:
+            again = run.seen_by is self._guard and self._guard is not None
             run.values = self._checked(run.values)  # which may be another rollout's
-            self._forward(run)
+            self._forward(run, again)
 
     def _checked(self, values: dict) -> dict:
         """All values of a run: copies of those given, for callers may change theirs, or what is loaded if it is the same."""
@@ -174,11 +175,12 @@ class Sweep:
             run.start(self.workspace)
             self.workspace.forget()
 
-    def _forward(self, run: Run) -> None:
-        """All passes; keeps the first snapshots on the way."""
+    def _forward(self, run: Run, again: bool = False) -> None:
+        """All passes; keeps the first snapshots on the way. again: the guard has seen this run come to its end."""
         self._load(run)
         ws, checkpoints = self.workspace, self.checkpoints
         self._guard.restart()
+        advance = self._guard.advance_again if again else self._guard.advance
         if self.contacts:
             ws.forget_contacts()
         self.workspace.first_step = run.first_step
@@ -192,9 +194,10 @@ class Sweep:
             first = checkpoints.bounds(segment)[0]
             last = checkpoints.bounds(path[k + 1])[0] if k + 1 < len(path) else self.num_passes
             with ws.report.of_passes(last - first):
-                self._guard.advance(first, last, self.num_passes, self.save_every, self._recorded)
+                advance(first, last, self.num_passes, self.save_every, self._recorded)
         if self.solver.last_frame_is_state:
             ws.save_frame(self.num_frames - 1)
+        run.seen_by = self._guard
         self._kept, self._current = path, run  # segments whose starts are in the snapshots
 
     def _record(self, first: int, last: int) -> None:

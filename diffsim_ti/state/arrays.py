@@ -67,6 +67,7 @@ class SceneArrays:
             pressed=bool(self.pressures or self.chambers),
             tied=self.paths is not None,
             cabled=self.paths is not None and bool(scene.cables),
+            fibres=self.num_fibre_blocks > 0,
             founded=bool(len(self.founded)),
             dragged=self.num_dragged > 0,
             motion=scene.motion is not None,
@@ -139,13 +140,16 @@ class SceneArrays:
 
     def _upload_ties(self, scene, start, corner_of, num_corners: int) -> tuple:
         """(start, corner_of, number of corners), with those of springs and then of cables, which are loads."""
-        self.num_ties, self.first_tied, self.first_load = 0, num_corners, num_corners
+        self.num_ties = self.num_fibre_blocks = 0
+        self.first_tied = self.first_load = num_corners
         if len(self.founded):
             self.foundation_slot = runtime.upload(slots(self.founded, self.num_vertices), ti.i32)
         if self.paths is None:
             return start, corner_of, num_corners
         paths, self.num_ties = self.paths, len(self.paths)
         springs = sum(len(term.paths(self.mesh)) for term in scene.springs)
+        if self.in_lanes:  # kernels take fibres, which are the last, eight at a time
+            self.num_fibre_blocks = sum(len(t.paths(self.mesh)) for t in scene.cables if t.of_fibres) // LANES
         self.first_load += int(paths.first_corner[paths.first_point[springs]])
         start, corner_of = with_more_corners(start, corner_of, paths.vertices, num_corners)
         self.tie_start = runtime.upload(paths.first_point, ti.i32)

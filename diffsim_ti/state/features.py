@@ -58,6 +58,7 @@ class Features:
     tied: bool = False  # whether there are springs or cables
     ties_per_step: bool = False
     cabled: bool = False
+    fibres: bool = False  # whether there are eight ties in a row that are fibres of tetrahedra, on a CPU
     growing: bool = False  # whether tetrahedra grow over time
     growth_per_step: bool = False
     growth_uniform: bool = True

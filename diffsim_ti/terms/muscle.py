@@ -38,7 +38,7 @@ class Muscle(Cable):
     Blemker, Pinsky, Delp 2005, A 3D model of muscle, doi:10.1016/j.jbiomech.2004.04.009 (active stress along fibres).
     """
 
-    by_tension = True
+    by_tension = of_fibres = True
 
     def __init__(
         self,

@@ -7,10 +7,12 @@ from functools import cached_property
 import taichi as ti
 
 from diffsim_ti.elements.dragged_triangle import DRAGGED, DraggedTriangle
+from diffsim_ti.elements.fibres import FibreBlock
+from diffsim_ti.elements.nodes import nodes_of
 from diffsim_ti.elements.pressed_face import pressed_element
 from diffsim_ti.elements.pressed_triangle import PRESSED, PressedTriangle
 from diffsim_ti.elements.tie import TIED, TieElement
-from diffsim_ti.runtime import let, traced
+from diffsim_ti.runtime import LANES, PRECISIONS, let, traced
 from diffsim_ti.solvers.explicit.foundations import FOUNDED
 from diffsim_ti.solvers.explicit.guides import GUIDED
 from diffsim_ti.state.bodies import BODIES
@@ -23,16 +25,29 @@ A = ti.template()  # an array or Bundle handed to a Taichi function
 
 def counts_of_further(arrays) -> dict:
     """How many there are, and where their corners begin."""
-    names = "num_ties", "first_tied", "first_load", "num_pressed", "first_pressed", "num_dragged", "first_dragged"
+    names = (
+        "num_ties",
+        "num_fibre_blocks",
+        "first_tied",
+        "first_load",
+        "num_pressed",
+        "first_pressed",
+        "num_dragged",
+        "first_dragged",
+    )
     return {name: getattr(arrays, name) for name in names} | dict(first_push=arrays.first_pressed)
 
 
 @dataclass(frozen=True)
 class FurtherElements:
-    """Functions of item k of those after the tetrahedra: pressed triangles first."""
+    """Functions of item k of those after the tetrahedra: pressed triangles, ties, fibres, triangles in a fluid.
+
+    blocks: whether fibres go eight at a time, where there are as many in a row.
+    """
 
     features: Features
     precision: str
+    blocks: bool = False
 
     @property
     def any(self) -> bool:
@@ -45,6 +60,11 @@ class FurtherElements:
     @property
     def tied(self) -> bool:
         return self.features.tied
+
+    @property
+    def in_eights(self) -> bool:
+        """Whether some of the ties, the last ones, are fibres that go eight at a time."""
+        return self.blocks and self.features.fibres
 
     @property
     def dragged(self) -> bool:
@@ -63,13 +83,30 @@ class FurtherElements:
     def tie(self) -> TieElement:
         return TieElement(self.precision, self.features.ties_per_step)
 
+    @cached_property
+    def fibre(self) -> FibreBlock:
+        has = self.features
+        return FibreBlock(
+            self.precision, has.ties_per_step, nodes_of(has.order, PRECISIONS[self.precision]).count, has.shape
+        )
+
+    @traced
+    def num_single(self, plan):
+        """Number of ties that go one by one."""
+        return let(plan.num_ties - LANES * plan.num_fibre_blocks) if self.in_eights else plan.num_ties
+
+    @traced
+    def num_tied(self, plan):
+        """Number of items that ties are."""
+        return let(self.num_single(plan) + plan.num_fibre_blocks) if self.in_eights else plan.num_ties
+
     @traced
     def after(self, plan):
         """Number of items of tetrahedra and of these."""
         if self.dragged:
-            return let(plan.num_items + plan.num_pressed + plan.num_ties + plan.num_dragged)
+            return let(plan.num_items + plan.num_pressed + self.num_tied(plan) + plan.num_dragged)
         if self.tied:
-            return let(plan.num_items + plan.num_pressed + plan.num_ties)
+            return let(plan.num_items + plan.num_pressed + self.num_tied(plan))
         return let(plan.num_items + plan.num_pressed) if self.pressed else plan.num_items
 
     @property
@@ -109,6 +146,7 @@ class FurtherElements:
         out += ["first_pressed"] if self.pressed else []
         out += ["num_ties"] if self.tied or self.dragged else []
         out += ["first_tied"] if self.tied else []
+        out += ["num_fibre_blocks"] if self.in_eights else []
         out += ["num_dragged", "first_dragged"] if self.dragged else []
         out += ["num_bodies"] if self.features.reduced else []
         out += ["first_load"] if self.features.loaded_corners else []
@@ -116,9 +154,21 @@ class FurtherElements:
 
     @traced
     def is_tie(self, k, plan):
-        """Whether item k is a spring or a cable."""
+        """Whether item k is a tie by itself."""
         after = k >= plan.num_pressed
-        return let(after & (k < plan.num_pressed + plan.num_ties)) if self.dragged else after
+        return let(after & (k < plan.num_pressed + self.num_single(plan))) if self.dragged or self.in_eights else after
+
+    @traced
+    def is_block(self, k, plan):
+        """Whether item k is a block of fibres."""
+        after = k >= plan.num_pressed + self.num_single(plan)
+        return let(after & (k < plan.num_pressed + self.num_tied(plan))) if self.dragged else after
+
+    @traced
+    def first_fibre(self, k, plan):
+        """The tie with which the block that item k is begins."""
+        single = self.num_single(plan)
+        return let(single + LANES * (k - plan.num_pressed - single))
 
     @ti.func
     def forces(self, k, now: A, scene: A, state: A, s, plan: A):
@@ -128,8 +178,11 @@ class FurtherElements:
         if ti.static(self.tied):
             if self.is_tie(k, plan):
                 self.tie.forces(k - plan.num_pressed, now, scene, state, s, plan.first_tied)
+        if ti.static(self.in_eights):
+            if self.is_block(k, plan):
+                self.fibre.forces(self.first_fibre(k, plan), now, scene, state, s, plan.first_tied)
         if ti.static(self.dragged):
-            t = k - plan.num_pressed - plan.num_ties
+            t = k - plan.num_pressed - self.num_tied(plan)
             if t >= 0:
                 self.in_fluid.forces(t, scene, state, s, plan.first_dragged)
 
@@ -141,8 +194,11 @@ class FurtherElements:
         if ti.static(self.tied):
             if self.is_tie(k, plan):
                 self.tie.forces_jvp(k - plan.num_pressed, now, scene, state, s, tangent, plan.first_tied)
+        if ti.static(self.in_eights):
+            if self.is_block(k, plan):
+                self.fibre.forces_jvp(self.first_fibre(k, plan), now, scene, state, s, tangent, plan.first_tied)
         if ti.static(self.dragged):
-            t = k - plan.num_pressed - plan.num_ties
+            t = k - plan.num_pressed - self.num_tied(plan)
             if t >= 0:
                 self.in_fluid.forces_jvp(t, scene, state, s, tangent, plan.first_dragged)
 
@@ -154,7 +210,10 @@ class FurtherElements:
         if ti.static(self.tied):
             if self.is_tie(k, plan):
                 self.tie.forces_vjp(k - plan.num_pressed, now, scene, state, s, adjoint, plan.first_tied)
+        if ti.static(self.in_eights):
+            if self.is_block(k, plan):
+                self.fibre.forces_vjp(self.first_fibre(k, plan), now, scene, state, s, adjoint, plan.first_tied)
         if ti.static(self.dragged):
-            t = k - plan.num_pressed - plan.num_ties
+            t = k - plan.num_pressed - self.num_tied(plan)
             if t >= 0:
                 self.in_fluid.forces_vjp(t, scene, state, s, adjoint, plan.first_dragged)

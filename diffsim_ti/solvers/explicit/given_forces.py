@@ -61,13 +61,15 @@ class GivenForces:
 
     @ti.func
     def gathered(self, i, scene: A, plan: A, pulls: A):
-        """What pressures do at vertex i, and what pulls, cables, of what it gathers."""
-        f, first = self.vector(0), plan.first_load
+        """What pressures do at vertex i, and what pulls, cables, of what it gathers: they are the last of its corners."""
+        f, first, end = self.vector(0), plan.first_load, scene.start[i + 1]
         if ti.static(self.features.cabled and not pulls):
             first = plan.first_push
-        for c in range(scene.start[i], scene.start[i + 1]):
-            if scene.corner_of[c] >= first:
-                f = f + scene.corner[scene.corner_of[c]]
+        for back in range(1, end - scene.start[i] + 1):
+            c = scene.corner_of[end - back]
+            if c < first:
+                break
+            f = f + scene.corner[c]
         return f
 
     @ti.func

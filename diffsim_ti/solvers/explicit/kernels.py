@@ -45,7 +45,7 @@ class ExplicitKernels:
 
     @cached_property
     def further(self) -> FurtherElements:
-        return FurtherElements(self.vertex.features, self.vertex.law.precision)
+        return FurtherElements(self.vertex.features, self.vertex.law.precision, blocks=True)
 
     @cached_property
     def bodies(self) -> BodyStage:
