@@ -82,6 +82,11 @@ class TermsOfScene:
         return Paths.joined([term.paths(self.mesh) for term in self.ties])
 
     @property
+    def num_fibres(self) -> int:
+        """Number of ties, the last ones, that are fibres of muscles."""
+        return sum(len(term.paths(self.mesh)) for term in self.ties if term.of_fibres)
+
+    @property
     def one_sided_ties(self) -> np.ndarray:
         """Of each tie whether it pulls only."""
         return np.concatenate([np.full(len(term.paths(self.mesh)), term.one_sided) for term in self.ties])

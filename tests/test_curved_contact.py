@@ -1,6 +1,7 @@
 """Obstacles, and surfaces that meet each other, feel the faces of ten-node tetrahedra as curved as they are."""
 
 import warnings
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -270,6 +271,60 @@ def test_curved_faces_press_on_each_other(solver, precision):
         np.testing.assert_allclose(q, p, rtol=0, atol=1e-12 * np.abs(p).max())
 
 
+def rubbing_balls(precision="f64", friction=0.4, **options) -> ds.Scene:
+    contact = ds.SelfContact(2e3, W, friction=friction, friction_speed=5e-3)
+    return balls_face_to_face(precision=precision, **options).replace(terms=[contact])
+
+
+@pytest.mark.parametrize("solver, precision", [(EXPLICIT, "f64"), (ds.BDF2Solver, "f64"), (EXPLICIT, "f32")])
+def test_curved_faces_rub_on_each_other(solver, precision):
+    scene, exact = rubbing_balls(precision), {} if solver.explicit else dict(tolerance=1e-12)
+    rollout = ds.Rollout(solver(scene, dt=5e-5 if solver.explicit else 2e-3, **exact), 4, gradients="all")
+    frames = rollout.forward()
+    assert isinstance(rollout.sweep.workspace.pairs, CurvedPairs)
+    assert_transposed(rollout, {"f64": 1e-11 if solver.explicit else 1e-8, "f32": 1e-3}[precision])
+    if solver.explicit:
+        mass, smooth = rollout.sweep.workspace.mass, scene.replace(terms=[ds.SelfContact(2e3, W)])
+        without = ds.Rollout(solver(smooth, dt=5e-5), 4, gradients=[]).forward()
+        p, q = ((mass * frames.velocities[k]).sum(0) for k in (0, -1))
+        assert np.abs(q - p).max() < {"f64": 1e-12, "f32": 1e-5}[precision] * np.abs(p).max()
+        assert np.abs(frames.velocities - without.velocities).max() > 0.1
+    if solver.explicit and precision == "f64":
+        names = ["rest_positions", "density", "self_contact_friction", "self_contact_friction_speed"]
+        assert ds.check_gradients(rollout, inputs=names, verbose=False).passed
+
+
+def test_rubbing_of_curved_faces_adds_no_energy():
+    """Whatever the velocities, the length of a pass, the coefficient and the friction speed."""
+    rng, lost = np.random.default_rng(3), []
+    for mu, eps in ((1e-2, 1e-5), (0.5, 1.0), (1e3, 1e-3)):
+        contact = ds.SelfContact(2e3, W, friction=mu, friction_speed=eps)
+        scene = balls_face_to_face(fixed=[0]).replace(terms=[contact])
+        ws = ds.Simulator(ds.SemiImplicitSolver(scene, dt=1e-6)).workspace
+        pairs, mass = ws.pairs, ws.mass
+        for h in (1e-7, 1e-4, 1.0):
+            pairs.forces(ws.state.u, 0, ws.arrays.corner)
+            pairs.friction.measure(ws.state.u, 0)
+            v = rng.normal(size=(1, scene.mesh.num_vertices, 3)) * 10.0 ** rng.uniform(-3, 1)
+            v[0, 0] = 0
+            runtime.fill(ws.state.v, v)
+            pairs.friction.slide(ws.state, 0, SimpleNamespace(h=h, alpha=h, decay=1.0), recording=False)
+            before, now = (0.5 * float((mass * x[0] ** 2).sum()) for x in (v, runtime.fetch(ws.state.v)))
+            assert now <= before * (1 + 1e-14)
+            lost.append(1 - now / before)
+    assert max(lost) > 1e-3 and min(lost) < 1e-4
+
+
+def test_sets_that_rub_have_points_between_their_nodes():
+    """Those whose nodes are all in the set; so named bodies rub as all do."""
+    scene = rubbing_balls(friction={("body_0", "body_1"): 0.4})
+    named, all_ = (ds.Rollout(EXPLICIT(s, dt=5e-5), 2, gradients=[]).forward() for s in (scene, rubbing_balls()))
+    np.testing.assert_array_equal(named.positions, all_.positions)
+    surface = CollisionSurface(scene.mesh, 1)
+    both = np.concatenate([surface.vertex_sets[name] for name in ("body_0", "body_1")])
+    np.testing.assert_array_equal(np.sort(both), np.arange(surface.num_vertices))
+
+
 def test_forces_of_curved_faces_are_the_slope_of_their_energy():
     simulator = ds.Simulator(ds.BDF2Solver(balls_face_to_face(), dt=2e-3))
     potential, n = simulator.workspace.potential, simulator.scene.mesh.num_vertices
@@ -303,6 +358,6 @@ def test_triangles_are_cut_only_where_curvature_asks():
     mesh, contact = ball(2), ds.SelfContact(1.0, W)
     assert [cuts_of(mesh, ds.SelfContact(1.0, width)) for width in (0.1, 0.01, W, 1e-4)] == [0, 1, 2, 3]
     assert cuts_of(mesh.linear(), contact) == cuts_of(mesh.linear().quadratic(), contact) == 0
-    assert cuts_of(mesh, ds.SelfContact(1.0, W, friction=0.2)) == 0
+    assert cuts_of(mesh, ds.SelfContact(1.0, W, friction=0.2)) == 2
     straight = scene_of(mesh.linear().quadratic(), contact)
     assert type(ds.Simulator(EXPLICIT(straight, dt=1e-5)).workspace.pairs) is SurfacePairs

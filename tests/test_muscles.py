@@ -9,6 +9,8 @@ from test_gradients import random_mesh
 from test_term_order import SOLVERS
 
 import diffsim_ti as ds
+from diffsim_ti.solvers.explicit.further_elements import FurtherElements
+from diffsim_ti.solvers.explicit.kernels import explicit_kernels
 
 STEPS = 3
 
@@ -33,7 +35,7 @@ def muscles(mesh) -> list:
     ]
 
 
-def rollout_of(kind, terms=None, order=1, steps=STEPS, precision="f64", **options) -> ds.Rollout:
+def rollout_of(kind, terms=None, order=1, steps=STEPS, precision="f64", gradients="all", **options) -> ds.Rollout:
     mesh, rng = mesh_of(order), np.random.default_rng(2)
     start = mesh.vertices + 0.01 * rng.normal(size=mesh.vertices.shape)
     options = dict(fixed="xmin", initial_positions=start) | options
@@ -42,13 +44,41 @@ def rollout_of(kind, terms=None, order=1, steps=STEPS, precision="f64", **option
     exact = {} if kind.explicit else dict(tolerance=1e-12)
     static = kind is ds.StaticSolver
     solver = kind(scene, load_steps=2, dt=2e-3, **exact) if static else kind(scene, dt=2e-3, substeps=4, **exact)
-    return ds.Rollout(solver, steps, save_every=1, gradients="all")
+    return ds.Rollout(solver, steps, save_every=1, gradients=gradients)
 
 
 @pytest.mark.parametrize("kind, order", [(kind, 1) for kind in SOLVERS] + [(ds.VelocityVerletSolver, 2)])
 def test_every_number(kind, order):
     """By a dot product each: activations of every spelling, stresses, the rest shape."""
     assert_transposed(rollout_of(kind, order=order), 1e-11 if kind.explicit else 1e-8)
+
+
+@pytest.mark.parametrize(
+    "kind, order, precision", [(ds.VelocityVerletSolver, 1, "f64"), (ds.SemiImplicitSolver, 2, "f32")]
+)
+def test_eight_fibres_at_once_are_eight_fibres(kind, order, precision, monkeypatch):
+    """To the last digit, forward and in both derivatives, whatever stands beside them, and how many are left over; without
+    the rest shape among the gradients too."""
+    mesh, rng = mesh_of(order), np.random.default_rng(4)
+    some = rng.permutation(mesh.num_tetrahedra)[:11]
+    beside = [ds.Muscle([1, 0, 1], 1e4, 0.5, some, name="few"), ds.Spring(0, ds.Anchor([2.0, 0, 0]), 1e3)]
+    beside += [ds.Pressure(100.0), ds.Cable([0, 5, 7], 5.0)]
+    found = []
+    for blocks in (True, False):
+        with monkeypatch.context() as patch:
+            if not blocks:
+                patch.setattr(FurtherElements, "in_eights", property(lambda self: False))
+                explicit_kernels.cache_clear()
+            for names in (None, "all"):
+                rollout = rollout_of(kind, beside + muscles(mesh), order, precision=precision, gradients=names)
+                frames, seed = rollout.forward(), np.random.default_rng(5)
+                by = rollout.vjp(frames, *seed.normal(size=(2, *frames.positions.shape)))
+                change = {name: seed.normal(size=np.shape(rollout.values[name])) for name in by}
+                moved = rollout.jvp(frames, **change)
+                found.append([frames.positions, *moved, *by.values()])
+    explicit_kernels.cache_clear()
+    for ours, theirs in zip(found[:2], found[2:]):
+        assert all(np.array_equal(x, y) for x, y in zip(ours, theirs, strict=True))
 
 
 def test_gradients_against_differences():

@@ -10,6 +10,7 @@ import taichi as ti
 
 from diffsim_ti import runtime
 from diffsim_ti.contact.buffers import Launches
+from diffsim_ti.contact.curved_friction import friction_of
 from diffsim_ti.mesh.collision_surface import CollisionSurface, cuts_of
 from diffsim_ti.runtime import PRECISIONS, Kernel, kernels_of
 
@@ -90,6 +91,7 @@ class FinerArrays:
         self.scene, self.mesh, self.precision = arrays, surface, arrays.precision
         self.self_contact, self.num_vertices = arrays.self_contact, surface.num_vertices
         self.parameters_of_self_contact = arrays.parameters_of_self_contact
+        self.fp, self.vector, self.supports = arrays.fp, arrays.vector, SimpleNamespace(guided=())  # nodes are held
         self.rest = runtime.array(arrays.vector, surface.num_vertices)
         self.corner = runtime.array(arrays.vector, len(surface.surface_vertices))
         self._rest_of = None
@@ -118,8 +120,6 @@ class CurvedPairs:
     """As SurfacePairs or ImplicitPairs, for arrays of the nodes. Numbers of vertices in messages that the mesh does not have
     are those of the collision surface."""
 
-    friction = None
-
     def __init__(self, kind: type, arrays, parallel: bool, cuts: int):
         surface = CollisionSurface(arrays.mesh, cuts)
         self.a, self.finer, self.matrix = arrays, FinerArrays(arrays, surface), surface.matrix
@@ -132,6 +132,7 @@ class CurvedPairs:
         self._row, self._rest_dot = runtime.array(vector, 1, n), runtime.array(vector, surface.num_vertices)
         self.step, self.next = runtime.array(vector, 1, n), runtime.array(vector, 1, n)
         self._launch = Launches()
+        self.friction = friction_of(self)
 
     # ---- between nodes and points ------------------------------------------------------------------------------------
 
@@ -140,6 +141,19 @@ class CurvedPairs:
         refine = self._launch(self.kernels.refine, rows=self.down, at=SimpleNamespace(source=u, target=target))
         refine(count=self.finer.num_vertices, slot=slot)
         return target
+
+    def fine(self, u, slot: int):
+        """Displacements of the finer surface, from those of a slot."""
+        return self._fine(u, slot, self._u)
+
+    def fine_change(self, w):
+        """Their changes, from w[0]."""
+        return self._fine(w, 0, self._w)
+
+    def fine_numbers(self, numbers) -> SimpleNamespace:
+        """What pairs of the finer surface read of changes of numbers."""
+        runtime.fill(self._rest_dot, self.matrix @ runtime.fetch(numbers.rest).astype(np.float64))
+        return SimpleNamespace(rest=self._rest_dot, parameters=numbers.parameters)
 
     def _gather(self, out) -> None:
         """From the points' corners to those of the nodes, the last ones of `out`."""
@@ -166,33 +180,33 @@ class CurvedPairs:
         return self.inner.builds
 
     def load(self, u) -> None:
-        self.inner.load(self._fine(u, 0, self._u))
+        self.inner.load(self.fine(u, 0))
 
     def check_apart(self, u) -> None:
-        self.inner.check_apart(self._fine(u, 0, self._u))
+        self.inner.check_apart(self.fine(u, 0))
 
     def forget(self, u) -> None:
-        self.inner.forget(self._fine(u, 0, self._u))
+        self.inner.forget(self.fine(u, 0))
 
     def ensure(self, u, slot: int) -> None:
-        self.inner.ensure(self._fine(u, slot, self._u), 0)
+        self.inner.ensure(self.fine(u, slot), 0)
 
     def check_pass(self, u, slot: int, h: float) -> None:
-        self.inner.check_pass(self._fine(u, slot, self._u), 0, h)
+        self.inner.check_pass(self.fine(u, slot), 0, h)
 
     def look(self, u) -> tuple[float, float]:
-        return self.inner.look(self._fine(u, 0, self._u))
+        return self.inner.look(self.fine(u, 0))
 
     def unbind(self) -> None:
         self._launch.clear()
         self.inner.unbind()
 
     def forces(self, u, slot: int, out, exact: bool = False) -> None:
-        self.inner.forces(self._fine(u, slot, self._u), 0, self.finer.corner, exact)
+        self.inner.forces(self.fine(u, slot), 0, self.finer.corner, exact)
         self._gather(out)
 
     def product(self, u, slot: int, w, out, rest_dot=None, parameters_dot=(0.0, 0.0), has_planes=False) -> None:
-        fine_u, fine_w, moved = self._fine(u, slot, self._u), self._fine(w, 0, self._w), None
+        fine_u, fine_w, moved = self.fine(u, slot), self.fine_change(w), None
         if rest_dot is not None:
             runtime.fill(self._rest_dot, self.matrix @ runtime.fetch(rest_dot).astype(np.float64))
             moved = self._rest_dot
@@ -201,9 +215,11 @@ class CurvedPairs:
 
     def clear_sums(self) -> None:
         self.inner.clear_sums()
+        if self.friction:
+            self.friction.clear_sums()
 
     def vjp(self, u, slot: int, w, out) -> None:
-        self.inner.vjp(self._fine(u, slot, self._u), 0, self._fine(w, 0, self._w), self.finer.corner)
+        self.inner.vjp(self.fine(u, slot), 0, self.fine_change(w), self.finer.corner)
         self._gather(out)
 
     def collect(self) -> tuple[np.ndarray, np.ndarray]:
@@ -217,20 +233,20 @@ class CurvedPairs:
         self.inner.begin(self._spread(u))
 
     def place(self, u) -> None:
-        self.inner.place(self._fine(u, 0, self._u))
+        self.inner.place(self.fine(u, 0))
         self._gather(self.a.corner)
 
     def energies(self) -> np.ndarray:
         return self.inner.energies()
 
     def hessian_product(self, u, w, convex: bool) -> None:
-        self.inner.hessian_product(self._fine(u, 0, self._u), self._fine(w, 0, self._w), convex)
+        self.inner.hessian_product(self.fine(u, 0), self.fine_change(w), convex)
         self._gather(self.a.corner)
 
     def add_blocks(self, u, out) -> None:
         """Those of points by squares of what nodes have of them, without what two points of a node have in common."""
         runtime.fill(self._blocks, 0)
-        self.inner.add_blocks(self._fine(u, 0, self._u), self._blocks)
+        self.inner.add_blocks(self.fine(u, 0), self._blocks)
         at = SimpleNamespace(source=self._blocks, target=out)
         self._launch(self.kernels.add_blocks, rows=self.up, at=at)(count=self.a.num_vertices)
 

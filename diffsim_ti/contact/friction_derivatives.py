@@ -239,11 +239,7 @@ class FrictionDerivatives(FrictionKernels):
         return self.kernel("measure_vjp", self.measure_all_vjp, at, OWN | ADJ | SUMS, begin="int", num_rows="int")
 
     @ti.func
-    def slide_all_vjp(self, scene: A, at: A, plan: A):
-        ti.loop_config(serialize=not self.parallel)
-        for s in range(plan.num_surface):
-            if scene.rubs[s] > 0:
-                self.pull(s, scene, at, plan)
+    def all_pairs_vjp(self, scene: A, at: A, plan: A):
         for kind in ti.static((VERTEX_TRIANGLE, EDGE_EDGE)):
             ti.loop_config(serialize=not self.parallel)
             for p in range(first_of(kind, plan), behind(kind, plan)):
@@ -253,6 +249,22 @@ class FrictionDerivatives(FrictionKernels):
         for s in range(plan.num_surface):
             if scene.rubs[s] > 0:
                 self.end_vertex(s, scene, at, plan)
+
+    @cached_property
+    def pairs_vjp(self) -> Kernel:
+        """From `pulled`, adjoints of the impulses, to those of the velocities before the stage, to v_adj, of loads, weights
+        and what presses."""
+        at = self.state | dict(v_adj="vectors2", by_place="vectors")
+        at |= dict.fromkeys(("by_rate", "by_mass", "by_speed", "by_mu"), "scalars")
+        return self.kernel("pairs_vjp", self.all_pairs_vjp, at, OWN | ADJ | SUMS, **PASS)
+
+    @ti.func
+    def slide_all_vjp(self, scene: A, at: A, plan: A):
+        ti.loop_config(serialize=not self.parallel)
+        for s in range(plan.num_surface):
+            if scene.rubs[s] > 0:
+                self.pull(s, scene, at, plan)
+        self.all_pairs_vjp(scene, at, plan)
         self.measure_all_vjp(scene, at, plan)
 
     @cached_property

@@ -102,7 +102,7 @@ class LaggedFriction(PairFriction):
         """Change of the forces for those of u, of x, of where the pass begins, and of `numbers`, a Tangent."""
         self._back_to_begin()
         runtime.fill(self.pairs.step, du_begin[None])
-        self._changes(self.pairs.next, 0, self.pairs.step, numbers)
+        self.changes(self.pairs.next, 0, self.pairs.step, numbers)
         d_pressing = whole(self.own.pressing_dot)[self.felt].astype(np.float64)
         dw, dn, dL = whole(self.own.weights_dot)[self.felt].astype(np.float64), d_pressing[:, :3], d_pressing[:, 3]
         d_speed = float(runtime.fetch(numbers.parameters)[self.pairs.first + 2])

@@ -10,9 +10,7 @@ BOWED, MOST_CUTS = 0.1, 3
 
 def cuts_of(mesh, term) -> int:
     """How often self-contact cuts the four triangles of each face in four, until they are within BOWED widths of it;
-    MOST_CUTS at most, none for pairs with friction. A cut leaves a fourth of the distance."""
-    if term.has_friction:
-        return 0
+    MOST_CUTS at most. A cut leaves a fourth of the distance."""
     off = bow(mesh) / (BOWED * float(term.values["self_contact_width"]))
     return int(np.clip(np.ceil(np.log2(max(off, 1.0)) / 2), 0, MOST_CUTS))
 
@@ -49,6 +47,17 @@ class CollisionSurface:
         # what belongs together: a new vertex to one of its nodes
         links = np.concatenate([at[:, None], np.tile(nodes[:, 5:], mesh.elements.shape[1] - 1)], 1)
         self.elements = np.concatenate([mesh.elements, links])
+        self.tetrahedron_sets, self.vertex_sets = {}, self._sets(mesh)
+
+    def _sets(self, mesh) -> dict[str, np.ndarray]:
+        """Vertices of the mesh's sets, of tetrahedra too; a new one is in those that all of its nodes are in."""
+        named = {name: mesh.elements[own] for name, own in mesh.tetrahedron_sets.items()} | dict(mesh.vertex_sets)
+        apart, out = np.diff(self.matrix.indptr), {}
+        for name, members in named.items():
+            inside = np.zeros(self.matrix.shape[1])
+            inside[members] = 1
+            out[name] = np.flatnonzero((self.matrix != 0).astype(float) @ inside == apart)
+        return out
 
 
 def _triangles(grid, parts: int) -> np.ndarray:

@@ -12,7 +12,7 @@ from diffsim_ti.potential.attached import Attached
 from diffsim_ti.potential.face_contact import FaceContact
 from diffsim_ti.potential.kernels import potential_kernels
 from diffsim_ti.potential.patch_coupling import PatchCoupling
-from diffsim_ti.state.history import copy_slot
+from diffsim_ti.slots import copy_slot
 
 
 class Potential:

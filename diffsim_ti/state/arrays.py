@@ -140,23 +140,20 @@ class SceneArrays:
 
     def _upload_ties(self, scene, start, corner_of, num_corners: int) -> tuple:
         """(start, corner_of, number of corners), with those of springs and then of cables, which are loads."""
-        self.num_ties = self.num_fibre_blocks = 0
-        self.first_tied = self.first_load = num_corners
+        self.num_ties, self.first_tied, self.first_load, self.num_fibre_blocks = 0, num_corners, num_corners, 0
         if len(self.founded):
             self.foundation_slot = runtime.upload(slots(self.founded, self.num_vertices), ti.i32)
         if self.paths is None:
             return start, corner_of, num_corners
-        paths, self.num_ties = self.paths, len(self.paths)
-        springs = sum(len(term.paths(self.mesh)) for term in scene.springs)
-        if self.in_lanes:  # kernels take fibres, which are the last, eight at a time
-            self.num_fibre_blocks = sum(len(t.paths(self.mesh)) for t in scene.cables if t.of_fibres) // LANES
+        paths, springs = self.paths, sum(len(term.paths(self.mesh)) for term in scene.springs)
+        self.num_ties, self.num_fibre_blocks = len(paths), self.in_lanes * (scene.num_fibres // LANES)  # the last
         self.first_load += int(paths.first_corner[paths.first_point[springs]])
         start, corner_of = with_more_corners(start, corner_of, paths.vertices, num_corners)
         self.tie_start = runtime.upload(paths.first_point, ti.i32)
         self.point_start = runtime.upload(paths.first_corner, ti.i32)
         self.point_vertex = runtime.upload(paths.vertices, ti.i32)
         self.point_weight = runtime.upload(paths.weights, self.fp)
-        # 1 what pulls only, 0 what pushes too, -1 what pulls as it is told, whose length nobody asks for
+        # 1: pulls only, 0: pushes too, -1: pulls as it is told, whose length nobody asks for
         self.tie_sides = runtime.upload(np.where(scene.given_tensions, -1, scene.one_sided_ties), ti.i32)
         return start, corner_of, num_corners + len(paths.vertices)
 

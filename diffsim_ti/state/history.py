@@ -6,6 +6,7 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
+from diffsim_ti.slots import copy_slot
 from diffsim_ti.state.arrays import SceneArrays
 
 
@@ -28,16 +29,9 @@ class History:
         runtime.check_alive(self.u.owner)
         for k, view in enumerate(self._views):
             if view is None:
-                _copy_slot(self._state[k], slot, target._state[k], to)
+                copy_slot(self._state[k], slot, target._state[k], to)
             else:
                 target._views[k][to] = view[slot]
-
-
-@runtime.untaped
-@ti.kernel
-def _copy_slot(source: ti.types.ndarray(ndim=2), s: ti.i32, target: ti.types.ndarray(ndim=2), t: ti.i32):
-    for i in range(source.shape[1]):
-        target[t, i] = source[s, i]
 
 
 @runtime.untaped
@@ -50,15 +44,6 @@ def _find_bad(u: ti.types.ndarray(ndim=2), v: ti.types.ndarray(ndim=2), bad: ti.
                 finite = finite and not (ti.math.isnan(value) or ti.math.isinf(value))
         if not finite:
             ti.atomic_min(bad[0], i)
-
-
-def copy_slot(source, s: int, target, t: int) -> None:
-    """target[t] = source[s]; on the CPU without the cost of a launch."""
-    host = runtime.view(target)
-    if host is None:
-        _copy_slot(source, s, target, t)
-    else:
-        host[t] = runtime.view(source)[s]
 
 
 def first_bad_vertex(history: History) -> int | None:

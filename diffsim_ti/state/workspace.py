@@ -11,8 +11,9 @@ from diffsim_ti.contact.curved_pairs import pairs_of
 from diffsim_ti.contact.surface_pairs import SurfacePairs
 from diffsim_ti.inputs import Derived, Mass
 from diffsim_ti.runtime import Kernel
+from diffsim_ti.slots import copy_slot
 from diffsim_ti.state.arrays import SceneArrays
-from diffsim_ti.state.history import History, copy_slot, first_bad_vertex
+from diffsim_ti.state.history import History, first_bad_vertex
 from diffsim_ti.state.solve_report import SolveReport
 from diffsim_ti.state.watch import ContactWatch
 

@@ -14,8 +14,7 @@ def warn_of_bow(mesh: TetrahedralMesh, term) -> None:
     off = bow(mesh) / 4 ** cuts_of(mesh, term)
     if off > width:
         warnings.warn(
-            f"{type(term).__name__}: faces of this mesh are curved, and lie up to {off:.3g} m from the flat triangles that "
-            f"stand for each, more than the width {width:.3g} m: refine the mesh where it is curved, or take a wider "
-            f"contact{' or one without friction' if term.has_friction else ''}",
+            f"{type(term).__name__}: faces of this mesh are curved, and lie up to {off:.3g} m from the triangles that "
+            f"stand for each, more than the width {width:.3g} m: refine the mesh where it is curved, or take a wider one",
             stacklevel=4,
         )

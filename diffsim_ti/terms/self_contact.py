@@ -18,8 +18,8 @@ class SelfContact(Term):
     Energy of a pair at distance d: m b(d) with b(d) = -stiffness (d - width)^2 log(d / width) for d < width, exactly zero
     beyond (barrier.py); m fades out edges that become parallel (contact/proximity.py), with lengths as in the mesh.
     Pairs that share a vertex do not count. stiffness [N/m], width [m].
-    Where ten-node faces are curved by a tenth of the width or more, and without friction, primitives are those of a finer
-    surface on the curved faces (mesh/collision_surface.py); with friction, of four flat triangles for each face.
+    Where ten-node faces are curved by a tenth of the width or more, primitives are those of a finer surface on the curved
+    faces (mesh/collision_surface.py), whose new vertices are in the sets that all of their nodes are in.
 
     friction [-]: Coulomb's coefficient of pairs that press with N = m |db/dd|; 0 compiles none. A dict has that of pairs of
     sets of vertices or tetrahedra, {("palm", "ball"): 0.6}, and other pairs do not rub; a pair whose corners are in several

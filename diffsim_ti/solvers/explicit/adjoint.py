@@ -10,10 +10,10 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.inputs import Derived
+from diffsim_ti.slots import copy_slot
 from diffsim_ti.solvers.explicit.felt_faces import FeltAdjoint
 from diffsim_ti.solvers.explicit.held_derivatives import HeldAdjoint
 from diffsim_ti.solvers.explicit.impulse_record import ImpulseRecord
-from diffsim_ti.state.history import copy_slot
 from diffsim_ti.state.numbers import OF_STEPS, Adjoint
 from diffsim_ti.state.workspace import FrameArrays
 
@@ -201,8 +201,10 @@ class ExplicitAdjoint:
         if now is None or not now.alpha > 0:
             yield
             return
+        if not friction.takes_pending:
+            self._complete(numbers, num_passes)
         with friction.alone(self.ws.record, slot + 1):
-            pending = numbers["first"] < num_passes - 1
+            pending = friction.takes_pending and numbers["first"] < num_passes - 1
             friction.slide_vjp(self.ws.record, slot, now, self, pending)
             yield
         friction.add_place(self)

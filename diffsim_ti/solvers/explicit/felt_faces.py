@@ -7,9 +7,9 @@ from diffsim_ti import runtime
 from diffsim_ti.mesh import geometry
 from diffsim_ti.mesh.curved_triangles import are_felt
 from diffsim_ti.potential.face_lattice import BENT, lattices, nodes_of_faces
+from diffsim_ti.slots import copy_slot
 from diffsim_ti.solvers.explicit.face_derivatives import face_derivatives
 from diffsim_ti.solvers.explicit.face_kernels import face_kernels
-from diffsim_ti.state.history import copy_slot
 from diffsim_ti.terms.obstacles.barrier import beta
 
 TRAVEL, LOAD = 0.2, 0.2

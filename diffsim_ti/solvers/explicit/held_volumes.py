@@ -17,9 +17,8 @@ from functools import cached_property
 
 import numpy as np
 
-from diffsim_ti import runtime
 from diffsim_ti.mesh.enclosure import Enclosure
-from diffsim_ti.state.history import copy_slot
+from diffsim_ti.slots import VertexRows
 
 
 class VolumeLost(FloatingPointError):
@@ -109,7 +108,8 @@ class HeldVolumes:
         free = np.tile(np.eye(3), (scene.mesh.num_vertices, 1, 1))
         free[scene.supports.vertices] -= scene.supports.held
         self.free = free[self.nodes]
-        self._row = runtime.array(workspace.arrays.vector, 1, workspace.arrays.num_vertices)
+        own = VertexRows(workspace.arrays, self.nodes)
+        self.rows, self.put = own.get, own.put
         self.kept = {}  # of recorded passes, by the slot they led to: places and velocities before the stage, and s
         self.clear()
 
@@ -127,24 +127,6 @@ class HeldVolumes:
         """Of the frames of the last run, shape (frames, chambers); the first has none."""
         none = np.zeros(len(self.places))
         return np.stack([self.spread(self.of_frames.get(k, none)) for k in range(num_frames)])
-
-    # ---- rows of the nodes -------------------------------------------------------------------------------------------
-
-    def rows(self, source, slot: int) -> np.ndarray:
-        """A slot's vectors of the walls, float64."""
-        host = runtime.view(source)
-        return (runtime.fetch(source, slot) if host is None else host[slot])[self.nodes, :3].astype(np.float64)
-
-    def put(self, target, slot: int, data: np.ndarray) -> None:
-        """Others in their place."""
-        host = runtime.view(target)
-        if host is not None:
-            host[slot, self.nodes, :3] = data
-            return
-        whole = runtime.fetch(target, slot)
-        whole[self.nodes] = data
-        runtime.fill(self._row, whole[None])
-        copy_slot(self._row, 0, target, slot)
 
     @property
     def rest(self) -> np.ndarray:

@@ -15,6 +15,7 @@ from diffsim_ti.potential.fluid import Fluid, Together
 from diffsim_ti.potential.free import FreeBodies, FreeDirections, held_as, mask_of
 from diffsim_ti.potential.potential import Potential
 from diffsim_ti.potential.way import Way
+from diffsim_ti.slots import copy_slot
 from diffsim_ti.solvers.implicit.approach import Approach
 from diffsim_ti.solvers.implicit.given import GivenInPasses
 from diffsim_ti.solvers.implicit.held_strains import HeldStrains
@@ -28,7 +29,7 @@ from diffsim_ti.solvers.implicit.preconditioned import Preconditioned
 from diffsim_ti.solvers.implicit.pressed import Pressed
 from diffsim_ti.solvers.implicit.stage import Stage
 from diffsim_ti.solvers.implicit.threads import one_blas_thread
-from diffsim_ti.state.history import History, copy_slot
+from diffsim_ti.state.history import History
 from diffsim_ti.state.walls import Moment
 from diffsim_ti.state.workspace import Workspace
 
