@@ -331,7 +331,7 @@ def iterations(mesh: ds.TetrahedralMesh, nu: float, volume: str) -> int:
 
 
 @pytest.mark.filterwarnings("ignore:.*tetrahedra lock")
-@pytest.mark.parametrize("nu, volume", [(0.3, "tetrahedra"), (0.49, "tetrahedra"), (0.49, "patches")])
+@pytest.mark.parametrize("nu, volume", [(nu, volume) for nu in (0.3, 0.49) for volume in ("tetrahedra", "patches")])
 def test_multigrid_takes_as_many_iterations_as_for_linear_tetrahedra(nu, volume):
     """Of about as many unknowns, within a factor of 1.5."""
     fine, coarse = (ds.TetrahedralMesh.create_box((4 * n + 1, n + 1, n + 1), (1.0, 0.25, 0.25), "five") for n in (8, 4))

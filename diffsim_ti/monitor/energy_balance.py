@@ -102,7 +102,7 @@ class EnergyBalance:
         if self.ws.arrays.features().driven:
             runtime.fill(self.ws.contact.work, 0)
             if self.ws.faces:
-                runtime.fill(self.ws.faces.work, 0)
+                self.ws.faces.clear_work()
         if self.ws.volumes:
             self.ws.volumes.work = 0.0
         self.window = Window(first, num_passes, self.ws.changes, self.ws.substep, level)
@@ -124,7 +124,7 @@ class EnergyBalance:
         window, features = self.window, self.ws.arrays.features()
         work = self._noted_work() if features.driven else 0.0
         if features.moving and self.ws.faces:
-            work += float(runtime.fetch(self.ws.faces.work).astype(np.float64).sum())
+            work += self.ws.faces.all_work()
         if self.ws.volumes:
             work += self.ws.volumes.work
         if window.level is None:

@@ -211,6 +211,7 @@ class ExplicitAdjoint:
 
     def _start_faces(self, alone, numbers: dict) -> None:
         """Go back through the contact of faces, whose impulse may be asked for."""
+        self.faces.slide(alone, self.impulses.seed_friction(numbers) if self.ws.impulses else None)
         by_speed = self.impulses.seed(numbers, alone.pushes) if self.ws.impulses else None
         if by_speed is None:
             self.faces.start(alone, numbers)

@@ -14,12 +14,17 @@ from diffsim_ti.state.pass_table import pass_at
 A = ti.template()
 # of surface vertices: changes, or adjoints, of e and v; what a part is given; those of u0
 OWN = dict.fromkeys(("shift_dot", "speed_dot", "seed", "begin_dot"), "vectors")
+RUBBED = dict(impulse_dot="vectors")  # changes, or adjoints, of what rough obstacles push the nodes of each face with
 OF_FACES = dict(sums="scalars2", felt="vectors2", path="vectors2", rest_adj="vectors", by_areas="scalars")
 
 
 @dataclass(frozen=True)
 class FaceDerivatives(FaceKernels):
     """After `begins` and `parts_of_pass` with the same number of parts; what a part takes of forces is held."""
+
+    @property
+    def own(self) -> dict:
+        return OWN | (RUBBED if self.rough else {})
 
     # ---- tangent -----------------------------------------------------------------------------------------------------
 
@@ -39,13 +44,18 @@ class FaceDerivatives(FaceKernels):
             u, du = self.rows_of(f, faces.place, k, faces), self.seed_rows(f, own, faces)
             for g in ti.static(self.groups):
                 for o in range(g.count):
+                    rows = self.rows(0)
                     if ti.static(g.force.turns):
-                        total += self.turned_jvp(g, o, f, u, du, then, scene, faces, tangent)
+                        rows = self.turned_jvp(g, o, f, u, du, then, scene, faces, tangent)
                     else:
                         X = self.rest_rows(f, scene.rest, self.place(g, o, then, scene.path), faces)
                         w = du + self.rest_rows(f, tangent.rest, self.place(g, o, then, tangent.path), faces)
                         rows, _ = self.face("jvp", g, o, f, X, u, w, scene, faces, tangent)
-                        total += rows
+                    total += rows
+                    if ti.static(g.force.friction):
+                        for a in ti.static(range(self.nodes)):
+                            at, length = self.pushed_row(f, g.number + o, a), self.part_length(now, plan)
+                            own.impulse_dot[at] = own.impulse_dot[at] + length * self.direct(self.row_of(rows, a))
             self.store(f, total, faces)
 
     # ---- of an obstacle that turns, with which forces turn: theta adds theta x f, and its adjoint f x w ---------------
@@ -131,7 +141,7 @@ class FaceDerivatives(FaceKernels):
     @cached_property
     def jvp(self) -> Kernel:
         """Change of the state at the end of a pass, where that without contact within faces stands in `tangent`."""
-        arrays = dict(tangent=dict(u="vectors2", v="vectors2") | TANGENT, own=OWN)
+        arrays = dict(tangent=dict(u="vectors2", v="vectors2") | TANGENT, own=self.own)
         return self._kernel("jvp", self.all_jvp, **arrays)
 
     # ---- adjoint -----------------------------------------------------------------------------------------------------
@@ -170,11 +180,17 @@ class FaceDerivatives(FaceKernels):
             u, w = self.rows_of(f, faces.place, k, faces), self.seed_rows(f, own, faces)
             for g in ti.static(self.groups):
                 for o in range(g.count):
+                    felt = w
+                    if ti.static(g.force.friction):  # the impulses are felt by friction, too
+                        for a in ti.static(range(self.nodes)):
+                            by = self.part_length(now, plan) * own.impulse_dot[self.pushed_row(f, g.number + o, a)]
+                            for m in ti.static(range(3)):
+                                felt[a, m] += by[m]
                     if ti.static(g.force.turns):
-                        total += self.turned_vjp(g, o, f, u, w, then, scene, faces, out)
+                        total += self.turned_vjp(g, o, f, u, felt, then, scene, faces, out)
                     else:
                         X = self.rest_rows(f, scene.rest, self.place(g, o, then, scene.path), faces)
-                        rows, _ = self.face("vjp", g, o, f, X, u, w, scene, faces, out)
+                        rows, _ = self.face("vjp", g, o, f, X, u, felt, scene, faces, out)
                         total += rows
                         by_X = self.row_of(rows, 0) + self.row_of(rows, 1) + self.row_of(rows, 2)
                         for a in ti.static(range(3, self.nodes)):
@@ -220,7 +236,7 @@ class FaceDerivatives(FaceKernels):
     def vjp(self) -> Kernel:
         """Adjoint of the state at the end of a pass without contact within faces, in place, and of u0; adds those of all
         else."""
-        arrays = dict(adjoint=dict(u="vectors2", v="vectors2", sums=ADJOINT["sums"]), out=OF_FACES, own=OWN)
+        arrays = dict(adjoint=dict(u="vectors2", v="vectors2", sums=ADJOINT["sums"]), out=OF_FACES, own=self.own)
         return self._kernel("vjp", self.all_vjp, ("steps", "num_parts"), **arrays)
 
     @ti.func
@@ -233,7 +249,7 @@ class FaceDerivatives(FaceKernels):
     @cached_property
     def begin_vjp(self) -> Kernel:
         """Add the adjoint of u0, once the rest of the pass is reversed."""
-        return self._kernel("begin_vjp", self.all_begin_vjp, adjoint=dict(u="vectors2"), own=OWN)
+        return self._kernel("begin_vjp", self.all_begin_vjp, adjoint=dict(u="vectors2"), own=self.own)
 
     @ti.func
     def all_begin_jvp(self, scene: A, faces: A, state: A, table: A, tangent: A, own: A, plan: A):
@@ -244,7 +260,7 @@ class FaceDerivatives(FaceKernels):
     @cached_property
     def begin_jvp(self) -> Kernel:
         """Keep the change of u0."""
-        return self._kernel("begin_jvp", self.all_begin_jvp, tangent=dict(u="vectors2"), own=OWN)
+        return self._kernel("begin_jvp", self.all_begin_jvp, tangent=dict(u="vectors2"), own=self.own)
 
 
 @lru_cache(maxsize=None)

@@ -28,6 +28,7 @@ from diffsim_ti.state.pass_table import pass_at
 
 A = ti.template()
 FACES = dict.fromkeys(("corners", "own", "parts", "start", "entries", "vertices", "near"), "ints")
+PUSHED = dict(impulse="vectors")  # of rough obstacles on the nodes of each face, in a pass
 FACES |= dict.fromkeys(("share", "whole", "shift", "offsets"), "vectors") | dict.fromkeys(
     ("begin", "place", "speed"), "vectors2"
 )
@@ -47,11 +48,21 @@ class FaceKernels(FaceWalls):
     def _kernel(self, name: str, body, more=(), **arrays) -> Kernel:
         own = dict(
             scene=SCENE | (GUIDED if self.features.guided else {}),
-            faces=FACES,
+            faces=FACES | (PUSHED if self.rough else {}),
             state=dict(u="vectors2", v="vectors2"),
             table=dict(ints="ints", floats="scalars"),
         )
         return Kernel("face_" + name, body, self.precision, own | arrays, NUMBERS | dict.fromkeys(more, "int"))
+
+    @property
+    def rough(self) -> bool:
+        """Whether points within faces rub on some obstacle."""
+        return any(g.force.friction for g in self.groups)
+
+    @traced
+    def pushed_row(self, f, o, a):
+        """Place in `impulse` of node a of face f and obstacle o."""
+        return let((f * self.num_obstacles + o) * self.nodes + a)
 
     @ti.func
     def direct(self, f):
@@ -190,6 +201,10 @@ class FaceKernels(FaceWalls):
                     speed = self.speed(g, k, now, scene.path)
                     for a in ti.static(range(self.nodes)):
                         faces.done[f] = faces.done[f] + length * self.dot3(self.row_of(rows, a), speed)
+                if ti.static(g.force.friction):
+                    for a in ti.static(range(self.nodes)):
+                        at = self.pushed_row(f, g.number + k, a)
+                        faces.impulse[at] = faces.impulse[at] + length * self.direct(self.row_of(rows, a))
                 row = f * ti.static(self.num_obstacles) + g.number + k
                 faces.least[row] = least
                 for a in ti.static(range(self.nodes)):
@@ -201,6 +216,9 @@ class FaceKernels(FaceWalls):
     def clear_pushed(self, f, faces: A):
         for o in range(ti.static(self.num_obstacles)):
             faces.pushed[f * ti.static(self.num_obstacles) + o] = ti.cast(0, self.fp)
+            if ti.static(self.rough):
+                for a in range(ti.static(self.nodes)):
+                    faces.impulse[self.pushed_row(f, o, a)] = self.vector(0)
 
     @ti.func
     def all_forces(self, scene: A, faces: A, state: A, table: A, plan: A):

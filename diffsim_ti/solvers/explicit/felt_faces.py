@@ -4,11 +4,14 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
+from diffsim_ti.contact.pair_friction import ratio_by_rate
+from diffsim_ti.inputs import Derived
 from diffsim_ti.mesh import geometry
 from diffsim_ti.mesh.curved_triangles import are_felt
 from diffsim_ti.potential.face_lattice import BENT, lattices, nodes_of_faces
-from diffsim_ti.slots import copy_slot
+from diffsim_ti.slots import VertexRows, copy_slot
 from diffsim_ti.solvers.explicit.face_derivatives import face_derivatives
+from diffsim_ti.solvers.explicit.face_friction import FaceFriction
 from diffsim_ti.solvers.explicit.face_kernels import face_kernels
 from diffsim_ti.terms.obstacles.barrier import beta
 
@@ -64,7 +67,13 @@ class FeltFaces:
         runtime.fill(self.work, 0)
         self.row, self.place = runtime.array(a.vector, 1, a.num_vertices), None
         self._make_room(1)
-        self.kept = {}  # of recorded passes in which faces came near, by slots: (parts, state without their contact, pushes)
+        self.friction, self.rub = FaceFriction(workspace, surface), None  # what rubbed in the last pass
+        rows = faces.size * len(a.contacts) if self.friction else 0
+        self.impulse, self.rows = runtime.array(a.vector, rows or 1), VertexRows(a, surface)
+        self.corners_of = own.reshape(faces.shape)
+        self.work_of_friction = 0.0
+        # of recorded passes in which faces came near, by slots: (parts, state without their contact, pushes, what rubbed)
+        self.kept = {}
         self.pushes = None  # in the last pass: whether each obstacle pushed on faces around each vertex
         self.saturated = False  # whether the last pass would have taken more parts than there may be
 
@@ -105,10 +114,13 @@ class FeltFaces:
         """A pass begins at a slot."""
         copy_slot(history.u, slot, self.begin, 0)
 
-    def after_pass(self, history, slot: int, plan: dict, recording: bool, asked: bool = False) -> np.ndarray | None:
+    def after_pass(
+        self, history, slot: int, plan: dict, num_passes: int, recording: bool, asked: bool = False
+    ) -> np.ndarray | None:
         """The pass led to a slot: go its way again where faces come near, and note what they did; where it is `asked`,
-        the velocity that they have added."""
+        the velocity that their pushes have added."""
         self.kept.pop(slot, None)
+        self.rub = None
         self._run("approaches", plan, history, slot)
         n = self._fewest_parts()
         while n:
@@ -121,13 +133,44 @@ class FeltFaces:
         if n:
             self.saturated = n >= self.most_parts
             self.pushes = self._who_pushes() if asked else None
-            if recording:
-                state = runtime.fetch_row(history.u, slot), runtime.fetch_row(history.v, slot)
-                self.kept[slot] = n, state, self.pushes
-            before = runtime.fetch_row(history.v, slot) if asked else None
+            state = runtime.fetch_row(history.u, slot), runtime.fetch_row(history.v, slot)
             self._run("ends", plan, history, slot, n, watch=self.ws.watch)
-            return runtime.fetch_row(history.v, slot) - before if asked else None
+            pushed = runtime.fetch_row(history.v, slot) - state[1] if asked else None
+            self._slide(history, slot, plan, num_passes)
+            if recording:
+                self.kept[slot] = n, state, self.pushes, self.rub
+            return pushed
         return None
+
+    def _slide(self, history, slot: int, plan: dict, num_passes: int) -> None:
+        """Friction of what was pushed."""
+        if not self.friction:
+            return
+        u, v = self.rows.get(history.u, slot), self.rows.get(history.v, slot)
+        x = self.rows.get(self.begin, 0) + self.a.values.rest[self.rows.nodes]
+        self.rub = self.friction.begin(self.impulses(self.impulse), v, x, self.corners_of, plan["first"], num_passes)
+        if self.rub is not None:
+            self.friction.slide(self.rub)
+            self.rows.put(history.v, slot, v + self.rub.gained)
+            self.rows.put(history.u, slot, u + self.rub.ratio * self.rub.gained)
+            self.work_of_friction += self.friction.work(self.rub)
+
+    def impulses(self, array) -> np.ndarray:
+        """Of obstacles on the nodes of faces, or changes of them, shape (faces, obstacles, nodes, 3)."""
+        return runtime.fetch(array).astype(np.float64).reshape(self.num_faces, len(self.a.contacts), -1, 3)
+
+    def impulses_of_friction(self) -> np.ndarray | None:
+        """Of each obstacle that rubs on surface vertices in the last pass [N s]; None where nothing rubbed."""
+        return None if self.rub is None else self.friction.impulses(self.rub)
+
+    def clear_work(self) -> None:
+        """Of moving obstacles, to be counted anew."""
+        runtime.fill(self.work, 0)
+        self.work_of_friction = 0.0
+
+    def all_work(self) -> float:
+        """Of moving obstacles on the body [J]."""
+        return float(runtime.fetch(self.work).astype(np.float64).sum()) + self.work_of_friction
 
     def _who_pushes(self) -> np.ndarray:
         """Whether each obstacle pushes on faces around each vertex, shape (obstacles, num_vertices)."""
@@ -182,7 +225,7 @@ class Alone:
 
     def __init__(self, faces: FeltFaces, history, slot: int):
         self.faces, self.history, self.slot = faces, history, slot
-        self.n, self._state, self.pushes = faces.kept[slot]
+        self.n, self._state, self.pushes, self.rub = faces.kept[slot]
 
     def __enter__(self) -> "Alone":
         self._whole = [runtime.fetch_row(x, self.slot) for x in (self.history.u, self.history.v)]
@@ -199,8 +242,11 @@ class Alone:
 
     @property
     def speed(self) -> np.ndarray:
-        """The velocity that faces have added in the pass."""
-        return self._whole[1] - self._state[1]
+        """The velocity that the pushes of faces have added in the pass."""
+        out = self._whole[1] - self._state[1]
+        if self.rub is not None:
+            out[self.faces.rows.nodes] -= self.rub.gained
+        return out
 
     def go(self, plan: dict) -> None:
         """Its parts again, from where the pass begins, the slot before."""
@@ -218,6 +264,7 @@ class FaceChanges:
         self.shift_dot, self.speed_dot, self.seed, self.begin_dot = (
             runtime.array(a.vector, faces.num_surface) for _ in range(4)
         )
+        self.impulse_dot, self.rows = runtime.array(a.vector, *faces.impulse.shape), VertexRows(a, faces.rows.nodes)
 
     def _run(self, name: str, alone: Alone, plan: dict, **records) -> None:
         self.faces._run(name, plan, alone.history, alone.slot, alone.n, features=self.features, own=self, **records)
@@ -241,7 +288,24 @@ class FeltTangent(FaceChanges):
     def end(self, alone: Alone, plan: dict) -> None:
         """After it."""
         alone.go(plan)
+        runtime.fill(self.impulse_dot, 0)
         self._run_parts("jvp", alone, plan, tangent=self.of_all)
+
+    def slide(self, alone: Alone, change: Derived, rate_dot: float) -> np.ndarray | None:
+        """Then that of friction; the changes of the impulses of each obstacle that rubs, where one does."""
+        rub, faces, nodes = alone.rub, self.faces, self.rows.nodes
+        if rub is None:
+            return None
+        a, u, v = faces.a, self.rows.get(self.at.u, 0), self.rows.get(self.at.v, 0)
+        dx = runtime.fetch(self.begin_dot).astype(np.float64) + change.rest[nodes]
+        inverse_dot = -(faces.friction.inverse**2) * change.mass[nodes, None]
+        walls = a.walls.jvp(a.rows["path"], change.path, rub.moment)
+        impulses = faces.impulses(self.impulse_dot)
+        gained, each = faces.friction.jvp(rub, impulses, v, dx, inverse_dot, change.parameters, walls)
+        self.rows.put(self.at.v, 0, v + gained)
+        by_rate = rate_dot * ratio_by_rate(rub.now) * rub.gained
+        self.rows.put(self.at.u, 0, u + rub.ratio * gained + by_rate)
+        return each
 
 
 class FeltAdjoint(FaceChanges):
@@ -259,19 +323,54 @@ class FeltAdjoint(FaceChanges):
     def clear(self) -> None:
         for x in (self.sums, self.felt, self.rest_adj, self.by_areas):
             runtime.fill(x, 0)
+        values = self.faces.a.values
+        self.parameters, self.by_rate = np.zeros_like(values.parameters), 0.0
+        self.path_adj = None if values.path is None else np.zeros_like(values.path)
+        self.inverse, self.rest = np.zeros((self.faces.num_surface, 1)), np.zeros((self.faces.num_surface, 3))
+
+    def slide(self, alone: Alone, impulses_adj: np.ndarray | None = None) -> None:
+        """Go back through friction, the very last thing; impulses_adj: of those of each obstacle that rubs."""
+        rub, faces, self._by_x = alone.rub, self.faces, None
+        runtime.fill(self.impulse_dot, 0)
+        if rub is None:
+            return
+        p, q = self.rows.get(self.at.u, 0), self.rows.get(self.at.v, 0)
+        by = faces.friction.vjp(rub, q + rub.ratio * p, impulses_adj)
+        self.by_rate += ratio_by_rate(rub.now) * float((p * rub.gained).sum())
+        self.rows.put(self.at.v, 0, q + by.v)
+        felt = np.zeros((faces.num_faces, len(faces.a.contacts), *by.impulses.shape[1:]))
+        np.add.at(felt, (rub.face, faces.friction.number[rub.obstacle]), by.impulses)
+        runtime.fill(self.impulse_dot, felt.reshape(-1, 3))
+        self.parameters += by.parameters
+        self.inverse += by.inverse
+        self.rest += by.x
+        self._by_x = by.x
+        if self.path_adj is not None:
+            faces.a.walls.vjp(faces.a.rows["path"], by.walls, rub.moment, self.path_adj)
 
     def start(self, alone: Alone, plan: dict) -> None:
         """Go back through the contact of faces, the last thing that the pass did."""
         alone.go(plan)
         plan = plan | dict(steps=1, num_parts=self.num_parts)
         self._run_parts("vjp", alone, plan, back=True, adjoint=self.of_all, out=self)
+        if self._by_x is not None:
+            runtime.fill(self.begin_dot, runtime.fetch(self.begin_dot) + self._by_x)
 
     def end(self, alone: Alone, plan: dict) -> None:
         """The rest of the pass is reversed."""
         self._run("begin_vjp", alone, plan, adjoint=self.at)
 
-    def collect(self, out) -> None:
-        """Add the adjoints of parameters and rest positions to a `Derived`."""
+    def collect(self, out: Derived) -> None:
+        """Add the adjoints of parameters, masses, paths and rest positions to a `Derived`."""
+        nodes, mass = self.rows.nodes, np.zeros_like(out.mass)
+        mass[nodes] = -(self.inverse * self.faces.friction.inverse**2)[:, 0]
+        out.mass = out.mass + mass
+        out.parameters[: len(self.parameters)] += self.parameters
+        out.rest[nodes] += self.rest
+        if self.features.drag >= 0:
+            out.parameters[self.features.drag] += self.by_rate
+        if self.path_adj is not None:
+            out.path += self.path_adj
         count = self.features.num_parameters
         out.parameters[:count] += runtime.fetch(self.sums).astype(np.float64).sum(1)[:count]
         out.rest[self.faces.mesh.surface_vertices] += runtime.fetch(self.rest_adj)

@@ -299,9 +299,11 @@ class ExplicitWorkspace(Workspace):
                 self.volumes.before_pass(history, slot)
             launch(**numbers, base=base, stride=stride)
             if self.faces:
-                change = self.faces.after_pass(history, slot + stride, numbers, recording, self.impulses is not None)
+                asked = self.impulses is not None
+                change = self.faces.after_pass(history, slot + stride, numbers, num_passes, recording, asked)
                 if change is not None:
                     self.impulses.add(numbers, change, self.faces.pushes)
+                    self.impulses.add_friction(numbers, self.faces.impulses_of_friction())
             if pairs:
                 if pairs.friction:
                     now = self.numbers_of(numbers["first"], num_passes)

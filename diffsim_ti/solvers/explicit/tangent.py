@@ -86,6 +86,9 @@ class ExplicitTangent:
         if before is not None:
             change = runtime.fetch_row(self.v, 0) - before
             self.impulses.add_jvp(numbers, alone.speed, change, self.tangent.mass, alone.pushes)
+        of_friction = self.faces.slide(alone, self.tangent, self._rate_dot)
+        if before is not None:
+            self.impulses.add_friction(numbers, of_friction)
 
     def contact_forces(self, frame_time: np.ndarray) -> np.ndarray:
         """Changes of the frames' contact forces."""

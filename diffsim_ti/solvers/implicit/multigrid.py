@@ -14,8 +14,7 @@ class Multigrid:
     """Smoothed aggregation on the assembled matrix of the rest state, with rigid motions as near kernel.
 
     Isotropic laws: turning a body turns its stiffness, K(R u) = R K(u) R^T. So residuals are turned back by each vertex's
-    mean rotation, and corrections forth. Contact stiffness joins the finest level. A V-cycle has one sweep of Gauss-Seidel
-    on each way, forward down and backward up, which keeps it symmetric.
+    mean rotation, and corrections forth. Contact stiffness joins the finest level. The V-cycle over it is cycle.py's.
     Below ten-node tetrahedra lie the linear ones of their corners, and aggregates of these (p-multigrid): aggregates of all
     ten nodes take half as many iterations again.
     Vanek, Mandel, Brezina 1996, doi:10.1007/BF02238511; Bell, Olson, Schroder, PyAMG, doi:10.21105/joss.04142; Heys,
