@@ -11,7 +11,7 @@ import numpy as np
 from diffsim_ti import runtime
 from diffsim_ti.inputs import Derived
 from diffsim_ti.slots import copy_slot
-from diffsim_ti.solvers.explicit.felt_faces import FeltAdjoint
+from diffsim_ti.solvers.explicit.felt_derivatives import FeltAdjoint
 from diffsim_ti.solvers.explicit.held_derivatives import HeldAdjoint
 from diffsim_ti.solvers.explicit.impulse_record import ImpulseRecord
 from diffsim_ti.state.numbers import OF_STEPS, Adjoint

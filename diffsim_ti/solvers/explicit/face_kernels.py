@@ -54,23 +54,6 @@ class FaceKernels(FaceWalls):
         )
         return Kernel("face_" + name, body, self.precision, own | arrays, NUMBERS | dict.fromkeys(more, "int"))
 
-    @property
-    def rough(self) -> bool:
-        """Whether points within faces rub on some obstacle."""
-        return any(g.force.friction for g in self.groups)
-
-    @traced
-    def pushed_row(self, f, o, a):
-        """Place in `impulse` of node a of face f and obstacle o."""
-        return let((f * self.num_obstacles + o) * self.nodes + a)
-
-    @ti.func
-    def direct(self, f):
-        """Without the fourth component."""
-        out = f
-        out[3] = ti.cast(0, self.fp)
-        return out
-
     @ti.func
     def gathered(self, s, faces: A):
         """Sum of what the faces around surface vertex s have for it, in a fixed order."""
@@ -78,14 +61,6 @@ class FaceKernels(FaceWalls):
         for c in range(faces.start[s], faces.start[s + 1]):
             out += faces.share[faces.entries[c]]
         return out
-
-    @ti.func
-    def store(self, f, rows, faces: A):
-        for a in ti.static(range(self.nodes)):
-            x = self.vector(0)
-            for m in ti.static(range(4)):
-                x[m] = rows[a, m]
-            faces.share[self.nodes * f + a] = x
 
     @ti.func
     def share_of(self, k, plan: A):

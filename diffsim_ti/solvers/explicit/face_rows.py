@@ -169,3 +169,30 @@ class FaceRows(HeldBack):
                 if bent or d <= 0:
                     least = ti.min(least, d)
         return least
+
+    # ---- what faces do to their nodes ---------------------------------------------------------------------------------
+
+    @ti.func
+    def direct(self, f):
+        """Without the fourth component."""
+        out = f
+        out[3] = ti.cast(0, self.fp)
+        return out
+
+    @ti.func
+    def store(self, f, rows, faces: A):
+        for a in ti.static(range(self.nodes)):
+            x = self.vector(0)
+            for m in ti.static(range(4)):
+                x[m] = rows[a, m]
+            faces.share[self.nodes * f + a] = x
+
+    @property
+    def rough(self) -> bool:
+        """Whether points within faces rub on some obstacle."""
+        return any(g.force.friction for g in self.groups)
+
+    @traced
+    def pushed_row(self, f, o, a):
+        """Place in `impulse` of node a of face f and obstacle o."""
+        return let((f * self.num_obstacles + o) * self.nodes + a)

@@ -8,7 +8,7 @@ import numpy as np
 from diffsim_ti import runtime
 from diffsim_ti.inputs import Derived
 from diffsim_ti.slots import copy_slot
-from diffsim_ti.solvers.explicit.felt_faces import FeltTangent
+from diffsim_ti.solvers.explicit.felt_derivatives import FeltTangent
 from diffsim_ti.solvers.explicit.held_derivatives import HeldTangent
 from diffsim_ti.solvers.explicit.impulse_record import ImpulseRecord
 from diffsim_ti.state.numbers import Tangent
