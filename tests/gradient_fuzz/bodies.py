@@ -30,8 +30,9 @@ def with_part(mesh, rng):
     return mesh.with_tetrahedron_set("part", np.sort(rng.permutation(mesh.num_tetrahedra)[:count]))
 
 
-def with_middles(mesh, start, rng):
-    """(the same body of ten-node tetrahedra, some of whose edges are bent, and the start of all nodes)."""
+def with_middles(mesh, start, rng, most: float = 0.03):
+    """(the same body of ten-node tetrahedra, some of whose edges are bent by `most` cells at most, and the start of all
+    nodes)."""
     straight = mesh.quadratic()
     ends = straight.elements[:, MID_EDGES]
     moved, started = np.zeros((2, *straight.vertices.shape))
@@ -39,7 +40,7 @@ def with_middles(mesh, start, rng):
     started[straight.elements[:, 4:]] = started[ends].mean(2)
     if rng.random() < 0.6:
         middles = np.unique(straight.elements[:, 4:])
-        moved[middles] = 0.03 * CELL * rng.uniform(-1, 1, (len(middles), 3))
+        moved[middles] = most * CELL * rng.uniform(-1, 1, (len(middles), 3))
     bent = ds.TetrahedralMesh(
         straight.vertices + moved,
         straight.elements,

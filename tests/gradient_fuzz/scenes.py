@@ -110,7 +110,8 @@ def build(seed: int, precision: str | None = None, calm: float = 1.0) -> Configu
     start = start + shift
     mesh = bodies.with_part(mesh, rng) if rng.random() < 0.5 else mesh
     if kind.order == 2:
-        mesh, start = bodies.with_middles(mesh, start, np.random.default_rng([23, seed]))
+        bent = 0.08 if kind.self_contact else 0.03  # so that surfaces that meet are curved
+        mesh, start = bodies.with_middles(mesh, start, np.random.default_rng([23, seed]), bent)
     law, E = material(kind, rng, mesh)
     law = newer.grown(kind, seed, law, mesh)
     density = rng.uniform(600, 1200) * (1 + 0.3 * rng.random(mesh.num_tetrahedra) if rng.random() < 0.4 else 1.0)
