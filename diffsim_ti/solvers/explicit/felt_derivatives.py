@@ -42,7 +42,8 @@ class FeltTangent(FaceChanges):
     def end(self, alone: Alone, plan: dict) -> None:
         """After it."""
         alone.go(plan)
-        runtime.fill(self.impulse_dot, 0)
+        if self.faces.friction:
+            runtime.fill(self.impulse_dot, 0)
         self._run_parts("jvp", alone, plan, tangent=self.of_all)
 
     def slide(self, alone: Alone, change: Derived, rate_dot: float) -> np.ndarray | None:
@@ -85,8 +86,9 @@ class FeltAdjoint(FaceChanges):
     def slide(self, alone: Alone, impulses_adj: np.ndarray | None = None) -> None:
         """Go back through friction, the very last thing; impulses_adj: of those of each obstacle that rubs."""
         rub, faces, self._by_x = alone.rub, self.faces, None
-        runtime.fill(self.impulse_dot, 0)
         if rub is None:
+            if faces.friction:
+                runtime.fill(self.impulse_dot, 0)
             return
         p, q = self.rows.get(self.at.u, 0), self.rows.get(self.at.v, 0)
         by = faces.friction.vjp(rub, q + rub.ratio * p, impulses_adj)

@@ -130,12 +130,12 @@ class FeltFaces:
         if n:
             self.saturated = n >= self.most_parts
             self.pushes = self._who_pushes() if asked else None
-            state = runtime.fetch_row(history.u, slot), runtime.fetch_row(history.v, slot)
+            u, v = (runtime.fetch_row(x, slot) if recording or asked else None for x in (history.u, history.v))
             self.run("ends", plan, history, slot, n, watch=self.ws.watch)
-            pushed = runtime.fetch_row(history.v, slot) - state[1] if asked else None
+            pushed = runtime.fetch_row(history.v, slot) - v if asked else None
             self._slide(history, slot, plan, num_passes)
             if recording:
-                self.kept[slot] = n, state, self.pushes, self.rub
+                self.kept[slot] = n, (u, v), self.pushes, self.rub
             return pushed
         return None
 
