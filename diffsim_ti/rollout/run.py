@@ -18,7 +18,7 @@ class Run:
     contacts: what it noted of them, worked out when asked for.
     start: called with the workspace after the values are loaded; sets another start there, the same each time.
     first_step: steps that came before, for reports.
-    seen_by: the guard that looked after it to its end.
+    seen_by: the name of the sweep that looked after it to its end.
     """
 
     values: dict

@@ -62,7 +62,8 @@ class Sweep:
         places = -(-self.scene.mesh.num_tetrahedra // runtime.LANES) * runtime.LANES
         law_state = places * len(self.scene.law.state_names) / (4 * self.scene.mesh.num_vertices)
         self.checkpoints = choose_checkpoints(self.num_passes, self.state_bytes, every, memory, law_state)
-        self.workspace = self._guard = None  # made by the first run
+        self.workspace = None  # made by the first run
+        self._name = object()  # that runs bear
         self._loaded = None  # the values that are on the device
         self._current = None  # the run whose frames and snapshots the workspace holds
         self._adjoint = None  # the solver's, made by the first pull-back
@@ -133,7 +134,7 @@ class Sweep:
     def bring_back(self, run: Run) -> None:
         """See to it that frames and kept states are those of a run."""
         if self._current is not run:
-            again = run.seen_by is self._guard and self._guard is not None
+            again = run.seen_by is self._name
             run.values = self._checked(run.values)  # which may be another rollout's
             self._forward(run, again)
 
@@ -197,7 +198,7 @@ class Sweep:
                 advance(first, last, self.num_passes, self.save_every, self._recorded)
         if self.solver.last_frame_is_state:
             ws.save_frame(self.num_frames - 1)
-        run.seen_by = self._guard
+        run.seen_by = self._name
         self._kept, self._current = path, run  # segments whose starts are in the snapshots
 
     def _record(self, first: int, last: int) -> None:
