@@ -13,16 +13,25 @@ import pytest
 import diffsim_ti
 
 
+ARCH = os.environ.get("DIFFSIM_TI_ARCH", "cpu")
+
+
+def start():
+    debug = dict(debug=True) if os.environ.get("DIFFSIM_TI_DEBUG") else {}
+    diffsim_ti.init(ARCH, precision="f64", **debug)
+
+
 @pytest.fixture(scope="session", autouse=True)
 def taichi():
-    debug = dict(debug=True) if os.environ.get("DIFFSIM_TI_DEBUG") else {}
-    diffsim_ti.init(os.environ.get("DIFFSIM_TI_ARCH", "cpu"), precision="f64", **debug)
+    start()
     gc.freeze()  # all modules: tracing kernels makes many objects, and each thousand of them would look through these
 
 
 @pytest.fixture(scope="module", autouse=True)
-def default_precision(taichi):
-    """What a file leaves behind (commands choose a precision) is not what the next one starts with."""
+def as_at_first(taichi):
+    """What a file leaves behind (commands choose a backend and a precision) is not what the next one starts with."""
+    if diffsim_ti.runtime.arch_name() != ARCH:
+        start()
     diffsim_ti.runtime.set_precision("f64")
 
 
