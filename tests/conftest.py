@@ -12,7 +12,6 @@ import pytest
 
 import diffsim_ti
 
-
 ARCH = os.environ.get("DIFFSIM_TI_ARCH", "cpu")
 
 
