@@ -314,7 +314,7 @@ def test_what_self_contact_leaves_out_of_curved_faces_is_said():
     middles = mesh.vertices[mesh.surface_faces[:, 3:]] - mesh.vertices[corners].mean(2)
     height = np.linalg.norm(middles, axis=2).max()
     assert height / 4 * (1 - 1e-12) <= bow(mesh) <= height and bow(mesh.linear().quadratic()) < 1e-15
-    for width, options in ((0.9 / 64, {}), (0.9, dict(friction=0.1))):  # which cuts triangles no further, or not at all
+    for width, options in ((0.9 / 64, {}), (0.9 / 64, dict(friction=0.1))):  # which cuts triangles no further
         with pytest.warns(UserWarning, match="SelfContact: faces of this mesh are curved, and lie up to"):
             ds.Scene(mesh, law, terms=ds.SelfContact(stiffness=1.0, width=width * bow(mesh), **options))
         with warnings.catch_warnings():
