@@ -25,16 +25,8 @@ A = ti.template()  # an array or Bundle handed to a Taichi function
 
 def counts_of_further(arrays) -> dict:
     """How many there are, and where their corners begin."""
-    names = (
-        "num_ties",
-        "num_fibre_blocks",
-        "first_tied",
-        "first_load",
-        "num_pressed",
-        "first_pressed",
-        "num_dragged",
-        "first_dragged",
-    )
+    names = "num_ties", "first_tied", "first_load", "num_pressed", "first_pressed", "num_dragged", "first_dragged"
+    names += ("num_fibre_blocks",)
     return {name: getattr(arrays, name) for name in names} | dict(first_push=arrays.first_pressed)
 
 
@@ -85,10 +77,8 @@ class FurtherElements:
 
     @cached_property
     def fibre(self) -> FibreBlock:
-        has = self.features
-        return FibreBlock(
-            self.precision, has.ties_per_step, nodes_of(has.order, PRECISIONS[self.precision]).count, has.shape
-        )
+        has, nodes = self.features, nodes_of(self.features.order, PRECISIONS[self.precision])
+        return FibreBlock(self.precision, has.ties_per_step, nodes.count, has.shape)
 
     @traced
     def num_single(self, plan):
