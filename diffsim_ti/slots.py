@@ -1,5 +1,7 @@
 """Slots of arrays of vectors on the device, (slots, num_vertices): copied, and read and written in part from the host."""
 
+from contextlib import contextmanager
+
 import numpy as np
 import taichi as ti
 
@@ -43,3 +45,15 @@ class VertexRows:
         whole[self.nodes] = data
         runtime.fill(self._row, whole[None])
         copy_slot(self._row, 0, target, slot)
+
+    @contextmanager
+    def replaced(self, history, slot: int, u: np.ndarray, v: np.ndarray):
+        """Other displacements and velocities in a slot of a record, for a while."""
+        before = self.get(history.u, slot), self.get(history.v, slot)
+        self._set(history, slot, u, v)
+        yield
+        self._set(history, slot, *before)
+
+    def _set(self, history, slot: int, u: np.ndarray, v: np.ndarray) -> None:
+        self.put(history.u, slot, u)
+        self.put(history.v, slot, v)

@@ -10,7 +10,7 @@ over points k in place of h sum (|w_k| / m_k) S_k. That bounds W of
 |sum_p r_p C^T w_p|^2 / m as there, for |C^T w| <= |C|^T |w|.
 """
 
-from contextlib import contextmanager
+from contextlib import nullcontext
 
 import numpy as np
 
@@ -150,20 +150,10 @@ class CurvedFriction:
         """On nodes, from what kernels have added to vectors of points."""
         return self.C.T @ (runtime.fetch_row(changed, 0) - before[0])[self.points] / self.lightness
 
-    @contextmanager
     def alone(self, history, slot: int):
+        """A recorded pass to a slot without friction; then the record is what it was."""
         kept = self.kept.get(slot)
-        if kept is None:
-            yield
-            return
-        after = self.rows.get(history.u, slot), self.rows.get(history.v, slot)
-        self._put(history, slot, kept)
-        yield
-        self._put(history, slot, after)
-
-    def _put(self, history, slot: int, state: tuple) -> None:
-        self.rows.put(history.u, slot, state[0])
-        self.rows.put(history.v, slot, state[1])
+        return nullcontext() if kept is None else self.rows.replaced(history, slot, *kept[:2])
 
     def _begin(self, history, slot: int) -> None:
         """Measure again where a recorded pass began."""

@@ -11,7 +11,7 @@ Leimkuhler, Reich 2004, Simulating Hamiltonian Dynamics, 7.2, doi:10.1017/CBO978
 """
 
 import weakref
-from contextlib import contextmanager
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -108,8 +108,8 @@ class HeldVolumes:
         free = np.tile(np.eye(3), (scene.mesh.num_vertices, 1, 1))
         free[scene.supports.vertices] -= scene.supports.held
         self.free = free[self.nodes]
-        own = VertexRows(workspace.arrays, self.nodes)
-        self.rows, self.put = own.get, own.put
+        self._own = VertexRows(workspace.arrays, self.nodes)
+        self.rows, self.put = self._own.get, self._own.put
         self.kept = {}  # of recorded passes, by the slot they led to: places and velocities before the stage, and s
         self.clear()
 
@@ -214,18 +214,7 @@ class HeldVolumes:
             num_passes,
         )
 
-    @contextmanager
     def alone(self, history, slot: int):
         """A recorded pass to a slot without the stage; then the record is what it was."""
         kept = self.kept.get(slot)
-        if kept is None:
-            yield
-            return
-        whole = self.rows(history.u, slot), self.rows(history.v, slot)
-        self._set(history, slot, kept)
-        yield
-        self._set(history, slot, whole)
-
-    def _set(self, history, slot: int, state: tuple) -> None:
-        self.put(history.u, slot, state[0])
-        self.put(history.v, slot, state[1])
+        return nullcontext() if kept is None else self._own.replaced(history, slot, *kept[:2])
