@@ -145,6 +145,14 @@ def test_the_adjoint_of_the_stage_is_the_transpose_of_its_tangent(way, solver, p
     assert_transposed(rollout, {"f64": 1e-10, "f32": 2e-3}[precision])
 
 
+def test_paths_are_felt_in_passes_that_open_no_step():
+    """Kicks in stages come near in the last pass of a substep alone."""
+    scene = under_a_roller(moving).replace(material=ds.KelvinVoigt(ds.StableNeoHookean(5e4, 0.3), time=1e-4))
+    dt = 0.2 * ds.stable_dt(scene).dt
+    solver = ds.SemiImplicitSolver(scene, dt=2 * dt, substeps=2, viscous_stages=3)
+    assert_transposed(ds.Rollout(solver, 3, save_every=1, gradients="all"), 1e-10)
+
+
 def test_gradients_of_the_stage_are_those_of_differences():
     names = "initial_velocities density roller.radius roller.friction roller.friction_speed roller.about rest_positions"
     names += " roller.path roller.width"

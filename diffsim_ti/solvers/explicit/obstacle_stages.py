@@ -50,19 +50,23 @@ class ObstacleStages(ObstaclePlaces):
         """Sum what every num_parts-th of `count` vertices (or faces) felt of a path in the steps that passes last .. first
         complete, in order."""
         low, high = pass_at(table, first - plan.window), pass_at(table, last - plan.window)
-        c, part, moving = p // plan.num_parts, p % plan.num_parts, ti.static(self.features.moving)
         for back in range(high.row - low.row + low.opens):
-            row = high.row - back
-            at, after = 2 * (moving * (row % plan.steps) + c), ti.min(row + 1, high.next)
-            to_row, to_next = self.vector(0), self.vector(0)
-            for m in range((count - part + plan.num_parts - 1) // plan.num_parts):
-                i = part + m * plan.num_parts
-                to_row += adjoint.felt[at, i]
-                to_next += adjoint.felt[at + 1, i]
-                adjoint.felt[at, i] = self.vector(0)
-                adjoint.felt[at + 1, i] = self.vector(0)
-            adjoint.path[row, p] = adjoint.path[row, p] + to_row
-            adjoint.path[after, p] = adjoint.path[after, p] + to_next
+            self.fold_row(p, count, high.row - back, high.next, adjoint, plan)
+
+    @ti.func
+    def fold_row(self, p, count, row, last, adjoint: A, plan: A):
+        """The same of one step; last: the last row that there is, or the next one."""
+        c, part, moving = p // plan.num_parts, p % plan.num_parts, ti.static(self.features.moving)
+        at, after = 2 * (moving * (row % plan.steps) + c), ti.min(row + 1, last)
+        to_row, to_next = self.vector(0), self.vector(0)
+        for m in range((count - part + plan.num_parts - 1) // plan.num_parts):
+            i = part + m * plan.num_parts
+            to_row += adjoint.felt[at, i]
+            to_next += adjoint.felt[at + 1, i]
+            adjoint.felt[at, i] = self.vector(0)
+            adjoint.felt[at + 1, i] = self.vector(0)
+        adjoint.path[row, p] = adjoint.path[row, p] + to_row
+        adjoint.path[after, p] = adjoint.path[after, p] + to_next
 
     # ---- what is noted -----------------------------------------------------------------------------------------------
 
