@@ -76,6 +76,12 @@ class Supports:
             out[self.guided] -= np.einsum("kij,kj->ki", self.guides, out[self.guided])
         return out
 
+    def freedom(self, num_vertices: int) -> np.ndarray:
+        """Projectors onto what each vertex of a mesh of so many may do, shape (num_vertices, 3, 3)."""
+        out = np.tile(np.eye(3), (num_vertices, 1, 1))
+        out[self.vertices] -= self.held
+        return out
+
     def projectors(self, vertices: np.ndarray, name: object = None) -> np.ndarray:
         """Onto the directions in which the support of that name holds each of its vertices, shape (k, 3, 3); of another
         name, those in which any does."""

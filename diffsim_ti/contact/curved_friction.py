@@ -6,8 +6,8 @@ friction adds energy is then made of the nodes' masses: with G = |C| M^-1 |C|^T,
 
     c = h sum_k |w_k| (G S)_k,    S_k = sum |w_k| mu N
 
-over points k in place of h sum (|w_k| / m_k) S_k. That bounds W of
-|sum_p r_p C^T w_p|^2 / m as there, for |C^T w| <= |C|^T |w|.
+over points k in place of h sum (|w_k| / m_k) S_k. That bounds W of |sum_p r_p C^T w_p|^2 / m as there, for
+|C^T w| <= |C|^T |w|.
 """
 
 from contextlib import nullcontext
@@ -68,9 +68,7 @@ class CurvedFriction:
         self.rows, self.points = VertexRows(a, surface), points
         self.C = pairs.matrix[points][:, surface].tocsr()
         self.size = abs(self.C)
-        self.free = np.tile(np.eye(3), (a.num_vertices, 1, 1))
-        self.free[a.supports.vertices] -= a.supports.held
-        self.free = self.free[surface]
+        self.free = a.supports.freedom(a.num_vertices)[surface]
         n = pairs.finer.num_vertices
         self.v, self.dv, self.unread = (runtime.array(a.vector, 1, n) for _ in range(3))
         self.unit, self.no_mass = runtime.array(a.fp, n), runtime.array(a.fp, n)

@@ -60,8 +60,7 @@ class Chamber(Term):
 
     def settled(self, scene, density, initial_positions, initial_velocities) -> "Chamber":
         out, mesh, supports = copy(self), scene.mesh, scene.supports
-        free = np.tile(np.eye(3), (mesh.num_vertices, 1, 1))
-        free[supports.vertices] -= supports.held
+        free = supports.freedom(mesh.num_vertices)
         called = f"{type(self).__name__}" + (f" {self.name!r}" if self.name else "")
         moves = scene.motion is not None
         out.enclosure = Enclosure.of(self.faces(mesh), free, mesh.vertices, called, moves)

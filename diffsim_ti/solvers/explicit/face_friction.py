@@ -55,9 +55,7 @@ class FaceFriction:
         self.numbers = np.array(
             [at for _, at in self.obstacles], int
         )  # of mu; eps comes next, a point turned about last
-        free = np.tile(np.eye(3), (a.num_vertices, 1, 1))
-        free[a.supports.vertices] -= a.supports.held
-        self.free = free[surface]
+        self.free = a.supports.freedom(a.num_vertices)[surface]
 
     def __bool__(self) -> bool:
         return bool(self.obstacles)

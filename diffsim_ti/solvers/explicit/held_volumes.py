@@ -105,9 +105,7 @@ class HeldVolumes:
         closed = [scene.chambers[k].enclosure for k in self.places]
         self.nodes = np.unique(np.concatenate([enclosure.triangles.ravel() for enclosure in closed]))
         self.enclosures = [enclosure.of_nodes(self.nodes) for enclosure in closed]
-        free = np.tile(np.eye(3), (scene.mesh.num_vertices, 1, 1))
-        free[scene.supports.vertices] -= scene.supports.held
-        self.free = free[self.nodes]
+        self.free = scene.supports.freedom(scene.mesh.num_vertices)[self.nodes]
         self._own = VertexRows(workspace.arrays, self.nodes)
         self.rows, self.put = self._own.get, self._own.put
         self.kept = {}  # of recorded passes, by the slot they led to: places and velocities before the stage, and s
