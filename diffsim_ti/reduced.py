@@ -1,6 +1,6 @@
 """Bodies that move by few numbers: which vertices go together, and how."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -66,8 +66,7 @@ class Reduced:
 
     affine: displacements A X + t of the mesh's places X, twelve numbers, u = B q; `x -> of(x)` is the nearest such to any
     x, a projection. B is that of the mesh, whatever rest_positions a run takes.
-    rigid: places R X + t of the rest positions X of a run, six numbers, in explicit steps. A start is the nearest such
-    (inputs/rigid_start.py).
+    rigid: places R X + t of the rest positions X of a run, six numbers. A start is the nearest such (inputs/rigid_start.py).
     a basis, in implicit steps and statics, of all the mesh's vertices, of which those of the set count: m functions for
     each component, shape (num_vertices, m), such as the `weights` of a `designs.Cage`, 3 m numbers; or m fields of
     displacements, (m, num_vertices, 3), such as the `shapes` of `modes`, m numbers. Neither need be orthonormal.
@@ -125,13 +124,15 @@ class Reduced:
         """Sets that do not deform."""
         return tuple(body for body in self.bodies if body.rigid)
 
-    def refuse_rigid(self, what: str) -> None:
-        """Raise ValueError where a set does not deform."""
-        for body in self.rigid:
-            raise ValueError(
-                f"{what}: the set {body.name!r} is rigid, which SemiImplicitSolver and VelocityVerletSolver alone know; "
-                'take one of these, or "affine" in place of "rigid" and a stiff material'
-            )
+    def with_stress(self, elements: np.ndarray, volume: str) -> Callable[[np.ndarray], np.ndarray]:
+        """volumes -> those without elements that lie wholly in a set that does not deform: what rounding makes of their
+        stress would turn it. Patches need all."""
+        if not self.rigid or volume != "tetrahedra":
+            return lambda volumes: volumes
+        stressed = np.ones(len(elements))
+        for body, own in zip(self.bodies, self.elements(elements)):
+            stressed[own] = not body.rigid
+        return lambda volumes: (volumes.reshape(len(stressed), -1) * stressed[:, None]).reshape(volumes.shape)
 
     def elements(self, elements: np.ndarray) -> list[np.ndarray]:
         """Which elements, rows of vertices, lie wholly in each set."""

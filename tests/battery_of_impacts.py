@@ -105,7 +105,7 @@ def draw(
         moving=bool(rng.integers(2)),
         turning=turning,
         rough=rough,
-        reduced=("affine", "by functions", "by fields")[number % 3] if reduced else None,
+        reduced=("affine", "by functions", "by fields", "rigid")[(number + number // 6) % 4] if reduced else None,
         order=order,
     )
 
@@ -174,8 +174,8 @@ def reduced(case: Case, mesh, held) -> tuple:
     mesh = ds.TetrahedralMesh(x, mesh.elements, vertex_sets={"front": np.flatnonzero(front)})
     stiffer = np.where(front[mesh.elements].all(1), 1.0 if front.all() else 100.0, 1.0)
     n = len(x)
-    if case.reduced == "affine":
-        how = "affine"
+    if case.reduced in ("affine", "rigid"):
+        how = case.reduced
     elif case.reduced == "by functions":
         how = np.column_stack([np.ones(n), x, rng.standard_normal((n, 2))])
     else:

@@ -11,7 +11,7 @@ from diffsim_ti import verify
 from diffsim_ti.designs import Cage
 
 SHELL = {"shell": "affine"}
-KINDS = ("affine", "functions", "fields")
+KINDS = ("affine", "rigid", "functions", "fields")
 
 
 def motions(kind, mesh):
@@ -21,7 +21,7 @@ def motions(kind, mesh):
         return np.column_stack([np.ones(len(X)), X, X[:, 0] * X[:, 1] / 0.1])
     turns = [np.cross(axis, X) for axis in np.eye(3)]
     bends = 0.03 * np.random.default_rng(6).standard_normal((3, *X.shape))
-    return kind if kind == "affine" else np.stack([*(0 * X + axis for axis in np.eye(3)), *turns, *bends])
+    return kind if kind in ("affine", "rigid") else np.stack([*(0 * X + axis for axis in np.eye(3)), *turns, *bends])
 
 
 @lru_cache

@@ -25,6 +25,11 @@ class FreeDirections:
 
     __mul__ = __rmul__
 
+    @property
+    def linear(self) -> "FreeDirections":
+        """The same, with all motions of sets that do not deform."""
+        return self
+
     def projectors(self) -> np.ndarray:
         """Of all vertices, shape (num_vertices, 3, 3)."""
         out = self.mask[:, :, None] * np.eye(3)
@@ -44,16 +49,24 @@ class FreeDirections:
 
 
 class FreeBodies(FreeDirections):
-    """The same where some vertices go together (reduced.py): none of these is held."""
+    """The same where some vertices go together (reduced.py): none of these is held.
 
-    def __init__(self, mask: np.ndarray, guided: np.ndarray, guides: np.ndarray, reduced):
+    rigid: of what sets that do not deform feel where they stand (rigid_sets.py); None: of all motions of their vertices.
+    """
+
+    def __init__(self, mask: np.ndarray, guided: np.ndarray, guides: np.ndarray, reduced, rigid=None):
         super().__init__(mask, guided, guides)
-        self.reduced = reduced
+        self.reduced, self.rigid = reduced, rigid
 
     def __rmul__(self, x: np.ndarray) -> np.ndarray:
-        return self.reduced.of(super().__rmul__(x))
+        x = self.reduced.of(super().__rmul__(x))
+        return self.rigid.felt(x) if self.rigid else x
 
     __mul__ = __rmul__
+
+    @property
+    def linear(self) -> "FreeBodies":
+        return FreeBodies(self.mask, self.guided, self.guides, self.reduced)
 
 
 Free = np.ndarray | FreeDirections  # numbers (num_vertices, 1) where no vertex is held in some directions alone
@@ -74,6 +87,12 @@ def cleaned(free: Free, x: np.ndarray) -> np.ndarray:
     return x * free if isinstance(free, FreeDirections) else x
 
 
+def linear_of(free: Free) -> Free:
+    """What vertices may do, with all motions of sets that do not deform: these are no linear space."""
+    return free.linear if isinstance(free, FreeDirections) else free
+
+
 def held_as(free: Free, held: np.ndarray, moving: np.ndarray) -> np.ndarray:
     """Displacements that are `held` where vertices are held, and `moving` in what they may do."""
+    free = linear_of(free)
     return held + (moving - held) * free if isinstance(free, FreeDirections) else held * (1 - free) + moving * free

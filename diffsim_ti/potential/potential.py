@@ -12,6 +12,7 @@ from diffsim_ti.potential.attached import Attached
 from diffsim_ti.potential.face_contact import FaceContact
 from diffsim_ti.potential.kernels import potential_kernels
 from diffsim_ti.potential.patch_coupling import PatchCoupling
+from diffsim_ti.potential.rigid_sets import RigidSets
 from diffsim_ti.slots import copy_slot
 
 
@@ -41,6 +42,7 @@ class Potential:
         self.held = arrays.held_numbers()  # what the law measures rates from in a pass
         self.rate = runtime.array(a.fp, 1) if a.law.viscous else None  # [1/s], of changes in a pass; zero in statics
         self.attached: Attached | None = None  # springs, cables, foundations: set by whom a time is known
+        self.rigid: RigidSets | None = None  # sets that do not deform: set by whom passes are known
 
     @property
     def rubbing(self):
@@ -83,6 +85,8 @@ class Potential:
         self.held_at = runtime.fetch(self.u)[0].astype(np.float64)
         if self.pairs:
             self.pairs.place(self.u)
+        if self.rigid:
+            self.rigid.place(self.held_at)
         return self.held_at
 
     def hold(self, history, slot: int) -> None:
@@ -185,9 +189,11 @@ class Potential:
 
     @property
     def stress_points(self) -> StressPoints:
-        """Of the rest shape that is loaded."""
-        if self._points is None or self._points[0] is not self.arrays.values:
-            self._points = self.arrays.values, StressPoints.of(self.arrays.mesh, self.arrays.values)
+        """Of the rest shape that is loaded; without volumes where there is no stress."""
+        a = self.arrays
+        if self._points is None or self._points[0] is not a.values:
+            points = StressPoints.of(a.mesh, a.values)
+            self._points = a.values, points._replace(volumes=a.with_stress(points.volumes))
         return self._points[1]
 
     @cached_property

@@ -76,10 +76,10 @@ class SceneArrays:
             reduced=presses and bool(scene.reduced),
             rigid=presses and bool(scene.reduced.rigid),
         )
+        self.with_stress = scene.reduced.with_stress(mesh.elements, scene.volume)
         self.bodies = BodyArrays(scene, fp, self.vector) if self._features["reduced"] else None
         vars(self).update(self.bodies.arrays if self.bodies else {})
-        # walls (potential/) as one looks between passes
-        self.walls = Walls(self.obstacles)
+        self.walls = Walls(self.obstacles)  # (potential/) as one looks between passes
         self.offsets = runtime.array(self.vector, self.walls.size)
         self.values: Derived | None = None
         self._known_features: dict[tuple[bool, bool], Features] = {}  # for these values
@@ -346,5 +346,5 @@ class SceneArrays:
 
     def volume_blocks(self, volumes: np.ndarray) -> np.ndarray:
         """Blocks of volumes; repetitions in a patch have none, nor what is rigid."""
-        blocks = self.to_blocks(self.bodies.of_soft(volumes) if self.bodies else volumes)
+        blocks = self.to_blocks(self.with_stress(volumes))
         return blocks if isinstance(self.place, slice) else blocks * self.alone.reshape(-1, LANES)

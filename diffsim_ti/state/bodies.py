@@ -36,9 +36,6 @@ class BodyArrays:
         self.rigid = np.array([body.rigid for body in self.bodies])
         self._mesh_places = mesh.vertices[self.vertices]
         self._rounded = np.float32 if fp == ti.f32 else np.float64
-        self._soft = np.ones(len(mesh.elements))
-        for body, own in zip(self.bodies, scene.reduced.elements(mesh.elements)):
-            self._soft[own] = not body.rigid or scene.volume != "tetrahedra"  # patches need volumes
         owner = np.full(mesh.num_vertices, -1)
         owner[self.vertices] = self.owner
         ints = dict(body_first=self.first, body_vertex=self.vertices, body_kind=self.rigid, body_of=owner)
@@ -48,10 +45,6 @@ class BodyArrays:
         self.arrays["body_mass"] = runtime.array(fp, len(self.vertices))
         self.arrays["body_numbers"] = runtime.array(ti.f64, NUMBERS * len(members))
         self.arrays["body_reach"] = runtime.array(fp, mesh.num_vertices)
-
-    def of_soft(self, volumes: np.ndarray) -> np.ndarray:
-        """Volumes without those of elements that have no stress: what rounding makes of it would turn a rigid body."""
-        return (volumes.reshape(len(self._soft), -1) * self._soft[:, None]).reshape(volumes.shape)
 
     def load(self, values: Derived, inverse_mass: np.ndarray) -> None:
         """Numbers for values of a run."""

@@ -33,10 +33,6 @@ def _anchor(arrays, derived):
     return None if derived.motion is None else derived.displacement[arrays.held]
 
 
-def _of_soft(arrays, x):
-    return arrays.bodies.of_soft(x) if arrays.bodies else x
-
-
 def _whole(arrays, x):
     return x.astype(np.float64)
 
@@ -50,7 +46,7 @@ PARTS = {
     "volumes": Part(
         "blocks",
         lambda a, d: a.volume_blocks(d.volumes),
-        lambda a, x: _of_soft(a, a.from_blocks(x, a.points).reshape(a.values.volumes.shape)),
+        lambda a, x: a.with_stress(a.from_blocks(x, a.points).reshape(a.values.volumes.shape)),
     ),
     "coefficients": Part(
         "blocks", lambda a, d: a.coefficient_blocks(d.coefficients), lambda a, x: a.from_blocks(x, a.num_coefficients)

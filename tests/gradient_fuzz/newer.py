@@ -25,7 +25,7 @@ def mass_scaling(kind, seed: int) -> float | None:
 
 def reduced(kind, seed: int, mesh, fixed, deformed: bool) -> dict | None:
     """A set that moves by few numbers, where runs have one of which nothing is held: affinely or rigidly in explicit ones,
-    where obstacles push; affinely, by functions of each component, or by fields in implicit ones."""
+    where obstacles push; affinely, rigidly, by functions of each component, or by fields in implicit ones."""
     rng = np.random.default_rng([36, seed])
     stages = kind.explicit and kind.obstacles and kind.contact == "stage"
     if deformed or stages or rng.random() > (1.0 if kind.explicit else 0.5):
@@ -46,9 +46,9 @@ def reduced(kind, seed: int, mesh, fixed, deformed: bool) -> dict | None:
 def motions(rng, mesh, count: int):
     """Rigid translations and a little more, at random, for a set of so many vertices."""
     n, more = mesh.num_vertices, int(rng.integers(1, max(2, min(6, count - 1))))
-    which = rng.integers(3)
-    if which == 0:
-        return "affine"
+    which = rng.integers(4)
+    if which in (0, 3):
+        return ("affine", "rigid")[which == 3]
     if which == 1:
         return np.column_stack([np.ones(n), rng.standard_normal((n, more))])
     rigid = np.eye(3)[:, None] * np.ones((n, 1))

@@ -82,7 +82,7 @@ class ImplicitAdjoint(RecordedPasses):
         self.growth = None if a.values.growths is None else np.zeros_like(a.values.growths)
         self.attached = a.values.zeros()  # of springs, cables and foundations
         self.pressure = None if a.values.follower is None else np.zeros_like(a.values.follower)
-        self.rest_by_pressure = np.zeros_like(self.p)
+        self.rest_adj = np.zeros_like(self.p)
         self.fluid = np.zeros(len(a.values.parameters))
         self.forces = None if a.values.forces is None else np.zeros_like(a.values.forces)
         self.motion = None if a.values.motion is None else np.zeros_like(a.values.motion)
@@ -117,7 +117,7 @@ class ImplicitAdjoint(RecordedPasses):
         """Adjoints of u*, and of x, from which velocities are measured; adds those of a fluid's numbers."""
         fluid = self.ws.fluid
         by_place, by_speed, numbers = fluid.vjp_of_all(self.places, by_star, len(self.fluid))
-        self.rest_by_pressure, self.fluid = self.rest_by_pressure + by_place, self.fluid + numbers
+        self.rest_adj, self.fluid = self.rest_adj + by_place, self.fluid + numbers
         return by_place + by_speed / fluid.gamma, -by_speed / fluid.gamma
 
     def _pull_back_growth(self, j: int) -> None:
@@ -143,9 +143,9 @@ class ImplicitAdjoint(RecordedPasses):
         by_contacts = np.zeros_like(p) if seen is None else seen[0]
         if s.static:
             q = np.zeros_like(q)
-        p_free, q_free = p * ws.free, q * ws.free
+        p_free, q_free = p * ws.linear, q * ws.linear
         # the equation
-        seed = s.c0 * p_free + s.e0 / s.gamma * q_free + by_contacts * ws.free
+        seed = s.c0 * p_free + s.e0 / s.gamma * q_free + by_contacts * ws.linear
         if np.abs(seed).max(initial=0.0) < 1e-18 * np.abs(p).max(
             initial=0.0
         ):  # rounding of what is held, no direction of ours
@@ -181,7 +181,7 @@ class ImplicitAdjoint(RecordedPasses):
             felt = ws.follower.pressures_vjp(self.places, by_star)
             if nu is not None:
                 by_place = by_place + ws.volumes.add_targets(nu, self.places, felt)
-            reaction, self.rest_by_pressure = reaction + by_place, self.rest_by_pressure + by_place
+            reaction, self.rest_adj = reaction + by_place, self.rest_adj + by_place
             ws.solver.schedule.add_pressure(self.pressure, j, ws.share_at_stage(j, s), felt)
         self.gravity += share * (ws.mass * by_star).sum(0)
         self._add_mass(by_star, self.weight(share))
@@ -190,8 +190,7 @@ class ImplicitAdjoint(RecordedPasses):
             ws.solver.schedule.add_load(self.forces, j, ws.share_at_stage(j, s), keyed, felt)
         # where inertia starts from
         inertial = self.mass * by_star
-        if self.element_masses is not None:
-            reaction = reaction - inertial  # held vertices are felt by their neighbours' inertia too
+        reaction = reaction - inertial  # held vertices are felt by their neighbours' inertia too
         x_adj, by_begin = inertial - s.e0 / s.gamma * q_free + by_x, 0.0
         if ws.potential.has_friction:
             by_first, by_first_x = runtime.fetch(self.lag).astype(np.float64) + (0.0 if seen is None else seen[1])
@@ -210,6 +209,10 @@ class ImplicitAdjoint(RecordedPasses):
             self.rate += db1 * (y_adj * self.before[1]).sum()
         u_adj = s.a0 * x_adj + (1 - s.c0) * p_free + by_lag
         v_adj = s.b0 * y_adj
+        if ws.rigid:
+            turned = ws.rigid.turned_vjp(by_star)
+            self.rest_adj = self.rest_adj + turned
+            ws.rigid.held_vjp(s.c0 * p + s.e0 / s.gamma * q + reaction + turned, u_adj, self.rest_adj)
         # prescribed places
         if len(held):
             self._pull_back_held(j, p, q, reaction, u_adj, v_adj)
@@ -280,7 +283,7 @@ class ImplicitAdjoint(RecordedPasses):
         if self.ws.potential.faces and features.areas:
             by_areas = runtime.fetch(self.face_areas).astype(np.float64)
             rest = rest + rest_of_areas(a, a.values.rest, by_areas)
-        out.rest = rest + self.rest_by_pressure + out.rest
+        out.rest = rest + self.rest_adj + out.rest
         out.growths = self.growth
         out.forces, out.motion, out.path, out.follower = self.forces, self.motion, self.path, self.pressure
         for name in ("ties", "tie_segments", "foundation"):

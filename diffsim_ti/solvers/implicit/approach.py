@@ -72,7 +72,8 @@ class Approach:
 
     def _carried(self, place, step, walls, drift, obstacle: int):
         """All that moves freely goes along with an obstacle; None where that way is not free."""
-        along = step + self.ws.carried(obstacle, place, walls, drift) * self.ws.free
+        along = step + self.ws.carried(obstacle, place, walls, drift) * self.ws.linear
+        along = self.ws.rigid.nearest(place + along) - place if self.ws.rigid else along
         if not (along - step).any() or self.ws.way.share(place, along, walls, drift) < 1:
             return None
         return place + along if self._is_sound(place, place + along) else None

@@ -95,7 +95,7 @@ class GivenInPasses:
         """The scene's chambers that hold a volume."""
         if not self.scene.holds_volumes:
             return None
-        return HeldVolumes(self.follower, self.free, self.arrays.values.rest, self.solver.tolerance, eps)
+        return HeldVolumes(self.follower, self.linear, self.arrays.values.rest, self.solver.tolerance, eps)
 
     def start_multipliers(self, j: int, u: np.ndarray) -> None:
         """Begin pass j with the pressures of held volumes that the pass before it ended with."""

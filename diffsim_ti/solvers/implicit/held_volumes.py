@@ -16,7 +16,7 @@ import numpy as np
 class HeldVolumes:
     """Of the chambers of a ChamberPressure (potential/) that hold their volume.
 
-    free: what vertices may do; eps: rounding of displacements.
+    free: what vertices may do, sets that do not deform all; eps: rounding of displacements.
     """
 
     share = 0.1  # measured: a hundredth loses thick spheres, all of it halves the steps

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from diffsim_ti.copies import CarriesMore
-from diffsim_ti.potential.free import Free
+from diffsim_ti.potential.free import Free, linear_of
 
 
 class NotConverged(CarriesMore, FloatingPointError):
@@ -18,19 +18,20 @@ class NotConverged(CarriesMore, FloatingPointError):
 
 class Operator:
     """w -> c m w + d2E/du2 w at the potential's displacement, less what follower pressures change; rows of fixed vertices
-    are zero.
+    are zero. Sets that do not deform move as w says, and turn what they feel (potential/rigid_sets.py).
 
-    mass: c m, shape (num_vertices, 1) [N/m]; free: what vertices may do (free.py); transposed: of pressures.
+    mass: c m, shape (num_vertices, 1) [N/m]; free: what vertices may do (free.py); transposed: of pressures and such sets.
     """
 
     def __init__(self, potential, mass: np.ndarray, free: Free, follower=None, transposed: bool = False):
         self.potential, self.mass, self.free = potential, mass, free
         self.products, self.correction = 0, None
         self.follower, self.transposed, self._pressing = follower, transposed, None
+        self.rigid, self._linear = potential.rigid, linear_of(free)
 
     @property
     def symmetric(self) -> bool:
-        return self.follower is None or self.follower.symmetric
+        return (self.follower is None or self.follower.symmetric) and (not self.rigid or self.rigid.symmetric)
 
     @property
     def stays_on_device(self) -> bool:
@@ -40,6 +41,15 @@ class Operator:
 
     def __call__(self, w: np.ndarray) -> np.ndarray:
         self.products += 1
+        if not self.rigid:
+            return self._of_places(w) * self.free
+        turned = self.rigid.stiffness(w, self.transposed, convex=self.correction is not None)
+        if self.transposed:
+            return self.rigid.motion_vjp(self._of_places(w) * self._linear) + turned
+        return self._of_places(self.rigid.motion(w)) * self.free + turned
+
+    def _of_places(self, w: np.ndarray) -> np.ndarray:
+        """For a change w of places, of all vertices."""
         y = self.mass * w + self.potential.product(w, convex=self.correction is not None)
         if self.correction is not None:
             y += self.correction(w)
@@ -47,8 +57,8 @@ class Operator:
             if self._pressing is None:
                 at = self.follower.tangent(self.potential.arrays.values.rest + self.potential.held_at)
                 self._pressing = at.T if self.transposed else at
-            y -= self._pressing(w * self.free)
-        return y * self.free
+            y -= self._pressing(w * self._linear)
+        return y
 
 
 def conjugate_gradients(operator, b, preconditioner, tolerance: float, max_iterations: int, eps: float):

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from diffsim_ti.potential.free import Free, cleaned, mask_of
+from diffsim_ti.potential.free import Free, cleaned, linear_of, mask_of
 from diffsim_ti.potential.way import Met
 from diffsim_ti.solvers.implicit.linear import NotConverged, Operator, conjugate_gradients, gmres
 from diffsim_ti.solvers.implicit.projection import Projection
@@ -76,12 +76,17 @@ class Newton:
     ):
         self.volumes = volumes  # of chambers, that are held (held_volumes.py), or None
         self.follower = follower  # pressures (potential/follower_pressure.py), or None
-        self.by_residual = follower is not None and not follower.symmetric
         self.moves = mask_of(free)  # in some direction
         self.potential, self.free, self.way, self.preconditioners = potential, free, way, preconditioners
         self.tolerance, self.max_iterations, self.eps = tolerance, max_iterations, eps
         self.reach = 0.01 * float(np.ptp(potential.arrays.values.rest, 0).max())  # of the first step away from a saddle
         self.report, self.reports = NewtonReport(), []  # of the last solve, of all since somebody looked
+        self.rigid = potential.rigid  # sets that do not deform
+
+    @property
+    def by_residual(self) -> bool:
+        """Whether there is no potential: of pressures, or of rigid sets whose forces are not taken where a pass ends."""
+        return not self.operator().symmetric
 
     def solve(
         self,
@@ -110,11 +115,12 @@ class Newton:
         self.preconditioner, self.stiffness = self.preconditioners(mass)
         E, size, norm, rough, solved = self._evaluate(u), 0.0, np.inf, False, False
         self.upright = bool(np.all(E[2] > 0))
+        turns = self.rigid.rounding  # of places
         most = self.max_iterations if rounds is None else rounds
         while self._goes_on(most, rounds is None):
             R, now = self._residual(u)
             size, before = max(size, now), norm
-            floor = 4 * self.eps * np.linalg.norm(self._rigidity() * np.abs(u).max(1, keepdims=True) * self.moves)
+            floor = 4 * np.linalg.norm(self._rigidity() * (self.eps * np.abs(u).max(1, keepdims=True) + turns) * self.moves)
             norm = np.linalg.norm(R)
             report.residuals.append(norm / size if size > 0 else 0.0)
             if rounds is not None and norm <= self.roughly * size:
@@ -178,6 +184,11 @@ class Newton:
         self.potential.place(u)
         return self._residual(u)[0]
 
+    def residual_of(self, problem: tuple) -> np.ndarray:
+        """The same where the potential stands, of mass, inertial and loads of `solve`."""
+        self.mass, self.inertial, self.loads = problem
+        return self._residual(self.potential.held_at)[0]
+
     def _rigidity(self) -> np.ndarray:
         """How much force a small displacement makes at each vertex [N/m], contact and friction included."""
         contact = self.potential.contact_blocks()
@@ -194,7 +205,9 @@ class Newton:
             x = self.potential.arrays.values.rest + u
             f, sizes = f + self.follower.forces(x), sizes + self.follower.sizes(x)
         size = np.sqrt((sizes**2).sum() + (self.loads**2).sum() + (inertia**2 * self.moves).sum())
-        return (f + self.loads - inertia) * self.free, size
+        R = f + self.loads - inertia
+        self.rigid.feel(R)
+        return R * self.free, size
 
     def _forcing(self, norm, before, solved, size, floor) -> float:
         """Relative residual of a round's linear solve: rough while rounds gain little, but not of the last one, whose error
@@ -216,13 +229,14 @@ class Newton:
             least, limit = min(forcing, self.inexact), 10 * len(R)
 
             def solve(g):
+                g = g * self.free
                 if self.by_residual:
-                    return gmres(A, g, self.preconditioner, least, limit)[0]
+                    return self.rigid.motion(gmres(A, g, self.preconditioner, least, limit)[0])
                 return conjugate_gradients(A, g, self.preconditioner, least, limit, self.eps)[0]
 
             direction, change, self._rise = self.volumes.bordered(u, direction, solve)
             self.report.products, R = self.report.products + A.products - done, R + change
-        return cleaned(self.free, direction), R
+        return cleaned(linear_of(self.free), direction), R
 
     def _count_anew(self, u, moved, direction) -> None:
         """Multipliers go as far as the step from u along a direction that was found."""
@@ -234,9 +248,9 @@ class Newton:
         limit = 10 * len(R)
         if self.by_residual:
             self._indefinite = False
-            d, *_ = gmres(A, R, self.preconditioner, forcing, limit)
+            d, *_ = gmres(A, R * self.free, self.preconditioner, forcing, limit)
             self.report.products += A.products
-            return d
+            return self.rigid.motion(d)
         d, _, count, negative = conjugate_gradients(A, R, self.preconditioner, forcing, limit, self.eps)
         self._indefinite = negative is not None
         if negative is not None:
@@ -305,6 +319,11 @@ class Newton:
         self.report.cuts += free < 1
         return free
 
+    def is_free(self, u, step) -> bool:
+        """Whether nothing is met on the way of a step."""
+        pairs = self.potential.pairs
+        return self.way(u, step, 1.0)[0] == 1 and (not pairs or pairs.safe_share(u, step) == 1)
+
     def _falls(self, u, d, slope) -> bool:
         """Whether Phi does not rise again at u as steeply as it fell before: what is left to ask where its change drowns in
         rounding. Hager, Zhang 2005, A New Conjugate Gradient Method with Guaranteed Descent, doi:10.1137/030601880."""
@@ -317,13 +336,15 @@ class Newton:
 
     def _try(self, u, step, before, upright):
         """(displacement, what is there, change of Phi, rounding of that change); infinite change if not admissible."""
-        trial = self.potential.place(u + step)
+        there = self.rigid.nearest(u + step)  # which may turn on another way than `_safe_share` saw
+        met = bool(self.rigid) and not self.is_free(u, there - u)
+        trial = self.potential.place(there)
         E, parts, J = before
         after, step = self._evaluate(trial), trial - u
         change = after[0] - E + float((step * (self.mass * (u + 0.5 * step - self.inertial) - self.loads)).sum())
         if self.follower is not None:
             change -= self.follower.work(self.potential.arrays.values.rest + u, step)
-        if upright and np.any(~(after[2] > 0.1 * J)):
+        if met or (upright and np.any(~(after[2] > 0.1 * J))):
             change = np.inf
         rounding = parts + after[1] + float((self.stiffness * trial**2).sum())  # of strains that come from large u
         return trial, after, change, 10 * self.eps * rounding

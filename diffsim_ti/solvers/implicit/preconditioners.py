@@ -36,42 +36,60 @@ class BlockJacobi:
 
 class BodyBlocks(BlockJacobi):
     """The same, and the inverse of d2E/dq2 of each set that moves by few numbers q: of the body at rest, with inertia and
-    contact as they are; where its basis is of each component turned with it, as in multigrid.py."""
+    contact as they are; where its basis is of each component turned with it, as in multigrid.py. Of sets that do not deform
+    q are shifts and turns (potential/rigid_sets.py), whose part of the body at rest turns with them, too."""
 
     def __init__(self, potential, mass: np.ndarray, free: Free, size: np.ndarray, parallel: bool = True):
         super().__init__(potential, mass, free, size, parallel)
         with potential.at_rest():
-            self._at_rest = [self._of_products(body) for body in free.reduced.bodies]
+            soft = [(body, body.fields()) for body in free.reduced.bodies if not body.rigid]
+            stiff = [(own, own.fields()) for own in free.rigid.sets]
+            self._at_rest = [(body, self._of_products(body.vertices, fields)) for body, fields in soft]
+            self._rigid_at_rest = [(own, self._of_products(own.vertices, fields)) for own, fields in stiff]
 
-    def _of_products(self, body) -> np.ndarray:
-        """B^T d2E/du2 B where the potential stands, shape (count, count)."""
-        out, fields = np.zeros((body.count, body.count)), body.fields()
-        for j in range(body.count):
+    def _of_products(self, vertices: np.ndarray, fields: np.ndarray) -> np.ndarray:
+        """B^T d2E/du2 B where the potential stands, shape (count, count), for fields B of shape (k, 3, count)."""
+        columns = []
+        for j in range(fields.shape[2]):
             w = np.zeros((len(self.mass), 3))
-            w[body.vertices] = fields[:, :, j]
-            out[:, j] = body.numbers(self.potential.product(w)).ravel()
-        return 0.5 * (out + out.T)
+            w[vertices] = fields[:, :, j]
+            columns.append(np.tensordot(fields, self.potential.product(w)[vertices], ((0, 1), (0, 1))))
+        return 0.5 * (np.array(columns) + np.array(columns).T)
 
     def update(self, u: np.ndarray) -> None:
         super().update(u)
         contact, rest, self._bodies = self.potential.contact_blocks(), self.potential.arrays.values.rest, []
-        for body, G in zip(self.free.reduced.bodies, self._at_rest):
+        self._rigid = [(own, self._inverse_of(own, G, contact)) for own, G in self._rigid_at_rest]
+        for body, G in self._at_rest:
             own, n = body.vertices, body.count
             if body.per_component:
                 R, m = turn_of(rest[own], rest[own] + u[own]), n // 3
                 G = np.einsum("ia,jakb,lb->jikl", R, G.reshape(m, 3, m, 3), R, optimize=True).reshape(n, n)
-            blocks = self.mass[own, :, None] * np.eye(3) + (0.0 if contact is None else contact[own])
-            fields = body.fields()
-            G = G + fields.reshape(-1, n).T @ np.matmul(blocks, fields).reshape(-1, n)
-            values, vectors = np.linalg.eigh(0.5 * (G + G.T))
-            values = np.maximum(np.abs(values), 1e-12 * np.abs(values).max() + self.least[own].min())
-            self._bodies.append((body, (vectors / values) @ vectors.T))
+            self._bodies.append((body, self._inverse_with(G, own, body.fields(), contact)))
+
+    def _inverse_with(self, G: np.ndarray, own: np.ndarray, fields: np.ndarray, contact: np.ndarray | None) -> np.ndarray:
+        """Of G with inertia and contact of the vertices, without what is negative."""
+        blocks = self.mass[own, :, None] * np.eye(3) + (0.0 if contact is None else contact[own])
+        G = G + np.tensordot(fields, np.matmul(blocks, fields), ((0, 1), (0, 1)))
+        values, vectors = np.linalg.eigh(0.5 * (G + G.T))
+        values = np.maximum(np.abs(values), 1e-12 * np.abs(values).max() + self.least[own].min())
+        return (vectors / values) @ vectors.T
+
+    def _inverse_of(self, own, G: np.ndarray, contact: np.ndarray | None) -> np.ndarray:
+        """Of a set that does not deform."""
+        R = own.rotation().R
+        G = np.einsum("ia,jakb,lb->jikl", R, G.reshape(2, 3, 2, 3), R).reshape(6, 6)
+        G[3:, 3:] += own.stiffness_of_turns()
+        return self._inverse_with(G, own.vertices, own.fields(), contact)
 
     def __call__(self, r: np.ndarray) -> np.ndarray:
         out = super().__call__(r)
         for body, inverse in self._bodies:
             q = body.numbers(r)
             out[body.vertices] = body.motion((inverse @ q.ravel()).reshape(q.shape))
+        for own, inverse in self._rigid:
+            fields = own.fields()
+            out[own.vertices] = fields @ (inverse @ np.tensordot(fields, r[own.vertices], ((0, 1), (0, 1))))
         return out
 
 

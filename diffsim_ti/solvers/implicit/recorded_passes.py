@@ -27,6 +27,7 @@ class RecordedPasses:
         self.u_star = (self.u_next - (1 - stage.c0) * self.u) / stage.c0
         self.mass = stage.inertia * ws.mass
         ws.begin(j, stage, self.u, self.x)
+        ws.rigid.begin(self.u, stage.c0)
         if ws.strains:
             ws.strains.hold(stage, self.u, self.before)
         ws.potential.hold(ws.record, j - base)
@@ -34,18 +35,23 @@ class RecordedPasses:
         self.operator = Operator(ws.potential, self.mass, ws.free, ws.on_surface, self.transposed)
         self.places = ws.arrays.values.rest + ws.potential.held_at
         ws.take_multipliers(j, ws.potential.held_at)
+        if ws.rigid:  # what they feel turns with them
+            ws.newton.residual_of(ws.problem(j, stage, self.x, self.y))
         self._preconditioner = None
 
     def solve(self, b: np.ndarray) -> np.ndarray:
-        """A^-1 b, or A^-T b, on the free vertices, zero elsewhere."""
-        b = b * self.ws.free
+        """A^-1 b, or A^-T b, on the free vertices, zero elsewhere; of sets that do not deform their motion, or of A^-T, what
+        they feel."""
+        rigid, transposed = self.ws.rigid, self.transposed
+        b = rigid.motion_vjp(b * self.ws.linear) if transposed else b * self.ws.free
         if not b.any():
             return b
         if self._preconditioner is None:
             self._preconditioner, _ = self.ws.preconditioner(self.mass)
             self._preconditioner.update(self.u_star)
         x = solve(self.operator, b, self._preconditioner, self.tolerance, self.eps, 20 * len(b))
-        return cleaned(self.ws.free, x)
+        x = cleaned(self.ws.free, x)
+        return x if transposed else rigid.motion(x)
 
     def weight(self, share: float) -> np.ndarray:
         """dR/dm of each vertex [m/s^2]: gravity less the acceleration."""

@@ -62,10 +62,6 @@ class ImplicitSolver(Solver):
         self.max_iterations = whole("max_iterations", max_iterations, 1)
         super().__init__(scene, dt, substeps, parallel)
 
-    def check_scene(self, scene) -> None:
-        super().check_scene(scene)
-        scene.reduced.refuse_rigid(type(self).__name__)
-
     @abstractmethod
     def stage(self, rate: float, fresh: bool, j: int) -> Stage:
         """The numbers of pass j; `fresh`: there is no state before the present one."""

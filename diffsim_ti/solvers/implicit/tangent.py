@@ -65,6 +65,8 @@ class ImplicitTangent(RecordedPasses):
         place, speed = ws.prescribed(j, tangent)
         now = self.du[a.held]
         held = ws.with_held(np.zeros_like(self.du), now if place is None else now + (place - now) / s.c0)
+        if ws.rigid:
+            held = ws.rigid.held_jvp(held, self.du, tangent.rest)
         rubbing, rubbed = ws.potential.rubbing, 0.0
         if rubbing:
             rubbed = rubbing.jvp(ws.potential.held_at, held, dx, self.du, self.numbers)
@@ -108,6 +110,8 @@ class ImplicitTangent(RecordedPasses):
             dR += ws.fluid.jvp_of_all(self.places, held + tangent.rest, dv, tangent.parameters)
         if ws.attached:
             dR += ws.attached.jvp(ws.potential.held_at, held, tangent, *ws.time_of(j, s))
+        if ws.rigid:
+            dR += ws.rigid.turned(held + tangent.rest)
         d_star = self.solve(dR + self.mass * (dx + s.gamma * dy - held))
         if ws.volumes:
             targets = ws.volumes.targets_jvp(self.places, held + tangent.rest, dp)

@@ -12,8 +12,9 @@ from diffsim_ti.inputs import ConsistentMass, Mass, kinetic_energy
 from diffsim_ti.monitor.energy_watch import EnergyWatch
 from diffsim_ti.potential.attached import Attached
 from diffsim_ti.potential.fluid import Fluid, Together
-from diffsim_ti.potential.free import FreeBodies, FreeDirections, held_as, mask_of
+from diffsim_ti.potential.free import FreeBodies, FreeDirections, held_as, linear_of, mask_of
 from diffsim_ti.potential.potential import Potential
+from diffsim_ti.potential.rigid_sets import RigidSets
 from diffsim_ti.potential.way import Way
 from diffsim_ti.slots import copy_slot
 from diffsim_ti.solvers.implicit.approach import Approach
@@ -69,10 +70,12 @@ class ImplicitWorkspace(Preconditioned, ObstacleWays, Noted, GivenInPasses, Work
         a = self.arrays
         self._mass = self.mass_of(derived)
         self.free = (runtime.fetch(a.inverse_mass)[:, None] > 0).astype(np.float64)
+        self.rigid = self.potential.rigid = RigidSets(self.scene.reduced, derived.rest)
         if self.scene.reduced:
-            self.free = FreeBodies(self.free, a.supports.guided, a.supports.guides, self.scene.reduced)
+            self.free = FreeBodies(self.free, a.supports.guided, a.supports.guides, self.scene.reduced, self.rigid)
         elif a.features().guided:
             self.free = FreeDirections(self.free, a.supports.guided, a.supports.guides)
+        self.linear = linear_of(self.free)
         eps = np.finfo(runtime.NUMPY[self.scene.precision]).eps
         tolerance, rounds = self.solver.tolerance, self.solver.max_iterations
         me = weakref.proxy(self)  # no circle: a dropped run gives its memory back at once
@@ -202,12 +205,9 @@ class ImplicitWorkspace(Preconditioned, ObstacleWays, Noted, GivenInPasses, Work
         stage = self.solver.stage(self.rate, before is None, j)
         x, y = self.inertial(stage, u, v, before)
         place, speed = self.prescribed(j, self.arrays.values)
-        mass, inertial = stage.inertia * self.mass, x + stage.gamma * y
-        if stage.static:
-            loads = self.loads(j, stage)
-        else:
-            inertial, loads = self.led_by_loads(j, stage, inertial, mass)
-        start = u if stage.static else u + self.free * (inertial - u)
+        problem = self.problem(j, stage, x, y)
+        self.rigid.begin(u, stage.c0)
+        start = u if stage.static else self.rigid.nearest(u + self.linear * (problem[1] - u))
         if place is not None:
             held = self.arrays.held
             start = self.with_held(start, u[held] + (place - u[held]) / stage.c0)
@@ -216,7 +216,7 @@ class ImplicitWorkspace(Preconditioned, ObstacleWays, Noted, GivenInPasses, Work
             self.strains.hold(stage, u, before)
         self.start_multipliers(j, u)
         try:
-            u_star = self._solve(u, start, (mass, inertial, loads), stage)
+            u_star = self._solve(u, start, problem, stage)
         except NotConverged as error:
             raise self._explained(error, u) from None
         self.u_star = u_star
@@ -227,7 +227,8 @@ class ImplicitWorkspace(Preconditioned, ObstacleWays, Noted, GivenInPasses, Work
         held = self.arrays.held
         place, speed = (u[held], v[held]) if place is None else (place, speed)
         u_next, v_next = self.with_held(u_next, place), self.with_held(v_next, speed)
-        u_next, v_next = self.scene.reduced.of(u_next), self.scene.reduced.of(v_next)  # without what rounding adds
+        # without what rounding adds
+        u_next, v_next = self.rigid.end(self.scene.reduced.of(u_next)), self.scene.reduced.of(v_next)
         if stage.c0 != 1:
             self._check_end(j, u_star, u_next)
         if self.energy_watch:
@@ -236,9 +237,18 @@ class ImplicitWorkspace(Preconditioned, ObstacleWays, Noted, GivenInPasses, Work
             self.energy_watch.note(u, u_star, u_next, v_next, places, added)
         return u_next, np.zeros_like(v) if stage.static else v_next
 
+    def problem(self, j: int, stage: Stage, x: np.ndarray, y: np.ndarray) -> tuple:
+        """Mass, inertial and loads of `Newton.solve` in pass j, inertia starting from (x, y)."""
+        mass, inertial = stage.inertia * self.mass, x + stage.gamma * y
+        if stage.static:
+            return mass, inertial, self.loads(j, stage)
+        return mass, *self.led_by_loads(j, stage, inertial, mass)
+
     def _kinetic_added(self, u, v, u_next, v_star, y, stage: Stage) -> float:
-        """Kinetic energy [J] that a pass has added beyond the work of what accelerates the free vertices, before drag."""
-        after, before, way, rate = (x * mask_of(self.free) for x in (v_star, v, u_next - u, (v_star - y) / stage.gamma))
+        """Kinetic energy [J] that a pass has added beyond the work of what accelerates the free vertices, before drag; what
+        keeps a shape does none."""
+        way = self.rigid.felt(u_next - u)
+        after, before, way, rate = (x * mask_of(self.free) for x in (v_star, v, way, (v_star - y) / stage.gamma))
         added = kinetic_energy(self.mass, after) - kinetic_energy(self.mass, before)
         return added - float((rate * (self.mass * way)).sum())
 
@@ -259,7 +269,9 @@ class ImplicitWorkspace(Preconditioned, ObstacleWays, Noted, GivenInPasses, Work
         longest = min(self.way_past_obstacles(held, start - held)[0], self.pairs_share(held, start - held))
         J0 = self.volume_ratios(held)
         for fraction in (longest, 0.5 * longest, 0.25 * longest):
-            at = held + fraction * (start - held)
+            at = self.rigid.nearest(held + fraction * (start - held))
+            if self.rigid and not self.newton.is_free(held, at - held):
+                continue  # it turns on another way
             if not np.any((J0 > 0) & ~(self.volume_ratios(at) > 0)):
                 return at
         return held
