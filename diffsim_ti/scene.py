@@ -73,8 +73,8 @@ class Scene(TermsOfScene, MadeAgain):
         whatever values a run takes; gradients by density and rest shape are those of such masses. `describe()` says how
         much was added. Implicit steps and statics add none.
     reduced: {name of a tetrahedron or vertex set: "affine"}: its vertices move by twelve numbers, x = X + A X + t, in every
-        solver. "rigid": by six, turned and moved, in explicit ones alone. Or a basis, in implicit steps and statics: weights
-        of a `designs.Cage`, the shapes of `modes`. Of a start only what a set can do counts (reduced.py).
+        solver. "rigid": by six, turned and moved, in every solver. Or a basis, in implicit steps and statics: weights of a
+        `designs.Cage`, the shapes of `modes`. Of a start only what a set can do counts (reduced.py).
 
     Raises ValueError with rule, value and remedy for anything that does not fit, before any kernel runs. Warns where
     tetrahedra lock, above Poisson's ratio 0.45.

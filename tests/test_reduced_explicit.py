@@ -369,9 +369,3 @@ def test_the_benchmark_of_a_stiff_part():
 def test_refused(terms, options, words):
     with pytest.raises(ValueError, match=words):
         ds.SemiImplicitSolver(scene_of({"shell": "rigid"}, terms=terms), dt=1e-4, **options)
-
-
-def test_implicit_steps_know_no_rigid_sets():
-    for solver in (ds.ImplicitEulerSolver, ds.BDF2Solver, ds.ImplicitMidpointSolver, ds.StaticSolver):
-        with pytest.raises(ValueError, match=f"{solver.__name__}: the set 'shell' is rigid.*or \"affine\""):
-            solver(scene_of({"shell": "rigid"}))

@@ -39,7 +39,9 @@ class RigidSet:
         self._size = float(np.sqrt((self.D**2).sum()))  # of a turn
 
     def nearest(self, u: np.ndarray) -> np.ndarray:
-        """The rigid displacement nearest to u, both of the set's vertices."""
+        """The rigid displacement nearest to u, both of the set's vertices; what is only shifted stays to the bit."""
+        if not np.ptp(u, 0).any():
+            return u
         R = Nearest(self._apart(u), self.D).R
         return u.mean(0) + self.D @ (R.T - np.eye(3))
 

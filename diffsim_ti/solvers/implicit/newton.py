@@ -115,12 +115,12 @@ class Newton:
         self.preconditioner, self.stiffness = self.preconditioners(mass)
         E, size, norm, rough, solved = self._evaluate(u), 0.0, np.inf, False, False
         self.upright = bool(np.all(E[2] > 0))
-        turns = self.rigid.rounding  # of places
         most = self.max_iterations if rounds is None else rounds
         while self._goes_on(most, rounds is None):
             R, now = self._residual(u)
             size, before = max(size, now), norm
-            floor = 4 * np.linalg.norm(self._rigidity() * (self.eps * np.abs(u).max(1, keepdims=True) + turns) * self.moves)
+            rounding = self.eps * np.abs(u).max(1, keepdims=True) + self.rigid.rounding
+            floor = 4 * np.linalg.norm(self._rigidity() * rounding * self.moves)
             norm = np.linalg.norm(R)
             report.residuals.append(norm / size if size > 0 else 0.0)
             if rounds is not None and norm <= self.roughly * size:

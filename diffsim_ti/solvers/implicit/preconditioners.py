@@ -67,7 +67,9 @@ class BodyBlocks(BlockJacobi):
                 G = np.einsum("ia,jakb,lb->jikl", R, G.reshape(m, 3, m, 3), R, optimize=True).reshape(n, n)
             self._bodies.append((body, self._inverse_with(G, own, body.fields(), contact)))
 
-    def _inverse_with(self, G: np.ndarray, own: np.ndarray, fields: np.ndarray, contact: np.ndarray | None) -> np.ndarray:
+    def _inverse_with(
+        self, G: np.ndarray, own: np.ndarray, fields: np.ndarray, contact: np.ndarray | None
+    ) -> np.ndarray:
         """Of G with inertia and contact of the vertices, without what is negative."""
         blocks = self.mass[own, :, None] * np.eye(3) + (0.0 if contact is None else contact[own])
         G = G + np.tensordot(fields, np.matmul(blocks, fields), ((0, 1), (0, 1)))
