@@ -193,7 +193,7 @@ class Potential:
         a = self.arrays
         if self._points is None or self._points[0] is not a.values:
             points = StressPoints.of(a.mesh, a.values)
-            self._points = a.values, points._replace(volumes=a.with_stress(points.volumes))
+            self._points = a.values, StressPoints(points.nodes, points.gradients, a.with_stress(points.volumes))
         return self._points[1]
 
     @cached_property

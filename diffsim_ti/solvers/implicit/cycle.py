@@ -44,16 +44,20 @@ class Level:
         self.b, self.x, self.d, self.y = (runtime.array(ROWS[self.numbers], self.nodes) for _ in range(4))
         self.diagonal, self.inverse = (runtime.array(ROWS[self.numbers], self.numbers * self.nodes) for _ in range(2))
         self.kernels = kernels_of(LevelKernels, self.numbers, "f32", parallel)
+        shape = self.nodes, self.numbers, self.inverse.element_shape[0]
+        self._columns = [np.zeros(shape, np.float32) for _ in range(2)]  # of blocks, filled up with zeros
         self.theta = 1.0
         self.put(self.diagonal_blocks)
         self.theta = THETA * MARGIN * self._largest()
         self.put(self.diagonal_blocks)
 
-    def put(self, diagonal: np.ndarray) -> None:
-        """Set the diagonal blocks."""
-        for target, blocks in ((self.diagonal, diagonal), (self.inverse, inverses(diagonal) / self.theta)):
-            columns = np.swapaxes(blocks, 1, 2).reshape(-1, self.numbers)
-            runtime.fill(target, np.pad(columns, ((0, 0), (0, self.inverse.element_shape[0] - self.numbers))))
+    def put(self, diagonal: np.ndarray, nodes=slice(None)) -> None:
+        """Set the diagonal blocks of some nodes."""
+        for target, columns, blocks in zip(
+            (self.diagonal, self.inverse), self._columns, (diagonal, inverses(diagonal) / self.theta)
+        ):
+            columns[nodes, :, : self.numbers] = np.swapaxes(blocks, 1, 2)
+            runtime.fill(target, columns.reshape(-1, columns.shape[2]))
 
     def _largest(self) -> float:
         """The largest eigenvalue of D^-1 A, by power iteration."""
@@ -138,10 +142,10 @@ class Cycle:
     def _wide(self, M, parallel: bool) -> bool:
         return parallel and M.shape[0] // M.blocksize[0] > self.wide or not runtime.runs_on_cpu()
 
-    def put_diagonal(self, blocks: np.ndarray) -> None:
-        """Set the diagonal blocks of the finest level."""
+    def put_diagonal(self, blocks: np.ndarray, nodes=slice(None)) -> None:
+        """Set the diagonal blocks of some nodes of the finest level."""
         if len(self.levels) > 1:
-            self.levels[0].put(blocks)
+            self.levels[0].put(blocks, nodes)
 
     def __call__(self, at, scale: float) -> None:
         """at.z = Q V Q^T at.r; scale: a number that brings r to about one."""

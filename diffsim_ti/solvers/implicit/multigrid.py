@@ -66,9 +66,10 @@ class Multigrid:
             contact = self.free.around(contact)
         R = self.frames.matrices()
         contact = np.swapaxes(R, 1, 2) @ contact @ R
-        if self._contact is not None and np.array_equal(contact, self._contact):
-            return
-        self.cycle.put_diagonal(self._at_rest + contact)
+        before = np.zeros_like(contact) if self._contact is None else self._contact
+        changed = np.flatnonzero((contact != before).any((1, 2)))
+        if len(changed):
+            self.cycle.put_diagonal(self._at_rest[changed] + contact[changed], changed)
         self._contact = contact
 
     def __call__(self, r: np.ndarray) -> np.ndarray:

@@ -17,7 +17,8 @@ class Projection:
         a = potential.arrays
         potential.blocks()
         C = potential.tangents()
-        some = np.nonzero(has_eigenvalue_below(C, -slight * np.linalg.norm(C, axis=(1, 2))))[0]
+        sizes = np.sqrt(np.einsum("eij,eij->e", C, C))
+        some = np.nonzero(has_eigenvalue_below(C, -slight * sizes))[0]
         C = C[some]
         values, vectors = np.linalg.eigh(0.5 * (C + np.swapaxes(C, 1, 2)))
         least = 1e-4 * np.abs(values).max(1, initial=0.0)[:, None]
