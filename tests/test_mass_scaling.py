@@ -53,6 +53,16 @@ def test_no_more_is_added_than_allowed_and_where_it_is_needed():
     assert 1 < scene(1e-4).mass_scaling.gain < scaled.mass_scaling.gain
 
 
+@pytest.mark.parametrize("share", [1e-4, 0.01])
+@pytest.mark.parametrize("seed", range(3))
+def test_what_it_says_to_have_won_is_what_the_stable_step_wins(share, seed):
+    mesh = with_slivers(seed=seed)
+    scaled = scene(share, mesh)
+    won = ds.stable_dt(scaled) / ds.stable_dt(scene(None, mesh))
+    assert scaled.mass_scaling.gain == pytest.approx(won, rel=3e-3) and won > 1
+    assert f"the stable step by a factor of {scaled.mass_scaling.gain:.3g}" in scaled.describe()
+
+
 def test_what_is_held_takes_no_mass():
     """A sliver at the clamp does not limit the step of the others, nor does its bound."""
     mesh = with_slivers()

@@ -149,6 +149,14 @@ def test_derivatives_of_the_compliance():
     assert by_E @ change == pytest.approx(difference, rel=1e-4)
 
 
+def test_equilibria_of_peers(capsys):
+    """Newton's method with factors finds what ours does; a peer that cannot answer is said and left out."""
+    benchmark, gone = example("benchmarks/static_peers"), {"torch-fem": ("static_torch_fem.py", "/bin/false")}
+    ((tetrahedra, ours, lu, *_, other),) = benchmark.main([160], gone, repeats=1)
+    assert tetrahedra == 168 and ours > 0 and float(lu.split(", ")[1].rstrip(")")) < 1e-5 and other == ""
+    assert "static_torch_fem.py:" in capsys.readouterr().out
+
+
 def test_benchmark_of_implicit_steps(capsys):
     """Every part runs; the direct solver takes the same steps."""
     benchmark = example("benchmarks/implicit_steps")
