@@ -2,10 +2,11 @@
 
     python examples/benchmarks/static_peers.py --torch-fem PYTHON --jax-fem PYTHON --sizes 5000 25000
 
-The beam of implicit_steps.py, E = 5e6 Pa, in float64, hangs from one end under its weight, in one load step; all that a solve
-sets up is timed, compiling is not (the best of some repetitions in one process). CHOLMOD is taken where scikit-sparse is
-installed. PYTHON: an interpreter whose environment holds the peer, which runs in a process of its own (peers/). Each chooses
-its linear solver by itself, JAX-FEM by PETSc. BLAS has one thread. Prints a table in Markdown, with the largest difference from ours in shares of the largest displacement.
+The beam of implicit_steps.py, E = 5e6 Pa, in float64, hangs from one end under its weight, in one load step. All that a
+solve sets up is timed, compiling is not (the best of some repetitions in one process). CHOLMOD is taken where scikit-sparse
+is installed. PYTHON: an interpreter whose environment holds the peer, which runs in a process of its own (peers/). Each
+chooses its linear solver by itself, JAX-FEM by PETSc. BLAS has one thread. Prints a table in Markdown, with the largest
+difference from ours in shares of the largest displacement.
 """
 
 import argparse
