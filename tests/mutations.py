@@ -41,7 +41,7 @@ TESTS = """
     test_open_laws.py test_viscous_stages.py test_unequal_steps.py test_quadratic.py test_quadratic_loads.py
     test_quadratic_outputs.py test_curved_contact.py test_mass_scaling.py
     test_designs.py test_identify.py test_identify_experiments.py test_surface_drag.py test_reduced.py
-    test_reduced_explicit.py
+    test_reduced_explicit.py test_reduced_rigid.py
 """.split()
 
 WRONG_NUMBERS = ("AssertionError", "assert ", "Failed: ", "FloatingPointError")
