@@ -73,8 +73,8 @@ class Reduced:
 
     The set moves by u = B q alone, so that forces do what B^T f says, and what B lacks is held as by a support. Linear
     momentum is kept where B has the rigid translations (constant functions); angular momentum, in the midpoint rule, where
-    it is of each component and has X, too, as cages have. Modes of a body that is held have neither: they are for what
-    stays where it is and does not turn far.
+    it is of each component and has X, too, as cages have; both of rigid sets. Modes of a body that is held have neither:
+    they are for what stays where it is and does not turn far.
 
     Raises ValueError for what is no {name: kind or basis}, bases of other shapes or of which some are all but combinations
     of others, sets that are not known, lie in a plane, or share vertices with each other or with what is held.

@@ -10,6 +10,9 @@ Hessian of the incremental potential on the rigid motions is symmetric. The midp
 constraint pull as the middle of the step is stretched, so that they keep angular momentum and do no work.
 Gonzalez 1999, Mechanical systems subject to holonomic constraints, doi:10.1016/S0167-2789(99)00054-8.
 
+Newton's method goes along du*, then to the nearest place whose end is rigid. Its matrix has, besides that of all vertices
+between both spaces, what turning y* changes of the torque of the forces that the shape resists.
+
 A vector of all vertices w stands for t = mean w and omega = J^-1 sum y* x w, J = sum |y*|^2 - y* y*^T: of residuals it is
 what the set feels of them, of directions the motion t + omega x y'.
 """

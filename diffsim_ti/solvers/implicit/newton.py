@@ -222,7 +222,7 @@ class Newton:
     def _step(self, u, R, forcing):
         """(direction, R): Newton's, towards the volumes that are held, and the residual that it goes down by."""
         A = self.operator()
-        balanced = self.volumes.predicted(u, R, self.stiffness) if self.volumes else R
+        balanced = self.volumes.predicted(u, R, self.stiffness) * self.free if self.volumes else R
         direction = self._direction(A, balanced, forcing)
         if self.volumes:
             done = A.products
@@ -248,7 +248,7 @@ class Newton:
         limit = 10 * len(R)
         if self.by_residual:
             self._indefinite = False
-            d, *_ = gmres(A, R * self.free, self.preconditioner, forcing, limit)
+            d, *_ = gmres(A, R, self.preconditioner, forcing, limit)
             self.report.products += A.products
             return self.rigid.motion(d)
         d, _, count, negative = conjugate_gradients(A, R, self.preconditioner, forcing, limit, self.eps)
