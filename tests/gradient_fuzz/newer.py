@@ -48,7 +48,7 @@ def motions(rng, mesh, count: int):
     n, more = mesh.num_vertices, int(rng.integers(1, max(2, min(6, count - 1))))
     which = rng.integers(4)
     if which in (0, 3):
-        return ("affine", "rigid")[which == 3]
+        return "rigid" if which == 3 else "affine"
     if which == 1:
         return np.column_stack([np.ones(n), rng.standard_normal((n, more))])
     rigid = np.eye(3)[:, None] * np.ones((n, 1))
@@ -109,6 +109,11 @@ def pose(kind, seed: int, number: int, path, x, duration: float, calm: float) ->
     return dict(
         path=lambda t: np.concatenate([path(t), turns(a * np.sin(2 * t / duration) + b * t / duration)]), about=about
     )
+
+
+def comes_late(obstacle, seed: int, number: int) -> bool:
+    """A third of what moves begins where only some passes feel it."""
+    return obstacle.path and np.random.default_rng([41, seed, number]).random() < 1 / 3
 
 
 def rubbing(kind, seed: int, mesh, duration: float) -> dict:

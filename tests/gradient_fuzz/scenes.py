@@ -234,7 +234,8 @@ def _obstacles(kind, seed, rng, mesh, start, fixed, stiff, duration, calm) -> tu
             options |= dict(friction=rng.uniform(0.1, 0.8), friction_speed=typical * 10 ** rng.uniform(-1.0, 0.8))
         path = smooth_path(rng, calm * 0.05 * CELL, duration) if o.path else None
         moved = newer.pose(kind, seed, len(placed), path, start, duration, calm)
-        placed.append(place(o, rng, start, n, width, options | moved, below, calm))
+        late = newer.comes_late(o, seed, len(placed))
+        placed.append(place(o, rng, start, n, width, options | moved, below, calm, late))
         paths.append(moved["path"])
     return placed, paths, rng.standard_normal(3) if push is None else push
 
