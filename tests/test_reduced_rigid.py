@@ -162,6 +162,27 @@ def test_gradients_beside_all_loads(solver):
     assert ds.check_gradients(rollout, verbose=False).passed
 
 
+@pytest.mark.parametrize("precision", ["f32", "f64"])
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_checkpoints_and_other_rest_positions_leave_no_trace(solver, precision):
+    """To the bit, between runs of one Rollout and another that keeps a third of its states."""
+    scene = scene_of(RIGID, precision=precision, fixed="xmin", initial_velocities=spinning())
+    whole, parts = (
+        ds.Rollout(solver(scene, dt=5e-3), 6, save_every=2, gradients="all", **more)
+        for more in ({}, dict(checkpoint_every=2))
+    )
+    first = whole.forward()
+    seed = np.random.default_rng(0).standard_normal(first.positions.shape)
+    expected = whole.vjp(first, seed)
+    stretched = whole.forward(rest_positions=bar().vertices * [1.0, 1.2, 1.0]).positions
+    assert np.abs(stretched - first.positions).max() > 1e-3
+    for rollout in (whole, parts):
+        frames = rollout.forward()
+        assert np.array_equal(frames.positions, first.positions)
+        found = rollout.vjp(frames, seed)
+        assert all(np.array_equal(found[name], expected[name]) for name in expected)
+
+
 @pytest.mark.parametrize("solver", [*SOLVERS, ds.StaticSolver])
 def test_a_volume_is_held_beside_them(solver):
     """Oil in a hollow cube whose lid is rigid, pressed; dot products, and the pressure by differences."""
