@@ -73,6 +73,24 @@ def test_what_is_held_takes_no_mass():
     assert solver.stable_dt() <= solver.stable_dt(tight=True) * (1 + 1e-3)
     whole = scene(0.01, mesh, fixed=np.arange(mesh.num_vertices))
     assert np.all(whole.mass_scaling.factors == 1) and whole.mass_scaling.share == 0
+    assert "the stable step by a factor of 1" in whole.describe()
+
+
+@pytest.mark.parametrize("share", [1e-3, 0.01])
+def test_a_sliver_within_a_rigid_set_limits_nothing(share):
+    """Neither is mass spent on it; what is said to be won is won."""
+    mesh = with_slivers()
+    sliver = mesh.tetrahedra[np.argmin(mesh.volumes)]
+    part = np.flatnonzero(np.isin(mesh.tetrahedra, sliver).sum(1) >= 3)
+    mesh = ds.TetrahedralMesh(mesh.vertices, mesh.tetrahedra, tetrahedron_sets={"part": part})
+    body = np.unique(mesh.tetrahedra[part])
+    inner = np.setdiff1d(body, mesh.tetrahedra[~np.isin(mesh.tetrahedra, body).all(1)])
+    plain, s = (scene(amount, mesh, reduced={"part": "rigid"}) for amount in (None, share))
+    assert np.all(s.mass_scaling.factors[inner] == 1) and s.mass_scaling.factors.max() > 1
+    solver = ds.VelocityVerletSolver(s, dt=1e-7)
+    assert solver.stable_dt() <= solver.stable_dt(tight=True) * (1 + 1e-3)
+    assert s.mass_scaling.gain < scene(share, mesh).mass_scaling.gain  # which the sliver rules
+    assert ds.stable_dt(s) > ds.stable_dt(plain) * (1 - 1e-3)
 
 
 def test_vertices_of_no_tetrahedron_count_for_nothing():

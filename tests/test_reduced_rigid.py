@@ -137,6 +137,43 @@ def everything(order=1, volume="tetrahedra", law=None):
     return ds.Scene(mesh, law or ds.StableNeoHookean(1e5, 0.4), 1000.0, terms, **given)
 
 
+# the sets in order, how the other end is held, whether steps are unequal
+BESIDE = [
+    (("left", "rigid"), ("right", "rigid"), None, False),
+    (("right", "rigid"), ("left", "affine"), "xmin", True),
+    (("left", "affine"), ("right", "rigid"), {"xmin": "y"}, True),
+    (("right", "rigid"), ("left", "rigid"), "moving", False),
+]
+
+
+@pytest.mark.parametrize("which", range(len(BESIDE)))
+@pytest.mark.parametrize("solver", [*SOLVERS, ds.StaticSolver])
+def test_several_sets_beside_supports(solver, which):
+    """Two sets with soft cells between them and to what is held, on rough ground: of any kinds, in any order."""
+    *sets, held, unequal = BESIDE[which]
+    static = solver is ds.StaticSolver
+    mesh = ds.TetrahedralMesh.create_box((7, 2, 3), size=(0.6, 0.1, 0.12), pattern="five")
+    along = mesh.centroids[:, 0]
+    parts = dict(left=(along > 0.1) & (along < 0.25), right=along > 0.4)
+    parts = {name: np.flatnonzero(chosen) for name, chosen in parts.items()}
+    mesh = ds.TetrahedralMesh(mesh.vertices, mesh.tetrahedra, vertex_sets=mesh.vertex_sets, tetrahedron_sets=parts)
+    fixed = "xmin" if held == "moving" or static else held
+    motion = (lambda t: [0.004 * t if static else 0.05 * t, 0.0, 0.0]) if held == "moving" else None
+    floor = ds.Ground(-0.012, stiffness=3e4, width=0.02, friction=0.3, friction_speed=0.1)
+    spin = 0 * mesh.vertices if static else np.cross([0.4, -1.0, 0.7], mesh.vertices - mesh.vertices.mean(0))
+    law, given = ds.StableNeoHookean(2e5, 0.3), dict(fixed=fixed, motion=motion, initial_velocities=spin)
+    scene = ds.Scene(mesh, law, 1000.0, [floor, ds.Gravity()], reduced=dict(sets), precision="f64", **given)
+    steps = ds.UnequalSteps([2e-3, 3e-3, 1.5e-3], 2) if unequal and not static else 3
+    options = dict(load_steps=2) if static else dict(dt=3e-3, substeps=2)
+    rollout = ds.Rollout(solver(scene, tolerance=1e-12, **options), steps, save_every=1, gradients="all")
+    frames = rollout.forward()
+    for name, kind in sets:
+        own = np.unique(mesh.tetrahedra[parts[name]])
+        off = np.abs(distances(frames.positions[-1, own]) - distances(mesh.vertices[own])).max()
+        assert (off < 1e-14) == (kind == "rigid")
+    assert verify.dot_product_test(rollout) <= 1e-9
+
+
 SCENES = {
     "linear": everything,
     "ten nodes": lambda: everything(order=2),

@@ -37,7 +37,7 @@ class RigidSet:
     """One of them, in a pass."""
 
     def __init__(self, body: Together, rest: np.ndarray):
-        self.vertices, self.rest, self.D = body.vertices, rest[body.vertices], body.apart(rest)
+        self.vertices, self.D = body.vertices, body.apart(rest)
         self.C = np.zeros((3, 3))
         self._size = float(np.sqrt((self.D**2).sum()))  # of a turn
 

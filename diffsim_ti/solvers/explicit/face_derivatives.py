@@ -230,9 +230,8 @@ class FaceDerivatives(FaceKernels):
                     self.go_back(s, k, now, faces, adjoint, out, own, plan)
         if ti.static(self.features.moving > 0):
             for p in range(ti.static(self.features.moving) * plan.num_parts):
-                now = pass_at(
-                    table, plan.first - plan.window
-                )  # not each pass of a step comes here: each is folded by itself
+                # not each pass of a step comes here: each is folded by itself
+                now = pass_at(table, plan.first - plan.window)
                 self.fold_row(p, plan.num_faces, now.row, now.next, out, plan)
 
     @cached_property

@@ -52,9 +52,8 @@ class FaceFriction:
             if g.force.friction and a.features().reaches(g):
                 self.obstacles += [(g.number + k, g.first + k * g.size + g.force.count + 2) for k in range(g.count)]
         self.number = np.array([o for o, _ in self.obstacles], int)
-        self.numbers = np.array(
-            [at for _, at in self.obstacles], int
-        )  # of mu; eps comes next, a point turned about last
+        # of mu; eps comes next, a point turned about last
+        self.numbers = np.array([at for _, at in self.obstacles], int)
         self.free = a.supports.freedom(a.num_vertices)[surface]
 
     def __bool__(self) -> bool:
