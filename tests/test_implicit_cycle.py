@@ -5,6 +5,7 @@ import pytest
 
 import diffsim_ti as ds
 from diffsim_ti.solvers.implicit.linear import Operator, conjugate_gradients
+from diffsim_ti.solvers.implicit.preconditioners import inverses_where_clear
 
 
 def beam(precision="f64", **more) -> ds.Scene:
@@ -27,6 +28,21 @@ def preconditioner_at(workspace, u):
     found, _ = workspace.preconditioner(np.zeros((len(u), 1)))
     found.update(u)
     return found
+
+
+def test_clear_blocks_are_definite_and_their_inverses_right():
+    rng = np.random.default_rng(3)
+    turned, _ = np.linalg.qr(rng.standard_normal((20_000, 3, 3)))
+    values = 10 ** rng.uniform(-5, 2, (20_000, 3)) * np.where(rng.random((20_000, 3)) < 0.05, -1, 1)
+    least = 10 ** rng.uniform(-6, 0, 20_000)
+    D = np.einsum("kia,ka,kja->kij", turned, values, turned)
+    inverse, clear = inverses_where_clear(D, least)
+    assert clear.mean() > 0.1 and (values[clear].min(1) >= least[clear]).all()
+    exact = np.einsum("kia,ka,kja->kij", turned, 1 / values, turned)
+    off = np.abs(inverse - exact).max((1, 2)) / np.abs(exact).max((1, 2))
+    assert off[clear].max() < 1e-9 and not inverse[~clear].any()  # conditions up to 3e5, of what is squared on the way
+    alike = values.min(1) > 0.01 * values.max(1)
+    assert clear[alike & (values.min(1) > 3 * least)].all()  # such as bodies have
 
 
 def test_a_cycle_is_symmetric_and_positive_definite(static):

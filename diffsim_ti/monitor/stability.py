@@ -146,7 +146,7 @@ class Stiffness:
         self.viscous, self.rate = law.viscous, runtime.array(a.fp, 1)
         kernels = potential_kernels(law, felt, workspace.parallel, a.in_lanes)
         at = (workspace.state, self)
-        self._multiply = kernels.stiffness.bind(a.in_lanes, scene=a, pass_=self, at=at, out=self)
+        self._multiply = kernels.stiffness.bind(a.in_vectors, scene=a, pass_=self, at=at, out=self)
         self.vector, self._random = None, np.random.default_rng(1)
         self.attached = Attached.of(workspace.scene)  # springs, cables and foundations
         self._told = None  # the numbers that they have

@@ -109,7 +109,7 @@ class BodyForces:
 
     def _run(self, name: str, **records) -> np.ndarray:
         a = self.arrays
-        launch = getattr(self.kernels, name).bind(a.in_lanes, scene=a, at=self.at, out=self.out, **records)
+        launch = getattr(self.kernels, name).bind(a.in_vectors, scene=a, at=self.at, out=self.out, **records)
         launch(num_items=a.num_items, num_vertices=a.num_vertices)
         return runtime.fetch_row(self.out.y, 0)
 

@@ -58,7 +58,7 @@ class Potential:
         a = self.arrays
         if name not in self._launches:
             own = dict(scene=a, pass_=self, at=self, out=self) | records
-            self._launches[name] = getattr(self.kernels, name).bind(lanes and a.in_lanes, **own)
+            self._launches[name] = getattr(self.kernels, name).bind(lanes and a.in_vectors, **own)
         self._launches[name](**self.sizes())
 
     def sizes(self) -> dict:

@@ -52,6 +52,7 @@ from diffsim_ti.runtime.start import (
     check_precision,
     init,
     is_alive,
+    moves_vectors,
     program,
     runs_on_cpu,
     set_precision,

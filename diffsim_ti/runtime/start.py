@@ -215,6 +215,11 @@ def runs_on_cpu() -> bool:
     return arch_name() == "cpu" and form == "cpu"
 
 
+def moves_vectors() -> bool:
+    """Whether kernels of tetrahedra load and store whole vectors: lanes of a CPU, the four numbers of a vertex on CUDA."""
+    return runs_on_cpu() or arch_name() == "cuda"
+
+
 def check_backend(precision: str) -> None:
     """Raise ValueError if the running backend cannot compute in this precision."""
     if arch_name() == "vulkan" and precision == "f64":

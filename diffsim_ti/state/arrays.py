@@ -39,11 +39,11 @@ class SceneArrays:
         self._order_tetrahedra(scene)
         self.num_coefficients, self.num_blocks = len(self.law.coefficient_names), len(self.order) // LANES
         self.in_lanes = self.law.lanes and runtime.runs_on_cpu()
+        self.in_vectors = self.law.lanes and runtime.moves_vectors()
         self.num_items = self.num_blocks if self.in_lanes else self.num_places
         self.num_vertices, self.num_tetrahedra = mesh.num_vertices, mesh.num_tetrahedra
         self.contacts = tuple(t for t in scene.ordered_terms if t.acts_on_surface)
-        self.fixed, self.held, self.feels_faces = scene.fixed, scene.held, feels_faces
-        self.supports = scene.supports
+        self.fixed, self.held, self.supports, self.feels_faces = scene.fixed, scene.held, scene.supports, feels_faces
         self.pressures = scene.pressures if presses else ()  # that gather with the tetrahedra's corners
         self.chambers = scene.gases if presses else ()  # likewise
         self.paths = scene.tie_paths if presses and scene.ties else None

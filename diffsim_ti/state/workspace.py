@@ -111,7 +111,7 @@ class Workspace:
         """A kernel bound to the scene and other records, kept as long as the arrays are."""
         parts = [part for record in records.values() for part in (record if type(record) is tuple else (record,))]
         key = (kernel, *map(id, parts))
-        return self.kept(key, lambda: (kernel.bind(self.arrays.in_lanes, scene=self.arrays, **records), parts))[0]
+        return self.kept(key, lambda: (kernel.bind(self.arrays.in_vectors, scene=self.arrays, **records), parts))[0]
 
     def forget(self) -> None:
         """The state was set from outside: forget what came before it."""

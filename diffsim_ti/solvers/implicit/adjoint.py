@@ -46,7 +46,7 @@ class ImplicitAdjoint(RecordedPasses):
             runtime.fill(corner, 0)  # also where surfaces in contact have theirs
             self._law = SimpleNamespace(z=self.z, corner=corner, y=y)
         self.held = a.held_numbers()  # in a pass, by the law
-        self._vjp = self.kernels.vjp.bind(a.in_lanes, **own)
+        self._vjp = self.kernels.vjp.bind(a.in_vectors, **own)
         if p.faces:
             faces = face_kernels(self.features, a.precision, workspace.parallel)
             self.face_areas = runtime.array(a.fp, nodes_of_faces(a).size if self.features.areas else 1)

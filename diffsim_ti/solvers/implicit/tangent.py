@@ -33,7 +33,7 @@ class ImplicitTangent(RecordedPasses):
             runtime.fill(self.z, 0)
             self._law = SimpleNamespace(z=self.z, w=p.w)
         self.held = a.held_numbers()
-        self._jvp = kernels.jvp.bind(a.in_lanes, **own)
+        self._jvp = kernels.jvp.bind(a.in_vectors, **own)
         if p.faces:
             self._jvp_of_faces = p.faces.bind(p.faces.kernels.jvp, tangent=(self, self.numbers))
         self.contacts = ContactRecord(workspace) if workspace.impulses else None
