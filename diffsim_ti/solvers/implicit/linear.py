@@ -1,5 +1,6 @@
 """Linear systems of the implicit solvers: A x = b with A = c M + d2E/du2 on the free vertices, by products alone."""
 
+import math
 from collections.abc import Iterable
 
 import numpy as np
@@ -104,34 +105,46 @@ def gmres(operator, b, preconditioner, tolerance: float, max_iterations: int, re
     x, r, size, count = np.zeros_like(b), b, np.linalg.norm(b), 0
     residual = 1.0 if size > 0 else 0.0
     while residual > tolerance and count < max_iterations:
-        beta = np.linalg.norm(r)
-        V, Z, H = [r / beta], [], np.zeros((restart + 1, restart))
+        V, Z = (np.empty((16, b.size)) for _ in range(2))  # rows: the basis, and it preconditioned
+        H, turns, left = np.zeros((restart + 1, restart)), [], np.linalg.norm(r)
+        rhs = np.eye(1, restart + 1)[0] * left
+        V[0] = r.ravel() / left
         for k in range(restart):
-            Z.append(preconditioner(V[k]))
-            w, count = operator(Z[k]), count + 1
-            whole = np.linalg.norm(w)
+            if k + 1 == len(V):  # room for twice as many
+                V, Z = (np.concatenate([basis, np.empty_like(basis[: restart - k])]) for basis in (V, Z))
+            z = preconditioner(V[k].reshape(b.shape))
+            w, count = operator(z).ravel(), count + 1
+            Z[k], whole = z.ravel(), np.linalg.norm(w)
             for _ in range(2):  # twice is enough
-                for i, v in enumerate(V):
-                    h = float((v * w).sum())
-                    H[i, k] += h
-                    w = w - h * v
+                h = V[: k + 1] @ w
+                H[: k + 1, k] += h
+                w = w - h @ V[: k + 1]
             H[k + 1, k] = np.linalg.norm(w)
-            rhs = np.zeros(k + 2)
-            rhs[0] = beta
-            y, *_ = np.linalg.lstsq(H[: k + 2, : k + 1], rhs, rcond=None)
-            left = np.linalg.norm(H[: k + 2, : k + 1] @ y - rhs)
+            left *= _turn_last(H[: k + 2, k].tolist(), turns)
             if not np.isfinite(left):
                 raise FloatingPointError("the stiffness of this state is not finite")
             spanned = H[k + 1, k] <= 1e-12 * whole  # all that these directions lead to
             if left <= tolerance * size or spanned or count >= max_iterations:
                 break
-            V.append(w / H[k + 1, k])
-        x = x + sum(c * z for c, z in zip(y, Z))
+            V[k + 1] = w / H[k + 1, k]
+        y, *_ = np.linalg.lstsq(H[: k + 2, : k + 1], rhs[: k + 2], rcond=None)
+        x = x + (y @ Z[: k + 1]).reshape(b.shape)
         r = b - operator(x)
         before, residual = residual, np.linalg.norm(r) / size
         if residual > 0.9 * before:  # it stands
             break
     return x, residual, count
+
+
+def _turn_last(column: list, turns: list) -> float:
+    """Turn the last column of a Hessenberg matrix by the Givens rotations (c, s) of those before it, and note its own, which
+    leaves it without a last number: |s|, by which that makes the least residual smaller."""
+    for i, (c, s) in enumerate(turns):
+        column[i], column[i + 1] = c * column[i] + s * column[i + 1], c * column[i + 1] - s * column[i]
+    a, b = column[-2:]
+    size = math.hypot(a, b)
+    turns.append((a / size, b / size) if size else (0.0, 1.0))
+    return abs(turns[-1][1])
 
 
 def solve(operator, b, preconditioner, tolerance: float, eps: float, max_iterations: int) -> np.ndarray:
