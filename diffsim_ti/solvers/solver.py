@@ -119,7 +119,11 @@ class Solver(ABC):
 
     def lengths(self, j: ArrayLike, rate: float) -> tuple[np.ndarray, np.ndarray]:
         """(lengths h of passes j [s], exp(-rate h))"""
-        h, place = np.unique(self.schedule.length(np.asarray(j)), return_inverse=True)
+        j = np.asarray(j)
+        if j.size == 1:  # asked for in each pass by what works on the host
+            h = float(self.schedule.length(j.item()))
+            return np.full(j.shape, h), np.full(j.shape, math.exp(-rate * h))
+        h, place = np.unique(self.schedule.length(j), return_inverse=True)
         decay = np.array([math.exp(-rate * x) for x in h])  # whose last bit NumPy's own may have otherwise
         return h[place].reshape(np.shape(j)), decay[place].reshape(np.shape(j))
 

@@ -153,10 +153,11 @@ class FaceFriction:
         of_law = dict(S=S, inverse=inverse, lightness=lightness, kappa=kappa, f=f, y=y, B=B, r=r)
         return SimpleNamespace(**of_push, **of_motion, **of_law)
 
-    def slide(self, rub: Rubbing) -> None:
-        """Find what vertices gain."""
+    def slide(self, rub: Rubbing) -> float:
+        """Find what vertices gain; returns the work of moving obstacles on the body [J]."""
         k = self._known(rub)
         rub.gained = k.inverse * self.freed(self._gather(rub, k.w[:, :, None] * k.r[:, None]))
+        return float((k.r * k.wall).sum())
 
     def impulses(self, rub: Rubbing) -> np.ndarray:
         """Of each rough obstacle on each surface vertex [N s], shape (obstacles, surface, 3)."""
@@ -167,11 +168,6 @@ class FaceFriction:
         out = np.zeros((len(self.number), len(self.surface), 3))
         np.add.at(out, (rub.obstacle[:, None], rub.corners), at_nodes)
         return out
-
-    def work(self, rub: Rubbing) -> float:
-        """Of moving obstacles on the body [J]."""
-        k = self._known(rub)
-        return float((k.r * k.wall).sum())
 
     # ---- derivatives -------------------------------------------------------------------------------------------------
 

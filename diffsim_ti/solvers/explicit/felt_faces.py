@@ -147,10 +147,9 @@ class FeltFaces:
         x = self.rows.get(self.begin, 0) + self.a.values.rest[self.rows.nodes]
         self.rub = self.friction.begin(self.impulses(self.impulse), v, x, self.corners_of, plan["first"], num_passes)
         if self.rub is not None:
-            self.friction.slide(self.rub)
+            self.work_of_friction += self.friction.slide(self.rub)
             self.rows.put(history.v, slot, v + self.rub.gained)
             self.rows.put(history.u, slot, u + self.rub.ratio * self.rub.gained)
-            self.work_of_friction += self.friction.work(self.rub)
 
     def impulses(self, array) -> np.ndarray:
         """Of obstacles on the nodes of faces, or changes of them, shape (faces, obstacles, nodes, 3)."""
