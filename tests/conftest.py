@@ -9,6 +9,7 @@ import os
 
 import areas
 import pytest
+from left_out import left_out
 
 import diffsim_ti
 
@@ -46,11 +47,17 @@ def pytest_configure(config):
 def pytest_collection_modifyitems(config, items):
     """Without the thorough ones; of several processes none waits at the end for another's long file."""
     if not config.getoption("--thorough"):
-        left_out = [item for item in items if item.get_closest_marker("thorough")]
-        config.hook.pytest_deselected(items=left_out)
-        items[:] = [item for item in items if item not in set(left_out)]
+        single = left_out()
+        left_out_now = [item for item in items if item.get_closest_marker("thorough") or _id(item) in single]
+        config.hook.pytest_deselected(items=left_out_now)
+        items[:] = [item for item in items if item not in set(left_out_now)]
     if hasattr(config, "workerinput"):
         items.sort(key=lambda item: areas.place(item.path.stem))
+
+
+def _id(item) -> str:
+    """As left_out.py names it."""
+    return item.nodeid.removeprefix("tests/").replace(".py", "", 1)
 
 
 def pytest_terminal_summary(terminalreporter, config):

@@ -303,3 +303,32 @@ def test_a_solver_whose_substeps_changed_is_refused():
     ds.Simulator(solver).set_substeps(2)
     with pytest.raises(RuntimeError, match="substeps changed"):
         rollout.forward()
+
+
+@pytest.mark.parametrize("solver", [ds.ImplicitEulerSolver, ds.BDF2Solver, ds.ImplicitMidpointSolver, ds.StaticSolver])
+def test_a_run_of_solves_is_solved_once(solver, monkeypatch):
+    """Tangents and adjoints, in any order and however many, read the record that the run has left, and leave it as it is."""
+    mesh = ds.TetrahedralMesh.create_cube(3, 0.1)
+    ground = ds.Ground(mesh.vertices[:, 1].min() - 1e-3, 1e3, 5e-3, friction=0.3)
+    fixed = "ymax" if solver is ds.StaticSolver else None
+    scene = ds.Scene(mesh, ds.StableNeoHookean(2e4, 0.3), terms=[ds.Gravity(), ground], fixed=fixed, precision="f64")
+    rollout = ds.Rollout(solver(scene, dt=5e-3), 3, save_every=1)
+    frames, passes = rollout.forward(), []
+    advance = type(rollout.sweep.workspace).advance
+    monkeypatch.setattr(
+        type(rollout.sweep.workspace), "advance", lambda self, *a, **k: passes.append(a) or advance(self, *a, **k)
+    )
+    seed = np.random.default_rng(0).standard_normal(frames.positions.shape)
+    tangents, gradients = [], []
+    for _ in range(2):
+        tangents.append(rollout.jvp(frames, youngs_modulus=1e3, gravity=[1.0, 2.0, 3.0]))
+        gradients.append(rollout.vjp(frames, seed))
+    assert not passes
+    assert all(a.tobytes() == b.tobytes() for a, b in zip(*tangents))
+    assert all(gradients[0][name].tobytes() == gradients[1][name].tobytes() for name in gradients[0])
+    again = ds.Rollout(solver(scene, dt=5e-3), 3, save_every=1, checkpoint_every=1)  # solved anew, from kept states
+    found = again.vjp(again.forward(), seed)
+    assert passes and all(found[name].tobytes() == gradients[0][name].tobytes() for name in found)
+    without = ds.Rollout(solver(scene, dt=5e-3), 3, gradients=[])
+    without.forward()
+    assert without.sweep.workspace.record is None  # nobody will ask for it

@@ -239,7 +239,7 @@ def test_a_law_that_implicit_solvers_do_not_know_ends_in_the_error(cube):
 def test_a_fall_of_the_battery(solver):
     """One of those that `python tests/battery_of_falls.py` draws; and its judge notices what is wrong."""
     beam = next(path for path in battery_of_falls.ASSETS if path.stem == "beam")
-    case = dict(mesh=str(beam), size=0.05, youngs_modulus=1e4, height=0.1, solver=solver)
+    case = dict(mesh=str(beam), size=0.05, youngs_modulus=1e4, height=0.05, solver=solver)
     fallen = battery_of_falls.fall(case)
     assert battery_of_falls.judge(fallen) == "good", fallen
     for wrong in (dict(gap=-1e-6), dict(rise=0.02), dict(ended=False, said="so")):

@@ -1,6 +1,5 @@
 """n steps of a solver on the device: forward, in reverse from kept states, and in tangents."""
 
-import warnings
 from collections.abc import Callable, Iterable
 
 import numpy as np
@@ -10,9 +9,11 @@ from diffsim_ti.checked import as_numbers, listed, number, whole
 from diffsim_ti.inputs import Derived
 from diffsim_ti.monitor.guard import Guard
 from diffsim_ti.rollout.checkpoints import choose_checkpoints
+from diffsim_ti.rollout.doubts import warn_of_coarse_steps, warn_of_explosion
 from diffsim_ti.rollout.run import Run, Seed
 from diffsim_ti.solvers.solver import Solver
-from diffsim_ti.state.watch import ContactResolution
+
+RECORD_BYTES = 200e6  # up to which the first run of implicit solvers is recorded
 
 
 class Sweep:
@@ -40,8 +41,8 @@ class Sweep:
         self.contacts = contacts  # whether runs note what obstacles do to each vertex in each frame
         self.chambers = chambers and solver.scene.holds_volumes  # whether pressures in chambers are wanted of frames
         self.solver, self.scene, self.steps = solver, solver.scene, steps
-        self.save_every = max(self.steps, 1) if save_every is None else whole("save_every", save_every, 0)
-        if self.save_every < 1 or self.steps % self.save_every:
+        self.save_every = max(steps, 1) if save_every is None else whole("save_every", save_every, 0)
+        if self.save_every < 1 or steps % self.save_every:
             raise ValueError(f"save_every = {save_every} must be >= 1 and divide steps = {steps}")
         self.num_frames = self.steps // self.save_every + 1
         self.values = self.scene.inputs.at_times(solver.schedule.time(np.arange(self.steps + 1)))
@@ -158,7 +159,7 @@ class Sweep:
             raise RuntimeError("the solver's substeps changed since this Rollout was made: make a new one")
         self._current = None  # until the sweep is through
         values = run.values
-        if self._loaded is not None and all(values[name] is self._loaded[name] for name in values):
+        if self._loaded is not None and all(value is self._loaded[name] for name, value in values.items()):
             self.workspace.restart()
         else:
             derived, self._loaded = self._derive(values), None
@@ -185,7 +186,7 @@ class Sweep:
         if self.contacts:
             ws.forget_contacts()
         self.workspace.first_step = run.first_step
-        self._recorded = checkpoints.num_segments == 1 and self._adjoint is not None  # a gradient was asked for before
+        self._recorded = checkpoints.num_segments == 1 and self._expects_gradient()
         if self._recorded:
             ws.make_record(checkpoints.segment + 1)
         ws.report.clear()
@@ -201,6 +202,11 @@ class Sweep:
         run.seen_by = self._name
         self._kept, self._current = path, run  # segments whose starts are in the snapshots
 
+    def _expects_gradient(self) -> bool:
+        """Whether a run is worth its record: one was asked for before, or passes are solves, which cost more than that."""
+        solves = not self.solver.explicit and bool(self.wanted)
+        return self._adjoint is not None or solves and self.checkpoints.states() * self.state_bytes <= RECORD_BYTES
+
     def _record(self, first: int, last: int) -> None:
         """Passes first .. last - 1 from the current state, recorded."""
         ws = self.workspace
@@ -213,13 +219,15 @@ class Sweep:
 
     def push_forward(self, run: Run, change: Derived) -> tuple[np.ndarray, np.ndarray]:
         """Changes of the frames' positions and velocities, float64, for a change of what kernels read."""
-        current = self._current
-        self._load(run)
-        ws, checkpoints = self.workspace, self.checkpoints
-        tangent = self._make_tangent(change)
+        current, recorded = self._current, self._recorded and self._current is run
+        if not recorded:
+            self._load(run)
+        self._current = None  # until the sweep is through
+        ws, checkpoints, tangent = self.workspace, self.checkpoints, self._make_tangent(change)
         for k in range(checkpoints.num_segments):
             first, last = checkpoints.bounds(k)
-            self._record(first, last)
+            if not recorded:
+                self._record(first, last)
             tangent.advance(first, last, self.num_passes, self.save_every)
             ws.restore(ws.record, last - first)
         if self.solver.last_frame_is_state:
@@ -238,7 +246,9 @@ class Sweep:
         hardly resolve, and of an adjoint that grew out of use.
         """
         self.bring_back(run)
-        self._warn_if_coarse(run.contact_resolution)
+        if not (run.contact_resolution.resolved or self._warned):
+            self._warned = True
+            warn_of_coarse_steps(self.solver, run.contact_resolution)
         of_frames = self._reverse(seed, self.careful)
         derived, of_start = seed.collect(self._adjoint, self.truncates)
         if not np.isfinite(sum(of_start) + derived.coefficients.sum()):
@@ -246,7 +256,7 @@ class Sweep:
                 self._reverse(seed, True)  # raises where it happens
             raise FloatingPointError("the adjoint is not finite at the start of the run")
         if not self.chambers or seed.chamber_pressures is None:  # which feel places by the square of the rate of steps
-            self._warn_if_exploded(of_frames, of_start)
+            warn_of_explosion(of_frames, of_start, float(self.solver.schedule.time(self.steps)) or self.solver.dt)
         return derived
 
     def _reverse(self, seed: Seed, careful: bool) -> tuple[float, float]:
@@ -256,12 +266,11 @@ class Sweep:
             shape = "rest_positions" in self.wanted
             density = shape or "density" in self.wanted  # the rest shape makes masses
             self._adjoint = self._make_adjoint(density, shape)
-        norms = seed.put(self._adjoint, self.solver.last_frame_is_state)
+        norms, self.health = seed.put(self._adjoint, self.solver.last_frame_is_state), []
         if self.contacts:
             self._adjoint.seed_contacts(seed.contact_forces, self.frame_time)
         if self.chambers:
             self._adjoint.chamber_record.adjoints = seed.chamber_pressures
-        self.health = []
         stop = 0 if self.truncate is None else self.solver.schedule.first(max(0, self.steps - self.truncate))
         kept, end = self._kept, checkpoints.num_segments
         self._kept = kept[:1]  # the sweep overwrites the others, also if it does not get to its end
@@ -315,32 +324,8 @@ class Sweep:
                 f"the adjoint became not finite in step {now} (t = {self.solver.schedule.time(now):g} s): "
                 "look at the loss and at how long the rollout stays smooth; parameters are unchanged"
             )
-        scaled = 1.0
-        norm = float(np.hypot(by_position, by_velocity))
+        scaled, norm = 1.0, float(np.hypot(by_position, by_velocity))
         if self.clip is not None and norm > self.clip:
             scaled = self.clip / norm
             self._adjoint.scale(scaled)
         self.health.append({"step": step, "norm_position": by_position, "norm_velocity": by_velocity, "scaled": scaled})
-
-    def _warn_if_coarse(self, seen: ContactResolution) -> None:
-        """Once."""
-        if not seen.resolved and not self._warned:
-            self._warned = True
-            damped = self.solver.stages_contact and self.solver.contact_damping > 0
-            warnings.warn(
-                f"gradients through contacts may be off by more than 10 %: {seen}; take substeps of at most "
-                f"{seen.advised_substep:.3g} s instead of {seen.substep:.3g} s, or a softer or wider barrier"
-                + (", or a smaller contact_damping" if damped else ""),
-                stacklevel=4,
-            )
-
-    def _warn_if_exploded(self, of_frames, of_start) -> None:
-        """Norms of the adjoints of displacements and velocities, where the sweep began and where it ended."""
-        duration = float(self.solver.schedule.time(self.steps)) or self.solver.dt
-        start, end = (by_u + by_v / duration for by_u, by_v in (of_frames, of_start))
-        if end > 1e8 * start > 0:
-            warnings.warn(
-                f"the adjoint grew by {end / start:.1g} over the run: the motion is chaotic or unstable, and this "
-                "gradient is of little use; shorten the rollout, pass truncate=, or see gradient_health",
-                stacklevel=4,
-            )

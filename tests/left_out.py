@@ -1,0 +1,79 @@
+"""Single tests that are left out like those marked `thorough`, and what proves the same; a table of README.md says it, too.
+
+Of a product of parameters a mark would leave out a whole row or column. Ids are those of pytest, without tests/ and .py.
+"""
+
+# what proves the same -> tests
+LEFT_OUT = {
+    "box, mesh, sphere; transposes of all shapes in `test_contact_stage.py`": """
+        test_contact_gradients::test_every_input[cylinder]
+        test_contact_gradients::test_every_input[capsule]
+    """,
+    "BDF2 in a bowl, velocity Verlet before a capsule; the same in f64": """
+        test_curved_contact::test_the_adjoint_is_the_transpose_of_the_tangent[VelocityVerletSolver-plane-options0-f64]
+        test_curved_contact::test_curved_faces_rub_on_each_other[VelocityVerletSolver-f32]
+        test_curved_contact::test_curved_faces_press_on_each_other[VelocityVerletSolver-f32]
+    """,
+    "the same laws in f64; other laws of the same kind": """
+        test_open_laws::test_everything_follows_from_the_energy[ogden-f32-single]
+        test_open_laws::test_everything_follows_from_the_energy[tissue-f32-single]
+        test_open_laws::test_gradients_by_every_number[yeoh-SemiImplicitSolver]
+        test_open_laws::test_gradients_by_every_number[knowles-SemiImplicitSolver]
+        test_open_laws::test_uniaxial_force_is_that_of_the_closed_form[yeoh]
+        test_open_laws::test_gradients_on_patches[tissue]
+        test_quadratic::test_forces_and_stiffness_are_derivatives_of_the_energy[Corotated-tetrahedra]
+        test_quadratic::test_forces_and_stiffness_are_derivatives_of_the_energy[MooneyRivlin-tetrahedra]
+        test_gradients::test_one_step_is_the_transpose_of_its_tangent[f32-1e-05-StVenantKirchhoff-SemiImplicitSolver]
+        test_gradients::test_one_step_is_the_transpose_of_its_tangent[f32-1e-05-StVenantKirchhoff-VelocityVerletSolver]
+        test_gradients::test_one_step_is_the_transpose_of_its_tangent[f32-1e-05-SmithNeoHookean-SemiImplicitSolver]
+        test_gradients::test_one_step_is_the_transpose_of_its_tangent[f32-1e-05-SmithNeoHookean-VelocityVerletSolver]
+        test_gradients::test_one_step_is_the_transpose_of_its_tangent[f32-1e-05-MooneyRivlin-SemiImplicitSolver]
+        test_gradients::test_one_step_is_the_transpose_of_its_tangent[f32-1e-05-MooneyRivlin-VelocityVerletSolver]
+        test_gradients::test_one_step_is_the_transpose_of_its_tangent[f32-1e-05-LinearElastic-SemiImplicitSolver]
+        test_gradients::test_one_step_is_the_transpose_of_its_tangent[f32-1e-05-LinearElastic-VelocityVerletSolver]
+    """,
+    "other seeds": """
+        test_batch::test_scenes_are_bit_for_bit_those_alone[3]
+        test_batch::test_what_acts_on_bodies[0]
+        test_batch::test_what_acts_on_bodies[3]
+    """,
+    "four-node fibres; gradients by ten-node ones": """
+        test_muscles::test_eight_fibres_at_once_are_eight_fibres[SemiImplicitSolver-2-f32]
+    """,
+    "affine sets in f32, rigid ones in f64": """
+        test_reduced_explicit::test_tangent_and_adjoint_agree[rigid-SemiImplicitSolver-f32-1e-05]
+        test_reduced_explicit::test_tangent_and_adjoint_agree[rigid-VelocityVerletSolver-f32-1e-05]
+    """,
+    "capsules; transposes and impacts before a mesh": """
+        test_contact_faces::test_forces_and_energies_are_those_of_implicit_steps[mesh-True]
+    """,
+    "velocity Verlet and statics": """
+        test_quadratic_outputs::test_derivatives[midpoint]
+    """,
+    "the same in f64": """
+        test_self_contact_implicit::test_large_steps_keep_bodies_apart_and_their_momentum[ImplicitEulerSolver-f32]
+        test_self_contact_implicit::test_large_steps_keep_bodies_apart_and_their_momentum[ImplicitMidpointSolver-f32]
+        test_self_contact_implicit::test_large_steps_keep_bodies_apart_and_their_momentum[BDF2Solver-f32]
+    """,
+    "the same in explicit steps; friction within faces in implicit ones by equilibria": """
+        test_face_friction::test_a_block_slides_on_rails_that_no_vertex_meets
+    """,
+    "boxes and capsules": """
+        test_contact_crossing::test_thin_obstacles_are_not_jumped_over[cylinder-SemiImplicitSolver_force]
+        test_contact_crossing::test_thin_obstacles_are_not_jumped_over[cylinder-VelocityVerletSolver_force]
+    """,
+    "a plane; gaps in a bowl": """
+        test_curved_contact::test_energy_is_that_of_the_formula_and_all_solvers_feel_it[bowl]
+    """,
+    "a larger stretch": """
+        test_implicit_cycle::test_nearly_incompressible_cubes_are_stretched_and_squashed_in_one_load_step[0.3]
+    """,
+    "the midpoint rule": """
+        test_reduced_rigid::test_gradients_beside_all_loads[BDF2Solver]
+    """,
+}
+
+
+def left_out() -> dict[str, str]:
+    """Reasons by ids."""
+    return {test: reason for reason, tests in LEFT_OUT.items() for test in tests.split()}
