@@ -20,7 +20,7 @@ import numpy as np
 import taichi as ti
 from compare_peers import common_jobs
 from peers import work
-from speed import BATCH_STEPS, SUBSTEPS, batch_work, common_rollout
+from speed import BATCH_STEPS, SUBSTEPS, H, batch_work, common_rollout
 
 import diffsim_ti as ds
 from diffsim_ti import runtime, verify
@@ -160,20 +160,29 @@ def torch_streams(options) -> dict:
 
 
 def speed(options, tetrahedra: int) -> dict:
-    """Time of a substep, forward and with its reverse; and of copying its state and tetrahedra once."""
+    """Time of a substep, forward and with its reverse, by runs of few and many, and of what a call takes besides; the bytes
+    of state, shape and corner forces that a substep has to move, by its time."""
     if tetrahedra > options.largest:
         return dict(left_out="beyond --largest")
-    rollout = common_rollout(SIZES[tetrahedra], "f32", per_tetrahedron=False)
-    frames = rollout.forward()
-    adjoint = np.ones_like(frames.positions)
-    rollout.vjp(frames, adjoint)
-    forward = seconds(rollout.forward, 3) / SUBSTEPS
-    both = seconds(lambda: rollout.vjp(rollout.forward(), adjoint), 3) / SUBSTEPS
+    n = SIZES[tetrahedra]
+    times, counts = {}, (16, 16 * (25 if n < 30 else 8 if n < 90 else 4))
+    for count in counts:
+        rollout = common_rollout(n, "f32", False, count, H * min(1.0, 30 / n))  # so that many are stable
+        frames = rollout.forward()
+        adjoint = np.ones_like(frames.positions)
+        rollout.vjp(frames, adjoint)
+        forward = seconds(rollout.forward, 4)
+        times[count] = np.array([forward, seconds(lambda: rollout.vjp(rollout.forward(), adjoint), 4)])
+    few, many = counts
+    forward, both = each = (times[many] - times[few]) / (many - few)
+    fixed = times[few] - few * each
     vertices, m = rollout.scene.mesh.num_vertices, rollout.scene.mesh.num_tetrahedra
-    touched = 4 * (m * (4 + 10 + 2 * 12) + vertices * 12)  # indices, shape, corner forces there and back, state
+    touched = 4 * (m * (4 + 10 + 2 * 16) + vertices * 16)
     return dict(
         forward_us=round(1e6 * forward, 1),
         with_reverse_us=round(1e6 * both, 1),
+        call_ms=round(1e3 * fixed[0], 1),
+        both_calls_ms=round(1e3 * fixed[1], 1),
         forward_GB_per_s=round(touched / forward / 1e9, 2),
         megabytes=round(runtime.allocated_megabytes()),
     )

@@ -32,8 +32,10 @@ def best_seconds(function, repeats: int) -> float:
     return best
 
 
-def common_rollout(resolution: int, precision: str, per_tetrahedron: bool = True) -> ds.Rollout:
-    """The common work on a cube with `resolution` vertices a side."""
+def common_rollout(
+    resolution: int, precision: str, per_tetrahedron: bool = True, substeps: int = SUBSTEPS, h: float = H
+) -> ds.Rollout:
+    """The common work on a cube with `resolution` vertices a side, in a step of `substeps` substeps of h [s]."""
     mesh = ds.TetrahedralMesh.create_cube(resolution)
     m = mesh.num_tetrahedra if per_tetrahedron else ()
     E, nu = 1e5, 0.4
@@ -42,13 +44,13 @@ def common_rollout(resolution: int, precision: str, per_tetrahedron: bool = True
         mesh,
         material,
         density=1000.0,
-        terms=[ds.Gravity(-9.8), ds.Drag(-math.log(0.999) / H)],
+        terms=[ds.Gravity(-9.8), ds.Drag(-math.log(0.999) / h)],
         initial_positions=mesh.vertices * 1.01,
         precision=precision,
     )
     # the common step is within the stable one at these sizes; --growth goes beyond, where only time is looked at
-    solver = ds.SemiImplicitSolver(scene, dt=SUBSTEPS * H, substeps=SUBSTEPS, allow_unstable=resolution > 31)
-    return ds.Rollout(solver, 1, gradients=["mu", "lam", "initial_positions"])
+    solver = ds.SemiImplicitSolver(scene, dt=substeps * h, substeps=substeps, allow_unstable=resolution > 31)
+    return ds.Rollout(solver, 1, gradients=["mu", "lam", "initial_positions"], memory=8000)
 
 
 def measure(resolution: int, precision: str, repeats: int) -> dict:
