@@ -275,7 +275,7 @@ def test_markers_keep_their_digits_in_float32():
 
 @by_solver
 def test_further_seeds_run_nothing_forward(solver, monkeypatch):
-    """Neither a second seed nor a tangent between; and the first needs one recorded run."""
+    """Neither a second seed nor a tangent between; and the first needs one recorded run where passes are no solves."""
     rollout = small(solver)
     kind, passes = type(rollout.solver.workspace(rollout.solver.start_values())), []
     advance = kind.advance
@@ -288,13 +288,12 @@ def test_further_seeds_run_nothing_forward(solver, monkeypatch):
 
     monkeypatch.setattr(kind, "advance", counted)
     first = rollout.vjp(frames, positions=seed)
-    assert sum(passes) == rollout.sweep.num_passes
+    assert sum(passes) == (rollout.sweep.num_passes if rollout.solver.explicit else 0)
     passes.clear()
     for name in rollout.outputs:
         rollout.vjp(frames, **{name: RNG.normal(size=frames[name].shape)})
     assert not passes
     rollout.jvp(frames, gravity=np.ones(3))
-    passes.clear()
     again = rollout.vjp(frames, positions=seed)
     assert not passes and all(np.array_equal(again[name], first[name]) for name in first)
     assert issubclass(kind, ExplicitWorkspace) == rollout.solver.explicit
