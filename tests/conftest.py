@@ -48,9 +48,12 @@ def pytest_collection_modifyitems(config, items):
     """Without the thorough ones; of several processes none waits at the end for another's long file."""
     if not config.getoption("--thorough"):
         single = left_out()
-        left_out_now = [item for item in items if item.get_closest_marker("thorough") or _id(item) in single]
-        config.hook.pytest_deselected(items=left_out_now)
-        items[:] = [item for item in items if item not in set(left_out_now)]
+        if config.args_source is pytest.Config.ArgsSource.TESTPATHS:  # all of them
+            if gone := set(single) - {_id(item) for item in items}:
+                raise pytest.UsageError(f"left_out.py names tests that are not there: {', '.join(sorted(gone))}")
+        deselected = {item for item in items if item.get_closest_marker("thorough") or _id(item) in single}
+        config.hook.pytest_deselected(items=list(deselected))
+        items[:] = [item for item in items if item not in deselected]
     if hasattr(config, "workerinput"):
         items.sort(key=lambda item: areas.place(item.path.stem))
 
