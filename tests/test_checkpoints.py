@@ -305,6 +305,19 @@ def test_a_solver_whose_substeps_changed_is_refused():
         rollout.forward()
 
 
+@by_solver
+def test_tangents_read_the_record_that_a_run_has_left(solver):
+    """The same bits, whether a tangent records the run itself or comes before or after adjoints of one that is recorded."""
+    change = dict(youngs_modulus=1e3, gravity=[1.0, 2.0, 3.0])
+    fresh, used = rollout(solver), rollout(solver)
+    first = fresh.jvp(fresh.forward(), **change)
+    gradients_of(used)
+    frames = used.forward()
+    for _ in range(2):
+        assert all(a.tobytes() == b.tobytes() for a, b in zip(used.jvp(frames, **change), first))
+        assert_same_bits(used.vjp(frames, W, Z), stored_whole(solver))
+
+
 @pytest.mark.parametrize("solver", [ds.ImplicitEulerSolver, ds.BDF2Solver, ds.ImplicitMidpointSolver, ds.StaticSolver])
 def test_a_run_of_solves_is_solved_once(solver, monkeypatch):
     """Tangents and adjoints, in any order and however many, read the record that the run has left, and leave it as it is."""
