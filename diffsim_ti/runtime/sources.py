@@ -18,7 +18,7 @@ from taichi.lang.expr import Expr
 from taichi.lang.util import cook_dtype
 from taichi.types import primitive_types
 
-from diffsim_ti.runtime import variables
+from diffsim_ti.runtime import tracer, variables
 from diffsim_ti.runtime.language import traced
 
 _of_kernels, _trace, _any_cast = kernel_impl._get_tree_and_ctx, kernel_impl.transform_tree, ops.cast
@@ -114,3 +114,4 @@ def trace_faster() -> None:
     ti.cast = ops.cast = _cast
     ASTTransformerContext.get_pos_info = _place
     variables.make_fewer()
+    tracer.hurry()

@@ -1,0 +1,224 @@
+"""Taichi's tracer with less ado for each node of source code: the same expressions and messages in two thirds of the time.
+
+Taichi enters a context manager for each node, makes a record of its place in the file for each expression, and asks of each
+value which of a dozen types it has. Here what nodes of kernels are most often comes first; all else is left to Taichi.
+"""
+
+import ast
+import operator
+from functools import lru_cache
+
+from taichi._lib import core
+from taichi.lang import impl, ops
+from taichi.lang.any_array import AnyArray
+from taichi.lang.ast import ast_transformer
+from taichi.lang.ast.ast_transformer import ASTTransformer, build_stmt
+from taichi.lang.ast.ast_transformer_utils import Builder, LoopStatus, ReturnStatus
+from taichi.lang.exception import TaichiTypeError
+from taichi.lang.expr import Expr
+from taichi.lang.matrix_ops import matmul
+from taichi.types import primitive_types
+
+_any_node, _any_expr, _any_binary = Builder.__call__, Expr.__init__, ops._binary_operation
+_any_subscript, _any_variable, _any_builtin = impl.subscript, impl.expr_init, ASTTransformer.build_call_if_is_builtin
+_PLAIN, _INTEGERS = (int, float), range(-(2**31), 2**31)
+_OPERATORS = {
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: operator.truediv,
+    ast.FloorDiv: operator.floordiv,
+    ast.Mod: operator.mod,
+    ast.Pow: operator.pow,
+    ast.LShift: operator.lshift,
+    ast.RShift: operator.rshift,
+    ast.BitOr: operator.or_,
+    ast.BitXor: operator.xor,
+    ast.BitAnd: operator.and_,
+    ast.MatMult: matmul,
+}
+_DECORATORS = {
+    id(impl.static): "static",
+    id(impl.static_assert): "static_assert",
+    id(impl.grouped): "grouped",
+    id(ast_transformer.ndrange): "ndrange",
+}
+_record_of = lru_cache(maxsize=None)(core.DebugInfo)  # of a place in a file
+
+
+class _Fails:
+    """A transformer whose every method raises an error, so that Taichi says of it what it says of its own."""
+
+    def __init__(self, error: Exception):
+        self.error = error
+
+    def __getattr__(self, name: str):
+        def again(context, node):
+            raise self.error
+
+        return again
+
+
+@lru_cache(maxsize=None)
+def _method_of(kind: type):
+    return getattr(build_stmt, "build_" + kind.__name__, None)
+
+
+def _node(transformer, context, node):
+    """What a node stands for."""
+    kind = type(node)
+    if kind is ast.Constant:
+        node.ptr = node.value
+        return node.value
+    if kind is ast.Name:
+        try:
+            return _name(context, node)
+        except Exception:
+            return _any_node(transformer, context, node)
+    method = _method_of(kind)
+    if method is None or not isinstance(node, (ast.stmt, ast.expr)):
+        return _any_node(transformer, context, node)
+    places = impl.pytaichi.src_info_stack
+    places.append(context.get_pos_info(node))
+    try:
+        return method(context, node)
+    except Exception as error:
+        return _any_node(_Fails(error), context, node)
+    finally:
+        places.pop()
+
+
+def _name(context, node: ast.Name):
+    name = node.id
+    for scope in reversed(context.local_scopes):
+        if name in scope:
+            found = scope[name]
+            break
+    else:
+        found = context.get_var_by_name(name)
+    node.ptr = found
+    if isinstance(found, Expr):
+        found.dbg_info = _record_of(context.get_pos_info(node))
+        found.ptr.set_dbg_info(found.dbg_info)
+    return found
+
+
+def _statements(context, statements: list) -> list:
+    scopes = context.local_scopes
+    scopes.append({})
+    try:
+        for statement in statements:
+            if context.returned != ReturnStatus.NoReturn or context.loop_status() != LoopStatus.Normal:
+                break
+            build_stmt(context, statement)
+    finally:
+        scopes.pop()
+    return statements
+
+
+def _operation(context, node: ast.BinOp):
+    left, right = build_stmt(context, node.left), build_stmt(context, node.right)
+    try:
+        node.ptr = _OPERATORS[type(node.op)](left, right)
+    except TypeError as error:
+        raise TaichiTypeError(str(error)) from None
+    return node.ptr
+
+
+def _decorator(context, node) -> str:
+    """Which of Taichi's words for the tracer itself a call calls, if any."""
+    if type(node) is not ast.Call:
+        return ""
+    names, value = [], node.func
+    while isinstance(value, ast.Attribute):
+        names.append(value.attr)
+        value = value.value
+    found = context.global_vars.get(value.id) if isinstance(value, ast.Name) else None
+    for name in reversed(names):
+        found = getattr(found, name, None)
+    return _DECORATORS.get(id(found), "")
+
+
+def _builtin(context, node, arguments, keywords) -> bool:
+    """Whether a call of one of Python's own functions was built."""
+    known = getattr(node.func.ptr, "_is_taichi_function", False)
+    return False if known else _any_builtin(context, node, arguments, keywords)
+
+
+def _record():
+    """Where the tracer is."""
+    return _record_of(impl.pytaichi.src_info_stack[-1])
+
+
+def _expr(self, *values, dbg_info=None, dtype=None) -> None:
+    """Expr(value): a C++ expression, or a small number."""
+    value = values[0] if len(values) == 1 else None
+    if type(value) is core.Expr:
+        own = value
+    elif type(value) is Expr and value.ptr_type_checked:
+        self.ptr, self.ptr_type_checked, self.dbg_info = value.ptr, True, value.dbg_info
+        return
+    elif (
+        type(value) is int and dtype is None and value in _INTEGERS and impl.pytaichi.default_ip is primitive_types.i32
+    ):
+        own = core.make_const_expr_int(primitive_types.i32, value)
+    else:
+        _any_expr(self, *values, dbg_info=dbg_info, dtype=dtype)
+        return
+    self.ptr, self.dbg_info, self.ptr_type_checked = own, dbg_info, True
+    if dbg_info is not None:
+        own.set_dbg_info(dbg_info)
+    own.type_check(impl.pytaichi.prog.config())
+
+
+def _binary(of_taichi, of_python, a, b):
+    left, right = isinstance(a, Expr), isinstance(b, Expr)
+    if not (left and (right or type(b) in _PLAIN) or right and type(a) in _PLAIN):
+        return _any_binary(of_taichi, of_python, a, b)
+    record = _record()
+    if not left:
+        a = Expr(a, dbg_info=record)
+    if not right:
+        b = Expr(b, dbg_info=record)
+    return Expr(of_taichi(a.ptr, b.ptr), dbg_info=record)
+
+
+def _subscript(builder, value, *indices, skip_reordered=False):
+    """value[indices] of an array, or a part of a vector."""
+    if not isinstance(value, AnyArray) and not (isinstance(value, Expr) and value.is_tensor()):
+        return _any_subscript(builder, value, *indices, skip_reordered=skip_reordered)
+    group = core.ExprGroup()
+    for index in indices:
+        if not isinstance(index, Expr):
+            if type(index) is not int or index < 0:
+                return _any_subscript(builder, value, *indices, skip_reordered=skip_reordered)
+            index = Expr(index)
+        group.push_back(index.ptr)
+    return Expr(impl.pytaichi.compiling_callable.ast_builder().expr_subscript(value.ptr, group, _record()))
+
+
+def _variable(value):
+    """A new variable."""
+    if type(value) is not Expr:
+        return _any_variable(value)
+    return Expr(impl.pytaichi.compiling_callable.ast_builder().expr_var(value.ptr, _record()))
+
+
+_CHANGES = {  # what is Taichi's own -> what stands in its place
+    (ASTTransformer, "__call__"): _node,
+    (ASTTransformer, "build_BinOp"): staticmethod(_operation),
+    (ASTTransformer, "get_decorator"): staticmethod(_decorator),
+    (ASTTransformer, "build_call_if_is_builtin"): staticmethod(_builtin),
+    (ast_transformer, "build_stmts"): _statements,
+    (Expr, "__init__"): _expr,
+    (ops, "_binary_operation"): _binary,
+    (impl, "subscript"): _subscript,
+    (impl, "expr_init"): _variable,
+}
+TAICHI = {place: getattr(*place) for place in _CHANGES}
+
+
+def hurry() -> None:
+    """Have Taichi trace so, in all of this process."""
+    for (owner, name), own in _CHANGES.items():
+        setattr(owner, name, own)

@@ -1,0 +1,212 @@
+"""Kernels are traced as Taichi itself traces them, only faster: the same code, the same messages."""
+
+import importlib.util
+import itertools
+import random
+import re
+
+import numpy as np
+import pytest
+import taichi as ti
+from taichi.lang import impl
+
+from diffsim_ti import runtime
+
+if runtime.QUADRANTS:
+    pytest.skip("Quadrants has a tracer of its own", allow_module_level=True)
+
+from diffsim_ti.runtime import tracer
+
+LEVELS = itertools.count(1000)
+HEADER = """import math
+import taichi as ti
+from taichi import static as known
+
+a_few, GLOBAL, VECTORS = [1, 2, 3], 2.5, ti.types.ndarray(ti.types.vector(3, ti.f64), 1)
+
+
+@ti.func
+def mixed(x, y):
+    z = x * y + 1
+    if z > 2:
+        z -= y
+    return z
+
+
+@ti.func
+def pair(x, y: ti.template()):
+    return x + y, ti.max(x, y)
+
+
+"""
+
+
+class Writer:
+    """A random kernel."""
+
+    def __init__(self, seed: int):
+        self.random, self.floats, self.ints = random.Random(seed), ["f", "GLOBAL"], ["i", "n"]
+
+    def expression(self, depth: int = 0) -> str:
+        pick = self.random.random
+        if depth > 3 or pick() < 0.2:
+            return self.random.choice(
+                [*self.floats, "a[i]", "v[i][1]", "w[1]", str(round(pick(), 3)), "2", "ti.cast(3, ti.f64)"]
+            )
+        x, y, k = self.expression(depth + 1), self.expression(depth + 1), self.integer(depth + 1)
+        return self.random.choice(
+            [
+                f"({x} {self.random.choice('+-*/')} {y})",
+                f"({x}) ** 2",
+                f"-({x})",
+                f"mixed({x}, {y})",
+                f"pair({x}, {y})[{self.random.randrange(2)}]",
+                f"max({x}, {y}, 1)",
+                f"abs({x})",
+                f"ti.select({k} > 1, {x}, {y})",
+                f"({x} if {k} % 2 == 0 else {y})",
+                f"a[({k}) % 4]",
+                f"v[({k}) % 4].norm_sqr()",
+                f"(v[i] * {x}).dot(w)",
+                f"(ti.Matrix([[1.0, {x}], [2.0, 3.0]]) @ ti.Vector([{y}, 1.0]))[{self.random.randrange(2)}]",
+                f"ti.static(math.sqrt({self.random.randrange(1, 9)}))",
+                f"float({k})",
+            ]
+        )
+
+    def integer(self, depth: int = 0) -> str:
+        if depth > 3 or self.random.random() < 0.4:
+            return self.random.choice([*self.ints, "1", "3", "a.shape[0]"])
+        x, y = self.integer(depth + 1), self.integer(depth + 1)
+        return self.random.choice(
+            [
+                f"({x} + {y})",
+                f"({x} // 2)",
+                f"({x} << 1)",
+                f"({x} & {y})",
+                f"({x} | 1)",
+                f"({x} ^ {y})",
+                f"int({x})",
+                f"ti.abs({x})",
+            ]
+        )
+
+    def statements(self, indent: str, depth: int = 0) -> list[str]:
+        lines = []
+        for _ in range(self.random.randrange(1, 4)):
+            new, x = f"x{len(self.floats)}", self.expression()
+            kind = self.random.randrange(8)
+            if kind < 3:
+                lines.append(f"{indent}{new} = {x} + 0.0")
+                self.floats.append(new)
+            elif kind == 3:
+                lines.append(f"{indent}{new}, {new}_ = pair({x}, {self.expression()})")
+                self.floats += [new, f"{new}_"]
+            elif kind == 4:
+                lines.append(f"{indent}a[i] {self.random.choice(['=', '+=', '*='])} {x} * 1.5")
+            elif kind == 5:
+                lines.append(f"{indent}w[{self.random.randrange(3)}] = {x} - 1")
+            elif depth < 2:
+                inner = [*self.floats]
+                head = self.random.choice(
+                    [
+                        f"if {self.integer()} > 1 and {x} < 3:",
+                        f"for k{depth} in range({self.random.randrange(1, 4)}):",
+                        f"for k{depth} in ti.static(range(2)):",
+                        f"for k{depth}, each{depth} in known(enumerate(a_few)):",
+                    ]
+                )
+                lines += [indent + head, *self.statements(indent + "    ", depth + 1)]
+                self.floats = inner
+        return lines or [f"{indent}a[i] = {self.expression()}"]
+
+    def kernel(self, last: str = "") -> str:
+        body = self.statements(" " * 8)
+        return HEADER + "\n".join(
+            [
+                "@ti.kernel",
+                "def made(a: ti.types.ndarray(ti.f64, 1), v: VECTORS, n: ti.i32, f: ti.f64):",
+                "    for i in range(a.shape[0]):",
+                "        w = v[i] * 2",
+                *body,
+                *([" " * 8 + last] if last else []),
+                "        a[i] += w.sum()",
+            ]
+        )
+
+
+def traced(kernel, capfd) -> tuple:
+    """(the error, the code before Taichi's first pass and where each part of it stands, what it computes)"""
+    config, error = impl.get_runtime().prog.config(), ""
+    a, v = ti.ndarray(ti.f64, 4), ti.Vector.ndarray(3, ti.f64, 4)
+    a.from_numpy(np.arange(4.0)), v.from_numpy(np.arange(12.0).reshape(4, 3) / 7)
+    capfd.readouterr()
+    config.print_ir = config.print_ir_dbg_info = True
+    config.opt_level = next(LEVELS)  # so that nothing is found in a cache
+    try:
+        kernel(a, v, 3, 0.7)
+    except Exception as raised:
+        error = f"{type(raised).__name__}: {raised}"
+    finally:
+        config.print_ir = config.print_ir_dbg_info = False
+    return error, capfd.readouterr().out.partition("\n}\n")[0], a.to_numpy().tolist()
+
+
+def both(source: str, path, capfd, monkeypatch) -> list[tuple]:
+    """What `traced` finds as the package traces and as Taichi does."""
+    path.write_text(source)
+    found = []
+    for functions in ({}, tracer.TAICHI):
+        with monkeypatch.context() as patch:
+            for (owner, name), function in functions.items():
+                is_static = isinstance(vars(owner).get(name), staticmethod)
+                patch.setattr(owner, name, staticmethod(function) if is_static else function)
+            spec = importlib.util.spec_from_file_location("kernels", path)
+            module = importlib.util.module_from_spec(spec)
+            spec.loader.exec_module(module)
+            found.append(traced(module.made, capfd))
+    return found
+
+
+@pytest.fixture(autouse=True)
+def level():
+    config = impl.get_runtime().prog.config()
+    before = config.opt_level
+    yield
+    config.opt_level = before
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_random_kernels_are_traced_as_taichi_traces_them(seed, tmp_path, capfd, monkeypatch):
+    ours, theirs = both(Writer(seed).kernel(), tmp_path / "kernels.py", capfd, monkeypatch)
+    assert ours == theirs and not ours[0] and ours[1].count("File") > 10
+
+
+WRONG = {
+    "w[1] = nowhere + 1": 'Name "nowhere" is not defined',
+    "w[1] = mixed(nowhere, 1)": 'Name "nowhere" is not defined',
+    "w[1] = v[-1][0]": "Negative indices",
+    "w[1] = mixed(1.0)": "missing",
+    "w[1] = v[i].nothing": "no attribute 'nothing'",
+    "w[1] = a[i] @ 2": "matmul",
+    "w[1] = 1 << 2.5": "unsupported operand",
+    "w[1] = 3000000000": "exceeded the range",
+    "w[1] = a[i] + 'x'": "",
+    "w[1] = a[i, 0]": "",
+    "w[1] = f[0]": "",
+    "w[1] = math.sqrt(f)": "",
+    "lambda: 3": "Unsupported node",
+    "n = 3": "immutable",
+    "w[0] = v": "",
+}
+
+
+@pytest.mark.filterwarnings("ignore:.*non-taichi function")
+@pytest.mark.parametrize("line", WRONG)
+def test_what_is_wrong_is_said_as_taichi_says_it(line, tmp_path, capfd, monkeypatch):
+    ours, theirs = both(Writer(3).kernel(line), tmp_path / "kernels.py", capfd, monkeypatch)
+    assert ours[0] and WRONG[line] in ours[0]
+    ours, theirs = (
+        re.sub(r"(?s)Traceback .*\n(?=\w)", "", found[0]) for found in (ours, theirs)
+    )  # frames of the tracer
+    assert ours == theirs
