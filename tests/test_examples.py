@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from example_files import EXAMPLES, example
 
+ARCH = os.environ.get("DIFFSIM_TI_ARCH", "cpu")
+
 
 def test_throw_at_target(capsys):
     numbers = example("control/throw_at_target").main()
@@ -118,11 +120,10 @@ def test_benchmark(precision):
 )
 def test_gpu_gate(more):
     """Parts of the script for the day a card is there, each in a process of its own, on whatever this run is on."""
-    arch = os.environ.get("DIFFSIM_TI_ARCH", "cpu")
     only = ["device", *more, "Warp, 48,000"]
-    command = [sys.executable, str(EXAMPLES / "benchmarks/gpu_gate.py"), f"--arch={arch}", "--largest=6000", "--only"]
+    command = [sys.executable, str(EXAMPLES / "benchmarks/gpu_gate.py"), f"--arch={ARCH}", "--largest=6000", "--only"]
     out = subprocess.run([*command, *only], capture_output=True, text=True)
     rows = {row["part"]: row for row in (json.loads(line) for line in out.stdout.splitlines() if line.startswith("{"))}
     assert out.returncode == 0 and list(rows) == only, out.stdout + out.stderr
-    assert rows["device"]["arch"] == arch and rows[more[-1]]["passed"] and "left_out" in rows["Warp, 48,000"]
+    assert rows["device"]["arch"] == ARCH and rows[more[-1]]["passed"] and "left_out" in rows["Warp, 48,000"]
     assert "1 scenes" in more or "| explicit f32 | motion" in out.stdout

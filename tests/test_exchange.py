@@ -101,7 +101,7 @@ def test_a_surface_falls_from_the_shell(tmp_path, capsys):
     out = [str(tmp_path / "fall.glb"), str(tmp_path / "fall.npz")]
     path = saved_surface(tmp_path / "body.stl")
     with pytest.raises(SystemExit) as end:
-        app.main(["simulate", str(path), "--duration", ".1", "-o", out[0], "-o", out[1]])
+        app.main(["simulate", str(path), "--duration", ".04", "--fps", "100", "-o", out[0], "-o", out[1]])
     assert end.value.code == 0, capsys.readouterr().err
     places, times = animated(tmp_path / "fall.glb")[0]
     arrays = np.load(out[1])

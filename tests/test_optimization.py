@@ -151,6 +151,7 @@ def start(path) -> subprocess.Popen:
     return subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
 
 
+@pytest.mark.thorough
 def test_kill_at_random_moments(tmp_path):
     """In new processes: the next run finds a whole file (warnings are errors there) and ends as if nothing had been."""
     moments = random.Random(0)

@@ -179,6 +179,7 @@ def relative(motion, right) -> float:
     return np.linalg.norm(motion - right, axis=-1).max() / np.linalg.norm(right, axis=-1).max()
 
 
+@pytest.mark.thorough
 def test_advice_is_implicit_where_explicit_steps_are_tiny():
     """Against explicit steps at their limit: as right as promised, and the explicit run takes longer."""
     (scene, duration, tolerance), advice = held_back("pull"), advised("pull")
