@@ -65,8 +65,9 @@ class Block(Items):
             out.append([let(self.lanes(*(at(w, d) for w in whole))) for d in range(3)])
         return out
 
-    def store(self, corner, item, forces, zero, add: bool = False):
-        begin = let(self.nodes * LANES * item)
+    def store(self, corner, item, forces, zero, add: bool = False, first=None):
+        begin = self.nodes * LANES * item
+        begin = let(begin if first is None else begin + first)
         for a in range(self.nodes):
             for lane in range(LANES):
                 force = self.vector(*(at(forces[a][d], lane) for d in range(3)), zero)
@@ -113,8 +114,9 @@ class Single(Items):
         whole = [let(at(vectors, slot, at(tets, place))) for place in places]
         return [[let(at(w, d)) for d in range(3)] for w in whole]
 
-    def store(self, corner, item, forces, zero, add: bool = False):
-        begin = let(self.nodes * item)
+    def store(self, corner, item, forces, zero, add: bool = False, first=None):
+        begin = self.nodes * item
+        begin = let(begin if first is None else begin + first)
         for a in range(self.nodes):
             self.put_force(at(corner, begin + a), self.vector(*forces[a], zero), add)
 

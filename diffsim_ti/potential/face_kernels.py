@@ -1,12 +1,12 @@
 """Kernels of points within faces (faces.py), a loop over all vertices each."""
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import taichi as ti
 
 from diffsim_ti.potential.faces import FacePoints
-from diffsim_ti.runtime import Kernel
+from diffsim_ti.runtime import Kernel, kernels_of
 from diffsim_ti.state.features import Features
 from diffsim_ti.state.numbers import ADJOINT, SCENE, TANGENT
 
@@ -102,7 +102,6 @@ class FaceKernels(FacePoints):
         return self._kernel("face_vjp", self.all_vjp, **own)
 
 
-@lru_cache(maxsize=None)
 def face_kernels(features: Features, precision: str, parallel: bool) -> FaceKernels:
     """Kernels for a scene's features."""
-    return FaceKernels(features, precision, parallel)
+    return kernels_of(FaceKernels, features.of_state(), precision, parallel)

@@ -1,14 +1,14 @@
 """Kernels of the potential energy of a displacement: elasticity of all tetrahedra, obstacles at surface vertices."""
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import taichi as ti
 
 from diffsim_ti.elements.patched_tetrahedron import functions_of
 from diffsim_ti.materials.calculus.tensor import Tensor, sum_of
 from diffsim_ti.potential.obstacles import ObstaclePotential
-from diffsim_ti.runtime import PRECISIONS, Bundle, Kernel, assign, let, traced
+from diffsim_ti.runtime import PRECISIONS, Bundle, Kernel, assign, kernels_of, let, traced
 from diffsim_ti.runtime import at as entry
 from diffsim_ti.state.features import Features
 from diffsim_ti.state.numbers import ADJOINT, SCENE, TANGENT, with_held, with_pass
@@ -179,28 +179,28 @@ class PotentialKernels:
             el.put(tangent, 81 * len(el.points), e, 81 * q + 9 * c, dP.numbers)
 
     @traced
-    def corner_blocks(self, e, scene, tangent, columns):
-        """The 3x3 block of -df_a/du_a of each corner a, by columns."""
+    def corner_column(self, e, scene, d, tangent, corners, first):
+        """Column d of the 3x3 block of -df_a/du_a of each corner a, a displacement e_d of it; corners from `first` on."""
         el = self.element
         B, volume = el.gradients_of(e, scene.gradients), el.volume_of(e, scene.volumes)
         zero = ti.cast(0, self.fp)
         N = [[let(sum_of(B[a, j] for a in range(3)) * ti.cast(-1, self.fp)) for j in range(3)]]
         N += [[B[a, j] for j in range(3)] for a in range(3)]
-        for d in range(3):  # column d: the displacement e_d of the corner
-            C = [el.numbers(tangent, 9 * (3 * d + k), 9, 81, e) for k in range(3)]
-            forces = []
-            for a in range(4):
-                dP = [let(sum_of(C[k][m] * N[a][k] for k in range(3)) * volume) for m in range(9)]
-                forces.append([let(sum_of(dP[3 * i + j] * N[a][j] for j in range(3))) for i in range(3)])
-            el.store_corners(columns[d], e, forces, zero)
+        C = [el.numbers(tangent, 9 * (3 * d + k), 9, 81, e) for k in range(3)]
+        forces = []
+        for a in range(4):
+            dP = [let(sum_of(C[k][m] * N[a][k] for k in range(3)) * volume) for m in range(9)]
+            forces.append([let(sum_of(dP[3 * i + j] * N[a][j] for j in range(3))) for i in range(3)])
+        el.store_corners(corners, e, forces, zero, first=first)
 
     @ti.func
-    def contact_column(self, i, d: A, at: A, scene: A, pass_: A, plan: A):
+    def contact_column(self, i, d, at: A, scene: A, pass_: A, plan: A):
         """Column d of df/du of obstacles at vertex i."""
         f = self.obstacles.vector(0)
         if self.felt(i, scene):
             unit = self.obstacles.vector(0)
-            unit[d] = 1
+            for m in ti.static(range(3)):
+                unit[m] = ti.select(d == m, ti.cast(1, self.fp), ti.cast(0, self.fp))
             f = self.obstacles.whole_product(i, at.u[0, i], unit, scene, pass_, plan)
         return f
 
@@ -211,28 +211,29 @@ class PotentialKernels:
             for c in range(9):
                 self.tangent_column(e, scene, at, c, out.tangent)
             if ti.static(self.features.order == 1):
-                self.corner_blocks(e, scene, out.tangent, (out.corner0, out.corner1, out.corner2))
+                for d in range(3):
+                    self.corner_column(e, scene, d, out.tangent, out.corners, d * (out.corners.shape[0] // 3))
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.num_vertices):
-            for d, corner in ti.static(enumerate((out.corner0, out.corner1, out.corner2))):
-                column = self.contact_column(i, d, at, scene, pass_, plan)
+            for d in range(3):
+                f = self.obstacles.vector(0)
                 if ti.static(self.features.order == 1):
-                    out.blocks[d, i] = self.element.gather(i, scene, corner) - column
-                else:
-                    out.blocks[d, i] = 0 - column
+                    for c in range(scene.start[i], scene.start[i + 1]):
+                        f += out.corners[d * (out.corners.shape[0] // 3) + scene.corner_of[c]]
+                out.blocks[d, i] = f - self.contact_column(i, d, at, scene, pass_, plan)
 
     @cached_property
     def blocks(self) -> Kernel:
         """d2psi/dF2 of each point, and the 3x3 diagonal blocks of -df/du, by columns; of ten nodes the tetrahedra's part is
         left to the host."""
-        out = dict.fromkeys(("corner0", "corner1", "corner2"), "vectors") | dict(tangent="blocks", blocks="vectors2")
+        out = dict(corners="vectors", tangent="blocks", blocks="vectors2")
         return self._kernel("blocks", self.all_blocks, at=dict(u="vectors2"), out=out)
 
     @ti.func
     def all_contact_blocks(self, scene: A, pass_: A, at: A, out: A, plan: A):
         ti.loop_config(serialize=not self.parallel)
         for i in range(plan.num_vertices):
-            for d in ti.static(range(3)):
+            for d in range(3):
                 out.blocks[d, i] = 0 - self.contact_column(i, d, at, scene, pass_, plan)
 
     @cached_property
@@ -301,7 +302,6 @@ class PotentialKernels:
         return self._kernel("vjp", self.all_vjp, **own)
 
 
-@lru_cache(maxsize=None)
 def potential_kernels(law, features: Features, parallel: bool, lanes: bool) -> PotentialKernels:
     """Kernels for a law and a scene's features."""
-    return PotentialKernels(law, features, parallel, lanes)
+    return kernels_of(PotentialKernels, law, features.of_state(), parallel, lanes)

@@ -199,10 +199,10 @@ class Potential:
     @cached_property
     def _block_arrays(self) -> SimpleNamespace:
         a = self.arrays
-        corners = {f"corner{d}": runtime.array(a.vector, *a.corner.shape) for d in range(3)}
+        corners = runtime.array(a.vector, 3 * a.corner.shape[0])
         room = 81 * a.points * a.num_blocks
         tangent, blocks = runtime.array(a.lanes, room), runtime.array(a.vector, 3, a.num_vertices)
-        return SimpleNamespace(tangent=tangent, blocks=blocks, **corners)
+        return SimpleNamespace(tangent=tangent, blocks=blocks, corners=corners)
 
     @property
     def coupling(self) -> PatchCoupling:

@@ -10,12 +10,12 @@ corners by its arch at most, a fourth of that of the part that it was cut from. 
 """
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import taichi as ti
 
 from diffsim_ti.potential.curved_faces import MOST_SHARES
-from diffsim_ti.runtime import Kernel, traced
+from diffsim_ti.runtime import Kernel, kernels_of, traced
 from diffsim_ti.state.features import Features
 from diffsim_ti.state.numbers import SCENE
 from diffsim_ti.state.obstacle_functions import ObstacleFunctions
@@ -289,7 +289,6 @@ class SweptKernels(ObstacleFunctions):
         return self._kernel("distances", self.all_distances)
 
 
-@lru_cache(maxsize=None)
 def swept_kernels(features: Features, precision: str, parallel: bool) -> SweptKernels:
     """Kernels for a scene's features."""
-    return SweptKernels(features, precision, parallel)
+    return kernels_of(SweptKernels, features.of_state(), precision, parallel)

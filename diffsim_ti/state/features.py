@@ -128,6 +128,13 @@ class Features:
         """Whether obstacles may be nearer to a point within a face than to its corners."""
         return self.curved or not group.force.hollow
 
+    def of_state(self) -> "Features":
+        """What energies, forces and their derivatives in a given state see of it: scenes that differ in the rest share their
+        kernels."""
+        kept = "order groups growing growth_per_step growth_uniform uniform curved density shape".split()
+        numbers = self.num_parameters if self.density or self.shape else 0  # say where other sums begin
+        return Features(**{name: getattr(self, name) for name in kept}, num_parameters=numbers)
+
     def sums(self) -> Rows:
         """Rows of the per-vertex adjoint sums: those of the parameters stand as the parameters do."""
         sizes = {"mass": int(self.density), "rest": 3 * self.shape, "surface": int(self.areas)}
