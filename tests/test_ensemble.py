@@ -16,14 +16,16 @@ def test_shares_of_ranks():
     assert shares(np.ones(2), 3) == [[0], [1], []]
 
 
-def test_a_killed_rank_changes_no_bit(tmp_path):
-    """Two ranks, of which one dies on the way, against one process."""
-    result, starts = run(tmp_path / "two", kills=1, iterations=80)
-    one = alone(80)
-    assert result["processes"] == 2 and one["processes"] == 1 and result["restarts"] == 1
-    assert len(starts) == 1 and all(begin == left > 0 for left, begin in starts)  # no whole iteration is lost
+@pytest.mark.parametrize("kills, iterations", [(0, 20), pytest.param(1, 80, marks=pytest.mark.thorough)])
+def test_two_ranks_are_one_bit_for_bit(tmp_path, kills, iterations):
+    """Two ranks, of which one dies on the way or none, against one process."""
+    result, starts = run(tmp_path / "two", kills, iterations)
+    one = alone(iterations)
+    assert result["processes"] == 2 and one["processes"] == 1 and result["restarts"] == kills
+    assert len(starts) == kills and all(begin == left > 0 for left, begin in starts)  # no whole iteration is lost
     assert {name: result[name] for name in ("E", "nu", "loss")} == {name: one[name] for name in ("E", "nu", "loss")}
-    assert result["E_error"] < 0.02 and result["nu_error"] < 0.03
+    if iterations >= 80:
+        assert result["E_error"] < 0.02 and result["nu_error"] < 0.03
     assert (tmp_path / "two" / "train_distributed.png").stat().st_size > 5000
 
 

@@ -75,7 +75,7 @@ def test_tutorial(tmp_path):
 
 def test_indentation(capsys, monkeypatch):
     indentation = example("identify/indentation")
-    monkeypatch.setattr(indentation, "STEPS", 4)
+    monkeypatch.setattr(indentation, "STEPS", 3)
     numbers = indentation.main()
     assert max(numbers["errors"].values()) < 0.01 and numbers["runs"] <= 10
     assert max(numbers["spread"]) < 0.01  # standard errors, of numbers in logarithms
