@@ -101,6 +101,19 @@ LEFT_OUT = {
         test_quadratic_solvers::test_kinetic_energy_is_of_the_masses_in_use[VelocityVerletSolver]
         test_every_adjoint::test_frames_and_schedules_do_not_matter[ImplicitEulerSolver]
         test_springs::test_every_number[ImplicitEulerSolver-f32]
+        test_every_adjoint::test_frames_and_schedules_do_not_matter[ImplicitMidpointSolver]
+        test_term_order::test_any_order_gives_the_same_bits[ImplicitMidpointSolver-f64]
+        test_term_order::test_any_order_gives_the_same_bits[BDF2Solver-f64]
+        test_implicit_contact::test_gradients_through_friction_on_a_moving_obstacle[BDF2Solver]
+        test_chambers::test_the_pressure_is_a_result_with_gradient[BDF2Solver]
+        test_curved_contact::test_curved_faces_rub_on_each_other[BDF2Solver-f64]
+        test_contact_faces::test_gradients_agree_with_differences_where_a_pass_is_gone_in_many_parts[SemiImplicitSolver-False]
+    """,
+    "velocity Verlet; transposes in all solvers, and differences in all of `test_implicit_gradients.py`": """
+        test_springs::test_gradients_against_differences[StaticSolver]
+        test_loads_together::test_gradients_are_those_of_differences[ImplicitEulerSolver]
+        test_unequal_steps::test_gradients_are_those_of_differences[BDF2Solver]
+        test_surface_drag::test_gradients_against_differences[BDF2Solver-names1]
         test_swept::test_gradients_where_ways_are_cut_and_obstacles_come_in_parts[ImplicitEulerSolver]
         test_self_contact_near::test_gradients_of_closing_parts[ImplicitEulerSolver-slit]
     """,

@@ -70,9 +70,9 @@ def test_areas_turn_and_grow_with_the_body():
 
 
 def test_the_gap_under_a_cube_does_not_depend_on_its_mesh():
-    """4, 9, 25 and 81 vertices on the floor, and the gap at which the pressure rho g h is carried."""
+    """4, 9, 25 and 49 vertices on the floor, and the gap at which the pressure rho g h is carried."""
     gaps = []
-    for resolution in (2, 3, 5, 9):
+    for resolution in (2, 3, 5, 7):
         mesh = ds.TetrahedralMesh.create_cube(resolution=resolution, size=0.2).translated((0, 0.008, 0))
         terms = [ds.Gravity(), ds.Drag(40.0), ds.Ground(stiffness_per_area=1e6, width=0.01)]
         scene = ds.Scene(mesh, ds.StableNeoHookean(1e6, 0.3), terms=terms, precision="f64")
