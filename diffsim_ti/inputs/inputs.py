@@ -95,7 +95,9 @@ class Inputs:
         self.values = self.check({name: i.value for name, i in self.described.items() if i.value is not None})
         named = dict(zip(scene.terms, self._names))
         self._per_step = [name for name, i in self.described.items() if i.is_per_step]
-        self.parameters = Rows({term: term.num_numbers for term in scene.ordered_terms})
+        # obstacles first: scenes that differ in what else acts on them share the kernels that obstacles are in
+        terms = sorted(scene.ordered_terms, key=lambda term: not term.acts_on_surface)
+        self.parameters = Rows({term: term.num_numbers for term in terms})
         self.paths = [named[term][term.path_name] for term in scene.moving]  # names, in the order of kernels' columns
         self.keyed = [(named[term][term.plain], term) for term in scene.ordered_terms if term.keyed]
         alone = len(scene.dead_loads) == 1 and scene.dead_loads[0].sums_itself

@@ -46,7 +46,6 @@ def drop_of(scene: ds.Scene) -> tuple[float, float]:
 
 def main(cells: dict[str, tuple[int, ...]] = CELLS, rounds: int = 3) -> dict:
     """Returns {(kind, cells): (unknowns, error, seconds)}, printed as a table."""
-    ds.init("cpu", precision="f64")
     found = {}
     print("| elements | cells | unknowns | error % | time [s] |")
     print("| --- | ---: | ---: | ---: | ---: |")
@@ -74,4 +73,5 @@ def report(found: dict) -> None:
 
 
 if __name__ == "__main__":
+    ds.init("cpu", precision="f64")
     main(QUICK if "--quick" in sys.argv else CELLS)

@@ -101,7 +101,6 @@ def gradient(rollout: ds.Rollout, kind: str) -> tuple[float, float]:
 
 def main(starts: int = 20, kinds: tuple = KINDS) -> dict:
     """{kind: {"equal" or "adaptive": rows of (median substeps, median error, median time [s])}}, printed as tables."""
-    ds.init("cpu", precision="f64")
     return {kind: table_of(kind, starts) for kind in kinds}
 
 
@@ -133,4 +132,5 @@ def table_of(kind: str, starts: int) -> dict:
 
 if __name__ == "__main__":
     warnings.simplefilter("ignore")
+    ds.init("cpu", precision="f64")
     main(3 if "--quick" in sys.argv else 20)

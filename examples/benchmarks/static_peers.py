@@ -113,7 +113,6 @@ def asked(script: str, python: str, job: dict) -> tuple | None:
 
 def main(sizes, peers: dict, repeats: int = 3, most_direct: int = 60_000) -> list:
     """Rows (tetrahedra, ours [s], times of the others [s] ...), printed as a table."""
-    ds.init("cpu", precision="f64")
     names, rows = [*direct_solvers(), *peers], []
     for size in sizes:
         scene = scene_of(beam(size), E)
@@ -144,6 +143,7 @@ if __name__ == "__main__":
     parser.add_argument("--torch-fem", help="an interpreter that has it")
     parser.add_argument("--jax-fem", help="an interpreter that has it")
     options = parser.parse_args()
+    ds.init("cpu", precision="f64")
     with threadpool_limits(1):
         main(
             options.sizes,
