@@ -12,10 +12,14 @@ LEFT_OUT = {
         test_implicit_contact::test_reverse_sweep_against_tangent_on_every_shape[half_space]
         test_contact_gradients::test_tangent_and_mirror[box-SemiImplicitSolver]
         test_contact_gradients::test_tangent_and_mirror[box-VelocityVerletSolver]
-        test_contact_faces::test_the_adjoint_is_the_transpose_of_the_tangent[needle-VelocityVerletSolver-f64-options2]
-        test_face_friction::test_the_adjoint_of_the_stage_is_the_transpose_of_its_tangent[None-VelocityVerletSolver-f64-options0]
+    """,
+    "every input of them in `test_contact_gradients.py`": """
         test_contact_stage::test_every_shape[half_space]
         test_contact_stage::test_every_shape[bowl]
+    """,
+    "capsules and thin boxes; obstacles that move and turn; transposes of the same": """
+        test_contact_faces::test_the_adjoint_is_the_transpose_of_the_tangent[needle-VelocityVerletSolver-f64-options2]
+        test_face_friction::test_the_adjoint_of_the_stage_is_the_transpose_of_its_tangent[None-VelocityVerletSolver-f64-options0]
         test_contact_force::test_gradients_agree_with_differences[euler round]
     """,
     "BDF2 in a bowl, velocity Verlet before a capsule; the same in f64": """
@@ -109,12 +113,14 @@ LEFT_OUT = {
         test_curved_contact::test_curved_faces_rub_on_each_other[BDF2Solver-f64]
         test_contact_faces::test_gradients_agree_with_differences_where_a_pass_is_gone_in_many_parts[SemiImplicitSolver-False]
     """,
-    "velocity Verlet; transposes in all solvers, and differences in all of `test_implicit_gradients.py`": """
+    "velocity Verlet or BDF2; transposes in all solvers, and differences in all of `test_implicit_gradients.py`": """
         test_springs::test_gradients_against_differences[StaticSolver]
         test_loads_together::test_gradients_are_those_of_differences[ImplicitEulerSolver]
         test_unequal_steps::test_gradients_are_those_of_differences[BDF2Solver]
         test_surface_drag::test_gradients_against_differences[BDF2Solver-names1]
         test_swept::test_gradients_where_ways_are_cut_and_obstacles_come_in_parts[ImplicitEulerSolver]
+    """,
+    "a C in implicit steps, a slit in explicit ones": """
         test_self_contact_near::test_gradients_of_closing_parts[ImplicitEulerSolver-slit]
     """,
     "velocity Verlet; linear tetrahedra in all of them": """

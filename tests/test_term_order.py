@@ -256,3 +256,18 @@ def test_two_frictions_on_one_vertex_swapped(solver):
     (way, gradient), (half_way, half_gradient) = swapped(solver, CORNER), swapped(solver, CORNER, 1e-3)
     assert 1e-5 < way < 1e-3 and 1e-5 < gradient < 0.15
     assert 0.4 < half_way / way < 0.6 and half_gradient < 0.7 * gradient
+
+
+def test_kernels_of_a_state_do_not_know_what_else_acts():
+    """Energies, forces and distances of a law before a floor are the same kernels whatever else moves the body."""
+    mesh, floor = (
+        ds.TetrahedralMesh.create_box(2, 0.1).translated([0, 0.004, 0]),
+        ds.Ground(stiffness=1e3, friction=0.3),
+    )
+    others = [], [ds.Gravity()], [ds.Drag(0.5), ds.Gravity(), ds.Muscle((0, 1, 0), 1e3, np.ones(3))]
+    found = []
+    for terms in others:
+        scene = ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3), terms=[*terms, floor], precision="f64")
+        solver = ds.ImplicitEulerSolver(scene, 1e-3)
+        found.append(solver.workspace(solver.start_values()).potential.kernels)
+    assert all(kernels is found[0] for kernels in found)
