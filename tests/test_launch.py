@@ -1,5 +1,6 @@
 """Prepared launches: the same kernel with the same arrays again and again, other numbers and other tensors each time."""
 
+from dataclasses import dataclass
 from types import SimpleNamespace
 
 import numpy as np
@@ -7,7 +8,9 @@ import pytest
 import taichi as ti
 import torch
 
+import diffsim_ti as ds
 from diffsim_ti import runtime
+from diffsim_ti.materials.linear_elastic import LinearElasticLaw
 from diffsim_ti.runtime import repeated_loops
 
 pytestmark = pytest.mark.backends
@@ -176,3 +179,46 @@ def test_errors_in_kernels_say_where():
     assert wrong_mark.count("^") == len("name_that_nothing_has")
     number = int(inlined.split("line ")[1].split(",")[0])
     assert wrong == open(__file__).read().splitlines()[number - 1]
+
+
+@pytest.fixture
+def bundles(monkeypatch):
+    """What kernels that compile are given, bundle by bundle: (names, those of them that are read)."""
+    out, made = [], runtime.Bundle.__init__
+
+    def remembered(self, **parts):
+        made(self, **parts)
+        self.__dict__["_read"] = set()
+        out.append((set(parts), self.__dict__["_read"]))
+
+    def noted(self, name):
+        own = object.__getattribute__(self, "__dict__")
+        if name in own and "_read" in own:
+            own["_read"].add(name)
+        return object.__getattribute__(self, name)
+
+    monkeypatch.setattr(runtime.Bundle, "__init__", remembered)
+    monkeypatch.setattr(runtime.Bundle, "__getattribute__", noted, raising=False)
+    return out
+
+
+@dataclass(frozen=True)
+class OwnLaw(LinearElasticLaw):
+    """One that no kernel was compiled for before."""
+
+
+class Own(ds.LinearElastic):
+    def law(self, precision):
+        return OwnLaw(precision)
+
+
+@pytest.mark.parametrize("solver", [ds.SemiImplicitSolver, ds.ImplicitEulerSolver])
+def test_kernels_of_a_plain_scene_take_no_array_that_they_do_not_read(solver, bundles):
+    """Each costs half a microsecond in every launch."""
+    scene = ds.Scene(ds.TetrahedralMesh.create_cube(2), Own(1e5, 0.3), terms=[ds.Gravity()])
+    rollout = ds.Rollout(solver(scene, dt=1e-3), 2, gradients=["initial_velocities"])
+    frames = rollout.forward()
+    rollout.vjp(frames, np.ones(frames.positions.shape))
+    scenes = [(parts, read) for parts, read in bundles if "tets" in parts]
+    spare = {"start", "corner_of", "corner", "inverse_mass", "parameters"}  # which some kernels of a kind read
+    assert len(scenes) >= 2 and all(parts <= read | spare for parts, read in scenes)

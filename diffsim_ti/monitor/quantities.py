@@ -15,7 +15,7 @@ from diffsim_ti.potential.kernels import potential_kernels
 from diffsim_ti.runtime import Kernel, assign, traced
 from diffsim_ti.runtime import at as entry
 from diffsim_ti.state.features import Features
-from diffsim_ti.state.numbers import SCENE, with_state
+from diffsim_ti.state.numbers import SCENE, needed, with_state
 from diffsim_ti.state.workspace import Workspace
 
 A = ti.template()
@@ -63,18 +63,20 @@ class ObserverKernels:
         for e in range(plan.num_places):
             self.store_points(e, scene, at, out)
 
+    def _kernel(self, name: str, body, *out: str) -> Kernel:
+        at = with_state(dict(u="vectors2"), self.law)
+        own = dict(scene=needed(SCENE, self.features), at=at, out=dict.fromkeys(out, "scalars"))
+        return Kernel(name, body, self.law.precision, own, dict(num_places="int"))
+
     @cached_property
     def stored(self) -> Kernel:
         """Energy density [J/m^3] at each point alone, for what looks often."""
-        own = dict(scene=SCENE, at=with_state(dict(u="vectors2"), self.law), out=dict(energy="scalars"))
-        return Kernel("stored", self.store, self.law.precision, own, dict(num_places="int"))
+        return self._kernel("stored", self.store, "energy")
 
     @cached_property
     def fields(self) -> Kernel:
         """Energy density [J/m^3], von Mises stress [Pa], J at each point."""
-        out = dict.fromkeys(("energy", "von_mises", "J"), "scalars")
-        own = dict(scene=SCENE, at=with_state(dict(u="vectors2"), self.law), out=out)
-        return Kernel("fields", self.observe, self.law.precision, own, dict(num_places="int"))
+        return self._kernel("fields", self.observe, "energy", "von_mises", "J")
 
 
 @lru_cache(maxsize=None)

@@ -8,7 +8,7 @@ import taichi as ti
 from diffsim_ti.potential.faces import FacePoints
 from diffsim_ti.runtime import Kernel, kernels_of
 from diffsim_ti.state.features import Features
-from diffsim_ti.state.numbers import ADJOINT, SCENE, TANGENT
+from diffsim_ti.state.numbers import ADJOINT, SCENE, TANGENT, needed
 
 A = ti.template()
 PASS = dict(
@@ -23,7 +23,7 @@ class FaceKernels(FacePoints):
     parallel: bool
 
     def _kernel(self, name: str, body, **arrays) -> Kernel:
-        own = dict(scene=SCENE, pass_=PASS, at=dict(u="vectors2", w="vectors2")) | arrays
+        own = dict(scene=needed(SCENE, self.features), pass_=PASS, at=dict(u="vectors2", w="vectors2")) | arrays
         return Kernel(name, body, self.precision, own, dict(num_vertices="int"))
 
     @ti.func

@@ -11,7 +11,7 @@ from diffsim_ti.potential.obstacles import ObstaclePotential
 from diffsim_ti.runtime import PRECISIONS, Bundle, Kernel, assign, kernels_of, let, traced
 from diffsim_ti.runtime import at as entry
 from diffsim_ti.state.features import Features
-from diffsim_ti.state.numbers import ADJOINT, SCENE, TANGENT, with_held, with_pass
+from diffsim_ti.state.numbers import ADJOINT, SCENE, TANGENT, needed, with_held, with_pass
 
 A = ti.template()
 PASS = dict(walls="vectors", lag="vectors2", pressed="vectors2")  # what contact sees of a pass (obstacles.py)
@@ -45,7 +45,8 @@ class PotentialKernels:
         return ObstaclePotential(self.features, self.law.precision)
 
     def _kernel(self, name: str, body, **arrays) -> Kernel:
-        own = dict(scene=SCENE, pass_=PASS) | arrays | dict(at=with_pass(arrays["at"], self.law))
+        own = dict(scene=needed(SCENE, self.features), pass_=PASS if self.features.groups else {}) | arrays
+        own |= dict(at=with_pass(arrays["at"], self.law))
         return Kernel(name, body, self.law.precision, own, NUMBERS)
 
     @ti.func

@@ -14,7 +14,7 @@ from diffsim_ti.potential.faces import FacePoints
 from diffsim_ti.potential.obstacles import ObstaclePotential
 from diffsim_ti.runtime import Kernel
 from diffsim_ti.state.features import Features
-from diffsim_ti.state.numbers import ADJOINT, SCENE, TANGENT
+from diffsim_ti.state.numbers import ADJOINT, SCENE, TANGENT, needed
 
 A = ti.template()
 PASS = dict(walls="vectors", lag="vectors2", pressed="vectors2")
@@ -28,7 +28,8 @@ class ObstacleShares(ObstaclePotential):
     parallel: bool
 
     def _kernel(self, name: str, body, **arrays) -> Kernel:
-        return Kernel(name, body, self.precision, dict(scene=SCENE, pass_=PASS) | arrays, NUMBERS)
+        own = dict(scene=needed(SCENE, self.features), pass_=PASS) | arrays
+        return Kernel(name, body, self.precision, own, NUMBERS)
 
     @ti.func
     def dragged(self, g: A, k, i, scene: A, pass_: A):
@@ -115,7 +116,8 @@ class FaceShares(FacePoints):
     parallel: bool
 
     def _kernel(self, name: str, body, **arrays) -> Kernel:
-        own = dict(scene=SCENE, pass_=FACES, at=dict(u="vectors2", w="vectors2"), out=dict(y="vectors2")) | arrays
+        states = dict(at=dict(u="vectors2", w="vectors2"), out=dict(y="vectors2"))
+        own = dict(scene=needed(SCENE, self.features), pass_=FACES) | states | arrays
         return Kernel(name, body, self.precision, own, dict(num_vertices="int", which="int"))
 
     @ti.func

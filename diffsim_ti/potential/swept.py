@@ -17,7 +17,7 @@ import taichi as ti
 from diffsim_ti.potential.curved_faces import MOST_SHARES
 from diffsim_ti.runtime import Kernel, kernels_of, traced
 from diffsim_ti.state.features import Features
-from diffsim_ti.state.numbers import SCENE
+from diffsim_ti.state.numbers import SCENE, needed
 from diffsim_ti.state.obstacle_functions import ObstacleFunctions
 from diffsim_ti.state.walls import MORE
 from diffsim_ti.terms.obstacles import turning
@@ -38,7 +38,7 @@ class SweptKernels(ObstacleFunctions):
     parallel: bool
 
     def _kernel(self, name: str, body) -> Kernel:
-        own = dict(scene=SCENE, way=WAY, at=dict(u="vectors2"), out=FOUND)
+        own = dict(scene=needed(SCENE, self.features), way=WAY, at=dict(u="vectors2"), out=FOUND)
         return Kernel(
             name, body, self.precision, own, dict(num_vertices="int", count="int", most="float", kept="float")
         )

@@ -59,9 +59,10 @@ class Launch:
         kinds = kernel.arguments[len(self._arrays) :]
         floats = [id(argument.annotation) in primitive_types.real_type_ids for argument in kinds]
         self._setters = [
-            ((self._context.set_arg_float if is_float else self._context.set_arg_int), (k,))
+            ((self._context.set_arg_float if is_float else self._context.set_arg_int), (k,), is_float)
             for k, is_float in enumerate(floats, start=len(self._arrays))
         ]
+        self._set = [None] * len(floats)
 
     def __call__(self, *numbers) -> None:
         check_alive(self._owner)
@@ -78,8 +79,10 @@ class Launch:
             self._prepare(numbers)
         if self._buffer:
             self._buffer.restore()
-        for (setter, index), number in zip(self._setters, numbers):
-            setter(index, number)
+        for (setter, index, is_float), number, before in zip(self._setters, numbers, self._set):
+            if is_float or number != before:  # a third of a microsecond each
+                setter(index, number)
+        self._set = numbers
         if self._repeated:
             with self._repeated.times(numbers[-1]):
                 self._owner().launch_kernel(self._code, self._context)

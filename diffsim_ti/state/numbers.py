@@ -73,6 +73,36 @@ del SCENE["mass"]
 OF_TETRAHEDRA = {name: PARTS[name].kind for name in ("gradients", "volumes", "coefficients", "growths")}
 OF_STEPS = {name: PARTS[name].kind for name in ("forces", "motion", "anchor", "path")}
 ADJOINT = OF_TETRAHEDRA | dict(sums="scalars2")
+OF_SHAPE = "gradients", "volumes"  # of the adjoint, those by the rest shape
+
+# what only some scenes' kernels read: each array costs half a microsecond in every launch
+WITH_MOTION = dict.fromkeys(("motion_slot", "motion", "anchor"), lambda has: has.motion or has.guided)
+WITH_OBSTACLES = dict.fromkeys(
+    ("surface", "seen"), lambda has: bool(has.groups) or has.reduced
+)
+ONLY_WITH = {
+    "force_slot": lambda has: has.forces,
+    "forces": lambda has: has.forces,
+    **WITH_MOTION,
+    "growths": lambda has: has.growing,
+    "path": lambda has: has.moving > 0,
+    "felt": lambda has: has.moving > 0,
+    **WITH_OBSTACLES,
+    "rest": lambda has: has.groups or has.shape or has.loaded_corners or has.tied or has.founded or has.reduced,
+    "parameters": lambda has: has.num_parameters > 0 or has.groups,
+    "stage": lambda has: has.num_staged > 0,
+    "work": lambda has: has.driven,
+}
+
+
+def needed(arrays: dict, has) -> dict:
+    """Those of some arrays that a scene with such `Features` needs."""
+    return {name: kind for name, kind in arrays.items() if name not in ONLY_WITH or ONLY_WITH[name](has)}
+
+
+def adjoints(arrays: dict, has) -> dict:
+    """The same of adjoints."""
+    return {name: kind for name, kind in needed(arrays, has).items() if has.shape or name not in OF_SHAPE}
 
 
 def with_state(arrays: dict, law) -> dict:
@@ -141,7 +171,7 @@ class Adjoint:
     def collect(self) -> Derived:
         """All of them in float64 on the host, those of the state being zero; without the shape, None for what it makes."""
         a, features, rows = self._arrays, self._features, self._features.sums()
-        unknown = () if features.shape else ("gradients", "volumes")
+        unknown = () if features.shape else OF_SHAPE
         read = [name for name in self._names if name in PARTS and getattr(a.values, name, None) is not None]
         read = [name for name in read if name not in unknown]
         out, sums = a.values.zeros(but=(*read, *unknown)), runtime.look(self.sums).astype(np.float64)

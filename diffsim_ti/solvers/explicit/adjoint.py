@@ -69,7 +69,10 @@ class ExplicitAdjoint:
             self.impulse, self.mass_adj = self.impulses.impulse, np.zeros(a.num_vertices)
 
     def fits(self, workspace) -> bool:
-        """Whether kernels and shapes are still those of the run."""
+        """Whether kernels and shapes are still those of the run; they are as long as launches stay bound."""
+        return workspace.kept(("fits", id(self)), lambda: (self._fits(workspace), self))[0]
+
+    def _fits(self, workspace) -> bool:
         a = workspace.arrays
         same = self.numbers.fits(a, a.features(self.features.density, self.features.shape))
         same = same and self.felt.shape[0] == max(1, 2 * self.features.moving * self._steps)
@@ -149,6 +152,9 @@ class ExplicitAdjoint:
 
     def _bound(self, num_passes: int) -> Callable:
         """The kernel of a pass, with what all passes of a run share."""
+        return self.ws.kept(("pass", id(self), num_passes), lambda: (self._bind(num_passes), self))[0]
+
+    def _bind(self, num_passes: int) -> Callable:
         ws, own = self.ws, (self, self.numbers, self.frames)
         states = (ws.record, ws.frames, ws.watch, ws.contact)
         launch = ws.bound(ws.kernels(self.features).step_vjp, state=states, adjoint=own, table=ws.table)

@@ -23,7 +23,7 @@ from diffsim_ti.runtime import Bundle, Kernel, let, traced
 from diffsim_ti.solvers.explicit.face_walls import FaceWalls
 from diffsim_ti.solvers.explicit.guides import GUIDED
 from diffsim_ti.state.features import Features
-from diffsim_ti.state.numbers import SCENE
+from diffsim_ti.state.numbers import SCENE, needed
 from diffsim_ti.state.pass_table import pass_at
 
 A = ti.template()
@@ -47,7 +47,7 @@ class FaceKernels(FaceWalls):
 
     def _kernel(self, name: str, body, more=(), **arrays) -> Kernel:
         own = dict(
-            scene=SCENE | (GUIDED if self.features.guided else {}),
+            scene=needed(SCENE, self.features) | (GUIDED if self.features.guided else {}),
             faces=FACES | (PUSHED if self.rough else {}),
             state=dict(u="vectors2", v="vectors2"),
             table=dict(ints="ints", floats="scalars"),

@@ -11,14 +11,14 @@ from diffsim_ti.solvers.explicit.body_stage import BodyStage
 from diffsim_ti.solvers.explicit.further_elements import FurtherElements
 from diffsim_ti.solvers.explicit.kick_drift import KickDrift
 from diffsim_ti.solvers.explicit.outside_work import with_drag
-from diffsim_ti.state.numbers import ADJOINT, OF_STEPS, SCENE, TANGENT, with_state
+from diffsim_ti.state.numbers import ADJOINT, OF_STEPS, SCENE, TANGENT, adjoints, needed, with_state
 from diffsim_ti.state.pass_table import pass_at, reversed_pass
 
 A = ti.template()
 STATE = dict.fromkeys(("u", "v", "f", "frames_u", "frames_v"), "vectors2")
 STATE |= dict(seen="scalars2", stage="vectors2", work="scalars")
+RECORDED = {name: STATE[name] for name in ("u", "v", "f", "stage")}  # what the way back reads of it
 CHANGE = dict(u="vectors2", v="vectors2", frames_u="vectors2", frames_v="vectors2")  # of a state, or its adjoint
-CORNERS = dict(corner="vectors", rate_corner="vectors")  # adjoints of u and v, still to be gathered
 PLAN = dict(ints="ints", floats="scalars")  # the tables of the passes, from pass `window` on
 TURNS = dict(turns="ints")  # of the loops of a launch for many passes
 NUMBERS = dict.fromkeys(("num_items", "num_vertices", "window", "first", "count", "base"), "int") | dict(
@@ -65,10 +65,12 @@ class ExplicitKernels:
 
     def with_record(self, arrays: dict) -> dict:
         """The same, with the impulses of obstacles where they are recorded."""
-        return self.with_state(arrays) | (dict(impulse="vectors2") if self.recorded else {})
+        return self.with_state(arrays) | (dict(impulse="vectors2") if self.vertex.features.recorded else {})
 
-    def state(self) -> dict:
-        return self.with_record(STATE)
+    @property
+    def corners(self) -> dict:
+        """Adjoints of u and v, still to be gathered."""
+        return dict(corner="vectors") | (dict(rate_corner="vectors") if self.vertex.reads_rates else {})
 
     @property
     def is_short(self) -> bool:
@@ -76,14 +78,10 @@ class ExplicitKernels:
         has, short = self.vertex.features, self.vertex.law.short and self.vertex.lanes
         return short and has.order == 1 and not (has.groups or has.reduced or self.further.any)
 
-    @property
-    def recorded(self) -> bool:
-        return self.vertex.features.recorded
-
     @traced
     def counted(self, now):
         """A pass with `into`: the first row of `impulse` of the frame that it leads to, -1 if none counts it."""
-        if not self.recorded:
+        if not self.vertex.features.recorded:
             return now
         rows = 2 * self.vertex.obstacles.num_obstacles
         return Bundle(**vars(now), into=let(ti.select(now.counted >= 0, now.counted * rows, -1)))
@@ -178,7 +176,7 @@ class ExplicitKernels:
     @cached_property
     def step(self) -> Kernel:
         """`count` passes from pass `first` on."""
-        return self._kernel("step", self.passes, dict(state=self.state()), self.repeated, stride="int")
+        return self._kernel("step", self.passes, dict(state=self.with_record(STATE)), self.repeated, stride="int")
 
     # ---- tangent -----------------------------------------------------------------------------------------------------
 
@@ -235,7 +233,7 @@ class ExplicitKernels:
     def step_jvp(self) -> Kernel:
         """The tangent of passes first .. first + count - 1 along recorded slots; the change of the state is advanced in
         place."""
-        own = dict(state=self.state(), tangent=self.with_record(CHANGE) | TANGENT | self.further.tangent)
+        own = dict(state=self.with_record(STATE), tangent=self.with_record(CHANGE) | TANGENT | self.further.tangent)
         return self._kernel("step_jvp", self.passes_jvp, own, self.repeated, rate_dot="float")
 
     # ---- adjoint -----------------------------------------------------------------------------------------------------
@@ -304,8 +302,9 @@ class ExplicitKernels:
                     self.vertex.step_vjp(i, j, now, scene, state, adjoint, plan)
                 for e in range(self.further.after(plan)):
                     self.elements_vjp(e, j, scene, state, adjoint, table, plan)
-                for p in range(moving * plan.num_parts):
-                    self.vertex.obstacles.fold_part(p, plan.num_vertices, j, j, adjoint, table, plan)
+                if ti.static(moving > 0):
+                    for p in range(moving * plan.num_parts):
+                        self.vertex.obstacles.fold_part(p, plan.num_vertices, j, j, adjoint, table, plan)
 
     @cached_property
     def step_vjp(self) -> Kernel:
@@ -315,10 +314,9 @@ class ExplicitKernels:
         steps: those for which there is room in `felt`; num_parts: sums over vertices that are made for each path.
         """
         numbers = dict.fromkeys(("num_passes", "halt", "kick", "steps", "num_parts"), "int")
-        own = self.with_record(CHANGE) | ADJOINT | OF_STEPS | CORNERS
-        own |= dict(w="vectors2", felt="vectors2")
-        own |= self.further.adjoint
-        arrays = dict(state=self.state(), adjoint=own)
+        own = adjoints(self.with_record(CHANGE) | ADJOINT | OF_STEPS, self.vertex.features) | self.corners
+        own |= dict(w="vectors2", felt="vectors2") | self.further.adjoint
+        arrays = dict(state=self.with_record(RECORDED), adjoint=own)
         return self._kernel("step_vjp", self.passes_vjp, arrays, self.repeated, **numbers)
 
     @ti.func
@@ -332,12 +330,13 @@ class ExplicitKernels:
     @cached_property
     def finish_vjp(self) -> Kernel:
         """Add the gather that the first pass of the run has left."""
-        corners = {name: SCENE[name] for name in ("start", "corner_of")}
-        own = dict(scene=corners, adjoint=dict(u="vectors2", v="vectors2") | CORNERS)
+        gathered = dict(u="vectors2") | (dict(v="vectors2") if self.vertex.reads_rates else {})
+        own = dict(scene={name: SCENE[name] for name in ("start", "corner_of")}, adjoint=gathered | self.corners)
         return Kernel("finish_vjp", self.gather_rest, self.vertex.law.precision, own, dict(num_vertices="int"))
 
     def _kernel(self, name: str, body, arrays: dict, repeated: bool, **numbers) -> Kernel:
         arrays = dict(scene=SCENE | self.further.arrays) | arrays | dict(table=PLAN)
+        arrays = {bundle: needed(own, self.vertex.features) for bundle, own in arrays.items()}
         numbers = NUMBERS | self.further.counts | numbers
         if repeated:
             arrays["table"], numbers = PLAN | TURNS, numbers | dict(times="int")

@@ -250,17 +250,23 @@ class ExplicitWorkspace(Workspace):
         out = dict(num_items=a.num_items, num_vertices=a.num_vertices, num_bodies=len(self.scene.reduced.bodies))
         return out | counts_of_further(a)
 
-    def launches(self, first: int, last: int, num_passes: int, save_every: int, most: int, backwards=False) -> Iterator:
-        """Numbers of the launches that passes first .. last - 1 take, for each of which their table is shown.
-
-        most: passes that a launch takes. backwards: from the last passes to the first.
-        """
-        a, solver, schedule = self.arrays, self.solver, self.solver.schedule
+    def _rows(self) -> int:
+        """How many rows what is given by steps has."""
+        a = self.arrays
         num_rows = max((len(x) for x in (a.values.path, a.values.motion) if x is not None), default=1)
         # they ask in which step a pass lies
         if num_rows == 1 and (a.features().pressed or a.paths or a.features().forces_keyed or a.features().growing):
             given = a.values.forces, a.values.follower, a.values.ties, a.values.growths
             num_rows = max(1 + len(x) for x in given if x is not None)
+        return num_rows
+
+    def launches(self, first: int, last: int, num_passes: int, save_every: int, most: int, backwards=False) -> Iterator:
+        """Numbers of the launches that passes first .. last - 1 take, for each of which their table is shown.
+
+        most: passes that a launch takes. backwards: from the last passes to the first.
+        """
+        solver, schedule = self.solver, self.solver.schedule
+        num_rows = self.kept("rows", self._rows)
         run = num_passes, num_rows, save_every, self.rate, schedule
         turn, sizes = -1 if backwards else 1, self.kept("sizes", self._sizes)
         sizes = sizes | dict(contact_damping=solver.contact_damping)
