@@ -75,29 +75,28 @@ OF_STEPS = {name: PARTS[name].kind for name in ("forces", "motion", "anchor", "p
 ADJOINT = OF_TETRAHEDRA | dict(sums="scalars2")
 OF_SHAPE = "gradients", "volumes"  # of the adjoint, those by the rest shape
 
-# what only some scenes' kernels read: each array costs half a microsecond in every launch
-WITH_MOTION = dict.fromkeys(("motion_slot", "motion", "anchor"), lambda has: has.motion or has.guided)
-WITH_OBSTACLES = dict.fromkeys(
-    ("surface", "seen"), lambda has: bool(has.groups) or has.reduced
-)
-ONLY_WITH = {
-    "force_slot": lambda has: has.forces,
-    "forces": lambda has: has.forces,
-    **WITH_MOTION,
-    "growths": lambda has: has.growing,
-    "path": lambda has: has.moving > 0,
-    "felt": lambda has: has.moving > 0,
-    **WITH_OBSTACLES,
-    "rest": lambda has: has.groups or has.shape or has.loaded_corners or has.tied or has.founded or has.reduced,
-    "parameters": lambda has: has.num_parameters > 0 or has.groups,
-    "stage": lambda has: has.num_staged > 0,
-    "work": lambda has: has.driven,
-}
+
+def _absent(has) -> set[str]:
+    """Arrays that kernels of a scene with such `Features` do not read: each costs half a microsecond in every launch."""
+    obstacles = has.groups or has.reduced
+    read = {
+        ("force_slot", "forces"): has.forces,
+        ("motion_slot", "motion", "anchor"): has.motion or has.guided,
+        ("growths",): has.growing,
+        ("surface", "seen", "path"): obstacles,
+        ("felt",): has.moving,
+        ("rest",): obstacles or has.shape or has.loaded_corners or has.tied or has.founded,
+        ("parameters",): obstacles or has.num_parameters,
+        ("stage",): has.num_staged,
+        ("work",): has.driven,
+    }
+    return {name for names, some in read.items() if not some for name in names}
 
 
 def needed(arrays: dict, has) -> dict:
-    """Those of some arrays that a scene with such `Features` needs."""
-    return {name: kind for name, kind in arrays.items() if name not in ONLY_WITH or ONLY_WITH[name](has)}
+    """Those of some arrays that kernels of a scene with such `Features` read."""
+    absent = _absent(has)
+    return {name: kind for name, kind in arrays.items() if name not in absent}
 
 
 def adjoints(arrays: dict, has) -> dict:
