@@ -25,9 +25,10 @@ def main() -> int:
     parser.add_argument("--configurations", type=int, help="how many; default as many as time allows")
     parser.add_argument("--seed", type=int, default=0, help="the first seed; default 0")
     parser.add_argument("--only", action="store_true", help="only this seed, with every derivative")
+    parser.add_argument("--arch", default="cpu", help="where kernels run; default cpu")
     parser.add_argument("--json", type=Path, help="write the tables here too")
     arguments = parser.parse_args()
-    ds.init(precision="f64")
+    ds.init(arguments.arch, "f64")
     end, report = time.monotonic() + 60 * arguments.minutes, Report()
     last = arguments.seed + (1 if arguments.only else arguments.configurations or sys.maxsize)
     for seed in range(arguments.seed, last):

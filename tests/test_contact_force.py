@@ -338,7 +338,7 @@ def test_a_scene_whose_loss_does_not_name_it_pays_nothing():
         assert [("impulse" in k.arrays["state"]) for k in (kernels.step, kernels.step_vjp, kernels.step_jvp)] == [
             there
         ] * 3
-        assert kernels.recorded == there and hasattr(ws.contact, "impulse") == there
+        assert ws.arrays.features().recorded == there and hasattr(ws.contact, "impulse") == there
 
 
 def test_traction_is_force_per_area():

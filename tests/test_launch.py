@@ -215,7 +215,7 @@ class Own(ds.LinearElastic):
 @pytest.mark.parametrize("solver", [ds.SemiImplicitSolver, ds.ImplicitEulerSolver])
 def test_kernels_of_a_plain_scene_take_no_array_that_they_do_not_read(solver, bundles):
     """Each costs half a microsecond in every launch."""
-    scene = ds.Scene(ds.TetrahedralMesh.create_cube(2), Own(1e5, 0.3), terms=[ds.Gravity()])
+    scene = ds.Scene(ds.TetrahedralMesh.create_cube(2), Own(1e5, 0.3), terms=[ds.Gravity()], precision="f32")
     rollout = ds.Rollout(solver(scene, dt=1e-3), 2, gradients=["initial_velocities"])
     frames = rollout.forward()
     rollout.vjp(frames, np.ones(frames.positions.shape))

@@ -70,8 +70,8 @@ def check_finite(name: str, adjoint: np.ndarray, save_every: int) -> None:
 def norm(x: np.ndarray) -> float:
     """Euclidean norm in float64, without overflow."""
     x = np.asarray(x, np.float64).ravel()
-    square = float(np.einsum("i,i", x, x))  # on this thread: those of BLAS wait for Taichi's
-    if 1e-280 < square < 1e280:
+    square = float(x.dot(x) if x.size < 5000 else np.einsum("i,i", x, x))  # alone: threads of BLAS wait for Taichi's
+    if 1e-280 < square < 1e280 or not x.any():
         return square**0.5
     largest = float(np.abs(x).max(initial=0.0))  # squares vanish, overflow, or are not finite
     return largest * float(np.linalg.norm(x / largest)) if 0 < largest < np.inf else largest
