@@ -156,7 +156,7 @@ class DifferentiableSimulator:
     @uncompiled
     def reset(self, positions: torch.Tensor | None = None, velocities: torch.Tensor | None = None) -> None:
         """Back to the start, or to given positions [m] and velocities [m/s], tensors of shape (num_vertices, 3)."""
-        self._follow_dtype()
+        self._follow_dtype(self.dtype)
         self._displacements, self._velocities = torch.zeros_like(self._rest), torch.zeros_like(self._rest)
         self._steps = 0  # done since
         if positions is not None:
@@ -208,36 +208,37 @@ class DifferentiableSimulator:
         return "\n".join([*parts, f"computed on {runtime.arch_name()}, tensors on {self.device}"])
 
     def _checked(self, name: str, value, *shapes) -> torch.Tensor:
-        """A floating point tensor of one of these shapes, brought to this simulator's dtype and device in the graph."""
+        """A floating point tensor of one of these shapes, brought to the dtype and device of `_rest` in the graph."""
         value = value if isinstance(value, torch.Tensor) else torch.as_tensor(value)
         if tuple(value.shape) not in [tuple(shape) for shape in shapes]:
             expected = " or ".join(str(tuple(shape)) for shape in shapes)
             raise ValueError(f"{name}: expected shape {expected}, got {tuple(value.shape)}")
         if not value.is_floating_point():
-            raise ValueError(f"{name}: expected a floating point tensor such as {self.dtype}, got {value.dtype}")
-        return value.to(dtype=self.dtype, device=self.device)
+            raise ValueError(f"{name}: expected a floating point tensor such as {self._rest.dtype}, got {value.dtype}")
+        return value.to(self._rest)
 
-    def _follow_dtype(self) -> None:
-        """Take on the precision of the material, which may have been moved since."""
-        if self.dtype not in DTYPES.values():
-            raise ValueError(f"the material's parameters must be float32 or float64, got {self.dtype}")
-        if self._rest is not None and self._rest.dtype == self.dtype:
+    def _inputs(self) -> dict[str, torch.Tensor]:
+        """What a run takes besides state and forces, in the precision of the material, which may have been moved since."""
+        inputs = dict(self.material.tensors(self.mesh))
+        self._follow_dtype(next(iter(inputs.values())).dtype)
+        inputs["gravity"] = self.solver.gravity_vector(self._rest)
+        inputs["density"] = torch.as_tensor(self.density, dtype=self._rest.dtype, device=self.device)
+        return inputs | (self._contact.tensors(self._rest) if self._contact else {})
+
+    def _follow_dtype(self, dtype: torch.dtype) -> None:
+        """Take on a precision."""
+        if dtype not in DTYPES.values():
+            raise ValueError(f"the material's parameters must be float32 or float64, got {dtype}")
+        if self._rest is not None and self._rest.dtype == dtype:
             return
         self._rollouts, self._scenes = {}, {}
-        self._rest = torch.tensor(np.array(self.mesh.vertices), dtype=self.dtype, device=self.device)
+        self._rest = torch.tensor(np.array(self.mesh.vertices), dtype=dtype, device=self.device)
         if hasattr(self, "_displacements"):
             self._displacements, self._velocities = (x.to(self._rest) for x in (self._displacements, self._velocities))
 
-    def _inputs(self) -> dict[str, torch.Tensor]:
-        """What a run takes besides state and forces."""
-        inputs = self.material.tensors(self.mesh) | {"gravity": self.solver.gravity_vector(self._rest)}
-        inputs["density"] = torch.as_tensor(self.density, dtype=self.dtype, device=self.device)
-        return inputs | (self._contact.tensors(self._rest) if self._contact else {})
-
     def _advance(self, steps, external_forces, checkpoint_every=None, save_every=None) -> TorchFrames:
-        self._follow_dtype()
-        tensors = {"initial_displacements": self._displacements, "initial_velocities": self._velocities}
-        tensors |= self._inputs()
+        inputs = self._inputs()
+        tensors = {"initial_displacements": self._displacements, "initial_velocities": self._velocities} | inputs
         if external_forces is not None:
             shape = tuple(self._rest.shape)
             tensors["external_forces"] = self._checked("external_forces", external_forces, shape, (steps, *shape))

@@ -49,7 +49,7 @@ def pytest_collection_modifyitems(config, items):
     """Without the thorough ones; of several processes none waits at the end for another's long file."""
     if not config.getoption("--thorough"):
         single = left_out(PLAIN)
-        if config.args_source is pytest.Config.ArgsSource.TESTPATHS:  # all of them
+        if config.args_source is pytest.Config.ArgsSource.TESTPATHS and not config.getoption("lf"):  # all of them
             if gone := single - {_id(item) for item in items}:
                 raise pytest.UsageError(f"left_out.py names tests that are not there: {', '.join(sorted(gone))}")
         deselected = {item for item in items if item.get_closest_marker("thorough") or _id(item) in single}

@@ -144,12 +144,14 @@ class Sweep:
         unknown = [name for name in values if name not in self.inputs]
         if unknown:
             raise ValueError(f"no input named {unknown[0]!r}; this rollout has {', '.join(self.inputs)}")
-        known, given = self._loaded or self.values, {}
+        known, kept, given = self._loaded or self.values, {}, {}
         for name, value in values.items():
-            value = as_numbers(name, value)
-            same = value is known[name] or value.shape == known[name].shape and np.array_equal(value, known[name])
-            given[name] = known[name] if same else value.copy()
-        out = self.values | self.scene.inputs.check(given)
+            value, before = as_numbers(name, value), known[name]
+            if value is before or value.shape == before.shape and (value == before).all():
+                kept[name] = before  # and was checked
+            else:
+                given[name] = value.copy()
+        out = self.values | kept | self.scene.inputs.check(given)
         self.scene.inputs.check_steps(out, self.steps)
         return out
 

@@ -193,10 +193,13 @@ def check_alive(owner: weakref.ref) -> None:
 
 def arch_name() -> str:
     """Name of the running backend."""
-    program()
-    arch = impl.current_cfg().arch
+    owner, name = _settings.get("runs", (None, ""))
+    if owner is not None and owner() is current_program() is not None and not _settings.get("forked"):
+        return name  # the usual way, as short as can be
+    owner, arch = program(), impl.current_cfg().arch
     for name, value in _ARCHS.items():
         if value == arch:
+            _settings["runs"] = owner, name
             return name
     raise RuntimeError(
         f"Taichi was started on {_core.arch_name(arch)}, which diffsim_ti does not know: "

@@ -27,7 +27,10 @@ def bounded(x: torch.Tensor, low: float, high: float, name: str = "") -> torch.T
     With a name, a warning says once that the range is used. A projected gradient: Bertsekas, Nonlinear Programming, 1999,
     sec. 2.3.
     """
-    if name and bool(((x < low) | (x > high)).any()):
+    least, largest = map(torch.Tensor.item, x.detach().aminmax())
+    if low <= least <= largest <= high:
+        return x
+    if name and (least < low or largest > high):
         message = f"{name} has left [{low:g}, {high:g}] and is taken at that bound; its gradient leads back"
         warnings.warn(message + ": smaller steps come from material.parameter_groups(relative=...)", stacklevel=2)
     return _Bounded.apply(x, low, high)
