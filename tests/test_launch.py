@@ -26,6 +26,12 @@ def add_multiple(
 
 
 @ti.kernel
+def add_both(target: ti.types.ndarray(ti.f32, 1), one: ti.i32, two: ti.i32):
+    for i in range(target.shape[0]):
+        target[i] += one + two
+
+
+@ti.kernel
 def exchange(tensor: ti.types.ndarray(ti.f32, 1), array: ti.types.ndarray(ti.f32, 1)):
     for i in range(array.shape[0]):
         kept = array[i]
@@ -41,6 +47,16 @@ def test_launch_takes_other_numbers_each_time():
         launch(0.5 * k, k % 5)
         expected[k % 5 :] += np.float32(0.5 * k) * numbers[k % 5 :]
     assert np.array_equal(runtime.fetch(target), expected)
+
+
+def test_a_launch_that_failed_leaves_no_number_behind():
+    target = runtime.upload(np.zeros(4), ti.f32)
+    launch = runtime.Launch(add_both, target)
+    launch(1, 2)
+    with pytest.raises((TypeError, ti.TaichiRuntimeTypeError)):
+        launch(5, "two")
+    launch(1, 2)
+    assert runtime.fetch(target).tolist() == [6.0] * 4
 
 
 def test_two_launches_of_one_kernel_keep_their_own_arrays():

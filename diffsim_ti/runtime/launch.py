@@ -62,7 +62,7 @@ class Launch:
             ((self._context.set_arg_float if is_float else self._context.set_arg_int), (k,), is_float)
             for k, is_float in enumerate(floats, start=len(self._arrays))
         ]
-        self._set = [None] * len(floats)
+        self._set = [None] * len(floats)  # the numbers as the context has them
 
     def __call__(self, *numbers) -> None:
         check_alive(self._owner)
@@ -79,10 +79,12 @@ class Launch:
             self._prepare(numbers)
         if self._buffer:
             self._buffer.restore()
-        for (setter, index, is_float), number, before in zip(self._setters, numbers, self._set):
-            if is_float or number != before:  # a third of a microsecond each
-                setter(index, number)
-        self._set = numbers
+        known = self._set
+        for k, (setter, index, is_float) in enumerate(self._setters):
+            if is_float or numbers[k] != known[k]:  # a third of a microsecond each
+                known[k] = None  # also if this is interrupted
+                setter(index, numbers[k])
+                known[k] = numbers[k]
         if self._repeated:
             with self._repeated.times(numbers[-1]):
                 self._owner().launch_kernel(self._code, self._context)
