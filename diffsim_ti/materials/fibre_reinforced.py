@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffsim_ti.differentiation import exp, maximum
+from diffsim_ti.differentiation import exp, where
 from diffsim_ti.materials.around import Around
 from diffsim_ti.materials.energy_law import EnergyLaw
 from diffsim_ti.materials.law import Law
@@ -17,7 +17,10 @@ UNITS = {"k1": "Pa", "k2": "-", "fibre": "-"}
 
 @dataclass(frozen=True)
 class FibreLaw(EnergyLaw):
-    """psi = k1/(2 k2) (exp(k2 e^2) - 1), e = max(a . C a / |a|^2 - 1, 0)"""
+    """psi = k1/(2 k2) (exp(k2 e^2) - 1), e = max(a . C a / |a|^2 - 1, 0)
+
+    Where fibres are just slack, as in a body at rest, the stiffness is the mean of both sides, for any change of shape.
+    """
 
     coefficient_names = ("k1", "k2", "a_x", "a_y", "a_z")
 
@@ -25,8 +28,9 @@ class FibreLaw(EnergyLaw):
         k1, k2, *a = p
         G = H + H.transpose() + H.transpose() @ H  # C - I
         along = sum(a[i] * G[i, k] * a[k] for i in range(3) for k in range(3))
-        e = maximum(along / sum(x * x for x in a), 0)
-        return k1 / (2 * k2) * (exp(k2 * e * e) - 1)
+        e = along / sum(x * x for x in a)
+        taut = where(e > 0, e, where(e < 0, 0, e / 2))
+        return k1 / (2 * k2) * (exp(k2 * e * taut) - 1)
 
 
 @dataclass(frozen=True)
@@ -103,7 +107,8 @@ class FibreReinforced(Around):
     which resist being stretched alone. k1 [Pa], k2 [-], fibre: the direction a at rest, of any length, shape (3,) or
     (num_tetrahedra, 3). A second family of fibres is one more `FibreReinforced` around the first; its inputs are k1_2,
     k2_2 and fibre_2. Small strains along stretched fibres have 4 k1 more of Young's modulus.
-    e^2 has a kink of second order at e = 0: gradients of a body whose fibres are all just slack or taut are one-sided.
+    e^2 has a kink of second order at e = 0, where a body at rest begins: its stiffness is there the mean of both sides, so
+    that gradients of a substep from rest are what central differences give.
     Holzapfel, Gasser, Ogden 2000, A new constitutive framework for arterial wall mechanics, doi:10.1023/A:1010835316564.
     Raises ValueError for numbers out of range, and for a matrix that has a state or depends on the velocity.
     """
