@@ -271,3 +271,41 @@ def test_kernels_of_a_state_do_not_know_what_else_acts():
         solver = ds.ImplicitEulerSolver(scene, 1e-3)
         found.append(solver.workspace(solver.start_values()).potential.kernels)
     assert all(kernels is found[0] for kernels in found)
+
+
+KEYS = [0, 1e-2], np.array([[0.0, 0, 0], [0, 1e-3, 0]])
+ALONE = {
+    "nothing": dict,
+    "gravity": lambda: dict(terms=[ds.Gravity()]),
+    "drag": lambda: dict(terms=[ds.Drag(1.0)]),
+    "force": lambda: dict(terms=[ds.ExternalForce(np.ones((8, 3)))]),
+    "forces by steps": lambda: dict(terms=[ds.ExternalForce(np.ones((2, 8, 3)))]),
+    "pressures by steps": lambda: dict(terms=[ds.Pressure([10.0, 20.0], "xmax")]),
+    "spring": lambda: dict(terms=[ds.Spring(0, 7, 10.0, rest_length=0.1)]),
+    "cable": lambda: dict(terms=[ds.Cable([0, 7], tension=1.0)]),
+    "muscle": lambda: dict(terms=[ds.Muscle((0, 1, 0), 1e3, 0.5)]),
+    "foundation": lambda: dict(terms=[ds.ElasticFoundation(1e5, 1e4, "ymin")]),
+    "fluid": lambda: dict(terms=[ds.SurfaceDrag(1000.0)], initial_velocities=(1.0, 0, 0)),
+    "self-contact": lambda: dict(terms=[ds.SelfContact(stiffness=10.0, width=1e-3)]),
+    "floor": lambda: dict(terms=[ds.Ground(-0.005, stiffness=100.0, friction=0.2)]),
+    "moving floor": lambda: dict(terms=[ds.Ground(-0.005, stiffness=100.0, path=KEYS)]),
+    "clamp": lambda: dict(fixed="xmin"),
+    "rollers": lambda: dict(fixed={"xmin": "x"}),
+    "moving clamp": lambda: dict(fixed="xmin", motion=KEYS),
+    "moving rollers": lambda: dict(fixed={"xmin": "x"}, motion=KEYS),
+    "growth": lambda: dict(terms=[ds.Growth(([0, 1e-2], np.array([1.0, 1.1])))]),
+}
+
+
+@pytest.mark.parametrize("name", ALONE)
+def test_each_thing_alone(name):
+    """Kernels get the arrays that a scene has something for: what a thing needs is there without any other one."""
+    mesh = ds.TetrahedralMesh.create_cube(2, size=0.1)
+    scene = ds.Scene(mesh, ds.StableNeoHookean(1e4, 0.3), **ALONE[name]())
+    rollout = ds.Rollout(ds.SemiImplicitSolver(scene, dt=1e-3), 2, gradients="all")
+    frames, rng = rollout.forward(), np.random.default_rng(0)
+    w = rng.standard_normal(frames.positions.shape)
+    gradients = rollout.vjp(frames, w)
+    d = {key: rng.standard_normal(g.shape) for key, g in gradients.items()}
+    by_tangent = (w * rollout.jvp(frames, **d)[0]).sum()
+    assert sum((gradients[key] * d[key]).sum() for key in d) == pytest.approx(by_tangent, rel=1e-10)

@@ -70,7 +70,7 @@ class ExplicitAdjoint:
 
     def fits(self, workspace) -> bool:
         """Whether kernels and shapes are still those of the run; they are as long as launches stay bound."""
-        return workspace.kept(("fits", id(self)), lambda: (self._fits(workspace), self))[0]
+        return workspace.kept(("fits", id(self)), lambda: self if self._fits(workspace) else None) is self
 
     def _fits(self, workspace) -> bool:
         a = workspace.arrays
