@@ -9,7 +9,7 @@ from diffsim_ti import runtime
 
 
 @runtime.untaped
-@ti.kernel
+@runtime.kernel
 def _copy_slot(source: ti.types.ndarray(ndim=2), s: ti.i32, target: ti.types.ndarray(ndim=2), t: ti.i32):
     for i in range(source.shape[1]):
         target[t, i] = source[s, i]

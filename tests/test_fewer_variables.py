@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import taichi as ti
 
+from diffsim_ti import runtime
 from diffsim_ti.runtime import variables
 
 CALLEES = """
@@ -89,7 +90,7 @@ def functions(source: str, name: str, wrap) -> dict:
 def by_taichi(run, start) -> np.ndarray:
     out = np.zeros(8)
 
-    @ti.kernel
+    @runtime.kernel
     def kernel(out: ti.types.ndarray(ti.f64, 1), a: ti.f64, b: ti.f64):
         for _ in range(1):
             run(a, b, out)

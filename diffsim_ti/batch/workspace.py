@@ -328,7 +328,7 @@ _NONE = np.zeros((1, 1, 3))  # rows of what a scene has not
 
 
 @runtime.untaped
-@ti.kernel
+@runtime.kernel
 def _smallest_gaps(seen: ti.types.ndarray(ndim=2), gaps: ti.types.ndarray(ndim=1)):
     """Rows 0, 3, 6, ... of what contacts did, scenes innermost."""
     for b in range(gaps.shape[0]):

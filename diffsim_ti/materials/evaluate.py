@@ -16,7 +16,7 @@ def _kernel(law):
     vectors, scalars = ti.types.ndarray(ti.types.vector(K, law.fp), 1), ti.types.ndarray(law.fp, 1)
 
     @runtime.untaped
-    @ti.kernel
+    @runtime.kernel
     def evaluate_law(H: matrices, p: vectors, psi: scalars, P: matrices, by_coefficient: vectors):
         for i in range(H.shape[0]):
             h, coefficients = tensor(H[i]), [p[i][c] for c in ti.static(range(K))]

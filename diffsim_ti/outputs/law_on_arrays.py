@@ -16,7 +16,7 @@ def _kernel(law, what: str):
     vectors = ti.types.ndarray(ti.types.vector(K, law.fp), 1)
 
     @runtime.untaped
-    @ti.kernel
+    @runtime.kernel
     def law_on_arrays(H: matrices, W: matrices, p: vectors, dp: vectors, P: matrices, by_p: vectors):
         for i in range(H.shape[0]):
             h, w, q, dq = (

@@ -22,7 +22,7 @@ def _kernel(law):
     matrices, scalars = ti.types.ndarray(ti.types.matrix(3, 3, law.fp), 1), ti.types.ndarray(law.fp, 1)
 
     @runtime.untaped
-    @ti.kernel
+    @runtime.kernel
     def dilatations(H: matrices, W: matrices, theta: scalars, G: matrices, dG: matrices):
         for i in range(H.shape[0]):
             h, w = tensor(H[i]), tensor(W[i])

@@ -2,6 +2,8 @@
 
 import taichi as ti
 
+from diffsim_ti import runtime
+
 # Fields of frames have shape (frames, vertices), or (runs, frames, vertices) in a rollout of several runs.
 
 
@@ -21,7 +23,7 @@ def _put(field: ti.template(), k, f, i, value):
         field[f, i] = value
 
 
-@ti.kernel
+@runtime.kernel
 def show_frames(
     u: ti.types.ndarray(ndim=2),
     v: ti.types.ndarray(ndim=2),
@@ -39,7 +41,7 @@ def show_frames(
         _put(displacements, k, f, i, ti.Vector([u[f, i][0], u[f, i][1], u[f, i][2]]))
 
 
-@ti.kernel
+@runtime.kernel
 def take_seeds(
     positions: ti.template(),
     velocities: ti.template(),
@@ -56,14 +58,14 @@ def take_seeds(
             v_adj[f, i][d] = v[d]
 
 
-@ti.kernel
+@runtime.kernel
 def add_squares(x: ti.types.ndarray(ndim=2), total: ti.types.ndarray(ndim=1)):
     """total[0] += |x|^2."""
     for f, i in ti.ndrange(x.shape[0], x.shape[1]):
         total[0] += x[f, i][0] * x[f, i][0] + x[f, i][1] * x[f, i][1] + x[f, i][2] * x[f, i][2]
 
 
-@ti.kernel
+@runtime.kernel
 def take_positions(field: ti.template(), known: ti.types.ndarray(ndim=2), u: ti.types.ndarray(ndim=2)):
     """u[0] += field - known[0]: u belongs to the positions `known`, which cost it no digits where the field has them."""
     for i in range(u.shape[1]):
@@ -71,7 +73,7 @@ def take_positions(field: ti.template(), known: ti.types.ndarray(ndim=2), u: ti.
             u[0, i][d] += field[i][d] - known[0, i][d]
 
 
-@ti.kernel
+@runtime.kernel
 def take_vectors(field: ti.template(), zero: ti.types.ndarray(ti.i32, ndim=1), target: ti.types.ndarray(ndim=2)):
     """target[0] = field, but nothing where `zero` says so."""
     for i in range(target.shape[1]):
@@ -81,14 +83,14 @@ def take_vectors(field: ti.template(), zero: ti.types.ndarray(ti.i32, ndim=1), t
                 target[0, i][d] = 0
 
 
-@ti.kernel
+@runtime.kernel
 def add_numbers(field: ti.template(), values: ti.types.ndarray()):
     """field += values, for a field of numbers."""
     for I in ti.grouped(field):
         field[I] += values[I]
 
 
-@ti.kernel
+@runtime.kernel
 def add_vectors(field: ti.template(), values: ti.types.ndarray()):
     """field += values, for a field of 3-vectors."""
     for I in ti.grouped(field):

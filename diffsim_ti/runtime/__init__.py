@@ -37,7 +37,7 @@ from diffsim_ti.runtime.arrays import (
 )
 from diffsim_ti.runtime.device import device_name, use_device
 from diffsim_ti.runtime.field_pool import FieldPool, current_tape, fields
-from diffsim_ti.runtime.kernels import LANES, ROWS, Kernel, array_types, kernels_of
+from diffsim_ti.runtime.kernels import LANES, ROWS, Kernel, array_types, kernel, kernels_of
 from diffsim_ti.runtime.language import Bundle, Expr, assign, at, each_lane, let, spread, traced, variable
 from diffsim_ti.runtime.launch import Launch, TensorLaunch
 from diffsim_ti.runtime.repeated_loops import can_repeat
@@ -60,8 +60,4 @@ from diffsim_ti.runtime.start import (
 from diffsim_ti.runtime.threads import take_turns as _take_turns
 from diffsim_ti.runtime.threads import untaped
 
-if not QUADRANTS:
-    from diffsim_ti.runtime.sources import trace_faster as _trace_faster
-
-    _trace_faster()
 _take_turns()

@@ -9,7 +9,13 @@ import taichi as ti
 
 from diffsim_ti.runtime.language import Bundle
 from diffsim_ti.runtime.launch import Launch
+from diffsim_ti.runtime.quadrants import QUADRANTS
 from diffsim_ti.runtime.start import PRECISIONS, runs_on_cpu
+
+if QUADRANTS:  # has a tracer of its own
+    kernel = ti.kernel
+else:
+    from diffsim_ti.runtime.sources import kernel
 
 LANES = 8  # tetrahedra in a block
 ROWS = {3: ti.types.vector(4, ti.f32), 6: ti.types.vector(8, ti.f32)}  # three or six numbers of a preconditioner
@@ -74,7 +80,7 @@ class Kernel:
         linecache.cache[file] = (len(source), None, source.splitlines(True), file)  # Taichi reads a kernel's source
         scope = dict(body=body, Bundle=Bundle, types=[kind for _, kind in arguments])
         exec(compile(source, file, "exec"), scope)
-        self.kernel = ti.kernel(scope[name])
+        self.kernel = kernel(scope[name])
 
     def bind(self, vectorized: bool = False, **records) -> Callable:
         """The kernel with its arrays bound; call it with the numbers, by name.

@@ -9,6 +9,7 @@ pair out again by a walk through the whole kernel: its time grows with the squar
 
 import ast
 import textwrap
+from contextlib import contextmanager, nullcontext
 
 import taichi as ti
 from taichi._lib import core
@@ -20,6 +21,7 @@ from taichi.types import primitive_types
 
 from diffsim_ti.runtime import tracer, variables
 from diffsim_ti.runtime.language import traced
+from diffsim_ti.runtime.threads import LOCK
 
 _of_kernels, _trace, _any_cast = kernel_impl._get_tree_and_ctx, kernel_impl.transform_tree, ops.cast
 _sources: dict = {}  # by code: functions that a factory makes share theirs
@@ -108,10 +110,40 @@ def _cast(obj, dtype):
     return _any_cast(obj, dtype)
 
 
-def trace_faster() -> None:
-    """Give Taichi these answers, in all of this process."""
-    kernel_impl._get_tree_and_ctx, kernel_impl.transform_tree = _tree_and_context, _transform
-    ti.cast = ops.cast = _cast
-    ASTTransformerContext.get_pos_info = _place
-    variables.make_fewer()
-    tracer.hurry()
+_CHANGES = {
+    (kernel_impl, "_get_tree_and_ctx"): _tree_and_context,
+    (kernel_impl, "transform_tree"): _transform,
+    (ti, "cast"): _cast,
+    (ops, "cast"): _cast,
+    (ASTTransformerContext, "get_pos_info"): _place,
+    **variables.CHANGES,
+    **tracer.CHANGES,
+}
+_INHERITED = object()
+
+
+@contextmanager
+def _faster():
+    """Taichi traces with these answers until the end of the block; the lock keeps other threads from compiling meanwhile."""
+    with LOCK:
+        before = {(owner, name): vars(owner).get(name, _INHERITED) for owner, name in _CHANGES}
+        try:
+            for (owner, name), own in _CHANGES.items():
+                setattr(owner, name, own)
+            yield
+        finally:
+            for (owner, name), own in before.items():
+                delattr(owner, name) if own is _INHERITED else setattr(owner, name, own)
+
+
+def kernel(function):
+    """`ti.kernel` for kernels of this package, which are traced faster. Kernels of others are left as they are."""
+    made = ti.kernel(function)
+    primal, materialize = made._primal, made._primal.materialize
+
+    def faster(key=None, **more):
+        with _faster() if key not in primal.compiled_kernels else nullcontext():
+            materialize(key=key, **more)
+
+    primal.materialize = faster
+    return made

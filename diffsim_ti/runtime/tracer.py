@@ -204,7 +204,7 @@ def _variable(value):
     return Expr(impl.pytaichi.compiling_callable.ast_builder().expr_var(value.ptr, _record()))
 
 
-_CHANGES = {  # what is Taichi's own -> what stands in its place
+CHANGES = {  # (owner, name) of a function of Taichi's -> what sources.py puts in its place while a kernel of ours is traced
     (ASTTransformer, "__call__"): _node,
     (ASTTransformer, "build_BinOp"): staticmethod(_operation),
     (ASTTransformer, "get_decorator"): staticmethod(_decorator),
@@ -215,10 +215,3 @@ _CHANGES = {  # what is Taichi's own -> what stands in its place
     (impl, "subscript"): _subscript,
     (impl, "expr_init"): _variable,
 }
-TAICHI = {place: getattr(*place) for place in _CHANGES}
-
-
-def hurry() -> None:
-    """Have Taichi trace so, in all of this process."""
-    for (owner, name), own in _CHANGES.items():
-        setattr(owner, name, own)

@@ -105,6 +105,4 @@ def _store(context, name: str, value: Expr, may_share: bool) -> None:
     context.create_variable(name, own)
 
 
-def make_fewer() -> None:
-    """Have Taichi do so, in all of this process."""
-    ASTTransformer.build_Assign = staticmethod(_build_assign)
+CHANGES = {(ASTTransformer, "build_Assign"): staticmethod(_build_assign)}  # as in tracer.py

@@ -34,7 +34,7 @@ def slots(indices: np.ndarray, num_vertices: int) -> np.ndarray:
 
 
 @runtime.untaped
-@ti.kernel
+@runtime.kernel
 def _clear_from(corner: ti.types.ndarray(ndim=1), first: ti.i32):
     for c in range(first, corner.shape[0]):
         corner[c] = 0 * corner[c]

@@ -35,7 +35,7 @@ class History:
 
 
 @runtime.untaped
-@ti.kernel
+@runtime.kernel
 def _find_bad(u: ti.types.ndarray(ndim=2), v: ti.types.ndarray(ndim=2), bad: ti.types.ndarray(ti.i32, 1)):
     for i in range(u.shape[1]):
         finite = True

@@ -27,7 +27,7 @@ def _copy_kernel(way: str, serial: bool):
     tensors, arrays = ti.types.ndarray(ndim=3), ti.types.ndarray(ndim=2)
 
     @runtime.untaped
-    @ti.kernel
+    @runtime.kernel
     def copy(p: tensors, q: tensors, u: arrays, v: arrays):
         ti.loop_config(serialize=serial)
         for k, i in ti.ndrange(p.shape[0], p.shape[1]):
