@@ -20,9 +20,10 @@ class _Tensors(Output):
     """at: "tetrahedra", (frames, num_tetrahedra, 3, 3); "vertices", the means of what the tetrahedra around have there; or
     material points X [m], shape (k, 3), each with the tensor of its tetrahedron. That of a tetrahedron with ten nodes is the
     mean over its points, by their volumes; at X and at its nodes it is the linear function of place that these four make,
-    which is more accurate than the tensor of the displacements there. of: tetrahedra that count alone at their vertices. numbers: what of them is given instead, a name in deformation.NUMBERS, or None. name: how a loss calls
-    it. Barlow 1976, Optimal stress locations in finite element models, doi:10.1002/nme.1620100202; Hinton, Campbell 1974,
-    Local and global smoothing of discontinuous finite element functions, doi:10.1002/nme.1620080305."""
+    which is more accurate than the tensor of the displacements there. of: tetrahedra that count alone at their vertices.
+    numbers: what of them is given instead, a name in deformation.NUMBERS, or None. name: how a loss calls it.
+    Barlow 1976, Optimal stress locations in finite element models, doi:10.1002/nme.1620100202; Hinton, Campbell 1974, Local
+    and global smoothing of discontinuous finite element functions, doi:10.1002/nme.1620080305."""
 
     per_item = True  # whether there is a value for each tetrahedron or vertex
     alike = False  # whether tetrahedra count alike at their vertices, and not by their volumes

@@ -33,9 +33,9 @@ class ParaViewWriter(Writer):
     Each frame can be read once it is written: the .pvd is replaced as a whole after each, so an interrupted run leaves a
     valid series. Frames that an earlier series of that name left in the folder are removed first. Frames hold
     displacement [m], velocity [m/s] and what is fixed per vertex, and von_mises [Pa], energy_density [J/m^3] and J [-] per
-    tetrahedron (of ten nodes von_mises per vertex), in the precision of the displacements; besides, what else a frame's fields have for every vertex or
-    every tetrahedron, such as forces and stresses (`Frame.of_run`), tensors row by row. Ten-node tetrahedra are quadratic
-    cells. Raises OSError if the folder cannot be written.
+    tetrahedron (of ten nodes von_mises per vertex), in the precision of the displacements; besides, what else a frame's
+    fields have for every vertex or every tetrahedron, such as forces and stresses (`Frame.of_run`), tensors row by row.
+    Ten-node tetrahedra are quadratic cells. Raises OSError if the folder cannot be written.
     """
 
     suffixes = (".pvd",)
