@@ -360,7 +360,9 @@ def test_traction_is_force_per_area():
 
 
 @pytest.mark.parametrize("stiffness", [1e7, 1e11])
-@pytest.mark.parametrize("order, pattern, cells", [(1, "five", (5, 4, 5)), (2, "five", (5, 4, 5)), (2, "kuhn", (3, 7, 5))])
+@pytest.mark.parametrize(
+    "order, pattern, cells", [(1, "five", (5, 4, 5)), (2, "five", (5, 4, 5)), (2, "kuhn", (3, 7, 5))]
+)
 def test_an_even_pressure_has_an_even_traction(order, pattern, cells, stiffness):
     """A block with nu = 0 is pressed on a floor that is much softer or stiffer than it: at corners of faces, at middles and
     at the block's edges, between cells of unequal sides too, the traction is force per area; elsewhere there is none."""

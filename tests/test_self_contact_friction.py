@@ -299,7 +299,9 @@ def test_friction_at_rest_balances_the_supports(load_steps):
 
 def test_friction_of_implicit_steps_is_what_momentum_gains():
     scene, dt = rubbing(), 2e-4
-    rollout = ds.Rollout(ds.ImplicitEulerSolver(scene, dt, tolerance=1e-11), 20, save_every=1, outputs=parts_of("body_1"))
+    rollout = ds.Rollout(
+        ds.ImplicitEulerSolver(scene, dt, tolerance=1e-11), 20, save_every=1, outputs=parts_of("body_1")
+    )
     frames = rollout.forward()
     mass = scene.inputs.derive(scene.inputs.values).mass[4:, None]
     gained = np.diff((mass * frames.velocities[:, 4:]).sum(1), axis=0) / dt

@@ -101,7 +101,6 @@ class _Tensors(Output):
             return self.means.shares_jvp(derived.rest, moved.rest)
         return moved.volumes[self.chosen].ravel()
 
-
     def value(self, frames: "Frames") -> np.ndarray:
         shown = self._start(frames)[3]
         return NUMBERS[self.numbers][1](shown) if self.numbers else shown
