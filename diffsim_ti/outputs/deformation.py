@@ -206,7 +206,13 @@ def _deviator(T: np.ndarray) -> np.ndarray:
 
 def stretches(E: np.ndarray) -> np.ndarray:
     """sqrt(1 + 2 E_i), ascending, E_i: eigenvalues of Green's strain."""
-    return np.sqrt(1 + 2 * principal(E))
+    squares = 1 + 2 * principal(E)
+    if np.any(squares <= 0):  # of the linear function through the points of a ten-node tetrahedron
+        raise ValueError(
+            f"Strain: stretches of a strain whose 1 + 2 E is {squares.min():.3g} at a vertex or point: the strain changes too "
+            'much within one tetrahedron; take at="tetrahedra", or refine the mesh there'
+        )
+    return np.sqrt(squares)
 
 
 def stretches_jvp(E: np.ndarray, dE: np.ndarray) -> np.ndarray:
