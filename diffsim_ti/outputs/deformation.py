@@ -209,7 +209,7 @@ def stretches(E: np.ndarray) -> np.ndarray:
     squares = 1 + 2 * principal(E)
     if np.any(squares <= 0):  # of the linear function through the points of a ten-node tetrahedron
         raise ValueError(
-            f"Strain: stretches of a strain whose 1 + 2 E is {squares.min():.3g} at a vertex or point: the strain changes too "
+            f"Strain: stretches of a strain whose 1 + 2 E is {squares.min():.3g} at a vertex or point: it changes too "
             'much within one tetrahedron; take at="tetrahedra", or refine the mesh there'
         )
     return np.sqrt(squares)
