@@ -50,11 +50,11 @@ class Output(ABC):
     name: str
     unit = ""  # for pictures
     cumulative = False  # whether it counts from the first frame on, and so is of no state by itself
-    reads_contact_forces = False  # whether it reads frames.contact_forces, which runs then note
+    reads_contact_forces = False  # whether runs must note frames.contact_forces for it
     reads_chamber_pressures = False  # the same of frames.chamber_pressures
 
     def needs_contact_forces(self, solver) -> bool:
-        """Whether runs of this solver must note frames.contact_forces for it."""
+        """Whether runs of this solver must; here, whether it reads them in all."""
         return self.reads_contact_forces
 
     @staticmethod

@@ -140,7 +140,8 @@ class Strain(_Tensors):
     principal: its eigenvalues E_i instead, ascending, shape (frames, ..., 3). stretches: the principal stretches
     sqrt(1 + 2 E_i) [-], ascending; at vertices those of the mean strain. Where two of either coincide only their sum has a
     gradient: each has the slope along an eigenvector that the solver happened to choose.
-    The gradient is exact by all inputs. Raises ValueError for another `at`, points outside the mesh, or both of these.
+    The gradient is exact by all inputs. Raises ValueError for another `at`, points outside the mesh, or both of these, and
+    by the first run that has no stretches somewhere, strains changing too much within a ten-node tetrahedron.
     Holzapfel, Nonlinear Solid Mechanics, 2000, sec. 2.5 and 2.6.
     """
 

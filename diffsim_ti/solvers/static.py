@@ -85,7 +85,7 @@ class StaticSolver(ImplicitSolver):
             if free:
                 which = f"piece {number} of {len(used)} of the body" if len(used) > 1 else "the body"
                 if self.scene.obstacles or self.scene.term(SelfContact):  # which may hold it: known when it is closed
-                    self.loose = self.loose or f"{which} free to move rigidly ({free})"
+                    self.loose = self.loose or f"{which} is free to move rigidly ({free})"
                     continue
                 raise ValueError(
                     f"statics: {which} is free to move rigidly ({free}): hold it by fixed=..., at three vertices that do "

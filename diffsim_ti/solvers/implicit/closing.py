@@ -20,13 +20,10 @@ from diffsim_ti.supports import rigid_motions_left
 
 
 class Closing:
-    """Of a workspace whose solver says in `loose` which motions the supports leave."""
+    """Of a workspace whose solver says in `loose` what is free to move rigidly but for contact."""
 
-    first, growth, held = (
-        1e-3,
-        4.0,
-        1e-9,
-    )  # way of the first step over the body's size, of the next ones; relative stiffness
+    first, growth = 1e-3, 4.0  # way of the first step over the body's size, and of each over that of the one before
+    least = 1e-6  # stiffness of a motion that is held, over that of the stiffest
 
     def __init__(self, workspace):
         self.ws, self.said = weakref.proxy(workspace), False  # which holds this: no circle
@@ -40,10 +37,8 @@ class Closing:
         for number in np.unique(piece[ws.scene.mesh.tetrahedra[:, 0]]):
             own = (piece == number)[:, None]
             arms = (x - x[own[:, 0]].mean(0)) / self.size
-            z = np.stack(
-                [*np.broadcast_to(np.eye(3)[:, None], (3, *x.shape)), *np.cross(np.eye(3)[:, None], arms[None])]
-            )
-            z *= own
+            shifts = np.broadcast_to(np.eye(3)[:, None], (3, *x.shape))
+            z = np.concatenate([shifts, np.cross(np.eye(3)[:, None], arms)]) * own
             against = np.stack([m - m * ws.linear for m in z]).reshape(6, -1)
             values, vectors = np.linalg.eigh(against @ against.T)
             out += list(np.tensordot(vectors.T[values < 1e-10 * own.sum()], z, 1))
@@ -53,13 +48,11 @@ class Closing:
         """Those of them that contact, springs and the like do not resist at u."""
         z = self._motions(u)
         self.ws.potential.place(u)
-        K = (
-            np.tensordot(z, [self.ws.potential.contact_product(w) for w in z], ([1, 2], [1, 2]))
-            if len(z)
-            else z[:0, 0, :0]
-        )
+        if not len(z):
+            return z
+        K = np.tensordot(z, [self.ws.potential.contact_product(w) for w in z], ([1, 2], [1, 2]))
         values, vectors = np.linalg.eigh(0.5 * (K + K.T))
-        return np.tensordot(vectors.T[values < self.held * np.abs(self.ws.newton.stiffness).sum()], z, 1)
+        return np.tensordot(vectors.T[values <= self.least * max(values[-1], 0.0)], z, 1)
 
     def approached(self, start: np.ndarray, problem: tuple) -> np.ndarray:
         """A place from where Newton's method finds the equilibrium of a problem (`Newton.solve`). Raises NotConverged."""
@@ -70,7 +63,7 @@ class Closing:
         while len(left):
             if not pull > 0 or way > 4 * self.size or np.abs(place - start).max() > self.size:
                 raise NotConverged(
-                    f"statics: the supports leave {ws.solver.loose}, and contact leaves {self._words(left)}: hold it by "
+                    f"statics: but for contact {ws.solver.loose}, and contact leaves {self._words(left)}: hold it by "
                     "fixed=..., bring it nearer to what it is to lie on, let it begin within the barrier where friction is "
                     "to hold it, or use a solver with inertia",
                     [],
@@ -79,7 +72,7 @@ class Closing:
             left = self.left(place)
         if not self.said:
             self.said = True
-            warnings.warn(f"statics: the supports leave {ws.solver.loose}; contact holds it", stacklevel=2)
+            warnings.warn(f"statics: but for contact {ws.solver.loose}; contact holds it", stacklevel=2)
         return place
 
     def _words(self, left: np.ndarray) -> str:
