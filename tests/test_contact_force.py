@@ -376,7 +376,9 @@ def test_an_even_pressure_has_an_even_traction(order, pattern, cells, stiffness)
     pressure, bottom = frames["contact_force"][-1, 1] / 0.1**2, np.isclose(mesh.vertices[:, 1], 0)
     t = frames["contact_traction"][-1]
     # the barrier deals out its stiffness in shares that an even pressure does not quite have
-    assert t[bottom, 1] == pytest.approx(pressure, rel=0.01 if stiffness == 1e11 else 0.05)
+    assert t[bottom, 1] == pytest.approx(
+        pressure, rel=0.01 if stiffness == 1e11 else 0.05 if pattern == "five" else 0.08
+    )
     assert not t[~bottom].any() and np.abs(t[:, [0, 2]]).max() < 1e-6 * pressure
 
 
