@@ -19,4 +19,5 @@ class Series:
     def write(self, time, positions, displacements, velocities, fields):
         """`fields`: has von_mises, energy_density and J."""
         obstacles = None if self.scene is None else [points for points, _ in obstacle_surfaces(self.scene, time)]
-        self._writer.write(Frame(time, positions, displacements, velocities, vars(fields), obstacles))
+        given = {name: values for name, values in vars(fields).items() if values is not None}
+        self._writer.write(Frame(time, positions, displacements, velocities, given, obstacles))

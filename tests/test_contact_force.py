@@ -342,18 +342,61 @@ def test_a_scene_whose_loss_does_not_name_it_pays_nothing():
 
 
 def test_traction_is_force_per_area():
-    """Of each part, on the bottom of a cube that lies in the floor's barrier; a_i t_i is the force on each vertex."""
+    """Of each part, on the bottom of a cube that lies in the floor's barrier; its integral over the bottom is the force."""
     scene = pressed()
     named = [ds.ContactForce("floor", part, f"f_{part}", per_vertex=True) for part in ("normal", "friction")]
     named += [ds.ContactTraction("floor", part, f"t_{part}") for part in ("normal", "friction")]
     frames = ds.Rollout(ds.SemiImplicitSolver(scene, dt=1e-3), 3, outputs=named).forward()
-    areas, bottom = scene.inputs.derive(scene.inputs.values).surface, scene.mesh.vertex_indices("ymin")
-    assert areas[bottom].sum() == pytest.approx(0.1**2, rel=1e-9)
+    bottom = scene.mesh.vertex_indices("ymin")
+    faces = scene.mesh.surface_triangles[np.isin(scene.mesh.surface_triangles, bottom).all(1)]
     for part in ("normal", "friction"):
         f, t = frames[f"f_{part}"], frames[f"t_{part}"]
-        assert areas[:, None] * t == pytest.approx(f, rel=1e-12) and np.abs(f[-1, bottom]).max() > 0
+        integral = 0.1**2 / len(faces) * t[:, faces].mean(2).sum(1)
+        assert integral == pytest.approx(f.sum(1), rel=1e-4)  # but for tilts, squared
+        assert np.abs(f[-1, bottom]).max() > 0
+        assert not t[-1][np.setdiff1d(np.arange(len(t[-1])), bottom)].any()
     assert frames["t_normal"][-1, bottom, 1].min() > 0 and not frames["t_normal"][-1][:, [0, 2]].any()
     assert not frames["t_friction"][-1][:, 1].any()
+
+
+@pytest.mark.parametrize("stiffness", [1e7, 1e11])
+@pytest.mark.parametrize(
+    "order, pattern, cells", [(1, "five", (5, 4, 5)), (2, "five", (5, 4, 5)), (2, "kuhn", (3, 7, 5))]
+)
+def test_an_even_pressure_has_an_even_traction(order, pattern, cells, stiffness):
+    """A block with nu = 0 is pressed on a floor that is much softer or stiffer than it: at corners of faces, at middles and
+    at the block's edges, between cells of unequal sides too, the traction is force per area; elsewhere there is none."""
+    mesh = ds.TetrahedralMesh.create_box(cells, (0.1, 0.06, 0.1), pattern=pattern)
+    mesh = mesh if order == 1 else mesh.quadratic()
+    floor = ds.Ground(-0.002, stiffness_per_area=stiffness, width=0.004, name="floor")
+    down = dict(fixed="ymax", motion=lambda t: [0, -0.002 * t, 0], precision="f64")
+    scene = ds.Scene(mesh, ds.LinearElastic(1e6, 0.0), terms=[floor], **down)
+    named = [ds.ContactTraction("floor"), ds.ContactForce("floor")]
+    frames = ds.Rollout(ds.StaticSolver(scene, tolerance=1e-10), 1, outputs=named).forward()
+    pressure, bottom = frames["contact_force"][-1, 1] / 0.1**2, np.isclose(mesh.vertices[:, 1], 0)
+    t = frames["contact_traction"][-1]
+    # the barrier deals out its stiffness in shares that an even pressure does not quite have
+    assert t[bottom, 1] == pytest.approx(
+        pressure, rel=0.01 if stiffness == 1e11 else 0.05 if pattern == "five" else 0.08
+    )
+    assert not t[~bottom].any() and np.abs(t[:, [0, 2]]).max() < 1e-6 * pressure
+
+
+def test_traction_on_faces_of_ten_nodes_has_derivatives():
+    mesh = ds.TetrahedralMesh.create_box((3, 2, 3), (0.1, 0.05, 0.1), origin=(0, 0.004, 0)).quadratic()
+    held = dict(fixed="ymax", motion=lambda t: (0.001 * t, -0.001 * t, 0.0), precision="f64")
+    scene = ds.Scene(mesh, ds.StableNeoHookean(2e5, 0.3), terms=[ds.Gravity(), pressed().terms[1]], **held)
+    named = [ds.ContactTraction("floor", part, name=part) for part in ("total", "friction")]
+    solver = ds.StaticSolver(scene, load_steps=2, tolerance=1e-12)
+    rollout, rng = ds.Rollout(solver, 2, save_every=1, outputs=named, gradients="all"), np.random.default_rng(0)
+    assert verify.dot_product_test(rollout) < 1e-9
+    frames, value = rollout.forward(), rollout.values["rest_positions"]
+    way = rng.normal(size=value.shape) * verify.input_scale(rollout, "rest_positions")
+    tangents = rollout.tangents(frames, rest_positions=way)
+    ends = [rollout.forward(rest_positions=value + s * 1e-4 * way) for s in (1, -1)]
+    for name in ("total", "friction"):
+        difference = (ends[0][name] - ends[1][name]) / 2e-4
+        np.testing.assert_allclose(tangents[name], difference, atol=1e-7 * np.abs(difference).max())
 
 
 def test_what_does_not_fit_is_refused():

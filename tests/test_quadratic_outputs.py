@@ -6,6 +6,10 @@ from quadratic_meshes import crumpled, with_vertices
 from test_tensor_outputs import POINTS, assert_derivatives, bent, outputs
 
 import diffsim_ti as ds
+from diffsim_ti.visual.colouring import field_of
+from diffsim_ti.visual.frame import Frame
+from diffsim_ti.visual.series import SavedSeries
+from diffsim_ti.writers import open_writer
 
 
 def body() -> ds.TetrahedralMesh:
@@ -27,7 +31,7 @@ def rollout_of(kind):
         "static": lambda: ds.StaticSolver(scene, tolerance=1e-12),
         "midpoint": lambda: ds.ImplicitMidpointSolver(scene, dt=5e-3, tolerance=1e-12),
     }[kind]()
-    more = [ds.MaterialPoints(POINTS)]
+    more = [ds.MaterialPoints(POINTS), ds.Stress("of_some", at="vertices", of=[0, 3, 4])]
     return ds.Rollout(solver, 2, save_every=1, outputs=outputs() + more, gradients="all")
 
 
@@ -66,21 +70,66 @@ def test_a_homogeneous_stretch_has_its_closed_form():
     assert frames["elastic_energy"][0] == pytest.approx(psi * shares, rel=1e-9)
 
 
-def test_stress_at_places_is_that_of_the_place():
-    """A displacement of second degree has linear strains, which are found anywhere in an element, not only their means."""
-    mesh, E, nu = ds.TetrahedralMesh.create_box((2, 2, 2), 1.0).quadratic(), 5e4, 0.3
+def test_stress_at_places_and_vertices_is_that_of_the_place():
+    """A displacement of second degree has linear strains, which are found anywhere in an element and at all nodes, those of
+    the surface included, not only their means."""
+    mesh, E, nu = ds.TetrahedralMesh.create_box((2, 2, 3), 1.0).quadratic(), 5e4, 0.3
     x, y, z = mesh.vertices.T
     u = 1e-3 * np.stack([x * x + y * z, x * y - z * z, y * y + x * z], 1)
     places = np.random.default_rng(3).uniform(0.1, 0.9, (6, 3))
-    X, Y, Z = places.T
+    X, Y, Z = np.concatenate([places, mesh.vertices]).T
     rows = [[2 * X, Z, Y], [Y, X, -2 * Z], [Z, 2 * Y, X]]
     H = 1e-3 * np.moveaxis(np.array(rows), 2, 0)
     strain, mu, lam = 0.5 * (H + np.swapaxes(H, 1, 2)), E / (2 * (1 + nu)), E * nu / ((1 + nu) * (1 - 2 * nu))
     exact = 2 * mu * strain + lam * np.trace(strain, axis1=1, axis2=2)[:, None, None] * np.eye(3)
     scene = ds.Scene(mesh, ds.LinearElastic(E, nu), initial_positions=mesh.vertices + u, precision="f64")
-    stress = ds.Stress(at=places, kind="first_piola")
-    frames = ds.Rollout(ds.VelocityVerletSolver(scene, dt=1e-6), 1, outputs=[stress]).forward()
-    assert frames["stress"][0] == pytest.approx(exact, abs=1e-8 * np.abs(exact).max())
+    named = [ds.Stress(name, at, kind="first_piola") for name, at in (("places", places), ("nodes", "vertices"))]
+    frames = ds.Rollout(ds.VelocityVerletSolver(scene, dt=1e-6), 1, outputs=named).forward()
+    found = np.concatenate([frames["places"][0], frames["nodes"][0]])
+    assert found == pytest.approx(exact, abs=1e-8 * np.abs(exact).max())
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_of_says_which_side_of_an_interface_is_meant(order):
+    """Two materials of one strain: stress is that of the side that is named, at its vertices; without, between the two."""
+    mesh = ds.TetrahedralMesh.create_box((3, 2, 2), 1.0)
+    mesh = mesh.with_tetrahedron_set("soft", mesh.centroids[:, 0] < 0.5)
+    mesh = mesh if order == 1 else mesh.quadratic()
+    law = ds.LinearElastic({"soft": 1e4, "default": 5e4}, 0.0)
+    scene = ds.Scene(mesh, law, initial_positions=mesh.vertices * [1.001, 1, 1], precision="f64")
+    named = [ds.Stress("soft", "vertices", of="soft", kind="first_piola"), ds.Stress("both", "vertices")]
+    named += [ds.Strain("one", "vertices", of="soft"), ds.Strain("mean", "vertices")]
+    named += [ds.Stress("stiff", "vertices", of=mesh.centroids[:, 0] > 0.5, kind="first_piola")]
+    frames = ds.Rollout(ds.VelocityVerletSolver(scene, dt=1e-6), 1, outputs=named).forward()
+    x, soft, stiff = mesh.vertices[:, 0], frames["soft"][0][:, 0, 0], frames["stiff"][0][:, 0, 0]
+    assert soft == pytest.approx(np.where(x <= 0.5, 10.0, 50.0)) and stiff == pytest.approx(
+        np.where(x < 0.5, 10.0, 50.0)
+    )
+    middle = frames["both"][0][np.isclose(x, 0.5), 0, 0]
+    assert middle.min() > 15 and middle.max() < 45
+    assert frames["one"] == pytest.approx(frames["mean"], abs=1e-12)
+    with pytest.raises(
+        ValueError, match='of= says which tetrahedra count at their vertices; it goes with at="vertices"'
+    ):
+        ds.Stress(of="soft")
+    with pytest.raises(ValueError, match="no tetrahedron set is called 'hard'"):
+        ds.Stress(at="vertices", of="hard").settled(scene)
+
+
+def test_pictures_and_files_have_von_mises_stress_at_vertices(tmp_path):
+    mesh = body()
+    scene = ds.Scene(mesh, ds.Corotated(5e4, 0.3), 900.0, initial_positions=bent(mesh.vertices), precision="f64")
+    simulator = ds.Simulator(ds.VelocityVerletSolver(scene, dt=2e-4))
+    exact = simulator.output(ds.Stress(at="vertices", von_mises=True))
+    frame = Frame.of(simulator)
+    assert frame.fields["von_mises"] == pytest.approx(exact, rel=1e-10)
+    assert field_of(simulator, "von_mises") == pytest.approx(exact, rel=1e-10)
+    with open_writer(tmp_path / "run.pvd", scene) as out:
+        out.write(frame)
+    saved = SavedSeries(tmp_path / "run.pvd").frame(0)
+    assert saved.colours["von_mises"] == pytest.approx(exact, rel=1e-10) and len(saved.colours["J"]) == len(
+        mesh.elements
+    )
 
 
 def test_volumes_are_of_whole_faces():

@@ -254,6 +254,88 @@ def test_forces_have_derivatives():
             assert abs(pushed - difference) <= 1e-4 * scale + floor, (key, name)
 
 
+def dragged(solver, end, **options):
+    """Two soft blocks, the upper one pressed down and dragged by its top until the time `end`, and a floor that rubs too."""
+    low = ds.TetrahedralMesh.create_box((2, 2, 2), (0.2, 0.1, 0.2))
+    up = ds.TetrahedralMesh.create_box((2, 2, 2), 0.1).rotated([0, 1, 0], 0.2).translated([0.05, 0.103, 0.05])
+    mesh = ds.TetrahedralMesh.joined([low, up])
+    y = mesh.vertices[:, 1]
+    mesh = mesh.with_vertex_set("base", y < 1e-9).with_vertex_set("top", y > 0.2)
+    floor = ds.Ground(-0.005, 2e4, 0.01, friction=0.3, name="floor", path=lambda t: [0.02 * t / end, 0, 0])
+    scene = ds.Scene(
+        mesh,
+        ds.StableNeoHookean(1e6, 0.3),
+        1000.0,
+        [ds.SelfContact(1e4, 0.003, friction=0.5), floor],
+        fixed={"base": "xyz", "top": "xyz"},
+        motion={"top": lambda t: [0.03 * max(t / end - 0.4, 0), -0.008 * min(t / end, 0.5), 0]},
+        precision="f64",
+    )
+    return solver(scene, dt=end / 4, tolerance=1e-12, **options)
+
+
+def parts_of(on):
+    return [ds.SelfContactForce(on, part, name=part) for part in ("normal", "friction", "total")]
+
+
+@pytest.mark.parametrize("load_steps", [1, 2])
+def test_friction_at_rest_balances_the_supports(load_steps):
+    solver = dragged(ds.StaticSolver, 4.0, load_steps=load_steps)
+    named = [*parts_of("body_1"), ds.Reaction("top"), ds.SelfContactForce(name="each", per_vertex=True)]
+    frames = ds.Rollout(solver, 4, save_every=1, outputs=named).forward()
+    total, size = frames["total"], np.abs(frames["normal"]).max()
+    assert np.abs(frames["friction"][2:]).max(1).min() > 0.05 * size
+    np.testing.assert_allclose(frames["normal"] + frames["friction"], total, atol=1e-12 * size)
+    np.testing.assert_allclose(frames["reaction"], -total, atol=1e-8 * size)
+    np.testing.assert_allclose(frames["each"].sum(1), 0, atol=1e-12 * size)
+    simulator = ds.Simulator(solver, contact_forces=True)
+    with pytest.raises(ValueError, match="contact_forces=True"):
+        ds.Simulator(solver).output(named[1])
+    for k in range(5):
+        np.testing.assert_allclose(simulator.output(named[1]), frames["friction"][k], atol=1e-8 * size)
+        if k < 4:
+            simulator.step()
+
+
+def test_friction_of_implicit_steps_is_what_momentum_gains():
+    scene, dt = rubbing(), 2e-4
+    rollout = ds.Rollout(
+        ds.ImplicitEulerSolver(scene, dt, tolerance=1e-11), 20, save_every=1, outputs=parts_of("body_1")
+    )
+    frames = rollout.forward()
+    mass = scene.inputs.derive(scene.inputs.values).mass[4:, None]
+    gained = np.diff((mass * frames.velocities[:, 4:]).sum(1), axis=0) / dt
+    assert np.abs(frames["friction"]).max() > 1
+    np.testing.assert_allclose(frames["normal"] + frames["friction"], frames["total"], atol=1e-12)
+    np.testing.assert_allclose(frames["total"][1:], gained, atol=1e-6 * np.abs(gained).max())
+
+
+@pytest.mark.parametrize("solver", [ds.StaticSolver, *IMPLICIT])
+def test_friction_of_a_solve_has_derivatives(solver):
+    """Of steps of two passes, every other of which is a frame, with an obstacle that a loss names too."""
+    named = [
+        ds.SelfContactForce("body_1", "friction", name="on"),
+        ds.SelfContactForce("body_0", name="about", about=(0, 0.1, 0)),
+        ds.SelfContactForce(name="each", per_vertex=True, part="friction"),
+        ds.ContactForce("floor"),
+    ]
+    options = dict(load_steps=2) if solver is ds.StaticSolver else dict(substeps=2)
+    made = dragged(solver, 4.0 if solver is ds.StaticSolver else 0.02, **options)
+    rollout = ds.Rollout(made, 4, save_every=2, outputs=named, gradients="all")
+    assert verify.dot_product_test(rollout) <= 1e-9
+    if solver is not ds.StaticSolver:
+        return
+    rng, frames = np.random.default_rng(0), rollout.forward()
+    for key in ("self_contact_friction", "rest_positions"):
+        value = rollout.values[key]
+        way = rng.normal(size=np.shape(value)) * verify.input_scale(rollout, key)
+        tangents = rollout.tangents(frames, **{key: way})
+        ends = [rollout.forward(**{key: value + sign * 1e-5 * way}) for sign in (1, -1)]
+        for name in ("on", "about", "each"):
+            difference = (ends[0][name] - ends[1][name]) / 2e-5
+            np.testing.assert_allclose(tangents[name], difference, atol=1e-4 * np.abs(difference).max(), err_msg=key)
+
+
 def test_forces_that_cannot_be():
     with pytest.raises(ValueError, match="part must be normal, friction or total"):
         ds.SelfContactForce("body_1", "all")

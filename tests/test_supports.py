@@ -312,6 +312,46 @@ def test_statics_says_which_rigid_motions_are_free():
     assert rigid_motions_left(corners, np.tile(np.eye(3), (2, 1, 1))) == "1 rotation: about x"
 
 
+def lying(gap, order=1, gravity=(0, -9.81, 0), friction=0.0, fixed=None):
+    """A block above a floor, which holds it along y."""
+    mesh = ds.TetrahedralMesh.create_box(3, 0.1, origin=(0, gap, 0))
+    floor = ds.Ground(0, stiffness_per_area=1e6, width=0.005, friction=friction, name="floor")
+    fixed = {"xmin": "x", "zmin": "z"} if fixed is None else fixed
+    mesh, terms = mesh if order == 1 else mesh.quadratic(), [ds.Gravity(gravity), floor]
+    return ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3), 1000.0, terms, fixed, precision="f64")
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_contact_holds_what_supports_leave(order):
+    """From any gap up to the body's size the block goes to one equilibrium, with exact gradients."""
+    ends = []
+    for gap in (1e-4, 0.004, 0.02, 0.09) if order == 1 else (0.004, 0.02):
+        solver = ds.StaticSolver(lying(gap, order), tolerance=1e-11)
+        rollout = ds.Rollout(solver, 2, save_every=1, outputs=ds.ContactForce("floor"), gradients="all")
+        with pytest.warns(UserWarning, match=r"free to move rigidly \(1 translation: along y\); contact holds it"):
+            frames = rollout.forward()
+        ends.append(frames.positions)
+        np.testing.assert_allclose(frames["contact_force"][1:], [[0, 9.81, 0]] * 2, atol=1e-6)
+        np.testing.assert_allclose(ends[-1][1:], ends[0][[1, 1]], atol=1e-9)
+    assert order == 2 or ds.dot_product_test(rollout) < 1e-8
+
+
+def test_contact_that_does_not_hold_is_refused():
+    for options, words in (
+        (dict(gap=0.5), "leaves 1 translation: along y"),
+        (dict(gap=0.01, gravity=(0, 9.81, 0)), "leaves 1 translation: along y"),
+        (dict(gap=0.01, gravity=(0, 0, 0)), "leaves 1 translation: along y"),
+        (dict(gap=0.004, fixed={"xmin": "x"}), "leaves 1 translation: along z"),
+        (dict(gap=0.004, fixed=[]), "2 translations, 1 rotation: along x and z, about y"),
+    ):
+        simulator = ds.Simulator(ds.StaticSolver(lying(**options)))
+        with pytest.raises(ds.NotConverged, match=f"contact .*{words}: hold it by"):
+            simulator.step()
+    within = ds.Simulator(ds.StaticSolver(lying(0.004, friction=0.5, fixed=[])))  # friction holds it
+    with pytest.warns(UserWarning, match="6 rigid modes.*contact holds it"):
+        within.step()
+
+
 def test_sets_join():
     mesh = ds.TetrahedralMesh.create_cube(3).with_surface_set("lid", lambda x, n: n[:, 1] > 0.9)
     supports = Supports(mesh, {"xmin": "x", "lid": "normal", "zmin": "xyz", "xmax": [[1, 1, 0], [1, -1, 0]]})

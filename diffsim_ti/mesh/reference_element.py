@@ -46,6 +46,12 @@ class ReferenceElement:
         """Shares of the volume that belong to the points, shape (num_points,)."""
         return self._rule[1]
 
+    @property
+    def nodes(self) -> np.ndarray:
+        """xi of the nodes, shape (num_nodes, 3)."""
+        corners = np.eye(4)[:, 1:]
+        return corners if self.order == 1 else np.concatenate([corners, corners[MID_EDGES].mean(1)])
+
     def functions(self, xi: np.ndarray) -> np.ndarray:
         """N_a at points, shape (k, num_nodes)."""
         L = barycentric(xi)

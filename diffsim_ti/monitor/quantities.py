@@ -47,6 +47,9 @@ class ObserverKernels:
         a, b, c = S[0, 0] - S[1, 1], S[1, 1] - S[2, 2], S[2, 2] - S[0, 0]
         shear = S[0, 1] * S[0, 1] + S[1, 2] * S[1, 2] + S[2, 0] * S[2, 0]
         out.von_mises[k] = ti.sqrt(ti.cast(0.5, self.element.types.fp) * (a * a + b * b + c * c) + 3 * shear)
+        if ti.static(self.features.order == 2):
+            for i in ti.static(range(3)):
+                out.stress[i, k] = ti.Vector([S[i, 0], S[i, 1], S[i, 2], 0])
 
     @traced
     def store_points(self, e, scene, at, out):
@@ -63,9 +66,9 @@ class ObserverKernels:
         for e in range(plan.num_places):
             self.store_points(e, scene, at, out)
 
-    def _kernel(self, name: str, body, *out: str) -> Kernel:
+    def _kernel(self, name: str, body, *out: str, **more: str) -> Kernel:
         at = with_state(dict(u="vectors2"), self.law)
-        own = dict(scene=needed(SCENE, self.features), at=at, out=dict.fromkeys(out, "scalars"))
+        own = dict(scene=needed(SCENE, self.features), at=at, out=dict.fromkeys(out, "scalars") | more)
         return Kernel(name, body, self.law.precision, own, dict(num_places="int"))
 
     @cached_property
@@ -75,8 +78,9 @@ class ObserverKernels:
 
     @cached_property
     def fields(self) -> Kernel:
-        """Energy density [J/m^3], von Mises stress [Pa], J at each point."""
-        return self._kernel("fields", self.observe, "energy", "von_mises", "J")
+        """Energy density [J/m^3], von Mises stress [Pa], J at each point; of ten nodes rows of Cauchy's stress [Pa] too."""
+        more = dict(stress="vectors2") if self.features.order == 2 else {}
+        return self._kernel("fields", self.observe, "energy", "von_mises", "J", **more)
 
 
 @lru_cache(maxsize=None)
@@ -100,11 +104,13 @@ class Energy(float):
 @dataclass
 class TetrahedronFields:
     """Per tetrahedron: energy density [J/m^3], von Mises stress [Pa], volume ratio J [-]; float64. Of ten nodes: means over
-    the points, and the smallest J there and at the corners."""
+    the points, the smallest J there and at the corners, and Cauchy's stress [Pa] at the points, shape (num_tetrahedra, 4,
+    3, 3)."""
 
     energy_density: np.ndarray
     von_mises: np.ndarray
     J: np.ndarray
+    stress: np.ndarray | None = None
 
 
 def tetrahedron_fields(workspace: Workspace) -> TetrahedronFields:
@@ -114,17 +120,21 @@ def tetrahedron_fields(workspace: Workspace) -> TetrahedronFields:
     def bind():
         room = a.points * a.num_places
         out = SimpleNamespace(**{name: runtime.array(a.fp, room) for name in ("energy", "von_mises", "J")})
+        out.stress = runtime.array(a.vector, 3, room) if a.points > 1 else None
         return out, observer_kernels(a.law, a.features()).fields.bind(scene=a, at=workspace.state, out=out)
 
     out, launch = workspace.kept("fields", bind)
     launch(num_places=a.num_places)
     energy, von_mises, J = (a.at_points(runtime.fetch(x)) for x in (out.energy, out.von_mises, out.J))
+    stress = None
     if a.points > 1:
+        rows = np.stack([runtime.fetch_row(out.stress, i) for i in range(3)], 1)
+        stress = rows.reshape(-1, a.points, 3, 3)[a.place].astype(np.float64)
         share = a.values.volumes / a.values.volumes.sum(1, keepdims=True)
         energy, von_mises = (energy * share).sum(1), (von_mises * share).sum(1)
         u = runtime.fetch_row(workspace.state.u, 0).astype(np.float64)
         J = np.minimum(J.min(1), ratios_at_corners(a.mesh.elements, a.values.rest, u).min(1))
-    return TetrahedronFields(energy, von_mises, J)
+    return TetrahedronFields(energy, von_mises, J, stress)
 
 
 def elastic_energy(workspace: Workspace) -> float:

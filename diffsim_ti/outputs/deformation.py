@@ -65,22 +65,36 @@ def _edges(u: np.ndarray, elements: np.ndarray, order: int) -> np.ndarray:
 
 
 class PointMeans:
-    """Means over points by their volumes V, T_i = sum V_p T_p / sum V_p; of item i over `around`, rows of ones."""
+    """Means over points by volumes V, T_i = sum c_ip V_p T_p / sum c_ip V_p; of item i over the points in row i of
+    `around`, which holds the c_ip."""
 
     def __init__(self, around):
         self._around = around
 
     @classmethod
-    def of_vertices(cls, mesh) -> "PointMeans":
-        """Of each vertex over all points of the tetrahedra around."""
-        points, nodes = mesh.reference.num_points, mesh.reference.num_nodes
-        columns = np.repeat(np.arange(mesh.num_tetrahedra * points).reshape(-1, points), nodes, 0)
-        return cls(_ones(np.repeat(mesh.elements.ravel(), points), columns.ravel(), mesh.num_vertices))
+    def of_vertices(cls, mesh, of: np.ndarray) -> "PointMeans":
+        """Of each vertex over the tetrahedra around, with the value that each has there: with one point that of the point,
+        with four that of the linear function through them.
+
+        of: tetrahedra that count alone at their vertices, none: all.
+        """
+        element, mask = mesh.reference, np.zeros(mesh.num_tetrahedra, bool)
+        shares = np.ones((4, 1)) if element.order == 1 else barycentric(element.nodes) @ _LINEAR
+        mask[of] = True
+        own = np.zeros(mesh.num_vertices, bool)
+        own[mesh.elements[mask]] = True
+        counts = np.repeat((mask[:, None] | ~own[mesh.elements]).ravel(), element.num_points)
+        rows = np.repeat(mesh.elements.ravel(), element.num_points)[counts]
+        points = np.arange(mesh.num_tetrahedra * element.num_points).reshape(-1, element.num_points)
+        columns = np.repeat(points, element.num_nodes, 0).ravel()[counts]
+        weights = np.tile(shares.ravel(), mesh.num_tetrahedra)[counts]
+        return cls(_matrix(weights, rows, columns, (mesh.num_vertices, points.size)))
 
     @classmethod
     def of_tetrahedra(cls, count: int, points: int) -> "PointMeans":
         """Of each tetrahedron over its points."""
-        return cls(_ones(np.repeat(np.arange(count), points), np.arange(count * points), count))
+        every = np.arange(count * points)
+        return cls(_matrix(np.ones(len(every)), every // points, every, (count, len(every))))
 
     def value(self, T: np.ndarray, V: np.ndarray) -> np.ndarray:
         """T: (frames, points, ...) -> (frames, items, ...)."""
@@ -157,10 +171,10 @@ class PointInterpolation:
         return every * _like(c, T), (every * T).reshape(len(T), len(c), -1).sum((0, 2))
 
 
-def _ones(rows: np.ndarray, columns: np.ndarray, num_rows: int):
+def _matrix(weights: np.ndarray, rows: np.ndarray, columns: np.ndarray, shape: tuple[int, int]):
     from scipy.sparse import csr_matrix
 
-    return csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(num_rows, columns.max() + 1))
+    return csr_matrix((weights, (rows, columns)), shape)
 
 
 def _like(per_item: np.ndarray, T: np.ndarray) -> np.ndarray:
@@ -192,7 +206,13 @@ def _deviator(T: np.ndarray) -> np.ndarray:
 
 def stretches(E: np.ndarray) -> np.ndarray:
     """sqrt(1 + 2 E_i), ascending, E_i: eigenvalues of Green's strain."""
-    return np.sqrt(1 + 2 * principal(E))
+    squares = 1 + 2 * principal(E)
+    if np.any(squares <= 0):  # of the linear function through the points of a ten-node tetrahedron
+        raise ValueError(
+            f"Strain: stretches of a strain whose 1 + 2 E is {squares.min():.3g} at a vertex or point: it changes too "
+            'much within one tetrahedron; take at="tetrahedra", or refine the mesh there'
+        )
+    return np.sqrt(squares)
 
 
 def stretches_jvp(E: np.ndarray, dE: np.ndarray) -> np.ndarray:

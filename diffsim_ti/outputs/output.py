@@ -53,6 +53,10 @@ class Output(ABC):
     reads_contact_forces = False  # whether runs must note frames.contact_forces for it
     reads_chamber_pressures = False  # the same of frames.chamber_pressures
 
+    def needs_contact_forces(self, solver) -> bool:
+        """Whether runs of this solver must; here, whether it reads them in all."""
+        return self.reads_contact_forces
+
     @staticmethod
     def refuse_growth(output: str, scene: "Scene") -> None:
         """Raise ValueError where tetrahedra grow over time: an output knows frames, not what they had grown by."""

@@ -30,7 +30,9 @@ class SelfContactForce(Output):
 
     n: the pair's normal, w_i: the weights of its four corners (whose sum is 0), N: what its barrier presses with; f, mu,
     eps: of friction (terms/self_contact.py). So the sum over all vertices is zero, and that over one body is what all
-    others do to it. It is of the state: a step's own friction has the velocities that its stage or solve ends with.
+    others do to it. It is of the state, but friction in implicit and static solvers is that of the substep that ends in the
+    frame: it takes N, n and w from where the substep begins, and v_i = (u_i - x_i) / gamma, of a static solve the way of a
+    load step over its share of dt. So it is what the solve balanced, also at rest. The first frame has that of its state.
 
     on: whose sum is taken, by a vertex set's name, indices, a mask or a list of names, as of `mesh.vertex_indices`; of a
         joined mesh "body_0", "body_1" and so on.
@@ -73,6 +75,7 @@ class SelfContactForce(Output):
             raise ValueError(f"{self!r}: the scene has no SelfContact; add it to the scene's terms")
         out = copy(self)
         out.scene, out.arrays, n = scene, SceneArrays(scene), scene.mesh.num_vertices
+        out.num_obstacles = len(scene.obstacles)
         out.vertices = np.arange(n) if self.on is None else np.unique(scene.mesh.vertex_indices(self.on))
         out.pairs, out.surface = pairs_of(ImplicitPairs, out.arrays, False), scene.mesh.surface_vertices
         out.rubs = None if self.part == "normal" else out.pairs.friction
@@ -81,16 +84,26 @@ class SelfContactForce(Output):
     def shape(self, num_frames: int) -> tuple[int, ...]:
         return (num_frames, len(self.vertices), 3) if self.per_vertex else (num_frames, 3)
 
+    def needs_contact_forces(self, solver) -> bool:
+        term = solver.scene.term(SelfContact)
+        return not solver.explicit and self.part != "normal" and term is not None and term.has_friction
+
     # ---- on all vertices, shape (num_vertices, 3) --------------------------------------------------------------------
 
-    def _place(self, frames, k: int) -> np.ndarray:
-        """Go to frame k; its displacements [m]."""
+    def _place(self, frames, k: int) -> tuple[np.ndarray, bool]:
+        """Go to frame k; its displacements [m], and whether friction is that of the state."""
         u, v = frames.displacements[k].astype(np.float64), frames.velocities[k].astype(np.float64)
+        rubs = bool(self.rubs) and not self._is_noted(frames, k)
         self.pairs.begin(u)
-        if self.rubs:
+        if rubs:
             self.rubs.begin(u, u - v, 1.0)
         self.pairs.place(self.pairs.next)
-        return u
+        return u, rubs
+
+    def _is_noted(self, frames, k: int) -> bool:
+        """Whether friction of frame k is what the run noted in the last row of its contact forces."""
+        noted = frames.contact_forces
+        return bool(self.rubs) and frames.steps[k] > 0 and noted is not None and noted.shape[1] > self.num_obstacles
 
     def _at_corners(self) -> np.ndarray:
         """What the pairs have put into the last corners, of all vertices."""
@@ -102,9 +115,10 @@ class SelfContactForce(Output):
         self.arrays.load(self.scene.inputs.derive(frames.inputs))
         out = []
         for k in range(len(frames.positions)):
-            u = self._place(frames, k)
+            u, rubs = self._place(frames, k)
             f = self._at_corners() if self.part != "friction" else np.zeros(u.shape)
-            out.append(f + self.rubs.forces(u) if self.rubs else f)
+            f = f + frames.contact_forces[k, -1, 1] if self._is_noted(frames, k) else f
+            out.append(f + self.rubs.forces(u) if rubs else f)
         return np.stack(out)
 
     def _of(self, frames, f: np.ndarray) -> np.ndarray:
@@ -126,12 +140,14 @@ class SelfContactForce(Output):
         dx = zero if change.positions is None else change.positions
         dv = zero if change.velocities is None else change.velocities
         for k in range(len(zero)):
-            u, du, df = self._place(frames, k), dx[k] - moved.rest, np.zeros(zero.shape[1:])
+            (u, rubs), du, df = self._place(frames, k), dx[k] - moved.rest, np.zeros(zero.shape[1:])
             if self.part != "friction":
                 runtime.fill(self.pairs.step, du[None])
                 self.pairs.product(self.pairs.next, 0, self.pairs.step, self.arrays.corner, numbers.rest, by)
                 df += self._at_corners()
-            out.append(df + self.rubs.jvp(u, du, du - dv[k], du, numbers) if self.rubs else df)
+            if self._is_noted(frames, k) and change.contact_forces is not None:
+                df = df + change.contact_forces[k, -1, 1]
+            out.append(df + self.rubs.jvp(u, du, du - dv[k], du, numbers) if rubs else df)
         if self.about is None:
             return self._of(frames, np.stack(out))
         own, x = np.stack(out)[:, self.vertices], frames.positions[:, self.vertices]
@@ -147,14 +163,17 @@ class SelfContactForce(Output):
             w[:, self.vertices] = seed if self.per_vertex else seed[:, None]
         self.arrays.load(derived)
         self.pairs.clear_sums()
-        rest = np.zeros(positions.shape[1:])
+        rest, noted = np.zeros(positions.shape[1:]), None
         for k in range(len(w)):
-            u, by_u = self._place(frames, k), np.zeros(rest.shape)
+            (u, rubs), by_u = self._place(frames, k), np.zeros(rest.shape)
             if self.part != "friction":
                 runtime.fill(self.pairs.step, w[k][None])
                 self.pairs.vjp(self.pairs.next, 0, self.pairs.step, self.arrays.corner)
                 by_u += self._at_corners()
-            if self.rubs:
+            if self._is_noted(frames, k):
+                noted = np.zeros(frames.contact_forces.shape) if noted is None else noted
+                noted[k, -1, 1] = w[k]
+            if rubs:
                 by_v, _, by_begin = self.rubs.vjp(u, w[k])
                 by_u, velocities[k] = by_u + by_begin, by_v
             positions[k] += by_u
@@ -163,4 +182,5 @@ class SelfContactForce(Output):
         by_numbers, by_rest = self.pairs.collect()
         adjoint.parameters[self.arrays.parameters_of_self_contact] = by_numbers
         adjoint.rest = rest + by_rest
-        return Change(positions, velocities, self.scene.inputs.derive_vjp(frames.inputs, adjoint, tuple(frames.inputs)))
+        inputs = self.scene.inputs.derive_vjp(frames.inputs, adjoint, tuple(frames.inputs))
+        return Change(positions, velocities, inputs, contact_forces=noted)

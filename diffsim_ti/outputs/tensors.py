@@ -17,24 +17,30 @@ if TYPE_CHECKING:
 
 
 class _Tensors(Output):
-    """at: "tetrahedra", (frames, num_tetrahedra, 3, 3); "vertices", the means over the tetrahedra around by their volumes;
-    or material points X [m], shape (k, 3), each with the tensor of its tetrahedron. That of a tetrahedron with ten nodes is
-    the mean over its points, by their volumes; at X it is the linear function of place that these four make, which is more
-    accurate there than what X itself would feel. numbers: what of them is given instead, a name in deformation.NUMBERS, or
-    None. name: how a loss calls it. Barlow 1976, Optimal stress locations in finite element models,
-    doi:10.1002/nme.1620100202."""
+    """at: "tetrahedra", (frames, num_tetrahedra, 3, 3); "vertices", the means of what the tetrahedra around have there; or
+    material points X [m], shape (k, 3), each with the tensor of its tetrahedron. That of a tetrahedron with ten nodes is the
+    mean over its points, by their volumes; at X and at its nodes it is the linear function of place that these four make,
+    which is more accurate than the tensor of the displacements there. of: tetrahedra that count alone at their vertices.
+    numbers: what of them is given instead, a name in deformation.NUMBERS, or None. name: how a loss calls it.
+    Barlow 1976, Optimal stress locations in finite element models, doi:10.1002/nme.1620100202; Hinton, Campbell 1974, Local
+    and global smoothing of discontinuous finite element functions, doi:10.1002/nme.1620080305."""
 
     per_item = True  # whether there is a value for each tetrahedron or vertex
+    alike = False  # whether tetrahedra count alike at their vertices, and not by their volumes
 
-    def __init__(self, name: str, at: str | ArrayLike, **numbers: bool):
+    def __init__(self, name: str, at: str | ArrayLike, of: str | ArrayLike | None, **numbers: bool):
         asked = [which for which, wanted in numbers.items() if wanted]
         if len(asked) > 1:
             raise ValueError(
                 f"{type(self).__name__}: {' and '.join(asked)} exclude each other; take one output for each"
             )
-        self.name, self.at, self.numbers = name, at, asked[0] if asked else None
+        self.name, self.at, self.of, self.numbers = name, at, of, asked[0] if asked else None
         if isinstance(at, str) and at not in ("tetrahedra", "vertices"):
             raise ValueError(f'{type(self).__name__}: at must be "tetrahedra", "vertices" or points, got {at!r}')
+        if of is not None and not self._at_vertices:
+            raise ValueError(
+                f'{type(self).__name__}: of= says which tetrahedra count at their vertices; it goes with at="vertices"'
+            )
 
     def settled(self, scene: "Scene") -> "Output":
         out, mesh = copy(self), scene.mesh
@@ -43,8 +49,10 @@ class _Tensors(Output):
         located = None if every else mesh.locate(self.at)
         out.chosen = np.arange(mesh.num_tetrahedra) if every else located.tetrahedra
         out.read, out.count = out.chosen, len(out.chosen)  # read: whose deformation is looked at
-        if every and self.at == "vertices":
-            out.means, out.count = PointMeans.of_vertices(mesh), mesh.num_vertices
+        if self._at_vertices:
+            of = [] if self.of is None else mesh.tetrahedron_indices(self.of)
+            out.means, out.count = PointMeans.of_vertices(mesh, of), mesh.num_vertices
+            out.alike = out.points > 1
         elif out.points > 1 and not every:
             out.means = PointInterpolation(mesh, located)
         elif out.points > 1:
@@ -76,11 +84,19 @@ class _Tensors(Output):
     def _interpolated(self) -> bool:
         return isinstance(self.means, PointInterpolation)
 
+    @property
+    def _at_vertices(self) -> bool:
+        return isinstance(self.at, str) and self.at == "vertices"
+
     def _shares(self, derived) -> np.ndarray:
-        """Volumes of the points of the chosen tetrahedra, or their shares in values at places."""
+        """How much the points of the chosen tetrahedra count: by their volumes, alike, or by shares in values at places."""
+        if self.alike:
+            return np.ones(self.points * len(self.chosen))
         return self.means.shares(derived.rest) if self._interpolated else derived.volumes[self.chosen].ravel()
 
     def _shares_jvp(self, derived, moved) -> np.ndarray:
+        if self.alike:
+            return np.zeros(self.points * len(self.chosen))
         if self._interpolated:
             return self.means.shares_jvp(derived.rest, moved.rest)
         return moved.volumes[self.chosen].ravel()
@@ -106,7 +122,7 @@ class _Tensors(Output):
             seed, by_shares = self.means.vjp(T, self._shares(derived), seed)
             if self._interpolated:
                 by_rest = self.means.shares_vjp(derived.rest, by_shares)
-            else:
+            elif not self.alike:
                 np.add.at(adjoint.volumes, self.chosen, by_shares.reshape(-1, *adjoint.volumes.shape[1:]))
         H_adj = self._tensors_vjp(deformation, derived, seed, adjoint)
         positions, by_B = deformation.vjp(H_adj, self.num_vertices)
@@ -119,19 +135,25 @@ class _Tensors(Output):
 class Strain(_Tensors):
     """Green's strain E = (F^T F - I) / 2 [-], F = I + sum_a u_a (x) grad N_a, in each frame; symmetric 3x3 tensors.
 
-    at: "tetrahedra", (frames, num_tetrahedra, 3, 3); "vertices", means over the tetrahedra around, by their volumes; or
-    points X [m] of the rest shape, shape (k, 3). name: how a loss calls it.
+    at: "tetrahedra", (frames, num_tetrahedra, 3, 3); "vertices", (frames, num_vertices, 3, 3), as `Stress` has it; or
+    points X [m] of the rest shape, shape (k, 3). of: as of `Stress`. name: how a loss calls it.
     principal: its eigenvalues E_i instead, ascending, shape (frames, ..., 3). stretches: the principal stretches
     sqrt(1 + 2 E_i) [-], ascending; at vertices those of the mean strain. Where two of either coincide only their sum has a
     gradient: each has the slope along an eigenvector that the solver happened to choose.
-    The gradient is exact by all inputs. Raises ValueError for another `at`, points outside the mesh, or both of these.
+    The gradient is exact by all inputs. Raises ValueError for another `at`, points outside the mesh, or both of these, and
+    by the first run that has no stretches somewhere, strains changing too much within a ten-node tetrahedron.
     Holzapfel, Nonlinear Solid Mechanics, 2000, sec. 2.5 and 2.6.
     """
 
     def __init__(
-        self, name: str = "strain", at: str | ArrayLike = "tetrahedra", principal: bool = False, stretches: bool = False
+        self,
+        name: str = "strain",
+        at: str | ArrayLike = "tetrahedra",
+        principal: bool = False,
+        stretches: bool = False,
+        of: str | ArrayLike | None = None,
     ):
-        super().__init__(name, at, principal=principal, stretches=stretches)
+        super().__init__(name, at, of, principal=principal, stretches=stretches)
 
     def _tensors(self, deformation, derived):
         H = deformation.H
@@ -149,8 +171,15 @@ class Strain(_Tensors):
 class Stress(_Tensors):
     """Stress [Pa] in each frame: Cauchy's sigma = P F^T / J, or the first Piola-Kirchhoff stress P = dpsi/dF.
 
-    kind: "cauchy" or "first_piola". at: "tetrahedra", (frames, num_tetrahedra, 3, 3); "vertices", means over the tetrahedra
-    around, by their volumes; or points X [m] of the rest shape, shape (k, 3). name: how a loss calls it.
+    kind: "cauchy" or "first_piola". at: "tetrahedra", (frames, num_tetrahedra, 3, 3); "vertices", (frames, num_vertices,
+        3, 3); or points X [m] of the rest shape, shape (k, 3). name: how a loss calls it.
+    of: tetrahedra, by a set's name, indices, a mask or a list of names, that count alone at their vertices: where two
+        materials meet and stress jumps, which side's stress is meant. Without it an interface has the mean of both sides.
+
+    At a vertex it is the mean over the tetrahedra around of the stress that each has at the vertex, which in ten-node
+    tetrahedra is the linear function through their four points, with volume="patches" too. Linear tetrahedra have one stress
+    each and count by their volumes: at a surface this mean is the stress some half an element below; take ten nodes
+    (`mesh.quadratic()`) for stress at surfaces.
     principal: Cauchy's eigenvalues instead, ascending, shape (frames, ..., 3); where two coincide only their sum has a
     gradient. von_mises: sqrt(3/2 s : s) of Cauchy's deviator s instead, shape (frames, ...), at vertices that of the mean
     stress; where it is 0 it has a kink, and its gradient is given as 0.
@@ -178,12 +207,13 @@ class Stress(_Tensors):
         principal: bool = False,
         kind: str = "cauchy",
         von_mises: bool = False,
+        of: str | ArrayLike | None = None,
     ):
         if kind not in ("cauchy", "first_piola"):
             raise ValueError(f'Stress: kind must be "cauchy" or "first_piola", got {kind!r}')
         if (principal or von_mises) and kind != "cauchy":
             raise ValueError("Stress: principal values and von Mises stress are Cauchy's; P is not symmetric")
-        super().__init__(name, at, principal=principal, von_mises=von_mises)
+        super().__init__(name, at, of, principal=principal, von_mises=von_mises)
         self.kind = kind
 
     def settled(self, scene: "Scene") -> "Stress":

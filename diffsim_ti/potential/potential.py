@@ -36,7 +36,7 @@ class Potential:
         self.per_gamma, self.held_at = 1.0, np.zeros((n, 3))
         self.size, self.contact = runtime.array(a.fp, n), runtime.array(a.fp, n)
         self.elastic, self.J = runtime.array(a.fp, a.points * m), runtime.array(a.fp, a.points * m)
-        self._launches, self._coupling, self._barrier_blocks = {}, None, None  # made when first needed
+        self._launches, self._coupling = {}, None  # made when first needed
         self._points = None
         self.z = arrays.law_states(1)  # the state of the law, held during a pass
         self.held = arrays.held_numbers()  # what the law measures rates from in a pass
@@ -204,6 +204,10 @@ class Potential:
         tangent, blocks = runtime.array(a.lanes, room), runtime.array(a.vector, 3, a.num_vertices)
         return SimpleNamespace(tangent=tangent, blocks=blocks, corners=corners)
 
+    @cached_property
+    def _barriers(self) -> SimpleNamespace:
+        return SimpleNamespace(blocks=runtime.array(self.arrays.vector, 3, self.arrays.num_vertices))
+
     @property
     def coupling(self) -> PatchCoupling:
         """What patches add to d2E/du2, by the numbers that are loaded."""
@@ -230,18 +234,31 @@ class Potential:
             part = slice(begin, min(begin + size, a.num_tetrahedra))
             yield part, a.from_blocks(source, 81 * a.points, part).reshape(-1, 9, 9)
 
+    def contact_product(self, w: np.ndarray) -> np.ndarray:
+        """The part of contact and of what is attached in `product`; of obstacles at vertices by their blocks."""
+        a, y = self.arrays, np.zeros_like(w)
+        runtime.fill(self.w, w[None])
+        if a.contacts:
+            self.launch("contact_blocks", lanes=False, out=self._barriers)
+            blocks = np.swapaxes(runtime.fetch(self._barriers.blocks).astype(np.float64), 0, 1)
+            y += np.einsum("kij,kj->ki", blocks, w)
+        if self.faces:
+            y -= self.faces.product()[0]
+        if self.pairs:
+            self.pairs.hessian_product(self.u, self.w, False)
+            y[a.mesh.surface_vertices] -= runtime.fetch(a.corner)[a.first_contact_corner :][
+                : len(a.mesh.surface_vertices)
+            ]
+        return sum((part.product(self.held_at, w) for part in self._on_host()), y)
+
     def contact_blocks(self) -> np.ndarray | None:
         """The part of contact and of what is attached in `blocks`; None without."""
         attached = sum(part.blocks(self.held_at) for part in self._on_host()) if self._on_host() else None
         if not (self.arrays.contacts or self.pairs):
             return attached
-        if self._barrier_blocks is None:
-            self._barrier_blocks = SimpleNamespace(
-                blocks=runtime.array(self.arrays.vector, 3, self.arrays.num_vertices)
-            )
-        self.launch("contact_blocks", lanes=False, out=self._barrier_blocks)
+        self.launch("contact_blocks", lanes=False, out=self._barriers)
         if self.pairs:
-            self.pairs.add_blocks(self.u, self._barrier_blocks.blocks)
-        blocks = np.swapaxes(runtime.fetch(self._barrier_blocks.blocks).astype(np.float64), 0, 1)
+            self.pairs.add_blocks(self.u, self._barriers.blocks)
+        blocks = np.swapaxes(runtime.fetch(self._barriers.blocks).astype(np.float64), 0, 1)
         blocks = blocks + self.faces.blocks() if self.faces else blocks
         return blocks if attached is None else blocks + attached

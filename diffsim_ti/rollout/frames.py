@@ -20,7 +20,8 @@ class Frames:
 
     `contact_forces` [N], where an output reads them: what each obstacle did to each vertex, on average since the frame
     before, by its barrier and by friction; shape (frames, obstacles, 2, num_vertices, 3), obstacles as in
-    `scene.obstacles`. The first frame has none.
+    `scene.obstacles`. The first frame has none. In implicit runs of surfaces with friction a row more has that of each
+    other's friction, in the substep that ends in the frame.
 
     `computed` are these outputs themselves, as settled for the scene; `sets`: those of inputs that were given by named sets.
 

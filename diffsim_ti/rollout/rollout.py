@@ -84,7 +84,7 @@ class Rollout:
             health=health,
         )
         given = (outputs,) if isinstance(outputs, Output) else tuple(listed("outputs", outputs, "Outputs"))
-        contacts = any(getattr(output, "reads_contact_forces", False) for output in given)
+        contacts = any(isinstance(output, Output) and output.needs_contact_forces(solver) for output in given)
         chambers = any(getattr(output, "reads_chamber_pressures", False) for output in given)
         self.sweep = sweep = Sweep(solver, steps, **options, contacts=contacts, chambers=chambers)
         self.steps, self.save_every, self.num_frames = sweep.steps, sweep.save_every, sweep.num_frames

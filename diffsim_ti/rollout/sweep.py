@@ -257,7 +257,7 @@ class Sweep:
             if not self.careful:
                 self._reverse(seed, True)  # raises where it happens
             raise FloatingPointError("the adjoint is not finite at the start of the run")
-        if not self.chambers or seed.chamber_pressures is None:  # which feel places by the square of the rate of steps
+        if not any(getattr(seed, name) is not None for name in self.noted):  # whose seeds are no adjoints of places
             warn_of_explosion(of_frames, of_start, float(self.solver.schedule.time(self.steps)) or self.solver.dt)
         return derived
 

@@ -8,6 +8,7 @@ from diffsim_ti.mesh.sets import pieces
 from diffsim_ti.potential.attached import attached_places
 from diffsim_ti.solvers.implicit.solver import ImplicitSolver, Stage
 from diffsim_ti.supports import rigid_motions_left
+from diffsim_ti.terms import SelfContact
 
 if TYPE_CHECKING:
     from diffsim_ti.scene import Scene
@@ -20,7 +21,9 @@ class StaticSolver(ImplicitSolver):
 
     load_steps: in the first step loads and prescribed motion are laid on in so many parts, each starting from the last.
     Raises ValueError, which names the motions, if the supports leave a piece of the body free to move rigidly; NotConverged
-    otherwise. Nocedal, Wright, Numerical Optimization, 2nd ed., 2006, ch. 3 and 7, doi:10.1007/978-0-387-40065-5.
+    otherwise. Where the scene has obstacles or SelfContact such a piece goes, as the loads pull it, by up to the body's size
+    to where contact holds it, with a warning; NotConverged if nothing does.
+    Nocedal, Wright, Numerical Optimization, 2nd ed., 2006, ch. 3 and 7, doi:10.1007/978-0-387-40065-5.
 
     >>> import diffsim_ti as ds
     >>> mesh = ds.TetrahedralMesh.create_cube(resolution=2)
@@ -81,6 +84,9 @@ class StaticSolver(ImplicitSolver):
             free = rigid_motions_left(np.concatenate([mesh.vertices[supports.vertices[own]], places]), held)
             if free:
                 which = f"piece {number} of {len(used)} of the body" if len(used) > 1 else "the body"
+                if self.scene.obstacles or self.scene.term(SelfContact):  # which may hold it: known when it is closed
+                    self.loose = self.loose or f"{which} is free to move rigidly ({free})"
+                    continue
                 raise ValueError(
                     f"statics: {which} is free to move rigidly ({free}): hold it by fixed=..., at three vertices that do "
                     "not lie on a line or in as many directions as that takes, or use a solver with inertia"

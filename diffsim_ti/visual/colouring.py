@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.outputs.deformation import PointMeans, von_mises
 from diffsim_ti.simulator import Simulator
 from diffsim_ti.visual.fields import Field, field_named
 
@@ -91,4 +92,16 @@ def field_of(simulator: Simulator, name: str) -> np.ndarray:
         return np.broadcast_to(modulus, simulator.scene.mesh.num_tetrahedra)
     if name == "gradient":
         raise ValueError("a gradient is no field of the state; pass its size per vertex or tetrahedron as values")
-    return getattr(simulator.tetrahedron_fields(), name)
+    return measured_fields(simulator)[name]
+
+
+def measured_fields(simulator: Simulator) -> dict[str, np.ndarray]:
+    """von Mises stress [Pa], energy density [J/m^3] and J [-] of a state, per tetrahedron; of ten nodes the first is that at
+    vertices, as `Stress(at="vertices", von_mises=True)` has it."""
+    measured, mesh = simulator.tetrahedron_fields(), simulator.scene.mesh
+    fields = {name: getattr(measured, name) for name in ("von_mises", "energy_density", "J")}
+    if mesh.order == 2:
+        means = simulator.workspace.kept("means at vertices", lambda: PointMeans.of_vertices(mesh, []))
+        stress = measured.stress.reshape(1, -1, 3, 3)
+        fields["von_mises"] = von_mises(means.value(stress, np.ones(stress.shape[1])))[0]
+    return fields

@@ -14,6 +14,7 @@ from diffsim_ti.scene import Scene
 from diffsim_ti.simulator import Simulator
 from diffsim_ti.terms.marks import Mark
 from diffsim_ti.terms.obstacles.shapes import Triangles
+from diffsim_ti.visual.colouring import measured_fields
 from diffsim_ti.visual.fields import FIELDS
 from diffsim_ti.visual.scene_marks import marks_of
 
@@ -96,9 +97,8 @@ class Frame:
         outputs: become fields as in `of_run`; last: the simulator that took the last step to this state, if another did.
         """
         u, v, scene = simulator.displacements, simulator.velocities, simulator.scene
-        measured = simulator.tetrahedron_fields()
         fields = dict(displacement=np.linalg.norm(u, axis=1), speed=np.linalg.norm(v, axis=1))
-        fields |= {name: getattr(measured, name) for name in ("von_mises", "energy_density", "J")}
+        fields |= measured_fields(simulator)
         moved = [points for points, _ in obstacle_surfaces(scene, simulator.time)] if scene.moving else None
         x, values = simulator.positions, simulator.values
         drawn = marks_of(scene, x, simulator.time, simulator.step_count, values)

@@ -85,6 +85,8 @@ class SavedSeries:
         u, v = (saved.point_data[name] for name in ("displacement", "velocity"))
         fields = dict(displacement=np.linalg.norm(u, axis=1), speed=np.linalg.norm(v, axis=1))
         fields |= {name: np.asarray(saved.cell_data[name][0], np.float64) for name in FIELDS if name in saved.cell_data}
+        numbers = {name: y for name, y in saved.point_data.items() if name in FIELDS and np.ndim(y) == 1}
+        fields |= {name: np.asarray(y, np.float64) for name, y in numbers.items()}
         vectors = {name: y for name, y in saved.point_data.items() if np.shape(y) == (len(u), 3)}
         fields |= {name: y for name, y in vectors.items() if name not in ("displacement", "velocity")}
         marks = read_marks(self._parts[k]["2"], self._labels) if "2" in self._parts[k] else []

@@ -11,7 +11,8 @@ class ArraysWriter(Writer):
     """Writes the frames' arrays when it is closed; until then they are kept in memory. n frames:
 
     time [s], shape (n,); positions, displacements [m], velocities [m/s], shape (n, num_vertices, 3); the fields (von_mises,
-    energy_density, J ...), shape (n, num_tetrahedra); rest_positions [m], tetrahedra, all vertices of each, fixed.
+    energy_density, J ...), shape (n, num_tetrahedra), of ten nodes von_mises (n, num_vertices); rest_positions [m],
+    tetrahedra, all vertices of each, fixed.
     Obstacles are left out.
     """
 

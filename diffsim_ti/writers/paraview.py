@@ -33,9 +33,9 @@ class ParaViewWriter(Writer):
     Each frame can be read once it is written: the .pvd is replaced as a whole after each, so an interrupted run leaves a
     valid series. Frames that an earlier series of that name left in the folder are removed first. Frames hold
     displacement [m], velocity [m/s] and what is fixed per vertex, and von_mises [Pa], energy_density [J/m^3] and J [-] per
-    tetrahedron, in the precision of the displacements; besides, what else a frame's fields have for every vertex or
-    every tetrahedron, such as forces and stresses (`Frame.of_run`), tensors row by row. Ten-node tetrahedra are quadratic
-    cells. Raises OSError if the folder cannot be written.
+    tetrahedron (of ten nodes von_mises per vertex), in the precision of the displacements; besides, what else a frame's
+    fields have for every vertex or every tetrahedron, such as forces and stresses (`Frame.of_run`), tensors row by row.
+    Ten-node tetrahedra are quadratic cells. Raises OSError if the folder cannot be written.
     """
 
     suffixes = (".pvd",)
@@ -62,10 +62,9 @@ class ParaViewWriter(Writer):
         held = np.isin(np.arange(len(frame.positions)), self.setting.fixed).astype("u1")
         point_data, cell_data = {"displacement": frame.displacements, "velocity": frame.velocities}, {}
         for name, value in frame.fields.items():
-            if name in PER_TETRAHEDRON or (name not in FIELDS and len(value) == self.setting.mesh.num_tetrahedra):
-                cell_data[name] = value
-            elif name not in FIELDS:
-                point_data[name] = value
+            if name in PER_TETRAHEDRON or name not in FIELDS:
+                of_cells = len(value) == self.setting.mesh.num_tetrahedra
+                (cell_data if of_cells else point_data)[name] = value
         point_data, cell_data = (
             {text_of(name): _rows(value).astype(dtype) for name, value in data.items()}
             for data in (point_data, cell_data)

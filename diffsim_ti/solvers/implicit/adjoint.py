@@ -55,7 +55,7 @@ class ImplicitAdjoint(RecordedPasses):
         self.contacts, areas = None, self.face_areas if p.faces else runtime.array(a.fp, 1)
         if workspace.impulses:
             self.contacts = ContactRecord(workspace)
-            self._shares = SharesAdjoint(workspace, self.features, self.numbers, areas)
+            self._shares = SharesAdjoint(workspace, self.features, self.numbers, areas) if num_obstacles else None
         self._by_pressed = PressedAdjoint(workspace, self.features, self.numbers, areas) if p.presses else None
 
     def fits(self, workspace) -> bool:
@@ -132,15 +132,23 @@ class ImplicitAdjoint(RecordedPasses):
         self.ws.launch_law_state("vjp", self.features, j, slot, slot + 1, **own)
         self.p = self.p + runtime.fetch_row(self._law.y, 0)
 
-    def _pull_back_contacts(self, j: int, save_every: int) -> tuple | None:
-        """Adjoints of what the forces of obstacles in pass j depend on, where a loss names them (SharesAdjoint)."""
-        seed = self.contacts.seed(j, save_every, self.stage.static) if self.contacts else None
-        return None if seed is None else self._shares.pull_back(seed)
+    def _pull_back_contacts(self, j: int, save_every: int) -> tuple[tuple | None, tuple | None]:
+        """Adjoints of what the forces of obstacles in pass j depend on (SharesAdjoint), and friction between surfaces
+        (LaggedFriction.vjp), where a loss names them."""
+        seed, friction = self.contacts.seed(j, save_every, self.stage.static) if self.contacts else (None, None)
+        seen = None if seed is None else self._shares.pull_back(seed)
+        if friction is None:
+            return seen, None
+        p = self.potential
+        rubbed = p.rubbing.vjp(p.held_at, friction)
+        p.place(self.u_star)
+        return seen, rubbed
 
     def _pull_back(self, j: int, save_every: int) -> None:
         ws, s, p, q, held = self.ws, self.stage, self.p, self.q, self.ws.arrays.held
-        seen = self._pull_back_contacts(j, save_every)
-        by_contacts = np.zeros_like(p) if seen is None else seen[0]
+        seen, rubbed = self._pull_back_contacts(j, save_every)
+        by_contacts, by_x, by_lag = np.zeros((3, *p.shape)) if rubbed is None else rubbed
+        by_contacts = by_contacts if seen is None else by_contacts + seen[0]
         if s.static:
             q = np.zeros_like(q)
         p_free, q_free = p * ws.linear, q * ws.linear
@@ -166,13 +174,12 @@ class ImplicitAdjoint(RecordedPasses):
         if ws.potential.faces:
             reaction = reaction + self._vjp_of_faces()
         reaction = reaction + by_contacts
-        by_x, by_lag = 0.0, np.zeros_like(p)
         if ws.fluid:
-            by_place, by_x = self._pull_back_fluid(by_star)
-            reaction = reaction + by_place
+            by_place, by_speed = self._pull_back_fluid(by_star)
+            reaction, by_x = reaction + by_place, by_x + by_speed
         if ws.potential.rubbing:
-            by_place, by_rub, by_lag = ws.potential.rubbing.vjp(ws.potential.held_at, by_star)
-            reaction, by_x = reaction + by_place, by_x + by_rub
+            by_place, by_rub, by_begin = ws.potential.rubbing.vjp(ws.potential.held_at, by_star)
+            reaction, by_x, by_lag = reaction + by_place, by_x + by_rub, by_lag + by_begin
         if ws.attached:
             reaction = reaction + ws.attached.vjp(ws.potential.held_at, by_star, self.attached, *ws.time_of(j, s))
         share = ws.load_share(j, s)

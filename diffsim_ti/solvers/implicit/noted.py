@@ -21,11 +21,12 @@ class Noted:
         return self.impulses.forces
 
     def note_contacts(self, j: int, save_every: int) -> None:
-        """What obstacles did in pass j, where it is asked for."""
+        """What obstacles, and friction between surfaces, did in pass j, where it is asked for."""
         if self.impulses and save_every:
-            self.potential.place(self.u_star)
-            shares = self.kept("shares", lambda: Shares(self))
-            self.impulses.add(j, save_every, self.is_static, shares.forces)
+            at = self.potential.place(self.u_star)
+            shares = self.kept("shares", lambda: Shares(self)) if len(self.arrays.obstacles) else None
+            friction = lambda: self.potential.rubbing.forces(at)  # noqa: E731
+            self.impulses.add(j, save_every, self.is_static, lambda: shares.forces(), friction)
 
     def note_solves(self, j: int, num_passes: int, seconds: float) -> None:
         """What pass j took; statics say which saddles they left and, without contact, where states were not stable."""

@@ -39,6 +39,7 @@ class ImplicitSolver(Solver):
     arguments = ("dt", "substeps", "tolerance", "max_iterations", "parallel", "preconditioner")
     last_frame_is_state = True
     multistep = False
+    loose = ""  # what is free to move rigidly but for contact, in words: of equilibria (closing.py)
     may_gain_energy = False  # whether long steps can add energy, so that it must be watched
 
     def __init__(

@@ -37,7 +37,7 @@ class ImplicitTangent(RecordedPasses):
         if p.faces:
             self._jvp_of_faces = p.faces.bind(p.faces.kernels.jvp, tangent=(self, self.numbers))
         self.contacts = ContactRecord(workspace) if workspace.impulses else None
-        self._shares = Shares(workspace) if workspace.impulses else None
+        self._shares = Shares(workspace) if workspace.impulses and len(a.obstacles) else None
         self.rate_dot = float(tangent.parameters[a.features().drag]) if a.features().drag >= 0 else 0.0
         self.frames, self.chamber_record = ([], []), ChamberRecord(workspace.solver, workspace.held_chambers)
 
@@ -119,7 +119,7 @@ class ImplicitTangent(RecordedPasses):
             self.chamber_record.note(j, save_every, change)
         d_star = held + d_star
         if self.contacts:
-            self._note_contacts(j, save_every, d_star)
+            self._note_contacts(j, save_every, d_star, dx)
         before = self.du, self.dv
         self.du = s.c0 * d_star + (1 - s.c0) * self.du
         self.dv = s.e0 * (d_star - dx) / s.gamma + s.e1 * dy + de0 * self.v_star + de1 * self.y
@@ -129,11 +129,13 @@ class ImplicitTangent(RecordedPasses):
             self.dv = np.zeros_like(self.dv)
         self.tangent_before = before
 
-    def _note_contacts(self, j: int, save_every: int, d_star: np.ndarray) -> None:
-        """Change of the forces of obstacles in pass j, u* changing by d_star."""
-        runtime.fill(self.ws.potential.w, d_star[None])
+    def _note_contacts(self, j: int, save_every: int, d_star: np.ndarray, dx: np.ndarray) -> None:
+        """Change of the forces of obstacles, and of friction between surfaces, in pass j, u* changing by d_star."""
+        p = self.ws.potential
+        runtime.fill(p.w, d_star[None])
         record = dict(tangent=(SimpleNamespace(lag=self.lag, walls=self.walls, pressed=self.pressed), self.numbers))
-        self.contacts.add(j, save_every, self.stage.static, lambda: self._shares.forces("jvp", **record))
+        friction = lambda: p.rubbing.jvp(p.held_at, d_star, dx, self.du, self.numbers)  # noqa: E731
+        self.contacts.add(j, save_every, self.stage.static, lambda: self._shares.forces("jvp", **record), friction)
 
     def contact_forces(self, frame_time: np.ndarray) -> np.ndarray:
         """Changes of the frames' contact forces."""

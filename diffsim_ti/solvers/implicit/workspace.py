@@ -18,6 +18,7 @@ from diffsim_ti.potential.rigid_sets import RigidSets
 from diffsim_ti.potential.way import Way
 from diffsim_ti.slots import copy_slot
 from diffsim_ti.solvers.implicit.approach import Approach
+from diffsim_ti.solvers.implicit.closing import Closing
 from diffsim_ti.solvers.implicit.given import GivenInPasses
 from diffsim_ti.solvers.implicit.held_strains import HeldStrains
 from diffsim_ti.solvers.implicit.laid_on import LaidOn
@@ -89,7 +90,7 @@ class ImplicitWorkspace(Preconditioned, ObstacleWays, Noted, GivenInPasses, Work
         self.attached = self.potential.attached = Attached.of(self.scene)
         self.newton = Newton(self.potential, self.free, way, preconditioner, tolerance, rounds, eps, *followers)
         self._preconditioners = {}
-        self.way, self.approach = Way(self.arrays, self.parallel), Approach(self)
+        self.way, self.approach, self.closing = Way(self.arrays, self.parallel), Approach(self), Closing(self)
         self.check_apart()
 
     @property
@@ -255,8 +256,10 @@ class ImplicitWorkspace(Preconditioned, ObstacleWays, Noted, GivenInPasses, Work
     def _solve(self, u, start, problem: tuple, stage: Stage) -> np.ndarray:
         """The minimum of the pass; problem: mass, inertial, loads of `Newton.solve`."""
         held = self.approach(u, start, problem)
+        begin = self.admissible(start, held)
+        begin = self.closing.approached(begin, problem) if self.solver.loose else begin
         try:
-            return self.newton.solve(self.admissible(start, held), *problem, leave_saddles=stage.static)
+            return self.newton.solve(begin, *problem, leave_saddles=stage.static)
         except NotConverged as error:
             if not stage.static or self.volumes or self.newton.max_iterations < self.enough:
                 raise
