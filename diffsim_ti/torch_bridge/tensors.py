@@ -166,7 +166,7 @@ class TensorRollout:
             if direct and name in START:
                 start[name] = tensor
                 continue
-            value = tensor.detach().to("cpu", torch.float64).numpy()  # the run keeps a copy of its own
+            value = tensor.detach().to("cpu", torch.promote_types(tensor.dtype, torch.float32)).numpy()
             if name == "initial_displacements":
                 name, value = "initial_positions", self.rollout.values["rest_positions"] + value
             values[name] = value
