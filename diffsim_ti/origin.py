@@ -52,12 +52,17 @@ def warn_of_rounding(what: str, x, mesh, remedy: str) -> None:
 
 
 def warn_of_coarse_places(scene) -> None:
-    """Where places were given in float32, or numbers of obstacles near the body are too large for it."""
+    """Where places were given in float32, or where the start's displacements, or numbers of obstacles near the body, are too
+    large for it."""
     inputs = scene.inputs
     for name, described in inputs.described.items():
         if described.single and described.axes:
             warn_of_rounding(name, described.value.astype(np.float32), scene.mesh, "give it in float64")
-    if scene.precision != "f32" or not scene.obstacles:
+    if scene.precision != "f32":
+        return
+    away = inputs.values["initial_positions"] - inputs.values["rest_positions"]
+    warn_of_rounding("initial displacements", away.astype(np.float32), scene.mesh, START_NEARER)
+    if not scene.obstacles:
         return
     parameters, places = inputs.derive(inputs.values).parameters, scene.places(0.0)
     for term in scene.obstacles:

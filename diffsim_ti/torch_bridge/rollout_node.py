@@ -71,7 +71,8 @@ class _OutputNode(torch.autograd.Function):
     @staticmethod
     def forward(ctx, rollout: Rollout, name: str, frames, names: tuple, *tensors):
         ctx.rollout, ctx.name, ctx.frames, ctx.names, ctx.tensors = rollout, name, frames, names, tensors
-        return torch.from_numpy(np.array(frames[name])).to(tensors[0])
+        dtype = torch.float64 if rollout.scene.origin.any() else tensors[0].dtype
+        return torch.from_numpy(np.array(frames[name])).to(tensors[0].device, dtype)
 
     @staticmethod
     @first_order_only(REMEDY)

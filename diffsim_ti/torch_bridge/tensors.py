@@ -66,7 +66,7 @@ class TensorStart:
     def __call__(self, workspace) -> None:
         given, values, pair = next(iter(self.start.values())), workspace.arrays.values, []
         for name, loaded in zip(START, (values.displacement, values.velocity)):
-            pair.append(self.start[name] if name in self.start else torch.tensor(loaded).to(given))
+            pair.append(self.start[name] if name in self.start else torch.tensor(loaded).to(given).contiguous())
         self.face.copy("in", [x[None] for x in pair], (workspace.state.u, workspace.state.v))
 
 
