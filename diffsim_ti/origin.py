@@ -34,9 +34,22 @@ def positions_of(scene, rest: np.ndarray, u: np.ndarray) -> np.ndarray:
     return rest + u if scene.origin.any() else (rest + u).astype(u.dtype)
 
 
+def is_single(x) -> bool:
+    """Whether an array or tensor is in float32."""
+    return "float32" in str(getattr(x, "dtype", "")) and 0 not in x.shape
+
+
+def warn_of_rounded(what: str, x, enough: float, of: str) -> None:
+    """Where numbers given in float32 are rounded by more than is enough, a share of something."""
+    if is_single(x) and (coarse := ROUNDING * float(np.nanmax(abs(np.asarray(x))))) > enough:
+        warnings.warn(
+            f"{what}: float32 resolves them to {coarse:.2g}, too little for {of}: give them in float64", stacklevel=4
+        )
+
+
 def warn_of_rounding(what: str, x, mesh, remedy: str) -> None:
     """Where numbers [m], an array or tensor in float32, are too coarse for a mesh; other precisions pass."""
-    if "float32" not in str(getattr(x, "dtype", "")) or 0 in x.shape:
+    if not is_single(x):
         return
     with np.errstate(all="ignore"):
         largest = float(abs(x).max())

@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.checked import numbers, wholes
+from diffsim_ti.origin import warn_of_rounded
 from diffsim_ti.rollout import Frames, Rollout
 
 
@@ -32,6 +33,7 @@ class Measurement:
         if not np.all(self.noise > 0):
             raise ValueError(f"{output}: noise must be > 0, a standard deviation in the output's unit")
         self.seen = np.isfinite(self.values)
+        warn_of_rounded(output, values, float(self.noise.min(initial=np.inf)), "the noise")
         if np.any(np.isinf(self.values)):
             raise ValueError(f"{output}: values must be finite, or NaN where a sample is missing")
         if self.noise.ndim > self.values.ndim or any(

@@ -6,7 +6,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import ArrayLike
 
-from diffsim_ti.origin import middle_far_part
+from diffsim_ti.origin import OF_WIDTHS, middle_far_part, warn_of_rounded
 from diffsim_ti.runtime import at, let, traced
 from diffsim_ti.terms.described import place
 from diffsim_ti.terms.obstacles.obstacle import Obstacle, ObstacleForce
@@ -34,6 +34,9 @@ class MeshObstacle(Obstacle):
         **options,
     ):
         super().__init__([place("position", position, "mesh_position")], **options)
+        warn_of_rounded(
+            "MeshObstacle: vertices", vertices, OF_WIDTHS * float(self.values["barrier_width"]), "the width"
+        )
         vertices, triangles = np.asarray(vertices, np.float64), np.asarray(triangles, np.int64)
         check_closed(vertices, triangles)
         if int(resolution) != resolution or resolution < 4:
