@@ -34,25 +34,17 @@ def positions_of(scene, rest: np.ndarray, u: np.ndarray) -> np.ndarray:
     return rest + u if scene.origin.any() else (rest + u).astype(u.dtype)
 
 
-def is_single(x) -> bool:
-    """Whether an array or tensor is in float32."""
-    return "float32" in str(getattr(x, "dtype", "")) and 0 not in x.shape
-
-
-def warn_of_rounded(what: str, x, enough: float, of: str) -> None:
-    """Where numbers given in float32 are rounded by more than is enough, a share of something."""
-    if is_single(x) and (coarse := ROUNDING * float(np.nanmax(abs(np.asarray(x))))) > enough:
-        warnings.warn(
-            f"{what}: float32 resolves them to {coarse:.2g}, too little for {of}: give them in float64", stacklevel=4
-        )
+def rounding_of(x) -> float:
+    """What float32 rounds numbers by at most that are an array or tensor in float32; 0 for others."""
+    if "float32" not in str(getattr(x, "dtype", "")) or 0 in x.shape:
+        return 0.0
+    with np.errstate(all="ignore"):
+        return ROUNDING * float(abs(x).max())
 
 
 def warn_of_rounding(what: str, x, mesh, remedy: str) -> None:
-    """Where numbers [m], an array or tensor in float32, are too coarse for a mesh; other precisions pass."""
-    if not is_single(x):
-        return
-    with np.errstate(all="ignore"):
-        largest = float(abs(x).max())
+    """Where numbers [m] in float32 are too coarse for a mesh; other precisions pass."""
+    largest = rounding_of(x) / ROUNDING
     if not np.ptp(mesh.vertices, 0).max() < largest < np.inf:
         return
     coarse, shortest = ROUNDING * largest, np.linalg.norm(np.diff(mesh.vertices[mesh.edges], axis=1), axis=2).min()
@@ -75,10 +67,9 @@ def warn_of_coarse_places(scene) -> None:
         return
     away = inputs.values["initial_positions"] - inputs.values["rest_positions"]
     warn_of_rounding("initial displacements", away.astype(np.float32), scene.mesh, START_NEARER)
-    if not scene.obstacles:
-        return
-    parameters, places = inputs.derive(inputs.values).parameters, scene.places(0.0)
-    for term in scene.obstacles:
+    felt = [term for term in scene.obstacles if "barrier_width" in term.values]
+    parameters, places = inputs.derive(inputs.values).parameters if felt else (), scene.places(0.0)
+    for term in felt:
         known = [i for i in term.described if i.value is not None]
         lengths = np.repeat([i.unit == "m" for i in known], [i.value.size for i in known])
         largest = float(np.abs(parameters[inputs.parameters.of(term)][lengths]).max())

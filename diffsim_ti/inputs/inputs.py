@@ -137,15 +137,14 @@ class Inputs:
 
     def _away(self) -> dict:
         """{moving obstacle: how far its path takes it from where it was made, if that is far} [m] (origin.py)."""
-        if self.scene.precision != "f32":
-            return {term: np.zeros(3) for term in self.scene.moving}
-        return {term: far_part(row[:3], self.length) for term, row in self.scene.places(0.0).items()}
+        known = self.scene.precision == "f32"
+        places = self.scene.places(0.0).items()
+        return {t: far_part(row[:3], self.length) if known and t.says_places else np.zeros(3) for t, row in places}
 
     def _origin(self, term) -> np.ndarray:
         """What the places of a term are measured from on the device [m]."""
         origin = self.scene.origin - self.away.get(term, 0.0)
-        places = [i.axes for i in term.described if i.plain != getattr(term, "about_name", None)]
-        if origin.any() and term.acts_on_surface and not any(places):
+        if origin.any() and term.acts_on_surface and not term.says_places:
             size = float(np.abs(origin).max())
             raise ValueError(
                 f"{type(term).__name__} and the body lie {size:.3g} m from the origin, where float32 resolves "

@@ -79,6 +79,11 @@ class Term(ABC):
         """
         return []
 
+    @property
+    def says_places(self) -> bool:
+        """Whether some of its inputs, but for the point that it turns about, are said to be places."""
+        return any(i.axes and i.name != "about" for i in self.described)
+
     def shift(self, origin: np.ndarray) -> np.ndarray:
         """What the numbers that kernels take as they are have less where places are measured from `origin` [m]."""
         return np.concatenate([np.zeros(0), *(i.shift(origin) for i in self.described if i.value is not None)])

@@ -1,12 +1,13 @@
 """A closed triangle mesh as an obstacle: its signed distance on a grid, between whose points cubic B-splines are C2."""
 
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
 import taichi as ti
 from numpy.typing import ArrayLike
 
-from diffsim_ti.origin import OF_WIDTHS, middle_far_part, warn_of_rounded
+from diffsim_ti.origin import OF_WIDTHS, middle_far_part, rounding_of
 from diffsim_ti.runtime import at, let, traced
 from diffsim_ti.terms.described import place
 from diffsim_ti.terms.obstacles.obstacle import Obstacle, ObstacleForce
@@ -34,9 +35,9 @@ class MeshObstacle(Obstacle):
         **options,
     ):
         super().__init__([place("position", position, "mesh_position")], **options)
-        warn_of_rounded(
-            "MeshObstacle: vertices", vertices, OF_WIDTHS * float(self.values["barrier_width"]), "the width"
-        )
+        if rounding_of(vertices) > OF_WIDTHS * self.values["barrier_width"]:
+            coarse = f"float32 resolves vertices to {rounding_of(vertices):.2g} m, too little for the barrier's width"
+            warnings.warn(f"MeshObstacle: {coarse}: give them in float64", stacklevel=2)
         vertices, triangles = np.asarray(vertices, np.float64), np.asarray(triangles, np.int64)
         check_closed(vertices, triangles)
         if int(resolution) != resolution or resolution < 4:
