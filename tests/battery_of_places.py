@@ -19,7 +19,7 @@ from gradient_fuzz.scenes import build  # noqa: E402
 
 import diffsim_ti as ds  # noqa: E402
 
-BESIDE = (0.0137, -0.021, 0.0071)  # [m]
+BESIDE = (0.37, -0.21, 0.71)  # [m]
 
 
 def off(seed: int) -> tuple[float, str]:

@@ -87,11 +87,11 @@ class PoseColumns(Link):
 
     theta = J(r) dr of a rotation vector r, 2 vec(dq q^*) / |q|^2 of a quaternion.
 
-    away: of each path, what its translations have less (origin.py) [m].
+    away: of each path, what its translations have less (origin.py) [m]; nothing by default.
     Raises ValueError for rows that are a full turn or more apart.
     """
 
-    def __init__(self, reads: Iterable[str], writes: str, away: Iterable[np.ndarray]):
+    def __init__(self, reads: Iterable[str], writes: str, away: Iterable[np.ndarray] = ()):
         self.reads, self.writes, self.away = tuple(reads), (writes,), tuple(away)
 
     def value(self, *x):
