@@ -14,6 +14,7 @@ from diffsim_ti import runtime
 from diffsim_ti.diff_physics import DifferentiableBarrierContact, TorchMaterial, refuse_state
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.monitor import stability
+from diffsim_ti.origin import middle_far_part, warn_of_rounding
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.scene import Scene
 from diffsim_ti.solvers import SemiImplicitSolver, Solver, StaticSolver
@@ -146,7 +147,7 @@ class DifferentiableSimulator:
     @property
     def positions(self) -> torch.Tensor:
         """Positions [m], shape (num_vertices, 3), in the graph."""
-        return self._rest + self._displacements
+        return self._at_rest() + self._displacements
 
     @property
     def velocities(self) -> torch.Tensor:
@@ -160,7 +161,7 @@ class DifferentiableSimulator:
         self._displacements, self._velocities = torch.zeros_like(self._rest), torch.zeros_like(self._rest)
         self._steps = 0  # done since
         if positions is not None:
-            self._displacements = self._checked("positions", positions, self._rest.shape) - self._rest
+            self._displacements = self._from_rest(positions)
         if velocities is not None:
             self._velocities = self._checked("velocities", velocities, self._rest.shape)
         self._choose_substeps()
@@ -207,15 +208,16 @@ class DifferentiableSimulator:
         parts = [self._rollout(1, False, None, None).solver.describe(), self._scene(False).describe()]
         return "\n".join([*parts, f"computed on {runtime.arch_name()}, tensors on {self.device}"])
 
-    def _checked(self, name: str, value, *shapes) -> torch.Tensor:
-        """A floating point tensor of one of these shapes, brought to the dtype and device of `_rest` in the graph."""
+    def _checked(self, name: str, value, *shapes, like: torch.Tensor | None = None) -> torch.Tensor:
+        """A floating point tensor of one of these shapes, brought to the dtype and device of `_rest`, or of another one, in
+        the graph."""
         value = value if isinstance(value, torch.Tensor) else torch.as_tensor(value)
         if tuple(value.shape) not in [tuple(shape) for shape in shapes]:
             expected = " or ".join(str(tuple(shape)) for shape in shapes)
             raise ValueError(f"{name}: expected shape {expected}, got {tuple(value.shape)}")
         if not value.is_floating_point():
             raise ValueError(f"{name}: expected a floating point tensor such as {self._rest.dtype}, got {value.dtype}")
-        return value.to(self._rest)
+        return value.to(self._rest if like is None else like)
 
     def _inputs(self) -> dict[str, torch.Tensor]:
         """What a run takes besides state and forces, in the precision of the material, which may have been moved since."""
@@ -224,6 +226,18 @@ class DifferentiableSimulator:
         inputs["gravity"] = self.solver.gravity_vector(self._rest)
         inputs["density"] = torch.as_tensor(self.density, dtype=self._rest.dtype, device=self.device)
         return inputs | (self._contact.tensors(self._rest) if self._contact else {})
+
+    def _at_rest(self) -> torch.Tensor:
+        """The mesh's vertices, in float64 where that would cost digits: far from the origin (origin.py)."""
+        if self.dtype == torch.float32 and middle_far_part(self.mesh.vertices).any():
+            return torch.tensor(np.array(self.mesh.vertices), device=self.device)
+        return self._rest
+
+    def _from_rest(self, positions: torch.Tensor) -> torch.Tensor:
+        """Displacements of given positions, in the precision of `_rest`."""
+        warn_of_rounding("positions", positions, self.mesh, "give them in float64")
+        at_rest = self._at_rest()
+        return (self._checked("positions", positions, at_rest.shape, like=at_rest) - at_rest).to(self._rest)
 
     def _follow_dtype(self, dtype: torch.dtype) -> None:
         """Take on a precision."""

@@ -17,6 +17,7 @@ from diffsim_ti.materials.material import Material
 from diffsim_ti.materials.moduli import youngs_poisson
 from diffsim_ti.materials.patch_law import PatchLaw
 from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.origin import middle_far_part, warn_of_coarse_places
 from diffsim_ti.potential.assembled import body_stiffness
 from diffsim_ti.reduced import Reduced
 from diffsim_ti.supports import Fixed, Supports
@@ -137,9 +138,11 @@ class Scene(TermsOfScene, MadeAgain):
         self.cables = tuple(sorted(cables, key=lambda t: t.of_fibres))  # which come last, for kernels
         self.ties = self.springs + self.cables
         self.foundations = tuple(t for t in self.ordered_terms if isinstance(t, ElasticFoundation))
+        self.origin = middle_far_part(mesh.vertices) if self.precision == "f32" else np.zeros(3)  # origin.py
         self.mass_scaling = None if mass_scaling is None else MassScaling.of(self, density, mass_scaling)
         self.inputs = Inputs(self, density, initial_positions, initial_velocities)
         self._check_start()
+        warn_of_coarse_places(self)
         if volume == "tetrahedra":
             warn_if_locking(self)
 
@@ -247,7 +250,7 @@ class Scene(TermsOfScene, MadeAgain):
 
     def places(self, time: float) -> dict[Term, np.ndarray]:
         """Displacement or pose of each moving obstacle at a time [s], shape (3,), (6,) or (7,) [m]."""
-        return {term: rows[0] for term, rows in zip(self.moving, self.path_rows([time]).values())}
+        return {term: sampled_path(term.path_name, term.path, [time])[0] for term in self.moving}
 
     # ---- matrices ----------------------------------------------------------------------------------------------------
 

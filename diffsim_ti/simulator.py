@@ -11,6 +11,7 @@ from diffsim_ti.inputs.poses import PoseColumns
 from diffsim_ti.monitor import quantities
 from diffsim_ti.monitor.guard import Guard
 from diffsim_ti.monitor.quantities import Energy, TetrahedronFields
+from diffsim_ti.origin import positions_of
 from diffsim_ti.outputs import Output
 from diffsim_ti.rollout.frames import Frames
 from diffsim_ti.solvers.solver import Solver
@@ -26,8 +27,8 @@ class Simulator:
     each step what obstacles do, for `output(ContactForce(...))`.
 
     positions, displacements [m] and velocities [m/s] are NumPy copies of shape (num_vertices, 3) in the scene's
-    precision; time [s] and step_count say where it is. A run that goes wrong raises Divergence (a FloatingPointError)
-    and leaves the state before the step that failed.
+    precision (positions far from the origin in float64, origin.py); time [s] and step_count say where it is. A run that
+    goes wrong raises Divergence (a FloatingPointError) and leaves the state before the step that failed.
 
     >>> import diffsim_ti as ds
     >>> mesh = ds.TetrahedralMesh.create_cube(resolution=2)
@@ -121,8 +122,8 @@ class Simulator:
             clamped = inputs.derive(inputs.at_times(times)).motion if self.scene.clamps else None
             arrays.load_rows(motion=self.scene.motion_rows(times) if clamped is None else clamped)
         if values.path is not None:
-            rows = self.scene.path_rows([self.time, self.time + self.solver.dt])
-            arrays.load_rows(path=PoseColumns(rows, "path").value(*rows.values())[0])
+            rows, away = self.scene.path_rows([self.time, self.time + self.solver.dt]), self.scene.inputs.away.values()
+            arrays.load_rows(path=PoseColumns(rows, "path", away).value(*rows.values())[0])
         inputs = self.scene.inputs
         if inputs.makes_rows:
             now = inputs.derive(inputs.at_step(self.step_count, self.solver.dt, self._set))
@@ -143,8 +144,7 @@ class Simulator:
     @property
     def positions(self) -> np.ndarray:
         """Positions [m]."""
-        u = self.displacements
-        return (self._start.rest + u).astype(u.dtype)
+        return positions_of(self.scene, self._start.rest, self.displacements)
 
     @property
     def velocities(self) -> np.ndarray:
@@ -206,6 +206,8 @@ class Simulator:
         displaced, moving = self.scene.inputs.start_links()
         for name, value in (("positions", positions), ("velocities", velocities)):
             if value is not None:
+                if name == "positions":
+                    self.scene.inputs.warn_if_coarse("initial_positions", value)
                 value = numbers(name, value)
                 if value.shape != shape or not np.all(np.isfinite(value)):
                     raise ValueError(f"{name}: expected finite numbers of shape {shape}, got shape {value.shape}")

@@ -15,6 +15,7 @@ from diffsim_ti.batch.taped import BatchTapeFace
 from diffsim_ti.checked import as_numbers, instance, whole
 from diffsim_ti.copies import made_again
 from diffsim_ti.inputs import Derived
+from diffsim_ti.origin import positions_of
 from diffsim_ti.outputs import Output
 from diffsim_ti.rollout.frames import Frames, check_finite
 from diffsim_ti.rollout.rollout import Rollout
@@ -137,7 +138,7 @@ class Batch:
         """Those of all scenes from displacements (scenes, frames, n, 3)."""
         rest = values["rest_positions"]
         rest = np.stack(rest)[:, None] if isinstance(rest, Own) else rest
-        return (rest + u).astype(u.dtype)
+        return positions_of(self.scene, rest, u)
 
     def _sound(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Whether states (k, n, 3) are finite and no vertex crosses the body within a substep."""

@@ -28,6 +28,7 @@ def checked_values(one: Rollout, given: dict, scenes: int) -> dict:
     if unknown:
         raise ValueError(f"no input named {unknown[0]!r}; this batch has {', '.join(one.inputs)}")
     for name, value in given.items():
+        inputs.warn_if_coarse(name, value)
         if isinstance(value, Own) or _is_own(one, name, value := as_numbers(name, value), scenes):
             whole = np.array(value, np.float64)
             whole.flags.writeable = False

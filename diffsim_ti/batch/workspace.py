@@ -157,6 +157,8 @@ class BatchWorkspace:
         arrays = [np.zeros(1) if x is None else x for x in (arrays if name in self.own else arrays[:1])]
         if name == "inverse_mass":
             arrays = [self.arrays.inverse_of(x) for x in arrays]
+        if name == "rest":
+            arrays = [x - self.arrays.origin for x in arrays]
         arrays = [placed(self.arrays, name, x) for x in arrays]
         if name in self.own:
             return self._packed(arrays, kind)

@@ -113,7 +113,7 @@ class FinerArrays:
         """Take the rest shape that the scene has loaded."""
         if self._rest_of is not self.values.rest:
             self._rest_of = self.values.rest
-            runtime.fill(self.rest, self.mesh.matrix @ self.values.rest)
+            runtime.fill(self.rest, self.mesh.matrix @ (self.values.rest - self.scene.origin))
 
 
 class CurvedPairs:

@@ -75,6 +75,8 @@ class Input:
     change: (value, RunSize) -> how large a change of it matters, for `verify`.
     unit: "-" of a number without dimension, "" where it is not said.
     label: how errors of a constructor call it; default `plain`. The unit stands behind if not in it.
+    axes: of places, the axis of each of its numbers, "xyz" or such as "y" of a height; "" of all else (origin.py).
+    single: whether the value was given in float32.
     given: what the value was given as, if that is a tensor with a graph; the face to its library takes it from here.
     """
 
@@ -86,6 +88,8 @@ class Input:
     change: Callable[[np.ndarray, RunSize], float] = own_size
     plain: str = ""
     label: str = ""
+    axes: str = ""
+    single: bool = False
     given: object = field(default=None, init=False)
 
     def __post_init__(self):
@@ -93,6 +97,7 @@ class Input:
             object.__setattr__(self, "given", self.value)
             object.__setattr__(self, "value", self.value.detach().cpu().numpy())
         if self.value is not None:
+            object.__setattr__(self, "single", self.single or getattr(self.value, "dtype", None) == np.float32)
             object.__setattr__(self, "value", frozen(numbers(self.plain or self.name, self.value)))
             object.__setattr__(self, "shapes", self.shapes or (self.value.shape,))
         object.__setattr__(self, "plain", self.plain or self.name)
@@ -115,6 +120,11 @@ class Input:
             raise ValueError(f"{label} must be {_counted(self.shapes[0])}{unit}, got shape {value.shape}")
         if self.range and not np.all(self.range.holds(value)):
             raise ValueError(f"{label} must be {self.range.words}{unit}, got {value.min():g}")
+
+    def shift(self, origin: np.ndarray) -> np.ndarray:
+        """What its numbers have less where places are measured from `origin` [m], shape (size,)."""
+        out = [origin["xyz".index(axis)] for axis in self.axes] or [0.0]
+        return np.resize(out, self.value.size)
 
     def known(self, sizes: Mapping[str, int]) -> "Input":
         """The same, with numbers for the words of lengths that `sizes` knows."""

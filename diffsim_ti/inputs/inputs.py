@@ -21,6 +21,7 @@ from diffsim_ti.inputs.poses import PoseColumns
 from diffsim_ti.inputs.rigid_start import RigidDisplacement, RigidVelocity
 from diffsim_ti.inputs.surface_areas import SurfaceAreas
 from diffsim_ti.inputs.ties import JoinedRows, JoinedSegments
+from diffsim_ti.origin import FAR, ROUNDING, far_part, warn_of_rounding
 from diffsim_ti.rows import Rows
 
 if TYPE_CHECKING:
@@ -81,6 +82,7 @@ class Inputs:
         initial_velocities: ArrayLike | None,
     ):
         self.scene, self.mesh = scene, scene.mesh
+        self.length = float(np.ptp(self.mesh.vertices, 0).max())
         self.sizes = {"vertices": self.mesh.num_vertices, "tetrahedra": self.mesh.num_tetrahedra}
         last = {i.plain: i for i in self._at_last()}
         self.described = {i.plain: i for i in self._of_body(density, initial_positions, initial_velocities)}
@@ -99,6 +101,7 @@ class Inputs:
         terms = sorted(scene.ordered_terms, key=lambda term: not term.acts_on_surface)
         self.parameters = Rows({term: term.num_numbers for term in terms})
         self.paths = [named[term][term.path_name] for term in scene.moving]  # names, in the order of kernels' columns
+        self.away = self._away()
         self.keyed = [(named[term][term.plain], term) for term in scene.ordered_terms if term.keyed]
         alone = len(scene.dead_loads) == 1 and scene.dead_loads[0].sums_itself
         self.sums_loads = bool(scene.dead_loads) and not alone
@@ -114,7 +117,7 @@ class Inputs:
         velocities = np.broadcast_to(velocities, (n, 3))
         places, per_tetrahedron = (("vertices", 3),), ((), ("tetrahedra",))
         return [
-            Input("initial_positions", X if positions is None else positions, places, "m", change=length),
+            Input("initial_positions", X if positions is None else positions, places, "m", change=length, axes="xyz"),
             Input("initial_velocities", velocities, places, "m/s", change=speed),
             *self.scene.material.described(self.mesh),
             Input("density", density, per_tetrahedron, "kg/m^3", POSITIVE),
@@ -122,15 +125,34 @@ class Inputs:
 
     def _at_last(self) -> list[Input]:
         """What stands at the end of the list: the rest shape, whose gradient costs extra, and the prescribed motion."""
-        out = [Input("rest_positions", self.mesh.vertices, (("vertices", 3),), "m", change=length)]
+        out = [Input("rest_positions", self.mesh.vertices, (("vertices", 3),), "m", change=length, axes="xyz")]
         for clamp, pose in self.scene.clamps:
             shape = ("steps + 1", pose.width)
             out.append(Input(clamp.pose, None, (shape,), "m, rad", change=length_per_step))
-            out.append(Input(clamp.about, pose.about, ((3,),), "m", change=length))
+            out.append(Input(clamp.about, pose.about, ((3,),), "m", change=length, axes="xyz"))
         if self.scene.translates:
             shape = ("steps + 1", len(self.scene.held), 3)
             out.append(Input("prescribed_motion", None, (shape,), "m", change=length))
         return out
+
+    def _away(self) -> dict:
+        """{moving obstacle: how far its path takes it from where it was made, if that is far} [m] (origin.py)."""
+        known = self.scene.precision == "f32"
+        places = self.scene.places(0.0).items()
+        return {t: far_part(row[:3], self.length) if known and t.says_places else np.zeros(3) for t, row in places}
+
+    def _origin(self, term) -> np.ndarray:
+        """What the places of a term are measured from on the device [m]."""
+        origin = self.scene.origin - self.away.get(term, 0.0)
+        if origin.any() and term.acts_on_surface and not term.says_places:
+            size = float(np.abs(origin).max())
+            raise ValueError(
+                f"{type(term).__name__} and the body lie {size:.3g} m from the origin, where float32 resolves "
+                f"{ROUNDING * size:.2g} m, and none of its inputs says that it is a place: say so of those that are, "
+                'Input(..., axes="xyz"), of a height axes="y"; or pass precision="f64", or move everything to within '
+                f"{FAR} body lengths of the origin"
+            )
+        return origin
 
     def start_links(self) -> tuple[Link, Link]:
         """Of displacements and velocities, as the scene can have them."""
@@ -143,6 +165,7 @@ class Inputs:
     def _links(self, named: dict) -> list[Link]:
         """Those of the body, of its material, of the terms, and what joins the terms' numbers and paths."""
         mesh, scene, places = self.mesh, self.scene, {}
+        shift = np.zeros(max(self.parameters.total, 1))
         out = [
             links.RestShape(mesh.tetrahedra) if mesh.order == 1 else CurvedShape(mesh.elements),
             *self.start_links(),
@@ -160,10 +183,16 @@ class Inputs:
             out += links_of
             as_they_are = not any(own in link.writes for link in links_of)
             places |= _placed(term, named[term], rows) if as_they_are else {own: rows}
+            if as_they_are and rows.stop > rows.start:
+                origin = self._origin(term)
+                shift[rows] = term.shift(origin)
+                for link in term.nearer(origin, self.length, names, own) if scene.precision == "f32" else ():
+                    out.append(link)
+                    places[link.writes[0]] = places.pop(link.reads[0])
         out += self._sums_of_loads()
-        out.append(links.Placed(places, "parameters", max(self.parameters.total, 1)))
+        out.append(links.Placed(places, "parameters", shift))
         if self.paths:
-            out.append(PoseColumns(self.paths, "path"))
+            out.append(PoseColumns(self.paths, "path", self.away.values()))
         if scene.clamps:
             out.append(ClampedMotion([clamp for clamp, _ in scene.clamps], len(scene.held), scene.translates))
         elif scene.motion is not None:
@@ -238,6 +267,11 @@ class Inputs:
         if unknown:
             raise ValueError(f"no input named {unknown[0]!r}; this scene has {', '.join(self.described)}")
         return {name: self.described[name].checked(name, value, self.sizes) for name, value in values.items()}
+
+    def warn_if_coarse(self, name: str, given) -> None:
+        """Where a value for a run, as it was given, is places in float32 that are too coarse for the mesh."""
+        if self.described[name].axes:
+            warn_of_rounding(name, given, self.mesh, "give it in float64")
 
     def check_steps(self, values: dict, steps: int) -> None:
         """Raise ValueError unless what is given per step has the rows that a run of so many steps reads."""

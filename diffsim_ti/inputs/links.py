@@ -154,20 +154,43 @@ class PerStep(Link):
         return (y_adj[0][0] if x[0].ndim < self.ndim else y_adj[0],)
 
 
-class Placed(Link):
-    """All numbers of some arrays, those of each in its range of one list of `size`, which is zero elsewhere."""
+class NearestPoint(Link):
+    """The point of a plane that is nearest to o, of any of its points p and a normal n of any length:
 
-    def __init__(self, places: dict[str, slice], writes: str, size: int):
-        self.reads, self.places, self.writes, self.size = tuple(places), tuple(places.values()), (writes,), size
+    q = o + s n,    s = n . (p - o) / n . n
+    """
 
-    def value(self, *x):
-        out = np.zeros(self.size)
-        for place, part in zip(self.places, x):
-            out[place] = part.ravel()
-        return (out,)
+    def __init__(self, point: str, normal: str, writes: str, near: np.ndarray):
+        self.reads, self.writes, self.near = (point, normal), (writes,), near
+
+    def value(self, p, n):
+        return (self.near + n * (n @ (p - self.near)) / (n @ n),)
 
     def jvp(self, x, dx):
-        return self.value(*dx)
+        (p, n), (dp, dn) = x, dx
+        s = n @ (p - self.near) / (n @ n)
+        return (s * dn + n * (dn @ (p - self.near) + n @ dp - 2 * s * (n @ dn)) / (n @ n),)
+
+    def vjp(self, x, y_adj):
+        (p, n), (q_adj,) = x, y_adj
+        s, along = n @ (p - self.near) / (n @ n), (q_adj @ n) / (n @ n)
+        return along * n, s * q_adj + along * (p - self.near - 2 * s * n)
+
+
+class Placed(Link):
+    """All numbers of some arrays, those of each in its range of one list, zero elsewhere, less those of `shift`."""
+
+    def __init__(self, places: dict[str, slice], writes: str, shift: np.ndarray):
+        self.reads, self.places, self.writes, self.shift = tuple(places), tuple(places.values()), (writes,), shift
+
+    def value(self, *x):
+        return (self.jvp(x, x)[0] - self.shift,)
+
+    def jvp(self, x, dx):
+        out = np.zeros(len(self.shift))
+        for place, part in zip(self.places, dx):
+            out[place] = part.ravel()
+        return (out,)
 
     def vjp(self, x, y_adj):
         return [y_adj[0][place].reshape(part.shape) for place, part in zip(self.places, x)]

@@ -87,19 +87,23 @@ class PoseColumns(Link):
 
     theta = J(r) dr of a rotation vector r, 2 vec(dq q^*) / |q|^2 of a quaternion.
 
+    away: of each path, what its translations have less (origin.py) [m]; nothing by default.
     Raises ValueError for rows that are a full turn or more apart.
     """
 
-    def __init__(self, reads: Iterable[str], writes: str):
-        self.reads, self.writes = tuple(reads), (writes,)
+    def __init__(self, reads: Iterable[str], writes: str, away: Iterable[np.ndarray] = ()):
+        self.reads, self.writes, self.away = tuple(reads), (writes,), tuple(away)
 
     def value(self, *x):
-        return (np.concatenate([self._columns(name, rows) for name, rows in zip(self.reads, x)], 1),)
+        out = [self._columns(name, rows) for name, rows in zip(self.reads, x)]
+        for columns, away in zip(out, self.away):
+            columns[:, 0] -= away
+        return (np.concatenate(out, 1),)
 
     @staticmethod
     def _columns(name: str, rows: np.ndarray) -> np.ndarray:
         if rows.shape[1] == 3:
-            return rows[:, None]
+            return rows[:, None].copy()
         phi = np.zeros((len(rows), 3))
         phi[:-1] = between(name, rows)
         most = np.linalg.norm(phi, axis=1).max(initial=0.0)

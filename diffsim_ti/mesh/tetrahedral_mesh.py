@@ -19,6 +19,7 @@ from diffsim_ti.mesh.locate import LocatedPoints, locate
 from diffsim_ti.mesh.named_sets import NamedSets
 from diffsim_ti.mesh.sets import checked_sets, join, pieces, rows_on_surface
 from diffsim_ti.mesh.ten_nodes import edges_of
+from diffsim_ti.origin import warn_of_rounding
 
 CONNECTIVITY = (  # what stays when vertices move
     "_elements _tetrahedra _surface_faces _surface_triangles _middles _vertex_sets _tetrahedron_sets _surface_sets".split()
@@ -61,7 +62,7 @@ class TetrahedralMesh(Exchange, NamedSets, Elements):
         surface_sets: dict | None = None,
         fix_orientation: bool = False,
     ):
-        vertices = checks.checked_vertices(vertices)
+        given, vertices = vertices, checks.checked_vertices(vertices)
         elements = checks.checked_tetrahedra(tetrahedra, len(vertices))
         volumes = checks.checked_volumes(vertices, elements[:, :4])
         elements = checks.oriented(elements, volumes, fix_orientation)
@@ -75,6 +76,7 @@ class TetrahedralMesh(Exchange, NamedSets, Elements):
         self._surface_sets = checked_sets(on_surface, len(self._surface_triangles), "surface")
         checks.warn_of_orphans(self.unused_vertices)
         checks.warn_of_slivers(self)
+        warn_of_rounding("vertices", given, self, "give them in float64")
 
     @classmethod
     def create_cube(

@@ -11,8 +11,8 @@ from diffsim_ti.state.watch import ContactResolution
 
 @dataclass(eq=False)
 class Frames:
-    """Saved states of one run: positions [m], velocities [m/s], displacements from the rest shape [m] (which
-    keep their digits in float32), each of shape (frames, num_vertices, 3), and times [s].
+    """Saved states of one run: positions [m] (far from the origin in float64), velocities [m/s], displacements from the rest
+    shape [m] (which keep their digits in float32), each of shape (frames, num_vertices, 3), and times [s].
 
     `outputs` has what the Rollout was told to compute besides, by name; `frames["name"]` gives any of them.
 

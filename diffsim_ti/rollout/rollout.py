@@ -9,6 +9,7 @@ from diffsim_ti import runtime
 from diffsim_ti.checked import as_numbers, instance, listed, shape_of, shown
 from diffsim_ti.copies import made_again
 from diffsim_ti.inputs import Derived
+from diffsim_ti.origin import positions_of
 from diffsim_ti.outputs import Change, Displacements, Output, Positions, Velocities
 from diffsim_ti.rollout.checkpoints import Checkpoints
 from diffsim_ti.rollout.frames import Frames, HostSeed, check_finite
@@ -184,7 +185,7 @@ class Rollout:
     def frames_of(self, run: Run) -> Frames:
         """The frames of the run that the sweep ran last, with all outputs."""
         u, v = (runtime.fetch(x) for x in self.sweep.workspace.frames)
-        positions = (run.values["rest_positions"] + u).astype(u.dtype)
+        positions = positions_of(self.scene, run.values["rest_positions"], u)
         inputs = run.values
         if run.start is not None:
             start = dict(initial_positions=positions[0], initial_velocities=v[0])

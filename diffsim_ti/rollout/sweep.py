@@ -146,6 +146,7 @@ class Sweep:
             raise ValueError(f"no input named {unknown[0]!r}; this rollout has {', '.join(self.inputs)}")
         known, kept, given = self._loaded or self.values, {}, {}
         for name, value in values.items():
+            self.scene.inputs.warn_if_coarse(name, value)
             value, before = as_numbers(name, value), known[name]
             if value is before or value.shape == before.shape and (value == before).all():
                 kept[name] = before  # and was checked

@@ -8,6 +8,7 @@ import taichi as ti
 
 from diffsim_ti import runtime
 from diffsim_ti.checked import whole
+from diffsim_ti.origin import warn_of_rounding
 from diffsim_ti.outputs import Change
 from diffsim_ti.rollout import field_copies
 from diffsim_ti.rollout.field_seed import STATES, field_seed
@@ -61,6 +62,7 @@ class TapeFace:
             if name in rollout.outputs:
                 shape = tuple(rollout.outputs[name].shape(rollout.num_frames))
                 self._fields[name] = self._take(shape, self._output_rows())
+                self._warn_if_coarse(name, "rest_positions" if name == "positions" else None)
             elif split_name(name)[1] is not None:
                 self._fields[name] = self._field_of_set(name)
             elif SPELLING.get(name, name) in rollout.inputs:
@@ -73,9 +75,19 @@ class TapeFace:
                         "with rest_positions, use initial_positions: displacements are those from the mesh"
                     )
                 self._fields[name] = self._filled(name, self._loaded(name))
+                self._warn_if_coarse(name, name)
             else:
                 raise ValueError(f"no input named {name!r}; this {self.word} has {', '.join(rollout.inputs)}")
         return self._fields[name]
+
+    def _warn_if_coarse(self, name: str, of: str | None) -> None:
+        """Where a field in float32 has places, those of the input `of`, far from the origin."""
+        scene = self.rollout.scene
+        if of in scene.inputs.described and scene.inputs.described[of].axes:
+            instead = {"positions": "displacements", "initial_positions": "initial_displacements"}.get(name)
+            remedy = "take precision='f64'" + (f", or the field of {instead}" if instead else "")
+            value = np.asarray(self._loaded(of), self.number)
+            warn_of_rounding(f"the field of {name}", value, scene.mesh, remedy)
 
     def _field_of_set(self, name: str):
         """The number of a named set; where the scene's differ in it, the first."""

@@ -79,7 +79,8 @@ class SceneArrays:
         self.with_stress = scene.reduced.with_stress(mesh.elements, scene.volume)
         self.bodies = BodyArrays(scene, fp, self.vector) if self._features["reduced"] else None
         vars(self).update(self.bodies.arrays if self.bodies else {})
-        self.walls = Walls(self.obstacles)  # (potential/) as one looks between passes
+        self.origin, away = scene.origin, [scene.inputs.away.get(term, np.zeros(3)) for term in self.contacts]
+        self.walls = Walls(self.obstacles, np.reshape(away, (-1, 3)))  # (potential/) as one looks between passes
         self.offsets = runtime.array(self.vector, self.walls.size)
         self.values: Derived | None = None
         self._known_features: dict[tuple[bool, bool], Features] = {}  # for these values
@@ -228,6 +229,8 @@ class SceneArrays:
         sources["parameters"] = np.concatenate([values.parameters, self.tables]), self.fp
         if not (self.contacts or self.self_contact or self.pressures or self.chambers or self.fluids):
             sources["rest"] = np.zeros((1, 3)), self.vector
+        else:
+            sources["rest"] = values.rest - self.origin, self.vector
         sources["inverse_mass"] = self.inverse_of(values.mass), self.fp
         for name, (data, dtype) in sources.items():
             current = getattr(self, name, None)

@@ -34,7 +34,7 @@ class BodyArrays:
         self.vertices = np.concatenate(members)
         self.owner = np.repeat(np.arange(len(members)), np.diff(self.first))
         self.rigid = np.array([body.rigid for body in self.bodies])
-        self._mesh_places = mesh.vertices[self.vertices]
+        self.origin, self._mesh_places = scene.origin, mesh.vertices[self.vertices]
         self._rounded = np.float32 if fp == ti.f32 else np.float64
         owner = np.full(mesh.num_vertices, -1)
         owner[self.vertices] = self.owner
@@ -49,7 +49,7 @@ class BodyArrays:
     def load(self, values: Derived, inverse_mass: np.ndarray) -> None:
         """Numbers for values of a run."""
         self.mass = values.mass[self.vertices].astype(self._rounded).astype(np.float64)
-        places = np.where(self.rigid[self.owner, None], values.rest[self.vertices], self._mesh_places)
+        places = np.where(self.rigid[self.owner, None], values.rest[self.vertices], self._mesh_places) - self.origin
         self.places = places.astype(self._rounded).astype(np.float64)
         self.total = self._sums(self.mass)
         self.centre = self._sums(self.mass[:, None] * self.places) / self.total[:, None]

@@ -28,9 +28,11 @@ class Moment:
 
 
 class Walls:
-    """obstacles: as `SceneArrays.obstacles`; rows of paths are columns of `inputs/poses.py`."""
+    """obstacles: as `SceneArrays.obstacles`; rows of paths are columns of `inputs/poses.py`. away: what each obstacle's
+    displacements have less, shape (obstacles, 3) [m] (origin.py)."""
 
-    def __init__(self, obstacles: list[tuple]):
+    def __init__(self, obstacles: list[tuple], away: np.ndarray):
+        self.away = away
         self.columns = [(k, c) for k, (_, _, c) in enumerate(obstacles) if c >= 0]
         turning = [(k, c) for k, (force, _, c) in enumerate(obstacles) if force.turns]
         self.turning = [(3 * len(obstacles) + MORE * n, c) for n, (_, c) in enumerate(turning)]
@@ -69,15 +71,16 @@ class Walls:
 
     def row_of(self, k: int, rows: np.ndarray) -> np.ndarray:
         """Where obstacle k is where forces are taken: 3 numbers, or 7 of a pose."""
+        shift = rows[3 * k] + self.away[k]
         if k not in self.place_of:
-            return rows[3 * k]
-        return np.concatenate([rows[3 * k], rotations.from_rodrigues(rows[3 * self.place_of[k]])])
+            return shift
+        return np.concatenate([shift, rotations.from_rodrigues(rows[3 * self.place_of[k]])])
 
     def velocity_at(self, k: int, rows: np.ndarray, point: np.ndarray, about: np.ndarray) -> np.ndarray:
         """Of obstacle k at a point [m/s]."""
         if k not in self.place_of:
             return rows[3 * k + 2]
-        return rows[3 * k + 2] + np.cross(rows[3 * self.place_of[k] + 2], point - rows[3 * k] - about)
+        return rows[3 * k + 2] + np.cross(rows[3 * self.place_of[k] + 2], point - rows[3 * k] - self.away[k] - about)
 
     # ---- places ------------------------------------------------------------------------------------------------------
 
@@ -103,7 +106,7 @@ class Walls:
         """How far obstacle k takes points [m] that it holds on a drift, shape (points, 3)."""
         out = np.tile(drift[k], (len(points), 1))
         if k in self.place_of:
-            arm = points - places[k] - about
+            arm = points - places[k] - self.away[k] - about
             out += rotations.turned(rotations.quaternion(drift[self.place_of[k]]), arm) - arm
         return out
 

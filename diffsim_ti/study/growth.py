@@ -57,7 +57,7 @@ def growth(
     largest = sizes.max(0)
     half = len(times) // 2
     rate = float(np.polyfit(times[half:], np.log(np.maximum(largest[half:], 1e-300)), 1)[0])
-    rounding = float(np.finfo(start.positions.dtype).eps)
+    rounding = float(np.finfo(start.displacements.dtype).eps)
     beyond = np.flatnonzero(largest * rounding > useful)
     return Growth(times, sizes, rate, float(times[beyond[0]]) if len(beyond) else None)
 

@@ -16,7 +16,7 @@ def positive(argument: str, value: ArrayLike, unit: str, plain: str = "") -> Inp
 def place(argument: str, value: ArrayLike, plain: str) -> Input:
     """A point of an obstacle's shape: 3 numbers [m]."""
     present(argument, value)
-    return Input(argument, value, ((3,),), "m", change=length, plain=plain)
+    return Input(argument, value, ((3,),), "m", change=length, plain=plain, axes="xyz")
 
 
 def extent(argument: str, value: ArrayLike, plain: str) -> Input:

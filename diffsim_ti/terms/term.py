@@ -79,6 +79,20 @@ class Term(ABC):
         """
         return []
 
+    @property
+    def says_places(self) -> bool:
+        """Whether some of its inputs, but for the point that it turns about, are said to be places."""
+        return any(i.axes and i.name != "about" for i in self.described)
+
+    def shift(self, origin: np.ndarray) -> np.ndarray:
+        """What the numbers that kernels take as they are have less where places are measured from `origin` [m]."""
+        return np.concatenate([np.zeros(0), *(i.shift(origin) for i in self.described if i.value is not None)])
+
+    def nearer(self, origin: np.ndarray, length: float, names: dict[str, str], own: str) -> list[Link]:
+        """Links from places that need not be where they are to places near `origin` [m], by body lengths [m]; each writes
+        what kernels take for the first that it reads."""
+        return []
+
     def sizes(self, mesh: TetrahedralMesh) -> dict[str, int]:
         """What words for lengths in the shapes of its inputs mean."""
         return {}

@@ -111,7 +111,7 @@ def _anchors(given: Sequence[Point], plain: str) -> list[Input]:
         return []
     value = own[0].given if len(own) == 1 else np.concatenate([np.atleast_2d(point.position) for point in own])
     shapes = (("anchors", 3),) if np.ndim(value) == 2 else ((3,), ("anchors", 3))
-    return [Input("anchors", value, shapes, "m", change=length, plain=plain, label="anchors")]
+    return [Input("anchors", value, shapes, "m", change=length, plain=plain, label="anchors", axes="xyz")]
 
 
 def _points(mesh: TetrahedralMesh, given: Point, kind: str) -> list[tuple]:

@@ -46,7 +46,12 @@ class DifferentiableBarrierContact:
         numbers = dict(ground_height=self.ground_height, barrier_stiffness=self.kappa, barrier_width=self.d_hat)
         if self.term().has_friction:
             numbers |= dict(friction=self.friction, friction_speed=self.friction_speed)
-        return {name: torch.as_tensor(x, dtype=like.dtype, device=like.device) for name, x in numbers.items()}
+        out = {name: torch.as_tensor(x, dtype=like.dtype, device=like.device) for name, x in numbers.items()}
+        if not isinstance(self.ground_height, torch.Tensor):  # a place, which may be far from the origin
+            out["ground_height"] = torch.tensor(self.ground_height, dtype=torch.float64, device=like.device)
+        elif self.ground_height.dtype == torch.float64:
+            out["ground_height"] = self.ground_height.to(like.device)
+        return out
 
     def barrier_potential(self, d: torch.Tensor) -> torch.Tensor:
         """Energy [J] at distances d [m], elementwise."""

@@ -30,7 +30,7 @@ class _BatchNode(torch.autograd.Function):
     def forward(ctx, batch: Batch, names: tuple, kept: list, *tensors):
         values = {}
         for name, tensor in zip(names, tensors):
-            value = tensor.detach().to("cpu", torch.float64).numpy()
+            value = tensor.detach().to("cpu", torch.promote_types(tensor.dtype, torch.float32)).numpy()
             if name == "initial_displacements":
                 name, value = "initial_positions", batch.scene.inputs.values["rest_positions"] + value
             values[name] = value

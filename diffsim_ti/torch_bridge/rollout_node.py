@@ -7,6 +7,7 @@ import numpy as np
 
 from diffsim_ti.batch import Batch
 from diffsim_ti.checked import numbers
+from diffsim_ti.origin import START_NEARER, warn_of_rounding
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.torch_bridge.autograd import first_order_only, refuse_transforms, torch, uncompiled
 from diffsim_ti.torch_bridge.batch_node import TorchBatchFrames, batch_frames
@@ -23,7 +24,8 @@ class _States(NamedTuple):
 
 
 class TorchFrames(_States):
-    """Saved states as tensors of shape (frames, num_vertices, 3): positions [m], velocities [m/s], displacements [m].
+    """Saved states as tensors of shape (frames, num_vertices, 3): positions [m] (far from the origin in float64), velocities
+    [m/s], displacements [m].
 
     `outputs` has what the Rollout was told to compute besides, by name; `frames["name"]` gives any of them.
     """
@@ -69,7 +71,8 @@ class _OutputNode(torch.autograd.Function):
     @staticmethod
     def forward(ctx, rollout: Rollout, name: str, frames, names: tuple, *tensors):
         ctx.rollout, ctx.name, ctx.frames, ctx.names, ctx.tensors = rollout, name, frames, names, tensors
-        return torch.from_numpy(np.array(frames[name])).to(tensors[0])
+        dtype = torch.float64 if rollout.scene.origin.any() else tensors[0].dtype
+        return torch.from_numpy(np.array(frames[name])).to(tensors[0].device, dtype)
 
     @staticmethod
     @first_order_only(REMEDY)
@@ -142,8 +145,10 @@ def rollout_frames(rollout: Rollout | Batch, **tensors: torch.Tensor) -> TorchFr
     for name in rollout.computed:
         around = ("positions", "velocities", *rollout.sweep.noted, *names)
         outputs[name] = _OutputNode.apply(rollout, name, kept[0], around, *states, *tensors.values())
+    warn_of_rounding("displacements", displacements.detach(), rollout.scene.mesh, START_NEARER)
+    like = displacements.double() if rollout.scene.origin.any() else displacements
     if "rest_positions" not in tensors:
-        rest = torch.from_numpy(np.array(rollout.values["rest_positions"])).to(displacements)
+        rest = torch.from_numpy(np.array(rollout.values["rest_positions"])).to(like)
         return TorchFrames(rest + displacements, velocities, displacements, outputs)
-    rest = tensors["rest_positions"].to(displacements)  # the reverse sweep gives the gradient of positions = rest + u
+    rest = tensors["rest_positions"].to(like)  # the reverse sweep gives the gradient of positions = rest + u
     return TorchFrames(rest.detach() + displacements, velocities, displacements + (rest.detach() - rest), outputs)

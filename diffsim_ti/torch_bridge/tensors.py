@@ -66,7 +66,7 @@ class TensorStart:
     def __call__(self, workspace) -> None:
         given, values, pair = next(iter(self.start.values())), workspace.arrays.values, []
         for name, loaded in zip(START, (values.displacement, values.velocity)):
-            pair.append(self.start[name] if name in self.start else torch.tensor(loaded).to(given))
+            pair.append(self.start[name] if name in self.start else torch.tensor(loaded).to(given).contiguous())
         self.face.copy("in", [x[None] for x in pair], (workspace.state.u, workspace.state.v))
 
 
@@ -166,7 +166,7 @@ class TensorRollout:
             if direct and name in START:
                 start[name] = tensor
                 continue
-            value = tensor.detach().to("cpu", torch.float64).numpy()  # the run keeps a copy of its own
+            value = tensor.detach().to("cpu", torch.promote_types(tensor.dtype, torch.float32)).numpy()
             if name == "initial_displacements":
                 name, value = "initial_positions", self.rollout.values["rest_positions"] + value
             values[name] = value

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 
+from diffsim_ti.origin import middle_far_part
 from diffsim_ti.visual.frame import Frame, Setting
 from diffsim_ti.writers.writer import Writer, register
 
@@ -17,7 +18,8 @@ class GltfWriter(Writer):
     """Writes the body's surface and the obstacles when it is closed; until then their places are kept in memory.
 
     Each frame is a morph target, whose weight the animation brings to 1 at the frame's time [s] and leads linearly to the
-    next. Places are those of the first frame and float32 differences to it [m], y upwards. A body has one colour: what a
+    next. Places are those of the first frame, of what is far from the origin less a translation (origin.py), and float32
+    differences to it [m], y upwards. A body has one colour: what a
     field shows cannot move in glTF, .vtu and films have it.
     Khronos Group 2021, glTF 2.0 Specification, sections 3.7.2 (morph targets) and 3.11 (animations).
     """
@@ -79,9 +81,9 @@ class Content:
 
     def add_surface(self, name: str, triangles: np.ndarray, places: list, times: int | None, colour: tuple) -> None:
         """Triangles that go through `places`, at the times of an accessor."""
-        first, changes = places[0], [x - places[0] for x in places[1:]]
+        changes, away = [x - places[0] for x in places[1:]], middle_far_part(places[0])
         shape = dict(
-            attributes=dict(POSITION=self.add(first, ARRAY, limits=True)),
+            attributes=dict(POSITION=self.add(places[0] - away, ARRAY, limits=True)),
             indices=self.add(triangles.ravel().astype(np.uint32), ELEMENTS),
             material=len(self.parts["materials"]),
         )
@@ -91,7 +93,7 @@ class Content:
         self.parts["meshes"].append(
             dict(name=name, primitives=[shape]) | (dict(weights=[0.0] * len(changes)) if changes else {})
         )
-        self.parts["nodes"].append(dict(name=name, mesh=node))
+        self.parts["nodes"].append(dict(name=name, mesh=node) | (dict(translation=away.tolist()) if away.any() else {}))
         look = dict(baseColorFactor=[*colour, 1.0], metallicFactor=0.0, roughnessFactor=0.8)
         self.parts["materials"].append(dict(name=name, pbrMetallicRoughness=look, doubleSided=True))
         if changes:

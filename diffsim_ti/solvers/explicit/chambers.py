@@ -37,7 +37,7 @@ class Chambers:
             first_row=ints([rows.start for rows in self.rows]),
             begins=ints(np.cumsum([0, *counts])),
             anchor=ints([e.triangles[0, 0] if e.point is None else -1 for e in closed]),
-            point=runtime.upload(np.array([zero if e.point is None else e.point for e in closed]), a.vector),
+            point=runtime.upload(np.array([zero if e.point is None else e.point - a.origin for e in closed]), a.vector),
             volume=runtime.array(a.fp, self.count * self.parts),
             felt=runtime.array(a.fp, self.count * self.parts),
         )

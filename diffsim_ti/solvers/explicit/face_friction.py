@@ -96,7 +96,7 @@ class FaceFriction:
                 continue
             pose, h = 3 * self.a.walls.place_of[o], rub.now.h
             turn = h * rub.walls[pose + 2]
-            r = y[own] - rub.walls[3 * o] - self.a.values.parameters[self.numbers[k] + 2 :][:3]
+            r = y[own] - self.a.origin - rub.walls[3 * o] - self.a.values.parameters[self.numbers[k] + 2 :][:3]
             yield k, own, pose, r, rotations.left_jacobian(turn), rotations.turned(rotations.quaternion(turn), r)
 
     def _wall(self, rub: Rubbing, y: np.ndarray) -> np.ndarray:

@@ -30,7 +30,9 @@ class Ground(Obstacle):
     """
 
     def __init__(self, height: float = 0.0, stiffness: float | None = None, width: float = 0.01, **options):
-        super().__init__([Input("height", height, ((),), "m", plain="ground_height")], stiffness, width, **options)
+        super().__init__(
+            [Input("height", height, ((),), "m", plain="ground_height", axes="y")], stiffness, width, **options
+        )
 
     def distance(self, positions: np.ndarray) -> np.ndarray:
         return positions[:, 1] - float(self.values["ground_height"])

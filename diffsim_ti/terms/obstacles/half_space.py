@@ -7,6 +7,8 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti.checked import present
 from diffsim_ti.inputs import Input
+from diffsim_ti.inputs.links import NearestPoint
+from diffsim_ti.origin import far_part
 from diffsim_ti.runtime import traced
 from diffsim_ti.terms.described import place
 from diffsim_ti.terms.obstacles import shapes
@@ -47,6 +49,12 @@ class HalfSpace(Obstacle):
     def distance(self, positions):
         n = self.values["half_space_normal"]
         return (positions - self.values["half_space_point"]) @ (n / np.linalg.norm(n))
+
+    def nearer(self, origin, length, names, own):
+        n, away = self.values["half_space_normal"], self.values["half_space_point"] - origin
+        if not far_part(away - n * (n @ away) / (n @ n), length).any():
+            return []
+        return [NearestPoint(names["half_space_point"], names["half_space_normal"], f"{own} point", origin)]
 
     def floor_height(self):
         upwards = np.allclose(shapes.unit(self.values["half_space_normal"]), [0, 1, 0])

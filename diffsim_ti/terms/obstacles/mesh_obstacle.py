@@ -1,11 +1,13 @@
 """A closed triangle mesh as an obstacle: its signed distance on a grid, between whose points cubic B-splines are C2."""
 
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
 import taichi as ti
 from numpy.typing import ArrayLike
 
+from diffsim_ti.origin import OF_WIDTHS, middle_far_part, rounding_of
 from diffsim_ti.runtime import at, let, traced
 from diffsim_ti.terms.described import place
 from diffsim_ti.terms.obstacles.obstacle import Obstacle, ObstacleForce
@@ -33,6 +35,9 @@ class MeshObstacle(Obstacle):
         **options,
     ):
         super().__init__([place("position", position, "mesh_position")], **options)
+        if rounding_of(vertices) > OF_WIDTHS * self.values["barrier_width"]:
+            coarse = f"float32 resolves vertices to {rounding_of(vertices):.2g} m, too little for the barrier's width"
+            warnings.warn(f"MeshObstacle: {coarse}: give them in float64", stacklevel=2)
         vertices, triangles = np.asarray(vertices, np.float64), np.asarray(triangles, np.int64)
         check_closed(vertices, triangles)
         if int(resolution) != resolution or resolution < 4:
@@ -41,9 +46,10 @@ class MeshObstacle(Obstacle):
         cell = (high - low).max() / resolution
         pad = float(self.values["barrier_width"]) + 2 * cell
         counts = np.ceil((high - low + 2 * pad) / cell).astype(int) + 1
-        self.origin, self.cell, self.counts = low - pad, float(cell), tuple(int(n) for n in counts)
+        self._base = middle_far_part(vertices)
+        self.origin, self.cell, self.counts = low - self._base - pad, float(cell), tuple(int(n) for n in counts)
         self._surface = vertices, triangles
-        axes = [self.origin[d] + cell * np.arange(counts[d]) for d in range(3)]
+        axes = [self._base[d] + self.origin[d] + cell * np.arange(counts[d]) for d in range(3)]
         points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
         from scipy.ndimage import spline_filter
 
@@ -60,6 +66,12 @@ class MeshObstacle(Obstacle):
 
     def distance(self, positions):
         return self._exact(positions - self.values["mesh_position"])
+
+    def shift(self, origin):
+        """The grid is measured from `_base`, which the position has more."""
+        out = super().shift(origin)
+        out[:3] -= self._base
+        return out
 
     def surface(self, size):
         points, triangles = self._surface

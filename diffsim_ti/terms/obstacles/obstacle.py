@@ -50,6 +50,7 @@ class Obstacle(Term):
     scene lists them. Swapping two there, at 90 degrees to each other, moved a body by 7e-4 of the way that it went in 32 ms
     with substeps of 2 ms, and a gradient by up to 12 % (that of friction_speed); half of both with 1 ms. Elsewhere, and in
     implicit steps, swapping changes round-off alone.
+    A shape of one's own says of its inputs which are places, Input(..., axes="xyz"), of a height axes="y" (origin.py).
     Raises ValueError for numbers out of range, both stiffnesses at once, or a body that starts on or in the obstacle.
     Li et al. 2020, Incremental Potential Contact, doi:10.1145/3386569.3392425.
     """
