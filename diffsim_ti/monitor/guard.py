@@ -116,6 +116,9 @@ class Guard:
                 balance.before(first, num_passes)
             self.mark(first)
             self._pass(first, stop, num_passes, save_every, recording)
+            self.ws.look_between_points(stop)
+            if self.ws.bending and self.ws.solver.explicit:
+                self.ws.bending.look(stop, runtime.fetch_row(self.ws.state.u, 0))
             if self.ws.watch.crossing() is not None and self.ws.solver.explicit:
                 self._diagnose_crossing(stop, num_passes)
             if self.ws.first_bad_vertex() is not None:
@@ -211,6 +214,7 @@ class Guard:
         for j in range(self.good_pass, bad_by):
             self.mark(j)
             ws.advance(j, j + 1, num_passes)
+            ws.look_between_points(j + 1)
             crossing = ws.watch.crossing()
             if crossing is not None:
                 break

@@ -12,6 +12,7 @@ from diffsim_ti.rollout.checkpoints import choose_checkpoints
 from diffsim_ti.rollout.doubts import warn_of_coarse_steps, warn_of_explosion
 from diffsim_ti.rollout.run import Run, Seed
 from diffsim_ti.solvers.solver import Solver
+from diffsim_ti.state.bending import FacesBend
 
 RECORD_BYTES = 200e6  # up to which the first run of implicit solvers is recorded
 
@@ -64,6 +65,7 @@ class Sweep:
         law_state = places * len(self.scene.law.state_names) / (4 * self.scene.mesh.num_vertices)
         self.checkpoints = choose_checkpoints(self.num_passes, self.state_bytes, every, memory, law_state)
         self.workspace = None  # made by the first run
+        self._bend = 0.0  # how far faces have bent in runs so far [m] (state/bending.py)
         self._name = object()  # that runs bear
         self._loaded = None  # the values that are on the device
         self._current = None  # the run whose frames and snapshots the workspace holds
@@ -112,7 +114,7 @@ class Sweep:
         return self.scene.inputs.derive(values)
 
     def _make_workspace(self, derived):
-        return self.solver.workspace(derived)
+        return self.solver.workspace(derived, self._bend)
 
     def _make_guard(self):
         return Guard(self.workspace)
@@ -181,6 +183,14 @@ class Sweep:
 
     def _forward(self, run: Run, again: bool = False) -> None:
         """All passes; keeps the first snapshots on the way. again: the guard has seen this run come to its end."""
+        while True:
+            try:
+                return self._forward_as_bent(run, again)
+            except FacesBend as bent:
+                self._bend, self._loaded = bent.bend, None
+                self.workspace = self._adjoint = None
+
+    def _forward_as_bent(self, run: Run, again: bool) -> None:
         self._load(run)
         ws, checkpoints = self.workspace, self.checkpoints
         self._guard.restart()
