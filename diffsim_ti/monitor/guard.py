@@ -192,13 +192,17 @@ class Guard:
             "squeezed, or vertices press into a contact)"
         )
         raise Divergence(
-            f"{self.ws.when(step)}: the substep {self.ws.substep:.4g} s {why}: reduce dt, raise "
-            "substeps, or pass allow_unstable=True",
+            f"{self.ws.when(step)}: the substep {self.ws.substep:.4g} s {why}: take substeps of "
+            f"{self._calm_substep(limit):.3g} s (reduce dt, raise substeps), or pass allow_unstable=True",
             step,
             None,
             tet,
             float(limit),
         )
+
+    def _calm_substep(self, stable: float) -> float:
+        """A substep [s] to take where the present one was too long for a state whose stable step is given."""
+        return min(0.5 * self.ws.substep, 0.7 * float(stable)) if stable > 0 else 0.5 * self.ws.substep
 
     def _flies_apart(self) -> bool:
         """Whether vertices cross the body within a substep: no state that a stable step leads to."""
@@ -241,7 +245,7 @@ class Guard:
             remedy = f"the barrier cannot stop it at any step: raise its {stiffer}, or its width"
         stable, _ = self._stable_step()
         if not self.ws.substep <= stable:  # the speed is of the steps' own making
-            stiffness, enough = None, min(0.5 * self.ws.substep, 0.7 * stable)
+            stiffness, enough = None, self._calm_substep(stable)
             remedy = (
                 f"the substep has outgrown the stable step {stable:.3g} s of this state, whose elements are squeezed: "
                 f"reduce the substep to {enough:.3g} s"
@@ -302,8 +306,8 @@ class Guard:
         stable, state = self._stable_step()
         step = self.ws.step_of(j, num_passes)
         why = (
-            f"the substep {self.ws.substep:.4g} s exceeds the stable step {stable:.4g} s {state}: reduce dt, "
-            "raise substeps, or use an implicit solver"
+            f"the substep {self.ws.substep:.4g} s exceeds the stable step {stable:.4g} s {state}: take substeps of "
+            f"{self._calm_substep(stable):.3g} s (reduce dt, raise substeps, or use an implicit solver)"
             if not self.ws.substep <= stable
             else f"the stable step {state} is {stable:.4g} s, so look at forces, contacts, inputs and inverted tetrahedra"
         )

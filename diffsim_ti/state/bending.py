@@ -10,15 +10,15 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.mesh.collision_surface import BOWED, cuts_of
-from diffsim_ti.mesh.face_points import bows, points_of_bow
+from diffsim_ti.mesh.face_points import bow, bows, points_of_bow
 
 
 class FacesBend(Exception):
-    """Faces have bent by `bow` [m] near what they touch, farther than a run takes them for; `bend` is what to take."""
+    """Faces have bent by `off` [m] near what they touch, farther than a run takes them for; `bend` is what to take."""
 
-    def __init__(self, bow: float):
-        super().__init__(f"faces of ten-node tetrahedra have bent by {bow:.3g} m where they touch")
-        self.bend = 2 * bow
+    def __init__(self, off: float):
+        super().__init__(f"faces of ten-node tetrahedra have bent by {off:.3g} m where they touch")
+        self.bend = 2 * off
 
 
 class Bending:
@@ -26,11 +26,12 @@ class Bending:
 
     def __init__(self, workspace):
         self.ws, a = weakref.proxy(workspace), workspace.arrays
-        self.faces, known = a.mesh.surface_faces, 2 * a.bend
+        self.faces, known = a.mesh.surface_faces, 2 * max(bow(a.mesh), a.bend)
         self.limits = [BOWED * float(term.values["barrier_width"]) + known for term in a.contacts]
         self.of_pairs, pair = np.inf, a.self_contact
         if pair:
-            self.of_pairs = BOWED * float(pair.values["self_contact_width"]) * 4 ** cuts_of(a.mesh, pair, a.bend)
+            cut = BOWED * float(pair.values["self_contact_width"]) * 4 ** cuts_of(a.mesh, pair, a.bend)
+            self.of_pairs = max(known, cut)
         self.limit = min([self.of_pairs, *self.limits])
 
     @classmethod

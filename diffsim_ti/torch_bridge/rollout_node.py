@@ -25,14 +25,15 @@ class _States(NamedTuple):
 class TorchFrames(_States):
     """Saved states as tensors of shape (frames, num_vertices, 3): positions [m], velocities [m/s], displacements [m].
 
-    `outputs` has what the Rollout was told to compute besides, by name; `frames["name"]` gives any of them.
+    `outputs` has what the Rollout was told to compute besides, by name; `frames["name"]` gives any of them. `alive`: whether
+    the run came to its end (`Rollout(..., raise_errors=False)`).
     """
 
     outputs: dict[str, torch.Tensor]
 
-    def __new__(cls, positions, velocities, displacements, outputs=None):
+    def __new__(cls, positions, velocities, displacements, outputs=None, alive=True):
         frames = super().__new__(cls, positions, velocities, displacements)
-        frames.outputs = outputs or {}
+        frames.outputs, frames.alive = outputs or {}, alive
         return frames
 
     def __getitem__(self, key):
@@ -144,6 +145,7 @@ def rollout_frames(rollout: Rollout | Batch, **tensors: torch.Tensor) -> TorchFr
         outputs[name] = _OutputNode.apply(rollout, name, kept[0], around, *states, *tensors.values())
     if "rest_positions" not in tensors:
         rest = torch.from_numpy(np.array(rollout.values["rest_positions"])).to(displacements)
-        return TorchFrames(rest + displacements, velocities, displacements, outputs)
+        return TorchFrames(rest + displacements, velocities, displacements, outputs, rollout.alive)
     rest = tensors["rest_positions"].to(displacements)  # the reverse sweep gives the gradient of positions = rest + u
-    return TorchFrames(rest.detach() + displacements, velocities, displacements + (rest.detach() - rest), outputs)
+    displacements, moved = displacements + (rest.detach() - rest), rest.detach() + displacements
+    return TorchFrames(moved, velocities, displacements, outputs, rollout.alive)
