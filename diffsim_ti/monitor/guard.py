@@ -8,8 +8,8 @@ import numpy as np
 from diffsim_ti import runtime
 from diffsim_ti.copies import CarriesMore
 from diffsim_ti.monitor import quantities, stability
+from diffsim_ti.monitor.chatter import Chatter
 from diffsim_ti.monitor.energy_watch import EnergyGained
-from diffsim_ti.state.walls import Moment
 from diffsim_ti.state.watch import place_name
 from diffsim_ti.state.workspace import Workspace
 from diffsim_ti.terms.obstacles.barrier import beta
@@ -60,6 +60,7 @@ class Guard:
         self.good = workspace.history(1)
         self.good_pass = 0
         self._stiffness, self._warned, self._warned_of_gain = None, False, False
+        self.chatter = Chatter.of(workspace)
         self.restart()
 
     def restart(self) -> None:
@@ -130,6 +131,8 @@ class Guard:
             self._passes += stop - first
             if self._passes >= self.every:
                 self._passes = 0
+                if self.chatter:
+                    self.chatter.look(stop, num_passes)
                 self._look_at_step(stop, num_passes)
             first = stop
 
@@ -226,7 +229,7 @@ class Guard:
         ws.watch.put(self._seen)
         k, place, depth = crossing
         term, step, vertices = ws.watch.contacts[k], self.ws.step_of(j, num_passes), ws.watch.vertices_of(place)
-        speeds = [float(np.linalg.norm(ws.velocity_of(i) - self._velocity_of_obstacle(k, j, i))) for i in vertices]
+        speeds = [float(np.linalg.norm(ws.velocity_of(i) - ws.velocity_of_obstacle(k, j, i))) for i in vertices]
         speed, vertex = max(speeds), vertices[int(np.argmax(speeds))]
         width, of_face = float(term.values["barrier_width"]), len(vertices) == 3
         enough = min(0.1 * width / max(speed, 1e-300), (0.25 if of_face else 0.5) * self.ws.substep)
@@ -260,16 +263,6 @@ class Guard:
             speed,
             stiffness,
         )
-
-    def _velocity_of_obstacle(self, k: int, j: int, vertex: int) -> np.ndarray:
-        """At a vertex, when pass j begins [m/s]."""
-        arrays, schedule = self.ws.arrays, self.ws.solver.schedule
-        if arrays.obstacles[k][2] < 0:
-            return np.zeros(3)
-        begin = schedule.begin(j)
-        rows = arrays.walls.value(arrays.rows["path"], Moment(schedule, j, begin, begin))
-        position = arrays.values.rest[vertex] + runtime.fetch(self.ws.state.u)[0, vertex]
-        return arrays.walls.velocity_at(k, rows, position, self.ws.watch.contacts[k].about)
 
     def _stiffness_needed(self, k: int, vertex: int, speed: float) -> float | None:
         """Stiffness [N/m] whose barrier, alone, stops the vertex at a fiftieth of the width; None if the present one can.

@@ -16,6 +16,7 @@ from diffsim_ti.state.arrays import SceneArrays
 from diffsim_ti.state.bending import Bending
 from diffsim_ti.state.history import History, first_bad_vertex
 from diffsim_ti.state.solve_report import SolveReport
+from diffsim_ti.state.walls import Moment
 from diffsim_ti.state.watch import ContactWatch
 
 
@@ -182,6 +183,16 @@ class Workspace:
     def velocity_of(self, vertex: int):
         """Velocity of one vertex [m/s]."""
         return runtime.fetch(self.state.v)[0, vertex]
+
+    def velocity_of_obstacle(self, k: int, j: int, vertex: int) -> np.ndarray:
+        """At a vertex, when pass j begins [m/s]."""
+        arrays, schedule = self.arrays, self.solver.schedule
+        if arrays.obstacles[k][2] < 0:
+            return np.zeros(3)
+        begin = schedule.begin(j)
+        rows = arrays.walls.value(arrays.rows["path"], Moment(schedule, j, begin, begin))
+        position = arrays.values.rest[vertex] + runtime.fetch(self.state.u)[0, vertex]
+        return arrays.walls.velocity_at(k, rows, position, self.watch.contacts[k].about)
 
     def restore_to_record(self) -> None:
         """Copy the current state to slot 0 of the record."""
