@@ -71,7 +71,7 @@ class Sweep:
         self.workspace = None  # made by the first run
         self._bend = 0.0  # how far faces have bent in runs so far [m] (state/bending.py)
         self._name = object()  # that runs bear
-        self._loaded = None  # the values that are on the device
+        self._loaded, self._started = None, False  # the values that are on the device; whether the run began elsewhere
         self._current = None  # the run whose frames and snapshots the workspace holds
         self._adjoint = None  # the solver's, made by the first pull-back
         self.contact_change = self.chamber_change = None  # of the contact forces and chambers, by the last tangent
@@ -184,6 +184,8 @@ class Sweep:
         values = run.values
         if self._loaded is not None and all(value is self._loaded[name] for name, value in values.items()):
             self.workspace.restart()
+            if self._started:
+                self.workspace.check_apart()
         else:
             derived, self._loaded = self._derive(values), None
             if self.workspace is None:
@@ -196,7 +198,8 @@ class Sweep:
             else:
                 self.workspace.load(derived)
             self._loaded = values
-        if run.start is not None:
+        self._started = run.start is not None  # elsewhere than the values say
+        if self._started:
             run.start(self.workspace)
             self.workspace.forget()
 
