@@ -70,6 +70,7 @@ class Simulator:
     def _take_bent(self, bend: float) -> None:
         """Go on from before the step with faces that bend by so much [m]."""
         old, before = self.workspace, self._before
+        old.report.substeps -= self.solver.num_passes(1)  # which are done again
         self._make_workspace(bend)
         self.workspace.restore(before, 0)
         self.workspace.report, self.workspace.watch.earlier = old.report, [old.watch.resolution()]

@@ -4,6 +4,7 @@ Contact takes a face for the four triangles of its nodes, unless it was curved f
 Where a face has bent farther, the run that finds it is done again with faces as curved as they are.
 """
 
+import warnings
 import weakref
 
 import numpy as np
@@ -48,7 +49,15 @@ class Bending:
         if not off.max(initial=0) > self.limit:  # nor where it is not finite
             return
         if self.ws.pairs and self.ws.pairs.list.count and off.max() > self.of_pairs:
-            raise FacesBend(float(off.max()))
+            bend, width = FacesBend(float(off.max())), self.ws.pairs.width
+            left = bend.bend / 2 / 4 ** cuts_of(a.mesh, a.self_contact, bend.bend)
+            if left > width:
+                warnings.warn(
+                    f"{bend}, and lie up to {left:.3g} m from the triangles of SelfContact, more than its width {width:.3g} "
+                    f"m: refine the mesh, or take a width of {left:.3g} m",
+                    stacklevel=7,
+                )
+            raise bend
         self.ws.place_obstacles(now)
         places = runtime.fetch(a.offsets).astype(np.float64)
         for k, (term, limit) in enumerate(zip(a.contacts, self.limits)):
