@@ -12,7 +12,7 @@ from diffsim_ti.terms.gravity import Gravity
 from diffsim_ti.terms.motion import Motion
 from diffsim_ti.terms.obstacles.obstacle_force import ObstacleForce
 from diffsim_ti.terms.obstacles.shapes import Triangles
-from diffsim_ti.terms.obstacles.stiffness import TIMES, pressed_by, speed_over_time, stiffness_of_impact
+from diffsim_ti.terms.obstacles.stiffness import approach, over_time, pressed_by, stiffness_of_impact
 from diffsim_ti.terms.pose import brought_back, carried, path_width, sampled_path
 from diffsim_ti.terms.term import Term
 
@@ -144,8 +144,13 @@ class Obstacle(Term):
         start = np.zeros(3) if self.path is None else sampled_path(self.path_name, self.path, [0.0])[0]
         fall = max(float(self.gap(positions, start).min()), 0.0)
         first = 0.0 if initial_velocities is None else np.linalg.norm(np.atleast_2d(initial_velocities), axis=1).max()
-        led = 0.0 if scene.motion is None else speed_over_time(scene.supports.rows(scene.motion, TIMES))
-        own = 0.0 if self.path is None else speed_over_time(sampled_path(self.path_name, self.path, TIMES)[:, :3])
+        led = own = 0.0
+        if scene.motion is not None:
+            moves = over_time(lambda t: scene.supports.rows(scene.motion, t))
+            led = approach([self.gap(positions[scene.held] + x, start) for x in moves])
+        if self.path is not None:
+            rows = over_time(lambda t: sampled_path(self.path_name, self.path, t))
+            own = approach([self.gap(positions, row) for row in rows])
         speed, width = float(np.sqrt(first**2 + 2 * g * fall)) + led + own, float(self.values["barrier_width"])
         mean, mesh = float(np.mean(density)), scene.mesh
         pressed = pressed_by(scene.terms, mesh, mean)

@@ -1,6 +1,9 @@
 """How stiff a barrier must be: from density, speed of waves, impact and weight."""
 
+from collections.abc import Callable
+
 import numpy as np
+from numpy.typing import ArrayLike
 
 from diffsim_ti.materials.moduli import pressure_wave_speed
 
@@ -29,13 +32,18 @@ def pressed_by(terms, mesh, density: float) -> float:
     size, total = np.ptp(mesh.bounding_box, 0), 0.0
     section = float(np.sort(size)[:2].prod())
     for term in terms:
-        kind, most = type(term).__name__, {i.plain: _most(term, i) for i in term.described}
+        kind, most = type(term).__name__, {}
+        if kind in ("Muscle", "Cable", "Traction", "Pressure", "GasChamber", "BodyForce", "ExternalForce"):
+            most = {described.plain: _most(term, described) for described in term.described}
         if kind == "Muscle":
             total += most["muscle_stress"] * max(1.0, most["activation"])
         elif kind == "Cable":
             total += sum(x for name, x in most.items() if "tension" in name) / section
-        elif kind in ("Traction", "Pressure", "GasChamber"):
-            total += sum(x for name, x in most.items() if name in ("traction", "pressure", "gas_pressure"))
+        elif kind in ("Traction", "Pressure"):
+            total += sum(most.values())
+        elif kind == "GasChamber":
+            outside = most.pop("outside_pressure")
+            total += abs(most[term.described[0].plain] - outside)
         elif kind == "BodyForce":
             total += most["body_force"] * (density if term.per == "mass" else 1.0) * float(size.max())
         elif kind == "ExternalForce":
@@ -45,11 +53,22 @@ def pressed_by(terms, mesh, density: float) -> float:
 
 def _most(term, described) -> float:
     """The largest amount of a number, or of rows of three, over time."""
-    value = term.rows(TIMES) if described.value is None and hasattr(term, "rows") else described.value
+    value = over_time(term.rows) if described.value is None and hasattr(term, "rows") else described.value
     value = np.abs(np.zeros(1) if value is None else np.asarray(value, np.float64))
     return float((np.linalg.norm(value, axis=-1) if value.shape[-1:] == (3,) else value).max(initial=0.0))
 
 
-def speed_over_time(places: np.ndarray) -> float:
-    """The largest speed [m/s] of places at TIMES, shape (len(TIMES), ..., 3)."""
-    return float((np.linalg.norm(np.diff(places, axis=0), axis=-1) / np.diff(TIMES)[0]).max(initial=0.0))
+def over_time(rows: Callable[[list[float]], ArrayLike]) -> np.ndarray:
+    """What a function of times says at TIMES, as far as it can be asked: one may know those of its run alone."""
+    out = [np.asarray(rows([0.0]))[0]]
+    for t in TIMES[1:]:
+        try:
+            out.append(np.asarray(rows([t]))[0])
+        except (IndexError, KeyError, ValueError, FloatingPointError):
+            break
+    return np.array(out)
+
+
+def approach(gaps: ArrayLike) -> float:
+    """The largest speed [m/s] with which gaps [m] at TIMES close, shape (times, k)."""
+    return float(-np.diff(gaps, axis=0).min(initial=0.0) / np.diff(TIMES)[0])
