@@ -208,7 +208,6 @@ PRESSING = {
     "traction": (dict(terms=[ds.Traction(lambda t: (0, -4e4 * t, 3e4 * t))]), 1e5),
     "body force": (dict(terms=[ds.BodyForce((0, -50.0, 0), per="mass")]), 2 * 1000 * 50 * 0.2),
     "force": (dict(terms=[ds.ExternalForce((0, -40.0, 0), vertices=[0, 1])]), 2 * 2 * 40 / 0.2**2),
-    "gas": (dict(terms=[ds.GasChamber(1.2e5, outside=1e5)]), 4e4),
     "two": (dict(terms=[ds.Pressure(3e4), ds.Muscle([0, 1, 0], 4e4, 0.0)]), 1.4e5),
 }
 
