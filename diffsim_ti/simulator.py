@@ -15,6 +15,7 @@ from diffsim_ti.origin import positions_of
 from diffsim_ti.outputs import Output
 from diffsim_ti.rollout.frames import Frames
 from diffsim_ti.solvers.solver import Solver
+from diffsim_ti.state.bending import FacesBend
 from diffsim_ti.state.solve_report import SolveReport
 from diffsim_ti.state.watch import ContactResolution
 from diffsim_ti.terms import ExternalForce
@@ -55,14 +56,32 @@ class Simulator:
         self.solver, self.scene = solver, solver.scene
         solver.simulator = weakref.ref(self)
         self._start = solver.start_values()
-        self.workspace = solver.workspace(self._start)
         self._notes, self._settled = bool(contact_forces), {}
-        if contact_forces:
+        self._make_workspace()
+        self.reset()
+
+    def _make_workspace(self, bend: float = 0.0) -> None:
+        self.workspace = self.solver.workspace(self._start, bend)
+        if self._notes:
             self.workspace.make_frames(2)
             self.workspace.record_contacts()
         self._guard = Guard(self.workspace)
         self._before = self.workspace.history(1)
-        self.reset()
+
+    def _take_bent(self, bend: float) -> None:
+        """Go on from before the step with faces that bend by so much [m]."""
+        old, before = self.workspace, self._before
+        old.report.substeps -= self.solver.num_passes(1)  # which are done again
+        self._make_workspace(bend)
+        self.workspace.restore(before, 0)
+        self.workspace.report, self.workspace.watch.earlier = old.report, [old.watch.resolution()]
+        if old.arrays.rows["forces"] is not None:
+            self.workspace.arrays.load_rows(forces=old.arrays.rows["forces"])
+        self._load_step()
+        self.workspace.place_obstacles(0)
+        if self.workspace.pairs:
+            self.workspace.pairs.forget(self.workspace.state.u)
+        self.workspace.check_apart()
 
     def __reduce__(self):
         raise TypeError(
@@ -97,6 +116,9 @@ class Simulator:
         try:
             with self.workspace.report.of_passes(passes):
                 self._guard.advance(0, passes, passes, int(self._notes))
+        except FacesBend as bent:
+            self._take_bent(bent.bend)
+            return self.step()
         except FloatingPointError:
             self.workspace.restore(self._before, 0)
             if self._notes:

@@ -201,6 +201,41 @@ def test_the_scene_chooses_it_by_the_impact():
     assert chosen[0] == pytest.approx(chosen[1]) and chosen[0] > 0
 
 
+PRESSING = {
+    "muscle": (dict(terms=[ds.Muscle([0, 1, 0], 4e4, 0.0)]), 8e4),  # twice, for what is laid on suddenly
+    "muscle over time": (dict(terms=[ds.Muscle([0, 1, 0], 2e4, lambda t: 1.5 * t)]), 6e4),
+    "pressure": (dict(terms=[ds.Pressure(3e4)]), 6e4),
+    "traction": (dict(terms=[ds.Traction(lambda t: (0, -4e4 * t, 3e4 * t))]), 1e5),
+    "body force": (dict(terms=[ds.BodyForce((0, -50.0, 0), per="mass")]), 2 * 1000 * 50 * 0.2),
+    "force": (dict(terms=[ds.ExternalForce((0, -40.0, 0), vertices=[0, 1])]), 2 * 2 * 40 / 0.2**2),
+    "two": (dict(terms=[ds.Pressure(3e4), ds.Muscle([0, 1, 0], 4e4, 0.0)]), 1.4e5),
+}
+
+
+@pytest.mark.parametrize("kind", PRESSING)
+def test_the_scene_chooses_it_by_what_presses(kind):
+    """k = (rho c v + ... + 2 p) / (1.19 w), p of all that can press."""
+    options, pressure = PRESSING[kind]
+    mesh = ds.TetrahedralMesh.create_cube(resolution=2, size=0.2).translated((0, 0.05, 0))
+
+    def chosen(terms=()):
+        scene = ds.Scene(mesh, SOFT, terms=[ds.Gravity(), ds.Ground(name="floor", width=0.01), *terms])
+        return float(scene.inputs.values["floor.stiffness_per_area"])
+
+    assert 1.19 * 0.01 * (chosen(options["terms"]) - chosen()) == pytest.approx(pressure, rel=1e-9)
+
+
+def test_the_scene_chooses_it_by_what_moves():
+    mesh = ds.TetrahedralMesh.create_cube(resolution=2, size=0.2).translated((0, 0.05, 0))
+    still = ds.Scene(mesh, SOFT, terms=[ds.Ground(name="floor")], initial_velocities=(0, -0.8, 0))
+    path = ds.Scene(mesh, SOFT, terms=[ds.Ground(name="floor", path=lambda t: [0, 0.8 * t, 0])])
+    led = ds.Scene(
+        mesh, SOFT, terms=[ds.Ground(name="floor")], fixed="ymax", motion=([0, 1], [[0, 0, 0], [0, -0.8, 0]])
+    )
+    chosen = [float(scene.inputs.values["floor.stiffness_per_area"]) for scene in (still, path, led)]
+    assert chosen[1:] == pytest.approx([chosen[0]] * 2)
+
+
 def test_advice_is_in_the_unit_of_the_obstacle():
     mesh = ds.TetrahedralMesh.create_cube(resolution=2, size=0.2).translated((0, 0.0105, 0))
     for stiff, words in (

@@ -1,5 +1,6 @@
 """No vertex gets through an obstacle in silence."""
 
+import numpy as np
 import pytest
 from contact_scenes import EXPLICIT, FORCE, SHAPES, points, tetrahedron
 
@@ -122,3 +123,25 @@ def test_moving_obstacles_in_forward_runs():
     run.advance()
     assert run.seen.crossed == 0 and 0 < run.seen.gap < 0.03
     assert run.simulator.velocities[:, 0].mean() > 1.0
+
+
+@pytest.mark.parametrize("solver", FORCE)
+def test_a_run_that_fails_may_be_marked(solver):
+    """As in a Batch: frames hold the last good state, gradients are zero, and the next run is as if nothing had been."""
+    scene = points(tetrahedron(0.035), ds.Ground(stiffness=1e2), initial_velocities=[0.1, -0.3, 0])
+    rollout = ds.Rollout(solver(scene, dt=1e-3), 120, save_every=10, raise_errors=False)
+    failed = np.tile([0.1, -1.0, 0], (4, 1))
+    frames = rollout.forward(initial_velocities=failed)
+    assert not frames.alive and not rollout.alive and isinstance(frames.error, ds.Crossing)
+    last = frames.error.step // 10
+    assert (frames.positions[: last + 1, :3, 1] > 0).all() and (frames.positions[last:] == frames.positions[last]).all()
+    with pytest.warns(UserWarning, match="gradient of a run that was stopped is zero"):
+        gradients = rollout.vjp(frames, positions=np.ones_like(frames.positions))
+    assert not any(np.any(x) for x in gradients.values())
+    with pytest.raises(ds.Crossing):
+        rollout.jvp(frames, barrier_width=1.0)
+    good, alone = rollout.forward(), ds.Rollout(rollout.solver, 120, save_every=10).forward()
+    assert good.alive and (good.positions == alone.positions).all()
+    assert np.any(rollout.vjp(good, positions=np.ones_like(good.positions))["initial_velocities"])
+    with pytest.raises(ds.Crossing):
+        ds.Rollout(rollout.solver, 120).forward(initial_velocities=failed)

@@ -298,3 +298,42 @@ def test_faces_push_no_vertex_through_a_wall(solver):
     rollout = ds.Rollout(solver(scene, dt=1e-3, contact_damping=0.02), 22, save_every=1, gradients="all")
     assert min(wall.gap(x).min() for x in rollout.forward().positions) > 0
     assert ds.dot_product_test(rollout) < 1e-11
+
+
+STARTS = np.random.default_rng(3)
+
+
+@pytest.mark.parametrize("solver, precision", [(ds.VelocityVerletSolver, "f64"), (ds.BDF2Solver, "f32")])
+def test_what_starts_in_front_of_a_face_is_not_behind_it(solver, precision):
+    """A needle points at a face, an edge, a corner of a cube, so that its gap is known: what does not touch stays, and what
+    touches runs on."""
+    mesh = ds.TetrahedralMesh.create_box(2, size=SIZE)
+    touched = 0
+    cases = (5e-4, 6.0, [1, 0, 0]), (5e-4, 0.02, [0, 1, 0]), (5e-3, 0.05, [0, 1, 1]), (5e-3, 3.0, [1, 1, 1])
+    for width, gap, outwards in cases:  # gaps in widths
+        n = np.array(outwards) / np.linalg.norm(outwards)
+        at = np.where(n > 0, SIZE, STARTS.uniform(0.3, 0.7, 3) * SIZE)
+        start = at + (gap * width + 1e-3) * n
+        needle = ds.Capsule(start, start + 0.3 * n, 1e-3, width=width, stiffness_per_area=1e7)
+        scene = ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3), terms=[needle], fixed="xmin", precision=precision)
+        simulator = ds.Simulator(solver(scene, dt=1e-4))
+        simulator.run(2)
+        if gap > 1.4:
+            assert not simulator.velocities.any()
+        else:
+            touched += simulator.velocities.any()
+    assert touched
+
+
+def test_a_needle_that_starts_near_still_does_not_slip_between_points():
+    """Points reach less far where a body starts near an obstacle: what gets between them is found all the same."""
+    mesh = ds.TetrahedralMesh.create_box(2, size=SIZE)
+    at = np.array([0.43, 1, 0.41]) * SIZE
+    needle = ds.Capsule(
+        at + [0, 6e-4, 0], at + [0, 0.3, 0], 1e-4, width=5e-3, stiffness_per_area=1e3, path=lambda t: [0, -t, 0]
+    )
+    scene = ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3), terms=[needle], fixed="ymin", precision="f64")
+    simulator = ds.Simulator(ds.VelocityVerletSolver(scene, dt=1e-4))
+    assert simulator.workspace.faces.is_shortened
+    with pytest.raises(ds.Crossing, match="face .* behind Capsule"):
+        simulator.run(60)

@@ -1,5 +1,8 @@
 """Coulomb friction: sticking, sliding, stopping, and that it only ever slows."""
 
+import re
+import warnings
+
 import numpy as np
 import pytest
 from contact_scenes import BASE, FORCE, RESTING, G, points, resting_gap, tetrahedron
@@ -136,3 +139,25 @@ def test_two_rough_walls_act_one_after_the_other(solver):
     )
     end = ds.Rollout(solver(scene, dt=1e-3), 1000).forward()
     assert np.abs(end.positions[-1, 0] - BASE[0] - [0, resting_gap(G), 0]).max() < 1.1e-3  # creep of friction_speed
+
+
+@pytest.mark.parametrize("solver", [ds.VelocityVerletSolver])
+def test_a_block_that_shakes_while_it_slides_says_so_and_viscosity_helps(solver):
+    """From 2 m/s it stops after v^2 / (2 mu g); without viscosity its vibrations grow, and it goes 5 % too far."""
+    mesh, mu = ds.TetrahedralMesh.create_box((3, 2, 3), (0.1, 0.05, 0.1)).translated([0, 9.9e-4, 0]), 0.7
+    floor = ds.Ground(width=1e-3, friction=mu, stiffness_per_area=1e9)
+
+    def way(material):
+        scene = ds.Scene(mesh, material, 1000.0, [ds.Gravity(), floor], initial_velocities=(2, 0, 0), precision="f64")
+        dt = 0.5 * ds.stable_dt(scene).dt
+        simulator = ds.Simulator(solver(scene, dt=dt))
+        simulator.run(int(0.33 / dt))
+        return (simulator.positions - mesh.vertices)[:, 0].mean() / (2**2 / (2 * mu * G))
+
+    block = ds.StableNeoHookean(1e6, 0.3)
+    with pytest.warns(UserWarning, match="slides on Ground.*shakes at") as warned:
+        assert way(block) > 1.02
+    time = float(re.search(r"KelvinVoigt\(StableNeoHookean\(...\), (\S+)\)", str(warned[0].message))[1])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert way(ds.KelvinVoigt(block, time)) == pytest.approx(1, abs=5e-3)

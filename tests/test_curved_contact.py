@@ -198,6 +198,41 @@ def test_a_ball_comes_to_rest_where_the_sphere_would(solver):
     assert abs(lowest(mesh, simulator.positions) + R + 1.2 * W - expected) < 0.15 * W
 
 
+def arch(sag: float) -> tuple[ds.TetrahedralMesh, np.ndarray]:
+    """A bar of few ten-node tetrahedra that is straight in the mesh, and its vertices where it is bent to an arch."""
+    mesh = ds.TetrahedralMesh.create_box((3, 2, 2), (0.4, 0.02, 0.1)).quadratic()
+    x = mesh.vertices.copy()
+    x[:, 1] += sag * np.sin(np.pi * x[:, 0] / 0.4)
+    return mesh, x
+
+
+@pytest.mark.parametrize("solver", [EXPLICIT, IMPLICIT])
+def test_what_bends_in_a_run_is_felt_as_curved(solver):
+    """A tilted plate that comes down on an arch feels the body's own face, not four flat triangles; gradients know it."""
+    mesh, x = arch(0.06)
+    n = np.array([0.3, -1, 0]) / np.hypot(0.3, 1)
+    grid = np.array([[i, j] for i in range(21) for j in range(21 - i)]) / 20
+
+    def nearest(positions):
+        faces = reference_face.functions(grid) @ positions[mesh.surface_faces]
+        return float(((faces - top) @ n).min())
+
+    top = np.zeros(3)
+    top = (nearest(x) - 0.002) * n  # the plate, 2 mm from the arch
+    plate = ds.HalfSpace(top, n, width=0.01, stiffness_per_area=1e7, path=lambda t: [0, -1.0 * t, 0])
+    scene = scene_of(mesh, plate, initial_positions=x, fixed=["xmin", "xmax"])
+    made = solver(scene, dt=2e-5) if solver.explicit else solver(scene, dt=1e-3, tolerance=1e-12)
+    simulator, steps = ds.Simulator(made), 60 if solver.explicit else 4
+    assert not simulator.workspace.arrays.curved
+    for _ in range(steps):
+        simulator.step()
+        assert nearest(simulator.positions) > -simulator.time * 1.0 * abs(n[1]) and simulator.workspace.arrays.curved
+    assert simulator.step_count == steps and np.abs(simulator.velocities).max() > 0.1
+    rollout = ds.Rollout(made, 4, gradients=["initial_positions", "youngs_modulus", "barrier_width"])
+    assert_transposed(rollout, 1e-9)
+    assert rollout.sweep.workspace.arrays.curved
+
+
 def test_straight_edges_and_linear_tetrahedra_know_nothing_of_it():
     cube, ground = ds.TetrahedralMesh.create_cube(2), ds.Ground(-0.01, stiffness=1e3, width=0.02)
     for mesh in (cube, cube.quadratic()):

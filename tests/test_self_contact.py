@@ -1,5 +1,6 @@
 """Contact of bodies with each other and with themselves in runs: motion, gradients, conservation, determinism, refusals."""
 
+import re
 from functools import lru_cache
 
 import numpy as np
@@ -310,7 +311,7 @@ def test_a_width_beyond_many_elements_is_refused():
 def test_tunnelling_is_an_error_that_names_the_pair_and_keeps_the_state():
     solver = crossed_edges(speed=400.0)
     simulator = ds.Simulator(solver)
-    with pytest.raises(ds.Tunnelling, match=r"substep of 0\.0001 s.*shorter step"):
+    with pytest.raises(ds.Tunnelling, match=r"substep of 0\.0001 s.*take substeps of"):
         simulator.run(20)
     simulator.check_surfaces()
     weak = ds.Simulator(
@@ -327,13 +328,35 @@ def test_tunnelling_is_an_error_that_names_the_pair_and_keeps_the_state():
 def test_contact_too_stiff_for_its_step_says_so_and_its_advice_works():
     scene = crossed_edges().scene
     stiff = ds.Simulator(ds.SemiImplicitSolver(scene.replace(terms=[ds.SelfContact(1e9, WIDTH)]), dt=DT))
-    with pytest.raises(ds.Tunnelling, match=r"at .* rad/s is too stiff for it: take a shorter step") as error:
+    with pytest.raises(ds.Tunnelling, match=r"at .* rad/s is too stiff for it: take substeps of") as error:
         stiff.run(200)
-    step = 0.2 / float(str(error.value).split(" rad/s")[0].split()[-1])
+    step = error.value.stable_dt
     shorter = ds.SemiImplicitSolver(stiff.solver.scene, dt=step)
     simulator = ds.Simulator(shorter)
     simulator.run(round(3e-3 / step))
     simulator.check_surfaces()
+
+
+@pytest.mark.parametrize("stiffness, dt", [(1.0, 1e-4), (1e-2, 4e-4), (1e7, 4e-4)])
+def test_a_throw_goes_well_when_the_advice_is_taken(stiffness, dt):
+    """Too weak a contact, steps that are too long, and both: one error, whose numbers are right."""
+    scene, of = two_blocks().scene, dict(substep=dt, stiffness=stiffness)
+
+    def throw():
+        now = scene.replace(terms=[ds.SelfContact(of["stiffness"], WIDTH)])
+        simulator = ds.Simulator(ds.SemiImplicitSolver(now, dt=of["substep"]))
+        simulator.run(int(0.016 / of["substep"]))
+        simulator.check_surfaces()
+        return simulator
+
+    with pytest.raises(ds.Tunnelling, match="take substeps of") as error:
+        throw()
+    said = re.search(r"stiffness to (\S+) N/m", str(error.value))
+    assert (said is None) == (error.value.stiffness is None) == (stiffness > 1e3)
+    of["substep"] = float(re.search(r"substeps of (\S+) s", str(error.value))[1])
+    of["stiffness"] = float(said[1]) if said else stiffness
+    assert of["substep"] == pytest.approx(error.value.stable_dt, rel=0.01)
+    assert throw().smallest_gap() > 0
 
 
 def test_one_per_scene_and_gap_needs_it():

@@ -15,6 +15,8 @@ from diffsim_ti.batch.taped import BatchTapeFace
 from diffsim_ti.checked import as_numbers, instance, whole
 from diffsim_ti.copies import made_again
 from diffsim_ti.inputs import Derived
+from diffsim_ti.mesh.collision_surface import BOWED
+from diffsim_ti.mesh.face_points import bow, bows
 from diffsim_ti.origin import positions_of
 from diffsim_ti.outputs import Output
 from diffsim_ti.rollout.frames import Frames, check_finite
@@ -121,6 +123,9 @@ class Batch:
     def _side_by_side(self, values: dict) -> BatchFrames:
         run, times = self.sweep.run(values), self.one.times
         u, v = self.sweep.states()
+        if self._bend(self._positions(values, u)):
+            self.lanes, self.why_not = False, "ten-node faces bend where they touch"
+            return self._by_turns(values)
         last_good, crossed = np.full(self.num_scenes, self.num_frames - 1), self.sweep.crossed()
         for b in {*np.flatnonzero(~self._sound(u[:, -1], v[:, -1])), *crossed}:
             good = self._sound(u[b], v[b])
@@ -133,6 +138,17 @@ class Batch:
         states = self._positions(values, u), v, u
         frames = LazyFrames(self.num_scenes, lambda b: self._frames_of(values, b, states, times, resolution(b)))
         return BatchFrames(self, values, frames, last_good, run, states=states)
+
+    def _bend(self, positions: np.ndarray) -> bool:
+        """Whether faces are bent in some frame as scenes side by side do not take them (state/bending.py)."""
+        mesh, widths = self.scene.mesh, [float(t.values["barrier_width"]) for t in self.scene.obstacles]
+        if mesh.order == 1 or not widths:
+            return False
+        off = max(bows(x[mesh.surface_faces]).max(initial=0) for x in positions.reshape(-1, mesh.num_vertices, 3))
+        if not off > BOWED * min(widths) + 2 * bow(mesh):
+            return False
+        resolution = self.sweep.resolutions()
+        return any(np.isfinite(resolution(b).smallest_gap) for b in range(self.num_scenes))
 
     def _positions(self, values: dict, u: np.ndarray) -> np.ndarray:
         """Those of all scenes from displacements (scenes, frames, n, 3)."""

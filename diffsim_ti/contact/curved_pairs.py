@@ -20,7 +20,7 @@ ROWS = dict(start="ints", index="ints", weight="scalars")
 
 def pairs_of(kind: type, arrays, parallel: bool):
     """Pairs of a kind (surface_pairs.py, implicit_pairs.py), of a finer surface where faces are curved and smooth."""
-    cuts = cuts_of(arrays.mesh, arrays.self_contact)
+    cuts = cuts_of(arrays.mesh, arrays.self_contact, arrays.bend)
     return CurvedPairs(kind, arrays, parallel, cuts) if cuts else kind(arrays, parallel)
 
 

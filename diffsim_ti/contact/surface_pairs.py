@@ -14,11 +14,17 @@ from diffsim_ti.contact.pair_friction import PairFriction
 from diffsim_ti.contact.pair_kernels import PairKernels
 from diffsim_ti.mesh.sets import pieces
 from diffsim_ti.runtime import kernels_of
-from diffsim_ti.terms.obstacles.barrier import CROSSOVER
+from diffsim_ti.terms.obstacles.barrier import CROSSOVER, beta
+
+HELD = 4  # vertices that a pair is to stop, with what is behind it
 
 
 class Tunnelling(FloatingPointError):
-    """In one pass, surfaces moved so far that they may have gone through each other."""
+    """In one pass, surfaces moved so far that they may have gone through each other. Of explicit steps it carries stable_dt
+    [s], a substep that resolves the barrier, and stiffness [N/m], one that stops them, or None where theirs would do."""
+
+    stable_dt: float | None = None
+    stiffness: float | None = None
 
 
 class Overlap(ValueError):
@@ -212,26 +218,57 @@ class SurfacePairs:
         pairs = runtime.fetch(self.list.pairs)[: 4 * self.list.count].reshape(-1, 4)
         plane = whole(self.plane)[: self.list.count].astype(np.float64)
         fastest = self._fastest(plane[:, 3], pairs)
-        remedy = "take a shorter step, raise the contact's stiffness or width, or lower the speed"
-        if fastest * h > 1:
-            remedy = f"contact at {fastest:.3g} rad/s is too stiff for it: take a shorter step, or lower its stiffness"
+        stiffness, enough = self._resolved(moved[surface] / h, h, fastest)
+        remedy = f"take substeps of {enough:.3g} s"
+        if stiffness is not None:
+            remedy = f"no step stops them: raise the contact's stiffness to {stiffness:.3g} N/m and {remedy}"
+        elif fastest * h > 1:
+            remedy = f"contact at {fastest:.3g} rad/s is too stiff for it: {remedy}"
         if not crossed:
             i = surface[np.linalg.norm(moved[surface], axis=1).argmax()]
             speed = np.linalg.norm(moved[i]) / h
-            raise Tunnelling(
+            error = Tunnelling(
                 f"vertex {i} moves at {speed:.3g} m/s, {np.linalg.norm(moved[i]):.3g} m in one substep of {h:.3g} s: "
                 f"too far for a contact of width {self.width:.3g} m to see what it passes; {remedy}"
             )
+            error.stable_dt, error.stiffness = enough, stiffness
+            raise error
         closing = np.full(len(pairs), -np.inf)
         for kind, part in enumerate((slice(0, self.list.num_vt), slice(self.list.num_vt, None))):
             for a, b in OPPOSITE[kind]:
                 change = ((moved[pairs[part, b]] - moved[pairs[part, a]]) * plane[part, :3]).sum(1)
                 closing[part] = np.maximum(closing[part], change)
         worst = int((closing - plane[:, 3]).argmax())
-        raise Tunnelling(
+        error = Tunnelling(
             f"{self._name(worst, pairs)} may have gone through each other: their gap was {plane[worst, 3]:.3g} m, and they "
             f"closed by {closing[worst]:.3g} m ({closing[worst] / h:.3g} m/s) in one substep of {h:.3g} s; {remedy}"
         )
+        error.stable_dt, error.stiffness = enough, stiffness
+        raise error
+
+    def _resolved(self, v: np.ndarray, h: float, fastest: float) -> tuple[float | None, float]:
+        """(stiffness [N/m] that stops surface vertices of velocities v [m/s], None if the present one does; a substep [s]).
+
+        The barrier k w^2 beta(s) of a pair takes HELD times m V^2 / 2, m the heaviest vertex, V how fast they meet: of all
+        vertices, or where contact is too stiff for the substep h, and speeds are of its own making, of bodies and of the
+        start. With the present k that is at s; where s < 1 / 50, at s = 1 / 10 with a new one. omega h is 1/2 there at most,
+        of the lightest vertex, and V h a tenth of the width.
+        """
+        light = runtime.fetch(self.a.inverse_mass).astype(np.float64)[self.mesh.surface_vertices]
+        mass, light = 1 / light[light > 0].min(initial=np.inf), light.max(initial=0)
+        frames = np.stack([v[self.body[self.mesh.surface_vertices] == b].mean(0) for b in range(self.num_bodies)])
+        start = self.a.values.velocity
+        start = float(np.linalg.norm(start - start.mean(0), axis=1).max(initial=0))
+        own = frames if fastest * h > 1 and len(frames) > 1 else v
+        speed = max(2 * start, 2 * float(np.linalg.norm(own - own.mean(0), axis=1).max(initial=0)), 1e-300)
+        k, w, energy = float(self.a.values.parameters[self.first]), self.width, 0.5 * HELD * mass * speed**2
+        shares = np.geomspace(0.02, 1, 400)
+        s, stiffness = float(np.interp(-energy / (k * w * w), -beta(shares), shares)), None
+        if energy > k * w * w * beta(0.02):
+            s, stiffness = 0.1, energy / float(w * w * beta(0.1))
+        t = 1 - 1 / s
+        omega = np.sqrt((stiffness or k) * light * (t * t - 4 * t + 2 * np.log1p(-t)))
+        return stiffness, float(min(0.5 / max(omega, 1e-300), 0.1 * w / speed, 0.5 * h))
 
     def _fastest(self, gaps: np.ndarray, pairs: np.ndarray) -> float:
         """A frequency [rad/s] of pairs that press, of the lightest vertex against the stiffest pair."""

@@ -43,7 +43,8 @@ def curved_faces(mesh) -> np.ndarray:
     return off > STRAIGHT * longest
 
 
-def are_felt(mesh, terms) -> bool:
-    """Whether obstacles feel that faces are curved at rest: else they feel the triangles, flat as they are."""
+def are_felt(mesh, terms, bend: float = 0.0) -> bool:
+    """Whether obstacles feel that faces are curved at rest or bend by `bend` [m]: else they feel the triangles, flat as
+    they are."""
     widths = [float(t.values["barrier_width"]) for t in terms if "barrier_width" in t.values]
-    return mesh.order == 2 and bool(widths) and bow(mesh) > FELT * min(widths)
+    return mesh.order == 2 and bool(widths) and max(bow(mesh), bend) > FELT * min(widths)

@@ -1,5 +1,7 @@
 """Integrals over faces of three or of six nodes: points with normals, and what each of the nodes has of a point."""
 
+from functools import lru_cache
+
 import numpy as np
 
 from diffsim_ti.mesh import reference_face
@@ -102,14 +104,27 @@ def face_points(faces: np.ndarray) -> LinearFaces | QuadraticFaces:
 
 
 def bow(mesh) -> float:
-    """How far curved faces lie from the four triangles that stand for each in contact, at most [m]: at the middles of their
-    sides and at their own."""
-    if mesh.order == 1:
-        return 0.0
+    """How far curved faces of a mesh lie from the four triangles that stand for each in contact, at most [m]."""
+    return float(bows(mesh.vertices[mesh.surface_faces]).max(initial=0.0)) if mesh.order == 2 else 0.0
+
+
+def bows(nodes: np.ndarray) -> np.ndarray:
+    """The same of each face, from its nodes, shape (k, 6, 3): at the middles of the triangles' sides and at their own."""
+    of_curved, flat = _places_of_bow()
+    return np.linalg.norm(np.einsum("ka,fai->fki", of_curved - flat, nodes), axis=2).max(1, initial=0.0)
+
+
+def points_of_bow(nodes: np.ndarray) -> np.ndarray:
+    """Where `bows` looks, on the curved faces, shape (k, 15, 3)."""
+    return np.einsum("ka,fai->fki", _places_of_bow()[0], nodes)
+
+
+@lru_cache(maxsize=None)
+def _places_of_bow() -> tuple[np.ndarray, np.ndarray]:
+    """Shares of the nodes, of points of the curved face and of the triangles, shape (15, 6)."""
     corners = np.array([[0, 0], [1, 0], [0, 1], [0.5, 0], [0.5, 0.5], [0, 0.5]])[QUARTERS]
     at = np.concatenate([corners.mean(1), (0.5 * (corners + np.roll(corners, 1, 1))).reshape(-1, 2)])
     flat = np.zeros((4, 3, 6))  # the same places of the triangles: shares of the nodes
     np.put_along_axis(flat, QUARTERS[:, :, None], 1.0, 2)
     flat = np.concatenate([flat.mean(1), (0.5 * (flat + np.roll(flat, 1, 1))).reshape(-1, 6)])
-    off = np.einsum("ka,fai->fki", reference_face.functions(at) - flat, mesh.vertices[mesh.surface_faces])
-    return float(np.linalg.norm(off, axis=2).max(initial=0.0))
+    return reference_face.functions(at), flat

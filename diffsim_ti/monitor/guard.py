@@ -8,8 +8,8 @@ import numpy as np
 from diffsim_ti import runtime
 from diffsim_ti.copies import CarriesMore
 from diffsim_ti.monitor import quantities, stability
+from diffsim_ti.monitor.chatter import Chatter
 from diffsim_ti.monitor.energy_watch import EnergyGained
-from diffsim_ti.state.walls import Moment
 from diffsim_ti.state.watch import place_name
 from diffsim_ti.state.workspace import Workspace
 from diffsim_ti.terms.obstacles.barrier import beta
@@ -60,6 +60,7 @@ class Guard:
         self.good = workspace.history(1)
         self.good_pass = 0
         self._stiffness, self._warned, self._warned_of_gain = None, False, False
+        self.chatter = Chatter.of(workspace)
         self.restart()
 
     def restart(self) -> None:
@@ -116,6 +117,9 @@ class Guard:
                 balance.before(first, num_passes)
             self.mark(first)
             self._pass(first, stop, num_passes, save_every, recording)
+            self.ws.look_between_points(stop)
+            if self.ws.bending and self.ws.solver.explicit:
+                self.ws.bending.look(stop, runtime.fetch_row(self.ws.state.u, 0))
             if self.ws.watch.crossing() is not None and self.ws.solver.explicit:
                 self._diagnose_crossing(stop, num_passes)
             if self.ws.first_bad_vertex() is not None:
@@ -127,6 +131,8 @@ class Guard:
             self._passes += stop - first
             if self._passes >= self.every:
                 self._passes = 0
+                if self.chatter:
+                    self.chatter.look(stop, num_passes)
                 self._look_at_step(stop, num_passes)
             first = stop
 
@@ -189,13 +195,17 @@ class Guard:
             "squeezed, or vertices press into a contact)"
         )
         raise Divergence(
-            f"{self.ws.when(step)}: the substep {self.ws.substep:.4g} s {why}: reduce dt, raise "
-            "substeps, or pass allow_unstable=True",
+            f"{self.ws.when(step)}: the substep {self.ws.substep:.4g} s {why}: take substeps of "
+            f"{self._calm_substep(limit):.3g} s (reduce dt, raise substeps), or pass allow_unstable=True",
             step,
             None,
             tet,
             float(limit),
         )
+
+    def _calm_substep(self, stable: float) -> float:
+        """A substep [s] to take where the present one was too long for a state whose stable step is given."""
+        return min(0.5 * self.ws.substep, 0.7 * float(stable)) if stable > 0 else 0.5 * self.ws.substep
 
     def _flies_apart(self) -> bool:
         """Whether vertices cross the body within a substep: no state that a stable step leads to."""
@@ -211,6 +221,7 @@ class Guard:
         for j in range(self.good_pass, bad_by):
             self.mark(j)
             ws.advance(j, j + 1, num_passes)
+            ws.look_between_points(j + 1)
             crossing = ws.watch.crossing()
             if crossing is not None:
                 break
@@ -218,7 +229,7 @@ class Guard:
         ws.watch.put(self._seen)
         k, place, depth = crossing
         term, step, vertices = ws.watch.contacts[k], self.ws.step_of(j, num_passes), ws.watch.vertices_of(place)
-        speeds = [float(np.linalg.norm(ws.velocity_of(i) - self._velocity_of_obstacle(k, j, i))) for i in vertices]
+        speeds = [float(np.linalg.norm(ws.velocity_of(i) - ws.velocity_of_obstacle(k, j, i))) for i in vertices]
         speed, vertex = max(speeds), vertices[int(np.argmax(speeds))]
         width, of_face = float(term.values["barrier_width"]), len(vertices) == 3
         enough = min(0.1 * width / max(speed, 1e-300), (0.25 if of_face else 0.5) * self.ws.substep)
@@ -237,7 +248,7 @@ class Guard:
             remedy = f"the barrier cannot stop it at any step: raise its {stiffer}, or its width"
         stable, _ = self._stable_step()
         if not self.ws.substep <= stable:  # the speed is of the steps' own making
-            stiffness, enough = None, min(0.5 * self.ws.substep, 0.7 * stable)
+            stiffness, enough = None, self._calm_substep(stable)
             remedy = (
                 f"the substep has outgrown the stable step {stable:.3g} s of this state, whose elements are squeezed: "
                 f"reduce the substep to {enough:.3g} s"
@@ -252,16 +263,6 @@ class Guard:
             speed,
             stiffness,
         )
-
-    def _velocity_of_obstacle(self, k: int, j: int, vertex: int) -> np.ndarray:
-        """At a vertex, when pass j begins [m/s]."""
-        arrays, schedule = self.ws.arrays, self.ws.solver.schedule
-        if arrays.obstacles[k][2] < 0:
-            return np.zeros(3)
-        begin = schedule.begin(j)
-        rows = arrays.walls.value(arrays.rows["path"], Moment(schedule, j, begin, begin))
-        position = arrays.values.rest[vertex] + runtime.fetch(self.ws.state.u)[0, vertex]
-        return arrays.walls.velocity_at(k, rows, position, self.ws.watch.contacts[k].about)
 
     def _stiffness_needed(self, k: int, vertex: int, speed: float) -> float | None:
         """Stiffness [N/m] whose barrier, alone, stops the vertex at a fiftieth of the width; None if the present one can.
@@ -298,8 +299,8 @@ class Guard:
         stable, state = self._stable_step()
         step = self.ws.step_of(j, num_passes)
         why = (
-            f"the substep {self.ws.substep:.4g} s exceeds the stable step {stable:.4g} s {state}: reduce dt, "
-            "raise substeps, or use an implicit solver"
+            f"the substep {self.ws.substep:.4g} s exceeds the stable step {stable:.4g} s {state}: take substeps of "
+            f"{self._calm_substep(stable):.3g} s (reduce dt, raise substeps, or use an implicit solver)"
             if not self.ws.substep <= stable
             else f"the stable step {state} is {stable:.4g} s, so look at forces, contacts, inputs and inverted tetrahedra"
         )

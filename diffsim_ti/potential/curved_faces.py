@@ -115,72 +115,77 @@ class CurvedPoints(ObstacleFunctions):
                         for b in ti.static(range(3)):
                             turns[b, m] = ti.select(a == b, t[m], turns[b, m])
             ni, ti_ = self.row_of(corners, spot), self.row_of(turns, spot)  # nothing of a node that is no corner
+            step = self.step_of_lattice(X, u, per, inner)
             for x in range(parts + 1):
+                onwards = 0
                 for y in range(parts + 1 - x):
-                    s1, s2 = x * per, y * per
-                    s = ti.Vector([1 - s1 - s2, s1, s2])
-                    W, of_corner = self.node_weights(s, inner), ti.cast(0, self.fp)
-                    own = ti.cast(0, self.fp)
-                    for a in ti.static(range(6)):
-                        own = ti.select(spot == a, W[a], own)
-                        if ti.static(a < 3):
-                            of_corner = ti.select(spot == a, s[a], of_corner)
-                    Xs, us = self.mix(W, X), self.mix(W, u)
-                    now = g.force.outlook(scene.parameters, first, Xs, us)
-                    sigma = (now[3] - reach) / width
-                    said = s[0] * corners[0, 3] + s[1] * corners[1, 3] + s[2] * corners[2, 3]
-                    t = self.besides(g, said, now[3]) / width
-                    if x < parts and y < parts and x + y > 0 and felt(sigma, t, g.force, self.fp):
-                        weight = one
-                        if ti.static(g.force.per_area):  # the face beyond an edge has its own half
-                            weight = ti.select(x > 0 and y > 0 and x + y < parts, one + one, one)
-                        scale = 0 - weight * stiffness * width
-                        if ti.static(what == "energy"):
-                            out[0] += (
-                                of_corner
-                                * weight
-                                * stiffness
-                                * width
-                                * width
-                                * point_energy(sigma, t, g.force, self.fp)
-                            )
-                        elif ti.static(what == "force"):
-                            Fs, Ft = point_slopes(sigma, t, g.force, self.fp)
-                            out += scale * (self.besides(g, Fs, Ft) * own * now + Ft * of_corner * ni)
-                        elif ti.static(what == "numbers"):
-                            Fs, Ft = point_slopes(sigma, t, g.force, self.fp)
-                            Fss, Fst, Ftt = point_curvatures(sigma, t, g.force, self.fp)
-                            along, across = own * self.dot3(now, wi), of_corner * self.dot3(ni, wi)
-                            by_s = scale * (self.besides(g, Fss, Fst) * along + Fst * across)
-                            by_t = scale * (self.besides(g, Fst, Ftt) * along + Ftt * across)
-                            push = self.besides(g, Fs, Ft)
-                            f, by_now = scale * (push * along + Ft * across), scale * push * own * wi
-                            by_now[3] = self.besides(g, by_s, by_t) / width
-                            g.force.outlook_vjp(scene.parameters, first, Xs, us, by_now, more.sums, i)
-                            for a in ti.static(range(3)):
-                                of_a = ti.select(spot == a, scale * Ft * s[a], ti.cast(0, self.fp))
-                                for m in ti.static(range(3)):
-                                    by[a, m] += of_a * wi[m]
-                                by[a, 3] += s[a] * by_t / width
-                            at_k, at_w = first + g.force.count, first + g.force.count + 1
-                            more.sums[at_k, i] = more.sums[at_k, i] + f / stiffness
-                            more.sums[at_w, i] = more.sums[at_w, i] + (f - sigma * by_s - t * by_t) / width
-                            out[0] += f
-                        else:
-                            Fs, Ft = point_slopes(sigma, t, g.force, self.fp)
-                            Fss, Fst, Ftt = point_curvatures(sigma, t, g.force, self.fp)
-                            dn = self.turn(what, g, first, Xs, us, self.mix(W, w), scene, more)
-                            ds = dn[3] / width
-                            said = s[0] * turns[0, 3] + s[1] * turns[1, 3] + s[2] * turns[2, 3]
-                            dt = self.besides(g, said, dn[3]) / width
-                            grown = ti.cast(0, self.fp)
-                            if ti.static(what == "jvp"):
-                                dwidth = more.parameters[first + g.force.count + 1] / width
-                                ds, dt = ds - sigma * dwidth, dt - t * dwidth
-                                grown = thicker + more.parameters[first + g.force.count] / stiffness + dwidth
-                            dFs, dFt = Fss * ds + Fst * dt + grown * Fs, Fst * ds + Ftt * dt + grown * Ft
-                            out += scale * own * (self.besides(g, dFs, dFt) * now + self.besides(g, Fs, Ft) * dn)
-                            out += scale * of_corner * (dFt * ni + Ft * ti_)
+                    if y >= onwards:
+                        s1, s2 = x * per, y * per
+                        s = ti.Vector([1 - s1 - s2, s1, s2])
+                        W, of_corner = self.node_weights(s, inner), ti.cast(0, self.fp)
+                        own = ti.cast(0, self.fp)
+                        for a in ti.static(range(6)):
+                            own = ti.select(spot == a, W[a], own)
+                            if ti.static(a < 3):
+                                of_corner = ti.select(spot == a, s[a], of_corner)
+                        Xs, us = self.mix(W, X), self.mix(W, u)
+                        now = g.force.outlook(scene.parameters, first, Xs, us)
+                        ahead, _ = self.passed(g, now[3], width + reach, step, parts)
+                        onwards = y + 1 + ahead
+                        sigma = (now[3] - reach) / width
+                        said = s[0] * corners[0, 3] + s[1] * corners[1, 3] + s[2] * corners[2, 3]
+                        t = self.besides(g, said, now[3]) / width
+                        if x < parts and y < parts and x + y > 0 and felt(sigma, t, g.force, self.fp):
+                            weight = one
+                            if ti.static(g.force.per_area):  # the face beyond an edge has its own half
+                                weight = ti.select(x > 0 and y > 0 and x + y < parts, one + one, one)
+                            scale = 0 - weight * stiffness * width
+                            if ti.static(what == "energy"):
+                                out[0] += (
+                                    of_corner
+                                    * weight
+                                    * stiffness
+                                    * width
+                                    * width
+                                    * point_energy(sigma, t, g.force, self.fp)
+                                )
+                            elif ti.static(what == "force"):
+                                Fs, Ft = point_slopes(sigma, t, g.force, self.fp)
+                                out += scale * (self.besides(g, Fs, Ft) * own * now + Ft * of_corner * ni)
+                            elif ti.static(what == "numbers"):
+                                Fs, Ft = point_slopes(sigma, t, g.force, self.fp)
+                                Fss, Fst, Ftt = point_curvatures(sigma, t, g.force, self.fp)
+                                along, across = own * self.dot3(now, wi), of_corner * self.dot3(ni, wi)
+                                by_s = scale * (self.besides(g, Fss, Fst) * along + Fst * across)
+                                by_t = scale * (self.besides(g, Fst, Ftt) * along + Ftt * across)
+                                push = self.besides(g, Fs, Ft)
+                                f, by_now = scale * (push * along + Ft * across), scale * push * own * wi
+                                by_now[3] = self.besides(g, by_s, by_t) / width
+                                g.force.outlook_vjp(scene.parameters, first, Xs, us, by_now, more.sums, i)
+                                for a in ti.static(range(3)):
+                                    of_a = ti.select(spot == a, scale * Ft * s[a], ti.cast(0, self.fp))
+                                    for m in ti.static(range(3)):
+                                        by[a, m] += of_a * wi[m]
+                                    by[a, 3] += s[a] * by_t / width
+                                at_k, at_w = first + g.force.count, first + g.force.count + 1
+                                more.sums[at_k, i] = more.sums[at_k, i] + f / stiffness
+                                more.sums[at_w, i] = more.sums[at_w, i] + (f - sigma * by_s - t * by_t) / width
+                                out[0] += f
+                            else:
+                                Fs, Ft = point_slopes(sigma, t, g.force, self.fp)
+                                Fss, Fst, Ftt = point_curvatures(sigma, t, g.force, self.fp)
+                                dn = self.turn(what, g, first, Xs, us, self.mix(W, w), scene, more)
+                                ds = dn[3] / width
+                                said = s[0] * turns[0, 3] + s[1] * turns[1, 3] + s[2] * turns[2, 3]
+                                dt = self.besides(g, said, dn[3]) / width
+                                grown = ti.cast(0, self.fp)
+                                if ti.static(what == "jvp"):
+                                    dwidth = more.parameters[first + g.force.count + 1] / width
+                                    ds, dt = ds - sigma * dwidth, dt - t * dwidth
+                                    grown = thicker + more.parameters[first + g.force.count] / stiffness + dwidth
+                                dFs, dFt = Fss * ds + Fst * dt + grown * Fs, Fst * ds + Ftt * dt + grown * Ft
+                                out += scale * own * (self.besides(g, dFs, dFt) * now + self.besides(g, Fs, Ft) * dn)
+                                out += scale * of_corner * (dFt * ni + Ft * ti_)
         if ti.static(what == "numbers"):
             self.corners_vjp(g, first, X, u, by, scene, more, i)
         if ti.static(what != "energy"):

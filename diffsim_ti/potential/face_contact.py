@@ -8,7 +8,7 @@ import taichi as ti
 
 from diffsim_ti import runtime
 from diffsim_ti.potential.face_kernels import face_kernels
-from diffsim_ti.potential.face_lattice import face_rows
+from diffsim_ti.potential.face_lattice import around_vertices, face_rows, nodes_of_faces, shortened
 
 
 class FaceContact:
@@ -24,6 +24,7 @@ class FaceContact:
         a, (*rows, reach, weight) = self.a, face_rows(self.a)
         self.face_start, self.face_next, self.face_parts = (runtime.upload(x.ravel(), ti.i32) for x in rows)
         self.face_reach, self.face_weight = (runtime.upload(x.ravel(), a.fp) for x in (reach, weight))
+        self.reach, self._triangles = reach, around_vertices(nodes_of_faces(a), a.mesh.num_vertices)[1]
         self.kernels, self.parallel = face_kernels(a.features(), a.precision, parallel), parallel
         self._out = SimpleNamespace(
             contact=runtime.array(a.fp, a.num_vertices),
@@ -31,6 +32,10 @@ class FaceContact:
             blocks=runtime.array(a.vector, 3, a.num_vertices),
         )
         self._launches = {}
+
+    def begin(self, distances: np.ndarray) -> None:
+        """A run starts with these distances [m] of the triangles of the surface to what is nearest."""
+        runtime.fill(self.face_reach, shortened(self.reach, distances[self._triangles]).ravel())
 
     def bind(self, kernel, **records):
         """A kernel of faces.py at the potential's displacement, with more arrays than its own; returns y, a copy."""

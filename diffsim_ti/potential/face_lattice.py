@@ -8,7 +8,8 @@ from diffsim_ti.mesh.curved_triangles import FELT, arches, nodes_of_triangles
 from diffsim_ti.terms.obstacles import barrier
 
 FLAT, BENT, GROWTH = FELT, 0.12, 8
-PER_WIDTH, MOST_PARTS = 4, 64  # lattice points along a width; along the side of a face
+PER_WIDTH, MOST_PARTS = 4, 64  # lattice points along a width; along the side of a face, if half of PER_WIDTH are there
+FINEST = 1024  # lattice points along the side of a face, at most
 SMOOTH = 0.05  # of a width: how far a curved face is from the triangles of its lattice, before what is smooth
 REACH = 0.65  # of the distance of lattice points: from what lies between them to the nearest, faces being stretched a little
 
@@ -152,15 +153,25 @@ def lattices(arrays) -> tuple[np.ndarray, ...]:
     x = mesh.vertices[mesh.surface_triangles]
     longest = np.linalg.norm(x - np.roll(x, 1, axis=1), axis=2).max(1)
     widths = np.array([float(t.values["barrier_width"]) for t in arrays.contacts])
-    parts = np.clip(np.ceil(PER_WIDTH * longest[:, None] / widths), 2, MOST_PARTS).astype(int)
+    along = PER_WIDTH * longest[:, None] / widths
+    parts = np.clip(np.ceil(along), 2, np.clip(np.ceil(along / 2), MOST_PARTS, FINEST)).astype(int)
     smooth = np.array([arrays.curved and twin.hollow for twin, *_ in arrays.obstacles], bool)
     if smooth.any():
-        fewest = np.ceil(np.sqrt(arches(mesh)[:, None] / (SMOOTH * widths[smooth]))).astype(int)
+        fewest = np.ceil(np.sqrt(np.maximum(arches(mesh), arrays.bend)[:, None] / (SMOOTH * widths[smooth]))).astype(
+            int
+        )
         parts[:, smooth] = np.minimum(parts[:, smooth], np.clip(fewest, 3, MOST_PARTS))
     apart = longest[:, None] / parts
     reach, weight = REACH * apart, (apart / widths) ** 2
     reach[:, smooth], weight[:, smooth] = 0, np.minimum(weight[:, smooth], 1)
     return parts, reach, weight
+
+
+def shortened(reach: np.ndarray, distances: np.ndarray) -> np.ndarray:
+    """r, shape (triangles, obstacles), in a run that starts with these distances [m] of the triangles: halved, where it is
+    longer, until it is half of them at most. What starts in front of an obstacle is not behind it then."""
+    halvings = np.ceil(np.log2(2 * reach / distances[:, None], where=reach > 0, out=np.zeros_like(reach)))
+    return np.where(reach > distances[:, None], reach * 0.5**halvings, reach)
 
 
 def nodes_of_faces(arrays) -> np.ndarray:

@@ -278,63 +278,70 @@ class FacePoints(CurvedPoints):
     ):
         out, c0, t0, w0 = self.vector(0), self.row_of(corners, 0), self.row_of(turns, 0), self.row_of(w, 0)
         by = self.rows(0)  # adjoints of `corners`
+        step = self.step_of_lattice(X, u, per, None)
         for x in range(parts):
+            onwards = 0
             for y in range(parts - x):
-                s1, s2 = x * per, y * per
-                s0 = 1 - s1 - s2
-                shares = ti.Vector([s0, s1, s2])
-                Xs, us = self.mix(shares, X), self.mix(shares, u)
-                now = g.force.outlook(scene.parameters, first, Xs, us)
-                s = (now[3] - reach) / width
-                t = (s0 * corners[0, 3] + s1 * corners[1, 3] + s2 * corners[2, 3] - now[3]) / width
-                if x + y > 0 and s < 1 and t > ti.cast(FLAT, self.fp):
-                    weight = one
-                    if ti.static(g.force.per_area):
-                        weight = ti.select(x > 0 and y > 0, one + one, one)  # the face beyond an edge has its own half
-                    scale = 0 - s0 * weight * stiffness * width
-                    if ti.static(what == "energy"):
-                        F = point_energy(s, t, g.force, self.fp)
-                        out[0] += s0 * weight * stiffness * width * width * F
-                    elif ti.static(what == "force"):
-                        Fs, Ft = point_slopes(s, t, g.force, self.fp)
-                        out += scale * (Fs * now + Ft * (c0 - now))
-                    elif ti.static(what == "numbers"):
-                        Fs, Ft = point_slopes(s, t, g.force, self.fp)
-                        Fss, Fst, Ftt = point_curvatures(s, t, g.force, self.fp)
-                        along, across = now.dot(w0), (c0 - now).dot(w0)  # w0 has no fourth component
-                        by_s = scale * (Fss * along + Fst * across)
-                        by_t = scale * (Fst * along + Ftt * across)
-                        f = scale * (Fs * along + Ft * across)
-                        by_now = scale * (Fs - Ft) * w0
-                        by_now[3] = (by_s - by_t) / width
-                        g.force.outlook_vjp(scene.parameters, first, Xs, us, by_now, more.sums, i)
-                        for m in ti.static(range(3)):
-                            by[0, m] += scale * Ft * w0[m]
-                        by[0, 3] += s0 * by_t / width
-                        by[1, 3] += s1 * by_t / width
-                        by[2, 3] += s2 * by_t / width
-                        at_k, at_w = first + g.force.count, first + g.force.count + 1
-                        more.sums[at_k, i] = more.sums[at_k, i] + f / stiffness
-                        more.sums[at_w, i] = more.sums[at_w, i] + (f - s * by_s - t * by_t) / width
-                        out[0] += f
-                    else:
-                        Fs, Ft = point_slopes(s, t, g.force, self.fp)
-                        Fss, Fst, Ftt = point_curvatures(s, t, g.force, self.fp)
-                        dn = self.turn(what, g, first, Xs, us, self.mix(shares, w), scene, more)
-                        ds = dn[3] / width
-                        dt = (s0 * turns[0, 3] + s1 * turns[1, 3] + s2 * turns[2, 3] - dn[3]) / width
-                        grown = ti.cast(0, self.fp)
-                        if ti.static(what == "jvp"):
-                            dwidth = more.parameters[first + g.force.count + 1] / width
-                            ds, dt = ds - s * dwidth, dt - t * dwidth
-                            grown = thicker + more.parameters[first + g.force.count] / stiffness + dwidth
-                        out += scale * (
-                            (Fss * ds + Fst * dt) * now
-                            + Fs * dn
-                            + (Fst * ds + Ftt * dt) * (c0 - now)
-                            + Ft * (t0 - dn)
-                            + grown * (Fs * now + Ft * (c0 - now))
-                        )
+                if y >= onwards:
+                    s1, s2 = x * per, y * per
+                    s0 = 1 - s1 - s2
+                    shares = ti.Vector([s0, s1, s2])
+                    Xs, us = self.mix(shares, X), self.mix(shares, u)
+                    now = g.force.outlook(scene.parameters, first, Xs, us)
+                    ahead, _ = self.passed(g, now[3], width + reach, step, parts)
+                    onwards = y + 1 + ahead
+                    s = (now[3] - reach) / width
+                    t = (s0 * corners[0, 3] + s1 * corners[1, 3] + s2 * corners[2, 3] - now[3]) / width
+                    if x + y > 0 and s < 1 and t > ti.cast(FLAT, self.fp):
+                        weight = one
+                        if ti.static(g.force.per_area):
+                            weight = ti.select(
+                                x > 0 and y > 0, one + one, one
+                            )  # the face beyond an edge has its own half
+                        scale = 0 - s0 * weight * stiffness * width
+                        if ti.static(what == "energy"):
+                            F = point_energy(s, t, g.force, self.fp)
+                            out[0] += s0 * weight * stiffness * width * width * F
+                        elif ti.static(what == "force"):
+                            Fs, Ft = point_slopes(s, t, g.force, self.fp)
+                            out += scale * (Fs * now + Ft * (c0 - now))
+                        elif ti.static(what == "numbers"):
+                            Fs, Ft = point_slopes(s, t, g.force, self.fp)
+                            Fss, Fst, Ftt = point_curvatures(s, t, g.force, self.fp)
+                            along, across = now.dot(w0), (c0 - now).dot(w0)  # w0 has no fourth component
+                            by_s = scale * (Fss * along + Fst * across)
+                            by_t = scale * (Fst * along + Ftt * across)
+                            f = scale * (Fs * along + Ft * across)
+                            by_now = scale * (Fs - Ft) * w0
+                            by_now[3] = (by_s - by_t) / width
+                            g.force.outlook_vjp(scene.parameters, first, Xs, us, by_now, more.sums, i)
+                            for m in ti.static(range(3)):
+                                by[0, m] += scale * Ft * w0[m]
+                            by[0, 3] += s0 * by_t / width
+                            by[1, 3] += s1 * by_t / width
+                            by[2, 3] += s2 * by_t / width
+                            at_k, at_w = first + g.force.count, first + g.force.count + 1
+                            more.sums[at_k, i] = more.sums[at_k, i] + f / stiffness
+                            more.sums[at_w, i] = more.sums[at_w, i] + (f - s * by_s - t * by_t) / width
+                            out[0] += f
+                        else:
+                            Fs, Ft = point_slopes(s, t, g.force, self.fp)
+                            Fss, Fst, Ftt = point_curvatures(s, t, g.force, self.fp)
+                            dn = self.turn(what, g, first, Xs, us, self.mix(shares, w), scene, more)
+                            ds = dn[3] / width
+                            dt = (s0 * turns[0, 3] + s1 * turns[1, 3] + s2 * turns[2, 3] - dn[3]) / width
+                            grown = ti.cast(0, self.fp)
+                            if ti.static(what == "jvp"):
+                                dwidth = more.parameters[first + g.force.count + 1] / width
+                                ds, dt = ds - s * dwidth, dt - t * dwidth
+                                grown = thicker + more.parameters[first + g.force.count] / stiffness + dwidth
+                            out += scale * (
+                                (Fss * ds + Fst * dt) * now
+                                + Fs * dn
+                                + (Fst * ds + Ftt * dt) * (c0 - now)
+                                + Ft * (t0 - dn)
+                                + grown * (Fs * now + Ft * (c0 - now))
+                            )
         if ti.static(what == "numbers"):
             self.corners_vjp(g, first, X, u, by, scene, more, i)
         if ti.static(what != "energy"):

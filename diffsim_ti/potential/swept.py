@@ -24,7 +24,7 @@ from diffsim_ti.terms.obstacles import turning
 
 A = ti.template()
 MARCHES = 200  # halts on a way
-LEVELS = 9  # a side of a face is cut in 2^9 parts at most
+LEVELS, FINEST = 9, 12  # a side of a face is cut in 2^9 parts at most on a way, in 2^12 where it is looked at once
 TINY = 1e-3  # share of the distance, or of the width if that is less: what counts as met
 
 WAY = dict(places="vectors", drifts="vectors", step="vectors2", corners="ints")
@@ -81,7 +81,7 @@ class SweptKernels(ObstacleFunctions):
         return out
 
     @ti.func
-    def face_clearance(self, g: A, first, X, u, inner, scene: A, wanted):
+    def face_clearance(self, g: A, first, X, u, inner, scene: A, wanted, levels: A):
         """A distance [m] that a face keeps: `wanted` or more if it is that far away, else half of its own or more; not
         positive if a point of it was found to be in the obstacle. X, u: rows of its nodes."""
         code, level, far, half = 0, 0, ti.cast(1e30, self.fp), ti.cast(0.5, self.fp)
@@ -117,7 +117,7 @@ class SweptKernels(ObstacleFunctions):
                 low = ti.max(low, of_corners - arch / ti.cast(1 << (2 * level), self.fp))
             if ti.static(g.force.convex):
                 low = ti.max(low, d + along)
-            last = level == LEVELS or r <= ti.cast(ti.static(g.force.grain), self.fp)
+            last = level == levels or r <= ti.cast(ti.static(g.force.grain), self.fp)
             if last:  # by the plane there; what lies between is nearer than its middle by little
                 low = ti.max(low, d + along, ti.cast(0.05, self.fp) * d)
             if last or low >= wanted or low >= half * nearest:
@@ -222,7 +222,7 @@ class SweptKernels(ObstacleFunctions):
         for m in range(MARCHES):
             left = speed * (most - t)
             X, u = self.corners_at(g, k, j, t, scene, way, at)
-            d = self.face_clearance(g, first, X, u, inner, scene, left)
+            d = self.face_clearance(g, first, X, u, inner, scene, left, LEVELS)
             if m == 0:
                 near = ti.min(d, width)
                 halt = ti.cast(TINY, self.fp) * near
@@ -276,7 +276,8 @@ class SweptKernels(ObstacleFunctions):
                 if ti.static(self.features.reaches(g)) or j < plan.num_vertices:
                     for k in range(g.count):
                         X, u = self.corners_at(g, k, j, none, scene, way, at)
-                        d = self.face_clearance(g, g.first + k * g.size, X, u, self.is_inner(j, plan), scene, plan.most)
+                        inner, first = self.is_inner(j, plan), g.first + k * g.size
+                        d = self.face_clearance(g, first, X, u, inner, scene, plan.most, FINEST)
                         if d < least:
                             least = d
                             blocker = g.number + k

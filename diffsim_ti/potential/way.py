@@ -77,14 +77,19 @@ class Way:
         self._look("distances", u, places, max(within, 1e-30))
         return self.met
 
-    def check_apart(self, u: np.ndarray, places: np.ndarray) -> None:
-        """Raise Overlap if a vertex or a face is in an obstacle. A state that is not finite is looked at elsewhere."""
-        met = self.nearest(u, places) if np.all(np.isfinite(u)) else None
-        if met is not None:
+    def check_apart(self, u: np.ndarray, places: np.ndarray, within: float = 0.0) -> np.ndarray:
+        """Distances [m] of faces to what is nearest, or `within` of those that are farther away; from half of it on they are
+        what is known to be free. Raises Overlap if a vertex or a face is in an obstacle. A state that is not finite is
+        looked at elsewhere."""
+        if not np.all(np.isfinite(u)):
+            return np.full(self.count - self.num_vertices, within)
+        met = self.nearest(u, places, within)
+        if met is not None and met.value <= 1e-30:
             raise Overlap(
                 f"{self.terms[met.obstacle]!r} reaches {-met.value:.3g} m into {met} of the body: move the body or the "
                 "obstacle"
             )
+        return self.found[self.num_vertices :] if self.terms else np.zeros(0)
 
     def _look(self, name: str, u, places, most: float, kept: float = 0.0) -> None:
         if name not in self._launches:
@@ -95,7 +100,7 @@ class Way:
         self._launches[name](num_vertices=self.num_vertices, count=self.count, most=most, kept=kept)
         found, blocker = runtime.fetch(self._out.found), runtime.fetch(self._out.blocker)
         j = int(found.argmin())
-        self.met = None
+        self.found, self.met = found.astype(np.float64), None
         if blocker[j] >= 0:
             self.met = Met(
                 tuple(int(i) for i in dict.fromkeys(self.corners_of[j, :3])), int(blocker[j]), float(found[j])

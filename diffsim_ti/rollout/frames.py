@@ -28,6 +28,9 @@ class Frames:
     `chamber_pressures` [Pa], where an output reads them: those in chambers whose volume is held, shape (frames, chambers),
     of the substep that ends in the frame; others, and the first frame, have none (0).
 
+    `error`: what stopped a run of `Rollout(..., raise_errors=False)`, None where it is `alive`; from there on frames hold
+    the last good one.
+
     `inputs` are the values that the run started from, so that its gradient can be taken whenever it is wanted.
     """
 
@@ -44,6 +47,12 @@ class Frames:
     sets: dict = field(default_factory=dict, repr=False)  # of inputs given by named sets, by input (set_values.py)
     steps: np.ndarray | None = field(default=None, repr=False)  # of the run that are done in each frame
     run: Run | None = field(default=None, repr=False)
+    error: FloatingPointError | None = None
+
+    @property
+    def alive(self) -> bool:
+        """Whether the run came to its end."""
+        return self.error is None
 
     def __getstate__(self) -> dict:
         """Without the run, which lives on the device: a copy by pickle has no gradient."""

@@ -39,6 +39,9 @@ class Rollout:
     outputs: what a loss may name besides positions, velocities and displacements, such as ContactForce, Reaction, Stress,
         MaterialPoints (outputs/).
     runs: how many runs one tape may hold, each with frames of its own; see `run`.
+    raise_errors: False marks a run that goes wrong instead of raising: `frames.alive`, and of the last run `rollout.alive`,
+        are False, frames hold the last good state from there on, `frames.error` says what stopped it, and gradients of
+        that run are zero, with a warning; tangents raise what stopped it.
 
     Two ways to use it. With arrays: `frames = rollout.forward(youngs_modulus=...)`, then `rollout.vjp(frames, ...)`.
     In Taichi: `rollout.run()` under `ti.ad.Tape`, with fields `rollout.positions`, `rollout.velocities` (frames x
@@ -71,6 +74,7 @@ class Rollout:
         health: bool = False,
         outputs: Output | Iterable[Output] = (),
         runs: int | None = None,
+        raise_errors: bool = True,
     ):
         instance("Rollout", "solver", solver, Solver, "a solver such as SemiImplicitSolver(scene)")
         solver, steps = self._stepped(solver, steps)
@@ -83,6 +87,7 @@ class Rollout:
             clip=clip,
             truncate=truncate,
             health=health,
+            raise_errors=raise_errors,
         )
         given = (outputs,) if isinstance(outputs, Output) else tuple(listed("outputs", outputs, "Outputs"))
         contacts = any(isinstance(output, Output) and output.needs_contact_forces(solver) for output in given)
@@ -165,6 +170,11 @@ class Rollout:
         return SolveReport() if self.sweep.workspace is None else self.sweep.workspace.report
 
     @property
+    def alive(self) -> bool:
+        """Whether the last run came to its end; see `raise_errors`."""
+        return self.sweep.last_error is None
+
+    @property
     def health(self) -> list[dict]:
         """Norms of the adjoint in the steps of the last reverse sweep, last step first, if asked for."""
         return self.sweep.health
@@ -194,6 +204,10 @@ class Rollout:
         frames.computed = self.computed
         frames.steps = np.arange(self.num_frames) * self.save_every
         frames.contact_forces, frames.chamber_pressures = self.sweep.contact_forces(), self.sweep.chamber_pressures()
+        frames.error, last = run.error, self.sweep.last_good(run)
+        for noted in (frames.contact_forces, frames.chamber_pressures):
+            if noted is not None:
+                noted[last + 1 :] = noted[last]
         for name, output in self.computed.items():
             value, shape = np.asarray(output.value(frames)), tuple(output.shape(self.num_frames))
             if value.shape != shape:
@@ -240,7 +254,7 @@ class Rollout:
         """Gradients by the wanted inputs from adjoints of what kernels read, and those by inputs directly."""
         out = self.scene.inputs.derive_vjp(run.values, derived, self.wanted if wanted is None else wanted)
         for name, direct in change.inputs.items():
-            if name in out:
+            if name in out and run.error is None:
                 out[name] = out[name] + direct
         return out
 

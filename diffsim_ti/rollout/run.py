@@ -19,6 +19,7 @@ class Run:
     start: called with the workspace after the values are loaded; sets another start there, the same each time.
     first_step: steps that came before, for reports.
     seen_by: the name of the sweep that looked after it to its end.
+    error: what stopped it, where the sweep marks runs that fail; its frames hold the last good one from there on.
     """
 
     values: dict
@@ -26,6 +27,7 @@ class Run:
     first_step: int = 0
     contacts: Callable[[], ContactResolution] | None = None
     seen_by: object | None = None
+    error: FloatingPointError | None = None
 
     @cached_property
     def contact_resolution(self) -> ContactResolution:

@@ -1,5 +1,6 @@
 """n steps of a solver on the device: forward, in reverse from kept states, and in tangents."""
 
+import warnings
 from collections.abc import Callable, Iterable
 
 import numpy as np
@@ -11,7 +12,9 @@ from diffsim_ti.monitor.guard import Guard
 from diffsim_ti.rollout.checkpoints import choose_checkpoints
 from diffsim_ti.rollout.doubts import warn_of_coarse_steps, warn_of_explosion
 from diffsim_ti.rollout.run import Run, Seed
+from diffsim_ti.slots import copy_slot
 from diffsim_ti.solvers.solver import Solver
+from diffsim_ti.state.bending import FacesBend
 
 RECORD_BYTES = 200e6  # up to which the first run of implicit solvers is recorded
 
@@ -37,7 +40,9 @@ class Sweep:
         health: bool = False,
         contacts: bool = False,
         chambers: bool = False,
+        raise_errors: bool = True,
     ):
+        self.raise_errors, self.last_error = raise_errors, None  # what stopped the last run
         self.contacts = contacts  # whether runs note what obstacles do to each vertex in each frame
         self.chambers = chambers and solver.scene.holds_volumes  # whether pressures in chambers are wanted of frames
         self.solver, self.scene, self.steps = solver, solver.scene, steps
@@ -64,8 +69,9 @@ class Sweep:
         law_state = places * len(self.scene.law.state_names) / (4 * self.scene.mesh.num_vertices)
         self.checkpoints = choose_checkpoints(self.num_passes, self.state_bytes, every, memory, law_state)
         self.workspace = None  # made by the first run
+        self._bend = 0.0  # how far faces have bent in runs so far [m] (state/bending.py)
         self._name = object()  # that runs bear
-        self._loaded = None  # the values that are on the device
+        self._loaded, self._started = None, False  # the values that are on the device; whether the run began elsewhere
         self._current = None  # the run whose frames and snapshots the workspace holds
         self._adjoint = None  # the solver's, made by the first pull-back
         self.contact_change = self.chamber_change = None  # of the contact forces and chambers, by the last tangent
@@ -112,7 +118,7 @@ class Sweep:
         return self.scene.inputs.derive(values)
 
     def _make_workspace(self, derived):
-        return self.solver.workspace(derived)
+        return self.solver.workspace(derived, self._bend)
 
     def _make_guard(self):
         return Guard(self.workspace)
@@ -127,13 +133,28 @@ class Sweep:
 
     def run(self, values: dict, start: Callable | None = None) -> Run:
         """Run from the scene's inputs with some values replaced; see `Run` for `start`."""
-        run = Run(self._checked(values), start, self.first_step)
-        self._forward(run)
+        run, self.last_error = Run(self._checked(values), start, self.first_step), None
+        try:
+            self._forward(run)
+        except FloatingPointError as error:
+            if self.raise_errors:
+                raise
+            run.error = self.last_error = error
+            last = self.last_good(run)
+            for frames in self.workspace.frames:
+                for k in range(last + 1, self.num_frames):
+                    copy_slot(frames, last, frames, k)
         run.contacts = self.workspace.watch.seen_so_far()
         return run
 
+    def last_good(self, run: Run) -> int:
+        """The last frame of a run before what stopped it, if something did."""
+        if run.error is None:
+            return self.num_frames - 1
+        return max(0, getattr(run.error, "step", 0) - run.first_step) // self.save_every
+
     def bring_back(self, run: Run) -> None:
-        """See to it that frames and kept states are those of a run."""
+        """See to it that frames and kept states are those of a run that came to its end."""
         if self._current is not run:
             again = run.seen_by is self._name
             run.values = self._checked(run.values)  # which may be another rollout's
@@ -164,6 +185,8 @@ class Sweep:
         values = run.values
         if self._loaded is not None and all(value is self._loaded[name] for name, value in values.items()):
             self.workspace.restart()
+            if self._started:
+                self.workspace.check_apart()
         else:
             derived, self._loaded = self._derive(values), None
             if self.workspace is None:
@@ -176,12 +199,21 @@ class Sweep:
             else:
                 self.workspace.load(derived)
             self._loaded = values
-        if run.start is not None:
+        self._started = run.start is not None  # elsewhere than the values say
+        if self._started:
             run.start(self.workspace)
             self.workspace.forget()
 
     def _forward(self, run: Run, again: bool = False) -> None:
         """All passes; keeps the first snapshots on the way. again: the guard has seen this run come to its end."""
+        while True:
+            try:
+                return self._forward_as_bent(run, again)
+            except FacesBend as bent:
+                self._bend, self._loaded = bent.bend, None
+                self.workspace = self._adjoint = None
+
+    def _forward_as_bent(self, run: Run, again: bool) -> None:
         self._load(run)
         ws, checkpoints = self.workspace, self.checkpoints
         self._guard.restart()
@@ -222,6 +254,8 @@ class Sweep:
 
     def push_forward(self, run: Run, change: Derived) -> tuple[np.ndarray, np.ndarray]:
         """Changes of the frames' positions and velocities, float64, for a change of what kernels read."""
+        if run.error is not None:
+            raise run.error
         current, recorded = self._current, self._recorded and self._current is run
         if not recorded:
             self._load(run)
@@ -246,8 +280,10 @@ class Sweep:
         """Adjoints of what kernels read at the start of a run.
 
         Raises FloatingPointError, naming the step, where an adjoint is not finite. Warns of contacts that the steps
-        hardly resolve, and of an adjoint that grew out of use.
+        hardly resolve, of an adjoint that grew out of use, and of a run that was stopped, whose adjoints are zero.
         """
+        if run.error is not None:
+            return self._no_adjoints(run, seed)
         self.bring_back(run)
         if not (run.contact_resolution.resolved or self._warned):
             self._warned = True
@@ -262,13 +298,27 @@ class Sweep:
             warn_of_explosion(of_frames, of_start, float(self.solver.schedule.time(self.steps)) or self.solver.dt)
         return derived
 
-    def _reverse(self, seed: Seed, careful: bool) -> tuple[float, float]:
-        """The reverse sweep; the norms of its seed."""
-        ws, checkpoints = self.workspace, self.checkpoints
-        if self._adjoint is None or not self._adjoint.fits(ws):
+    def _no_adjoints(self, run: Run, seed: Seed) -> Derived:
+        warnings.warn(f"the gradient of a run that was stopped is zero: {run.error}", stacklevel=4)
+        self._make_ready()
+        seed.put(self._adjoint, self.solver.last_frame_is_state)
+        derived, _ = seed.collect(self._adjoint, True)
+        for part in derived.parts().values():
+            if part is not None:
+                part[...] = 0
+        return derived
+
+    def _make_ready(self) -> None:
+        """The solver's adjoint."""
+        if self._adjoint is None or not self._adjoint.fits(self.workspace):
             shape = "rest_positions" in self.wanted
             density = shape or "density" in self.wanted  # the rest shape makes masses
             self._adjoint = self._make_adjoint(density, shape)
+
+    def _reverse(self, seed: Seed, careful: bool) -> tuple[float, float]:
+        """The reverse sweep; the norms of its seed."""
+        ws, checkpoints = self.workspace, self.checkpoints
+        self._make_ready()
         norms, self.health = seed.put(self._adjoint, self.solver.last_frame_is_state), []
         if self.contacts:
             self._adjoint.seed_contacts(seed.contact_forces, self.frame_time)

@@ -29,6 +29,7 @@ class SceneArrays:
         feels_faces: bool = False,
         presses: bool = False,
         in_steps: bool = False,
+        bend: float = 0.0,
     ):
         mesh, precision = scene.mesh, scene.precision
         fp = runtime.PRECISIONS[precision]
@@ -53,7 +54,7 @@ class SceneArrays:
         self._upload_topology(scene)
         rows = scene.inputs.parameters
         self.obstacles = self._twins(scene)
-        self.curved = are_felt(mesh, self.contacts)
+        self.curved, self.bend = are_felt(mesh, self.contacts, bend), bend
         self._features = dict(
             order=mesh.order,
             curved=self.curved,

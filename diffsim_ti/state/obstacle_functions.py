@@ -130,6 +130,30 @@ class ObstacleFunctions:
             lengths.append(let(sum_of(x * x for x in bow)))
         return let(ti.cast(1 / 3, self.fp) * ti.sqrt(ti.max(*lengths)))
 
+    # distances change by no more than the way: where a point of a lattice is far away, the next ones are not looked at
+
+    @ti.func
+    def step_of_lattice(self, X, u, per, inner):
+        """How far two neighbours in a row of a triangle's lattice lie apart at most [m]."""
+        edge = ti.cast(0, self.fp)
+        for m in ti.static(range(3)):
+            e = per * ((X[2, m] - X[0, m]) + (u[2, m] - u[0, m]))
+            edge += e * e
+        length = ti.sqrt(edge)
+        if ti.static(self.features.curved):
+            length += 6 * per * self.arch(X + u, inner)
+        return ti.max(ti.cast(1.01, self.fp) * length, ti.cast(1e-30, self.fp))
+
+    @ti.func
+    def passed(self, g: A, d, felt, step, parts):
+        """(how many of the next points are farther away than `felt`, d or less than it) for a point at distance d."""
+        far = d
+        if ti.static(g.force.grain > 0):  # splines are steeper than distances, and end with their grid
+            inside = d < ti.cast(1e6 * g.force.grain, self.fp)
+            far = ti.select(inside, ti.cast(0.8, self.fp) * d, felt)
+        ahead = ti.min((far - felt) / step, ti.cast(parts, self.fp))
+        return ti.cast(ti.max(ahead, ti.cast(0, self.fp)), ti.i32), far
+
     @ti.func
     def dot3(self, a, b):
         """Of vectors whose fourth component says something else."""

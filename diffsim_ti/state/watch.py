@@ -106,6 +106,7 @@ class ContactWatch:
 
     def clear(self) -> None:
         """Forget what was seen."""
+        self.earlier: list[ContactResolution] = []  # of the same run, in other arrays
         self.parts: list[tuple[np.ndarray, float]] = []  # what was seen in passes of other lengths, and these [s]
         self._clear()
 
@@ -138,6 +139,13 @@ class ContactWatch:
         k, i = np.unravel_index(np.argmin(gaps), gaps.shape)
         return (int(k), int(i), -float(gaps[k, i])) if gaps[k, i] <= 0 else None
 
+    def note(self, met, face: int) -> None:
+        """A face, or where that is negative a vertex, that was found in an obstacle (potential/way.py)."""
+        rows = self.rows()
+        place = self.ws.arrays.num_vertices + face if face >= 0 else met.vertices[0]
+        rows[3 * met.obstacle, place] = min(met.value, rows[3 * met.obstacle, place])
+        self.put(rows)
+
     def vertices_of(self, place: int) -> tuple[int, ...]:
         """The vertex, or the corners of the face, that a column of `seen` is about."""
         n = self.ws.arrays.num_vertices
@@ -166,7 +174,7 @@ class ContactWatch:
         return partial(self._worst_of, values, largest, parts)
 
     def _worst_of(self, values: Derived, largest: tuple[float, float], parts: list) -> ContactResolution:
-        seen = [self.resolution_of(rows, values, h, largest) for rows, h in parts]
+        seen = [*self.earlier, *(self.resolution_of(rows, values, h, largest) for rows, h in parts)]
         return worst(seen) if self.contacts else seen[-1]
 
     def resolution_of(

@@ -13,8 +13,10 @@ from diffsim_ti.inputs import Derived, Mass
 from diffsim_ti.runtime import Kernel
 from diffsim_ti.slots import copy_slot
 from diffsim_ti.state.arrays import SceneArrays
+from diffsim_ti.state.bending import Bending
 from diffsim_ti.state.history import History, first_bad_vertex
 from diffsim_ti.state.solve_report import SolveReport
+from diffsim_ti.state.walls import Moment
 from diffsim_ti.state.watch import ContactWatch
 
 
@@ -43,27 +45,30 @@ class Workspace:
     attached = None  # springs, cables and foundations on the host (potential/attached.py)
     impulses = None  # of obstacles on vertices in each frame, where a loss names them
 
-    def __init__(self, solver, derived: Derived):
+    def __init__(self, solver, derived: Derived, bend: float = 0.0):
         self.solver, self.scene, self.report = solver, solver.scene, SolveReport()
         self.substep = solver.substep  # length of the passes that were last looked after [s]
         self.owner = runtime.program()
         explicit = solver.explicit
         self.arrays = SceneArrays(
-            self.scene, solver.stages_contact, self.feels_faces(self.scene), explicit, in_steps=not explicit
+            self.scene, solver.stages_contact, self.feels_faces(self.scene, bend), explicit, not explicit, bend
         )
         self.parallel = solver.runs_parallel()
         self.pairs = pairs_of(self.pairs_kind, self.arrays, self.parallel) if self.arrays.self_contact else None
         self.state = self.history(1)
         self.record: History | None = None
         self.frames = FrameArrays.of(self.arrays, 1, 1)
-        self.watch = ContactWatch(self)
+        self.watch, self.bending = ContactWatch(self), Bending.of(self)
         self._launches = {}
         self.load(derived)
 
     @staticmethod
-    def feels_faces(scene) -> bool:
+    def feels_faces(scene, bend: float = 0.0) -> bool:
         """Whether passes take forces at points within faces."""
         return False
+
+    def look_between_points(self, now: int) -> None:
+        """Note what contact within faces may have missed before pass `now`."""
 
     def history(self, num_slots: int, record: bool = False) -> History:
         """Room for states of this run."""
@@ -178,6 +183,16 @@ class Workspace:
     def velocity_of(self, vertex: int):
         """Velocity of one vertex [m/s]."""
         return runtime.fetch(self.state.v)[0, vertex]
+
+    def velocity_of_obstacle(self, k: int, j: int, vertex: int) -> np.ndarray:
+        """At a vertex, when pass j begins [m/s]."""
+        arrays, schedule = self.arrays, self.solver.schedule
+        if arrays.obstacles[k][2] < 0:
+            return np.zeros(3)
+        begin = schedule.begin(j)
+        rows = arrays.walls.value(arrays.rows["path"], Moment(schedule, j, begin, begin))
+        position = arrays.values.rest[vertex] + runtime.fetch(self.state.u)[0, vertex]
+        return arrays.walls.velocity_at(k, rows, position, self.watch.contacts[k].about)
 
     def restore_to_record(self) -> None:
         """Copy the current state to slot 0 of the record."""

@@ -27,14 +27,15 @@ class TorchFrames(_States):
     """Saved states as tensors of shape (frames, num_vertices, 3): positions [m] (far from the origin in float64), velocities
     [m/s], displacements [m].
 
-    `outputs` has what the Rollout was told to compute besides, by name; `frames["name"]` gives any of them.
+    `outputs` has what the Rollout was told to compute besides, by name; `frames["name"]` gives any of them. `alive`: whether
+    the run came to its end (`Rollout(..., raise_errors=False)`).
     """
 
     outputs: dict[str, torch.Tensor]
 
-    def __new__(cls, positions, velocities, displacements, outputs=None):
+    def __new__(cls, positions, velocities, displacements, outputs=None, alive=True):
         frames = super().__new__(cls, positions, velocities, displacements)
-        frames.outputs = outputs or {}
+        frames.outputs, frames.alive = outputs or {}, alive
         return frames
 
     def __getitem__(self, key):
@@ -149,6 +150,7 @@ def rollout_frames(rollout: Rollout | Batch, **tensors: torch.Tensor) -> TorchFr
     like = displacements.double() if rollout.scene.origin.any() else displacements
     if "rest_positions" not in tensors:
         rest = torch.from_numpy(np.array(rollout.values["rest_positions"])).to(like)
-        return TorchFrames(rest + displacements, velocities, displacements, outputs)
+        return TorchFrames(rest + displacements, velocities, displacements, outputs, rollout.alive)
     rest = tensors["rest_positions"].to(like)  # the reverse sweep gives the gradient of positions = rest + u
-    return TorchFrames(rest.detach() + displacements, velocities, displacements + (rest.detach() - rest), outputs)
+    displacements, moved = displacements + (rest.detach() - rest), rest.detach() + displacements
+    return TorchFrames(moved, velocities, displacements, outputs, rollout.alive)

@@ -93,14 +93,8 @@ class FaceForces(FaceRows):
         found, by, least = self.rows(0), self.rows(0), ti.cast(1e30, self.fp)
         parts = faces.parts[row]
         one, thicker = self.one_point(what, g, f, row, X, parts, faces, out)
-        per, edge = ti.cast(1, self.fp) / ti.cast(parts, self.fp), self.rows(0)
-        for m in ti.static(range(3)):
-            edge[0, m] = per * ((X[2, m] - X[0, m]) + (u[2, m] - u[0, m]))
-        # distances change by no more than the way: where a point is far away, the next ones are not looked at
-        length = self.longest(edge)
-        if ti.static(self.features.curved):
-            length += 6 * per * self.arch(X + u, self.inner(f))
-        step = ti.max(ti.cast(1.01, self.fp) * length, ti.cast(1e-30, self.fp))
+        per = ti.cast(1, self.fp) / ti.cast(parts, self.fp)
+        step = self.step_of_lattice(X, u, per, self.inner(f))
         for x in range(parts + 1):
             onwards = 0
             for y in range(parts + 1 - x):
@@ -110,13 +104,9 @@ class FaceForces(FaceRows):
                     N = self.node_weights(s, self.inner(f))
                     Xs, us = self.mix(N, X), self.mix(N, u)
                     now = g.force.outlook(scene.parameters, first, Xs, us)
-                    far = now[3]
-                    if ti.static(g.force.grain > 0):  # splines are steeper than distances, and end with their grid
-                        inside = now[3] < ti.cast(1e6 * g.force.grain, self.fp)
-                        far = ti.select(inside, ti.cast(0.8, self.fp) * now[3], width + reach)
+                    ahead, far = self.passed(g, now[3], width + reach, step, parts)
                     least = ti.min(least, ti.min(far, now[3]) - reach)
-                    ahead = ti.min((far - reach - width) / step, ti.cast(parts, self.fp))
-                    onwards = y + 1 + ti.cast(ti.max(ahead, ti.cast(0, self.fp)), ti.i32)
+                    onwards = y + 1 + ahead
                     sigma = (now[3] - reach) / width
                     said = s[0] * corners[0, 3] + s[1] * corners[1, 3] + s[2] * corners[2, 3]
                     t = self.besides(g, said, now[3]) / width

@@ -154,20 +154,25 @@ class FaceRows(HeldBack):
             d = g.force.gap(scene.parameters, first, self.row_of(X, a), self.row_of(u, a))
             for b in ti.static(range(3)):
                 gaps[b] = ti.select(a == b, d, gaps[b])
+        step, felt = self.step_of_lattice(X, u, per, self.inner(f)), width + reach + self.size_of_rows(f, move)
         for x in range(parts + 1):
+            onwards = 0
             for y in range(parts + 1 - x):
-                s1, s2 = x * per, y * per
-                s = ti.Vector([1 - s1 - s2, s1, s2])
-                N = self.node_weights(s, self.inner(f))
-                now = g.force.outlook(scene.parameters, first, self.mix(N, X), self.mix(N, u))
-                d, before = now[3], now[3] - self.dot3(now, self.mix(N, move))
-                bent = s.dot(gaps) - d > ti.cast(BENT, self.fp) * width
-                if bent and d <= reach:
-                    d -= reach
-                if before <= 0 and (bent or d <= 0):
-                    d = ti.min(d, before)
-                if bent or d <= 0:
-                    least = ti.min(least, d)
+                if y >= onwards:
+                    s1, s2 = x * per, y * per
+                    s = ti.Vector([1 - s1 - s2, s1, s2])
+                    N = self.node_weights(s, self.inner(f))
+                    now = g.force.outlook(scene.parameters, first, self.mix(N, X), self.mix(N, u))
+                    ahead, _ = self.passed(g, now[3], felt, step, parts)
+                    onwards = y + 1 + ahead
+                    d, before = now[3], now[3] - self.dot3(now, self.mix(N, move))
+                    bent = s.dot(gaps) - d > ti.cast(BENT, self.fp) * width
+                    if bent and d <= reach:
+                        d -= reach
+                    if before <= 0 and (bent or d <= 0):
+                        d = ti.min(d, before)
+                    if bent or d <= 0:
+                        least = ti.min(least, d)
         return least
 
     # ---- what faces do to their nodes ---------------------------------------------------------------------------------

@@ -5,7 +5,7 @@ import taichi as ti
 
 from diffsim_ti import runtime
 from diffsim_ti.mesh.curved_triangles import are_felt
-from diffsim_ti.potential.face_lattice import BENT, lattices, nodes_of_faces
+from diffsim_ti.potential.face_lattice import BENT, lattices, nodes_of_faces, shortened
 from diffsim_ti.slots import VertexRows, copy_slot
 from diffsim_ti.solvers.explicit.face_derivatives import face_derivatives
 from diffsim_ti.solvers.explicit.face_friction import FaceFriction
@@ -15,8 +15,9 @@ from diffsim_ti.terms.obstacles.barrier import beta
 TRAVEL, LOAD = 0.2, 0.2
 
 
-def feels_faces(scene) -> bool:
-    """Whether a scene has an obstacle that could reach into a face of the body between its corners.
+def feels_faces(scene, bend: float = 0.0) -> bool:
+    """Whether a scene has an obstacle that could reach into a face of the body between its corners; bend: how far faces have
+    bent in a run [m] (state/bending.py).
 
     A ball of radius R that touches a face, whose longest edge is L, is nearer to it than its corners say by L^2 / 6 R at
     most. Where that is less than what points within faces feel in full, BENT widths (potential/face_lattice.py), corners
@@ -25,7 +26,7 @@ def feels_faces(scene) -> bool:
     x = scene.mesh.vertices[scene.mesh.surface_triangles]
     longest = 1.2 * np.linalg.norm(x - np.roll(x, 1, axis=1), axis=2).max(initial=0)
     obstacles = [t for t in scene.terms if t.acts_on_surface and "barrier_width" in t.values]
-    return are_felt(scene.mesh, obstacles) or any(
+    return are_felt(scene.mesh, obstacles, bend) or any(
         longest**2 > 6 * t.least_radius() * BENT * float(t.values["barrier_width"]) for t in obstacles
     )
 
@@ -48,6 +49,7 @@ class FeltFaces:
         entries = np.argsort(own, kind="stable")
         start = np.searchsorted(own[entries], np.arange(len(surface) + 1))
         parts, reach, weight = lattices(a)
+        self.full_reach, self.is_shortened = reach, False
         ints = dict(corners=faces, own=own, start=start, entries=entries, vertices=surface, parts=parts)
         for name, data in ints.items():
             setattr(self, name, runtime.upload(data.ravel(), ti.i32))
@@ -104,6 +106,12 @@ class FeltFaces:
         order = (range(n)[::-1] if back else range(n)) if self.ws.parallel else [0]
         for k in order:
             self.run(name, plan, state, slot, n, k, **records)
+
+    def starts(self, distances: np.ndarray) -> None:
+        """A run starts with these distances [m] of the triangles to what is nearest."""
+        reach = shortened(self.full_reach, distances)
+        self.is_shortened = bool((reach < self.full_reach).any())
+        runtime.fill(self.reach, reach.ravel())
 
     # ---- in passes ---------------------------------------------------------------------------------------------------
 

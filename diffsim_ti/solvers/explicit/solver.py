@@ -106,9 +106,14 @@ class ExplicitSolver(Solver):
     def lags(self, j: int, num_passes: int) -> bool:
         """Whether before pass j the velocity is that of half a substep ago."""
 
-    def workspace(self, derived: Derived) -> "ExplicitWorkspace":
-        """Arrays and bound launches for runs of this solver."""
-        return ExplicitWorkspace(self, derived)
+    def workspace(self, derived: Derived, bend: float = 0.0) -> "ExplicitWorkspace":
+        """Arrays and bound launches for runs of this solver; bend: see state/bending.py."""
+        if bend and self.scene.reduced:
+            raise ValueError(
+                f"reduced sets ({self.scene.reduced.describe()}) feel obstacles at their vertices alone in explicit steps, "
+                f"and ten-node faces bend by {bend / 2:.3g} m where they touch: take a finer mesh, or an implicit solver"
+            )
+        return ExplicitWorkspace(self, derived, bend)
 
     def adjoint(self, workspace, density: bool, shape: bool):
         """The reverse sweep of a run."""
@@ -125,13 +130,14 @@ class ExplicitWorkspace(Workspace):
     feels_faces = staticmethod(feels_faces)
     work_per_launch = 4_000_000  # tetrahedra x passes in one launch: a tenth of a second, so that Ctrl-C is heard
 
-    def __init__(self, solver, derived: Derived):
+    def __init__(self, solver, derived: Derived, bend: float = 0.0):
         self.table = PassTable(runtime.PRECISIONS[solver.scene.precision])
-        super().__init__(solver, derived)
-        self.in_parallel = solver.passes_per_launch()
+        super().__init__(solver, derived, bend)
+        self.in_parallel = 1 if self.arrays.feels_faces else solver.passes_per_launch()
         self.repeated = self.parallel and self.in_parallel > 1
         features, a = self.arrays.features(), self.arrays
         self.faces = FeltFaces(self) if a.feels_faces else None
+        self.check_apart()
         self.following = following(self.scene)
         self.chambers = Chambers(self) if a.chambers else None
         self.volumes = HeldVolumes(self) if self.scene.holds_volumes else None
@@ -169,8 +175,25 @@ class ExplicitWorkspace(Workspace):
         """Raise ValueError if a face is in an obstacle that faces feel."""
         a = self.arrays
         if a.feels_faces:
-            way = self.kept("way", lambda: Way(a, self.parallel))
-            way.check_apart(runtime.fetch_row(self.state.u, 0), runtime.fetch(a.offsets)[::3].astype(np.float64))
+            far = 2 * self.faces.full_reach.max(initial=0) if self.faces else 0.0
+            distances = self.way.check_apart(*self._in_front_of_obstacles(), far)
+            if self.faces:
+                self.faces.starts(distances)
+
+    @property
+    def way(self) -> Way:
+        return self.kept("way", lambda: Way(self.arrays, self.parallel))
+
+    def _in_front_of_obstacles(self) -> tuple:
+        return runtime.fetch_row(self.state.u, 0), runtime.fetch(self.arrays.offsets)[::3].astype(np.float64)
+
+    def look_between_points(self, now: int) -> None:
+        """Note what got into an obstacle before pass `now` between points of faces that do not reach as far as that."""
+        if self.faces and self.faces.is_shortened:
+            self.place_obstacles(now)
+            met = self.way.nearest(*self._in_front_of_obstacles())
+            if met is not None:
+                self.watch.note(met, int(self.way.found.argmin()) - self.way.num_vertices)
 
     def chamber_pressures(self, num_frames: int, save_every: int) -> np.ndarray:
         return self.volumes.of_all(num_frames)

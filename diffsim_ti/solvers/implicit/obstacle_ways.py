@@ -26,7 +26,11 @@ class ObstacleWays:
     def check_apart(self) -> None:
         """Raise Overlap if a face is in an obstacle, which vertices alone do not show."""
         u, walls = runtime.fetch_row(self.state.u, 0), runtime.fetch(self.arrays.offsets)[::3].astype(np.float64)
-        self.way.check_apart(u, walls)
+        faces = self.potential.faces
+        if faces is None:
+            self.way.check_apart(u, walls)
+        else:
+            faces.begin(self.way.check_apart(u, walls, 2 * faces.reach.max(initial=0)))
 
     def _walls_at_end(self, j: int) -> np.ndarray:
         """Displacements of the obstacles at the end of pass j."""

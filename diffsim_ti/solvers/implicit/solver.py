@@ -67,9 +67,9 @@ class ImplicitSolver(Solver):
     def stage(self, rate: float, fresh: bool, j: int) -> Stage:
         """The numbers of pass j; `fresh`: there is no state before the present one."""
 
-    def workspace(self, derived):
-        """Arrays and launches for runs of this solver."""
-        return ImplicitWorkspace(self, derived)
+    def workspace(self, derived, bend=0.0):
+        """Arrays and launches for runs of this solver; bend: see state/bending.py."""
+        return ImplicitWorkspace(self, derived, bend)
 
     def adjoint(self, workspace, density: bool, shape: bool):
         """The reverse sweep of a run."""

@@ -51,10 +51,10 @@ class ImplicitWorkspace(Preconditioned, ObstacleWays, Noted, GivenInPasses, Work
     pairs_kind = ImplicitPairs
     enough = 20  # rounds with which an equilibrium that was not found is looked for in parts
 
-    def __init__(self, solver, derived):
+    def __init__(self, solver, derived, bend=0.0):
         self.potential, self._length = None, solver.substep
         self.energy_watch = EnergyWatch(self) if solver.may_gain_energy and not solver.scene.growing else None
-        super().__init__(solver, derived)
+        super().__init__(solver, derived, bend)
 
     def history(self, num_slots, record=False):
         kind = TwoStepHistory if self.solver.multistep else History
@@ -160,6 +160,8 @@ class ImplicitWorkspace(Preconditioned, ObstacleWays, Noted, GivenInPasses, Work
             begin, self.newton.reports = time.perf_counter(), []
             try:
                 u_next, v_next = self._pass(j, u, v, before)
+                if self.bending:
+                    self.bending.look(j + 1, u_next)
                 self.note_contacts(j, save_every)
                 self.note_solves(j, num_passes, time.perf_counter() - begin)
             except (NotConverged, Tunnelling) as error:

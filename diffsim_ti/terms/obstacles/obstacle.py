@@ -12,7 +12,7 @@ from diffsim_ti.terms.gravity import Gravity
 from diffsim_ti.terms.motion import Motion
 from diffsim_ti.terms.obstacles.obstacle_force import ObstacleForce
 from diffsim_ti.terms.obstacles.shapes import Triangles
-from diffsim_ti.terms.obstacles.stiffness import stiffness_of_impact
+from diffsim_ti.terms.obstacles.stiffness import approach, over_time, pressed_by, stiffness_of_impact
 from diffsim_ti.terms.pose import brought_back, carried, path_width, sampled_path
 from diffsim_ti.terms.term import Term
 
@@ -27,7 +27,8 @@ class Obstacle(Term):
 
     stiffness_per_area [N/m^3]: k is that times the share of the surface at rest that the vertex stands for
     (inputs/surface_areas.py): gaps, forces and friction are those of a surface and converge as it is refined. None lets the
-    scene choose it from density, wave speed, weight and impact (stiffness.py). Or
+    scene choose it, once, from density, wave speed, weight, impact, motions and paths over the first second, loads and
+    muscles (stiffness.py). Or
     stiffness [N/m]: k of every vertex alike, however many there are.
     width [m]: how far the obstacle is felt.
     Faces of ten-node tetrahedra that are curved in the mesh, by .02 widths or more, are felt as curved as they move, by
@@ -134,7 +135,8 @@ class Obstacle(Term):
         return "friction" in self.values
 
     def settled(self, scene, density, initial_positions, initial_velocities) -> "Obstacle":
-        """With the stiffness per area that the fall from the start, or the start's velocity, asks for."""
+        """With the stiffness per area that the fall from the start, the start's velocity, motions over the first second, and
+        what presses on the body ask for."""
         if not self.chooses_stiffness:
             return self
         gravity = scene.term(Gravity)
@@ -143,12 +145,21 @@ class Obstacle(Term):
         start = np.zeros(3) if self.path is None else sampled_path(self.path_name, self.path, [0.0])[0]
         fall = max(float(self.gap(positions, start).min()), 0.0)
         first = 0.0 if initial_velocities is None else np.linalg.norm(np.atleast_2d(initial_velocities), axis=1).max()
-        speed, width = float(np.sqrt(first**2 + 2 * g * fall)), float(self.values["barrier_width"])
-        stiffness = stiffness_of_impact(scene.mesh, scene.material, float(np.mean(density)), g, speed, width)
+        led = own = 0.0
+        if scene.motion is not None:
+            moves = over_time(lambda t: scene.supports.rows(scene.motion, t))
+            led = approach([self.gap(positions[scene.held] + x, start) for x in moves])
+        if self.path is not None:
+            rows = over_time(lambda t: sampled_path(self.path_name, self.path, t))
+            own = approach([self.gap(positions, row) for row in rows])
+        speed, width = float(np.sqrt(first**2 + 2 * g * fall)) + led + own, float(self.values["barrier_width"])
+        mean, mesh = float(np.mean(density)), scene.mesh
+        pressed = pressed_by(scene.terms, mesh, mean)
+        stiffness = stiffness_of_impact(mesh, scene.material, mean, g, speed, width, pressed)
         if not stiffness > 0:
             raise ValueError(
-                f"{type(self).__name__}: without gravity and velocity nothing says how stiff the barrier must be; pass "
-                "stiffness_per_area [N/m^3]"
+                f"{type(self).__name__}: without gravity, velocity, motion and loads nothing says how stiff the barrier "
+                "must be; pass stiffness_per_area [N/m^3]"
             )
         return self.with_input(PER_AREA, value=stiffness)
 
