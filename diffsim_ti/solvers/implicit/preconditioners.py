@@ -6,15 +6,32 @@ Both are functions of the present state alone, so that a run that is started aga
 import numpy as np
 
 from diffsim_ti.potential.free import Free, FreeDirections, mask_of
+from diffsim_ti.solvers.implicit.factorised import Effort
 
 
-class BlockJacobi:
+class Preconditioner:
+    """What is known of a preconditioner of a potential's Hessian; `begin` forgets it, so that passes do not depend on those
+    before them: given_up, whether it was too slow; unfit, whether it was not positive definite; has_warned, whether that was
+    said."""
+
+    given_up = unfit = has_warned = False
+
+    def begin(self) -> None:
+        self.given_up = self.unfit = False
+
+    @property
+    def effort(self) -> Effort:
+        """Of the factorisation that takes its place."""
+        return Effort.of(self.potential.arrays.mesh)
+
+
+class BlockJacobi(Preconditioner):
     """The inverse 3x3 diagonal blocks; blocks that are not positive definite take |eigenvalues|.
 
     size: of the diagonal at rest [N/m], to which what is all but zero is raised.
     """
 
-    def __init__(self, potential, mass: np.ndarray, free: Free, size: np.ndarray, parallel: bool = True):
+    def __init__(self, potential, mass: np.ndarray, free: Free, size: np.ndarray | float, parallel: bool = True):
         self.potential, self.mass, self.free, self.least = potential, mass, free, 1e-6 * (size + mass)
 
     def update(self, u: np.ndarray) -> None:
