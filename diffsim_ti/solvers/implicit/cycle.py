@@ -86,8 +86,8 @@ def inverses(blocks: np.ndarray) -> np.ndarray:
 
 
 def positive_inverse(A: np.ndarray) -> np.ndarray:
-    """The inverse of a symmetric matrix; where that is not definite, as of a body that nothing holds yet, of eigenvalues raised
-    to a millionth of the largest, which float32 resolves."""
+    """The inverse of a symmetric matrix; where that is not definite, as of a body that nothing holds yet, eigenvalues are
+    raised to a millionth of the largest, which float32 resolves."""
     values, vectors = np.linalg.eigh(A)
     if values[0] > 1e-10 * values[-1]:
         return np.linalg.inv(A)

@@ -99,7 +99,9 @@ def _in_turn(operator, preconditioner, most: int):
             other = BlockJacobi(operator.potential, diagonal_of(operator.mass), operator.free, 0.0)
             other.update(operator.potential.held_at)
     if preconditioner.unfit:
-        _say(preconditioner, f"{type(preconditioner).__name__} is not positive definite in this state: {method} instead")
+        _say(
+            preconditioner, f"{type(preconditioner).__name__} is not positive definite in this state: {method} instead"
+        )
     elif effort.unknowns > effort.large:
         reason = f"conjugate gradients had not converged after {effort.patience} products of {effort.unknowns} unknowns"
         _say(preconditioner, f"{reason}: {method} instead, which may take minutes and gigabytes")
