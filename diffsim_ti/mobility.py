@@ -176,7 +176,8 @@ class Rows:
             about = np.round(self.mesh.vertices[own].mean((0, 1)), 6).tolist()
             return (
                 f"{len(own)} tetrahedra about {about} meet others, or each other, at vertices or edges alone "
-                f"(vertices {at}): a hinge, about which they turn without strain ({whole or f'{left} motions'}), a mechanism; join them by faces, leave them out of the mesh, hold them"
+                f"(vertices {at}): a hinge, about which they turn without strain ({whole or f'{left} motions'}), a "
+                "mechanism; join them by faces, leave them out of the mesh, hold them"
             )
         number = pieces(self.mesh)
         every = np.unique(number[self.mesh.tetrahedra[:, 0]])
