@@ -51,7 +51,7 @@ class Effort:
 
     @property
     def patience(self) -> int:
-        """Products of the Hessian that take about as long as assembly and factorisation."""
+        """Products of the Hessian, with multigrid, that take about as long as assembly and factorisation."""
         return int(100 + self.operations / (50 * self.coupled))
 
     @property

@@ -88,7 +88,7 @@ def _in_turn(operator, preconditioner, most: int):
         yield preconditioner, most
         return
     if not preconditioner.given_up:
-        yield preconditioner, min(most, effort.patience)
+        yield preconditioner, min(most, preconditioner.patience)
         preconditioner.given_up = True
     other = operator.factorised() if effort.fits else None
     method = "a sparse factorisation"
@@ -103,7 +103,7 @@ def _in_turn(operator, preconditioner, most: int):
             preconditioner, f"{type(preconditioner).__name__} is not positive definite in this state: {method} instead"
         )
     elif effort.unknowns > effort.large:
-        reason = f"conjugate gradients had not converged after {effort.patience} products of {effort.unknowns} unknowns"
+        reason = f"conjugate gradients had not converged after {preconditioner.patience} products of {effort.unknowns} unknowns"
         _say(preconditioner, f"{reason}: {method} instead, which may take minutes and gigabytes")
     yield other, most
 

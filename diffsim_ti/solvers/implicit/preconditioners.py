@@ -15,6 +15,7 @@ class Preconditioner:
     said."""
 
     given_up = unfit = has_warned = False
+    quick = 1  # products with multigrid take so many times as long
 
     def begin(self) -> None:
         self.given_up = self.unfit = False
@@ -24,12 +25,19 @@ class Preconditioner:
         """Of the factorisation that takes its place."""
         return Effort.of(self.potential.arrays.mesh)
 
+    @property
+    def patience(self) -> int:
+        """Products in which it has to be enough."""
+        return self.quick * self.effort.patience
+
 
 class BlockJacobi(Preconditioner):
     """The inverse 3x3 diagonal blocks; blocks that are not positive definite take |eigenvalues|.
 
     size: of the diagonal at rest [N/m], to which what is all but zero is raised.
     """
+
+    quick = 3
 
     def __init__(self, potential, mass: np.ndarray, free: Free, size: np.ndarray | float, parallel: bool = True):
         self.potential, self.mass, self.free, self.least = potential, mass, free, 1e-6 * (size + mass)
