@@ -211,6 +211,7 @@ def _spanned(vectors: np.ndarray) -> str:
     """A basis of what vectors span, in words."""
     _, sizes, V = np.linalg.svd(vectors.reshape(-1, 3), full_matrices=False)
     basis = V[sizes > 1e-6]
+    basis = basis * np.sign(basis[np.arange(len(basis)), np.abs(basis).argmax(1)])[:, None]
     projector = basis.T @ basis
     axes = [axis for axis, d in AXES.items() if abs(projector[d, d] - 1) < 1e-9]
     if len(axes) == len(basis):

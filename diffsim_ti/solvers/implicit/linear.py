@@ -103,8 +103,8 @@ def _in_turn(operator, preconditioner, most: int):
             preconditioner, f"{type(preconditioner).__name__} is not positive definite in this state: {method} instead"
         )
     elif effort.unknowns > effort.large:
-        reason = f"conjugate gradients had not converged after {preconditioner.patience} products of {effort.unknowns} unknowns"
-        _say(preconditioner, f"{reason}: {method} instead, which may take minutes and gigabytes")
+        reason = f"conjugate gradients had not converged after {preconditioner.patience} products"
+        _say(preconditioner, f"{reason} of {effort.unknowns} unknowns: {method} instead, which may take minutes")
     yield other, most
 
 
