@@ -43,7 +43,7 @@ def terms_by_name(mesh: ds.TetrahedralMesh) -> dict[str, Callable[[], object]]:
         "gravity": lambda: ds.Gravity(),
         "drag": lambda: ds.Drag(1.0),
         "force": lambda: ds.ExternalForce([0.0, 1.0, 0.0], [top]),
-        "floor": lambda: ds.Ground(height=-0.01, width=0.005),
+        "floor": lambda: ds.Ground(height=-0.01, width=0.005, stiffness_per_area=1e7),
         "self-contact": lambda: ds.SelfContact(width=0.002),
     }
 
@@ -185,9 +185,10 @@ def main() -> int:
         for names in itertools.combinations(terms_by_name(mesh), 2):
             for solver in IMPLICIT:
                 said = run_pair(mesh, names, solver)
+                bad += bool(said) and not said.startswith("ValueError")  # that is what is refused
                 if said:
                     print(*names, solver.__name__, said[:200], flush=True)
-        return 0
+        return int(bad > 0)
     for number in range(options.cases):
         case, found = draw(number, options.seed, options.cells), judged(number, options.seed, options.cells)
         ratio = (found["seconds"] - 0.5) / (found["once"] * (found["rounds"] + 2))  # one more looks for saddles
