@@ -10,7 +10,7 @@ from diffsim_ti.copies import CarriesMore
 from diffsim_ti.inputs import diagonal_of
 from diffsim_ti.potential.free import Free, linear_of
 from diffsim_ti.solvers.implicit.factorised import Factorised
-from diffsim_ti.solvers.implicit.preconditioners import BlockJacobi
+from diffsim_ti.solvers.implicit.preconditioners import BlockJacobi, Preconditioner
 
 
 class NotConverged(CarriesMore, FloatingPointError):
@@ -81,13 +81,13 @@ class Operator:
 
 def _in_turn(operator, preconditioner, most: int):
     """(preconditioner, products that it may take) one after the other, until a solve succeeds: that of the pass, as many as
-    the time of a factorisation allows; the factorisation, from then on in all rounds of a solve of Newton's; where there is
-    none, the first again, or block Jacobi where that is not positive definite."""
-    effort = getattr(preconditioner, "effort", None)
-    if effort is None:
+    the time of a factorisation allows, in all rounds of a solve of Newton's twice as many; the factorisation, in all rounds
+    from then on; where there is none, the first again, or block Jacobi where that is not positive definite."""
+    if not isinstance(preconditioner, Preconditioner):
         yield preconditioner, most
         return
-    if not preconditioner.given_up:
+    effort = preconditioner.effort
+    if not (preconditioner.given_up or preconditioner.spent > 2 * preconditioner.patience):
         yield preconditioner, min(most, preconditioner.patience)
         preconditioner.given_up = True
     other = operator.factorised() if effort.fits else None
@@ -108,6 +108,11 @@ def _in_turn(operator, preconditioner, most: int):
     yield other, most
 
 
+def _count(preconditioner, products: int) -> None:
+    if isinstance(preconditioner, Preconditioner):
+        preconditioner.spent += products
+
+
 def _say(preconditioner, message: str) -> None:
     """Once of each preconditioner."""
     if not preconditioner.has_warned:
@@ -124,6 +129,7 @@ def conjugate_gradients(operator, b, preconditioner, tolerance: float, max_itera
     """
     for own, most in _in_turn(operator, preconditioner, max_iterations):
         found = _conjugate_gradients(operator, b, own, tolerance, most, eps)
+        _count(own, found[2])
         if found[1] <= tolerance or found[3] is not None:
             break
         if own is preconditioner and not np.isfinite(found[1]):
@@ -172,6 +178,7 @@ def gmres(operator, b, preconditioner, tolerance: float, max_iterations: int, re
     """
     for own, most in _in_turn(operator, preconditioner, max_iterations):
         found = _gmres(operator, b, own, tolerance, most, restart)
+        _count(own, found[2])
         if found[1] <= tolerance:
             break
     return found

@@ -11,14 +11,14 @@ from diffsim_ti.solvers.implicit.factorised import Effort
 
 class Preconditioner:
     """What is known of a preconditioner of a potential's Hessian; `begin` forgets it, so that passes do not depend on those
-    before them: given_up, whether it was too slow; unfit, whether it was not positive definite; has_warned, whether that was
-    said."""
+    before them: the products spent; given_up, whether it was too slow; unfit, whether it was not positive definite;
+    has_warned, whether that was said."""
 
-    given_up = unfit = has_warned = False
+    spent, given_up, unfit, has_warned = 0, False, False, False
     quick = 1  # products with multigrid take so many times as long
 
     def begin(self) -> None:
-        self.given_up = self.unfit = False
+        self.spent, self.given_up, self.unfit = 0, False, False
 
     @property
     def effort(self) -> Effort:
@@ -63,6 +63,8 @@ class BodyBlocks(BlockJacobi):
     """The same, and the inverse of d2E/dq2 of each set that moves by few numbers q: of the body at rest, with inertia and
     contact as they are; where its basis is of each component turned with it, as in multigrid.py. Of sets that do not deform
     q are shifts and turns (potential/rigid_sets.py), whose part of the body at rest turns with them, too."""
+
+    patience = 10**9  # for nothing takes its place
 
     def __init__(self, potential, mass: np.ndarray, free: Free, size: np.ndarray, parallel: bool = True):
         super().__init__(potential, mass, free, size, parallel)
