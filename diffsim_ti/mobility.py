@@ -183,15 +183,9 @@ class Rows:
         every = np.unique(number[self.mesh.tetrahedra[:, 0]])
         own = np.unique(np.searchsorted(every, number[self.vertices[mine]])).tolist()
         many = f"pieces {', '.join(map(str, own))} of {len(every)} of the body, which springs or cables join, are"
-        which = (
-            "the body is"
-            if len(every) == 1
-            else many
-            if len(own) > 1
-            else f"piece {own[0]} of {len(every)} of the body is"
-        )
+        one = "the body is" if len(every) == 1 else f"piece {own[0]} of {len(every)} of the body is"
         motions = f"rigidly ({whole})" if whole else f"against each other without strain ({left} motions)"
         return (
-            f"{which} free to move {motions}: hold it by fixed=..., at three vertices that do not lie on a line or in as "
-            "many directions as that takes, by springs, elastic cables that are not slack, or foundations"
+            f"{many if len(own) > 1 else one} free to move {motions}: hold it by fixed=..., at three vertices that do not lie "
+            "on a line or in as many directions as that takes, by springs, elastic cables that are not slack, or foundations"
         )

@@ -90,21 +90,18 @@ def _in_turn(operator, preconditioner, most: int):
     if not (preconditioner.given_up or preconditioner.spent > 2 * preconditioner.patience):
         yield preconditioner, min(most, preconditioner.patience)
         preconditioner.given_up = True
-    other = operator.factorised() if effort.fits else None
-    method = "a sparse factorisation"
+    other, name = operator.factorised() if effort.fits else None, type(preconditioner).__name__
+    instead = "its sparse factorisation takes their place, which may take minutes"
     if other is None:
-        method, other = "they go on", preconditioner
+        other, instead = preconditioner, "there is no room for a factorisation, so they go on"
         if preconditioner.unfit:
-            method = "block Jacobi"
             other = BlockJacobi(operator.potential, diagonal_of(operator.mass), operator.free, 0.0)
             other.update(operator.potential.held_at)
     if preconditioner.unfit:
-        _say(
-            preconditioner, f"{type(preconditioner).__name__} is not positive definite in this state: {method} instead"
-        )
+        _say(preconditioner, f"{name} is not positive definite in this state: {type(other).__name__} takes its place")
     elif effort.unknowns > effort.large:
-        reason = f"conjugate gradients had not converged after {preconditioner.patience} products"
-        _say(preconditioner, f"{reason} of {effort.unknowns} unknowns: {method} instead, which may take minutes")
+        words = f"conjugate gradients or GMRES take more than {preconditioner.patience} products of a Hessian of"
+        _say(preconditioner, f"{words} {effort.unknowns} unknowns: {instead}")
     yield other, most
 
 
