@@ -184,8 +184,9 @@ class Rows:
         own = np.unique(np.searchsorted(every, number[self.vertices[mine]])).tolist()
         many = f"pieces {', '.join(map(str, own))} of {len(every)} of the body, which springs or cables join, are"
         one = "the body is" if len(every) == 1 else f"piece {own[0]} of {len(every)} of the body is"
+        which = many if len(own) > 1 else one
         motions = f"rigidly ({whole})" if whole else f"against each other without strain ({left} motions)"
         return (
-            f"{many if len(own) > 1 else one} free to move {motions}: hold it by fixed=..., at three vertices that do not lie "
-            "on a line or in as many directions as that takes, by springs, elastic cables that are not slack, or foundations"
+            f"{which} free to move {motions}: hold it by fixed=..., at three vertices that do not lie on a line or in as "
+            "many directions as that takes, by springs, elastic cables that are not slack, or foundations"
         )
