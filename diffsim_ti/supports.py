@@ -185,8 +185,13 @@ def rigid_motions_left(places: np.ndarray, held: np.ndarray) -> str:
     size = float(np.abs(arms).max(initial=0.0)) or 1.0
     across = np.cross(np.eye(3)[None], arms[:, None] / size)  # rows e_d x arm
     motions = np.concatenate([np.tile(np.eye(3), (len(places), 1, 1)), across], 1)  # (k, 6, 3)
-    felt = np.concatenate([np.zeros((6, 6)), np.einsum("kij,kmj->kim", held, motions).reshape(-1, 6)])
-    _, sizes, V = np.linalg.svd(felt, full_matrices=False)
+    return motions_left(np.einsum("kij,kmj->kim", held, motions).reshape(-1, 6))
+
+
+def motions_left(felt: np.ndarray) -> str:
+    """The rigid motions that none of the rows, shape (k, 6), feels, in words; a row says what it feels of three translations
+    and of three rotations."""
+    _, sizes, V = np.linalg.svd(np.concatenate([np.zeros((6, 6)), felt]), full_matrices=False)
     left = V[sizes <= 1e-8 * max(sizes.max(), 1.0)]
     if len(left) == 6:
         return "6 rigid modes: 3 translations, 3 rotations"
@@ -206,6 +211,7 @@ def _spanned(vectors: np.ndarray) -> str:
     """A basis of what vectors span, in words."""
     _, sizes, V = np.linalg.svd(vectors.reshape(-1, 3), full_matrices=False)
     basis = V[sizes > 1e-6]
+    basis = basis * np.sign(basis[np.arange(len(basis)), np.abs(basis).argmax(1)])[:, None]
     projector = basis.T @ basis
     axes = [axis for axis, d in AXES.items() if abs(projector[d, d] - 1) < 1e-9]
     if len(axes) == len(basis):

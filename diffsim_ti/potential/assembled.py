@@ -2,8 +2,9 @@
 
 import numpy as np
 
+from diffsim_ti.inputs import ConsistentMass, Mass
 from diffsim_ti.potential.attached import Attached
-from diffsim_ti.potential.free import FreeDirections, mask_of, projectors_of
+from diffsim_ti.potential.free import Free, FreeDirections, mask_of, projectors_of
 from diffsim_ti.potential.potential import Potential
 from diffsim_ti.state.arrays import SceneArrays
 
@@ -34,8 +35,9 @@ def element_matrices(potential) -> np.ndarray:
     return np.moveaxis((left @ right).reshape(m, k, 3, 3, k), 4, 2)
 
 
-def assemble(potential, mass, free):
-    """(c M + K as a block matrix, places of its diagonal blocks); what is held keeps a diagonal."""
+def assemble(potential, mass: Mass, free: Free, more=()):
+    """(c M + K of the stress where `potential.blocks` was last called, with SciPy matrices `more`, as a block matrix, places
+    of its diagonal blocks); what is held keeps a diagonal."""
     from scipy.sparse import bsr_matrix
 
     n, nodes = potential.arrays.num_vertices, potential.arrays.mesh.elements.astype(np.int64)
@@ -45,6 +47,14 @@ def assemble(potential, mass, free):
         rows, columns, blocks = potential.coupling.entries(potential.patch_gradients())
         places = np.concatenate([places, rows * n + columns])
         parts.append(blocks.reshape(-1, 9))
+    if isinstance(mass, ConsistentMass):
+        own = (mass.factor * mass.matrix).tocoo()
+        places = np.concatenate([places, own.row.astype(np.int64) * n + own.col])
+        parts.append((own.data[:, None, None] * np.eye(3)).reshape(-1, 9))
+    for matrix in more:
+        own = matrix.tobsr((3, 3))
+        places = np.concatenate([places, np.repeat(np.arange(n), np.diff(own.indptr)) * n + own.indices])
+        parts.append(own.data.reshape(-1, 9))
     each = np.arange(n, dtype=np.int64) * (n + 1)  # also of vertices in no tetrahedron
     places, inverse = np.unique(np.concatenate([places, each]), return_inverse=True)
     data, first = np.zeros((len(places), 9)), 0
@@ -59,7 +69,8 @@ def assemble(potential, mass, free):
     if isinstance(free, FreeDirections):
         data = P[rows] @ data @ P[columns]
     diagonal = np.searchsorted(places, each)
-    data[diagonal] += mass[:, :, None] * np.eye(3)
+    if not isinstance(mass, ConsistentMass):
+        data[diagonal] += mass[:, :, None] * np.eye(3)
     data[diagonal[~is_free]] = np.eye(3) * (np.abs(data).max() or 1.0)
     if isinstance(free, FreeDirections):
         at = diagonal[free.guided]

@@ -3,7 +3,6 @@
 import numpy as np
 
 from diffsim_ti.inputs import Derived
-from diffsim_ti.inputs.ties import directions
 from diffsim_ti.potential.ties import Ties
 from diffsim_ti.state.schedule import EqualSteps, Schedule
 
@@ -169,29 +168,3 @@ class Attached:
             out[own] += self.foundation.forces(w)
             adj.foundation -= (w[own][:, :, None] * u[own][:, None]).reshape(-1, 3)
         return out
-
-
-def attached_places(scene, of_piece: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Places at rest [m] where springs to anchors and foundations hold a piece of the body, a mask over its vertices, and
-    projectors onto the directions in which they do, (k, 3) and (k, 3, 3)."""
-    places, held = [np.zeros((0, 3))], [np.zeros((0, 3, 3))]
-    derived = scene.inputs.derive(scene.inputs.at_times([0.0])) if scene.springs or scene.foundations else None
-    if scene.foundations:
-        vertices = scene.founded_vertices
-        values, vectors = np.linalg.eigh(derived.foundation.reshape(-1, 3, 3))
-        kept = (values > 1e-9 * values.max(initial=0.0))[:, None] * vectors
-        own = of_piece[vertices]
-        places.append(scene.mesh.vertices[vertices[own]])
-        held.append((kept @ np.swapaxes(kept, 1, 2))[own])
-    if scene.springs:
-        paths, n = scene.tie_paths, scene.mesh.num_vertices
-        points, stiffness = paths.matrix(n), derived.ties[0, 0::2, 2]
-        springs = sum(len(term.paths(scene.mesh)) for term in scene.springs)
-        for k, first in enumerate(paths.first_point[:springs]):
-            ends = np.array([first, first + 1])
-            body = ends[~np.isin(ends, paths.anchored)]
-            if len(body) == 1 and stiffness[k] > 0 and of_piece[paths.vertices[paths.first_corner[body[0]]]]:
-                along = directions(derived.tie_segments[first : first + 1])[0]
-                places.append(points[body] @ scene.mesh.vertices)
-                held.append((np.outer(along, along) if along.any() else np.eye(3))[None])
-    return np.concatenate(places), np.concatenate(held)

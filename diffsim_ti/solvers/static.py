@@ -2,12 +2,8 @@
 
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from diffsim_ti.mesh.sets import pieces
-from diffsim_ti.potential.attached import attached_places
+from diffsim_ti.mobility import free_motions
 from diffsim_ti.solvers.implicit.solver import ImplicitSolver, Stage
-from diffsim_ti.supports import rigid_motions_left
 from diffsim_ti.terms import SelfContact
 
 if TYPE_CHECKING:
@@ -20,9 +16,10 @@ class StaticSolver(ImplicitSolver):
     saddle. Several steps follow prescribed motion and forces per step quasi-statically.
 
     load_steps: in the first step loads and prescribed motion are laid on in so many parts, each starting from the last.
-    Raises ValueError, which names the motions, if the supports leave a piece of the body free to move rigidly; NotConverged
-    otherwise. Where the scene has obstacles or SelfContact such a piece goes, as the loads pull it, by up to the body's size
-    to where contact holds it, with a warning; NotConverged if nothing does.
+    Raises ValueError, which names the motions, if supports, springs, cables and foundations leave a piece of the body free
+    to move rigidly, or parts that meet at a vertex or an edge alone free to turn, as about a hinge; NotConverged otherwise.
+    Where the scene has obstacles or SelfContact such a piece goes, as the loads pull it, by up to the body's size to where
+    contact holds it, with a warning; NotConverged if nothing does.
     Nocedal, Wright, Numerical Optimization, 2nd ed., 2006, ch. 3 and 7, doi:10.1007/978-0-387-40065-5.
 
     >>> import diffsim_ti as ds
@@ -73,21 +70,9 @@ class StaticSolver(ImplicitSolver):
         return Stage(self.substep, b0=0.0, e0=0.0, static=True)
 
     def _refuse_rigid_modes(self) -> None:
-        """Raise ValueError, which names them, if the supports leave rigid motions of a piece of the body."""
-        mesh, supports = self.scene.mesh, self.scene.supports
-        piece = pieces(mesh)
-        used = [k for k in range(piece.max(initial=-1) + 1) if np.any(piece[mesh.tetrahedra[:, 0]] == k)]
-        for number, k in enumerate(used):
-            own = piece[supports.vertices] == k
-            places, held = attached_places(self.scene, piece == k)
-            held = np.concatenate([supports.held[own], held])
-            free = rigid_motions_left(np.concatenate([mesh.vertices[supports.vertices[own]], places]), held)
-            if free:
-                which = f"piece {number} of {len(used)} of the body" if len(used) > 1 else "the body"
-                if self.scene.obstacles or self.scene.term(SelfContact):  # which may hold it: known when it is closed
-                    self.loose = self.loose or f"{which} is free to move rigidly ({free})"
-                    continue
-                raise ValueError(
-                    f"statics: {which} is free to move rigidly ({free}): hold it by fixed=..., at three vertices that do "
-                    "not lie on a line or in as many directions as that takes, or use a solver with inertia"
-                )
+        """Raise ValueError, which names them, if rigid motions of a part of the body are left that no contact can hold."""
+        said = free_motions(self.scene)
+        if said and (self.scene.obstacles or self.scene.term(SelfContact)):  # which may: known when it is closed
+            self.loose = said.split(": hold")[0]
+        elif said:
+            raise ValueError(f"statics: {said}, or use a solver with inertia")

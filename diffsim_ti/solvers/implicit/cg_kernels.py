@@ -8,7 +8,7 @@ import taichi as ti
 from diffsim_ti.runtime import PRECISIONS, Kernel
 
 A = ti.template()
-# places of numbers in `state`; STOPPED: 0 while it goes on, then 1 converged, 2 negative curvature
+# places of numbers in `state`; STOPPED: 0 while it goes on, then 1 converged, 2 negative curvature, 3 r . z <= 0
 RZ, BETA, ALPHA, SQUARE, STOPPED, COUNT, LEAST = range(7)
 
 
@@ -47,6 +47,8 @@ class CGKernels:
         ti.loop_config(serialize=True)
         for _ in range(1):
             rz, old = self.total(cg.part, 0, plan.chunks), cg.state[RZ]
+            if cg.state[STOPPED] == 0 and not rz > 0:
+                cg.state[STOPPED] = ti.cast(3, self.fp)
             cg.state[BETA] = ti.cast(0, self.fp)
             if cg.state[COUNT] > 0 and cg.state[STOPPED] == 0:
                 cg.state[BETA] = rz / old

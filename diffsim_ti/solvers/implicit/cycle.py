@@ -85,6 +85,15 @@ def inverses(blocks: np.ndarray) -> np.ndarray:
     return 0.5 * (out + np.swapaxes(out, 1, 2))
 
 
+def positive_inverse(A: np.ndarray) -> np.ndarray:
+    """The inverse of a symmetric matrix; where that is not definite, as of a body that nothing holds yet, eigenvalues are
+    raised to a millionth of the largest, which float32 resolves."""
+    values, vectors = np.linalg.eigh(A)
+    if values[0] > 1e-10 * values[-1]:
+        return np.linalg.inv(A)
+    return (vectors / np.maximum(np.abs(values), 1e-6 * np.abs(values).max())) @ vectors.T
+
+
 def inverse_matrix(M):
     """The inverse of a matrix of blocks, body by body, as one; motions that a block has not stay zero."""
     from scipy.sparse import bsr_matrix
@@ -99,7 +108,7 @@ def inverse_matrix(M):
         dense = M[at][:, at].toarray()
         there = np.abs(np.diagonal(dense)) > 0
         inverse = np.zeros_like(dense)
-        inverse[np.ix_(there, there)] = np.linalg.inv(dense[np.ix_(there, there)])
+        inverse[np.ix_(there, there)] = positive_inverse(dense[np.ix_(there, there)])
         inverse = 0.5 * (inverse + inverse.T)
         rows.append(np.repeat(own, len(own)))
         columns.append(np.tile(own, len(own)))

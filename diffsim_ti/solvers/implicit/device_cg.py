@@ -55,6 +55,8 @@ class DeviceCG:
                 state = runtime.fetch(self.state)
                 if state[STOPPED] or not np.isfinite(state[SQUARE]):
                     break
+        if state[STOPPED] == 3:  # the preconditioner is not positive definite
+            return np.zeros_like(b), np.inf, int(state[COUNT]), None
         if not np.isfinite(state[SQUARE]):
             raise FloatingPointError("the stiffness of this state is not finite")
         count, negative = int(state[COUNT]), None

@@ -50,8 +50,6 @@ class GivenInPasses:
             share = self.share_at_stage(j, stage)
             p = self.solver.schedule.pressure(self.arrays.rows["follower"], j, share)
             self.follower.at(p, self.load_share(j, stage))
-        if self.volumes:
-            self.volumes.stiffen(self.preconditioner(stage.inertia * self.mass)[1])
 
     def attach(self, j: int, stage: Stage) -> None:
         """Springs, cables and foundations as they are in pass j."""

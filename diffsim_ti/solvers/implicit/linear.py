@@ -1,12 +1,16 @@
 """Linear systems of the implicit solvers: A x = b with A = c M + d2E/du2 on the free vertices, by products alone."""
 
 import math
+import warnings
 from collections.abc import Iterable
 
 import numpy as np
 
 from diffsim_ti.copies import CarriesMore
+from diffsim_ti.inputs import diagonal_of
 from diffsim_ti.potential.free import Free, linear_of
+from diffsim_ti.solvers.implicit.factorised import Factorised
+from diffsim_ti.solvers.implicit.preconditioners import BlockJacobi, Preconditioner
 
 
 class NotConverged(CarriesMore, FloatingPointError):
@@ -29,6 +33,7 @@ class Operator:
         self.products, self.correction = 0, None
         self.follower, self.transposed, self._pressing = follower, transposed, None
         self.rigid, self._linear = potential.rigid, linear_of(free)
+        self._factors = None  # (correction, what `factorised` found with it)
 
     @property
     def symmetric(self) -> bool:
@@ -39,6 +44,18 @@ class Operator:
         """Whether products need nothing of the host."""
         plain = isinstance(self.mass, np.ndarray) and isinstance(self.free, np.ndarray)
         return plain and self.correction is None and self.follower is None and self.potential.stays_on_device
+
+    def factorised(self) -> Factorised | None:
+        """What factorised.py makes of it, found once."""
+        if self._factors is None or self._factors[0] is not self.correction:
+            self._factors = self.correction, Factorised.of(self)
+        return self._factors[1]
+
+    @property
+    def saddle_is_known(self) -> bool:
+        """Whether a factorisation has found few directions of negative curvature, and turned these round."""
+        found = self._factors and self._factors[1]
+        return bool(found) and 0 < found.negative <= 10
 
     def __call__(self, w: np.ndarray) -> np.ndarray:
         self.products += 1
@@ -62,12 +79,63 @@ class Operator:
         return y
 
 
+def _in_turn(operator, preconditioner, most: int):
+    """(preconditioner, products that it may take) one after the other, until a solve succeeds: that of the pass, as many as
+    the time of a factorisation allows, in all rounds of a solve of Newton's twice as many; the factorisation, in all rounds
+    from then on; where there is none, the first again, or block Jacobi where that is not positive definite."""
+    if not isinstance(preconditioner, Preconditioner):
+        yield preconditioner, most
+        return
+    effort = preconditioner.effort
+    if not (preconditioner.given_up or preconditioner.spent > 2 * preconditioner.patience):
+        yield preconditioner, min(most, preconditioner.patience)
+        preconditioner.given_up = True
+    other, name = operator.factorised() if effort.fits else None, type(preconditioner).__name__
+    instead = "its sparse factorisation takes their place, which may take minutes"
+    if other is None:
+        other, instead = preconditioner, "there is no room for a factorisation, so they go on"
+        if preconditioner.unfit:
+            other = BlockJacobi(operator.potential, diagonal_of(operator.mass), operator.free, 0.0)
+            other.update(operator.potential.held_at)
+    if preconditioner.unfit:
+        _say(preconditioner, f"{name} is not positive definite in this state: {type(other).__name__} takes its place")
+    elif effort.unknowns > effort.large:
+        words = f"conjugate gradients or GMRES take more than {preconditioner.patience} products of a Hessian of"
+        _say(preconditioner, f"{words} {effort.unknowns} unknowns: {instead}")
+    yield other, most
+
+
+def _count(preconditioner, products: int) -> None:
+    if isinstance(preconditioner, Preconditioner):
+        preconditioner.spent += products
+
+
+def _say(preconditioner, message: str) -> None:
+    """Once of each preconditioner."""
+    if not preconditioner.has_warned:
+        preconditioner.has_warned = True
+        warnings.warn(message, stacklevel=2)
+
+
 def conjugate_gradients(operator, b, preconditioner, tolerance: float, max_iterations: int, eps: float):
     """(x, relative residual, iterations, p): |b - A x| <= tolerance |b| unless stopped before.
 
     Stops at a direction p of negative curvature (else None) with the x before it or, if it is the first direction, with
-    the preconditioned b: a direction of descent. Nocedal, Wright, Numerical Optimization, alg. 7.1.
+    the preconditioned b: a direction of descent. Nocedal, Wright, Numerical Optimization, alg. 7.1. A preconditioner that is
+    too slow or not positive definite is replaced (`_in_turn`).
     """
+    for own, most in _in_turn(operator, preconditioner, max_iterations):
+        found = _conjugate_gradients(operator, b, own, tolerance, most, eps)
+        _count(own, found[2])
+        if found[1] <= tolerance or found[3] is not None:
+            break
+        if own is preconditioner and not np.isfinite(found[1]):
+            preconditioner.unfit = True
+    return found
+
+
+def _conjugate_gradients(operator, b, preconditioner, tolerance: float, max_iterations: int, eps: float):
+    """The same with one preconditioner; an infinite residual if that is not positive definite, r . z <= 0."""
     solver = getattr(preconditioner, "solver", None)
     if solver is not None and operator.stays_on_device:
         found = solver(operator.mass, operator.free, b, tolerance, max_iterations, eps)
@@ -80,6 +148,8 @@ def conjugate_gradients(operator, b, preconditioner, tolerance: float, max_itera
     z = preconditioner(r)
     p, rz = z, float((r * z).sum())
     for k in range(1, max_iterations + 1):
+        if not rz > 0:
+            return x, np.inf, k, None
         Ap = operator(p)
         curvature = float((p * Ap).sum())
         if not curvature > 10 * eps * np.linalg.norm(p) * np.linalg.norm(Ap):
@@ -99,9 +169,20 @@ def conjugate_gradients(operator, b, preconditioner, tolerance: float, max_itera
 
 def gmres(operator, b, preconditioner, tolerance: float, max_iterations: int, restart: int = 80):
     """(x, relative residual, iterations) of A x = b for any A: GMRES, preconditioned from the right, started again every so
-    many products, and where rounding has left more than it knows of, until that helps no more.
+    many products, and where rounding has left more than it knows of, until that helps no more. A preconditioner that is too
+    slow is replaced (`_in_turn`).
     Saad, Schultz 1986, doi:10.1137/0907058.
     """
+    for own, most in _in_turn(operator, preconditioner, max_iterations):
+        found = _gmres(operator, b, own, tolerance, most, restart)
+        _count(own, found[2])
+        if found[1] <= tolerance:
+            break
+    return found
+
+
+def _gmres(operator, b, preconditioner, tolerance: float, max_iterations: int, restart: int):
+    """The same with one preconditioner."""
     x, r, size, count = np.zeros_like(b), b, np.linalg.norm(b), 0
     residual = 1.0 if size > 0 else 0.0
     while residual > tolerance and count < max_iterations:
@@ -177,15 +258,18 @@ def solve_symmetric(operator, b, preconditioner, tolerance: float, eps: float, m
 
         n = b.size
         A = LinearOperator((n, n), lambda w: operator(w.reshape(-1, 3)).ravel(), dtype=np.float64)
-        M = LinearOperator((n, n), lambda w: preconditioner(w.reshape(-1, 3)).ravel(), dtype=np.float64)
-        x = np.zeros_like(b)
-        for _ in range(5):  # MINRES measures in the preconditioner's norm: go on until the plain one is small
-            r = b - operator(x)
-            residual = np.linalg.norm(r) / np.linalg.norm(b)
+        for own, most in _in_turn(operator, preconditioner, max_iterations):
+            M = LinearOperator((n, n), lambda w: own(w.reshape(-1, 3)).ravel(), dtype=np.float64)
+            x = np.zeros_like(b)
+            for _ in range(5):  # MINRES measures in the preconditioner's norm: go on until the plain one is small
+                r = b - operator(x)
+                residual = np.linalg.norm(r) / np.linalg.norm(b)
+                if residual <= tolerance:
+                    break
+                step, _ = minres(A, r.ravel(), M=M, rtol=0.1 * tolerance, maxiter=most)
+                x += step.reshape(b.shape)
             if residual <= tolerance:
                 break
-            step, _ = minres(A, r.ravel(), M=M, rtol=0.1 * tolerance, maxiter=max_iterations)
-            x += step.reshape(b.shape)
     if residual > tolerance:
         raise not_solved(residual, tolerance, count)
     return x

@@ -7,14 +7,17 @@ from diffsim_ti.potential.assembled import assemble
 from diffsim_ti.potential.free import Free, FreeDirections, projectors_of
 from diffsim_ti.solvers.implicit.cycle import Cycle, upload_rows
 from diffsim_ti.solvers.implicit.device_cg import DeviceCG
+from diffsim_ti.solvers.implicit.preconditioners import Preconditioner
 from diffsim_ti.solvers.implicit.rotations import Frames
 
 
-class Multigrid:
-    """Smoothed aggregation on the assembled matrix of the rest state, with rigid motions as near kernel.
+class Multigrid(Preconditioner):
+    """Smoothed aggregation on the assembled matrix of the rest state, springs, cables and foundations included, with rigid
+    motions as near kernel.
 
     Isotropic laws: turning a body turns its stiffness, K(R u) = R K(u) R^T. So residuals are turned back by each vertex's
-    mean rotation, and corrections forth. Contact stiffness joins the finest level. The V-cycle over it is cycle.py's.
+    mean rotation, and corrections forth. Contact stiffness, and what is attached as it changes, join the finest level. The
+    V-cycle over it is cycle.py's.
     Below ten-node tetrahedra lie the linear ones of their corners, and aggregates of these (p-multigrid): aggregates of all
     ten nodes take half as many iterations again.
     Vanek, Mandel, Brezina 1996, doi:10.1007/BF02238511; Bell, Olson, Schroder, PyAMG, doi:10.21105/joss.04142; Heys,
@@ -27,8 +30,13 @@ class Multigrid:
         self.potential, self.free = potential, free
         mesh, rest = potential.arrays.mesh, potential.arrays.values.rest
         with potential.at_rest():
+            at, attached = potential.held_at, potential.attached
             potential.blocks()
-            matrix, diagonal = assemble(potential, mass, free)
+            matrix, diagonal = assemble(potential, mass, free, [attached.matrix(at)] if attached else [])
+            self._known = np.zeros((len(at), 3, 3))  # of what `update` adds
+            if attached:
+                own = attached.blocks(at)
+                self._known = free.around(own) if isinstance(free, FreeDirections) else own
         aggregated, allowed = matrix, free
         if mesh.order == 2:
             aggregated, allowed, rest, up = of_corners(matrix, free, mesh, rest)
@@ -65,7 +73,7 @@ class Multigrid:
         if isinstance(self.free, FreeDirections):
             contact = self.free.around(contact)
         R = self.frames.matrices()
-        contact = np.swapaxes(R, 1, 2) @ contact @ R
+        contact = np.swapaxes(R, 1, 2) @ contact @ R - self._known
         before = np.zeros_like(contact) if self._contact is None else self._contact
         changed = np.flatnonzero((contact != before).any((1, 2)))
         if len(changed):

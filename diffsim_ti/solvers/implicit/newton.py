@@ -255,7 +255,7 @@ class Newton:
         self._indefinite = negative is not None
         if negative is not None:
             self.report.indefinite += 1
-            if count <= self.trusted:
+            if count <= self.trusted and not A.saddle_is_known:
                 for slight in self.slight:
                     A.correction = Projection(self.potential, slight)
                     d, *_, negative = conjugate_gradients(A, R, self.preconditioner, forcing, limit, self.eps)

@@ -24,6 +24,7 @@ class Preconditioned:
                 self._preconditioners.pop(next(iter(self._preconditioners)))
             self._preconditioners[key] = kind(self.potential, mass, self.free, size, self.parallel), size
         kept, size = self._preconditioners[key]
+        kept.begin()
         return kept, size + size_of
 
     def _rounded(self, inertia: np.ndarray) -> np.ndarray:

@@ -6,15 +6,40 @@ Both are functions of the present state alone, so that a run that is started aga
 import numpy as np
 
 from diffsim_ti.potential.free import Free, FreeDirections, mask_of
+from diffsim_ti.solvers.implicit.factorised import Effort
 
 
-class BlockJacobi:
+class Preconditioner:
+    """What is known of a preconditioner of a potential's Hessian; `begin` forgets it, so that passes do not depend on those
+    before them: the products spent; given_up, whether it was too slow; unfit, whether it was not positive definite;
+    has_warned, whether that was said."""
+
+    spent, given_up, unfit, has_warned = 0, False, False, False
+    quick = 1  # products with multigrid take so many times as long
+
+    def begin(self) -> None:
+        self.spent, self.given_up, self.unfit = 0, False, False
+
+    @property
+    def effort(self) -> Effort:
+        """Of the factorisation that takes its place."""
+        return Effort.of(self.potential.arrays.mesh)
+
+    @property
+    def patience(self) -> int:
+        """Products in which it has to be enough."""
+        return self.quick * self.effort.patience
+
+
+class BlockJacobi(Preconditioner):
     """The inverse 3x3 diagonal blocks; blocks that are not positive definite take |eigenvalues|.
 
     size: of the diagonal at rest [N/m], to which what is all but zero is raised.
     """
 
-    def __init__(self, potential, mass: np.ndarray, free: Free, size: np.ndarray, parallel: bool = True):
+    quick = 3
+
+    def __init__(self, potential, mass: np.ndarray, free: Free, size: np.ndarray | float, parallel: bool = True):
         self.potential, self.mass, self.free, self.least = potential, mass, free, 1e-6 * (size + mass)
 
     def update(self, u: np.ndarray) -> None:
@@ -38,6 +63,8 @@ class BodyBlocks(BlockJacobi):
     """The same, and the inverse of d2E/dq2 of each set that moves by few numbers q: of the body at rest, with inertia and
     contact as they are; where its basis is of each component turned with it, as in multigrid.py. Of sets that do not deform
     q are shifts and turns (potential/rigid_sets.py), whose part of the body at rest turns with them, too."""
+
+    patience = 10**9  # for nothing takes its place
 
     def __init__(self, potential, mass: np.ndarray, free: Free, size: np.ndarray, parallel: bool = True):
         super().__init__(potential, mass, free, size, parallel)

@@ -27,6 +27,16 @@ class Projection:
         self.C = np.einsum("eij,ej,ekj,e->eik", vectors, change, vectors, volumes[some], optimize=True)
         self.N, self.nodes, self.num_vertices = N[some], nodes[some], a.num_vertices
 
+    def matrix(self):
+        """The same as a SciPy matrix [N/m]."""
+        from scipy.sparse import coo_matrix
+
+        C = self.C.reshape(-1, 3, 3, 3, 3)
+        blocks = np.einsum("eai,ecidj,ebj->eacbd", self.N, C, self.N, optimize=True)
+        at, size = (3 * self.nodes[:, :, None] + np.arange(3)).reshape(len(C), -1), 3 * self.num_vertices
+        rows, columns = (x.ravel() for x in np.broadcast_arrays(at[:, :, None], at[:, None]))
+        return coo_matrix((blocks.ravel(), (rows, columns)), shape=(size, size)).tocsr()
+
     def __call__(self, w: np.ndarray) -> np.ndarray:
         dH = np.einsum("eac,eaj->ecj", w[self.nodes], self.N)
         dP = np.matmul(self.C, dH.reshape(-1, 9, 1)).reshape(-1, 3, 3)

@@ -31,6 +31,8 @@ class ImplicitSolver(Solver):
         direction an obstacle, or the surface itself, cuts short do not count, up to five times as many, nor do those that
         come after while ten of them halve the residual.
     preconditioner: of the linear solves: "block_jacobi", "multigrid" (smoothed aggregation), or "auto", by the body's size.
+        Where they take more products than the time of a sparse factorisation allows (slender bodies), that takes its place,
+        from 30 000 unknowns on with a warning.
 
     On the way from one state to the next no vertex or face meets an obstacle; what comes to the body, obstacles on their
     paths and held vertices, makes room for itself. Where there is none, Blocked (a NotConverged) says what stands there.

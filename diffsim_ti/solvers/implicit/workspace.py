@@ -313,6 +313,8 @@ class ImplicitWorkspace(Preconditioned, ObstacleWays, Noted, GivenInPasses, Work
         self.press(j, stage)
         self.attach(j, stage)
         self.grow(j, stage)
+        if self.volumes:  # after all that the stiffness at rest is made of
+            self.volumes.stiffen(self.preconditioner(stage.inertia * self.mass)[1])
 
     def moment(self, j: int, stage: Stage) -> Moment:
         """Where pass j lies for obstacles; a chord of two passes about its end for a solver of two steps."""
