@@ -35,6 +35,10 @@ def functions_of(law, features, lanes: bool) -> Tetrahedron:
 class PatchedTetrahedron(Tetrahedron):
     """The functions of `Tetrahedron`, with the same meaning. In all of them q = [*p', pi] (patch_law.py)."""
 
+    @property
+    def is_short(self) -> bool:
+        return self.law.base.short
+
     # ---- what a patch knows -----------------------------------------------------------------------------------------
 
     @traced
@@ -110,8 +114,9 @@ class PatchedTetrahedron(Tetrahedron):
         return [SimpleNamespace(**vars(t), **of_patch, q=[*t.p, pressure]) for t in known]
 
     @traced
-    def seen(self, item, scene, at, s) -> list[tuple]:
-        return [(t.H, t.q) for t in self._patch_of(item, scene, at, s)]
+    def each_seen(self, item, scene, at, s, body) -> None:
+        known = self._patch_of(item, scene, at, s)
+        self.each_point([[t.H for t in known]], lambda q, H: body(q, H, known[0].q) or ((), ()), tensors=0)
 
     # ---- forces and their derivatives -------------------------------------------------------------------------------
 
