@@ -125,9 +125,9 @@ class Sweep:
 
     # ---- forward ----------------------------------------------------------------------------------------------------
 
-    def run(self, values: dict, start: Callable | None = None) -> Run:
-        """Run from the scene's inputs with some values replaced; see `Run` for `start`."""
-        run = Run(self._checked(values), start, self.first_step)
+    def run(self, values: dict, start: Callable | None = None, law_state=None) -> Run:
+        """Run from the scene's inputs with some values replaced; see `Run` for the rest."""
+        run = Run(self._checked(values), start, self.first_step, law_state)
         self._forward(run)
         run.contacts = self.workspace.watch.seen_so_far()
         return run
@@ -175,6 +175,9 @@ class Sweep:
             else:
                 self.workspace.load(derived)
             self._loaded = values
+        if run.law_state is not None:
+            run.law_state = self.workspace.checked_law_state(run.law_state)
+            self.workspace.set_law_state(run.law_state)
         if run.start is not None:
             run.start(self.workspace)
             self.workspace.forget()
