@@ -165,8 +165,8 @@ class Simulator:
     @property
     def state(self) -> dict[str, np.ndarray]:
         """All that the run needs to go on, for `resume`: displacements [m], velocities [m/s], law_state, step_count, of
-        two-step solvers the displacements and velocities before, and the forces that `set_forces` gave.
-        `np.savez(file, **simulator.state)` keeps it, to the bit."""
+        two-step solvers the displacements and velocities before, pressures of held volumes in implicit steps, and the forces
+        that `set_forces` gave. `np.savez(file, **simulator.state)` keeps it, to the bit."""
         state = self.workspace.state
         out = dict(displacements=self.displacements, velocities=self.velocities, step_count=np.array(self.step_count))
         if state.z is not None:
@@ -174,6 +174,8 @@ class Simulator:
         if self._has_before and not state.fresh[0]:
             before = (runtime.fetch_row(x, 0) for x in (state.before.u, state.before.v))
             out["displacements_before"], out["velocities_before"] = before
+        if self.workspace.last_multipliers is not None:
+            out["held_pressures"] = self.workspace.last_multipliers
         return out | self._set
 
     def resume(self, state: dict) -> None:
@@ -186,7 +188,9 @@ class Simulator:
         two_step = {"displacements_before", "velocities_before"} if self._has_before else set()
         term = self.scene.term(ExternalForce)
         forces = set() if term is None else {self.scene.input_names(term)["external_forces"]}
-        lacking, more = known.keys() - two_step - forces - given.keys(), given.keys() - known.keys() - two_step - forces
+        held = {"held_pressures"} if self.workspace.volumes and not self.solver.explicit else set()
+        optional = two_step | forces | held
+        lacking, more = known.keys() - optional - given.keys(), given.keys() - known.keys() - optional
         if lacking or more or len(given.keys() & two_step) == 1:
             raise ValueError(
                 f"resume: this run has the state {', '.join(known)}, got {', '.join(given) or 'nothing'}: "
@@ -196,8 +200,11 @@ class Simulator:
         if count.shape or count != int(count) or count < 0:
             raise ValueError(f"resume: step_count must be a whole number >= 0, got {count!r}")
         for name in ("displacements", "velocities", *(two_step & given.keys())):
-            if given[name].shape != shape or not np.all(np.isfinite(given[name])):
-                raise ValueError(f"resume: {name}: expected finite numbers of shape {shape}, got {given[name].shape}")
+            value, own = given[name], known["displacements"].dtype
+            if value.shape != shape or value.dtype != own or not np.all(np.isfinite(value)):
+                raise ValueError(
+                    f"resume: {name}: expected finite numbers, {own} of shape {shape}, got {value.dtype} of {value.shape}"
+                )
         law_state = self.workspace.checked_law_state(given["law_state"]) if "law_state" in given else None
         self.reset()
         for name in forces & given.keys():
@@ -213,6 +220,8 @@ class Simulator:
             runtime.fill(now.before.v, given["velocities_before"][None])
             now.fresh[0] = False
         self.step_count = int(count)
+        if held & given.keys():
+            self.workspace.go_on_from(given["held_pressures"].copy(), self.step_count)
         self.workspace.place_obstacles(int(self.solver.schedule.first(1)) if count else 0)
 
     @property

@@ -176,7 +176,7 @@ class Sweep:
                 self.workspace.load(derived)
             self._loaded = values
         if run.law_state is not None:
-            run.law_state = self.workspace.checked_law_state(run.law_state)
+            run.law_state = self.workspace.checked_law_state(run.law_state).copy()
             self.workspace.set_law_state(run.law_state)
         if run.start is not None:
             run.start(self.workspace)

@@ -42,6 +42,7 @@ class Workspace:
     energy_watch = None  # counts energy that long steps add, for solvers that neither damp nor limit it
     changes = 0  # of the state from outside its passes
     attached = None  # springs, cables and foundations on the host (potential/attached.py)
+    last_multipliers = None  # of held volumes, in implicit steps
     impulses = None  # of obstacles on vertices in each frame, where a loss names them
 
     def __init__(self, solver, derived: Derived):
