@@ -141,6 +141,7 @@ class Tetrahedron(Growing):
         if self.order == 1 or self.is_short:
             found = [body(q, *(one[q] for one in lists)) for q in self.points]
             return list(zip(*(of for of, _ in found))), [let(sum_of(x)) for x in zip(*(of for _, of in found))]
+        lists = [[Tensor(x.numbers) for x in one] for one in lists]  # none that is found in the loop alone
         zero, count = let(0 * lists[0][0][0, 0]), len(self.points)
         job = Bundle(
             lists=lists,
