@@ -172,7 +172,7 @@ class Simulator:
         if state.z is not None:
             out["law_state"] = self.law_state
         if self._has_before and not state.fresh[0]:
-            before = (runtime.fetch_row(x, 0) for x in (state.before.u, state.before.v))
+            before = (runtime.fetch(x)[0] for x in (state.before.u, state.before.v))
             out["displacements_before"], out["velocities_before"] = before
         if self.workspace.last_multipliers is not None:
             out["held_pressures"] = self.workspace.last_multipliers
