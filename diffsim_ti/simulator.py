@@ -85,8 +85,8 @@ class Simulator:
 
     def __reduce__(self):
         raise TypeError(
-            "a Simulator holds memory of the device and does not pickle: pickle its solver, positions and velocities, and "
-            "there Simulator(solver), set_state(positions, velocities)"
+            "a Simulator holds memory of the device and does not pickle: pickle its solver and its state, and there "
+            "Simulator(solver), resume(state)"
         )
 
     def reset(self) -> None:
@@ -175,9 +175,76 @@ class Simulator:
 
     @property
     def law_state(self) -> np.ndarray:
-        """What the law remembers of each tetrahedron, shape (num_tetrahedra, S), in the order of its `state_names`."""
-        arrays, z, S = self.workspace.arrays, self.workspace.state.z, len(self.scene.law.state_names)
-        return np.zeros((arrays.num_tetrahedra, 0)) if z is None else arrays.from_blocks(runtime.fetch(z)[0], S)
+        """What the law remembers of each tetrahedron, shape (num_tetrahedra, S), or (num_tetrahedra, 4, S) at the points of
+        ten-node tetrahedra, in the order of its `state_names`."""
+        arrays, z = self.workspace.arrays, self.workspace.state.z
+        return np.zeros(arrays.law_state_shape) if z is None else arrays.law_state_of(runtime.fetch(z)[0])
+
+    @property
+    def _has_before(self) -> bool:
+        return getattr(self.solver, "multistep", False)
+
+    @property
+    def state(self) -> dict[str, np.ndarray]:
+        """All that the run needs to go on, for `resume`: displacements [m], velocities [m/s], law_state, step_count, of
+        two-step solvers the displacements and velocities before, pressures of held volumes in implicit steps, and the forces
+        that `set_forces` gave. `np.savez(file, **simulator.state)` keeps it, to the bit."""
+        state = self.workspace.state
+        out = dict(displacements=self.displacements, velocities=self.velocities, step_count=np.array(self.step_count))
+        if state.z is not None:
+            out["law_state"] = self.law_state
+        if self._has_before and not state.fresh[0]:
+            before = (runtime.fetch(x)[0] for x in (state.before.u, state.before.v))
+            out["displacements_before"], out["velocities_before"] = before
+        if self.workspace.last_multipliers is not None:
+            out["held_pressures"] = self.workspace.last_multipliers
+        return out | self._set
+
+    def resume(self, state: dict) -> None:
+        """Go on from a `state` of this scene and solver with the same bits, as if the run had not stopped.
+
+        state: the dictionary, or what np.load makes of its file. The scene, the solver and its substeps must be as they
+        were. Raises ValueError for parts that lack, that nobody knows, or that have other shapes.
+        """
+        given, known = {name: np.asarray(state[name]) for name in state}, self.state
+        two_step = {"displacements_before", "velocities_before"} if self._has_before else set()
+        term = self.scene.term(ExternalForce)
+        forces = set() if term is None else {self.scene.input_names(term)["external_forces"]}
+        held = {"held_pressures"} if self.workspace.volumes and not self.solver.explicit else set()
+        optional = two_step | forces | held
+        lacking, more = known.keys() - optional - given.keys(), given.keys() - known.keys() - optional
+        if lacking or more or len(given.keys() & two_step) == 1:
+            raise ValueError(
+                f"resume: this run has the state {', '.join(known)}, got {', '.join(given) or 'nothing'}: "
+                "make the simulator of the same scene and solver"
+            )
+        shape, count = known["displacements"].shape, given["step_count"]
+        if count.shape or count != int(count) or count < 0:
+            raise ValueError(f"resume: step_count must be a whole number >= 0, got {count!r}")
+        for name in ("displacements", "velocities", *(two_step & given.keys())):
+            value, own = given[name], known["displacements"].dtype
+            if value.shape != shape or value.dtype != own or not np.all(np.isfinite(value)):
+                raise ValueError(
+                    f"resume: {name}: expected finite numbers, {own} of shape {shape}, got {value.dtype} of {value.shape}"
+                )
+        law_state = self.workspace.checked_law_state(given["law_state"]) if "law_state" in given else None
+        self.reset()
+        for name in forces & given.keys():
+            self.set_forces(given[name])
+        now = self.workspace.state
+        runtime.fill(now.u, given["displacements"][None])
+        runtime.fill(now.v, given["velocities"][None])
+        if law_state is not None:
+            self.workspace.set_law_state(law_state)
+        self.workspace.forget()
+        if two_step & given.keys():
+            runtime.fill(now.before.u, given["displacements_before"][None])
+            runtime.fill(now.before.v, given["velocities_before"][None])
+            now.fresh[0] = False
+        self.step_count = int(count)
+        if held & given.keys():
+            self.workspace.go_on_from(given["held_pressures"].copy(), self.step_count)
+        self.workspace.place_obstacles(int(self.solver.schedule.first(1)) if count else 0)
 
     @property
     def values(self) -> dict[str, np.ndarray]:
@@ -206,6 +273,7 @@ class Simulator:
         )
         frames.inputs = self.values_of_step
         frames.steps = np.array([self.step_count])
+        frames.law_state = self.law_state[None]
         if self._notes:
             frames.contact_forces = self.workspace.contact_forces(self.solver.dt)[1:]
         if output.reads_chamber_pressures and self.scene.holds_volumes:
@@ -218,12 +286,19 @@ class Simulator:
             self._settled[output] = output.settled(self.scene)
         return self._settled[output]
 
-    def set_state(self, positions: ArrayLike | None = None, velocities: ArrayLike | None = None) -> None:
-        """Put the body elsewhere: positions [m], velocities [m/s], shape (num_vertices, 3); None leaves a part as it is.
+    def set_state(
+        self,
+        positions: ArrayLike | None = None,
+        velocities: ArrayLike | None = None,
+        law_state: ArrayLike | None = None,
+    ) -> None:
+        """Put the body elsewhere: positions [m], velocities [m/s], shape (num_vertices, 3), and what the law remembers, in
+        the shape of `law_state`; None leaves a part as it is.
 
-        Fixed vertices keep no velocity; of sets that are `reduced` what they can do is taken. What the law remembers
-        stays; `reset` clears it.
+        Fixed vertices keep no velocity; of sets that are `reduced` what they can do is taken. `reset` goes back to the
+        start; a run that was saved goes on by `resume`.
         """
+        law_state = None if law_state is None else self.workspace.checked_law_state(law_state)
         state, shape = self.workspace.state, (self.scene.mesh.num_vertices, 3)
         displaced, moving = self.scene.inputs.start_links()
         for name, value in (("positions", positions), ("velocities", velocities)):
@@ -239,6 +314,8 @@ class Simulator:
                     given = dict(initial_velocities=value, rest=self._start.rest)
                     given["displacement"] = runtime.fetch_row(state.u, 0)
                     runtime.fill(state.v, moving.value(*(given[part] for part in moving.reads))[0][None])
+        if law_state is not None:
+            self.workspace.set_law_state(law_state)
         self.workspace.forget()
 
     def set_forces(self, forces: ArrayLike) -> None:

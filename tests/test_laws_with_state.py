@@ -95,6 +95,17 @@ def test_stress_under_held_strain_relaxes_exponentially(solver, steps_in_tau):
         np.testing.assert_allclose(
             simulator.law_state, [[(1 - left) * E[pair] for pair in PAIRS]] * len(fields.J), atol=1e-13
         )
+        stress = simulator.output(ds.Stress(kind="first_piola"))
+        np.testing.assert_allclose(stress, np.broadcast_to(P, stress.shape), rtol=0, atol=1e-11 * abs(P).max())
+        assert simulator.output(ds.ElasticEnergy()) == pytest.approx(psi * MESH.volumes.sum(), rel=1e-12)
+        force, moment = (simulator.output(ds.Reaction(about=about)) for about in (None, [0, 0, 0]))
+        weight = 9.81 * simulator.scene.inputs.derive(simulator.scene.inputs.values).mass
+        np.testing.assert_allclose(force, [0, weight.sum(), 0], rtol=0, atol=1e-9 * abs(P).max())
+        turning = np.cross(simulator.positions, weight[:, None] * [0, 1, 0]).sum(0)  # a Cauchy stress does not turn
+        np.testing.assert_allclose(moment, turning, rtol=0, atol=1e-9 * abs(P).max())
+        of_side = simulator.output(ds.Reaction("xmin"))
+        own = weight[MESH.vertex_indices("xmin")].sum()
+        np.testing.assert_allclose(of_side - [0, own, 0], -P[:, 0], rtol=0, atol=1e-11 * abs(P).max())  # of 1 m^2
         simulator.step()
 
 
@@ -345,6 +356,86 @@ def test_steps_are_those_of_a_rollout(solver):
     with pytest.raises(FloatingPointError), np.errstate(invalid="ignore"):
         simulator.step()
     np.testing.assert_array_equal(simulator.law_state, known)
+
+
+def saved(simulator, tmp_path) -> dict:
+    np.savez(tmp_path / "state.npz", **simulator.state)
+    return np.load(tmp_path / "state.npz")
+
+
+@pytest.mark.parametrize("precision", ["f64", "f32"])
+@every_solver
+@pytest.mark.parametrize("remembers", [True, False])
+def test_a_saved_run_goes_on_with_the_same_bits(solver, precision, remembers, tmp_path):
+    """Also of what is drawn along, which depends on the time."""
+    material = ds.KelvinVoigt(rubber(), time=1e-3) if remembers else ds.StableNeoHookean(MU, 0.3)
+    body = scene(material, precision=precision)
+    one, other = (ds.Simulator(solver(body, dt=2e-3)) for _ in range(2))
+    one.run(3)
+    other.run(1)  # which resume forgets
+    kept = saved(one, tmp_path)
+    one.run(3)
+    other.resume(kept)
+    other.run(3)
+    assert one.time == other.time
+    for name, value in one.state.items():
+        np.testing.assert_array_equal(other.state[name], value, err_msg=name)
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_what_a_law_remembers_can_be_set(order):
+    """In a simulator and in a rollout; a run of 2 + 2 steps ends where one of 4 does, and ten nodes have it at points."""
+    mesh = MESH if order == 1 else MESH.quadratic()
+    usual = dict(fixed="xmin", precision="f64", initial_positions=mesh.vertices * [1.2, 1, 1])
+    solver = ds.SemiImplicitSolver(ds.Scene(mesh, rubber(), terms=[ds.Gravity()], **usual), dt=2e-3)
+    one, other = ds.Simulator(solver), ds.Simulator(solver)
+    one.run(2)
+    z = one.law_state
+    assert z.shape == ((mesh.num_tetrahedra, 6) if order == 1 else (mesh.num_tetrahedra, 4, 6)) and z.std(0).min() > 0
+    start = dict(positions=one.positions, velocities=one.velocities)
+    other.set_state(**start, law_state=z)
+    np.testing.assert_array_equal(other.law_state, z)
+    frames = ds.Rollout(solver, 2).forward(law_state=z, **{f"initial_{name}": value for name, value in start.items()})
+    without = ds.Rollout(solver, 2).forward(**{f"initial_{name}": value for name, value in start.items()})
+    one.run(2), other.run(2)
+    for found in (other.positions, frames.positions[-1]):
+        np.testing.assert_allclose(found, one.positions, rtol=0, atol=1e-13)
+    assert abs(without.positions[-1] - one.positions).max() > 1e-6
+
+
+def test_gradients_of_a_run_from_a_set_state():
+    r = rollout(scene(), steps=2)
+    z = 0.1 * np.random.default_rng(5).standard_normal((MESH.num_tetrahedra, 6))
+    w, tau = np.cos(np.arange(3 * MESH.num_vertices)).reshape(-1, 3), float(np.max(r.values["tau"]))
+
+    def loss(tau):
+        frames = r.forward(law_state=z, tau=tau)
+        return frames, (frames.positions[-1] * w).sum()
+
+    frames, _ = loss(tau)
+    found = r.vjp(frames, positions=np.stack([0 * w, w]))["tau"]
+    h = 1e-5 * tau
+    assert found == pytest.approx((loss(tau + h)[1] - loss(tau - h)[1]) / (2 * h), rel=1e-6)
+
+
+def test_a_state_that_does_not_fit_is_refused():
+    simulator = ds.Simulator(ds.SemiImplicitSolver(scene(), dt=2e-3))
+    with pytest.raises(ValueError, match=r"law_state: expected finite numbers of shape \(\d+, 6\)"):
+        simulator.set_state(law_state=np.zeros((3, 6)))
+    with pytest.raises(ValueError, match="law_state"):
+        ds.Rollout(simulator.solver, 1).forward(law_state=np.full((MESH.num_tetrahedra, 6), np.nan))
+    plain = ds.Simulator(ds.SemiImplicitSolver(scene(ds.StableNeoHookean(MU, 0.3)), dt=2e-3))
+    with pytest.raises(ValueError, match="StableNeoHookean remembers nothing"):
+        plain.set_state(law_state=np.zeros((MESH.num_tetrahedra, 6)))
+    for state in (simulator.state | dict(more=1), {}, plain.state):
+        with pytest.raises(ValueError, match="resume: this run has the state displacements"):
+            simulator.resume(state)
+    with pytest.raises(ValueError, match="resume: velocities: expected finite numbers"):
+        simulator.resume(simulator.state | dict(velocities=np.zeros(3)))
+    with pytest.raises(ValueError, match="ask Simulator.output"):
+        ds.Rollout(simulator.solver, 1, outputs=[ds.Stress()])
+    with pytest.raises(ValueError, match="ask Simulator.output"):
+        ds.Rollout(simulator.solver, 1, outputs=[ds.Reaction("xmin")])
 
 
 # ---- what does not work says so ----------------------------------------------------------------------------------------

@@ -43,13 +43,21 @@ def log1p(x: Number) -> Number:
 
 def expm1(x: Number) -> Number:
     """e^x - 1, with all its digits near zero."""
-    out = x.graph.function(expm1_values(x.value, x.graph.fp)[0], (x, lambda: 1 + out))
-    return out
+    return _expm1_of(x)[0]
 
 
 def expm1_minus_x(x: Number) -> Number:
     """e^x - 1 - x, with all its digits near zero: what energies of powers are made of."""
-    return x.graph.function(expm1_values(x.value, x.graph.fp)[1], (x, lambda: expm1(x)))
+    return _expm1_of(x)[1]
+
+
+def _expm1_of(x: Number) -> tuple[Number, Number]:
+    """(e^x - 1, e^x - 1 - x), found once for each Number."""
+    if "expm1" not in x.known:
+        plain, less = expm1_values(x.value, x.graph.fp)
+        own = x.graph.function(plain, (x, lambda: 1 + own))
+        x.known["expm1"] = own, x.graph.function(less, (x, lambda: own))
+    return x.known["expm1"]
 
 
 def x_minus_log1p(x: Number) -> Number:
@@ -94,9 +102,10 @@ BERNOULLI = (1 / 12, -1 / 720, 1 / 30240, -1 / 1209600, 1 / 47900160, -691 / 130
 def expm1_values(x, fp) -> tuple:
     """(e^x - 1, e^x - 1 - x) with all their digits, of a number or of lanes: plain subtraction loses x and x^2 / 2."""
     (one, half), y = (spread(let(ti.cast(c, fp)), x) for c in (1, 0.5)), let(x * x)
-    series = spread(let(ti.cast(BERNOULLI[-1], fp)), x)
+    series = ti.cast(BERNOULLI[-1], fp)
     for c in BERNOULLI[-2::-1]:
-        series = let(series * y + ti.cast(c, fp))
+        series = series * y + ti.cast(c, fp)
+    series = let(series)
     scale = let(x / (one - x * half + y * series))
     plain, close = let(each_lane(ti.exp, x) - one), let(y * 4 < 1)
     return let(ti.select(close, scale, plain)), let(ti.select(close, scale * x * (half - x * series), plain - x))

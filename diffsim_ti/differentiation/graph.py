@@ -7,6 +7,7 @@ Griewank, Walther, Evaluating Derivatives, ch. 3 and 5, doi:10.1137/1.9780898717
 """
 
 import operator
+from contextlib import contextmanager
 from numbers import Integral, Real
 
 import taichi as ti
@@ -24,10 +25,30 @@ class Number:
     _data_oriented = True  # Taichi hands it on as it is, so that tensors may be made of it
     __array_ufunc__ = None  # NumPy's numbers leave operations to this class
 
-    def __init__(self, graph, value, parents=()):
-        self.graph, self.value = graph, let(value)
+    def __init__(self, graph, value, parents=(), made_of=None):
+        self.graph, self.made_of, self.uses = graph, made_of, 0
+        self.known = {}  # what some function has found of it, by the function's name
+        self._value = None if made_of else let(value)
         self.parents = [[parent, partial, None] for parent, partial in parents]
         graph.numbers.append(self)
+        if made_of and not graph.waits:
+            self.value  # noqa: B018  it is found here
+
+    @property
+    def value(self):
+        """As a variable, found when it is first asked for."""
+        if self._value is None:
+            self._value = let(self._expression())
+            self.graph.found.append(self)
+        return self._value
+
+    def _expression(self):
+        operation, *operands = self.made_of
+        return operation(*(x.used() if isinstance(x, Number) else self.graph.constant(x) for x in operands))
+
+    def used(self):
+        """For one more operation: as a variable, but where this is its only use."""
+        return self._expression() if self._value is None and self.uses < 2 else self.value
 
     def partials(self):
         """(parent, derivative by it), each found once."""
@@ -41,49 +62,52 @@ class Number:
     def _value_of(self, other):
         return other.value if isinstance(other, Number) else self.graph.constant(other)
 
-    def _with(self, value, *parents) -> "Number":
-        """A result; parents that are Python numbers have no derivatives."""
-        return Number(self.graph, value, [(p, partial) for p, partial in parents if isinstance(p, Number)])
+    def _made(self, operation, a, b, *parents) -> "Number":
+        """operation(a, b); parents that are Python numbers have no derivatives."""
+        numbers = [x for x in (a, b) if isinstance(x, Number)]
+        linear = operation in (operator.add, operator.sub) or len(numbers) < 2 and operation is operator.mul
+        for x in numbers:
+            x.uses += 1 if linear else 2  # a derivative has it too
+        parents = [(p, partial) for p, partial in parents if isinstance(p, Number)]
+        return Number(self.graph, None, parents, (operation, a, b))
 
     def __add__(self, other):
-        return self._with(self.value + self._value_of(other), (self, lambda: 1), (other, lambda: 1))
+        return self._made(operator.add, self, other, (self, lambda: 1), (other, lambda: 1))
 
     def __radd__(self, other):
-        return self._with(self._value_of(other) + self.value, (self, lambda: 1))
+        return self._made(operator.add, other, self, (self, lambda: 1))
 
     def __sub__(self, other):
-        return self._with(self.value - self._value_of(other), (self, lambda: 1), (other, lambda: -1))
+        return self._made(operator.sub, self, other, (self, lambda: 1), (other, lambda: -1))
 
     def __rsub__(self, other):
-        return self._with(self._value_of(other) - self.value, (self, lambda: -1))
+        return self._made(operator.sub, other, self, (self, lambda: -1))
 
     def __neg__(self):
         return 0 - self
 
     def __mul__(self, other):
-        return self._with(self.value * self._value_of(other), (self, lambda: other), (other, lambda: self))
+        return self._made(operator.mul, self, other, (self, lambda: other), (other, lambda: self))
 
     def __rmul__(self, other):
-        return self._with(self._value_of(other) * self.value, (self, lambda: other))
+        return self._made(operator.mul, other, self, (self, lambda: other))
 
     def __truediv__(self, other):
-        value = self.value / self._value_of(other)
-        out = self._with(value, (self, lambda: 1 / other), (other, lambda: 0 - out / other))
+        out = self._made(operator.truediv, self, other, (self, lambda: 1 / other), (other, lambda: 0 - out / other))
         return out
 
     def __rtruediv__(self, other):
-        out = self._with(self._value_of(other) / self.value, (self, lambda: 0 - out / self))
+        out = self._made(operator.truediv, other, self, (self, lambda: 0 - out / self))
         return out
 
     def __pow__(self, n):
         """x^n for a Python number or a Number n; unless n is a Python integer, x must be positive."""
         n = int(n) if isinstance(n, Integral) else n
         value = self.value**n if isinstance(n, int) else each_lane(operator.pow, self.value, self._value_of(n))
-        out = self._with(
-            value,
-            (self, lambda: n if isinstance(n, int) and n in (0, 1) else n * self ** (n - 1)),
-            (n, lambda: out * self.graph.log(self)),
-        )
+        parents = [(self, lambda: n if isinstance(n, int) and n in (0, 1) else n * self ** (n - 1))]
+        if isinstance(n, Number):
+            parents.append((n, lambda: out * self.graph.log(self)))
+        out = Number(self.graph, value, parents)
         return out
 
     def __lt__(self, other):
@@ -95,10 +119,26 @@ class Number:
 
 
 class Graph:
-    """Numbers in the order in which they were made; `fp` is the scene's float, `parameters` its parameter array."""
+    """Numbers in the order in which they were made; `fp` is the scene's float, `parameters` its parameter array.
 
-    def __init__(self, fp, parameters=None):
-        self.fp, self.parameters, self.numbers = fp, parameters, []
+    waits: sums, products and quotients are found where they are first asked for, and not at all if nobody asks; what only
+    one sum has is part of it, and no variable. The time in which a kernel compiles grows with the square of their number.
+    What a loop or a branch of a kernel asks for is unknown behind it: `within`.
+    """
+
+    def __init__(self, fp, parameters=None, waits: bool = False):
+        self.fp, self.parameters, self.numbers, self.waits, self.found = fp, parameters, [], waits, []
+
+    @contextmanager
+    def within(self):
+        """What is found in this `with` block stands in a loop or branch."""
+        found, numbers = len(self.found), len(self.numbers)
+        yield
+        for number in self.found[found:]:
+            number._value = None
+        for number in self.numbers[:numbers]:
+            number.known.clear()
+        del self.found[found:]
 
     def constant(self, value):
         return ti.cast(value, self.fp)
@@ -212,8 +252,8 @@ class Graph:
     def _product(self, partial, x):
         """partial x as a value of the kernel."""
         if isinstance(partial, Real):
-            return x if partial == 1 else let(self.constant(partial) * x)
-        return let((partial.value if isinstance(partial, Number) else partial) * x)
+            return x if partial == 1 else self.constant(partial) * x
+        return (partial.value if isinstance(partial, Number) else partial) * x
 
     @staticmethod
     def _product_of_numbers(partial, x):
@@ -228,8 +268,8 @@ class Graph:
     def _sum(terms):
         total = terms[0]
         for term in terms[1:]:
-            total = let(total + term)
-        return total
+            total = total + term
+        return let(total)
 
     @staticmethod
     def _sum_of_numbers(terms):

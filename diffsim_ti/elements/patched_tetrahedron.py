@@ -35,6 +35,10 @@ def functions_of(law, features, lanes: bool) -> Tetrahedron:
 class PatchedTetrahedron(Tetrahedron):
     """The functions of `Tetrahedron`, with the same meaning. In all of them q = [*p', pi] (patch_law.py)."""
 
+    @property
+    def is_short(self) -> bool:
+        return self.law.base.short
+
     # ---- what a patch knows -----------------------------------------------------------------------------------------
 
     @traced
@@ -110,15 +114,21 @@ class PatchedTetrahedron(Tetrahedron):
         return [SimpleNamespace(**vars(t), **of_patch, q=[*t.p, pressure]) for t in known]
 
     @traced
-    def seen(self, item, scene, at, s) -> list[tuple]:
-        return [(t.H, t.q) for t in self._patch_of(item, scene, at, s)]
+    def each_seen(self, item, scene, at, s, body) -> None:
+        known = self._patch_of(item, scene, at, s)
+        self.each_point([[t.H for t in known]], lambda q, H: body(q, H, known[0].q) or ((), ()), tensors=0)
 
     # ---- forces and their derivatives -------------------------------------------------------------------------------
 
     @traced
     def forces(self, item, scene, at, s, corner) -> None:
         known = self._patch_of(item, scene, at, s)
-        self.store(item, corner, [(self.law.stress(t.H, t.q) * t.V) @ t.B.transpose() for t in known])
+
+        def push(q, H, B):
+            P = self.law.stress(H, known[0].q)
+            return [(P * self.volume_of(item, scene.volumes, q)) @ B.transpose()], ()
+
+        self.store(item, corner, self.each_point([[t.H for t in known], [t.B for t in known]], push)[0][0])
 
     @traced
     def pressure_forces(self, item, scene, at, s, corner) -> None:
@@ -129,11 +139,14 @@ class PatchedTetrahedron(Tetrahedron):
 
     @traced
     def stiffness(self, item, scene, at, s, corner) -> None:
-        pushes = []
-        for t in self._patch_of(item, scene, at, s, at.w):
-            dP = self.law.stress_differential(t.H, t.dH, t.q) + t.gradient * t.dpi
-            pushes.append((dP * t.V) @ t.B.transpose())
-        self.store(item, corner, pushes)
+        known = self._patch_of(item, scene, at, s, at.w)
+
+        def push(q, H, dH, gradient, B):
+            dP = self.law.stress_differential(H, dH, known[0].q) + gradient * known[0].dpi
+            return [(dP * self.volume_of(item, scene.volumes, q)) @ B.transpose()], ()
+
+        lists = [[getattr(t, name) for t in known] for name in ("H", "dH", "gradient", "B")]
+        self.store(item, corner, self.each_point(lists, push)[0][0])
 
     @traced
     def forces_jvp(self, item, scene, at, s, change, corner, dots) -> None:

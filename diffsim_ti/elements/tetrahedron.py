@@ -20,7 +20,7 @@ from diffsim_ti.elements.items import Block, Single
 from diffsim_ti.elements.nodes import Nodes, nodes_of
 from diffsim_ti.materials.calculus.tensor import Tensor, inner, sum_of
 from diffsim_ti.materials.law import Law
-from diffsim_ti.runtime import LANES, Bundle, let, traced
+from diffsim_ti.runtime import LANES, Bundle, assign, let, traced, variable
 from diffsim_ti.runtime import at as entry
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
@@ -32,6 +32,40 @@ class Onwards(Bundle):
 
     def pick(self, moved, held):
         return moved if self.moves is None else let(ti.select(self.moves, moved, held))
+
+
+@ti.func
+def _each_point(job: A, count: ti.template()):
+    for q in range(count):
+        for k in ti.static(range(count)):
+            if q == k:
+                _take(job, k)
+        _find(job, q)
+        for k in ti.static(range(count)):
+            if q == k:
+                _put(job, k)
+
+
+@traced
+def _take(job, k: int) -> None:
+    for now, one in zip(job.now, job.lists):
+        for target, number in zip(now, one[k].numbers):
+            assign(target, number)
+
+
+@traced
+def _find(job, q) -> None:
+    tensors, numbers = job.body(q, *(Tensor(one) for one in job.now))
+    job.found = [one.numbers for one in tensors]
+    for total, number in zip(job.sums, numbers):
+        assign(total, total + number)
+
+
+@traced
+def _put(job, k: int) -> None:
+    for points, numbers in zip(job.out, job.found):
+        for target, number in zip(points[k], numbers):
+            assign(target, number)
 
 
 @dataclass(frozen=True)
@@ -85,6 +119,10 @@ class Tetrahedron(Growing):
     store_corners = property(lambda self: self.items.store)
     broadcast = property(lambda self: self.items.broadcast)
 
+    @property
+    def is_short(self) -> bool:
+        return self.law.short
+
     # ---- what an item has -------------------------------------------------------------------------------------------
 
     @traced
@@ -93,12 +131,37 @@ class Tetrahedron(Growing):
         return self.nodes.edges(self.items.corners(x, s, scene.tets, item))
 
     @traced
-    def seen(self, item, scene, at, s) -> list[tuple]:
-        """(H, what the law takes besides) at each point, for kernels that look at a state."""
-        return [
-            (D @ self.gradients_of(item, scene.gradients, q), self.numbers_at(item, scene, at, s, q))
-            for q, D in enumerate(self.edges(item, scene, at.u, s))
-        ]
+    def each_point(self, lists: list, body, tensors: int = 1, sums: int = 0) -> tuple[list, list]:
+        """For each point body(q, *its Tensor of each list), which gives (`tensors` Tensors, `sums` numbers): (a list of
+        Tensors at the points for each of these, sums over the points).
+
+        A loop, where points are several and the law is long: code of each point takes four times as much memory, and
+        sixteen times as long to compile.
+        """
+        if self.order == 1 or self.is_short:
+            found = [body(q, *(one[q] for one in lists)) for q in self.points]
+            return list(zip(*(of for of, _ in found))), [let(sum_of(x)) for x in zip(*(of for _, of in found))]
+        lists = [[Tensor(x.numbers) for x in one] for one in lists]  # none that is found in the loop alone
+        zero, count = let(0 * lists[0][0][0, 0]), len(self.points)
+        job = Bundle(
+            lists=lists,
+            body=body,
+            now=[[variable(x) for x in one[0].numbers] for one in lists],
+            out=[[[variable(zero) for _ in range(9)] for _ in range(count)] for _ in range(tensors)],
+            sums=[variable(zero) for _ in range(sums)],
+        )
+        _each_point(job, count)
+        return [[Tensor(x) for x in one] for one in job.out], [let(x) for x in job.sums]
+
+    @traced
+    def each_seen(self, item, scene, at, s, body) -> None:
+        """body(q, H, what the law takes besides) at each point, for kernels that look at a state."""
+
+        def of(q, D):
+            body(q, D @ self.gradients_of(item, scene.gradients, q), self.numbers_at(item, scene, at, s, q))
+            return (), ()
+
+        self.each_point([self.edges(item, scene, at.u, s)], of, tensors=0)
 
     @traced
     def gradients_of(self, item, array, q: int = 0) -> Tensor:
@@ -177,45 +240,51 @@ class Tetrahedron(Growing):
 
     @traced
     def _edges_read(self, item, scene, at, s) -> list:
-        """For each point, edges of all whose gradients the law reads, at slot s."""
-        return list(zip(*(self.edges(item, scene, x, s) for x in ((at.u, at.v) if self.reads_rates else (at.u,)))))
+        """Edges of all whose gradients the law reads, at slot s: a list for each."""
+        return [self.edges(item, scene, x, s) for x in ((at.u, at.v) if self.reads_rates else (at.u,))]
 
     @traced
     def forces(self, item, scene, at, s, corner) -> None:
         """Corner forces at slot s."""
-        pushes = []
-        for q, D in enumerate(self._edges_read(item, scene, at, s)):
+
+        def push(q, *D):
             B = self.gradients_of(item, scene.gradients, q)
             P = self.law.stress_at([d @ B for d in D], self.numbers_at(item, scene, at, s, q))
-            pushes.append((P * self.volume_of(item, scene.volumes, q)) @ B.transpose())
-        self.store(item, corner, pushes)
+            return [(P * self.volume_of(item, scene.volumes, q)) @ B.transpose()], ()
+
+        self.store(item, corner, self.each_point(self._edges_read(item, scene, at, s), push)[0][0])
 
     @traced
     def stiffness(self, item, scene, at, s, corner) -> None:
         """Corner products of the derivative of the elastic force with at.w (negative semi-definite at rest), and of a
         viscous one, times a rate."""
-        pushes = []
-        for q, (D, W) in enumerate(zip(self.edges(item, scene, at.u, s), self.edges(item, scene, at.w, 0))):
+
+        def push(q, D, W):
             B = self.gradients_of(item, scene.gradients, q)
             H, dH, numbers = D @ B, W @ B, self.numbers_at(item, scene, at, s, q)
             dP = self.law.stress_differential(H, dH, numbers)
             if self.law.viscous and not self.holds(at):
                 dP = dP + self.law.viscous_differential(H, dH, numbers) * self.rate_of(at)
-            pushes.append((dP * self.volume_of(item, scene.volumes, q)) @ B.transpose())
-        self.store(item, corner, pushes)
+            return [(dP * self.volume_of(item, scene.volumes, q)) @ B.transpose()], ()
+
+        edges = [self.edges(item, scene, at.u, s), self.edges(item, scene, at.w, 0)]
+        self.store(item, corner, self.each_point(edges, push)[0][0])
 
     @traced
     def forces_jvp(self, item, scene, at, s, change, corner, dots) -> None:
         """Change of the corner forces for a change of what `at` has, in slot 0, and of coefficients and rest shape."""
-        pushes, dD_of = [], self._edges_read(item, scene, change, 0)
-        for q, D in enumerate(self._edges_read(item, scene, at, s)):
+
+        def push(q, *edges):
+            D, moving = edges[: len(edges) // 2], edges[len(edges) // 2 :]
             B, B_dot = self.gradients_of(item, scene.gradients, q), self.gradients_of(item, dots.gradients, q)
             volume, numbers = self.volume_of(item, scene.volumes, q), self.numbers_at(item, scene, at, s, q)
-            x, dx = [d @ B for d in D], [moved @ B + d @ B_dot for d, moved in zip(D, dD_of[q])]
+            x, dx = [d @ B for d in D], [moved @ B + d @ B_dot for d, moved in zip(D, moving)]
             P, dP = self.law.stress_and_jvp_at(x, dx, numbers, self._numbers_jvp(item, change, dots, q))
             turned = B * self.volume_of(item, dots.volumes, q) + B_dot * volume
-            pushes.append((dP * volume) @ B.transpose() + P @ turned.transpose())
-        self.store(item, corner, pushes)
+            return [(dP * volume) @ B.transpose() + P @ turned.transpose()], ()
+
+        edges = [*self._edges_read(item, scene, at, s), *self._edges_read(item, scene, change, 0)]
+        self.store(item, corner, self.each_point(edges, push)[0][0])
 
     @traced
     def _numbers_jvp(self, item, change, dots, q) -> list:
@@ -230,22 +299,20 @@ class Tetrahedron(Growing):
 
         The work of the forces on w is -sum V P(D B) : (W B), with D, W the edges of u and w.
         """
-        pushes, rates, by_p = [], [], None
-        for q, (D, W) in enumerate(zip(self._edges_read(item, scene, at, s), self.edges(item, scene, w, 0))):
+
+        def push(q, *edges):
+            *D, W = edges
             B, volume = self.gradients_of(item, scene.gradients, q), self.volume_of(item, scene.volumes, q)
             x, dH, numbers = [d @ B for d in D], W @ B, self.numbers_at(item, scene, at, s, q)
             both = self.law.stress_and_vjp_at if shape else self.law.stress_vjp_at
             *P, by_x, products = both(x, dH, numbers)  # the stress itself is felt by the rest shape alone
-            pushes.append((by_x[0] * volume) @ B.transpose())
-            if self.reads_rates:
-                rates.append((by_x[1] * volume) @ B.transpose())
+            pushes = [(by * volume) @ B.transpose() for by in by_x]
             minus = let(ti.cast(-1, self.fp) * volume)
             own, by_z = self._parted([minus * product for product in products])
             if self.holds(at):
                 *by_held, _ = by_z[len(self.law.state_names) :]
                 by_z = by_z[: len(self.law.state_names)]
                 self.items.put_row(adjoint.held, 0, len(by_held) * q, len(by_held) * self.nodes.points, item, by_held)
-            by_p = own if by_p is None else [a + b for a, b in zip(by_p, own)]
             if self.has_state:
                 known = self.state_of(item, adjoint.z, 0, q)
                 self.put_state(item, adjoint.z, 0, [a + b for a, b in zip(known, by_z)], q)
@@ -253,10 +320,15 @@ class Tetrahedron(Growing):
                 (P,) = P
                 by_B = sum_of([*(d.transpose() @ by for d, by in zip(D, by_x)), W.transpose() @ P])
                 self._add_shape(item, adjoint, q, by_B * minus, ti.cast(-1, self.fp) * inner(P, dH))
+            return pushes, own
+
+        edges = [*self._edges_read(item, scene, at, s), self.edges(item, scene, w, 0)]
+        count = len(self.law.coefficient_names)
+        (pushes, *rates), by_p = self.each_point(edges, push, len(self.law.reads), count)
         self.store(item, corner, pushes, add)
-        if self.reads_rates:
-            self.store(item, adjoint.rate_corner, rates)
-        self.items.add(adjoint.coefficients, len(by_p), item, by_p)
+        for rate in rates:
+            self.store(item, adjoint.rate_corner, rate)
+        self.items.add(adjoint.coefficients, count, item, by_p)
         self.add_growth(item, adjoint, by_p, scene)
 
     @traced
@@ -275,49 +347,57 @@ class Tetrahedron(Growing):
     # ---- the law's state after a pass --------------------------------------------------------------------------------
 
     @traced
-    def _read_onwards(self, item, scene, at, s, u_slot) -> list:
-        """For each point (B, D, H, numbers of the law), of the state in slot s and the displacement in slot `u_slot` (None:
-        s)."""
-        out = []
-        for q, D in enumerate(self.edges(item, scene, at.u, s if u_slot is None else u_slot)):
-            B = self.gradients_of(item, scene.gradients, q)
-            out.append((B, D, D @ B, self.numbers_at(item, scene, at, s, q)))
-        return out
+    def _edges_onwards(self, item, scene, at, s, u_slot) -> list[Tensor]:
+        """Edges of the displacement in slot `u_slot` (None: s)."""
+        return self.edges(item, scene, at.u, s if u_slot is None else u_slot)
 
     @traced
     def move_on(self, item, scene, at, s, slot, onwards, u_slot=None) -> None:
         """Put the state after a pass into a slot."""
-        for q, (_, _, H, numbers) in enumerate(self._read_onwards(item, scene, at, s, u_slot)):
+
+        def move(q, D):
+            H, numbers = D @ self.gradients_of(item, scene.gradients, q), self.numbers_at(item, scene, at, s, q)
             after, held = self.law.next_state_at(H, numbers, onwards.h), self._parted(numbers)[1]
             self.put_state(item, at.z, slot, [onwards.pick(a, b) for a, b in zip(after, held)], q)
+            return (), ()
+
+        self.each_point([self._edges_onwards(item, scene, at, s, u_slot)], move, tensors=0)
 
     @traced
     def move_on_jvp(self, item, scene, at, s, change, dots, onwards, u_slot=None) -> None:
         """Its change, in place of that of the state before."""
-        moved = self.edges(item, scene, change.u, 0)
-        for q, (B, D, H, numbers) in enumerate(self._read_onwards(item, scene, at, s, u_slot)):
-            dH = moved[q] @ B + D @ self.gradients_of(item, dots.gradients, q)
+
+        def move(q, D, moved):
+            B, numbers = self.gradients_of(item, scene.gradients, q), self.numbers_at(item, scene, at, s, q)
+            dH = moved @ B + D @ self.gradients_of(item, dots.gradients, q)
             dq = self._numbers_jvp(item, change, dots, q)
-            after, held = self.law.next_state_jvp(H, dH, numbers, dq, onwards.h), self._parted(dq)[1]
+            after, held = self.law.next_state_jvp(D @ B, dH, numbers, dq, onwards.h), self._parted(dq)[1]
             self.put_state(item, change.z, 0, [onwards.pick(a, b) for a, b in zip(after, held)], q)
+            return (), ()
+
+        edges = [self._edges_onwards(item, scene, at, s, u_slot), self.edges(item, scene, change.u, 0)]
+        self.each_point(edges, move, tensors=0)
 
     @traced
     def move_on_vjp(self, item, scene, at, s, onwards, corner, adjoint, shape: bool, u_slot=None) -> None:
         """From the adjoint of the state after a pass to that of the state before, in its place, and, in corners, to that of
         the displacement; adds those of coefficients and, if `shape`, of B."""
-        pushes, points = [], self.nodes.points
-        for q, (B, D, H, numbers) in enumerate(self._read_onwards(item, scene, at, s, u_slot)):
+
+        def move(q, D):
+            B, numbers = self.gradients_of(item, scene.gradients, q), self.numbers_at(item, scene, at, s, q)
             later = self.state_of(item, adjoint.z, 0, q)
             zero = [let(0 * x) for x in later]
             by_H, by_q = self.law.next_state_vjp(
-                H, numbers, onwards.h, [onwards.pick(x, o) for x, o in zip(later, zero)]
+                D @ B, numbers, onwards.h, [onwards.pick(x, o) for x, o in zip(later, zero)]
             )
             by_p, by_z = self._parted(by_q)
             held = [onwards.pick(o, x) for x, o in zip(later, zero)]
             self.put_state(item, adjoint.z, 0, [a + b for a, b in zip(by_z, held)], q)
             self.items.add(adjoint.coefficients, len(by_p), item, by_p)
             self.add_growth(item, adjoint, by_p, scene)
-            pushes.append((by_H * ti.cast(-1, self.fp)) @ B.transpose())
             if shape:
+                points = self.nodes.points
                 self.items.add(adjoint.gradients, 9 * points, item, (D.transpose() @ by_H).numbers, 9 * q)
-        self.store(item, corner, pushes)
+            return [(by_H * ti.cast(-1, self.fp)) @ B.transpose()], ()
+
+        self.store(item, corner, self.each_point([self._edges_onwards(item, scene, at, s, u_slot)], move)[0][0])

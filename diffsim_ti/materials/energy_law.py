@@ -74,14 +74,14 @@ class EnergyLaw(Law):
     @traced
     def _record(self, H, p):
         """(graph, leaves of p, psi)"""
-        g = Graph(self.fp)
+        g = Graph(self.fp, waits=True)
         numbers = [g.leaf(x) for x in p]
         return g, numbers, self.psi(Tensor(g.leaf(x) for x in H.numbers), *self._parted(numbers))
 
     @traced
     def _record_stress(self, x, p):
         """(graph, leaves of x and p, P); x holds H alone, for the stress of psi, or H and H_dot."""
-        g = Graph(self.fp)
+        g = Graph(self.fp, waits=True)
         read, numbers = [Tensor(g.leaf(number) for number in one.numbers) for one in x], [g.leaf(c) for c in p]
         parted = self._parted(numbers)
         P = g.gradient(self.psi(read[0], *parted), read[0].numbers)
@@ -93,7 +93,7 @@ class EnergyLaw(Law):
     @traced
     def _record_next_state(self, H, q, h):
         """(graph, leaves of H and q, next state)"""
-        g = Graph(self.fp)
+        g = Graph(self.fp, waits=True)
         read, numbers = Tensor(g.leaf(x) for x in H.numbers), [g.leaf(x) for x in q]
         following = list(self.next_state(read, *self._parted(numbers), g.leaf(h)))
         if len(following) != len(self.state_names):
@@ -105,7 +105,7 @@ class EnergyLaw(Law):
 
     @traced
     def _record_dilatation(self, H):
-        g = Graph(self.fp)
+        g = Graph(self.fp, waits=True)
         h = Tensor(g.leaf(x) for x in H.numbers)
         theta = self.theta(h)
         return g, h.numbers, theta, g.gradient(theta, h.numbers)
@@ -128,23 +128,27 @@ class EnergyLaw(Law):
     @traced
     def stress_and_jvp_at(self, x, dx, p, dp):
         g, leaves, P = self._record_stress(x, p)
-        dP = g.forward([*zip(leaves, [*_numbers(dx), *dp])], P)
-        return _tensor([number.value for number in P], x[0]), _tensor(dP, x[0])
+        stress = _tensor([number.value for number in P], x[0])
+        return stress, _tensor(g.forward([*zip(leaves, [*_numbers(dx), *dp])], P), x[0])
 
     @traced
     def stress_and_vjp_at(self, x, W, p):
         g, leaves, P = self._record_stress(x, p)
+        return _tensor([number.value for number in P], x[0]), *self._pulled(x, W, g, leaves, P)
+
+    @staticmethod
+    def _pulled(x, W, g, leaves, P):
         by = _spread(g.reverse([*zip(P, W.numbers)], leaves), x[0])
-        by_x = [Tensor(by[9 * k : 9 * k + 9]) for k in range(len(x))]
-        return _tensor([number.value for number in P], x[0]), by_x, by[9 * len(x) :]
+        return [Tensor(by[9 * k : 9 * k + 9]) for k in range(len(x))], by[9 * len(x) :]
 
     @traced
     def stress_jvp_at(self, x, dx, p, dp):
-        return self.stress_and_jvp_at(x, dx, p, dp)[1]
+        g, leaves, P = self._record_stress(x, p)
+        return _tensor(g.forward([*zip(leaves, [*_numbers(dx), *dp])], P), x[0])
 
     @traced
     def stress_vjp_at(self, x, W, p):
-        return self.stress_and_vjp_at(x, W, p)[1:]
+        return self._pulled(x, W, *self._record_stress(x, p))
 
     @traced
     def stress(self, H, p):

@@ -45,6 +45,12 @@ class Law:
     lanes = True  # written with + - * / and max alone, so that a number may be a vector of lanes
 
     @property
+    def title(self) -> str:
+        """Its name, and those of the laws within."""
+        within = [x.title for x in vars(self).values() if isinstance(x, Law)]
+        return type(self).__name__.removesuffix("Law") + (f"({within[0]})" if within else "")
+
+    @property
     def fp(self):
         """Taichi's type of its numbers."""
         return PRECISIONS[self.precision]

@@ -34,9 +34,11 @@ class ObserverKernels:
 
     @traced
     def observe_points(self, e, scene, at, out):
-        for q, (H, p) in enumerate(self.element.seen(e, scene, at, 0)):
+        def see(q, H, p):
             self.observe_point(e * len(self.element.points) + q, H, self.law.stress(H, p), out)
             assign(entry(out.energy, e * len(self.element.points) + q), self.law.energy_density(H, p))
+
+        self.element.each_seen(e, scene, at, 0, see)
 
     @ti.func
     def observe_point(self, k, H: A, P: A, out: A):
@@ -53,8 +55,10 @@ class ObserverKernels:
 
     @traced
     def store_points(self, e, scene, at, out):
-        for q, (H, p) in enumerate(self.element.seen(e, scene, at, 0)):
+        def see(q, H, p):
             assign(entry(out.energy, e * len(self.element.points) + q), self.law.energy_density(H, p))
+
+        self.element.each_seen(e, scene, at, 0, see)
 
     @ti.func
     def observe(self, scene: A, at: A, out: A, plan: A):

@@ -13,7 +13,7 @@ from diffsim_ti.inputs import Derived
 from diffsim_ti.runtime import Kernel
 from diffsim_ti.state.arrays import SceneArrays
 from diffsim_ti.state.features import Features
-from diffsim_ti.state.numbers import ADJOINT, SCENE, TANGENT, Adjoint, Tangent
+from diffsim_ti.state.numbers import ADJOINT, SCENE, TANGENT, Adjoint, Tangent, with_state
 
 A = ti.template()
 STATE = dict(u="vectors2", v="vectors2")
@@ -33,7 +33,10 @@ class BodyForceKernels:
         return functions_of(self.law, self.features, self.lanes)
 
     def _kernel(self, name: str, body, **arrays) -> Kernel:
-        own = dict(scene=SCENE, at=STATE, out=CORNERS | dict(y="vectors2", y_rate="vectors2")) | arrays
+        own = (
+            dict(scene=SCENE, at=with_state(STATE, self.law), out=CORNERS | dict(y="vectors2", y_rate="vectors2"))
+            | arrays
+        )
         return Kernel(name, body, self.law.precision, own, dict(num_items="int", num_vertices="int"))
 
     @ti.func
@@ -81,11 +84,11 @@ def _kernels(law, features: Features, lanes: bool) -> BodyForceKernels:
 class BodyForces:
     """Forces -dE/du [N] of stress, shape (num_vertices, 3), at the states that frames show.
 
-    Raises ValueError for a law with a state of its own, which frames do not have.
+    Raises ValueError for a law with a state of its own, which frames do not have; remembers: it is placed there.
     """
 
-    def __init__(self, scene):
-        if scene.law.state_names:
+    def __init__(self, scene, remembers: bool = False):
+        if scene.law.state_names and not remembers:
             raise ValueError(
                 f"{type(scene.law).__name__} has a state ({', '.join(scene.law.state_names)}) that frames do not keep: this "
                 "output knows laws of the displacement and velocity gradients only"
@@ -98,6 +101,7 @@ class BodyForces:
             SimpleNamespace(**{name: runtime.array(a.vector, 1, a.num_vertices) for name in names})
             for names in (("u", "v", "w"), ("u", "v"), ("y", "y_rate"))
         )
+        self.at.z = a.law_states(1)
         self.out.corner, self.out.rate_corner = (runtime.array(a.vector, *a.corner.shape) for _ in range(2))
 
     def load(self, values: dict) -> Derived:
@@ -113,8 +117,10 @@ class BodyForces:
         launch(num_items=a.num_items, num_vertices=a.num_vertices)
         return runtime.fetch_row(self.out.y, 0)
 
-    def place(self, u: np.ndarray, v: np.ndarray) -> None:
-        """Go to a displacement [m] and a velocity [m/s]."""
+    def place(self, u: np.ndarray, v: np.ndarray, law_state: np.ndarray | None = None) -> None:
+        """Go to a displacement [m] and a velocity [m/s], and to what the law remembers."""
+        if self.at.z is not None:
+            runtime.fill(self.at.z, self.arrays.to_blocks(law_state)[None])
         runtime.fill(self.at.u, u[None])
         runtime.fill(self.at.v, v[None])
 

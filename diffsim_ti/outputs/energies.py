@@ -24,7 +24,7 @@ class ElasticEnergy(Output):
     sets: tetrahedron sets, by name, indices or mask, for the energy of each; shape (frames, len(sets)). name: how a loss
     calls it. The gradient is exact by all inputs.
     With volume="patches" a tetrahedron has pi theta / 2 of its patch's pressure pi in the place of lam theta^2 / 2.
-    Raises ValueError for laws with rates or a state.
+    Of a law with a state, `Simulator.output` alone knows it. Raises ValueError for laws with rates.
     Holzapfel, Nonlinear Solid Mechanics, 2000, sec. 6.1.
     """
 
@@ -33,16 +33,15 @@ class ElasticEnergy(Output):
 
     def settled(self, scene: "Scene") -> "ElasticEnergy":
         law, mesh = scene.law, scene.mesh
-        if law.in_steps().reads != ("H",) or law.state_names:
+        if law.in_steps().reads != ("H",):
             raise ValueError(
-                f"ElasticEnergy knows laws of the displacement gradient, not {type(law).__name__}: take a law without rates "
-                "and state"
+                f"ElasticEnergy knows laws of the displacement gradient, not {law.title}: take a law without rates"
             )
         self.refuse_growth("ElasticEnergy", scene)
         out = copy(self)
         out.scene, out.all = scene, np.arange(mesh.num_tetrahedra)
         out.patched = scene.volume == "patches"
-        out.law = law.base if out.patched else law
+        out.law, out.reads_law_state = law.base if out.patched else law, bool(law.state_names)
         masks = np.ones((1, mesh.num_tetrahedra))
         if self.sets is not None:
             masks = np.zeros((len(self.sets), mesh.num_tetrahedra))
@@ -63,7 +62,10 @@ class ElasticEnergy(Output):
         F, K = deformation.F, len(self.law.coefficient_names)
         at = PatchPressure.of(self.scene, derived, deformation.H) if self.patched else None
         p = self._at_points(derived.coefficients) if at is None else at.kept
-        psi, P, by = evaluate(self.law, F.reshape(-1, 3, 3), np.tile(p, (len(F), 1)))
+        p = np.tile(p, (len(F), 1))
+        if self.reads_law_state:
+            p, K = np.concatenate([p, frames.law_state.reshape(len(p), -1)], 1), K + frames.law_state.shape[-1]
+        psi, P, by = evaluate(self.law, F.reshape(-1, 3, 3), p)
         psi, P, by = (x.astype(np.float64) for x in (psi, P, by))
         return derived, deformation, psi.reshape(F.shape[:2]), P.reshape(F.shape), by.reshape(*F.shape[:2], K), at
 

@@ -11,7 +11,7 @@ from diffsim_ti.materials.calculus.tensor import tensor
 
 @lru_cache(maxsize=None)
 def _kernel(law, what: str):
-    K = len(law.coefficient_names)
+    K = len(law.coefficient_names) + len(law.state_names)
     matrices = ti.types.ndarray(ti.types.matrix(3, 3, law.fp), 1)
     vectors = ti.types.ndarray(ti.types.vector(K, law.fp), 1)
 
@@ -39,10 +39,11 @@ def _kernel(law, what: str):
 
 
 class LawOnArrays:
-    """H: shape (m, 3, 3); p: coefficients, (K,) or (m, K) [Pa]. Only for laws of the displacement gradient alone."""
+    """H: shape (m, 3, 3); p: coefficients, (K,) or (m, K) [Pa], and behind them the numbers of a law's state. Only for laws
+    of the displacement gradient."""
 
     def __init__(self, law):
-        self.law, self.K = law, len(law.coefficient_names)
+        self.law, self.K = law, len(law.coefficient_names) + len(law.state_names)
 
     def _run(self, what: str, H, W, p, dp) -> tuple[np.ndarray, np.ndarray]:
         runtime.program()

@@ -51,6 +51,7 @@ class Output(ABC):
     unit = ""  # for pictures
     cumulative = False  # whether it counts from the first frame on, and so is of no state by itself
     reads_contact_forces = False  # whether runs must note frames.contact_forces for it
+    reads_law_state = False  # whether it evaluates a law that remembers, which a Simulator's state alone has
     reads_chamber_pressures = False  # the same of frames.chamber_pressures
 
     def needs_contact_forces(self, solver) -> bool:

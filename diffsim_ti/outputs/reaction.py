@@ -35,7 +35,8 @@ class Reaction(Output):
     The gradient is exact by all inputs. In single precision a reaction is the small sum of large forces of stress: it has an
     error of some 1e-6 of these.
 
-    Raises ValueError for a support that is not held, for a law with a state, or for about= and per_vertex=True together.
+    Of a law with a state, `Simulator.output` alone knows it. Raises ValueError for a support that is not held, or for about=
+    and per_vertex=True together.
     Belytschko, Liu, Moran, Nonlinear Finite Elements for Continua and Structures, 2000, sec. 4.4.
 
     >>> import diffsim_ti as ds
@@ -77,7 +78,8 @@ class Reaction(Output):
                 f"Reaction: the support must be among the held vertices, but {len(loose) or 'all'} of its "
                 f"{len(out.vertices)} vertices are free: fix them (Scene(..., fixed=...)) or name others"
             )
-        out.scene, out.body, out.loads = scene, BodyForces(scene), GivenLoads(scene)
+        out.scene, out.body, out.loads = scene, BodyForces(scene, remembers=True), GivenLoads(scene)
+        out.reads_law_state = bool(scene.law.state_names)
         out.onto = scene.supports.projectors(out.vertices, self.support)
         return out
 
@@ -86,8 +88,9 @@ class Reaction(Output):
 
     # ---- forces on all vertices, shape (frames, num_vertices, 3) -----------------------------------------------------
 
-    def _state(self, frames, k: int) -> tuple[np.ndarray, np.ndarray]:
-        return frames.displacements[k].astype(np.float64), frames.velocities[k].astype(np.float64)
+    def _state(self, frames, k: int) -> tuple:
+        law_state = frames.law_state[k] if self.reads_law_state else None
+        return frames.displacements[k].astype(np.float64), frames.velocities[k].astype(np.float64), law_state
 
     def _pressures(self, frames, k: int) -> np.ndarray | None:
         """Of chambers that hold a volume in frame k."""

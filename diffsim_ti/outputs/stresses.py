@@ -13,7 +13,7 @@ class TetrahedronStress:
 
     def __init__(self, scene, chosen: np.ndarray):
         self.scene, self.chosen, self.read, self.points = scene, chosen, chosen, scene.mesh.reference.num_points
-        self.law = LawOnArrays(scene.law)
+        self.law, self.law_state = LawOnArrays(scene.law), None  # what it remembers in frames
 
     def chosen_of(self, x: np.ndarray) -> np.ndarray:
         """Of arrays of the tetrahedra that are read, those that are chosen."""
@@ -25,8 +25,11 @@ class TetrahedronStress:
 
     def _numbers(self, coefficients: np.ndarray, frames: int) -> np.ndarray:
         """Coefficients of all frames, (frames points, K)."""
-        every = np.broadcast_to(coefficients, (self.scene.mesh.num_tetrahedra, self.law.K))
-        return np.tile(np.repeat(every[self.read], self.points, 0), (frames, 1))
+        every = np.broadcast_to(coefficients, (self.scene.mesh.num_tetrahedra, coefficients.shape[-1]))
+        out = np.tile(np.repeat(every[self.read], self.points, 0), (frames, 1))
+        if self.law_state is None:
+            return out
+        return np.concatenate([out, self.law_state[:, self.read].reshape(len(out), -1)], 1)
 
     def value(self, H, derived) -> np.ndarray:
         """P [Pa]."""

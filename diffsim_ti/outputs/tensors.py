@@ -218,16 +218,19 @@ class Stress(_Tensors):
 
     def settled(self, scene: "Scene") -> "Stress":
         law = scene.law
-        if law.in_steps().reads != ("H",) or law.state_names:
+        if law.in_steps().reads != ("H",):
             raise ValueError(
-                f"Stress knows laws of the displacement gradient, not {type(law).__name__}: take a law without rates and "
-                "state"
+                f"Stress knows laws of the displacement gradient, not {law.title}: take a law without rates"
             )
         self.refuse_growth("Stress", scene)
         out = super().settled(scene)
         out.stresses = (TetrahedronStress if scene.volume == "tetrahedra" else PatchStress)(scene, out.chosen)
-        out.read = out.stresses.read
+        out.read, out.reads_law_state = out.stresses.read, bool(law.state_names)
         return out
+
+    def value(self, frames: "Frames") -> np.ndarray:
+        self.stresses.law_state = frames.law_state if self.reads_law_state else None
+        return super().value(frames)
 
     def _cauchy(self, P, F):
         return P @ np.swapaxes(F, -1, -2) / np.linalg.det(F)[..., None, None]

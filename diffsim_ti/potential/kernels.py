@@ -65,11 +65,13 @@ class PotentialKernels:
 
     @traced
     def elastic_energies(self, e, scene, at, out):
-        for q, (H, numbers) in enumerate(self.single.seen(e, scene, at, 0)):
+        def see(q, H, numbers):
             k = e * len(self.single.points) + q
             psi = self.law.energy_density(H, numbers)
             assign(entry(out.elastic, k), psi * self.single.volume_of(e, scene.volumes, q))
             assign(entry(out.J, k), self.volume_ratio(H))
+
+        self.single.each_seen(e, scene, at, 0, see)
 
     @ti.func
     def energies(self, scene: A, pass_: A, at: A, out: A, plan: A):
@@ -175,9 +177,12 @@ class PotentialKernels:
         """Column c of d2psi/dF2 at each point q, nine numbers, to rows 81 q + 9 c .. 81 q + 9 c + 8 of its block."""
         el = self.element
         dH = Tensor(el.broadcast(ti.cast(c == k, self.fp)) for k in range(9))
-        for q, (H, numbers) in enumerate(el.seen(e, scene, at, 0)):
+
+        def see(q, H, numbers):
             dP = self.law.stress_differential(H, dH, numbers)
             el.put(tangent, 81 * len(el.points), e, 81 * q + 9 * c, dP.numbers)
+
+        el.each_seen(e, scene, at, 0, see)
 
     @traced
     def corner_column(self, e, scene, d, tangent, corners, first):

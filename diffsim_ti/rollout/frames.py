@@ -45,6 +45,7 @@ class Frames:
     computed: dict = field(default_factory=dict, repr=False)
     chamber_pressures: np.ndarray | None = field(default=None, repr=False)
     sets: dict = field(default_factory=dict, repr=False)  # of inputs given by named sets, by input (set_values.py)
+    law_state: np.ndarray | None = field(default=None, repr=False)  # of a Simulator's state, for outputs
     steps: np.ndarray | None = field(default=None, repr=False)  # of the run that are done in each frame
     run: Run | None = field(default=None, repr=False)
     error: FloatingPointError | None = None

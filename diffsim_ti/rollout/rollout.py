@@ -136,7 +136,13 @@ class Rollout:
                 raise ValueError(
                     f"outputs: need names of their own without blanks, got {shown(output.name)}; taken: {taken}"
                 )
-            out[output.name] = output.settled(self.scene)
+            out[output.name] = settled = output.settled(self.scene)
+            if settled.reads_law_state:
+                raise ValueError(
+                    f"outputs: {output.name!r} needs what {self.scene.law.title} remembers "
+                    f"({', '.join(self.scene.law.state_names)}), which frames do not keep: ask Simulator.output(...) at the "
+                    "moments that matter, or let the loss be of positions and velocities"
+                )
         return out
 
     def with_scene(self, **changes) -> "Rollout":
@@ -181,14 +187,16 @@ class Rollout:
 
     # ---- with arrays ------------------------------------------------------------------------------------------------
 
-    def forward(self, **values) -> Frames:
+    def forward(self, law_state: ArrayLike | None = None, **values) -> Frames:
         """Run from the scene's inputs, with some of them replaced, and return the saved frames.
+
+        law_state: what the law remembers at the start, in the shape of `Simulator.law_state`; gradients are by all else.
 
         A material's numbers and others per tetrahedron may be given by named sets, `youngs_modulus={"soft": 2e4}`; gradients
         by them have the same names, and so may tangents (set_values.py).
         """
         values, sets = spread_all(self.scene, self.values, values)
-        frames = self.frames_of(self.sweep.run(values))
+        frames = self.frames_of(self.sweep.run(values, law_state=law_state))
         frames.sets = sets
         return frames
 

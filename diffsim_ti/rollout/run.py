@@ -16,6 +16,7 @@ class Run:
     """A forward run, by what it takes to do it again: the values of its inputs, and what else sets its start.
 
     contacts: what it noted of them, worked out when asked for.
+    law_state: what the law remembers at the start; None: its initial state.
     start: called with the workspace after the values are loaded; sets another start there, the same each time.
     first_step: steps that came before, for reports.
     seen_by: the name of the sweep that looked after it to its end.
@@ -25,6 +26,7 @@ class Run:
     values: dict
     start: Callable | None = None
     first_step: int = 0
+    law_state: np.ndarray | None = None
     contacts: Callable[[], ContactResolution] | None = None
     seen_by: object | None = None
     error: FloatingPointError | None = None

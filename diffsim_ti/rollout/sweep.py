@@ -131,9 +131,9 @@ class Sweep:
 
     # ---- forward ----------------------------------------------------------------------------------------------------
 
-    def run(self, values: dict, start: Callable | None = None) -> Run:
-        """Run from the scene's inputs with some values replaced; see `Run` for `start`."""
-        run, self.last_error = Run(self._checked(values), start, self.first_step), None
+    def run(self, values: dict, start: Callable | None = None, law_state=None) -> Run:
+        """Run from the scene's inputs with some values replaced; see `Run` for the rest."""
+        run, self.last_error = Run(self._checked(values), start, self.first_step, law_state), None
         try:
             self._forward(run)
         except FloatingPointError as error:
@@ -199,6 +199,9 @@ class Sweep:
             else:
                 self.workspace.load(derived)
             self._loaded = values
+        if run.law_state is not None:
+            run.law_state = self.workspace.checked_law_state(run.law_state).copy()
+            self.workspace.set_law_state(run.law_state)
         self._started = run.start is not None  # elsewhere than the values say
         if self._started:
             run.start(self.workspace)

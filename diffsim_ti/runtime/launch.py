@@ -1,12 +1,17 @@
 """Kernels with their arrays bound once, launched many times."""
 
 import contextlib
+import os
+import signal
+import subprocess
 
 import numpy as np
 import taichi as ti
 from taichi.lang import impl
 from taichi.types import primitive_types
 
+from diffsim_ti import ranks
+from diffsim_ti.runtime import tracer
 from diffsim_ti.runtime.argument_buffer import ArgumentBuffer
 from diffsim_ti.runtime.arrays import check_owner, full_shape
 from diffsim_ti.runtime.quadrants import QUADRANTS
@@ -25,22 +30,28 @@ class Launch:
     they do: without them the same bits, and a third of the compile time for scenes with many terms; but short kernels that
     run all the time are a tenth faster with them.
     loops: so many of its first loops are gone through as often as the last number says (repeated_loops.py); 0: once.
+    title: what it is, for who waits until it is compiled.
     """
 
-    def __init__(self, kernel, *arrays, vectorized: bool = False, polished: bool = False, loops: int = 0):
+    def __init__(
+        self, kernel, *arrays, vectorized: bool = False, polished: bool = False, loops: int = 0, title: str = ""
+    ):
         for array in arrays:
             check_owner(array)
         self._kernel, self._arrays, self._loops = kernel._primal, arrays, loops
         self._options = dict(real_matrix_scalarize=not vectorized, advanced_optimization=polished)
         self._setters, self._buffer, self._repeated, self._owner = None, None, None, program()
+        self._title = title or f"the kernel {kernel._primal.func.__name__}"
 
     def _prepare(self, numbers: tuple) -> None:
         prog = impl.get_runtime().prog
         config, kernel = prog.config(), self._kernel
         with _settings(config, **self._options):
             materialize()
+            before = tracer.made["variables"]
             compiled = kernel.compiled_kernels[kernel.ensure_compiled(*self._arrays, *numbers)]
-            self._code = prog.compile_kernel(config, prog.get_device_caps(), compiled)
+            self.variables = tracer.made["variables"] - before  # that were traced here
+            self._code = self._compile(prog, config, compiled)
         if self._loops:
             self._repeated = RepeatedLoops(self._code, self._owner, self._loops)
         self._context, arch = compiled.make_launch_context(), arch_name()
@@ -63,6 +74,10 @@ class Launch:
             for k, is_float in enumerate(floats, start=len(self._arrays))
         ]
         self._set = [None] * len(floats)  # the numbers as the context has them
+
+    def _compile(self, prog, config, traced):
+        with say_if_long(f"compiling {self._title}") if self.variables > SHORT else contextlib.nullcontext():
+            return prog.compile_kernel(config, prog.get_device_caps(), traced)
 
     def __call__(self, *numbers) -> None:
         check_alive(self._owner)
@@ -90,6 +105,32 @@ class Launch:
                 self._owner().launch_kernel(self._code, self._context)
         else:
             self._owner().launch_kernel(self._code, self._context)
+
+
+PATIENCE, SHORT = 5, 500  # [s]; variables of kernels that take less than a second
+
+
+@contextlib.contextmanager
+def say_if_long(what: str):
+    """Say so on stderr, once, if a `with` block of Taichi takes longer than PATIENCE [s].
+
+    The compiler holds Python's lock, so that no thread of this process could say it, and no interrupt is heard: another
+    process waits, and is ended if the block ends first. Of several ranks the first one says it.
+    """
+    text = f"diffsim_ti: {what} takes longer than {PATIENCE} s; an interrupt (Ctrl-C) is heard when it is done"
+    waiting = None
+    if os.name == "posix" and ranks.is_first():
+        with contextlib.suppress(OSError):
+            script = 'sleep "$1"; kill -0 "$2" 2> /dev/null && echo "$3" >&2'
+            arguments = ["sh", "-c", script, "sh", str(PATIENCE), str(os.getpid()), text]
+            waiting = subprocess.Popen(arguments, stdin=subprocess.DEVNULL, start_new_session=True)
+    try:
+        yield
+    finally:
+        if waiting:
+            with contextlib.suppress(OSError):
+                os.killpg(waiting.pid, signal.SIGKILL)
+            waiting.wait()
 
 
 @contextlib.contextmanager

@@ -325,6 +325,16 @@ class SceneArrays:
         initial = self.law.initial_state or (0.0,) * len(self.law.state_names)
         return np.repeat(np.tile(initial, self.points * self.num_blocks)[:, None], LANES, 1)
 
+    def law_state_of(self, blocks: np.ndarray) -> np.ndarray:
+        """The inverse."""
+        shape = self.law_state_shape
+        return self.from_blocks(blocks, int(np.prod(shape[1:]))).reshape(shape)
+
+    @property
+    def law_state_shape(self) -> tuple[int, ...]:
+        points = () if self.points == 1 else (self.points,)
+        return (self.num_tetrahedra, *points, len(self.law.state_names))
+
     def coefficient_blocks(self, coefficients: np.ndarray) -> np.ndarray:
         """Blocks of coefficients, shape (K,) or (num_tetrahedra, K); a single block serves all if they are uniform."""
         uniform = np.zeros(LANES, int) if coefficients.ndim == 1 else None

@@ -7,6 +7,7 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
+from diffsim_ti.checked import numbers
 from diffsim_ti.contact.curved_pairs import pairs_of
 from diffsim_ti.contact.surface_pairs import SurfacePairs
 from diffsim_ti.inputs import Derived, Mass
@@ -43,6 +44,7 @@ class Workspace:
     energy_watch = None  # counts energy that long steps add, for solvers that neither damp nor limit it
     changes = 0  # of the state from outside its passes
     attached = None  # springs, cables and foundations on the host (potential/attached.py)
+    last_multipliers = None  # of held volumes, in implicit steps
     impulses = None  # of obstacles on vertices in each frame, where a loss names them
 
     def __init__(self, solver, derived: Derived, bend: float = 0.0):
@@ -123,6 +125,23 @@ class Workspace:
         self.changes += 1
         if self.pairs:
             self.pairs.forget(self.state.u)
+
+    def checked_law_state(self, law_state) -> np.ndarray:
+        """What a law shall remember, as an array; raises ValueError for another shape."""
+        value, shape = numbers("law_state", law_state), self.arrays.law_state_shape
+        names = self.arrays.law.state_names
+        if not names:
+            raise ValueError(f"law_state: {self.arrays.law.title} remembers nothing; leave it out")
+        if value.shape != shape or not np.all(np.isfinite(value)):
+            raise ValueError(
+                f"law_state: expected finite numbers of shape {shape}, in each tetrahedron {', '.join(names)}, "
+                f"got shape {value.shape}"
+            )
+        return value
+
+    def set_law_state(self, law_state: np.ndarray) -> None:
+        """Let the law remember this, checked."""
+        runtime.fill(self.state.z, self.arrays.to_blocks(law_state)[None])
 
     def step_of(self, j: int, num_passes: int) -> int:
         """The step that pass j belongs to; velocity Verlet's closing half kick belongs to the last one."""

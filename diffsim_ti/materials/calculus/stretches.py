@@ -42,55 +42,72 @@ def sum_over_stretches(H: Tensor, f: Callable[[Number], Number]) -> Number:
         return f(log1p(e * 2) * 0.5)
 
     diagonal = [entry(i, i) for i in range(3)]
-    terms, kept = [of_strain(e) for e in diagonal], {}
+    terms = [of_strain(e) for e in diagonal]
+    pairs, found = ((0, 1), (0, 2), (1, 2)), []
 
-    def slope(i: int):
-        """f'(e_i)"""
-        if i not in kept:
-            kept[i] = _derivative(graph, of_strain, diagonal[i].value, 1)
-        return kept[i]
+    def curvature(pair: tuple):
+        """2 f'[e_i, e_j]; those of all pairs are found together, where second derivatives ask for the first."""
+        if not found:
+            strains = [(e.value, graph.gradient(y, [e])[0].value) for y, e in zip(terms, diagonal)]
+            found.extend(divided_differences(graph, of_strain, [[strains[k] for k in pair] for pair in pairs]))
+        return 2 * found[pairs.index(pair)]
 
     def coupling(i: int, j: int) -> Number:
         """f'[e_i, e_j] A_ij^2 for A_ij = 0; f' is asked for only where second derivatives are."""
         x, zero = entry(i, j), graph.constant(0)
-
-        def curvature():
-            return 2 * divided_difference(graph, of_strain, *((diagonal[k].value, slope(k)) for k in (i, j)))
-
-        first = graph.function(zero, (x, curvature))
+        first = graph.function(zero, (x, lambda: curvature((i, j))))
         return graph.function(zero, (x, lambda: first))
 
-    return sum_of([*terms, coupling(0, 1), coupling(0, 2), coupling(1, 2)])
+    return sum_of([*terms, *(coupling(*pair) for pair in pairs)])
 
 
-def _derivative(graph: Graph, f: Callable, at, order: int):
-    """A derivative of f at a value of the kernel."""
-    x = graph.leaf(at)
-    y = f(x)
-    for _ in range(order):
-        (y,) = graph.gradient(y, [x])
-    return spread(y.value, at)
-
-
-def divided_difference(graph: Graph, f: Callable, a: tuple, b: tuple):
-    """f'[a, b] of (a, f'(a)) and (b, f'(b)), principal strains: the mean of f'' between them, where they are close."""
-    gap, mean = let(a[0] - b[0]), let(1 + a[0] + b[0])
-    is_far = let(gap * gap > mean * mean * graph.constant(NEAR[graph.fp] ** 2))
-    far = (a[1] - b[1]) / ti.select(is_far, gap, mean)
-    job = Bundle(graph=graph, f=f, middle=let((a[0] + b[0]) * graph.constant(0.5)), gap=gap, total=variable(0 * gap))
+def divided_differences(graph: Graph, f: Callable, pairs: list) -> list:
+    """f'[a, b] for pairs of (a, f'(a)) and (b, f'(b)), principal strains: the mean of f'' between them, where they are
+    close."""
+    gaps = [let(a[0] - b[0]) for a, b in pairs]
+    means = [let(1 + a[0] + b[0]) for a, b in pairs]
+    is_far = [let(g * g > m * m * graph.constant(NEAR[graph.fp] ** 2)) for g, m in zip(gaps, means)]
+    far = [(a[1] - b[1]) / ti.select(*of) for (a, b), of in zip(pairs, zip(is_far, gaps, means))]
+    middles = [let((a[0] + b[0]) * graph.constant(0.5)) for a, b in pairs]
+    totals = [variable(0 * gap) for gap in gaps]
+    job = Bundle(
+        graph=graph, f=f, middle=variable(middles[0]), gap=variable(gaps[0]), totals=totals, of=(middles, gaps)
+    )
     _add_curvatures(job)
-    return let(ti.select(is_far, far, job.total))
+    return [let(ti.select(*of)) for of in zip(is_far, far, totals)]
 
 
 @ti.func
 def _add_curvatures(job: ti.template()):
-    for k in range(3):  # Gauss's rule
-        _add_curvature(job, k)
+    for pair, k in ti.ndrange(3, 3):  # k: a place of Gauss's rule
+        for p in ti.static(range(3)):
+            if pair == p:
+                _take(job, p)
+        mean = _curvature(job, k)
+        for p in ti.static(range(3)):
+            if pair == p:
+                _add(job, p, mean)
 
 
 @traced
-def _add_curvature(job, k) -> None:
-    real = job.graph.constant
+def _take(job, p: int) -> None:
+    for target, values in zip((job.middle, job.gap), job.of):
+        assign(target, values[p])
+
+
+@traced
+def _add(job, p: int, value) -> None:
+    assign(job.totals[p], job.totals[p] + value)
+
+
+@traced
+def _curvature(job, k):
+    """f'' at a place of Gauss's rule, times its weight."""
+    real, graph = job.graph.constant, job.graph
     weight = ti.select(k == 1, real(8 / 18), real(5 / 18))
-    at = let(job.middle + job.gap * (real(k - 1) * real(math.sqrt(0.15))))
-    assign(job.total, job.total + _derivative(job.graph, job.f, at, 2) * weight)
+    with graph.within():
+        x = graph.leaf(let(job.middle + job.gap * (real(k - 1) * real(math.sqrt(0.15)))))
+        y = job.f(x)
+        for _ in range(2):
+            (y,) = graph.gradient(y, [x])
+        return let(spread(y.value, x.value) * weight)

@@ -128,6 +128,16 @@ class GivenInPasses:
             out[self.follower.held] = self.multipliers[max(self.multipliers)]
         return out
 
+    @property
+    def last_multipliers(self) -> np.ndarray | None:
+        """Those that the last pass ended with; None before the first, and without held volumes."""
+        return self.multipliers[max(self.multipliers)] if self.multipliers else None
+
+    def go_on_from(self, multipliers: np.ndarray, step: int) -> None:
+        """Begin a step with these."""
+        self.first_step = step
+        self.multipliers = {self._pass_of_all(0) - 1: multipliers}
+
     def _pass_of_all(self, j: int) -> int:
         """Number of pass j, also of the steps of a run that come one by one."""
         return self.first_step * int(np.max(self.solver.schedule.substeps)) + j
