@@ -10,7 +10,6 @@ import weakref
 
 import numpy as np
 
-from diffsim_ti.potential.free import held_as
 from diffsim_ti.solvers.implicit.linear import NotConverged
 
 
@@ -22,14 +21,14 @@ class LaidOn:
     def __init__(self, workspace):
         self.ws = weakref.proxy(workspace)  # which holds this: no circle
 
-    def __call__(self, u: np.ndarray, start: np.ndarray, problem: tuple, error: NotConverged) -> np.ndarray:
-        """The equilibrium with held vertices as in `start`, from that at u; error: what a solve at once said.
+    def __call__(self, u: np.ndarray, held: np.ndarray, problem: tuple, error: NotConverged) -> np.ndarray:
+        """The equilibrium with held vertices as in `held`, from that at u; error: what a solve at once said.
 
         Raises NotConverged, which says how far the path of equilibria goes and how it ends.
         """
         ws, (mass, inertial, loads) = self.ws, problem
         newton, most = ws.newton, ws.newton.max_iterations
-        out_of_balance, way = newton.residual_at(u), held_as(ws.free, start, u) - u
+        out_of_balance, way = newton.residual_at(u), held - u
         done, share, place = 0.0, self.first, u
         if not np.all(np.isfinite(out_of_balance)):
             raise error
@@ -39,8 +38,7 @@ class LaidOn:
                 s = min(done + share, 1.0)
                 part = loads - (1 - s) * out_of_balance
                 try:
-                    here = ws.admissible(place + (s - done) * way, place)
-                    place, done = newton.solve(here, mass, inertial, part, leave_saddles=s == 1), s
+                    place, done = newton.solve(place + (s - done) * way, mass, inertial, part, leave_saddles=s == 1), s
                     share *= 2
                 except NotConverged:
                     share = 0.5 * min(share, 1 - done)

@@ -47,7 +47,8 @@ class Newton:
     beyond it) may it fall further.
 
     tolerance: |R| over the size of the forces that meet at the vertices (corner by corner, so that it does not vanish
-    at equilibrium), loads and inertia, the largest of the rounds. Beyond it goes only what rounding allows.
+    at equilibrium), loads and inertia, all of the present round: where a solve began is no measure of where it ends. Beyond
+    it goes only what rounding allows, of displacements as large as those that the solve began with or has come to.
     """
 
     insist = 2.0**-10
@@ -113,13 +114,12 @@ class Newton:
         if self.volumes:
             self.volumes.place(u, self.volumes.multipliers)
         self.preconditioner, self.stiffness = self.preconditioners(mass)
-        E, size, norm, rough, solved = self._evaluate(u), 0.0, np.inf, False, False
+        E, norm, rough, solved, far = self._evaluate(u), np.inf, False, False, np.abs(u).max(1, keepdims=True)
         self.upright = bool(np.all(E[2] > 0))
         most = self.max_iterations if rounds is None else rounds
         while self._goes_on(most, rounds is None):
-            R, now = self._residual(u)
-            size, before = max(size, now), norm
-            rounding = self.eps * np.abs(u).max(1, keepdims=True) + self.rigid.rounding
+            (R, size), before = self._residual(u), norm
+            rounding = self.eps * np.maximum(np.abs(u).max(1, keepdims=True), far) + self.rigid.rounding
             floor = 4 * np.linalg.norm(self._rigidity() * rounding * self.moves)
             norm = np.linalg.norm(R)
             report.residuals.append(norm / size if size > 0 else 0.0)
@@ -324,6 +324,24 @@ class Newton:
         pairs = self.potential.pairs
         return self.way(u, step, 1.0)[0] == 1 and (not pairs or pairs.safe_share(u, step) == 1)
 
+    def _against_loads(self, u, step) -> float:
+        """Change of Phi along a step without those of E and W."""
+        return float((step * (self.mass * (u + 0.5 * step - self.inertial) - self.loads)).sum())
+
+    def rise(self, u: np.ndarray, before: tuple, there: np.ndarray, problem: tuple) -> float:
+        """How much higher Phi is at another place than at u, where the energy was `before`. What follows the surface does no
+        more work on the way than by its forces at u. Infinite where a tetrahedron changes its volume more than tenfold."""
+        self.mass, self.inertial, self.loads = problem
+        step = self.potential.place(there) - u
+        (after, _, J), (E, _, J0) = self.potential.energy(), before
+        if np.any((J0 > 0) & ~((J > 0.1 * J0) & (J < 10 * J0))):
+            return np.inf
+        change = after - E + self._against_loads(u, step)
+        if self.follower is not None:
+            x = self.potential.arrays.values.rest + u
+            change -= min(float((self.follower.forces(x) * step).sum()), self.follower.work(x, step))
+        return change
+
     def _falls(self, u, d, slope) -> bool:
         """Whether Phi does not rise again at u as steeply as it fell before: what is left to ask where its change drowns in
         rounding. Hager, Zhang 2005, A New Conjugate Gradient Method with Guaranteed Descent, doi:10.1137/030601880."""
@@ -341,7 +359,7 @@ class Newton:
         trial = self.potential.place(there)
         E, parts, J = before
         after, step = self._evaluate(trial), trial - u
-        change = after[0] - E + float((step * (self.mass * (u + 0.5 * step - self.inertial) - self.loads)).sum())
+        change = after[0] - E + self._against_loads(u, step)
         if self.follower is not None:
             change -= self.follower.work(self.potential.arrays.values.rest + u, step)
         if met or (upright and np.any(~(after[2] > 0.1 * J))):

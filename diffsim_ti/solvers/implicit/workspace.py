@@ -207,16 +207,14 @@ class ImplicitWorkspace(Preconditioned, ObstacleWays, Noted, GivenInPasses, Work
         place, speed = self.prescribed(j, self.arrays.values)
         problem = self.problem(j, stage, x, y)
         self.rigid.begin(u, stage.c0)
-        start = u if stage.static else self.rigid.nearest(u + self.linear * (problem[1] - u))
-        if place is not None:
-            held = self.arrays.held
-            start = self.with_held(start, u[held] + (place - u[held]) / stage.c0)
+        starts = [] if stage.static else [problem[1], x + stage.gamma * y]
+        held = u if place is None else self.with_held(u, u[self.arrays.held] + (place - u[self.arrays.held]) / stage.c0)
         self.begin(j, stage, u, x)
         if self.strains:
             self.strains.hold(stage, u, before)
         self.start_multipliers(j, u)
         try:
-            u_star = self._solve(u, start, problem, stage)
+            u_star = self._solve(u, held, starts, problem, stage)
         except NotConverged as error:
             raise self._explained(error, u) from None
         self.u_star = u_star
@@ -252,29 +250,37 @@ class ImplicitWorkspace(Preconditioned, ObstacleWays, Noted, GivenInPasses, Work
         added = kinetic_energy(self.mass, after) - kinetic_energy(self.mass, before)
         return added - float((rate * (self.mass * way)).sum())
 
-    def _solve(self, u, start, problem: tuple, stage: Stage) -> np.ndarray:
-        """The minimum of the pass; problem: mass, inertial, loads of `Newton.solve`."""
-        held = self.approach(u, start, problem)
-        try:
-            return self.newton.solve(self.admissible(start, held), *problem, leave_saddles=stage.static)
-        except NotConverged as error:
-            if not stage.static or self.volumes or self.newton.max_iterations < self.enough:
-                raise
-            return LaidOn(self)(u, start, problem, error)
+    def _solve(self, u, held, starts: list, problem: tuple, stage: Stage) -> np.ndarray:
+        """The minimum of the pass that descends from `held`, where the body was, with held vertices where they get.
 
-    def admissible(self, start, u):
-        """The start of Newton's method: where inertia leads, or less far where something would turn inside out or meet an
-        obstacle."""
-        held = held_as(self.free, start, u)
-        longest = min(self.way_past_obstacles(held, start - held)[0], self.pairs_share(held, start - held))
-        J0 = self.volume_ratios(held)
-        for fraction in (longest, 0.5 * longest, 0.25 * longest):
-            at = self.rigid.nearest(held + fraction * (start - held))
-            if self.rigid and not self.newton.is_free(held, at - held):
-                continue  # it turns on another way
-            if not np.any((J0 > 0) & ~(self.volume_ratios(at) > 0)):
-                return at
-        return held
+        starts: where inertia leads, and where velocities do; problem: mass, inertial, loads of `Newton.solve`.
+        """
+        starts = [held_as(self.free, self.rigid.nearest(u + self.linear * (start - u)), held) for start in starts]
+        near = self.approach(u, held, starts, problem)
+        try:
+            return self.newton.solve(self.admissible(near, starts, problem), *problem, leave_saddles=stage.static)
+        except NotConverged as error:
+            if self.volumes or self.newton.report.cuts or self.newton.max_iterations < self.enough:
+                raise
+            return LaidOn(self)(u, held, problem, error)
+
+    def admissible(self, u: np.ndarray, starts: list, problem: tuple) -> np.ndarray:
+        """Where Newton's method begins: u or, if Phi is lower there, one of `starts`, or less far where something would turn
+        inside out or meet an obstacle. The solution of a pass is the minimum that descends from u: where inertia or loads
+        would lead what is stiff or light there are others."""
+        best, least = u, 0.0
+        if starts:
+            self.potential.place(u)
+            before = self.potential.energy()
+        for start in starts:
+            if not self.newton.rise(u, before, start, problem) < least:
+                continue
+            longest = min(self.way_past_obstacles(u, start - u)[0], self.pairs_share(u, start - u))
+            at = self.rigid.nearest(u + longest * (start - u))
+            rise = self.newton.rise(u, before, at, problem)
+            if rise < least and not (self.rigid and not self.newton.is_free(u, at - u)):  # it turns on another way
+                best, least = at, rise
+        return best
 
     def volume_ratios(self, u: np.ndarray) -> np.ndarray:
         """J of each tetrahedron at a displacement."""
