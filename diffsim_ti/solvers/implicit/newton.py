@@ -215,7 +215,9 @@ class Newton:
         Method, choice 2, doi:10.1137/0917003."""
         if not np.isfinite(norm):
             return self.inexact
-        exact = max(min(self.inexact, np.sqrt(norm / size)), 0.3 * floor / norm)  # rounding would hide more
+        last = 0.3 * self.tolerance * size / norm  # what makes this round the last one, if that is within reach
+        exact = min(self.inexact, np.sqrt(norm / size), last if last > 0.03 * self.inexact else 1.0)
+        exact = max(exact, 0.3 * floor / norm)  # rounding would hide more
         gained = min(norm / before, 1.0) if np.isfinite(before) else 1.0
         return exact if solved else max(exact, min(self.rough, 0.9 * gained**2))
 

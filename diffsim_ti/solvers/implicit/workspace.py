@@ -48,7 +48,7 @@ class ImplicitWorkspace(Preconditioned, ObstacleWays, Noted, GivenInPasses, Work
     """A run of an implicit solver. Vectors of vertices are worked on in float64 on the host, tetrahedra on the device."""
 
     pairs_kind = ImplicitPairs
-    enough = 20  # rounds with which an equilibrium that was not found is looked for in parts
+    enough = 20  # rounds with which a solution that was not found is looked for in parts
 
     def __init__(self, solver, derived):
         self.potential, self._length = None, solver.substep
@@ -214,7 +214,7 @@ class ImplicitWorkspace(Preconditioned, ObstacleWays, Noted, GivenInPasses, Work
             self.strains.hold(stage, u, before)
         self.start_multipliers(j, u)
         try:
-            u_star = self._solve(u, held, starts, problem, stage)
+            u_star = self._solve(j, u, held, starts, problem, stage)
         except NotConverged as error:
             raise self._explained(error, u) from None
         self.u_star = u_star
@@ -250,19 +250,19 @@ class ImplicitWorkspace(Preconditioned, ObstacleWays, Noted, GivenInPasses, Work
         added = kinetic_energy(self.mass, after) - kinetic_energy(self.mass, before)
         return added - float((rate * (self.mass * way)).sum())
 
-    def _solve(self, u, held, starts: list, problem: tuple, stage: Stage) -> np.ndarray:
+    def _solve(self, j, u, held, starts: list, problem: tuple, stage: Stage) -> np.ndarray:
         """The minimum of the pass that descends from `held`, where the body was, with held vertices where they get.
 
         starts: where inertia leads, and where velocities do; problem: mass, inertial, loads of `Newton.solve`.
         """
-        starts = [held_as(self.free, self.rigid.nearest(u + self.linear * (start - u)), held) for start in starts]
+        starts = [held_as(self.free, held, self.rigid.nearest(u + self.linear * (start - u))) for start in starts]
         near = self.approach(u, held, starts, problem)
         try:
             return self.newton.solve(self.admissible(near, starts, problem), *problem, leave_saddles=stage.static)
         except NotConverged as error:
-            if self.volumes or self.newton.report.cuts or self.newton.max_iterations < self.enough:
+            if self.newton.max_iterations < self.enough or self.newton.report.cuts and not stage.static:
                 raise
-            return LaidOn(self)(u, held, problem, error)
+            return LaidOn(self)(j, stage, u, held, problem, error)
 
     def admissible(self, u: np.ndarray, starts: list, problem: tuple) -> np.ndarray:
         """Where Newton's method begins: u or, if Phi is lower there, one of `starts`, or less far where something would turn
@@ -311,9 +311,7 @@ class ImplicitWorkspace(Preconditioned, ObstacleWays, Noted, GivenInPasses, Work
         if self.fluid:
             a = self.arrays.values
             self.fluid.at(a.parameters, a.rest + x, stage.gamma)
-        self.press(j, stage)
-        self.attach(j, stage)
-        self.grow(j, stage)
+        self.lay_on(j, stage)
 
     def moment(self, j: int, stage: Stage) -> Moment:
         """Where pass j lies for obstacles; a chord of two passes about its end for a solver of two steps."""
@@ -333,7 +331,7 @@ class ImplicitWorkspace(Preconditioned, ObstacleWays, Noted, GivenInPasses, Work
     def share_at_stage(self, j: int, stage: Stage) -> float:
         """Share of the step at which pass j takes its forces."""
         schedule = self.solver.schedule
-        return schedule.begin(j) + (schedule.end(j) - schedule.begin(j)) / stage.c0
+        return schedule.begin(j) + (schedule.end(j) - schedule.begin(j)) * self.laid / stage.c0
 
     def walls_vjp(self, walls_adj: np.ndarray, j: int, stage: Stage, path_adj: np.ndarray) -> None:
         """Add the adjoints of the rows of paths for those of `walls`."""
