@@ -58,14 +58,16 @@ class LaidOn:
                 ws.walls_before, ws.walls_at_stage = (ws.arrays.walls.moved(walls[0], drift, x) for x in (done, s))
                 try:
                     near = ws.approach(place, place + (s - done) * way, [], part)
-                    place, done = newton.solve(near, *part, leave_saddles=stage.static and s == 1), s
-                    share *= 2
+                    there = newton.solve(near, *part, leave_saddles=stage.static and s == 1)
+                    ws.check_upright(place, there)
+                    place, done, share = there, s, 2 * share
                 except NotConverged:
                     share = 0.5 * min(share, 1 - done)
                     if stage.static and share < max(self.nearly * ws.reached(j, stage, done), self.least):
                         ws.potential.place(place)
                         newton.residual_of(lay_on(done))
-                        raise NotConverged(self._why(error, ws.reached(j, stage, done)), error.residuals) from None
+                        why = self._why(error, self._share_of_loads(j, stage, done))
+                        raise NotConverged(why, error.residuals) from None
                     if not stage.static and share < self.in_motion:
                         raise error from None
         finally:
@@ -74,6 +76,20 @@ class LaidOn:
             ws.walls_before, ws.walls_at_stage = walls
             lay_on(1.0)
         return place
+
+    def _share_of_loads(self, j: int, stage: Stage, done: float) -> float:
+        """Of what its step lays on; in the first one loads that also change in time grow faster than the share of the step."""
+        ws, sizes = self.ws, []
+        share = ws.reached(j, stage, done)
+        if ws._pass_of_all(j) >= ws.solver.substeps or ws.volumes:
+            return share
+        for k, laid in ((j, done), (int(ws.solver.schedule.first(ws.solver.schedule.row(j) + 1)) - 1, 1.0)):
+            ws.lay_on(k, stage, laid)
+            forces = ws.loads(k, stage)
+            if ws.follower is not None:
+                forces = forces + ws.follower.forces(ws.arrays.values.rest)
+            sizes.append(np.linalg.norm(forces))
+        return sizes[0] / sizes[1] if sizes[1] > 0 else share
 
     def _why(self, error: NotConverged, reached: float) -> str:
         """In terms of the problem, where the path ends: at a share of what the step lays on."""

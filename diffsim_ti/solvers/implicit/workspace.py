@@ -160,7 +160,7 @@ class ImplicitWorkspace(Preconditioned, ObstacleWays, Noted, GivenInPasses, Work
             try:
                 u_next, v_next = self._pass(j, u, v, before)
                 self.note_contacts(j, save_every)
-                self.note_solves(j, num_passes, time.perf_counter() - begin)
+                self.note_solves(j, num_passes, time.perf_counter() - begin, self.begun)
             except (NotConverged, Tunnelling) as error:
                 raise self.dated(error, j, num_passes) from None
             if self.solver.multistep:
@@ -209,6 +209,7 @@ class ImplicitWorkspace(Preconditioned, ObstacleWays, Noted, GivenInPasses, Work
         self.rigid.begin(u, stage.c0)
         starts = [] if stage.static else [problem[1], x + stage.gamma * y]
         held = u if place is None else self.with_held(u, u[self.arrays.held] + (place - u[self.arrays.held]) / stage.c0)
+        self.begun = u, held, problem
         self.begin(j, stage, u, x)
         if self.strains:
             self.strains.hold(stage, u, before)
@@ -257,12 +258,21 @@ class ImplicitWorkspace(Preconditioned, ObstacleWays, Noted, GivenInPasses, Work
         """
         starts = [held_as(self.free, held, self.rigid.nearest(u + self.linear * (start - u))) for start in starts]
         near = self.approach(u, held, starts, problem)
+        parts = self.newton.max_iterations >= self.enough
         try:
-            return self.newton.solve(self.admissible(near, starts, problem), *problem, leave_saddles=stage.static)
+            there = self.newton.solve(self.admissible(near, starts, problem), *problem, leave_saddles=stage.static)
+            if parts:
+                self.check_upright(u, there)
+            return there
         except NotConverged as error:
-            if self.newton.max_iterations < self.enough or self.newton.report.cuts and not stage.static:
+            if not parts or self.newton.report.cuts and not stage.static:
                 raise
             return LaidOn(self)(j, stage, u, held, problem, error)
+
+    def check_upright(self, u, there) -> None:
+        """Raise NotConverged where the last solve has turned a tetrahedron inside out that was far from that at u."""
+        if not self.newton.upright and np.any((self.volume_ratios(u) > 0.1) & ~(self.volume_ratios(there) > 0)):
+            raise NotConverged("tetrahedra turn inside out: take smaller steps or lay on less", self.newton.report.residuals)
 
     def admissible(self, u: np.ndarray, starts: list, problem: tuple) -> np.ndarray:
         """Where Newton's method begins: u or, if Phi is lower there, one of `starts`, or less far where something would turn
