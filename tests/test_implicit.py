@@ -5,6 +5,7 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
+from battery_of_long_steps import draw, judge
 
 import diffsim_ti as ds
 from diffsim_ti.solvers.implicit.projection import has_eigenvalue_below
@@ -515,3 +516,15 @@ def test_vertices_in_no_tetrahedron_change_nothing(where, preconditioner):
         np.testing.assert_array_equal(ends[0][place], X[place])
     frequencies = [ds.modes(ds.Scene(of, ds.StableNeoHookean(1e5, 0.3)), 8).frequencies for of in (mesh, body)]
     np.testing.assert_allclose(frequencies[0][6:], frequencies[1][6:], rtol=1e-9)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_long_steps_of_stiff_and_light_bodies_end_where_statics_do():
+    """A sample of `python tests/battery_of_long_steps.py`."""
+    rng, said = np.random.default_rng(5), []
+    for _ in range(30):
+        case = draw(
+            rng, laws=("LinearElastic", "StVenantKirchhoff"), orders=(1,), loads=("traction", "weight", "motion")
+        )
+        said.append((judge(case), case))
+    assert all(verdict == "good" for verdict, _ in said), [x for x in said if x[0] != "good"]

@@ -78,7 +78,7 @@ class LaidOn:
         return place
 
     def _share_of_loads(self, j: int, stage: Stage, done: float) -> float:
-        """Of what its step lays on; in the first one loads that also change in time grow faster than the share of the step."""
+        """Of what its step lays on; in the first step loads that change in time, too, grow faster than its share."""
         ws, sizes = self.ws, []
         share = ws.reached(j, stage, done)
         if ws._pass_of_all(j) >= ws.solver.substeps or ws.volumes:

@@ -180,8 +180,8 @@ class Newton:
         return self._downhill() is not None
 
     def follows(self, u: np.ndarray, change: np.ndarray, way: np.ndarray) -> np.ndarray | None:
-        """How the equilibrium at u goes on for a change of loads [N] and a way of held vertices, linearised there; None where
-        it is not stable. Of the last solve's mass."""
+        """How the equilibrium at u goes on for a change of loads [N] and a way of held vertices, linearised there, with the
+        mass of the last solve; None where it is not stable."""
         self.potential.place(u)
         A = self.operator()
         self.preconditioner.update(u)

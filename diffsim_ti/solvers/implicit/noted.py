@@ -11,7 +11,10 @@ from diffsim_ti.state.solve_report import Buckled
 class Noted:
     """A part of ImplicitWorkspace."""
 
-    explained = 2.0  # times what tangents say that equilibria of one branch may be apart
+    explained, softened = (
+        2.0,
+        10.0,
+    )  # times what tangents at both ends, or before, say that equilibria of a branch are apart
 
     def record_contacts(self) -> None:
         self.impulses = ContactRecord(self)
@@ -30,7 +33,8 @@ class Noted:
             self.impulses.add(j, save_every, self.is_static, shares.forces)
 
     def note_solves(self, j: int, num_passes: int, seconds: float, begin: tuple) -> None:
-        """What pass j took; statics say where they left a branch of stable equilibria. begin: u, `held`, problem of the pass."""
+        """What pass j took; statics say where they left a branch of stable equilibria. begin: where the pass began, the same
+        with held vertices where they got, and its problem."""
         step, solves = self.step_of(j, num_passes), self.newton.reports
         self.report.note(step, seconds, solves)
         saddles, unstable = (sum(getattr(solve, name) for solve in solves) for name in ("saddles", "indefinite"))
@@ -43,31 +47,39 @@ class Noted:
             if not saddles:
                 left = (
                     f"{unstable} of {rounds} rounds of Newton's method met states that are not stable, and the body went "
-                    f"more than {self.explained:g} times as far as its stiffness before and after explains: it has buckled "
-                    "or snapped on the way (follow it by more load_steps)"
+                    "much farther than its stiffness explains: it has buckled or snapped on the way (follow it by more "
+                    "load_steps)"
                 )
             went = "it went to a lower equilibrium, which may be one of several, and gradients are of it"
             said = f"step {step}: {left}; {went}"
             warnings.warn(Buckled(said, step, saddles, unstable), stacklevel=2)
 
     def _left_a_branch(self, j: int, u, held, problem: tuple, saddles: int) -> bool:
-        """Whether the equilibrium of pass j is farther from that before it than the tangents there, and without saddles
-        here, explain. On one smooth branch it is as far as the tangents between are long in the mean, so that somewhere
-        between it was much softer than at both ends: near a limit point or a bifurcation."""
+        """Whether the equilibrium of pass j is farther from that before it than the tangents at both explain. On one smooth
+        branch it is as far as the tangents between are long in the mean, so that somewhere between it was much softer than
+        at both ends: near a limit point or a bifurcation. Where a saddle was left, or the tangent before says next to
+        nothing, that alone decides: just beyond a bifurcation the tangent is long."""
         newton, here = self.newton, self.u_star
         self.potential.place(u)
         change, far = newton.residual_of(problem), np.linalg.norm(here - u)
-        for place in (u,) if saddles else (u, here):
-            explained = newton.follows(place, change, held - u)
-            if explained is not None and far <= self.explained * np.linalg.norm(explained):
+        for place in (u, here):
+            way = newton.follows(place, change, held - u)
+            if way is None and place is u and self._pass_of_all(j) == 0 and not self._was_stable(j):
                 return False
-            if explained is None and place is u and self._pass_of_all(j) == 0:  # is it stable before loads are laid on?
-                self.lay_on(j, self.solver.stage(self.rate, True, j), 0.0)
-                left = not newton.is_unstable()
-                self.lay_on(j, self.solver.stage(self.rate, True, j))
-                if not left:
-                    return False
+            size = np.inf if way is None else np.linalg.norm(way)
+            if way is not None and far <= self.explained * size:
+                return False
+            if place is u and (saddles or far > self.softened * size):
+                return True
         return True
+
+    def _was_stable(self, j: int) -> bool:
+        """Whether the potential stands at a stable state before pass j lays on anything."""
+        stage = self.solver.stage(self.rate, True, j)
+        self.lay_on(j, stage, 0.0)
+        stable = not self.newton.is_unstable()
+        self.lay_on(j, stage)
+        return stable
 
     @property
     def is_static(self) -> bool:
