@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from diffsim_ti.inputs import diagonal_of
 from diffsim_ti.potential.free import Free, cleaned, linear_of, mask_of
 from diffsim_ti.potential.way import Met
 from diffsim_ti.solvers.implicit.linear import NotConverged, Operator, conjugate_gradients, gmres
@@ -156,14 +157,24 @@ class Newton:
             u, E = moved
         if solved or norm <= 100 * floor or (rounds is not None and np.isfinite(norm)):  # rounding has the last word
             return u
-        history = ", ".join(f"{r:.2g}" for r in report.residuals[-8:])
         report.place = u
-        raise NotConverged(
-            f"Newton's method stopped after {len(report.residuals)} rounds at a relative residual of "
-            f"{report.residuals[-1]:.2g} (asked for {self.tolerance:g}; the last ones: {history}): take smaller steps, more "
-            "load steps, or a looser tolerance; where the equilibrium is unstable (it buckles or snaps) follow the "
-            "motion to the next one instead, by ImplicitEulerSolver with Drag",
-            report.residuals,
+        raise NotConverged(self._why(report.residuals), report.residuals)
+
+    def _why(self, done: list) -> str:
+        """What a solve that failed says, and what helps: more rounds where they gained to the last."""
+        statics, gains = not diagonal_of(self.mass).any(), len(done) < 2 or done[-1] < 0.5 * done[-2]
+        remedy = f"pass max_iterations={max(4 * len(done), 50)}, " if len(done) >= self.max_iterations and gains else ""
+        if statics:
+            remedy += (
+                "take more load steps or lay on less; where the equilibrium is unstable (it buckles or snaps) follow the "
+                "motion to the next one instead, by ImplicitEulerSolver with Drag"
+            )
+        else:
+            remedy += "take smaller steps"
+        history = ", ".join(f"{r:.2g}" for r in done[-8:])
+        return (
+            f"Newton's method stopped after {len(done)} rounds at a relative residual of {done[-1]:.2g} (asked for "
+            f"{self.tolerance:g}; the last ones: {history}): {remedy}"
         )
 
     def _goes_on(self, most: int, to_the_end: bool) -> bool:
