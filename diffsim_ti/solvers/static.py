@@ -20,8 +20,9 @@ class StaticSolver(ImplicitSolver):
 
     load_steps: in the first step loads and prescribed motion are laid on in so many parts, each starting from the last.
     Raises ValueError, which names the motions, if the supports leave a piece of the body free to move rigidly; NotConverged
-    where the body does not bear what a step lays on, which names the share of it that it bears. Warns Buckled where it leaves
-    a branch of stable equilibria. Nocedal, Wright, Numerical Optimization, 2nd ed., 2006, ch. 3 and 7, doi:10.1007/978-0-387-40065-5.
+    where the body does not bear what a step lays on, which names the share of it that it bears. Warns Buckled where it
+    leaves a branch of stable equilibria. Nocedal, Wright, Numerical Optimization, 2nd ed., 2006, ch. 3 and 7,
+    doi:10.1007/978-0-387-40065-5.
 
     >>> import diffsim_ti as ds
     >>> mesh = ds.TetrahedralMesh.create_cube(resolution=2)

@@ -20,11 +20,7 @@ class LaidOn:
     """Of a workspace."""
 
     first, rounds = 0.25, 30  # share; Newton's rounds in a part
-    nearly, least, in_motion = (
-        0.005,
-        2.0**-13,
-        2.0**-5,
-    )  # smallest part: of what is reached; of a pass of statics; of others
+    nearly, least, in_motion = 0.005, 2.0**-13, 2.0**-5  # smallest: of what is reached, of statics, of others
 
     def __init__(self, workspace):
         self.ws = weakref.proxy(workspace)  # which holds this: no circle

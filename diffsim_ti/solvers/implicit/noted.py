@@ -11,10 +11,7 @@ from diffsim_ti.state.solve_report import Buckled
 class Noted:
     """A part of ImplicitWorkspace."""
 
-    explained, softened = (
-        2.0,
-        10.0,
-    )  # times what tangents at both ends, or before, say that equilibria of a branch are apart
+    explained, softened = 2.0, 10.0  # times what tangents at both ends, or before, say: farther is another branch
 
     def record_contacts(self) -> None:
         self.impulses = ContactRecord(self)

@@ -285,7 +285,8 @@ class ImplicitWorkspace(Preconditioned, ObstacleWays, Noted, GivenInPasses, Work
             self.potential.place(u)
             before = self.potential.energy()
         for start in starts:
-            if not self.newton.rise(u, before, start, problem) < least:
+            # surfaces are looked at together where they have not passed through each other
+            if not self.pairs and not self.newton.rise(u, before, start, problem) < least:
                 continue
             longest = min(self.way_past_obstacles(u, start - u)[0], self.pairs_share(u, start - u))
             at = self.rigid.nearest(u + longest * (start - u))
