@@ -23,7 +23,7 @@ LAWS = {
     "Corotated": lambda E: ds.Corotated(E, 0.3),
     "MooneyRivlin": lambda E: ds.MooneyRivlin(E, 0.3, c01_share=0.3),
     "Yeoh": lambda E: ds.Yeoh(0.2 * E, 0.02 * E, 0.0, E),
-    "Gent": lambda E: ds.Gent(E, 0.3, 5.0),
+    "Gent": lambda E: ds.Gent(0.4 * E, 30.0, E),
     "Ogden": lambda E: ds.Ogden([0.4 * E], [2.0], E),
     "KelvinVoigt": lambda E: ds.KelvinVoigt(ds.StableNeoHookean(E, 0.3), time=1e-9),
 }
