@@ -1,10 +1,12 @@
 """Implicit solvers: closed forms, order, dissipation, conservation, and what happens where Newton's method has it hard."""
 
+import re
 from contextlib import nullcontext
 from functools import lru_cache
 
 import numpy as np
 import pytest
+from battery_of_long_steps import draw, judge
 
 import diffsim_ti as ds
 from diffsim_ti.solvers.implicit.projection import has_eigenvalue_below
@@ -515,3 +517,39 @@ def test_vertices_in_no_tetrahedron_change_nothing(where, preconditioner):
         np.testing.assert_array_equal(ends[0][place], X[place])
     frequencies = [ds.modes(ds.Scene(of, ds.StableNeoHookean(1e5, 0.3)), 8).frequencies for of in (mesh, body)]
     np.testing.assert_allclose(frequencies[0][6:], frequencies[1][6:], rtol=1e-9)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_long_steps_of_stiff_and_light_bodies_end_where_statics_do():
+    """A sample of `python tests/battery_of_long_steps.py`."""
+    rng, said = np.random.default_rng(5), []
+    for _ in range(30):
+        case = draw(
+            rng, laws=("LinearElastic", "StVenantKirchhoff"), orders=(1,), loads=("traction", "weight", "motion")
+        )
+        said.append((judge(case), case))
+    assert all(verdict == "good" for verdict, _ in said), [x for x in said if x[0] != "good"]
+
+
+def hanging_solver(kind, **options):
+    scene = ds.Scene(cube(), ds.StableNeoHookean(1e5, 0.3), terms=[ds.Gravity()], fixed="xmin", precision="f64")
+    return kind(scene, dt=0.1, tolerance=1e-12, **options)
+
+
+@pytest.mark.parametrize("rounds", [1, 2, 3])
+@pytest.mark.parametrize("kind", [*SOLVERS, ds.StaticSolver], ids=lambda s: s.__name__)
+def test_rounds_that_gain_to_the_last_ask_for_as_many_as_it_takes(kind, rounds):
+    with pytest.raises(ds.NotConverged, match=r"pass max_iterations=\d+") as error:
+        ds.Rollout(hanging_solver(kind, max_iterations=rounds), 2).forward()
+    advised = int(re.search(r"max_iterations=(\d+)", str(error.value))[1])
+    ds.Rollout(hanging_solver(kind, max_iterations=advised), 2).forward()
+
+
+def test_solvers_that_a_tunnelling_of_the_midpoint_rule_names_get_by():
+    terms = [ds.Gravity(), ds.Ground(-0.2)]
+    scene = ds.Scene(cube(), ds.StableNeoHookean(1e5, 0.3), 1e3, terms, initial_velocities=(0, -30, 0), precision="f64")
+    with pytest.raises(ds.Tunnelling, match="ImplicitEulerSolver or BDF2Solver") as error:
+        ds.Rollout(ds.ImplicitMidpointSolver(scene, dt=0.01), 10).forward()
+    for name in re.findall(r"\w+Solver", str(error.value)):
+        u = ds.Rollout(getattr(ds, name)(scene, dt=0.01), 10).forward().displacements[-1]
+        assert (scene.mesh.vertices + u)[:, 1].min() > -0.2

@@ -1,5 +1,7 @@
 """The preconditioner of implicit solves and conjugate gradients on the device; equilibria that are laid on in parts."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -213,3 +215,55 @@ def test_what_no_part_leads_to_is_said_in_terms_of_the_problem():
     workspace.newton.solve = fails
     with pytest.raises(ds.NotConverged, match="path of equilibria .* goes to 0% of what is laid on.*limit point"):
         workspace.advance(0, 1, 1)
+
+
+MODULUS = 1e5
+LIMIT = MODULUS / 27**0.5  # the most that St Venant-Kirchhoff bears in compression without side motion [Pa], at nu = 0
+
+
+def pressed_beyond(load: str, stress: float, load_steps: int = 1) -> ds.Rollout:
+    """A block that is pressed along x in three steps, in which loads grow in time, or in one, without side motion."""
+    rising = lambda t: stress * min(t / 3, 1.0)  # noqa: E731
+    terms = {
+        "traction": ds.Traction((-stress, 0, 0), "xmax"),
+        "pressure": ds.Pressure(stress, "xmax"),
+        "rising traction": ds.Traction(lambda t: (-rising(t), 0, 0), "xmax"),
+        "rising pressure": ds.Pressure(rising, "xmax"),
+        "weight": ds.Gravity((-stress / 50.0, 0, 0)),
+    }
+    fixed = {"xmin": "x", "ymin": "y", "zmin": "z", "ymax": "y", "zmax": "z"}
+    material = ds.StVenantKirchhoff(MODULUS, 0.0)
+    scene = ds.Scene(ds.TetrahedralMesh.create_box(2, 0.1), material, 1000.0, terms[load], fixed, precision="f64")
+    return ds.Rollout(ds.StaticSolver(scene, load_steps=load_steps), 3 if "rising" in load else 1)
+
+
+def share_named(rollout: ds.Rollout) -> float:
+    with pytest.raises(ds.NotConverged, match="what is laid on in the step") as error:
+        rollout.forward()
+    return float(re.search(r"goes to ([\d.e+-]+)% of what is laid on", str(error.value))[1]) / 100
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("load_steps", [1, 7])
+@pytest.mark.parametrize(
+    "load, times, share",
+    [
+        ("traction", 1.02, 1 / 1.02),
+        ("traction", 300.0, 1 / 300),
+        ("pressure", 3.0, 1 / 3),
+        ("rising traction", 20.0, 0.15),  # in the first of three steps
+        ("rising pressure", 20.0, 0.15),
+        ("rising pressure", 1.02, 3 / 1.02 - 2),  # in the last
+    ],
+)
+def test_what_is_beyond_a_limit_load_says_the_share_that_is_borne(load, times, share, load_steps):
+    assert share_named(pressed_beyond(load, times * LIMIT, load_steps)) == pytest.approx(share, rel=0.02)
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("load", ["traction", "pressure", "weight"])
+def test_a_little_less_than_the_share_that_is_named_is_borne(load):
+    share = share_named(pressed_beyond(load, 3 * LIMIT))
+    u = pressed_beyond(load, 0.99 * share * 3 * LIMIT).forward().displacements[-1]
+    assert -0.05 < u[:, 0].min() < -0.02
+    assert share_named(pressed_beyond(load, 1.02 * share * 3 * LIMIT)) > 0.97

@@ -9,9 +9,11 @@ from diffsim_ti.copies import CarriesMore
 
 
 class Buckled(CarriesMore, UserWarning):
-    """Statics left stationary states that were no minima, `saddles` of them in step `step`, or, where that is 0, met states
-    with an indefinite Hessian in `unstable` rounds on the way to the equilibrium, which is how a body buckles whose mesh is
-    not quite symmetric (not said where there is contact, whose barriers have such states anyway; the report counts all)."""
+    """Statics left a branch of stable equilibria: stationary states that were no minima, `saddles` of them in step `step`,
+    or, where that is 0, the new equilibrium is much farther away than the stiffness before and after it explains and
+    `unstable` rounds met an indefinite Hessian on the way, which is how a body snaps, or buckles whose mesh is not quite
+    symmetric. An indefinite Hessian alone says nothing: rounds pass through states that are no equilibria (not said where
+    there is contact, whose barriers have such states; the report counts all)."""
 
     def __init__(self, message: str = "", step: int = 0, saddles: int = 0, unstable: int = 0):
         super().__init__(message)

@@ -10,7 +10,6 @@ import weakref
 
 import numpy as np
 
-from diffsim_ti.potential.free import held_as
 from diffsim_ti.solvers.implicit.blocked import Blocked
 
 
@@ -24,13 +23,14 @@ class Approach:
     def __init__(self, workspace):
         self.ws = weakref.proxy(workspace)  # which holds this: no circle
 
-    def __call__(self, u, start, problem: tuple) -> np.ndarray:
-        """Displacements with held vertices as in `start`, in front of the obstacles where forces are taken in the pass.
+    def __call__(self, u, held, starts: list, problem: tuple) -> np.ndarray:
+        """Displacements with held vertices where they get, in front of the obstacles where forces are taken in the pass.
 
-        u: where the pass begins; start: where inertia leads; problem: mass, inertial, loads of `Newton.solve`.
+        u: where the pass begins; held: the same with held vertices where they get; starts: where the body may be led;
+        problem: mass, inertial, loads of `Newton.solve`.
         Raises Blocked where no room is left.
         """
-        ws, held = self.ws, held_as(self.ws.free, start, u)
+        ws = self.ws
         way, before, after = ws.way, ws.walls_before, ws.walls_at_stage
         step, drift = held - u, ws.arrays.walls.drift(before, after)
         if not (step.any() or drift.any()):
@@ -38,9 +38,13 @@ class Approach:
         ws.check_pairs(u, step)
         if way.share(u, step, before, drift) == 1:
             return held
-        if way.share(u, start - u, before, drift) == 1 and self._is_sound(u, start):
-            return start
         try:
+            for start in starts:
+                if way.share(u, start - u, before, drift) == 1 and self._is_sound(u, start):
+                    ws.put_obstacles(before)
+                    ws.potential.place(held)
+                    if ws.newton.rise(held, ws.potential.energy(), start, problem) <= 0:
+                        return start
             return self._in_parts(u, step, before, drift, problem)
         finally:
             ws.put_obstacles(after)

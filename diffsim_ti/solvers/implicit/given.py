@@ -15,6 +15,8 @@ from diffsim_ti.solvers.implicit.stage import Stage
 class GivenInPasses:
     """A part of ImplicitWorkspace."""
 
+    laid = 1.0  # share of what a pass of statics lays on that is there (laid_on.py)
+
     # ---- supports ----------------------------------------------------------------------------------------------------
 
     def with_held(self, x: np.ndarray, held: np.ndarray) -> np.ndarray:
@@ -44,11 +46,30 @@ class GivenInPasses:
 
     # ---- loads -------------------------------------------------------------------------------------------------------
 
+    def lay_on(self, j: int, stage: Stage, share: float = 1.0) -> None:
+        """Set what pass j presses, attaches and grows; of statics a share of what it lays on."""
+        self.laid = share if stage.static else 1.0
+        self.press(j, stage)
+        self.attach(j, stage)
+        self.grow(j, stage)
+
+    def reached(self, j: int, stage: Stage, share: float) -> float:
+        """Share of its step to which a share of pass j leads."""
+        schedule = self.solver.schedule
+        return float(schedule.begin(j) + share * (schedule.end(j) - schedule.begin(j)))
+
     def press(self, j: int, stage: Stage) -> None:
         """Set the pressures of pass j."""
         if self.follower is not None:
             share = self.share_at_stage(j, stage)
-            p = self.solver.schedule.pressure(self.arrays.rows["follower"], j, share)
+            schedule, rows = self.solver.schedule, self.arrays.rows["follower"]
+            p = schedule.pressure(rows, j, share)
+            if self.laid < 1 and j > 0:  # of steps of which each has its own the last one's goes over into this one's
+                p, last = (
+                    schedule.pressure(rows, j, schedule.end(j)),
+                    schedule.pressure(rows, j - 1, schedule.end(j - 1)),
+                )
+                p = last + self.laid * (p - last)
             self.follower.at(p, self.load_share(j, stage))
 
     def attach(self, j: int, stage: Stage) -> None:
@@ -178,7 +199,7 @@ class GivenInPasses:
         """Share of the loads in pass j."""
         if not stage.static:
             return 1.0
-        return min(1.0, (j + 1) / self.solver.substeps)
+        return min(1.0, (self._pass_of_all(j) + self.laid) / self.solver.substeps)
 
     @cached_property
     def force_vertices(self) -> np.ndarray:

@@ -1,8 +1,10 @@
-"""An equilibrium that Newton's method does not find at once, along the equilibria that lead there.
+"""A pass that Newton's method does not solve at once, along the solutions that lead there.
 
-What is out of balance at the start, R0, and the way of the held vertices are laid on in parts: a share s of both leaves
-R(u) - (1 - s) R0 = 0, which the start solves for s = 0. Shares grow where solves succeed and halve where they fail.
-Where no share helps, the path of equilibria may have turned back (a limit point) or branched (a bifurcation).
+What the pass lays on comes in parts: at a share s, statics take that share of the change of loads, pressures, growth and
+times, and all passes that of the way of held vertices and obstacles. What is out of balance where the pass begins all the
+same, R0 (inertia; loads that jump from step to step), is laid on with it: R(u, s) - (1 - s) R0 = 0, which the start solves
+for s = 0. Shares grow where solves succeed and halve where they fail. Where no share helps, the path of equilibria may have
+turned back (a limit point) or branched (a bifurcation).
 Allgower, Georg 2003, Introduction to Numerical Continuation Methods, doi:10.1137/1.9780898719154.
 """
 
@@ -10,53 +12,85 @@ import weakref
 
 import numpy as np
 
-from diffsim_ti.potential.free import held_as
 from diffsim_ti.solvers.implicit.linear import NotConverged
+from diffsim_ti.solvers.implicit.stage import Stage
 
 
 class LaidOn:
-    """Of a workspace whose passes are equilibria."""
+    """Of a workspace."""
 
-    first, least, rounds = 0.25, 2.0**-7, 30  # shares; Newton's rounds in a part
+    first, rounds = 0.25, 30  # share; Newton's rounds in a part
+    nearly, least, in_motion = 0.005, 2.0**-13, 2.0**-5  # smallest: of what is reached, of statics, of others
 
     def __init__(self, workspace):
         self.ws = weakref.proxy(workspace)  # which holds this: no circle
 
-    def __call__(self, u: np.ndarray, start: np.ndarray, problem: tuple, error: NotConverged) -> np.ndarray:
-        """The equilibrium with held vertices as in `start`, from that at u; error: what a solve at once said.
+    def __call__(self, j: int, stage: Stage, u, held, problem: tuple, error: NotConverged) -> np.ndarray:
+        """The solution of pass j with held vertices as in `held`, from u; error: what a solve at once said.
 
-        Raises NotConverged, which says how far the path of equilibria goes and how it ends.
+        Raises it or, in statics, NotConverged, which says how far the path of equilibria goes and how it ends.
         """
-        ws, (mass, inertial, loads) = self.ws, problem
-        newton, most = ws.newton, ws.newton.max_iterations
-        out_of_balance, way = newton.residual_at(u), held_as(ws.free, start, u) - u
+        ws, newton, (mass, inertial, loads) = self.ws, self.ws.newton, problem
+        most, walls = newton.max_iterations, (ws.walls_before, ws.walls_at_stage)
+        drift, way = ws.arrays.walls.drift(*walls), held - u
         done, share, place = 0.0, self.first, u
-        if not np.all(np.isfinite(out_of_balance)):
-            raise error
+
+        def lay_on(s: float) -> tuple:
+            ws.put_obstacles(ws.arrays.walls.moved(walls[0], drift, s))
+            ws.lay_on(j, stage, s)
+            return mass, inertial, ws.loads(j, stage) if stage.static else loads
+
         newton.max_iterations, newton.steady = min(self.rounds, most), 0  # a smaller part costs less than more rounds
         try:
+            ws.start_multipliers(j, u)
+            ws.potential.place(u)
+            out_of_balance = newton.residual_of(lay_on(0.0))
+            if not np.all(np.isfinite(out_of_balance)):
+                raise error
             while done < 1:
                 s = min(done + share, 1.0)
-                part = loads - (1 - s) * out_of_balance
+                part = lay_on(s)
+                part = *part[:2], part[2] - (1 - s) * out_of_balance
+                ws.walls_before, ws.walls_at_stage = (ws.arrays.walls.moved(walls[0], drift, x) for x in (done, s))
                 try:
-                    here = ws.admissible(place + (s - done) * way, place)
-                    place, done = newton.solve(here, mass, inertial, part, leave_saddles=s == 1), s
-                    share *= 2
+                    near = ws.approach(place, place + (s - done) * way, [], part)
+                    there = newton.solve(near, *part, leave_saddles=stage.static and s == 1)
+                    ws.check_upright(place, there)
+                    place, done, share = there, s, 2 * share
                 except NotConverged:
                     share = 0.5 * min(share, 1 - done)
-                    if share < self.least:
-                        raise NotConverged(self._why(error, place, done), error.residuals) from None
+                    if stage.static and share < max(self.nearly * ws.reached(j, stage, done), self.least):
+                        ws.potential.place(place)
+                        newton.residual_of(lay_on(done))
+                        why = self._why(error, self._share_of_loads(j, stage, done))
+                        raise NotConverged(why, error.residuals) from None
+                    if not stage.static and share < self.in_motion:
+                        raise error from None
         finally:
             newton.max_iterations = most
             del newton.steady
+            ws.walls_before, ws.walls_at_stage = walls
+            lay_on(1.0)
         return place
 
-    def _why(self, error: NotConverged, place: np.ndarray, done: float) -> str:
-        """In terms of the problem."""
+    def _share_of_loads(self, j: int, stage: Stage, done: float) -> float:
+        """Of what its step lays on; in the first step loads that change in time, too, grow faster than its share."""
+        ws, sizes = self.ws, []
+        share = ws.reached(j, stage, done)
+        if ws._pass_of_all(j) >= ws.solver.substeps or ws.volumes:
+            return share
+        for k, laid in ((j, done), (int(ws.solver.schedule.first(ws.solver.schedule.row(j) + 1)) - 1, 1.0)):
+            ws.lay_on(k, stage, laid)
+            forces = ws.loads(k, stage)
+            if ws.follower is not None:
+                forces = forces + ws.follower.forces(ws.arrays.values.rest)
+            sizes.append(np.linalg.norm(forces))
+        return sizes[0] / sizes[1] if sizes[1] > 0 else share
+
+    def _why(self, error: NotConverged, reached: float) -> str:
+        """In terms of the problem, where the path ends: at a share of what the step lays on."""
         newton = self.ws.newton
-        newton.residual_at(place)
-        unstable = done > 0 and not newton.by_residual and newton.is_unstable()
-        if unstable:
+        if reached > 0 and not newton.by_residual and newton.is_unstable():
             end = (
                 "and is unstable there, so that the body buckles or snaps to a state far away: give it an imperfection or "
                 "a small force that chooses the way"
@@ -67,7 +101,7 @@ class LaidOn:
                 "carries, or be too hard for Newton's method: lay on less"
             )
         return (
-            f"no equilibrium was found: the path of equilibria from the state before goes to {done:.0%} of what is laid on "
-            f"(loads, motion of what is held), {end}, or take a solver with inertia, which follows the jump "
-            f"(at once: {len(error.residuals)} rounds, to a relative residual of {error.residuals[-1]:.2g})"
+            f"no equilibrium was found: the path of equilibria from the state before goes to {100 * reached:.3g}% of what "
+            f"is laid on in the step (loads, motion of what is held), {end}, or take a solver with inertia, which follows "
+            f"the jump (at once: {len(error.residuals)} rounds, to a relative residual of {error.residuals[-1]:.2g})"
         )

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from diffsim_ti.inputs import diagonal_of
 from diffsim_ti.potential.free import Free, cleaned, linear_of, mask_of
 from diffsim_ti.potential.way import Met
 from diffsim_ti.solvers.implicit.linear import NotConverged, Operator, conjugate_gradients, gmres
@@ -47,7 +48,8 @@ class Newton:
     beyond it) may it fall further.
 
     tolerance: |R| over the size of the forces that meet at the vertices (corner by corner, so that it does not vanish
-    at equilibrium), loads and inertia, the largest of the rounds. Beyond it goes only what rounding allows.
+    at equilibrium), loads and inertia, all of the present round: where a solve began is no measure of where it ends. Beyond
+    it goes only what rounding allows, of displacements as large as those that the solve began with or has come to.
     """
 
     insist = 2.0**-10
@@ -113,13 +115,12 @@ class Newton:
         if self.volumes:
             self.volumes.place(u, self.volumes.multipliers)
         self.preconditioner, self.stiffness = self.preconditioners(mass)
-        E, size, norm, rough, solved = self._evaluate(u), 0.0, np.inf, False, False
+        E, norm, rough, solved, far = self._evaluate(u), np.inf, False, False, np.abs(u).max(1, keepdims=True)
         self.upright = bool(np.all(E[2] > 0))
         most = self.max_iterations if rounds is None else rounds
         while self._goes_on(most, rounds is None):
-            R, now = self._residual(u)
-            size, before = max(size, now), norm
-            rounding = self.eps * np.abs(u).max(1, keepdims=True) + self.rigid.rounding
+            (R, size), before = self._residual(u), norm
+            rounding = self.eps * np.maximum(np.abs(u).max(1, keepdims=True), far) + self.rigid.rounding
             floor = 4 * np.linalg.norm(self._rigidity() * rounding * self.moves)
             norm = np.linalg.norm(R)
             report.residuals.append(norm / size if size > 0 else 0.0)
@@ -156,14 +157,24 @@ class Newton:
             u, E = moved
         if solved or norm <= 100 * floor or (rounds is not None and np.isfinite(norm)):  # rounding has the last word
             return u
-        history = ", ".join(f"{r:.2g}" for r in report.residuals[-8:])
         report.place = u
-        raise NotConverged(
-            f"Newton's method stopped after {len(report.residuals)} rounds at a relative residual of "
-            f"{report.residuals[-1]:.2g} (asked for {self.tolerance:g}; the last ones: {history}): take smaller steps, more "
-            "load steps, or a looser tolerance; where the equilibrium is unstable (it buckles or snaps) follow the "
-            "motion to the next one instead, by ImplicitEulerSolver with Drag",
-            report.residuals,
+        raise NotConverged(self._why(report.residuals), report.residuals)
+
+    def _why(self, done: list) -> str:
+        """What a solve that failed says, and what helps: more rounds where they gained to the last."""
+        statics, gains = not diagonal_of(self.mass).any(), len(done) < 2 or done[-1] < 0.5 * done[-2]
+        remedy = f"pass max_iterations={max(4 * len(done), 50)}, " if len(done) >= self.max_iterations and gains else ""
+        if statics:
+            remedy += (
+                "take more load steps or lay on less; where the equilibrium is unstable (it buckles or snaps) follow the "
+                "motion to the next one instead, by ImplicitEulerSolver with Drag"
+            )
+        else:
+            remedy += "take smaller steps"
+        history = ", ".join(f"{r:.2g}" for r in done[-8:])
+        return (
+            f"Newton's method stopped after {len(done)} rounds at a relative residual of {done[-1]:.2g} (asked for "
+            f"{self.tolerance:g}; the last ones: {history}): {remedy}"
         )
 
     def _goes_on(self, most: int, to_the_end: bool) -> bool:
@@ -178,6 +189,16 @@ class Newton:
     def is_unstable(self) -> bool:
         """Whether Phi falls in some direction where the potential stands."""
         return self._downhill() is not None
+
+    def follows(self, u: np.ndarray, change: np.ndarray, way: np.ndarray) -> np.ndarray | None:
+        """How the equilibrium at u goes on for a change of loads [N] and a way of held vertices, linearised there, with the
+        mass of the last solve; None where it is not stable."""
+        self.potential.place(u)
+        A = self.operator()
+        self.preconditioner.update(u)
+        R = (change - A._of_places(way)) * self.free
+        d, *_, negative = conjugate_gradients(A, R, self.preconditioner, 0.01, 10 * len(R), self.eps)
+        return d + way if negative is None else None
 
     def residual_at(self, u: np.ndarray) -> np.ndarray:
         """-dPhi/du of the last solve [N]."""
@@ -215,7 +236,9 @@ class Newton:
         Method, choice 2, doi:10.1137/0917003."""
         if not np.isfinite(norm):
             return self.inexact
-        exact = max(min(self.inexact, np.sqrt(norm / size)), 0.3 * floor / norm)  # rounding would hide more
+        last = 0.3 * self.tolerance * size / norm  # what makes this round the last one, if that is within reach
+        exact = min(self.inexact, np.sqrt(norm / size), last if last > 0.03 * self.inexact else 1.0)
+        exact = max(exact, 0.3 * floor / norm)  # rounding would hide more
         gained = min(norm / before, 1.0) if np.isfinite(before) else 1.0
         return exact if solved else max(exact, min(self.rough, 0.9 * gained**2))
 
@@ -324,6 +347,24 @@ class Newton:
         pairs = self.potential.pairs
         return self.way(u, step, 1.0)[0] == 1 and (not pairs or pairs.safe_share(u, step) == 1)
 
+    def _against_loads(self, u, step) -> float:
+        """Change of Phi along a step without those of E and W."""
+        return float((step * (self.mass * (u + 0.5 * step - self.inertial) - self.loads)).sum())
+
+    def rise(self, u: np.ndarray, before: tuple, there: np.ndarray, problem: tuple) -> float:
+        """How much higher Phi is at another place than at u, where the energy was `before`. What follows the surface does no
+        more work on the way than by its forces at u. Infinite where a tetrahedron changes its volume more than tenfold."""
+        self.mass, self.inertial, self.loads = problem
+        step = self.potential.place(there) - u
+        (after, _, J), (E, _, J0) = self.potential.energy(), before
+        if np.any((J0 > 0) & ~((J > 0.1 * J0) & (J < 10 * J0))):
+            return np.inf
+        change = after - E + self._against_loads(u, step)
+        if self.follower is not None:
+            x = self.potential.arrays.values.rest + u
+            change -= min(float((self.follower.forces(x) * step).sum()), self.follower.work(x, step))
+        return change
+
     def _falls(self, u, d, slope) -> bool:
         """Whether Phi does not rise again at u as steeply as it fell before: what is left to ask where its change drowns in
         rounding. Hager, Zhang 2005, A New Conjugate Gradient Method with Guaranteed Descent, doi:10.1137/030601880."""
@@ -341,7 +382,7 @@ class Newton:
         trial = self.potential.place(there)
         E, parts, J = before
         after, step = self._evaluate(trial), trial - u
-        change = after[0] - E + float((step * (self.mass * (u + 0.5 * step - self.inertial) - self.loads)).sum())
+        change = after[0] - E + self._against_loads(u, step)
         if self.follower is not None:
             change -= self.follower.work(self.potential.arrays.values.rest + u, step)
         if met or (upright and np.any(~(after[2] > 0.1 * J))):

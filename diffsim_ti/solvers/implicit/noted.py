@@ -11,6 +11,8 @@ from diffsim_ti.state.solve_report import Buckled
 class Noted:
     """A part of ImplicitWorkspace."""
 
+    explained, softened = 2.0, 10.0  # times what tangents at both ends, or before, say: farther is another branch
+
     def record_contacts(self) -> None:
         self.impulses = ContactRecord(self)
 
@@ -28,25 +30,54 @@ class Noted:
             friction = lambda: self.potential.rubbing.forces(at)  # noqa: E731
             self.impulses.add(j, save_every, self.is_static, lambda: shares.forces(), friction)
 
-    def note_solves(self, j: int, num_passes: int, seconds: float) -> None:
-        """What pass j took; statics say which saddles they left and, without contact, where states were not stable."""
+    def note_solves(self, j: int, num_passes: int, seconds: float, begin: tuple) -> None:
+        """What pass j took; statics say where they left a branch of stable equilibria. begin: where the pass began, the same
+        with held vertices where they got, and its problem."""
         step, solves = self.step_of(j, num_passes), self.newton.reports
         self.report.note(step, seconds, solves)
         saddles, unstable = (sum(getattr(solve, name) for solve in solves) for name in ("saddles", "indefinite"))
         # whose curved barriers, and states beside the volumes that are held, are indefinite where nothing buckles
         if self.arrays.contacts or self.pairs or self.volumes:
             unstable = 0
-        if self.is_static and (saddles or unstable):
+        if self.is_static and (saddles or unstable) and self._left_a_branch(j, *begin, saddles):
             rounds = sum(max(len(solve.residuals) - 1, 0) for solve in solves)
             left = f"{saddles} saddle{'s' * (saddles > 1)} left: the body was in balance and not stable, as when it buckles"
             if not saddles:
                 left = (
-                    f"{unstable} of {rounds} rounds of Newton's method met states that are not stable: the body may have "
-                    "buckled on the way (follow it by more load_steps)"
+                    f"{unstable} of {rounds} rounds of Newton's method met states that are not stable, and the body went "
+                    "much farther than its stiffness explains: it has buckled or snapped on the way (follow it by more "
+                    "load_steps)"
                 )
             went = "it went to a lower equilibrium, which may be one of several, and gradients are of it"
             said = f"step {step}: {left}; {went}"
             warnings.warn(Buckled(said, step, saddles, unstable), stacklevel=2)
+
+    def _left_a_branch(self, j: int, u, held, problem: tuple, saddles: int) -> bool:
+        """Whether the equilibrium of pass j is farther from that before it than the tangents at both explain. On one smooth
+        branch it is as far as the tangents between are long in the mean, so that somewhere between it was much softer than
+        at both ends: near a limit point or a bifurcation. Where a saddle was left, or the tangent before says next to
+        nothing, that alone decides: just beyond a bifurcation the tangent is long."""
+        newton, here = self.newton, self.u_star
+        self.potential.place(u)
+        change, far = newton.residual_of(problem), np.linalg.norm(here - u)
+        for place in (u, here):
+            way = newton.follows(place, change, held - u)
+            if way is None and place is u and self._pass_of_all(j) == 0 and not self._was_stable(j):
+                return False
+            size = np.inf if way is None else np.linalg.norm(way)
+            if way is not None and far <= self.explained * size:
+                return False
+            if place is u and (saddles or far > self.softened * size):
+                return True
+        return True
+
+    def _was_stable(self, j: int) -> bool:
+        """Whether the potential stands at a stable state before pass j lays on anything."""
+        stage = self.solver.stage(self.rate, True, j)
+        self.lay_on(j, stage, 0.0)
+        stable = not self.newton.is_unstable()
+        self.lay_on(j, stage)
+        return stable
 
     @property
     def is_static(self) -> bool:

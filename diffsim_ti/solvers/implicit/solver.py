@@ -24,9 +24,11 @@ if TYPE_CHECKING:
 
 
 class ImplicitSolver(Solver):
-    """Implicit steps: each is a minimum of an incremental potential, found by Newton's method (newton.py).
+    """Implicit steps: each is the minimum of an incremental potential that descends from where the step begins, found by
+    Newton's method (newton.py) at once or, where that fails, in parts of what the step lays on.
 
-    tolerance: relative residual of the equation of motion; gradients are as exact as the solve.
+    tolerance: residual of the equation of motion against the forces that meet at vertices, loads and inertia where the solve
+        ends; gradients are as exact as the solve.
     max_iterations: Newton rounds per substep, after which NotConverged is raised and the state stays as it was. Rounds whose
         direction an obstacle, or the surface itself, cuts short do not count, up to five times as many, nor do those that
         come after while ten of them halve the residual.

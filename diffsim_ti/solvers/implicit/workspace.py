@@ -49,7 +49,7 @@ class ImplicitWorkspace(Preconditioned, ObstacleWays, Noted, GivenInPasses, Work
     """A run of an implicit solver. Vectors of vertices are worked on in float64 on the host, tetrahedra on the device."""
 
     pairs_kind = ImplicitPairs
-    enough = 20  # rounds with which an equilibrium that was not found is looked for in parts
+    enough = 20  # rounds with which a solution that was not found is looked for in parts
 
     def __init__(self, solver, derived, bend=0.0):
         self.potential, self._length = None, solver.substep
@@ -163,7 +163,7 @@ class ImplicitWorkspace(Preconditioned, ObstacleWays, Noted, GivenInPasses, Work
                 if self.bending:
                     self.bending.look(j + 1, u_next)
                 self.note_contacts(j, save_every)
-                self.note_solves(j, num_passes, time.perf_counter() - begin)
+                self.note_solves(j, num_passes, time.perf_counter() - begin, self.begun)
             except (NotConverged, Tunnelling) as error:
                 raise self.dated(error, j, num_passes) from None
             if self.solver.multistep:
@@ -210,16 +210,15 @@ class ImplicitWorkspace(Preconditioned, ObstacleWays, Noted, GivenInPasses, Work
         place, speed = self.prescribed(j, self.arrays.values)
         problem = self.problem(j, stage, x, y)
         self.rigid.begin(u, stage.c0)
-        start = u if stage.static else self.rigid.nearest(u + self.linear * (problem[1] - u))
-        if place is not None:
-            held = self.arrays.held
-            start = self.with_held(start, u[held] + (place - u[held]) / stage.c0)
+        starts = [] if stage.static else [problem[1], x + stage.gamma * y]
+        held = u if place is None else self.with_held(u, u[self.arrays.held] + (place - u[self.arrays.held]) / stage.c0)
+        self.begun = u, held, problem
         self.begin(j, stage, u, x)
         if self.strains:
             self.strains.hold(stage, u, before)
         self.start_multipliers(j, u)
         try:
-            u_star = self._solve(u, start, problem, stage)
+            u_star = self._solve(j, u, held, starts, problem, stage)
         except NotConverged as error:
             raise self._explained(error, u) from None
         self.u_star = u_star
@@ -255,31 +254,50 @@ class ImplicitWorkspace(Preconditioned, ObstacleWays, Noted, GivenInPasses, Work
         added = kinetic_energy(self.mass, after) - kinetic_energy(self.mass, before)
         return added - float((rate * (self.mass * way)).sum())
 
-    def _solve(self, u, start, problem: tuple, stage: Stage) -> np.ndarray:
-        """The minimum of the pass; problem: mass, inertial, loads of `Newton.solve`."""
-        held = self.approach(u, start, problem)
-        begin = self.admissible(start, held)
-        begin = self.closing.approached(begin, problem) if self.solver.loose else begin
-        try:
-            return self.newton.solve(begin, *problem, leave_saddles=stage.static)
-        except NotConverged as error:
-            if not stage.static or self.volumes or self.newton.max_iterations < self.enough:
-                raise
-            return LaidOn(self)(u, start, problem, error)
+    def _solve(self, j, u, held, starts: list, problem: tuple, stage: Stage) -> np.ndarray:
+        """The minimum of the pass that descends from `held`, where the body was, with held vertices where they get.
 
-    def admissible(self, start, u):
-        """The start of Newton's method: where inertia leads, or less far where something would turn inside out or meet an
-        obstacle."""
-        held = held_as(self.free, start, u)
-        longest = min(self.way_past_obstacles(held, start - held)[0], self.pairs_share(held, start - held))
-        J0 = self.volume_ratios(held)
-        for fraction in (longest, 0.5 * longest, 0.25 * longest):
-            at = self.rigid.nearest(held + fraction * (start - held))
-            if self.rigid and not self.newton.is_free(held, at - held):
-                continue  # it turns on another way
-            if not np.any((J0 > 0) & ~(self.volume_ratios(at) > 0)):
-                return at
-        return held
+        starts: where inertia leads, and where velocities do; problem: mass, inertial, loads of `Newton.solve`.
+        """
+        starts = [held_as(self.free, held, self.rigid.nearest(u + self.linear * (start - u))) for start in starts]
+        near = self.approach(u, held, starts, problem)
+        near = self.closing.approached(near, problem) if self.solver.loose else near
+        parts = self.newton.max_iterations >= self.enough
+        try:
+            there = self.newton.solve(self.admissible(near, starts, problem), *problem, leave_saddles=stage.static)
+            if parts:
+                self.check_upright(u, there)
+            return there
+        except NotConverged as error:
+            if not parts or self.newton.report.cuts and not stage.static:
+                raise
+            return LaidOn(self)(j, stage, u, held, problem, error)
+
+    def check_upright(self, u, there) -> None:
+        """Raise NotConverged where the last solve has turned a tetrahedron inside out that was far from that at u."""
+        if not self.newton.upright and np.any((self.volume_ratios(u) > 0.1) & ~(self.volume_ratios(there) > 0)):
+            raise NotConverged(
+                "tetrahedra turn inside out: take smaller steps or lay on less", self.newton.report.residuals
+            )
+
+    def admissible(self, u: np.ndarray, starts: list, problem: tuple) -> np.ndarray:
+        """Where Newton's method begins: u or, if Phi is lower there, one of `starts`, or less far where something would turn
+        inside out or meet an obstacle. The solution of a pass is the minimum that descends from u: where inertia or loads
+        would lead what is stiff or light there are others."""
+        best, least = u, 0.0
+        if starts:
+            self.potential.place(u)
+            before = self.potential.energy()
+        for start in starts:
+            # surfaces are looked at together where they have not passed through each other
+            if not self.pairs and not self.newton.rise(u, before, start, problem) < least:
+                continue
+            longest = min(self.way_past_obstacles(u, start - u)[0], self.pairs_share(u, start - u))
+            at = self.rigid.nearest(u + longest * (start - u))
+            rise = self.newton.rise(u, before, at, problem)
+            if rise < least and not (self.rigid and not self.newton.is_free(u, at - u)):  # it turns on another way
+                best, least = at, rise
+        return best
 
     def volume_ratios(self, u: np.ndarray) -> np.ndarray:
         """J of each tetrahedron at a displacement."""
@@ -310,9 +328,7 @@ class ImplicitWorkspace(Preconditioned, ObstacleWays, Noted, GivenInPasses, Work
         if self.fluid:
             a = self.arrays.values
             self.fluid.at(a.parameters, a.rest + x, stage.gamma)
-        self.press(j, stage)
-        self.attach(j, stage)
-        self.grow(j, stage)
+        self.lay_on(j, stage)
         if self.volumes:  # after all that the stiffness at rest is made of
             self.volumes.stiffen(self.preconditioner(stage.inertia * self.mass)[1])
 
@@ -334,7 +350,7 @@ class ImplicitWorkspace(Preconditioned, ObstacleWays, Noted, GivenInPasses, Work
     def share_at_stage(self, j: int, stage: Stage) -> float:
         """Share of the step at which pass j takes its forces."""
         schedule = self.solver.schedule
-        return schedule.begin(j) + (schedule.end(j) - schedule.begin(j)) / stage.c0
+        return schedule.begin(j) + (schedule.end(j) - schedule.begin(j)) * self.laid / stage.c0
 
     def walls_vjp(self, walls_adj: np.ndarray, j: int, stage: Stage, path_adj: np.ndarray) -> None:
         """Add the adjoints of the rows of paths for those of `walls`."""
