@@ -135,8 +135,14 @@ class Rollout:
 
     def with_scene(self, **changes) -> "Rollout":
         """The same rollout of a scene with some arguments replaced, such as precision="f64"."""
-        solver, unequal = self.solver.for_scene(self.scene.replace(**changes)), self.schedule
-        return Rollout(solver, self.steps if unequal is None else unequal, **self._options)
+        return self._with(self.solver.for_scene(self.scene.replace(**changes)))
+
+    def with_solver(self, **changes) -> "Rollout":
+        """The same rollout by a solver with some arguments replaced, such as tolerance=1e-10."""
+        return self._with(self.solver.for_scene(self.scene, **changes))
+
+    def _with(self, solver: Solver) -> "Rollout":
+        return Rollout(solver, self.steps if self.schedule is None else self.schedule, **self._options)
 
     @property
     def schedule(self) -> UnequalSteps | None:
