@@ -164,7 +164,7 @@ class GradientReport:
                 f"{r.input:22s} {r.analytic: 16.8e} {r.differences: 16.8e} {r.relative_error:11.1e} {resolution:>11s} "
                 f"{rate:>12s}  {r.verdict}"
             )
-        lines += [f"{r.input}: {r.verdict}: {r.advice}" for r in self.rows if r.advice]
+        lines += [f"{r.input}: {r.advice}" for r in self.rows if r.advice]
         return "\n".join(lines + self.notes)
 
 
@@ -231,7 +231,10 @@ class _Pulled:
 @contextmanager
 def _solved_to(rollout: Rollout, tolerance: float):
     """The same Rollout, so with whatever its `vjp` is, solved to another tolerance meanwhile."""
-    kept, other = (rollout.solver, rollout.sweep), rollout.with_solver(tolerance=tolerance)
+    kept, other = (
+        (rollout.solver, rollout.sweep),
+        rollout.on(rollout.solver.for_scene(rollout.scene, tolerance=tolerance)),
+    )
     rollout.solver, rollout.sweep = other.solver, other.sweep
     try:
         yield

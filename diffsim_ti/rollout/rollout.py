@@ -90,6 +90,7 @@ class Rollout:
         self.steps, self.save_every, self.num_frames = sweep.steps, sweep.save_every, sweep.num_frames
         self.values, self.inputs, self.wanted = sweep.values, sweep.inputs, sweep.wanted
         self.outputs = self._check_outputs((Positions(), Velocities(), Displacements(), *given))
+        self.given_outputs = given  # as they were given, for whatever scene
         self.computed = {output.name: self.outputs[output.name] for output in given}  # besides the states themselves
         self._options = options | dict(outputs=given, runs=runs)
         self.gradients: dict[str, np.ndarray] = {}
@@ -135,14 +136,12 @@ class Rollout:
 
     def with_scene(self, **changes) -> "Rollout":
         """The same rollout of a scene with some arguments replaced, such as precision="f64"."""
-        return self._with(self.solver.for_scene(self.scene.replace(**changes)))
+        return self.on(self.solver.for_scene(self.scene.replace(**changes)))
 
-    def with_solver(self, **changes) -> "Rollout":
-        """The same rollout by a solver with some arguments replaced, such as tolerance=1e-10."""
-        return self._with(self.solver.for_scene(self.scene, **changes))
-
-    def _with(self, solver: Solver) -> "Rollout":
-        return Rollout(solver, self.steps if self.schedule is None else self.schedule, **self._options)
+    def on(self, solver: Solver, **options) -> "Rollout":
+        """As many steps of another solver, with some of the options replaced."""
+        steps = self.steps if self.schedule is None else self.schedule
+        return Rollout(solver, steps, **self._options | options)
 
     @property
     def schedule(self) -> UnequalSteps | None:
