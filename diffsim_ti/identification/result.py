@@ -214,7 +214,7 @@ class Identification:
             low, high = ends(self.intervals)
         for i, (label, x) in enumerate(zip(self.labels, self.numbers)):
             more = "" if self.intervals is None else f" +- {errors[i]:.2g}, 95 % in [{low[i]:.6g}, {high[i]:.6g}]"
-            lines.append(f"{label} = {x:.6g}{more if self.residuals_fit else ', without an interval'}")
+            lines.append(f"{label} = {x:.6g}{more if self.residuals_fit else ' (without an interval)'}")
         for direction in self.unseen:
             lines.append("NOT SEEN: " + ", ".join(f"{x:+.2f} {name}" for name, x in direction.items()))
         verdict = "NOT explained by the noise" if not self.residuals_fit else "as the noise explains"
