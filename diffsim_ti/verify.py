@@ -1,8 +1,9 @@
 """Proofs that a user can run: Taylor test, dot-product test, a table of every gradient, its health, Hessian products."""
 
 from collections.abc import Callable, Iterable
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -174,42 +175,39 @@ class _Pulled:
     def __init__(self, rollout: Rollout, loss: Loss, stack: ExitStack):
         self.rollout, self.loss = rollout, loss
         self.frames, self.own = self._at({})
-        self.gradients, self.tolerance, self.left = self.own, None, 0.0
-        self._scattered: list | None = None
-        asked = getattr(rollout.solver, "tolerance", None)
-        if asked is None:
-            return
-        loose, self.tolerance = self.own, asked
-        for k in range(3):
-            tolerance = TIGHT[rollout.scene.precision] * 100.0**k
-            if tolerance < asked and self._solve_to(tolerance, stack):
-                break
-        if self.tolerance == asked:  # tight as it is, or it cannot be tighter
-            asked = min(100 * asked, 0.1)
-            with _solved_to(rollout, asked):
-                loose = self._at({})[1]
-        self._loose, self.left = loose, (self.tolerance / asked) ** 0.5
+        self.gradients, self._scattered = self.own, None
+        self.asked = self.tolerance = getattr(rollout.solver, "tolerance", None)
+        for k in range(0 if self.asked is None else 3):
+            tight = TIGHT[rollout.scene.precision] * 100.0**k
+            if tight < self.asked:
+                with suppress(NotConverged), ExitStack() as trial:
+                    trial.enter_context(_solved_to(rollout, tight))
+                    self.frames, self.gradients = self._at({})
+                    self.tolerance = tight
+                    stack.push(trial.pop_all())
+                    break
+        self._loose = None  # (gradients, tolerance) of a solve that is looser
+        if self.tolerance != self.asked:
+            self._loose = self.own, self.asked
+        elif self.asked is not None:
+            tolerance = min(100 * self.asked, 0.1)
+            with _solved_to(rollout, tolerance):
+                self._loose = self._at({})[1], tolerance
 
     def _at(self, values: dict) -> tuple[Frames, dict]:
         frames = self.rollout.forward(**values)
         return frames, pull_back(self.rollout, frames, self.loss)
 
-    def _solve_to(self, tolerance: float, stack: ExitStack) -> bool:
-        with ExitStack() as trial:
-            trial.enter_context(_solved_to(self.rollout, tolerance))
-            try:
-                self.frames, self.gradients = self._at({})
-            except NotConverged:
-                return False
-            stack.push(trial.pop_all())
-        self.tolerance = tolerance
-        return True
+    def along(self, gradients: dict, name: str, direction: np.ndarray) -> float:
+        """Derivative by an input along a direction of it."""
+        return float((gradients[name] * direction).sum())
 
     def unsolved(self, name: str, direction: np.ndarray) -> float:
         """What the solver's tolerance may leave of a derivative: what a looser one changes, by the root of their ratio."""
-        return (
-            self.left * abs(float(((self._loose[name] - self.gradients[name]) * direction).sum())) if self.left else 0.0
-        )
+        if self._loose is None:
+            return 0.0
+        change = self.along(self._loose[0], name, direction) - self.along(self.gradients, name, direction)
+        return abs(change) * (self.tolerance / self._loose[1]) ** 0.5
 
     def scatter(self, name: str, direction: np.ndarray) -> float:
         """What rounding makes of a derivative: twice its largest change in two runs whose numbers, other than places, which
@@ -219,22 +217,18 @@ class _Pulled:
             eps = np.finfo(runtime.NUMPY[self.rollout.scene.precision]).eps
             numbers = {n: x for n, x in self.rollout.values.items() if not n.endswith(("_positions", "_motion"))}
             for _ in range(2):
-                try:
+                with suppress(*FAILURES):
                     near = {n: x * (1 + eps * rng.choice([-1, 1], x.shape)) for n, x in numbers.items()}
                     self._scattered.append(self._at(near)[1])
-                except FAILURES:
-                    continue
-        changes = [float(((g[name] - self.gradients[name]) * direction).sum()) for g in self._scattered]
-        return 2 * max(map(abs, changes), default=0.0)
+        here = self.along(self.gradients, name, direction)
+        return 2 * max((abs(self.along(g, name, direction) - here) for g in self._scattered), default=0.0)
 
 
 @contextmanager
 def _solved_to(rollout: Rollout, tolerance: float):
     """The same Rollout, so with whatever its `vjp` is, solved to another tolerance meanwhile."""
-    kept, other = (
-        (rollout.solver, rollout.sweep),
-        rollout.on(rollout.solver.for_scene(rollout.scene, tolerance=tolerance)),
-    )
+    kept = rollout.solver, rollout.sweep
+    other = rollout.on(rollout.solver.for_scene(rollout.scene, tolerance=tolerance))
     rollout.solver, rollout.sweep = other.solver, other.sweep
     try:
         yield
@@ -281,8 +275,20 @@ def check_gradients(
         exact = _Pulled(rollout.with_scene(precision="f64"), loss, stack) if single else own
         start = float(loss(exact.frames)[0])
         for name in names:
-            direction = _random_direction(rollout, name, rng)
-            report.rows.append(_Row(own, exact, name, direction, start, tolerance).check())
+            direction, x = _random_direction(rollout, name, rng), exact.rollout.values[name]
+            analytic, slope = (p.along(p.gradients, name, direction) for p in (own, exact))
+
+            def along(t: float, name=name, x=x, direction=direction) -> float:
+                return float(loss(exact.rollout.forward(**{name: x + t * direction}))[0])
+
+            left = own.unsolved(name, direction) + (exact.unsolved(name, direction) if single else 0.0)
+            scatter = partial(own.scatter, name, direction)
+            judged = Judgement(CentralDifferences(along, 1.0, start, FAILURES), analytic, tolerance, left, scatter)
+            judged.judge(single)
+            rate, zero = judged.differences.taylor_rate(slope), judged.is_zero
+            resolution = 0.0 if zero else judged.resolution
+            values = name, analytic, judged.differences.value, judged.relative_error, resolution, rate
+            report.rows.append(GradientCheck(*values, judged.verdict, judged.advice(rollout, own.tolerance)))
         report.notes += _note(own, report.rows)
     if verbose:
         print(report)
@@ -291,32 +297,34 @@ def check_gradients(
 
 def _note(own: _Pulled, rows: list[GradientCheck]) -> list[str]:
     """What the tolerance that the user asked for leaves of the gradients."""
-    if own.gradients is own.own:
+    if own.gradients is own.own or not rows:
         return []
     sizes = {r.input: max(float(np.linalg.norm(own.gradients[r.input])), 1e-300) for r in rows}
     off = {name: float(np.linalg.norm(own.own[name] - own.gradients[name])) / size for name, size in sizes.items()}
     worst = max(off, key=off.get)
     return [
-        f"Solved to a tolerance of {own.tolerance:.0e} for this check. At the solver's own, gradients differ from these by "
-        f"up to {off[worst]:.1e} ({worst})."
+        f"Solved to a tolerance of {own.tolerance:.0e} for this check. At the solver's own, {own.asked:.0e}, gradients "
+        f"differ from these by up to {off[worst]:.1e} ({worst})."
     ]
 
 
-class _Row:
-    """The check of one input."""
+class Judgement:
+    """The verdict on a derivative that is claimed, beside differences: `verdict`, `resolution`, `relative_error`, `advice`.
 
-    def __init__(self, own: _Pulled, exact: _Pulled, name: str, direction, start: float, tolerance: float):
-        self.own, self.exact, self.name, self.tolerance = own, exact, name, tolerance
-        self.single, x = own is not exact, exact.rollout.values[name]
-        self.analytic, self.slope = (float((p.gradients[name] * direction).sum()) for p in (own, exact))
-        self.direction = direction
+    left: what a solver's tolerance may leave of the derivative. scatter: returns what rounding makes of it; asked for at
+    once where `judge` is told to, and else where the derivative does not seem right.
+    """
 
-        def along(t: float) -> float:
-            return float(own.loss(exact.rollout.forward(**{name: x + t * direction}))[0])
-
-        self.differences = CentralDifferences(along, 1.0, start, FAILURES)
-        self.left = own.unsolved(name, direction) + (exact.unsolved(name, direction) if self.single else 0.0)
-        self.scatter = own.scatter(name, direction) if self.single else 0.0
+    def __init__(
+        self,
+        differences: CentralDifferences,
+        analytic: float,
+        tolerance: float,
+        left: float = 0.0,
+        scatter: Callable[[], float] = lambda: 0.0,
+    ):
+        self.differences, self.analytic, self.tolerance, self.left = differences, analytic, tolerance, left
+        self.scatter, self._scatter, self.verdict = 0.0, scatter, NOT_RESOLVED
 
     @property
     def scale(self) -> float:
@@ -327,75 +335,85 @@ class _Row:
         return abs(self.analytic - self.differences.value)
 
     @property
+    def relative_error(self) -> float:
+        return self.error / self.scale if self.scale > 0 else 0.0
+
+    @property
     def uncertainty(self) -> float:
         return self.differences.uncertainty + self.left + self.scatter
 
     @property
     def resolution(self) -> float:
-        return self.tolerance + 4 * self.uncertainty / self.scale if self.scale > 0 else np.inf
+        """The smallest relative error that is seen: never less than one that is there and not called right."""
+        seen = self.tolerance + 4 * self.uncertainty / self.scale if self.scale > 0 else np.inf
+        return max(seen, self.relative_error) if self.verdict == NOT_RESOLVED else seen
 
     @property
     def is_zero(self) -> bool:
-        """Whether the gradient is zero, and the loss the same everywhere."""
+        """Whether the derivative is zero, and the loss the same everywhere."""
         values = set(self.differences.known.values())
         return self.analytic == 0 and len(values) == 1 and len(self.differences.known) > 1
 
     @property
     def is_right(self) -> bool:
         near = self.error <= self.tolerance * self.scale + self.uncertainty
-        return self.is_zero or bool(near and self.resolution <= max(COARSE, 10 * self.tolerance))
+        resolved = self.tolerance * self.scale + 4 * self.uncertainty <= max(COARSE, 10 * self.tolerance) * self.scale
+        return self.is_zero or bool(near and resolved and self.scale > 0)
 
-    def check(self) -> GradientCheck:
-        """The row: with three steps where that is enough, and else with as many as tell more."""
+    def judge(self, scatters: bool = False) -> str:
+        """Find the verdict: with three steps where these are enough, and else with as many as tell more."""
         of, enough = self.differences, 2 * min(self.tolerance, 1e-6)
         of.begin()
-        verdict = RIGHT
+        self.scatter = self._scatter() if scatters else 0.0
         if not self.is_zero and not (self.is_right and of.uncertainty <= enough * self.scale):
             of.improve(enough * self.scale)
             if not self.is_right:
-                self.scatter = self.own.scatter(self.name, self.direction)
-            if not self.is_right:
-                least = self.tolerance * self.scale + 3 * (self.left + self.scatter)
-                off = of.settles_off(self.analytic, least)
-                verdict = RIGHT if self.is_right else WRONG if off and self.error > least else NOT_RESOLVED
-        error = self.error / self.scale if self.scale > 0 else 0.0
-        resolution = (
-            0.0 if self.is_zero else max(self.resolution, error) if verdict == NOT_RESOLVED else self.resolution
+                self.scatter = self._scatter()
+        off = not self.is_right and of.settles_off(
+            self.analytic, self.tolerance * self.scale + 3 * (self.left + self.scatter)
         )
-        advice = self._advice(verdict, error)
-        rate = of.taylor_rate(self.slope)
-        return GradientCheck(self.name, self.analytic, of.value, error, resolution, rate, verdict, advice)
+        if self.is_right:
+            self.verdict = RIGHT
+        elif off and self.error > self.tolerance * self.scale + self.uncertainty:
+            self.verdict = WRONG
+        return self.verdict
 
-    def _advice(self, verdict: str, error: float) -> str:
-        of, rollout = self.differences, self.own.rollout
-        if verdict == RIGHT:
+    def advice(self, rollout: Rollout, tolerance: float | None) -> str:
+        """Why the derivative is not called right, and what to change; tolerance: to which the rollout was solved."""
+        of = self.differences
+        if self.verdict == RIGHT:
             return ""
         if not of.steps:
             return f"no run near the start succeeds ({of.failure}): move the start away from that"
         span = f"steps of {of.steps[0]:.0e} to {of.steps[-1]:.0e} of its size"
-        if verdict == WRONG:
-            return f"off by {error:.1e}, where differences by {span} settle to {self.uncertainty / self.scale:.1e}"
+        known = self.uncertainty / max(self.scale, 1e-300)
+        if self.verdict == WRONG:
+            return f"off by {self.relative_error:.1e}, where differences by {span} are known to {known:.1e}"
         fewer = f", or take fewer than its {rollout.steps} steps" if rollout.steps > 1 else ""
-        elsewhere = of.noise > 1e5 * np.finfo(np.float64).eps * max(map(abs, of.known.values()))
         parts = dict(gradient=self.scatter, solver=self.left, loss=of.rounding, kinks=of.spread + of.jump)
-        known = dict(
-            gradient=f"rounding makes the gradient scatter by {self.scatter:.1e}: "
-            + ('make the scene with precision="f64"' if self.single else "watch an output that depends on it more")
-            + fewer,
-            solver=f"its tolerance of {self.own.tolerance} may leave {self.left:.1e} of the derivative: pass a smaller one, "
-            "and more max_iterations if the solver does not get there",
-            loss=f"the loss scatters by {of.noise:.1e} and changes by {abs(of.value):.1e} with the input's size: "
-            + (
+        worst = max(parts, key=parts.get)
+        if worst == "gradient":
+            single = rollout.scene.precision == "f32"
+            remedy = 'make the scene with precision="f64"' if single else "watch an output that depends on it more"
+            return f"rounding makes the gradient scatter by {self.scatter:.1e}: {remedy}{fewer}"
+        if worst == "solver":
+            return (
+                f"a tolerance of {tolerance:.0e} may leave {self.left:.1e} of the derivative: pass a smaller one, and more "
+                "max_iterations if the solver does not get there"
+            )
+        if worst == "kinks":
+            return (
+                f"differences by {span} agree to no better than {known:.1e} (kinks of contact or friction, or a chaotic "
+                f"run): start where nothing touches{fewer}"
+            )
+        hides = "rounding hides it, so watch an output that depends on it more"
+        if of.noise > 1e5 * np.finfo(np.float64).eps * max(map(abs, of.known.values())):
+            hides = (
                 f"inputs that differ by {of.close:.0e} lead to other states (buckling, chaotic contact), so follow one of "
                 "them by smaller steps, more load steps"
-                if elsewhere
-                else "rounding hides it, so watch an output that depends on it more"
             )
-            + fewer,
-            kinks=f"differences by {span} agree to no better than {parts['kinks'] / max(self.scale, 1e-300):.1e} (kinks of "
-            f"contact or friction, or a chaotic run): start where nothing touches{fewer}",
-        )
-        return known[max(parts, key=parts.get)]
+        changes = f"the loss scatters by {of.noise:.1e} and changes by {abs(of.value):.1e} with the input's size"
+        return f"{changes}: {hides}{fewer}"
 
 
 @dataclass
