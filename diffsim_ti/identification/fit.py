@@ -60,8 +60,8 @@ def identify(
     method: "Levenberg-Marquardt", which takes the fewest simulations; "L-BFGS-B" (SciPy's) needs gradients alone, so serves
     where tangents are dear; or a function that makes a torch optimiser of a list of tensors, t of all unknowns, such as
     `lambda t: torch.optim.Adam(t, lr=0.05)`, for costs that are rough. Both begin anew when resumed.
-    starts: how many searches, the first from the unknowns' own start, the others from those of four times as many points
-    around it whose cost is least (`around`); or a list of {unknown: numbers}, further starts. The best search is returned,
+    starts: how many searches, the first from the unknowns' own start, the others from those of sixteen times as many
+    points around it whose cost is least (`around`); or a list of {unknown: numbers}, further starts. The best search is returned,
     `Identification.starts` has all. Default: one, and up to four more, until one explains the data, where the residuals of
     the first are more than three times the noise. max_iterations are of each.
     check_mesh: fit the data again with ten-node tetrahedra of the same mesh, by a few forward runs, and widen the intervals

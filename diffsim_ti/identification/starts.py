@@ -11,8 +11,8 @@ from diffsim_ti.identification.priors import Priors
 from diffsim_ti.identification.problem import Problem
 from diffsim_ti.identification.search import FAILURES
 
-EACH = 4  # points whose cost is asked for, for each start
-WIDTH = dict(log=np.log(10.0), bounded=3.0, linear=3.0)  # of the free variables: a factor of ten, three scales
+EACH = 16  # points whose cost is asked for, for each start: a run each, where a search takes dozens
+WIDTH = dict(log=np.log(10.0), bounded=2.0, linear=3.0)  # of the free variables: a factor of ten, three scales
 
 
 def further_starts(problem: Problem, starts: int | Iterable[dict]) -> int | list[np.ndarray]:
