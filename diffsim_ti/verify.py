@@ -24,6 +24,8 @@ __all__ = [
     "pull_back",
     "linear_loss",
     "dot_product_test",
+    "CentralDifferences",
+    "Judgement",
     "GradientCheck",
     "GradientReport",
     "check_gradients",

@@ -61,9 +61,9 @@ def identify(
     where tangents are dear; or a function that makes a torch optimiser of a list of tensors, t of all unknowns, such as
     `lambda t: torch.optim.Adam(t, lr=0.05)`, for costs that are rough. Both begin anew when resumed.
     starts: how many searches, the first from the unknowns' own start, the others from those of sixteen times as many
-    points around it whose cost is least (`around`); or a list of {unknown: numbers}, further starts. The best search is returned,
-    `Identification.starts` has all. Default: one, and up to four more, until one explains the data, where the residuals of
-    the first are more than three times the noise. max_iterations are of each.
+    points around it whose cost is least (`around`); or further starts, a list of {unknown: numbers}. The best search is
+    returned, `Identification.starts` has all. Default: one, and up to four more, until one explains the data, where the
+    residuals of the first are more than three times the noise. max_iterations are of each.
     check_mesh: fit the data again with ten-node tetrahedra of the same mesh, by a few forward runs, and widen the intervals
     by what estimates move (`MeshCheck`). Default: where it costs no more than three times the fit, or takes some seconds.
     False for data of this very mesh, which know nothing of its error.
@@ -113,7 +113,8 @@ def identify(
 
     with progress_bar("identify", most) if progress else nullcontext(lambda *_: None) as show:
         more = search(lambda: Search(problem, priors, resume), show)
-        if more and (starts is not None or (searches[0][2] and _is_far(searches[0][0], FAR))):
+        first, why, _ = searches[0]
+        if more and (starts is not None or (not why.startswith("stopped") and _is_far(first, FAR))):
             for start in further if isinstance(further, list) else around(problem, priors, further):
                 with suppress(*FAILURES):  # numbers that end its first run
                     more = search(lambda start=start: Search(problem, priors, None, start, len(searches)), show)

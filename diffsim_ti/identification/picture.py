@@ -46,8 +46,9 @@ def save_picture(
         axes[2].annotate(
             f"{label} {found.numbers[i]:.5g}", (1, i), xytext=(0, 6), textcoords="offset points", ha="center"
         )
-    title = "95 % interval over the estimate" if shown else "no intervals: the fit does not explain the data"
-    axes[2].set(xlabel=title, yticks=[], ylim=(-0.5, len(found.labels) - 0.3))
+    none = "no intervals: the fit does not explain the data"
+    label = "95 % interval over the estimate" if found.residuals_fit else none
+    axes[2].set(xlabel=label, yticks=[], ylim=(-0.5, len(found.labels) - 0.3))
     if found.headline:
         figure.suptitle("\n".join(textwrap.wrap(found.headline, 150)), color="tab:red", fontsize=9)
     Path(path).parent.mkdir(parents=True, exist_ok=True)
