@@ -155,21 +155,22 @@ def main() -> int:
     parser.add_argument("--show", action="store_true", help="print every table")
     arguments = parser.parse_args()
     ds.init(precision="f64")
-    counts, failed, refused, coarse = Counter(), 0, 0, []
+    counts, failed, refused = Counter(), 0, 0
     seeds = (
         seed for k in range(arguments.cases) for seed in [k // arguments.each * PER_STRUCTURE + k % arguments.each]
     )
     for seed in seeds:
         found = judge(arguments.seed + seed)
         refused += bool(found.refusal)
-        for name, said, fault, resolution in found.rows:
+        for _, said, fault, _ in found.rows:
             counts["planted" if fault else "right", said] += 1
-            if said == "NOT RESOLVED":
-                coarse.append((found.seed, name, resolution))
         failed += bool(found.failures)
-        unsure = any(said == "NOT RESOLVED" for _, said, *_ in found.rows)
-        if found.failures or unsure or arguments.show:
-            print(f"{found.seed}: {found.what}; planted: {found.planted or 'nothing'}; {found.seconds:.1f} s")
+        said = ", ".join(f"{name} {verdict}" for name, verdict, *_ in found.rows) or found.refusal
+        print(
+            f"{found.seed}: {found.what}; planted: {found.planted or 'nothing'}; {said}; {found.seconds:.1f} s",
+            flush=True,
+        )
+        if found.failures or "NOT RESOLVED" in said or arguments.show:
             print(found.table, *found.failures, sep="\n", flush=True)
     print(f"{arguments.cases} rollouts, {refused} refused, {failed} failed")
     for (of, said), count in sorted(counts.items()):
