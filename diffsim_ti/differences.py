@@ -162,6 +162,8 @@ class CentralDifferences:
         further off than the derivatives of both sides are from each other: of the right slope they would come nearer at
         least in proportion to the step, whatever kinks f' has. Takes smaller steps as far as noise leaves them.
         """
+        if self.measured is None:
+            self.measure()
         while self.left and 16 * self.noise / self.left[0] <= abs(self.value - slope):
             if not self.take(self.left[0] / self.scale):
                 break

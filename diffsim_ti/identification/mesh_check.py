@@ -11,13 +11,14 @@ from diffsim_ti.identification.problem import Experiment, Problem
 from diffsim_ti.identification.result import Information, MeshCheck
 from diffsim_ti.identification.search import FAILURES, Search
 
-RUNS = 12  # on the finer mesh at most; four or five are usual
+RUNS, USUAL = 12, 5  # on the finer mesh: at most, and usually
 SETTLED = (
     0.1,
     0.02,
 )  # a step that is this share of the standard errors, or of the way from the first estimates, is the last
 LONGEST = 2.0  # change of a free variable in one step
 DEAREST, ALWAYS = 3.0, 1e8  # times the work of the fit, or so much (seconds), up to which it is done unasked
+SHORTER = 4.0  # times as many explicit steps are stable
 # work per tetrahedron and pass, over that of linear ones in explicit steps
 TEN_NODES, IMPLICIT, MODES = 5.0, 300.0, 1000.0
 
@@ -30,17 +31,18 @@ def mesh_check(search: Search, J: np.ndarray, found: Information, asked: bool | 
     """
     if asked is False:
         return MeshCheck(reason="it was not asked for")
+    rollouts = search.problem.rollouts
+    fit = search.problem.simulations / len(rollouts) * sum(_work(x) for x in rollouts)
+    dear = USUAL * sum(_work(x) * TEN_NODES * (SHORTER if _is_explicit(x) else 1.0) for x in rollouts)
+    if asked is None and dear > max(DEAREST * fit, ALWAYS):
+        often = f"{dear / fit:.2g} times the fit's own time"
+        return MeshCheck(reason=f"ten-node tetrahedra would take about {often}; check_mesh=True does it")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of what the body is known for already
             fine = _finer(search)
     except ValueError as error:
         return MeshCheck(reason=f"it cannot be had of ten-node tetrahedra ({error})")
-    dear = 5 * sum(map(_work, fine.rollouts))
-    fit = search.problem.simulations / len(fine.rollouts) * sum(map(_work, search.problem.rollouts))
-    if asked is None and dear > max(DEAREST * fit, ALWAYS):
-        often = f"{dear / fit:.2g} times the fit's own time"
-        return MeshCheck(reason=f"ten-node tetrahedra would take {often}; check_mesh=True does it")
     try:
         return _refitted(search, fine, J, found)
     except FAILURES as error:
@@ -105,10 +107,12 @@ def _carried(m: Measurement, coarse: Experiment, fine: Experiment) -> Measuremen
     return Measurement(m.output, m.values, m.noise, at, m.times)
 
 
+def _is_explicit(experiment: Experiment) -> bool:
+    return not isinstance(experiment, ModalTest) and experiment.solver.explicit
+
+
 def _work(experiment: Experiment) -> float:
-    mesh = experiment.scene.mesh
-    size = mesh.num_tetrahedra * (TEN_NODES if mesh.order == 2 else 1.0)
+    size = experiment.scene.mesh.num_tetrahedra
     if isinstance(experiment, ModalTest):
         return MODES * size
-    solver = experiment.solver
-    return size * solver.num_passes(experiment.steps) * (1.0 if solver.explicit else IMPLICIT)
+    return size * experiment.solver.num_passes(experiment.steps) * (1.0 if _is_explicit(experiment) else IMPLICIT)
