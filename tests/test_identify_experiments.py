@@ -166,6 +166,7 @@ def test_a_force_curve_tells_two_numbers_of_a_law(tmp_path, capsys):
         "xmin",
         "--pull",
         "xmax",
+        "--no-check-mesh",
         "--along",
         "x",
     ]

@@ -20,7 +20,7 @@ LONGEST = 2.0  # change of a free variable in one step
 DEAREST, ALWAYS = 3.0, 1e8  # times the work of the fit, or so much (seconds), up to which it is done unasked
 SHORTER = 4.0  # times as many explicit steps are stable
 # work per tetrahedron and pass, over that of linear ones in explicit steps
-TEN_NODES, IMPLICIT, MODES = 5.0, 300.0, 1000.0
+TEN_NODES, IMPLICIT, MODES = 5.0, 3000.0, 1000.0
 
 
 def mesh_check(search: Search, J: np.ndarray, found: Information, asked: bool | None) -> MeshCheck:
