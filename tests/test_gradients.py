@@ -402,6 +402,11 @@ def test_verdicts_on_derivatives_of_random_functions():
         fault = abs(wrong - slope) / max(abs(wrong), abs(slope))
         assert planted.verdict != "right" or fault <= planted.resolution, seed
     assert np.mean(told, 0).min() > 0.7
+    for f in (lambda t: 3.0, lambda t: 3.0 + t * t):  # of which nothing depends on t, or has its least there
+        assert [verify.Judgement(verify.CentralDifferences(f), a, 1e-6).judge() == "right" for a in (0.0, 1e-3)] == [
+            True,
+            False,
+        ]
 
 
 @pytest.mark.parametrize("solver", [ds.StaticSolver, ds.BDF2Solver])
