@@ -1,15 +1,19 @@
 """Proofs that a user can run: Taylor test, dot-product test, a table of every gradient, its health, Hessian products."""
 
 from collections.abc import Callable, Iterable
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffsim_ti.differences import TaylorResult, central_difference, taylor_rate, taylor_test
+from diffsim_ti import runtime
+from diffsim_ti.differences import CentralDifferences, TaylorResult, central_difference, taylor_test
 from diffsim_ti.identification import Identifiability, identifiability
 from diffsim_ti.inputs import RunSize
 from diffsim_ti.rollout import Frames, Rollout
+from diffsim_ti.solvers import NotConverged
 
 __all__ = [
     "Loss",
@@ -20,6 +24,8 @@ __all__ = [
     "pull_back",
     "linear_loss",
     "dot_product_test",
+    "CentralDifferences",
+    "Judgement",
     "GradientCheck",
     "GradientReport",
     "check_gradients",
@@ -107,23 +113,42 @@ def dot_product_test(rollout: Rollout, inputs: Iterable[str] | None = None, seed
     return max(differences)
 
 
+RIGHT, WRONG, NOT_RESOLVED = "right", "WRONG", "NOT RESOLVED"
+TIGHT = {"f64": 1e-12, "f32": 1e-6}  # tolerance of solves whose gradients are checked
+COARSE = 1e-3  # resolution beyond which no gradient is called right
+FAILURES = (ValueError, ArithmeticError, NotConverged)  # of a run whose numbers went too far
+
+
 @dataclass
 class GradientCheck:
-    """One row of `check_gradients`: directional derivatives along a random direction, and the Taylor rate."""
+    """One row of `check_gradients`: directional derivatives along a random direction, and what they show.
+
+    resolution: the smallest relative error that could have been seen; a gradient is never right where that is coarse.
+    verdict: "right", "WRONG" or "NOT RESOLVED"; advice: why, and what to change. taylor_rate: 2 where the gradient is right,
+    infinite where the loss is linear along the direction; the verdict does not depend on it.
+    """
 
     input: str
     analytic: float
     differences: float
     relative_error: float
+    resolution: float
     taylor_rate: float
-    passed: bool
+    verdict: str
+    advice: str = ""
+
+    @property
+    def passed(self) -> bool:
+        """Whether the gradient is right, and was resolved."""
+        return self.verdict == RIGHT
 
 
 @dataclass
 class GradientReport:
-    """The rows of `check_gradients`; `passed` if all did; `str()` is the table."""
+    """The rows of `check_gradients` and notes on how they were found; `passed` if all are right; `str()` is the table."""
 
     rows: list[GradientCheck] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
 
     @property
     def passed(self) -> bool:
@@ -132,15 +157,85 @@ class GradientReport:
 
     def __str__(self) -> str:
         lines = [
-            f"{'input':22s} {'analytic':>16s} {'differences':>16s} {'rel. error':>11s} {'Taylor rate':>12s}  verdict"
+            f"{'input':22s} {'analytic':>16s} {'differences':>16s} {'rel. error':>11s} {'resolution':>11s} "
+            f"{'Taylor rate':>12s}  verdict"
         ]
         for r in self.rows:
-            rate = "linear" if np.isinf(r.taylor_rate) else f"{r.taylor_rate:.3f}"
+            rate = "linear" if np.isinf(r.taylor_rate) else "-" if np.isnan(r.taylor_rate) else f"{r.taylor_rate:.3f}"
+            resolution = f"{r.resolution:.1e}" if r.resolution else "exact"
             lines.append(
-                f"{r.input:22s} {r.analytic: 16.8e} {r.differences: 16.8e} {r.relative_error:11.1e} {rate:>12s}  "
-                f"{'right' if r.passed else 'WRONG'}"
+                f"{r.input:22s} {r.analytic: 16.8e} {r.differences: 16.8e} {r.relative_error:11.1e} {resolution:>11s} "
+                f"{rate:>12s}  {r.verdict}"
             )
-        return "\n".join(lines)
+        lines += [f"{r.input}: {r.advice}" for r in self.rows if r.advice]
+        return "\n".join(lines + self.notes)
+
+
+class _Pulled:
+    """Gradients of a loss by a rollout's own `vjp`, solved to a tight tolerance meanwhile, and how far off they may be."""
+
+    def __init__(self, rollout: Rollout, loss: Loss, stack: ExitStack):
+        self.rollout, self.loss = rollout, loss
+        self.frames, self.own = self._at({})
+        self.gradients, self._scattered = self.own, None
+        self.asked = self.tolerance = getattr(rollout.solver, "tolerance", None)
+        for k in range(0 if self.asked is None else 3):
+            tight = TIGHT[rollout.scene.precision] * 100.0**k
+            if tight < self.asked:
+                with suppress(NotConverged), ExitStack() as trial:
+                    trial.enter_context(_solved_to(rollout, tight))
+                    self.frames, self.gradients = self._at({})
+                    self.tolerance = tight
+                    stack.push(trial.pop_all())
+                    break
+        self._loose = None  # (gradients, tolerance) of a solve that is looser
+        if self.tolerance != self.asked:
+            self._loose = self.own, self.asked
+        elif self.asked is not None:
+            tolerance = min(100 * self.asked, 0.1)
+            with _solved_to(rollout, tolerance):
+                self._loose = self._at({})[1], tolerance
+
+    def _at(self, values: dict) -> tuple[Frames, dict]:
+        frames = self.rollout.forward(**values)
+        return frames, pull_back(self.rollout, frames, self.loss)
+
+    def along(self, gradients: dict, name: str, direction: np.ndarray) -> float:
+        """Derivative by an input along a direction of it."""
+        return float((gradients[name] * direction).sum())
+
+    def unsolved(self, name: str, direction: np.ndarray) -> float:
+        """What the solver's tolerance may leave of a derivative: what a looser one changes, by the root of their ratio."""
+        if self._loose is None:
+            return 0.0
+        change = self.along(self._loose[0], name, direction) - self.along(self.gradients, name, direction)
+        return abs(change) * (self.tolerance / self._loose[1]) ** 0.5
+
+    def scatter(self, name: str, direction: np.ndarray) -> float:
+        """What rounding makes of a derivative: twice its largest change in two runs whose numbers, other than places, which
+        would strain the body, differ by one unit in the last place."""
+        if self._scattered is None:
+            rng, self._scattered = np.random.default_rng(0), []
+            eps = np.finfo(runtime.NUMPY[self.rollout.scene.precision]).eps
+            numbers = {n: x for n, x in self.rollout.values.items() if not n.endswith(("_positions", "_motion"))}
+            for _ in range(2):
+                with suppress(*FAILURES):
+                    near = {n: x * (1 + eps * rng.choice([-1, 1], x.shape)) for n, x in numbers.items()}
+                    self._scattered.append(self._at(near)[1])
+        here = self.along(self.gradients, name, direction)
+        return 2 * max((abs(self.along(g, name, direction) - here) for g in self._scattered), default=0.0)
+
+
+@contextmanager
+def _solved_to(rollout: Rollout, tolerance: float):
+    """The same Rollout, so with whatever its `vjp` is, solved to another tolerance meanwhile."""
+    kept = rollout.solver, rollout.sweep
+    other = rollout.on(rollout.solver.for_scene(rollout.scene, tolerance=tolerance))
+    rollout.solver, rollout.sweep = other.solver, other.sweep
+    try:
+        yield
+    finally:
+        rollout.solver, rollout.sweep = kept
 
 
 def check_gradients(
@@ -151,15 +246,20 @@ def check_gradients(
     verbose: bool = True,
     tolerance: float | None = None,
 ) -> GradientReport:
-    """Check the gradient by every input against extrapolated central differences and by its Taylor rate; print the table.
+    """Check the gradient by every input against extrapolated central differences, and print a table with three verdicts.
+
+    right: the error is within the tolerance and what is not known of the differences, and one of `resolution` would have
+    been seen; that is never coarser than 1e-3, or ten times the tolerance.
+    WRONG: differences of the smallest steps that rounding leaves settle on another value, and both sides of the start do.
+    NOT RESOLVED: neither can be said; the advice names what hides it and what to change.
 
     loss(frames) -> (value, gradient by positions, gradient by velocities or None), and a dict {output: gradient by it}
     where it names further outputs; default `linear_loss`, which names all.
-    Differences and Taylor rates are taken in float64, of an f32 scene too: differences in f32 see nothing.
+    Differences are taken in float64, of an f32 scene too: differences in f32 see nothing. Implicit and static solvers are
+    solved to a tolerance of 1e-12 meanwhile, since differences see what looser solves leave; a note says how far the
+    gradients at their own tolerance are from those.
     inputs: names, default all; verbose: whether to print. tolerance: largest relative error, default 1e-6 in f64 (what
     differences resolve on a long run), 1e-3 in f32.
-    A row passes if its error is within the tolerance and its Taylor rate reaches 1.9: over four neighbouring steps, each a
-    half or a third of the one before, of .1 to 1e-6 of the input's size. Those of the differences come first.
 
     >>> import diffsim_ti as ds
     >>> mesh = ds.TetrahedralMesh.create_cube(resolution=2)
@@ -169,38 +269,155 @@ def check_gradients(
     >>> ds.check_gradients(rollout, inputs=["gravity", "initial_velocities"], verbose=False).passed
     True
     """
-    single = rollout.scene.precision == "f32"
-    double = rollout.with_scene(precision="f64") if single else rollout
-    loss = loss or linear_loss(rollout, seed)
-    tolerance = tolerance or (1e-3 if single else 1e-6)
-    rng = np.random.default_rng(seed + 1)
-    frames = rollout.forward()
-    gradients = pull_back(rollout, frames, loss)
-    start = loss(double.forward() if single else frames)[0]
-    report = GradientReport()
-    for name in rollout.wanted if inputs is None else inputs:
-        direction, x = _random_direction(rollout, name, rng), rollout.values[name]
-        known = {0.0: float(start)}
+    single, names = rollout.scene.precision == "f32", rollout.wanted if inputs is None else tuple(inputs)
+    loss, tolerance = loss or linear_loss(rollout, seed), tolerance or (1e-3 if single else 1e-6)
+    report, rng = GradientReport(), np.random.default_rng(seed + 1)
+    with ExitStack() as stack:
+        own = _Pulled(rollout, loss, stack)
+        exact = _Pulled(rollout.with_scene(precision="f64"), loss, stack) if single else own
+        start = float(loss(exact.frames)[0])
+        for name in names:
+            direction, x = _random_direction(rollout, name, rng), exact.rollout.values[name]
+            analytic, slope = (p.along(p.gradients, name, direction) for p in (own, exact))
 
-        def along(t, name=name, x=x, direction=direction, known=known):
-            t = float(t)
-            if t not in known:
-                known[t] = float(loss(double.forward(**{name: x + t * direction}))[0])
-            return known[t]
+            def along(t: float, name=name, x=x, direction=direction) -> float:
+                return float(loss(exact.rollout.forward(**{name: x + t * direction}))[0])
 
-        analytic = float((gradients[name] * direction).sum())
-        exact = analytic
-        if single:
-            exact = float((pull_back(double, double.forward(), loss)[name] * direction).sum())
-        differences, uncertainty = central_difference(along)
-        rate = taylor_rate(along, known, exact)
-        scale = max(abs(differences), abs(analytic))
-        error = abs(analytic - differences) / scale if scale > 0 else 0.0
-        resolved = abs(analytic - differences) <= 10 * uncertainty + tolerance * scale
-        report.rows.append(GradientCheck(name, analytic, differences, error, rate, resolved and rate >= 1.9))
+            left = own.unsolved(name, direction) + (exact.unsolved(name, direction) if single else 0.0)
+            scatter = partial(own.scatter, name, direction)
+            judged = Judgement(CentralDifferences(along, 1.0, start, FAILURES), analytic, tolerance, left, scatter)
+            judged.judge(single)
+            rate, zero = judged.differences.taylor_rate(slope), judged.is_zero
+            resolution = 0.0 if zero else judged.resolution
+            values = name, analytic, judged.differences.value, judged.relative_error, resolution, rate
+            report.rows.append(GradientCheck(*values, judged.verdict, judged.advice(rollout, own.tolerance)))
+        report.notes += _note(own, report.rows)
     if verbose:
         print(report)
     return report
+
+
+def _note(own: _Pulled, rows: list[GradientCheck]) -> list[str]:
+    """What the tolerance that the user asked for leaves of the gradients."""
+    if own.gradients is own.own or not rows:
+        return []
+    sizes = {r.input: max(float(np.linalg.norm(own.gradients[r.input])), 1e-300) for r in rows}
+    off = {name: float(np.linalg.norm(own.own[name] - own.gradients[name])) / size for name, size in sizes.items()}
+    worst = max(off, key=off.get)
+    return [
+        f"Solved to a tolerance of {own.tolerance:.0e} for this check. At the solver's own, {own.asked:.0e}, gradients "
+        f"differ from these by up to {off[worst]:.1e} ({worst})."
+    ]
+
+
+class Judgement:
+    """The verdict on a derivative that is claimed, beside differences: `verdict`, `resolution`, `relative_error`, `advice`.
+
+    left: what a solver's tolerance may leave of the derivative. scatter: returns what rounding makes of it; asked for at
+    once where `judge` is told to, and else where the derivative does not seem right.
+    """
+
+    def __init__(
+        self,
+        differences: CentralDifferences,
+        analytic: float,
+        tolerance: float,
+        left: float = 0.0,
+        scatter: Callable[[], float] = lambda: 0.0,
+    ):
+        self.differences, self.analytic, self.tolerance, self.left = differences, analytic, tolerance, left
+        self.scatter, self._scatter, self.verdict = 0.0, scatter, NOT_RESOLVED
+
+    @property
+    def scale(self) -> float:
+        return max(abs(self.analytic), abs(self.differences.value))
+
+    @property
+    def error(self) -> float:
+        return abs(self.analytic - self.differences.value)
+
+    @property
+    def relative_error(self) -> float:
+        return self.error / self.scale if self.scale > 0 else 0.0
+
+    @property
+    def uncertainty(self) -> float:
+        return self.differences.uncertainty + self.left + self.scatter
+
+    @property
+    def resolution(self) -> float:
+        """The smallest relative error that is seen: never less than one that is there and not called right."""
+        seen = self.tolerance + 4 * self.uncertainty / self.scale if self.scale > 0 else np.inf
+        return max(seen, self.relative_error) if self.verdict == NOT_RESOLVED else seen
+
+    @property
+    def is_zero(self) -> bool:
+        """Whether the derivative is zero, and differences are beside what the loss changes by, if it changes at all."""
+        of = self.differences
+        most = max((abs(of.known[s] - of.known[0.0]) / h for h in of.steps for s in (h, -h)), default=0.0)
+        near = abs(of.value) + self.uncertainty <= self.tolerance * most or most == 0
+        return self.analytic == 0 and bool(of.steps) and near
+
+    @property
+    def is_right(self) -> bool:
+        near = self.error <= self.tolerance * self.scale + self.uncertainty
+        resolved = self.tolerance * self.scale + 4 * self.uncertainty <= max(COARSE, 10 * self.tolerance) * self.scale
+        return self.is_zero or bool(near and resolved and self.scale > 0)
+
+    def judge(self, scatters: bool = False) -> str:
+        """Find the verdict: with three steps where these are enough, and else with as many as tell more."""
+        of, enough = self.differences, 2 * min(self.tolerance, 1e-6)
+        of.begin()
+        self.scatter = self._scatter() if scatters else 0.0
+        if not self.is_zero and not (self.is_right and of.uncertainty <= enough * self.scale):
+            of.improve(enough * self.scale)
+            if not self.is_right:
+                self.scatter = self._scatter()
+        off = not self.is_right and of.settles_off(
+            self.analytic, self.tolerance * self.scale + 3 * (self.left + self.scatter)
+        )
+        if self.is_right:
+            self.verdict = RIGHT
+        elif off and self.error > self.tolerance * self.scale + self.uncertainty:
+            self.verdict = WRONG
+        return self.verdict
+
+    def advice(self, rollout: Rollout, tolerance: float | None) -> str:
+        """Why the derivative is not called right, and what to change; tolerance: to which the rollout was solved."""
+        of = self.differences
+        if self.verdict == RIGHT:
+            return ""
+        if not of.steps:
+            return f"no run near the start succeeds ({of.failure}): move the start away from that"
+        span = f"steps of {of.steps[0]:.0e} to {of.steps[-1]:.0e} of its size"
+        known = self.uncertainty / max(self.scale, 1e-300)
+        if self.verdict == WRONG:
+            return f"off by {self.relative_error:.1e}, where differences by {span} are known to {known:.1e}"
+        fewer = f", or take fewer than its {rollout.steps} steps" if rollout.steps > 1 else ""
+        parts = dict(gradient=self.scatter, solver=self.left, loss=of.rounding, kinks=of.spread + of.jump)
+        worst = max(parts, key=parts.get)
+        if worst == "gradient":
+            single = rollout.scene.precision == "f32"
+            remedy = 'make the scene with precision="f64"' if single else "watch an output that depends on it more"
+            return f"rounding makes the gradient scatter by {self.scatter:.1e}: {remedy}{fewer}"
+        if worst == "solver":
+            return (
+                f"a tolerance of {tolerance:.0e} may leave {self.left:.1e} of the derivative: pass a smaller one, and more "
+                "max_iterations if the solver does not get there"
+            )
+        if worst == "kinks":
+            return (
+                f"differences by {span} agree to no better than {known:.1e} (kinks of contact or friction, or a chaotic "
+                f"run): start where nothing touches{fewer}"
+            )
+        hides = "rounding hides it, so watch an output that depends on it more"
+        if of.noise > 1e5 * np.finfo(np.float64).eps * max(map(abs, of.known.values())):
+            hides = (
+                f"inputs that differ by {of.close:.0e} lead to other states (buckling, chaotic contact), so follow one of "
+                "them by smaller steps, more load steps"
+            )
+        changes = f"the loss scatters by {of.noise:.1e} and changes by {abs(of.value):.1e} with the input's size"
+        return f"{changes}: {hides}{fewer}"
 
 
 @dataclass

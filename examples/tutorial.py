@@ -49,7 +49,7 @@ seed[-1, top, 1] = 1 / len(top)  # of the mean height of the top at the end
 gradients = rollout.vjp(frames, positions=seed)
 print({name: f"{float(value):.4g}" for name, value in gradients.items()})
 
-# %% Trust, but check: against differences, which the package does for you. A right gradient has a Taylor rate near 2.
+# %% Trust, but check: against differences, which the package does for you. It says right, WRONG or NOT RESOLVED.
 report = ds.check_gradients(rollout)  # prints its table
 assert report.passed
 
@@ -60,6 +60,7 @@ found = ds.identify(
     rollout,
     ds.Measurement("positions", seen, noise=5e-4, at=top),
     {"youngs_modulus": ds.Unknown(3e4, range=(1e4, 6e4))},
+    check_mesh=False,  # data of this very mesh know nothing of its error; those of a real body do
 )
 low, high = found.intervals["youngs_modulus"]
 print(f"E = {found.estimates['youngs_modulus']:.4g} Pa, 95 % within {low:.4g} and {high:.4g}; the truth was 4.5e4")

@@ -4,6 +4,7 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
+from battery_of_verdicts import judge as judged
 from gradient_fuzz.differences import derivative
 from gradient_fuzz.judge import PASSED, ZERO, judge
 from gradient_fuzz.report import Report, failure_text
@@ -29,6 +30,14 @@ def test_configuration(seed):
     assert not found.failed, failure_text(found)
     assert not found.refusal, found.refusal
     assert len(found.rows) >= 6 and sum(row.verdict in (PASSED, ZERO) for row in found.rows) >= len(found.rows) - 1
+
+
+@pytest.mark.parametrize("seed", [47, 52, 81])  # explicit and implicit; odd ones have a fault
+def test_verdicts(seed):
+    found = judged(seed)
+    assert not found.failures and not found.refusal, found
+    for _, verdict, fault, resolution in found.rows:
+        assert verdict == ("WRONG" if fault > resolution else "right"), found
 
 
 def test_they_feel_what_they_should():

@@ -372,6 +372,74 @@ def test_check_gradients_says_wrong(monkeypatch, name):
     assert str(report).count("WRONG") == 1
 
 
+def random_function(rng):
+    """(f, f'(0)): waves with kinks of second order, some near 0, in 10 % of them a corner at 0, and noise."""
+    w = 10 ** rng.uniform(-1, rng.choice([0.5, 1.5, 2.5]), 3)
+    a, p, slope = rng.standard_normal(3) / w ** rng.uniform(0, 2), rng.uniform(0, 6.3, 3), rng.standard_normal()
+    at = rng.choice([-1, 1], 10) * 10 ** rng.uniform(-7, 0, 10)
+    kinks = rng.choice([0, 0, 1]) * rng.standard_normal(10) * 10 ** rng.uniform(-3, 2, 10)
+    corner, noise = 1e-2 * rng.standard_normal() * (rng.random() < 0.1), 10 ** rng.uniform(-17, -7)
+
+    def f(t):
+        bent = (kinks * np.maximum(0, (t - at) * np.sign(at)) ** 2).sum() + corner * max(t, 0.0)
+        own = np.random.default_rng(np.float64(t).view(np.uint64)).standard_normal()  # the same at the same t
+        return float(1 + slope * t + (a * np.sin(w * t + p)).sum() + bent + noise * own)
+
+    return f, float(slope + (a * w * np.cos(p)).sum() + rng.choice([0, corner]))
+
+
+def test_verdicts_on_derivatives_of_random_functions():
+    """No right one is called WRONG, none whose fault is above the resolution right; most are told apart."""
+    told = []
+    for seed in range(150):
+        rng = np.random.default_rng(seed)
+        f, slope = random_function(rng)
+        right = verify.Judgement(verify.CentralDifferences(f), slope, 1e-6)
+        wrong = slope * (1 + rng.choice([-1, 1]) * 10 ** rng.uniform(-4, 0))
+        planted = verify.Judgement(verify.CentralDifferences(f), wrong, 1e-6)
+        told.append((right.judge() == "right", planted.judge() == "WRONG"))
+        assert right.verdict != "WRONG", seed
+        fault = abs(wrong - slope) / max(abs(wrong), abs(slope))
+        assert planted.verdict != "right" or fault <= planted.resolution, seed
+    assert np.mean(told, 0).min() > 0.7
+    for f in (lambda t: 3.0, lambda t: 3.0 + t * t):  # of which nothing depends on t, or has its least there
+        assert [verify.Judgement(verify.CentralDifferences(f), a, 1e-6).judge() == "right" for a in (0.0, 1e-3)] == [
+            True,
+            False,
+        ]
+
+
+@pytest.mark.parametrize("solver", [ds.StaticSolver, ds.BDF2Solver])
+def test_solvers_are_solved_to_rounding_for_the_check(solver, monkeypatch):
+    """At a loose tolerance right gradients are right, wrong ones wrong, and the rollout is as it was."""
+    mesh = ds.TetrahedralMesh.create_box((4, 2, 2), (0.6, 0.2, 0.2), pattern="five")
+    scene = ds.Scene(mesh, ds.StableNeoHookean(2e5, 0.3), terms=[ds.Gravity()], fixed="xmin", precision="f64")
+    rollout = ds.Rollout(solver(scene, dt=1e-2, tolerance=1e-3), 2)
+    names, before = ["youngs_modulus", "poissons_ratio"], rollout.forward().positions
+    report = ds.check_gradients(rollout, inputs=names, verbose=False)
+    assert report.passed and "tolerance of 1e-12" in str(report), report
+    assert rollout.solver.tolerance == 1e-3 and np.array_equal(rollout.forward().positions, before)
+    right = rollout.vjp
+    monkeypatch.setattr(rollout, "vjp", lambda *a: (g := right(*a)) | {names[0]: g[names[0]] * 1.0001})
+    report = ds.check_gradients(rollout, inputs=names, verbose=False)
+    assert [row.verdict for row in report.rows] == ["WRONG", "right"], report
+
+
+def test_what_noise_hides_is_not_resolved():
+    """An input that the loss depends on less than it scatters: neither right nor WRONG, with advice."""
+    rollout = rollout_of(full_scene(), steps=10)
+    plain = verify.linear_loss(rollout)
+
+    def loss(frames):
+        value, *rest = plain(frames)
+        return 1e12 + value, *rest
+
+    report = ds.check_gradients(rollout, loss, inputs=["youngs_modulus"], verbose=False)
+    row = report.rows[0]
+    assert row.verdict == "NOT RESOLVED" and not report.passed and row.resolution > 0.1
+    assert "rounding hides it" in row.advice and "fewer than its 10 steps" in str(report)
+
+
 def test_taylor_test_tells_right_from_wrong():
     def f(x):
         return float(np.sin(x).sum())

@@ -81,6 +81,13 @@ def identify(
         str | None, typer.Option(help="of a force curve: vertex set, or xmin .. zmax, that is moved")
     ] = None,
     along: Annotated[Up, typer.Option(help="of a force curve: where the displacement and the force point")] = Up.y,
+    starts: Annotated[
+        int | None, typer.Option(help="how many searches; default more than one where the first explains nothing")
+    ] = None,
+    check_mesh: Annotated[
+        bool | None,
+        typer.Option("--check-mesh/--no-check-mesh", help="fit again by ten-node tetrahedra; default if cheap"),
+    ] = None,
     output: Annotated[Path, typer.Option("--output", "-o", help="picture")] = Path("output/identify.png"),
 ) -> None:
     """Find numbers of a body, with 95 % intervals, from tracks of markers on it or a force curve; draw data and fit."""
@@ -104,7 +111,7 @@ def identify(
     else:
         scene = ds.Scene(body, law, density, terms, fixed_vertices(body, fixed or []), precision="f64")
         (rollout, measured), ways = _tracked(ds, scene, *read_tracks(data), noise), None
-    found = ds.identify(rollout, measured, guesses, progress=True)
+    found = ds.identify(rollout, measured, guesses, progress=True, starts=starts, check_mesh=check_mesh)
     print(found)
     more = {} if ways is None else dict(at=ways, at_label="displacement [m]")
     save_picture(output, found, measured, rollout.forward(**found.inputs[0]), **more)

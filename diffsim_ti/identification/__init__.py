@@ -6,7 +6,7 @@ from diffsim_ti.identification.identifiability import Identifiability, identifia
 from diffsim_ti.identification.measurements import Measurement
 from diffsim_ti.identification.modal_test import ModalTest
 from diffsim_ti.identification.priors import Normal, Smooth
-from diffsim_ti.identification.result import Identification, Information
+from diffsim_ti.identification.result import Identification, Information, MeshCheck
 from diffsim_ti.identification.unknowns import Unknown
 
 __all__ = [
@@ -18,6 +18,7 @@ __all__ = [
     "Smooth",
     "Identification",
     "Information",
+    "MeshCheck",
     "expected",
     "compare",
     "identifiability",

@@ -1,7 +1,7 @@
 """From measurements to numbers: `identify`."""
 
 from collections.abc import Callable, Iterable
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,14 +12,17 @@ from diffsim_ti.checked import shown
 from diffsim_ti.identification.descent import l_bfgs_b, torch_descent
 from diffsim_ti.identification.levenberg_marquardt import DENSE, levenberg_marquardt
 from diffsim_ti.identification.measurements import measurements
+from diffsim_ti.identification.mesh_check import mesh_check
 from diffsim_ti.identification.modal_test import ModalTest
 from diffsim_ti.identification.priors import Priors
 from diffsim_ti.identification.problem import Problem, is_experiment
-from diffsim_ti.identification.result import Identification, Information, described
-from diffsim_ti.identification.search import Ended, Search
+from diffsim_ti.identification.result import Identification, Information, MeshCheck, described
+from diffsim_ti.identification.search import FAILURES, STOPPED, Ended, Search
+from diffsim_ti.identification.starts import around, further_starts
 from diffsim_ti.progress import progress as progress_bar
 from diffsim_ti.rollout import Rollout
 
+FAR, AT_MOST = 3.0, 4  # residuals over the noise beyond which further starts are tried, and how many
 METHODS = {"Levenberg-Marquardt": levenberg_marquardt, "L-BFGS-B": l_bfgs_b}
 
 
@@ -36,6 +39,8 @@ def identify(
     progress: bool = False,
     resume: dict | str | Path | None = None,
     method: str | Callable = "Levenberg-Marquardt",
+    starts: int | Iterable[dict] | None = None,
+    check_mesh: bool | None = None,
 ) -> Identification:
     """Find numbers of a scene from what was measured: least squares, with intervals and a test of the residuals.
 
@@ -55,6 +60,13 @@ def identify(
     method: "Levenberg-Marquardt", which takes the fewest simulations; "L-BFGS-B" (SciPy's) needs gradients alone, so serves
     where tangents are dear; or a function that makes a torch optimiser of a list of tensors, t of all unknowns, such as
     `lambda t: torch.optim.Adam(t, lr=0.05)`, for costs that are rough. Both begin anew when resumed.
+    starts: how many searches, the first from the unknowns' own start, the others from those of sixteen times as many
+    points around it whose cost is least (`around`); or further starts, a list of {unknown: numbers}. The best search is
+    returned, `Identification.starts` has all. Default: one, and up to four more, until one explains the data, where the
+    residuals of the first are more than three times the noise. max_iterations are of each.
+    check_mesh: fit the data again with ten-node tetrahedra of the same mesh, by a few forward runs, and widen the intervals
+    by what estimates move (`MeshCheck`). Default: where it costs no more than three times the fit, or takes some seconds.
+    False for data of this very mesh, which know nothing of its error.
     Numbers that end a run (Divergence, NotConverged, ValueError) shorten the step.
     Raises ValueError for what does not fit, before any run, and what the first run raises.
     Marquardt 1963, doi:10.1137/0111030; Seber, Wild, Nonlinear Regression, 1989, ch. 5, on intervals.
@@ -80,40 +92,88 @@ def identify(
     noises = noise if several and isinstance(noise, list | tuple) else [noise] * len(rollouts)
     given = [measurements(x, s) for x, s in zip(data, noises)] if several else [measurements(data, noise)]
     problem = Problem(rollouts, given, unknowns)
-    search = Search(problem, Priors(prior, problem.unknowns, rollouts[0].scene.mesh), resume)
+    priors = Priors(prior, problem.unknowns, rollouts[0].scene.mesh)
+    further = AT_MOST if starts is None else further_starts(problem, starts)
     most, with_covariance = max_iterations, problem.size <= DENSE if covariance is None else covariance
-    with progress_bar("identify", most) if progress else nullcontext(lambda *_: None) as show:
+    searches = []
+
+    def search(how, show) -> bool:
+        """Run a search to its end; whether there may be more."""
+        one = how()
         try:
-            if callback is not None and not search.is_resumed and callback(search.row(0), search.point.frames) is True:
-                raise Ended("stopped by the callback")
-            if len(search.report) >= most:
+            if callback is not None and not one.is_resumed and callback(one.row(0), one.point.frames) is True:
+                raise Ended(STOPPED)
+            if len(one.report) >= most:
                 raise Ended(f"stopped after {most} iterations")
-            stopped, converged = go_on(search, partial(search.record, most, show, callback), tolerance)
+            stopped, converged = go_on(one, partial(one.record, most, show, callback), tolerance)
         except Ended as end:
             stopped, converged = str(end), False
-    return _result(search, stopped, converged, with_covariance)
+        searches.append((one, stopped, converged))
+        return stopped != STOPPED
+
+    with progress_bar("identify", most) if progress else nullcontext(lambda *_: None) as show:
+        more = search(lambda: Search(problem, priors, resume), show)
+        first, why, _ = searches[0]
+        if more and (starts is not None or (not why.startswith("stopped") and _is_far(first, FAR))):
+            for start in further if isinstance(further, list) else around(problem, priors, further):
+                with suppress(*FAILURES):  # numbers that end its first run
+                    more = search(lambda start=start: Search(problem, priors, None, start, len(searches)), show)
+                if not more or (starts is None and not _is_far(searches[-1][0], 1.0)):
+                    break
+    best = min(range(len(searches)), key=lambda k: searches[k][0].cost)
+    if best > 0:
+        searches[best][0].path = searches[0][0].path
+        searches[best][0].write()
+    return _result(searches, best, with_covariance, check_mesh if more else False)
 
 
-def _result(search: Search, stopped: str, converged: bool, with_covariance: bool) -> Identification:
+def _is_far(search: Search, times: float) -> bool:
+    """Whether the residuals are more than what so many times the noise explains."""
+    from scipy.special import chdtrc
+
+    r = search.point.residual
+    square, degrees = float(r @ r) / times**2, len(r) - search.problem.size
+    return degrees > 0 and float(chdtrc(degrees, square)) < 0.01
+
+
+def _result(
+    searches: list[tuple[Search, str, bool]], best: int, with_covariance: bool, check_mesh: bool | None
+) -> Identification:
+    search, stopped, converged = searches[best]
     problem, t = search.problem, search.point.t
     residual = search.point.residual
-    settled, more = float(problem.size), {}
+    settled, more, simulations = float(problem.size), {}, problem.simulations
+    mesh = MeshCheck(reason="more unknowns than a covariance is made for")
     if with_covariance:
         J, R = problem.jacobian(search.point) if search.J is None else search.J, search.priors.R
         found = Information.of(problem.labels, J, (R.T * search.priors.weights(t)) @ R)
-        more, settled = described(problem, t, found), found.seen_share
+        simulations = problem.simulations
+        mesh = mesh_check(search, J, found, check_mesh)
+        more = described(problem, t, found, 0.0 if mesh.shifts is None else mesh.shifts)
+        settled = found.seen_share
     return Identification(
         problem.numbers(t),
         problem.labels,
         problem.all_numbers(t),
         residual,
         float(residual @ residual),
-        max(len(residual) - settled, 1.0),
-        problem.simulations,
+        max(len(residual) - settled, 0.0),
+        simulations,
         stopped,
         converged,
         search.report,
         [{k: x for k, x in problem.inputs(e, t).items() if k != "time_offset"} for e in range(len(problem.rollouts))],
         search.state,
+        [
+            dict(
+                start=problem.all_numbers(one.start),
+                numbers=problem.all_numbers(one.point.t),
+                cost=one.cost,
+                chi_square=float(one.point.residual @ one.point.residual),
+                stopped=why,
+            )
+            for one, why, _ in searches
+        ],
+        mesh,
         **more,
     )

@@ -1,11 +1,12 @@
 """A picture of an identification: data and fit, residuals over the noise, numbers with their intervals."""
 
+import textwrap
 from pathlib import Path
 
 import numpy as np
 
 from diffsim_ti.identification.measurements import Measurement
-from diffsim_ti.identification.result import Identification
+from diffsim_ti.identification.result import Identification, ends
 from diffsim_ti.rollout import Frames
 
 
@@ -38,13 +39,18 @@ def save_picture(
     axes[1].plot(t, r, ".", ms=4)
     axes[1].axhspan(-1.96, 1.96, alpha=0.15)
     axes[1].set(xlabel=at_label, ylabel="residual / noise", title=f"chi² {found.chi_square:.4g} of {found.degrees:.4g}")
+    shown = found.intervals and found.residuals_fit
     for i, label in enumerate(found.labels if found.intervals else []):
-        low, high = np.concatenate([np.atleast_2d(x) for x in found.intervals.values()])[i] / found.numbers[i]
-        axes[2].plot([low, high], [i, i], "|-")
+        low, high = (end[i] / found.numbers[i] for end in ends(found.intervals))
+        axes[2].plot(*([low, high], [i, i], "|-") if shown else ([1], [i], "o"))
         axes[2].annotate(
             f"{label} {found.numbers[i]:.5g}", (1, i), xytext=(0, 6), textcoords="offset points", ha="center"
         )
-    axes[2].set(xlabel="95 % interval over the estimate", yticks=[], ylim=(-0.5, len(found.labels) - 0.3))
+    none = "no intervals: the fit does not explain the data"
+    label = "95 % interval over the estimate" if found.residuals_fit else none
+    axes[2].set(xlabel=label, yticks=[], ylim=(-0.5, len(found.labels) - 0.3))
+    if found.headline:
+        figure.suptitle("\n".join(textwrap.wrap(found.headline, 150)), color="tab:red", fontsize=9)
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=120)
     plt.close(figure)

@@ -18,22 +18,32 @@ class Ended(Exception):
     """A search stops here, with the reason as its text."""
 
 
+STOPPED = "stopped by the callback"
+
+
 class Search:
     """The best point so far, its cost sum r^2 + prior, and a report of each iteration, written to `path` if there is one."""
 
-    def __init__(self, problem: Problem, priors: Priors, resume: dict | str | Path | None):
-        self.problem, self.priors, self.damping, self.report = problem, priors, 1e-3, []
+    def __init__(
+        self,
+        problem: Problem,
+        priors: Priors,
+        resume: dict | str | Path | None = None,
+        start: np.ndarray | None = None,
+        number: int = 0,
+    ):
+        self.problem, self.priors, self.damping, self.report, self.number = problem, priors, 1e-3, [], number
         self.path = Path(resume) if isinstance(resume, str | Path) else None
         state = resume
         if self.path is not None:
             state = json.loads(self.path.read_text()) if self.path.exists() else None
-        self.is_resumed, t = state is not None, np.zeros(problem.size)
+        self.is_resumed, t = state is not None, np.zeros(problem.size) if start is None else start
         if state is not None:
             if state["labels"] != problem.labels:
                 raise ValueError(f"resume: the state is of {state['labels']}, these unknowns are {problem.labels}")
             t, self.damping, self.report = np.array(state["t"]), state["damping"], list(state["report"])
             problem.simulations = state["simulations"]
-        self.began = time.perf_counter()
+        self.began, self.start = time.perf_counter(), t
         self.point = problem.run(t)
         self.cost = self.cost_of(self.point)
         self.J = None  # dr/dt at the point, where it was made
@@ -59,9 +69,17 @@ class Search:
             simulations=self.problem.simulations,
         )
 
+    def write(self) -> None:
+        """Write the state, if there is a path for it."""
+        if self.path:
+            temporary = self.path.with_name(self.path.name + ".tmp")
+            temporary.write_text(json.dumps(self.state))
+            temporary.replace(self.path)
+
     def row(self, iteration: int, promised: float | None = None, why: str | None = None) -> dict:
         """The report of an iteration: what its step promised, why it was not taken."""
         return dict(
+            start=self.number,
             iteration=iteration,
             cost=self.cost,
             chi_square=float(self.point.residual @ self.point.residual),
@@ -84,13 +102,10 @@ class Search:
         """Note an iteration, write the state, show and tell it. Raises Ended after the last one, or if the callback asks."""
         done = self.row(len(self.report) + 1, promised, why)
         self.report.append(done)
-        if self.path:
-            temporary = self.path.with_name(self.path.name + ".tmp")
-            temporary.write_text(json.dumps(self.state))
-            temporary.replace(self.path)
+        self.write()
         shown = ", ".join(f"{label} {x:.5g}" for label, x in list(zip(self.problem.labels, done["numbers"]))[:4])
         show(done["iteration"], f"chi^2 {done['chi_square']:.5g} of {self.problem.num_data}, {shown}")
         if callback is not None and callback(done, self.point.frames) is True:
-            raise Ended("stopped by the callback")
+            raise Ended(STOPPED)
         if len(self.report) >= most:
             raise Ended(f"stopped after {most} iterations")

@@ -96,6 +96,7 @@ class Rollout:
         self.steps, self.save_every, self.num_frames = sweep.steps, sweep.save_every, sweep.num_frames
         self.values, self.inputs, self.wanted = sweep.values, sweep.inputs, sweep.wanted
         self.outputs = self._check_outputs((Positions(), Velocities(), Displacements(), *given))
+        self.given_outputs = given  # as they were given, for whatever scene
         self.computed = {output.name: self.outputs[output.name] for output in given}  # besides the states themselves
         self._options = options | dict(outputs=given, runs=runs)
         self.gradients: dict[str, np.ndarray] = {}
@@ -147,8 +148,12 @@ class Rollout:
 
     def with_scene(self, **changes) -> "Rollout":
         """The same rollout of a scene with some arguments replaced, such as precision="f64"."""
-        solver, unequal = self.solver.for_scene(self.scene.replace(**changes)), self.schedule
-        return Rollout(solver, self.steps if unequal is None else unequal, **self._options)
+        return self.on(self.solver.for_scene(self.scene.replace(**changes)))
+
+    def on(self, solver: Solver, **options) -> "Rollout":
+        """As many steps of another solver, with some of the options replaced."""
+        steps = self.steps if self.schedule is None else self.schedule
+        return Rollout(solver, steps, **self._options | options)
 
     @property
     def schedule(self) -> UnequalSteps | None:

@@ -77,9 +77,9 @@ class Solver(ABC):
         own = dict(scene=self.scene) | {name: getattr(self, name) for name in self.arguments}
         return _on_schedule, (type(self), own, self._schedule)
 
-    def for_scene(self, scene: "Scene") -> "Solver":
-        """The same solver for another scene."""
-        return type(self)(scene, **{name: getattr(self, name) for name in self.arguments})
+    def for_scene(self, scene: "Scene", **changes) -> "Solver":
+        """The same solver for another scene, with some arguments replaced."""
+        return type(self)(scene, **{name: getattr(self, name) for name in self.arguments} | changes)
 
     def unchecked_for(self, scene: "Scene") -> "Solver":
         """The same for another scene, in which an explicit step may be too long."""

@@ -2,11 +2,10 @@
 
 import numpy as np
 
+from diffsim_ti.finer import HELD, is_named
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.grid import PATTERNS, box
 from diffsim_ti.scene import Scene
-
-HELD = "held, by indices"  # the set of what a scene holds so
 
 
 def halved_grid(mesh: TetrahedralMesh) -> TetrahedralMesh | None:
@@ -52,11 +51,7 @@ def on_coarser(scene: Scene, mesh: TetrahedralMesh) -> Scene:
     if several:
         raise ValueError(f"{several[0]} is given for each tetrahedron")
     fixed, at = given["fixed"], scene.mesh.locate(mesh.vertices, nearest=True).matrix
-    if (
-        fixed is not None
-        and not isinstance(fixed, (str, dict))
-        and any(not isinstance(n, str) for n in np.ravel(fixed))
-    ):
+    if not is_named(fixed):
         held = np.zeros(scene.mesh.num_vertices)
         held[scene.mesh.vertex_indices(fixed)] = 1
         if not np.any(own := at @ held > 1 - 1e-6):

@@ -5,11 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from diffsim_ti.finer import on_ten_nodes
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.scene import Scene
 from diffsim_ti.solvers import VelocityVerletSolver, stable_dt
-from diffsim_ti.study.coarser import HELD, halved_grid, on_coarser
+from diffsim_ti.study.coarser import halved_grid, on_coarser
 from diffsim_ti.study.problem import ELEMENTS
 
 SHARE = 0.8  # of the stable step at the start
@@ -45,27 +46,6 @@ def refined(mesh: TetrahedralMesh) -> TetrahedralMesh:
     surface = {name: nodes.surface_triangles[rows] for name, rows in nodes.surface_sets.items()}
     sets = dict(vertex_sets=nodes.vertex_sets, tetrahedron_sets=of, surface_sets=surface)
     return TetrahedralMesh(nodes.vertices, tetrahedra, **sets)
-
-
-def on_ten_nodes(scene: Scene, mesh: TetrahedralMesh | None = None) -> Scene:
-    """The same scene of ten-node tetrahedra; mesh: another linear mesh than the scene's, whose first vertices are its own
-    and whose others are middles of its edges. Raises ValueError for what cannot be carried over."""
-    given, base = dict(scene.arguments), scene.mesh if mesh is None else mesh
-    fixed = given["fixed"]
-    by_name = fixed is None or isinstance(fixed, (str, dict)) or all(isinstance(name, str) for name in np.ravel(fixed))
-    if not by_name:
-        if mesh is not None:
-            raise ValueError(
-                "vertices that are held by their indices are not those of a finer mesh: name them as a set"
-            )
-        base, given["fixed"] = base.with_vertex_set(HELD, fixed), HELD
-    nodes = base.quadratic()
-    for name in ("initial_positions", "initial_velocities"):
-        if np.ndim(given[name]) == 2:
-            x = np.asarray(given[name], np.float64)
-            x = x if mesh is None else scene.mesh.quadratic().from_corners @ x
-            given[name] = nodes.from_corners @ x
-    return Scene(**given | dict(mesh=nodes, volume="tetrahedra"))
 
 
 def own_element(scene: Scene) -> str:

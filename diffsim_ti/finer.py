@@ -1,0 +1,118 @@
+"""The same scene, and the same rollout, of ten-node tetrahedra."""
+
+import math
+from collections.abc import Mapping
+from copy import copy
+
+import numpy as np
+
+from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.rollout import Rollout
+from diffsim_ti.scene import Scene
+from diffsim_ti.solvers.solver import Solver
+from diffsim_ti.terms import ExternalForce
+from diffsim_ti.terms.pose import Pose
+
+HELD = "held, by indices"  # the set of what a scene holds so
+SHARE = 0.5  # of the stable step, so that a body may be found four times as stiff
+
+
+def is_named(chosen) -> bool:
+    """Whether a part of a mesh is chosen by names of sets, or not at all, not by indices."""
+    return (
+        chosen is None or isinstance(chosen, str | Mapping) or all(isinstance(name, str) for name in np.ravel(chosen))
+    )
+
+
+def on_ten_nodes(scene: Scene, mesh: TetrahedralMesh | None = None) -> Scene:
+    """The same scene of ten-node tetrahedra; mesh: another linear mesh than the scene's, whose first vertices are its own
+    and whose others are middles of its edges.
+
+    What is chosen by indices becomes a set, which its sides' mid-edge vertices join; forces on single vertices stay there.
+    Raises ValueError for what cannot be carried over.
+    """
+    given, base, terms = dict(scene.arguments), scene.mesh if mesh is None else mesh, []
+    for k, term in enumerate(given["terms"]):
+        surface, own = getattr(term, "surface", None), copy(term)
+        if isinstance(term, ExternalForce):
+            own.vertices, terms = term.indices(scene.mesh), [*terms, own]
+            continue
+        if not is_named(surface):
+            if mesh is not None:
+                raise ValueError(
+                    f"{term!r} acts on a surface by indices, which a finer mesh does not have: name it as a set"
+                )
+            own.surface = f"surface of term {k}"
+            base, term = base.with_surface_set(own.surface, surface), own
+        terms.append(term)
+    if not is_named(given["fixed"]):
+        if mesh is not None:
+            raise ValueError(
+                "vertices that are held by their indices are not those of a finer mesh: name them as a set"
+            )
+        base, given["fixed"] = base.with_vertex_set(HELD, given["fixed"]), HELD
+    nodes = base.quadratic()
+    for name in ("initial_positions", "initial_velocities"):
+        if np.ndim(given[name]) == 2:
+            x = np.asarray(given[name], np.float64)
+            x = x if mesh is None else scene.mesh.quadratic().from_corners @ x
+            given[name] = nodes.from_corners @ x
+    if mesh is None and given["motion"] is not None:
+        given["motion"] = _motion(scene, nodes, given["fixed"])
+    return Scene(**given | dict(mesh=nodes, terms=terms, volume="tetrahedra"))
+
+
+def _motion(scene: Scene, nodes: TetrahedralMesh, fixed):
+    """The scene's prescribed motion, where it is given for each vertex also of what lies between these."""
+
+    def carried(motion, old: np.ndarray, new: np.ndarray):
+        def rows(x) -> np.ndarray:
+            x = np.asarray(x, np.float64)
+            if x.shape[-2:] != (len(old), 3):
+                return x
+            every = np.zeros((*x.shape[:-2], scene.mesh.num_vertices, 3))
+            every[..., old, :] = x
+            return np.moveaxis(np.tensordot(nodes.from_corners[new].toarray(), every, (1, -2)), 0, -2)
+
+        if callable(motion):
+            return lambda t: rows(motion(t))
+        if isinstance(motion, Pose):
+            return motion
+        return motion[0], rows(motion[1]) if np.ndim(motion[1]) == 3 else motion[1]
+
+    motion = scene.arguments["motion"]
+    if isinstance(motion, Mapping):
+        return {k: carried(x, scene.mesh.vertex_indices(k), nodes.vertex_indices(k)) for k, x in motion.items()}
+    names = [fixed] if isinstance(fixed, str) else list(fixed)
+    return carried(motion, scene.held, np.unique(np.concatenate([nodes.vertex_indices(name) for name in names])))
+
+
+def rollout_on_ten_nodes(rollout: Rollout, values: dict) -> Rollout:
+    """The same rollout of ten-node tetrahedra; an explicit solver takes as many substeps more as these ask for at the values
+    of inputs. Raises ValueError for what cannot be carried over."""
+    scene, outputs = rollout.scene, []
+    if scene.mesh.order == 2:
+        raise ValueError("the mesh has ten-node tetrahedra already; fit the data on a mesh of smaller ones as well")
+    for k, output in enumerate(rollout.given_outputs):
+        if getattr(output, "per_vertex", False):
+            raise ValueError(f"{output!r} is of each vertex, and forces on those of ten-node tetrahedra are others")
+        parts = [getattr(output, name, None) for name in ("on", "sets")]
+        if not all(is_named(part) for part in parts):
+            raise ValueError(f"{output!r} is of vertices by their indices: name them as a set")
+        if not is_named(getattr(output, "support", None)):
+            name, own = f"support of output {k}", copy(output)
+            own.support = name
+            scene, output = scene.replace(mesh=scene.mesh.with_vertex_set(name, output.support)), own
+        outputs.append(output)
+    fine, solver = on_ten_nodes(scene), rollout.solver
+    made = _divided(solver, fine, values) if solver.explicit else solver.for_scene(fine)
+    return rollout.on(made, outputs=outputs)
+
+
+def _divided(solver: Solver, fine: Scene, values: dict) -> Solver:
+    """The explicit solver with substeps for the finer mesh."""
+    if solver.unequal_steps is not None:
+        raise ValueError("its steps are of unequal lengths, which explicit steps of a finer mesh would have to divide")
+    stable = solver.unchecked_for(fine.with_values(values)).stable_dt(tight=True).dt
+    substeps = max(solver.substeps, math.ceil(solver.dt / (SHARE * stable)))
+    return solver.for_scene(fine, check_start=False, substeps=substeps)
