@@ -181,9 +181,11 @@ class Rollout:
         frames.sets = sets
         return frames
 
-    def frames_of(self, run: Run) -> Frames:
-        """The frames of the run that the sweep ran last, with all outputs."""
-        u, v = (runtime.fetch(x) for x in self.sweep.workspace.frames)
+    def frames_of(self, run: Run, last: int | None = None) -> Frames:
+        """The frames of the run that the sweep ran last, with all outputs. last: of one that stopped, the last frame that it
+        came to, which stands for those after it too."""
+        rows = slice(None) if last is None else np.minimum(np.arange(self.num_frames), last)
+        u, v = (runtime.fetch(x)[rows] for x in self.sweep.workspace.frames)
         positions = (run.values["rest_positions"] + u).astype(u.dtype)
         inputs = run.values
         if run.start is not None:
@@ -192,7 +194,8 @@ class Rollout:
         frames = Frames(positions, v, u, self.times, inputs, run.contact_resolution, run=run)
         frames.computed = self.computed
         frames.steps = np.arange(self.num_frames) * self.save_every
-        frames.contact_forces, frames.chamber_pressures = self.sweep.contact_forces(), self.sweep.chamber_pressures()
+        noted = self.sweep.contact_forces(), self.sweep.chamber_pressures()
+        frames.contact_forces, frames.chamber_pressures = (None if x is None else x[rows] for x in noted)
         for name, output in self.computed.items():
             value, shape = np.asarray(output.value(frames)), tuple(output.shape(self.num_frames))
             if value.shape != shape:

@@ -7,7 +7,6 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.contact.implicit_pairs import ImplicitPairs
-from diffsim_ti.contact.surface_pairs import Tunnelling
 from diffsim_ti.inputs import ConsistentMass, Mass, kinetic_energy
 from diffsim_ti.monitor.energy_watch import EnergyWatch
 from diffsim_ti.potential.attached import Attached
@@ -161,7 +160,7 @@ class ImplicitWorkspace(Preconditioned, ObstacleWays, Noted, GivenInPasses, Work
                 u_next, v_next = self._pass(j, u, v, before)
                 self.note_contacts(j, save_every)
                 self.note_solves(j, num_passes, time.perf_counter() - begin)
-            except (NotConverged, Tunnelling) as error:
+            except FloatingPointError as error:
                 raise self.dated(error, j, num_passes) from None
             if self.solver.multistep:
                 copy_slot(self.state.u, 0, self.state.before.u, 0)
