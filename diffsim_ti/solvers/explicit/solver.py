@@ -72,6 +72,7 @@ class ExplicitSolver(Solver):
 
     explicit = True
     arguments = (*Solver.arguments, "contact", "contact_damping")
+    check_bodies = staticmethod(check_bodies)
 
     def __init__(self, *arguments, contact: str = "stage", contact_damping: float = CONTACT_DAMPING, **options):
         if contact not in ("stage", "force"):
@@ -79,7 +80,7 @@ class ExplicitSolver(Solver):
         self.contact, self.contact_damping = contact, between("contact_damping", contact_damping, 0, 1, ends=True)
         scene = arguments[0] if arguments else options.get("scene")
         if getattr(scene, "reduced", False):
-            check_bodies(scene, contact)
+            self.check_bodies(scene, contact)
         super().__init__(*arguments, **options)
 
     @property
