@@ -129,6 +129,7 @@ class Scene(TermsOfScene, MadeAgain):
         self.growing = tuple(t for t in self.ordered_terms if isinstance(t, Growth))
         if self.growing:
             self.material = grown(self.material, volume)
+        self.law  # noqa: B018 - refuses what its volume does not support
         self.chambers = tuple(t for t in self.ordered_terms if isinstance(t, Chamber))
         self.gases = tuple(t for t in self.chambers if not t.holds)
         self.following = (*self.pressures, *self.chambers)  # what presses on the surface as it is
