@@ -57,6 +57,7 @@ class Simulator:
         self.workspace = solver.workspace(self._start)
         self._notes, self._settled = bool(contact_forces), {}
         if contact_forces:
+            solver.check_contact_forces()
             self.workspace.make_frames(2)
             self.workspace.record_contacts()
         self._guard = Guard(self.workspace)

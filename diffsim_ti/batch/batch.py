@@ -19,6 +19,7 @@ from diffsim_ti.outputs import Output
 from diffsim_ti.rollout.frames import Frames, check_finite
 from diffsim_ti.rollout.rollout import Rollout
 from diffsim_ti.rollout.run import Run
+from diffsim_ti.rollout.shape import spread_change, spread_shape, with_shape
 from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.state.schedule import UnequalSteps
 
@@ -108,6 +109,7 @@ class Batch:
 
     def forward(self, raise_errors: bool = False, **inputs: ArrayLike) -> BatchFrames:
         """Run all scenes, with some inputs replaced. raise_errors: raise what stopped the first one that died."""
+        inputs = spread_shape(inputs, self.one.values)
         inputs, sets = spread_given(self.scene, inputs, self.one.values, self.num_scenes)
         values = checked_values(self.one, inputs, self.num_scenes)
         run = (self._side_by_side if self.lanes else self._by_turns)(values)
@@ -202,7 +204,7 @@ class Batch:
         out = (self._vjp_side_by_side if self.lanes else self._vjp_by_turns)(frames, given)
         for name in out.keys() & frames.sets.keys():
             out[name] = gathered_scenes(out[name], frames.values[name], *frames.sets[name])
-        return out
+        return with_shape(out, self.one.sweep.wants_shape)
 
     @staticmethod
     def _warn_of_dead(frames: BatchFrames, what: str) -> None:
@@ -274,6 +276,7 @@ class Batch:
     def tangents(self, frames: BatchFrames, **tangents: ArrayLike) -> dict[str, np.ndarray]:
         """Changes of all outputs, (scenes, ...), for changes of inputs, to first order, float64; zero, with a warning, of
         scenes that did not come to their end."""
+        tangents = spread_change(tangents)
         unknown = [name for name in tangents if name not in self.inputs]
         if unknown:
             raise ValueError(f"tangents: no input named {unknown[0]!r}; this batch has {', '.join(self.inputs)}")

@@ -14,6 +14,7 @@ from diffsim_ti.rollout.checkpoints import Checkpoints
 from diffsim_ti.rollout.frames import Frames, HostSeed, check_finite
 from diffsim_ti.rollout.run import Run
 from diffsim_ti.rollout.set_values import change_like, gathered, spread_all
+from diffsim_ti.rollout.shape import spread_change, spread_shape, with_shape
 from diffsim_ti.rollout.sweep import Sweep
 from diffsim_ti.rollout.taped import TapeFace
 from diffsim_ti.solvers.solver import Solver
@@ -31,7 +32,8 @@ class Rollout:
     save_every: a frame every so many steps, besides the start; must divide `steps`. Default: only the end.
     checkpoint_every: keep a state every so many steps and compute the rest again in the reverse sweep.
     memory: or a budget [MB] from which they are chosen (default 1000). The gradient is bitwise the same.
-    gradients: names of inputs whose gradient is wanted; default all but rest_positions, which costs extra.
+    gradients: names of inputs whose gradient is wanted; default all but rest_positions, which costs extra. "shape": of the
+        whole body's, with its supports (`vjp`).
     clip: largest norm of the running adjoint; it is scaled back when it exceeds that (the gradient is then no gradient).
     truncate: differentiate only the last so many steps.
     health: keep a report of the adjoint's norm per step (`rollout.health`).
@@ -174,9 +176,10 @@ class Rollout:
         """Run from the scene's inputs, with some of them replaced, and return the saved frames.
 
         A material's numbers and others per tetrahedron may be given by named sets, `youngs_modulus={"soft": 2e4}`; gradients
-        by them have the same names, and so may tangents (set_values.py).
+        by them have the same names, and so may tangents (set_values.py). `shape` [m], (num_vertices, 3), moves initial and
+        rest positions together, and supports with them (shape.py).
         """
-        values, sets = spread_all(self.scene, self.values, values)
+        values, sets = spread_all(self.scene, self.values, spread_shape(values, self.values))
         frames = self.frames_of(self.sweep.run(values))
         frames.sets = sets
         return frames
@@ -210,6 +213,9 @@ class Rollout:
 
         Float64 arrays of the inputs' shapes; None for a part that the loss does not name. Further seeds of the same
         frames cost a reverse sweep each: no pass runs forward again unless too few states are kept.
+        That by `rest_positions` is of a body whose start, and with it its supports, stay where they are: the gradient by the
+        shape of a body that is held is the sum of this and that by `initial_positions`, which a Rollout made with
+        gradients="shape" has under the name "shape".
         """
         instance("Rollout.vjp", "frames", frames, Frames, "what forward returned")
         change = self.pulled_to_frames(frames, dict(positions=positions, velocities=velocities) | seeds)
@@ -219,6 +225,7 @@ class Rollout:
         self.gradients = self.gradients_of(frames.run, self.sweep.pull_back(frames.run, seed), change)
         for name in self.gradients.keys() & frames.sets.keys():
             self.gradients[name] = gathered(self.gradients[name], frames.sets[name])
+        self.gradients = with_shape(self.gradients, self.sweep.wants_shape)
         return self.gradients
 
     def pulled_to_frames(self, frames: Frames, seeds: dict) -> Change:
@@ -262,6 +269,7 @@ class Rollout:
         return {name: output.jvp(frames, change) for name, output in self.outputs.items()}
 
     def _pushed_to_frames(self, frames: Frames, tangents: dict) -> Change:
+        tangents = spread_change(tangents)
         unknown = [name for name in tangents if name not in self.inputs]
         if unknown:
             raise ValueError(f"jvp: no input named {unknown[0]!r}; this rollout has {', '.join(self.inputs)}")

@@ -11,6 +11,7 @@ from diffsim_ti.monitor.guard import Guard
 from diffsim_ti.rollout.checkpoints import choose_checkpoints
 from diffsim_ti.rollout.doubts import warn_of_coarse_steps, warn_of_explosion
 from diffsim_ti.rollout.run import Run, Seed
+from diffsim_ti.rollout.shape import MOVED
 from diffsim_ti.solvers.solver import Solver
 
 RECORD_BYTES = 200e6  # up to which the first run of implicit solvers is recorded
@@ -38,6 +39,8 @@ class Sweep:
         contacts: bool = False,
         chambers: bool = False,
     ):
+        if contacts:
+            solver.check_contact_forces()
         self.contacts = contacts  # whether runs note what obstacles do to each vertex in each frame
         self.chambers = chambers and solver.scene.holds_volumes  # whether pressures in chambers are wanted of frames
         self.solver, self.scene, self.steps = solver, solver.scene, steps
@@ -72,11 +75,15 @@ class Sweep:
         self._recorded, self._warned = False, False  # whether the record holds all passes; whether of coarse contacts
 
     def _check_names(self, names) -> tuple[str, ...]:
+        self.wants_shape = False  # the sum of these by initial and by rest positions (shape.py)
         if names is None:
             return tuple(name for name in self.inputs if name != "rest_positions")
         if isinstance(names, str):
             names = self.inputs if names == "all" else (names,)
         names = tuple(listed("gradients", names, "names of inputs"))
+        self.wants_shape = "shape" in names
+        if self.wants_shape:
+            names = tuple(dict.fromkeys((*(name for name in names if name != "shape"), *MOVED)))
         unknown = [name for name in names if name not in self.inputs]
         if unknown:
             raise ValueError(f"gradients: no input named {unknown[0]!r}; this rollout has {', '.join(self.inputs)}")

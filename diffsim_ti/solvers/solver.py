@@ -72,6 +72,9 @@ class Solver(ABC):
         if not hasattr(scene, "with_consistent_mass"):
             raise ValueError(f"{type(self).__name__}: takes a Scene, got {shown(scene)}")
 
+    def check_contact_forces(self) -> None:
+        """Raise ValueError where runs cannot note what obstacles do."""
+
     def __reduce__(self):
         """As it was made, for its scene."""
         own = dict(scene=self.scene) | {name: getattr(self, name) for name in self.arguments}

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from diffsim_ti.inputs import ratios_at_corners
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.obstacles import floor_of, obstacle_surfaces
-from diffsim_ti.inputs import ratios_at_corners
 from diffsim_ti.outputs import Output, Stress
 from diffsim_ti.outputs.deformation import Deformation
 from diffsim_ti.outputs.given_loads import GivenLoads
@@ -113,8 +113,8 @@ class Frame:
 
 
 def _strained(scene: Scene, frames: "Frames", k: int) -> dict[str, np.ndarray]:
-    """J of each tetrahedron in a frame, the smallest of ten nodes' points and corners, and von Mises stress [Pa], the mean of
-    its points."""
+    """Of each tetrahedron in a frame: J, the smallest of its points and of ten nodes' corners, and the mean von Mises stress
+    of its points [Pa]."""
     mesh, derived = scene.mesh, scene.inputs.derive(frames.inputs)
     one = {name: getattr(frames, name)[[k]] for name in ("positions", "velocities", "displacements", "times", "steps")}
     one = replace(frames, **one, outputs={})

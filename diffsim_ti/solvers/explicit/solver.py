@@ -83,6 +83,13 @@ class ExplicitSolver(Solver):
             self.check_bodies(scene, contact)
         super().__init__(*arguments, **options)
 
+    def check_contact_forces(self) -> None:
+        if self.contact == "force" and any(term.acts_on_surface for term in self.scene.terms):
+            raise ValueError(
+                f"ContactForce and ContactTraction are of obstacles that act as a stage, and this {type(self).__name__} "
+                'takes them as forces: pass it contact="stage", or take an implicit solver, as reduced sets need'
+            )
+
     @property
     def stages_contact(self) -> bool:
         return self.contact == "stage"
