@@ -64,7 +64,7 @@ class Scene(TermsOfScene, MadeAgain):
         (num_held, 3) [m], or keyframes (times, displacements) between which it is linear; of what is held in some
         directions, only those count. Or a `Pose`, which turns them; or, where `fixed` names sets, {name: such a motion}.
     initial_positions [m], initial_velocities [m/s]: shape (num_vertices, 3) or 3 numbers (velocities); default at rest.
-        Held vertices stay at initial_positions, whatever rest_positions a run takes; `Rollout.forward(shape=...)` moves both.
+        Held vertices stay at initial_positions whatever rest_positions a run takes; `Rollout.forward(shape=...)` moves both.
     precision: "f32", "f64" or None for the default that `diffsim_ti.init` set.
     volume: where a change of volume is resisted: in each of the "tetrahedra", which lock as Poisson's ratio nears 0.5, or
         on average over "patches" of up to eight, which lock much less (patched_tetrahedron.py).
