@@ -12,6 +12,7 @@ from diffsim_ti.checked import between
 from diffsim_ti.contact.surface_pairs import Tunnelling
 from diffsim_ti.inputs import Derived
 from diffsim_ti.monitor.energy_balance import EnergyBalance
+from diffsim_ti.monitor.own_work import OwnWork
 from diffsim_ti.potential.attached import Attached
 from diffsim_ti.potential.chamber_pressure import following
 from diffsim_ti.potential.fluid import Fluid
@@ -148,6 +149,7 @@ class ExplicitWorkspace(Workspace):
             stage=runtime.array(a.vector, *(noted if features.staged else (1, 1))),
             # done on each vertex from outside [J] (outside_work.py)
             work=runtime.array(a.fp, a.num_vertices * (1 + features.cabled) if features.driven else 1),
+            own_work=runtime.array(a.fp, a.num_vertices),
         )
         self.attached = Attached.of(self.scene)  # springs, cables and foundations, for what looks between passes
         self.probe = None  # room for a pass that is not taken
@@ -156,6 +158,13 @@ class ExplicitWorkspace(Workspace):
     def load(self, derived: Derived) -> None:
         super().load(derived)
         self.check_apart()
+
+    def balance(self) -> OwnWork | None:
+        if not OwnWork.serves(self):
+            return None
+        self.arrays.count_own_work()
+        self._launches.clear()
+        return OwnWork(self)
 
     def record_contacts(self) -> None:
         self.arrays.record_contacts()
@@ -196,12 +205,14 @@ class ExplicitWorkspace(Workspace):
             self.pairs.ensure(self.probe.u, 0)
             self.pairs.forces(self.probe.u, 0, self.arrays.corner)
         seen, step = self.watch.rows(), self.kernels(self.arrays.features()).step
+        counted = runtime.fetch(self.contact.own_work)  # of passes that are taken alone
         launch = self.bound(step, state=(self.probe, self.frames, self.watch, self.contact), table=self.table)
         for numbers in self.launches(j, j + 1, num_passes, 0, 1):
             if self.chambers:
                 self.chambers.forces(self.probe, 0, numbers)
             launch(**numbers, base=j, stride=1)
         self.watch.put(seen)
+        runtime.fill(self.contact.own_work, counted)
         return runtime.fetch(self.probe.f)[0].astype(np.float64)
 
     def loads_at(self, j: int, num_passes: int, pulls: bool = True) -> np.ndarray:
