@@ -190,7 +190,7 @@ class Guard:
         )
         raise Divergence(
             f"{self.ws.when(step)}: the substep {self.ws.substep:.4g} s {why}: reduce dt, raise "
-            "substeps, or pass allow_unstable=True",
+            "substeps, or pass allow_unstable=True to the solver",
             step,
             None,
             tet,

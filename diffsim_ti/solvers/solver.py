@@ -194,7 +194,7 @@ class Solver(ABC):
                 what, remedy = f"of {self._schedule}, the longest:", "shorten the longest steps"
             raise ValueError(
                 f"the substep {what} {self.substep:.4g} s exceeds the stable step {tight}: {remedy}, use an implicit "
-                "solver, or pass allow_unstable=True"
+                "solver, or pass allow_unstable=True to this one"
             )
 
     def choose_substeps(self, share: float = 0.7, values: Mapping[str, ArrayLike] | None = None) -> None:

@@ -41,7 +41,7 @@ def add_work_of_pass(step: A, i, u, v, v_plus, f, u_next, v_next, now: A, scene:
 
 @ti.func
 def work_of_own_forces(step: A, i, v, v_plus, f, v_next, now: A, scene: A, plan: A):
-    """Work [J] of weight and of what the body itself does on vertex i in the kick from v to v_plus, without loads and cables:
+    """Work [J] of weight and of what the body itself does on vertex i in the kick from v to v_plus, without loads, cables:
     what kinetic energy gains by it. Stages, drag and friction come after the kick."""
     done, inverse, own = ti.cast(0, step.fp), scene.inverse_mass[i], f
     if ti.static(step.features.forces):
