@@ -30,7 +30,7 @@ def warn_if_locking(scene: "Scene") -> None:
         remedy += 'pass volume="patches" to the Scene, '
     if nu > limit + 1e-12:
         warnings.warn(
-            f"{scene.material.name}: Poisson's ratio {nu:.6g} is above {limit}, where {kind} tetrahedra lock "
-            f'(bend too little): {remedy}cut the cells of create_box with pattern="five", refine the mesh, or lower the ratio',
+            f"{scene.material.name}: Poisson's ratio {nu:.6g} is above {limit}, where {kind} tetrahedra lock (bend too "
+            f'little): {remedy}cut the cells of create_box with pattern="five", refine the mesh, or lower the ratio',
             stacklevel=3,
         )

@@ -180,6 +180,9 @@ class Scene(TermsOfScene, MadeAgain):
 
     def with_each(self, values: Mapping[str, ArrayLike] | None) -> list["Scene"]:
         """The scenes of a `Batch`, whose inputs `values` have the axis of scenes in front; this one alone without any."""
+        if values is None:
+            return [self]
+        instance("scenes", "values", values, Mapping, 'inputs by name, {"youngs_modulus": [1e4, 2e4]}')
         if not values:
             return [self]
         own = {name: as_numbers(name, x) for name, x in values.items()}

@@ -90,10 +90,6 @@ def stiff(**options):
     return verlet(law=ds.StableNeoHookean(1e9, 0.3), **options)
 
 
-def near(width: float):
-    return ds.Simulator(verlet(terms=[ds.SelfContact(1e3, width)]))
-
-
 # (file, part of the message): (what provokes it, the same as it advises)
 FOLLOWED = {
     ("batch/batch.py", "leave out lanes=True"): (
@@ -212,10 +208,6 @@ FOLLOWED = {
         lambda: strong(100.0),
         lambda: strong(advised(lambda: strong(100.0))),
     ),
-    ("contact/surface_pairs.py", "take a width below"): (
-        lambda: near(7.0),
-        lambda: near(0.999 * advised(lambda: near(7.0))),
-    ),
     ("mesh/grid.py", "vertices; take at most"): (
         lambda: ds.TetrahedralMesh.create_box(10**4, 1.0),
         lambda: ds.TetrahedralMesh.create_box(3, 1.0),
@@ -227,6 +219,7 @@ ELSEWHERE = {  # (file, part of the message): the test that provokes it and foll
     ("batch/taped.py", "its field is already"): "test_batch_tape.py",
     ("checked.py", "is a tensor with a graph"): "test_torch.py, test_calls.py",
     ("cli/identify.py", "expected input=guess"): "test_identify.py",
+    ("contact/surface_pairs.py", "take a width below"): "test_self_contact.py",
     ("diff_simulator.py", "a two-step method"): "test_torch_solvers.py",
     ("identification/descent.py", "take smaller steps"): "names neither an argument nor a number",
     ("identification/problem.py", "has no gradient by"): "test_identification.py",

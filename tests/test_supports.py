@@ -123,7 +123,7 @@ def test_explicit_energy_is_followed_with_supports_that_move(kind):
 # ---- closed forms --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", [ds.StaticSolver, ds.VelocityVerletSolver])
+@pytest.mark.parametrize("kind", [ds.StaticSolver, pytest.param(ds.VelocityVerletSolver, marks=pytest.mark.thorough)])
 def test_the_shape_of_a_held_body_moves_its_supports(kind):
     """`shape` against differences, in NumPy, torch and batches; the gradient by rest_positions alone is another."""
     mesh, rng = ds.TetrahedralMesh.create_box((4, 2, 2), (0.3, 0.1, 0.1)), np.random.default_rng(0)

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from diffsim_ti.checked import present
+from diffsim_ti.checked import instance
 from diffsim_ti.monitor.stability import StepLimit, element_limit, lanczos_limit
 from diffsim_ti.monitor.stiffest import stiffest
 from diffsim_ti.scene import Scene
@@ -29,7 +29,7 @@ def stable_dt(scene: Scene, tight: bool = True) -> StepLimit:
     >>> print(f"{ds.stable_dt(soft) / ds.stable_dt(stiff):.6f}")  # four times the stiffness, half of the step
     2.000000
     """
-    present("scene", scene)
+    instance("stable_dt", "scene", scene, Scene, "a Scene")
     return lanczos_limit(start_workspace(scene, stiffest)) if tight else element_limit(scene)
 
 

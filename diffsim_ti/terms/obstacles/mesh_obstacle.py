@@ -6,6 +6,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import ArrayLike
 
+from diffsim_ti.checked import numbers, whole, wholes
 from diffsim_ti.runtime import at, let, traced
 from diffsim_ti.terms.described import place
 from diffsim_ti.terms.obstacles.obstacle import Obstacle, ObstacleForce
@@ -33,10 +34,9 @@ class MeshObstacle(Obstacle):
         **options,
     ):
         super().__init__([place("position", position, "mesh_position")], **options)
-        vertices, triangles = np.asarray(vertices, np.float64), np.asarray(triangles, np.int64)
+        vertices, triangles = numbers("MeshObstacle: vertices", vertices), wholes("MeshObstacle: triangles", triangles)
         check_closed(vertices, triangles)
-        if int(resolution) != resolution or resolution < 4:
-            raise ValueError(f"MeshObstacle: resolution must be a whole number of at least 4 cells, got {resolution}")
+        resolution = whole("MeshObstacle: resolution", resolution, 4)
         low, high = vertices.min(0), vertices.max(0)
         cell = (high - low).max() / resolution
         pad = float(self.values["barrier_width"]) + 2 * cell
@@ -74,7 +74,12 @@ def check_closed(vertices: np.ndarray, triangles: np.ndarray) -> None:
     if vertices.ndim != 2 or vertices.shape[1] != 3 or triangles.ndim != 2 or triangles.shape[1] != 3:
         shapes = f"{vertices.shape}, {triangles.shape}"
         raise ValueError(f"MeshObstacle: vertices must have shape (k, 3) and triangles (t, 3), got {shapes}")
-    if not np.all(np.isfinite(vertices)) or triangles.min() < 0 or triangles.max() >= len(vertices):
+    if (
+        not triangles.size
+        or not np.all(np.isfinite(vertices))
+        or triangles.min() < 0
+        or triangles.max() >= len(vertices)
+    ):
         raise ValueError("MeshObstacle: vertices must be finite, and triangles must name them by index")
     edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
     keys = edges[:, 0] * len(vertices) + edges[:, 1]
