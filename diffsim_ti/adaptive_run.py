@@ -123,10 +123,13 @@ class ForwardRun:
         self.simulator = self._last = Simulator(solver, **self._noted)
         self.frame_time = self.parts * solver.dt
         ws = self.simulator.workspace
+        self._balance = ws.balance()
+        self.drift: float | None = None if self._balance is None else 0.0  # [J], the steps' own (monitor/own_work.py)
         self._start = ws.history(1)
         ws.save(self._start, 0)
         ws.advance(0, 1, solver.num_passes(1))  # compiles
         ws.restore(self._start, 0)
+        self._begin_balance()
         self._limit = self._stable_dt()
         self._energy, self._refined = self.simulator.compute_energy(), 0
         self._lowest, self._begun, self._squeezed, self._implicit = self._energy, self._energy, False, None
@@ -139,8 +142,13 @@ class ForwardRun:
         dt = self.simulator.solver.dt
         return dt / self._choose_substeps() if self.adapts else self.simulator.solver.substep
 
+    def _begin_balance(self) -> None:
+        if self._balance:
+            self._balance.begin()
+
     def balance_anew(self) -> None:
         """Measure the rise and drift of energy from the present state on, which something outside has changed."""
+        self._begin_balance()
         self._energy = self._lowest = self._begun = self.simulator.compute_energy()
         self.largest_energy = max(self.largest_energy, self._moving(self._energy))
         self._fastest = max(self._fastest, self._moving(self._energy))
@@ -157,6 +165,8 @@ class ForwardRun:
                 self._advance_part(last=part == self.parts - 1)
             else:
                 self.simulator.step()
+            if self._balance:
+                self.drift += self._balance.take()
             self._look()
         self.energies.append(self._energy)
         self.seen.seconds += time.perf_counter() - begin
@@ -185,6 +195,7 @@ class ForwardRun:
                 self.seen.retries[-1] += "; shorter ones do not lower that, and the energy is below that of the start"
                 return
             sim.workspace.restore(self._start, 0)
+            self._begin_balance()
             sim.step_count = first
             substeps *= 2
         if self.implicit or not self._advance_part_implicitly(why):
@@ -200,6 +211,7 @@ class ForwardRun:
             return False
         if self._implicit is None:
             self._implicit = Simulator(ImplicitEulerSolver(self.scene, dt=sim.solver.dt), **self._noted)
+            self._implicit.workspace.balance()
         other = self._implicit
         if self.scene.term(ExternalForce) is not None:
             runtime.fill(other.workspace.arrays.forces, runtime.fetch(sim.workspace.arrays.forces))
@@ -208,12 +220,17 @@ class ForwardRun:
             other.step_count = sim.step_count
             try:
                 hand_on(sim, other)
+                watch = other.workspace.energy_watch
+                if watch:
+                    watch.begin()
                 other.step()
             except (FloatingPointError, Overlap):  # explicit steps see obstacles only at points within faces
                 continue
             self.seen.implicit_parts += 1
             self.seen.retries.append(f"t = {sim.time:.4g} s: {why}; this part by {substeps} steps of implicit Euler")
             hand_on(other, sim)
+            self._begin_balance()
+            self.drift = None if self.drift is None or watch is None else self.drift + watch.take()
             sim.step_count += 1
             self._last = other
             self._limit = self._stable_dt()

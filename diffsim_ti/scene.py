@@ -65,6 +65,7 @@ class Scene(TermsOfScene, MadeAgain):
         (num_held, 3) [m], or keyframes (times, displacements) between which it is linear; of what is held in some
         directions, only those count. Or a `Pose`, which turns them; or, where `fixed` names sets, {name: such a motion}.
     initial_positions [m], initial_velocities [m/s]: shape (num_vertices, 3) or 3 numbers (velocities); default at rest.
+        Held vertices stay at initial_positions whatever rest_positions a run takes; `Rollout.forward(shape=...)` moves both.
     precision: "f32", "f64" or None for the default that `diffsim_ti.init` set.
     volume: where a change of volume is resisted: in each of the "tetrahedra", which lock as Poisson's ratio nears 0.5, or
         on average over "patches" of up to eight, which lock much less (patched_tetrahedron.py).
@@ -77,8 +78,9 @@ class Scene(TermsOfScene, MadeAgain):
         solver. "rigid": by six, turned and moved, in every solver. Or a basis, in implicit steps and statics: weights of a
         `designs.Cage`, the shapes of `modes`. Of a start only what a set can do counts (reduced.py).
 
-    Raises ValueError with rule, value and remedy for anything that does not fit, before any kernel runs. Warns where
-    tetrahedra lock, above Poisson's ratio 0.45.
+    Raises ValueError with rule, value and remedy for what no solver takes, and runs no kernel. What one kind of solver does
+    not support its constructor refuses, and what an output does not, that of `Rollout`. Warns where tetrahedra lock, above
+    Poisson's ratio 0.45.
 
     >>> import diffsim_ti as ds
     >>> mesh, material = ds.TetrahedralMesh.create_cube(resolution=2), ds.StableNeoHookean(E=1e5, nu=0.3)
@@ -130,6 +132,7 @@ class Scene(TermsOfScene, MadeAgain):
         self.growing = tuple(t for t in self.ordered_terms if isinstance(t, Growth))
         if self.growing:
             self.material = grown(self.material, volume)
+        self.law  # noqa: B018 - refuses what its volume does not support
         self.chambers = tuple(t for t in self.ordered_terms if isinstance(t, Chamber))
         self.gases = tuple(t for t in self.chambers if not t.holds)
         self.following = (*self.pressures, *self.chambers)  # what presses on the surface as it is
@@ -180,6 +183,9 @@ class Scene(TermsOfScene, MadeAgain):
 
     def with_each(self, values: Mapping[str, ArrayLike] | None) -> list["Scene"]:
         """The scenes of a `Batch`, whose inputs `values` have the axis of scenes in front; this one alone without any."""
+        if values is None:
+            return [self]
+        instance("scenes", "values", values, Mapping, 'inputs by name, {"youngs_modulus": [1e4, 2e4]}')
         if not values:
             return [self]
         own = {name: as_numbers(name, x) for name, x in values.items()}

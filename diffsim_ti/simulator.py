@@ -57,6 +57,8 @@ class Simulator:
         solver.simulator = weakref.ref(self)
         self._start = solver.start_values()
         self._notes, self._settled = bool(contact_forces), {}
+        if contact_forces:
+            solver.check_contact_forces()
         self._make_workspace()
         self.reset()
 

@@ -1,5 +1,6 @@
 """Supports: which vertices do not move freely, and in which directions."""
 
+import warnings
 from collections.abc import Mapping
 
 import numpy as np
@@ -9,6 +10,7 @@ from diffsim_ti.checked import numbers, shown
 from diffsim_ti.inputs.clamps import Clamp
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.geometry import triangle_normals
+from diffsim_ti.mesh.sets import parts_of_joined
 from diffsim_ti.terms.motion import Motion, sampled
 from diffsim_ti.terms.pose import Pose
 
@@ -26,6 +28,7 @@ class Supports:
 
     def __init__(self, mesh: TetrahedralMesh, fixed: Fixed | None):
         self.by_name: dict[str, tuple[np.ndarray, np.ndarray]] = {}  # (vertices, unit directions) of each set
+        _warn_of_several_bodies(mesh, fixed)
         if isinstance(fixed, Mapping):
             for name, how in fixed.items():
                 self.by_name[name] = mesh.vertex_indices(name), _directions(mesh, name, how)
@@ -137,6 +140,18 @@ class Supports:
                 "vertex out of one set, or hold the sets in other directions"
             )
         return out
+
+
+def _warn_of_several_bodies(mesh: TetrahedralMesh, fixed: Fixed | None) -> None:
+    """Say which sets hold several bodies because these had sets of one name before they were joined."""
+    given = [fixed] if isinstance(fixed, str) else fixed if isinstance(fixed, Mapping | list | tuple) else ()
+    for name in (name for name in given if isinstance(name, str)):
+        if parts := parts_of_joined(mesh.vertex_sets, name):
+            warnings.warn(
+                f"fixed: {name!r} holds {len(parts)} bodies, whose sets of this name were joined; name those that are "
+                f"meant: {', '.join(map(repr, parts))}",
+                stacklevel=4,
+            )
 
 
 def _directions(mesh: TetrahedralMesh, name: str, how: str | ArrayLike) -> np.ndarray:

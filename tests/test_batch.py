@@ -287,6 +287,79 @@ def test_a_scene_that_crosses_an_obstacle_fails_alone():
     assert (heights > LOW - 0.05).all()
 
 
+GIVEN = dict(  # over time: terms and options of a scene
+    path=(lambda: [], {}),
+    pose=(lambda: [ds.HalfSpace((0, -9.0, 0), (0, 1, 0), path=lambda t: (0, t, 0, 0, 0, t), stiffness=1e3)], {}),
+    load=(
+        lambda: [
+            ds.Traction(lambda t: (10 * t, 0, 0), "ymax"),
+            ds.ExternalForce(np.full((8, len(MESH.vertices), 3), 1e-3)),
+        ],
+        {},
+    ),
+    muscle=(lambda: [ds.Muscle((0, 1, 0), 1e3, np.linspace(0, 1, 8))], {}),
+    motion=(lambda: [], dict(fixed="xmin", motion=lambda t: (0, 0.01 * t, 0))),
+)
+BY_TURNS = ds.BDF2Solver, ds.VelocityVerletSolver, ds.ImplicitMidpointSolver, ds.SemiImplicitSolver
+
+
+@pytest.mark.parametrize(
+    "given, solver",
+    [
+        ("path load muscle motion", ds.BDF2Solver),
+        *(pytest.param(given, solver, marks=pytest.mark.thorough) for given in GIVEN for solver in BY_TURNS),
+    ],
+)
+def test_a_scene_by_turns_fails_alone_whatever_is_given_over_time(given, solver):
+    """The first and the last fly into the floor, far too fast, after a while."""
+    path = (lambda t: (0, t, 0)) if "path" in given else None
+    terms, options = [ds.Ground(-10.0, stiffness_per_area=1e4, path=path, name="floor")], {}
+    for name in given.split():
+        terms, options = terms + GIVEN[name][0](), options | GIVEN[name][1]
+    scene = ds.Scene(MESH, ELASTIC, 1000.0, terms=terms, precision="f64", **options)
+    solver = solver(scene, dt=1e-3) if solver.explicit else solver(scene, dt=1e-3, max_iterations=12)
+    outputs, rng = [ds.ContactForce("floor")], np.random.default_rng(0)
+    batch = ds.Batch(solver, 8, 4, save_every=2, outputs=outputs, lanes=False)
+    speed = 0.1 * rng.normal(size=(4, *MESH.vertices.shape))
+    speed[[0, 3]] = 0, -4000, 0
+    own = {name: x * rng.uniform(0.9, 1.1, (4, *x.shape)) for name, x in batch.one.values.items() if x.ndim == 3}
+    own["initial_velocities"] = speed
+    frames = batch.forward(**own)
+    np.testing.assert_array_equal(frames.alive, [False, True, True, False])
+    for b in (0, 3):
+        last = frames.last_good[b]
+        assert last > 0 and isinstance(frames.error(b), FloatingPointError)
+        np.testing.assert_array_equal(frames.positions[b, last:], frames.positions[[b], last].repeat(5 - last, 0))
+    seed = rng.normal(size=frames.positions.shape)
+    with pytest.warns(UserWarning, match=r"scenes \[0, 3\] did not come to their end: their gradients are zero"):
+        gradients = batch.vjp(frames, seed)
+    with pytest.warns(UserWarning, match="their changes are zero"):
+        changes = batch.tangents(frames, initial_velocities=speed)
+    total = {}
+    for b in (1, 2):
+        alone = batch.one.forward(**{name: x[b] for name, x in own.items()})
+        np.testing.assert_array_equal(alone.positions, frames.positions[b])
+        for name, gradient in batch.one.vjp(alone, seed[b]).items():
+            total[name] = total.get(name, 0) + gradient
+            if name in own:
+                np.testing.assert_array_equal(gradients[name][b], gradient, err_msg=name)
+        for name, change in batch.one.tangents(alone, initial_velocities=speed[b]).items():
+            np.testing.assert_array_equal(changes[name][b], change, err_msg=name)
+    for name, gradient in gradients.items():
+        if name in own:
+            assert not gradient[[0, 3]].any(), name
+        else:
+            np.testing.assert_allclose(gradient, total[name], rtol=0, atol=1e-13 * np.abs(gradient).max(), err_msg=name)
+    assert not any(change[[0, 3]].any() for change in changes.values())
+
+
+def test_scenes_that_are_refused_are_named():
+    batch = ds.Batch(ds.ImplicitEulerSolver(simple(1).scene, dt=1e-3), 2, 2)
+    inside_out = np.stack([MESH.vertices, -MESH.vertices])
+    with pytest.raises(ValueError, match="^scene 1: "):
+        batch.forward(rest_positions=inside_out)
+
+
 @pytest.mark.parametrize("lanes", [None, False], ids=["lanes", "by turns"])
 def test_outputs_of_all_scenes(lanes):
     points = MESH.vertices[:4] * 0.9 + 0.005

@@ -1,12 +1,15 @@
 """Wrong calls: of public constructors, and wrong numbers of runs. Only errors of the package come out, in one line."""
 
 import traceback
+from contextlib import nullcontext
 from functools import lru_cache
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from fuzz_calls import LAWS, OPTIONS, TERMS, TETRAHEDRON, body, combination
 
 import diffsim_ti as ds
 from diffsim_ti.checked import shown
@@ -18,6 +21,15 @@ WRONG = (
     *(None, "a", "", b"x", 0, -1, 3, 2.5, np.nan, np.inf, -np.inf, 1e300, 10**400, True, 1j, object(), type),
     *([], [1], [1, 2, 3], ["a"], [None], [[1, 2], [3]], {}, {"a": 1}, {1: 2}, (), set(), lambda: 3, lambda t: "x"),
     *(np.zeros(0), np.zeros((2, 3)), np.zeros((8, 3)), np.full((8, 3), np.nan), np.zeros(5, bool), np.array("x")),
+    *(
+        np.zeros((0, 3)),
+        np.zeros((3, 8)),
+        np.zeros((8, 3), "f4"),
+        np.zeros((8, 3), int),
+        np.zeros(8, complex),
+        range(0),
+    ),
+    *([[]], [()], {"xmin": []}, {"xmin": ""}, frozenset(), np.zeros((1, 8, 3)), np.zeros((2, 8, 3)), np.zeros((8, 0))),
 )
 
 
@@ -92,6 +104,17 @@ def calls() -> dict:
             dict(solver=solver, steps=4, save_every=2, checkpoint_every=None, memory=None, gradients=None)
             | dict(clip=None, truncate=None, health=False, outputs=(), runs=None),
         ),
+        "create_box": (ds.TetrahedralMesh.create_box, dict(resolution=2, size=1.0, origin=(0, 0, 0), pattern="kuhn")),
+        "Growth": (ds.Growth, dict(growth=0.1, tetrahedra=None, per="all", name=None)),
+        "SurfaceDrag": (ds.SurfaceDrag, dict(density=1.0, normal=1.0, tangential=0.1, stream=[0, 0, 0], surface=None)),
+        "MeshObstacle": (
+            ds.MeshObstacle,
+            dict(vertices=[[0, -3, 0], [1, -3, 0], [0, -3, 1], [0, -4, 0]], triangles=TETRAHEDRON, resolution=4) | wall,
+        ),
+        "Pose": (of_motion, dict(path=lambda t: [0, t, 0, 0, 0, t], about=[0, 0, 0])),
+        "Strain": (output_of(ds.Strain), dict(name="s", at="tetrahedra", principal=False)),
+        "KineticEnergy": (output_of(ds.KineticEnergy), dict(sets=None, name="e")),
+        "WorkOfLoads": (output_of(ds.WorkOfLoads), dict(weight=True, name="w")),
         "UnequalSteps": (ds.UnequalSteps, dict(lengths=[1e-3], substeps=1)),
         "MaterialPoints": (ds.MaterialPoints, dict(points=[[0.5, 0.5, 0.5]], name="x", nearest=False)),
     }
@@ -132,6 +155,11 @@ def runs() -> dict:
     return out | dict(joined=ds.TetrahedralMesh.joined, from_file=ds.TetrahedralMesh.from_file)
 
 
+def of_motion(**arguments):
+    """A motion as a scene takes it, which asks it for places."""
+    return objects()["scene"].replace(fixed="xmin", motion=ds.Pose(**arguments))
+
+
 def output_of(kind):
     """An output as a rollout of a held body takes it, which looks at it."""
 
@@ -147,6 +175,8 @@ def made(make, arguments: dict):
     if make is ds.Simulator:
         return make(*arguments.values())
     out = make(**arguments)
+    if isinstance(out, ds.Rollout):
+        out.forward()
     if isinstance(out, Material):
         return ds.Scene(objects()["mesh"], out, precision="f64")
     if hasattr(out, "check") and hasattr(out, "described"):
@@ -240,3 +270,44 @@ def test_states_and_sizes_are_checked_at_once():
     with pytest.raises(ValueError, match="positions: expected finite numbers"):
         simulator.set_state(positions=np.full((8, 3), np.nan))
     assert np.array_equal(simulator.positions, before)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_what_does_not_go_together_is_refused_in_our_words():
+    """Combinations of laws, terms, solvers, elements and outputs, as they are made; `fuzz_calls.py` runs them, too."""
+    for known in (TERMS, OPTIONS):
+        for make in known.values():  # else nothing below means anything
+            ds.Scene(body(1), LAWS["stable"], terms=make()) if callable(make) else ds.Scene(
+                body(1), LAWS["stable"], **make
+            )
+    assert not [said for said in (combination(seed, runs=False) for seed in range(60)) if said]
+
+
+@pytest.mark.parametrize("volume", ["tetrahedra", "patches"])
+def test_laws_that_patches_do_not_support_are_refused_with_the_scene(volume):
+    for name in ("kelvin_voigt", "prony"):
+        with pytest.raises(ValueError, match='take volume="tetrahedra"') if volume == "patches" else nullcontext():
+            ds.Scene(objects()["mesh"], LAWS[name], volume=volume)
+
+
+@pytest.mark.parametrize("steps", [[], (), np.zeros(0), ds.UnequalSteps])
+def test_no_lengths_of_steps_are_refused(steps):
+    with pytest.raises(ValueError, match="expected one number"):
+        ds.UnequalSteps([]) if steps is ds.UnequalSteps else ds.Rollout(objects()["solver"], steps)
+
+
+def test_unknown_options_of_init_are_refused():
+    for name in ("backend", "device", "fp"):
+        with pytest.raises(TypeError, match=f"init has no argument '{name}'"):
+            ds.init(**{name: "cpu"})
+
+
+@pytest.mark.parametrize("suffix, package", [("xdmf", "h5py"), ("med", "h5py"), ("e", "netCDF4")])
+def test_formats_name_the_package_that_they_need(tmp_path, suffix, package):
+    if find_spec(package):
+        return  # and works
+    (tmp_path / f"b.{suffix}").write_bytes(b"")
+    save, read = objects()["mesh"].save, ds.TetrahedralMesh.from_file
+    for call in (lambda: save(tmp_path / f"a.{suffix}"), lambda: read(tmp_path / f"b.{suffix}")):
+        with pytest.raises((ImportError, ValueError), match=f"pip install {package}|cannot read"):
+            call()

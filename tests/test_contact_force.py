@@ -407,9 +407,13 @@ def test_what_does_not_fit_is_refused():
         ds.ContactForce("floor", "shear")
     with pytest.raises(ValueError, match="about= or per_vertex=True"):
         ds.ContactForce("floor", about=(0, 0, 0), per_vertex=True)
-    as_force = ds.Rollout(ds.SemiImplicitSolver(scene, dt=1e-4, contact="force"), 1, outputs=ds.ContactForce("floor"))
-    with pytest.raises(ValueError, match='pass contact="stage"'):
-        as_force.forward()
+    as_force = ds.SemiImplicitSolver(scene, dt=1e-4, contact="force")
+    for make in (
+        lambda: ds.Rollout(as_force, 1, outputs=ds.ContactForce("floor")),
+        lambda: ds.Simulator(as_force, contact_forces=True),
+    ):
+        with pytest.raises(ValueError, match='pass it contact="stage"'):
+            make()
     balls = [
         ds.Sphere((x, -0.06, 0.05), 0.06, stiffness_per_area=3e5, name=f"ball{k}") for k, x in enumerate((0.02, 0.08))
     ]

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import diffsim_ti as ds
+from diffsim_ti.adaptive_run import ForwardRun
 from diffsim_ti.monitor.energy_watch import EnergyGained
 from diffsim_ti.monitor.stability import lanczos_limit
 from diffsim_ti.study.stability_axes import AXES
@@ -230,3 +231,62 @@ def test_the_midpoints_advice_helps():
                 run.step()
                 seen.append(run.compute_energy())
         assert max(seen) < 1.1 * start
+
+
+# ---- the drift of runs, apart from what is done to the body ------------------------------------------------------------
+
+SLIDING = dict(initial_velocities=np.array([1.0, 0.0, 0.0]))
+SWINGING = dict(initial_velocities=0.3 * np.sin(20 * MESH.vertices[:, [1, 2, 0]]))
+ALONE = dict(  # terms and options of scenes in which energy is taken or given in one way
+    free=([], SWINGING),
+    drag=([ds.Drag(5.0)], SWINGING),
+    friction=([ds.Gravity(), ds.Ground(-0.004, friction=0.5, stiffness_per_area=1e6)], SLIDING),
+    fluid=([ds.SurfaceDrag(500.0)], SLIDING),
+    traction=([ds.Traction((50.0, 0, 0), "xmax")], dict(fixed="xmin")),
+    pressure=([ds.Pressure(lambda t: 1e4 * t)], dict(fixed="xmin")),
+    muscle=([ds.Muscle((1, 0, 0), 2e3, lambda t: min(1, 20 * t))], {}),
+    supports=([ds.Gravity()], dict(fixed="xmin", motion=lambda t: (0, 0.01 * np.sin(60 * t), 0))),
+    rollers=([ds.Gravity()], dict(fixed={"xmin": "x"}, motion=lambda t: (0.01 * np.sin(60 * t), 0, 0))),
+    wall=([ds.HalfSpace((0, -0.02, 0), (0, 1, 0), stiffness_per_area=1e6, path=lambda t: (0, 0.5 * t, 0))], {}),
+)
+ALL_AT_ONCE = "drag friction traction muscle supports"
+LARGEST_DRIFT = {  # share of the energy that moves, of substeps of 1e-4 s, and of 1e-3 s in implicit steps
+    ds.VelocityVerletSolver: 1e-3,
+    ds.SemiImplicitSolver: 1e-2,
+    ds.ImplicitMidpointSolver: 1e-2,
+    ds.BDF2Solver: 0.2,
+    ds.ImplicitEulerSolver: 0.5,
+}
+
+
+@pytest.mark.parametrize(
+    "names, kind",
+    [
+        (ALL_AT_ONCE, ds.VelocityVerletSolver),
+        ("friction", ds.BDF2Solver),
+        *(pytest.param(name, kind, marks=pytest.mark.thorough) for name in ALONE for kind in LARGEST_DRIFT),
+    ],
+)
+@pytest.mark.filterwarnings("ignore")
+def test_the_drift_of_a_run_is_that_of_its_steps(names, kind):
+    """It falls with the step, however much friction, drag, loads and what moves take and give."""
+    terms, options = [], {}
+    for name in names.split():
+        terms += [term for term in ALONE[name][0] if type(term) not in map(type, terms)]
+        options |= ALONE[name][1]
+    scene, drifts, part = body(terms, MESH, **options), [], 0.01 if kind.explicit else 0.02
+    for dt in (1e-4, 5e-5) if kind.explicit else (1e-3, 2.5e-4):
+        run = ForwardRun(scene, kind, part, dt=dt)
+        for _ in range(2 if kind.explicit else 1):
+            run.advance()
+        change = (run.energies[-1] - run.energies[0]) / run.largest_energy
+        drifts.append(run.drift / run.largest_energy)
+    assert abs(drifts[0]) < LARGEST_DRIFT[kind] and abs(drifts[1]) < max(0.7 * abs(drifts[0]), 1e-5)
+    assert names == "free" or abs(change) > 3 * abs(drifts[1]) + 0.02
+
+
+def test_what_cannot_be_told_apart_is_not_called_drift():
+    viscous = ds.Scene(MESH, ds.KelvinVoigt(SOFT, time=1e-3), 1000.0, precision="f64", **SWINGING)
+    run = ForwardRun(viscous, ds.VelocityVerletSolver, 1e-3, dt=1e-4)
+    run.advance()
+    assert run.drift is None and run.energies[-1] < run.energies[0]

@@ -12,6 +12,7 @@ import meshio
 import numpy as np
 import pytest
 
+import diffsim_ti as ds
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.checks import surface_of
 
@@ -532,6 +533,24 @@ def test_surface_sets_follow_the_mesh():
     assert set(map(tuple, both.surface_triangles[both.surface_sets["lid"]])) == set(map(tuple, expected))
     assert len(both.surface_sets["ymin"]) == len(other.surface_sets["ymin"]) + len(mesh.surface_sets["ymin"])
     assert len(both.surface_sets["body_1"]) == len(mesh.surface_triangles)
+
+
+def test_sets_of_one_name_are_told_apart_when_bodies_are_joined():
+    cube = TetrahedralMesh.create_cube(2).with_vertex_set("tip", [0])
+    plain = TetrahedralMesh.create_cube(2).translated((3, 0, 0))
+    both = TetrahedralMesh.joined([plain, cube]).translated((1, 0, 0))
+    for k, mesh in enumerate((plain, cube)):
+        np.testing.assert_array_equal(both.vertex_sets[f"body_{k}_xmin"], mesh.vertex_sets["xmin"] + 8 * k)
+        faces = both.surface_triangles[both.surface_sets[f"body_{k}_ymax"]]
+        np.testing.assert_array_equal(faces, mesh.surface_triangles[mesh.surface_sets["ymax"]] + 8 * k)
+    assert "body_1_tip" not in both.vertex_sets and both.vertex_sets["tip"].tolist() == [8]
+    law = ds.StableNeoHookean(1e5, 0.3)
+    for fixed in ("xmin", ["tip", "xmin"], {"xmin": "x"}):
+        with pytest.warns(UserWarning, match="'xmin' holds 2 bodies.*'body_0_xmin', 'body_1_xmin'"):
+            ds.Scene(both, law, fixed=fixed)
+    with warnings.catch_warnings(action="error"):
+        for fixed in ("tip", "body_0_xmin", ["body_0_xmin", "body_1_xmin"], both.vertex_indices("xmin"), None):
+            ds.Scene(both, law, fixed=fixed)
 
 
 @pytest.mark.parametrize("suffix", [".msh", ".vtu", ".vtk"])

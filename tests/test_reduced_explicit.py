@@ -107,6 +107,31 @@ def test_stable_steps_are_those_of_the_constrained_body():
     assert ds.stable_dt(alone) == ds.stable_dt(alone, tight=False) == np.inf
 
 
+def test_a_stable_step_is_told_whatever_explicit_solvers_refuse():
+    """Sets of every kind before a floor near and far, a thin rod, and beside friction of surfaces."""
+    X, low = bar().vertices, bar().vertices[:, 1].min()
+    free = ds.stable_dt(scene_of(None, terms=[]))
+    terms = dict(
+        far=ds.Ground(low - 0.01, width=0.005, stiffness=1e3),
+        near=ds.Ground(low - 0.001, width=0.005, stiffness=1e6),
+        rod=ds.Capsule(X.min(0) - 0.01, X.min(0) - [0.02, 0.01, 0.01], 1e-3, width=1e-3, stiffness=1e3),
+        rough=ds.SelfContact(stiffness=1e3, width=1e-3, friction=0.5),
+    )
+    for kind in (*KINDS, np.stack([np.ones(len(X)), *X.T, X[:, 0] ** 2], 1)):
+        alone = ds.stable_dt(scene_of({"shell": kind}, terms=[]))
+        for name, term in terms.items():
+            scene = scene_of({"shell": kind}, terms=[term])
+            told = ds.stable_dt(scene)
+            if not isinstance(kind, str):  # implicit steps alone
+                assert told == free, name
+            elif name == "near":
+                solver = ds.SemiImplicitSolver(scene, dt=1e-9, contact="force")
+                assert told == solver.stable_dt(tight=True) < 0.5 * alone, kind
+            else:
+                assert told == pytest.approx(alone, rel=1e-3), (kind, name)
+            assert 0 < ds.stable_dt(scene, tight=False) <= alone
+
+
 # ---- contact and friction --------------------------------------------------------------------------------------------
 
 

@@ -4,6 +4,7 @@ from contextlib import nullcontext
 
 import numpy as np
 import pytest
+import torch
 from scipy.optimize import brentq
 from test_every_adjoint import assert_transposed
 from test_gradients import random_mesh
@@ -11,6 +12,7 @@ from test_loads import loads, solver_of
 from test_term_order import SOLVERS
 
 import diffsim_ti as ds
+from diffsim_ti.diff_simulator import rollout_frames
 from diffsim_ti.supports import Supports, rigid_motions_left
 
 STEPS = 4
@@ -119,6 +121,36 @@ def test_explicit_energy_is_followed_with_supports_that_move(kind):
 
 
 # ---- closed forms --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", [ds.StaticSolver, pytest.param(ds.VelocityVerletSolver, marks=pytest.mark.thorough)])
+def test_the_shape_of_a_held_body_moves_its_supports(kind):
+    """`shape` against differences, in NumPy, torch and batches; the gradient by rest_positions alone is another."""
+    mesh, rng = ds.TetrahedralMesh.create_box((4, 2, 2), (0.3, 0.1, 0.1)), np.random.default_rng(0)
+    scene = ds.Scene(mesh, ds.StableNeoHookean(1e5, 0.3), terms=[ds.Gravity()], fixed="xmin", precision="f64")
+    solver = kind(scene, tolerance=1e-12) if kind is ds.StaticSolver else kind(scene, dt=1e-3, substeps=4)
+    steps = 1 if kind is ds.StaticSolver else 4
+    rollout, batch = (make(solver, steps, *n, gradients="shape") for make, n in ((ds.Rollout, ()), (ds.Batch, (2,))))
+    X, along = (x + 1e-3 * rng.normal(size=mesh.vertices.shape) for x in (mesh.vertices, 0.0))
+    tip = lambda x: rollout.forward(shape=x).positions[-1, -1, 1]  # noqa: E731
+    slope = (tip(X + 1e-3 * along) - tip(X - 1e-3 * along)) / 2e-3
+    frames = rollout.forward(shape=X)
+    seed = np.zeros(frames.positions.shape)
+    seed[-1, -1, 1] = 1
+    gradients = rollout.vjp(frames, seed)
+    assert (gradients["shape"] * along).sum() == pytest.approx(slope, rel=1e-6)
+    assert (gradients["rest_positions"] * along).sum() != pytest.approx(slope, rel=0.05)
+    assert (rollout.jvp(frames, shape=along)[0] * seed).sum() == pytest.approx(slope, rel=1e-6)
+    x = torch.tensor(X, requires_grad=True)
+    rollout_frames(rollout, shape=x).positions[-1, -1, 1].backward()
+    np.testing.assert_allclose(x.grad.numpy(), gradients["shape"], rtol=0, atol=1e-12)
+    many = batch.forward(shape=np.stack([mesh.vertices, X]))
+    by = batch.vjp(many, np.stack([0 * seed, seed]))["shape"]
+    np.testing.assert_allclose(by, [0 * along, gradients["shape"]], rtol=0, atol=1e-12)
+    with pytest.raises(ValueError, match="leave out rest_positions"):
+        rollout.forward(shape=X, rest_positions=X)
+    with pytest.raises(ValueError, match="places of all vertices"):
+        rollout.forward(shape=X[1:])
 
 
 def test_hanging_bar():

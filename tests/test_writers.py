@@ -211,3 +211,18 @@ def test_results_of_a_rollout_are_written(tmp_path):
     assert np.array_equal(last.point_data["principal"], frames["principal"][2]) and "sum" not in last.point_data
     assert np.array_equal(last.cell_data["stress"][0].reshape(-1, 3, 3), frames["stress"][2])
     assert len(SavedSeries(tmp_path / "run.pvd").frame(2).positions) == scene.mesh.num_vertices
+    simulator = ds.Simulator(ds.SemiImplicitSolver(scene, dt=1e-3))
+    simulator.run(4)
+    for name, values in Frame.of(simulator).colours.items():
+        if name != "energy_density":
+            np.testing.assert_allclose(Frame.of_run(scene, frames, 2).fields[name], values, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("law", [ds.StableNeoHookean(1e5, 0.3), ds.Prony(ds.StableNeoHookean(1e5, 0.3), [0.5], [0.1])])
+def test_defaults_draw_frames_of_a_rollout(tmp_path, law):
+    """By von Mises stress where a law's stress is a function of places, else by displacement."""
+    scene = ds.Scene(TetrahedralMesh.create_cube(3), law, fixed="ymin", terms=[ds.Gravity()], precision="f64")
+    frames = ds.Rollout(ds.SemiImplicitSolver(scene, dt=1e-3), 0).forward()
+    with open_writer(tmp_path / "run.png", scene, View(size=(64, 48))) as out:
+        out.write(Frame.of_run(scene, frames, 0))
+    assert (tmp_path / "run.png").stat().st_size > 100

@@ -22,6 +22,7 @@ from diffsim_ti.outputs import Output
 from diffsim_ti.rollout.frames import Frames, check_finite
 from diffsim_ti.rollout.rollout import Rollout
 from diffsim_ti.rollout.run import Run
+from diffsim_ti.rollout.shape import spread_change, spread_shape, with_shape
 from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.state.schedule import UnequalSteps
 
@@ -111,6 +112,7 @@ class Batch:
 
     def forward(self, raise_errors: bool = False, **inputs: ArrayLike) -> BatchFrames:
         """Run all scenes, with some inputs replaced. raise_errors: raise what stopped the first one that died."""
+        inputs = spread_shape(inputs, self.one.values)
         inputs, sets = spread_given(self.scene, inputs, self.one.values, self.num_scenes)
         values = checked_values(self.one, inputs, self.num_scenes)
         run = (self._side_by_side if self.lanes else self._by_turns)(values)
@@ -178,25 +180,17 @@ class Batch:
                 frames.append(self.one.forward(**own))
             except FloatingPointError as error:
                 errors[b] = error
-                frames.append(self._stopped(own, self._last_good(error)))
+                run = Run(own, contacts=self.one.sweep.workspace.watch.seen_so_far(), error=error)
+                frames.append(self.one.frames_of(run))
+            except ValueError as error:
+                error.args = (f"scene {b}: {error}",)
+                raise
         last_good = np.array([self._last_good(errors.get(b)) for b in range(self.num_scenes)])
         return BatchFrames(self, values, frames, last_good, None, errors)
 
     def _last_good(self, error: Exception | None) -> int:
         """The last frame before an error."""
         return self.num_frames - 1 if error is None else max(0, getattr(error, "step", 0)) // self.save_every
-
-    def _stopped(self, values: dict, last: int) -> Frames:
-        """Frames of a scene that died after frame `last`, whose state it holds from there on."""
-        until = Rollout(self.solver, last * self.save_every, save_every=self.save_every if last else None)
-        good = until.forward(**{name: x for name, x in values.items() if name in until.inputs})
-        rows = np.minimum(np.arange(self.num_frames), last)
-        states = good.positions[rows], good.velocities[rows], good.displacements[rows]
-        frames = Frames(*states, self.one.times, values, good.contact_resolution, run=good.run)
-        frames.computed, frames.steps = self.one.computed, np.arange(self.num_frames) * self.save_every
-        for name, output in self.one.computed.items():
-            frames.outputs[name] = np.asarray(output.value(frames))
-        return frames
 
     def error_alone(self, frames: BatchFrames, b: int) -> Exception:
         """What a run of scene b alone raises."""
@@ -223,13 +217,17 @@ class Batch:
             if x.shape != shape:
                 raise ValueError(f"gradient by the frames' {name}: expected shape {shape}, got {x.shape}")
             check_finite(name, x[frames.alive], self.save_every)
-        dead = np.flatnonzero(~frames.alive)
-        if dead.size:
-            warnings.warn(f"scenes {dead.tolist()} did not come to their end: their gradients are zero", stacklevel=2)
+        self._warn_of_dead(frames, "gradients")
         out = (self._vjp_side_by_side if self.lanes else self._vjp_by_turns)(frames, given)
         for name in out.keys() & frames.sets.keys():
             out[name] = gathered_scenes(out[name], frames.values[name], *frames.sets[name])
-        return out
+        return with_shape(out, self.one.sweep.wants_shape)
+
+    @staticmethod
+    def _warn_of_dead(frames: BatchFrames, what: str) -> None:
+        dead = np.flatnonzero(~frames.alive)
+        if dead.size:
+            warnings.warn(f"scenes {dead.tolist()} did not come to their end: their {what} are zero", stacklevel=3)
 
     def _vjp_side_by_side(self, frames: BatchFrames, given: dict) -> dict[str, np.ndarray]:
         shape, alive = (self.num_scenes, *frames.positions.shape[1:]), frames.alive
@@ -293,7 +291,9 @@ class Batch:
     # ---- tangents ----------------------------------------------------------------------------------------------------
 
     def tangents(self, frames: BatchFrames, **tangents: ArrayLike) -> dict[str, np.ndarray]:
-        """Changes of all outputs, (scenes, ...), for changes of inputs, to first order, float64."""
+        """Changes of all outputs, (scenes, ...), for changes of inputs, to first order, float64; zero, with a warning, of
+        scenes that did not come to their end."""
+        tangents = spread_change(tangents)
         unknown = [name for name in tangents if name not in self.inputs]
         if unknown:
             raise ValueError(f"tangents: no input named {unknown[0]!r}; this batch has {', '.join(self.inputs)}")
@@ -304,14 +304,18 @@ class Batch:
             {name: change_of(name, x, frames.values[name], b, self.num_scenes) for name, x in tangents.items()}
             for b in range(self.num_scenes)
         ]
-        if not self.lanes:
-            rows = [self.one.tangents(frames[b], **own[b]) for b in range(self.num_scenes)]
-        else:
+        self._warn_of_dead(frames, "changes")
+        out = {name: np.zeros((self.num_scenes, *x.shape(self.num_frames))) for name, x in self.outputs.items()}
+        if self.lanes:
             inputs = self.scene.inputs
             derived = [inputs.derive_jvp(frames[b].inputs, own[b]) for b in range(self.num_scenes)]
             du, dv = self.sweep.push_forward(frames.run, derived)
-            rows = [self.one.changes_of(frames[b], du[b], dv[b], own[b]) for b in range(self.num_scenes)]
-        return {name: np.stack([row[name] for row in rows]) for name in self.outputs}
+        for b in np.flatnonzero(frames.alive):
+            changes = self.one.tangents(frames[b], **own[b]) if not self.lanes else None
+            changes = changes or self.one.changes_of(frames[b], du[b], dv[b], own[b])
+            for name, change in changes.items():
+                out[name][b] = change
+        return out
 
     # ---- under ti.ad.Tape --------------------------------------------------------------------------------------------
 

@@ -14,7 +14,7 @@ from diffsim_ti.materials.material import Material
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.scene import Scene
 from diffsim_ti.solvers.solver import Solver
-from diffsim_ti.terms import Ground, Term
+from diffsim_ti.terms import Drag, Ground, Term
 from diffsim_ti.writers import WRITERS
 
 if TYPE_CHECKING:
@@ -225,6 +225,25 @@ def forces_named(names: Sequence[str], scene: Scene) -> "list[Output]":
     return out
 
 
+def works_on(scene: "Scene", explicit: bool) -> list[str]:
+    """What may do work on a body, or take energy from it, in words."""
+    rough = any(getattr(term, "has_friction", False) for term in scene.terms)
+    touched = explicit and any(term.acts_on_surface for term in scene.terms)
+    known = {
+        "friction": rough,
+        "contact damping": touched,
+        "drag": scene.term(Drag) is not None or bool(scene.fluids),
+        "viscosity": scene.law.viscous or bool(scene.law.state_names),
+        "loads": bool(scene.dead_loads or scene.pressures),
+        "gases and filled chambers": bool(scene.chambers),
+        "muscles and cables": bool(scene.cables),
+        "growth": bool(scene.growing),
+        "motion of supports": scene.motion is not None,
+        "motion of obstacles": bool(scene.moving),
+    }
+    return [what for what, acts in known.items() if acts]
+
+
 # ---- what is said at the end ------------------------------------------------------------------------------------------
 
 
@@ -259,9 +278,15 @@ def print_summary(run: "ForwardRun", setup: float, writing: float, files: list[s
     row("speed", f"{1 / each:.0f} substeps/s, {each / m * 1e9:.1f} ns per tetrahedron and substep")
     for name, energy in (("energy at start", run.energies[0]), ("energy at end", run.energies[-1])):
         row(name, f"{energy:.6g} J: " + ", ".join(f"{k} {v:.4g}" for k, v in energy.parts.items()))
-    drift = run.energies[-1] - run.energies[0]
-    share = drift / max(run.largest_energy, 1e-300)
-    row("energy drift", f"{drift:+.3g} J, {share:+.2%} of the largest kinetic + elastic + contact energy")
+    change, acting = run.energies[-1] - run.energies[0], works_on(run.scene, explicit=sim.solver.explicit)
+    drift, said = run.drift, " of the largest kinetic + elastic + contact energy"
+    share = lambda energy: f"{energy:+.3g} J, {energy / max(run.largest_energy, 1e-300):+.2%}"  # noqa: E731
+    if drift is None:
+        row("energy change", f"{share(change)}{said}, by steps and {', '.join(acting) or 'what the law does'} together")
+    else:
+        if acting:
+            row("energy by work", f"{share(change - drift)}{said}: {', '.join(acting)}")
+        row("energy drift", f"{share(drift)}{said}: of the steps themselves")
     inverted = f", {seen.inverted} tetrahedra inside-out at once" if seen.inverted else ""
     row("smallest J", f"{seen.J:.4g}{inverted}")
     if run.obstacles:

@@ -48,7 +48,7 @@ class ImplicitPairs(SurfacePairs):
             self.product(u, 0, w, self.a.corner, has_planes=True)
 
     def add_blocks(self, u, out) -> None:
-        """Add the diagonal blocks of the Hessian's convex part to rows 0..2 of `out` (potential_kernels.py)."""
+        """Add the diagonal blocks of the Hessian's convex part to rows 0..2 of `out` (potential/kernels.py)."""
         self.run(self.hessian.blocks, dict(u=u, out=out), slot=0)
 
     def safe_share(self, u: np.ndarray, step: np.ndarray, most: float = 1.0) -> float:

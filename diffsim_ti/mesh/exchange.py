@@ -43,8 +43,9 @@ class Exchange:
         points are ignored. Ten-node tetrahedra keep their mid-edge vertices, and edges that are curved.
         drop_orphans: leave out vertices that no tetrahedron uses (Gmsh writes some) and renumber; default: warn.
 
-        Raises FileNotFoundError, and ValueError for an unreadable file, one without tetrahedra or with both
-        kinds, other cells beside tetrahedra (cell types are named), and whatever the constructor refuses.
+        Raises FileNotFoundError, ImportError where meshio needs a further package (h5py for XDMF, CGNS and MED, netCDF4 for
+        Exodus), and ValueError for an unreadable file, one without tetrahedra or with both kinds, other cells
+        beside tetrahedra (cell types are named), and whatever the constructor refuses.
         """
         instance("from_file", "path", path, str | PathLike, "that of a mesh file")
         try:
@@ -66,7 +67,8 @@ class Exchange:
         turns blanks in names into underscores), all but surface sets in .inp; others lose them with a UserWarning. These
         keep every digit.
         Ten-node tetrahedra go into these three, .inp and .xdmf. ValueError for an unknown suffix, and in .msh for a name of
-        two sets (not a surface set and its own vertices).
+        two sets (not a surface set and its own vertices). ImportError where meshio needs a further package, h5py for
+        .xdmf (`from_file`).
         """
         lost = write_mesh(path, self)
         if lost:

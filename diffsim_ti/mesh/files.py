@@ -79,6 +79,8 @@ def _read(path: Path):
     try:
         with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
             return meshio.read(path, file_format="gmsh" if is_gmsh else None)
+    except ModuleNotFoundError as error:
+        raise _lacking(str(path), error) from error
     except (Exception, SystemExit) as error:
         reason = " ".join(f"{said.getvalue()} {error if str(error) != '1' else ''}".split()) or type(error).__name__
         hint = "check that it is complete and that its suffix names its format"
@@ -174,7 +176,18 @@ def write_mesh(path, mesh) -> list[str]:
         out.write(path)
     except (meshio.WriteError, meshio.ReadError) as error:
         raise ValueError(f"cannot save {path}: {error}; use one of {', '.join(KEEPS_SETS)}") from error
+    except ModuleNotFoundError as error:
+        raise _lacking(f"cannot save {path}", error) from error
     return lost
+
+
+def _lacking(what: str, error: ModuleNotFoundError) -> ImportError:
+    """What to say where meshio needs a package for a format (h5py for XDMF, CGNS, MED, H5M, HMF; netCDF4 for Exodus)."""
+    return ImportError(
+        f"{what}: meshio needs {error.name} for this format: pip install {error.name}, or use one of "
+        f"{', '.join(KEEPS_SETS)}, which need no more",
+        name=error.name,
+    )
 
 
 def named_parts(mesh) -> tuple[dict, dict]:

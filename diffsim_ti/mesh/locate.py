@@ -53,7 +53,7 @@ def locate(mesh, points, nearest: bool = False) -> LocatedPoints:
             raise ValueError(
                 f"{outside.size} of {len(points)} points lie outside the mesh: point {outside[worst]} at "
                 f"({', '.join(f'{x:.6g}' for x in points[outside[worst]])}) by {away[worst]:.3g} m, next to tetrahedron "
-                f"{near[worst]}; move them, or pass nearest=True for the nearest points of the body"
+                f"{near[worst]}; move them, or take mesh.locate(points, nearest=True).points, the nearest of the body"
             )
         points = points.copy()
         points[outside], tetrahedra[outside], L[outside] = places, near, coordinates

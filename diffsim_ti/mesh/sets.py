@@ -58,7 +58,8 @@ def indices_of(chosen, count: int, what: str) -> np.ndarray:
 
 
 def join_sets(parts: list[dict], firsts: np.ndarray) -> dict[str, np.ndarray]:
-    """Sets of several bodies as sets of all, and each body's members as "body_<k>"; those of body k begin at firsts[k]."""
+    """Sets of several bodies as sets of all, and each body's members as "body_<k>", those of a set that others have too as
+    "body_<k>_<name>"; those of body k begin at firsts[k]."""
     out = {}
     for k in range(len(parts)):
         name = f"body_{k}"
@@ -66,8 +67,21 @@ def join_sets(parts: list[dict], firsts: np.ndarray) -> dict[str, np.ndarray]:
             raise ValueError(f"joined names the bodies body_0, body_1, ..., but a mesh has a set {name!r}: rename it")
         out[name] = np.arange(firsts[k], firsts[k + 1])
     for name in dict.fromkeys(name for sets in parts for name in sets):
-        out[name] = np.concatenate([sets[name] + first for sets, first in zip(parts, firsts) if name in sets])
+        own = {k: sets[name] + firsts[k] for k, sets in enumerate(parts) if name in sets}
+        out |= {part_of(name, k): rows for k, rows in own.items()} if len(own) > 1 else {}
+        out[name] = np.concatenate([*own.values()])
     return out
+
+
+def part_of(name: str, body: int) -> str:
+    """The name of what one body has of a set whose name several bodies of a joined mesh have."""
+    return f"body_{body}_{name}"
+
+
+def parts_of_joined(sets: dict, name: str) -> list[str]:
+    """The names of the parts of a set that several bodies had before they were joined; empty for others."""
+    bodies = range(sum(key.startswith("body_") and key[5:].isdigit() for key in sets))
+    return [part for k in bodies if (part := part_of(name, k)) in sets]
 
 
 def places_of_triangles(triangles: np.ndarray, among: np.ndarray) -> np.ndarray:
@@ -126,10 +140,15 @@ def join(meshes: list) -> tuple[np.ndarray, np.ndarray, dict]:
         for k, (mesh, first) in enumerate(zip(meshes, firsts))
     ]
     names = dict.fromkeys(name for sets in triangles for name in sets)
+    surface_sets = {}
+    for name in names:
+        own = {k: sets[name] for k, sets in enumerate(triangles) if name in sets}
+        surface_sets |= {part_of(name, k): rows for k, rows in own.items()} if len(own) > 1 else {}
+        surface_sets[name] = np.concatenate([*own.values()])
     sets = dict(
         vertex_sets=join_sets([mesh.vertex_sets for mesh in meshes], firsts),
         tetrahedron_sets=join_sets([mesh.tetrahedron_sets for mesh in meshes], first_tets),
-        surface_sets={name: np.concatenate([sets[name] for sets in triangles if name in sets]) for name in names},
+        surface_sets=surface_sets,
     )
     vertices = np.concatenate([mesh.vertices for mesh in meshes])
     return vertices, np.concatenate([mesh.elements + first for mesh, first in zip(meshes, firsts)]), sets

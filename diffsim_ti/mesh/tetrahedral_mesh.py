@@ -111,8 +111,9 @@ class TetrahedralMesh(Exchange, NamedSets, Elements):
     def joined(cls, meshes: Iterable["TetrahedralMesh"]) -> "TetrahedralMesh":
         """Several bodies as one mesh of several pieces, one after the other.
 
-        Sets of the same name become one; each body's vertices, tetrahedra and surface are sets "body_0", "body_1", ... too.
-        ValueError for an empty list, and for meshes that have a set of such a name already.
+        Sets of the same name become one, and what each body has of them is "body_0_xmin", "body_1_xmin" ... too; each body's
+        vertices, tetrahedra and surface are sets "body_0", "body_1", ... A scene warns where the whole of such a set is a
+        support. ValueError for an empty list, and for meshes that have a set of such a name already.
         """
         meshes = [
             instance("joined", "each of the meshes", mesh, TetrahedralMesh, "a TetrahedralMesh")

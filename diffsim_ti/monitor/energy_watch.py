@@ -42,6 +42,17 @@ class EnergyWatch:
     def clear(self) -> None:
         """Forget what was seen."""
         self.gained, self.moving = 0.0, 0.0  # [J]
+        self.begin()
+
+    def begin(self) -> None:
+        """Follow the drift from the present state on."""
+        self._begun = self.gained
+
+    def take(self) -> float:
+        """What steps have added [J] since the last call, or `begin`; below zero where they took some."""
+        added = self.gained - self._begun
+        self.begin()
+        return added
 
     def note(
         self,
@@ -54,7 +65,8 @@ class EnergyWatch:
     ) -> None:
         """A step went from u by u_star to u_next, obstacles from places[0] by places[1] to places[2] (displacements [m],
         shape (num_obstacles, 3)); contacts are as in its pass. kinetic: what it has added to that energy [J]."""
-        with self.ws.potential.without_viscosity():  # what it takes is no gain, and none of a step's making
+        potential = self.ws.potential  # what viscosity and friction take is no gain, and none of a step's making
+        with potential.without_viscosity(), potential.without_friction():
             self._note(u, u_star, u_next, v_next, places, kinetic)
 
     def _note(self, u, u_star, u_next, v_next, places, kinetic) -> None:

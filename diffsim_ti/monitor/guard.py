@@ -196,7 +196,7 @@ class Guard:
         )
         raise Divergence(
             f"{self.ws.when(step)}: the substep {self.ws.substep:.4g} s {why}: take substeps of "
-            f"{self._calm_substep(limit):.3g} s (reduce dt, raise substeps), or pass allow_unstable=True",
+            f"{self._calm_substep(limit):.3g} s (reduce dt, raise substeps), or pass allow_unstable=True to the solver",
             step,
             None,
             tet,

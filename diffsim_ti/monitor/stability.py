@@ -68,7 +68,8 @@ def element_limit(scene: "Scene", values: dict | None = None, kicks: ViscousStag
         lam = means[patches]
     dilatation, largest = _squares_of_strains(scene.mesh, derived)
     within = scene.reduced.elements(scene.mesh.elements) if scene.reduced else []
-    for own in within:  # move together
+    together = [(body, own) for body, own in zip(scene.reduced.bodies, within) if body.kind != "basis" and len(own)]
+    for _, own in together:
         dilatation[own] = largest[own] = 0.0
     viscous = material.viscosities({name: values[name] for name in material.inputs})
 
@@ -80,8 +81,8 @@ def element_limit(scene: "Scene", values: dict | None = None, kicks: ViscousStag
         return omega2[worst := int(np.argmax(each))], c[worst] if np.ndim(c) else c, worst
 
     omega2, c = bound_of(mu, lam), 0.0 if viscous is None else bound_of(*viscous)
-    for body, own in zip(scene.reduced.bodies, within):
-        if len(own) and not body.rigid:
+    for body, own in together:
+        if not body.rigid:
             omega2[own[0]] = affine_bound(scene.mesh, derived.volumes, own, mu, lam, values["density"])
             if viscous is not None:
                 c[own[0]] = affine_bound(scene.mesh, derived.volumes, own, *viscous, values["density"])

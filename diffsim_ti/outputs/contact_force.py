@@ -34,8 +34,8 @@ class ContactForce(Output):
     Fixed vertices feel obstacles in implicit steps and statics alone, and what holds them takes that up.
     The gradient is exact by all inputs: moduli, density, rest shape, the obstacle's stiffness, friction, shape, path.
 
-    Raises ValueError for an obstacle that the scene has not, another part, or a name that is taken; and by the first run,
-    of explicit solvers, for obstacles that act as forces (contact="force") and where several reach into faces.
+    Raises ValueError, when a Rollout is made, for an obstacle that the scene has not, another part, a name that is taken,
+    and an explicit solver with contact="force"; and while one runs where several push on the faces around one vertex.
     Wriggers, Computational Contact Mechanics, 2nd ed., 2006, sec. 5 and 8, doi:10.1007/978-3-540-32609-0.
     """
 

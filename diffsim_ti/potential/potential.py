@@ -118,6 +118,25 @@ class Potential:
         if rate is not None:
             runtime.fill(self.rate, rate)
 
+    @contextmanager
+    def without_friction(self):
+        """What has a potential in the state alone, for friction has one in a pass."""
+        a, rubbing = self.arrays, getattr(self.rubbing, "inner", self.rubbing)  # that of curved faces acts on corners
+        rough = [first + force.count + 2 for force, first, _ in a.obstacles if force.friction]
+        if not (rough or rubbing):
+            yield
+            return
+        kept, pressing = runtime.fetch(a.parameters), rubbing.L if rubbing else None
+        smooth = kept.copy()
+        smooth[rough] = 0
+        if rubbing:
+            rubbing.L = np.zeros_like(pressing)
+        runtime.fill(a.parameters, smooth)
+        yield
+        runtime.fill(a.parameters, kept)
+        if rubbing:
+            rubbing.L = pressing
+
     def energy(self) -> tuple[float, float, np.ndarray]:
         """(energy [J], the sum of its absolute parts, J at each point)."""
         self.launch("energy", lanes=False)

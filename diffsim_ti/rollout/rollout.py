@@ -15,6 +15,7 @@ from diffsim_ti.rollout.checkpoints import Checkpoints
 from diffsim_ti.rollout.frames import Frames, HostSeed, check_finite
 from diffsim_ti.rollout.run import Run
 from diffsim_ti.rollout.set_values import change_like, gathered, spread_all
+from diffsim_ti.rollout.shape import spread_change, spread_shape, with_shape
 from diffsim_ti.rollout.sweep import Sweep
 from diffsim_ti.rollout.taped import TapeFace
 from diffsim_ti.solvers.solver import Solver
@@ -32,7 +33,8 @@ class Rollout:
     save_every: a frame every so many steps, besides the start; must divide `steps`. Default: only the end.
     checkpoint_every: keep a state every so many steps and compute the rest again in the reverse sweep.
     memory: or a budget [MB] from which they are chosen (default 1000). The gradient is bitwise the same.
-    gradients: names of inputs whose gradient is wanted; default all but rest_positions, which costs extra.
+    gradients: names of inputs whose gradient is wanted; default all but rest_positions, which costs extra. "shape": of the
+        whole body's, with its supports (`vjp`).
     clip: largest norm of the running adjoint; it is scaled back when it exceeds that (the gradient is then no gradient).
     truncate: differentiate only the last so many steps.
     health: keep a report of the adjoint's norm per step (`rollout.health`).
@@ -198,16 +200,18 @@ class Rollout:
         law_state: what the law remembers at the start, in the shape of `Simulator.law_state`; gradients are by all else.
 
         A material's numbers and others per tetrahedron may be given by named sets, `youngs_modulus={"soft": 2e4}`; gradients
-        by them have the same names, and so may tangents (set_values.py).
+        by them have the same names, and so may tangents (set_values.py). `shape` [m], (num_vertices, 3), moves initial and
+        rest positions together, and supports with them (shape.py).
         """
-        values, sets = spread_all(self.scene, self.values, values)
+        values, sets = spread_all(self.scene, self.values, spread_shape(values, self.values))
         frames = self.frames_of(self.sweep.run(values, law_state=law_state))
         frames.sets = sets
         return frames
 
     def frames_of(self, run: Run) -> Frames:
-        """The frames of the run that the sweep ran last, with all outputs."""
-        u, v = (runtime.fetch(x) for x in self.sweep.workspace.frames)
+        """The frames of the run that the sweep ran last, with all outputs; the last good one stands for those after it too."""
+        rows = np.minimum(np.arange(self.num_frames), self.sweep.last_good(run))
+        u, v = (runtime.fetch(x)[rows] for x in self.sweep.workspace.frames)
         positions = positions_of(self.scene, run.values["rest_positions"], u)
         inputs = run.values
         if run.start is not None:
@@ -216,11 +220,9 @@ class Rollout:
         frames = Frames(positions, v, u, self.times, inputs, run.contact_resolution, run=run)
         frames.computed = self.computed
         frames.steps = np.arange(self.num_frames) * self.save_every
-        frames.contact_forces, frames.chamber_pressures = self.sweep.contact_forces(), self.sweep.chamber_pressures()
-        frames.error, last = run.error, self.sweep.last_good(run)
-        for noted in (frames.contact_forces, frames.chamber_pressures):
-            if noted is not None:
-                noted[last + 1 :] = noted[last]
+        frames.error = run.error
+        noted = self.sweep.contact_forces(), self.sweep.chamber_pressures()
+        frames.contact_forces, frames.chamber_pressures = (None if x is None else x[rows] for x in noted)
         for name, output in self.computed.items():
             value, shape = np.asarray(output.value(frames)), tuple(output.shape(self.num_frames))
             if value.shape != shape:
@@ -235,6 +237,9 @@ class Rollout:
 
         Float64 arrays of the inputs' shapes; None for a part that the loss does not name. Further seeds of the same
         frames cost a reverse sweep each: no pass runs forward again unless too few states are kept.
+        That by `rest_positions` is of a body whose start, and with it its supports, stay where they are: the gradient by the
+        shape of a body that is held is the sum of this and that by `initial_positions`, which a Rollout made with
+        gradients="shape" has under the name "shape".
         """
         instance("Rollout.vjp", "frames", frames, Frames, "what forward returned")
         change = self.pulled_to_frames(frames, dict(positions=positions, velocities=velocities) | seeds)
@@ -244,6 +249,7 @@ class Rollout:
         self.gradients = self.gradients_of(frames.run, self.sweep.pull_back(frames.run, seed), change)
         for name in self.gradients.keys() & frames.sets.keys():
             self.gradients[name] = gathered(self.gradients[name], frames.sets[name])
+        self.gradients = with_shape(self.gradients, self.sweep.wants_shape)
         return self.gradients
 
     def pulled_to_frames(self, frames: Frames, seeds: dict) -> Change:
@@ -287,6 +293,7 @@ class Rollout:
         return {name: output.jvp(frames, change) for name, output in self.outputs.items()}
 
     def _pushed_to_frames(self, frames: Frames, tangents: dict) -> Change:
+        tangents = spread_change(tangents)
         unknown = [name for name in tangents if name not in self.inputs]
         if unknown:
             raise ValueError(f"jvp: no input named {unknown[0]!r}; this rollout has {', '.join(self.inputs)}")

@@ -12,6 +12,7 @@ from diffsim_ti.monitor.guard import Guard
 from diffsim_ti.rollout.checkpoints import choose_checkpoints
 from diffsim_ti.rollout.doubts import warn_of_coarse_steps, warn_of_explosion
 from diffsim_ti.rollout.run import Run, Seed
+from diffsim_ti.rollout.shape import MOVED
 from diffsim_ti.slots import copy_slot
 from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.state.bending import FacesBend
@@ -42,6 +43,8 @@ class Sweep:
         chambers: bool = False,
         raise_errors: bool = True,
     ):
+        if contacts:
+            solver.check_contact_forces()
         self.raise_errors, self.last_error = raise_errors, None  # what stopped the last run
         self.contacts = contacts  # whether runs note what obstacles do to each vertex in each frame
         self.chambers = chambers and solver.scene.holds_volumes  # whether pressures in chambers are wanted of frames
@@ -78,11 +81,15 @@ class Sweep:
         self._recorded, self._warned = False, False  # whether the record holds all passes; whether of coarse contacts
 
     def _check_names(self, names) -> tuple[str, ...]:
+        self.wants_shape = False  # the sum of these by initial and by rest positions (shape.py)
         if names is None:
             return tuple(name for name in self.inputs if name != "rest_positions")
         if isinstance(names, str):
             names = self.inputs if names == "all" else (names,)
         names = tuple(listed("gradients", names, "names of inputs"))
+        self.wants_shape = "shape" in names
+        if self.wants_shape:
+            names = tuple(dict.fromkeys((*(name for name in names if name != "shape"), *MOVED)))
         unknown = [name for name in names if name not in self.inputs]
         if unknown:
             raise ValueError(f"gradients: no input named {unknown[0]!r}; this rollout has {', '.join(self.inputs)}")

@@ -14,6 +14,7 @@ import numpy as np
 import taichi as ti
 from taichi._lib import core as _core
 from taichi.lang import impl
+from taichi.lang.misc import _SpecialConfig
 
 from diffsim_ti import ranks
 from diffsim_ti.runtime.current_program import current_program
@@ -25,6 +26,7 @@ NUMPY = {"f32": np.float32, "f64": np.float64}
 _ARCHS = {"cpu": ti.cpu, "cuda": ti.cuda, "vulkan": ti.vulkan}
 _PARENT = "DIFFSIM_TI_PARENT"  # process and backend that its spawned workers start on
 _FORM = "DIFFSIM_TI_FORM"
+_OF_TAICHI = "default_ip", "require_version", *vars(_SpecialConfig())  # options of ti.init besides its compiler's
 _settings = {"precision": "f32"}
 
 
@@ -49,7 +51,7 @@ def init(arch: str = "cpu", precision: str = "f32", threads: int | None = None, 
 
     Used before `init`, the library calls `init()` itself: CPU, f32. A `ti.init` of the host program is respected.
     Calling it again drops every array of earlier scenes; they say so when used.
-    Raises ValueError for an unknown name, RuntimeError for a backend that is not available.
+    Raises ValueError for an unknown name, TypeError for an unknown option, RuntimeError for a backend that is not available.
     """
     if arch not in _ARCHS:
         raise ValueError(f"arch must be one of {', '.join(_ARCHS)}, got {arch!r}")
@@ -63,9 +65,14 @@ def init(arch: str = "cpu", precision: str = "f32", threads: int | None = None, 
             + "); pass one of those to diffsim_ti.init"
             + ("" if cardless else f", or install the driver that {arch} needs")
         )
-    for name in ("default_fp", "fast_math"):
-        if name in options:
+    for name in options:
+        if name in ("default_fp", "fast_math"):
             raise ValueError(f"{name} cannot be chosen: diffsim_ti needs default_fp=f64 and fast_math=False")
+        if name not in _OF_TAICHI and not hasattr(impl.default_cfg(), name):
+            raise TypeError(
+                f"init has no argument {name!r}, and neither has ti.init: pass arch={', '.join(map(repr, _ARCHS))}, "
+                "precision, threads, or an option of ti.init such as debug=True"
+            )
     options.setdefault("log_level", ti.ERROR)
     if not _can_write_cache(options.get("offline_cache_file_path") or os.environ.get("TI_OFFLINE_CACHE_FILE_PATH")):
         # Taichi makes the folder even then, and crashes at exit if it cannot

@@ -16,7 +16,7 @@ class ImplicitEulerSolver(ImplicitSolver):
     >>> mesh = ds.TetrahedralMesh.create_cube(resolution=2)
     >>> material = ds.StableNeoHookean(E=1e5, nu=0.3)
     >>> scene = ds.Scene(mesh, material, terms=[ds.Gravity()], precision="f64")
-    >>> simulator = ds.Simulator(ds.ImplicitEulerSolver(scene, dt=0.1))  # an explicit step may have .057 s
+    >>> simulator = ds.Simulator(ds.ImplicitEulerSolver(scene, dt=0.1))  # an explicit step may have 0.054 s
     >>> simulator.step()
     >>> print(f"{simulator.velocities[0, 1]:.3f} m/s, {simulator.displacements[0, 1]:.4f} m")  # -g h and -g h^2
     -0.981 m/s, -0.0981 m

@@ -72,6 +72,9 @@ class Solver(ABC):
         if not hasattr(scene, "with_consistent_mass"):
             raise ValueError(f"{type(self).__name__}: takes a Scene, got {shown(scene)}")
 
+    def check_contact_forces(self) -> None:
+        """Raise ValueError where runs cannot note what obstacles do."""
+
     def __reduce__(self):
         """As it was made, for its scene."""
         own = dict(scene=self.scene) | {name: getattr(self, name) for name in self.arguments}
@@ -191,7 +194,7 @@ class Solver(ABC):
                 what, remedy = f"of {self._schedule}, the longest:", "shorten the longest steps"
             raise ValueError(
                 f"the substep {what} {self.substep:.4g} s exceeds the stable step {tight}: {remedy}, use an implicit "
-                "solver, or pass allow_unstable=True"
+                "solver, or pass allow_unstable=True to this one"
             )
 
     def choose_substeps(self, share: float = 0.7, values: Mapping[str, ArrayLike] | None = None) -> None:

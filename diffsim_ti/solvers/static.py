@@ -15,6 +15,7 @@ class StaticSolver(ImplicitSolver):
     `Rollout(StaticSolver(scene), steps=1)` is the map from inputs to the equilibrium; a minimum of the energy, not a
     saddle. Several steps follow prescribed motion and forces per step quasi-statically.
 
+    tolerance, max_iterations, preconditioner: as of implicit steps: "block_jacobi", "multigrid" or "auto" for the last.
     load_steps: in the first step loads and prescribed motion are laid on in so many parts, each starting from the last.
     Raises ValueError, which names the motions, if supports, springs, cables and foundations leave a piece of the body free
     to move rigidly, or parts that meet at a vertex or an edge alone free to turn, as about a hinge. Where the scene has

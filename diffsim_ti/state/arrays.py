@@ -197,6 +197,10 @@ class SceneArrays:
         """Kernels are to note what contact stages do."""
         self._features["recorded"], self._known_features = True, {}
 
+    def count_own_work(self) -> None:
+        """Kernels are to count the work of the body's own forces."""
+        self._features["balanced"], self._known_features = True, {}
+
     def features(self, density: bool = False, shape: bool = False) -> Features:
         """What kernels must contain for the values that are loaded."""
         if (density, shape) not in self._known_features:

@@ -73,6 +73,7 @@ class Features:
     uniform: bool = True  # one set of coefficients for all tetrahedra
     curved: bool = False  # whether faces are curved, as obstacles feel (mesh/curved_triangles.py)
     recorded: bool = False  # whether a loss names what a contact stage does
+    balanced: bool = False  # whether the work of the body's own forces is counted
     density: bool = False  # the last two: adjoints that cost extra, only if asked for
     shape: bool = False
 

@@ -89,6 +89,7 @@ def _absent(has) -> set[str]:
         ("parameters",): obstacles or has.num_parameters,
         ("stage",): has.num_staged,
         ("work",): has.driven,
+        ("own_work",): has.balanced,
     }
     return {name for names, some in read.items() if not some for name in names}
 

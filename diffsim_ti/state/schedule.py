@@ -248,6 +248,10 @@ class UnequalSteps(Schedule):
         lengths, parts = np.atleast_1d(numbers("lengths of steps", lengths)), np.asarray(substeps)
         if lengths.ndim != 1 or not (np.all(np.isfinite(lengths)) and np.all(lengths > 0)):
             raise ValueError("lengths of steps must be > 0 [s], one number for each step")
+        if lengths.size == 0:
+            raise ValueError(
+                "lengths of steps: expected one number [s] for each step, got none; Rollout(solver, 0) runs none"
+            )
         whole = parts.dtype.kind in "iuf" and np.all((parts == np.floor(parts)) & (parts >= 1) & np.isfinite(parts))
         if not whole or parts.shape not in ((), lengths.shape):
             raise ValueError(

@@ -169,6 +169,10 @@ class Workspace:
         self.frames = FrameArrays.of(self.arrays, count, self.arrays.num_vertices)
         self._launches.clear()
 
+    def balance(self):
+        """What follows the drift of the energy from now on, by `begin` and `take` (monitor/own_work.py); None where that
+        cannot be told from what is done to the body."""
+
     def record_contacts(self) -> None:
         """From now on note, for each frame, what obstacles do to each vertex; the frames are made."""
         raise NotImplementedError

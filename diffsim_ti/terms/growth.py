@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffsim_ti.checked import present
 from diffsim_ti.inputs import Input, Link, Range
 from diffsim_ti.inputs.loads import InTime
 from diffsim_ti.mesh import TetrahedralMesh
@@ -54,6 +55,7 @@ class Growth(Term):
             raise ValueError(f"Growth: per must be one of {', '.join(map(repr, PER))}, got {per!r}")
         if per == "set" and (isinstance(tetrahedra, str) or not all(isinstance(s, str) for s in tetrahedra or [0])):
             raise ValueError(f'Growth: per="set" takes tetrahedra=["left", "right"], names of sets, got {tetrahedra!r}')
+        present("growth", growth)
         shape = () if per == "all" else (len(tetrahedra),) if per == "set" else ("k",)
         self.given, self.keyed, self.per, self.tetrahedra = growth, is_keyed(growth), per, tetrahedra
         self.plain, self.ndim = "growth_over_time", len(shape) + 1

@@ -9,6 +9,7 @@ from diffsim_ti.batch import Batch
 from diffsim_ti.checked import numbers
 from diffsim_ti.origin import START_NEARER, warn_of_rounding
 from diffsim_ti.rollout import Rollout
+from diffsim_ti.rollout.shape import spread_shape
 from diffsim_ti.torch_bridge.autograd import first_order_only, refuse_transforms, torch, uncompiled
 from diffsim_ti.torch_bridge.batch_node import TorchBatchFrames, batch_frames
 from diffsim_ti.torch_bridge.set_tensors import spread_tensors
@@ -101,7 +102,8 @@ def rollout_frames(rollout: Rollout | Batch, **tensors: torch.Tensor) -> TorchFr
     """Functional face: run a Rollout with some inputs given as tensors; one autograd node, gradients to all of them.
 
     Names are those of `rollout.inputs`, whose numbers per tetrahedron {named set: tensor} may give; also
-    "initial_displacements" instead of "initial_positions" (which keeps its digits in float32). Numbers of the scene's
+    "initial_displacements" instead of "initial_positions" (which keeps its digits in float32), and "shape", which moves
+    initial and rest positions together. Numbers of the scene's
     terms that were given as tensors, as in `Sphere(radius=tensor)`, are among the
     inputs by themselves. Two runs before one backward are right. Second derivatives are refused (see
     `verify.hessian_product`).
@@ -116,6 +118,7 @@ def rollout_frames(rollout: Rollout | Batch, **tensors: torch.Tensor) -> TorchFr
     A `Batch` in place of the Rollout gives tensors of all its scenes (batch_node.py). `torch.compile` breaks its graph here.
     """
     refuse_transforms(tensors.values())
+    tensors = spread_shape(tensors, (rollout.one if isinstance(rollout, Batch) else rollout).values)
     if isinstance(rollout, Batch):
         return batch_frames(rollout, tensors)
     if "initial_positions" in tensors and "initial_displacements" in tensors:

@@ -1,14 +1,16 @@
 """A moment of a run, and what all of its moments share: what writers, films and windows are given."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from diffsim_ti.inputs import ratios_at_corners
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.obstacles import floor_of, obstacle_surfaces
-from diffsim_ti.outputs import Output
+from diffsim_ti.outputs import Output, Stress
+from diffsim_ti.outputs.deformation import Deformation
 from diffsim_ti.outputs.given_loads import GivenLoads
 from diffsim_ti.scene import Scene
 from diffsim_ti.simulator import Simulator
@@ -72,14 +74,16 @@ class Frame:
 
     @classmethod
     def of_run(cls, scene: Scene, frames: "Frames", k: int) -> "Frame":
-        """Frame k of a Rollout's run of a scene; its fields are the outputs that each vertex or each tetrahedron has:
-        vectors such as ContactForce(per_vertex=True), tensors and principal values such as Stress(at="vertices"). What some
-        vertices have, such as Reaction(per_vertex=True), is zero at the others.
+        """Frame k of a Rollout's run of a scene; its fields are displacement, speed, J, von Mises stress where `Stress`
+        supports the law, and the outputs that each vertex or each tetrahedron has: vectors such as
+        ContactForce(per_vertex=True), tensors and principal values such as Stress(at="vertices"). What some vertices have,
+        such as Reaction(per_vertex=True), is zero at the others.
 
         Raises IndexError for a frame that there is not.
         """
         u, v = frames.displacements[k], frames.velocities[k]
         fields = dict(displacement=np.linalg.norm(u, axis=1), speed=np.linalg.norm(v, axis=1))
+        fields |= _strained(scene, frames, k)
         given = [(name, frames.computed.get(name), y[k]) for name, y in frames.outputs.items()]
         shown, units = _of_items(given, scene)
         step = int(frames.steps[k])
@@ -106,6 +110,26 @@ class Frame:
         shown, units = _of_items([(output.name, by.settled(output), by.output(output)) for output in outputs], scene)
         shown |= _loads(scene, x, simulator.step_count, simulator.values_of_step)
         return cls(simulator.time, x, u, v, fields | shown, moved, **dict(marks=drawn, units=units) | more)
+
+
+def _strained(scene: Scene, frames: "Frames", k: int) -> dict[str, np.ndarray]:
+    """Of each tetrahedron in a frame: J, the smallest of its points and of ten nodes' corners, and the mean von Mises stress
+    of its points [Pa]."""
+    mesh, derived = scene.mesh, scene.inputs.derive(frames.inputs)
+    one = {name: getattr(frames, name)[[k]] for name in ("positions", "velocities", "displacements", "times", "steps")}
+    one = replace(frames, **one, outputs={})
+    F = Deformation.of(one, derived, mesh, np.arange(mesh.num_tetrahedra)).F
+    J = np.linalg.det(F).reshape(mesh.num_tetrahedra, -1).min(1)
+    if mesh.order == 2:
+        u = one.displacements[0].astype(np.float64)
+        J = np.minimum(J, ratios_at_corners(mesh.elements, derived.rest, u).min(1))
+    try:
+        stress = Stress(von_mises=True).settled(scene)
+    except ValueError:  # of laws that read more than places
+        return dict(J=J)
+    stress.means = None  # at each point, as of a simulator's frames
+    at_points = stress.value(one)[0].reshape(len(J), -1)
+    return dict(J=J, von_mises=np.average(at_points, 1, derived.volumes.reshape(len(J), -1)))
 
 
 def _of_items(values: Iterable[tuple], scene: Scene) -> tuple[dict[str, np.ndarray], dict[str, str]]:

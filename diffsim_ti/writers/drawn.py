@@ -20,14 +20,17 @@ class DrawnWriter(Writer):
 
     def open(self, setting: Setting) -> None:
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        self.setting, self._extent = setting, Extent(setting.mesh, self.view.colour)
+        self.setting, self.colour, self._extent = setting, self.view.colour, None
         self._waiting, self.count = tempfile.TemporaryFile(), 0
 
     def write(self, frame: Frame) -> None:
-        if self.view.colour not in frame.colours:
+        if self.colour is None:
+            self.colour = "von_mises" if "von_mises" in frame.colours else "displacement"
+        if self.colour not in frame.colours:
             known = ", ".join(frame.colours)
-            raise ValueError(f"colour: the frame must hold {self.view.colour}, it holds {known}; choose one of these")
-        values = np.asarray(frame.fields[self.view.colour])
+            raise ValueError(f"colour: the frame must hold {self.colour}, it holds {known}; choose one of these")
+        self._extent = self._extent or Extent(self.setting.mesh, self.colour)
+        values = np.asarray(frame.fields[self.colour])
         marks = [*frame.marks, *results_as_arrows(frame, self.setting.mesh, self.view.arrows)]
         self._extent.add(frame.positions, values, marks)
         for array in (frame.time, frame.positions, values, *self._points(frame)):

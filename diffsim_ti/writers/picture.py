@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-from diffsim_ti.visual.extent import Extent
 from diffsim_ti.visual.frame import Frame
 from diffsim_ti.writers.drawn import DrawnWriter
 from diffsim_ti.writers.writer import View, register
@@ -35,7 +34,7 @@ class PictureWriter(DrawnWriter):
             self._waiting.truncate()
             self.count = 0
             if self.view.fit == "end":
-                self._extent = Extent(self.setting.mesh, self.view.colour)
+                self._extent = None
         super().write(frame)
 
     def close(self) -> None:

@@ -18,16 +18,17 @@ WRITERS: dict[str, type["Writer"]] = {}
 class View:
     """How a run is shown, for formats that draw it.
 
-    colour: a name in visual/fields.py; fps: frames per second of a film; size: width and height [pixels], None for what
-    suits the format. camera, or azimuth and elevation [degrees] of one that sees all; ground: height of a floor [m]
-    instead of the setting's own; wireframe: draw edges; backend: "software", "vulkan" or "auto"; title: words before the
-    time. arrows: names of fields that are vectors of vertices, such as forces, to draw as arrows.
+    colour: a name in visual/fields.py; None for von Mises stress where frames hold it, else displacement. fps: frames per
+    second of a film; size: width and height [pixels], None for what suits the format. camera, or azimuth and elevation
+    [degrees] of one that sees all; ground: height of a floor [m] instead of the setting's own; wireframe: draw edges;
+    backend: "software", "vulkan" or "auto"; title: words before the time. arrows: names of fields that are vectors of
+    vertices, such as forces, to draw as arrows.
     fit: what camera and colours of a picture of the end are chosen by: the whole "run", or the "end" alone.
     say: told once what draws.
     Raises ValueError for what is out of range.
     """
 
-    colour: str = "von_mises"
+    colour: str | None = None
     fps: float = 30.0
     size: tuple[int, int] | None = None
     camera: Camera | None = None
@@ -42,7 +43,8 @@ class View:
     say: Callable[[str], object] | None = None
 
     def __post_init__(self):
-        field_named(self.colour)
+        if self.colour is not None:
+            field_named(self.colour)
         if not 0.01 <= self.fps <= 1e6:
             raise ValueError(f"fps: must be from .01 to 1e6 frames per second, got {self.fps:g}; 30 is usual")
         if self.size is not None and min(self.size) < 16:

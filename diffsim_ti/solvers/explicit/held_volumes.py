@@ -194,7 +194,7 @@ class HeldVolumes:
         return np.tensordot(q, walls.d, 1), q
 
     def _count_work(self, now, before: np.ndarray, after: np.ndarray, change: np.ndarray, walls: Walls) -> None:
-        """As KickDrift.work has it of loads."""
+        """As `work_of_pass` (outside_work.py) has it of loads."""
         whole, mass = now.pre + now.post, 1 / walls.inverse
         uneven = (now.pre - now.post) * (after - before)  # (pre^2 - post^2) times the body's own acceleration
         self.work += 0.5 * float((mass * change * (before + after + change + uneven / whole)).sum())

@@ -16,10 +16,9 @@ class ImpulseRecord:
     def __init__(self, workspace):
         self.arrays, a, features = workspace.arrays, workspace.arrays, workspace.arrays.features()
         if len(features.staged) < len(features.groups):
-            solver = type(workspace.solver).__name__
             raise ValueError(
-                f"explicit solvers know the forces of obstacles that act as a stage of their passes, and {solver} was told "
-                'to take some as forces: pass contact="stage", and obstacles with a distance'
+                "explicit solvers note what obstacles with a distance do, and one of this scene is a force alone: take an "
+                "implicit solver for ContactForce and ContactTraction"
             )
         reaching = [g.number + k for g in features.groups if features.reaches(g) for k in range(g.count)]
         self.reaching = reaching if workspace.faces else []

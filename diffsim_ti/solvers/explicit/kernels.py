@@ -16,7 +16,7 @@ from diffsim_ti.state.pass_table import pass_at, reversed_pass
 
 A = ti.template()
 STATE = dict.fromkeys(("u", "v", "f", "frames_u", "frames_v"), "vectors2")
-STATE |= dict(seen="scalars2", stage="vectors2", work="scalars")
+STATE |= dict(seen="scalars2", stage="vectors2", work="scalars", own_work="scalars")
 RECORDED = {name: STATE[name] for name in ("u", "v", "f", "stage")}  # what the way back reads of it
 CHANGE = dict(u="vectors2", v="vectors2", frames_u="vectors2", frames_v="vectors2")  # of a state, or its adjoint
 PLAN = dict(ints="ints", floats="scalars")  # the tables of the passes, from pass `window` on

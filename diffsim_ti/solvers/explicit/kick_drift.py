@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 import taichi as ti
 
-from diffsim_ti.solvers.explicit.outside_work import add_work_of_pass
+from diffsim_ti.solvers.explicit.outside_work import add_work_of_pass, work_of_own_forces
 from diffsim_ti.solvers.explicit.vertex_parts import VertexParts
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
@@ -127,6 +127,9 @@ class KickDrift(VertexParts):
                 self.obstacles.note(i, u, u_next, now, scene, state)
         if ti.static(self.counts_work):
             add_work_of_pass(self, i, u, v, v_kicked, f, u_next, v_next, now, scene, state, plan)
+        if ti.static(self.features.balanced):
+            done = work_of_own_forces(self, i, v, v_kicked, f, v_next, now, scene, plan)
+            state.own_work[i] = state.own_work[i] + done
         if plan.stride > 0:
             state.f[s, i] = f
         state.u[t, i] = u_next

@@ -40,6 +40,29 @@ def add_work_of_pass(step: A, i, u, v, v_plus, f, u_next, v_next, now: A, scene:
 
 
 @ti.func
+def work_of_own_forces(step: A, i, v, v_plus, f, v_next, now: A, scene: A, plan: A):
+    """Work [J] of weight and of what the body itself does on vertex i in the kick from v to v_plus, without loads, cables:
+    what kinetic energy gains by it. Stages, drag and friction come after the kick."""
+    done, inverse, own = ti.cast(0, step.fp), scene.inverse_mass[i], f
+    if ti.static(step.features.forces):
+        own += -1 * step.given.force(i, now, scene, scene.forces)
+    if ti.static(step.features.loaded_corners):
+        own += -1 * step.given.gathered(i, scene, plan, True)
+    led = now.pre * v + now.post * v_next
+    if inverse > 0:
+        if ti.static(step.features.gravity >= 0):
+            own += step.gravity(scene.parameters) / inverse
+        if ti.static(step.features.guided):
+            done += own.dot(step.guides.held(i, led, scene))
+            own, v = step.guides.free(i, own, scene), step.guides.free(i, v, scene)
+            v_plus = step.guides.free(i, v_plus, scene)
+        done += step.half() * (now.pre + now.post) * own.dot(v + v_plus)
+    elif ti.static(step.features.motion):
+        done += own.dot(led)
+    return done
+
+
+@ti.func
 def work_of_pass(step: A, i, u, v, v_plus, f, u_next, v_next, now: A, scene: A, plan: A, pulls: A):
     """Work [J] done on vertex i in the pass, less what drag takes, but for a contact stage's. v_plus: its velocity after the
     kick alone. pulls: whether cables are loads, or forces of the body's own."""

@@ -12,6 +12,7 @@ from diffsim_ti.checked import between
 from diffsim_ti.contact.surface_pairs import Tunnelling
 from diffsim_ti.inputs import Derived
 from diffsim_ti.monitor.energy_balance import EnergyBalance
+from diffsim_ti.monitor.own_work import OwnWork
 from diffsim_ti.potential.attached import Attached
 from diffsim_ti.potential.chamber_pressure import following
 from diffsim_ti.potential.fluid import Fluid
@@ -72,6 +73,7 @@ class ExplicitSolver(Solver):
 
     explicit = True
     arguments = (*Solver.arguments, "contact", "contact_damping")
+    check_bodies = staticmethod(check_bodies)
 
     def __init__(self, *arguments, contact: str = "stage", contact_damping: float = CONTACT_DAMPING, **options):
         if contact not in ("stage", "force"):
@@ -79,8 +81,15 @@ class ExplicitSolver(Solver):
         self.contact, self.contact_damping = contact, between("contact_damping", contact_damping, 0, 1, ends=True)
         scene = arguments[0] if arguments else options.get("scene")
         if getattr(scene, "reduced", False):
-            check_bodies(scene, contact)
+            self.check_bodies(scene, contact)
         super().__init__(*arguments, **options)
+
+    def check_contact_forces(self) -> None:
+        if self.contact == "force" and any(term.acts_on_surface for term in self.scene.terms):
+            raise ValueError(
+                f"ContactForce and ContactTraction are of obstacles that act as a stage, and this {type(self).__name__} "
+                'takes them as forces: pass it contact="stage", or take an implicit solver, as reduced sets need'
+            )
 
     @property
     def stages_contact(self) -> bool:
@@ -146,6 +155,7 @@ class ExplicitWorkspace(Workspace):
             stage=runtime.array(a.vector, *(noted if features.staged else (1, 1))),
             # done on each vertex from outside [J] (outside_work.py)
             work=runtime.array(a.fp, a.num_vertices * (1 + features.cabled) if features.driven else 1),
+            own_work=runtime.array(a.fp, a.num_vertices),
         )
         self.attached = Attached.of(self.scene)  # springs, cables and foundations, for what looks between passes
         self.probe = None  # room for a pass that is not taken
@@ -154,6 +164,13 @@ class ExplicitWorkspace(Workspace):
     def load(self, derived: Derived) -> None:
         super().load(derived)
         self.check_apart()
+
+    def balance(self) -> OwnWork | None:
+        if not OwnWork.serves(self):
+            return None
+        self.arrays.count_own_work()
+        self._launches.clear()
+        return OwnWork(self)
 
     def record_contacts(self) -> None:
         self.arrays.record_contacts()
@@ -211,12 +228,14 @@ class ExplicitWorkspace(Workspace):
             self.pairs.ensure(self.probe.u, 0)
             self.pairs.forces(self.probe.u, 0, self.arrays.corner)
         seen, step = self.watch.rows(), self.kernels(self.arrays.features()).step
+        counted = runtime.fetch(self.contact.own_work)  # of passes that are taken alone
         launch = self.bound(step, state=(self.probe, self.frames, self.watch, self.contact), table=self.table)
         for numbers in self.launches(j, j + 1, num_passes, 0, 1):
             if self.chambers:
                 self.chambers.forces(self.probe, 0, numbers)
             launch(**numbers, base=j, stride=1)
         self.watch.put(seen)
+        runtime.fill(self.contact.own_work, counted)
         return runtime.fetch(self.probe.f)[0].astype(np.float64)
 
     def loads_at(self, j: int, num_passes: int, pulls: bool = True) -> np.ndarray:

@@ -139,7 +139,9 @@ class GivenInPasses:
         out = np.zeros((num_frames, len(self.scene.chambers)))
         for frame in range(1, num_frames):
             last = self.solver.num_passes(frame * save_every) - 1
-            out[frame, self.follower.held] = self.multipliers[self._pass_of_all(last)]
+            out[frame, self.follower.held] = self.multipliers.get(
+                self._pass_of_all(last), 0.0
+            )  # of none that it came to
         return out
 
     def last_chamber_pressures(self) -> np.ndarray:

@@ -7,7 +7,6 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.contact.implicit_pairs import ImplicitPairs
-from diffsim_ti.contact.surface_pairs import Tunnelling
 from diffsim_ti.inputs import ConsistentMass, Mass, kinetic_energy
 from diffsim_ti.monitor.energy_watch import EnergyWatch
 from diffsim_ti.potential.attached import Attached
@@ -103,6 +102,12 @@ class ImplicitWorkspace(Preconditioned, ObstacleWays, Noted, GivenInPasses, Work
             return super().mass_of(values)
         return ConsistentMass.of(self.scene.mesh, values.element_masses)
 
+    def balance(self) -> EnergyWatch | None:
+        if self.scene.growing or self.scene.law.state_names or self.solver.stage(self.rate, True, 0).static:
+            return None
+        self.energy_watch = self.energy_watch or EnergyWatch(self)
+        return self.energy_watch
+
     def restart(self) -> None:
         super().restart()
         self.multipliers = {}
@@ -164,7 +169,7 @@ class ImplicitWorkspace(Preconditioned, ObstacleWays, Noted, GivenInPasses, Work
                     self.bending.look(j + 1, u_next)
                 self.note_contacts(j, save_every)
                 self.note_solves(j, num_passes, time.perf_counter() - begin, self.begun)
-            except (NotConverged, Tunnelling) as error:
+            except FloatingPointError as error:
                 raise self.dated(error, j, num_passes) from None
             if self.solver.multistep:
                 copy_slot(self.state.u, 0, self.state.before.u, 0)
@@ -235,7 +240,9 @@ class ImplicitWorkspace(Preconditioned, ObstacleWays, Noted, GivenInPasses, Work
             self._check_end(j, u_star, u_next)
         if self.energy_watch:
             places = self.walls_before, self.walls_at_stage, self._walls_at_end(j)
-            added = self._kinetic_added(u, v, u_next, v_star, y, stage) if self.solver.multistep else 0.0
+            keeps = self.solver.may_gain_energy and not self.solver.multistep  # the midpoint rule, kinetic energy
+            undamped = self.inertial(self.solver.stage(0.0, before is None, j), u, v, before)[1]
+            added = 0.0 if keeps else self._kinetic_added(u, v, u_next, v_star, undamped, stage)
             self.energy_watch.note(u, u_star, u_next, v_next, places, added)
         return u_next, np.zeros_like(v) if stage.static else v_next
 
@@ -247,8 +254,8 @@ class ImplicitWorkspace(Preconditioned, ObstacleWays, Noted, GivenInPasses, Work
         return mass, *self.led_by_loads(j, stage, inertial, mass)
 
     def _kinetic_added(self, u, v, u_next, v_star, y, stage: Stage) -> float:
-        """Kinetic energy [J] that a pass has added beyond the work of what accelerates the free vertices, before drag; what
-        keeps a shape does none."""
+        """Kinetic energy [J] that a pass has added beyond the work of what accelerates the free vertices, of which drag is a
+        part, for y is what inertia would lead to without; what keeps a shape does none."""
         way = self.rigid.felt(u_next - u)
         after, before, way, rate = (x * mask_of(self.free) for x in (v_star, v, way, (v_star - y) / stage.gamma))
         added = kinetic_energy(self.mass, after) - kinetic_energy(self.mass, before)

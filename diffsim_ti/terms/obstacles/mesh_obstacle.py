@@ -7,6 +7,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import ArrayLike
 
+from diffsim_ti.checked import numbers, whole, wholes
 from diffsim_ti.origin import OF_WIDTHS, middle_far_part, rounding_of
 from diffsim_ti.runtime import at, let, traced
 from diffsim_ti.terms.described import place
@@ -38,10 +39,9 @@ class MeshObstacle(Obstacle):
         if rounding_of(vertices) > OF_WIDTHS * self.values["barrier_width"]:
             coarse = f"float32 resolves vertices to {rounding_of(vertices):.2g} m, too little for the barrier's width"
             warnings.warn(f"MeshObstacle: {coarse}: give them in float64", stacklevel=2)
-        vertices, triangles = np.asarray(vertices, np.float64), np.asarray(triangles, np.int64)
+        vertices, triangles = numbers("MeshObstacle: vertices", vertices), wholes("MeshObstacle: triangles", triangles)
         check_closed(vertices, triangles)
-        if int(resolution) != resolution or resolution < 4:
-            raise ValueError(f"MeshObstacle: resolution must be a whole number of at least 4 cells, got {resolution}")
+        resolution = whole("MeshObstacle: resolution", resolution, 4)
         low, high = vertices.min(0), vertices.max(0)
         cell = (high - low).max() / resolution
         pad = float(self.values["barrier_width"]) + 2 * cell
@@ -86,7 +86,12 @@ def check_closed(vertices: np.ndarray, triangles: np.ndarray) -> None:
     if vertices.ndim != 2 or vertices.shape[1] != 3 or triangles.ndim != 2 or triangles.shape[1] != 3:
         shapes = f"{vertices.shape}, {triangles.shape}"
         raise ValueError(f"MeshObstacle: vertices must have shape (k, 3) and triangles (t, 3), got {shapes}")
-    if not np.all(np.isfinite(vertices)) or triangles.min() < 0 or triangles.max() >= len(vertices):
+    if (
+        not triangles.size
+        or not np.all(np.isfinite(vertices))
+        or triangles.min() < 0
+        or triangles.max() >= len(vertices)
+    ):
         raise ValueError("MeshObstacle: vertices must be finite, and triangles must name them by index")
     edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
     keys = edges[:, 0] * len(vertices) + edges[:, 1]

@@ -28,7 +28,9 @@ class Obstacle(Term):
     stiffness_per_area [N/m^3]: k is that times the share of the surface at rest that the vertex stands for
     (inputs/surface_areas.py): gaps, forces and friction are those of a surface and converge as it is refined. None lets the
     scene choose it, once, from density, wave speed, weight, impact, motions and paths over the first second, loads and
-    muscles (stiffness.py). Or
+    muscles (stiffness.py). A press, which moves against a body with a pressure p [Pa] (about Young's modulus times the
+    strain that it makes), needs p / (1.2 width): it then stands half a width from the surface, where the barrier pushes
+    with 1.19 k width. Or
     stiffness [N/m]: k of every vertex alike, however many there are.
     width [m]: how far the obstacle is felt.
     Faces of ten-node tetrahedra that are curved in the mesh, by .02 widths or more, are felt as curved as they move, by

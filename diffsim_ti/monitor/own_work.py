@@ -1,0 +1,51 @@
+"""What steps add to the energy of a run by themselves, apart from all that is done to it: the drift of a scheme.
+
+Kinetic energy T changes by the work W of the body's own forces, strains, weight, springs and self-contact, and by that of
+all else: loads, supports, friction, drag, contact stages. The own forces have an energy V, and dV + W, which vanishes as
+steps become short, is the scheme's own. What is left of a change of the whole energy was done from outside, or taken.
+"""
+
+import weakref
+
+import numpy as np
+
+from diffsim_ti import runtime
+from diffsim_ti.monitor import quantities
+from diffsim_ti.state.workspace import Workspace
+
+
+class OwnWork:
+    """Follows the drift of explicit steps; `drift` [J] is that since the last `begin`."""
+
+    def __init__(self, workspace: Workspace):
+        self.ws = weakref.proxy(workspace)  # which holds this: no circle
+        self.begin()
+
+    @staticmethod
+    def serves(workspace: Workspace) -> bool:
+        """Whether the forces of a scene are those of an energy that does not change with time, at each vertex by itself."""
+        scene, law = workspace.scene, workspace.arrays.law
+        energetic = law.reads == ("H",) and not law.state_names and not scene.growing
+        return energetic and not scene.reduced and not workspace.arrays.features().pressing
+
+    def begin(self) -> None:
+        """From the present state on."""
+        runtime.fill(self.ws.contact.own_work, 0)
+        self._energy = self._own_energy()
+
+    def take(self) -> float:
+        """The drift [J] since the last call, or `begin`."""
+        before, work = self._energy, float(runtime.fetch(self.ws.contact.own_work).astype(np.float64).sum())
+        self.begin()
+        return self._energy - before + work
+
+    def _own_energy(self) -> float:
+        """V [J]; the weight of vertices that are held is carried by what holds them."""
+        ws, a = self.ws, self.ws.arrays
+        out = quantities.elastic_energy(ws) + sum(quantities.attached_energies(ws).values())
+        at = a.features().gravity
+        if at >= 0:
+            mass = a.values.mass * (runtime.fetch(a.inverse_mass) > 0)
+            u = runtime.fetch_row(ws.state.u, 0).astype(np.float64)
+            out -= float((mass[:, None] * a.values.parameters[at:][:3] * (a.values.rest + u)).sum())
+        return out + (ws.pairs.look(ws.state.u)[0] if ws.pairs else 0.0)

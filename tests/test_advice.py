@@ -1,0 +1,278 @@
+"""Advice that works: each error or warning that names an argument or a number to take is provoked, and its advice followed.
+
+All such messages are collected from the source of the package. One that is in no table fails, and so does a row of a table
+whose message is gone.
+"""
+
+import ast
+import re
+import warnings
+from functools import lru_cache
+from pathlib import Path
+
+import pytest
+import torch
+
+import diffsim_ti as ds
+from diffsim_ti.diff_simulator import rollout_frames
+from diffsim_ti.strength import check_strength
+
+PACKAGE = Path(ds.__file__).parent
+ARGUMENT = re.compile(r"\b[a-z_]{3,}=")
+NUMBER = re.compile(r"(?:^|[;:,] |or )(?:take|reduce|raise|lower|shorten|pass|let)\b[^;:{]*\{\}")
+LAW, CUBE = ds.StableNeoHookean(1e5, 0.3), ds.TetrahedralMesh.create_cube(2)
+
+
+def words(node) -> str:
+    """The text of an expression, {} where a value stands."""
+    if isinstance(node, ast.JoinedStr):
+        return "".join(part.value if isinstance(part, ast.Constant) else "{}" for part in node.values)
+    return node.value if isinstance(node, ast.Constant) and isinstance(node.value, str) else ""
+
+
+@lru_cache
+def messages() -> list[tuple[str, str]]:
+    """(file, text) of all that is raised or warned of, and of parts of it that are put together before, with advice."""
+    out = []
+
+    def look(node, said: bool) -> None:
+        if text := words(node):
+            if " " in text and (NUMBER.search(text) or ARGUMENT.search(text) and said):
+                out.append((file, text))
+            return
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):  # a docstring
+            return
+        said = said or _says(node)
+        for child in ast.iter_child_nodes(node):
+            look(child, said)
+
+    for path in sorted(PACKAGE.rglob("*.py")):
+        file = str(path.relative_to(PACKAGE))
+        look(ast.parse(path.read_text()), False)
+    return out
+
+
+def _says(node) -> bool:
+    if isinstance(node, ast.Call):
+        name = getattr(node.func, "attr", getattr(node.func, "id", ""))
+        return name == "warn" or name.endswith("Error")
+    return isinstance(node, ast.Raise)
+
+
+def scene(**options) -> ds.Scene:
+    return ds.Scene(options.pop("mesh", CUBE), options.pop("law", LAW), precision="f64", **options)
+
+
+def verlet(**options):
+    own = {name: options.pop(name) for name in ("contact", "substeps", "allow_unstable") if name in options}
+    return ds.VelocityVerletSolver(scene(**options), dt=own.pop("dt", 1e-3), **own)
+
+
+TORCH_E = torch.tensor(1e5, dtype=torch.float64, requires_grad=True)
+JOINED = ds.TetrahedralMesh.joined([CUBE, CUBE.translated([3, 0, 0])])
+GROUND = ds.Ground(-0.1, stiffness=1e3, width=0.01)
+WIDE = dict(law=ds.StableNeoHookean(1e5, 0.48))
+RIGID = dict(mesh=JOINED, terms=[GROUND], reduced={"body_0": "rigid"})
+
+
+def advised(wrong) -> float:
+    """The number that an error advises."""
+    with pytest.raises(ValueError) as said:
+        wrong()
+    return float(re.search(r"(?:substeps=|modulus to |width below )([0-9.e+-]+)", str(said.value))[1])
+
+
+def strong(E: float) -> None:
+    check_strength(scene(law=ds.StableNeoHookean(E, 0.3), terms=[ds.Gravity(), ds.Ground(-0.01)]))
+
+
+def stiff(**options):
+    return verlet(law=ds.StableNeoHookean(1e9, 0.3), **options)
+
+
+# (file, part of the message): (what provokes it, the same as it advises)
+FOLLOWED = {
+    ("batch/batch.py", "leave out lanes=True"): (
+        lambda: ds.Batch(ds.BDF2Solver(scene(), dt=1e-3), 2, 2, lanes=True),
+        lambda: ds.Batch(ds.BDF2Solver(scene(), dt=1e-3), 2, 2),
+    ),
+    ("locking.py", "where {} tetrahedra lock"): (lambda: scene(**WIDE), lambda: scene(**WIDE, volume="patches")),
+    ("materials/patch_law.py", "averages energies, but"): (
+        lambda: scene(law=ds.KelvinVoigt(LAW, time=0.1), volume="patches"),
+        lambda: scene(law=ds.KelvinVoigt(LAW, time=0.1), volume="tetrahedra"),
+    ),
+    ("materials/patch_law.py", "averages energies of displacements"): (
+        lambda: scene(law=ds.Prony(LAW, [0.5], [0.1]), volume="patches"),
+        lambda: scene(law=ds.Prony(LAW, [0.5], [0.1]), volume="tetrahedra"),
+    ),
+    ("materials/grown.py", "does not know it"): (
+        lambda: scene(terms=[ds.Growth(0.1)], volume="patches"),
+        lambda: (scene(terms=[ds.Growth(0.1)]), scene(terms=[ds.Growth(0.1)], mesh=CUBE.quadratic())),
+    ),
+    ("mesh/checks.py", "pass fix_orientation=True"): (
+        lambda: ds.TetrahedralMesh(CUBE.vertices, CUBE.tetrahedra[:, [1, 0, 2, 3]]),
+        lambda: ds.TetrahedralMesh(CUBE.vertices, CUBE.tetrahedra[:, [1, 0, 2, 3]], fix_orientation=True),
+    ),
+    ("mesh/locate.py", "lie outside the mesh"): (
+        lambda: ds.Rollout(verlet(), 1, outputs=[ds.Stress(at=[[2.0, 0.5, 0.5]])]),
+        lambda: ds.Rollout(verlet(), 1, outputs=[ds.Stress(at=CUBE.locate([[2.0, 0.5, 0.5]], nearest=True).points)]),
+    ),
+    ("modes.py", "has no modes here"): (
+        lambda: ds.modes(scene(mesh=JOINED, reduced={"body_0": "rigid"}), 1),
+        lambda: ds.modes(scene(mesh=JOINED), 1),
+    ),
+    ("outputs/contact_force.py", "give about= or per_vertex=True"): (
+        lambda: ds.ContactForce("a", about=(0, 0, 0), per_vertex=True),
+        lambda: (ds.ContactForce("a", about=(0, 0, 0)), ds.ContactForce("a", per_vertex=True)),
+    ),
+    ("outputs/reaction.py", "give about= or per_vertex=True"): (
+        lambda: ds.Reaction(about=(0, 0, 0), per_vertex=True),
+        lambda: (ds.Reaction(about=(0, 0, 0)), ds.Reaction(per_vertex=True)),
+    ),
+    ("outputs/reaction.py", "must be among the held vertices"): (
+        lambda: ds.Rollout(verlet(), 1, outputs=[ds.Reaction("xmin")]),
+        lambda: ds.Rollout(verlet(fixed="xmin"), 1, outputs=[ds.Reaction("xmin")]),
+    ),
+    ("outputs/self_contact_force.py", "give on="): (
+        lambda: ds.SelfContactForce(),
+        lambda: (ds.SelfContactForce("xmin"), ds.SelfContactForce(per_vertex=True)),
+    ),
+    ("outputs/work.py", "the scene has no load"): (
+        lambda: ds.Rollout(verlet(terms=[ds.Gravity()]), 1, outputs=[ds.WorkOfLoads()]),
+        lambda: ds.Rollout(verlet(terms=[ds.Gravity()]), 1, outputs=[ds.WorkOfLoads(weight=True)]),
+    ),
+    ("rollout/frames.py", "pass others to Rollout"): (
+        lambda: ds.Rollout(verlet(), 0).forward()["kinetic"],
+        lambda: ds.Rollout(verlet(), 0, outputs=[ds.KineticEnergy(name="kinetic")]).forward()["kinetic"],
+    ),
+    ("scene.py", "pass fixed=..."): (
+        lambda: scene(motion=lambda t: (0, t, 0)),
+        lambda: scene(motion=lambda t: (0, t, 0), fixed="xmin"),
+    ),
+    ("simulator.py", "make the simulator with"): (
+        lambda: ds.Simulator(verlet(terms=[GROUND])).output(ds.ContactForce(GROUND)),
+        lambda: ds.Simulator(verlet(terms=[GROUND]), contact_forces=True).output(ds.ContactForce(GROUND)),
+    ),
+    ("simulator.py", "counts from the start of a run"): (
+        lambda: ds.Simulator(verlet()).output(ds.WorkOfLoads(weight=True)),
+        lambda: ds.Rollout(verlet(terms=[ds.Gravity()]), 0, outputs=[ds.WorkOfLoads(weight=True)]).forward(),
+    ),
+    ("solvers/explicit/body_checks.py", "feel obstacles as a force"): (
+        lambda: verlet(**RIGID),
+        lambda: verlet(**RIGID, contact="force"),
+    ),
+    ("solvers/explicit/solver.py", "are of obstacles that act as a stage"): (
+        lambda: ds.Rollout(verlet(terms=[GROUND], contact="force"), 1, outputs=[ds.ContactForce(GROUND)]),
+        lambda: ds.Rollout(verlet(terms=[GROUND], contact="stage"), 1, outputs=[ds.ContactForce(GROUND)]),
+    ),
+    ("solvers/implicit/solver.py", 'takes "block_jacobi"'): (
+        lambda: ds.BDF2Solver(scene(**RIGID), preconditioner="multigrid"),
+        lambda: [ds.BDF2Solver(scene(**RIGID), preconditioner=p) for p in ("block_jacobi", "auto")],
+    ),
+    ("solvers/semi_implicit.py", "has no viscosity"): (
+        lambda: ds.SemiImplicitSolver(scene(), dt=1e-3, viscous_stages=3),
+        lambda: (
+            ds.SemiImplicitSolver(scene(), dt=1e-3),
+            ds.SemiImplicitSolver(scene(law=ds.KelvinVoigt(LAW, time=1e-4)), dt=1e-4, viscous_stages=3),
+        ),
+    ),
+    ("solvers/solver.py", "exceeds the stable step"): (
+        stiff,
+        lambda: (stiff(allow_unstable=True), stiff(substeps=int(advised(stiff)))),
+    ),
+    ("solvers/static.py", "is free to move rigidly"): (
+        lambda: ds.StaticSolver(scene()),
+        lambda: (ds.StaticSolver(scene(fixed=[0, 1, 2])), ds.BDF2Solver(scene())),
+    ),
+    ("terms/growth.py", "names of sets"): (
+        lambda: ds.Growth([0.1], "soft", per="set"),
+        lambda: ds.Growth([0.1, 0.2], tetrahedra=["left", "right"], per="set"),
+    ),
+    ("terms/muscle.py", "names of sets"): (
+        lambda: ds.Muscle((1, 0, 0), 1.0, [1.0], tetrahedra="left", per="set"),
+        lambda: ds.Muscle((1, 0, 0), 1.0, [1.0, 1.0], tetrahedra=["left", "right"], per="set"),
+    ),
+    ("runtime/start.py", "init has no argument"): (lambda: ds.init(backend="cpu"), lambda: None),
+    ("runtime/start.py", "cannot be chosen"): (lambda: ds.init("cpu", fast_math=True), lambda: None),
+    ("torch_bridge/rollout_node.py", "but this rollout computes"): (
+        lambda: rollout_frames(ds.Rollout(verlet(), 1, gradients=["initial_positions"]), density=TORCH_E),
+        lambda: [
+            rollout_frames(ds.Rollout(verlet(), 1, gradients=names), density=TORCH_E) for names in (["density"], "all")
+        ],
+    ),
+    ("torch_bridge/batch_node.py", "requires a gradient"): (
+        lambda: rollout_frames(ds.Batch(verlet(), 1, 2, gradients=["initial_positions"]), youngs_modulus=TORCH_E),
+        lambda: rollout_frames(ds.Batch(verlet(), 1, 2, gradients="all"), youngs_modulus=TORCH_E),
+    ),
+    ("strength.py", "raise Young's modulus to"): (
+        lambda: strong(100.0),
+        lambda: strong(advised(lambda: strong(100.0))),
+    ),
+    ("mesh/grid.py", "vertices; take at most"): (
+        lambda: ds.TetrahedralMesh.create_box(10**4, 1.0),
+        lambda: ds.TetrahedralMesh.create_box(3, 1.0),
+    ),
+}
+
+ANOTHER_MACHINE = "needs another machine, process, backend or build"
+ELSEWHERE = {  # (file, part of the message): the test that provokes it and follows it, or why none does
+    ("batch/taped.py", "its field is already"): "test_batch_tape.py",
+    ("checked.py", "is a tensor with a graph"): "test_torch.py, test_calls.py",
+    ("cli/identify.py", "expected input=guess"): "test_identify.py",
+    ("contact/surface_pairs.py", "take a width below"): "test_self_contact.py",
+    ("diff_simulator.py", "a two-step method"): "test_torch_solvers.py",
+    ("identification/descent.py", "take smaller steps"): "names neither an argument nor a number",
+    ("identification/problem.py", "has no gradient by"): "test_identification.py",
+    ("materials/patch_law.py", "does not say what its theta is"): "test_locking.py, with laws of one's own",
+    ("mesh/checks.py", "in no tetrahedron"): "test_mesh.py",
+    ("mesh/enclosure.py", "the surface is open at the edge"): "test_chambers.py",
+    ("mesh/enclosure.py", "must not be moved"): "test_chambers.py",
+    ("monitor/guard.py", "has gained {} J"): "test_energy_watch.py",
+    ("monitor/guard.py", "reduce the substep to {} s"): "test_contact_crossing.py, battery_of_impacts.py",
+    ("monitor/guard.py", "the barrier cannot stop it"): "test_contact_crossing.py, battery_of_impacts.py",
+    ("monitor/guard.py", "the substep has outgrown"): "test_contact_crossing.py, battery_of_impacts.py",
+    ("monitor/guard.py", "reduce dt, raise substeps"): "test_step_limit.py",
+    ("monitor/guard.py", "was stiffer than the substep"): "test_contact.py, test_contact_faces.py",
+    ("monitor/stability.py", "in this precision"): "test_step_limit.py",
+    ("rollout/doubts.py", "gradients through contacts"): "test_contact_gradients.py",
+    ("rollout/doubts.py", "the adjoint grew"): "test_gradient_faults.py; a chaotic run has no better gradient",
+    ("rollout/taped.py", "already ran in this tape"): "test_tape.py",
+    ("runtime/argument_buffer.py", "install taichi"): ANOTHER_MACHINE,
+    ("runtime/device.py", "needs Taichi on CUDA"): ANOTHER_MACHINE,
+    ("runtime/repeated_loops.py", "install taichi"): ANOTHER_MACHINE,
+    ("runtime/start.py", "was forked"): ANOTHER_MACHINE,
+    ("runtime/start.py", "fast_math=True"): ANOTHER_MACHINE,
+    ("runtime/start.py", "Vulkan has no float64"): ANOTHER_MACHINE,
+    ("solvers/implicit/blocked.py", "finds no room"): "test_swept.py, battery_of_impacts.py",
+    ("solvers/implicit/blocked.py", "the barrier cannot stop it"): "battery_of_impacts.py",
+    ("solvers/implicit/blocked.py", "take substeps of"): "battery_of_impacts.py",
+    ("solvers/solver.py", "pass substeps="): "above, as a part of what exceeds the stable step",
+    ("strength.py", "or let it fall"): "test_strength.py",
+    ("study/trials.py", "nothing tried meets"): "test_study.py; a budget is no promise",
+    ("terms/growth.py", "takes growth of shape"): "test_growth_over_time.py",
+    ("terms/muscle.py", "takes activations of shape"): "test_muscles.py",
+    ("terms_of_scene.py", "give them a name="): "test_scene.py",
+    ("torch_bridge/step_sizes.py", "parameter_groups(relative=...)"): "test_step_sizes.py",
+    ("torch_bridge/step_sizes.py", "parameter_groups(relative=0.05)"): "test_step_sizes.py",
+    ("torch_bridge/tensors.py", "sees no card"): ANOTHER_MACHINE,
+    ("verify.py", "no health report"): "test_gradient_faults.py",
+    ("visual/drawing.py", "no Vulkan driver"): ANOTHER_MACHINE,
+}
+
+
+def test_all_advice_is_in_a_table():
+    tables = [*FOLLOWED, *ELSEWHERE]
+    missing = [m for m in messages() if not any(m[0] == file and part in m[1] for file, part in tables)]
+    gone = [key for key in tables if not any(key[0] == file and key[1] in text for file, text in messages())]
+    assert not missing, "\n".join(map(str, missing))
+    assert not gone, gone
+
+
+@pytest.mark.parametrize("key", FOLLOWED, ids=lambda key: f"{key[0]}: {key[1]}")
+def test_advice_works(key):
+    wrong, right = FOLLOWED[key]
+    said = re.escape(key[1]).replace(r"\{\}", ".*")
+    with warnings.catch_warnings(action="error"):
+        with pytest.raises((ValueError, TypeError, KeyError, UserWarning), match=said):
+            wrong()
+        right()
