@@ -100,3 +100,15 @@ def test_files_are_short():
     lengths = {str(path): lines(path.read_text()) for path in MODULES}
     assert {name: length for name, length in lengths.items() if length > 600} == {}
     assert sorted(lengths.values())[len(lengths) // 2] <= 120
+
+
+def test_kernels_are_those_of_runtime():
+    """Which are traced faster (runtime/sources.py): `ti.kernel` stands nowhere else."""
+    found = [
+        str(path)
+        for path, tree in MODULES.items()
+        if room(path) != "runtime"
+        for node in ast.walk(tree)
+        if isinstance(node, ast.FunctionDef) and any(ast.unparse(d) == "ti.kernel" for d in node.decorator_list)
+    ]
+    assert found == []

@@ -209,7 +209,7 @@ class Rollout:
         return frames
 
     def frames_of(self, run: Run) -> Frames:
-        """The frames of the run that the sweep ran last, with all outputs; the last good one stands for those after it too."""
+        """The frames of the run that the sweep ran last, with all outputs; the last good one stands for those after it."""
         rows = np.minimum(np.arange(self.num_frames), self.sweep.last_good(run))
         u, v = (runtime.fetch(x)[rows] for x in self.sweep.workspace.frames)
         positions = positions_of(self.scene, run.values["rest_positions"], u)
