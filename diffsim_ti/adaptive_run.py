@@ -165,7 +165,7 @@ class ForwardRun:
                 self._advance_part(last=part == self.parts - 1)
             else:
                 self.simulator.step()
-            if self._balance:
+            if self.drift is not None:
                 self.drift += self._balance.take()
             self._look()
         self.energies.append(self._energy)

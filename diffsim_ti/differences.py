@@ -81,7 +81,7 @@ class CentralDifferences:
     uncertainty: the sum of `spread`, the largest distance of the value to its three neighbours in Neville's table, where the
     sum is least; `rounding`, what the noise of f leaves of it; and `jump`, half of what f' jumps by at 0, from one-sided
     differences. The noise of f is a unit of its last place until `measure` has taken it from third differences.
-    start: f(0), if it is known. Steps at which f raises one of `failures` are left out; `failure` is the last of these.
+    at_zero: f(0), if it is known. Steps at which f raises one of `failures` are left out; `failure` is the last of these.
     Ridders 1982, doi:10.1016/S0141-1195(82)80057-0; More, Wild 2011, Estimating Computational Noise, doi:10.1137/100786125.
     """
 
@@ -94,11 +94,11 @@ class CentralDifferences:
         self,
         f: Callable[[float], float],
         scale: float = 1.0,
-        start: float | None = None,
+        at_zero: float | None = None,
         failures: tuple = (ValueError,),
     ):
         self.f, self.scale, self.failures, self.failure = f, scale, failures, None
-        self.known = {0.0: float(f(0.0)) if start is None else float(start)}
+        self.known = {0.0: float(f(0.0)) if at_zero is None else float(at_zero)}
         self.measured: float | None = None
         self.value, self.spread, self.rounding, self.jump = 0.0, np.inf, 0.0, 0.0
 

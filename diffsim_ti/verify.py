@@ -330,10 +330,12 @@ class Judgement:
 
     @property
     def scale(self) -> float:
+        """What errors are relative to: the larger of both."""
         return max(abs(self.analytic), abs(self.differences.value))
 
     @property
     def error(self) -> float:
+        """Their distance."""
         return abs(self.analytic - self.differences.value)
 
     @property
@@ -342,6 +344,7 @@ class Judgement:
 
     @property
     def uncertainty(self) -> float:
+        """How far off both may be together."""
         return self.differences.uncertainty + self.left + self.scatter
 
     @property
@@ -360,6 +363,7 @@ class Judgement:
 
     @property
     def is_right(self) -> bool:
+        """Whether the derivative is near the differences, and these are known well enough to say so."""
         near = self.error <= self.tolerance * self.scale + self.uncertainty
         resolved = self.tolerance * self.scale + 4 * self.uncertainty <= max(COARSE, 10 * self.tolerance) * self.scale
         return self.is_zero or bool(near and resolved and self.scale > 0)
