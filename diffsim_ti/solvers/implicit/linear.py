@@ -81,13 +81,14 @@ class Operator:
 
 def _in_turn(operator, preconditioner, most: int):
     """(preconditioner, products that it may take) one after the other, until a solve succeeds: that of the pass, as many as
-    the time of a factorisation allows, in all rounds of a solve of Newton's twice as many; the factorisation, in all rounds
+    the time of a factorisation allows, in all rounds of an equilibrium twice as many; the factorisation, in all rounds
     from then on; where there is none, the first again, or block Jacobi where that is not positive definite."""
     if not isinstance(preconditioner, Preconditioner):
         yield preconditioner, most
         return
     effort = preconditioner.effort
-    if not (preconditioner.given_up or preconditioner.spent > 2 * preconditioner.patience):
+    static = not np.any(diagonal_of(operator.mass))  # steps with inertia take few rounds, which are to stay as they are
+    if not (preconditioner.given_up or static and preconditioner.spent > 2 * preconditioner.patience):
         yield preconditioner, min(most, preconditioner.patience)
         preconditioner.given_up = True
     other, name = operator.factorised() if effort.fits else None, type(preconditioner).__name__
