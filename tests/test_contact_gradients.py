@@ -47,7 +47,7 @@ def test_every_input(name):
     assert {"friction", "friction_speed", "barrier_stiffness", "barrier_width"} <= {row.input for row in report.rows}
     assert sum(row.input.endswith("_path") for row in report.rows) == 1
     for row in report.rows:
-        assert row.relative_error < 1e-6 and row.taylor_rate > 1.5, str(report)
+        assert row.relative_error < 1e-6 and row.verdict == "right", str(report)
         assert row.analytic != 0 or row.input == "friction_speed", row.input  # which is not felt while all slides
 
 
@@ -86,7 +86,7 @@ def test_several_rough_and_moving_obstacles():
     rollout = ds.Rollout(ds.VelocityVerletSolver(scene, dt=4e-3, substeps=SUBSTEPS), STEPS)
     assert {"half_space_path", "sphere_path", "friction", "friction_2"} <= set(rollout.inputs)
     report = ds.check_gradients(rollout, verbose=False)
-    assert all(row.relative_error < 1e-6 and row.taylor_rate > 1.5 for row in report.rows), str(report)
+    assert all(row.relative_error < 1e-6 and row.verdict == "right" for row in report.rows), str(report)
     assert ds.dot_product_test(rollout) < 1e-12
 
 

@@ -28,6 +28,8 @@ class Frames:
     `chamber_pressures` [Pa], where an output reads them: those in chambers whose volume is held, shape (frames, chambers),
     of the substep that ends in the frame; others, and the first frame, have none (0).
 
+    `law_state`: what the law remembers, of frames that outputs of a `Simulator` are asked of.
+
     `error`: what stopped a run of `Rollout(..., raise_errors=False)`, None where it is `alive`; from there on frames hold
     the last good one.
 

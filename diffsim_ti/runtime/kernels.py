@@ -68,7 +68,7 @@ class Kernel:
         self.arrays, self.numbers, self.options = arrays, tuple(numbers), dict(loops=loops, polished=polished)
         owner = getattr(body, "__self__", None)
         law = getattr(owner, "law", None) or getattr(getattr(owner, "element", None), "law", None)
-        self.options["title"] = f"the kernel {name}" + (f" of {law.title}" if law else "")
+        self.options["title"] = f"the kernel {name}" + (f" of {law.title}" if hasattr(law, "title") else "")
         types = array_types(precision)
         arguments = [(f"{b}_{a}", types[kind]) for b, own in arrays.items() for a, kind in own.items()]
         arguments += [(n, types[kind]) for n, kind in numbers.items()]

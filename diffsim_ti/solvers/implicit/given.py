@@ -119,7 +119,7 @@ class GivenInPasses:
     def start_multipliers(self, j: int, u: np.ndarray) -> None:
         """Begin pass j with the pressures of held volumes that the pass before it ended with."""
         if self.volumes:
-            now = self._pass_of_all(j)
+            now = self.pass_of_all(j)
             if j == 0:  # steps that come one by one are not to fill the memory
                 self.multipliers = {k: kept for k, kept in self.multipliers.items() if k >= now - 1}
             before = self.multipliers.get(now - 1)
@@ -128,19 +128,19 @@ class GivenInPasses:
     def keep_multipliers(self, j: int) -> None:
         """Note those that pass j ended with."""
         if self.volumes:
-            self.multipliers[self._pass_of_all(j)] = self.volumes.multipliers
+            self.multipliers[self.pass_of_all(j)] = self.volumes.multipliers
 
     def take_multipliers(self, j: int, u: np.ndarray) -> None:
         """Stand where pass j ended, at u."""
         if self.volumes:
-            self.volumes.place(u, self.multipliers[self._pass_of_all(j)])
+            self.volumes.place(u, self.multipliers[self.pass_of_all(j)])
 
     def chamber_pressures(self, num_frames: int, save_every: int) -> np.ndarray:
         out = np.zeros((num_frames, len(self.scene.chambers)))
         for frame in range(1, num_frames):
             last = self.solver.num_passes(frame * save_every) - 1
             out[frame, self.follower.held] = self.multipliers.get(
-                self._pass_of_all(last), 0.0
+                self.pass_of_all(last), 0.0
             )  # of none that it came to
         return out
 
@@ -159,9 +159,9 @@ class GivenInPasses:
     def go_on_from(self, multipliers: np.ndarray, step: int) -> None:
         """Begin a step with these."""
         self.first_step = step
-        self.multipliers = {self._pass_of_all(0) - 1: multipliers}
+        self.multipliers = {self.pass_of_all(0) - 1: multipliers}
 
-    def _pass_of_all(self, j: int) -> int:
+    def pass_of_all(self, j: int) -> int:
         """Number of pass j, also of the steps of a run that come one by one."""
         return self.first_step * int(np.max(self.solver.schedule.substeps)) + j
 
@@ -201,7 +201,7 @@ class GivenInPasses:
         """Share of the loads in pass j."""
         if not stage.static:
             return 1.0
-        return min(1.0, (self._pass_of_all(j) + self.laid) / self.solver.substeps)
+        return min(1.0, (self.pass_of_all(j) + self.laid) / self.solver.substeps)
 
     @cached_property
     def force_vertices(self) -> np.ndarray:

@@ -77,7 +77,7 @@ class LaidOn:
         """Of what its step lays on; in the first step loads that change in time, too, grow faster than its share."""
         ws, sizes = self.ws, []
         share = ws.reached(j, stage, done)
-        if ws._pass_of_all(j) >= ws.solver.substeps or ws.volumes:
+        if ws.pass_of_all(j) >= ws.solver.substeps or ws.volumes:
             return share
         for k, laid in ((j, done), (int(ws.solver.schedule.first(ws.solver.schedule.row(j) + 1)) - 1, 1.0)):
             ws.lay_on(k, stage, laid)

@@ -60,13 +60,13 @@ class Operator:
     def __call__(self, w: np.ndarray) -> np.ndarray:
         self.products += 1
         if not self.rigid:
-            return self._of_places(w) * self.free
+            return self.of_places(w) * self.free
         turned = self.rigid.stiffness(w, self.transposed, convex=self.correction is not None)
         if self.transposed:
-            return self.rigid.motion_vjp(self._of_places(w) * self._linear) + turned
-        return self._of_places(self.rigid.motion(w)) * self.free + turned
+            return self.rigid.motion_vjp(self.of_places(w) * self._linear) + turned
+        return self.of_places(self.rigid.motion(w)) * self.free + turned
 
-    def _of_places(self, w: np.ndarray) -> np.ndarray:
+    def of_places(self, w: np.ndarray) -> np.ndarray:
         """For a change w of places, of all vertices."""
         y = self.mass * w + self.potential.product(w, convex=self.correction is not None)
         if self.correction is not None:

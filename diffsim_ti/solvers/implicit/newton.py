@@ -196,7 +196,7 @@ class Newton:
         self.potential.place(u)
         A = self.operator()
         self.preconditioner.update(u)
-        R = (change - A._of_places(way)) * self.free
+        R = (change - A.of_places(way)) * self.free
         d, *_, negative = conjugate_gradients(A, R, self.preconditioner, 0.01, 10 * len(R), self.eps)
         return d + way if negative is None else None
 

@@ -62,7 +62,7 @@ class Noted:
         change, far = newton.residual_of(problem), np.linalg.norm(here - u)
         for place in (u, here):
             way = newton.follows(place, change, held - u)
-            if way is None and place is u and self._pass_of_all(j) == 0 and not self._was_stable(j):
+            if way is None and place is u and self.pass_of_all(j) == 0 and not self._was_stable(j):
                 return False
             size = np.inf if way is None else np.linalg.norm(way)
             if way is not None and far <= self.explained * size:
