@@ -253,7 +253,7 @@ ELSEWHERE = {  # (file, part of the message): the test that provokes it and foll
     (
         "state/bending.py",
         "refine the mesh, or take a width of",
-    ): "none: a warning of faces that bow more than three cuts resolve",
+    ): "none: faces that bow beyond three cuts",
     ("solvers/implicit/blocked.py", "finds no room"): "test_swept.py, battery_of_impacts.py",
     ("solvers/implicit/blocked.py", "the barrier cannot stop it"): "battery_of_impacts.py",
     ("solvers/implicit/blocked.py", "take substeps of"): "battery_of_impacts.py",
