@@ -180,10 +180,6 @@ FOLLOWED = {
         stiff,
         lambda: (stiff(allow_unstable=True), stiff(substeps=int(advised(stiff)))),
     ),
-    ("solvers/static.py", "is free to move rigidly"): (
-        lambda: ds.StaticSolver(scene()),
-        lambda: (ds.StaticSolver(scene(fixed=[0, 1, 2])), ds.BDF2Solver(scene())),
-    ),
     ("terms/growth.py", "names of sets"): (
         lambda: ds.Growth([0.1], "soft", per="set"),
         lambda: ds.Growth([0.1, 0.2], tetrahedra=["left", "right"], per="set"),
@@ -250,10 +246,7 @@ ELSEWHERE = {  # (file, part of the message): the test that provokes it and foll
     ("runtime/start.py", "Vulkan has no float64"): ANOTHER_MACHINE,
     ("solvers/implicit/closing.py", "but for contact {}"): "test_supports.py",
     ("solvers/implicit/newton.py", "pass max_iterations={}"): "test_implicit.py",
-    (
-        "state/bending.py",
-        "refine the mesh, or take a width of",
-    ): "none: faces that bow beyond three cuts",
+    ("state/bending.py", "refine the mesh, or take a width of"): "none: faces that bow beyond three cuts",
     ("solvers/implicit/blocked.py", "finds no room"): "test_swept.py, battery_of_impacts.py",
     ("solvers/implicit/blocked.py", "the barrier cannot stop it"): "battery_of_impacts.py",
     ("solvers/implicit/blocked.py", "take substeps of"): "battery_of_impacts.py",

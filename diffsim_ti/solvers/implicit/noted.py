@@ -12,6 +12,7 @@ class Noted:
     """A part of ImplicitWorkspace."""
 
     explained, softened = 2.0, 10.0  # times what tangents at both ends, or before, say: farther is another branch
+    usual = 8  # rounds of a solve that leaves no branch
 
     def record_contacts(self) -> None:
         self.impulses = ContactRecord(self)
@@ -36,17 +37,18 @@ class Noted:
         step, solves = self.step_of(j, num_passes), self.newton.reports
         self.report.note(step, seconds, solves)
         saddles, unstable = (sum(getattr(solve, name) for solve in solves) for name in ("saddles", "indefinite"))
+        rounds = [max(len(solve.residuals) - 1, 0) for solve in solves]
+        far = unstable or max(rounds, default=0) > self.usual  # full steps may leap over the states that are not stable
         # whose curved barriers, and states beside the volumes that are held, are indefinite where nothing buckles
         if self.arrays.contacts or self.pairs or self.volumes:
-            unstable = 0
-        if self.is_static and (saddles or unstable) and self._left_a_branch(j, *begin, saddles):
-            rounds = sum(max(len(solve.residuals) - 1, 0) for solve in solves)
+            far = False
+        if self.is_static and (saddles or far) and self._left_a_branch(j, *begin, saddles):
             left = f"{saddles} saddle{'s' * (saddles > 1)} left: the body was in balance and not stable, as when it buckles"
             if not saddles:
                 left = (
-                    f"{unstable} of {rounds} rounds of Newton's method met states that are not stable, and the body went "
-                    "much farther than its stiffness explains: it has buckled or snapped on the way (follow it by more "
-                    "load_steps)"
+                    "the body went much farther than its stiffness explains: it has buckled or snapped on the way "
+                    f"({unstable} of {sum(rounds)} rounds of Newton's method met states that are not stable; follow it by "
+                    "more load_steps)"
                 )
             went = "it went to a lower equilibrium, which may be one of several, and gradients are of it"
             said = f"step {step}: {left}; {went}"
