@@ -11,8 +11,8 @@ URL = "https://example.org/owner/name"
 
 def test_all_name_one_version():
     said = re.search(r"^version: (\S+)$", (ROOT / "CITATION.cff").read_text(), re.M)[1]
-    newest = re.search(r"^\*\*(\S+?)\*\*", (ROOT / "CHANGELOG.md").read_text(), re.M)[1]
-    assert said == ds.__version__ and newest in (ds.__version__, "Next")
+    newest = re.search(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(), re.M)[1]
+    assert said == ds.__version__ and newest in (ds.__version__, "Unreleased")
 
 
 def test_links_of_an_index_lead_to_files():
