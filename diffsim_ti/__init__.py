@@ -5,15 +5,12 @@ import os
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # read when taichi is imported
 os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")  # no network traffic from a simulator
 
-from diffsim_ti import interrupts
+from diffsim_ti.common import interrupts
 
 interrupts.guard_import()
 
 import diffsim_ti.runtime  # noqa: F401  before anything imports taichi: it chooses which
-from diffsim_ti.adaptive_steps import adaptive_steps
 from diffsim_ti.batch import Batch, BatchFrames
-from diffsim_ti.contact.surface_pairs import Tunnelling
-from diffsim_ti.ensemble import Ensemble
 from diffsim_ti.identification import (
     Identification,
     Measurement,
@@ -41,8 +38,8 @@ from diffsim_ti.materials import (
     StVenantKirchhoff,
     Yeoh,
 )
+from diffsim_ti.mechanics.surfaces.surface_pairs import Tunnelling
 from diffsim_ti.mesh import TetrahedralMesh
-from diffsim_ti.modes import Modes, modes
 from diffsim_ti.monitor.energy_watch import EnergyGained
 from diffsim_ti.monitor.guard import Crossing, Divergence
 from diffsim_ti.outputs import (
@@ -61,10 +58,12 @@ from diffsim_ti.outputs import (
     TieTension,
     WorkOfLoads,
 )
+from diffsim_ti.outputs.modes import Modes, modes
 from diffsim_ti.rollout import Frames, Rollout
+from diffsim_ti.rollout.adaptive_steps import adaptive_steps
+from diffsim_ti.rollout.simulator import Simulator
 from diffsim_ti.runtime import init
 from diffsim_ti.scene import Scene
-from diffsim_ti.simulator import Simulator
 from diffsim_ti.solvers import (
     BDF2Solver,
     ImplicitEulerSolver,
@@ -103,6 +102,7 @@ from diffsim_ti.terms import (
     SurfaceDrag,
     Traction,
 )
+from diffsim_ti.torch_bridge.ensemble import Ensemble
 from diffsim_ti.verify import check_gradients, dot_product_test, taylor_test
 
 __version__ = "0.2.0"

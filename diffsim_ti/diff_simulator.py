@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
+from diffsim_ti.common.origin import middle_far_part, warn_of_rounding
 from diffsim_ti.diff_physics import DifferentiableBarrierContact, TorchMaterial, refuse_state
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.monitor import stability
-from diffsim_ti.origin import middle_far_part, warn_of_rounding
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.scene import Scene
 from diffsim_ti.solvers import SemiImplicitSolver, Solver, StaticSolver

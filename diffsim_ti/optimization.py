@@ -11,9 +11,9 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
 
-from diffsim_ti import ranks
+from diffsim_ti.common import ranks
+from diffsim_ti.common.progress import progress
 from diffsim_ti.mesh import TetrahedralMesh
-from diffsim_ti.progress import progress
 from diffsim_ti.torch_bridge.autograd import torch
 
 KEYS = ("iteration", "losses", "seconds", "best_loss", "best", "module", "optimizer", "random")

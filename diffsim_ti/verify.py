@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
-from diffsim_ti.differences import CentralDifferences, TaylorResult, central_difference, taylor_test
+from diffsim_ti.common.differences import CentralDifferences, TaylorResult, central_difference, taylor_test
 from diffsim_ti.identification import Identifiability, identifiability
 from diffsim_ti.inputs import RunSize
 from diffsim_ti.rollout import Frames, Rollout

@@ -43,9 +43,9 @@ def draw(rng, meshes, order: int = 1) -> dict:
 def fall(case: dict) -> dict:
     """Run one, and say how it went."""
     import diffsim_ti as ds
-    from diffsim_ti.adaptive_run import ForwardRun
     from diffsim_ti.cli.options import fall_scene, load_body, make_material, solver_class
-    from diffsim_ti.strength import check_strength
+    from diffsim_ti.scene.strength import check_strength
+    from diffsim_ti.writers.adaptive_run import ForwardRun
 
     ds.init()
     begin, height = time.perf_counter(), case["height"] * case["size"]

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 import diffsim_ti as ds
-from diffsim_ti.adaptive_run import ForwardRun
 from diffsim_ti.cli.options import fall_scene, load_body, make_material, solver_class
+from diffsim_ti.writers.adaptive_run import ForwardRun
 
 SIZE, HEIGHT, G = 0.2, 0.02, 9.81
 

@@ -15,7 +15,7 @@ import torch
 
 import diffsim_ti as ds
 from diffsim_ti.diff_simulator import rollout_frames
-from diffsim_ti.strength import check_strength
+from diffsim_ti.scene.strength import check_strength
 
 PACKAGE = Path(ds.__file__).parent
 ARGUMENT = re.compile(r"\b[a-z_]{3,}=")
@@ -96,7 +96,7 @@ FOLLOWED = {
         lambda: ds.Batch(ds.BDF2Solver(scene(), dt=1e-3), 2, 2, lanes=True),
         lambda: ds.Batch(ds.BDF2Solver(scene(), dt=1e-3), 2, 2),
     ),
-    ("locking.py", "where {} tetrahedra lock"): (lambda: scene(**WIDE), lambda: scene(**WIDE, volume="patches")),
+    ("scene/locking.py", "where {} tetrahedra lock"): (lambda: scene(**WIDE), lambda: scene(**WIDE, volume="patches")),
     ("materials/patch_law.py", "averages energies, but"): (
         lambda: scene(law=ds.KelvinVoigt(LAW, time=0.1), volume="patches"),
         lambda: scene(law=ds.KelvinVoigt(LAW, time=0.1), volume="tetrahedra"),
@@ -117,7 +117,7 @@ FOLLOWED = {
         lambda: ds.Rollout(verlet(), 1, outputs=[ds.Stress(at=[[2.0, 0.5, 0.5]])]),
         lambda: ds.Rollout(verlet(), 1, outputs=[ds.Stress(at=CUBE.locate([[2.0, 0.5, 0.5]], nearest=True).points)]),
     ),
-    ("modes.py", "has no modes here"): (
+    ("outputs/modes.py", "has no modes here"): (
         lambda: ds.modes(scene(mesh=JOINED, reduced={"body_0": "rigid"}), 1),
         lambda: ds.modes(scene(mesh=JOINED), 1),
     ),
@@ -145,19 +145,19 @@ FOLLOWED = {
         lambda: ds.Rollout(verlet(), 0).forward()["kinetic"],
         lambda: ds.Rollout(verlet(), 0, outputs=[ds.KineticEnergy(name="kinetic")]).forward()["kinetic"],
     ),
-    ("scene.py", "pass fixed=..."): (
+    ("scene/scene.py", "pass fixed=..."): (
         lambda: scene(motion=lambda t: (0, t, 0)),
         lambda: scene(motion=lambda t: (0, t, 0), fixed="xmin"),
     ),
-    ("simulator.py", "make the simulator with"): (
+    ("rollout/simulator.py", "make the simulator with"): (
         lambda: ds.Simulator(verlet(terms=[GROUND])).output(ds.ContactForce(GROUND)),
         lambda: ds.Simulator(verlet(terms=[GROUND]), contact_forces=True).output(ds.ContactForce(GROUND)),
     ),
-    ("simulator.py", "counts from the start of a run"): (
+    ("rollout/simulator.py", "counts from the start of a run"): (
         lambda: ds.Simulator(verlet()).output(ds.WorkOfLoads(weight=True)),
         lambda: ds.Rollout(verlet(terms=[ds.Gravity()]), 0, outputs=[ds.WorkOfLoads(weight=True)]).forward(),
     ),
-    ("solvers/explicit/body_checks.py", "feel obstacles as a force"): (
+    ("mechanics/reduced/body_checks.py", "feel obstacles as a force"): (
         lambda: verlet(**RIGID),
         lambda: verlet(**RIGID, contact="force"),
     ),
@@ -200,7 +200,7 @@ FOLLOWED = {
         lambda: rollout_frames(ds.Batch(verlet(), 1, 2, gradients=["initial_positions"]), youngs_modulus=TORCH_E),
         lambda: rollout_frames(ds.Batch(verlet(), 1, 2, gradients="all"), youngs_modulus=TORCH_E),
     ),
-    ("strength.py", "raise Young's modulus to"): (
+    ("scene/strength.py", "raise Young's modulus to"): (
         lambda: strong(100.0),
         lambda: strong(advised(lambda: strong(100.0))),
     ),
@@ -213,11 +213,11 @@ FOLLOWED = {
 ANOTHER_MACHINE = "needs another machine, process, backend or build"
 ELSEWHERE = {  # (file, part of the message): the test that provokes it and follows it, or why none does
     ("batch/taped.py", "its field is already"): "test_batch_tape.py",
-    ("checked.py", "is a tensor with a graph"): "test_torch.py, test_calls.py",
+    ("common/checked.py", "is a tensor with a graph"): "test_torch.py, test_calls.py",
     ("cli/identify.py", "expected input=guess"): "test_identify.py",
-    ("contact/surface_pairs.py", "take a width below"): "test_self_contact.py",
-    ("contact/surface_pairs.py", "take substeps of {} s"): "test_self_contact.py, battery_of_throws.py",
-    ("contact/surface_pairs.py", "no step stops them"): "test_self_contact.py, battery_of_throws.py",
+    ("mechanics/surfaces/surface_pairs.py", "take a width below"): "test_self_contact.py",
+    ("mechanics/surfaces/surface_pairs.py", "take substeps of {} s"): "test_self_contact.py, battery_of_throws.py",
+    ("mechanics/surfaces/surface_pairs.py", "no step stops them"): "test_self_contact.py, battery_of_throws.py",
     ("diff_simulator.py", "a two-step method"): "test_torch_solvers.py",
     ("identification/descent.py", "take smaller steps"): "names neither an argument nor a number",
     ("identification/problem.py", "has no gradient by"): "test_identification.py",
@@ -234,7 +234,7 @@ ELSEWHERE = {  # (file, part of the message): the test that provokes it and foll
     ("monitor/guard.py", "reduce dt, raise substeps"): "test_step_limit.py",
     ("monitor/guard.py", "was stiffer than the substep"): "test_contact.py, test_contact_faces.py",
     ("monitor/stability.py", "in this precision"): "test_step_limit.py",
-    ("origin.py", "of the barrier's width"): "test_far_from_origin.py",
+    ("common/origin.py", "of the barrier's width"): "test_far_from_origin.py",
     ("rollout/doubts.py", "gradients through contacts"): "test_contact_gradients.py",
     ("rollout/doubts.py", "the adjoint grew"): "test_gradient_faults.py; a chaotic run has no better gradient",
     ("rollout/taped.py", "already ran in this tape"): "test_tape.py",
@@ -247,15 +247,15 @@ ELSEWHERE = {  # (file, part of the message): the test that provokes it and foll
     ("solvers/implicit/closing.py", "but for contact {}"): "test_supports.py",
     ("solvers/implicit/newton.py", "pass max_iterations={}"): "test_implicit.py",
     ("state/bending.py", "refine the mesh, or take a width of"): "none: faces that bow beyond three cuts",
-    ("solvers/implicit/blocked.py", "finds no room"): "test_swept.py, battery_of_impacts.py",
-    ("solvers/implicit/blocked.py", "the barrier cannot stop it"): "battery_of_impacts.py",
-    ("solvers/implicit/blocked.py", "take substeps of"): "battery_of_impacts.py",
+    ("mechanics/obstacles/blocked.py", "finds no room"): "test_swept.py, battery_of_impacts.py",
+    ("mechanics/obstacles/blocked.py", "the barrier cannot stop it"): "battery_of_impacts.py",
+    ("mechanics/obstacles/blocked.py", "take substeps of"): "battery_of_impacts.py",
     ("solvers/solver.py", "pass substeps="): "above, as a part of what exceeds the stable step",
-    ("strength.py", "or let it fall"): "test_strength.py",
+    ("scene/strength.py", "or let it fall"): "test_strength.py",
     ("study/trials.py", "nothing tried meets"): "test_study.py; a budget is no promise",
     ("terms/growth.py", "takes growth of shape"): "test_growth_over_time.py",
     ("terms/muscle.py", "takes activations of shape"): "test_muscles.py",
-    ("terms_of_scene.py", "give them a name="): "test_scene.py",
+    ("terms/terms_of_scene.py", "give them a name="): "test_scene.py",
     ("torch_bridge/step_sizes.py", "parameter_groups(relative=...)"): "test_step_sizes.py",
     ("torch_bridge/step_sizes.py", "parameter_groups(relative=0.05)"): "test_step_sizes.py",
     ("torch_bridge/tensors.py", "sees no card"): ANOTHER_MACHINE,

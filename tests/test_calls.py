@@ -12,7 +12,7 @@ import torch
 from fuzz_calls import LAWS, OPTIONS, TERMS, TETRAHEDRON, body, combination
 
 import diffsim_ti as ds
-from diffsim_ti.checked import shown
+from diffsim_ti.common.checked import shown
 from diffsim_ti.diff_simulator import rollout_frames
 from diffsim_ti.materials import Material
 

@@ -7,9 +7,9 @@ from test_every_adjoint import assert_transposed
 from test_term_order import IMPLICIT, SOLVERS
 
 import diffsim_ti as ds
+from diffsim_ti.mechanics.chambers.multipliers import HeldVolumes
+from diffsim_ti.mechanics.chambers.pressures import ChamberPressure
 from diffsim_ti.monitor.stability import Stiffness
-from diffsim_ti.potential.chamber_pressure import ChamberPressure
-from diffsim_ti.solvers.implicit.held_volumes import HeldVolumes
 
 STEPS = 2
 PLANES = dict(x0="x", y0="y", z0="z")

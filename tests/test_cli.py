@@ -11,18 +11,18 @@ import saved_series as series
 from open_laws.relaxing import RelaxingRubber
 from open_laws.viscous import ViscousRubber
 
-from diffsim_ti import adaptive_run as forward
 from diffsim_ti import picture
 from diffsim_ti.cli import app as cli
 from diffsim_ti.cli import options
-from diffsim_ti.contact.surface_pairs import Overlap
 from diffsim_ti.materials import StableNeoHookean
+from diffsim_ti.mechanics.surfaces.surface_pairs import Overlap
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.monitor.quantities import Energy, TetrahedronFields
+from diffsim_ti.rollout.simulator import Simulator
 from diffsim_ti.scene import Scene
-from diffsim_ti.simulator import Simulator
 from diffsim_ti.solvers import BDF2Solver, ImplicitEulerSolver, SemiImplicitSolver, VelocityVerletSolver
 from diffsim_ti.terms import Gravity, Ground, Sphere
+from diffsim_ti.writers import adaptive_run as forward
 
 
 def command(*arguments):

@@ -11,7 +11,7 @@ from test_swept import needle
 
 import diffsim_ti as ds
 from diffsim_ti.inputs.surface_areas import SurfaceAreas
-from diffsim_ti.potential import face_lattice
+from diffsim_ti.mechanics.obstacles import face_lattice
 
 SOFT = ds.StableNeoHookean(1e5, 0.3)
 CORNERS = 0.1 * np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])  # of a regular tetrahedron

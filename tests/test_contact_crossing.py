@@ -5,7 +5,7 @@ import pytest
 from contact_scenes import EXPLICIT, FORCE, SHAPES, points, tetrahedron
 
 import diffsim_ti as ds
-from diffsim_ti.adaptive_run import ForwardRun
+from diffsim_ti.writers.adaptive_run import ForwardRun
 
 solvers = pytest.mark.parametrize("solver", FORCE)
 

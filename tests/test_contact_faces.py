@@ -7,9 +7,9 @@ import pytest
 from impact_judge import Judge
 
 import diffsim_ti as ds
-from diffsim_ti.adaptive_run import ForwardRun
+from diffsim_ti.mechanics.obstacles.felt_faces import FeltFaces
 from diffsim_ti.monitor.stability import Stiffness
-from diffsim_ti.solvers.explicit.felt_faces import FeltFaces
+from diffsim_ti.writers.adaptive_run import ForwardRun
 
 SIZE, WIDTH = 0.2, 0.01
 EXPLICIT = [ds.SemiImplicitSolver, ds.VelocityVerletSolver]

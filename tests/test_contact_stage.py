@@ -11,7 +11,7 @@ from test_contact_crossing import THIN
 
 import diffsim_ti as ds
 from diffsim_ti import runtime
-from diffsim_ti.solvers.explicit import contact_stage
+from diffsim_ti.mechanics.obstacles import contact_stage
 from diffsim_ti.solvers.explicit.kernels import explicit_kernels
 from diffsim_ti.terms.obstacles import barrier, secant
 

@@ -10,12 +10,12 @@ from test_every_adjoint import assert_transposed
 
 import diffsim_ti as ds
 from diffsim_ti import runtime
-from diffsim_ti.contact.curved_pairs import CurvedPairs
-from diffsim_ti.contact.surface_pairs import SurfacePairs
+from diffsim_ti.mechanics.obstacles.face_lattice import lattices
+from diffsim_ti.mechanics.surfaces.curved_pairs import CurvedPairs
+from diffsim_ti.mechanics.surfaces.surface_pairs import SurfacePairs
 from diffsim_ti.mesh import curved_triangles, reference_face
 from diffsim_ti.mesh.collision_surface import CollisionSurface, cuts_of
 from diffsim_ti.mesh.ten_nodes import QUARTERS
-from diffsim_ti.potential.face_lattice import lattices
 from diffsim_ti.terms.obstacles.barrier import beta
 
 R, W = 0.1, 0.004

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import diffsim_ti as ds
-from diffsim_ti.adaptive_run import ForwardRun
 from diffsim_ti.monitor.energy_watch import EnergyGained
 from diffsim_ti.monitor.stability import lanczos_limit
 from diffsim_ti.study.stability_axes import AXES
 from diffsim_ti.study.stability_map import given_by_muscles
+from diffsim_ti.writers.adaptive_run import ForwardRun
 
 MESH = ds.TetrahedralMesh.create_box(4, size=0.1)
 ABOVE = MESH.translated([0, 0.02 - MESH.bounding_box[0, 1], 0])

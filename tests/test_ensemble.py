@@ -6,8 +6,8 @@ import torch
 from kill_ranks import alone, run
 
 import diffsim_ti as ds
-from diffsim_ti import ranks
-from diffsim_ti.ensemble import shares
+from diffsim_ti.common import ranks
+from diffsim_ti.torch_bridge.ensemble import shares
 
 
 def test_shares_of_ranks():

@@ -11,10 +11,10 @@ from test_gradients import by_solver, final_loss_gradient, free_scene, full_scen
 import diffsim_ti as ds
 from diffsim_ti import verify
 from diffsim_ti.materials.stable_neo_hookean import StableNeoHookeanLaw
+from diffsim_ti.mechanics.obstacles.contact_stage import ContactStage
 from diffsim_ti.runtime import traced
 from diffsim_ti.solvers.explicit import vertex_parts
 from diffsim_ti.solvers.explicit.adjoint import ExplicitAdjoint
-from diffsim_ti.solvers.explicit.contact_stage import ContactStage
 from diffsim_ti.terms.obstacles.ground import GroundForce
 
 # ---- mutations: each must fail the dot-product test or the table of gradients -----------------------------------------

@@ -13,7 +13,7 @@ import pytest
 from test_cli import fails
 
 import diffsim_ti as ds
-from diffsim_ti import interrupts
+from diffsim_ti.common import interrupts
 from diffsim_ti.film import render_series
 from diffsim_ti.visual.frame import Frame, Setting
 from diffsim_ti.visual.series import SavedSeries

@@ -7,7 +7,7 @@ from test_chambers import assert_outputs_transposed, assert_tangents, hollow, pi
 from test_every_adjoint import assert_transposed
 
 import diffsim_ti as ds
-from diffsim_ti.solvers.explicit.held_derivatives import HeldAdjoint
+from diffsim_ti.mechanics.chambers.held_volume_derivatives import HeldAdjoint
 
 EXPLICIT = [ds.SemiImplicitSolver, ds.VelocityVerletSolver]
 EVERY = [*EXPLICIT, ds.ImplicitEulerSolver, ds.StaticSolver]

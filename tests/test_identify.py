@@ -7,10 +7,10 @@ import pytest
 from scipy.optimize import least_squares
 
 import diffsim_ti as ds
-from diffsim_ti.finer import rollout_on_ten_nodes
 from diffsim_ti.identification.picture import save_picture
 from diffsim_ti.identification.priors import Priors
 from diffsim_ti.identification.problem import Problem
+from diffsim_ti.rollout.finer import rollout_on_ten_nodes
 from diffsim_ti.study.elements import refined
 
 identify = partial(ds.identify, check_mesh=False)  # data are of the mesh that is fitted

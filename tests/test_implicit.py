@@ -9,7 +9,7 @@ import pytest
 from battery_of_long_steps import draw, judge
 
 import diffsim_ti as ds
-from diffsim_ti.solvers.implicit.projection import has_eigenvalue_below
+from diffsim_ti.mechanics.stress.projection import has_eigenvalue_below
 from diffsim_ti.solvers.implicit.rotations import rotations_of
 
 SOLVERS = (ds.ImplicitEulerSolver, ds.ImplicitMidpointSolver, ds.BDF2Solver)
@@ -271,7 +271,7 @@ def test_series_of_bars_with_stiffnesses_over_six_decades():
 @pytest.mark.parametrize("force", [0.5, 50.0])
 def test_every_iterate_of_a_compression_keeps_its_orientation(force, monkeypatch):
     """Fifty times the load that halves the block, laid on at once."""
-    from diffsim_ti.potential.potential import Potential
+    from diffsim_ti.mechanics.energy.potential import Potential
 
     smallest, plain = [], Potential.forces
     monkeypatch.setattr(Potential, "forces", lambda self: (smallest.append(self.energy()[2].min()), plain(self))[1])

@@ -9,11 +9,11 @@ import pytest
 from chamber_meshes import hollow_cube
 
 import diffsim_ti as ds
-from diffsim_ti.mobility import free_motions
+from diffsim_ti.mechanics.stress.projection import Projection
+from diffsim_ti.mechanics.supports.mobility import free_motions
 from diffsim_ti.solvers.implicit.factorised import Effort, Factorised
 from diffsim_ti.solvers.implicit.linear import Operator, conjugate_gradients, gmres, solve
 from diffsim_ti.solvers.implicit.preconditioners import BlockJacobi
-from diffsim_ti.solvers.implicit.projection import Projection
 
 LAW = ds.StableNeoHookean(1e5, 0.3)
 

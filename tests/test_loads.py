@@ -7,7 +7,7 @@ from test_gradients import random_mesh
 from test_term_order import SOLVERS
 
 import diffsim_ti as ds
-from diffsim_ti.potential.follower_pressure import FollowerPressure, is_symmetric
+from diffsim_ti.mechanics.pressure.follower_pressure import FollowerPressure, is_symmetric
 from diffsim_ti.solvers.implicit.linear import Operator, gmres
 
 STEPS = 4

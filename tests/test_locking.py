@@ -8,10 +8,10 @@ from example_files import example
 
 import diffsim_ti as ds
 from diffsim_ti.materials import MATERIALS
+from diffsim_ti.mechanics.energy.assembled import assemble
 from diffsim_ti.mesh.patches import SIZE, in_eights, volume_patches
 from diffsim_ti.monitor import quantities
 from diffsim_ti.monitor.stability import element_limit, lanczos_limit
-from diffsim_ti.potential.assembled import assemble
 
 locking = example("benchmarks/locking")
 

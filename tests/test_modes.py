@@ -6,7 +6,7 @@ from scipy.linalg import eigh
 
 import diffsim_ti as ds
 from diffsim_ti import verify
-from diffsim_ti.potential.attached import Attached
+from diffsim_ti.mechanics.ties.attached import Attached
 
 E, NU, RHO = 3e6, 0.3, 1200.0
 

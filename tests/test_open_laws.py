@@ -13,11 +13,11 @@ from open_laws.viscous import ViscousRubber
 import diffsim_ti as ds
 from diffsim_ti import runtime, verify
 from diffsim_ti.differentiation import x_minus_log1p
-from diffsim_ti.elements.items import Block, Single
 from diffsim_ti.materials import EnergyLaw, FibreReinforced, Gent, Grown, Material, Ogden, Yeoh
 from diffsim_ti.materials.calculus.tensor import Tensor, invariants
 from diffsim_ti.materials.gent import GentLaw
 from diffsim_ti.materials.ogden import OgdenLaw
+from diffsim_ti.mechanics.stress.items import Block, Single
 from diffsim_ti.runtime import traced
 
 COUNT = 8  # states, one for each lane

@@ -7,8 +7,7 @@ from contact_scenes import G, points, resting_gap, tetrahedron, with_options
 from matplotlib.image import imread
 
 import diffsim_ti as ds
-from diffsim_ti import rotations
-from diffsim_ti.adaptive_run import ForwardRun, run_and_write
+from diffsim_ti.common import rotations
 from diffsim_ti.film import render_series
 from diffsim_ti.inputs.poses import PoseColumns
 from diffsim_ti.obstacles import obstacle_surfaces
@@ -17,6 +16,7 @@ from diffsim_ti.visual.frame import Frame
 from diffsim_ti.visual.frame_sources import LiveFrames
 from diffsim_ti.visual.series import SavedSeries
 from diffsim_ti.writers import View, writer_for
+from diffsim_ti.writers.adaptive_run import ForwardRun, run_and_write
 
 MU, CREEP, DT = 0.5, 1e-4, 5e-4
 SOLVERS = with_options(ds.SemiImplicitSolver, contact_damping=1.0), ds.ImplicitEulerSolver

@@ -16,9 +16,9 @@ from diffsim_ti.diff_simulator import rollout_frames
 from diffsim_ti.inputs import StressPoints
 from diffsim_ti.inputs.surface_areas import SurfaceAreas
 from diffsim_ti.materials import MATERIALS
+from diffsim_ti.mechanics.energy.potential import Potential
 from diffsim_ti.mesh.face_points import bow
 from diffsim_ti.mesh.reference_element import quadrature
-from diffsim_ti.potential.potential import Potential
 from diffsim_ti.state.arrays import SceneArrays
 
 STEPS = 4

@@ -7,9 +7,9 @@ from quadratic_meshes import box, crumpled, face_rule, renumbered, ring, six, si
 from test_every_adjoint import assert_transposed
 
 import diffsim_ti as ds
+from diffsim_ti.mechanics.pressure.follower_pressure import FollowerPressure, is_symmetric
 from diffsim_ti.mesh import reference_face
 from diffsim_ti.mesh.face_points import face_points
-from diffsim_ti.potential.follower_pressure import FollowerPressure, is_symmetric
 
 LAW = ds.StableNeoHookean(1e5, 0.3)
 CURVED = pytest.mark.parametrize("make", [wavy, crumpled, lambda: ring(2)], ids=["wavy", "crumpled", "ring"])

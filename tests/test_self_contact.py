@@ -10,7 +10,7 @@ from scipy.optimize import brentq
 
 import diffsim_ti as ds
 from diffsim_ti import verify
-from diffsim_ti.contact.surface_pairs import SurfacePairs
+from diffsim_ti.mechanics.surfaces.surface_pairs import SurfacePairs
 
 MATERIAL = ds.StableNeoHookean(5e4, 0.3)
 STIFFNESS, WIDTH, DT = 2e4, 5e-3, 1e-4

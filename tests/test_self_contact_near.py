@@ -8,9 +8,9 @@ from near_meshes import c_shape, shaken, slit
 
 import diffsim_ti as ds
 from diffsim_ti import runtime, verify
-from diffsim_ti.contact.evaluate import evaluate_pairs
-from diffsim_ti.contact.proximity import EDGE_EDGE, PARALLEL, VERTEX_TRIANGLE
-from diffsim_ti.contact.surface_pairs import surface_edges
+from diffsim_ti.mechanics.surfaces.evaluate import evaluate_pairs
+from diffsim_ti.mechanics.surfaces.proximity import EDGE_EDGE, PARALLEL, VERTEX_TRIANGLE
+from diffsim_ti.mechanics.surfaces.surface_pairs import surface_edges
 from diffsim_ti.terms.obstacles.barrier import beta
 
 LAW, STIFFNESS, WIDTH = ds.StableNeoHookean(5e4, 0.3), 2e3, 5e-3

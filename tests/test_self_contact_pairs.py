@@ -8,14 +8,14 @@ import taichi as ti
 
 import diffsim_ti as ds
 from diffsim_ti import runtime
-from diffsim_ti.contact.box_tree import BoxTree, beyond
-from diffsim_ti.contact.broad_phase import CandidatePairs
-from diffsim_ti.contact.broad_phase_kernels import bits_from, lowest, sort
-from diffsim_ti.contact.buffers import BLOCK, Buffers, Launches
-from diffsim_ti.contact.evaluate import evaluate_pairs
-from diffsim_ti.contact.listed_pair import MARGIN
-from diffsim_ti.contact.proximity import EDGE_EDGE, VERTEX_TRIANGLE
-from diffsim_ti.contact.surface_pairs import surface_edges
+from diffsim_ti.mechanics.surfaces.box_tree import BoxTree, beyond
+from diffsim_ti.mechanics.surfaces.broad_phase import CandidatePairs
+from diffsim_ti.mechanics.surfaces.broad_phase_kernels import bits_from, lowest, sort
+from diffsim_ti.mechanics.surfaces.buffers import BLOCK, Buffers, Launches
+from diffsim_ti.mechanics.surfaces.evaluate import evaluate_pairs
+from diffsim_ti.mechanics.surfaces.listed_pair import MARGIN
+from diffsim_ti.mechanics.surfaces.proximity import EDGE_EDGE, VERTEX_TRIANGLE
+from diffsim_ti.mechanics.surfaces.surface_pairs import surface_edges
 from diffsim_ti.mesh.sets import pieces
 
 by_kind = pytest.mark.parametrize("kind", [VERTEX_TRIANGLE, EDGE_EDGE])

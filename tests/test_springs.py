@@ -10,7 +10,7 @@ from test_term_order import SOLVERS
 
 import diffsim_ti as ds
 from diffsim_ti.diff_simulator import rollout_frames
-from diffsim_ti.potential.attached import Attached
+from diffsim_ti.mechanics.ties.attached import Attached
 from diffsim_ti.state.schedule import EqualSteps
 
 STEPS = 4

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import diffsim_ti as ds
-from diffsim_ti.adaptive_run import ForwardRun
 from diffsim_ti.cli.options import fall_scene
-from diffsim_ti.strength import check_strength
+from diffsim_ti.scene.strength import check_strength
+from diffsim_ti.writers.adaptive_run import ForwardRun
 
 CUBE = ds.TetrahedralMesh.create_box(4, size=0.5)
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import diffsim_ti as ds
+from diffsim_ti.mechanics.obstacles.obstacle_ways import ObstacleWays
 from diffsim_ti.solvers import SOLVERS
-from diffsim_ti.solvers.implicit.obstacle_ways import ObstacleWays
 from diffsim_ti.study import boundary, growth, map_picture, power_limit, stability_map
 from diffsim_ti.study.stability_axes import AXES, body
 from diffsim_ti.study.stability_map import OUTCOMES, judge

@@ -13,7 +13,7 @@ from test_term_order import SOLVERS
 
 import diffsim_ti as ds
 from diffsim_ti.diff_simulator import rollout_frames
-from diffsim_ti.supports import Supports, rigid_motions_left
+from diffsim_ti.terms.supports import Supports, rigid_motions_left
 
 STEPS = 4
 MIXED = {"xmin": "x", "ymin": "y", "zmin": "z", "lid": [[1, 1, 0.5]]}

@@ -6,8 +6,8 @@ from battery_of_impacts import SOLVERS, battery, draw
 from impact_judge import Judge, distance_to_segment, overlaps
 
 import diffsim_ti as ds
-from diffsim_ti.potential.way import Way
-from diffsim_ti.solvers.implicit.blocked import Blocked
+from diffsim_ti.mechanics.obstacles.blocked import Blocked
+from diffsim_ti.mechanics.obstacles.way import Way
 
 DAMPED = pytest.mark.parametrize("solver", [ds.ImplicitEulerSolver, ds.BDF2Solver], ids=lambda s: s.__name__)
 SOFT = ds.StableNeoHookean(1e5, 0.3)
@@ -214,7 +214,7 @@ def squeezed(solver, **options):
 
 @DAMPED
 def test_gradients_where_ways_are_cut_and_obstacles_come_in_parts(solver, monkeypatch):
-    from diffsim_ti.solvers.implicit.approach import Approach
+    from diffsim_ti.mechanics.obstacles.approach import Approach
 
     parts, usual = [], Approach._in_parts
     monkeypatch.setattr(Approach, "_in_parts", lambda self, *a: parts.append(1) or usual(self, *a))

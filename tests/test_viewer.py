@@ -11,7 +11,6 @@ from saved_series import Series
 
 import diffsim_ti as ds
 from diffsim_ti import cli
-from diffsim_ti.adaptive_run import ForwardRun
 from diffsim_ti.cli import options as cli_options
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.visual import viewer
@@ -21,6 +20,7 @@ from diffsim_ti.visual.drawing import Drawing
 from diffsim_ti.visual.frame_sources import LiveFrames, SavedFrames
 from diffsim_ti.visual.viewer import Viewer
 from diffsim_ti.writers import View, writer_for
+from diffsim_ti.writers.adaptive_run import ForwardRun
 
 SIZE = (200, 150)
 

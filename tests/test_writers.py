@@ -11,11 +11,11 @@ from matplotlib.image import imread
 
 import diffsim_ti as ds
 from diffsim_ti import writers
-from diffsim_ti.adaptive_run import ForwardRun, file_in, run_and_write
 from diffsim_ti.cli import app
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.visual.series import SavedSeries
 from diffsim_ti.writers import Frame, Setting, View, Writer, open_writer, register, writer_for
+from diffsim_ti.writers.adaptive_run import ForwardRun, file_in, run_and_write
 
 SIZE = (160, 120)
 

@@ -12,12 +12,12 @@ from diffsim_ti.batch.set_values import gathered_scenes
 from diffsim_ti.batch.side_by_side import why_not
 from diffsim_ti.batch.sweep import BatchSweep, Own, value_of
 from diffsim_ti.batch.taped import BatchTapeFace
-from diffsim_ti.checked import as_numbers, instance, whole
-from diffsim_ti.copies import made_again
+from diffsim_ti.common.checked import as_numbers, instance, whole
+from diffsim_ti.common.copies import made_again
+from diffsim_ti.common.origin import positions_of
 from diffsim_ti.inputs import Derived
 from diffsim_ti.mesh.collision_surface import BOWED
 from diffsim_ti.mesh.face_points import bow, bows
-from diffsim_ti.origin import positions_of
 from diffsim_ti.outputs import Output
 from diffsim_ti.rollout.frames import Frames, check_finite
 from diffsim_ti.rollout.rollout import Rollout

@@ -8,8 +8,8 @@ import taichi as ti
 from diffsim_ti.batch.free_vertices import FreeVertices
 from diffsim_ti.batch.tetrahedra import TetrahedronOfEight, element_of_eight
 from diffsim_ti.batch.views import AtVertices, Corners, Item, Scratch, Shared, Uniform, Vectors, View
-from diffsim_ti.elements.tetrahedron import Onwards
 from diffsim_ti.materials.calculus.tensor import sum_of
+from diffsim_ti.mechanics.stress.tetrahedron import Onwards
 from diffsim_ti.runtime import Bundle, at, let, traced
 from diffsim_ti.solvers.explicit.further_elements import FurtherElements
 from diffsim_ti.solvers.explicit.kick_drift import KickDrift

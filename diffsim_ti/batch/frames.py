@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffsim_ti.checked import as_numbers
+from diffsim_ti.common.checked import as_numbers
 from diffsim_ti.rollout.frames import Frames
 from diffsim_ti.rollout.run import Run
 from diffsim_ti.state.watch import ContactResolution

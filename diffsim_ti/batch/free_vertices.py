@@ -9,8 +9,8 @@ from functools import cached_property
 
 import taichi as ti
 
+from diffsim_ti.mechanics.loads.explicit import GivenForces
 from diffsim_ti.runtime import LANES, PRECISIONS, Bundle, assign, at, let, traced, variable
-from diffsim_ti.solvers.explicit.given_forces import GivenForces
 from diffsim_ti.state.features import Features
 
 A = ti.template()

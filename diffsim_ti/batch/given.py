@@ -6,7 +6,7 @@ import numpy as np
 
 from diffsim_ti.batch.set_values import spread_scenes
 from diffsim_ti.batch.sweep import BatchValues, Own, value_of
-from diffsim_ti.checked import as_numbers
+from diffsim_ti.common.checked import as_numbers
 from diffsim_ti.rollout.rollout import Rollout
 from diffsim_ti.rollout.set_values import change_like
 from diffsim_ti.scene import Scene

@@ -3,7 +3,7 @@
 import taichi as ti
 
 from diffsim_ti import runtime
-from diffsim_ti.slots import copy_slot
+from diffsim_ti.runtime.slots import copy_slot
 
 
 class BatchHistory:

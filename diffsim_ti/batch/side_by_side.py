@@ -3,7 +3,7 @@
 import numpy as np
 
 from diffsim_ti import runtime
-from diffsim_ti.solvers.explicit.felt_faces import feels_faces
+from diffsim_ti.mechanics.obstacles.felt_faces import feels_faces
 from diffsim_ti.terms import SelfContact
 
 

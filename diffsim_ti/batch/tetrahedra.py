@@ -1,4 +1,4 @@
-"""Functions of the tetrahedra of a batch, and of patches of them (elements/patched_tetrahedron.py)."""
+"""Functions of the tetrahedra of a batch, and of patches of them (mechanics/stress/patched_tetrahedron.py)."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -6,9 +6,9 @@ from functools import cached_property
 import taichi as ti
 
 from diffsim_ti.batch.views import EightScenes, ItemsOfScenes, OneScene
-from diffsim_ti.elements.patched_tetrahedron import MOST, PatchedTetrahedron
-from diffsim_ti.elements.tetrahedron import Tetrahedron
 from diffsim_ti.materials.patch_law import PatchLaw
+from diffsim_ti.mechanics.stress.patched_tetrahedron import MOST, PatchedTetrahedron
+from diffsim_ti.mechanics.stress.tetrahedron import Tetrahedron
 from diffsim_ti.runtime import LANES, Bundle, assign, let, traced, variable
 
 A = ti.template()  # an array or Bundle handed to a Taichi function

@@ -9,7 +9,7 @@ from functools import cached_property
 import taichi as ti
 
 from diffsim_ti.batch.layouts import APART
-from diffsim_ti.elements.items import Items
+from diffsim_ti.mechanics.stress.items import Items
 from diffsim_ti.runtime import LANES, Expr, assign, at, let, traced
 
 A = ti.template()  # an array or Bundle handed to a Taichi function

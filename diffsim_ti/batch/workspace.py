@@ -19,8 +19,8 @@ from diffsim_ti.batch.layouts import Innermost, Lanes, in_slots
 from diffsim_ti.batch.side_by_side import growths_placed, placed
 from diffsim_ti.batch.table import ScenesTable
 from diffsim_ti.inputs import Derived
-from diffsim_ti.slots import copy_slot
-from diffsim_ti.solvers.explicit.contact_stage import ROWS
+from diffsim_ti.mechanics.obstacles.contact_stage import ROWS
+from diffsim_ti.runtime.slots import copy_slot
 from diffsim_ti.solvers.explicit.further_elements import counts_of_further
 from diffsim_ti.state.arrays import SceneArrays
 from diffsim_ti.state.solve_report import SolveReport

@@ -9,8 +9,6 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from diffsim_ti import interrupts
-from diffsim_ti.adaptive_run import Interrupted
 from diffsim_ti.cli.identify import identify
 from diffsim_ti.cli.options import (
     SUFFIXES,
@@ -43,8 +41,10 @@ from diffsim_ti.cli.options import (
 )
 from diffsim_ti.cli.study import register as register_study
 from diffsim_ti.cli.view import register
+from diffsim_ti.common import interrupts
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.scene import Scene
+from diffsim_ti.writers.adaptive_run import Interrupted
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, help="Soft bodies on tetrahedra.")
 register_study(app)  # chart, stability, recommend
@@ -154,8 +154,8 @@ def simulate(
 ) -> None:
     """Simulate a body, by default its fall onto a floor; write a series and a picture of the end, or films, arrays ..."""
     from diffsim_ti import runtime
-    from diffsim_ti.adaptive_run import ForwardRun, file_in, run_and_write
     from diffsim_ti.writers import View, writer_for
+    from diffsim_ti.writers.adaptive_run import ForwardRun, file_in, run_and_write
 
     begin = time.perf_counter()
     check_length(duration, fps, dt)
@@ -277,12 +277,12 @@ def demo(
 ) -> None:
     """Drop a twisted jelly column, write pictures and a series, and take the gradient of its fall by Young's modulus."""
     from diffsim_ti import runtime
-    from diffsim_ti.adaptive_run import ForwardRun, run_and_write
     from diffsim_ti.materials import StableNeoHookean
     from diffsim_ti.picture import save_picture
     from diffsim_ti.scene import Scene
     from diffsim_ti.solvers import SemiImplicitSolver
     from diffsim_ti.terms import Gravity
+    from diffsim_ti.writers.adaptive_run import ForwardRun, run_and_write
 
     begin = time.perf_counter()
     runtime.init(backend)

@@ -18,8 +18,8 @@ from diffsim_ti.terms import Drag, Ground, Term
 from diffsim_ti.writers import WRITERS
 
 if TYPE_CHECKING:
-    from diffsim_ti.adaptive_run import ForwardRun
     from diffsim_ti.outputs import Output
+    from diffsim_ti.writers.adaptive_run import ForwardRun
 
 
 Up = Enum("Up", {name: name for name in ("x", "y", "z", "-x", "-y", "-z")}, type=str)

@@ -9,7 +9,7 @@ import typer
 from diffsim_ti.cli.options import Backend, Density, Folder, MaterialName, Poisson, Precision, Youngs, load_body
 from diffsim_ti.cli.own_scene import Fixed, Workers, own_scene
 from diffsim_ti.cli.sweep import sweep
-from diffsim_ti.progress import progress
+from diffsim_ti.common.progress import progress
 
 Quick = Annotated[bool, typer.Option("--quick", help="small meshes, few steps: seconds instead of minutes")]
 

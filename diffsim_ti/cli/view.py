@@ -99,11 +99,11 @@ def view(
 ) -> None:
     """Look at a saved series in a window, or at a mesh as it falls: play, step, scrub, turn, colour by a field, pull."""
     from diffsim_ti import runtime
-    from diffsim_ti.adaptive_run import ForwardRun
     from diffsim_ti.terms import ExternalForce
     from diffsim_ti.visual.frame_sources import LiveFrames, SavedFrames
     from diffsim_ti.visual.viewer import NO_DISPLAY, Viewer, has_display
     from diffsim_ti.writers import View, writer_for
+    from diffsim_ti.writers.adaptive_run import ForwardRun
 
     if not has_display():
         raise RuntimeError(NO_DISPLAY)

@@ -5,8 +5,8 @@ import warnings
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffsim_ti.checked import numbers, wholes
-from diffsim_ti.origin import rounding_of
+from diffsim_ti.common.checked import numbers, wholes
+from diffsim_ti.common.origin import rounding_of
 from diffsim_ti.rollout import Frames, Rollout
 
 

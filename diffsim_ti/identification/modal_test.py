@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from diffsim_ti.checked import instance, whole
-from diffsim_ti.modes import Modes, modes
+from diffsim_ti.common.checked import instance, whole
+from diffsim_ti.outputs.modes import Modes, modes
 from diffsim_ti.scene import Scene
 
 START = ("initial_positions", "initial_velocities")

@@ -8,7 +8,7 @@ import numpy as np
 from diffsim_ti.identification.measurements import Measurement
 from diffsim_ti.identification.modal_test import ModalTest
 from diffsim_ti.identification.unknowns import TIME_OFFSET, Free, Unknown
-from diffsim_ti.modes import Modes
+from diffsim_ti.outputs.modes import Modes
 from diffsim_ti.rollout import Frames, Rollout
 
 Experiment = Rollout | ModalTest

@@ -5,7 +5,7 @@ from contextlib import suppress
 
 import numpy as np
 
-from diffsim_ti.checked import shown
+from diffsim_ti.common.checked import shown
 from diffsim_ti.identification.levenberg_marquardt import DENSE
 from diffsim_ti.identification.priors import Priors
 from diffsim_ti.identification.problem import Problem

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffsim_ti.checked import numbers, shape_of, shown
+from diffsim_ti.common.checked import numbers, shape_of, shown
 from diffsim_ti.rollout import Rollout
 
 TIME_OFFSET = "time_offset"  # of measurements with times of their own [s]

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from diffsim_ti import rotations
+from diffsim_ti.common import rotations
 from diffsim_ti.inputs.chain import Link
 from diffsim_ti.inputs.poses import quaternions, theta_of, theta_vjp
 

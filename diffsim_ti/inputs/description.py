@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffsim_ti.checked import as_numbers, numbers
+from diffsim_ti.common.checked import as_numbers, numbers
 
 # lengths: numbers, or "vertices", "tetrahedra" of the mesh, "steps", "steps + 1" of a run
 Shape = tuple[int | str, ...]

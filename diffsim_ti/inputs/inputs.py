@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffsim_ti.checked import numbers
+from diffsim_ti.common.checked import numbers
+from diffsim_ti.common.origin import FAR, ROUNDING, far_part, warn_of_rounding
+from diffsim_ti.common.rows import Rows
 from diffsim_ti.inputs import links
 from diffsim_ti.inputs.chain import Chain, Link
 from diffsim_ti.inputs.clamps import ClampedMotion
@@ -21,8 +23,6 @@ from diffsim_ti.inputs.poses import PoseColumns
 from diffsim_ti.inputs.rigid_start import RigidDisplacement, RigidVelocity
 from diffsim_ti.inputs.surface_areas import SurfaceAreas
 from diffsim_ti.inputs.ties import JoinedRows, JoinedSegments
-from diffsim_ti.origin import FAR, ROUNDING, far_part, warn_of_rounding
-from diffsim_ti.rows import Rows
 
 if TYPE_CHECKING:
     from diffsim_ti.scene import Scene

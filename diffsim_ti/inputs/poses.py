@@ -10,8 +10,8 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from diffsim_ti import rotations
-from diffsim_ti.checked import shown
+from diffsim_ti.common import rotations
+from diffsim_ti.common.checked import shown
 from diffsim_ti.inputs.chain import Link
 
 COLUMNS = 3  # of a pose: translation, R as modified Rodrigues parameters, phi

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffsim_ti.checked import shape_of
+from diffsim_ti.common.checked import shape_of
 from diffsim_ti.differentiation import expm1_minus_x
 from diffsim_ti.materials.calculus.isochoric import isochoric
 from diffsim_ti.materials.calculus.stretches import sum_over_stretches

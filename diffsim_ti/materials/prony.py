@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffsim_ti.checked import shape_of
+from diffsim_ti.common.checked import shape_of
 from diffsim_ti.differentiation import exp
 from diffsim_ti.materials.around import Around
 from diffsim_ti.materials.calculus.green import PAIRS, SIX

@@ -7,7 +7,7 @@ import warnings
 
 import numpy as np
 
-from diffsim_ti.checked import numbers
+from diffsim_ti.common.checked import numbers
 from diffsim_ti.mesh import jacobian
 from diffsim_ti.mesh.geometry import FACES, edge_matrices, signed_volumes, squared_edges
 from diffsim_ti.mesh.reference_element import MID_EDGES

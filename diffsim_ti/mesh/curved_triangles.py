@@ -6,7 +6,7 @@ A point of a triangle, whose shares of its corners are s, lies at
 
 exactly on the quadratic face; y: the middle, p and q: the ends of the face's edge that is parallel to side ab. Each of the
 four triangles of a face has its corners first among six nodes, and the others in an order for which the weights of three of
-the triangles are the same functions of s, and the fourth's, the inner one's, others (state/obstacle_functions.py).
+the triangles are the same functions of s, and the fourth's, the inner one's, others (obstacle_functions.py).
 """
 
 import numpy as np

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
-from diffsim_ti.checked import instance
+from diffsim_ti.common.checked import instance
 from diffsim_ti.mesh.files import KEEPS_SETS, as_meshio, parts_of, read_mesh, write_mesh
 from diffsim_ti.mesh.filling import filled
 from diffsim_ti.mesh.sets import without_unused

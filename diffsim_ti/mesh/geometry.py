@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from diffsim_ti.checked import numbers, shown
+from diffsim_ti.common.checked import numbers, shown
 
 # Corner a's opposite face, seen from outside of a tetrahedron of positive volume.
 FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])

@@ -4,7 +4,7 @@ from itertools import permutations
 
 import numpy as np
 
-from diffsim_ti.checked import numbers, shape_of, shown
+from diffsim_ti.common.checked import numbers, shape_of, shown
 
 # Cell corner (a, b, c) in {0, 1}^3. Kuhn: one tetrahedron per order of walking x, y, z from (0,0,0) to (1,1,1); all
 # share that diagonal. Five: a regular tetrahedron on four alternate corners and one at each other corner.

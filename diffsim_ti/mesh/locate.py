@@ -5,7 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
-from diffsim_ti.checked import numbers
+from diffsim_ti.common.checked import numbers
 from diffsim_ti.mesh.geometry import FACES, nearest_on_triangles
 from diffsim_ti.mesh.inverse_map import barycentric_in, nearest_on_face, reach
 from diffsim_ti.mesh.reference_face import functions

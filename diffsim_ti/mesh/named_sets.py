@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffsim_ti.checked import shape_of
+from diffsim_ti.common.checked import shape_of
 from diffsim_ti.mesh.geometry import triangle_normals
 from diffsim_ti.mesh.sets import array_of, checked_sets, chosen_indices, rows_of
 

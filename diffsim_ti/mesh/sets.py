@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from diffsim_ti.checked import shape_of
+from diffsim_ti.common.checked import shape_of
 
 
 def checked_sets(sets: dict | None, count: int, what: str) -> dict[str, np.ndarray]:

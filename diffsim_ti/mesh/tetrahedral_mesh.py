@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
-from diffsim_ti.checked import instance, listed
+from diffsim_ti.common.checked import instance, listed
+from diffsim_ti.common.origin import warn_of_rounding
 from diffsim_ti.mesh import checks, geometry
 from diffsim_ti.mesh.description import content_hash, describe
 from diffsim_ti.mesh.elements import Elements
@@ -19,7 +20,6 @@ from diffsim_ti.mesh.locate import LocatedPoints, locate
 from diffsim_ti.mesh.named_sets import NamedSets
 from diffsim_ti.mesh.sets import checked_sets, join, pieces, rows_on_surface
 from diffsim_ti.mesh.ten_nodes import edges_of
-from diffsim_ti.origin import warn_of_rounding
 
 CONNECTIVITY = (  # what stays when vertices move
     "_elements _tetrahedra _surface_faces _surface_triangles _middles _vertex_sets _tetrahedron_sets _surface_sets".split()

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from diffsim_ti import runtime
+from diffsim_ti.mechanics.workspace import Workspace
 from diffsim_ti.monitor import quantities
 from diffsim_ti.state.history import History
-from diffsim_ti.state.workspace import Workspace
 
 
 @dataclass

@@ -4,9 +4,9 @@ import weakref
 
 import numpy as np
 
-from diffsim_ti.copies import CarriesMore
+from diffsim_ti.common.copies import CarriesMore
 from diffsim_ti.inputs import kinetic_energy
-from diffsim_ti.state.workspace import Workspace
+from diffsim_ti.mechanics.workspace import Workspace
 
 
 class EnergyGained(CarriesMore, UserWarning):

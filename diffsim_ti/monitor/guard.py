@@ -6,12 +6,12 @@ from collections.abc import Iterator
 import numpy as np
 
 from diffsim_ti import runtime
-from diffsim_ti.copies import CarriesMore
+from diffsim_ti.common.copies import CarriesMore
+from diffsim_ti.mechanics.workspace import Workspace
 from diffsim_ti.monitor import quantities, stability
 from diffsim_ti.monitor.chatter import Chatter
 from diffsim_ti.monitor.energy_watch import EnergyGained
 from diffsim_ti.state.watch import place_name
-from diffsim_ti.state.workspace import Workspace
 from diffsim_ti.terms.obstacles.barrier import beta
 
 

@@ -10,8 +10,8 @@ import weakref
 import numpy as np
 
 from diffsim_ti import runtime
+from diffsim_ti.mechanics.workspace import Workspace
 from diffsim_ti.monitor import quantities
-from diffsim_ti.state.workspace import Workspace
 
 
 class OwnWork:

@@ -8,15 +8,15 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
-from diffsim_ti.elements.patched_tetrahedron import functions_of
 from diffsim_ti.inputs import kinetic_energy, ratios_at_corners
-from diffsim_ti.potential.attached import Attached
-from diffsim_ti.potential.kernels import potential_kernels
+from diffsim_ti.mechanics.energy.kernels import potential_kernels
+from diffsim_ti.mechanics.stress.patched_tetrahedron import functions_of
+from diffsim_ti.mechanics.ties.attached import Attached
+from diffsim_ti.mechanics.workspace import Workspace
 from diffsim_ti.runtime import Kernel, assign, traced
 from diffsim_ti.runtime import at as entry
 from diffsim_ti.state.features import Features
 from diffsim_ti.state.numbers import SCENE, needed, with_state
-from diffsim_ti.state.workspace import Workspace
 
 A = ti.template()
 

@@ -7,15 +7,15 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.inputs import StressPoints
-from diffsim_ti.mass_scaling import row_sums
+from diffsim_ti.mechanics.energy.kernels import potential_kernels
+from diffsim_ti.mechanics.ties.attached import Attached
+from diffsim_ti.mechanics.workspace import Workspace
 from diffsim_ti.mesh.patches import volume_patches
 from diffsim_ti.monitor.reduced_bounds import affine_bound
 from diffsim_ti.monitor.stiffest import stiffest
-from diffsim_ti.potential.attached import Attached
-from diffsim_ti.potential.kernels import potential_kernels
 from diffsim_ti.state.schedule import EqualSteps
 from diffsim_ti.state.viscous_stages import ViscousStages
-from diffsim_ti.state.workspace import Workspace
+from diffsim_ti.terms.mass_scaling import row_sums
 
 if TYPE_CHECKING:
     from diffsim_ti.scene import Scene

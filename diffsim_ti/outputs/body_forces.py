@@ -8,8 +8,8 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
-from diffsim_ti.elements.patched_tetrahedron import functions_of
 from diffsim_ti.inputs import Derived
+from diffsim_ti.mechanics.stress.patched_tetrahedron import functions_of
 from diffsim_ti.runtime import Kernel
 from diffsim_ti.state.arrays import SceneArrays
 from diffsim_ti.state.features import Features

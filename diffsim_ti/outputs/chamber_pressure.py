@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from diffsim_ti.mechanics.chambers.pressures import ChamberPressure as Pressures
 from diffsim_ti.outputs.output import Change, Output
-from diffsim_ti.potential.chamber_pressure import ChamberPressure as Pressures
 from diffsim_ti.terms import Chamber
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffsim_ti.checked import wholes
+from diffsim_ti.common.checked import wholes
 from diffsim_ti.mesh.enclosure import weighted_triangles
 from diffsim_ti.outputs.output import Change, Output
 

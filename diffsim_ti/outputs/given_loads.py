@@ -3,8 +3,8 @@
 import numpy as np
 
 from diffsim_ti.inputs import Derived
-from diffsim_ti.potential.attached import Attached
-from diffsim_ti.potential.chamber_pressure import following
+from diffsim_ti.mechanics.chambers.pressures import following
+from diffsim_ti.mechanics.ties.attached import Attached
 from diffsim_ti.state.schedule import EqualSteps, Schedule
 from diffsim_ti.terms import Gravity
 

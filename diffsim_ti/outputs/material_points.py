@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffsim_ti.checked import numbers
+from diffsim_ti.common.checked import numbers
 from diffsim_ti.mesh.geometry import inverse_edges, shape_gradients
 from diffsim_ti.mesh.inverse_map import barycentric_in, solved
 from diffsim_ti.outputs.output import Change, Output

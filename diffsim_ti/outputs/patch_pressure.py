@@ -3,7 +3,7 @@
     pi_p = lam_p theta_p,   lam_p = sum V_e lam_e / W_p,   theta_p = sum V_e theta_e / W_p,   W_p = sum V_e
 
 so that tetrahedra have the stress P(H; p') + pi dtheta/dF and, as their share of the patch's energy, pi theta / 2 per volume
-(elements/patched_tetrahedron.py, materials/patch_law.py). Arrays are by frames and the points of all tetrahedra.
+(mechanics/stress/patched_tetrahedron.py, materials/patch_law.py). Arrays are by frames and the points of all tetrahedra.
 """
 
 from dataclasses import dataclass

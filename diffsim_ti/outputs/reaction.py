@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffsim_ti.checked import numbers
+from diffsim_ti.common.checked import numbers
 from diffsim_ti.outputs.body_forces import BodyForces
 from diffsim_ti.outputs.given_loads import GivenLoads
 from diffsim_ti.outputs.moments import moments, moments_jvp, moments_vjp

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
-from diffsim_ti.contact.curved_pairs import pairs_of
-from diffsim_ti.contact.implicit_pairs import ImplicitPairs
+from diffsim_ti.mechanics.surfaces.curved_pairs import pairs_of
+from diffsim_ti.mechanics.surfaces.implicit_pairs import ImplicitPairs
 from diffsim_ti.outputs.moments import moments, moments_jvp, moments_vjp
 from diffsim_ti.outputs.output import Change, Output
 from diffsim_ti.state.arrays import SceneArrays

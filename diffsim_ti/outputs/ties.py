@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from diffsim_ti.mechanics.ties.attached import Attached
 from diffsim_ti.outputs.given_loads import at_end
 from diffsim_ti.outputs.output import Change, Output
-from diffsim_ti.potential.attached import Attached
 from diffsim_ti.terms.ties import Tie
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ from diffsim_ti import runtime
 from diffsim_ti.outputs import Change
 from diffsim_ti.rollout import field_copies
 from diffsim_ti.rollout.frames import HostSeed, check_finite, norm
-from diffsim_ti.slots import copy_slot
+from diffsim_ti.runtime.slots import copy_slot
 
 STATES = ("positions", "velocities", "displacements")
 

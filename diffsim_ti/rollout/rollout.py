@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
-from diffsim_ti.checked import as_numbers, instance, listed, shape_of, shown
-from diffsim_ti.copies import made_again
+from diffsim_ti.common.checked import as_numbers, instance, listed, shape_of, shown
+from diffsim_ti.common.copies import made_again
+from diffsim_ti.common.origin import positions_of
 from diffsim_ti.inputs import Derived
-from diffsim_ti.origin import positions_of
 from diffsim_ti.outputs import Change, Displacements, Output, Positions, Velocities
 from diffsim_ti.rollout.checkpoints import Checkpoints
 from diffsim_ti.rollout.frames import Frames, HostSeed, check_finite

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from diffsim_ti.checked import as_numbers, instance, shown
+from diffsim_ti.common.checked import as_numbers, instance, shown
 from diffsim_ti.scene import Scene
 
 Rows = dict[str, np.ndarray]  # tetrahedra of each set

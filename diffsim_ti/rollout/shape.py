@@ -8,7 +8,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from diffsim_ti.checked import as_numbers
+from diffsim_ti.common.checked import as_numbers
 
 MOVED = "initial_positions", "rest_positions"
 

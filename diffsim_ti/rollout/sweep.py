@@ -6,14 +6,14 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 from diffsim_ti import runtime
-from diffsim_ti.checked import as_numbers, listed, number, whole
+from diffsim_ti.common.checked import as_numbers, listed, number, whole
 from diffsim_ti.inputs import Derived
 from diffsim_ti.monitor.guard import Guard
 from diffsim_ti.rollout.checkpoints import choose_checkpoints
 from diffsim_ti.rollout.doubts import warn_of_coarse_steps, warn_of_explosion
 from diffsim_ti.rollout.run import Run, Seed
 from diffsim_ti.rollout.shape import MOVED
-from diffsim_ti.slots import copy_slot
+from diffsim_ti.runtime.slots import copy_slot
 from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.state.bending import FacesBend
 
@@ -102,7 +102,7 @@ class Sweep:
         return np.reshape(times if self.steps else [1.0], (-1, 1, 1, 1, 1))
 
     def contact_forces(self) -> np.ndarray | None:
-        """Mean forces [N] of obstacles on vertices in the frames of the last run (state/workspace.py), if they are noted."""
+        """Mean forces [N] of obstacles on vertices in the frames of the last run, if they are noted."""
         return self.workspace.contact_forces(self.frame_time) if self.contacts else None
 
     def chamber_pressures(self) -> np.ndarray | None:

@@ -7,14 +7,14 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
-from diffsim_ti.checked import whole
-from diffsim_ti.origin import warn_of_rounding
+from diffsim_ti.common.checked import whole
+from diffsim_ti.common.origin import warn_of_rounding
+from diffsim_ti.mechanics.workspace import Workspace
 from diffsim_ti.outputs import Change
 from diffsim_ti.rollout import field_copies
 from diffsim_ti.rollout.field_seed import STATES, field_seed
 from diffsim_ti.rollout.run import Run
 from diffsim_ti.rollout.set_values import gathered, per_tetrahedron, rows_of_sets, split_name, spread
-from diffsim_ti.state.workspace import Workspace
 
 if TYPE_CHECKING:
     from diffsim_ti.rollout.rollout import Rollout

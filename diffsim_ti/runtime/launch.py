@@ -10,7 +10,7 @@ import taichi as ti
 from taichi.lang import impl
 from taichi.types import primitive_types
 
-from diffsim_ti import ranks
+from diffsim_ti.common import ranks
 from diffsim_ti.runtime import tracer
 from diffsim_ti.runtime.argument_buffer import ArgumentBuffer
 from diffsim_ti.runtime.arrays import check_owner, full_shape

@@ -16,7 +16,7 @@ from taichi._lib import core as _core
 from taichi.lang import impl
 from taichi.lang.misc import _SpecialConfig
 
-from diffsim_ti import ranks
+from diffsim_ti.common import ranks
 from diffsim_ti.runtime.current_program import current_program
 from diffsim_ti.runtime.device import count_cards
 from diffsim_ti.runtime.threads import LOCK, materialize

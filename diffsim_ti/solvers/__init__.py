@@ -1,7 +1,7 @@
 """Ways to advance a scene: one per file."""
 
+from diffsim_ti.common.errors import NotConverged
 from diffsim_ti.solvers.bdf2 import BDF2Solver
-from diffsim_ti.solvers.implicit.linear import NotConverged
 from diffsim_ti.solvers.implicit_euler import ImplicitEulerSolver
 from diffsim_ti.solvers.implicit_midpoint import ImplicitMidpointSolver
 from diffsim_ti.solvers.semi_implicit import SemiImplicitSolver

@@ -4,7 +4,7 @@ from typing import overload
 
 import numpy as np
 
-from diffsim_ti.checked import whole
+from diffsim_ti.common.checked import whole
 from diffsim_ti.materials.material import Material
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.scene import Scene

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
-from diffsim_ti.checked import number, shown, whole
+from diffsim_ti.common.checked import number, shown, whole
 from diffsim_ti.monitor import stability
 from diffsim_ti.monitor.stiffest import sampled_by_runs, stiffest
 from diffsim_ti.state.schedule import EqualSteps, Schedule, UnequalSteps

@@ -2,12 +2,12 @@
 
 from collections.abc import Callable
 
-from diffsim_ti.checked import instance
+from diffsim_ti.common.checked import instance
+from diffsim_ti.mechanics.workspace import Workspace
 from diffsim_ti.monitor.stability import StepLimit, element_limit, lanczos_limit
 from diffsim_ti.monitor.stiffest import stiffest
 from diffsim_ti.scene import Scene
 from diffsim_ti.solvers.semi_implicit import SemiImplicitSolver
-from diffsim_ti.state.workspace import Workspace
 
 
 def stable_dt(scene: Scene, tight: bool = True) -> StepLimit:

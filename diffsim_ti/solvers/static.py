@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from diffsim_ti.mobility import free_motions
+from diffsim_ti.mechanics.supports.mobility import free_motions
 from diffsim_ti.solvers.implicit.solver import ImplicitSolver, Stage
 from diffsim_ti.terms import SelfContact
 

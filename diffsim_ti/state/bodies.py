@@ -4,7 +4,7 @@ Of a body's vertices, with masses m and places X that it is measured by (affine:
 
     M = sum m,    X_ = sum m X / M,    y = X - X_,    J = sum m y y^T
 
-All that kernels do is sums with m and y, and products with 1 / M and J^-1 (solvers/explicit/bodies.py). They are float64
+All that kernels do is sums with m and y, and products with 1 / M and J^-1 (mechanics/reduced/explicit.py). They are float64
 in every precision, and of m and X as the device has them: what they are off by would add up over passes.
 """
 

@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass, replace
 
+from diffsim_ti.common.rows import Rows
 from diffsim_ti.inputs.poses import COLUMNS
-from diffsim_ti.rows import Rows
 from diffsim_ti.terms import VertexForce
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
-from diffsim_ti.slots import copy_slot
+from diffsim_ti.runtime.slots import copy_slot
 from diffsim_ti.state.arrays import SceneArrays
 
 

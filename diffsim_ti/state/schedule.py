@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffsim_ti.checked import numbers
+from diffsim_ti.common.checked import numbers
 from diffsim_ti.state.pass_table import FLOATS, INTS
 
 

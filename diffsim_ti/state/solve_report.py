@@ -5,7 +5,7 @@ from collections import deque
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from diffsim_ti.copies import CarriesMore
+from diffsim_ti.common.copies import CarriesMore
 
 
 class Buckled(CarriesMore, UserWarning):

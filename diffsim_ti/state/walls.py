@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from diffsim_ti import rotations
+from diffsim_ti.common import rotations
 from diffsim_ti.state.schedule import Schedule
 
 MORE = 6  # rows of an obstacle that turns

@@ -140,7 +140,7 @@ class ContactWatch:
         return (int(k), int(i), -float(gaps[k, i])) if gaps[k, i] <= 0 else None
 
     def note(self, met, face: int) -> None:
-        """A face, or where that is negative a vertex, that was found in an obstacle (potential/way.py)."""
+        """A face, or where that is negative a vertex, that was found in an obstacle (mechanics/obstacles/way.py)."""
         rows = self.rows()
         place = self.ws.arrays.num_vertices + face if face >= 0 else met.vertices[0]
         rows[3 * met.obstacle, place] = min(met.value, rows[3 * met.obstacle, place])

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from diffsim_ti.adaptive_steps import adaptive_steps
 from diffsim_ti.rollout import Rollout
+from diffsim_ti.rollout.adaptive_steps import adaptive_steps
 from diffsim_ti.solvers import stable_dt
 
 SHARES = (0.01,)  # of the mass

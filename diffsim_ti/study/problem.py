@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffsim_ti.copies import made_again
+from diffsim_ti.common.copies import made_again
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.scene import Scene
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from diffsim_ti.potential.attached import Attached
+from diffsim_ti.mechanics.ties.attached import Attached
+from diffsim_ti.rollout.simulator import Simulator
 from diffsim_ti.scene import Scene
-from diffsim_ti.simulator import Simulator
 from diffsim_ti.solvers import SOLVERS
 from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.study.executors import each

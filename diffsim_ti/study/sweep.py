@@ -11,8 +11,8 @@ from functools import lru_cache
 
 import numpy as np
 
+from diffsim_ti.common.progress import progress
 from diffsim_ti.monitor.stability import element_limit
-from diffsim_ti.progress import progress
 from diffsim_ti.rollout import Frames, Rollout
 from diffsim_ti.rollout.set_values import split_name, spread_all
 from diffsim_ti.scene import Scene

@@ -10,7 +10,8 @@ import numpy as np
 
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.rollout import Rollout
-from diffsim_ti.scene import LOCKING_RATIO, Scene
+from diffsim_ti.scene import Scene
+from diffsim_ti.scene.scene import LOCKING_RATIO
 from diffsim_ti.solvers import SOLVERS, BDF2Solver, VelocityVerletSolver, stable_dt
 from diffsim_ti.study.alternatives import alternatives
 from diffsim_ti.study.elements import ElementTrial, ElementTrials, own_element

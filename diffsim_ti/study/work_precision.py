@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 
-from diffsim_ti.progress import progress
+from diffsim_ti.common.progress import progress
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.scene import Scene
 from diffsim_ti.solvers import SOLVERS, StaticSolver, VelocityVerletSolver, stable_dt

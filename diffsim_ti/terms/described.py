@@ -2,7 +2,7 @@
 
 from numpy.typing import ArrayLike
 
-from diffsim_ti.checked import present
+from diffsim_ti.common.checked import present
 from diffsim_ti.inputs import POSITIVE, Input
 from diffsim_ti.inputs.description import length
 

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffsim_ti.checked import present
+from diffsim_ti.common.checked import present
 from diffsim_ti.inputs import Input
 from diffsim_ti.inputs.links import PerStep
 from diffsim_ti.inputs.loads import InTime

@@ -5,7 +5,7 @@ from copy import copy
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffsim_ti.checked import present
+from diffsim_ti.common.checked import present
 from diffsim_ti.inputs import Input, Link
 from diffsim_ti.inputs.foundation import FoundationStiffness
 from diffsim_ti.mesh import TetrahedralMesh

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffsim_ti.checked import numbers
+from diffsim_ti.common.checked import numbers
 from diffsim_ti.inputs import Input
 from diffsim_ti.terms.term import Term
 

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffsim_ti.checked import numbers, shown
+from diffsim_ti.common.checked import numbers, shown
 
 # a function of time [s], or keyframes (times [s], displacements [m])
 Motion = Callable[[float], ArrayLike] | tuple[ArrayLike, ArrayLike]

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffsim_ti.checked import numbers, present
+from diffsim_ti.common.checked import numbers, present
 from diffsim_ti.inputs import Input, Link
 from diffsim_ti.inputs.loads import InTime
 from diffsim_ti.inputs.muscles import MuscleTension

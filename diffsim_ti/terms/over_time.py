@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffsim_ti.checked import shape_of
+from diffsim_ti.common.checked import shape_of
 from diffsim_ti.inputs import Input
 
 # what holds all the time, one for each step, a function of time [s], or keyframes (times [s], values)

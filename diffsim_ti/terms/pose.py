@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffsim_ti import rotations
-from diffsim_ti.checked import numbers
+from diffsim_ti.common import rotations
+from diffsim_ti.common.checked import numbers
 from diffsim_ti.inputs.poses import between, quaternions
 from diffsim_ti.terms.motion import Motion, sampled
 

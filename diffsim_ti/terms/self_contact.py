@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from diffsim_ti.checked import numbers
+from diffsim_ti.common.checked import numbers
 from diffsim_ti.inputs import NOT_NEGATIVE, Input
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.terms.bow import warn_of_bow
@@ -16,7 +16,7 @@ class SelfContact(Term):
     """Pairs of surface primitives, vertex and triangle or edge and edge, push each other apart nearer than `width`.
 
     Energy of a pair at distance d: m b(d) with b(d) = -stiffness (d - width)^2 log(d / width) for d < width, exactly zero
-    beyond (barrier.py); m fades out edges that become parallel (contact/proximity.py), with lengths as in the mesh.
+    beyond (barrier.py); m fades out edges that become parallel (proximity.py), with lengths as in the mesh.
     Pairs that share a vertex do not count. stiffness [N/m], width [m].
     Where ten-node faces are curved by a tenth of the width or more, primitives are those of a finer surface on the curved
     faces (mesh/collision_surface.py), whose new vertices are in the sets that all of their nodes are in.
@@ -26,7 +26,7 @@ class SelfContact(Term):
     sets belongs to those of its vertex, or of each edge's first one, and of the triangle's first one.
     friction_speed [m/s]: the speed of sliding below which friction is smoothed, and with which what is held may creep:
     mu N f(s / friction_speed), f(y) = 2 y - y^2 for y < 1, 1 beyond. In explicit steps it is a stage of each pass that adds
-    no energy, whatever the step (contact/friction_kernels.py); in implicit ones a force, with N and the normal from where
+    no energy, whatever the step (friction_kernels.py); in implicit ones a force, with N and the normal from where
     the step begins. Its forces F act at the two ends of the gap d: a couple d x F, which changes angular momentum by
     less than the width times the impulse of friction. Edges that pass each other are bumps, which take energy: a slab on a
     slope went as with .0005 more friction at a width of 4 mm, and as with .0001 at 1 mm, whatever friction_speed and step.

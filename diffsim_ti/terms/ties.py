@@ -6,7 +6,7 @@ from copy import copy
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffsim_ti.checked import numbers, present
+from diffsim_ti.common.checked import numbers, present
 from diffsim_ti.inputs import Input, Link
 from diffsim_ti.inputs.description import Range, length
 from diffsim_ti.inputs.loads import InTime

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from diffsim_ti.batch import Batch
-from diffsim_ti.checked import numbers
+from diffsim_ti.common.checked import numbers
 from diffsim_ti.torch_bridge.autograd import first_order_only, torch
 from diffsim_ti.torch_bridge.set_tensors import spread_tensors
 

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 from diffsim_ti.batch import Batch
-from diffsim_ti.checked import numbers
-from diffsim_ti.origin import START_NEARER, warn_of_rounding
+from diffsim_ti.common.checked import numbers
+from diffsim_ti.common.origin import START_NEARER, warn_of_rounding
 from diffsim_ti.rollout import Rollout
 from diffsim_ti.rollout.shape import spread_shape
 from diffsim_ti.torch_bridge.autograd import first_order_only, refuse_transforms, torch, uncompiled

@@ -14,7 +14,7 @@ from diffsim_ti import runtime
 from diffsim_ti.outputs import Change
 from diffsim_ti.rollout.frames import HostSeed, check_finite
 from diffsim_ti.rollout.run import Run
-from diffsim_ti.slots import copy_slot
+from diffsim_ti.runtime.slots import copy_slot
 from diffsim_ti.torch_bridge.autograd import torch
 
 DTYPES = {"f32": torch.float32, "f64": torch.float64}

@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.outputs.deformation import PointMeans, von_mises
-from diffsim_ti.simulator import Simulator
+from diffsim_ti.rollout.simulator import Simulator
 from diffsim_ti.visual.fields import Field, field_named
 
 SIGNED = "PuOr"

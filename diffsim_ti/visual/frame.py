@@ -12,8 +12,8 @@ from diffsim_ti.obstacles import floor_of, obstacle_surfaces
 from diffsim_ti.outputs import Output, Stress
 from diffsim_ti.outputs.deformation import Deformation
 from diffsim_ti.outputs.given_loads import GivenLoads
+from diffsim_ti.rollout.simulator import Simulator
 from diffsim_ti.scene import Scene
-from diffsim_ti.simulator import Simulator
 from diffsim_ti.terms.marks import Mark
 from diffsim_ti.terms.obstacles.shapes import Triangles
 from diffsim_ti.visual.colouring import measured_fields

@@ -20,7 +20,7 @@ from diffsim_ti.visual.frame import Frame, Setting
 from diffsim_ti.visual.series import SavedSeries
 
 if TYPE_CHECKING:
-    from diffsim_ti.adaptive_run import ForwardRun
+    from diffsim_ti.writers.adaptive_run import ForwardRun
 
 
 @dataclass

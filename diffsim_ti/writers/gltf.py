@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 
-from diffsim_ti.origin import middle_far_part
+from diffsim_ti.common.origin import middle_far_part
 from diffsim_ti.visual.frame import Frame, Setting
 from diffsim_ti.writers.writer import Writer, register
 

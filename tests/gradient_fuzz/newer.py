@@ -3,7 +3,7 @@
 import numpy as np
 
 import diffsim_ti as ds
-from diffsim_ti.solvers.explicit.body_checks import check_bodies
+from diffsim_ti.mechanics.reduced.body_checks import check_bodies
 
 from .loads import over_time
 from .structures import CELL

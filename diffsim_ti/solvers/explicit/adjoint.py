@@ -10,12 +10,12 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.inputs import Derived
-from diffsim_ti.slots import copy_slot
-from diffsim_ti.solvers.explicit.felt_derivatives import FeltAdjoint
-from diffsim_ti.solvers.explicit.held_derivatives import HeldAdjoint
-from diffsim_ti.solvers.explicit.impulse_record import ImpulseRecord
+from diffsim_ti.mechanics.chambers.held_volume_derivatives import HeldAdjoint
+from diffsim_ti.mechanics.obstacles.felt_derivatives import FeltAdjoint
+from diffsim_ti.mechanics.obstacles.impulse_record import ImpulseRecord
+from diffsim_ti.mechanics.workspace import FrameArrays
+from diffsim_ti.runtime.slots import copy_slot
 from diffsim_ti.state.numbers import OF_STEPS, Adjoint
-from diffsim_ti.state.workspace import FrameArrays
 
 STEPS = [name for name in OF_STEPS if name != "path"]
 PARTS = 64  # sums over vertices that a GPU's threads make side by side

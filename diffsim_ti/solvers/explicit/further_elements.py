@@ -6,15 +6,15 @@ from functools import cached_property
 
 import taichi as ti
 
-from diffsim_ti.elements.dragged_triangle import DRAGGED, DraggedTriangle
-from diffsim_ti.elements.fibres import FibreBlock
-from diffsim_ti.elements.nodes import nodes_of
-from diffsim_ti.elements.pressed_face import pressed_element
-from diffsim_ti.elements.pressed_triangle import PRESSED, PressedTriangle
-from diffsim_ti.elements.tie import TIED, TieElement
+from diffsim_ti.mechanics.fluid.dragged_triangle import DRAGGED, DraggedTriangle
+from diffsim_ti.mechanics.pressure.pressed_face import pressed_element
+from diffsim_ti.mechanics.pressure.pressed_triangle import PRESSED, PressedTriangle
+from diffsim_ti.mechanics.stress.nodes import nodes_of
+from diffsim_ti.mechanics.supports.guides import GUIDED
+from diffsim_ti.mechanics.ties.fibres import FibreBlock
+from diffsim_ti.mechanics.ties.foundations import FOUNDED
+from diffsim_ti.mechanics.ties.tie import TIED, TieElement
 from diffsim_ti.runtime import LANES, PRECISIONS, let, traced
-from diffsim_ti.solvers.explicit.foundations import FOUNDED
-from diffsim_ti.solvers.explicit.guides import GUIDED
 from diffsim_ti.state.bodies import BODIES
 from diffsim_ti.state.features import Features
 from diffsim_ti.state.numbers import ALONE

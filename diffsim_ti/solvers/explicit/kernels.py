@@ -5,12 +5,12 @@ from functools import cached_property, lru_cache
 
 import taichi as ti
 
-from diffsim_ti.elements.tetrahedron import Onwards
+from diffsim_ti.mechanics.obstacles.outside_work import with_drag
+from diffsim_ti.mechanics.reduced.body_adjoint import BodyStage
+from diffsim_ti.mechanics.stress.tetrahedron import Onwards
 from diffsim_ti.runtime import Bundle, Kernel, let, traced
-from diffsim_ti.solvers.explicit.body_stage import BodyStage
 from diffsim_ti.solvers.explicit.further_elements import FurtherElements
 from diffsim_ti.solvers.explicit.kick_drift import KickDrift
-from diffsim_ti.solvers.explicit.outside_work import with_drag
 from diffsim_ti.state.numbers import ADJOINT, OF_STEPS, SCENE, TANGENT, adjoints, needed, with_state
 from diffsim_ti.state.pass_table import pass_at, reversed_pass
 

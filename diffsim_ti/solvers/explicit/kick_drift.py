@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 import taichi as ti
 
-from diffsim_ti.solvers.explicit.outside_work import add_work_of_pass, work_of_own_forces
+from diffsim_ti.mechanics.obstacles.outside_work import add_work_of_pass, work_of_own_forces
 from diffsim_ti.solvers.explicit.vertex_parts import VertexParts
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
@@ -85,7 +85,7 @@ class KickDrift(VertexParts):
         if ti.static(self.features.reduced):
             if scene.body_of[i] < 0:
                 self.go_on(i, j, u, v, f, now, scene, state, plan)
-            else:  # the body's stage goes on (bodies.py)
+            else:  # the body's stage goes on (explicit.py)
                 scene.body_force[0, i] = f
                 if plan.stride > 0:
                     state.f[s, i] = f

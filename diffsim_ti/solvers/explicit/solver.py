@@ -8,28 +8,28 @@ from types import SimpleNamespace
 import numpy as np
 
 from diffsim_ti import runtime
-from diffsim_ti.checked import between
-from diffsim_ti.contact.surface_pairs import Tunnelling
+from diffsim_ti.common.checked import between
 from diffsim_ti.inputs import Derived
+from diffsim_ti.mechanics.chambers.gases import Chambers
+from diffsim_ti.mechanics.chambers.held_volumes import HeldVolumes
+from diffsim_ti.mechanics.chambers.pressures import following
+from diffsim_ti.mechanics.fluid.on_host import Fluid
+from diffsim_ti.mechanics.obstacles.contact_stage import ROWS
+from diffsim_ti.mechanics.obstacles.felt_faces import FeltFaces, feels_faces
+from diffsim_ti.mechanics.obstacles.impulse_record import ImpulseRecord
+from diffsim_ti.mechanics.obstacles.way import Way
+from diffsim_ti.mechanics.reduced.body_checks import check_bodies
+from diffsim_ti.mechanics.surfaces.surface_pairs import Tunnelling
+from diffsim_ti.mechanics.ties.attached import Attached
+from diffsim_ti.mechanics.workspace import Workspace
 from diffsim_ti.monitor.energy_balance import EnergyBalance
 from diffsim_ti.monitor.own_work import OwnWork
-from diffsim_ti.potential.attached import Attached
-from diffsim_ti.potential.chamber_pressure import following
-from diffsim_ti.potential.fluid import Fluid
-from diffsim_ti.potential.way import Way
 from diffsim_ti.solvers.explicit.adjoint import ExplicitAdjoint
-from diffsim_ti.solvers.explicit.body_checks import check_bodies
-from diffsim_ti.solvers.explicit.chambers import Chambers
-from diffsim_ti.solvers.explicit.contact_stage import ROWS
-from diffsim_ti.solvers.explicit.felt_faces import FeltFaces, feels_faces
 from diffsim_ti.solvers.explicit.further_elements import counts_of_further
-from diffsim_ti.solvers.explicit.held_volumes import HeldVolumes
-from diffsim_ti.solvers.explicit.impulse_record import ImpulseRecord
 from diffsim_ti.solvers.explicit.kernels import ExplicitKernels, explicit_kernels
 from diffsim_ti.solvers.explicit.tangent import ExplicitTangent
 from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.state.pass_table import PassTable
-from diffsim_ti.state.workspace import Workspace
 from diffsim_ti.terms import SelfContact
 
 
@@ -62,9 +62,9 @@ class ExplicitSolver(Solver):
     contact: "stage", the default: obstacles act in a stage of each pass (contact_stage.py), which no step is too large
         for; or "force": their barriers are one more force, which the step has to follow. A vertex that is driven with more
         than a barrier holds, 7 stiffness width^2, crosses in either and raises Crossing, unless much is damped. Sets that
-        are `reduced` feel obstacles by "force" alone (bodies.py); their friction is a stage that slows the whole set.
+        are `reduced` feel obstacles by "force" alone (explicit.py); their friction is a stage that slows the whole set.
         Points within faces feel what is narrower than they are in either by a stage of its own, which goes the way of the
-        pass again in as many parts as barrier and speed ask for (face_kernels.py), and then friction acts there.
+        pass again in as many parts as barrier and speed ask for (explicit_face_kernels.py), and then friction acts there.
     contact_damping: of the stage, from 0, which keeps the energy of a contact, to 1, which damps what the step does not
         resolve and is the smoothest. A vertex that is pressed with N rests at velocity (1 - c) h N / 2 m in the
         semi-implicit solver, whose rest is exact with 1, and at -c h N / 2 m in velocity Verlet, exact with 0.

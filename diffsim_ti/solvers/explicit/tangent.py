@@ -7,12 +7,12 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.inputs import Derived
-from diffsim_ti.slots import copy_slot
-from diffsim_ti.solvers.explicit.felt_derivatives import FeltTangent
-from diffsim_ti.solvers.explicit.held_derivatives import HeldTangent
-from diffsim_ti.solvers.explicit.impulse_record import ImpulseRecord
+from diffsim_ti.mechanics.chambers.held_volume_derivatives import HeldTangent
+from diffsim_ti.mechanics.obstacles.felt_derivatives import FeltTangent
+from diffsim_ti.mechanics.obstacles.impulse_record import ImpulseRecord
+from diffsim_ti.mechanics.workspace import FrameArrays
+from diffsim_ti.runtime.slots import copy_slot
 from diffsim_ti.state.numbers import Tangent
-from diffsim_ti.state.workspace import FrameArrays
 
 
 class ExplicitTangent:

@@ -5,13 +5,13 @@ from functools import cached_property
 
 import taichi as ti
 
-from diffsim_ti.elements.patched_tetrahedron import functions_of
+from diffsim_ti.mechanics.loads.explicit import GivenForces
+from diffsim_ti.mechanics.obstacles.contact_stage import ContactStage
+from diffsim_ti.mechanics.obstacles.obstacle_stages import ObstacleStages
+from diffsim_ti.mechanics.stress.patched_tetrahedron import functions_of
+from diffsim_ti.mechanics.supports.guides import Guides
+from diffsim_ti.mechanics.ties.foundations import Foundations
 from diffsim_ti.runtime import PRECISIONS
-from diffsim_ti.solvers.explicit.contact_stage import ContactStage
-from diffsim_ti.solvers.explicit.foundations import Foundations
-from diffsim_ti.solvers.explicit.given_forces import GivenForces
-from diffsim_ti.solvers.explicit.guides import Guides
-from diffsim_ti.solvers.explicit.obstacle_stages import ObstacleStages
 from diffsim_ti.state.features import Features
 
 

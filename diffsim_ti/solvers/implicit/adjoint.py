@@ -10,12 +10,12 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.inputs import Derived
-from diffsim_ti.potential.face_kernels import face_kernels
-from diffsim_ti.potential.face_lattice import nodes_of_faces, rest_of_areas
-from diffsim_ti.potential.kernels import potential_kernels
-from diffsim_ti.solvers.chamber_record import ChamberRecord
-from diffsim_ti.solvers.implicit.contact_record import ContactRecord, SharesAdjoint
-from diffsim_ti.solvers.implicit.pressed import PressedAdjoint
+from diffsim_ti.mechanics.chambers.record import ChamberRecord
+from diffsim_ti.mechanics.energy.kernels import potential_kernels
+from diffsim_ti.mechanics.obstacles.contact_record import ContactRecord, SharesAdjoint
+from diffsim_ti.mechanics.obstacles.face_kernels import face_kernels
+from diffsim_ti.mechanics.obstacles.face_lattice import nodes_of_faces, rest_of_areas
+from diffsim_ti.mechanics.obstacles.pressed import PressedAdjoint
 from diffsim_ti.solvers.implicit.recorded_passes import RecordedPasses
 from diffsim_ti.solvers.implicit.threads import one_blas_thread
 from diffsim_ti.state.numbers import Adjoint

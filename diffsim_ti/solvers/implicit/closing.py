@@ -14,9 +14,9 @@ import weakref
 
 import numpy as np
 
+from diffsim_ti.common.errors import NotConverged
 from diffsim_ti.mesh.sets import pieces
-from diffsim_ti.solvers.implicit.linear import NotConverged
-from diffsim_ti.supports import rigid_motions_left
+from diffsim_ti.terms.supports import rigid_motions_left
 
 
 class Closing:

@@ -6,8 +6,8 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from diffsim_ti.potential.assembled import assemble
-from diffsim_ti.potential.free import FreeBodies
+from diffsim_ti.mechanics.energy.assembled import assemble
+from diffsim_ti.mechanics.supports.free import FreeBodies
 
 MOST_NEGATIVE = 100  # pivots, each of which costs a solve
 

@@ -5,11 +5,11 @@ from functools import cached_property
 import numpy as np
 
 from diffsim_ti.inputs import ConsistentMass, Derived, Mass
-from diffsim_ti.potential.chamber_pressure import following
-from diffsim_ti.potential.follower_pressure import FollowerPressure, is_symmetric
-from diffsim_ti.potential.free import projectors_of
-from diffsim_ti.solvers.implicit.held_volumes import HeldVolumes
-from diffsim_ti.solvers.implicit.stage import Stage
+from diffsim_ti.mechanics.chambers.multipliers import HeldVolumes
+from diffsim_ti.mechanics.chambers.pressures import following
+from diffsim_ti.mechanics.pressure.follower_pressure import FollowerPressure, is_symmetric
+from diffsim_ti.mechanics.supports.free import projectors_of
+from diffsim_ti.state.stage import Stage
 
 
 class GivenInPasses:

@@ -12,8 +12,8 @@ import weakref
 
 import numpy as np
 
-from diffsim_ti.solvers.implicit.linear import NotConverged
-from diffsim_ti.solvers.implicit.stage import Stage
+from diffsim_ti.common.errors import NotConverged
+from diffsim_ti.state.stage import Stage
 
 
 class LaidOn:

@@ -2,28 +2,19 @@
 
 import math
 import warnings
-from collections.abc import Iterable
 
 import numpy as np
 
-from diffsim_ti.copies import CarriesMore
+from diffsim_ti.common.errors import NotConverged
 from diffsim_ti.inputs import diagonal_of
-from diffsim_ti.potential.free import Free, linear_of
+from diffsim_ti.mechanics.supports.free import Free, linear_of
 from diffsim_ti.solvers.implicit.factorised import Factorised
 from diffsim_ti.solvers.implicit.preconditioners import BlockJacobi, Preconditioner
 
 
-class NotConverged(CarriesMore, FloatingPointError):
-    """An iteration did not reach its tolerance. Carries `residuals`, the relative residual after each round."""
-
-    def __init__(self, message: str, residuals: Iterable[float]):
-        super().__init__(message)
-        self.residuals = list(residuals)
-
-
 class Operator:
     """w -> c m w + d2E/du2 w at the potential's displacement, less what follower pressures change; rows of fixed vertices
-    are zero. Sets that do not deform move as w says, and turn what they feel (potential/rigid_sets.py).
+    are zero. Sets that do not deform move as w says, and turn what they feel (mechanics/reduced/rigid_sets.py).
 
     mass: c m, shape (num_vertices, 1) [N/m]; free: what vertices may do (free.py); transposed: of pressures and such sets.
     """

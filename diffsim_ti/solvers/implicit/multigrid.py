@@ -3,8 +3,8 @@
 import numpy as np
 
 from diffsim_ti import runtime
-from diffsim_ti.potential.assembled import assemble
-from diffsim_ti.potential.free import Free, FreeDirections, projectors_of
+from diffsim_ti.mechanics.energy.assembled import assemble
+from diffsim_ti.mechanics.supports.free import Free, FreeDirections, projectors_of
 from diffsim_ti.solvers.implicit.cycle import Cycle, upload_rows
 from diffsim_ti.solvers.implicit.device_cg import DeviceCG
 from diffsim_ti.solvers.implicit.preconditioners import Preconditioner

@@ -15,11 +15,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from diffsim_ti.common.errors import NotConverged
 from diffsim_ti.inputs import diagonal_of
-from diffsim_ti.potential.free import Free, cleaned, linear_of, mask_of
-from diffsim_ti.potential.way import Met
-from diffsim_ti.solvers.implicit.linear import NotConverged, Operator, conjugate_gradients, gmres
-from diffsim_ti.solvers.implicit.projection import Projection
+from diffsim_ti.mechanics.obstacles.way import Met
+from diffsim_ti.mechanics.stress.projection import Projection
+from diffsim_ti.mechanics.supports.free import Free, cleaned, linear_of, mask_of
+from diffsim_ti.solvers.implicit.linear import Operator, conjugate_gradients, gmres
 
 LONGER = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # steps along an indefinite direction that are doubled while Phi falls
 
@@ -28,7 +29,7 @@ LONGER = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # steps along an indefinite direction
 class NewtonReport:
     """What a solve took: relative residual before each round, products of the Hessian, rounds with an indefinite
     Hessian, saddles that were left, evaluations of the energy, halvings in line searches; directions that an obstacle, or
-    the surface itself, cut short, and which obstacle cut the last one (potential/way.py)."""
+    the surface itself, cut short, and which obstacle cut the last one (mechanics/obstacles/way.py)."""
 
     residuals: list = field(default_factory=list)
     products: int = 0
@@ -42,7 +43,7 @@ class NewtonReport:
 
 
 class Newton:
-    """Minimises Phi from a start. From iterate to iterate the surface meets no obstacle (potential/way.py) and does not pass
+    """Minimises Phi from a start. From iterate to iterate the surface meets no obstacle (obstacles/way.py) and does not pass
     through itself. If the start has no J <= 0, J falls by a factor of ten at most, so that the energy's own resistance is
     felt in time; only where no share of a direction down to `insist` lowers Phi so (a law that is finite at J = 0, pressed
     beyond it) may it fall further.
@@ -76,8 +77,8 @@ class Newton:
         follower=None,
         volumes=None,
     ):
-        self.volumes = volumes  # of chambers, that are held (held_volumes.py), or None
-        self.follower = follower  # pressures (potential/follower_pressure.py), or None
+        self.volumes = volumes  # of chambers, that are held (multipliers.py), or None
+        self.follower = follower  # pressures (mechanics/pressure/follower_pressure.py), or None
         self.moves = mask_of(free)  # in some direction
         self.potential, self.free, self.way, self.preconditioners = potential, free, way, preconditioners
         self.tolerance, self.max_iterations, self.eps = tolerance, max_iterations, eps

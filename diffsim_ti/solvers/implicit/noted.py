@@ -4,7 +4,7 @@ import warnings
 
 import numpy as np
 
-from diffsim_ti.solvers.implicit.contact_record import ContactRecord, Shares
+from diffsim_ti.mechanics.obstacles.contact_record import ContactRecord, Shares
 from diffsim_ti.state.solve_report import Buckled
 
 

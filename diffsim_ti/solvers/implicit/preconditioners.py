@@ -5,7 +5,7 @@ Both are functions of the present state alone, so that a run that is started aga
 
 import numpy as np
 
-from diffsim_ti.potential.free import Free, FreeDirections, mask_of
+from diffsim_ti.mechanics.supports.free import Free, FreeDirections, mask_of
 from diffsim_ti.solvers.implicit.factorised import Effort
 
 
@@ -62,7 +62,7 @@ class BlockJacobi(Preconditioner):
 class BodyBlocks(BlockJacobi):
     """The same, and the inverse of d2E/dq2 of each set that moves by few numbers q: of the body at rest, with inertia and
     contact as they are; where its basis is of each component turned with it, as in multigrid.py. Of sets that do not deform
-    q are shifts and turns (potential/rigid_sets.py), whose part of the body at rest turns with them, too."""
+    q are shifts and turns (mechanics/reduced/rigid_sets.py), whose part of the body at rest turns with them, too."""
 
     patience = 10**9  # for nothing takes its place
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from diffsim_ti import runtime
-from diffsim_ti.potential.free import cleaned
+from diffsim_ti.mechanics.supports.free import cleaned
 from diffsim_ti.solvers.implicit.linear import Operator, solve
 
 

@@ -12,12 +12,12 @@ velocities by exp(-c h) in a stage of its own. Statics: no inertia, u* is where 
 from abc import abstractmethod
 from typing import TYPE_CHECKING
 
-from diffsim_ti.checked import between, whole
+from diffsim_ti.common.checked import between, whole
 from diffsim_ti.solvers.implicit.adjoint import ImplicitAdjoint
-from diffsim_ti.solvers.implicit.stage import Stage
 from diffsim_ti.solvers.implicit.tangent import ImplicitTangent
 from diffsim_ti.solvers.implicit.workspace import ImplicitWorkspace
 from diffsim_ti.solvers.solver import Solver
+from diffsim_ti.state.stage import Stage
 
 if TYPE_CHECKING:
     from diffsim_ti.scene import Scene

@@ -6,33 +6,33 @@ import weakref
 import numpy as np
 
 from diffsim_ti import runtime
-from diffsim_ti.contact.implicit_pairs import ImplicitPairs
+from diffsim_ti.common.errors import NotConverged
 from diffsim_ti.inputs import ConsistentMass, Mass, kinetic_energy
+from diffsim_ti.mechanics.energy.potential import Potential
+from diffsim_ti.mechanics.fluid.on_host import Fluid, Together
+from diffsim_ti.mechanics.obstacles.approach import Approach
+from diffsim_ti.mechanics.obstacles.obstacle_ways import ObstacleWays
+from diffsim_ti.mechanics.obstacles.pressed import Pressed
+from diffsim_ti.mechanics.obstacles.way import Way
+from diffsim_ti.mechanics.reduced.rigid_sets import RigidSets
+from diffsim_ti.mechanics.stress.held_strains import HeldStrains
+from diffsim_ti.mechanics.stress.law_state import law_state_kernels
+from diffsim_ti.mechanics.supports.free import FreeBodies, FreeDirections, held_as, linear_of, mask_of
+from diffsim_ti.mechanics.surfaces.implicit_pairs import ImplicitPairs
+from diffsim_ti.mechanics.ties.attached import Attached
+from diffsim_ti.mechanics.workspace import Workspace
 from diffsim_ti.monitor.energy_watch import EnergyWatch
-from diffsim_ti.potential.attached import Attached
-from diffsim_ti.potential.fluid import Fluid, Together
-from diffsim_ti.potential.free import FreeBodies, FreeDirections, held_as, linear_of, mask_of
-from diffsim_ti.potential.potential import Potential
-from diffsim_ti.potential.rigid_sets import RigidSets
-from diffsim_ti.potential.way import Way
-from diffsim_ti.slots import copy_slot
-from diffsim_ti.solvers.implicit.approach import Approach
+from diffsim_ti.runtime.slots import copy_slot
 from diffsim_ti.solvers.implicit.closing import Closing
 from diffsim_ti.solvers.implicit.given import GivenInPasses
-from diffsim_ti.solvers.implicit.held_strains import HeldStrains
 from diffsim_ti.solvers.implicit.laid_on import LaidOn
-from diffsim_ti.solvers.implicit.law_state import law_state_kernels
-from diffsim_ti.solvers.implicit.linear import NotConverged
 from diffsim_ti.solvers.implicit.newton import Newton
 from diffsim_ti.solvers.implicit.noted import Noted
-from diffsim_ti.solvers.implicit.obstacle_ways import ObstacleWays
 from diffsim_ti.solvers.implicit.preconditioned import Preconditioned
-from diffsim_ti.solvers.implicit.pressed import Pressed
-from diffsim_ti.solvers.implicit.stage import Stage
 from diffsim_ti.solvers.implicit.threads import one_blas_thread
 from diffsim_ti.state.history import History
+from diffsim_ti.state.stage import Stage
 from diffsim_ti.state.walls import Moment
-from diffsim_ti.state.workspace import Workspace
 
 
 class TwoStepHistory(History):

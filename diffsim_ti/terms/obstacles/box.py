@@ -6,7 +6,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import ArrayLike
 
-from diffsim_ti.checked import numbers, shape_of
+from diffsim_ti.common.checked import numbers, shape_of
 from diffsim_ti.inputs import POSITIVE, Input
 from diffsim_ti.runtime import traced
 from diffsim_ti.terms.described import extent, place

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffsim_ti.checked import present
+from diffsim_ti.common.checked import present
+from diffsim_ti.common.origin import far_part
 from diffsim_ti.inputs import Input
 from diffsim_ti.inputs.links import NearestPoint
-from diffsim_ti.origin import far_part
 from diffsim_ti.runtime import traced
 from diffsim_ti.terms.described import place
 from diffsim_ti.terms.obstacles import shapes

@@ -7,8 +7,8 @@ import numpy as np
 import taichi as ti
 from numpy.typing import ArrayLike
 
-from diffsim_ti.checked import numbers, whole, wholes
-from diffsim_ti.origin import OF_WIDTHS, middle_far_part, rounding_of
+from diffsim_ti.common.checked import numbers, whole, wholes
+from diffsim_ti.common.origin import OF_WIDTHS, middle_far_part, rounding_of
 from diffsim_ti.runtime import at, let, traced
 from diffsim_ti.terms.described import place
 from diffsim_ti.terms.obstacles.obstacle import Obstacle, ObstacleForce

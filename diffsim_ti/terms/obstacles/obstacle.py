@@ -34,7 +34,7 @@ class Obstacle(Term):
     stiffness [N/m]: k of every vertex alike, however many there are.
     width [m]: how far the obstacle is felt.
     Faces of ten-node tetrahedra that are curved in the mesh, by .02 widths or more, are felt as curved as they move, by
-    points on them (potential/curved_faces.py). Friction there is, in explicit steps, a stage after those of the pushes.
+    points on them (curved_faces.py). Friction there is, in explicit steps, a stage after those of the pushes.
     friction [-]: Coulomb's coefficient (friction.py); 0 compiles none. friction_speed [m/s]: the speed below which
     friction is smoothed, and with which a vertex that is held may creep.
     path: the obstacle's displacement over time [m], a function of time [s] that returns 3 numbers, or keyframes

@@ -1,0 +1,1 @@
+"""What all of the package shares and what knows nothing of bodies: checks, differences, progress, interrupts."""

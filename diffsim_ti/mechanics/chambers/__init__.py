@@ -1,0 +1,1 @@
+"""Chambers: gases and held volumes in cavities."""

@@ -1,0 +1,188 @@
+"""The tangent and the adjoint of the stage that holds volumes (held_volumes.py), along recorded passes."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from diffsim_ti.inputs import Derived
+from diffsim_ti.mechanics.chambers.held_volumes import HeldVolumes, Walls, along, slopes
+from diffsim_ti.mechanics.chambers.record import ChamberRecord
+
+
+@dataclass
+class HeldPass:
+    """A recorded pass j, between its slots."""
+
+    j: int
+    now: object  # its numbers
+    walls: Walls
+    ends: np.ndarray  # places of the walls after it
+    s: np.ndarray | None  # None where there was no stage
+    frame: int  # whose velocity it shows between kicks, or -1
+    q: np.ndarray | None = None  # of that, and
+    shown: np.ndarray | None = None  # the velocity
+
+    @property
+    def ratio(self) -> float:
+        """r."""
+        return self.now.decay / self.now.alpha
+
+    @property
+    def ratio_by_rate(self) -> float:
+        now = self.now
+        return (now.decay_by_rate * now.alpha - now.decay * now.alpha_by_rate) / now.alpha**2
+
+    @property
+    def per_pressure(self) -> float:
+        """s of 1 Pa."""
+        return self.now.alpha * (self.now.pre + self.now.post)
+
+
+def recorded(held: HeldVolumes, j: int, slot: int, num_passes: int, save_every: int, shows: bool = False) -> HeldPass:
+    """Pass j from a slot on; shows: its velocity between kicks is looked at also where it is no frame's."""
+    ws, kept = held.ws, held.kept.get(slot + 1)
+    now, history = ws.numbers_of(j, num_passes), ws.record
+    u, v = held.rows(history.u, slot), held.rows(history.v, slot)
+    walls, ends = held.walls(u), held.rest + held.rows(history.u, slot + 1)
+    one = HeldPass(j, now, walls, ends, None if kept is None else kept[2], held.frame(j, save_every, now))
+    if one.frame >= 0 or (shows and now.pre > 0):
+        a, gravity = ws.arrays.values, ws.arrays.features().gravity
+        weight = a.parameters[gravity:][:3] if gravity >= 0 else np.zeros(3)
+        v = v + now.pre * walls.freed(walls.inverse * held.rows(history.f, slot) + weight)
+        change, one.q = held.tangent_part(walls, v, held.rates(ws.arrays.rows["follower"], j))
+        one.shown = v + change
+    return one
+
+
+class HeldTangent:
+    """Of a run; at: what holds the changes u and v of the state and of frames; change: those of all else."""
+
+    def __init__(self, at, held: HeldVolumes, change):
+        self.at, self.held, self.change = at, held, change
+        self.chambers = ChamberRecord(held.ws.solver, held.places)
+        self.rest, mass = change.rest[held.nodes], held.ws.arrays.values.mass[held.nodes, None]
+        self.inverse = -change.mass[held.nodes, None] / mass**2
+
+    def before(self) -> None:
+        """A pass comes next."""
+        self.dx = self.rest + self.held.rows(self.at.u, 0)
+
+    def after(self, j: int, slot: int, num_passes: int, save_every: int, rate_dot: float) -> None:
+        """Pass j from a slot on is through, without the stage."""
+        held, at, one = self.held, self.at, recorded(self.held, j, slot, num_passes, save_every)
+        walls, rows = one.walls, self.change.follower
+        if one.s is not None:
+            du, dv = held.rows(at.u, 0), held.rows(at.v, 0)
+            G, pushed = walls.gradients(one.ends), walls.pushed_jvp(one.s, self.dx, self.inverse)
+            ds = np.linalg.solve(slopes(G, walls.d), held.targets(rows, j) - along(G, self.rest + du + pushed))
+            way = np.tensordot(ds, walls.d, 1) + pushed
+            held.put(at.u, 0, du + way)
+            by_ratio = rate_dot * one.ratio_by_rate * np.tensordot(one.s, walls.d, 1)
+            held.put(at.v, 0, dv + one.ratio * way + by_ratio)
+            by_rate = one.now.alpha_by_rate / one.now.alpha * rate_dot
+            self.chambers.note(j, save_every, (ds - by_rate * one.s) / one.per_pressure)
+        if one.frame >= 0:
+            dv, pushed = held.rows(at.frames.frames_v, one.frame), walls.pushed_jvp(one.q, self.dx, self.inverse)
+            left = held.rates(rows, j) - along(walls.turned(self.dx), one.shown) - along(walls.g, dv + pushed)
+            dq = np.linalg.solve(slopes(walls.g, walls.d), left)
+            held.put(at.frames.frames_v, one.frame, dv + np.tensordot(dq, walls.d, 1) + pushed)
+
+
+class HeldAdjoint:
+    """Of a run: sums over passes; at: what holds the adjoints u and v of the state and of frames."""
+
+    def __init__(self, at, held: HeldVolumes):
+        self.at, self.held, self.chambers = at, held, ChamberRecord(held.ws.solver, held.places)
+
+    def clear(self) -> None:
+        """A reverse sweep begins."""
+        n, values = len(self.held.nodes), self.held.ws.arrays.values
+        self.rest, self.inverse, self.by_rate = np.zeros((n, 3)), np.zeros((n, 1)), 0.0
+        self.follower, self.halted = np.zeros_like(values.follower), None
+
+    def start(self, j: int, slot: int, num_passes: int, save_every: int, halts: bool) -> None:
+        """Go back through the stage of pass j from a slot on; all of the adjoint after it is in `at`.
+
+        halts: stop at the state that the pass shows, whose velocity is tangent.
+        """
+        held, at, schedule = self.held, self.at, self.held.ws.solver.schedule
+        one = recorded(held, j, slot, num_passes, save_every, halts)
+        walls, self.by_x, rows = one.walls, np.zeros_like(self.rest), self.follower
+        if one.s is not None:
+            u_adj, v_adj = held.rows(at.u, 0), held.rows(at.v, 0)
+            by_pressure = self.chambers.adjoint(j, save_every) / one.per_pressure
+            G, way_adj = walls.gradients(one.ends), u_adj + one.ratio * v_adj
+            mu = np.linalg.solve(slopes(G, walls.d).T, along(walls.d, way_adj) + by_pressure)
+            z = -np.tensordot(mu, G, 1)
+            self._push(walls, one.s, way_adj + z)
+            self.rest += z
+            held.put(at.u, 0, u_adj + z)
+            schedule.add_pressure(rows, j, schedule.end(j), self._of_all(mu))
+            self.by_rate += one.ratio_by_rate * float(one.s @ along(walls.d, v_adj))
+            self.by_rate -= one.now.alpha_by_rate / one.now.alpha * float(by_pressure @ one.s)
+        self.halted = one if halts and one.q is not None else None
+        if one.frame >= 0 and not halts:
+            frame_adj = held.rows(at.frames.frames_v, one.frame)
+            held.put(at.frames.frames_v, one.frame, frame_adj + self._show(one, frame_adj))
+
+    def _halt(self, one: HeldPass) -> None:
+        """From the state between the kicks of a pass to that with a tangent velocity, of which all later ones are functions
+        likewise."""
+        held, at = self.held, self.at
+        of_frame = held.rows(at.frames.frames_v, one.frame) if one.frame >= 0 else 0.0
+        self._push(one.walls, one.q, of_frame - held.rows(at.v, 0))
+
+    def go_before_state(self) -> None:
+        """Back from there."""
+        if self.halted is not None:
+            held, at, self.by_x = self.held, self.at, np.zeros_like(self.rest)
+            v_adj = held.rows(at.v, 0)
+            held.put(at.v, 0, v_adj + self._show(self.halted, v_adj))
+            self._add_places()
+        self.halted = None
+
+    def _show(self, one: HeldPass, frame_adj: np.ndarray) -> np.ndarray:
+        """What comes to the adjoint of a velocity that is shown, before it is made tangent; adds those of all else."""
+        walls, rows, schedule = one.walls, self.follower, self.held.ws.solver.schedule
+        mu = np.linalg.solve(slopes(walls.g, walls.d).T, along(walls.d, frame_adj))
+        z = -np.tensordot(mu, walls.g, 1)
+        self._push(walls, one.q, frame_adj + z)
+        self.by_x -= sum(m * e.gradient_jvp(walls.x, one.shown) for m, e in zip(mu, walls.enclosures))
+        rate = self._of_all(mu) / schedule.step_length(one.j - 1)
+        row = rows[schedule.load_row(rows, one.j - 1)]
+        row[:, 0] -= rate
+        row[:, 1] += rate
+        return z
+
+    def _push(self, walls: Walls, s: np.ndarray, adjoint: np.ndarray) -> None:
+        by_x, by_inverse = walls.pushed_vjp(s, adjoint)
+        self.by_x, self.inverse = self.by_x + by_x, self.inverse + by_inverse
+
+    def _of_all(self, by_target: np.ndarray) -> np.ndarray:
+        """Among the numbers of all loads."""
+        out = np.zeros(self.follower.shape[1])
+        out[self.held.columns] = by_target
+        return out
+
+    def end(self) -> None:
+        """The rest of the pass is reversed: add what its beginning was to the stage."""
+        if self.halted is not None:
+            self._halt(self.halted)
+        self._add_places()
+
+    def _add_places(self) -> None:
+        self.rest += self.by_x
+        self.held.put(self.at.u, 0, self.held.rows(self.at.u, 0) + self.by_x)
+
+    def collect(self, out: Derived, drag: int) -> None:
+        """Add the adjoints of numbers."""
+        nodes = self.held.nodes
+        out.follower += self.follower
+        by_mass = np.zeros(len(out.displacement))
+        by_mass[nodes] = -self.inverse[:, 0] / self.held.ws.arrays.values.mass[nodes] ** 2
+        out.mass = out.mass + by_mass
+        rest = np.zeros_like(out.displacement)
+        rest[nodes] = self.rest
+        out.rest = out.rest + rest
+        if drag >= 0:
+            out.parameters[drag] += self.by_rate

@@ -1,0 +1,313 @@
+"""Kernels of the potential energy of a displacement: elasticity of all tetrahedra, obstacles at surface vertices."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import taichi as ti
+
+from diffsim_ti.materials.calculus.tensor import Tensor, sum_of
+from diffsim_ti.mechanics.obstacles.obstacles import ObstaclePotential
+from diffsim_ti.mechanics.stress.patched_tetrahedron import functions_of
+from diffsim_ti.runtime import PRECISIONS, Bundle, Kernel, assign, kernels_of, let, traced
+from diffsim_ti.runtime import at as entry
+from diffsim_ti.state.features import Features
+from diffsim_ti.state.numbers import ADJOINT, SCENE, TANGENT, needed, with_held, with_pass
+
+A = ti.template()
+PASS = dict(walls="vectors", lag="vectors2", pressed="vectors2")  # what contact sees of a pass (obstacles.py)
+NUMBERS = dict(num_items="int", num_tetrahedra="int", num_vertices="int", per_gamma="float")
+
+
+@dataclass(frozen=True)
+class PotentialKernels:
+    """Energy, forces, products of their derivatives, block diagonal: at displacement `at.u`, in the pass `pass_`."""
+
+    law: object
+    features: Features
+    parallel: bool
+    lanes: bool
+
+    @property
+    def fp(self):
+        return PRECISIONS[self.law.precision]
+
+    @cached_property
+    def element(self):
+        return functions_of(self.law, self.features, self.lanes)
+
+    @cached_property
+    def single(self):
+        """The element without lanes."""
+        return functions_of(self.law, self.features, False)
+
+    @cached_property
+    def obstacles(self) -> ObstaclePotential:
+        return ObstaclePotential(self.features, self.law.precision)
+
+    def _kernel(self, name: str, body, **arrays) -> Kernel:
+        own = dict(scene=needed(SCENE, self.features), pass_=PASS if self.features.groups else {}) | arrays
+        own |= dict(at=with_pass(arrays["at"], self.law))
+        return Kernel(name, body, self.law.precision, own, NUMBERS)
+
+    @ti.func
+    def felt(self, i, scene: A):
+        """Whether vertex i feels obstacles."""
+        felt = False
+        if ti.static(len(self.features.groups) > 0):
+            felt = scene.surface[i] > 0
+        return felt
+
+    # ---- energy ------------------------------------------------------------------------------------------------------
+
+    @ti.func
+    def volume_ratio(self, H):
+        return (H.matrix() + ti.Matrix.identity(self.fp, 3)).determinant()
+
+    @traced
+    def elastic_energies(self, e, scene, at, out):
+        def see(q, H, numbers):
+            k = e * len(self.single.points) + q
+            psi = self.law.energy_density(H, numbers)
+            assign(entry(out.elastic, k), psi * self.single.volume_of(e, scene.volumes, q))
+            assign(entry(out.J, k), self.volume_ratio(H))
+
+        self.single.each_seen(e, scene, at, 0, see)
+
+    @ti.func
+    def energies(self, scene: A, pass_: A, at: A, out: A, plan: A):
+        ti.loop_config(serialize=not self.parallel)
+        for e in range(plan.num_tetrahedra):
+            self.elastic_energies(e, scene, at, out)
+        ti.loop_config(serialize=not self.parallel)
+        for i in range(plan.num_vertices):
+            value = ti.cast(0, self.fp)
+            if self.felt(i, scene):
+                value = self.obstacles.whole_energy(i, at.u[0, i], scene, pass_, plan)
+            out.contact[i] = value
+
+    @cached_property
+    def energy(self) -> Kernel:
+        """Energy [J] and volume ratio of each point, energy of contact and friction [J] of each vertex."""
+        out = dict(elastic="scalars", J="scalars", contact="scalars")
+        return self._kernel("energy", self.energies, at=dict(u="vectors2"), out=out)
+
+    @ti.func
+    def barrier_energies(self, scene: A, pass_: A, at: A, out: A, plan: A):
+        ti.loop_config(serialize=not self.parallel)
+        for i in range(plan.num_vertices):
+            value = ti.cast(0, self.fp)
+            if self.felt(i, scene):
+                value = self.obstacles.energy(i, at.u[0, i], scene, pass_)
+            out.contact[i] = value
+
+    @cached_property
+    def barrier_energy(self) -> Kernel:
+        """Energy of the barriers [J] of each vertex."""
+        return self._kernel("barrier_energy", self.barrier_energies, at=dict(u="vectors2"), out=dict(contact="scalars"))
+
+    # ---- forces ------------------------------------------------------------------------------------------------------
+
+    @ti.func
+    def length(self, v):
+        return ti.sqrt(v.norm_sqr())  # `norm` adds a float64 zero
+
+    @ti.func
+    def all_forces(self, scene: A, pass_: A, at: A, out: A, plan: A):
+        ti.loop_config(serialize=not self.parallel)
+        for e in range(plan.num_items):
+            self.element.forces(e, scene, at, 0, scene.corner)
+        ti.loop_config(serialize=not self.parallel)
+        for i in range(plan.num_vertices):
+            pushed, total = self.obstacles.vector(0), self.obstacles.vector(0)
+            if self.felt(i, scene):
+                pushed = self.obstacles.whole_force(i, at.u[0, i], scene, pass_, plan)
+            norm = self.length(pushed)
+            for c in range(scene.start[i], scene.start[i + 1]):
+                part = scene.corner[scene.corner_of[c]]
+                total += part
+                norm += self.length(part)
+            out.y[0, i] = total + pushed
+            out.size[i] = norm
+
+    @cached_property
+    def forces(self) -> Kernel:
+        """Forces, and the sum of the sizes of what meets at a vertex, against which a rest is measured."""
+        return self._kernel("forces", self.all_forces, at=dict(u="vectors2"), out=dict(y="vectors2", size="scalars"))
+
+    # ---- products with the stiffness ---------------------------------------------------------------------------------
+
+    @ti.func
+    def multiply(self, scene: A, pass_: A, at: A, out: A, plan: A, friction: A):
+        ti.loop_config(serialize=not self.parallel)
+        for e in range(plan.num_items):
+            self.element.stiffness(e, scene, at, 0, scene.corner)
+        ti.loop_config(serialize=not self.parallel)
+        for i in range(plan.num_vertices):
+            f = self.element.gather(i, scene, scene.corner)
+            if self.felt(i, scene):
+                if ti.static(friction):
+                    f += self.obstacles.whole_product(i, at.u[0, i], at.w[0, i], scene, pass_, plan)
+                else:
+                    f += self.obstacles.product(i, at.u[0, i], at.w[0, i], scene, pass_)
+            out.y[0, i] = f
+
+    @ti.func
+    def products(self, scene: A, pass_: A, at: A, out: A, plan: A):
+        self.multiply(scene, pass_, at, out, plan, True)
+
+    @cached_property
+    def product(self) -> Kernel:
+        """y = df/du w"""
+        return self._kernel("product", self.products, at=dict(u="vectors2", w="vectors2"), out=dict(y="vectors2"))
+
+    @ti.func
+    def smooth_products(self, scene: A, pass_: A, at: A, out: A, plan: A):
+        self.multiply(scene, pass_, at, out, plan, False)
+
+    @cached_property
+    def stiffness(self) -> Kernel:
+        """y = df/du w without friction: what bounds an explicit step."""
+        own = dict(at=dict(u="vectors2", w="vectors2"), out=dict(y="vectors2"))
+        return self._kernel("stiffness", self.smooth_products, **own)
+
+    # ---- block diagonal ----------------------------------------------------------------------------------------------
+
+    @traced
+    def tangent_column(self, e, scene, at, c, tangent):
+        """Column c of d2psi/dF2 at each point q, nine numbers, to rows 81 q + 9 c .. 81 q + 9 c + 8 of its block."""
+        el = self.element
+        dH = Tensor(el.broadcast(ti.cast(c == k, self.fp)) for k in range(9))
+
+        def see(q, H, numbers):
+            dP = self.law.stress_differential(H, dH, numbers)
+            el.put(tangent, 81 * len(el.points), e, 81 * q + 9 * c, dP.numbers)
+
+        el.each_seen(e, scene, at, 0, see)
+
+    @traced
+    def corner_column(self, e, scene, d, tangent, corners, first):
+        """Column d of the 3x3 block of -df_a/du_a of each corner a, a displacement e_d of it; corners from `first` on."""
+        el = self.element
+        B, volume = el.gradients_of(e, scene.gradients), el.volume_of(e, scene.volumes)
+        zero = ti.cast(0, self.fp)
+        N = [[let(sum_of(B[a, j] for a in range(3)) * ti.cast(-1, self.fp)) for j in range(3)]]
+        N += [[B[a, j] for j in range(3)] for a in range(3)]
+        C = [el.numbers(tangent, 9 * (3 * d + k), 9, 81, e) for k in range(3)]
+        forces = []
+        for a in range(4):
+            dP = [let(sum_of(C[k][m] * N[a][k] for k in range(3)) * volume) for m in range(9)]
+            forces.append([let(sum_of(dP[3 * i + j] * N[a][j] for j in range(3))) for i in range(3)])
+        el.store_corners(corners, e, forces, zero, first=first)
+
+    @ti.func
+    def contact_column(self, i, d, at: A, scene: A, pass_: A, plan: A):
+        """Column d of df/du of obstacles at vertex i."""
+        f = self.obstacles.vector(0)
+        if self.felt(i, scene):
+            unit = self.obstacles.vector(0)
+            for m in ti.static(range(3)):
+                unit[m] = ti.select(d == m, ti.cast(1, self.fp), ti.cast(0, self.fp))
+            f = self.obstacles.whole_product(i, at.u[0, i], unit, scene, pass_, plan)
+        return f
+
+    @ti.func
+    def all_blocks(self, scene: A, pass_: A, at: A, out: A, plan: A):
+        ti.loop_config(serialize=not self.parallel)
+        for e in range(plan.num_items):
+            for c in range(9):
+                self.tangent_column(e, scene, at, c, out.tangent)
+            if ti.static(self.features.order == 1):
+                for d in range(3):
+                    self.corner_column(e, scene, d, out.tangent, out.corners, d * (out.corners.shape[0] // 3))
+        ti.loop_config(serialize=not self.parallel)
+        for i in range(plan.num_vertices):
+            for d in range(3):
+                f = self.obstacles.vector(0)
+                if ti.static(self.features.order == 1):
+                    for c in range(scene.start[i], scene.start[i + 1]):
+                        f += out.corners[d * (out.corners.shape[0] // 3) + scene.corner_of[c]]
+                out.blocks[d, i] = f - self.contact_column(i, d, at, scene, pass_, plan)
+
+    @cached_property
+    def blocks(self) -> Kernel:
+        """d2psi/dF2 of each point, and the 3x3 diagonal blocks of -df/du, by columns; of ten nodes the tetrahedra's part is
+        left to the host."""
+        out = dict(corners="vectors", tangent="blocks", blocks="vectors2")
+        return self._kernel("blocks", self.all_blocks, at=dict(u="vectors2"), out=out)
+
+    @ti.func
+    def all_contact_blocks(self, scene: A, pass_: A, at: A, out: A, plan: A):
+        ti.loop_config(serialize=not self.parallel)
+        for i in range(plan.num_vertices):
+            for d in range(3):
+                out.blocks[d, i] = 0 - self.contact_column(i, d, at, scene, pass_, plan)
+
+    @cached_property
+    def contact_blocks(self) -> Kernel:
+        """The part of obstacles in `blocks`."""
+        own = dict(at=dict(u="vectors2"), out=dict(blocks="vectors2"))
+        return self._kernel("contact_blocks", self.all_contact_blocks, **own)
+
+    # ---- patches -----------------------------------------------------------------------------------------------------
+
+    @ti.func
+    def unit_pressure(self, scene: A, pass_: A, at: A, out: A, plan: A):
+        ti.loop_config(serialize=not self.parallel)
+        for e in range(plan.num_items):
+            self.element.pressure_forces(e, scene, at, 0, scene.corner)
+
+    @cached_property
+    def pressure_forces(self) -> Kernel:
+        """Corner forces of a unit pressure in every patch."""
+        return self._kernel("pressure_forces", self.unit_pressure, at=dict(u="vectors2"), out={})
+
+    # ---- derivatives by everything -----------------------------------------------------------------------------------
+
+    @traced
+    def change(self, at, tangent) -> Bundle:
+        """What forces see of a change: w of the displacement, z of the law's state, `held` of what it holds in a pass."""
+        own = {name: getattr(tangent, name) for name in ("z", "held") if hasattr(tangent, name)}
+        return Bundle(u=at.w, **own)
+
+    @ti.func
+    def all_jvp(self, scene: A, pass_: A, at: A, out: A, tangent: A, plan: A):
+        ti.loop_config(serialize=not self.parallel)
+        for e in range(plan.num_items):
+            self.element.forces_jvp(e, scene, at, 0, self.change(at, tangent), scene.corner, tangent)
+        ti.loop_config(serialize=not self.parallel)
+        for i in range(plan.num_vertices):
+            f = self.element.gather(i, scene, scene.corner)
+            if self.felt(i, scene):
+                f = self.obstacles.add_jvp(i, f, at.u[0, i], at.w[0, i], scene, pass_, tangent, plan)
+            out.y[0, i] = f
+
+    @cached_property
+    def jvp(self) -> Kernel:
+        """Change y of the forces for changes w of the displacement and of everything else that they depend on."""
+        own = dict(at=dict(u="vectors2", w="vectors2"), out=dict(y="vectors2"))
+        own["tangent"] = with_held(TANGENT | PASS, self.law)
+        return self._kernel("jvp", self.all_jvp, **own)
+
+    @ti.func
+    def all_vjp(self, scene: A, pass_: A, at: A, out: A, adjoint: A, plan: A):
+        ti.loop_config(serialize=not self.parallel)
+        for e in range(plan.num_items):
+            self.element.forces_vjp(e, scene, at, 0, at.w, scene.corner, adjoint, self.features.shape)
+        ti.loop_config(serialize=not self.parallel)
+        for i in range(plan.num_vertices):
+            f = self.element.gather(i, scene, scene.corner)
+            if self.felt(i, scene):
+                f = self.obstacles.add_vjp(i, f, at.u[0, i], at.w[0, i], scene, pass_, adjoint, plan)
+            out.y[0, i] = f
+
+    @cached_property
+    def vjp(self) -> Kernel:
+        """y = df/du w (it is symmetric) and adjoints of the pass; adds the adjoints of all else that forces depend on."""
+        adjoint = ADJOINT | dict(lag="vectors2", walls="vectors2", pressed="vectors2")
+        own = dict(at=dict(u="vectors2", w="vectors2"), out=dict(y="vectors2"), adjoint=with_held(adjoint, self.law))
+        return self._kernel("vjp", self.all_vjp, **own)
+
+
+def potential_kernels(law, features: Features, parallel: bool, lanes: bool) -> PotentialKernels:
+    """Kernels for a law and a scene's features."""
+    return kernels_of(PotentialKernels, law, features.of_state(), parallel, lanes)

@@ -1,0 +1,283 @@
+"""The potential energy of a displacement on the device, with its derivatives, as arrays of float64."""
+
+from contextlib import contextmanager
+from functools import cached_property
+from types import SimpleNamespace
+
+import numpy as np
+
+from diffsim_ti import runtime
+from diffsim_ti.inputs import StressPoints
+from diffsim_ti.mechanics.energy.kernels import potential_kernels
+from diffsim_ti.mechanics.obstacles.face_contact import FaceContact
+from diffsim_ti.mechanics.reduced.rigid_sets import RigidSets
+from diffsim_ti.mechanics.stress.patch_coupling import PatchCoupling
+from diffsim_ti.mechanics.ties.attached import Attached
+from diffsim_ti.runtime.slots import copy_slot
+
+
+class Potential:
+    """Elastic and contact energy E(u) of a scene; displacements and results are NumPy arrays, shape (num_vertices, 3).
+
+    Everything after `place(u)` is at that displacement, which has the precision of the scene.
+    """
+
+    def __init__(self, arrays, tetrahedra: np.ndarray, parallel: bool, pairs=None):
+        self.arrays, self.tetrahedra, self.pairs, a = arrays, tetrahedra, pairs, arrays
+        self.kernels = potential_kernels(a.law, a.features(), parallel, a.in_lanes)
+        n, m, num_obstacles = a.num_vertices, a.num_places, len(a.obstacles)
+        self.u, self.w, self.y = (runtime.array(a.vector, 1, n) for _ in range(3))  # displacement, direction, result
+        self.has_friction = bool(a.features().rough)
+        self.lag = runtime.array(a.vector, 2, n if self.has_friction else 1)  # as obstacles.py says, like the walls
+        self.walls = runtime.array(a.vector, a.walls.size)
+        self.faces = FaceContact(self, parallel) if FaceContact.is_felt(arrays) else None
+        self.presses = any(g.force.friction and a.features().reaches(g) for g in a.features().groups)
+        self.pressed = runtime.array(a.vector, num_obstacles if self.presses else 1, n if self.presses else 1)
+        self.per_gamma, self.held_at = 1.0, np.zeros((n, 3))
+        self.size, self.contact = runtime.array(a.fp, n), runtime.array(a.fp, n)
+        self.elastic, self.J = runtime.array(a.fp, a.points * m), runtime.array(a.fp, a.points * m)
+        self._launches, self._coupling = {}, None  # made when first needed
+        self._points = None
+        self.z = arrays.law_states(1)  # the state of the law, held during a pass
+        self.held = arrays.held_numbers()  # what the law measures rates from in a pass
+        self.rate = runtime.array(a.fp, 1) if a.law.viscous else None  # [1/s], of changes in a pass; zero in statics
+        self.attached: Attached | None = None  # springs, cables, foundations: set by whom a time is known
+        self.rigid: RigidSets | None = None  # sets that do not deform: set by whom passes are known
+
+    @property
+    def rubbing(self):
+        """Friction of surfaces on each other (mechanics/surfaces/lagged_friction.py); None without."""
+        return self.pairs.friction if self.pairs else None
+
+    def _on_host(self) -> list:
+        """What acts on vertices from the host: what is attached, and friction of surfaces."""
+        return [part for part in (self.attached, self.rubbing) if part]
+
+    def launch(self, name: str, lanes: bool = True, **records) -> None:
+        """Run a kernel at the present displacement; records: more arrays than the potential's own."""
+        a = self.arrays
+        if name not in self._launches:
+            own = dict(scene=a, pass_=self, at=self, out=self) | records
+            self._launches[name] = getattr(self.kernels, name).bind(lanes and a.in_vectors, **own)
+        self._launches[name](**self.sizes())
+
+    def sizes(self) -> dict:
+        """The numbers that every kernel takes."""
+        a = self.arrays
+        sizes = dict(num_items=a.num_items, num_tetrahedra=a.num_places, num_vertices=a.num_vertices)
+        return sizes | dict(per_gamma=self.per_gamma)
+
+    def begin(self, u: np.ndarray, x: np.ndarray, per_gamma: float, walls: np.ndarray) -> None:
+        """What contact sees of a pass: its first displacement, x and 1 / gamma, and the obstacles (obstacles.py)."""
+        self.per_gamma = per_gamma
+        if self.has_friction:
+            runtime.fill(self.lag, np.stack([u, x]))
+        if len(walls):
+            runtime.fill(self.walls, walls)
+        if self.pairs:
+            self.pairs.begin(u)
+        if self.rubbing:
+            self.rubbing.begin(u, x, per_gamma)
+
+    def place(self, u: np.ndarray) -> np.ndarray:
+        """Go to displacement u [m]; returns it as the device holds it."""
+        runtime.fill(self.u, u[None])
+        self.held_at = runtime.fetch(self.u)[0].astype(np.float64)
+        if self.pairs:
+            self.pairs.place(self.u)
+        if self.rigid:
+            self.rigid.place(self.held_at)
+        return self.held_at
+
+    def hold(self, history, slot: int) -> None:
+        """Hold the state that the law has in a slot."""
+        if self.z is not None:
+            copy_slot(history.z, slot, self.z, 0)
+
+    @contextmanager
+    def at_rest(self):
+        """At rest, and then back to where it was."""
+        u, kept = self.held_at, [(x, runtime.fetch(x)) for x in (self.z, self.held) if x is not None]
+        self.place(np.zeros_like(u))
+        if self.z is not None:
+            runtime.fill(self.z, self.arrays.initial_state_blocks())
+        if self.held is not None:
+            runtime.fill(self.held, 0)
+        yield
+        self.place(u)
+        for array, numbers in kept:
+            runtime.fill(array, numbers)
+
+    @contextmanager
+    def without_viscosity(self):
+        """What the law stores alone."""
+        rate = None if self.rate is None else runtime.fetch(self.rate)
+        if rate is not None:
+            runtime.fill(self.rate, 0)
+        yield
+        if rate is not None:
+            runtime.fill(self.rate, rate)
+
+    @contextmanager
+    def without_friction(self):
+        """What has a potential in the state alone, for friction has one in a pass."""
+        a, rubbing = self.arrays, getattr(self.rubbing, "inner", self.rubbing)  # that of curved faces acts on corners
+        rough = [first + force.count + 2 for force, first, _ in a.obstacles if force.friction]
+        if not (rough or rubbing):
+            yield
+            return
+        kept, pressing = runtime.fetch(a.parameters), rubbing.L if rubbing else None
+        smooth = kept.copy()
+        smooth[rough] = 0
+        if rubbing:
+            rubbing.L = np.zeros_like(pressing)
+        runtime.fill(a.parameters, smooth)
+        yield
+        runtime.fill(a.parameters, kept)
+        if rubbing:
+            rubbing.L = pressing
+
+    def energy(self) -> tuple[float, float, np.ndarray]:
+        """(energy [J], the sum of its absolute parts, J at each point)."""
+        self.launch("energy", lanes=False)
+        elastic, contact, J = (runtime.fetch(x).astype(np.float64) for x in (self.elastic, self.contact, self.J))
+        if self.pairs:
+            contact = np.concatenate([contact, self.pairs.energies()])
+        if self.faces:
+            contact = np.concatenate([contact, self.faces.energies()])
+        contact = np.concatenate([contact, *(part.energies(self.held_at) for part in self._on_host())])
+        return elastic.sum() + contact.sum(), np.abs(elastic).sum() + np.abs(contact).sum(), J
+
+    def forces(self) -> tuple[np.ndarray, np.ndarray]:
+        """(forces -dE/du [N], sum of the sizes of the forces that meet at each vertex)."""
+        if self.pairs:
+            self.pairs.forces(self.u, 0, self.arrays.corner)
+        self.launch("forces")
+        forces, sizes = (runtime.fetch(x).astype(np.float64) for x in (self.y, self.size))
+        if self.faces:
+            pushed = self.faces.forces()
+            forces, sizes = forces + pushed, sizes + np.linalg.norm(pushed, axis=1)
+        for part in self._on_host():
+            forces, sizes = forces + part.forces(self.held_at), sizes + part.sizes(self.held_at)
+        return forces[0], sizes
+
+    def product(self, w: np.ndarray, convex: bool = False) -> np.ndarray:
+        """d2E/du2 w [N]; `convex`: of contact between surfaces, only its convex part."""
+        scale = np.abs(w).max() or 1.0  # f32 keeps its digits whatever the units
+        runtime.fill(self.w, (w / scale)[None])
+        self.multiply(convex)
+        y = runtime.fetch(self.y)[0].astype(np.float64)
+        y = (y + self.faces.product() if self.faces else y) * -scale
+        return sum((part.product(self.held_at, w, convex) for part in self._on_host()), y)
+
+    def multiply(self, convex: bool = False) -> None:
+        """y = -d2E/du2 w on the device, without faces and what is attached."""
+        if self.pairs:
+            self.pairs.hessian_product(self.u, self.w, convex)
+        self.launch("product")
+
+    @property
+    def stays_on_device(self) -> bool:
+        """Whether `multiply` does all of `product`."""
+        return not (self.faces or self.attached)
+
+    def blocks(self) -> np.ndarray:
+        """3x3 diagonal blocks of d2E/du2 [N/m], shape (num_vertices, 3, 3)."""
+        a = self.arrays
+        self.launch("blocks", out=self._block_arrays)
+        if self.pairs:
+            self.pairs.add_blocks(self.u, self._block_arrays.blocks)
+        blocks = np.swapaxes(runtime.fetch(self._block_arrays.blocks).astype(np.float64), 0, 1)
+        if self.faces:
+            blocks = blocks + self.faces.blocks()
+        for part in self._on_host():
+            blocks = blocks + part.blocks(self.held_at)
+        if a.points > 1:
+            blocks = blocks + self._element_blocks()
+        return blocks if a.patches is None else blocks + self.coupling.diagonal(self.patch_gradients())
+
+    def _element_blocks(self) -> np.ndarray:
+        """The part of tetrahedra of ten nodes in `blocks`: sum V grad N_a . d2psi/dF2 . grad N_a."""
+        nodes, N, volumes = self.stress_points
+        C = self.tangents().reshape(-1, 3, 3, 3, 3)
+        out = np.zeros((self.arrays.num_vertices, 3, 3))
+        for a in range(nodes.shape[1]):
+            own = np.einsum("pijkl,pj,pl,p->pik", C, N[:, a], N[:, a], volumes, optimize=True)
+            np.add.at(out, nodes[:, a], own)
+        return out
+
+    @property
+    def stress_points(self) -> StressPoints:
+        """Of the rest shape that is loaded; without volumes where there is no stress."""
+        a = self.arrays
+        if self._points is None or self._points[0] is not a.values:
+            points = StressPoints.of(a.mesh, a.values)
+            self._points = a.values, StressPoints(points.nodes, points.gradients, a.with_stress(points.volumes))
+        return self._points[1]
+
+    @cached_property
+    def _block_arrays(self) -> SimpleNamespace:
+        a = self.arrays
+        corners = runtime.array(a.vector, 3 * a.corner.shape[0])
+        room = 81 * a.points * a.num_blocks
+        tangent, blocks = runtime.array(a.lanes, room), runtime.array(a.vector, 3, a.num_vertices)
+        return SimpleNamespace(tangent=tangent, blocks=blocks, corners=corners)
+
+    @cached_property
+    def _barriers(self) -> SimpleNamespace:
+        return SimpleNamespace(blocks=runtime.array(self.arrays.vector, 3, self.arrays.num_vertices))
+
+    @property
+    def coupling(self) -> PatchCoupling:
+        """What patches add to d2E/du2, by the numbers that are loaded."""
+        if self._coupling is None or self._coupling[0] is not self.arrays.values:
+            self._coupling = self.arrays.values, PatchCoupling(self.arrays)
+        return self._coupling[1]
+
+    def patch_gradients(self) -> np.ndarray:
+        """g of `coupling` at the present displacement."""
+        a = self.arrays
+        self.launch("pressure_forces")
+        return self.coupling.rows(runtime.fetch(a.corner)[: a.first_contact_corner].astype(np.float64))
+
+    def tangents(self) -> np.ndarray:
+        """d2psi/dF2 [Pa] at each point, its patch's pressure held, where `blocks` was last called, shape (points, 9, 9)."""
+        a = self.arrays
+        return a.from_blocks(runtime.fetch(self._block_arrays.tangent), 81 * a.points).reshape(-1, 9, 9)
+
+    def tangent_chunks(self, size: int):
+        """(slice, `tangents` of it) for so many tetrahedra after the other, which caches hold."""
+        a, source = self.arrays, runtime.view(self._block_arrays.tangent)
+        source = runtime.fetch(self._block_arrays.tangent) if source is None else source
+        for begin in range(0, a.num_tetrahedra, size):
+            part = slice(begin, min(begin + size, a.num_tetrahedra))
+            yield part, a.from_blocks(source, 81 * a.points, part).reshape(-1, 9, 9)
+
+    def contact_product(self, w: np.ndarray) -> np.ndarray:
+        """The part of contact and of what is attached in `product`; of obstacles at vertices by their blocks."""
+        a, y = self.arrays, np.zeros_like(w)
+        runtime.fill(self.w, w[None])
+        if a.contacts:
+            self.launch("contact_blocks", lanes=False, out=self._barriers)
+            blocks = np.swapaxes(runtime.fetch(self._barriers.blocks).astype(np.float64), 0, 1)
+            y += np.einsum("kij,kj->ki", blocks, w)
+        if self.faces:
+            y -= self.faces.product()[0]
+        if self.pairs:
+            self.pairs.hessian_product(self.u, self.w, False)
+            y[a.mesh.surface_vertices] -= runtime.fetch(a.corner)[a.first_contact_corner :][
+                : len(a.mesh.surface_vertices)
+            ]
+        return sum((part.product(self.held_at, w) for part in self._on_host()), y)
+
+    def contact_blocks(self) -> np.ndarray | None:
+        """The part of contact and of what is attached in `blocks`; None without."""
+        attached = sum(part.blocks(self.held_at) for part in self._on_host()) if self._on_host() else None
+        if not (self.arrays.contacts or self.pairs):
+            return attached
+        self.launch("contact_blocks", lanes=False, out=self._barriers)
+        if self.pairs:
+            self.pairs.add_blocks(self.u, self._barriers.blocks)
+        blocks = np.swapaxes(runtime.fetch(self._barriers.blocks).astype(np.float64), 0, 1)
+        blocks = blocks + self.faces.blocks() if self.faces else blocks
+        return blocks if attached is None else blocks + attached

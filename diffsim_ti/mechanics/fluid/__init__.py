@@ -1,0 +1,1 @@
+"""Drag and lift of a fluid on the surface."""

@@ -1,0 +1,1 @@
+"""Obstacles: contact at vertices and within faces, friction, and the motion of obstacles."""

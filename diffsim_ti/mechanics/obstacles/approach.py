@@ -1,0 +1,88 @@
+"""What comes to a body within a pass: obstacles on their paths, and the body's own vertices where they are held.
+
+Where they are at the end of the pass the body may be in their way, and no minimum of the pass is to be found from there. So
+they come as far as the way is free, the incremental potential is lowered for them there, which makes room, and so on. The
+pass is solved when they have come; what was found on the way is but where it starts.
+Li et al. 2020, Incremental Potential Contact, supplement C, doi:10.1145/3386569.3392425.
+"""
+
+import weakref
+
+import numpy as np
+
+from diffsim_ti.mechanics.obstacles.blocked import Blocked
+
+
+class Approach:
+    """Brings a workspace's body in front of what comes to it."""
+
+    most_parts, rounds = 300, 12  # of a pass; Newton's in a part
+    kept = 0.5  # of the gap in a part: Newton's method doubles a small gap in a round, more or less
+    least, patience = 1e-4, 5  # share of the pass below which a part leads nowhere; so many in a row
+
+    def __init__(self, workspace):
+        self.ws = weakref.proxy(workspace)  # which holds this: no circle
+
+    def __call__(self, u, held, starts: list, problem: tuple) -> np.ndarray:
+        """Displacements with held vertices where they get, in front of the obstacles where forces are taken in the pass.
+
+        u: where the pass begins; held: the same with held vertices where they get; starts: where the body may be led;
+        problem: mass, inertial, loads of `Newton.solve`.
+        Raises Blocked where no room is left.
+        """
+        ws = self.ws
+        way, before, after = ws.way, ws.walls_before, ws.walls_at_stage
+        step, drift = held - u, ws.arrays.walls.drift(before, after)
+        if not (step.any() or drift.any()):
+            return held
+        ws.check_pairs(u, step)
+        if way.share(u, step, before, drift) == 1:
+            return held
+        try:
+            for start in starts:
+                if way.share(u, start - u, before, drift) == 1 and self._is_sound(u, start):
+                    ws.put_obstacles(before)
+                    ws.potential.place(held)
+                    if ws.newton.rise(held, ws.potential.energy(), start, problem) <= 0:
+                        return start
+            return self._in_parts(u, step, before, drift, problem)
+        finally:
+            ws.put_obstacles(after)
+
+    def _in_parts(self, place, step, before, drift, problem):
+        ws, done, stuck = self.ws, 0.0, 0
+        moved = ws.arrays.walls.moved
+        for _ in range(self.most_parts):
+            left, walls = 1 - done, moved(before, drift, done)
+            share = ws.way.share(place, left * step, walls, left * drift, kept=self.kept)
+            met = ws.way.met
+            place, done = place + share * left * step, done + share * left
+            if share == 1:
+                return place
+            stuck = stuck + 1 if share * left < self.least else 0
+            if stuck > self.patience:
+                break
+            walls = moved(before, drift, done)
+            carried = self._carried(place, (1 - done) * step, walls, (1 - done) * drift, met.obstacle)
+            if carried is not None:
+                return carried
+            ws.put_obstacles(walls)
+            place = ws.newton.solve(place, *problem, rounds=self.rounds)
+        ws.put_obstacles(walls)
+        own = list(met.vertices)
+        carried = ws.carried(met.obstacle, place[own], walls, drift, own)
+        speed = np.linalg.norm(carried - step[own], axis=1).max() / ws.substep
+        raise Blocked.pinched(ws, place, met, 1 - done, float(speed))
+
+    def _carried(self, place, step, walls, drift, obstacle: int):
+        """All that moves freely goes along with an obstacle; None where that way is not free."""
+        along = step + self.ws.carried(obstacle, place, walls, drift) * self.ws.linear
+        along = self.ws.rigid.nearest(place + along) - place if self.ws.rigid else along
+        if not (along - step).any() or self.ws.way.share(place, along, walls, drift) < 1:
+            return None
+        return place + along if self._is_sound(place, place + along) else None
+
+    def _is_sound(self, u, there) -> bool:
+        """Whether nothing turns inside out or meets itself on the way."""
+        J0, J = self.ws.volume_ratios(u), self.ws.volume_ratios(there)
+        return not np.any((J0 > 0) & ~(J > 0.1 * J0)) and self.ws.pairs_share(u, there - u) == 1

@@ -1,0 +1,124 @@
+"""What obstacles do in each frame of an implicit run, per vertex, with tangent and adjoint; on the host, in float64.
+
+Forces are those where passes take them, averaged over the passes since the frame before; of statics those of the last pass.
+"""
+
+from types import SimpleNamespace
+
+import numpy as np
+
+from diffsim_ti import runtime
+from diffsim_ti.mechanics.obstacles.obstacle_shares import share_kernels
+
+
+class Shares:
+    """Forces of each obstacle on each vertex in the pass that a potential is told of, shape (obstacles, 2, n, 3)."""
+
+    def __init__(self, workspace, features=None, at=None):
+        """at: what says where the forces are taken, instead of the potential (pressed.py)."""
+        self.p, self.a = workspace.potential if at is None else at, workspace.arrays
+        a, features = self.a, workspace.arrays.features() if features is None else features
+        self.at_vertices, self.of_faces = share_kernels(features, a.precision, workspace.parallel)
+        self.num_obstacles = len(a.obstacles)
+        self.force = runtime.array(a.vector, 2 * self.num_obstacles, a.num_vertices)
+        self.y = runtime.array(a.vector, 1, a.num_vertices)
+        self.reaching = [g.number + k for g in features.groups if features.reaches(g) for k in range(g.count)]
+        self._launches = {}
+
+    def _sizes(self, **more) -> dict:
+        return dict(num_vertices=self.a.num_vertices, per_gamma=self.p.per_gamma) | more
+
+    def run(self, name: str, **records) -> None:
+        """A kernel of obstacles at vertices."""
+        if name not in self._launches:
+            own = dict(scene=self.a, pass_=self.p, at=(self.p, self), out=self) | records
+            self._launches[name] = getattr(self.at_vertices, name).bind(**own)
+        self._launches[name](**self._sizes())
+
+    def run_face(self, name: str, which: int, **records) -> np.ndarray:
+        """A kernel of one obstacle at points within faces; its result on vertices."""
+        if ("face", name) not in self._launches:
+            place = SimpleNamespace(walls=self.p.walls), self.p.faces
+            own = dict(scene=self.a, pass_=place, at=self.p, out=self) | records
+            self._launches["face", name] = getattr(self.of_faces, name).bind(**own)
+        self._launches["face", name](**self._sizes(which=which))
+        return runtime.fetch_row(self.y, 0)
+
+    def forces(self, name: str = "forces", **records) -> np.ndarray:
+        """Forces, or "jvp": their change for w of the potential and `tangent`."""
+        self.run(name, **records)
+        n = self.a.num_vertices
+        out = runtime.fetch(self.force).astype(np.float64).reshape(self.num_obstacles, 2, n, 3)
+        if self.p.faces:
+            for k in self.reaching:
+                out[k, 0] += self.run_face(name, k, **records)
+        return out
+
+
+class ContactRecord:
+    """Forces of all frames, shape (frames, obstacles, 2, num_vertices, 3); where surfaces have friction with each other that
+    is in one row more, beside zeros, of the pass that ends in the frame."""
+
+    def __init__(self, workspace):
+        frames, a, self.schedule = workspace.frames.frames_u.shape[0], workspace.arrays, workspace.solver.schedule
+        self.num_obstacles, rows = len(a.obstacles), len(a.obstacles) + bool(workspace.potential.rubbing)
+        self.forces = np.zeros((frames, rows, 2, a.num_vertices, 3))
+
+    def _weight(self, j: int, save_every: int, static: bool) -> tuple[int, float]:
+        """(the frame that pass j leads to, how much it counts there)."""
+        frame = int(self.schedule.counted(j, save_every))
+        if frame < 0 or static:
+            return frame, float(frame >= 0 and self.schedule.ends_frame(j, save_every))
+        return frame, float(self.schedule.length(j) / self.schedule.frame_time(frame, save_every))
+
+    def add(self, j: int, save_every: int, static: bool, make, friction) -> None:
+        """Add make(), forces of obstacles in pass j, to the frame that the pass leads to, and put friction(), that between
+        surfaces, where the pass ends in it."""
+        frame, weight = self._weight(j, save_every, static)
+        if weight and self.num_obstacles:
+            self.forces[frame, : self.num_obstacles] += weight * make()
+        if self._ends(frame, j, save_every):
+            self.forces[frame, -1, 1] = friction()
+
+    def _ends(self, frame: int, j: int, save_every: int) -> bool:
+        """Whether friction between surfaces is noted, and pass j ends in its frame."""
+        return frame >= 0 and self.forces.shape[1] > self.num_obstacles and self.schedule.ends_frame(j, save_every)
+
+    def seed(self, j: int, save_every: int, static: bool) -> tuple[np.ndarray | None, np.ndarray | None]:
+        """Adjoints of the forces in pass j, and of friction between surfaces, `forces` being those of the frames; None where
+        they are zero."""
+        frame, weight = self._weight(j, save_every, static)
+        own = weight * self.forces[frame, : self.num_obstacles] if weight else np.zeros(0)
+        friction = self.forces[frame, -1, 1] if self._ends(frame, j, save_every) else np.zeros(0)
+        return tuple(x if x.any() else None for x in (own, friction))
+
+
+class SharesAdjoint(Shares):
+    """Adjoints by those of the forces."""
+
+    def __init__(self, workspace, features, numbers, face_areas, at=None):
+        super().__init__(workspace, features, at)
+        p, a = self.p, self.a
+        self.seed = runtime.array(a.vector, 2 * self.num_obstacles, a.num_vertices)
+        self.lag = runtime.array(a.vector, *p.lag.shape)
+        self.walls = runtime.array(a.vector, a.walls.size, a.num_vertices)
+        self.pressed = runtime.array(a.vector, *p.pressed.shape)
+        own = SimpleNamespace(lag=self.lag, walls=self.walls, pressed=self.pressed, face_areas=face_areas)
+        self.numbers = (own, numbers)
+
+    def pull_back(self, seed: np.ndarray) -> tuple[np.ndarray, ...]:
+        """(adjoint of u*, of the two rows of lag, of `pressed`, of the rows of walls) in float64; adds those of the scene's
+        numbers."""
+        runtime.fill(self.seed, seed.reshape(-1, *seed.shape[2:]))
+        for target in (self.lag, self.walls, self.pressed):
+            runtime.fill(target, 0)
+        self.run("vjp", adjoint=self.numbers)
+        by_u = runtime.fetch_row(self.y, 0)
+        if self.p.faces:
+            for k in self.reaching:
+                runtime.fill(self.p.w, seed[k, :1])
+                by_u = by_u + self.run_face("vjp", k, adjoint=self.numbers)
+        by_lag, by_pressed, by_walls = (
+            runtime.fetch(x).astype(np.float64) for x in (self.lag, self.pressed, self.walls)
+        )
+        return by_u, by_lag, by_pressed, by_walls.sum(1)

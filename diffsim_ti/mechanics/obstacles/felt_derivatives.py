@@ -1,0 +1,136 @@
+"""Changes and adjoints of what faces do in recorded explicit passes (felt_faces.py): pushes, and then friction."""
+
+import numpy as np
+
+from diffsim_ti import runtime
+from diffsim_ti.inputs import Derived
+from diffsim_ti.mechanics.obstacles.felt_faces import Alone, FeltFaces
+from diffsim_ti.mechanics.surfaces.pair_friction import ratio_by_rate
+from diffsim_ti.mesh import geometry
+from diffsim_ti.runtime.slots import VertexRows
+
+
+class FaceChanges:
+    """Changes, or adjoints, of what faces do in recorded passes."""
+
+    def __init__(self, faces: FeltFaces, features):
+        a, self.faces, self.features = faces.a, faces, features
+        self.shift_dot, self.speed_dot, self.seed, self.begin_dot = (
+            runtime.array(a.vector, faces.num_surface) for _ in range(4)
+        )
+        self.impulse_dot, self.rows = runtime.array(a.vector, *faces.impulse.shape), VertexRows(a, faces.rows.nodes)
+
+    def _run(self, name: str, alone: Alone, plan: dict, **records) -> None:
+        self.faces.run(name, plan, alone.history, alone.slot, alone.n, features=self.features, own=self, **records)
+
+    def _run_parts(self, name: str, alone: Alone, plan: dict, back=False, **records) -> None:
+        own = dict(features=self.features, own=self) | records
+        self.faces.run_parts(name, plan, alone.history, alone.slot, alone.n, back, **own)
+
+
+class FeltTangent(FaceChanges):
+    """The tangent of passes; at: what holds the changes u and v of the state, numbers: those of all else."""
+
+    def __init__(self, tangent, faces: FeltFaces):
+        super().__init__(faces, tangent.features)
+        self.at, self.of_all = tangent, (tangent, tangent.numbers)
+
+    def start(self, alone: Alone, plan: dict) -> None:
+        """Before the rest of the pass."""
+        self._run("begin_jvp", alone, plan, tangent=self.at)
+
+    def end(self, alone: Alone, plan: dict) -> None:
+        """After it."""
+        alone.go(plan)
+        if self.faces.friction:
+            runtime.fill(self.impulse_dot, 0)
+        self._run_parts("jvp", alone, plan, tangent=self.of_all)
+
+    def slide(self, alone: Alone, change: Derived, rate_dot: float) -> np.ndarray | None:
+        """Then that of friction; the changes of the impulses of each obstacle that rubs, where one does."""
+        rub, faces, nodes = alone.rub, self.faces, self.rows.nodes
+        if rub is None:
+            return None
+        a, u, v = faces.a, self.rows.get(self.at.u, 0), self.rows.get(self.at.v, 0)
+        dx = runtime.fetch(self.begin_dot).astype(np.float64) + change.rest[nodes]
+        inverse_dot = -(faces.friction.inverse**2) * change.mass[nodes, None]
+        walls = a.walls.jvp(a.rows["path"], change.path, rub.moment)
+        impulses = faces.impulses(self.impulse_dot)
+        gained, each = faces.friction.jvp(rub, impulses, v, dx, inverse_dot, change.parameters, walls)
+        self.rows.put(self.at.v, 0, v + gained)
+        by_rate = rate_dot * ratio_by_rate(rub.now) * rub.gained
+        self.rows.put(self.at.u, 0, u + rub.ratio * gained + by_rate)
+        return each
+
+
+class FeltAdjoint(FaceChanges):
+    """The adjoint of passes: sums over them, by faces and surface vertices."""
+
+    def __init__(self, adjoint, faces: FeltFaces):
+        super().__init__(faces, adjoint.features)
+        a, features = faces.a, adjoint.features
+        self.at, self.of_all = adjoint, (adjoint, adjoint.numbers)
+        self.path, self.num_parts = adjoint.path, adjoint.num_parts
+        self.sums = runtime.array(a.fp, features.num_parameters, faces.num_faces)
+        self.felt = runtime.array(a.vector, 2 * features.moving, faces.num_faces if features.moving else 1)
+        self.rest_adj, self.by_areas = runtime.array(a.vector, faces.num_surface), runtime.array(a.fp, faces.num_faces)
+
+    def clear(self) -> None:
+        for x in (self.sums, self.felt, self.rest_adj, self.by_areas):
+            runtime.fill(x, 0)
+        values = self.faces.a.values
+        self.parameters, self.by_rate = np.zeros_like(values.parameters), 0.0
+        self.path_adj = None if values.path is None else np.zeros_like(values.path)
+        self.inverse, self.rest = np.zeros((self.faces.num_surface, 1)), np.zeros((self.faces.num_surface, 3))
+
+    def slide(self, alone: Alone, impulses_adj: np.ndarray | None = None) -> None:
+        """Go back through friction, the very last thing; impulses_adj: of those of each obstacle that rubs."""
+        rub, faces, self._by_x = alone.rub, self.faces, None
+        if rub is None:
+            if faces.friction:
+                runtime.fill(self.impulse_dot, 0)
+            return
+        p, q = self.rows.get(self.at.u, 0), self.rows.get(self.at.v, 0)
+        by = faces.friction.vjp(rub, q + rub.ratio * p, impulses_adj)
+        self.by_rate += ratio_by_rate(rub.now) * float((p * rub.gained).sum())
+        self.rows.put(self.at.v, 0, q + by.v)
+        felt = np.zeros((faces.num_faces, len(faces.a.contacts), *by.impulses.shape[1:]))
+        np.add.at(felt, (rub.face, faces.friction.number[rub.obstacle]), by.impulses)
+        runtime.fill(self.impulse_dot, felt.reshape(-1, 3))
+        self.parameters += by.parameters
+        self.inverse += by.inverse
+        self.rest += by.x
+        self._by_x = by.x
+        if self.path_adj is not None:
+            faces.a.walls.vjp(faces.a.rows["path"], by.walls, rub.moment, self.path_adj)
+
+    def start(self, alone: Alone, plan: dict) -> None:
+        """Go back through the contact of faces, the last thing that the pass did."""
+        alone.go(plan)
+        plan = plan | dict(steps=1, num_parts=self.num_parts)
+        self._run_parts("vjp", alone, plan, back=True, adjoint=self.of_all, out=self)
+        if self._by_x is not None:
+            runtime.fill(self.begin_dot, runtime.fetch(self.begin_dot) + self._by_x)
+
+    def end(self, alone: Alone, plan: dict) -> None:
+        """The rest of the pass is reversed."""
+        self._run("begin_vjp", alone, plan, adjoint=self.at)
+
+    def collect(self, out: Derived) -> None:
+        """Add the adjoints of parameters, masses, paths and rest positions to a `Derived`."""
+        nodes, mass = self.rows.nodes, np.zeros_like(out.mass)
+        mass[nodes] = -(self.inverse * self.faces.friction.inverse**2)[:, 0]
+        out.mass = out.mass + mass
+        out.parameters[: len(self.parameters)] += self.parameters
+        out.rest[nodes] += self.rest
+        if self.features.drag >= 0:
+            out.parameters[self.features.drag] += self.by_rate
+        if self.path_adj is not None:
+            out.path += self.path_adj
+        count = self.features.num_parameters
+        out.parameters[:count] += runtime.fetch(self.sums).astype(np.float64).sum(1)[:count]
+        out.rest[self.faces.mesh.surface_vertices] += runtime.fetch(self.rest_adj)
+        rest, faces = self.faces.a.values.rest, self.faces.mesh.surface_triangles
+        by_areas = runtime.fetch(self.by_areas).astype(np.float64)
+        by_areas /= np.linalg.norm(geometry.triangle_normals(rest, faces), axis=1)
+        out.rest += geometry.triangle_areas_vjp(rest, faces, by_areas)

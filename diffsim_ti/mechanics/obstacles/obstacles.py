@@ -1,0 +1,348 @@
+"""Potential energy of obstacles at a vertex: barrier and friction, with all derivatives.
+
+Obstacles are looked at where they are in the pass, which `pass_.walls` says (state/walls.py). `pass_.lag` holds two rows:
+the displacement of the body where the pass begins, from which friction takes its normal force, and x, so that
+(u - x) per_gamma is the velocity. `pass_.pressed` holds a row for each obstacle (`reaches`).
+"""
+
+from dataclasses import dataclass
+
+import taichi as ti
+
+from diffsim_ti.mechanics.obstacles.obstacle_functions import ObstacleFunctions
+from diffsim_ti.runtime import assign, at, let, traced
+from diffsim_ti.state.walls import MORE
+from diffsim_ti.terms.obstacles import turning
+
+A = ti.template()  # an array or Bundle handed to a Taichi function
+
+
+@dataclass(frozen=True)
+class ObstaclePotential(ObstacleFunctions):
+    """Taichi functions of one vertex; g is a group of obstacles, k a place in it (state/features.py)."""
+
+    @ti.func
+    def rest_now(self, g: A, k, i, scene: A, pass_: A):
+        """Rest position of vertex i relative to an obstacle where forces are taken."""
+        return self.seen(g, scene.rest[i], self.place_of(g, k, 0, pass_))
+
+    @traced
+    def turning_row(self, g, k):
+        """Where the rows of an obstacle that turns begin."""
+        return 3 * self.num_obstacles + MORE * (g.turning + k)
+
+    @traced
+    def place_of(self, g, k, m, pass_):
+        """Displacement of an obstacle, of one that turns with its unit quaternion, where forces are taken (m = 0) or the
+        pass begins (1)."""
+        shift = at(pass_.walls, 3 * (g.number + k) + m)
+        if not g.force.turns:
+            return shift
+        s = self.turned.short(at(pass_.walls, self.turning_row(g, k) + m))
+        return self.turned.joined(shift, turning.from_rodrigues(s, self.fp), 4)
+
+    @traced
+    def moved(self, g, k, m, X, u, dr, scene, tangent):
+        """Change of the place of a vertex for dr of X + u, and for that of the obstacle."""
+        shift = at(tangent.walls, 3 * (g.number + k) + m)
+        if not g.force.turns:
+            return dr - shift
+        dplace = self.turned.joined(shift, at(tangent.walls, self.turning_row(g, k) + m))
+        return self.turned.moved(g, g.first + k * g.size, X, u, dr, dplace, scene, tangent)
+
+    @traced
+    def spread(self, g, k, m, i, X, u, by, scene, adjoint, by_arm=None):
+        """Adjoint of u for that of the changed place, and of the arm; adds those of what the obstacle's place is."""
+        if not g.force.turns:
+            return by, self.vector(0) - by
+        none = ti.Vector.zero(self.fp, 3)
+        first, by_arm = g.first + k * g.size, none if by_arm is None else by_arm
+        by_u, by_t, by_theta = self.turned.spread(g, first, i, X, u, by, by_arm, scene, adjoint.sums)
+        row = self.turning_row(g, k) + m
+        assign(at(adjoint.walls, row, i), at(adjoint.walls, row, i) + self.turned.long(by_theta))
+        return by_u, by_t
+
+    # ---- the barrier -------------------------------------------------------------------------------------------------
+
+    @ti.func
+    def energy(self, i, u, scene: A, pass_: A):
+        """Energy of the barriers [J]."""
+        value = ti.cast(0, self.fp)
+        for g in ti.static(self.features.groups):
+            for k in range(g.count):
+                X = self.rest_now(g, k, i, scene, pass_)
+                value += self.on_area(g, i, g.force.energy(scene.parameters, g.first + k * g.size, X, u), scene)
+        return value
+
+    @ti.func
+    def product(self, i, u, w, scene: A, pass_: A):
+        """Change of the barriers' force for a change w of the displacement."""
+        f, zero = self.vector(0), self.vector(0)
+        for g in ti.static(self.features.groups):
+            for k in range(g.count):
+                X = self.rest_now(g, k, i, scene, pass_)
+                change = g.force.force_jvp(scene.parameters, g.first + k * g.size, X, u, zero, w, zero)
+                f += self.on_area(g, i, change, scene)
+        return f
+
+    # ---- with friction -----------------------------------------------------------------------------------------------
+    # Of obstacles that reach into faces, points within them push as well: N and its direction are then the size and the
+    # direction of `pass_.pressed`, all that an obstacle pushes a vertex with where the pass begins.
+
+    def reaches(self, g) -> bool:
+        """Whether friction of a group takes its normal force from `pressed`."""
+        return g.force.friction and self.features.reaches(g)
+
+    @ti.func
+    def velocity(self, i, u, pass_: A, plan: A):
+        return plan.per_gamma * (u - pass_.lag[1, i])
+
+    @ti.func
+    def rest_before(self, g: A, k, i, scene: A, pass_: A):
+        """Rest position of vertex i relative to an obstacle where the pass begins."""
+        return self.seen(g, scene.rest[i], self.place_of(g, k, 1, pass_))
+
+    # The velocity of an obstacle that turns is that at the place where the pass begins, so that it is no function of u.
+
+    @traced
+    def wall(self, g, k, i, scene, pass_):
+        """Velocity of an obstacle at a vertex."""
+        v = at(pass_.walls, 3 * (g.number + k) + 2)
+        return self.turned_wall(g, k, i, v, scene, pass_) if g.force.turns else v
+
+    @ti.func
+    def arm(self, g: A, k, i, scene: A, pass_: A):
+        X = self.rest_before(g, k, i, scene, pass_)
+        return self.turned.arm(g, g.first + k * g.size, X, pass_.lag[0, i], scene)
+
+    @ti.func
+    def spin(self, g: A, k, walls: A):
+        """Angular velocity."""
+        return self.turned.short(walls[self.turning_row(g, k) + 2])
+
+    @ti.func
+    def turned_wall(self, g: A, k, i, v, scene: A, pass_: A):
+        tau, r = pass_.walls[self.turning_row(g, k) + 5][0], self.arm(g, k, i, scene, pass_)
+        return self.turned.wall(self.turned.short(v), self.spin(g, k, pass_.walls), tau, r)
+
+    @traced
+    def wall_jvp(self, g, k, i, scene, pass_, tangent):
+        """Its change."""
+        dv = at(tangent.walls, 3 * (g.number + k) + 2)
+        return self.turned_wall_jvp(g, k, i, dv, scene, pass_, tangent) if g.force.turns else dv
+
+    @ti.func
+    def turned_wall_jvp(self, g: A, k, i, dv, scene: A, pass_: A, tangent: A):
+        n, dr = 3 * (g.number + k), tangent.lag[0, i] + tangent.rest[i]
+        darm = self.turned.short(dr - tangent.walls[n + 1])
+        darm += -1 * self.turned.about(g, g.first + k * g.size, tangent.parameters)
+        tau, r = pass_.walls[self.turning_row(g, k) + 5][0], self.arm(g, k, i, scene, pass_)
+        omega, domega = self.spin(g, k, pass_.walls), self.spin(g, k, tangent.walls)
+        return self.turned.wall_jvp(self.turned.short(dv), omega, domega, tau, r, darm)
+
+    @ti.func
+    def turned_wall_vjp(self, g: A, k, i, by_place, by_wall, scene: A, pass_: A, adjoint: A):
+        """(adjoints of the place where the pass begins, of the obstacle's displacement there), of the velocity's and of six
+        numbers by_place; adds those of all else."""
+        row, r = self.turning_row(g, k), self.arm(g, k, i, scene, pass_)
+        tau, omega = pass_.walls[row + 5][0], self.spin(g, k, pass_.walls)
+        by_omega, by_arm = self.turned.wall_vjp(omega, tau, r, self.turned.short(by_wall))
+        adjoint.walls[row + 2, i] = adjoint.walls[row + 2, i] + self.turned.long(by_omega)
+        X = self.rest_before(g, k, i, scene, pass_)
+        by_u, by_t = self.spread(g, k, 1, i, X, pass_.lag[0, i], by_place, scene, adjoint, by_arm)
+        return by_u, by_t
+
+    @ti.func
+    def on_rubbed_area(self, g: A, i, x, scene: A):
+        """Friction on the area of vertex i; `pressed` is of the whole already."""
+        out = x
+        if ti.static(not self.reaches(g)):
+            out = self.on_area(g, i, x, scene)
+        return out
+
+    @ti.func
+    def is_rubbed(self, g: A, k, i, scene: A, pass_: A):
+        """Whether friction of an obstacle is felt."""
+        felt = False
+        if ti.static(self.reaches(g)):
+            felt = pass_.pressed[g.number + k, i].norm_sqr() > 0
+        else:
+            X = self.rest_before(g, k, i, scene, pass_)
+            felt = g.force.touches(scene.parameters, g.first + k * g.size, X, pass_.lag[0, i])
+        return felt
+
+    @traced
+    def felt_at(self, g, k, i, scene, pass_):
+        """What friction takes its normal force from, as `rub` has it: a place, or `pressed`."""
+        if self.reaches(g):
+            return None, let(at(pass_.pressed, g.number + k, i))
+        return self.rest_before(g, k, i, scene, pass_), let(at(pass_.lag, 0, i))
+
+    @ti.func
+    def lost(self, g: A, k, i, u, scene: A, pass_: A, plan: A):
+        """Potential of friction by the velocity [W]."""
+        v, wall, first = self.velocity(i, u, pass_, plan), self.wall(g, k, i, scene, pass_), g.first + k * g.size
+        return g.force.dissipation(scene.parameters, first, self.felt_at(g, k, i, scene, pass_), v, wall)
+
+    @ti.func
+    def push(self, g: A, k, i, u, scene: A, pass_: A):
+        X = self.rest_now(g, k, i, scene, pass_)
+        return g.force.force(scene.parameters, g.first + k * g.size, X, u, self.vector(0))
+
+    @ti.func
+    def drag(self, g: A, k, i, u, scene: A, pass_: A, plan: A):
+        v, wall, first = self.velocity(i, u, pass_, plan), self.wall(g, k, i, scene, pass_), g.first + k * g.size
+        return g.force.rub(scene.parameters, first, self.felt_at(g, k, i, scene, pass_), v, wall)
+
+    @ti.func
+    def drag_product(self, g: A, k, i, u, w, scene: A, pass_: A, plan: A):
+        """Change of `drag` for a change w of the displacement."""
+        v, wall, first = self.velocity(i, u, pass_, plan), self.wall(g, k, i, scene, pass_), g.first + k * g.size
+        dv = plan.per_gamma * w
+        return g.force.rub_product(scene.parameters, first, self.felt_at(g, k, i, scene, pass_), v, wall, dv)
+
+    @ti.func
+    def whole_energy(self, i, u, scene: A, pass_: A, plan: A):
+        """Energy of the barriers and the potential of friction [J]."""
+        value = ti.cast(0, self.fp)
+        for g in ti.static(self.features.groups):
+            for k in range(g.count):
+                X = self.rest_now(g, k, i, scene, pass_)
+                value += self.on_area(g, i, g.force.energy(scene.parameters, g.first + k * g.size, X, u), scene)
+                if ti.static(g.force.friction):
+                    if self.is_rubbed(g, k, i, scene, pass_):
+                        lost = self.lost(g, k, i, u, scene, pass_, plan)
+                        value += self.on_rubbed_area(g, i, lost, scene) / plan.per_gamma
+        return value
+
+    @ti.func
+    def whole_force(self, i, u, scene: A, pass_: A, plan: A):
+        f = self.vector(0)
+        for g in ti.static(self.features.groups):
+            for k in range(g.count):
+                f += self.on_area(g, i, self.push(g, k, i, u, scene, pass_), scene)
+                if ti.static(g.force.friction):
+                    if self.is_rubbed(g, k, i, scene, pass_):
+                        f += self.on_rubbed_area(g, i, self.drag(g, k, i, u, scene, pass_, plan), scene)
+        return f
+
+    @ti.func
+    def whole_product(self, i, u, w, scene: A, pass_: A, plan: A):
+        """Change of the force for a change w of the displacement."""
+        f, zero = self.vector(0), self.vector(0)
+        for g in ti.static(self.features.groups):
+            for k in range(g.count):
+                X = self.rest_now(g, k, i, scene, pass_)
+                change = g.force.force_jvp(scene.parameters, g.first + k * g.size, X, u, zero, w, zero)
+                f += self.on_area(g, i, change, scene)
+                if ti.static(g.force.friction):
+                    if self.is_rubbed(g, k, i, scene, pass_):
+                        f += self.on_rubbed_area(g, i, self.drag_product(g, k, i, u, w, scene, pass_, plan), scene)
+        return f
+
+    # ---- derivatives by everything -----------------------------------------------------------------------------------
+
+    @ti.func
+    def push_jvp(self, g: A, k, i, u, du, scene: A, pass_: A, tangent: A):
+        first, zero, X = g.first + k * g.size, self.vector(0), self.rest_now(g, k, i, scene, pass_)
+        moved = self.moved(g, k, 0, X, u, du + tangent.rest[i], scene, tangent)
+        f = g.force.force_jvp(scene.parameters, first, X, u, zero, moved, zero)
+        by = g.force.parameter_derivatives(scene.parameters, first, X, u, zero)
+        for m in ti.static(range(g.size)):
+            f += by[m] * tangent.parameters[first + m]
+        f = self.on_area(g, i, f, scene)
+        if ti.static(g.force.per_area):
+            f += tangent.surface[i] * self.push(g, k, i, u, scene, pass_)
+        return f
+
+    @ti.func
+    def drag_jvp(self, g: A, k, i, u, du, scene: A, pass_: A, tangent: A, plan: A):
+        first, dv = g.first + k * g.size, plan.per_gamma * (du - tangent.lag[1, i])
+        v, wall = self.velocity(i, u, pass_, plan), self.wall(g, k, i, scene, pass_)
+        moved, dwall = (self.felt_jvp(g, k, i, scene, pass_, tangent), self.wall_jvp(g, k, i, scene, pass_, tangent))
+        f = g.force.rub_jvp(
+            scene.parameters, first, self.felt_at(g, k, i, scene, pass_), v, wall, tangent.parameters, moved, dv, dwall
+        )
+        f = self.on_rubbed_area(g, i, f, scene)
+        if ti.static(g.force.per_area and not self.reaches(g)):
+            f += tangent.surface[i] * self.drag(g, k, i, u, scene, pass_, plan)
+        return f
+
+    @traced
+    def felt_jvp(self, g, k, i, scene, pass_, tangent):
+        """Change of what friction takes its normal force from."""
+        if self.reaches(g):
+            return at(tangent.pressed, g.number + k, i)
+        X, u = self.rest_before(g, k, i, scene, pass_), at(pass_.lag, 0, i)
+        return self.moved(g, k, 1, X, u, at(tangent.lag, 0, i) + at(tangent.rest, i), scene, tangent)
+
+    @ti.func
+    def add_jvp(self, i, f, u, du, scene: A, pass_: A, tangent: A, plan: A):
+        """f and the change of the force for changes of everything that it depends on."""
+        for g in ti.static(self.features.groups):
+            for k in range(g.count):
+                f += self.push_jvp(g, k, i, u, du, scene, pass_, tangent)
+                if ti.static(g.force.friction):
+                    if self.is_rubbed(g, k, i, scene, pass_):
+                        f += self.drag_jvp(g, k, i, u, du, scene, pass_, tangent, plan)
+        return f
+
+    @ti.func
+    def push_vjp(self, g: A, k, i, u, w, scene: A, pass_: A, adjoint: A):
+        n, first, zero = 3 * (g.number + k), g.first + k * g.size, self.vector(0)
+        if ti.static(g.force.per_area and self.features.shape):
+            self.add_to_area(g, i, self.push(g, k, i, u, scene, pass_).dot(w), adjoint)
+        w = self.on_area(g, i, w, scene)
+        X = self.rest_now(g, k, i, scene, pass_)
+        by_place, _ = g.force.force_vjp(scene.parameters, first, X, u, zero, w)
+        by_u, by_t = self.spread(g, k, 0, i, X, u, by_place, scene, adjoint)
+        by = g.force.parameter_derivatives(scene.parameters, first, X, u, zero)
+        for m in ti.static(range(g.size)):
+            adjoint.sums[first + m, i] = adjoint.sums[first + m, i] + by[m].dot(w)
+        self.add_to_rest(i, by_u, adjoint)
+        adjoint.walls[n, i] = by_t
+        adjoint.walls[n + 1, i] = zero
+        adjoint.walls[n + 2, i] = zero
+        return by_u
+
+    @ti.func
+    def drag_vjp(self, g: A, k, i, u, w, scene: A, pass_: A, adjoint: A, plan: A):
+        n, first = 3 * (g.number + k), g.first + k * g.size
+        if ti.static(g.force.per_area and self.features.shape and not self.reaches(g)):
+            self.add_to_area(g, i, self.drag(g, k, i, u, scene, pass_, plan).dot(w), adjoint)
+        w = self.on_rubbed_area(g, i, w, scene)
+        v, wall = self.velocity(i, u, pass_, plan), self.wall(g, k, i, scene, pass_)
+        by_felt, by_v, by_wall, by = g.force.rub_vjp(
+            scene.parameters, first, self.felt_at(g, k, i, scene, pass_), v, wall, w
+        )
+        for m in ti.static(range(g.size)):
+            adjoint.sums[first + m, i] = adjoint.sums[first + m, i] + by[m]
+        if ti.static(self.reaches(g)):
+            adjoint.pressed[g.number + k, i] = by_felt
+        if ti.static(g.force.turns or not self.reaches(g)):
+            by_u, by_t = self.felt_vjp(g, k, i, by_felt, by_wall, scene, pass_, adjoint)
+            self.add_to_rest(i, by_u, adjoint)
+            adjoint.lag[0, i] = adjoint.lag[0, i] + by_u
+            adjoint.walls[n + 1, i] = by_t
+        adjoint.walls[n + 2, i] = by_wall
+        adjoint.lag[1, i] = adjoint.lag[1, i] - plan.per_gamma * by_v
+        return plan.per_gamma * by_v
+
+    @traced
+    def felt_vjp(self, g, k, i, by_felt, by_wall, scene, pass_, adjoint):
+        """Adjoints of the place where the pass begins and of the obstacle's displacement there."""
+        if not g.force.turns:
+            return by_felt, self.vector(0) - by_felt
+        by_place = ti.Vector.zero(self.fp, 6) if self.reaches(g) else by_felt
+        return self.turned_wall_vjp(g, k, i, by_place, by_wall, scene, pass_, adjoint)
+
+    @ti.func
+    def add_vjp(self, i, f, u, w, scene: A, pass_: A, adjoint: A, plan: A):
+        """f and the adjoint of u for the adjoint w of the force; adds those of all else."""
+        for g in ti.static(self.features.groups):
+            for k in range(g.count):
+                f += self.push_vjp(g, k, i, u, w, scene, pass_, adjoint)
+                if ti.static(g.force.friction):
+                    if self.is_rubbed(g, k, i, scene, pass_):
+                        f += self.drag_vjp(g, k, i, u, w, scene, pass_, adjoint, plan)
+        return f

@@ -1,0 +1,1 @@
+"""Pressures that follow the surface they act on."""

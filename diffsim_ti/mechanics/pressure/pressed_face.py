@@ -1,0 +1,103 @@
+"""The face of six nodes under a pressure that follows it: node forces f_a = -p integral of N_a dx/ds x dx/dt, x = X + u.
+
+The integrand is of degree four, and the rule of reference_face.py exact. Node a of pressed face t writes corner
+`first + 6 t + a`, and vertices gather it with those of tetrahedra.
+"""
+
+from dataclasses import dataclass
+
+import taichi as ti
+
+from diffsim_ti.materials.calculus.tensor import sum_of
+from diffsim_ti.mechanics.pressure.pressed_triangle import PressedTriangle
+from diffsim_ti.mesh import reference_face
+from diffsim_ti.runtime import assign, at, let, traced
+
+A = ti.template()  # an array or Bundle handed to a Taichi function
+BY = reference_face.derivatives(reference_face.POINTS)
+# three times N_a times the points' shares: what the factor of a triangle's corner is to be multiplied by
+SHARES = 3 * reference_face.WEIGHTS[:, None] * reference_face.functions(reference_face.POINTS)
+
+
+@dataclass(frozen=True)
+class PressedFace(PressedTriangle):
+    """Functions of one face in a pass, as those of `PressedTriangle`."""
+
+    nodes = 6
+
+    @traced
+    def times(self, factors, vectors):
+        """Sum of vectors times numbers that are known when the kernel is compiled."""
+        parts = [v * ti.cast(float(c), self.fp) for c, v in zip(factors, vectors) if c != 0]
+        return let(sum_of(parts)) if parts else let(self.vector(0))
+
+    @traced
+    def tangents(self, t, x, rest, s, scene) -> list[tuple]:
+        """(dx/ds, dx/dt) at each point, of rest + x in slot s."""
+        i = [let(at(scene.pressed, 6 * t + a)) for a in range(6)]
+        y = [let((at(rest, k) - at(rest, i[0])) + (at(x, s, k) - at(x, s, i[0]))) for k in i[1:]]
+        return [tuple(self.times(by[1:, d], y) for d in range(2)) for by in BY]
+
+    @traced
+    def product(self, a, b):
+        """a x b"""
+        (a0, a1, a2), (b0, b1, b2) = ([at(v, d) for d in range(3)] for v in (a, b))
+        zero = ti.cast(0, self.fp)
+        return let(self.vector(a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0, zero))
+
+    @traced
+    def put(self, t, first, crosses, corner) -> None:
+        """Forces of nodes from what points have."""
+        for a in range(6):
+            assign(at(corner, first + 6 * t + a), self.times(SHARES[:, a], crosses))
+
+    @traced
+    def push(self, t, p, scene, state, s, first) -> None:
+        crosses = [let(self.product(e, f) * p) for e, f in self.tangents(t, state.u, scene.rest, s, scene)]
+        self.put(t, first, crosses, scene.corner)
+
+    @traced
+    def push_jvp(self, t, p, dp, scene, state, s, tangent, first) -> None:
+        changes = []
+        both = zip(self.tangents(t, state.u, scene.rest, s, scene), self.tangents(t, tangent.u, tangent.rest, 0, scene))
+        for (e, f), (de, df) in both:
+            turned = self.product(de, f) + self.product(e, df)
+            changes.append(let(turned * p + self.product(e, f) * dp))
+        self.put(t, first, changes, scene.corner)
+
+    @traced
+    def push_vjp(self, t, p, scene, state, s, adjoint, first):
+        """Writes and adds adjoints of places; returns w . sum of products, by which p is felt."""
+        w = [let(at(adjoint.w, 0, at(scene.pressed, 6 * t + a))) for a in range(6)]
+        by_s, by_t, felt = [], [], []
+        for q, (e, f) in enumerate(self.tangents(t, state.u, scene.rest, s, scene)):
+            own = self.times(SHARES[q], w)
+            by_s.append(let(self.product(f, own) * p))
+            by_t.append(let(self.product(own, e) * p))
+            n = self.product(e, f)
+            felt += [at(own, d) * at(n, d) for d in range(3)]
+        for a in range(6):
+            by = let(self.times(BY[:, a, 0], by_s) + self.times(BY[:, a, 1], by_t))
+            assign(at(adjoint.corner, first + 6 * t + a), by)
+            if self.shape:
+                assign(at(adjoint.pressed_rest, 6 * t + a), at(adjoint.pressed_rest, 6 * t + a) + by)
+        return let(sum_of(felt))
+
+    @ti.func
+    def forces(self, t, now: A, scene: A, state: A, s, first):
+        self.push(t, self.factor(t, now, scene.follower, scene), scene, state, s, first)
+
+    @ti.func
+    def forces_jvp(self, t, now: A, scene: A, state: A, s, tangent: A, first):
+        p, dp = self.factor(t, now, scene.follower, scene), self.factor(t, now, tangent.follower, scene)
+        self.push_jvp(t, p, dp, scene, state, s, tangent, first)
+
+    @ti.func
+    def forces_vjp(self, t, now: A, scene: A, state: A, s, adjoint: A, first):
+        felt = self.push_vjp(t, self.factor(t, now, scene.follower, scene), scene, state, s, adjoint, first)
+        self.add_felt(t, now, ti.cast(-1.0 / 6.0, self.fp) * felt, adjoint)
+
+
+def pressed_element(order: int, precision: str, per_step: bool, shape: bool) -> PressedTriangle:
+    """Of faces of elements of order 1 or 2."""
+    return (PressedFace if order == 2 else PressedTriangle)(precision, per_step, shape)

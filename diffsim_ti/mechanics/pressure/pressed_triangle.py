@@ -1,0 +1,79 @@
+"""The triangle under a pressure that follows it: corner forces -p n / 3, their differential and adjoint.
+
+n = (x_1 - x_0) x (x_2 - x_0) / 2, x = X + u. Corner a of pressed triangle t writes corner `first + 3 t + a`, and vertices
+gather it with those of tetrahedra.
+"""
+
+from dataclasses import dataclass
+
+import taichi as ti
+
+from diffsim_ti.mechanics.stress.step_numbers import StepNumbers
+
+A = ti.template()  # an array or Bundle handed to a Taichi function
+PRESSED = dict(pressed="ints", pressed_load="ints", follower="vectors2")  # vertices of each, number of the load, rows
+
+
+@dataclass(frozen=True)
+class PressedTriangle(StepNumbers):
+    """Functions of one triangle in a pass; per_step: whether pressures have a row for each step; shape: of adjoints."""
+
+    shape: bool
+    nodes = 3
+
+    @ti.func
+    def edges(self, t, x: A, rest: A, s, scene: A):
+        """x_1 - x_0 and x_2 - x_0 of rest + x in slot s."""
+        i, j, k = scene.pressed[3 * t], scene.pressed[3 * t + 1], scene.pressed[3 * t + 2]
+        return (rest[j] - rest[i]) + (x[s, j] - x[s, i]), (rest[k] - rest[i]) + (x[s, k] - x[s, i])
+
+    @ti.func
+    def factor(self, t, now: A, rows: A, scene: A):
+        """-p / 6, by which the product of edges gives the force of a corner."""
+        load, p = scene.pressed_load[t], ti.cast(0, self.fp)
+        for force, weight in ti.static(((now.force0, now.share0), (now.force1, now.share1))):
+            ends = rows[self.row(force), load]
+            p += weight * (ends[0] + self.share(force, now) * (ends[1] - ends[0]))
+        return p * ti.cast(-1.0 / 6.0, self.fp)  # the mean of both kicks
+
+    @ti.func
+    def store(self, t, first, force, corner: A):
+        for a in ti.static(range(3)):
+            corner[first + 3 * t + a] = force
+
+    @ti.func
+    def forces(self, t, now: A, scene: A, state: A, s, first):
+        e, f = self.edges(t, state.u, scene.rest, s, scene)
+        self.store(t, first, self.factor(t, now, scene.follower, scene) * self.cross(e, f), scene.corner)
+
+    @ti.func
+    def forces_jvp(self, t, now: A, scene: A, state: A, s, tangent: A, first):
+        e, f = self.edges(t, state.u, scene.rest, s, scene)
+        de, df = self.edges(t, tangent.u, tangent.rest, 0, scene)
+        p, dp = self.factor(t, now, scene.follower, scene), self.factor(t, now, tangent.follower, scene)
+        self.store(t, first, p * (self.cross(de, f) + self.cross(e, df)) + dp * self.cross(e, f), scene.corner)
+
+    @ti.func
+    def forces_vjp(self, t, now: A, scene: A, state: A, s, adjoint: A, first):
+        """Products of the transposed derivative with adjoint.w, to corners; adds the adjoints of pressures to
+        adjoint.pressed_felt and, if `shape`, those of places to adjoint.pressed_rest."""
+        e, f = self.edges(t, state.u, scene.rest, s, scene)
+        w = adjoint.w[0, scene.pressed[3 * t]]
+        for a in ti.static((1, 2)):
+            w += adjoint.w[0, scene.pressed[3 * t + a]]
+        p = self.factor(t, now, scene.follower, scene)
+        by_e, by_f = p * self.cross(f, w), p * self.cross(w, e)
+        balance = ti.cast(-1, self.fp) * (by_e + by_f)
+        for a, by in ti.static(enumerate((balance, by_e, by_f))):
+            adjoint.corner[first + 3 * t + a] = by
+            if ti.static(self.shape):
+                adjoint.pressed_rest[3 * t + a] = adjoint.pressed_rest[3 * t + a] + by
+        self.add_felt(t, now, ti.cast(-1.0 / 6.0, self.fp) * w.dot(self.cross(e, f)), adjoint)
+
+    @ti.func
+    def add_felt(self, t, now: A, felt, adjoint: A):
+        """Adds the adjoint of the pressure."""
+        for force, weight in ti.static(((now.force0, now.share0), (now.force1, now.share1))):
+            share, r, ends, by = self.share(force, now), self.row(force), self.vector(0), weight * felt
+            ends[0], ends[1] = by * (1 - share), by * share
+            adjoint.pressed_felt[r, t] = adjoint.pressed_felt[r, t] + ends

@@ -1,0 +1,1 @@
+"""Sets that move by few numbers: rigid and affine sets."""

@@ -1,0 +1,38 @@
+"""What explicit solvers refuse of scenes with bodies of few numbers."""
+
+from typing import TYPE_CHECKING
+
+from diffsim_ti.mechanics.obstacles.felt_faces import feels_faces
+from diffsim_ti.terms import SelfContact
+
+if TYPE_CHECKING:
+    from diffsim_ti.scene import Scene
+
+
+def check_bodies(scene: "Scene", contact: str) -> None:
+    """Raise ValueError for what these bodies do not have in explicit steps."""
+    said = f"reduced sets ({scene.reduced.describe()})"
+    for body in scene.reduced.bodies:
+        if body.kind == "basis":
+            raise ValueError(
+                f"reduced: explicit steps know affine and rigid sets, and {body.name!r} moves by a basis: take an implicit "
+                "solver"
+            )
+    if contact == "stage" and any(term.acts_on_surface for term in scene.terms):
+        raise ValueError(
+            f"{said} feel obstacles as a force in explicit steps, for a stage moves every vertex by itself: pass "
+            'contact="force"'
+        )
+    if feels_faces(scene):
+        raise ValueError(
+            f"{said} feel obstacles at their vertices alone in explicit steps, and one could reach into a face here: "
+            "take a finer mesh, a wider barrier, or an implicit solver"
+        )
+    if scene.holds_volumes:
+        raise ValueError(f"{said} and FilledChamber do not go together in explicit steps: take an implicit solver")
+    rubbing = scene.term(SelfContact)
+    if rubbing and rubbing.has_friction:
+        raise ValueError(
+            f"{said} have no friction in SelfContact in explicit steps, which slows every vertex by itself: leave it "
+            "out, or take an implicit solver"
+        )

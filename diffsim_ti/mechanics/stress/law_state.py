@@ -1,0 +1,85 @@
+"""What a law remembers, in implicit passes: it moves on once, from the state before a pass and where the pass ends."""
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+import taichi as ti
+
+from diffsim_ti.mechanics.stress.patched_tetrahedron import functions_of
+from diffsim_ti.mechanics.stress.tetrahedron import Onwards
+from diffsim_ti.runtime import Bundle, Kernel, traced
+from diffsim_ti.state.features import Features
+from diffsim_ti.state.numbers import OF_TETRAHEDRA, SCENE, TANGENT
+
+A = ti.template()
+AT = dict(u="vectors2", z="blocks2")
+NUMBERS = dict(num_items="int", num_vertices="int", slot="int", end="int", h="float")
+
+
+@dataclass(frozen=True)
+class LawStateKernels:
+    """From z in slot `slot` and u in slot `end`, over the length h [s]: forward, tangent and adjoint."""
+
+    law: object
+    features: Features
+    parallel: bool
+    lanes: bool
+
+    @cached_property
+    def element(self):
+        return functions_of(self.law, self.features, self.lanes)
+
+    @traced
+    def onwards(self, plan) -> Onwards:
+        return Onwards(h=plan.h, moves=None)
+
+    @ti.func
+    def all_forward(self, scene: A, at: A, plan: A):
+        ti.loop_config(serialize=not self.parallel)
+        for e in range(plan.num_items):
+            self.element.move_on(e, scene, at, plan.slot, plan.slot, self.onwards(plan), plan.end)
+
+    @cached_property
+    def forward(self) -> Kernel:
+        """The state after the pass, in the place of that before."""
+        return self._kernel("law_state", self.all_forward, at=AT)
+
+    @ti.func
+    def all_jvp(self, scene: A, at: A, tangent: A, plan: A):
+        ti.loop_config(serialize=not self.parallel)
+        for e in range(plan.num_items):
+            change = Bundle(u=tangent.w, z=tangent.z)
+            self.element.move_on_jvp(e, scene, at, plan.slot, change, tangent, self.onwards(plan), plan.end)
+
+    @cached_property
+    def jvp(self) -> Kernel:
+        """The change tangent.z of the state, for a change tangent.w of the displacement."""
+        tangent = TANGENT | dict(w="vectors2", z="blocks2")
+        return self._kernel("law_state_jvp", self.all_jvp, at=AT, tangent=tangent)
+
+    @ti.func
+    def all_vjp(self, scene: A, at: A, adjoint: A, plan: A):
+        ti.loop_config(serialize=not self.parallel)
+        for e in range(plan.num_items):
+            on = self.onwards(plan)
+            self.element.move_on_vjp(
+                e, scene, at, plan.slot, on, adjoint.corner, adjoint, self.features.shape, plan.end
+            )
+        ti.loop_config(serialize=not self.parallel)
+        for i in range(plan.num_vertices):
+            adjoint.y[0, i] = self.element.gather(i, scene, adjoint.corner)
+
+    @cached_property
+    def vjp(self) -> Kernel:
+        """From the adjoint.z of the state after to that before; adjoint.y of u; adds those of all else."""
+        adjoint = OF_TETRAHEDRA | dict(z="blocks2", corner="vectors", y="vectors2")
+        return self._kernel("law_state_vjp", self.all_vjp, at=AT, adjoint=adjoint)
+
+    def _kernel(self, name: str, body, **arrays) -> Kernel:
+        return Kernel(name, body, self.law.precision, dict(scene=SCENE) | arrays, NUMBERS)
+
+
+@lru_cache(maxsize=None)
+def law_state_kernels(law, features: Features, parallel: bool, lanes: bool) -> LawStateKernels:
+    """Kernels for a law and a scene's features."""
+    return LawStateKernels(law, features, parallel, lanes)

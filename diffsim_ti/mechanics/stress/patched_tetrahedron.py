@@ -1,0 +1,180 @@
+"""Tetrahedra whose change of volume is averaged over patches, so that they do not lock as nu approaches 0.5.
+
+    E = sum_e V_e psi(F_e; lam = 0) + sum_p W_p lam_p / 2 theta_p^2
+    W_p = sum_e V_e,  lam_p = sum_e V_e lam_e / W_p,  theta_p = sum_e V_e theta_e / W_p     over the points e of patch p
+
+A patch of linear tetrahedra is a block of eight (mesh/patches.py; rows left over have no volume), so that sums over a patch
+are sums over lanes. A tetrahedron of ten nodes is a patch by itself: the sums go over its points.
+Its pressure pi = lam_p theta_p takes the place of lam theta at each of its points: forces are those of an energy.
+Nagtegaal, Parks, Rice 1974, doi:10.1016/0045-7825(74)90032-2 (mean dilatation); de Souza Neto, Andrade Pires, Owen 2005,
+F-bar-based linear triangles and tetrahedra for finite strain analysis of nearly incompressible solids, doi:10.1002/nme.1187.
+"""
+
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import taichi as ti
+
+from diffsim_ti.materials.calculus.tensor import inner, sum_of
+from diffsim_ti.materials.patch_law import PatchLaw
+from diffsim_ti.mechanics.stress.tetrahedron import A, Tetrahedron
+from diffsim_ti.runtime import LANES, Bundle, let, traced
+from diffsim_ti.runtime import at as entry
+
+MOST = 6  # numbers of an item that its patch sums up
+
+
+def functions_of(law, features, lanes: bool) -> Tetrahedron:
+    """The element of a law and a scene's features; patches for a PatchLaw."""
+    kind = PatchedTetrahedron if isinstance(law, PatchLaw) else Tetrahedron
+    growth = (features.growth_per_step, features.growth_uniform) if features.growing else None
+    return kind(law, features.uniform, lanes, features.order, growth)
+
+
+@dataclass(frozen=True)
+class PatchedTetrahedron(Tetrahedron):
+    """The functions of `Tetrahedron`, with the same meaning. In all of them q = [*p', pi] (patch_law.py)."""
+
+    @property
+    def is_short(self) -> bool:
+        return self.law.base.short
+
+    # ---- what a patch knows -----------------------------------------------------------------------------------------
+
+    @traced
+    def _own(self, item, job) -> list[SimpleNamespace]:
+        """What an item knows by itself at each of its points; `numbers` are what its patch sums up."""
+        scene, base = job.scene, self.law.base
+        p, lam = self.law.split(self.coefficients_of(item, scene.coefficients))
+        D = self.edges(item, scene, job.at.u, job.s)
+        W = D if job.w is None else self.edges(item, scene, job.w, 0)
+        if job.dots is not None:
+            dp, dlam = self.law.split(self.coefficients_of(item, job.dots.coefficients))
+        out = []
+        for q in self.points:
+            t = SimpleNamespace(p=p, lam=lam, D=D[q], W=W[q])
+            t.B, t.V = self.gradients_of(item, scene.gradients, q), self.volume_of(item, scene.volumes, q)
+            t.H = t.D @ t.B
+            t.theta = base.dilatation(t.H)
+            t.numbers = [t.V, let(t.V * t.lam), let(t.V * t.theta)]
+            out.append(t)
+            if job.w is None:
+                continue
+            t.gradient, t.dH = base.dilatation_gradient(t.H), t.W @ t.B
+            if job.dots is None:
+                t.dtheta = inner(t.gradient, t.dH)
+                t.numbers.append(let(t.V * t.dtheta))
+                continue
+            t.dB = self.gradients_of(item, job.dots.gradients, q)
+            t.dV, t.dp = self.volume_of(item, job.dots.volumes, q), dp
+            t.dH = t.dH + t.D @ t.dB
+            t.dtheta = inner(t.gradient, t.dH)
+            t.numbers += [t.dV, let(t.dV * t.lam + t.V * dlam), let(t.dV * t.theta + t.V * t.dtheta)]
+        return out
+
+    @traced
+    def _row(self, item, job):
+        (t,) = self._own(item, job)
+        return ti.types.vector(MOST, self.fp)(*t.numbers, *[ti.cast(0, self.fp)] * (MOST - len(t.numbers)))
+
+    @ti.func
+    def _sum_one_by_one(self, item, job: A):
+        total = ti.types.vector(MOST, self.fp)(0)
+        first = item // LANES * LANES
+        for lane in range(LANES):
+            total += self._row(first + lane, job)
+        return total
+
+    @traced
+    def _sums(self, item, job, known) -> list:
+        """What the points of the item's patch sum up."""
+        if self.order == 2:
+            return [let(sum_of(numbers)) for numbers in zip(*(t.numbers for t in known))]
+        (t,) = known
+        if self.lanes:
+            return [self.items.broadcast(let(sum_of(entry(x, lane) for lane in range(LANES)))) for x in t.numbers]
+        total = let(self._sum_one_by_one(item, job))
+        return [let(entry(total, k)) for k in range(len(t.numbers))]
+
+    @traced
+    def _patch_of(self, item, scene, at, s, w=None, dots=None) -> list[SimpleNamespace]:
+        """What an item knows at its points, with its patch's lam_p, theta_p, pi and, for changes w of u, their changes."""
+        job = Bundle(scene=scene, at=at, s=s, w=w, dots=dots)
+        known, of_patch = self._own(item, job), {}
+        volume, stiff, swollen, *changes = self._sums(item, job, known)
+        lam_p, theta_p = of_patch["lam_p"], of_patch["theta_p"] = let(stiff / volume), let(swollen / volume)
+        pressure = let(lam_p * theta_p)
+        if len(changes) == 1:
+            of_patch["dtheta_p"] = let(changes[0] / volume)
+            of_patch["dpi"] = let(lam_p * of_patch["dtheta_p"])
+        elif changes:
+            dvolume, dstiff, dswollen = changes
+            dlam_p, dtheta_p = (dstiff - lam_p * dvolume) / volume, (dswollen - theta_p * dvolume) / volume
+            of_patch["dpi"] = let(dlam_p * theta_p + lam_p * dtheta_p)
+        return [SimpleNamespace(**vars(t), **of_patch, q=[*t.p, pressure]) for t in known]
+
+    @traced
+    def each_seen(self, item, scene, at, s, body) -> None:
+        known = self._patch_of(item, scene, at, s)
+        self.each_point([[t.H for t in known]], lambda q, H: body(q, H, known[0].q) or ((), ()), tensors=0)
+
+    # ---- forces and their derivatives -------------------------------------------------------------------------------
+
+    @traced
+    def forces(self, item, scene, at, s, corner) -> None:
+        known = self._patch_of(item, scene, at, s)
+
+        def push(q, H, B):
+            P = self.law.stress(H, known[0].q)
+            return [(P * self.volume_of(item, scene.volumes, q)) @ B.transpose()], ()
+
+        self.store(item, corner, self.each_point([[t.H for t in known], [t.B for t in known]], push)[0][0])
+
+    @traced
+    def pressure_forces(self, item, scene, at, s, corner) -> None:
+        """Corner forces of a unit pressure: the derivatives of -W_p theta_p by the displacement of the corners."""
+        known = self._own(item, Bundle(scene=scene, at=at, s=s, w=None, dots=None))
+        dilatation = self.law.base.dilatation_gradient
+        self.store(item, corner, [(dilatation(t.H) * t.V) @ t.B.transpose() for t in known])
+
+    @traced
+    def stiffness(self, item, scene, at, s, corner) -> None:
+        known = self._patch_of(item, scene, at, s, at.w)
+
+        def push(q, H, dH, gradient, B):
+            dP = self.law.stress_differential(H, dH, known[0].q) + gradient * known[0].dpi
+            return [(dP * self.volume_of(item, scene.volumes, q)) @ B.transpose()], ()
+
+        lists = [[getattr(t, name) for t in known] for name in ("H", "dH", "gradient", "B")]
+        self.store(item, corner, self.each_point(lists, push)[0][0])
+
+    @traced
+    def forces_jvp(self, item, scene, at, s, change, corner, dots) -> None:
+        pushes = []
+        for t in self._patch_of(item, scene, at, s, change.u, dots):
+            dP = self.law.stress_jvp(t.H, t.dH, t.q, [*t.dp, t.dpi])
+            turned = t.B * t.dV + t.dB * t.V
+            pushes.append((dP * t.V) @ t.B.transpose() + self.law.stress(t.H, t.q) @ turned.transpose())
+        self.store(item, corner, pushes)
+
+    @traced
+    def forces_vjp(self, item, scene, at, s, w, corner, adjoint, shape: bool, add: bool = False) -> None:
+        """The work of a patch's pressure on w is -W_p lam_p theta_p dtheta_p, with dtheta_p the change of theta_p for w."""
+        known, pushes = self._patch_of(item, scene, at, s, w), []
+        for q, t in enumerate(known):
+            dP, products = self.law.stress_differential_and_products(t.H, t.dH, t.q)
+            dP = dP + t.gradient * t.dpi
+            pushes.append((dP * t.V) @ t.B.transpose())
+            minus = let(ti.cast(-1, self.fp) * t.V)
+            by = self.law.split_vjp([let(minus * x) for x in products], let(minus * t.theta_p * t.dtheta_p))
+            self.items.add(adjoint.coefficients, len(products), item, by)
+            if shape:
+                self._shape_vjp(item, t, dP, adjoint, q)
+        self.store(item, corner, pushes, add)
+
+    @traced
+    def _shape_vjp(self, item, t, dP, adjoint, q: int) -> None:
+        P, minus = self.law.stress(t.H, t.q), ti.cast(-1, self.fp)
+        by_B = (t.D.transpose() @ dP + t.W.transpose() @ P) * let(minus * t.V)
+        in_patch = t.dtheta_p * (t.theta_p * (t.lam - t.lam_p - t.lam_p) + t.lam_p * t.theta)
+        self._add_shape(item, adjoint, q, by_B, minus * (inner(P, t.dH) + in_patch))

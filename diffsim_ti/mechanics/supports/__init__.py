@@ -1,0 +1,1 @@
+"""Vertices that are fixed or constrained in some directions."""

@@ -1,0 +1,113 @@
+"""Which pairs of surface primitives lie within reach of each other: walks through trees of boxes (box_tree.py).
+
+Reach of a pair is a base reach plus the slack of both primitives, the largest of their corners'; the slack for primitives of
+one body and that for different bodies are two numbers of each surface vertex. Pairs are kept if they are within reach and
+share no vertex, sorted by (vertex, triangle) and (edge, edge), so that the list depends on positions alone and not on
+threads.
+"""
+
+from types import SimpleNamespace
+
+import numpy as np
+import taichi as ti
+
+from diffsim_ti import runtime
+from diffsim_ti.mechanics.surfaces.box_tree import BoxTree
+from diffsim_ti.mechanics.surfaces.broad_phase_kernels import Piercing, Search
+from diffsim_ti.mechanics.surfaces.buffers import Buffers, Launches
+from diffsim_ti.mechanics.surfaces.list_kernels import ListKernels
+from diffsim_ti.mechanics.surfaces.proximity import EDGE_EDGE, PARALLEL, VERTEX_TRIANGLE
+from diffsim_ti.runtime import kernels_of
+
+
+class CandidatePairs:
+    """Pairs of a surface within reach: `pairs`, four vertices each, first vertex-triangle, then edge-edge.
+
+    scale: of each edge pair, 1 / sqrt(10^-3 A^2 B^2) with the lengths A, B given. row, corner_of: the corners 4 p + k
+    that meet at surface vertex s are corner_of[row[s] : row[s + 1]], in order. slack [m], of each surface vertex: what its
+    primitives' reach is larger by, towards those of the same body and of others; zero unless set. body: of each vertex.
+    """
+
+    def __init__(
+        self,
+        surface: np.ndarray,
+        triangles: np.ndarray,
+        edges: np.ndarray,
+        lengths: np.ndarray,
+        body: np.ndarray,
+        precision: str,
+        parallel: bool = True,
+    ):
+        self.searches = [kernels_of(Search, precision, parallel, kind) for kind in (VERTEX_TRIANGLE, EDGE_EDGE)]
+        self.piercing, self.lists = (
+            kernels_of(Piercing, precision, parallel),
+            kernels_of(ListKernels, precision, parallel),
+        )
+        self.launch, self.fp = Launches(), runtime.PRECISIONS[precision]
+        self.buffers = Buffers(self.launch, parallel)
+        self.trees = tuple(BoxTree(c, precision, parallel, self.launch) for c in (surface[:, None], triangles, edges))
+        self.surface, self.num_surface = self.trees[0].corners, len(surface)
+        self.lengths, self.typical = runtime.upload(lengths, self.fp), float(lengths.mean())
+        place = np.full(len(body), -1)
+        place[surface] = np.arange(len(surface))
+        self.place, self.body = runtime.upload(place, ti.i32), runtime.upload(body[surface], ti.i32)
+        self.slack = runtime.upload(np.zeros((len(surface), 4)), ti.types.vector(4, self.fp))
+        self.row_t, self.row_e = runtime.array(ti.i32, len(surface) + 1), runtime.array(ti.i32, len(edges) + 1)
+        self.row, self.cursor = (runtime.array(ti.i32, len(surface) + 1) for _ in range(2))
+        self.most = runtime.array(ti.i32, 1)
+        self.num_vt = self.num_ee = 0
+        self.room = [16, 32]  # partners kept of each vertex and edge; grows
+        self._take()
+
+    def _take(self) -> None:
+        count, b = self.num_vt + self.num_ee, self.buffers
+        self.pairs, self.corner_of = b.take("pairs", ti.i32, 4 * count), b.take("corners", ti.i32, 4 * count)
+        self.scale = b.take("scale", self.fp, self.num_ee)
+
+    @property
+    def count(self) -> int:
+        return self.num_vt + self.num_ee
+
+    def _find(self, kind: int, of: BoxTree, among: BoxTree, row, scene, slot: int, reach: float):
+        """Partners of each primitive of a tree, `room` places for each; their numbers, summed, in `row`."""
+        counts = dict(slot=slot, count=of.count, leaves=of.leaves, groups=of.groups, their_leaves=among.leaves)
+        while True:
+            partner = self.buffers.take(f"partners {kind}", ti.i32, self.room[kind] * of.count)
+            runtime.fill(self.most, 0)
+            out = SimpleNamespace(row=row, partner=partner, most=self.most)
+            records = dict(scene=scene, mine=of, theirs=among, out=out)
+            find = self.launch(self.searches[kind].find, vectorized=runtime.runs_on_cpu(), **records)
+            find(reach=reach, room=self.room[kind], **counts)
+            most = int(runtime.fetch(self.most)[0])
+            if most == 0:
+                self.buffers.scan(row, of.count)
+                return partner
+            self.room[kind] = most + most // 2
+
+    def build(self, rest, u, slot: int, reach: float) -> None:
+        """Find all pairs nearer than `reach` [m] and their slacks at rest + u[slot]."""
+        reach, scene, (v, t, e) = float(reach), SimpleNamespace(rest=rest, u=u), self.trees
+        for tree in self.trees:
+            tree.refit((scene, self), slot, reach)
+        partner_t = self._find(VERTEX_TRIANGLE, v, t, self.row_t, scene, slot, reach)
+        partner_e = self._find(EDGE_EDGE, e, e, self.row_e, scene, slot, reach)
+        self.num_vt, self.num_ee = (int(runtime.fetch(row, -1)) for row in (self.row_t, self.row_e))
+        self._take()
+        found = SimpleNamespace(partner_t=partner_t, partner_e=partner_e), self
+        write = self.launch(self.lists.write, list=self, found=found, vertices=v, triangles=t, edges=e)
+        sizes = dict(num_surface=self.num_surface, num_edges=e.count, num_vt=self.num_vt)
+        write(room_t=self.room[0], room_e=self.room[1], factor=PARALLEL**-0.5, **sizes)
+        corners = dict(count=4 * self.count, num_surface=self.num_surface)
+        self.launch(self.lists.count, list=self)(**corners)
+        self.buffers.scan(self.row, self.num_surface)
+        self.launch(self.lists.fill, list=self)(**corners)
+
+    def first_piercing(self, rest, u, slot: int) -> tuple[int, int] | None:
+        """(edge, triangle) of the surface that pass through each other, after a `build` at the same place; or None."""
+        _, t, e = self.trees
+        pierced = runtime.array(ti.i32, e.count)
+        records = dict(scene=SimpleNamespace(rest=rest, u=u), mine=e, theirs=t, out=SimpleNamespace(pierced=pierced))
+        self.piercing.find.bind(**records)(slot=slot, count=e.count, their_count=t.count, leaves=t.leaves)
+        found = runtime.fetch(pierced)[: e.count]
+        worst = int(np.argmax(found >= 0))
+        return (worst, int(found[worst])) if found[worst] >= 0 else None

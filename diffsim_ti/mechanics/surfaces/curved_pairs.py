@@ -1,0 +1,269 @@
+"""Contact of curved surfaces with each other: pairs of a finer surface (mesh/collision_surface.py), whose vertices x = C X
+are sums over nodes. Displacements go to them by C, forces back by C^T; all between is that of linear tetrahedra."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from types import SimpleNamespace
+
+import numpy as np
+import taichi as ti
+
+from diffsim_ti import runtime
+from diffsim_ti.mechanics.surfaces.buffers import Launches
+from diffsim_ti.mechanics.surfaces.curved_friction import friction_of
+from diffsim_ti.mesh.collision_surface import CollisionSurface, cuts_of
+from diffsim_ti.runtime import PRECISIONS, Kernel, kernels_of
+
+A = ti.template()
+ROWS = dict(start="ints", index="ints", weight="scalars")
+
+
+def pairs_of(kind: type, arrays, parallel: bool):
+    """Pairs of a kind (surface_pairs.py, implicit_pairs.py), of a finer surface where faces are curved and smooth."""
+    cuts = cuts_of(arrays.mesh, arrays.self_contact, arrays.bend)
+    return CurvedPairs(kind, arrays, parallel, cuts) if cuts else kind(arrays, parallel)
+
+
+@dataclass(frozen=True)
+class Transfer:
+    """Products with a sparse matrix of few rows, whose entries are `rows`."""
+
+    precision: str
+    parallel: bool
+
+    def _kernel(self, name: str, body, source: str, target: str, **numbers) -> Kernel:
+        own = dict(rows=ROWS, at=dict(source=source, target=target))
+        return Kernel(name, body, self.precision, own, dict(count="int") | numbers)
+
+    @property
+    def vector(self):
+        return ti.types.vector(4, PRECISIONS[self.precision])
+
+    @ti.func
+    def refine_all(self, rows: A, at: A, plan: A):
+        ti.loop_config(serialize=not self.parallel)
+        for k in range(plan.count):
+            total = self.vector(0)
+            for m in range(rows.start[k], rows.start[k + 1]):
+                total += rows.weight[m] * at.source[plan.slot, rows.index[m]]
+            at.target[0, k] = total
+
+    @cached_property
+    def refine(self) -> Kernel:
+        """target[0] = C source[slot]"""
+        return self._kernel("refine", self.refine_all, "vectors2", "vectors2", slot="int")
+
+    @ti.func
+    def gather_all(self, rows: A, at: A, plan: A):
+        ti.loop_config(serialize=not self.parallel)
+        for k in range(plan.count):
+            total = self.vector(0)
+            for m in range(rows.start[k], rows.start[k + 1]):
+                total += rows.weight[m] * at.source[rows.index[m]]
+            at.target[plan.first + k] = total
+
+    @cached_property
+    def gather(self) -> Kernel:
+        """target[first + k] = (rows source)[k]"""
+        return self._kernel("gather_points", self.gather_all, "vectors", "vectors", first="int")
+
+    @ti.func
+    def add_all(self, rows: A, at: A, plan: A):
+        ti.loop_config(serialize=not self.parallel)
+        for k in range(plan.count):
+            for m in range(rows.start[k], rows.start[k + 1]):
+                for d in range(3):
+                    w = rows.weight[m] * rows.weight[m]
+                    at.target[d, k] = at.target[d, k] + w * at.source[d, rows.index[m]]
+
+    @cached_property
+    def add_blocks(self) -> Kernel:
+        """Adds to rows 0..2 of target those of source, by squares of the weights."""
+        return self._kernel("add_point_blocks", self.add_all, "vectors2", "vectors2")
+
+
+class FinerArrays:
+    """What pairs read of the arrays of a scene, for the vertices of its collision surface."""
+
+    first_contact_corner = 0
+
+    def __init__(self, arrays, surface: CollisionSurface):
+        self.scene, self.mesh, self.precision = arrays, surface, arrays.precision
+        self.self_contact, self.num_vertices = arrays.self_contact, surface.num_vertices
+        self.parameters_of_self_contact = arrays.parameters_of_self_contact
+        self.fp, self.vector, self.supports = arrays.fp, arrays.vector, SimpleNamespace(guided=())  # nodes are held
+        self.rest = runtime.array(arrays.vector, surface.num_vertices)
+        self.corner = runtime.array(arrays.vector, len(surface.surface_vertices))
+        self._rest_of = None
+
+    @property
+    def values(self):
+        return self.scene.values
+
+    @property
+    def parameters(self):
+        return self.scene.parameters
+
+    @property
+    def inverse_mass(self):
+        lightness = self.mesh.matrix.power(2) @ runtime.fetch(self.scene.inverse_mass).astype(np.float64)
+        return runtime.upload(lightness, self.scene.fp)
+
+    def follow(self) -> None:
+        """Take the rest shape that the scene has loaded."""
+        if self._rest_of is not self.values.rest:
+            self._rest_of = self.values.rest
+            runtime.fill(self.rest, self.mesh.matrix @ (self.values.rest - self.scene.origin))
+
+
+class CurvedPairs:
+    """As SurfacePairs or ImplicitPairs, for arrays of the nodes. Numbers of vertices in messages that the mesh does not have
+    are those of the collision surface."""
+
+    def __init__(self, kind: type, arrays, parallel: bool, cuts: int):
+        surface = CollisionSurface(arrays.mesh, cuts)
+        self.a, self.finer, self.matrix = arrays, FinerArrays(arrays, surface), surface.matrix
+        self.inner, self.kernels = kind(self.finer, parallel), kernels_of(Transfer, arrays.precision, parallel)
+        fp, vector, n = arrays.fp, arrays.vector, arrays.num_vertices
+        self.down, self.up = _rows(surface.matrix, fp), _rows(surface.matrix.T.tocsr(), fp)
+        of_corners = surface.matrix.T.tocsr()[arrays.mesh.surface_vertices][:, surface.surface_vertices]
+        self.to_corners, self.num_corners = _rows(of_corners.tocsr(), fp), len(arrays.mesh.surface_vertices)
+        self._u, self._w, self._blocks = (runtime.array(vector, k, surface.num_vertices) for k in (1, 1, 3))
+        self._row, self._rest_dot = runtime.array(vector, 1, n), runtime.array(vector, surface.num_vertices)
+        self.step, self.next = runtime.array(vector, 1, n), runtime.array(vector, 1, n)
+        self._launch = Launches()
+        self.friction = friction_of(self)
+
+    # ---- between nodes and points ------------------------------------------------------------------------------------
+
+    def _fine(self, u, slot: int, target):
+        self.finer.follow()
+        refine = self._launch(self.kernels.refine, rows=self.down, at=SimpleNamespace(source=u, target=target))
+        refine(count=self.finer.num_vertices, slot=slot)
+        return target
+
+    def fine(self, u, slot: int):
+        """Displacements of the finer surface, from those of a slot."""
+        return self._fine(u, slot, self._u)
+
+    def fine_change(self, w):
+        """Their changes, from w[0]."""
+        return self._fine(w, 0, self._w)
+
+    def fine_numbers(self, numbers) -> SimpleNamespace:
+        """What pairs of the finer surface read of changes of numbers."""
+        runtime.fill(self._rest_dot, self.matrix @ runtime.fetch(numbers.rest).astype(np.float64))
+        return SimpleNamespace(rest=self._rest_dot, parameters=numbers.parameters)
+
+    def _gather(self, out) -> None:
+        """From the points' corners to those of the nodes, the last ones of `out`."""
+        at = SimpleNamespace(source=self.finer.corner, target=out)
+        gather = self._launch(self.kernels.gather, rows=self.to_corners, at=at)
+        gather(count=self.num_corners, first=self.a.first_contact_corner)
+
+    def _spread(self, u: np.ndarray) -> np.ndarray:
+        self.finer.follow()
+        return self.matrix @ u
+
+    # ---- as of pairs of nodes ----------------------------------------------------------------------------------------
+
+    @property
+    def width(self) -> float:
+        return self.inner.width
+
+    @property
+    def list(self):
+        return self.inner.list
+
+    @property
+    def builds(self) -> int:
+        return self.inner.builds
+
+    def load(self, u) -> None:
+        self.inner.load(self.fine(u, 0))
+
+    def check_apart(self, u) -> None:
+        self.inner.check_apart(self.fine(u, 0))
+
+    def forget(self, u) -> None:
+        self.inner.forget(self.fine(u, 0))
+
+    def ensure(self, u, slot: int) -> None:
+        self.inner.ensure(self.fine(u, slot), 0)
+
+    def check_pass(self, u, slot: int, h: float) -> None:
+        self.inner.check_pass(self.fine(u, slot), 0, h)
+
+    def look(self, u) -> tuple[float, float]:
+        return self.inner.look(self.fine(u, 0))
+
+    def unbind(self) -> None:
+        self._launch.clear()
+        self.inner.unbind()
+
+    def forces(self, u, slot: int, out, exact: bool = False) -> None:
+        self.inner.forces(self.fine(u, slot), 0, self.finer.corner, exact)
+        self._gather(out)
+
+    def product(self, u, slot: int, w, out, rest_dot=None, parameters_dot=(0.0, 0.0), has_planes=False) -> None:
+        fine_u, fine_w, moved = self.fine(u, slot), self.fine_change(w), None
+        if rest_dot is not None:
+            runtime.fill(self._rest_dot, self.matrix @ runtime.fetch(rest_dot).astype(np.float64))
+            moved = self._rest_dot
+        self.inner.product(fine_u, 0, fine_w, self.finer.corner, moved, parameters_dot, has_planes)
+        self._gather(out)
+
+    def clear_sums(self) -> None:
+        self.inner.clear_sums()
+        if self.friction:
+            self.friction.clear_sums()
+
+    def vjp(self, u, slot: int, w, out) -> None:
+        self.inner.vjp(self.fine(u, slot), 0, self.fine_change(w), self.finer.corner)
+        self._gather(out)
+
+    def collect(self) -> tuple[np.ndarray, np.ndarray]:
+        numbers, rest = self.inner.collect()
+        return numbers, self.matrix.T @ rest
+
+    # ---- in Newton's method ------------------------------------------------------------------------------------------
+
+    def begin(self, u: np.ndarray) -> None:
+        runtime.fill(self.next, u[None])
+        self.inner.begin(self._spread(u))
+
+    def place(self, u) -> None:
+        self.inner.place(self.fine(u, 0))
+        self._gather(self.a.corner)
+
+    def energies(self) -> np.ndarray:
+        return self.inner.energies()
+
+    def hessian_product(self, u, w, convex: bool) -> None:
+        self.inner.hessian_product(self.fine(u, 0), self.fine_change(w), convex)
+        self._gather(self.a.corner)
+
+    def add_blocks(self, u, out) -> None:
+        """Those of points by squares of what nodes have of them, without what two points of a node have in common."""
+        runtime.fill(self._blocks, 0)
+        self.inner.add_blocks(self.fine(u, 0), self._blocks)
+        at = SimpleNamespace(source=self._blocks, target=out)
+        self._launch(self.kernels.add_blocks, rows=self.up, at=at)(count=self.a.num_vertices)
+
+    def safe_share(self, u: np.ndarray, step: np.ndarray, most: float = 1.0) -> float:
+        return self.inner.safe_share(self._spread(u), self._spread(step), most)
+
+    def way_is_free(self, u: np.ndarray, step: np.ndarray) -> bool:
+        return self.inner.way_is_free(self._spread(u), self._spread(step))
+
+    def check_end(self, u: np.ndarray, u_next: np.ndarray) -> None:
+        self.inner.check_end(self._spread(u), self._spread(u_next))
+
+
+def _rows(matrix, fp) -> SimpleNamespace:
+    """A CSR matrix on the device."""
+    return SimpleNamespace(
+        start=runtime.upload(matrix.indptr, ti.i32),
+        index=runtime.upload(matrix.indices, ti.i32),
+        weight=runtime.upload(matrix.data, fp),
+    )

@@ -1,0 +1,149 @@
+"""Friction between surfaces in implicit passes: a force with a potential, from what presses where the pass begins."""
+
+import numpy as np
+
+from diffsim_ti import runtime
+from diffsim_ti.mechanics.surfaces.buffers import whole
+from diffsim_ti.mechanics.surfaces.pair_friction import PairFriction
+
+
+class LaggedFriction(PairFriction):
+    """Of the pairs that press with N at the first displacement of a pass, with the weights w and the normal n there.
+
+    A pair slides with t = (I - n n^T) sum_i w_i v_i, v = (u - x) / gamma, and its corners feel
+    -w_i mu N f(|t| / eps) t / |t| (terms/obstacles/friction.py). Displacements, directions and
+    results are NumPy arrays, shape (num_vertices, 3).
+    """
+
+    def __init__(self, pairs):
+        super().__init__(pairs)
+        self.corners, self.w, self.n = np.zeros((0, 4), int), np.zeros((0, 4)), np.zeros((0, 3))
+        self.L, self.x, self.per_gamma = np.zeros(0), np.zeros((self.a.num_vertices, 3)), 1.0
+        self.by_speed, self.u_begin = 0.0, None
+
+    def begin(self, u: np.ndarray, x: np.ndarray, per_gamma: float) -> None:
+        """A pass from u, where `pairs.begin` has been; x, 1 / gamma: as above."""
+        self.u_begin, self.x, self.per_gamma = u, x, per_gamma
+        self._measure_here()
+        pressing, count = whole(self.own.pressing), self.pairs.list.count
+        self.felt = felt = np.flatnonzero(pressing[:count, 3] > 0)
+        self.corners = runtime.fetch(self.pairs.list.pairs)[: 4 * count].reshape(-1, 4)[felt]
+        self.w, pressing = whole(self.own.weights)[felt].astype(np.float64), pressing[felt].astype(np.float64)
+        self.n, self.L = pressing[:, :3], pressing[:, 3]
+
+    def _measure_here(self) -> None:
+        self.pairs.forces(self.pairs.next, 0, self.a.corner)
+        self.measure(self.pairs.next, 0)
+
+    @property
+    def speed(self) -> float:
+        return float(self.a.values.parameters[self.pairs.first + 2])
+
+    def _sliding(self, u: np.ndarray) -> tuple:
+        """(velocities of the corners, their difference across the gap, t, |t|, t / |t|, f / |t|, df / d|t|)"""
+        v, eps = (self.per_gamma * (u - self.x))[self.corners], self.speed
+        relative = np.einsum("pk,pkd->pd", self.w, v)
+        t = self._across(relative)
+        s = np.linalg.norm(t, axis=1)
+        y, safe = s / eps, np.maximum(s, 1e-300)
+        kappa, slope = np.where(y < 1, (2 - y) / eps, 1 / np.maximum(s, eps)), np.where(y < 1, 2 * (1 - y) / eps, 0.0)
+        return v, relative, t, s, t / safe[:, None], kappa, slope
+
+    def _across(self, x: np.ndarray) -> np.ndarray:
+        return x - self.n * _dot(self.n, x)
+
+    def _scatter(self, at_corners: np.ndarray) -> np.ndarray:
+        out = np.zeros((self.a.num_vertices, *at_corners.shape[2:]))
+        np.add.at(out, self.corners, at_corners)
+        return out
+
+    def energies(self, u: np.ndarray) -> np.ndarray:
+        """Of each pair [J]: what sliding so would dissipate."""
+        s, eps = self._sliding(u)[3], self.speed
+        y = np.minimum(s / eps, 1)
+        return self.L / self.per_gamma * np.where(s < eps, eps * y * y * (1 - y / 3), s - eps / 3)
+
+    def _pulls(self, u: np.ndarray) -> np.ndarray:
+        _, _, t, _, _, kappa, _ = self._sliding(u)
+        return (-self.L * kappa)[:, None] * t
+
+    def forces(self, u: np.ndarray) -> np.ndarray:
+        """[N]"""
+        return self._scatter(self.w[:, :, None] * self._pulls(u)[:, None])
+
+    def sizes(self, u: np.ndarray) -> np.ndarray:
+        """Sum of the sizes of the forces that meet at each vertex [N]."""
+        return self._scatter(np.abs(self.w) * np.linalg.norm(self._pulls(u), axis=1)[:, None])
+
+    def _stiffness(self, u: np.ndarray) -> np.ndarray:
+        """The matrix L d(f t / |t|) / dt / gamma of each pair [N/m]."""
+        _, _, _, _, e, kappa, slope = self._sliding(u)
+        out = kappa[:, None, None] * (np.eye(3) - self.n[:, :, None] * self.n[:, None])
+        out += (slope - kappa)[:, None, None] * e[:, :, None] * e[:, None]
+        return (self.per_gamma * self.L)[:, None, None] * out
+
+    def product(self, u: np.ndarray, w: np.ndarray, convex: bool = False) -> np.ndarray:
+        """d2E/du2 w [N], which is convex."""
+        across = np.einsum("pij,pk,pkj->pi", self._stiffness(u), self.w, w[self.corners], optimize=True)
+        return self._scatter(self.w[:, :, None] * across[:, None])
+
+    def blocks(self, u: np.ndarray) -> np.ndarray:
+        """3x3 diagonal blocks of d2E/du2 [N/m]."""
+        return self._scatter((self.w**2)[:, :, None, None] * self._stiffness(u)[:, None])
+
+    # ---- derivatives -------------------------------------------------------------------------------------------------
+
+    def _back_to_begin(self) -> None:
+        """The list of pairs, and what presses, where the pass begins; `potential.place` leads away again."""
+        self.pairs.begin(self.u_begin)
+        self._measure_here()
+
+    def jvp(self, u: np.ndarray, du: np.ndarray, dx: np.ndarray, du_begin: np.ndarray, numbers) -> np.ndarray:
+        """Change of the forces for those of u, of x, of where the pass begins, and of `numbers`, a Tangent."""
+        self._back_to_begin()
+        runtime.fill(self.pairs.step, du_begin[None])
+        self.changes(self.pairs.next, 0, self.pairs.step, numbers)
+        d_pressing = whole(self.own.pressing_dot)[self.felt].astype(np.float64)
+        dw, dn, dL = whole(self.own.weights_dot)[self.felt].astype(np.float64), d_pressing[:, :3], d_pressing[:, 3]
+        d_speed = float(runtime.fetch(numbers.parameters)[self.pairs.first + 2])
+        v, relative, t, s, e, kappa, slope = self._sliding(u)
+        dv = (self.per_gamma * (du - dx))[self.corners]
+        d_relative = np.einsum("pk,pkd->pd", self.w, dv) + np.einsum("pk,pkd->pd", dw, v)
+        dt = self._across(d_relative) - dn * _dot(self.n, relative) - self.n * _dot(dn, relative)
+        ds = _dot(e, dt)[:, 0]
+        df = slope * (ds - s / self.speed * d_speed)
+        r, dr = (-self.L * kappa)[:, None] * t, (-dL * kappa)[:, None] * t
+        dr -= self.L[:, None] * ((df - kappa * ds)[:, None] * e + kappa[:, None] * dt)
+        return self._scatter(self.w[:, :, None] * dr[:, None] + dw[:, :, None] * r[:, None])
+
+    def vjp(self, u: np.ndarray, forces_adj: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Adjoints of u, of x, of where the pass begins; adds those of the numbers and of the rest shape."""
+        v, relative, t, s, e, kappa, slope = self._sliding(u)
+        g = forces_adj[self.corners]
+        r, r_adj = (-self.L * kappa)[:, None] * t, np.einsum("pk,pkd->pd", self.w, g)
+        by_f = -self.L * _dot(e, r_adj)[:, 0]
+        t_adj = (-self.L * kappa)[:, None] * r_adj + (by_f * (slope - kappa))[:, None] * e
+        self.by_speed -= float((by_f * slope * s / self.speed).sum())
+        relative_adj = self._across(t_adj)
+        n_adj = -t_adj * _dot(self.n, relative) - relative * _dot(self.n, t_adj)
+        w_adj = np.einsum("pkd,pd->pk", g, r) + np.einsum("pkd,pd->pk", v, relative_adj)
+        by_u = self._scatter(self.per_gamma * self.w[:, :, None] * relative_adj[:, None])
+        self._back_to_begin()
+        pressing_adj = np.concatenate([n_adj, -kappa[:, None] * _dot(t, r_adj)], 1)
+        by_begin = np.zeros_like(by_u)
+        by_begin[self.a.mesh.surface_vertices] = self._pull_back(self.pairs.next, 0, self.felt, w_adj, pressing_adj)
+        return by_u, -by_u, by_begin
+
+    def clear_sums(self) -> None:
+        super().clear_sums()
+        self.by_speed = 0.0
+
+    def collect(self) -> np.ndarray:
+        out = super().collect()
+        out[0] += self.by_speed
+        return out
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Shape (k, 1)."""
+    return (a * b).sum(1, keepdims=True)

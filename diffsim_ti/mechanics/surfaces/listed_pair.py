@@ -1,0 +1,166 @@
+"""A pair of a list in kernels: its corners, what it writes to them, and what a surface vertex sums of all its pairs.
+
+There are no atomics: each pair writes to its four corners, and each surface vertex sums its corners in order. What vertex s
+gets is written to `out[first_out + s]`, one more corner for the gather of the tetrahedra's forces.
+"""
+
+from dataclasses import dataclass
+
+import taichi as ti
+
+from diffsim_ti.mechanics.surfaces.proximity import EDGE_EDGE, VERTEX_TRIANGLE, Pair
+from diffsim_ti.runtime import Kernel, traced
+
+A = ti.template()
+MARGIN = 1.001
+SAFE = 0.9  # share of its gap by which a pair may close in one pass
+# which corners belong to different primitives
+OPPOSITE = (((0, 1), (0, 2), (0, 3)), ((0, 2), (0, 3), (1, 2), (1, 3)))
+LIST = dict(pairs="ints", scale="scalars", surface="ints", place="ints", row="ints", corner_of="ints")  # broad_phase.py
+SCENE = LIST | dict(rest="vectors", parameters="scalars", corner="vectors", plane="vectors")
+SCENE |= dict(rest_plane="vectors", rest_weights="vectors")  # motion_kernels.py
+NUMBERS = dict.fromkeys(("slot", "num_vt", "num_pairs", "num_surface", "first_out"), "int")
+
+
+@traced
+def first_of(kind, plan):
+    """The first pair of a kind, and below the one behind its last: no sums, for which a GPU would take a task each."""
+    return 0 if kind == VERTEX_TRIANGLE else plan.num_vt
+
+
+@traced
+def behind(kind, plan):
+    return plan.num_vt if kind == VERTEX_TRIANGLE else plan.num_pairs
+
+
+@ti.func
+def three(y):
+    """The first three components."""
+    return ti.Vector([y[0], y[1], y[2]])
+
+
+@ti.func
+def between(x: A, i, k, slot):
+    """x_k - x_i of the vertices' vectors in a slot."""
+    return three(x[slot, k] - x[slot, i])
+
+
+@ti.func
+def at_rest(rest: A, i, k):
+    """X_k - X_i of the rest shape's vectors."""
+    return three(rest[k] - rest[i])
+
+
+@dataclass(frozen=True)
+class ListedPair(Pair):
+    """Taichi functions of pair p of a list; those of edges follow those of vertex and triangle.
+
+    first: where the scene's parameters begin with stiffness and width. parallel: loops run on all threads.
+    """
+
+    first: int
+    parallel: bool
+
+    def kernel(self, name: str, body, at: dict, scene: dict | None = None, **numbers) -> Kernel:
+        """A kernel on the arrays of SCENE and more, and on those it is called `at`."""
+        return Kernel(name, body, self.precision, dict(scene=SCENE | (scene or {}), at=at), NUMBERS | numbers)
+
+    @ti.func
+    def own_share(self, p, scene: A):
+        """What pair p has of the scene's width: all, but no more than half of its distance at rest."""
+        return ti.min(
+            ti.cast(1, self.fp), ti.cast(0.5, self.fp) * scene.rest_plane[p][3] / scene.parameters[self.first + 1]
+        )
+
+    @ti.func
+    def numbers(self, p, scene: A):
+        """Stiffness and width of pair p (docstring of SelfContact)."""
+        share = self.own_share(p, scene)
+        return scene.parameters[self.first] / share, share * scene.parameters[self.first + 1]
+
+    @ti.func
+    def width(self, p, scene: A):
+        _, width = self.numbers(p, scene)
+        return width
+
+    @ti.func
+    def numbers_jvp(self, p, scene: A, d_stiffness, d_width, d_rest):
+        """Changes of stiffness and width of pair p for those of the scene's and of the pair's distance at rest."""
+        share, d_share = self.own_share(p, scene), ti.cast(0, self.fp)
+        k, W = scene.parameters[self.first], scene.parameters[self.first + 1]
+        if share < 1:
+            d_share = (ti.cast(0.5, self.fp) * d_rest - share * d_width) / W
+        return (d_stiffness - k / share * d_share) / share, share * d_width + W * d_share
+
+    @ti.func
+    def numbers_vjp(self, p, scene: A, by_stiffness, by_width):
+        """Adjoints of the scene's stiffness and width and of the pair's distance at rest."""
+        share, by_share = self.own_share(p, scene), ti.cast(0, self.fp)
+        k, W = scene.parameters[self.first], scene.parameters[self.first + 1]
+        if share < 1:
+            by_share = W * by_width - k / (share * share) * by_stiffness
+        return by_stiffness / share, share * (by_width - by_share / W), ti.cast(0.5, self.fp) * by_share / W
+
+    @ti.func
+    def is_felt(self, p, scene: A):
+        """Whether pair p is nearer than the width, by the plane that `forces` left here."""
+        return not scene.plane[p][3] > self.width(p, scene)
+
+    @ti.func
+    def scale_of(self, kind: A, p, scene: A, plan: A):
+        """What |a x b| of a pair of edges is measured by."""
+        scale = ti.cast(0, self.fp)
+        if ti.static(kind == EDGE_EDGE):
+            scale = scene.scale[p - plan.num_vt]
+        return scale
+
+    @ti.func
+    def four(self, y):
+        return self.vec4(y[0], y[1], y[2], ti.cast(0, self.fp))
+
+    @ti.func
+    def changes(self, p, scene: A, x: A, slot):
+        """Vectors of corners 1 to 3 of pair p relative to corner 0's."""
+        c0, c1, c2, c3 = scene.pairs[4 * p], scene.pairs[4 * p + 1], scene.pairs[4 * p + 2], scene.pairs[4 * p + 3]
+        return between(x, c0, c1, slot), between(x, c0, c2, slot), between(x, c0, c3, slot)
+
+    @ti.func
+    def changes_at_rest(self, p, scene: A, rest: A):
+        """The same of vectors of the rest shape."""
+        c0, c1, c2, c3 = scene.pairs[4 * p], scene.pairs[4 * p + 1], scene.pairs[4 * p + 2], scene.pairs[4 * p + 3]
+        return at_rest(rest, c0, c1), at_rest(rest, c0, c2), at_rest(rest, c0, c3)
+
+    @ti.func
+    def corners(self, p, scene: A, u: A, slot):
+        """Positions of corners 1 to 3 of pair p relative to corner 0."""
+        y1, y2, y3 = self.changes_at_rest(p, scene, scene.rest)
+        u1, u2, u3 = self.changes(p, scene, u, slot)
+        return y1 + u1, y2 + u2, y3 + u3
+
+    @ti.func
+    def store(self, p, scene: A, g1, g2, g3):
+        """Forces, minus the gradient, of the four corners."""
+        zero = self.vec3(0)
+        scene.corner[4 * p] = self.four(g1 + g2 + g3)
+        scene.corner[4 * p + 1] = self.four(zero - g1)
+        scene.corner[4 * p + 2] = self.four(zero - g2)
+        scene.corner[4 * p + 3] = self.four(zero - g3)
+
+    @ti.func
+    def sum_corners(self, scene: A, out: A, plan: A):
+        """What the pairs of each surface vertex have stored for it."""
+        ti.loop_config(serialize=not self.parallel)
+        for s in range(plan.num_surface):
+            total = self.vec4(0)
+            for k in range(scene.row[s], scene.row[s + 1]):
+                total += scene.corner[scene.corner_of[k]]
+            out[plan.first_out + s] = total
+
+    @ti.func
+    def all_products(self, scene: A, at: A, plan: A):
+        """`product` of every pair, which a subclass has, and their sums by vertex."""
+        for kind in ti.static((VERTEX_TRIANGLE, EDGE_EDGE)):
+            ti.loop_config(serialize=not self.parallel)
+            for p in range(first_of(kind, plan), behind(kind, plan)):
+                self.product(kind, p, scene, at, plan)
+        self.sum_corners(scene, at.out, plan)

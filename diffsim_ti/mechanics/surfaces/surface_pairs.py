@@ -1,0 +1,356 @@
+"""Contact within a run: the list of near pairs, kept while it holds, and the forces of its pairs."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import taichi as ti
+
+from diffsim_ti import runtime
+from diffsim_ti.mechanics.surfaces.broad_phase import CandidatePairs
+from diffsim_ti.mechanics.surfaces.buffers import branches, whole
+from diffsim_ti.mechanics.surfaces.listed_pair import OPPOSITE
+from diffsim_ti.mechanics.surfaces.motion_kernels import BLOCK, MotionKernels
+from diffsim_ti.mechanics.surfaces.pair_friction import PairFriction
+from diffsim_ti.mechanics.surfaces.pair_kernels import PairKernels
+from diffsim_ti.mesh.sets import pieces
+from diffsim_ti.runtime import kernels_of
+from diffsim_ti.terms.obstacles.barrier import CROSSOVER, beta
+
+HELD = 4  # vertices that a pair is to stop, with what is behind it
+
+
+class Tunnelling(FloatingPointError):
+    """In one pass, surfaces moved so far that they may have gone through each other. Of explicit steps it carries stable_dt
+    [s], a substep that resolves the barrier, and stiffness [N/m], one that stops them, or None where theirs would do."""
+
+    stable_dt: float | None = None
+    stiffness: float | None = None
+
+
+class Overlap(ValueError):
+    """A state in which surfaces touch or pass through each other, or an obstacle reaches into a face."""
+
+
+class SurfacePairs:
+    """Pairs of surface primitives of a scene with a SelfContact term (terms/self_contact.py).
+
+    The list holds all pairs that were within the width and the slacks of their vertices when it was made, and holds good
+    until a vertex has used up one of its two slacks: the one towards its own body by moving relative to that body, the one
+    towards others by moving relative to the mean of all bodies. Slacks follow the motion since the list before.
+    Pairs beyond the width add exact zeros, in a fixed order, so that forces have the same bits whatever the list's age.
+    Forces go to the last corners of an array of corners, one for each surface vertex (state/arrays.py).
+    """
+
+    friction_kind = PairFriction
+    typical_slack = 0.5  # share of the width that half of the vertices get at most, so that lists stay short
+    fewest_passes, most_passes = 3, 30  # that a list should last, by its slacks, but
+    least_slack = 0.1  # they are at least this share of the width, and
+    # width + 2 slack at most this share of an edge, of one body (with many neighbours) and of two
+    largest_reach = (1.0, 2.0)
+    most_edges = 4.0  # mean edges that the width may have
+    markers = 16  # vertices whose mean motion is that of a body
+
+    def __init__(self, arrays, parallel: bool):
+        self.a, mesh, term = arrays, arrays.mesh, arrays.self_contact
+        self.mesh, self.first, self.parallel = mesh, arrays.parameters_of_self_contact.start, parallel
+        self.kernels = kernels_of(PairKernels, arrays.precision, self.first, parallel)
+        self.motion = kernels_of(MotionKernels, arrays.precision, self.first, parallel)
+        edges = surface_edges(mesh)
+        lengths = np.linalg.norm(mesh.vertices[edges[:, 1]] - mesh.vertices[edges[:, 0]], axis=1)
+        self.edges, self.term = edges, term
+        self.body = np.full(mesh.num_vertices, -1)
+        self.body[mesh.surface_vertices] = np.unique(pieces(mesh)[mesh.surface_vertices], return_inverse=True)[1]
+        self.list = CandidatePairs(
+            mesh.surface_vertices, mesh.surface_triangles, edges, lengths, self.body, arrays.precision, parallel
+        )
+        self._launch, n, vector = self.list.launch, len(mesh.surface_vertices), self.kernels.vec4
+        self.before, self.built, self.sums, self.rest_adj = (runtime.array(vector, n) for _ in range(4))
+        self.none, self.flags = runtime.array(vector, 1), runtime.array(ti.i32, 3)
+        marked = spread(self.body[mesh.surface_vertices], self.markers)
+        self.num_bodies, self.marked = len(marked), runtime.upload(marked.ravel(), ti.i32)
+        bodies, blocks = branches(self.num_bodies), -(-n // BLOCK)
+        upper = branches(blocks)
+        self._sums = dict(body_block=bodies["size"], body_blocks=bodies["number"], blocks=blocks, **upper)
+        self.frame = runtime.array(vector, self.num_bodies + 2 + 2 * bodies["number"])
+        self.farthest = runtime.array(self.kernels.fp, 1 + blocks + upper["number"])
+        self.touched = runtime.array(ti.i32, n)
+        self.fresh, self.age, self.builds = False, 0, 0
+        self._checked_rest = self._scratch = None
+        self.friction = self.friction_kind(self) if term.has_friction else None
+
+    @property
+    def width(self) -> float:
+        return float(self.a.values.parameters[self.first + 1])
+
+    def load(self, u) -> None:
+        """New values, the start at u: raise ValueError if surfaces touch or cross, or if the width is too large."""
+        self.fresh = False
+        checked = (self.a.values.rest, self.width)
+        if self._checked_rest is None or self._checked_rest[0] is not checked[0] or self._checked_rest[1] != checked[1]:
+            rest_state = runtime.array(self.kernels.vec4, 1, self.a.num_vertices)
+            runtime.fill(rest_state, 0)
+            self._check_rest(rest_state)
+            self._checked_rest = checked
+        self._build(u, 0)
+        self.check_apart(u)
+
+    def _check_rest(self, u) -> None:
+        largest = self.most_edges * self.list.typical
+        if self.width > largest:
+            raise ValueError(
+                f"self-contact of width {self.width:.3g} m: more than {self.most_edges:g} times the mean edge of the "
+                f"surface, so that most of its pairs would be near at rest; take a width below {largest:.3g} m"
+            )
+        self._build(u, 0)
+        plane = whole(self.rest_plane)[: self.list.count]
+        if plane.size and not plane[:, 3].min() > 0:
+            worst, pairs = plane[:, 3].argmin(), runtime.fetch(self.list.pairs)[: 4 * self.list.count].reshape(-1, 4)
+            raise ValueError(
+                f"self-contact: {self._name(worst, pairs)} of one body touch at rest, so that no width is left to them; "
+                "move them apart in the mesh, or join their vertices"
+            )
+
+    def check_apart(self, u) -> None:
+        """Raise Overlap if surfaces touch or pass through each other at u[0]."""
+        if not self.fresh or self.age:
+            self._build(u, 0)
+        found = self.list.first_piercing(self.a.rest, u, 0)
+        if found:
+            edge, triangle = self.edges[found[0]], self.mesh.surface_triangles[found[1]]
+            raise Overlap(
+                f"surfaces pass through each other: edge {_numbers(edge)} and triangle {_numbers(triangle)}; "
+                "move the bodies apart"
+            )
+        gaps, pairs = self._distances(u)
+        if gaps.size and not gaps.min() > 0:
+            worst = int(gaps.argmin())
+            raise Overlap(f"surfaces touch: {self._name(worst, pairs)}; move the bodies apart")
+
+    def forget(self, u) -> None:
+        """The state was set from outside."""
+        self.age = 0
+        self._build(u, 0)
+        self.check_apart(u)
+
+    def run(self, kernel, at: dict, *more, **numbers) -> None:
+        """Launch a kernel of pairs, with the arrays `at`, and `more` of the scene."""
+        k, a = self.list, self.a
+        numbers |= dict(num_surface=k.num_surface, first_out=a.first_contact_corner)
+        scene = *more, k, self, SimpleNamespace(rest=a.rest, parameters=a.parameters)
+        self._launch(kernel, scene=scene, at=SimpleNamespace(**at))(
+            **dict(num_vt=k.num_vt, num_pairs=k.count) | numbers
+        )
+
+    # ---- the list ---------------------------------------------------------------------------------------------------
+
+    def _build(self, u, slot: int, wanted=0.0) -> None:
+        """The list at u[slot]; slacks follow the motion, or cover `wanted`, shape (n, 2) [m]."""
+        x = runtime.fetch(u, slot)[self.mesh.surface_vertices]
+        if not np.all(np.isfinite(x)):  # the guard of the run will say so
+            return
+        runtime.fill(self.list.slack, self._slacks(x, wanted))
+        self.list.build(self.a.rest, u, slot, self.width)
+        count, take = self.list.count, self.list.buffers.take
+        vector, fp = self.kernels.vec4, self.kernels.fp
+        self.corner, self.plane = take("forces", vector, 4 * count), take("planes", vector, count)
+        self.energy, self.numbers = take("energies", fp, count), take("numbers", vector, count)
+        self.rest_plane, self.rest_weights = take("planes at rest", vector, count), take("weights", vector, count)
+        if self.friction:
+            self.friction.make_room()
+        self.run(self.motion.begin, dict(u=u), slot=slot)
+        self.fresh, self.age = True, 0
+        self.builds += 1
+
+    def _slacks(self, x: np.ndarray, wanted) -> np.ndarray:
+        """Slacks [m] of the surface vertices towards their own body and others, shape (n, 4), for displacements x."""
+        slack, least = np.zeros((len(x), 4)), self.least_slack * self.width
+        slack[:, :2] = wanted
+        if self.fresh and self.age:
+            overall, last = self._travel(x - runtime.fetch(self.built)), self._travel(x - runtime.fetch(self.before))
+            pace = np.maximum(overall / self.age, last)
+            pace += pace.mean(0)  # the mean, for what will be hit
+            passes = self.typical_slack * self.width / max(float(np.median(pace.max(1))), 1e-300)
+            slack[:, :2] = np.clip(passes, self.fewest_passes, self.most_passes) * pace
+            # the slack before, for what shakes
+            slack[:, :2] = np.maximum(slack, 0.9 * whole(self.list.slack))[:, :2]
+        for k, largest in enumerate(self.largest_reach):
+            slack[:, k] = slack[:, k].clip(least, max(least, 0.5 * (largest * self.list.typical - self.width)))
+        return slack
+
+    def _travel(self, move: np.ndarray) -> np.ndarray:
+        """Lengths of surface vertices' motions relative to their body's and to the mean of all, shape (n, 2)."""
+        frame = move[runtime.fetch(self.marked).reshape(self.num_bodies, -1)].mean(1)
+        origins = frame[self.body[self.mesh.surface_vertices]], frame.mean(0)
+        return np.stack([np.linalg.norm(move - origin, axis=1) for origin in origins], 1)
+
+    def unbind(self) -> None:
+        """Let go of the arrays that forces were computed from."""
+        self._launch.clear()
+
+    def _check(self, u, slot: int, num_vt: int, num_pairs: int) -> tuple[bool, bool, bool]:
+        """Whether the list is stale, whether pairs beyond it may have crossed, and whether pairs of it may have."""
+        bodies = dict(num_bodies=self.num_bodies, markers=self.markers, lost=0.5 * self.width, **self._sums)
+        self.run(self.motion.check, dict(u=u), slot=slot, num_vt=num_vt, num_pairs=num_pairs, **bodies)
+        flags = runtime.view(self.flags)
+        stale, lost, crossed = runtime.fetch(self.flags) if flags is None else flags
+        return bool(stale), bool(lost), bool(crossed)
+
+    def ensure(self, u, slot: int) -> None:
+        """Make the list anew if it does not hold at u[slot]."""
+        if not self.fresh or self._check(u, slot, 0, 0)[0]:
+            self.age = 0  # a jump says nothing of the pace
+            self._build(u, slot)
+
+    def check_pass(self, u, slot: int, h: float) -> None:
+        """After a pass of length h [s] to u[slot]: raise Tunnelling if a pair may have crossed."""
+        self.age += 1
+        stale, lost, crossed = self._check(u, slot, self.list.num_vt, self.list.count)
+        if (lost or crossed) and np.all(np.isfinite(runtime.fetch(u, slot))):
+            self._refuse(runtime.fetch_row(u, slot), h, crossed)
+        if stale:
+            self._build(u, slot)
+
+    def _refuse(self, u: np.ndarray, h: float, crossed: bool) -> None:
+        surface = self.mesh.surface_vertices
+        moved = np.zeros((self.mesh.num_vertices, 3))
+        moved[surface] = u[surface] - runtime.fetch(self.before)
+        self.fresh = False
+        pairs = runtime.fetch(self.list.pairs)[: 4 * self.list.count].reshape(-1, 4)
+        plane = whole(self.plane)[: self.list.count].astype(np.float64)
+        fastest = self._fastest(plane[:, 3], pairs)
+        stiffness, enough = self._resolved(moved[surface] / h, h, fastest)
+        remedy = f"take substeps of {enough:.3g} s"
+        if stiffness is not None:
+            remedy = f"no step stops them: raise the contact's stiffness to {stiffness:.3g} N/m and {remedy}"
+        elif fastest * h > 1:
+            remedy = f"contact at {fastest:.3g} rad/s is too stiff for it: {remedy}"
+        if not crossed:
+            i = surface[np.linalg.norm(moved[surface], axis=1).argmax()]
+            speed = np.linalg.norm(moved[i]) / h
+            error = Tunnelling(
+                f"vertex {i} moves at {speed:.3g} m/s, {np.linalg.norm(moved[i]):.3g} m in one substep of {h:.3g} s: "
+                f"too far for a contact of width {self.width:.3g} m to see what it passes; {remedy}"
+            )
+            error.stable_dt, error.stiffness = enough, stiffness
+            raise error
+        closing = np.full(len(pairs), -np.inf)
+        for kind, part in enumerate((slice(0, self.list.num_vt), slice(self.list.num_vt, None))):
+            for a, b in OPPOSITE[kind]:
+                change = ((moved[pairs[part, b]] - moved[pairs[part, a]]) * plane[part, :3]).sum(1)
+                closing[part] = np.maximum(closing[part], change)
+        worst = int((closing - plane[:, 3]).argmax())
+        error = Tunnelling(
+            f"{self._name(worst, pairs)} may have gone through each other: their gap was {plane[worst, 3]:.3g} m, and they "
+            f"closed by {closing[worst]:.3g} m ({closing[worst] / h:.3g} m/s) in one substep of {h:.3g} s; {remedy}"
+        )
+        error.stable_dt, error.stiffness = enough, stiffness
+        raise error
+
+    def _resolved(self, v: np.ndarray, h: float, fastest: float) -> tuple[float | None, float]:
+        """(stiffness [N/m] that stops surface vertices of velocities v [m/s], None if the present one does; a substep [s]).
+
+        The barrier k w^2 beta(s) of a pair takes HELD times m V^2 / 2, m the heaviest vertex, V how fast they meet: of all
+        vertices, or where contact is too stiff for the substep h, and speeds are of its own making, of bodies and of the
+        start. With the present k that is at s; where s < 1 / 50, at s = 1 / 10 with a new one. omega h is 1/2 there at most,
+        of the lightest vertex, and V h a tenth of the width.
+        """
+        light = runtime.fetch(self.a.inverse_mass).astype(np.float64)[self.mesh.surface_vertices]
+        mass, light = 1 / light[light > 0].min(initial=np.inf), light.max(initial=0)
+        frames = np.stack([v[self.body[self.mesh.surface_vertices] == b].mean(0) for b in range(self.num_bodies)])
+        start = self.a.values.velocity
+        start = float(np.linalg.norm(start - start.mean(0), axis=1).max(initial=0))
+        own = frames if fastest * h > 1 and len(frames) > 1 else v
+        speed = max(2 * start, 2 * float(np.linalg.norm(own - own.mean(0), axis=1).max(initial=0)), 1e-300)
+        k, w, energy = float(self.a.values.parameters[self.first]), self.width, 0.5 * HELD * mass * speed**2
+        shares = np.geomspace(0.02, 1, 400)
+        s, stiffness = float(np.interp(-energy / (k * w * w), -beta(shares), shares)), None
+        if energy > k * w * w * beta(0.02):
+            s, stiffness = 0.1, energy / float(w * w * beta(0.1))
+        t = 1 - 1 / s
+        omega = np.sqrt((stiffness or k) * light * (t * t - 4 * t + 2 * np.log1p(-t)))
+        return stiffness, float(min(0.5 / max(omega, 1e-300), 0.1 * w / speed, 0.5 * h))
+
+    def _fastest(self, gaps: np.ndarray, pairs: np.ndarray) -> float:
+        """A frequency [rad/s] of pairs that press, of the lightest vertex against the stiffest pair."""
+        at_rest = whole(self.rest_plane)[: self.list.count, 3].astype(np.float64)
+        share = np.minimum(1, at_rest / (2 * self.width))  # listed_pair.py
+        t = 1 - 1 / np.clip(gaps / (share * self.width), CROSSOVER, 1)  # beta'' = t^2 - 4 t - 2 log s, s = 1 / (1 - t)
+        stiffness = self.a.values.parameters[self.first] / share * (t * t - 4 * t + 2 * np.log1p(-t))
+        lightness = runtime.fetch(self.a.inverse_mass).astype(np.float64)[pairs].max(1)
+        return float(np.sqrt((stiffness * lightness).max(initial=0)))
+
+    def _name(self, pair: int, pairs: np.ndarray) -> str:
+        c = pairs[pair]
+        if pair < self.list.num_vt:
+            return f"vertex {c[0]} and triangle {_numbers(c[1:])}"
+        return f"edges {_numbers(c[:2])} and {_numbers(c[2:])}"
+
+    # ---- forces -----------------------------------------------------------------------------------------------------
+
+    def forces(self, u, slot: int, out, exact: bool = False) -> None:
+        """Contact forces at u[slot], to the last corners of `out`."""
+        self.run(self.kernels.forces, dict(u=u, out=out), slot=slot, exact=int(exact))
+
+    def product(self, u, slot: int, w, out, rest_dot=None, parameters_dot=(0.0, 0.0), has_planes=False) -> None:
+        """Change of the contact forces for changes w[0] of the positions (and of rest shape, stiffness, width).
+
+        has_planes: `forces` were last computed at u[slot].
+        """
+        at = dict(u=u, w=w, rest_dot=self.none if rest_dot is None else rest_dot, out=out)
+        numbers = dict(zip(("d_stiffness", "d_width"), parameters_dot))
+        numbers |= dict(by_rest=int(rest_dot is not None), has_planes=int(has_planes))
+        self.run(self.kernels.products, at, slot=slot, **numbers)
+
+    def clear_sums(self) -> None:
+        """Begin a reverse sweep."""
+        runtime.fill(self.sums, 0)
+        runtime.fill(self.rest_adj, 0)
+        if self.friction:
+            self.friction.clear_sums()
+
+    def vjp(self, u, slot: int, w, out) -> None:
+        """The product with the adjoint w[0] of the forces; adds the adjoints of stiffness, width and rest shape."""
+        self.product(u, slot, w, out)
+        self.run(self.kernels.add_sums, dict(out=out), slot=slot)
+
+    def collect(self) -> tuple[np.ndarray, np.ndarray]:
+        """Adjoints of (stiffness, width, those of friction) and of the rest shape, (num_vertices, 3), by the forces alone;
+        float64."""
+        rest = np.zeros((self.mesh.num_vertices, 3))
+        rest[self.mesh.surface_vertices] = runtime.fetch(self.rest_adj)
+        numbers = whole(self.sums).astype(np.float64).sum(0)[:2]
+        return np.concatenate([numbers, self.friction.collect()]) if self.friction else numbers, rest
+
+    # ---- to look at -------------------------------------------------------------------------------------------------
+
+    def _distances(self, u) -> tuple[np.ndarray, np.ndarray]:
+        """Distances [m] and corners of all pairs of the list at u[0]."""
+        if self._scratch is None:
+            self._scratch = runtime.array(self.kernels.vec4, self.a.first_contact_corner + self.list.num_surface)
+        self.forces(u, 0, self._scratch, exact=True)
+        pairs = runtime.fetch(self.list.pairs)[: 4 * self.list.count].reshape(-1, 4)
+        return whole(self.plane)[: self.list.count, 3].astype(np.float64), pairs
+
+    def look(self, u) -> tuple[float, float]:
+        """Contact energy [J] and smallest gap [m] (infinite beyond the list's reach) at u[0]."""
+        self.ensure(u, 0)
+        gaps, _ = self._distances(u)
+        energies = runtime.fetch(self.energy)[: self.list.count].astype(np.float64)
+        return float(energies.sum()), float(gaps.min(initial=np.inf))
+
+
+def surface_edges(mesh) -> np.ndarray:
+    """Each edge of the surface once, the smaller index first, sorted; shape (k, 2)."""
+    return np.unique(np.sort(mesh.surface_triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1), axis=0)
+
+
+def spread(body: np.ndarray, count: int) -> np.ndarray:
+    """`count` members of each body, evenly spread over their numbers, repeated where there are fewer; (bodies, count)."""
+    members = np.argsort(body, kind="stable")
+    first = np.searchsorted(body[members], np.arange(body.max() + 2))
+    share = (np.arange(count) + 0.5) / count
+    return members[(first[:-1, None] + np.diff(first)[:, None] * share).astype(int)]
+
+
+def _numbers(indices) -> str:
+    return "(" + ", ".join(str(int(i)) for i in indices) + ")"

@@ -1,0 +1,1 @@
+"""Springs, cables, muscles and elastic foundations."""

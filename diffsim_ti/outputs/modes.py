@@ -1,0 +1,200 @@
+"""Vibrations of a body about a state: frequencies and shapes, with the gradients of frequencies."""
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from diffsim_ti.common.checked import shown
+from diffsim_ti.inputs import StressPoints
+from diffsim_ti.mechanics.ties.attached import Attached
+from diffsim_ti.outputs.body_forces import BodyForces
+
+if TYPE_CHECKING:
+    from diffsim_ti.scene import Scene
+
+SMALL, DENSE = 1e-8, 600  # of the largest eigenvalue: zero; unknowns up to which all of them are computed
+
+
+@dataclass(eq=False)
+class Modes:
+    """frequencies [Hz], ascending, shape (k,), negative where the state is unstable (lambda < 0: -sqrt(-lambda) / 2 pi);
+    eigenvalues lambda = (2 pi f)^2 [1/s^2]; shapes [1/sqrt(kg)], (k, num_vertices, 3), with shapes_i . M shapes_j = 1 where
+    i = j, else 0; groups: lists of modes whose frequencies coincide, whose mean alone has a gradient;
+    scene and displacements [m]: about what state they are."""
+
+    frequencies: np.ndarray
+    eigenvalues: np.ndarray
+    shapes: np.ndarray
+    groups: list[list[int]]
+    scene: "Scene" = field(repr=False)
+    displacements: np.ndarray = field(repr=False)
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """What `Frames` call outputs: frequencies."""
+        return getattr(self, name)
+
+    def gradients(self, by_frequency: ArrayLike) -> dict[str, np.ndarray]:
+        """Gradients of a loss by every input of the scene, for its gradient by the frequencies, shape (k,).
+
+            d lambda_i = phi_i . (dK - lambda_i dM) phi_i,        df = d lambda / (8 pi^2 f)
+
+        Where frequencies coincide each mode takes the mean of its group, which is the one of them that is differentiable:
+        the loss must weigh the modes of a group alike, and a group must not be cut by k. "displacements" is the gradient
+        by the state, besides. Initial positions and loads have none: chain what moves the state through its own rollout.
+        Of what is given over time the gradient is that of time 0.
+        phi . dK phi is the slope of the exact derivatives of phi . forces along phi, by differences of fourth order whose
+        error is 1e-10 of it.
+
+        Raises ValueError for another shape, for weights that differ within a group, and for frequencies of zero.
+        Magnus 1985, On differentiating eigenvalues and eigenvectors, doi:10.1017/S0266466600011129.
+        """
+        by = np.asarray(by_frequency, np.float64)
+        if by.shape != self.frequencies.shape:
+            raise ValueError(f"by_frequency: expected shape {self.frequencies.shape}, got {by.shape}")
+        size = np.abs(by).max(initial=0.0)
+        for group in self.groups:
+            if np.ptp(by[group]) > 1e-9 * size:
+                raise ValueError(
+                    f"modes {group} have one frequency, {self.frequencies[group[0]]:.6g} Hz, of which only the mean has a "
+                    f"gradient: weigh them alike, not {by[group]}"
+                )
+            if by[group[0]] and not abs(self.frequencies[group[0]]) > 0:
+                raise ValueError(f"modes {group} are motions without stiffness: their frequency 0 has no gradient")
+        body = BodyForces(self.scene)
+        values = self.scene.inputs.at_times([0.0])
+        derived, attached = body.load(values), Attached.of(self.scene)
+        total, by_state = derived.zeros(), np.zeros_like(self.displacements)
+        for group in self.groups:
+            if not by[group[0]]:
+                continue
+            weight = by[group[0]] / (8 * np.pi**2 * abs(self.frequencies[group[0]]))
+            for i in group:
+                slope, by_u = _slope(body, attached, self.displacements, self.shapes[i], derived)
+                for name, part in slope.parts().items():
+                    if part is not None:
+                        setattr(total, name, getattr(total, name) + weight * part)
+                by_state += weight * by_u
+                self._add_mass(total, -weight * self.eigenvalues[i], self.shapes[i])
+        return self.scene.inputs.derive_vjp(values, total, tuple(values)) | {"displacements": by_state}
+
+    def _add_mass(self, total, weight: float, phi: np.ndarray) -> None:
+        """Adds the adjoint of masses for that of phi . M phi."""
+        if total.element_masses is None:
+            total.mass = total.mass + weight * (phi**2).sum(1)
+            return
+        at = phi[self.scene.mesh.elements]
+        total.element_masses = total.element_masses + weight * at @ np.swapaxes(at, 1, 2)
+
+
+FOURTH_ORDER = ((-2, 1 / 12), (-1, -8 / 12), (1, 8 / 12), (2, -1 / 12))  # shifts and weights of a difference
+
+
+def _slope(body: BodyForces, attached: Attached | None, u: np.ndarray, phi: np.ndarray, derived):
+    """Derivatives of phi . K phi, of what kernels read and of u."""
+    X, H = derived.rest, StressPoints.of(body.scene.mesh, derived).displacement_gradients(phi)
+    step = 2e-3 / max(np.abs(H).max(), 1e-300)  # a strain that a law's third derivatives resolve
+    total, by_u, v = derived.zeros(), np.zeros_like(X), np.zeros_like(X)
+    for shift, weight in FOURTH_ORDER:
+        body.place(u + shift * step * phi, v)
+        adjoint = body.adjoint()
+        own, _ = body.vjp(phi, adjoint)
+        found, weight = adjoint.collect(), -weight / step
+        by_u += weight * own
+        for name in ("coefficients", "gradients", "volumes"):
+            setattr(total, name, getattr(total, name) + weight * getattr(found, name))
+    if attached is not None:
+        by_u += _slope_of_attached(attached.at_start(derived), u, phi, derived, total)
+    return total, by_u
+
+
+def _slope_of_attached(attached: Attached, u: np.ndarray, phi: np.ndarray, derived, total) -> np.ndarray:
+    """The same of springs, cables and foundations; adds what kernels read to `total`."""
+    step, by_u = 2e-3 / attached.turning(u, phi), np.zeros_like(u)
+    for shift, weight in FOURTH_ORDER:
+        found = derived.zeros()
+        by_u -= weight / step * attached.vjp_at_start(u + shift * step * phi, phi, found)
+        for name in ("ties", "tie_segments", "foundation"):
+            if (part := getattr(found, name)) is not None:
+                setattr(total, name, getattr(total, name) - weight / step * part)
+    return by_u
+
+
+def free_directions(scene: "Scene"):
+    """An orthonormal basis of the motions that supports leave, as columns of a SciPy CSC matrix, (3 num_vertices, k); each
+    moves one vertex."""
+    from scipy.sparse import csc_matrix
+
+    held = np.zeros((scene.mesh.num_vertices, 3, 3))
+    held[scene.held] = scene.supports.held
+    held[scene.mesh.unused_vertices] = np.eye(3)  # which have no mass
+    values, vectors = np.linalg.eigh(held)  # of a vertex that is free or held wholly, the axes
+    vertex, which = np.nonzero(values < 0.5)
+    rows = 3 * vertex[:, None] + np.arange(3)
+    columns = np.repeat(np.arange(len(vertex)), 3)
+    shape = 3 * scene.mesh.num_vertices, len(vertex)
+    out = csc_matrix((vectors[vertex, :, which].ravel(), (rows.ravel(), columns)), shape=shape)
+    out.eliminate_zeros()
+    return out
+
+
+def modes(scene: "Scene", k: int, displacements: ArrayLike | None = None, **values) -> Modes:
+    """The k lowest modes of small vibrations of a body about a state: K phi = lambda M phi, f = sqrt(lambda) / 2 pi.
+
+    K: `scene.stiffness_matrix(displacements)`, of the body's stress, springs, cables and foundations at displacements [m]
+    from the rest shape, default none; M: `scene.mass_matrix()`, lumped, or consistent of ten-node tetrahedra; vertices do
+    not move where they are held, and obstacles and pressures are not in K.
+    values: of the scene's inputs, instead of its own, such as youngs_modulus=2e5 or rest_positions=X.
+    A body that is not fixed has six frequencies of 0, its rigid motions, with k counting them. Everything is in float64.
+
+    Raises ValueError for k outside 1 .. the number of free unknowns, shapes that do not fit, or a law with rates or a state.
+    Bathe, Finite Element Procedures, 2nd ed., 2014, ch. 10.
+
+    >>> import diffsim_ti as ds
+    >>> mesh = ds.TetrahedralMesh.create_cube(resolution=2)
+    >>> material = ds.StableNeoHookean(E=1e5, nu=0.3)
+    >>> scene = ds.Scene(mesh, material, terms=[ds.Gravity()], precision="f64")
+    >>> frequencies = ds.modes(scene, 7).frequencies  # six rigid motions, and the first that strains
+    >>> print(abs(frequencies[:6]).max() < 1e-3, f"{frequencies[6]:.3f} Hz")
+    True 2.282 Hz
+    """
+    from scipy.linalg import eigh
+    from scipy.sparse import diags
+    from scipy.sparse.linalg import eigsh
+
+    if not hasattr(scene, "stiffness_matrix"):
+        raise ValueError(f"modes: scene must be a Scene, got {shown(scene)}")
+    if scene.precision != "f64":
+        scene = scene.replace(precision="f64")
+    if scene.reduced:
+        raise ValueError(
+            "modes: a scene with sets that are reduced= has no modes here; leave it out for those of all vertices"
+        )
+    u = scene.checked_displacements(displacements)
+    scene = scene.with_consistent_mass().with_values(values)
+    free = free_directions(scene)
+    count = free.shape[1]
+    if k not in range(1, count + 1) or isinstance(k, bool):
+        raise ValueError(f"modes: k must be a whole number of 1 .. {count}, the free unknowns, got {shown(k)}")
+    k = int(k)
+    mass = scene.mass_matrix()
+    scale = 1 / np.sqrt(abs(free).T.power(2) @ mass.diagonal())
+    K = free.T @ scene.stiffness_matrix(u) @ free
+    A = diags(scale) @ (0.5 * (K + K.T)) @ diags(scale)
+    M = diags(scale) @ (free.T @ mass @ free) @ diags(scale) if scene.mesh.order == 2 else None  # else the identity
+    size = float(abs(A).sum(1).max())
+    if count <= DENSE or 3 * k >= count:
+        values, vectors = eigh(A.toarray(), None if M is None else M.toarray(), subset_by_index=[0, k - 1])
+    else:
+        values, vectors = eigsh(A.tocsc(), k, M, sigma=-1e-6 * size, which="LM", tol=1e-13)
+        order = np.argsort(values)
+        values, vectors = values[order], vectors[:, order]
+    values = np.where(np.abs(values) < 1e-13 * size, 0.0, values)
+    shapes = (free @ (vectors * scale[:, None])).T
+    frequencies = np.sign(values) * np.sqrt(np.abs(values)) / (2 * np.pi)
+    groups = [[0]]
+    for i in range(1, k):
+        near = abs(values[i] - values[i - 1]) <= SMALL * max(abs(values[i]), 1e-6 * size * SMALL)
+        groups[-1].append(i) if near else groups.append([i])
+    return Modes(frequencies, values, shapes.reshape(k, -1, 3), groups, scene, u)

@@ -1,0 +1,316 @@
+"""Scene: what is simulated, and nothing about how."""
+
+from collections.abc import Iterable, Mapping
+from copy import copy
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from diffsim_ti import runtime
+from diffsim_ti.common.checked import as_numbers, instance, listed
+from diffsim_ti.common.copies import MadeAgain
+from diffsim_ti.common.origin import middle_far_part, warn_of_coarse_places
+from diffsim_ti.inputs import ConsistentMass, Inputs
+from diffsim_ti.materials.grown import grown
+from diffsim_ti.materials.material import Material
+from diffsim_ti.materials.moduli import youngs_poisson
+from diffsim_ti.materials.patch_law import PatchLaw
+from diffsim_ti.mechanics.energy.assembled import body_stiffness
+from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.scene.locking import LOCKING_RATIO, warn_if_locking
+from diffsim_ti.terms import (
+    Cable,
+    Chamber,
+    Drag,
+    ElasticFoundation,
+    Gravity,
+    Growth,
+    Obstacle,
+    Pressure,
+    SelfContact,
+    Spring,
+    SurfaceDrag,
+    Term,
+)
+from diffsim_ti.terms.mass_scaling import MassScaling
+from diffsim_ti.terms.motion import Motion
+from diffsim_ti.terms.obstacles.obstacle import PER_AREA
+from diffsim_ti.terms.pose import Pose, sampled_path
+from diffsim_ti.terms.reduced import Reduced
+from diffsim_ti.terms.supports import Fixed, Supports
+from diffsim_ti.terms.terms_of_scene import TermsOfScene
+
+__all__ = ["LOCKING_RATIO", "Scene"]
+
+
+def _kind(term) -> tuple:
+    """What kernels go through terms by: obstacles last, each kind's together, so that the order of a list means nothing."""
+    return term.acts_on_surface, type(term).__qualname__, type(term).__module__, term.variant
+
+
+class Scene(TermsOfScene, MadeAgain):
+    """A body, its material and what acts on it. Frozen: build another scene instead of changing one.
+
+    mesh: TetrahedralMesh, the rest shape.
+    material: a law with its numbers (materials/).
+    density [kg/m^3]: one number or one per tetrahedron; vertices carry the lumped mass sum rho V / 4. Ten-node tetrahedra
+        have consistent masses and weight, lumped ones (HRZ) in explicit steps.
+    terms: loads, contacts, damping (terms/); gravity, drag and self-contact at most once. What is not listed costs
+        nothing. Their order means nothing but that of obstacles of one kind, whose forces and frictions act one after
+        the other. Names of terms, each another (Ground(name="floor")), begin the names of their inputs: "floor.stiffness".
+    fixed: vertices that do not move freely: a vertex set's name, indices, a Boolean mask or a list of set names. Or
+        {name of a vertex or surface set: in which directions it is held}: axes such as "x" or "xyz", a direction (3
+        numbers) or several, or "normal" of a flat surface set; so are rollers and symmetry planes made.
+    motion: displacement of the held vertices from where they start: a function of time [s] that returns 3 numbers or shape
+        (num_held, 3) [m], or keyframes (times, displacements) between which it is linear; of what is held in some
+        directions, only those count. Or a `Pose`, which turns them; or, where `fixed` names sets, {name: such a motion}.
+    initial_positions [m], initial_velocities [m/s]: shape (num_vertices, 3) or 3 numbers (velocities); default at rest.
+        Held vertices stay at initial_positions whatever rest_positions a run takes; `Rollout.forward(shape=...)` moves both.
+    precision: "f32", "f64" or None for the default that `diffsim_ti.init` set.
+    volume: where a change of volume is resisted: in each of the "tetrahedra", which lock as Poisson's ratio nears 0.5, or
+        on average over "patches" of up to eight, which lock much less (patched_tetrahedron.py).
+    mass_scaling: the share of the mass, such as .01, that may be added to the vertices that limit explicit steps
+        (mass_scaling.py): bad tetrahedra then do not rule. Gravity acts on it, so that free fall stays as it is; weight and
+        reactions grow by the share. By which factors vertices are heavier is found for the numbers given here, and kept
+        whatever values a run takes; gradients by density and rest shape are those of such masses. `describe()` says how
+        much was added. Implicit steps and statics add none.
+    reduced: {name of a tetrahedron or vertex set: "affine"}: its vertices move by twelve numbers, x = X + A X + t, in every
+        solver. "rigid": by six, turned and moved, in every solver. Or a basis, in implicit steps and statics: weights of a
+        `designs.Cage`, the shapes of `modes`. Of a start only what a set can do counts (reduced.py).
+
+    Raises ValueError with rule, value and remedy for what no solver takes, and runs no kernel. What one kind of solver does
+    not support its constructor refuses, and what an output does not, that of `Rollout`. Warns where tetrahedra lock, above
+    Poisson's ratio 0.45.
+
+    >>> import diffsim_ti as ds
+    >>> mesh, material = ds.TetrahedralMesh.create_cube(resolution=2), ds.StableNeoHookean(E=1e5, nu=0.3)
+    >>> scene = ds.Scene(mesh, material, density=1200.0, terms=[ds.Gravity(), ds.Drag(2.0)], fixed="ymin", precision="f64")
+    >>> list(scene.inputs.described)[2:]
+    ['youngs_modulus', 'poissons_ratio', 'density', 'gravity', 'drag_rate', 'rest_positions']
+    >>> print(f"{scene.mass_matrix().diagonal().sum() / 3:.1f} kg")
+    1200.0 kg
+    """
+
+    def __init__(
+        self,
+        mesh: TetrahedralMesh,
+        material: Material,
+        density: ArrayLike = 1000.0,
+        terms: Term | Iterable[Term] = (),
+        fixed: Fixed | None = None,
+        motion: Motion | Pose | Mapping[str, Motion | Pose] | None = None,
+        initial_positions: ArrayLike | None = None,
+        initial_velocities: ArrayLike | None = None,
+        precision: str | None = None,
+        volume: str = "tetrahedra",
+        mass_scaling: float | None = None,
+        reduced: Mapping[str, str | ArrayLike] | None = None,
+    ):
+        self.arguments = {name: value for name, value in locals().items() if name != "self"}
+        self.mesh = instance("Scene", "mesh", mesh, TetrahedralMesh, "a TetrahedralMesh")
+        self.material = instance(
+            "Scene", "material", material, Material, "a material such as StableNeoHookean(1e5, 0.3)"
+        )
+        self.precision = runtime.check_precision(precision)
+        if volume not in ("tetrahedra", "patches"):
+            raise ValueError(f'volume must be "tetrahedra" or, against locking, "patches", got {volume!r}')
+        self.volume = volume
+        self.terms = tuple([terms] if isinstance(terms, Term) else listed("terms", terms, "terms such as Gravity()"))
+        self.supports = Supports(mesh, fixed)
+        self.fixed, self.held = self.supports.fixed, self.supports.vertices  # in all directions; in some
+        self.reduced = Reduced(mesh, reduced, self.held)
+        self.motion, (self.clamps, self.translates) = motion, self.supports.parts_of(motion)
+        self._check_terms()
+        self._given = self.arguments["terms"] = self.terms
+        settled = (t.settled(self, density, initial_positions, initial_velocities) for t in self.terms)
+        self.terms = tuple(copy(t) for t in settled)  # one that is listed twice is two
+        self.ordered_terms = tuple(sorted(self.terms, key=_kind))
+        self.moving = tuple(t for t in self.ordered_terms if t.path is not None)
+        self.dead_loads = tuple(t for t in self.ordered_terms if t.dead)
+        self.pressures = tuple(t for t in self.ordered_terms if isinstance(t, Pressure))
+        self.fluids = tuple(t for t in self.ordered_terms if isinstance(t, SurfaceDrag))
+        self.growing = tuple(t for t in self.ordered_terms if isinstance(t, Growth))
+        if self.growing:
+            self.material = grown(self.material, volume)
+        self.law  # noqa: B018 - refuses what its volume does not support
+        self.chambers = tuple(t for t in self.ordered_terms if isinstance(t, Chamber))
+        self.gases = tuple(t for t in self.chambers if not t.holds)
+        self.following = (*self.pressures, *self.chambers)  # what presses on the surface as it is
+        self.springs = tuple(t for t in self.ordered_terms if isinstance(t, Spring))
+        cables = (t for t in self.ordered_terms if isinstance(t, Cable))
+        self.cables = tuple(sorted(cables, key=lambda t: t.of_fibres))  # which come last, for kernels
+        self.ties = self.springs + self.cables
+        self.foundations = tuple(t for t in self.ordered_terms if isinstance(t, ElasticFoundation))
+        self.origin = middle_far_part(mesh.vertices) if self.precision == "f32" else np.zeros(3)  # origin.py
+        self.mass_scaling = None if mass_scaling is None else MassScaling.of(self, density, mass_scaling)
+        self.inputs = Inputs(self, density, initial_positions, initial_velocities)
+        self._check_start()
+        warn_of_coarse_places(self)
+        if volume == "tetrahedra":
+            warn_if_locking(self)
+
+    @property
+    def law(self):
+        """The law that kernels are compiled for."""
+        law = self.material.law(self.precision)
+        return PatchLaw(self.precision, law) if self.volume == "patches" else law
+
+    def _twin(self) -> "Scene":
+        out = Scene.__new__(Scene)
+        vars(out).update(vars(self))
+        return out
+
+    consistent = False  # whether masses and weight are consistent
+
+    def with_consistent_mass(self) -> "Scene":
+        """The scene as statics, implicit steps and modes have it: ten-node tetrahedra with consistent masses and weight, and
+        no mass that was added for the sake of an explicit step."""
+        if (self.mesh.order == 1 or self.consistent) and self.mass_scaling is None:
+            return self
+        out, names = self._twin(), ("density", "initial_positions", "initial_velocities")
+        out.consistent, out.mass_scaling = self.mesh.order > 1, None
+        out.inputs = Inputs(out, *(self.arguments[name] for name in names))
+        return out
+
+    def with_values(self, values: Mapping[str, ArrayLike]) -> "Scene":
+        """The scene with other numbers of inputs, for what is asked of it once; `replace` goes back to its own."""
+        if not values:
+            return self
+        out = self._twin()
+        out.inputs = copy(self.inputs)
+        out.inputs.values = self.inputs.values | self.inputs.check(values)
+        return out
+
+    def with_each(self, values: Mapping[str, ArrayLike] | None) -> list["Scene"]:
+        """The scenes of a `Batch`, whose inputs `values` have the axis of scenes in front; this one alone without any."""
+        if values is None:
+            return [self]
+        instance("scenes", "values", values, Mapping, 'inputs by name, {"youngs_modulus": [1e4, 2e4]}')
+        if not values:
+            return [self]
+        own = {name: as_numbers(name, x) for name, x in values.items()}
+        lengths = {name: len(x) if x.ndim else 0 for name, x in own.items()}
+        if min(lengths.values()) == 0 or len(set(lengths.values())) > 1:
+            said = ", ".join(f"{name} {x.shape}" for name, x in own.items())
+            raise ValueError(f"values: expected arrays with one axis of scenes in front, got shapes {said}")
+        count = next(iter(lengths.values()))
+        return [self.with_values({name: x[b] for name, x in own.items()}) for b in range(count)]
+
+    def replace(self, **changes) -> "Scene":
+        """A scene with some arguments replaced."""
+        return Scene(**self.arguments | changes)
+
+    def _check_terms(self) -> None:
+        for term in self.terms:
+            if not isinstance(term, Term):
+                raise ValueError(f"terms must be diffsim_ti terms such as Gravity(), got {term!r}")
+            term.check(self.mesh)
+        for kind in (Gravity, Drag, SelfContact):
+            if sum(isinstance(t, kind) for t in self.terms) > 1:
+                raise ValueError(f"a scene takes one {kind.__name__}, got several; add their numbers instead")
+        named = [t for t in self.terms if t.name is not None]
+        for k, term in enumerate(named):
+            for other in (t for t in named[:k] if t.name == term.name):
+                raise ValueError(f"two terms have the name {term.name!r}: {other!r} and {term!r}; give each its own")
+        if self.motion is not None and len(self.held) == 0:
+            raise ValueError("motion moves the fixed vertices, but none is fixed; pass fixed=...")
+        if self.motion is not None:
+            self.motion_rows([0.0])
+
+    def _check_start(self) -> None:
+        surface, positions = self.mesh.surface_vertices, self.inputs.values["initial_positions"]
+        places = self.places(0.0)
+        for term in self.terms:
+            term.check_start(positions, surface, *([places[term]] if term in places else []))
+
+    def largest_poissons_ratio(self) -> float:
+        """Poisson's ratio of small strains, the largest of all tetrahedra, whatever numbers the law is given by."""
+        values = self.inputs.values
+        mu, lam = self.material.lame({name: values[name] for name in self.material.inputs})
+        return float(np.max(youngs_poisson(mu, lam)[1]))
+
+    def input_names(self, term: Term) -> dict[str, str]:
+        """{plain name of a term's input: its name in this scene}, paths included: a second obstacle's end in _2, those of
+        a term with a name begin with it."""
+        for terms in (self.terms, self._given):
+            if term in terms:
+                return self.inputs.names_of(terms.index(term))
+        raise ValueError(f"this scene does not list {term!r}; it has {', '.join(map(repr, self.terms)) or 'no terms'}")
+
+    def given_tensors(self) -> dict[str, object]:
+        """{name of an input: tensor} of the terms' numbers that were given as tensors; their graphs stay with them."""
+        return {
+            self.inputs.names_of(k)[plain]: tensor
+            for k, term in enumerate(self._given)
+            for plain, tensor in term.tensors.items()
+        }
+
+    def motion_rows(self, times: ArrayLike) -> np.ndarray:
+        """Displacement of the held vertices from their start, without that of poses, shape (len(times), num_held, 3) [m]."""
+        return self.supports.rows(self.motion, times)
+
+    def path_rows(self, times: ArrayLike) -> dict[str, np.ndarray]:
+        """Path of each moving obstacle at each time [s], by input name, shape (len(times), 3, 6 or 7) [m]."""
+        names = self.inputs.paths
+        return {name: sampled_path(name, t.path, times) for name, t in zip(names, self.moving)}
+
+    def places(self, time: float) -> dict[Term, np.ndarray]:
+        """Displacement or pose of each moving obstacle at a time [s], shape (3,), (6,) or (7,) [m]."""
+        return {term: sampled_path(term.path_name, term.path, [time])[0] for term in self.moving}
+
+    # ---- matrices ----------------------------------------------------------------------------------------------------
+
+    def stiffness_matrix(self, displacements: ArrayLike | None = None):
+        """K = d2E/du2 [N/m] of the body's stress, springs, cables and elastic foundations at displacements [m] from the rest
+        shape, default none, shape (num_vertices, 3), as a SciPy CSR matrix of all 3 num_vertices unknowns, x, y, z of vertex
+        0 first, in float64.
+
+        Fixed vertices have their rows: strike them out. Tensions and lengths over time are those of time 0; a tension T adds
+        T / |d| across its segments d. What obstacles, self-contact and pressures add is not in it.
+        Raises ValueError for shapes that do not fit, or a law that reads more than the displacement gradient.
+        Zienkiewicz, Taylor, The Finite Element Method, vol. 2, 5th ed., 2000, sec. 10.3.
+        """
+        if self.law.in_steps().reads != ("H",) or self.law.state_names:
+            raise ValueError(
+                f"{type(self.law).__name__} is more than an energy of the displacement gradient: it has no K"
+            )
+        scene = self if self.precision == "f64" else self.replace(precision="f64")
+        return body_stiffness(scene, self.checked_displacements(displacements))
+
+    def mass_matrix(self):
+        """M [kg] as a SciPy CSR matrix of all 3 num_vertices unknowns, in float64: lumped and diagonal of linear tetrahedra,
+        without what `mass_scaling` adds for explicit steps; consistent of ten-node tetrahedra, as implicit steps have it."""
+        from scipy.sparse import diags, eye, kron
+
+        inputs = self.with_consistent_mass().inputs
+        derived = inputs.derive(inputs.values)
+        if derived.element_masses is None:
+            return diags(np.repeat(derived.mass, 3)).tocsr()
+        return kron(ConsistentMass.of(self.mesh, derived.element_masses).matrix, eye(3)).tocsr()
+
+    def describe(self) -> str:
+        """What is simulated, in a few lines."""
+        mass, terms = self.inputs.derive(self.inputs.values).mass.sum(), ", ".join(map(repr, self.terms)) or "none"
+        chosen = [
+            f"chosen from weight and speed: stiffness per area {float(t.values[PER_AREA]):.4g} N/m^3 of {type(t).__name__}"
+            for t in self.terms
+            if isinstance(t, Obstacle) and t.chooses_stiffness
+        ]
+        return "\n".join(
+            [
+                f"{self.mesh!r}",
+                f"{self.material!r}" + (", volume averaged over patches" if self.volume == "patches" else ""),
+                f"mass {mass:.6g} kg, precision {self.precision}",
+                f"terms: {terms}",
+                *([str(self.mass_scaling)] if self.mass_scaling else []),
+                f"fixed vertices: {len(self.fixed)}"
+                + (f", in some directions {len(self.supports.guided)}" if len(self.supports.guided) else "")
+                + (", moving" if self.motion is not None else ""),
+                *([f"moving by few numbers: {self.reduced.describe()}"] if self.reduced else []),
+                *chosen,
+                "inputs: " + ", ".join(f"{name}{i.in_brackets}" for name, i in self.inputs.described.items()),
+            ]
+        )
+
+    def __repr__(self) -> str:
+        return f"Scene({self.mesh!r}, {self.material!r}, terms=[{', '.join(map(repr, self.terms))}])"
