@@ -24,7 +24,7 @@ class BatchAdjoint:
         layout, n, m = ws.layout, a.num_vertices, a.num_places
         self.u, self.v, self.w = (layout.vectors(1, n) for _ in range(3))
         self.corner = ws.room_for_corners()
-        self.reads_rates = "H_dot" in a.law.reads or self.features.dragged
+        self.reads_rates = "H_dot" in a.law.reads or any(x.reads_rates for x in self.features.interactions)
         self.rate_corner = ws.room_for_corners() if self.reads_rates else runtime.array(layout.vector, 1)
         self.z = layout.numbers(1, ws.law_rows) if ws.law_rows else None
         self.coefficients = layout.numbers(a.num_coefficients * m)
@@ -41,23 +41,12 @@ class BatchAdjoint:
         self.frames_u, self.frames_v = frames.frames_u, frames.frames_v
 
     def _further(self, shape: bool) -> dict:
-        """Adjoints of what some scenes alone have: springs, cables, muscles, pressures, fluids, foundations, growth."""
-        ws, has, vectors = self.ws, self.features, self.ws.layout.vectors
-        a, numbers, out = ws.arrays, ws.numbers, {}
-        if has.pressed:
-            out["pressed_felt"] = vectors(numbers.follower.shape[0], a.num_pressed)
-            out["pressed_rest"] = vectors(a.pressed_nodes.size * shape)
-        if has.tied:
-            out["tie_felt"], out["tie_rest"] = (
-                runtime.array(ws.layout.vector, *x.shape) for x in (numbers.ties, numbers.tie_segments)
-            )
-        if has.dragged:
-            out["dragged_felt"] = vectors(2 * a.num_dragged)
-            out["dragged_rest"] = vectors(3 * a.num_dragged * shape)
-        if has.growing:
-            out["growths"] = runtime.array(ws.layout.number, *numbers.growths.shape)
-        if has.founded:
-            out["foundation_felt"] = runtime.array(ws.layout.vector, *numbers.foundation.shape)
+        """Adjoints of what some scenes alone have: interactions, and growth."""
+        ws, layout, out = self.ws, self.ws.layout, {}
+        for x in ws.arrays.interactions:
+            out |= {name: layout.vectors(*own) for name, own in x.adjoints(ws.arrays.values, shape).items()}
+        if self.features.growing:
+            out["growths"] = runtime.array(layout.number, *ws.numbers.growths.shape)
         return out
 
     @property
@@ -139,26 +128,12 @@ class BatchAdjoint:
 
     def _collect_further(self, out: Derived) -> None:
         a, found = self.ws.arrays, {name: self._vectors(x) for name, x in self.further.items() if name != "growths"}
-        scenes = np.arange(self.ws.num_scenes)[:, None]
-        if "tie_felt" in found:
-            out.ties, out.tie_segments = found["tie_felt"], found["tie_rest"]
+        for x in a.interactions:
+            x.collect(found, out, self.features.shape)
         if self.features.growing:
             rows = self._of(self.growths).reshape(*out.growths.shape[:2], a.num_places, 2)[:, :, a.place]
             own = np.swapaxes(rows, 2, 3)
             out.growths = own.sum(3, keepdims=True) if out.growths.shape[3] == 1 else own
-        if "foundation_felt" in found:
-            out.foundation = found["foundation_felt"]
-        if "pressed_felt" in found:
-            np.add.at(out.follower, (slice(None), slice(None), a.load_of), found["pressed_felt"])
-        if "dragged_felt" in found:
-            numbers = a.dragged_first[:, None] + np.arange(6)
-            felt = found["dragged_felt"].reshape(-1, numbers.size)
-            np.add.at(out.parameters, (scenes, numbers.ravel()), felt)
-        if self.features.shape:
-            for what in ("pressed", "dragged"):
-                if f"{what}_rest" in found:
-                    nodes = getattr(a, f"{what}_nodes").ravel()
-                    np.add.at(out.rest, (scenes, nodes), found[f"{what}_rest"])
 
     def _of_tetrahedra(self, array, *shape: int) -> np.ndarray:
         a = self.ws.arrays

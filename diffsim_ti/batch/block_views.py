@@ -8,10 +8,9 @@ import taichi as ti
 from diffsim_ti.batch.free_vertices import FreeVertices
 from diffsim_ti.batch.tetrahedra import TetrahedronOfEight, element_of_eight
 from diffsim_ti.batch.views import AtVertices, Corners, Item, Scratch, Shared, Uniform, Vectors, View
-from diffsim_ti.materials.calculus.tensor import sum_of
 from diffsim_ti.mechanics.stress.tetrahedron import Onwards
 from diffsim_ti.runtime import Bundle, at, let, traced
-from diffsim_ti.solvers.explicit.further_elements import FurtherElements
+from diffsim_ti.solvers.explicit.item_forces import ItemForces
 from diffsim_ti.solvers.explicit.kick_drift import KickDrift
 from diffsim_ti.state.features import Features
 from diffsim_ti.state.numbers import ALONE
@@ -60,7 +59,7 @@ class BlockViews:
         kinds = {name: "blocks" if name in self.own else kind for name, kind in SHARED.items()}
         lanes = dict.fromkeys(("coefficients", "parameters", "corner"), "blocks") | OF_STEPS
         topology = dict.fromkeys(("tets", "force_slot", "motion_slot", "special"), "ints")
-        further = self.further.arrays | self.alone | (dict(vertex_of_corner="ints") if self.further.any else {})
+        further = self.items.arrays | self.alone | (dict(vertex_of_corner="ints") if self.items.any else {})
         return topology | kinds | lanes | further | self.growing
 
     def table(self) -> dict:
@@ -113,7 +112,7 @@ class BlockViews:
     def scene_of(self, b, lane, scene, plan):
         """Scene `lane` of block b, for functions of vertices."""
         n = let(b * plan.num_vertices)
-        topology = "force_slot", "motion_slot", *(name for name in self.further.arrays if name not in ALONE)
+        topology = "force_slot", "motion_slot", *(name for name in self.items.arrays if name not in ALONE)
         out = {name: getattr(scene, name) for name in topology} | self.numbers_of(b, lane, scene, plan)
         for name in ("inverse_mass", "surface"):
             out[name] = View(getattr(scene, name), n, lane) if name in self.own else getattr(scene, name)
@@ -185,43 +184,20 @@ class BlockViews:
     # ---- what else acts on bodies: springs, cables and muscles, pressures, fluids, foundations -------------------------
 
     @cached_property
-    def further(self) -> FurtherElements:
-        return FurtherElements(self.features, self.law.precision)
+    def items(self) -> ItemForces:
+        return ItemForces(self.features)
 
     @property
     def alone(self) -> dict:
         """Their numbers, of which each scene has its own."""
-        return in_blocks({name: kind for name, kind in self.further.arrays.items() if name in ALONE})
-
-    @traced
-    def num_further(self, plan):
-        has = self.features
-        counts = has.pressed, has.tied, has.dragged
-        names = "num_pressed", "num_ties", "num_dragged"
-        return let(sum_of([getattr(plan, name) for some, name in zip(counts, names) if some]))
-
-    @traced
-    def further_item(self, t, plan):
-        """Which of them comes at place t: in the order of their corners springs and cables are before pressures."""
-        if not (self.further.tied and self.further.pressed):
-            return t + plan.num_pressed if self.further.tied else t
-        tied, pressed = t < plan.num_ties, t < plan.num_ties + plan.num_pressed
-        return let(ti.select(tied, t + plan.num_pressed, ti.select(pressed, t - plan.num_ties, t)))
+        return in_blocks({name: kind for name, kind in self.items.arrays.items() if name in ALONE})
 
     @traced
     def numbers_of(self, b, lane, record, plan) -> dict:
         """Vectors of which each scene has its own, from a record of the scenes' numbers, changes or adjoints."""
-        has, sizes = self.further, {}
-        if has.pressed:
-            sizes = dict(follower=plan.num_follower, pressed_felt=plan.num_pressed)
-            sizes |= dict(pressed_rest=has.triangle.nodes * plan.num_pressed)
-        if has.tied:
-            sizes |= dict(ties=2 * plan.num_ties, tie_segments=plan.num_points)
-            sizes |= dict(tie_felt=2 * plan.num_ties, tie_rest=plan.num_points)
-        if has.dragged:
-            sizes |= dict(dragged_felt=2 * plan.num_dragged, dragged_rest=3 * plan.num_dragged)
-        if self.features.founded:
-            sizes |= dict(foundation=plan.num_foundation, foundation_felt=plan.num_foundation)
+        sizes = {}
+        for part in (*self.items.parts, *self.features.at_vertices):
+            sizes |= part.sizes(plan)
         there = {name: let(b * size) for name, size in sizes.items() if hasattr(record, name)}
         return {name: self.vectors(getattr(record, name), first, lane) for name, first in there.items()}
 

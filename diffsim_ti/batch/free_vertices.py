@@ -55,7 +55,7 @@ class FreeVertices:
     def some_special(self) -> bool:
         """Whether something else may act at a vertex."""
         has = self.features
-        return bool(has.groups) or has.motion or has.guided or has.founded
+        return bool(has.groups) or has.motion or has.guided or bool(has.at_vertices)
 
     # ---- reading and writing -----------------------------------------------------------------------------------------
 
@@ -301,7 +301,7 @@ class FreeVertices:
         first, F, n = self.first_of(i, b, plan), self.features, let(b * plan.num_vertices + i)
         p = [let(x + y) for x, y in zip(self.read(adjoint.u, 0, first), self.read(adjoint.corner, first))]
         q = self.read(adjoint.v, 0, first)
-        if "H_dot" in self.law.reads or F.dragged:
+        if "H_dot" in self.law.reads or any(x.reads_rates for x in F.interactions):
             q = [let(x + y) for x, y in zip(q, self.read(adjoint.rate_corner, first))]
         v_plus_adj = [let(now.alpha * x + now.decay * y) for x, y in zip(p, q)]
         if F.drag >= 0:

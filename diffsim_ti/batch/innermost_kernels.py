@@ -103,13 +103,13 @@ class InnermostKernels(ExplicitKernels):
     @property
     def alone(self) -> dict:
         """Numbers of springs, cables, muscles and pressures, of which each scene has its own."""
-        return {name: kind for name, kind in self.further.arrays.items() if name in ALONE}
+        return {name: kind for name, kind in self.items.arrays.items() if name in ALONE}
 
     @traced
     def after(self, plan):
         """Number of tetrahedra of all scenes, and of what else acts on their bodies."""
-        one = let(self.further.after(Bundle(**{**vars(plan), "num_items": 0})))
-        return let(plan.num_items + one * plan.num_scenes) if self.further.any else plan.num_items
+        one = let(self.items.after(Bundle(**{**vars(plan), "num_items": 0})))
+        return let(plan.num_items + one * plan.num_scenes) if self.items.any else plan.num_items
 
     @traced
     def acting(self, t, j, scene, state, table, plan) -> tuple:
@@ -143,7 +143,7 @@ class InnermostKernels(ExplicitKernels):
     @ti.func
     def act(self, t, j, scene: A, state: A, table: A, plan: A):
         k, b, now, own, at_ = self.acting(t, j, scene, state, table, plan)
-        self.further.forces(k, now, own, at_, (j - plan.base) * plan.stride, plan)
+        self.items.forces(k, now, own, at_, (j - plan.base) * plan.stride, plan)
 
     @ti.func
     def vertex_step(self, t, j, scene: A, state: A, table: A, plan: A):
@@ -163,7 +163,7 @@ class InnermostKernels(ExplicitKernels):
             if turn < plan.count:
                 if t < plan.num_items:
                     self.tetrahedron(t, plan.first + turn, scene, state, table, plan)
-                elif ti.static(self.further.any):
+                elif ti.static(self.items.any):
                     self.act(t, plan.first + turn, scene, state, table, plan)
         for t in range(num_rows):
             turn = self.turn_of_second(t, table, plan)
@@ -189,7 +189,7 @@ class InnermostKernels(ExplicitKernels):
     @ti.func
     def act_jvp(self, t, j, scene: A, state: A, tangent: A, table: A, plan: A):
         k, b, now, own, at_ = self.acting(t, j, scene, state, table, plan)
-        self.further.forces_jvp(k, now, own, at_, j - plan.base, self.record_of(b, tangent, plan), plan)
+        self.items.forces_jvp(k, now, own, at_, j - plan.base, self.record_of(b, tangent, plan), plan)
 
     @ti.func
     def vertex_step_jvp(self, t, j, scene: A, state: A, tangent: A, table: A, plan: A):
@@ -217,7 +217,7 @@ class InnermostKernels(ExplicitKernels):
             if turn < plan.count:
                 if t < plan.num_items:
                     self.tetrahedron_jvp(t, plan.first + turn, scene, state, tangent, table, plan)
-                elif ti.static(self.further.any):
+                elif ti.static(self.items.any):
                     self.act_jvp(t, plan.first + turn, scene, state, tangent, table, plan)
         for t in range(num_rows):
             turn = self.turn_of_second(t, table, plan)
@@ -247,7 +247,7 @@ class InnermostKernels(ExplicitKernels):
     @ti.func
     def act_vjp(self, t, j, scene: A, state: A, adjoint: A, table: A, plan: A):
         k, b, now, own, at_ = self.acting(t, j, scene, state, table, plan)
-        self.further.forces_vjp(k, now, own, at_, j - plan.base, self.record_of(b, adjoint, plan), plan)
+        self.items.forces_vjp(k, now, own, at_, j - plan.base, self.record_of(b, adjoint, plan), plan)
 
     @ti.func
     def vertex_step_vjp(self, t, j, scene: A, state: A, adjoint: A, table: A, plan: A):
@@ -270,7 +270,7 @@ class InnermostKernels(ExplicitKernels):
             if turn < plan.count:
                 if t < plan.num_items:
                     self.tetrahedron_vjp(t, plan.first + plan.count - 1 - turn, scene, state, adjoint, table, plan)
-                elif ti.static(self.further.any):
+                elif ti.static(self.items.any):
                     self.act_vjp(t, plan.first + plan.count - 1 - turn, scene, state, adjoint, table, plan)
         if ti.static(moving > 0):
             for t in range(paths):
@@ -282,7 +282,7 @@ class InnermostKernels(ExplicitKernels):
     def step_vjp(self) -> Kernel:
         """The adjoint of passes first + count - 1 .. first; numbers as of a single scene (explicit/kernels.py)."""
         numbers = dict.fromkeys(("num_passes", "halt", "kick", "steps", "num_parts"), "int")
-        adjoint = self.with_state(CHANGE) | ADJOINT | OF_STEPS | self.further.adjoint | self.growing
+        adjoint = self.with_state(CHANGE) | ADJOINT | OF_STEPS | self.items.adjoint | self.growing
         arrays = dict(state=self.with_state(STATE), adjoint=adjoint)
         return self._kernel("step_vjp", self.passes_vjp, arrays, self.repeated, **numbers)
 
@@ -308,8 +308,8 @@ class InnermostKernels(ExplicitKernels):
         return arrays | dict(z="scalars2") if self.vertex.law.state_names else arrays
 
     def _kernel(self, name: str, body, arrays: dict, repeated: bool, **numbers) -> Kernel:
-        arrays = dict(scene=SCENE | OF_STEPS | self.further.arrays | self.growing) | arrays | dict(table=PLAN)
-        numbers = NUMBERS | numbers | self.further.counts
+        arrays = dict(scene=SCENE | OF_STEPS | self.items.arrays | self.growing) | arrays | dict(table=PLAN)
+        numbers = NUMBERS | numbers | self.items.counts
         if repeated:
             arrays["table"], numbers = PLAN | TURNS, numbers | dict(times="int")
         return Kernel(f"batch_{name}", body, self.vertex.law.precision, arrays, numbers, loops=2 * repeated)

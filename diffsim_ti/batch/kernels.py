@@ -60,11 +60,11 @@ class BatchKernels(BlockViews):
             self.element.forces(item, tetrahedra, state, s, tetrahedra.corner)
             if ti.static(self.element.has_state):
                 self.element.move_on(item, tetrahedra, state, s, s + plan.stride, self.onwards(now))
-        if ti.static(self.further.any):
-            for t in range(self.num_further(plan)):
+        if ti.static(self.items.any):
+            for t in range(self.items.count(plan)):
                 for lane in range(LANES):
                     own, at_ = self.acted_on(b, lane, scene, plan), self.state_of(b, lane, state, plan)
-                    self.further.forces(self.further_item(t, plan), self.one(now, lane), own, at_, s, plan)
+                    self.items.forces(t, self.one(now, lane), own, at_, s, plan)
         for i in range(plan.num_vertices):
             calm = self.free.step(i, b, s, now, scene, state, plan)
             if ti.static(self.free.some_special):
@@ -101,12 +101,12 @@ class BatchKernels(BlockViews):
             self.element.forces_jvp(item, tetrahedra, state, s, tangent, tetrahedra.corner, changed)
             if ti.static(self.element.has_state):
                 self.element.move_on_jvp(item, tetrahedra, state, s, tangent, changed, self.onwards(now))
-        if ti.static(self.further.any):
-            for t in range(self.num_further(plan)):
+        if ti.static(self.items.any):
+            for t in range(self.items.count(plan)):
                 for lane in range(LANES):
                     own, at_ = self.acted_on(b, lane, scene, plan), self.state_of(b, lane, state, plan)
-                    change, k = self.change_of(b, lane, tangent, plan), self.further_item(t, plan)
-                    self.further.forces_jvp(k, self.one(now, lane), own, at_, s, change, plan)
+                    change = self.change_of(b, lane, tangent, plan)
+                    self.items.forces_jvp(t, self.one(now, lane), own, at_, s, change, plan)
         for i in range(plan.num_vertices):
             calm = self.was_calm(s, b, i, state, plan)
             if calm == 1:
@@ -174,12 +174,12 @@ class BatchKernels(BlockViews):
                     item, tetrahedra, state, s, self.onwards(now), corner, by_tetrahedra, self.features.shape
                 )
             self.element.forces_vjp(item, tetrahedra, state, s, adjoint.w, corner, by_tetrahedra, self.features.shape)
-        if ti.static(self.further.any):
-            for t in range(self.num_further(plan)):
+        if ti.static(self.items.any):
+            for t in range(self.items.count(plan)):
                 for lane in range(LANES):
                     own, at_ = self.acted_on(b, lane, scene, plan), self.state_of(b, lane, state, plan)
-                    by, k = self.adjoint_of_acting(b, lane, scene, adjoint, plan), self.further_item(t, plan)
-                    self.further.forces_vjp(k, self.one(now, lane), own, at_, s, by, plan)
+                    by = self.adjoint_of_acting(b, lane, scene, adjoint, plan)
+                    self.items.forces_vjp(t, self.one(now, lane), own, at_, s, by, plan)
         for p in range(ti.static(self.features.moving)):
             for lane in range(LANES):
                 by = self.adjoint_of(b, lane, adjoint, plan)
@@ -189,14 +189,14 @@ class BatchKernels(BlockViews):
     def step_vjp(self) -> Kernel:
         """The adjoint of passes first + count - 1 .. first; numbers as of a single scene (explicit/kernels.py)."""
         numbers = dict.fromkeys(("num_passes", "halt", "kick", "steps", "num_parts"), "int")
-        adjoint = self.with_state(CHANGE) | ADJOINT | OF_STEPS | in_blocks(self.further.adjoint) | self.growing
+        adjoint = self.with_state(CHANGE) | ADJOINT | OF_STEPS | in_blocks(self.items.adjoint) | self.growing
         arrays = dict(state=self.with_state(STATE), adjoint=adjoint)
         return self._kernel("step_vjp", self.passes_vjp, arrays, **numbers)
 
     def _kernel(self, name: str, body, arrays: dict, **numbers) -> Kernel:
         arrays = dict(scene=self.scene()) | arrays | dict(table=self.table())
-        few = self.law.short and self.features.order == 1 and not (self.features.groups or self.further.any)
-        numbers = NUMBERS | numbers | self.further.counts
+        few = self.law.short and self.features.order == 1 and not (self.features.groups or self.items.any)
+        numbers = NUMBERS | numbers | self.items.counts
         return Kernel(f"batch_{name}", body, self.law.precision, arrays, numbers, polished=few)
 
 

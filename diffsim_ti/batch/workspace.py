@@ -21,7 +21,6 @@ from diffsim_ti.batch.table import ScenesTable
 from diffsim_ti.inputs import Derived
 from diffsim_ti.mechanics.obstacles.contact_stage import ROWS
 from diffsim_ti.runtime.slots import copy_slot
-from diffsim_ti.solvers.explicit.further_elements import counts_of_further
 from diffsim_ti.state.arrays import SceneArrays
 from diffsim_ti.state.solve_report import SolveReport
 
@@ -59,11 +58,8 @@ class BatchWorkspace:
             derived = [
                 replace(d, coefficients=np.broadcast_to(d.coefficients, (m, d.coefficients.shape[-1]))) for d in derived
             ]
-        if first.forces is not None:
-            most = max(derived, key=lambda d: len(d.forces))
-            first = replace(derived[0], forces=most.forces)
-        else:
-            first = derived[0]
+        given = [name for name in ("forces", "follower", "ties") if getattr(first, name) is not None]
+        first = replace(derived[0], **{name: max((getattr(d, name) for d in derived), key=len) for name in given})
         a.load(first)
         own = {name for name in ("gradients", "volumes", "rest", "surface") if _differ(derived, name)}
         own |= {"gradients", "volumes"} if own & {"gradients", "volumes"} else set()
@@ -139,7 +135,7 @@ class BatchWorkspace:
         out["growths"] = growths, lambda: (self.layout.pack(growths_placed(a, growths)), self.layout.number)
         self.num_step_rows = max((len(x) for x in (first.path, first.motion) if x is not None), default=1)
         has = a.features()
-        asked = has.forces_keyed or has.pressed or has.tied or has.growing  # in which step a pass lies
+        asked = has.asks_for_steps
         if self.num_step_rows == 1 and asked:
             given = (x for d in derived for x in (d.forces, d.follower, d.ties, d.growths) if x is not None)
             self.num_step_rows = max(1 + len(x) for x in given)
@@ -184,8 +180,9 @@ class BatchWorkspace:
             out[a.held] = SPECIAL
         if features.guided:
             out[self.scene.supports.guided] = SPECIAL
-        if features.founded:
-            out[a.founded] = SPECIAL
+        for x in a.interactions:
+            if not x.kernel(a.values, a.precision, False).at_corners:
+                out[x.acts_at] = SPECIAL
         return out
 
     @property
@@ -304,7 +301,7 @@ class BatchWorkspace:
         sizes |= dict(num_parameters=self.num_parameters, num_passes_shown=self.table.size)
         sizes |= dict(num_follower=self.counts["follower"], num_points=self.counts["tie_segments"])
         sizes |= dict(num_foundation=self.counts["foundation"])
-        sizes |= counts_of_further(a)
+        sizes |= a.counts
         sizes |= dict(contact_damping=solver.contact_damping)
         run, turn = (num_passes, self.num_step_rows, save_every, schedule), -1 if backwards else 1
         most = (

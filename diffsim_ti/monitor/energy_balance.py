@@ -175,7 +175,7 @@ class EnergyBalance:
             stored += ws.pairs.look(ws.state.u)[0]
         self.moving = max(self.moving, kinetic + stored)
         j = min(now, num_passes - 1)
-        if features.cabled and self.steady:
+        if features.pulled and self.steady:
             ties = ws.attached.at(values, a.rows["ties"], ws.solver.schedule, 0, 0.0).ties
             stored += float(ties.energies(runtime.fetch_row(ws.state.u, 0))[ties.cables].sum())
         forces = ws.forces_at(j, num_passes) - ws.loads_at(j, num_passes, pulls=not self.steady) + weight

@@ -16,6 +16,7 @@ from diffsim_ti.materials.material import Material
 from diffsim_ti.materials.moduli import youngs_poisson
 from diffsim_ti.materials.patch_law import PatchLaw
 from diffsim_ti.mechanics.energy.assembled import body_stiffness
+from diffsim_ti.mechanics.interactions import interactions_of
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.scene.locking import LOCKING_RATIO, warn_if_locking
 from diffsim_ti.terms import (
@@ -144,6 +145,7 @@ class Scene(TermsOfScene, MadeAgain):
         self.origin = middle_far_part(mesh.vertices) if self.precision == "f32" else np.zeros(3)  # origin.py
         self.mass_scaling = None if mass_scaling is None else MassScaling.of(self, density, mass_scaling)
         self.inputs = Inputs(self, density, initial_positions, initial_velocities)
+        self.interactions = interactions_of(self)
         self._check_start()
         warn_of_coarse_places(self)
         if volume == "tetrahedra":

@@ -45,11 +45,7 @@ class SceneArrays:
         self.num_vertices, self.num_tetrahedra = mesh.num_vertices, mesh.num_tetrahedra
         self.contacts = tuple(t for t in scene.ordered_terms if t.acts_on_surface)
         self.fixed, self.held, self.supports, self.feels_faces = scene.fixed, scene.held, scene.supports, feels_faces
-        self.pressures = scene.pressures if presses else ()  # that gather with the tetrahedra's corners
-        self.chambers = scene.gases if presses else ()  # likewise
-        self.paths = scene.tie_paths if presses and scene.ties else None
-        self.fluids = scene.fluids if presses else ()  # likewise
-        self.founded = scene.founded_vertices if presses else np.zeros(0, np.int64)
+        self.interactions = scene.interactions if presses else ()
         self.mesh, self.precision, self.self_contact = mesh, precision, scene.term(SelfContact)
         self._upload_topology(scene)
         rows = scene.inputs.parameters
@@ -65,12 +61,6 @@ class SceneArrays:
             drag=rows.first(scene.term(Drag)),
             forces=bool(scene.dead_loads),
             forces_keyed=scene.inputs.keyed_forces,
-            pressed=bool(self.pressures or self.chambers),
-            tied=self.paths is not None,
-            cabled=self.paths is not None and bool(scene.cables),
-            fibres=self.num_fibre_blocks > 0,
-            founded=bool(len(self.founded)),
-            dragged=self.num_dragged > 0,
             motion=scene.motion is not None,
             guided=bool(len(scene.supports.guided)),
             num_parameters=rows.total,
@@ -113,22 +103,21 @@ class SceneArrays:
             self.parameters_of_self_contact = scene.inputs.parameters.of(self.self_contact)
             start, corner_of = with_own_corner(start, corner_of, mesh.surface_vertices, num_corners)
             num_corners += len(mesh.surface_vertices)
-        start, corner_of, num_corners = self._upload_ties(scene, start, corner_of, num_corners)
-        self.first_pressed, (faces, self.load_of) = num_corners, scene.pressed_faces
-        self.pressed_nodes = faces if self.pressures else faces[:0]
-        self.num_pressed = len(self.pressed_nodes)
-        if self.pressures:
-            start, corner_of = with_more_corners(start, corner_of, faces.ravel(), num_corners)
-            num_corners += faces.size
-        if self.pressures or self.chambers:
-            self.pressed = runtime.upload(faces.ravel() if len(faces) else np.zeros(1), ti.i32)
-            self.pressed_load = runtime.upload(self.load_of if len(faces) else np.zeros(1), ti.i32)
-        self.first_chamber_corner = num_corners
-        if self.chambers:
-            closed = np.concatenate([chamber.enclosure.triangles for chamber in self.chambers])
-            start, corner_of = with_more_corners(start, corner_of, closed.ravel(), num_corners)
-            num_corners += closed.size
-        start, corner_of, num_corners = self._upload_fluids(scene, start, corner_of, num_corners)
+        self.first_corner = num_corners  # of interactions
+        self.counts, first_load, first_push = {}, None, None
+        for x in self.interactions:
+            corners = len(x.vertices)
+            self.counts |= {f"num_{x.name}": x.count, f"first_{x.name}": num_corners, **x.counts}
+            for name, data in x.topology.items():
+                setattr(self, name, runtime.upload(data, self.fp if data.dtype.kind == "f" else ti.i32))
+            if x.first_load < corners:
+                first_load = num_corners + x.first_load if first_load is None else first_load
+                first_push = num_corners if first_push is None and not x.pulls else first_push
+            if corners:
+                start, corner_of = with_more_corners(start, corner_of, x.vertices, num_corners)
+            num_corners += corners
+        ends = [num_corners if first is None else first for first in (first_load, first_push)]
+        self.counts |= dict(zip(("first_load", "first_push"), ends))
         self.start, self.corner_of = runtime.upload(start, ti.i32), runtime.upload(corner_of, ti.i32)
         self.corner = runtime.array(self.vector, num_corners)
         self.force_slot = self.motion_slot = runtime.array(ti.i32, 1)
@@ -139,39 +128,6 @@ class SceneArrays:
         if len(scene.supports.guided):
             self.guide_slot = runtime.upload(slots(scene.supports.guided, n), ti.i32)
             self.guides = runtime.upload(scene.supports.guides.reshape(-1, 3), self.vector)
-
-    def _upload_ties(self, scene, start, corner_of, num_corners: int) -> tuple:
-        """(start, corner_of, number of corners), with those of springs and then of cables, which are loads."""
-        self.num_ties, self.first_tied, self.first_load, self.num_fibre_blocks = 0, num_corners, num_corners, 0
-        if len(self.founded):
-            self.foundation_slot = runtime.upload(slots(self.founded, self.num_vertices), ti.i32)
-        if self.paths is None:
-            return start, corner_of, num_corners
-        paths, springs = self.paths, sum(len(term.paths(self.mesh)) for term in scene.springs)
-        self.num_ties, self.num_fibre_blocks = len(paths), self.in_lanes * (scene.num_fibres // LANES)  # the last
-        self.first_load += int(paths.first_corner[paths.first_point[springs]])
-        start, corner_of = with_more_corners(start, corner_of, paths.vertices, num_corners)
-        self.tie_start = runtime.upload(paths.first_point, ti.i32)
-        self.point_start = runtime.upload(paths.first_corner, ti.i32)
-        self.point_vertex = runtime.upload(paths.vertices, ti.i32)
-        self.point_weight = runtime.upload(paths.weights, self.fp)
-        # 1: pulls only, 0: pushes too, -1: pulls as it is told, whose length nobody asks for
-        self.tie_sides = runtime.upload(np.where(scene.given_tensions, -1, scene.one_sided_ties), ti.i32)
-        return start, corner_of, num_corners + len(paths.vertices)
-
-    def _upload_fluids(self, scene, start, corner_of, num_corners: int) -> tuple:
-        """(start, corner_of, number of corners), with those of triangles in a fluid."""
-        self.num_dragged, self.first_dragged = 0, num_corners
-        if not self.fluids:
-            return start, corner_of, num_corners
-        parts = [term.triangles(self.mesh) for term in self.fluids]
-        first = [np.full(len(p), scene.inputs.parameters.first(t)) for t, p in zip(self.fluids, parts)]
-        self.dragged_nodes, self.dragged_first = np.concatenate(parts), np.concatenate(first)
-        self.num_dragged = len(self.dragged_nodes)
-        self.dragged = runtime.upload(self.dragged_nodes.ravel(), ti.i32)
-        self.dragged_numbers = runtime.upload(self.dragged_first, ti.i32)
-        start, corner_of = with_more_corners(start, corner_of, self.dragged_nodes.ravel(), num_corners)
-        return start, corner_of, num_corners + self.dragged_nodes.size
 
     def _twins(self, scene) -> list[tuple]:
         """(compile-time twin, first parameter, column of the path or -1) of the obstacles; their tables stand behind the
@@ -208,12 +164,11 @@ class SceneArrays:
         return self._known_features[density, shape]
 
     def _make_features(self, density: bool, shape: bool) -> Features:
-        forces, follower, growth = self.values.forces, self.values.follower, self.values.growths
+        forces, growth = self.values.forces, self.values.growths
         return Features(
             **self._features,
             forces_per_step=forces is not None and len(forces) > 1,
-            pressure_per_step=self._features["pressed"] and len(follower) > 1,
-            ties_per_step=self.paths is not None and len(self.values.ties) > 1,
+            interactions=tuple(x.kernel(self.values, self.precision, shape) for x in self.interactions),
             growing=growth is not None,
             growth_per_step=growth is not None and len(growth) > 1 and not self.in_steps,
             growth_uniform=growth is None or growth.shape[2] == 1,
@@ -232,7 +187,7 @@ class SceneArrays:
         moved = before != self.features()
         sources = {name: on_device(self, name, values) for name in PARTS if name != "mass"}
         sources["parameters"] = np.concatenate([values.parameters, self.tables]), self.fp
-        if not (self.contacts or self.self_contact or self.pressures or self.chambers or self.fluids):
+        if not (self.contacts or self.self_contact or any(x.reads_rest for x in self.features().interactions)):
             sources["rest"] = np.zeros((1, 3)), self.vector
         else:
             sources["rest"] = values.rest - self.origin, self.vector
@@ -249,9 +204,9 @@ class SceneArrays:
         return moved
 
     def clear_corners_of_loads(self) -> None:
-        """No forces at corners of springs, pressed triangles and chambers, where tetrahedra alone are to be gathered."""
-        if self.pressures or self.chambers or self.num_ties or self.num_dragged:
-            clear_from(self.corner, self.first_tied)
+        """No forces at corners of interactions, where tetrahedra alone are to be gathered."""
+        if self.interactions:
+            clear_from(self.corner, self.first_corner)
 
     def load_rows(self, **rows: np.ndarray) -> None:
         """Other rows of motion, path, forces, pressure or ties, by name: those of the steps to come."""

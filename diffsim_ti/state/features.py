@@ -53,17 +53,10 @@ class Features:
     forces: bool = False
     forces_per_step: bool = False
     forces_keyed: bool = False  # whether they change within steps
-    pressed: bool = False  # whether passes take follower pressures on triangles
-    pressure_per_step: bool = False
-    tied: bool = False  # whether there are springs or cables
-    ties_per_step: bool = False
-    cabled: bool = False
-    fibres: bool = False  # whether there are eight ties in a row that are fibres of tetrahedra, on a CPU
+    interactions: tuple = ()  # what else acts on a body (mechanics/interaction.py)
     growing: bool = False  # whether tetrahedra grow over time
     growth_per_step: bool = False
     growth_uniform: bool = True
-    founded: bool = False  # whether vertices lie on an elastic foundation
-    dragged: bool = False  # whether triangles are in a fluid
     motion: bool = False
     guided: bool = False  # whether vertices are held in some directions alone
     reduced: bool = False  # whether explicit passes take sets of vertices by few numbers
@@ -98,9 +91,34 @@ class Features:
         return self.forces or self.motion or self.moving > 0 or self.loaded_corners
 
     @property
+    def items(self) -> tuple:
+        """Interactions whose items write to corners."""
+        return tuple(x for x in self.interactions if x.at_corners and not x.apart)
+
+    @property
+    def at_vertices(self) -> tuple:
+        """Interactions that act vertex by vertex."""
+        return tuple(x for x in self.interactions if not x.at_corners)
+
+    @property
+    def in_kernels(self) -> tuple:
+        """Both."""
+        return self.items + self.at_vertices
+
+    @property
     def loaded_corners(self) -> bool:
         """Whether vertices gather loads: of pressures, or of cables."""
-        return self.pressed or self.cabled or self.dragged
+        return any(x.is_load for x in self.interactions)
+
+    @property
+    def pulled(self) -> bool:
+        """Whether some loads may be counted as energy of the body's own as well."""
+        return any(x.is_load and x.pulls for x in self.interactions)
+
+    @property
+    def asks_for_steps(self) -> bool:
+        """Whether kernels ask in which step a pass lies."""
+        return self.forces_keyed or self.growing or any(x.asks_for_steps for x in self.interactions)
 
     @property
     def pressing(self) -> tuple[ObstacleGroup, ...]:

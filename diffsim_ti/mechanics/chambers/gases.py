@@ -9,6 +9,7 @@ import taichi as ti
 from diffsim_ti import runtime
 from diffsim_ti.mechanics.chambers.curved_gas_kernels import CurvedChamberKernels
 from diffsim_ti.mechanics.chambers.gas_kernels import ChamberKernels
+from diffsim_ti.mechanics.chambers.interaction import Gases
 from diffsim_ti.runtime import kernels_of
 
 PARTS = 64  # sums that a GPU's threads make side by side for each chamber
@@ -19,8 +20,8 @@ class Chambers:
 
     def __init__(self, workspace):
         self.ws, scene, a = weakref.proxy(workspace), workspace.scene, workspace.arrays
-        closed = [chamber.enclosure for chamber in a.chambers]
-        self.rows = [workspace.following.rows[scene.chambers.index(chamber)] for chamber in a.chambers]
+        gases = next(x for x in a.interactions if isinstance(x, Gases))
+        closed, self.rows = [chamber.enclosure for chamber in gases.terms], gases.rows
         counts = [len(enclosure.triangles) for enclosure in closed]
         own = [np.arange(len(e.triangles)) < e.num_own for e in closed]
         self.parts = 1 if runtime.runs_on_cpu() else PARTS
@@ -51,7 +52,7 @@ class Chambers:
         per_step = len(a.values.follower) > 1
         kernels = kernels_of(self.kernels, a.precision, per_step, self.parts, ws.parallel, shape)
         sizes = dict(num_triangles=len(self.triangles), num_sums=self.count * self.parts, slot=slot)
-        sizes |= dict(first=a.first_chamber_corner)
+        sizes |= dict(first=a.counts["first_gases"])
         launch = ws.bound(getattr(kernels, name), chambers=self.arrays, table=ws.table, **records)
         launch(**sizes, pass_=numbers["first"], window=numbers["window"])
 

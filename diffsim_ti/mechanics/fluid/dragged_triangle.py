@@ -11,35 +11,28 @@ from dataclasses import dataclass
 
 import taichi as ti
 
-from diffsim_ti.runtime import PRECISIONS
+from diffsim_ti.mechanics.interaction import ItemForce
+from diffsim_ti.runtime import traced
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
-DRAGGED = dict(dragged="ints", dragged_numbers="ints")  # corners of each, where its numbers stand in the parameters
 
 
 @dataclass(frozen=True)
-class DraggedTriangle:
+class DraggedTriangle(ItemForce):
     """Functions of one triangle in a pass; shape: of adjoints."""
 
-    precision: str
     shape: bool
+    name, reads_rates, reads_rest = "dragged", True, True
+    arrays = dict(dragged="ints", dragged_numbers="ints")  # corners of each, where its numbers stand in the parameters
+    adjoints = dict(dragged_felt="vectors", dragged_rest="vectors")
 
-    @property
-    def fp(self):
-        return PRECISIONS[self.precision]
-
-    @property
-    def vector(self):
-        return ti.types.vector(4, self.fp)
+    @traced
+    def sizes(self, plan) -> dict:
+        return dict(dragged_felt=2 * plan.num_dragged, dragged_rest=3 * plan.num_dragged)
 
     @ti.func
     def number(self, x: ti.template()):
         return ti.cast(x, self.fp)
-
-    @ti.func
-    def cross(self, a, b):
-        zero = ti.cast(0, self.fp)
-        return self.vector(a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0], zero)
 
     @ti.func
     def edges(self, t, x: A, rest: A, s, scene: A):
@@ -84,13 +77,13 @@ class DraggedTriangle:
             corner[first + 3 * t + a] = force
 
     @ti.func
-    def forces(self, t, scene: A, state: A, s, first):
+    def forces(self, t, now: A, scene: A, state: A, s, plan: A):
         rho, c, k = self.numbers(t, scene.parameters, scene)
         e, f, v, size, N, L, along, B = self.known(t, scene, state, s)
-        self.store(t, first, -rho * size * B, scene.corner)
+        self.store(t, self.first(plan), -rho * size * B, scene.corner)
 
     @ti.func
-    def forces_jvp(self, t, scene: A, state: A, s, tangent: A, first):
+    def forces_jvp(self, t, now: A, scene: A, state: A, s, tangent: A, plan: A):
         rho, c, k = self.numbers(t, scene.parameters, scene)
         drho, dc, dk = self.numbers(t, tangent.parameters, scene)
         e, f, v, size, N, L, along, B = self.known(t, scene, state, s)
@@ -101,10 +94,10 @@ class DraggedTriangle:
         dB = c * (dL * v + L * dv) + dc * L * v + dk * along * over * N
         dB += k * over * ((dalong - along * dL * over) * N + along * dN)
         change = rho * (dsize * B + size * dB) + drho * size * B
-        self.store(t, first, self.number(-1) * change, scene.corner)
+        self.store(t, self.first(plan), self.number(-1) * change, scene.corner)
 
     @ti.func
-    def forces_vjp(self, t, scene: A, state: A, s, adjoint: A, first):
+    def forces_vjp(self, t, now: A, scene: A, state: A, s, adjoint: A, plan: A):
         """Products of the transposed derivatives with adjoint.w, to corners; adds the adjoints of numbers to
         adjoint.dragged_felt and, if `shape`, those of places to adjoint.dragged_rest."""
         rho, c, k = self.numbers(t, scene.parameters, scene)
@@ -121,8 +114,8 @@ class DraggedTriangle:
         by_e, by_f = self.cross(f, by_N), self.cross(by_N, e)
         balance = self.number(-1) * (by_e + by_f)
         for a, by in ti.static(enumerate((balance, by_e, by_f))):
-            adjoint.corner[first + 3 * t + a] = by
-            adjoint.rate_corner[first + 3 * t + a] = by_v * self.number(1.0 / 3.0)
+            adjoint.corner[self.first(plan) + 3 * t + a] = by
+            adjoint.rate_corner[self.first(plan) + 3 * t + a] = by_v * self.number(1.0 / 3.0)
             if ti.static(self.shape):
                 adjoint.dragged_rest[3 * t + a] = adjoint.dragged_rest[3 * t + a] + by
         by_k, by_c = along * over * across, L * straight

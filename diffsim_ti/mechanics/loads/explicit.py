@@ -63,7 +63,7 @@ class GivenForces:
     def gathered(self, i, scene: A, plan: A, pulls: A):
         """What pressures do at vertex i, and what pulls, cables, of what it gathers: they are the last of its corners."""
         f, first, end = self.vector(0), plan.first_load, scene.start[i + 1]
-        if ti.static(self.features.cabled and not pulls):
+        if ti.static(self.features.pulled and not pulls):
             first = plan.first_push
         for back in range(1, end - scene.start[i] + 1):
             c = scene.corner_of[end - back]

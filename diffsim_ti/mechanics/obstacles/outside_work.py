@@ -16,7 +16,7 @@ A = ti.template()  # an array or Bundle handed to a Taichi function
 def add_work(step: A, i, done, state: A, plan: A):
     """To every account of vertex i [J]."""
     state.work[i] = state.work[i] + done
-    if ti.static(step.features.cabled):
+    if ti.static(step.features.pulled):
         own = plan.num_vertices + i
         state.work[own] = state.work[own] + done
 
@@ -33,7 +33,7 @@ def with_drag(step, now, scene):
 def add_work_of_pass(step: A, i, u, v, v_plus, f, u_next, v_next, now: A, scene: A, state: A, plan: A):
     """That of all but contact stages, to each account what is its own."""
     state.work[i] = state.work[i] + work_of_pass(step, i, u, v, v_plus, f, u_next, v_next, now, scene, plan, True)
-    if ti.static(step.features.cabled):
+    if ti.static(step.features.pulled):
         own = plan.num_vertices + i
         done = work_of_pass(step, i, u, v, v_plus, f, u_next, v_next, now, scene, plan, False)
         state.work[own] = state.work[own] + done

@@ -84,17 +84,18 @@ class PressedFace(PressedTriangle):
         return let(sum_of(felt))
 
     @ti.func
-    def forces(self, t, now: A, scene: A, state: A, s, first):
-        self.push(t, self.factor(t, now, scene.follower, scene), scene, state, s, first)
+    def forces(self, t, now: A, scene: A, state: A, s, plan: A):
+        self.push(t, self.factor(t, now, scene.follower, scene), scene, state, s, self.first(plan))
 
     @ti.func
-    def forces_jvp(self, t, now: A, scene: A, state: A, s, tangent: A, first):
+    def forces_jvp(self, t, now: A, scene: A, state: A, s, tangent: A, plan: A):
         p, dp = self.factor(t, now, scene.follower, scene), self.factor(t, now, tangent.follower, scene)
-        self.push_jvp(t, p, dp, scene, state, s, tangent, first)
+        self.push_jvp(t, p, dp, scene, state, s, tangent, self.first(plan))
 
     @ti.func
-    def forces_vjp(self, t, now: A, scene: A, state: A, s, adjoint: A, first):
-        felt = self.push_vjp(t, self.factor(t, now, scene.follower, scene), scene, state, s, adjoint, first)
+    def forces_vjp(self, t, now: A, scene: A, state: A, s, adjoint: A, plan: A):
+        p = self.factor(t, now, scene.follower, scene)
+        felt = self.push_vjp(t, p, scene, state, s, adjoint, self.first(plan))
         self.add_felt(t, now, ti.cast(-1.0 / 6.0, self.fp) * felt, adjoint)
 
 

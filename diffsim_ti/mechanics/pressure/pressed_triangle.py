@@ -8,18 +8,27 @@ from dataclasses import dataclass
 
 import taichi as ti
 
+from diffsim_ti.mechanics.interaction import ItemForce
 from diffsim_ti.mechanics.stress.step_numbers import StepNumbers
+from diffsim_ti.runtime import traced
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
-PRESSED = dict(pressed="ints", pressed_load="ints", follower="vectors2")  # vertices of each, number of the load, rows
 
 
 @dataclass(frozen=True)
-class PressedTriangle(StepNumbers):
+class PressedTriangle(StepNumbers, ItemForce):
     """Functions of one triangle in a pass; per_step: whether pressures have a row for each step; shape: of adjoints."""
 
     shape: bool
     nodes = 3
+    name, reads_rest, asks_for_steps = "pressed", True, True
+    arrays = dict(pressed="ints", pressed_load="ints", follower="vectors2")  # nodes of each, number of the load, rows
+    adjoints = dict(pressed_felt="vectors2", pressed_rest="vectors")
+
+    @traced
+    def sizes(self, plan) -> dict:
+        out = dict(follower=plan.num_follower, pressed_felt=plan.num_pressed)
+        return out | dict(pressed_rest=self.nodes * plan.num_pressed)
 
     @ti.func
     def edges(self, t, x: A, rest: A, s, scene: A):
@@ -42,19 +51,20 @@ class PressedTriangle(StepNumbers):
             corner[first + 3 * t + a] = force
 
     @ti.func
-    def forces(self, t, now: A, scene: A, state: A, s, first):
+    def forces(self, t, now: A, scene: A, state: A, s, plan: A):
         e, f = self.edges(t, state.u, scene.rest, s, scene)
-        self.store(t, first, self.factor(t, now, scene.follower, scene) * self.cross(e, f), scene.corner)
+        self.store(t, self.first(plan), self.factor(t, now, scene.follower, scene) * self.cross(e, f), scene.corner)
 
     @ti.func
-    def forces_jvp(self, t, now: A, scene: A, state: A, s, tangent: A, first):
+    def forces_jvp(self, t, now: A, scene: A, state: A, s, tangent: A, plan: A):
         e, f = self.edges(t, state.u, scene.rest, s, scene)
         de, df = self.edges(t, tangent.u, tangent.rest, 0, scene)
         p, dp = self.factor(t, now, scene.follower, scene), self.factor(t, now, tangent.follower, scene)
-        self.store(t, first, p * (self.cross(de, f) + self.cross(e, df)) + dp * self.cross(e, f), scene.corner)
+        change = p * (self.cross(de, f) + self.cross(e, df)) + dp * self.cross(e, f)
+        self.store(t, self.first(plan), change, scene.corner)
 
     @ti.func
-    def forces_vjp(self, t, now: A, scene: A, state: A, s, adjoint: A, first):
+    def forces_vjp(self, t, now: A, scene: A, state: A, s, adjoint: A, plan: A):
         """Products of the transposed derivative with adjoint.w, to corners; adds the adjoints of pressures to
         adjoint.pressed_felt and, if `shape`, those of places to adjoint.pressed_rest."""
         e, f = self.edges(t, state.u, scene.rest, s, scene)
@@ -65,7 +75,7 @@ class PressedTriangle(StepNumbers):
         by_e, by_f = p * self.cross(f, w), p * self.cross(w, e)
         balance = ti.cast(-1, self.fp) * (by_e + by_f)
         for a, by in ti.static(enumerate((balance, by_e, by_f))):
-            adjoint.corner[first + 3 * t + a] = by
+            adjoint.corner[self.first(plan) + 3 * t + a] = by
             if ti.static(self.shape):
                 adjoint.pressed_rest[3 * t + a] = adjoint.pressed_rest[3 * t + a] + by
         self.add_felt(t, now, ti.cast(-1.0 / 6.0, self.fp) * w.dot(self.cross(e, f)), adjoint)

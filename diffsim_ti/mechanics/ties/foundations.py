@@ -4,28 +4,26 @@ from dataclasses import dataclass
 
 import taichi as ti
 
-from diffsim_ti.runtime import PRECISIONS
+from diffsim_ti.mechanics.interaction import VertexwiseForce
+from diffsim_ti.runtime import traced
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
-FOUNDED = dict(foundation_slot="ints", foundation="vectors")  # place among those on one, or -1; three rows of K each
 
 
 @dataclass(frozen=True)
-class Foundations:
+class FoundationForce(VertexwiseForce):
     """Functions of one vertex i."""
 
-    precision: str
+    name = "foundation"
+    arrays = dict(foundation_slot="ints", foundation="vectors")  # place among those on one, or -1; three rows of K each
+    adjoints = dict(foundation_felt="vectors")
 
-    @property
-    def fp(self):
-        return PRECISIONS[self.precision]
-
-    @property
-    def vector(self):
-        return ti.types.vector(4, self.fp)
+    @traced
+    def sizes(self, plan) -> dict:
+        return dict(foundation=plan.num_foundation, foundation_felt=plan.num_foundation)
 
     @ti.func
-    def force(self, i, u, scene: A, stiffness: A):
+    def product(self, i, u, scene: A, stiffness: A):
         """-K u; stiffness: rows of K, or of its change. K is symmetric, so this is also the product with the transpose."""
         f, k = self.vector(0), scene.foundation_slot[i]
         if k >= 0:
@@ -34,9 +32,18 @@ class Foundations:
         return f
 
     @ti.func
-    def add_vjp(self, i, u, f_adj, scene: A, adjoint: A):
+    def force(self, i, u, v, now: A, scene: A):
+        return self.product(i, u, scene, scene.foundation)
+
+    @ti.func
+    def force_jvp(self, i, u, v, du, dv, now: A, scene: A, tangent: A):
+        return self.product(i, du, scene, scene.foundation) + self.product(i, u, scene, tangent.foundation)
+
+    @ti.func
+    def force_vjp(self, i, u, v, w, now: A, scene: A, adjoint: A):
         k = scene.foundation_slot[i]
         if k >= 0:
             for d in ti.static(range(3)):
                 row = adjoint.foundation_felt[3 * k + d]
-                adjoint.foundation_felt[3 * k + d] = row - f_adj[d] * u
+                adjoint.foundation_felt[3 * k + d] = row - w[d] * u
+        return self.product(i, w, scene, scene.foundation), self.vector(0)

@@ -13,9 +13,6 @@ import taichi as ti
 from diffsim_ti.mechanics.stress.step_numbers import StepNumbers
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
-TIED = dict.fromkeys(("tie_start", "point_start", "point_vertex", "tie_sides"), "ints") | dict(
-    point_weight="scalars", tie_segments="vectors", ties="vectors2"
-)
 
 
 @dataclass(frozen=True)

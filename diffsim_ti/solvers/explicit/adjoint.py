@@ -34,7 +34,7 @@ class ExplicitAdjoint:
         self.numbers = Adjoint(a, self.features, more=STEPS)
         self.u, self.v, self.w = (runtime.array(a.vector, 1, a.num_vertices) for _ in range(3))
         self.corner = runtime.array(a.vector, *a.corner.shape)  # products with the stiffness, still to be gathered
-        rates = "H_dot" in a.law.reads or self.features.dragged
+        rates = "H_dot" in a.law.reads or any(x.reads_rates for x in self.features.interactions)
         self.rate_corner = runtime.array(a.vector, *(a.corner.shape if rates else (1,)))
         whole = [runtime.array(a.vector, 1, a.num_vertices) for _ in range(1 + rates)]
         self.whole = SimpleNamespace(u=whole[0], v=whole[-1] if rates else self.v)  # with what is still to be gathered
@@ -45,19 +45,9 @@ class ExplicitAdjoint:
         self.path = runtime.array(a.vector, a.path.shape[0], moving * self.num_parts)
         self.frames = FrameArrays.of(a, *workspace.frames.frames_u.shape)
         self.z = a.law_states(1)  # of the state of the law
-        # of pressures by each triangle and of the places of its corners
-        self.pressed_felt = runtime.array(a.vector, a.follower.shape[0], max(a.num_pressed, 1))
-        self.pressed_rest = runtime.array(a.vector, a.pressed_nodes.size * self.features.shape)
-        # of numbers of a fluid by each triangle, two vectors, and of the places of its corners
-        self.dragged_felt = runtime.array(a.vector, 2 * a.num_dragged)
-        self.dragged_rest = runtime.array(a.vector, 3 * a.num_dragged * self.features.shape)
-        # of numbers of chambers, by steps, and of the places of their corners
-        corners = workspace.chambers.triangles.size if workspace.chambers else 0
-        self.chamber_felt = runtime.array(a.vector, a.follower.shape[0], 4 * len(a.chambers))
-        self.chamber_rest = runtime.array(a.vector, corners * self.features.shape)
-        # of springs, cables and foundations
-        self.tie_felt, self.tie_rest = (runtime.array(a.vector, *x.shape) for x in (a.ties, a.tie_segments))
-        self.foundation_felt = runtime.array(a.vector, *a.foundation.shape)
+        self._made_for = self._shapes(workspace)
+        self.of_interactions = {name: runtime.array(a.vector, *shape) for name, shape in self._made_for.items()}
+        vars(self).update(self.of_interactions)
         self.faces = FeltAdjoint(self, workspace.faces) if workspace.faces else None
         self.felt_by_bodies = a.bodies.adjoint() if a.bodies else {}
         vars(self).update(self.felt_by_bodies)
@@ -77,9 +67,15 @@ class ExplicitAdjoint:
         same = self.numbers.fits(a, a.features(self.features.density, self.features.shape))
         same = same and self.felt.shape[0] == max(1, 2 * self.features.moving * self._steps)
         same = same and self.path.shape[0] == a.path.shape[0]
-        same = same and self.pressed_felt.shape[0] == a.follower.shape[0]
-        same = same and self.tie_felt.shape == a.ties.shape
+        same = same and self._made_for == self._shapes(workspace)
         return same and self.frames.frames_u.shape == workspace.frames.frames_u.shape
+
+    def _shapes(self, workspace) -> dict[str, tuple[int, ...]]:
+        """Of the arrays of vectors that interactions add adjoints to."""
+        a, out = workspace.arrays, {}
+        for x in a.interactions:
+            out |= x.adjoints(a.values, self.features.shape)
+        return out
 
     def start(self, positions_adj: np.ndarray, velocities_adj: np.ndarray, last_frame_is_input: bool) -> None:
         """Set the adjoints of the frames, shape (frames, n, 3), and clear the rest.
@@ -103,12 +99,7 @@ class ExplicitAdjoint:
         has, out = self.features, [self.u, self.v, self.w]
         out += [self.z] if self.z is not None else []
         out += [self.felt, self.path] if has.moving else []
-        out += [self.pressed_felt, self.pressed_rest] if has.pressed else []
-        out += [self.chamber_felt, self.chamber_rest] if self.ws.chambers else []
-        out += [self.dragged_felt, self.dragged_rest] if has.dragged else []
-        out += [self.tie_felt, self.tie_rest] if has.tied else []
-        out += self.felt_by_bodies.values()
-        return out + ([self.foundation_felt] if has.founded else [])
+        return [*out, *self.of_interactions.values(), *self.felt_by_bodies.values()]
 
     def clear(self) -> None:
         """All adjoints zero, but those of the frames."""
@@ -278,20 +269,12 @@ class ExplicitAdjoint:
         if self.features.moving:
             path = runtime.fetch(self.path).astype(np.float64)
             out.path += path.reshape(len(path), self.features.moving, self.num_parts, 3).sum(2)
-        if self.features.pressed:
-            rest = rest + self._collect_pressures(out)
-        if self.features.dragged:
-            rest = rest + self._collect_fluids(out)
-        for name, felt in (
-            ("ties", self.tie_felt),
-            ("tie_segments", self.tie_rest),
-            ("foundation", self.foundation_felt),
-        ):
-            if getattr(out, name) is not None:
-                setattr(out, name, runtime.fetch(felt).astype(np.float64))
         if self.features.shape:
             rest = rest + runtime.fetch(self.frames.frames_u).astype(np.float64).sum(0)
         out.rest = rest + out.rest
+        found = {name: runtime.fetch(x).astype(np.float64) for name, x in self.of_interactions.items()}
+        for x in self.ws.arrays.interactions:
+            x.collect(found, out, self.features.shape)
         if self.felt_by_bodies:
             self.ws.arrays.bodies.collect(self.felt_by_bodies, out)
         if self.faces:
@@ -301,27 +284,3 @@ class ExplicitAdjoint:
         if self.ws.impulses:
             out.mass = out.mass + self.mass_adj
         return out
-
-    def _collect_fluids(self, out: Derived):
-        """Adds the adjoints of a fluid's numbers; returns those of the rest shape."""
-        a, rest = self.ws.arrays, np.zeros((self.ws.arrays.num_vertices, 3))
-        felt = runtime.fetch(self.dragged_felt).astype(np.float64).reshape(-1, 6)
-        np.add.at(out.parameters, a.dragged_first[:, None] + np.arange(6), felt)
-        if self.features.shape:
-            np.add.at(rest, a.dragged_nodes.ravel(), runtime.fetch(self.dragged_rest).astype(np.float64))
-        return rest
-
-    def _collect_pressures(self, out: Derived):
-        """Adds the adjoints of pressures; returns those of the rest shape."""
-        a, rest = self.ws.arrays, np.zeros((self.ws.arrays.num_vertices, 3))
-        if a.pressures:
-            np.add.at(out.follower, (slice(None), a.load_of), runtime.fetch(self.pressed_felt).astype(np.float64))
-        if a.pressures and self.features.shape:
-            np.add.at(rest, a.pressed_nodes.ravel(), runtime.fetch(self.pressed_rest).astype(np.float64))
-        if a.chambers:
-            rows = np.concatenate([np.arange(r.start, r.stop) for r in self.ws.chambers.rows])
-            out.follower[:, rows] += runtime.fetch(self.chamber_felt).astype(np.float64)
-        if a.chambers and self.features.shape:
-            corners = self.ws.chambers.triangles.ravel()
-            np.add.at(rest, corners, runtime.fetch(self.chamber_rest).astype(np.float64))
-        return rest

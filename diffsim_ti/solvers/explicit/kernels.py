@@ -9,7 +9,7 @@ from diffsim_ti.mechanics.obstacles.outside_work import with_drag
 from diffsim_ti.mechanics.reduced.body_adjoint import BodyStage
 from diffsim_ti.mechanics.stress.tetrahedron import Onwards
 from diffsim_ti.runtime import Bundle, Kernel, let, traced
-from diffsim_ti.solvers.explicit.further_elements import FurtherElements
+from diffsim_ti.solvers.explicit.item_forces import ItemForces
 from diffsim_ti.solvers.explicit.kick_drift import KickDrift
 from diffsim_ti.state.numbers import ADJOINT, OF_STEPS, SCENE, TANGENT, adjoints, needed, with_state
 from diffsim_ti.state.pass_table import pass_at, reversed_pass
@@ -44,8 +44,8 @@ class ExplicitKernels:
         return self.vertex.element
 
     @cached_property
-    def further(self) -> FurtherElements:
-        return FurtherElements(self.vertex.features, self.vertex.law.precision, blocks=True)
+    def items(self) -> ItemForces:
+        return ItemForces(self.vertex.features, blocks=True)
 
     @cached_property
     def bodies(self) -> BodyStage:
@@ -76,7 +76,7 @@ class ExplicitKernels:
     def is_short(self) -> bool:
         """Whether passes are of linear tetrahedra in lanes and little else: polished, these are a tenth faster."""
         has, short = self.vertex.features, self.vertex.law.short and self.vertex.lanes
-        return short and has.order == 1 and not (has.groups or has.reduced or self.further.any)
+        return short and has.order == 1 and not (has.groups or has.reduced or self.items.any)
 
     @traced
     def counted(self, now):
@@ -125,12 +125,12 @@ class ExplicitKernels:
 
     @ti.func
     def elements(self, e, j, scene: A, state: A, table: A, plan: A):
-        if ti.static(self.further.any):
+        if ti.static(self.items.any):
             if e < plan.num_items:
                 self.tetrahedra(e, j, scene, state, table, plan)
             else:
                 now, s = pass_at(table, j - plan.window), (j - plan.base) * plan.stride
-                self.further.forces(e - plan.num_items, now, scene, state, s, plan)
+                self.items.forces(e - plan.num_items, now, scene, state, s, plan)
         else:
             self.tetrahedra(e, j, scene, state, table, plan)
 
@@ -147,7 +147,7 @@ class ExplicitKernels:
     def passes(self, scene: A, state: A, table: A, plan: A):
         """Slot 0 holds the state before pass `base`; with stride 1 each pass writes the next slot, and its forces."""
         if ti.static(self.parallel):
-            num_items, num_vertices = self.further.after(plan), plan.num_vertices  # both bounds are read by one task
+            num_items, num_vertices = self.items.after(plan), plan.num_vertices  # both bounds are read by one task
             for e in range(num_items):
                 turn = self.turn_of_first(e, table)
                 if turn < plan.count:
@@ -164,7 +164,7 @@ class ExplicitKernels:
         else:
             ti.loop_config(serialize=True)
             for j in range(plan.first, plan.first + plan.count):
-                for e in range(self.further.after(plan)):
+                for e in range(self.items.after(plan)):
                     self.elements(e, j, scene, state, table, plan)
                 now = self.pass_on(j, scene, table, plan)
                 for i in range(plan.num_vertices):
@@ -182,12 +182,12 @@ class ExplicitKernels:
 
     @ti.func
     def elements_jvp(self, e, j, scene: A, state: A, tangent: A, table: A, plan: A):
-        if ti.static(self.further.any):
+        if ti.static(self.items.any):
             if e < plan.num_items:
                 self.tetrahedra_jvp(e, j, scene, state, tangent, table, plan)
             else:
                 now, s = pass_at(table, j - plan.window), j - plan.base
-                self.further.forces_jvp(e - plan.num_items, now, scene, state, s, tangent, plan)
+                self.items.forces_jvp(e - plan.num_items, now, scene, state, s, tangent, plan)
         else:
             self.tetrahedra_jvp(e, j, scene, state, tangent, table, plan)
 
@@ -203,7 +203,7 @@ class ExplicitKernels:
     @ti.func
     def passes_jvp(self, scene: A, state: A, tangent: A, table: A, plan: A):
         if ti.static(self.parallel):
-            num_items, num_vertices = self.further.after(plan), plan.num_vertices
+            num_items, num_vertices = self.items.after(plan), plan.num_vertices
             for e in range(num_items):
                 turn = self.turn_of_first(e, table)
                 if turn < plan.count:
@@ -220,7 +220,7 @@ class ExplicitKernels:
         else:
             ti.loop_config(serialize=True)
             for j in range(plan.first, plan.first + plan.count):
-                for e in range(self.further.after(plan)):
+                for e in range(self.items.after(plan)):
                     self.elements_jvp(e, j, scene, state, tangent, table, plan)
                 now = self.pass_of(j, table, plan)
                 for i in range(plan.num_vertices):
@@ -233,19 +233,19 @@ class ExplicitKernels:
     def step_jvp(self) -> Kernel:
         """The tangent of passes first .. first + count - 1 along recorded slots; the change of the state is advanced in
         place."""
-        own = dict(state=self.with_record(STATE), tangent=self.with_record(CHANGE) | TANGENT | self.further.tangent)
+        own = dict(state=self.with_record(STATE), tangent=self.with_record(CHANGE) | TANGENT | self.items.tangent)
         return self._kernel("step_jvp", self.passes_jvp, own, self.repeated, rate_dot="float")
 
     # ---- adjoint -----------------------------------------------------------------------------------------------------
 
     @ti.func
     def elements_vjp(self, e, j, scene: A, state: A, adjoint: A, table: A, plan: A):
-        if ti.static(self.further.any):
+        if ti.static(self.items.any):
             if e < plan.num_items:
                 self.tetrahedra_vjp(e, j, scene, state, adjoint, table, plan)
             else:
                 now, s = pass_at(table, j - plan.window), j - plan.base
-                self.further.forces_vjp(e - plan.num_items, now, scene, state, s, adjoint, plan)
+                self.items.forces_vjp(e - plan.num_items, now, scene, state, s, adjoint, plan)
         else:
             self.tetrahedra_vjp(e, j, scene, state, adjoint, table, plan)
 
@@ -271,7 +271,7 @@ class ExplicitKernels:
         """The gather of K w is left to the next call (or to `finish_vjp`), so that each pass has two loops, as forward."""
         moving = ti.static(self.vertex.features.moving)
         if ti.static(self.parallel):
-            num_items, num_vertices, parts = self.further.after(plan), plan.num_vertices, moving * plan.num_parts
+            num_items, num_vertices, parts = self.items.after(plan), plan.num_vertices, moving * plan.num_parts
             if ti.static(self.reduced):
                 for b in range(plan.num_bodies):
                     now = self.pass_back(plan.first, table, plan)
@@ -300,7 +300,7 @@ class ExplicitKernels:
                         self.bodies.step_vjp(b, j, now, scene, state, adjoint, plan)
                 for i in range(plan.num_vertices):
                     self.vertex.step_vjp(i, j, now, scene, state, adjoint, plan)
-                for e in range(self.further.after(plan)):
+                for e in range(self.items.after(plan)):
                     self.elements_vjp(e, j, scene, state, adjoint, table, plan)
                 if ti.static(moving > 0):
                     for p in range(moving * plan.num_parts):
@@ -315,7 +315,7 @@ class ExplicitKernels:
         """
         numbers = dict.fromkeys(("num_passes", "halt", "kick", "steps", "num_parts"), "int")
         own = adjoints(self.with_record(CHANGE) | ADJOINT | OF_STEPS, self.vertex.features) | self.corners
-        own |= dict(w="vectors2", felt="vectors2") | self.further.adjoint
+        own |= dict(w="vectors2", felt="vectors2") | self.items.adjoint
         arrays = dict(state=self.with_record(RECORDED), adjoint=own)
         return self._kernel("step_vjp", self.passes_vjp, arrays, self.repeated, **numbers)
 
@@ -335,9 +335,9 @@ class ExplicitKernels:
         return Kernel("finish_vjp", self.gather_rest, self.vertex.law.precision, own, dict(num_vertices="int"))
 
     def _kernel(self, name: str, body, arrays: dict, repeated: bool, **numbers) -> Kernel:
-        arrays = dict(scene=SCENE | self.further.arrays) | arrays | dict(table=PLAN)
+        arrays = dict(scene=SCENE | self.items.arrays) | arrays | dict(table=PLAN)
         arrays = {bundle: needed(own, self.vertex.features) for bundle, own in arrays.items()}
-        numbers = NUMBERS | self.further.counts | numbers
+        numbers = NUMBERS | self.items.counts | numbers
         if repeated:
             arrays["table"], numbers = PLAN | TURNS, numbers | dict(times="int")
         return Kernel(name, body, self.vertex.law.precision, arrays, numbers, 2 * repeated, self.is_short)

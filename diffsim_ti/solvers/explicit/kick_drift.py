@@ -80,8 +80,8 @@ class KickDrift(VertexParts):
                 f = self.obstacles.add_force(i, f, u, v, now, scene)
         if ti.static(self.features.forces):
             f += self.given.force(i, now, scene, scene.forces)
-        if ti.static(self.features.founded):
-            f += self.foundations.force(i, u, scene, scene.foundation)
+        for part in ti.static(self.features.at_vertices):
+            f += part.force(i, u, v, now, scene)
         if ti.static(self.features.reduced):
             if scene.body_of[i] < 0:
                 self.go_on(i, j, u, v, f, now, scene, state, plan)
@@ -148,9 +148,8 @@ class KickDrift(VertexParts):
                 df = self.obstacles.add_force_jvp(i, df, u, v, du, dv, now, scene, tangent)
         if ti.static(self.features.forces):
             df += self.given.force(i, now, scene, tangent.forces)
-        if ti.static(self.features.founded):
-            df += self.foundations.force(i, du, scene, scene.foundation)
-            df += self.foundations.force(i, u, scene, tangent.foundation)
+        for part in ti.static(self.features.at_vertices):
+            df += part.force_jvp(i, u, v, du, dv, now, scene, tangent)
         if ti.static(self.features.reduced):
             if scene.body_of[i] < 0:
                 self.go_on_jvp(i, j, df, now, scene, state, tangent, plan)
@@ -294,9 +293,10 @@ class KickDrift(VertexParts):
         """Back through the forces that are no element's; p and q: the adjoints of u and v so far."""
         if ti.static(self.features.forces):
             self.given.add_vjp(i, f_adj, now, scene, adjoint)
-        if ti.static(self.features.founded):
-            p += self.foundations.force(i, f_adj, scene, scene.foundation)
-            self.foundations.add_vjp(i, u, f_adj, scene, adjoint)
+        for part in ti.static(self.features.at_vertices):
+            by_u, by_v = part.force_vjp(i, u, v, f_adj, now, scene, adjoint)
+            p += by_u
+            q += by_v
         if ti.static(len(self.features.pressing) > 0):
             if scene.surface[i] > 0:
                 p, q = self.obstacles.add_force_vjp(i, p, q, u, v, f_adj, now, scene, adjoint)

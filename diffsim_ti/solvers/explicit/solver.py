@@ -25,7 +25,6 @@ from diffsim_ti.mechanics.workspace import Workspace
 from diffsim_ti.monitor.energy_balance import EnergyBalance
 from diffsim_ti.monitor.own_work import OwnWork
 from diffsim_ti.solvers.explicit.adjoint import ExplicitAdjoint
-from diffsim_ti.solvers.explicit.further_elements import counts_of_further
 from diffsim_ti.solvers.explicit.kernels import ExplicitKernels, explicit_kernels
 from diffsim_ti.solvers.explicit.tangent import ExplicitTangent
 from diffsim_ti.solvers.solver import Solver
@@ -148,13 +147,13 @@ class ExplicitWorkspace(Workspace):
         self.faces = FeltFaces(self) if a.feels_faces else None
         self.check_apart()
         self.following = following(self.scene)
-        self.chambers = Chambers(self) if a.chambers else None
+        self.chambers = Chambers(self) if self.scene.gases else None
         self.volumes = HeldVolumes(self) if self.scene.holds_volumes else None
         noted = ROWS * len(a.obstacles), a.num_vertices
         self.contact = SimpleNamespace(
             stage=runtime.array(a.vector, *(noted if features.staged else (1, 1))),
             # done on each vertex from outside [J] (outside_work.py)
-            work=runtime.array(a.fp, a.num_vertices * (1 + features.cabled) if features.driven else 1),
+            work=runtime.array(a.fp, a.num_vertices * (1 + features.pulled) if features.driven else 1),
             own_work=runtime.array(a.fp, a.num_vertices),
         )
         self.attached = Attached.of(self.scene)  # springs, cables and foundations, for what looks between passes
@@ -250,7 +249,7 @@ class ExplicitWorkspace(Workspace):
         if self.scene.fluids:
             v = runtime.fetch_row(self.state.v, 0)
             out += Fluid.of(self.scene).at(a.values.parameters, a.values.rest + u - v, 1.0).forces(a.values.rest + u)
-        if a.features().cabled and pulls:
+        if a.features().pulled and pulls:
             both = [[w * part for part in schedule.ties(a.rows["ties"], *k)] for w, k in kicks]
             numbers = (begin + end for begin, end in zip(*both))
             out += self.attached.ties.at(a.values.tie_segments, *numbers).forces(u, cables=True)
@@ -290,14 +289,14 @@ class ExplicitWorkspace(Workspace):
         """Numbers that all launches take."""
         a = self.arrays
         out = dict(num_items=a.num_items, num_vertices=a.num_vertices, num_bodies=len(self.scene.reduced.bodies))
-        return out | counts_of_further(a)
+        return out | a.counts
 
     def _rows(self) -> int:
         """How many rows what is given by steps has."""
         a = self.arrays
         num_rows = max((len(x) for x in (a.values.path, a.values.motion) if x is not None), default=1)
         # they ask in which step a pass lies
-        if num_rows == 1 and (a.features().pressed or a.paths or a.features().forces_keyed or a.features().growing):
+        if num_rows == 1 and a.features().asks_for_steps:
             given = a.values.forces, a.values.follower, a.values.ties, a.values.growths
             num_rows = max(1 + len(x) for x in given if x is not None)
         return num_rows

@@ -10,7 +10,6 @@ from diffsim_ti.mechanics.obstacles.contact_stage import ContactStage
 from diffsim_ti.mechanics.obstacles.obstacle_stages import ObstacleStages
 from diffsim_ti.mechanics.stress.patched_tetrahedron import functions_of
 from diffsim_ti.mechanics.supports.guides import Guides
-from diffsim_ti.mechanics.ties.foundations import Foundations
 from diffsim_ti.runtime import PRECISIONS
 from diffsim_ti.state.features import Features
 
@@ -38,7 +37,7 @@ class VertexParts:
     @property
     def reads_rates(self) -> bool:
         """Whether forces at corners are of velocities too."""
-        return self.element.reads_rates or self.features.dragged
+        return self.element.reads_rates or any(x.reads_rates for x in self.features.interactions)
 
     @property
     def counts_work(self) -> bool:
@@ -56,10 +55,6 @@ class VertexParts:
     @cached_property
     def given(self) -> GivenForces:
         return GivenForces(self.features, self.law.precision)
-
-    @cached_property
-    def foundations(self) -> Foundations:
-        return Foundations(self.law.precision)
 
     @cached_property
     def guides(self) -> Guides:

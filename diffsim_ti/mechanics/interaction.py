@@ -1,0 +1,173 @@
+"""What acts on a body beside its own stress and contact: each kind of force is said once, and all solvers read it here.
+
+An `Interaction` holds all terms of its kind in a scene: which vertices they act on, what kernels read of them, where
+adjoints go and how these come back to the scene's numbers. Its `kernel` is what kernels are compiled for, and equal ones
+share compiled kernels. Explicit steps, their tangents and adjoints, and batches loop over the interactions of a scene
+(mechanics/interactions.py lists the kinds), so that a new force is a new class here and nothing elsewhere.
+"""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+import taichi as ti
+
+from diffsim_ti.inputs import Derived
+from diffsim_ti.runtime import PRECISIONS, traced
+
+if TYPE_CHECKING:
+    from diffsim_ti.scene import Scene
+    from diffsim_ti.terms import Term
+
+A = ti.template()  # an array or Bundle handed to a Taichi function
+
+
+@dataclass(frozen=True)
+class ForceKernel:
+    """Taichi functions of one kind of force in a pass. Vectors have four components, the last zero.
+
+    arrays: {array of the scene that they read: kind}, as in `runtime.array_types`; adjoints: {array that they add to: kind}.
+    """
+
+    precision: str
+
+    name: ClassVar[str]  # of its counts
+    arrays: ClassVar[dict[str, str]] = {}
+    adjoints: ClassVar[dict[str, str]] = {}
+    is_load: ClassVar[bool] = True  # whether it does work on the body from outside
+    pulls: ClassVar[bool] = False  # whether this may be counted as energy of the body's own as well
+    reads_rates: ClassVar[bool] = False  # whether forces at corners are of velocities too
+    reads_rest: ClassVar[bool] = False
+    at_corners: ClassVar[bool] = True
+    asks_for_steps: ClassVar[bool] = False  # whether it reads numbers over time
+    apart: ClassVar[bool] = False  # whether launches of their own compute them before each pass
+
+    @property
+    def fp(self):
+        return PRECISIONS[self.precision]
+
+    @property
+    def vector(self):
+        return ti.types.vector(4, self.fp)
+
+    @ti.func
+    def cross(self, a, b):
+        zero = ti.cast(0, self.fp)
+        return self.vector(a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0], zero)
+
+
+@dataclass(frozen=True)
+class ItemForce(ForceKernel):
+    """Forces of items such as triangles or springs: item k writes to corners of its own, from corner `first` of the kind on,
+    and vertices gather these with the corners of tetrahedra. s: the slot of the state before the pass, whose numbers are
+    `now`. What one scene has another need not: `at` and `assign` alone may read and write arrays in functions for batches."""
+
+    @property
+    def counts(self) -> tuple[str, ...]:
+        """Names of the whole numbers that kernels take: how many items, and the first of their corners."""
+        return f"num_{self.name}", f"first_{self.name}"
+
+    @traced
+    def count(self, plan):
+        """How many items there are."""
+        return getattr(plan, f"num_{self.name}")
+
+    @traced
+    def first(self, plan):
+        return getattr(plan, f"first_{self.name}")
+
+    @traced
+    def sizes(self, plan) -> dict:
+        """{array of vectors of which each scene of a batch has its own: how many one of its rows has}"""
+        return {}
+
+    def alone(self) -> "ItemForce":
+        """For batches, in which items go one by one."""
+        return self
+
+    @ti.func
+    def forces(self, k, now: A, scene: A, state: A, s, plan: A):
+        """Writes forces [N] to scene.corner."""
+
+    @ti.func
+    def forces_jvp(self, k, now: A, scene: A, state: A, s, tangent: A, plan: A):
+        """Writes their change to scene.corner."""
+
+    @ti.func
+    def forces_vjp(self, k, now: A, scene: A, state: A, s, adjoint: A, plan: A):
+        """Writes products of the transposed derivatives with adjoint.w to adjoint.corner, of those by velocities to
+        adjoint.rate_corner, and adds the adjoints of numbers."""
+
+
+@dataclass(frozen=True)
+class VertexwiseForce(ForceKernel):
+    """Forces at each vertex i by its own displacement u and velocity v."""
+
+    is_load, at_corners = False, False
+
+    @traced
+    def sizes(self, plan) -> dict:
+        return {}
+
+    @ti.func
+    def force(self, i, u, v, now: A, scene: A):
+        """[N]"""
+
+    @ti.func
+    def force_jvp(self, i, u, v, du, dv, now: A, scene: A, tangent: A):
+        """Its change."""
+
+    @ti.func
+    def force_vjp(self, i, u, v, w, now: A, scene: A, adjoint: A):
+        """(adjoint of u, adjoint of v) for the adjoint w of the force; adds the adjoints of numbers."""
+
+
+class Interaction:
+    """All terms of one kind in a scene.
+
+    vertices: the vertex of each corner that its items write, shape (corners,); none where it acts vertex by vertex.
+    first_load: its corners are loads from here on. count: number of items.
+    topology: {array on the device: whole numbers or floats}, what kernels read that no input changes.
+    """
+
+    name: ClassVar[str]  # of its counts in kernels: num_<name> items, whose corners begin at first_<name>
+    kinds: ClassVar[tuple[type, ...]] = ()  # classes of its terms
+    vertices: np.ndarray = np.zeros(0, np.int64)
+    first_load = count = 0
+    pulls = False  # whether its loads may be counted as energy of the body's own as well
+
+    def __init__(self, scene: "Scene", terms: "tuple[Term, ...]"):
+        self.scene, self.mesh, self.terms = scene, scene.mesh, terms
+
+    acts_at: "np.ndarray | slice" = slice(None)  # vertices, of what acts vertex by vertex
+
+    @property
+    def topology(self) -> dict[str, np.ndarray]:
+        return {}
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """More whole numbers that kernels take."""
+        return {}
+
+    @classmethod
+    def takes(cls, term: "Term") -> bool:
+        """Whether a term is of the kind."""
+        return isinstance(term, cls.kinds) or term.interaction is cls
+
+    def kernel(self, values: Derived, precision: str, shape: bool) -> ForceKernel:
+        """What kernels are compiled for, at the values of a run; shape: whether adjoints of the rest shape are wanted."""
+        raise NotImplementedError
+
+    def adjoints(self, values: Derived, shape: bool) -> dict[str, tuple[int, ...]]:
+        """{array of vectors that adjoints are added to: its shape}"""
+        return {}
+
+    def collect(self, found: dict[str, np.ndarray], out: Derived, shape: bool) -> None:
+        """Add to `out` what these arrays hold, vectors of three numbers in float64; in batches all have one axis of scenes
+        in front."""
+
+
+def add_at(target: np.ndarray, places: np.ndarray, rows: np.ndarray) -> None:
+    """target[..., places, :] += rows, of places that may repeat."""
+    np.add.at(target, (..., places, slice(None)), rows)

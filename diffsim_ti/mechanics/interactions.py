@@ -1,0 +1,20 @@
+"""The kinds of interactions: a new one is a class in a folder of its own, and a name here."""
+
+from diffsim_ti.mechanics.chambers.interaction import Gases
+from diffsim_ti.mechanics.fluid.interaction import FluidDrag
+from diffsim_ti.mechanics.interaction import Interaction
+from diffsim_ti.mechanics.pressure.interaction import Pressures
+from diffsim_ti.mechanics.ties.interaction import Foundations, SpringsAndCables
+
+# in the order in which vertices gather their corners: what is no load comes first
+KINDS: tuple[type[Interaction], ...] = SpringsAndCables, Pressures, Gases, FluidDrag, Foundations
+
+
+def interactions_of(scene) -> tuple[Interaction, ...]:
+    """Those of a scene's terms; terms of users bring their own (`Term.interaction`)."""
+    kinds = dict.fromkeys((*KINDS, *(t.interaction for t in scene.ordered_terms if t.interaction is not None)))
+    found = []
+    for kind in kinds:
+        terms = tuple(t for t in scene.ordered_terms if kind.takes(t))
+        found += [kind(scene, terms)] if terms else []
+    return tuple(found)

@@ -1,0 +1,49 @@
+"""Pressures that follow the surface, among a scene's interactions."""
+
+from functools import cached_property
+
+import numpy as np
+
+from diffsim_ti.inputs import Derived
+from diffsim_ti.mechanics.interaction import Interaction, add_at
+from diffsim_ti.mechanics.pressure.pressed_face import pressed_element
+from diffsim_ti.terms import Pressure
+
+
+class Pressures(Interaction):
+    """Each face that a pressure acts on is an item."""
+
+    name, kinds = "pressed", (Pressure,)
+
+    @cached_property
+    def faces(self) -> np.ndarray:
+        """Shape (k, 3) or (k, 6)."""
+        return np.concatenate([term.faces(self.mesh) for term in self.terms])
+
+    @cached_property
+    def load_of(self) -> np.ndarray:
+        """The term of each."""
+        return np.repeat(np.arange(len(self.terms)), [len(term.faces(self.mesh)) for term in self.terms])
+
+    @property
+    def vertices(self) -> np.ndarray:
+        return self.faces.ravel()
+
+    @property
+    def count(self) -> int:
+        return len(self.faces)
+
+    @property
+    def topology(self):
+        return dict(pressed=self.faces.ravel(), pressed_load=self.load_of)
+
+    def kernel(self, values: Derived, precision: str, shape: bool):
+        return pressed_element(self.mesh.order, precision, len(values.follower) > 1, shape)
+
+    def adjoints(self, values, shape):
+        return dict(pressed_felt=(len(values.follower), self.count), pressed_rest=(self.faces.size * shape,))
+
+    def collect(self, found, out, shape):
+        add_at(out.follower, self.load_of, found["pressed_felt"])
+        if shape:
+            add_at(out.rest, self.vertices, found["pressed_rest"])
