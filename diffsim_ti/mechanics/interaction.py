@@ -60,7 +60,7 @@ class ForceKernel:
 class ItemForce(ForceKernel):
     """Forces of items such as triangles or springs: item k writes to corners of its own, from corner `first` of the kind on,
     and vertices gather these with the corners of tetrahedra. s: the slot of the state before the pass, whose numbers are
-    `now`. What one scene has another need not: `at` and `assign` alone may read and write arrays in functions for batches."""
+    `now`."""
 
     @property
     def counts(self) -> tuple[str, ...]:
