@@ -9,8 +9,8 @@ from test_gradients import random_mesh
 from test_term_order import SOLVERS
 
 import diffsim_ti as ds
-from diffsim_ti.solvers.explicit.further_elements import FurtherElements
-from diffsim_ti.solvers.explicit.kernels import explicit_kernels
+from diffsim_ti.solvers.explicit.item_forces import ItemForces
+from diffsim_ti.solvers.explicit.kernels import ExplicitKernels, explicit_kernels
 
 STEPS = 3
 
@@ -67,7 +67,8 @@ def test_eight_fibres_at_once_are_eight_fibres(kind, order, precision, monkeypat
     for blocks in (True, False):
         with monkeypatch.context() as patch:
             if not blocks:
-                patch.setattr(FurtherElements, "in_eights", property(lambda self: False))
+                one_by_one = property(lambda self: ItemForces(self.vertex.features))
+                patch.setattr(ExplicitKernels, "items", one_by_one)
                 explicit_kernels.cache_clear()
             for names in (None, "all"):
                 rollout = rollout_of(kind, beside + muscles(mesh), order, precision=precision, gradients=names)
