@@ -1,5 +1,6 @@
 """A configuration: a structure with numbers, drawn from one seed."""
 
+import re
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -183,7 +184,7 @@ def build(seed: int, precision: str | None = None, calm: float = 1.0) -> Configu
 
 def _fixed(kind, rng, mesh):
     """Vertices to hold; for statics three of every piece."""
-    pieces = [mesh.vertex_sets[name] for name in mesh.vertex_sets if name.startswith("body_")] or [
+    pieces = [mesh.vertex_sets[name] for name in mesh.vertex_sets if re.fullmatch(r"body_\d+", name)] or [
         np.arange(mesh.num_vertices)
     ]
     if kind.static:
