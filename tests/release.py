@@ -37,7 +37,7 @@ def tracked() -> list[str]:
 
 def released(files: list[str]) -> set[str]:
     """Those that the source archive holds."""
-    return {name for name in files if not name.startswith(".ci/") and name not in NOT_RELEASED}
+    return {name for name in files if not name.startswith((".ci/", ".github/")) and name not in NOT_RELEASED}
 
 
 def with_links(readme: str, url: str, version: str) -> str:

@@ -170,3 +170,12 @@ def test_every_test_file_is_in_an_area():
     assert files == set(areas.AREA_OF), "name each test file once in tests/areas.py"
     blank = re.sub(r"[\d.]+ \|$", " |", PAGES["tests/README.md"], flags=re.M)
     assert areas.table({}) in blank, "run the suite with --minutes"
+
+
+@pytest.mark.parametrize("page", ["diffsim_ti/README.md", "CONTRIBUTING.md"])
+def test_pages_for_whoever_carries_it_on_name_what_is_there(page):
+    text = (ROOT / page).read_text()
+    assert len(text.splitlines()) <= 150
+    for name in re.findall(r"`([\w/]+(?:/|\.py|\.md))`", text) + re.findall(r"\]\((?!https)([^)#]+)", text):
+        places = ROOT, (ROOT / page).parent, ROOT / "diffsim_ti", ROOT / "tests", *(ROOT / "diffsim_ti").rglob("*/")
+        assert any((place / name).exists() for place in places), name
