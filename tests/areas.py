@@ -34,11 +34,12 @@ AREAS = {
 }
 # files of a minute or so, the longest first: in several processes they come before all others
 LONGEST = (
-    "gradient_fuzz optimization torch_examples face_friction quadratic_outputs term_order every_adjoint "
+    "curved_contact gradient_fuzz contact_force far_from_origin optimization torch_examples face_friction quadratic_outputs "
+    "term_order every_adjoint "
     "loads_together static_examples contact_examples examples implicit_contact swept hertz implicit "
     "contact_gradients contact_stage contact_faces outputs locking chambers springs quadratic_solvers torch_physics "
     "quadratic_loads self_contact_implicit contact_rollers unequal_steps open_laws laws_with_state quadratic "
-    "contact_area seed_snippets quadratic_answers curved_contact"
+    "contact_area seed_snippets quadratic_answers"
 ).split()
 # files that start Taichi anew, the longest first: whatever comes after them compiles again what others have compiled
 LAST = "identify_experiments cli study_stability hard_use strength sweep exchange types marks identify".split()

@@ -5,6 +5,18 @@ Of a product of parameters a mark would leave out a whole row or column. Ids are
 
 # what proves the same -> tests
 LEFT_OUT = {
+    "the same in f64, and its other solvers and places": """
+        test_contact_faces::test_the_adjoint_is_the_transpose_of_the_tangent[thin box-SemiImplicitSolver-f32-options3]
+        test_curved_contact::test_the_adjoint_is_the_transpose_of_the_tangent[VelocityVerletSolver-capsule-options1-f32]
+        test_face_friction::test_the_adjoint_of_the_stage_is_the_transpose_of_its_tangent[moving-SemiImplicitSolver-f32-options1]
+        test_far_from_origin::test_it_does_not_matter_where_a_scene_is[ImplicitEulerSolver-far]
+        test_cli::test_a_fall_of_the_battery[bdf2]
+        test_quadratic::test_explicit_adjoints_are_the_transposes_of_tangents[tetrahedra-SemiImplicitSolver]
+        test_quadratic::test_explicit_adjoints_are_the_transposes_of_tangents[patches-VelocityVerletSolver]
+        test_reduced_explicit::test_tangent_and_adjoint_agree[rigid-SemiImplicitSolver-f32-1e-05]
+        test_reduced_explicit::test_tangent_and_adjoint_agree[affine-SemiImplicitSolver-f32-1e-05]
+        test_reduced_explicit::test_tangent_and_adjoint_agree[affine-VelocityVerletSolver-f32-1e-05]
+    """,
     "mesh, sphere; transposes of all shapes in `test_contact_stage.py`": """
         test_contact_gradients::test_every_input[cylinder]
         test_contact_gradients::test_every_input[capsule]
