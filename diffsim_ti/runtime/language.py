@@ -6,6 +6,8 @@ from taichi.lang import impl
 from taichi.lang.expr import Expr  # noqa: F401  what a number of a kernel is
 from taichi.types import vector
 
+made = {"variables": 0}  # in all of this process: what decides how long kernels take to compile (tracer.py counts)
+
 
 def traced(function):
     """Mark a plain Python function that kernels may call: it runs while the kernel is compiled and builds its code."""

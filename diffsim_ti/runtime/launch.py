@@ -11,9 +11,9 @@ from taichi.lang import impl
 from taichi.types import primitive_types
 
 from diffsim_ti.common import ranks
-from diffsim_ti.runtime import tracer
 from diffsim_ti.runtime.argument_buffer import ArgumentBuffer
 from diffsim_ti.runtime.arrays import check_owner, full_shape
+from diffsim_ti.runtime.language import made
 from diffsim_ti.runtime.quadrants import QUADRANTS
 from diffsim_ti.runtime.repeated_loops import RepeatedLoops
 from diffsim_ti.runtime.start import arch_name, check_alive, program
@@ -48,9 +48,9 @@ class Launch:
         config, kernel = prog.config(), self._kernel
         with _settings(config, **self._options):
             materialize()
-            before = tracer.made["variables"]
+            before = made["variables"]
             compiled = kernel.compiled_kernels[kernel.ensure_compiled(*self._arrays, *numbers)]
-            self.variables = tracer.made["variables"] - before  # that were traced here
+            self.variables = made["variables"] - before  # that were traced here
             self._code = self._compile(prog, config, compiled)
         if self._loops:
             self._repeated = RepeatedLoops(self._code, self._owner, self._loops)

@@ -19,6 +19,8 @@ from taichi.lang.expr import Expr
 from taichi.lang.matrix_ops import matmul
 from taichi.types import primitive_types
 
+from diffsim_ti.runtime.language import made
+
 _any_node, _any_expr, _any_binary = Builder.__call__, Expr.__init__, ops._binary_operation
 _any_subscript, _any_variable, _any_builtin = impl.subscript, impl.expr_init, ASTTransformer.build_call_if_is_builtin
 _PLAIN, _INTEGERS = (int, float), range(-(2**31), 2**31)
@@ -43,7 +45,6 @@ _DECORATORS = {
     id(impl.grouped): "grouped",
     id(ast_transformer.ndrange): "ndrange",
 }
-made = {"variables": 0}  # in all of this process: what decides how long kernels take to compile
 _record_of = lru_cache(maxsize=None)(core.DebugInfo)  # of a place in a file
 
 
