@@ -150,11 +150,6 @@ class Interaction:
         """More whole numbers that kernels take."""
         return {}
 
-    @classmethod
-    def takes(cls, term: "Term") -> bool:
-        """Whether a term is of the kind."""
-        return isinstance(term, cls.kinds) or term.interaction is cls
-
     def kernel(self, values: Derived, precision: str, shape: bool) -> ForceKernel:
         """What kernels are compiled for, at the values of a run; shape: whether adjoints of the rest shape are wanted."""
         raise NotImplementedError

@@ -11,10 +11,6 @@ KINDS: tuple[type[Interaction], ...] = SpringsAndCables, Pressures, Gases, Fluid
 
 
 def interactions_of(scene) -> tuple[Interaction, ...]:
-    """Those of a scene's terms; terms of users bring their own (`Term.interaction`)."""
-    kinds = dict.fromkeys((*KINDS, *(t.interaction for t in scene.ordered_terms if t.interaction is not None)))
-    found = []
-    for kind in kinds:
-        terms = tuple(t for t in scene.ordered_terms if kind.takes(t))
-        found += [kind(scene, terms)] if terms else []
-    return tuple(found)
+    """Those of a scene's terms."""
+    of_kinds = [(kind, tuple(t for t in scene.ordered_terms if isinstance(t, kind.kinds))) for kind in KINDS]
+    return tuple(kind(scene, terms) for kind, terms in of_kinds if terms)
