@@ -27,7 +27,7 @@ class Chatter:
 
     @classmethod
     def of(cls, workspace) -> "Chatter | None":
-        """For explicit steps and obstacles that rub."""
+        """For explicit steps and obstacles with friction."""
         rough = any(term.has_friction for term in workspace.watch.contacts)
         return cls(workspace) if workspace.solver.explicit and rough and not workspace.scene.reduced else None
 
