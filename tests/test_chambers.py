@@ -10,6 +10,7 @@ import diffsim_ti as ds
 from diffsim_ti.mechanics.chambers.multipliers import HeldVolumes
 from diffsim_ti.mechanics.chambers.pressures import ChamberPressure
 from diffsim_ti.monitor.stability import Stiffness
+from diffsim_ti.terms import Chamber
 
 STEPS = 2
 PLANES = dict(x0="x", y0="y", z0="z")
@@ -45,7 +46,7 @@ def solver_of(kind, of: ds.Scene):
 
 
 def rollout_of(kind, of: ds.Scene, steps=STEPS, **options) -> ds.Rollout:
-    outputs = [ds.ChamberPressure(term, name=f"p_{k}") for k, term in enumerate(of.chambers)]
+    outputs = [ds.ChamberPressure(term, name=f"p_{k}") for k, term in enumerate(of.terms_of(Chamber))]
     return ds.Rollout(solver_of(kind, of), steps, **dict(save_every=1, outputs=outputs, gradients="all") | options)
 
 

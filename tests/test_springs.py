@@ -11,6 +11,7 @@ from test_term_order import SOLVERS
 import diffsim_ti as ds
 from diffsim_ti.diff_simulator import rollout_frames
 from diffsim_ti.mechanics.ties.attached import Attached
+from diffsim_ti.mechanics.ties.interaction import SpringsAndCables
 from diffsim_ti.state.schedule import EqualSteps
 
 STEPS = 4
@@ -100,7 +101,7 @@ def test_a_run_again_has_the_same_bits(kind):
     turned = mesh.tetrahedra[:, [2, 0, 1, 3]]
     mesh = ds.TetrahedralMesh(mesh.vertices, turned, vertex_sets=mesh.vertex_sets).with_surface_set("lid", upper)
     rollout = rollout_of(kind, attached(mesh), mesh=mesh)
-    assert rollout.scene.tie_paths.matrix(mesh.num_vertices).has_canonical_format
+    assert rollout.scene.interaction(SpringsAndCables).paths.matrix(mesh.num_vertices).has_canonical_format
     first, seed = rollout.forward(), np.random.default_rng(5)
     seed = seed.normal(size=first.positions.shape)
     gradients = rollout.vjp(first, seed)

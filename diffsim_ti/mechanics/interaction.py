@@ -1,9 +1,10 @@
 """What acts on a body beside its own stress and contact: each kind of force is said once, and all solvers read it here.
 
-An `Interaction` holds all terms of its kind in a scene: which vertices they act on, what kernels read of them, where
-adjoints go and how these come back to the scene's numbers. Its `kernel` is what kernels are compiled for, and equal ones
-share compiled kernels. Explicit steps, their tangents and adjoints, and batches loop over the interactions of a scene
-(mechanics/interactions.py lists the kinds), so that a new force is a new class here and nothing elsewhere.
+An `Interaction` holds all terms of its kind in a scene: how their inputs become numbers that kernels read, which vertices
+they act on, where adjoints go and how these come back to the scene's numbers. Its `kernel` is what kernels are compiled
+for, and equal ones share compiled kernels. Inputs, explicit steps, their tangents and adjoints, batches, bounds of the
+stable step and what else asks for forces loop over the interactions of a scene (mechanics/interactions.py lists the kinds),
+so that a new force is a new class here and nothing elsewhere.
 """
 
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 import taichi as ti
 
-from diffsim_ti.inputs import Derived
+from diffsim_ti.inputs import Derived, Link
 from diffsim_ti.runtime import PRECISIONS, traced
 
 if TYPE_CHECKING:
@@ -26,13 +27,15 @@ A = ti.template()  # an array or Bundle handed to a Taichi function
 class ForceKernel:
     """Taichi functions of one kind of force in a pass. Vectors have four components, the last zero.
 
-    arrays: {array of the scene that they read: kind}, as in `runtime.array_types`; adjoints: {array that they add to: kind}.
+    arrays: {array of the scene that they read: kind}, as in `runtime.array_types`, without numbers that inputs change;
+    derived: the same of these, arrays of `Derived`; adjoints: {array that they add to: kind}.
     """
 
     precision: str
 
     name: ClassVar[str]  # of its counts
     arrays: ClassVar[dict[str, str]] = {}
+    derived: ClassVar[dict[str, str]] = {}
     adjoints: ClassVar[dict[str, str]] = {}
     is_load: ClassVar[bool] = True  # whether it does work on the body from outside
     pulls: ClassVar[bool] = False  # whether this may be counted as energy of the body's own as well
@@ -49,6 +52,12 @@ class ForceKernel:
     @property
     def vector(self):
         return ti.types.vector(4, self.fp)
+
+    @traced
+    def sizes(self, plan) -> dict:
+        """{array of vectors of which each scene of a batch has its own: how many one of its rows has}; kernels of batches
+        know the length of a row of each of `derived` as len_<name>."""
+        return {name: getattr(plan, f"len_{name}") for name in self.derived}
 
     @ti.func
     def cross(self, a, b):
@@ -76,11 +85,6 @@ class ItemForce(ForceKernel):
     def first(self, plan):
         return getattr(plan, f"first_{self.name}")
 
-    @traced
-    def sizes(self, plan) -> dict:
-        """{array of vectors of which each scene of a batch has its own: how many one of its rows has}"""
-        return {}
-
     def alone(self) -> "ItemForce":
         """For batches, in which items go one by one."""
         return self
@@ -105,10 +109,6 @@ class VertexwiseForce(ForceKernel):
 
     is_load, at_corners = False, False
 
-    @traced
-    def sizes(self, plan) -> dict:
-        return {}
-
     @ti.func
     def force(self, i, u, v, now: A, scene: A):
         """[N]"""
@@ -128,10 +128,16 @@ class Interaction:
     vertices: the vertex of each corner that its items write, shape (corners,); none where it acts vertex by vertex.
     first_load: its corners are loads from here on. count: number of items.
     topology: {array on the device: whole numbers or floats}, what kernels read that no input changes.
+    What a kind does not say it does not have: no numbers of its own, no kernel, no bound, nothing that it holds.
     """
 
     name: ClassVar[str]  # of its counts in kernels: num_<name> items, whose corners begin at first_<name>
     kinds: ClassVar[tuple[type, ...]] = ()  # classes of its terms
+    derived: ClassVar[dict[str, str]] = {}  # {array of `Derived`: kind}: "vectors2", rows of steps, or "vectors"
+    works: str = ""  # in words, by what it may do work on the body, or take energy from it
+    is_load = True  # whether it is a load that is given, maybe over time
+    reads_rates: ClassVar[bool] = False  # whether it reads velocities
+    apart: ClassVar[bool] = False  # whether launches of their own, before or after each pass, compute it
     vertices: np.ndarray = np.zeros(0, np.int64)
     first_load = count = 0
     pulls = False  # whether its loads may be counted as energy of the body's own as well
@@ -150,9 +156,26 @@ class Interaction:
         """More whole numbers that kernels take."""
         return {}
 
-    def kernel(self, values: Derived, precision: str, shape: bool) -> ForceKernel:
+    def links_of(self, term: "Term", names: dict[str, str], own: str, consistent: bool) -> list[Link]:
+        """Those of one of its terms, as `Term.links`; consistent: whether masses are."""
+        return term.links(names, own)
+
+    def links(self, own: "dict[Term, str]") -> list[Link]:
+        """What joins the numbers of its terms to the arrays of `derived`; own: {term: beginning of the names of its own}."""
+        return []
+
+    @property
+    def makes_rows(self) -> bool:
+        """Whether a run of one step asks its links for the rows of that step."""
+        return self.is_load and "vectors2" in self.derived.values()
+
+    def features(self, values: Derived, in_steps: bool) -> dict[str, bool]:
+        """Fields of `Features`, where kernels have something else of it than `kernel`; in_steps: of implicit ones."""
+        return {}
+
+    def kernel(self, values: Derived, precision: str, shape: bool) -> ForceKernel | None:
         """What kernels are compiled for, at the values of a run; shape: whether adjoints of the rest shape are wanted."""
-        raise NotImplementedError
+        return None
 
     def adjoints(self, values: Derived, shape: bool) -> dict[str, tuple[int, ...]]:
         """{array of vectors that adjoints are added to: its shape}"""
@@ -161,6 +184,20 @@ class Interaction:
     def collect(self, found: dict[str, np.ndarray], out: Derived, shape: bool) -> None:
         """Add to `out` what these arrays hold, vectors of three numbers in float64; in batches all have one axis of scenes
         in front."""
+
+    # ---- bounds ------------------------------------------------------------------------------------------------------
+
+    stiff_over_time: "tuple[Term, ...]" = ()  # terms whose stiffness may change over time
+    least: ClassVar[tuple[str, ...]] = ()  # plain names of their inputs that are stiffest where they are least
+
+    def added_omega2(self, values: dict[str, np.ndarray], derived: Derived) -> "np.ndarray | float":
+        """What it adds to the body's largest omega^2 [1/s^2] at most, at the stiffest `values` and what is derived of them:
+        a number, or of each vertex the sum of its row of |M^-1 K|, of which the largest counts."""
+        return 0.0
+
+    def resists(self, derived: Derived) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(row, vertex, force) of entries: forces with which it meets motions of the body at rest, each row by itself."""
+        return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3))
 
 
 def add_at(target: np.ndarray, places: np.ndarray, rows: np.ndarray) -> None:

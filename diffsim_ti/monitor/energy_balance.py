@@ -63,7 +63,7 @@ class EnergyBalance:
         """Forget what was seen."""
         self.window: Window | None = None
         self.steady, self._rows = True, None  # whether cables pull as they did at first, and with what (their rows)
-        self._soon = self.first if self.ws.scene.cables else np.inf
+        self._soon = self.first if self.ws.arrays.features().pulled else np.inf
         self.gained, self.moving = 0.0, 0.0  # [J]
         self._risen, self._lowest = 0.0, 0.0  # the level against that of the first look
 
@@ -86,7 +86,7 @@ class EnergyBalance:
 
     def _pulls_stay(self) -> bool:
         """Whether cables pull with what they pulled with at first: once that changes they are loads, until `clear`."""
-        rows = self.ws.arrays.rows["ties"] if self.ws.scene.cables else None
+        rows = self.ws.arrays.rows["ties"] if self.ws.arrays.features().pulled else None
         if not self.steady or rows is None or rows is self._rows:
             return True
         ends = rows.reshape(len(rows), -1, 2, 3)[

@@ -38,7 +38,8 @@ class ChamberPressure(Output):
 
     def settled(self, scene: "Scene") -> "ChamberPressure":
         out = copy(self)
-        out.place, out.inputs, out.pressures = scene.place_of_chamber(self.chamber), scene.inputs, Pressures(scene)
+        out.place = scene.place_among(scene.terms_of(Chamber), self.chamber, "chamber")
+        out.inputs, out.pressures = scene.inputs, Pressures(scene)
         out.law, out.rows = out.pressures.laws[out.place], out.pressures.rows[out.place]
         out.enclosure = out.pressures.enclosures[out.place]
         return out

@@ -4,6 +4,7 @@ import numpy as np
 
 from diffsim_ti.inputs import Derived
 from diffsim_ti.mechanics.chambers.pressures import following
+from diffsim_ti.mechanics.loads.interaction import DeadLoads
 from diffsim_ti.mechanics.ties.attached import Attached
 from diffsim_ti.state.schedule import EqualSteps, Schedule
 from diffsim_ti.terms import Gravity
@@ -24,11 +25,16 @@ class GivenLoads:
     """
 
     def __init__(self, scene, weight: bool = True):
-        self.scene, self.follower, self.elements = scene, following(scene), scene.mesh.elements
+        self.follower, self.elements = following(scene), scene.mesh.elements
         gravity = scene.term(Gravity) if weight else None
         self.gravity = None if gravity is None else scene.inputs.parameters.of(gravity)
-        self.loaded, self.keyed = scene.loaded_vertices if scene.dead_loads else None, scene.inputs.keyed_forces
+        self.dead = scene.interaction(DeadLoads)
         self.attached = Attached.of(scene)
+
+    @property
+    def any(self) -> bool:
+        """Whether there is one."""
+        return any(x is not None for x in (self.gravity, self.dead, self.follower, self.attached))
 
     @staticmethod
     def _row(step: int, rows: np.ndarray) -> np.ndarray:
@@ -37,7 +43,7 @@ class GivenLoads:
     def _dead(self, step: int, rows: np.ndarray, begins: bool) -> np.ndarray:
         """Of rows of loads, or of their adjoints, those that a frame shows (inputs/loads.py), as a view."""
         row = self._row(step, rows)
-        return row[1 if step and not begins else 0 :: 2] if self.keyed else row
+        return row[1 if step and not begins else 0 :: 2] if self.dead.keyed else row
 
     def _pressures(self, step: int, rows: np.ndarray, begins: bool) -> np.ndarray:
         return self._row(step, rows)[:, 1 if step and not begins else 0]
@@ -64,7 +70,7 @@ class GivenLoads:
 
     def held_vjp(self, x: np.ndarray, w: np.ndarray) -> np.ndarray:
         """Adjoint of the pressures of all chambers, zero of gases, for that of the forces."""
-        out = np.zeros(len(self.scene.chambers))
+        out = np.zeros(len(self.follower.laws))
         for k in self.follower.held:
             out[k] = float((self.follower.unit_forces(x, k) * w).sum())
         return out
@@ -74,8 +80,8 @@ class GivenLoads:
         out = np.zeros(x.shape)
         if self.gravity is not None:
             out += self._masses(derived)[:, None] * derived.parameters[self.gravity][:3]
-        if self.loaded is not None:
-            out[self.loaded] += self._dead(step, derived.forces, begins)
+        if self.dead:
+            out[self.dead.acts_at] += self._dead(step, derived.forces, begins)
         if self.follower is not None:
             out += self._following(derived, step, begins, held).forces(x)
         if self.attached:
@@ -97,8 +103,8 @@ class GivenLoads:
         if self.gravity is not None:
             g, dg = (of.parameters[self.gravity][:3] for of in (derived, moved))
             out += self._masses(moved)[:, None] * g + self._masses(derived)[:, None] * dg
-        if self.loaded is not None:
-            out[self.loaded] += self._dead(step, moved.forces, begins)
+        if self.dead:
+            out[self.dead.acts_at] += self._dead(step, moved.forces, begins)
         if self.follower is not None:
             follower = self._following(derived, step, begins, held)
             out += follower.jvp(x, dx, self._pressures(step, moved.follower, begins))
@@ -118,8 +124,8 @@ class GivenLoads:
             else:
                 adj.element_masses += by_mass[self.elements][:, :, None]
             adj.parameters[self.gravity.start : self.gravity.start + 3] += self._masses(derived) @ w
-        if self.loaded is not None:
-            self._dead(step, adj.forces, begins)[:] += w[self.loaded]
+        if self.dead:
+            self._dead(step, adj.forces, begins)[:] += w[self.dead.acts_at]
         out = np.zeros(x.shape)
         if self.attached:
             out += self._attached(derived, step, begins).vjp(x - derived.rest, w, adj, *at_end(step, begins))

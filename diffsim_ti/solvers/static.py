@@ -47,8 +47,10 @@ class StaticSolver(ImplicitSolver):
         preconditioner: str = "auto",
     ):
         self.check_scene(scene)
-        if scene.fluids:
-            raise ValueError("SurfaceDrag is of velocities, and an equilibrium has none; take a solver with inertia")
+        for term in (t for x in scene.interactions for t in x.terms if x.reads_rates):
+            raise ValueError(
+                f"{type(term).__name__} is of velocities, and an equilibrium has none; take a solver with inertia"
+            )
         law = scene.law
         if law.state_names:
             raise ValueError(

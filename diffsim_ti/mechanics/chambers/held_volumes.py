@@ -102,7 +102,7 @@ class HeldVolumes:
         self.ws, scene, follower = weakref.proxy(workspace), workspace.scene, workspace.following
         self.places = follower.held
         self.columns = [follower.rows[k].start for k in self.places]  # of their targets among the numbers of loads
-        closed = [scene.chambers[k].enclosure for k in self.places]
+        closed = [follower.enclosures[k] for k in self.places]
         self.nodes = np.unique(np.concatenate([enclosure.triangles.ravel() for enclosure in closed]))
         self.enclosures = [enclosure.of_nodes(self.nodes) for enclosure in closed]
         self.free = scene.supports.freedom(scene.mesh.num_vertices)[self.nodes]
@@ -117,7 +117,7 @@ class HeldVolumes:
 
     def spread(self, pressures: np.ndarray) -> np.ndarray:
         """Among those of all chambers, of which others have none here."""
-        out = np.zeros(len(self.ws.scene.chambers))
+        out = np.zeros(len(self.ws.following.laws))
         out[self.places] = pressures
         return out
 

@@ -1,29 +1,31 @@
-"""Gases in chambers, among a scene's interactions."""
+"""What fills chambers, among a scene's interactions."""
 
 from functools import cached_property
 
 import numpy as np
 
 from diffsim_ti.mechanics.chambers.gas_force import GasForce
-from diffsim_ti.mechanics.chambers.laws import law_of
-from diffsim_ti.mechanics.interaction import Interaction, add_at
-from diffsim_ti.terms import GasChamber
+from diffsim_ti.mechanics.interaction import add_at
+from diffsim_ti.mechanics.pressure.interaction import Pressing
+from diffsim_ti.terms import FilledChamber, GasChamber
+
+WORKS = "gases and filled chambers"
 
 
-class Gases(Interaction):
+class FilledChambers(Pressing):
+    """They act by multipliers, in stages of their own (held_volumes.py, multipliers.py)."""
+
+    name, kinds, works, apart = "filled", (FilledChamber,), WORKS, True
+
+
+class Gases(Pressing):
     """Three corners for each triangle of a chamber's wall and lids."""
 
-    name, kinds = "gases", (GasChamber,)
+    name, kinds, works, apart = "gases", (GasChamber,), WORKS, True
 
     @cached_property
     def triangles(self) -> np.ndarray:
         return np.concatenate([chamber.enclosure.triangles for chamber in self.terms])
-
-    @cached_property
-    def rows(self) -> list[slice]:
-        """Of the numbers of each in `Derived.follower`."""
-        ends = len(self.scene.pressures) + np.cumsum([0, *(law_of(t).count for t in self.scene.chambers)])
-        return [slice(*map(int, ends[k : k + 2])) for k in map(self.scene.chambers.index, self.terms)]
 
     @property
     def vertices(self) -> np.ndarray:
@@ -42,3 +44,17 @@ class Gases(Interaction):
         out.follower[..., rows, :] += found["chamber_felt"]
         if shape:
             add_at(out.rest, self.vertices, found["chamber_rest"])
+
+    @property
+    def stiff_over_time(self):
+        return self.terms
+
+    def added_omega2(self, values, derived):
+        """At rest: n p_0 / V_0 sum |dV/dx|^2 / m of the free vertices, of each chamber."""
+        free, out = np.delete(np.arange(self.mesh.num_vertices), self.scene.fixed), 0.0
+        for chamber in self.terms:
+            names = self.scene.input_names(chamber)
+            p = np.max(values[names[chamber.plain]])
+            V, g = chamber.enclosure.volume(derived.rest), chamber.enclosure.gradient(derived.rest)
+            out += float(values[names["gas_exponent"]] * p / V * ((g[free] ** 2).sum(1) / derived.mass[free]).sum())
+        return out

@@ -4,6 +4,8 @@ import numpy as np
 
 from diffsim_ti.mechanics.chambers.laws import law_of
 from diffsim_ti.mechanics.pressure.follower_pressure import FollowerPressure, Tangent
+from diffsim_ti.mechanics.pressure.interaction import Pressures
+from diffsim_ti.terms import Chamber
 
 
 class ChamberPressure(FollowerPressure):
@@ -13,15 +15,17 @@ class ChamberPressure(FollowerPressure):
     """
 
     def __init__(self, scene, symmetric: bool = True):
-        faces, load_of = scene.pressed_faces
-        own = [chamber.enclosure.faces for chamber in scene.chambers]
-        self.num_pressures = len(scene.pressures)
+        pressures, chambers = scene.interaction(Pressures), scene.terms_of(Chamber)
+        faces = pressures.faces if pressures else scene.mesh.surface_faces[:0]
+        load_of = pressures.load_of if pressures else np.zeros(0, np.int64)
+        own = [chamber.enclosure.faces for chamber in chambers]
+        self.num_pressures = len(pressures.terms) if pressures else 0
         loads = self.num_pressures + np.repeat(np.arange(len(own)), [len(rows) for rows in own])
         super().__init__(
             np.concatenate([faces, *own]), np.concatenate([load_of, loads]), scene.mesh.num_vertices, symmetric
         )
-        self.enclosures = [chamber.enclosure for chamber in scene.chambers]
-        self.laws = [law_of(chamber) for chamber in scene.chambers]
+        self.enclosures = [chamber.enclosure for chamber in chambers]
+        self.laws = [law_of(chamber) for chamber in chambers]
         ends = self.num_pressures + np.cumsum([0, *(law.count for law in self.laws)])
         self.rows = [slice(a, b) for a, b in zip(ends, ends[1:])]  # of the numbers, by chamber
         self.held = [k for k, law in enumerate(self.laws) if law.holds]
@@ -123,6 +127,7 @@ class ChamberPressure(FollowerPressure):
 
 def following(scene, symmetric: bool = True) -> FollowerPressure | None:
     """What presses on a scene's surface as it is now, or None."""
-    if scene.chambers:
+    if scene.terms_of(Chamber):
         return ChamberPressure(scene, symmetric)
-    return FollowerPressure(*scene.pressed_faces, scene.mesh.num_vertices, symmetric) if scene.pressures else None
+    pressures = scene.interaction(Pressures)
+    return pressures and FollowerPressure(pressures.faces, pressures.load_of, scene.mesh.num_vertices, symmetric)

@@ -12,7 +12,7 @@ from diffsim_ti.terms import SurfaceDrag
 class FluidDrag(Interaction):
     """Each triangle in a fluid is an item. Its six numbers stand in the scene's parameters, from `first_number` on."""
 
-    name, kinds = "dragged", (SurfaceDrag,)
+    name, kinds, works, is_load, reads_rates = "dragged", (SurfaceDrag,), "drag", False, True
 
     @cached_property
     def triangles(self) -> np.ndarray:

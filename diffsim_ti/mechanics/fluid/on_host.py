@@ -3,6 +3,7 @@ derivatives. dragged_triangle.py has the formulas."""
 
 import numpy as np
 
+from diffsim_ti.mechanics.fluid.interaction import FluidDrag
 from diffsim_ti.mesh.geometry import triangle_normals, triangle_normals_jvp, triangle_normals_vjp
 
 
@@ -28,11 +29,8 @@ class Fluid:
     @classmethod
     def of(cls, scene) -> "Fluid | None":
         """Of a scene; None without."""
-        if not scene.fluids:
-            return None
-        parts = [term.triangles(scene.mesh) for term in scene.fluids]
-        first = [np.full(len(p), scene.inputs.parameters.first(t)) for t, p in zip(scene.fluids, parts)]
-        return cls(np.concatenate(parts), np.concatenate(first), scene.mesh.num_vertices)
+        drag = scene.interaction(FluidDrag)
+        return drag and cls(drag.triangles, drag.first_number, scene.mesh.num_vertices)
 
     def at(self, parameters: np.ndarray, origin: np.ndarray, gamma: float) -> "Fluid":
         self.numbers, self.origin, self.gamma = self._numbers(parameters), origin, gamma

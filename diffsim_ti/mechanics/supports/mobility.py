@@ -9,7 +9,6 @@ doi:10.1016/0020-7683(86)90014-4.
 
 import numpy as np
 
-from diffsim_ti.inputs.ties import directions
 from diffsim_ti.mesh.sets import pieces
 from diffsim_ti.terms.supports import motions_left
 
@@ -68,15 +67,12 @@ class Rows:
         arms, self.size = np.linalg.norm(self.X[self.vertices] - self.middle[self.parts], axis=1), np.zeros(self.count)
         np.maximum.at(self.size, self.parts, arms)
         self._entries, self.num_rows, self.shared = [], 0, []
-        self._add_held(scene.supports.vertices, scene.supports.held)
+        held = scene.supports.held.reshape(-1, 3)
+        self._add_forces(np.arange(len(held)), np.repeat(scene.supports.vertices, 3), held)
         self._add_shared(np.setdiff1d(np.arange(len(self.vertices)), begin))
-        derived = scene.inputs.derive(scene.inputs.at_times([0.0])) if scene.foundations or scene.ties else None
-        if scene.foundations:
-            values, vectors = np.linalg.eigh(derived.foundation.reshape(-1, 3, 3))
-            kept = (values > 1e-9 * values.max(initial=0.0))[:, None] * vectors
-            self._add_held(scene.founded_vertices, kept @ np.swapaxes(kept, 1, 2))
-        if scene.ties:
-            self._add_ties(scene, derived)
+        derived = scene.inputs.derive(scene.inputs.at_times([0.0])) if scene.interactions else None
+        for x in scene.interactions:
+            self._add_forces(*x.resists(derived))
         self.row, self.part, self.wrench = (np.concatenate(x) for x in zip(*self._entries))
         self.shared = np.concatenate(self.shared)
 
@@ -87,10 +83,11 @@ class Rows:
         self.num_rows += len(shared)
         self.shared.append(shared)
 
-    def _add_held(self, vertices, held) -> None:
-        own = self.first[vertices] >= 0
-        vertices, held = np.repeat(vertices[own], 3), held[own].reshape(-1, 3)
-        self._add(np.arange(len(held)), self.first[vertices], vertices, held, np.full(len(held), -1))
+    def _add_forces(self, row, vertex, force) -> None:
+        """Forces on vertices, in new rows."""
+        own = self.first[vertex] >= 0
+        row, vertex, force = row[own], vertex[own], force[own]
+        self._add(row, self.first[vertex], vertex, force, np.full(row.max(initial=-1) + 1, -1))
 
     def _add_shared(self, others) -> None:
         """Vertices that are in other parts, too, than their first."""
@@ -98,24 +95,6 @@ class Rows:
         rows, unit = np.arange(len(vertices)), np.tile(np.eye(3), (len(others), 1))
         both = np.concatenate([self.first[vertices], np.repeat(self.parts[others], 3)])
         self._add(np.tile(rows, 2), both, np.tile(vertices, 2), np.concatenate([unit, -unit]), vertices)
-
-    def _add_ties(self, scene, derived) -> None:
-        """Springs and elastic cables that are not slack as a run begins, or whose length is given over time."""
-        paths, n = scene.tie_paths, scene.mesh.num_vertices
-        numbers = derived.ties[0].reshape(-1, 2, 3)
-        slack = scene.one_sided_ties & (numbers[:, 1, :2].max(1) < -1e-9 * np.abs(self.X).max())
-        keyed = np.concatenate([np.full(len(t.paths(scene.mesh)), getattr(t, "keyed", False)) for t in scene.ties])
-        holds = (numbers[:, 0, 2] > 0) & ~scene.given_tensions & (keyed | ~slack)
-        places = paths.matrix(n)
-        C = (places[paths.starts + 1] - places[paths.starts]).tocoo()
-        along, path = directions(derived.tie_segments)[paths.starts], paths.path_of
-        bare = ~along.any(1)  # a spring without length holds in all directions
-        for axis in (None, *np.eye(3)):
-            own = holds[path[C.row]] & (bare[C.row] == (axis is not None))
-            if own.any():
-                row, vertex = C.row[own], C.col[own]
-                force = C.data[own, None] * (along[row] if axis is None else axis)
-                self._add(path[row], self.first[vertex], vertex, force, np.full(len(paths), -1))
 
     def grounded(self) -> np.ndarray:
         """Mask over the parts that are held by what is fixed, and by parts that are held so."""

@@ -3,6 +3,7 @@
 import numpy as np
 
 from diffsim_ti.inputs import Derived
+from diffsim_ti.mechanics.ties.interaction import Foundations, SpringsAndCables
 from diffsim_ti.mechanics.ties.ties import Ties
 from diffsim_ti.state.schedule import EqualSteps, Schedule
 
@@ -35,16 +36,15 @@ class Attached:
     def __init__(self, scene):
         n, self.num_springs = scene.mesh.num_vertices, 0
         self.ties = self.foundation = None
-        if scene.ties:
-            cables = np.concatenate([np.full(len(t.paths(scene.mesh)), t in scene.cables) for t in scene.ties])
-            self.ties = Ties(scene.tie_paths, scene.one_sided_ties, cables, n)
-        if scene.foundations:
-            self.foundation = Foundation(scene.founded_vertices)
+        if ties := scene.interaction(SpringsAndCables):
+            self.ties = Ties(ties.paths, ties.one_sided, ties.cables, n)
+        if founded := scene.interaction(Foundations):
+            self.foundation = Foundation(founded.acts_at)
 
     @classmethod
     def of(cls, scene) -> "Attached | None":
         """None where a scene has none."""
-        return cls(scene) if scene.ties or scene.foundations else None
+        return cls(scene) if scene.interaction(SpringsAndCables) or scene.interaction(Foundations) else None
 
     def at(self, values: Derived, rows: np.ndarray | None, schedule: Schedule, j: int, share: float, laid: float = 1.0):
         """At a share of the step of pass j; rows: of ties, in time; laid: share of given tensions that is laid on."""
@@ -72,14 +72,6 @@ class Attached:
         if self.foundation:
             self.foundation.at(values.foundation)
         return self
-
-    def largest_omega2(self, mass: np.ndarray, u: np.ndarray, fixed: np.ndarray) -> float:
-        """A bound of the largest eigenvalue of M^-1 K [1/s^2] on the free vertices at displacements u, by sums of rows."""
-        rows = self.ties.row_sums(u) if self.ties else np.zeros(len(u))
-        if self.foundation:
-            rows[self.foundation.vertices] += np.abs(self.foundation.K).sum(2).max(1)
-        free = np.setdiff1d(np.nonzero(mass > 0)[0], fixed)
-        return float((rows[free] / mass[free]).max(initial=0.0))
 
     def _laid(self, share: float) -> np.ndarray:
         """Of each tie: those of springs are there from the start."""

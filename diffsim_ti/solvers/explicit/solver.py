@@ -13,7 +13,9 @@ from diffsim_ti.inputs import Derived
 from diffsim_ti.mechanics.chambers.gases import Chambers
 from diffsim_ti.mechanics.chambers.held_volumes import HeldVolumes
 from diffsim_ti.mechanics.chambers.pressures import following
+from diffsim_ti.mechanics.fluid.interaction import FluidDrag
 from diffsim_ti.mechanics.fluid.on_host import Fluid
+from diffsim_ti.mechanics.loads.interaction import DeadLoads
 from diffsim_ti.mechanics.obstacles.contact_stage import ROWS
 from diffsim_ti.mechanics.obstacles.felt_faces import FeltFaces, feels_faces
 from diffsim_ti.mechanics.obstacles.impulse_record import ImpulseRecord
@@ -29,7 +31,7 @@ from diffsim_ti.solvers.explicit.kernels import ExplicitKernels, explicit_kernel
 from diffsim_ti.solvers.explicit.tangent import ExplicitTangent
 from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.state.pass_table import PassTable
-from diffsim_ti.terms import SelfContact
+from diffsim_ti.terms import GasChamber, Growth, SelfContact
 
 
 @dataclass(frozen=True)
@@ -97,7 +99,10 @@ class ExplicitSolver(Solver):
     def passes_per_launch(self) -> int:
         """How many passes one launch does at most where they run in parallel (runtime/repeated_loops.py)."""
         alone = (
-            self.scene.term(SelfContact) or feels_faces(self.scene) or self.scene.chambers or self.scene.reduced
+            self.scene.term(SelfContact)
+            or feels_faces(self.scene)
+            or any(x.apart for x in self.scene.interactions)
+            or self.scene.reduced
         )  # which act between passes
         return 1 if alone or runtime.runs_on_cpu() or not runtime.can_repeat() else MOST_PASSES
 
@@ -147,7 +152,7 @@ class ExplicitWorkspace(Workspace):
         self.faces = FeltFaces(self) if a.feels_faces else None
         self.check_apart()
         self.following = following(self.scene)
-        self.chambers = Chambers(self) if self.scene.gases else None
+        self.chambers = Chambers(self) if self.scene.term(GasChamber) else None
         self.volumes = HeldVolumes(self) if self.scene.holds_volumes else None
         noted = ROWS * len(a.obstacles), a.num_vertices
         self.contact = SimpleNamespace(
@@ -158,7 +163,7 @@ class ExplicitWorkspace(Workspace):
         )
         self.attached = Attached.of(self.scene)  # springs, cables and foundations, for what looks between passes
         self.probe = None  # room for a pass that is not taken
-        self.energy_watch = EnergyBalance(self) if EnergyBalance.knows(a.law) and not self.scene.growing else None
+        self.energy_watch = EnergyBalance(self) if EnergyBalance.knows(a.law) and not self.scene.term(Growth) else None
 
     def load(self, derived: Derived) -> None:
         super().load(derived)
@@ -242,11 +247,11 @@ class ExplicitWorkspace(Workspace):
         a, schedule, u = self.arrays, self.solver.schedule, runtime.fetch_row(self.state.u, 0)
         out, kicks = np.zeros_like(u, np.float64), self._kicks(j, num_passes)
         if a.rows["forces"] is not None:
-            keyed = a.features().forces_keyed
-            out[self.scene.loaded_vertices] = sum(w * schedule.load(a.rows["forces"], *k, keyed) for w, k in kicks)
+            dead = self.scene.interaction(DeadLoads)
+            out[dead.acts_at] = sum(w * schedule.load(a.rows["forces"], *k, dead.keyed) for w, k in kicks)
         if self.following is not None:
             out += self.following.at(self.numbers_at(j, num_passes)).forces(a.values.rest + u)
-        if self.scene.fluids:
+        if self.scene.interaction(FluidDrag):
             v = runtime.fetch_row(self.state.v, 0)
             out += Fluid.of(self.scene).at(a.values.parameters, a.values.rest + u - v, 1.0).forces(a.values.rest + u)
         if a.features().pulled and pulls:
@@ -294,12 +299,7 @@ class ExplicitWorkspace(Workspace):
     def _rows(self) -> int:
         """How many rows what is given by steps has."""
         a = self.arrays
-        num_rows = max((len(x) for x in (a.values.path, a.values.motion) if x is not None), default=1)
-        # they ask in which step a pass lies
-        if num_rows == 1 and a.features().asks_for_steps:
-            given = a.values.forces, a.values.follower, a.values.ties, a.values.growths
-            num_rows = max(1 + len(x) for x in given if x is not None)
-        return num_rows
+        return a.num_step_rows([a.values])
 
     def launches(self, first: int, last: int, num_passes: int, save_every: int, most: int, backwards=False) -> Iterator:
         """Numbers of the launches that passes first .. last - 1 take, for each of which their table is shown.

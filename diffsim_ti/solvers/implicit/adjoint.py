@@ -193,7 +193,7 @@ class ImplicitAdjoint(RecordedPasses):
         self.gravity += share * (ws.mass * by_star).sum(0)
         self._add_mass(by_star, self.weight(share))
         if self.forces is not None:
-            felt, keyed = share * by_star[ws.force_vertices], ws.scene.inputs.keyed_forces
+            felt, keyed = share * by_star[ws.dead_loads.acts_at], ws.dead_loads.keyed
             ws.solver.schedule.add_load(self.forces, j, ws.share_at_stage(j, s), keyed, felt)
         # where inertia starts from
         inertial = self.mass * by_star

@@ -7,7 +7,9 @@ import numpy as np
 from diffsim_ti.inputs import ConsistentMass, Derived, Mass
 from diffsim_ti.mechanics.chambers.multipliers import HeldVolumes
 from diffsim_ti.mechanics.chambers.pressures import following
+from diffsim_ti.mechanics.loads.interaction import DeadLoads
 from diffsim_ti.mechanics.pressure.follower_pressure import FollowerPressure, is_symmetric
+from diffsim_ti.mechanics.pressure.interaction import Pressures
 from diffsim_ti.mechanics.supports.free import projectors_of
 from diffsim_ti.state.stage import Stage
 
@@ -102,8 +104,9 @@ class GivenInPasses:
 
     def follower_pressure(self) -> FollowerPressure | None:
         """What presses on the surface as it is."""
-        free, rest = projectors_of(self.free), self.arrays.values.rest
-        return following(self.scene, is_symmetric(*self.scene.pressed_faces, free, rest))
+        free, rest, pressures = projectors_of(self.free), self.arrays.values.rest, self.scene.interaction(Pressures)
+        alike = pressures is None or is_symmetric(pressures.faces, pressures.load_of, free, rest)
+        return following(self.scene, alike)
 
     @property
     def held_chambers(self) -> list[int]:
@@ -136,7 +139,7 @@ class GivenInPasses:
             self.volumes.place(u, self.multipliers[self.pass_of_all(j)])
 
     def chamber_pressures(self, num_frames: int, save_every: int) -> np.ndarray:
-        out = np.zeros((num_frames, len(self.scene.chambers)))
+        out = np.zeros((num_frames, len(self.follower.laws)))
         for frame in range(1, num_frames):
             last = self.solver.num_passes(frame * save_every) - 1
             out[frame, self.follower.held] = self.multipliers.get(
@@ -146,7 +149,7 @@ class GivenInPasses:
 
     def last_chamber_pressures(self) -> np.ndarray:
         """Those of chambers whose volume is held after the last pass, shape (chambers,); zero before the first."""
-        out = np.zeros(len(self.scene.chambers))
+        out = np.zeros(len(self.follower.laws))
         if self.multipliers:
             out[self.follower.held] = self.multipliers[max(self.multipliers)]
         return out
@@ -188,8 +191,8 @@ class GivenInPasses:
 
     def _add_forces(self, rows: np.ndarray | None, out: np.ndarray, j: int, stage: Stage) -> np.ndarray:
         if rows is not None:
-            share, keyed = self.share_at_stage(j, stage), self.scene.inputs.keyed_forces
-            out[self.force_vertices] += self.solver.schedule.load(rows, j, share, keyed)
+            share, keyed = self.share_at_stage(j, stage), self.dead_loads.keyed
+            out[self.dead_loads.acts_at] += self.solver.schedule.load(rows, j, share, keyed)
         return out
 
     def given_forces(self, rows: np.ndarray | None, j: int, stage: Stage) -> np.ndarray:
@@ -204,6 +207,5 @@ class GivenInPasses:
         return min(1.0, (self.pass_of_all(j) + self.laid) / self.solver.substeps)
 
     @cached_property
-    def force_vertices(self) -> np.ndarray:
-        """Vertices that given forces act on."""
-        return self.scene.loaded_vertices
+    def dead_loads(self) -> DeadLoads | None:
+        return self.scene.interaction(DeadLoads)

@@ -33,6 +33,7 @@ from diffsim_ti.solvers.implicit.threads import one_blas_thread
 from diffsim_ti.state.history import History
 from diffsim_ti.state.stage import Stage
 from diffsim_ti.state.walls import Moment
+from diffsim_ti.terms import Growth
 
 
 class TwoStepHistory(History):
@@ -52,7 +53,7 @@ class ImplicitWorkspace(Preconditioned, ObstacleWays, Noted, GivenInPasses, Work
 
     def __init__(self, solver, derived, bend=0.0):
         self.potential, self._length = None, solver.substep
-        self.energy_watch = EnergyWatch(self) if solver.may_gain_energy and not solver.scene.growing else None
+        self.energy_watch = EnergyWatch(self) if solver.may_gain_energy and solver.scene.term(Growth) is None else None
         super().__init__(solver, derived, bend)
 
     def history(self, num_slots, record=False):
@@ -103,7 +104,7 @@ class ImplicitWorkspace(Preconditioned, ObstacleWays, Noted, GivenInPasses, Work
         return ConsistentMass.of(self.scene.mesh, values.element_masses)
 
     def balance(self) -> EnergyWatch | None:
-        if self.scene.growing or self.scene.law.state_names or self.solver.stage(self.rate, True, 0).static:
+        if self.scene.term(Growth) or self.scene.law.state_names or self.solver.stage(self.rate, True, 0).static:
             return None
         self.energy_watch = self.energy_watch or EnergyWatch(self)
         return self.energy_watch
