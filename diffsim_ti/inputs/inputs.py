@@ -57,6 +57,13 @@ class Derived:
         parts = self.parts().items()
         return Derived(*(None if part is None or name in but else np.zeros(part.shape) for name, part in parts))
 
+    def add(self, other: "Derived", factor: float = 1.0) -> None:
+        """Add what another has that is not zero, times a factor."""
+        for name, more in other.parts().items():
+            if more is not None and more.any():
+                own = getattr(self, name)
+                setattr(self, name, factor * more if own is None else own + factor * more)
+
     def parts(self) -> dict[str, np.ndarray | None]:
         """{name: array}"""
         return {name: getattr(self, name) for name in READ}

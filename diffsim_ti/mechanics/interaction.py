@@ -3,7 +3,8 @@
 An `Interaction` holds all terms of its kind in a scene: which vertices they act on, what kernels read of them, where
 adjoints go and how these come back to the scene's numbers. Its `kernel` is what kernels are compiled for, and equal ones
 share compiled kernels. Explicit steps, their tangents and adjoints, and batches loop over the interactions of a scene
-(mechanics/interactions.py lists the kinds), so that a new force is a new class here and nothing elsewhere.
+(mechanics/interactions.py lists the kinds). Implicit steps, statics and outputs loop over their host forms (host_force.py),
+which `host` gives. So a new force is a folder of its own and nothing elsewhere.
 """
 
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti.inputs import Derived
+from diffsim_ti.mechanics.host_force import HostForce
 from diffsim_ti.runtime import PRECISIONS, traced
 
 if TYPE_CHECKING:
@@ -135,6 +137,8 @@ class Interaction:
     vertices: np.ndarray = np.zeros(0, np.int64)
     first_load = count = 0
     pulls = False  # whether its loads may be counted as energy of the body's own as well
+    in_kernels = True  # whether explicit steps take it by its kernel; else a stage of theirs knows its terms
+    no_equilibrium: ClassVar[str] = ""  # why statics refuse it
 
     def __init__(self, scene: "Scene", terms: "tuple[Term, ...]"):
         self.scene, self.mesh, self.terms = scene, scene.mesh, terms
@@ -152,6 +156,12 @@ class Interaction:
 
     def kernel(self, values: Derived, precision: str, shape: bool) -> ForceKernel:
         """What kernels are compiled for, at the values of a run; shape: whether adjoints of the rest shape are wanted."""
+        raise ValueError(
+            f"{type(self).__name__} has no kernel, which explicit steps run: write `kernel`, or take an implicit solver"
+        )
+
+    def host(self) -> HostForce:
+        """Its host form, for implicit steps and statics, stable steps, energies and outputs."""
         raise NotImplementedError
 
     def adjoints(self, values: Derived, shape: bool) -> dict[str, tuple[int, ...]]:

@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diffsim_ti.mechanics.chambers.pressures import ChamberPressure as Pressures
+from diffsim_ti.mechanics.chambers.laws import law_of
+from diffsim_ti.mechanics.chambers.pressures import rows_of
 from diffsim_ti.outputs.output import Change, Output
 from diffsim_ti.terms import Chamber
 
@@ -38,9 +39,9 @@ class ChamberPressure(Output):
 
     def settled(self, scene: "Scene") -> "ChamberPressure":
         out = copy(self)
-        out.place, out.inputs, out.pressures = scene.place_of_chamber(self.chamber), scene.inputs, Pressures(scene)
-        out.law, out.rows = out.pressures.laws[out.place], out.pressures.rows[out.place]
-        out.enclosure = out.pressures.enclosures[out.place]
+        out.place, out.inputs = scene.place_of_chamber(self.chamber), scene.inputs
+        chamber = scene.chambers[out.place]
+        out.law, out.enclosure, (out.rows,) = law_of(chamber), chamber.enclosure, rows_of(scene, [chamber])
         return out
 
     def shape(self, num_frames: int) -> tuple[int, ...]:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diffsim_ti.mechanics.ties.attached import Attached
+from diffsim_ti.mechanics.ties.ties import Ties
 from diffsim_ti.outputs.given_loads import at_end
 from diffsim_ti.outputs.output import Change, Output
 from diffsim_ti.terms.ties import Tie
@@ -28,7 +28,7 @@ class _OfTies(Output):
 
     def settled(self, scene: "Scene") -> "_OfTies":
         out = copy(self)
-        out.scene, out.own, out.attached = scene, scene.places_of_tie(self.tie), Attached.of(scene)
+        out.scene, out.own, out.ties = scene, scene.places_of_tie(self.tie), Ties(scene)
         out.count = out.own.stop - out.own.start
         return out
 
@@ -50,8 +50,8 @@ class _OfTies(Output):
     def _frames(self, frames, derived):
         """(ties as they are in each frame, displacements)"""
         for step, x in zip(frames.steps, frames.positions.astype(np.float64)):
-            ties = self.attached.at(derived, derived.ties, *at_end(int(step))).ties
-            yield ties, x - derived.rest, at_end(int(step))
+            instant = at_end(int(step))
+            yield self.ties.take(derived, instant), x - derived.rest, instant
 
     def value(self, frames: "Frames") -> np.ndarray:
         derived = self.scene.inputs.derive(frames.inputs)
@@ -62,8 +62,8 @@ class _OfTies(Output):
         derived = self.scene.inputs.derive(frames.inputs)
         moved = self.scene.inputs.derive_jvp(frames.inputs, change.inputs)
         dx, out = np.zeros(frames.positions.shape) if change.positions is None else change.positions, []
-        for (ties, u, (schedule, j, share)), moving in zip(self._frames(frames, derived), dx):
-            numbers = moved.tie_segments, *schedule.ties(moved.ties, j, share)
+        for (ties, u, at), moving in zip(self._frames(frames, derived), dx):
+            numbers = moved.tie_segments, *at.schedule.ties(moved.ties, at.j, at.share)
             out.append(self._jvp(ties, u, moving - moved.rest, numbers)[self.own])
         return np.reshape(out, self.shape(len(out)))
 
@@ -71,10 +71,10 @@ class _OfTies(Output):
         derived, positions = self.scene.inputs.derive(frames.inputs), np.zeros(frames.positions.shape)
         adj, all_ties = derived.zeros(), np.zeros((len(positions), len(self.scene.tie_paths)))
         all_ties[:, self.own] = seed.reshape(len(positions), -1)
-        for k, (ties, u, (schedule, j, share)) in enumerate(self._frames(frames, derived)):
+        for k, (ties, u, at) in enumerate(self._frames(frames, derived)):
             positions[k], segments, numbers = self._vjp(ties, u, all_ties[k])
             adj.tie_segments += segments
-            schedule.add_ties(adj.ties, j, share, numbers)
+            at.schedule.add_ties(adj.ties, at.j, at.share, numbers)
         adj.rest = adj.rest - positions.sum(0)
         return Change(
             positions=positions, inputs=self.scene.inputs.derive_vjp(frames.inputs, adj, tuple(frames.inputs))

@@ -45,7 +45,7 @@ class SceneArrays:
         self.num_vertices, self.num_tetrahedra = mesh.num_vertices, mesh.num_tetrahedra
         self.contacts = tuple(t for t in scene.ordered_terms if t.acts_on_surface)
         self.fixed, self.held, self.supports, self.feels_faces = scene.fixed, scene.held, scene.supports, feels_faces
-        self.interactions = scene.interactions if presses else ()
+        self.interactions = tuple(x for x in scene.interactions if x.in_kernels) if presses else ()
         self.mesh, self.precision, self.self_contact = mesh, precision, scene.term(SelfContact)
         self._upload_topology(scene)
         rows = scene.inputs.parameters
@@ -207,6 +207,11 @@ class SceneArrays:
         """No forces at corners of interactions, where tetrahedra alone are to be gathered."""
         if self.interactions:
             clear_from(self.corner, self.first_corner)
+
+    @property
+    def now(self) -> Derived:
+        """What is loaded, with the rows of the steps to come."""
+        return replace(self.values, **self.rows)
 
     def load_rows(self, **rows: np.ndarray) -> None:
         """Other rows of motion, path, forces, pressure or ties, by name: those of the steps to come."""

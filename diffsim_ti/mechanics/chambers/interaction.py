@@ -1,13 +1,14 @@
-"""Gases in chambers, among a scene's interactions."""
+"""Gases and filled chambers, among a scene's interactions."""
 
 from functools import cached_property
 
 import numpy as np
 
 from diffsim_ti.mechanics.chambers.gas_force import GasForce
-from diffsim_ti.mechanics.chambers.laws import law_of
+from diffsim_ti.mechanics.chambers.multipliers import HeldPressure
+from diffsim_ti.mechanics.chambers.pressures import ChamberPressure, rows_of
 from diffsim_ti.mechanics.interaction import Interaction, add_at
-from diffsim_ti.terms import GasChamber
+from diffsim_ti.terms import FilledChamber, GasChamber
 
 
 class Gases(Interaction):
@@ -22,8 +23,7 @@ class Gases(Interaction):
     @cached_property
     def rows(self) -> list[slice]:
         """Of the numbers of each in `Derived.follower`."""
-        ends = len(self.scene.pressures) + np.cumsum([0, *(law_of(t).count for t in self.scene.chambers)])
-        return [slice(*map(int, ends[k : k + 2])) for k in map(self.scene.chambers.index, self.terms)]
+        return rows_of(self.scene, self.terms)
 
     @property
     def vertices(self) -> np.ndarray:
@@ -31,6 +31,9 @@ class Gases(Interaction):
 
     def kernel(self, values, precision, shape):
         return GasForce(precision, len(values.follower) > 1)
+
+    def host(self):
+        return ChamberPressure(self.scene, self.terms)
 
     def adjoints(self, values, shape):
         return dict(
@@ -42,3 +45,12 @@ class Gases(Interaction):
         out.follower[..., rows, :] += found["chamber_felt"]
         if shape:
             add_at(out.rest, self.vertices, found["chamber_rest"])
+
+
+class FilledChambers(Interaction):
+    """Implicit steps find their pressures as multipliers (multipliers.py); explicit steps have a stage (held_volumes.py)."""
+
+    name, kinds, in_kernels = "filled", (FilledChamber,), False
+
+    def host(self):
+        return HeldPressure(self.scene, self.terms)

@@ -6,6 +6,7 @@ import numpy as np
 
 from diffsim_ti.inputs import Derived
 from diffsim_ti.mechanics.interaction import Interaction, add_at
+from diffsim_ti.mechanics.pressure.follower_pressure import FollowerPressure
 from diffsim_ti.mechanics.pressure.pressed_face import pressed_element
 from diffsim_ti.terms import Pressure
 
@@ -39,6 +40,9 @@ class Pressures(Interaction):
 
     def kernel(self, values: Derived, precision: str, shape: bool):
         return pressed_element(self.mesh.order, precision, len(values.follower) > 1, shape)
+
+    def host(self):
+        return FollowerPressure(self.faces, self.load_of, self.mesh.num_vertices)
 
     def adjoints(self, values, shape):
         return dict(pressed_felt=(len(values.follower), self.count), pressed_rest=(self.faces.size * shape,))

@@ -9,7 +9,7 @@ doi:10.1016/0020-7683(86)90014-4.
 
 import numpy as np
 
-from diffsim_ti.inputs.ties import directions
+from diffsim_ti.mechanics.interactions import host_forces
 from diffsim_ti.mesh.sets import pieces
 from diffsim_ti.terms.supports import motions_left
 
@@ -70,13 +70,9 @@ class Rows:
         self._entries, self.num_rows, self.shared = [], 0, []
         self._add_held(scene.supports.vertices, scene.supports.held)
         self._add_shared(np.setdiff1d(np.arange(len(self.vertices)), begin))
-        derived = scene.inputs.derive(scene.inputs.at_times([0.0])) if scene.foundations or scene.ties else None
-        if scene.foundations:
-            values, vectors = np.linalg.eigh(derived.foundation.reshape(-1, 3, 3))
-            kept = (values > 1e-9 * values.max(initial=0.0))[:, None] * vectors
-            self._add_held(scene.founded_vertices, kept @ np.swapaxes(kept, 1, 2))
-        if scene.ties:
-            self._add_ties(scene, derived)
+        derived = scene.inputs.derive(scene.inputs.at_times([0.0])) if scene.interactions else None
+        for force in host_forces(scene).take(derived):
+            self._add_resisted(*force.resisted())
         self.row, self.part, self.wrench = (np.concatenate(x) for x in zip(*self._entries))
         self.shared = np.concatenate(self.shared)
 
@@ -99,23 +95,11 @@ class Rows:
         both = np.concatenate([self.first[vertices], np.repeat(self.parts[others], 3)])
         self._add(np.tile(rows, 2), both, np.tile(vertices, 2), np.concatenate([unit, -unit]), vertices)
 
-    def _add_ties(self, scene, derived) -> None:
-        """Springs and elastic cables that are not slack as a run begins, or whose length is given over time."""
-        paths, n = scene.tie_paths, scene.mesh.num_vertices
-        numbers = derived.ties[0].reshape(-1, 2, 3)
-        slack = scene.one_sided_ties & (numbers[:, 1, :2].max(1) < -1e-9 * np.abs(self.X).max())
-        keyed = np.concatenate([np.full(len(t.paths(scene.mesh)), getattr(t, "keyed", False)) for t in scene.ties])
-        holds = (numbers[:, 0, 2] > 0) & ~scene.given_tensions & (keyed | ~slack)
-        places = paths.matrix(n)
-        C = (places[paths.starts + 1] - places[paths.starts]).tocoo()
-        along, path = directions(derived.tie_segments)[paths.starts], paths.path_of
-        bare = ~along.any(1)  # a spring without length holds in all directions
-        for axis in (None, *np.eye(3)):
-            own = holds[path[C.row]] & (bare[C.row] == (axis is not None))
-            if own.any():
-                row, vertex = C.row[own], C.col[own]
-                force = C.data[own, None] * (along[row] if axis is None else axis)
-                self._add(path[row], self.first[vertex], vertex, force, np.full(len(paths), -1))
+    def _add_resisted(self, row, vertex, force) -> None:
+        """What a host force resists (mechanics/host_force.py)."""
+        own = self.first[vertex] >= 0
+        row, vertex, count = row[own], vertex[own], row.max(initial=-1) + 1
+        self._add(row, self.first[vertex], vertex, force[own], np.full(count, -1))
 
     def grounded(self) -> np.ndarray:
         """Mask over the parts that are held by what is fixed, and by parts that are held so."""

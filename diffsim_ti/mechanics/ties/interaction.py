@@ -6,8 +6,9 @@ import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.mechanics.interaction import Interaction
-from diffsim_ti.mechanics.ties.foundations import FoundationForce
+from diffsim_ti.mechanics.ties.foundations import FoundationForce, FoundationOnHost
 from diffsim_ti.mechanics.ties.tie_force import TieForce
+from diffsim_ti.mechanics.ties.ties import Ties
 from diffsim_ti.runtime import LANES
 from diffsim_ti.state.corners import slots
 from diffsim_ti.terms import Cable, ElasticFoundation, Spring
@@ -47,6 +48,9 @@ class SpringsAndCables(Interaction):
         nodes = self.mesh.reference.num_nodes if fibres else 0
         return TieForce(precision, len(values.ties) > 1, bool(self.scene.cables), fibres, nodes, shape and fibres)
 
+    def host(self):
+        return Ties(self.scene)
+
     def adjoints(self, values, shape):
         return dict(tie_felt=values.ties.shape[:2], tie_rest=values.tie_segments.shape[:1])
 
@@ -70,6 +74,9 @@ class Foundations(Interaction):
 
     def kernel(self, values, precision, shape):
         return FoundationForce(precision)
+
+    def host(self):
+        return FoundationOnHost(self.acts_at)
 
     def adjoints(self, values, shape):
         return dict(foundation_felt=values.foundation.shape[:1])
