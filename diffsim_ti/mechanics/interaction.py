@@ -156,13 +156,13 @@ class Interaction:
 
     def kernel(self, values: Derived, precision: str, shape: bool) -> ForceKernel:
         """What kernels are compiled for, at the values of a run; shape: whether adjoints of the rest shape are wanted."""
-        raise ValueError(
-            f"{type(self).__name__} has no kernel, which explicit steps run: write `kernel`, or take an implicit solver"
-        )
+        raise NotImplementedError
 
     def host(self) -> HostForce:
         """Its host form, for implicit steps and statics, stable steps, energies and outputs."""
-        raise NotImplementedError
+        raise ValueError(
+            f"{type(self).__name__} has no `host`, which all solvers ask for: write it (mechanics/host_force.py)"
+        )
 
     def adjoints(self, values: Derived, shape: bool) -> dict[str, tuple[int, ...]]:
         """{array of vectors that adjoints are added to: its shape}"""
