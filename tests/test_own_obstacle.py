@@ -245,11 +245,11 @@ class TetherOnHostAlone(Tether):
     interaction = OnHostAlone
 
 
-def test_what_lacks_a_kernel_is_refused_by_explicit_solvers(tethered):
+def test_what_lacks_a_kernel_is_refused_by_explicit_solvers(tethered, monkeypatch):
     scene = tethered.replace(terms=TetherOnHostAlone(20.0, 30.0, [0.01, 0.02, 0.0]))
     ds.ImplicitEulerSolver(scene)
     with pytest.raises(ValueError, match="OnHostAlone has no `kernel`"):
         ds.VelocityVerletSolver(scene, dt=1e-4)
-    OnHostAlone.host = Interaction.host
+    monkeypatch.setattr(OnHostAlone, "host", Interaction.host)
     with pytest.raises(ValueError, match="OnHostAlone has no `host`"):
         ds.Rollout(ds.ImplicitEulerSolver(scene), 1).forward()

@@ -160,9 +160,7 @@ class Interaction:
 
     def host(self) -> HostForce:
         """Its host form, for implicit steps and statics, stable steps, energies and outputs."""
-        raise ValueError(
-            f"{type(self).__name__} has no `host`, which all solvers ask for: write it (mechanics/host_force.py)"
-        )
+        raise ValueError(f"{type(self).__name__} has no `host`, which all solvers ask for: write it (host_force.py)")
 
     def adjoints(self, values: Derived, shape: bool) -> dict[str, tuple[int, ...]]:
         """{array of vectors that adjoints are added to: its shape}"""
