@@ -116,7 +116,7 @@ def placed(terms, volume="tetrahedra", **options):
     workspace.begin(0, solver.stage(0.0, True, 0), u, u)
     u[:, 1] = 0.02 * mesh.vertices[:, 0] ** 2
     workspace.potential.place(u * np.linalg.norm(workspace.linear * np.ones_like(u), axis=1, keepdims=True).clip(0, 1))
-    return workspace, Operator(workspace.potential, np.zeros((len(u), 1)), workspace.free, workspace.on_surface)
+    return workspace, Operator(workspace.potential, np.zeros((len(u), 1)), workspace.free, workspace.newton.others)
 
 
 ATTACHED = [
@@ -137,7 +137,7 @@ def test_factorised_is_the_whole_hessian(support, load):
     x = np.random.default_rng(0).standard_normal(workspace.potential.held_at.shape) * workspace.free
     assert A.symmetric == (load != "open")
     for correction, transposed in ((None, False), (None, True), (Projection(workspace.potential), False)):
-        own = Operator(A.potential, A.mass, A.free, A.follower, transposed)
+        own = Operator(A.potential, A.mass, A.free, A.others, transposed)
         own.correction = correction
         M = own.factorised()
         exact = M(own(x))

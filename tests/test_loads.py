@@ -181,7 +181,7 @@ def test_a_closed_surface_has_a_potential_and_an_open_one_has_none():
         one, other = (w * pressure.jvp(x, v)).sum(), (v * pressure.jvp(x, w)).sum()
         assert is_symmetric(own, load_of[: len(own)], free, x) == closed
         assert (abs(one - other) < 1e-12 * abs(one)) == closed
-        np.testing.assert_allclose((v * pressure.vjp(x, w)).sum(), one, rtol=1e-12)
+        np.testing.assert_allclose((v * pressure.vjp(x, w)[0]).sum(), one, rtol=1e-12)
         difference = (pressure.forces(x + 1e-6 * v) - pressure.forces(x - 1e-6 * v)) / 2e-6
         np.testing.assert_allclose(pressure.jvp(x, v), difference, rtol=0, atol=1e-7)
         if closed:
@@ -218,8 +218,8 @@ def test_a_forgotten_transpose_would_be_found(monkeypatch):
     """The mutation that the dot product above is there for."""
     made = Operator.__init__
 
-    def forgetful(self, potential, mass, free, follower=None, transposed=False):
-        made(self, potential, mass, free, follower)
+    def forgetful(self, potential, mass, free, others, transposed=False):
+        made(self, potential, mass, free, others)
 
     monkeypatch.setattr(Operator, "__init__", forgetful)
     assert ds.dot_product_test(blown()) > 1e-4

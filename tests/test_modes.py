@@ -6,7 +6,7 @@ from scipy.linalg import eigh
 
 import diffsim_ti as ds
 from diffsim_ti import verify
-from diffsim_ti.mechanics.ties.attached import Attached
+from diffsim_ti.mechanics.interactions import host_forces
 
 E, NU, RHO = 3e6, 0.3, 1200.0
 
@@ -297,7 +297,7 @@ BLOCK = ds.TetrahedralMesh.create_box(3, size=(0.3, 0.11, 0.08))
 def test_stiffness_of_what_holds_a_body():
     """The slope of all forces on it, and one mass on a spring, or between two pulls, as the textbook has them."""
     scene, u = held_up(BLOCK), bent(BLOCK)
-    attached = Attached.of(scene).at_start(scene.inputs.derive(scene.inputs.values))
+    attached = host_forces(scene).take(scene.inputs.derive(scene.inputs.values))
     w, h = np.random.default_rng(0).normal(size=u.shape), 1e-6
     slope = (attached.forces(u - h * w) - attached.forces(u + h * w)) / (2 * h)
     bare = scene.replace(terms=())

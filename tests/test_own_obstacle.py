@@ -1,11 +1,15 @@
-"""An obstacle's shape of one's own: a class with a distance, its kernel and what is drawn, in one place."""
+"""An obstacle's shape of one's own, and a force of one's own: what a user writes outside the package."""
 
 from dataclasses import dataclass
 
 import numpy as np
 import pytest
+import taichi as ti
 
 import diffsim_ti as ds
+from diffsim_ti.inputs import Input
+from diffsim_ti.mechanics.host_force import HostForce
+from diffsim_ti.mechanics.interaction import Interaction, VertexwiseForce
 from diffsim_ti.obstacles import obstacle_surfaces, revolved
 from diffsim_ti.runtime import traced
 from diffsim_ti.terms.obstacles.obstacle import Obstacle, ObstacleForce
@@ -86,3 +90,166 @@ def test_it_is_drawn(scene):
         image = drawing.image(scene.mesh.vertices).astype(float)
     grey = (np.ptp(image, axis=2) < 8) & (image.mean(2) < 200)
     assert grey.sum() > 300
+
+
+# ---- a force of one's own: a term, its Taichi functions, its host form ---------------------------------------------------
+
+
+def tether(u, v, speed, k, c, d):
+    """f = -k (u - d) - c |v| v, for kernels and for the host."""
+    return -k * (u - d) - c * speed * v
+
+
+def tether_jvp(u, v, speed, du, dv, dspeed, k, c, d, dk, dc, dd):
+    return -dk * (u - d) - k * (du - dd) - dc * speed * v - c * (dspeed * v + speed * dv)
+
+
+VALUE, JVP = ti.func(tether), ti.func(tether_jvp)
+
+
+@dataclass(frozen=True)
+class TetherForce(VertexwiseForce):
+    """Of each vertex; its numbers k, c, d stand in the parameters from `first` on."""
+
+    first_number: int
+    name, reads_rates, adjoints = "tethered", True, dict(tether_felt="vectors")
+
+    @traced
+    def sizes(self, plan):
+        return dict(tether_felt=2 * plan.num_vertices)
+
+    @ti.func
+    def numbers(self, p: ti.template()):
+        n = ti.static(self.first_number)
+        return p[n], p[n + 1], self.vector(p[n + 2], p[n + 3], p[n + 4], ti.cast(0, self.fp))
+
+    @ti.func
+    def per(self, speed):
+        return ti.select(speed > 0, 1 / ti.max(speed, ti.cast(1e-30, self.fp)), ti.cast(0, self.fp))
+
+    @ti.func
+    def force(self, i, u, v, now: ti.template(), scene: ti.template()):
+        k, c, d = self.numbers(scene.parameters)
+        return VALUE(u, v, ti.sqrt(v.dot(v)), k, c, d)
+
+    @ti.func
+    def force_jvp(self, i, u, v, du, dv, now: ti.template(), scene: ti.template(), tangent: ti.template()):
+        k, c, d = self.numbers(scene.parameters)
+        dk, dc, dd = self.numbers(tangent.parameters)
+        speed = ti.sqrt(v.dot(v))
+        return JVP(u, v, speed, du, dv, v.dot(dv) * self.per(speed), k, c, d, dk, dc, dd)
+
+    @ti.func
+    def force_vjp(self, i, u, v, w, now: ti.template(), scene: ti.template(), adjoint: ti.template()):
+        k, c, d = self.numbers(scene.parameters)
+        speed = ti.sqrt(v.dot(v))
+        by_k, by_c = w.dot(d - u), -speed * v.dot(w)
+        adjoint.tether_felt[2 * i] += self.vector(by_k, by_c, ti.cast(0, self.fp), ti.cast(0, self.fp))
+        adjoint.tether_felt[2 * i + 1] += k * w
+        return -k * w, -c * (speed * w + v.dot(w) * self.per(speed) * v)
+
+
+class TetherOnHost(HostForce):
+    symmetric = reads_velocities = True
+
+    def __init__(self, rows: slice):
+        self.rows = rows
+
+    def take(self, values, instant):
+        self.k, self.c, *self.d = values.parameters[self.rows]
+        return super().take(values, instant)
+
+    def state(self, u):
+        v = self.velocities(u)
+        speed = np.linalg.norm(v, axis=1, keepdims=True)
+        return v, speed, np.divide(v, speed, out=np.zeros_like(v), where=speed > 0)
+
+    def forces(self, u):
+        v, speed, _ = self.state(u)
+        return tether(u, v, speed, self.k, self.c, np.array(self.d))
+
+    def jvp(self, u, du, dv, moved=None):
+        v, speed, along = self.state(u)
+        dk, dc, *dd = np.zeros(5) if moved is None else moved.parameters[self.rows]
+        dspeed = (along * dv).sum(1, keepdims=True)
+        return tether_jvp(u, v, speed, du, dv, dspeed, self.k, self.c, np.array(self.d), dk, dc, np.array(dd))
+
+    def vjp(self, u, w, adj=None):
+        v, speed, along = self.state(u)
+        if adj is not None:
+            by_c = -(speed * v * w).sum()
+            adj.parameters[self.rows] += [((np.array(self.d) - u) * w).sum(), by_c, *(self.k * w.sum(0))]
+        return -self.k * w, -self.c * (speed * w + along * (v * w).sum(1, keepdims=True))
+
+
+class Tethers(Interaction):
+    name = "tethered"
+
+    @property
+    def first(self):
+        return self.scene.inputs.parameters.first(self.terms[0])
+
+    def kernel(self, values, precision, shape):
+        return TetherForce(precision, self.first)
+
+    def host(self):
+        return TetherOnHost(self.scene.inputs.parameters.of(self.terms[0]))
+
+    def adjoints(self, values, shape):
+        return dict(tether_felt=(2 * self.mesh.num_vertices,))
+
+    def collect(self, found, out, shape):
+        felt = found["tether_felt"]
+        out.parameters[..., self.first : self.first + 2] += felt[..., ::2, :2].sum(-2)
+        out.parameters[..., self.first + 2 : self.first + 5] += felt[..., 1::2, :].sum(-2)
+
+
+class Tether(ds.terms.Term):
+    """Each vertex is drawn to where it is at rest, shifted by d [m], through a fluid; one in a scene."""
+
+    interaction = Tethers
+
+    def __init__(self, k, c, d):
+        super().__init__(Input("tether_k", k, ((),), "N/m"), Input("tether_c", c, ((),)), Input("tether_d", d, ((3,),)))
+
+
+@pytest.fixture(scope="module")
+def tethered():
+    cube, law = ds.TetrahedralMesh.create_cube(2, 0.2), ds.StableNeoHookean(1e4, 0.3)
+    terms = [ds.Gravity(), Tether(20.0, 30.0, [0.01, 0.02, 0.0]), ds.ElasticFoundation(1e3, 1e3, "xmin")]
+    velocities = dict(initial_velocities=(0.1, -0.5, 0.05))
+    return ds.Scene(cube, law, 1000.0, terms, "ymin", precision="f64", **velocities)
+
+
+@pytest.mark.parametrize("kind", [ds.VelocityVerletSolver, ds.BDF2Solver, ds.StaticSolver], ids=lambda s: s.__name__)
+def test_a_force_of_ones_own_acts_in_every_solver(tethered, kind):
+    options = dict(dt=2e-4) if kind.explicit else dict(dt=5e-3, tolerance=1e-12)
+    rollout = ds.Rollout(kind(tethered, **options), 3, gradients="all")
+    assert ds.dot_product_test(rollout) < 1e-9
+    names = ["tether_k", "tether_d"] + ["tether_c"] * (kind is not ds.StaticSolver)
+    assert ds.check_gradients(rollout, inputs=names).passed
+
+
+def test_implicit_and_explicit_steps_feel_the_same(tethered):
+    explicit = ds.Rollout(ds.VelocityVerletSolver(tethered, dt=1e-4), 100).forward().positions[-1]
+    implicit = ds.Rollout(ds.ImplicitMidpointSolver(tethered, dt=5e-4), 20).forward().positions[-1]
+    way = np.abs(explicit - tethered.mesh.vertices).max()
+    assert np.abs(explicit - implicit).max() < 1e-3 * way
+
+
+class OnHostAlone(Tethers):
+    kernel = Interaction.kernel
+
+
+class TetherOnHostAlone(Tether):
+    interaction = OnHostAlone
+
+
+def test_what_lacks_a_kernel_is_refused_by_explicit_solvers(tethered, monkeypatch):
+    scene = tethered.replace(terms=TetherOnHostAlone(20.0, 30.0, [0.01, 0.02, 0.0]))
+    ds.ImplicitEulerSolver(scene)
+    with pytest.raises(ValueError, match="OnHostAlone has no `kernel`"):
+        ds.VelocityVerletSolver(scene, dt=1e-4)
+    monkeypatch.setattr(OnHostAlone, "host", Interaction.host)
+    with pytest.raises(ValueError, match="OnHostAlone has no `host`"):
+        ds.Rollout(ds.ImplicitEulerSolver(scene), 1).forward()

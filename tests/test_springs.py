@@ -10,9 +10,9 @@ from test_term_order import SOLVERS
 
 import diffsim_ti as ds
 from diffsim_ti.diff_simulator import rollout_frames
-from diffsim_ti.mechanics.ties.attached import Attached
+from diffsim_ti.mechanics.host_force import HostForces
+from diffsim_ti.mechanics.interactions import host_forces
 from diffsim_ti.mechanics.ties.interaction import SpringsAndCables
-from diffsim_ti.state.schedule import EqualSteps
 
 STEPS = 4
 TIMES = np.array([0.0, 0.003, 0.1])
@@ -209,16 +209,15 @@ def test_tension_is_what_holds_an_anchor():
 # ---- energies, forces, momentum ------------------------------------------------------------------------------------------
 
 
-def ties_of(terms, mesh) -> tuple[Attached, np.ndarray]:
-    """(what is attached at the start, places of vertices)"""
+def ties_of(terms, mesh) -> HostForces:
+    """Springs, cables and foundations on the host, at the start."""
     of = scene(terms, mesh=mesh)
-    derived = of.inputs.derive(of.inputs.at_step(0, 1e-3))
-    return Attached.of(of).at(derived, derived.ties, EqualSteps(1e-3, 1), 0, 0.0), mesh.vertices
+    return host_forces(of).with_energy.take(of.inputs.derive(of.inputs.at_step(0, 1e-3)))
 
 
 def test_forces_are_derivatives_of_energies():
     mesh, rng = lidded(), np.random.default_rng(3)
-    held, _ = ties_of(attached(mesh), mesh)
+    held = ties_of(attached(mesh), mesh)
     u = 0.05 * rng.normal(size=mesh.vertices.shape)
     v, h = rng.normal(size=u.shape), 1e-6
     slope = (held.energies(u + h * v).sum() - held.energies(u - h * v).sum()) / (2 * h)
@@ -230,7 +229,7 @@ def test_forces_are_derivatives_of_energies():
         unit[i, d] = 1
         np.testing.assert_allclose(held.product(u, unit)[i], held.blocks(u)[i, :, d], atol=1e-9)
     blocks = np.linalg.norm(matrix(held, u).reshape(len(u), 3, len(u), 3), 2, axis=(1, 3)).sum(1)
-    assert np.all(blocks <= held.ties.row_sums(u) + np.abs(held.foundation.K).sum((1, 2)).max())
+    assert np.all(blocks <= held[0].row_sums(u) + np.abs(held[1].K).sum((1, 2)).max())
 
 
 def matrix(held, u, convex=False) -> np.ndarray:
@@ -242,7 +241,7 @@ def matrix(held, u, convex=False) -> np.ndarray:
 
 def test_what_is_pressed_yields_sideways_but_for_its_convex_part():
     mesh = lidded()
-    held, _ = ties_of([ds.Spring(7, ds.Anchor([0.0, 2.0, 0.0]), 900.0, tension=-500.0)], mesh)
+    held = ties_of([ds.Spring(7, ds.Anchor([0.0, 2.0, 0.0]), 900.0, tension=-500.0)], mesh)
     still = np.zeros_like(mesh.vertices)
     assert np.linalg.eigvalsh(matrix(held, still)).min() < -100
     assert np.linalg.eigvalsh(matrix(held, still, convex=True)).min() > -1e-9
@@ -265,7 +264,7 @@ def test_between_points_of_the_body_nothing_is_left(precision):
     f = first_push(own, mesh, precision)
     small = 1e-7 if precision == "f64" else 1e-3
     assert np.abs(f.sum(0)).max() < small and np.abs(np.cross(mesh.vertices, f).sum(0)).max() < small
-    held, _ = ties_of(own, mesh)
+    held = ties_of(own, mesh)
     np.testing.assert_allclose(f, held.forces(np.zeros_like(f)), atol=small)
     assert np.abs(f).max() > 10
 

@@ -174,8 +174,7 @@ class BatchWorkspace:
         if features.guided:
             out[self.scene.supports.guided] = SPECIAL
         for x in a.interactions:
-            kernel = x.kernel(a.values, a.precision, False)
-            if kernel and not kernel.at_corners:
+            if not x.kernel(a.values, a.precision, False).at_corners:
                 out[x.acts_at] = SPECIAL
         return out
 

@@ -47,6 +47,13 @@ class Derived:
     def __init__(self, **parts: np.ndarray | None):
         vars(self).update(parts)
 
+    def add(self, other: "Derived", factor: float = 1.0) -> None:
+        """Add what another has that is not zero, times a factor."""
+        for name, more in other.parts().items():
+            if more is not None and more.any():
+                own = getattr(self, name)
+                setattr(self, name, factor * more if own is None else own + factor * more)
+
     def parts(self) -> dict[str, np.ndarray | None]:
         """{name: array}"""
         return dict(vars(self))
@@ -62,12 +69,6 @@ class Derived:
     def zeros(self, but=()) -> "Derived":
         """The same shapes, all zero; None for those in `but`."""
         return self.replaced(**dict.fromkeys(but)).mapped(lambda part: np.zeros(part.shape))
-
-    def add(self, other: "Derived") -> None:
-        """Add another one's; where one has None, what the other has stays."""
-        for name, part in vars(other).items():
-            own = getattr(self, name)
-            setattr(self, name, part if own is None else own if part is None else own + part)
 
 
 # the names of the arrays of every scene

@@ -2,9 +2,10 @@
 
 An `Interaction` holds all terms of its kind in a scene: how their inputs become numbers that kernels read, which vertices
 they act on, where adjoints go and how these come back to the scene's numbers. Its `kernel` is what kernels are compiled
-for, and equal ones share compiled kernels. Inputs, explicit steps, their tangents and adjoints, batches, bounds of the
-stable step and what else asks for forces loop over the interactions of a scene (mechanics/interactions.py lists the kinds),
-so that a new force is a new class here and nothing elsewhere.
+for, and equal ones share compiled kernels. Inputs, explicit steps, their tangents and adjoints, and batches loop over the
+interactions of a scene (mechanics/interactions.py lists the kinds). Implicit steps, statics, bounds of the stable step and
+outputs loop over their host forms (host_force.py), which `host` gives. So a new force is a folder of its own and nothing
+elsewhere.
 """
 
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti.inputs import Derived, Link
+from diffsim_ti.mechanics.host_force import HostForce
 from diffsim_ti.runtime import PRECISIONS, traced
 
 if TYPE_CHECKING:
@@ -128,7 +130,6 @@ class Interaction:
     vertices: the vertex of each corner that its items write, shape (corners,); none where it acts vertex by vertex.
     first_load: its corners are loads from here on. count: number of items.
     topology: {array on the device: whole numbers or floats}, what kernels read that no input changes.
-    What a kind does not say it does not have: no numbers of its own, no kernel, no bound, nothing that it holds.
     """
 
     name: ClassVar[str]  # of its counts in kernels: num_<name> items, whose corners begin at first_<name>
@@ -136,11 +137,13 @@ class Interaction:
     derived: ClassVar[dict[str, str]] = {}  # {array of `Derived`: kind}: "vectors2", rows of steps, or "vectors"
     works: str = ""  # in words, by what it may do work on the body, or take energy from it
     is_load = True  # whether it is a load that is given, maybe over time
-    reads_rates: ClassVar[bool] = False  # whether it reads velocities
     apart: ClassVar[bool] = False  # whether launches of their own, before or after each pass, compute it
     vertices: np.ndarray = np.zeros(0, np.int64)
     first_load = count = 0
     pulls = False  # whether its loads may be counted as energy of the body's own as well
+    in_kernels = True  # whether explicit steps take it by its kernel; else a stage of theirs knows its terms
+    on_host = True  # whether it has a host form; else implicit steps know its numbers
+    no_equilibrium: ClassVar[str] = ""  # why statics refuse it
 
     def __init__(self, scene: "Scene", terms: "tuple[Term, ...]"):
         self.scene, self.mesh, self.terms = scene, scene.mesh, terms
@@ -173,9 +176,13 @@ class Interaction:
         """Fields of `Features`, where kernels have something else of it than `kernel`; in_steps: of implicit ones."""
         return {}
 
-    def kernel(self, values: Derived, precision: str, shape: bool) -> ForceKernel | None:
+    def kernel(self, values: Derived, precision: str, shape: bool) -> ForceKernel:
         """What kernels are compiled for, at the values of a run; shape: whether adjoints of the rest shape are wanted."""
-        return None
+        raise NotImplementedError
+
+    def host(self) -> HostForce:
+        """Its host form, for implicit steps and statics, stable steps, energies and outputs."""
+        raise ValueError(f"{type(self).__name__} has no `host`, which all solvers ask for: write it (host_force.py)")
 
     def adjoints(self, values: Derived, shape: bool) -> dict[str, tuple[int, ...]]:
         """{array of vectors that adjoints are added to: its shape}"""
@@ -190,14 +197,10 @@ class Interaction:
     stiff_over_time: "tuple[Term, ...]" = ()  # terms whose stiffness may change over time
     least: ClassVar[tuple[str, ...]] = ()  # plain names of their inputs that are stiffest where they are least
 
-    def added_omega2(self, values: dict[str, np.ndarray], derived: Derived) -> "np.ndarray | float":
-        """What it adds to the body's largest omega^2 [1/s^2] at most, at the stiffest `values` and what is derived of them:
-        a number, or of each vertex the sum of its row of |M^-1 K|, of which the largest counts."""
+    def added_omega2(self, values: dict[str, np.ndarray], derived: Derived) -> float:
+        """What it adds to the body's largest omega^2 [1/s^2] at most, beside the sums of rows of its host form; at the
+        stiffest `values` and what is derived of them."""
         return 0.0
-
-    def resists(self, derived: Derived) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(row, vertex, force) of entries: forces with which it meets motions of the body at rest, each row by itself."""
-        return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3))
 
 
 def add_at(target: np.ndarray, places: np.ndarray, rows: np.ndarray) -> None:

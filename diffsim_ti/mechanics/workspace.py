@@ -43,7 +43,6 @@ class Workspace:
     faces = None  # of explicit steps, that feel obstacles between their corners
     energy_watch = None  # counts energy that long steps add, for solvers that neither damp nor limit it
     changes = 0  # of the state from outside its passes
-    attached = None  # springs, cables and foundations on the host (mechanics/ties/attached.py)
     last_multipliers = None  # of held volumes, in implicit steps
     impulses = None  # of obstacles on vertices in each frame, where a loss names them
 

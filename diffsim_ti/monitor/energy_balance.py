@@ -6,6 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from diffsim_ti import runtime
+from diffsim_ti.mechanics.host_force import Instant
+from diffsim_ti.mechanics.ties.ties import Ties
 from diffsim_ti.mechanics.workspace import Workspace
 from diffsim_ti.monitor import quantities
 from diffsim_ti.state.history import History
@@ -176,7 +178,7 @@ class EnergyBalance:
         self.moving = max(self.moving, kinetic + stored)
         j = min(now, num_passes - 1)
         if features.pulled and self.steady:
-            ties = ws.attached.at(values, a.rows["ties"], ws.solver.schedule, 0, 0.0).ties
+            ties = ws.hosts.only(Ties).take(a.now, Instant(ws.solver.schedule))
             stored += float(ties.energies(runtime.fetch_row(ws.state.u, 0))[ties.cables].sum())
         forces = ws.forces_at(j, num_passes) - ws.loads_at(j, num_passes, pulls=not self.steady) + weight
         if a.bodies:  # without what holds them together

@@ -10,8 +10,9 @@ import taichi as ti
 from diffsim_ti import runtime
 from diffsim_ti.inputs import kinetic_energy, ratios_at_corners
 from diffsim_ti.mechanics.energy.kernels import potential_kernels
+from diffsim_ti.mechanics.host_force import Instant
+from diffsim_ti.mechanics.interactions import host_forces
 from diffsim_ti.mechanics.stress.patched_tetrahedron import functions_of
-from diffsim_ti.mechanics.ties.attached import Attached
 from diffsim_ti.mechanics.workspace import Workspace
 from diffsim_ti.runtime import Kernel, assign, traced
 from diffsim_ti.runtime import at as entry
@@ -171,12 +172,12 @@ def barrier_energies(workspace: Workspace) -> np.ndarray:
 
 
 def attached_energies(workspace: Workspace) -> dict[str, float]:
-    """Energies [J] of springs and foundations in the current state."""
-    attached = workspace.kept("attached", lambda: Attached.of(workspace.scene))
-    if not attached:
+    """Energies [J] of forces, such as of springs and foundations, in the current state."""
+    hosts = workspace.kept("hosts", lambda: host_forces(workspace.scene).with_energy)
+    if not hosts:
         return {}
-    a, u = workspace.arrays, runtime.fetch_row(workspace.state.u, 0)
-    return attached.at(a.values, a.rows["ties"], workspace.solver.schedule, 0, 0.0).stored(u)
+    u = runtime.fetch_row(workspace.state.u, 0)
+    return hosts.take(workspace.arrays.now, Instant(workspace.solver.schedule)).stored(u)
 
 
 def energy(workspace: Workspace) -> Energy:

@@ -8,11 +8,12 @@ import numpy as np
 from diffsim_ti import runtime
 from diffsim_ti.inputs import StressPoints
 from diffsim_ti.mechanics.energy.kernels import potential_kernels
-from diffsim_ti.mechanics.ties.attached import Attached
+from diffsim_ti.mechanics.interactions import host_forces
 from diffsim_ti.mechanics.workspace import Workspace
 from diffsim_ti.mesh.patches import volume_patches
 from diffsim_ti.monitor.reduced_bounds import affine_bound
 from diffsim_ti.monitor.stiffest import stiffest
+from diffsim_ti.state.schedule import EqualSteps
 from diffsim_ti.state.viscous_stages import ViscousStages
 from diffsim_ti.terms.mass_scaling import row_sums
 
@@ -86,9 +87,11 @@ def element_limit(scene: "Scene", values: dict | None = None, kicks: ViscousStag
             if viscous is not None:
                 c[own[0]] = affine_bound(scene.mesh, derived.volumes, own, *viscous, values["density"])
     omega2, c, worst = largest_of(omega2, c)
-    added = sum((x.added_omega2(values, derived) for x in scene.interactions), np.zeros(len(derived.mass)))
-    free = np.setdiff1d(np.nonzero(derived.mass > 0)[0], scene.fixed)
-    more = float(added[free].max(initial=0.0))  # what all of them add at the most
+    hosts = host_forces(scene).with_energy
+    more = sum(x.added_omega2(values, derived) for x in scene.interactions)
+    if hosts:  # what all of them add at the most
+        at = hosts.stiffest(derived, EqualSteps(1.0, 1))
+        more += at.largest_omega2(derived.mass, derived.displacement, scene.fixed)
     if scene.mass_scaling:
         mass = np.where(derived.mass > 0, derived.mass, 1.0)
         rows = row_sums(scene, mu, lam, scene.volume == "patches") / mass
@@ -135,7 +138,7 @@ class Stiffness:
         at = (workspace.state, self)
         self._multiply = kernels.stiffness.bind(a.in_vectors, scene=a, pass_=self, at=at, out=self)
         self.vector, self._random = None, np.random.default_rng(1)
-        self.attached = Attached.of(workspace.scene)  # springs, cables and foundations
+        self.hosts = host_forces(workspace.scene).with_energy
         self._told = None  # the numbers that they have
         self.bodies = workspace.arrays.bodies
 
@@ -166,13 +169,13 @@ class Stiffness:
         self._multiply(num_items=a.num_items, num_tetrahedra=a.num_places, num_vertices=a.num_vertices, per_gamma=0.0)
         y = runtime.fetch(self.y)[0].astype(np.float64) * scale
         y = -root * (y + self.ws.chambers.product(w) if self.ws.chambers else y)
-        if self.attached:
+        if self.hosts:
             now = runtime.fetch_row(self.ws.state.u, 0)
-            given = a.values, a.rows["ties"]
+            given = a.values, *a.rows.values()
             if self._told is None or any(x is not y for x, y in zip(given, self._told)):
-                self.attached.stiffest(*given, self.ws.solver.schedule)
+                self.hosts.stiffest(a.now, self.ws.solver.schedule)
                 self._told = given
-            y += root * self.attached.product(now, w)
+            y += root * self.hosts.product(now, w)
         return self.possible(y, root)
 
     def _stiffest(self, x: np.ndarray) -> float:

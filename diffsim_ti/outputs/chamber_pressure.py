@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diffsim_ti.mechanics.chambers.pressures import ChamberPressure as Pressures
+from diffsim_ti.mechanics.chambers.laws import law_of
+from diffsim_ti.mechanics.chambers.pressures import rows_of
 from diffsim_ti.outputs.output import Change, Output
 from diffsim_ti.terms import Chamber
 
@@ -38,10 +39,10 @@ class ChamberPressure(Output):
 
     def settled(self, scene: "Scene") -> "ChamberPressure":
         out = copy(self)
-        out.place = scene.place_among(scene.terms_of(Chamber), self.chamber, "chamber")
-        out.inputs, out.pressures = scene.inputs, Pressures(scene)
-        out.law, out.rows = out.pressures.laws[out.place], out.pressures.rows[out.place]
-        out.enclosure = out.pressures.enclosures[out.place]
+        chambers = scene.terms_of(Chamber)
+        out.place, out.inputs = scene.place_among(chambers, self.chamber, "chamber"), scene.inputs
+        chamber = chambers[out.place]
+        out.law, out.enclosure, (out.rows,) = law_of(chamber), chamber.enclosure, rows_of(scene, [chamber])
         return out
 
     def shape(self, num_frames: int) -> tuple[int, ...]:

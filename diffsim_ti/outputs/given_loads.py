@@ -3,38 +3,40 @@
 import numpy as np
 
 from diffsim_ti.inputs import Derived
-from diffsim_ti.mechanics.chambers.pressures import following
+from diffsim_ti.mechanics.chambers.multipliers import HeldPressure
+from diffsim_ti.mechanics.host_force import HostForces, Instant
+from diffsim_ti.mechanics.interactions import host_forces
 from diffsim_ti.mechanics.loads.interaction import DeadLoads
-from diffsim_ti.mechanics.ties.attached import Attached
-from diffsim_ti.state.schedule import EqualSteps, Schedule
-from diffsim_ti.terms import Gravity
+from diffsim_ti.state.schedule import EqualSteps
+from diffsim_ti.terms import Chamber, Gravity
 
 STEPS = EqualSteps(1.0, 1)  # a pass for each step
 
 
-def at_end(step: int, begins: bool = False) -> tuple[Schedule, int, float]:
-    """(schedule, pass, share of its step) of a frame after so many steps."""
-    return STEPS, max(step - 1, 0), float(step > 0 and not begins)
+def at_end(step: int, begins: bool = False) -> Instant:
+    """That of a frame after so many steps."""
+    return Instant(STEPS, max(step - 1, 0), float(step > 0 and not begins))
 
 
 class GivenLoads:
-    """Forces [N], shape (num_vertices, 3): weight, dead loads, pressures, chambers, springs, cables and foundations after so
-    many steps: those of the last of these as it ends; with `begins`, as it begins.
+    """Forces [N], shape (num_vertices, 3): weight, dead loads and those of interactions that do not read velocities, after
+    so many steps: those of the last of these as it ends; with `begins`, as it begins.
 
     held: the pressures [Pa] of the scene's chambers in a frame, of which those are taken that hold a volume.
     """
 
     def __init__(self, scene, weight: bool = True):
-        self.follower, self.elements = following(scene), scene.mesh.elements
+        self.elements, self.num_chambers = scene.mesh.elements, len(scene.terms_of(Chamber))
+        self.hosts = HostForces(force for force in host_forces(scene) if not force.reads_velocities)
+        self.filled = self.hosts.only(HeldPressure)
         gravity = scene.term(Gravity) if weight else None
         self.gravity = None if gravity is None else scene.inputs.parameters.of(gravity)
         self.dead = scene.interaction(DeadLoads)
-        self.attached = Attached.of(scene)
 
     @property
     def any(self) -> bool:
         """Whether there is one."""
-        return any(x is not None for x in (self.gravity, self.dead, self.follower, self.attached))
+        return bool(self.hosts) or self.gravity is not None or self.dead is not None
 
     @staticmethod
     def _row(step: int, rows: np.ndarray) -> np.ndarray:
@@ -45,35 +47,35 @@ class GivenLoads:
         row = self._row(step, rows)
         return row[1 if step and not begins else 0 :: 2] if self.dead.keyed else row
 
-    def _pressures(self, step: int, rows: np.ndarray, begins: bool) -> np.ndarray:
-        return self._row(step, rows)[:, 1 if step and not begins else 0]
-
-    def _attached(self, derived: Derived, step: int, begins: bool) -> Attached:
-        return self.attached.at(derived, derived.ties, *at_end(step, begins))
-
     def _masses(self, derived: Derived) -> np.ndarray:
         """What gravity acts on, shape (num_vertices,), or its change."""
         if derived.element_masses is None:
             return derived.mass
         return np.bincount(self.elements.ravel(), derived.element_masses.sum(2).ravel(), len(derived.mass))
 
-    def _following(self, derived: Derived, step: int, begins: bool, held):
-        """Pressures and chambers of a frame."""
-        follower = self.follower.at(self._pressures(step, derived.follower, begins))
-        for k in follower.held if held is not None else ():
-            follower.laws[k].multiplier = float(held[k])  # without a penalty, gamma: the pressure whatever the volume
-        return follower
+    def _hosts(self, derived: Derived, step: int, begins: bool, held) -> HostForces:
+        """As they are in a frame."""
+        hosts = self.hosts.take(derived, at_end(step, begins))
+        if self.filled and held is not None:
+            for law, k in zip(self.filled.laws, self.filled.places):
+                law.multiplier = float(held[k])  # without a penalty, gamma: the pressure whatever the volume
+        return hosts
 
     def held_jvp(self, x: np.ndarray, change: np.ndarray) -> np.ndarray:
         """Change of the forces for that of the pressures of held volumes."""
-        return sum((change[k] * self.follower.unit_forces(x, k) for k in self.follower.held), np.zeros(x.shape))
+        return sum(change[k] * push for k, push in self._unit_forces(x))
 
     def held_vjp(self, x: np.ndarray, w: np.ndarray) -> np.ndarray:
         """Adjoint of the pressures of all chambers, zero of gases, for that of the forces."""
-        out = np.zeros(len(self.follower.laws))
-        for k in self.follower.held:
-            out[k] = float((self.follower.unit_forces(x, k) * w).sum())
+        out = np.zeros(self.num_chambers)
+        for k, push in self._unit_forces(x):
+            out[k] = float((push * w).sum())
         return out
+
+    def _unit_forces(self, x: np.ndarray) -> list:
+        """(place of a chamber that holds a volume, forces of 1 Pa in it) of each."""
+        places = self.filled.places if self.filled else []
+        return [(place, self.filled.unit_forces(x - self.filled.rest, k)) for k, place in enumerate(places)]
 
     def forces(self, derived: Derived, x: np.ndarray, step: int, begins: bool = False, held=None) -> np.ndarray:
         """At places x [m] after so many steps."""
@@ -82,11 +84,7 @@ class GivenLoads:
             out += self._masses(derived)[:, None] * derived.parameters[self.gravity][:3]
         if self.dead:
             out[self.dead.acts_at] += self._dead(step, derived.forces, begins)
-        if self.follower is not None:
-            out += self._following(derived, step, begins, held).forces(x)
-        if self.attached:
-            out += self._attached(derived, step, begins).forces(x - derived.rest)
-        return out
+        return out + self._hosts(derived, step, begins, held).forces(x - derived.rest)
 
     def jvp(
         self,
@@ -105,13 +103,8 @@ class GivenLoads:
             out += self._masses(moved)[:, None] * g + self._masses(derived)[:, None] * dg
         if self.dead:
             out[self.dead.acts_at] += self._dead(step, moved.forces, begins)
-        if self.follower is not None:
-            follower = self._following(derived, step, begins, held)
-            out += follower.jvp(x, dx, self._pressures(step, moved.follower, begins))
-        if self.attached:
-            attached, du = self._attached(derived, step, begins), dx - moved.rest
-            out += attached.jvp(x - derived.rest, du, moved, *at_end(step, begins))
-        return out
+        hosts = self._hosts(derived, step, begins, held)
+        return out + hosts.jvp(x - derived.rest, dx - moved.rest, np.zeros_like(dx), moved)
 
     def vjp(
         self, derived: Derived, x: np.ndarray, w: np.ndarray, step: int, adj: Derived, begins: bool = False, held=None
@@ -126,12 +119,6 @@ class GivenLoads:
             adj.parameters[self.gravity.start : self.gravity.start + 3] += self._masses(derived) @ w
         if self.dead:
             self._dead(step, adj.forces, begins)[:] += w[self.dead.acts_at]
-        out = np.zeros(x.shape)
-        if self.attached:
-            out += self._attached(derived, step, begins).vjp(x - derived.rest, w, adj, *at_end(step, begins))
-            adj.rest -= out
-        if self.follower is None:
-            return out
-        follower = self._following(derived, step, begins, held)
-        self._pressures(step, adj.follower, begins)[:] += follower.pressures_vjp(x, w)
-        return out + follower.vjp(x, w)
+        by_u, _ = self._hosts(derived, step, begins, held).vjp(x - derived.rest, w, adj)
+        adj.rest -= by_u
+        return by_u

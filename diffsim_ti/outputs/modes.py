@@ -8,7 +8,8 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti.common.checked import shown
 from diffsim_ti.inputs import StressPoints
-from diffsim_ti.mechanics.ties.attached import Attached
+from diffsim_ti.mechanics.host_force import HostForces
+from diffsim_ti.mechanics.interactions import host_forces
 from diffsim_ti.outputs.body_forces import BodyForces
 
 if TYPE_CHECKING:
@@ -64,17 +65,15 @@ class Modes:
                 raise ValueError(f"modes {group} are motions without stiffness: their frequency 0 has no gradient")
         body = BodyForces(self.scene)
         values = self.scene.inputs.at_times([0.0])
-        derived, attached = body.load(values), Attached.of(self.scene)
+        derived, hosts = body.load(values), host_forces(self.scene).with_energy
         total, by_state = derived.zeros(), np.zeros_like(self.displacements)
         for group in self.groups:
             if not by[group[0]]:
                 continue
             weight = by[group[0]] / (8 * np.pi**2 * abs(self.frequencies[group[0]]))
             for i in group:
-                slope, by_u = _slope(body, attached, self.displacements, self.shapes[i], derived)
-                for name, part in slope.parts().items():
-                    if part is not None:
-                        setattr(total, name, getattr(total, name) + weight * part)
+                slope, by_u = _slope(body, hosts, self.displacements, self.shapes[i], derived)
+                total.add(slope, weight)
                 by_state += weight * by_u
                 self._add_mass(total, -weight * self.eigenvalues[i], self.shapes[i])
         return self.scene.inputs.derive_vjp(values, total, tuple(values)) | {"displacements": by_state}
@@ -91,7 +90,7 @@ class Modes:
 FOURTH_ORDER = ((-2, 1 / 12), (-1, -8 / 12), (1, 8 / 12), (2, -1 / 12))  # shifts and weights of a difference
 
 
-def _slope(body: BodyForces, attached: Attached | None, u: np.ndarray, phi: np.ndarray, derived):
+def _slope(body: BodyForces, hosts: HostForces, u: np.ndarray, phi: np.ndarray, derived):
     """Derivatives of phi . K phi, of what kernels read and of u."""
     X, H = derived.rest, StressPoints.of(body.scene.mesh, derived).displacement_gradients(phi)
     step = 2e-3 / max(np.abs(H).max(), 1e-300)  # a strain that a law's third derivatives resolve
@@ -104,20 +103,18 @@ def _slope(body: BodyForces, attached: Attached | None, u: np.ndarray, phi: np.n
         by_u += weight * own
         for name in ("coefficients", "gradients", "volumes"):
             setattr(total, name, getattr(total, name) + weight * getattr(found, name))
-    if attached is not None:
-        by_u += _slope_of_attached(attached.at_start(derived), u, phi, derived, total)
+    if hosts:
+        by_u += _slope_of_hosts(hosts.take(derived), u, phi, derived, total)
     return total, by_u
 
 
-def _slope_of_attached(attached: Attached, u: np.ndarray, phi: np.ndarray, derived, total) -> np.ndarray:
-    """The same of springs, cables and foundations; adds what kernels read to `total`."""
-    step, by_u = 2e-3 / attached.turning(u, phi), np.zeros_like(u)
+def _slope_of_hosts(hosts: HostForces, u: np.ndarray, phi: np.ndarray, derived, total) -> np.ndarray:
+    """The same of host forces; adds what kernels read to `total`."""
+    step, by_u = 2e-3 / hosts.turning(u, phi), np.zeros_like(u)
     for shift, weight in FOURTH_ORDER:
         found = derived.zeros()
-        by_u -= weight / step * attached.vjp_at_start(u + shift * step * phi, phi, found)
-        for name in ("ties", "tie_segments", "foundation"):
-            if (part := getattr(found, name)) is not None:
-                setattr(total, name, getattr(total, name) - weight / step * part)
+        by_u -= weight / step * hosts.vjp(u + shift * step * phi, phi, found)[0]
+        total.add(found, -weight / step)
     return by_u
 
 

@@ -68,8 +68,10 @@ class Reaction(Output):
         return f"Reaction({self.support!r}, name={self.name!r})"
 
     def settled(self, scene: "Scene") -> "Reaction":
-        for term in (t for x in scene.interactions for t in x.terms if x.reads_rates):
-            raise ValueError(f"Reaction does not know {type(term).__name__}; leave the one or the other out")
+        for x in scene.interactions:
+            if x.on_host and x.host().reads_velocities:
+                terms = ", ".join(sorted({type(term).__name__ for term in x.terms}))
+                raise ValueError(f"Reaction does not know {terms}; leave the one or the other out")
         out = copy(self)
         out.vertices = scene.held if self.support is None else scene.mesh.vertex_indices(self.support)
         loose = np.setdiff1d(out.vertices, scene.held)
@@ -159,7 +161,8 @@ class Reaction(Output):
             velocities[k] += by_v
             rest -= by_u
         adj = adjoint.collect()
-        adj.rest = adj.rest + rest
+        adj.element_masses = None
         adj.add(by_loads)
+        adj.rest = adj.rest + rest
         inputs = self.scene.inputs.derive_vjp(frames.inputs, adj, tuple(frames.inputs))
         return Change(positions, velocities, inputs, chamber_pressures=np.stack(by_held) if by_held else None)

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diffsim_ti.mechanics.ties.attached import Attached
 from diffsim_ti.mechanics.ties.interaction import SpringsAndCables
 from diffsim_ti.outputs.given_loads import at_end
 from diffsim_ti.outputs.output import Change, Output
@@ -32,7 +31,7 @@ class _OfTies(Output):
         ties = scene.interaction(SpringsAndCables)
         if ties is None:
             scene.place_among((), self.tie, "spring or cable")
-        out.scene, out.own, out.attached = scene, ties.places(self.tie), Attached.of(scene)
+        out.scene, out.own, out.ties = scene, ties.places(self.tie), ties.host()
         out.count = out.own.stop - out.own.start
         return out
 
@@ -54,8 +53,8 @@ class _OfTies(Output):
     def _frames(self, frames, derived):
         """(ties as they are in each frame, displacements)"""
         for step, x in zip(frames.steps, frames.positions.astype(np.float64)):
-            ties = self.attached.at(derived, derived.ties, *at_end(int(step))).ties
-            yield ties, x - derived.rest, at_end(int(step))
+            instant = at_end(int(step))
+            yield self.ties.take(derived, instant), x - derived.rest, instant
 
     def value(self, frames: "Frames") -> np.ndarray:
         derived = self.scene.inputs.derive(frames.inputs)
@@ -66,19 +65,19 @@ class _OfTies(Output):
         derived = self.scene.inputs.derive(frames.inputs)
         moved = self.scene.inputs.derive_jvp(frames.inputs, change.inputs)
         dx, out = np.zeros(frames.positions.shape) if change.positions is None else change.positions, []
-        for (ties, u, (schedule, j, share)), moving in zip(self._frames(frames, derived), dx):
-            numbers = moved.tie_segments, *schedule.ties(moved.ties, j, share)
+        for (ties, u, at), moving in zip(self._frames(frames, derived), dx):
+            numbers = moved.tie_segments, *at.schedule.ties(moved.ties, at.j, at.share)
             out.append(self._jvp(ties, u, moving - moved.rest, numbers)[self.own])
         return np.reshape(out, self.shape(len(out)))
 
     def vjp(self, frames: "Frames", seed: np.ndarray) -> Change:
         derived, positions = self.scene.inputs.derive(frames.inputs), np.zeros(frames.positions.shape)
-        adj, all_ties = derived.zeros(), np.zeros((len(positions), len(self.attached.ties.paths)))
+        adj, all_ties = derived.zeros(), np.zeros((len(positions), len(self.ties.paths)))
         all_ties[:, self.own] = seed.reshape(len(positions), -1)
-        for k, (ties, u, (schedule, j, share)) in enumerate(self._frames(frames, derived)):
+        for k, (ties, u, at) in enumerate(self._frames(frames, derived)):
             positions[k], segments, numbers = self._vjp(ties, u, all_ties[k])
             adj.tie_segments += segments
-            schedule.add_ties(adj.ties, j, share, numbers)
+            at.schedule.add_ties(adj.ties, at.j, at.share, numbers)
         adj.rest = adj.rest - positions.sum(0)
         return Change(
             positions=positions, inputs=self.scene.inputs.derive_vjp(frames.inputs, adj, tuple(frames.inputs))

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti import runtime
 from diffsim_ti.common.checked import number, shown, whole
+from diffsim_ti.mechanics.interaction import Interaction
 from diffsim_ti.monitor import stability
 from diffsim_ti.monitor.stiffest import sampled_by_runs, stiffest
 from diffsim_ti.state.schedule import EqualSteps, Schedule, UnequalSteps
@@ -50,6 +51,11 @@ class Solver(ABC):
     ):
         dt, substeps = number("dt", dt, unit="s"), whole("substeps", substeps, 1)
         self.check_scene(scene)
+        for x in scene.interactions:
+            if self.explicit and x.in_kernels and type(x).kernel is Interaction.kernel:
+                raise ValueError(
+                    f"{type(x).__name__} has no `kernel`, which explicit steps run: write it, or take an implicit solver"
+                )
         self.scene = scene if self.explicit else scene.with_consistent_mass()
         self.dt, self.substeps = float(dt), int(substeps)
         self.parallel, self.allow_unstable, self.check_start = parallel, allow_unstable, check_start

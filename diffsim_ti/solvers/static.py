@@ -47,10 +47,9 @@ class StaticSolver(ImplicitSolver):
         preconditioner: str = "auto",
     ):
         self.check_scene(scene)
-        for term in (t for x in scene.interactions for t in x.terms if x.reads_rates):
-            raise ValueError(
-                f"{type(term).__name__} is of velocities, and an equilibrium has none; take a solver with inertia"
-            )
+        for x in scene.interactions:
+            if x.no_equilibrium:
+                raise ValueError(f"{x.no_equilibrium}; take a solver with inertia")
         law = scene.law
         if law.state_names:
             raise ValueError(

@@ -45,10 +45,11 @@ class SceneArrays:
         self.num_vertices, self.num_tetrahedra = mesh.num_vertices, mesh.num_tetrahedra
         self.contacts = tuple(t for t in scene.ordered_terms if t.acts_on_surface)
         self.fixed, self.held, self.supports, self.feels_faces = scene.fixed, scene.held, scene.supports, feels_faces
-        self.interactions, self.presses = scene.interactions, presses
-        self.own = {name: kind for x in self.interactions for name, kind in x.derived.items()}  # their numbers
+        self.interactions = tuple(x for x in scene.interactions if x.in_kernels) if presses else ()
+        self._all = scene.interactions
+        self.own = {name: kind for x in self._all for name, kind in x.derived.items()}  # their numbers
         self.mesh, self.precision, self.self_contact = mesh, precision, scene.term(SelfContact)
-        self._upload_topology(scene)
+        self._upload_topology(scene, presses)
         rows = scene.inputs.parameters
         self.obstacles = self._twins(scene)
         self.curved, self.bend = are_felt(mesh, self.contacts, bend), bend
@@ -90,7 +91,7 @@ class SceneArrays:
         self.order[:m] = np.arange(m)
         self.place, self.num_places = slice(m), m
 
-    def _upload_topology(self, scene) -> None:
+    def _upload_topology(self, scene, presses) -> None:
         mesh, n = self.mesh, self.num_vertices
         self.tets = runtime.upload(self.to_blocks(mesh.elements).ravel(), ti.i32)
         self.first_contact_corner = num_corners = self.nodes * LANES * self.num_blocks
@@ -105,7 +106,7 @@ class SceneArrays:
         self.first_corner = num_corners  # of interactions
         self.counts, first_load, first_push = {}, None, None
         self.force_slot = self.motion_slot = runtime.array(ti.i32, 1)
-        for x in self.interactions if self.presses else ():
+        for x in self._all if presses else ():
             corners = len(x.vertices)
             self.counts |= {f"num_{x.name}": x.count, f"first_{x.name}": num_corners, **x.counts}
             for name, data in x.topology.items():
@@ -161,12 +162,13 @@ class SceneArrays:
         return self._known_features[density, shape]
 
     def _make_features(self, density: bool, shape: bool) -> Features:
-        kernels = (x.kernel(self.values, self.precision, shape) for x in self.interactions if self.presses)
-        more = {name: said for x in self.interactions for name, said in x.features(self.values, self.in_steps).items()}
+        said = {}
+        for x in self._all:
+            said |= x.features(self.values, self.in_steps)
         return Features(
             **self._features,
-            **more,
-            interactions=tuple(kernel for kernel in kernels if kernel),
+            **said,
+            interactions=tuple(x.kernel(self.values, self.precision, shape) for x in self.interactions),
             uniform=self.values.coefficients.ndim == 1,
             density=density,
             shape=shape,
@@ -214,6 +216,11 @@ class SceneArrays:
             given = (getattr(d, name) for d in derived for name in ("forces", "growths", *self.rows_of_steps))
             return max(1 + len(x) for x in given if x is not None)
         return out
+
+    @property
+    def now(self) -> Derived:
+        """What is loaded, with the rows of the steps to come."""
+        return Derived(**self.rows)
 
     def load_rows(self, **rows: np.ndarray) -> None:
         """Other rows of what is given by steps, by name: those of the steps to come."""

@@ -7,7 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from diffsim_ti.mechanics.ties.attached import Attached
+from diffsim_ti.mechanics.host_force import Instant
+from diffsim_ti.mechanics.interactions import host_forces
+from diffsim_ti.mechanics.ties.ties import Ties
 from diffsim_ti.rollout.simulator import Simulator
 from diffsim_ti.scene import Scene
 from diffsim_ti.solvers import SOLVERS
@@ -97,10 +99,10 @@ def measure(simulator: Simulator) -> tuple[float, float, float, float]:
 
 def given_by_muscles(simulator: Simulator) -> float:
     """What muscles and cables with steady pulls have given the body since it was at rest [J]."""
-    attached = Attached.of(simulator.scene)
-    if not attached or not attached.ties:
+    ties = host_forces(simulator.scene).only(Ties)
+    if ties is None:
         return 0.0
-    ties = attached.at_start(simulator.scene.inputs.derive(simulator.values)).ties
+    ties.take(simulator.scene.inputs.derive(simulator.values), Instant())
     return -float(ties.energies(simulator.displacements.astype(float))[ties.cables].sum())
 
 

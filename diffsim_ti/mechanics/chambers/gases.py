@@ -10,6 +10,7 @@ from diffsim_ti import runtime
 from diffsim_ti.mechanics.chambers.curved_gas_kernels import CurvedChamberKernels
 from diffsim_ti.mechanics.chambers.gas_kernels import ChamberKernels
 from diffsim_ti.mechanics.chambers.interaction import Gases
+from diffsim_ti.mechanics.host_force import Instant
 from diffsim_ti.runtime import kernels_of
 
 PARTS = 64  # sums that a GPU's threads make side by side for each chamber
@@ -21,6 +22,7 @@ class Chambers:
     def __init__(self, workspace):
         self.ws, scene, a = weakref.proxy(workspace), workspace.scene, workspace.arrays
         gases = scene.interaction(Gases)
+        self.host = gases.host()
         closed, self.rows = [chamber.enclosure for chamber in gases.terms], gases.rows
         counts = [len(enclosure.triangles) for enclosure in closed]
         own = [np.arange(len(e.triangles)) < e.num_own for e in closed]
@@ -73,7 +75,6 @@ class Chambers:
 
     def product(self, w: np.ndarray) -> np.ndarray:
         """df/dx w of the gases in the current state, shape (num_vertices, 3)."""
-        ws = self.ws
-        following = ws.following.at(ws.numbers_at(self.now, self.now + 2))
-        following.given = np.zeros_like(following.given)  # pressures do not count in the stable step
-        return following.jvp(ws.arrays.values.rest + runtime.fetch_row(ws.state.u, 0), w)
+        ws, u = self.ws, runtime.fetch_row(self.ws.state.u, 0)
+        kicks = ((x, Instant(ws.solver.schedule, *k)) for x, k in ws.kicks(self.now, self.now + 2))
+        return sum(x * self.host.take(ws.arrays.now, instant).jvp(u, w) for x, instant in kicks)

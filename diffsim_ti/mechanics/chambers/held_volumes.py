@@ -17,8 +17,10 @@ from functools import cached_property
 
 import numpy as np
 
+from diffsim_ti.mechanics.chambers.pressures import rows_of
 from diffsim_ti.mesh.enclosure import Enclosure
 from diffsim_ti.runtime.slots import VertexRows
+from diffsim_ti.terms import Chamber, FilledChamber
 
 
 class VolumeLost(FloatingPointError):
@@ -99,10 +101,11 @@ class HeldVolumes:
     """Those of a run's scene; `pressures` [Pa] of the last pass and of frames, `work` [J] on the body so far."""
 
     def __init__(self, workspace):
-        self.ws, scene, follower = weakref.proxy(workspace), workspace.scene, workspace.following
-        self.places = follower.held
-        self.columns = [follower.rows[k].start for k in self.places]  # of their targets among the numbers of loads
-        closed = [follower.enclosures[k] for k in self.places]
+        self.ws, scene = weakref.proxy(workspace), workspace.scene
+        filled, chambers = scene.terms_of(FilledChamber), scene.terms_of(Chamber)
+        self.places, self.num_chambers = [chambers.index(chamber) for chamber in filled], len(chambers)
+        self.columns = [rows.start for rows in rows_of(scene, filled)]  # of their targets among the numbers of loads
+        closed = [chamber.enclosure for chamber in filled]
         self.nodes = np.unique(np.concatenate([enclosure.triangles.ravel() for enclosure in closed]))
         self.enclosures = [enclosure.of_nodes(self.nodes) for enclosure in closed]
         self.free = scene.supports.freedom(scene.mesh.num_vertices)[self.nodes]
@@ -117,7 +120,7 @@ class HeldVolumes:
 
     def spread(self, pressures: np.ndarray) -> np.ndarray:
         """Among those of all chambers, of which others have none here."""
-        out = np.zeros(len(self.ws.following.laws))
+        out = np.zeros(self.num_chambers)
         out[self.places] = pressures
         return out
 

@@ -1,21 +1,17 @@
-"""What fills chambers, among a scene's interactions."""
+"""Gases and filled chambers, among a scene's interactions."""
 
 from functools import cached_property
 
 import numpy as np
 
 from diffsim_ti.mechanics.chambers.gas_force import GasForce
+from diffsim_ti.mechanics.chambers.multipliers import HeldPressure
+from diffsim_ti.mechanics.chambers.pressures import ChamberPressure, rows_of
 from diffsim_ti.mechanics.interaction import add_at
 from diffsim_ti.mechanics.pressure.interaction import Pressing
 from diffsim_ti.terms import FilledChamber, GasChamber
 
 WORKS = "gases and filled chambers"
-
-
-class FilledChambers(Pressing):
-    """They act by multipliers, in stages of their own (held_volumes.py, multipliers.py)."""
-
-    name, kinds, works, apart = "filled", (FilledChamber,), WORKS, True
 
 
 class Gases(Pressing):
@@ -27,12 +23,20 @@ class Gases(Pressing):
     def triangles(self) -> np.ndarray:
         return np.concatenate([chamber.enclosure.triangles for chamber in self.terms])
 
+    @cached_property
+    def rows(self) -> list[slice]:
+        """Of the numbers of each in `Derived.follower`."""
+        return rows_of(self.scene, self.terms)
+
     @property
     def vertices(self) -> np.ndarray:
         return self.triangles.ravel()
 
     def kernel(self, values, precision, shape):
         return GasForce(precision, len(values.follower) > 1)
+
+    def host(self):
+        return ChamberPressure(self.scene, self.terms)
 
     def adjoints(self, values, shape):
         return dict(
@@ -58,3 +62,12 @@ class Gases(Pressing):
             V, g = chamber.enclosure.volume(derived.rest), chamber.enclosure.gradient(derived.rest)
             out += float(values[names["gas_exponent"]] * p / V * ((g[free] ** 2).sum(1) / derived.mass[free]).sum())
         return out
+
+
+class FilledChambers(Pressing):
+    """Implicit steps find their pressures as multipliers (multipliers.py); explicit steps have a stage (held_volumes.py)."""
+
+    name, kinds, works, apart, in_kernels = "filled", (FilledChamber,), WORKS, True, False
+
+    def host(self):
+        return HeldPressure(self.scene, self.terms)

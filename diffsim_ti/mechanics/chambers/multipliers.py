@@ -12,23 +12,29 @@ Nocedal, Wright, Numerical Optimization, 2nd ed., 2006, 17.3 and 18.4, doi:10.10
 
 import numpy as np
 
+from diffsim_ti.mechanics.chambers.pressures import ChamberPressure
+
+
+class HeldPressure(ChamberPressure):
+    """What chambers push with that hold their volume."""
+
 
 class HeldVolumes:
-    """Of the chambers of a ChamberPressure (potential/) that hold their volume.
+    """Of the chambers of a HeldPressure.
 
     free: what vertices may do, sets that do not deform all; eps: rounding of displacements.
     """
 
     share = 0.1  # measured: a hundredth loses thick spheres, all of it halves the steps
 
-    def __init__(self, follower, free, rest: np.ndarray, tolerance: float, eps: float):
+    def __init__(self, follower: HeldPressure, free, rest: np.ndarray, tolerance: float, eps: float):
         self.follower, self.free, self.rest, self.tolerance, self.eps = follower, free, rest, tolerance, eps
-        self.laws = [follower.laws[k] for k in follower.held]
+        self.laws, self.places = follower.laws, follower.places
 
     def stiffen(self, stiffness: np.ndarray) -> None:
         """Set gamma so that gamma |g|^2 is a tenth of the stiffness of a vertex [N/m], shape (num_vertices, 1)."""
         self._stiffer = 0
-        for law, g in zip(self.laws, self.gradients(self.rest)):
+        for law, g in zip(self.laws, self.gradients(np.zeros_like(self.rest))):
             g = g * self.free
             law.gamma = self.share * float((g * stiffness * g).sum() / max((g * g).sum() ** 2, 1e-300))
 
@@ -39,13 +45,13 @@ class HeldVolumes:
             law.gamma *= 10
         return self._stiffer <= 3
 
-    def gradients(self, x: np.ndarray) -> list[np.ndarray]:
-        """dV/dx of each."""
-        return [self.follower.enclosures[k].gradient(x) for k in self.follower.held]
+    def gradients(self, u: np.ndarray) -> list[np.ndarray]:
+        """dV/du of each."""
+        return [enclosure.gradient(self.rest + u) for enclosure in self.follower.enclosures]
 
     def place(self, u: np.ndarray, multipliers: np.ndarray | None = None) -> None:
         """Count from the volumes at u, at the pressures there or at `multipliers`."""
-        V = self.follower.volumes(self.rest + u)[self.follower.held]
+        V = self.follower.volumes(self.rest + u)
         for k, (law, now) in enumerate(zip(self.laws, V)):
             law.multiplier = law.pressure(now) if multipliers is None else float(multipliers[k])
             law.volume = float(now)
@@ -66,7 +72,7 @@ class HeldVolumes:
 
     def met(self, u: np.ndarray) -> bool:
         """Whether volumes are as asked for, to tolerance and rounding."""
-        for law, left, g in zip(self.laws, self.missing, self.gradients(self.rest + u)):
+        for law, left, g in zip(self.laws, self.missing, self.gradients(u)):
             noise = 4 * self.eps * float((np.abs(g) * np.abs(u)).sum()) + 1e-14 * abs(law.target)
             if abs(left) > self.tolerance * abs(law.target) + noise:
                 return False
@@ -78,7 +84,7 @@ class HeldVolumes:
         `bordered` counts from there: what pressures balance anyway is not left to a rough solve, whose error would be larger
         than the direction.
         """
-        G = [g * self.free for g in self.gradients(u + self.rest)]
+        G = [g * self.free for g in self.gradients(u)]
         soft = np.divide(1.0, stiffness, out=np.zeros_like(stiffness), where=stiffness > 0)
         S = np.array([[float((g * soft * h).sum()) for h in G] for g in G])
         self._ahead = np.linalg.lstsq(S, -np.array([float((g * soft * R).sum()) for g in G]), rcond=None)[0]
@@ -87,7 +93,7 @@ class HeldVolumes:
     def bordered(self, u: np.ndarray, y: np.ndarray, solve) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(d, what comes to R, dp) from y = K'^-1 R, R as `predicted`; solve(g): K'^-1 g. The multipliers go to p + mu, for
         the line search."""
-        G = [g * self.free for g in self.gradients(self.rest + u)]
+        G = [g * self.free for g in self.gradients(u)]
         Z = [solve(g) for g in G]
         S = np.array([[float((g * z).sum()) for z in Z] for g in G])
         r, self._before = self.missing, self.multipliers
@@ -100,30 +106,33 @@ class HeldVolumes:
 
     # ---- derivatives -------------------------------------------------------------------------------------------------
 
-    def tangent(self, x: np.ndarray, y: np.ndarray, targets: np.ndarray, solve) -> tuple[np.ndarray, np.ndarray]:
+    def tangent(self, u: np.ndarray, y: np.ndarray, targets: np.ndarray, solve) -> tuple[np.ndarray, np.ndarray]:
         """(du, dp) from y = K'^-1 dR, the target in dR having the slope gamma; targets: their change less what V changes by
         all that does not follow from dR."""
-        G = [g * self.free for g in self.gradients(x)]
+        G = [g * self.free for g in self.gradients(u)]
         Z = [solve(g) for g in G]
         S = np.array([[float((g * z).sum()) for z in Z] for g in G])
         dp = np.linalg.solve(S, targets - np.array([float((g * y).sum()) for g in G]))
         return y + sum(m * z for m, z in zip(dp, Z)), dp
 
-    def targets_jvp(self, x: np.ndarray, dx: np.ndarray, numbers_dot: np.ndarray) -> np.ndarray:
-        """Change of targets for that of the numbers, less that of volumes by dx."""
-        rows = [self.follower.rows[k] for k in self.follower.held]
-        changes = [law.target_by_numbers() @ numbers_dot[own] for law, own in zip(self.laws, rows)]
-        return np.array(changes) - [float((G * dx).sum()) for G in self.gradients(x)]
+    def targets_jvp(self, u: np.ndarray, du: np.ndarray, moved) -> np.ndarray:
+        """Change of targets for that of the numbers, less that of volumes by du and by the rest shape."""
+        instant, dx = self.follower.instant, du + moved.rest
+        changes = instant.schedule.pressure(moved.follower, instant.j, instant.share)
+        of_targets = [law.target_by_numbers() @ changes[own] for law, own in zip(self.laws, self.follower.rows)]
+        return np.array(of_targets) - [float((G * dx).sum()) for G in self.gradients(u)]
 
-    def add_targets(self, nu: np.ndarray, x: np.ndarray, numbers_adj: np.ndarray) -> np.ndarray:
-        """Add to the adjoint of the numbers what comes by targets; returns that of x by volumes."""
-        for k, law, own in zip(self.follower.held, self.laws, nu):
-            numbers_adj[self.follower.rows[k]] += own * law.target_by_numbers()
-        return -sum(own * G for own, G in zip(nu, self.gradients(x)))
+    def add_targets(self, nu: np.ndarray, u: np.ndarray, adj) -> np.ndarray:
+        """Add to the adjoints of numbers and of the rest shape what comes by targets; returns that of u by volumes."""
+        for law, rows, own in zip(self.laws, self.follower.rows, nu):
+            self.follower.add_numbers(adj, rows, own * law.target_by_numbers())
+        by_u = -sum(own * G for own, G in zip(nu, self.gradients(u)))
+        adj.rest += by_u
+        return by_u
 
-    def adjoint(self, x: np.ndarray, y: np.ndarray, by_pressure: np.ndarray, solve) -> tuple[np.ndarray, np.ndarray]:
+    def adjoint(self, u: np.ndarray, y: np.ndarray, by_pressure: np.ndarray, solve) -> tuple[np.ndarray, np.ndarray]:
         """(w, nu) from y = K'^-T p: the adjoint of R, and what comes to that of targets, and less to that of volumes."""
-        G = [g * self.free for g in self.gradients(x)]
+        G = [g * self.free for g in self.gradients(u)]
         Z = [solve(g) for g in G]
         S = np.array([[float((g * z).sum()) for z in Z] for g in G])
         nu = np.linalg.solve(S, by_pressure + np.array([float((g * y).sum()) for g in G]))

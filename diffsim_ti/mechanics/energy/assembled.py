@@ -4,8 +4,8 @@ import numpy as np
 
 from diffsim_ti.inputs import ConsistentMass, Mass
 from diffsim_ti.mechanics.energy.potential import Potential
+from diffsim_ti.mechanics.interactions import host_forces
 from diffsim_ti.mechanics.supports.free import Free, FreeDirections, mask_of, projectors_of
-from diffsim_ti.mechanics.ties.attached import Attached
 from diffsim_ti.state.arrays import SceneArrays
 
 CHUNK = 2048  # elements whose matrices are made at once
@@ -81,13 +81,18 @@ def assemble(potential, mass: Mass, free: Free, more=()):
 
 def body_stiffness(scene, displacements: np.ndarray):
     """d2E/du2 [N/m] of stress, springs, cables and foundations at displacements [m], of all vertices alike, as a SciPy CSR
-    matrix; what changes over time is that of time 0."""
-    arrays, attached = SceneArrays(scene), Attached.of(scene)
+    matrix; what changes over time is that of time 0. Raises ValueError where another force has an energy, and no matrix."""
+    arrays, hosts = SceneArrays(scene), host_forces(scene).with_energy
     derived = scene.inputs.derive(scene.inputs.at_times([0.0]))
     arrays.load(derived)
     potential = Potential(arrays, scene.mesh.tetrahedra, False)
     potential.place(displacements)
     potential.blocks()
     n = scene.mesh.num_vertices
-    own = assemble(potential, np.zeros((n, 1)), np.ones((n, 1)))[0].tocsr()
-    return own if attached is None else (own + attached.at_start(derived).matrix(displacements)).tocsr()
+    out = assemble(potential, np.zeros((n, 1)), np.ones((n, 1)))[0].tocsr()
+    for force in hosts.take(derived):
+        matrix = force.matrix(displacements)
+        if matrix is None:
+            raise ValueError(f"the matrix of {type(force).__name__} is not known: write its `matrix`")
+        out = (out + matrix).tocsr()
+    return out

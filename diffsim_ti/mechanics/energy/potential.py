@@ -9,10 +9,10 @@ import numpy as np
 from diffsim_ti import runtime
 from diffsim_ti.inputs import StressPoints
 from diffsim_ti.mechanics.energy.kernels import potential_kernels
+from diffsim_ti.mechanics.host_force import NONE
 from diffsim_ti.mechanics.obstacles.face_contact import FaceContact
 from diffsim_ti.mechanics.reduced.rigid_sets import RigidSets
 from diffsim_ti.mechanics.stress.patch_coupling import PatchCoupling
-from diffsim_ti.mechanics.ties.attached import Attached
 from diffsim_ti.runtime.slots import copy_slot
 
 
@@ -41,7 +41,7 @@ class Potential:
         self.z = arrays.law_states(1)  # the state of the law, held during a pass
         self.held = arrays.held_numbers()  # what the law measures rates from in a pass
         self.rate = runtime.array(a.fp, 1) if a.law.viscous else None  # [1/s], of changes in a pass; zero in statics
-        self.attached: Attached | None = None  # springs, cables, foundations: set by whom a time is known
+        self.hosts = NONE  # host forces that have an energy: set by whom a time is known
         self.rigid: RigidSets | None = None  # sets that do not deform: set by whom passes are known
 
     @property
@@ -50,8 +50,8 @@ class Potential:
         return self.pairs.friction if self.pairs else None
 
     def _on_host(self) -> list:
-        """What acts on vertices from the host: what is attached, and friction of surfaces."""
-        return [part for part in (self.attached, self.rubbing) if part]
+        """What acts on vertices from the host: host forces with an energy, and friction of surfaces."""
+        return [part for part in (self.hosts, self.rubbing) if part]
 
     def launch(self, name: str, lanes: bool = True, **records) -> None:
         """Run a kernel at the present displacement; records: more arrays than the potential's own."""
@@ -171,7 +171,7 @@ class Potential:
         return sum((part.product(self.held_at, w, convex) for part in self._on_host()), y)
 
     def multiply(self, convex: bool = False) -> None:
-        """y = -d2E/du2 w on the device, without faces and what is attached."""
+        """y = -d2E/du2 w on the device, without faces and host forces."""
         if self.pairs:
             self.pairs.hessian_product(self.u, self.w, convex)
         self.launch("product")
@@ -179,7 +179,7 @@ class Potential:
     @property
     def stays_on_device(self) -> bool:
         """Whether `multiply` does all of `product`."""
-        return not (self.faces or self.attached)
+        return not (self.faces or self.hosts)
 
     def blocks(self) -> np.ndarray:
         """3x3 diagonal blocks of d2E/du2 [N/m], shape (num_vertices, 3, 3)."""
@@ -254,7 +254,7 @@ class Potential:
             yield part, a.from_blocks(source, 81 * a.points, part).reshape(-1, 9, 9)
 
     def contact_product(self, w: np.ndarray) -> np.ndarray:
-        """The part of contact and of what is attached in `product`; of obstacles at vertices by their blocks."""
+        """The part of contact and of host forces in `product`; of obstacles at vertices by their blocks."""
         a, y = self.arrays, np.zeros_like(w)
         runtime.fill(self.w, w[None])
         if a.contacts:
@@ -271,13 +271,13 @@ class Potential:
         return sum((part.product(self.held_at, w) for part in self._on_host()), y)
 
     def contact_blocks(self) -> np.ndarray | None:
-        """The part of contact and of what is attached in `blocks`; None without."""
-        attached = sum(part.blocks(self.held_at) for part in self._on_host()) if self._on_host() else None
+        """The part of contact and of host forces in `blocks`; None without."""
+        on_host = sum(part.blocks(self.held_at) for part in self._on_host()) if self._on_host() else None
         if not (self.arrays.contacts or self.pairs):
-            return attached
+            return on_host
         self.launch("contact_blocks", lanes=False, out=self._barriers)
         if self.pairs:
             self.pairs.add_blocks(self.u, self._barriers.blocks)
         blocks = np.swapaxes(runtime.fetch(self._barriers.blocks).astype(np.float64), 0, 1)
         blocks = blocks + self.faces.blocks() if self.faces else blocks
-        return blocks if attached is None else blocks + attached
+        return blocks if on_host is None else blocks + on_host

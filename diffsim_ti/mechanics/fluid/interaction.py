@@ -5,6 +5,7 @@ from functools import cached_property
 import numpy as np
 
 from diffsim_ti.mechanics.fluid.dragged_triangle import DraggedTriangle
+from diffsim_ti.mechanics.fluid.on_host import Fluid
 from diffsim_ti.mechanics.interaction import Interaction, add_at
 from diffsim_ti.terms import SurfaceDrag
 
@@ -12,7 +13,8 @@ from diffsim_ti.terms import SurfaceDrag
 class FluidDrag(Interaction):
     """Each triangle in a fluid is an item. Its six numbers stand in the scene's parameters, from `first_number` on."""
 
-    name, kinds, works, is_load, reads_rates = "dragged", (SurfaceDrag,), "drag", False, True
+    name, kinds, works, is_load = "dragged", (SurfaceDrag,), "drag", False
+    no_equilibrium = "SurfaceDrag is of velocities, and an equilibrium has none"
 
     @cached_property
     def triangles(self) -> np.ndarray:
@@ -37,6 +39,9 @@ class FluidDrag(Interaction):
 
     def kernel(self, values, precision, shape):
         return DraggedTriangle(precision, shape)
+
+    def host(self):
+        return Fluid(self.triangles, self.first_number, self.mesh.num_vertices)
 
     def adjoints(self, values, shape):
         return dict(dragged_felt=(2 * self.count,), dragged_rest=(3 * self.count * shape,))

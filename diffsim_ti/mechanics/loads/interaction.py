@@ -14,6 +14,7 @@ class DeadLoads(Interaction):
     """Forces that do not change with the body, added up; kernels take them as a part of the kick (explicit.py)."""
 
     name, kinds, works = "dead_loads", (BodyForce, ExternalForce, Traction), "loads"
+    in_kernels = on_host = False
 
     @cached_property
     def acts_at(self) -> np.ndarray:

@@ -9,6 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
+from diffsim_ti.mechanics.host_force import HostForce, Instant
 from diffsim_ti.mesh.enclosure import open_edges, spanned_by_edges
 from diffsim_ti.mesh.face_points import face_points
 
@@ -30,21 +31,32 @@ class Tangent:
         return Tangent(self.K.T, [(g, u) for u, g in self.pairs])
 
 
-class FollowerPressure:
+class FollowerPressure(HostForce):
     """Of faces (m, 3) or (m, 6), each of which belongs to a load; `at` says how large the pressures of loads are [Pa].
 
+    Displacements are from `rest`, the origin until `take` says otherwise.
     symmetric: whether there is a potential: all edges of each load's faces are inner ones, or held so (`is_symmetric`).
     """
 
+    rest, instant = 0.0, Instant()
+
     def __init__(self, faces: np.ndarray, load_of: np.ndarray, num_vertices: int, symmetric: bool = True):
         self.points, self.num_vertices, self.symmetric = face_points(faces), num_vertices, symmetric
-        self.load_of = np.repeat(load_of, self.points.points)
-        self.pressure = np.zeros(0)
+        self.faces, self.load_of = faces, np.repeat(load_of, self.points.points)
+        self.pressure = np.zeros(load_of.max(initial=-1) + 1)
 
-    def at(self, pressures: np.ndarray, share: float = 1.0) -> "FollowerPressure":
-        """With a share of pressures of the loads [Pa]."""
-        self.share, self.pressure = share, share * np.asarray(pressures, np.float64)
+    def restrict(self, free, rest):
+        self.symmetric = is_symmetric(self.faces, self.load_of[:: self.points.points], free, rest)
+
+    def at(self, pressures: np.ndarray) -> "FollowerPressure":
+        """With pressures of the loads [Pa]."""
+        self.pressure = np.asarray(pressures, np.float64)
         return self
+
+    def take(self, values, instant):
+        super().take(values, instant)
+        self.rest = values.rest
+        return self.at(instant.load * pressures_at(values.follower, instant)[: len(self.pressure)])
 
     def _to_vertices(self, by_points):
         """Sums at vertices of what the points have."""
@@ -55,22 +67,28 @@ class FollowerPressure:
         """-p of each point."""
         return -pressures[self.load_of, None]
 
-    def forces(self, x: np.ndarray) -> np.ndarray:
-        """Forces on vertices at x [N], shape (num_vertices, 3)."""
-        return self._to_vertices(self._pushes(self.pressure) * self.points.normals(x))
+    def forces(self, u):
+        return self._to_vertices(self._pushes(self.pressure) * self.points.normals(self.rest + u))
 
-    def sizes(self, x: np.ndarray) -> np.ndarray:
-        """Sum of the sizes of the forces that meet at each vertex [N]."""
-        by_nodes = self.points.to_nodes(self._pushes(self.pressure) * self.points.normals(x))
+    def sizes(self, u):
+        by_nodes = self.points.to_nodes(self._pushes(self.pressure) * self.points.normals(self.rest + u))
         part = np.linalg.norm(by_nodes, axis=2)
         return np.bincount(self.points.faces.ravel(), part.ravel(), self.num_vertices)
 
-    def jvp(self, x: np.ndarray, dx: np.ndarray, pressures_dot: np.ndarray | None = None) -> np.ndarray:
-        """Change of the forces for changes of x and of pressures."""
-        part = self._pushes(self.pressure) * self.points.normals_jvp(x, dx)
-        if pressures_dot is not None:
-            part += self._pushes(self.share * pressures_dot) * self.points.normals(x)
+    def jvp(self, u, du, dv=None, moved=None):
+        x, dx = self.rest + u, du if moved is None else du + moved.rest
+        part, dp = self._pushes(self.pressure) * self.points.normals_jvp(x, dx), self._pressures_jvp(x, dx, moved)
+        if dp is not None:
+            part += self._pushes(dp) * self.points.normals(x)
         return self._to_vertices(part)
+
+    def _pressures_jvp(self, x: np.ndarray, dx: np.ndarray, moved) -> np.ndarray | None:
+        """Change of the pressures of loads; None where there is none."""
+        if moved is None:
+            return None
+        instant = self.instant
+        change = instant.schedule.pressure(moved.follower, instant.j, instant.share)
+        return instant.load * change[: len(self.pressure)]
 
     @cached_property
     def _blocks(self):
@@ -84,8 +102,11 @@ class FollowerPressure:
         sums = csr_matrix((np.ones(place.size), place.ravel(), each), (place.size, len(pairs))).T.tocsr()
         return sums, columns, np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=n))])
 
-    def tangent(self, x: np.ndarray) -> Tangent:
-        """Change of the forces for many changes of x."""
+    def tangent(self, u, transposed=False):
+        out = self._tangent(self.rest + u)
+        return out.T if transposed else out
+
+    def _tangent(self, x: np.ndarray) -> Tangent:
         from scipy.sparse import bsr_matrix
 
         points, (sums, columns, start) = self.points, self._blocks
@@ -94,22 +115,40 @@ class FollowerPressure:
         blocks = (sums @ parts.reshape(-1, 9)).reshape(-1, 3, 3)
         return Tangent(bsr_matrix((blocks, columns, start), (3 * self.num_vertices,) * 2), [])
 
-    def vjp(self, x: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Adjoint of x for the adjoint w of the forces."""
-        return self.points.normals_vjp(x, self._pushes(self.pressure) * self._at_points(w))
+    def matrix(self, u):
+        """Of pressures as they are."""
+        return -self.tangent(u).K
 
-    def _at_points(self, w):
-        return self.points.from_nodes(w[self.points.faces])
+    def vjp(self, u, w, adj=None):
+        x, at_points = self.rest + u, self.points.from_nodes(w[self.points.faces])
+        by_points = -(self.points.normals(x) * at_points).sum(1)
+        by_x = self.points.normals_vjp(x, self._pushes(self.pressure) * at_points)
+        by_x = by_x + self._pressures_vjp(x, np.bincount(self.load_of, by_points, len(self.pressure)), adj)
+        if adj is not None:
+            adj.rest += by_x
+        return by_x, 0.0
 
-    def pressures_vjp(self, x: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Adjoint of the pressures of loads for the adjoint w of the forces."""
-        by_point = -(self.points.normals(x) * self._at_points(w)).sum(1)
-        return self.share * np.bincount(self.load_of, by_point, len(self.pressure))
+    def _pressures_vjp(self, x: np.ndarray, p_adj: np.ndarray, adj):
+        """Adjoint of x for that of the pressures of loads; adds those of their numbers."""
+        if adj is not None:
+            self.add_numbers(adj, slice(len(p_adj)), self.instant.load * p_adj)
+        return 0.0
 
-    def work(self, x: np.ndarray, step: np.ndarray) -> float:
-        """Work done along a straight step [J]: the forces are quadratic in it, so that Simpson's rule is exact."""
-        middle = 4 * self.forces(x + 0.5 * step)
-        return float(((self.forces(x) + middle + self.forces(x + step)) * step).sum()) / 6
+    def add_numbers(self, adj, rows, felt: np.ndarray) -> None:
+        """Add to the adjoints of `Derived.follower`, in some rows."""
+        whole, instant = np.zeros(adj.follower.shape[1]), self.instant
+        whole[rows] = felt
+        instant.schedule.add_pressure(adj.follower, instant.j, instant.share, whole)
+
+
+def pressures_at(rows: np.ndarray, instant: Instant) -> np.ndarray:
+    """Pressures and numbers of chambers at an instant, of rows in time. In a part of a pass of statics those of steps of
+    which each has its own go over from the last one's."""
+    schedule, j = instant.schedule, instant.j
+    if instant.laid == 1 or j == 0:
+        return schedule.pressure(rows, j, instant.share)
+    now, before = (schedule.pressure(rows, k, schedule.end(k)) for k in (j, j - 1))
+    return before + instant.laid * (now - before)
 
 
 def is_symmetric(faces: np.ndarray, load_of: np.ndarray, free: np.ndarray, x: np.ndarray) -> bool:

@@ -7,6 +7,7 @@ import numpy as np
 from diffsim_ti.inputs import Derived
 from diffsim_ti.inputs.loads import PressureRows
 from diffsim_ti.mechanics.interaction import Interaction, add_at
+from diffsim_ti.mechanics.pressure.follower_pressure import FollowerPressure
 from diffsim_ti.mechanics.pressure.pressed_face import pressed_element
 from diffsim_ti.terms import Chamber, Pressure
 
@@ -16,21 +17,11 @@ class Pressing(Interaction):
 
     derived = dict(follower="vectors2")
 
-    @property
-    def all(self) -> tuple:
-        """All terms of the scene that do, in the order of their rows."""
-        return self.scene.terms_of(Pressure, Chamber)
-
-    @cached_property
-    def rows(self) -> list[slice]:
-        """Of the numbers of each of its terms in `Derived.follower`."""
-        ends = np.cumsum([0, *(len(t.rows_in_time("")) for t in self.all)]).tolist()
-        return [slice(*ends[k : k + 2]) for k in map(self.all.index, self.terms)]
-
     def links(self, own):
-        if self.terms[0] is not self.all[0]:  # another kind joins them all
+        every = self.scene.terms_of(Pressure, Chamber)
+        if self.terms[0] is not every[0]:  # another kind joins them all
             return []
-        return [PressureRows([row for t in self.all for row in t.rows_in_time(own[t])], "follower")]
+        return [PressureRows([row for t in every for row in t.rows_in_time(own[t])], "follower")]
 
 
 class Pressures(Pressing):
@@ -62,6 +53,9 @@ class Pressures(Pressing):
 
     def kernel(self, values: Derived, precision: str, shape: bool):
         return pressed_element(self.mesh.order, precision, len(values.follower) > 1, shape)
+
+    def host(self):
+        return FollowerPressure(self.faces, self.load_of, self.mesh.num_vertices)
 
     def adjoints(self, values, shape):
         return dict(pressed_felt=(len(values.follower), self.count), pressed_rest=(self.faces.size * shape,))

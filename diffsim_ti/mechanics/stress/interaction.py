@@ -9,6 +9,7 @@ class Growths(Interaction):
     """They change what tetrahedra take for their rest shape, and act by their stress alone (growing.py)."""
 
     name, kinds, works, is_load, makes_rows = "growth", (Growth,), "growth", False, True
+    in_kernels = on_host = False
 
     def links(self, own):
         groups = [(None, None) if t.everywhere else t.groups(self.mesh) for t in self.terms]

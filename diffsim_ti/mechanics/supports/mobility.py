@@ -9,6 +9,7 @@ doi:10.1016/0020-7683(86)90014-4.
 
 import numpy as np
 
+from diffsim_ti.mechanics.interactions import host_forces
 from diffsim_ti.mesh.sets import pieces
 from diffsim_ti.terms.supports import motions_left
 
@@ -67,12 +68,11 @@ class Rows:
         arms, self.size = np.linalg.norm(self.X[self.vertices] - self.middle[self.parts], axis=1), np.zeros(self.count)
         np.maximum.at(self.size, self.parts, arms)
         self._entries, self.num_rows, self.shared = [], 0, []
-        held = scene.supports.held.reshape(-1, 3)
-        self._add_forces(np.arange(len(held)), np.repeat(scene.supports.vertices, 3), held)
+        self._add_held(scene.supports.vertices, scene.supports.held)
         self._add_shared(np.setdiff1d(np.arange(len(self.vertices)), begin))
         derived = scene.inputs.derive(scene.inputs.at_times([0.0])) if scene.interactions else None
-        for x in scene.interactions:
-            self._add_forces(*x.resists(derived))
+        for force in host_forces(scene).take(derived):
+            self._add_resisted(*force.resisted())
         self.row, self.part, self.wrench = (np.concatenate(x) for x in zip(*self._entries))
         self.shared = np.concatenate(self.shared)
 
@@ -83,11 +83,10 @@ class Rows:
         self.num_rows += len(shared)
         self.shared.append(shared)
 
-    def _add_forces(self, row, vertex, force) -> None:
-        """Forces on vertices, in new rows."""
-        own = self.first[vertex] >= 0
-        row, vertex, force = row[own], vertex[own], force[own]
-        self._add(row, self.first[vertex], vertex, force, np.full(row.max(initial=-1) + 1, -1))
+    def _add_held(self, vertices, held) -> None:
+        own = self.first[vertices] >= 0
+        vertices, held = np.repeat(vertices[own], 3), held[own].reshape(-1, 3)
+        self._add(np.arange(len(held)), self.first[vertices], vertices, held, np.full(len(held), -1))
 
     def _add_shared(self, others) -> None:
         """Vertices that are in other parts, too, than their first."""
@@ -95,6 +94,12 @@ class Rows:
         rows, unit = np.arange(len(vertices)), np.tile(np.eye(3), (len(others), 1))
         both = np.concatenate([self.first[vertices], np.repeat(self.parts[others], 3)])
         self._add(np.tile(rows, 2), both, np.tile(vertices, 2), np.concatenate([unit, -unit]), vertices)
+
+    def _add_resisted(self, row, vertex, force) -> None:
+        """What a host force resists (mechanics/host_force.py)."""
+        own = self.first[vertex] >= 0
+        row, vertex, count = row[own], vertex[own], row.max(initial=-1) + 1
+        self._add(row, self.first[vertex], vertex, force[own], np.full(count, -1))
 
     def grounded(self) -> np.ndarray:
         """Mask over the parts that are held by what is fixed, and by parts that are held so."""

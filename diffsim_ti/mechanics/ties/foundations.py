@@ -1,9 +1,11 @@
-"""Elastic foundations in explicit passes: at each vertex that lies on one, f = -K u."""
+"""Elastic foundations: at each vertex that lies on one, f = -K u."""
 
 from dataclasses import dataclass
 
+import numpy as np
 import taichi as ti
 
+from diffsim_ti.mechanics.host_force import VertexwiseHostForce
 from diffsim_ti.mechanics.interaction import VertexwiseForce
 from diffsim_ti.runtime import traced
 
@@ -48,3 +50,40 @@ class FoundationForce(VertexwiseForce):
                 row = adjoint.foundation_felt[3 * k + d]
                 adjoint.foundation_felt[3 * k + d] = row - w[d] * u
         return self.product(i, w, scene, scene.foundation), self.vector(0)
+
+
+class FoundationOnHost(VertexwiseHostForce):
+    """Of vertices that lie on one."""
+
+    def __init__(self, vertices: np.ndarray):
+        self.vertices = vertices
+
+    def take(self, values, instant):
+        self.K = values.foundation.reshape(-1, 3, 3)
+        return super().take(values, instant)
+
+    def own_blocks(self, u):
+        return self.K
+
+    def forces(self, u):
+        return -self.product(u, u)
+
+    def energies(self, u):
+        return -0.5 * (self.forces(u) * u)[self.vertices].sum(1)
+
+    def stored(self, u):
+        return dict(foundations=float(self.energies(u).sum()))
+
+    def jvp(self, u, du, dv, moved=None):
+        out, own = -self.product(u, du), self.vertices
+        if moved is not None:
+            out[own] -= np.einsum("kij,kj->ki", moved.foundation.reshape(-1, 3, 3), u[own])
+        return out
+
+    def vjp(self, u, w, adj=None):
+        if adj is not None:
+            adj.foundation -= (w[self.vertices][:, :, None] * u[self.vertices][:, None]).reshape(-1, 3)
+        return -self.product(u, w), 0.0
+
+    def turning(self, u, w):
+        return 0.0

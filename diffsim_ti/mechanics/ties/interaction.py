@@ -5,11 +5,10 @@ from functools import cached_property
 import numpy as np
 
 from diffsim_ti import runtime
-from diffsim_ti.inputs import Derived
 from diffsim_ti.inputs.foundation import FoundationRows
-from diffsim_ti.inputs.ties import JoinedRows, JoinedSegments, directions
+from diffsim_ti.inputs.ties import JoinedRows, JoinedSegments
 from diffsim_ti.mechanics.interaction import Interaction
-from diffsim_ti.mechanics.ties.foundations import FoundationForce
+from diffsim_ti.mechanics.ties.foundations import FoundationForce, FoundationOnHost
 from diffsim_ti.mechanics.ties.tie_force import TieForce
 from diffsim_ti.mechanics.ties.ties import Ties
 from diffsim_ti.mesh.paths import Paths
@@ -21,8 +20,8 @@ from diffsim_ti.terms import Cable, ElasticFoundation, Spring
 class SpringsAndCables(Interaction):
     """Each spring, cable or fibre of a muscle is an item; cables, which are loads, come last, and of these fibres.
 
-    paths: where they run; cables, one_sided, by_tension: of each whether it is one, whether it pulls only, and whether with
-    a tension that is given, however long it is.
+    paths: where they run; of each whether it is a cable (cables), whether it pulls only (one_sided), whether with a tension
+    that is given, however long it is (by_tension), and whether what is given changes within steps (keyed).
     """
 
     name, kinds, pulls, least = "ties", (Spring, Cable), True, ("cable_length",)
@@ -36,6 +35,7 @@ class SpringsAndCables(Interaction):
         self.by_tension = self._of_each([term.by_tension for term in self.terms])
         self.is_load = bool(self.cables.any())
         self.works = "muscles and cables" if self.is_load else ""
+        self.keyed = self._of_each([getattr(term, "keyed", False) for term in self.terms])
         springs = int((~self.cables).sum())
         self.first_load = int(self.paths.first_corner[self.paths.first_point[springs]])
         self.vertices, self.count = self.paths.vertices, len(self.paths)
@@ -63,11 +63,6 @@ class SpringsAndCables(Interaction):
         out = dict(tie_start=paths.first_point, point_start=paths.first_corner, point_vertex=paths.vertices)
         return out | dict(point_weight=np.asarray(paths.weights, np.float64), tie_sides=sides)
 
-    @cached_property
-    def on_host(self) -> Ties:
-        """In float64, with numbers of their own."""
-        return Ties(self.paths, self.one_sided, self.cables, self.mesh.num_vertices)
-
     @property
     def num_fibre_blocks(self) -> int:
         """Eights of fibres, the last ties, where kernels may take them so."""
@@ -83,6 +78,9 @@ class SpringsAndCables(Interaction):
         nodes = self.mesh.reference.num_nodes if fibres else 0
         return TieForce(precision, len(values.ties) > 1, self.is_load, fibres, nodes, shape and fibres)
 
+    def host(self):
+        return Ties(self)
+
     def adjoints(self, values, shape):
         return dict(tie_felt=values.ties.shape[:2], tie_rest=values.tie_segments.shape[:1])
 
@@ -92,32 +90,6 @@ class SpringsAndCables(Interaction):
     @property
     def stiff_over_time(self):
         return tuple(term for term in self.terms if isinstance(term, Cable))
-
-    def stiffest(self, derived: Derived, rows: np.ndarray) -> Ties:
-        """With the largest tension and stiffness of each in `rows` and its least length: what a step has to follow."""
-        ends = rows.reshape(len(rows), -1, 2, 3)
-        a, s = ends[:, :, 0, :2].max((0, 2)), ends[:, :, 1, :2].max((0, 2))
-        return self.on_host.at(derived.tie_segments, a, s, ends[:, :, 0, 2].max(0))
-
-    def added_omega2(self, values, derived):
-        rows = self.stiffest(derived, derived.ties).row_sums(derived.displacement)
-        return rows / np.where(derived.mass > 0, derived.mass, 1.0)
-
-    def resists(self, derived):
-        """Springs and elastic cables that are not slack as a run begins, or whose length is given over time."""
-        paths, numbers = self.paths, derived.ties[0].reshape(-1, 2, 3)
-        size = np.abs(self.mesh.vertices - self.mesh.vertices.mean(0)).max()
-        slack = self.one_sided & (numbers[:, 1, :2].max(1) < -1e-9 * size)
-        keyed = self._of_each([getattr(term, "keyed", False) for term in self.terms])
-        holds = (numbers[:, 0, 2] > 0) & ~self.by_tension & (keyed | ~slack)
-        C = self.on_host.parted.tocoo()
-        along, path = directions(derived.tie_segments)[paths.starts], paths.path_of
-        bare, out = ~along.any(1), []  # a spring without length holds in all directions
-        for k, axis in enumerate((None, *np.eye(3))):
-            own = holds[path[C.row]] & (bare[C.row] == (axis is not None))
-            row, vertex = C.row[own], C.col[own]
-            out.append((k * len(paths) + path[row], vertex, C.data[own, None] * (along[row] if axis is None else axis)))
-        return tuple(np.concatenate(parts) for parts in zip(*out))
 
 
 class Foundations(Interaction):
@@ -142,19 +114,11 @@ class Foundations(Interaction):
     def kernel(self, values, precision, shape):
         return FoundationForce(precision)
 
+    def host(self):
+        return FoundationOnHost(self.acts_at)
+
     def adjoints(self, values, shape):
         return dict(foundation_felt=values.foundation.shape[:1])
 
     def collect(self, found, out, shape):
         out.foundation = found["foundation_felt"]
-
-    def added_omega2(self, values, derived):
-        out = np.zeros(self.mesh.num_vertices)
-        out[self.acts_at] = np.abs(derived.foundation.reshape(-1, 3, 3)).sum(2).max(1)
-        return out / np.where(derived.mass > 0, derived.mass, 1.0)
-
-    def resists(self, derived):
-        values, vectors = np.linalg.eigh(derived.foundation.reshape(-1, 3, 3))
-        kept = (values > 1e-9 * values.max(initial=0.0))[:, None] * vectors
-        held = (kept @ np.swapaxes(kept, 1, 2)).reshape(-1, 3)
-        return np.arange(len(held)), np.repeat(self.acts_at, 3), held

@@ -7,14 +7,19 @@ less. d = D + C u: segments, D at rest, C from displacements of vertices.
 import numpy as np
 
 from diffsim_ti.inputs.ties import directions
-from diffsim_ti.mesh.paths import Paths
+from diffsim_ti.mechanics.host_force import HostForce
 
 
-class Ties:
-    """Springs and, after them, cables; `at` says what they are at a time."""
+class Ties(HostForce):
+    """Springs and, after them, cables, of `SpringsAndCables`; `at` says what they are at a time."""
 
-    def __init__(self, paths: Paths, one_sided: np.ndarray, cables: np.ndarray, num_vertices: int):
-        self.paths, self.one_sided, self.cables = paths, one_sided, cables
+    has_energy = symmetric = True
+
+    def __init__(self, ties):
+        self.paths = paths = ties.paths
+        self.one_sided, self.cables, num_vertices = ties.one_sided, ties.cables, ties.mesh.num_vertices
+        self._may_be_slack = self.one_sided & ~ties.keyed  # as the run begins, and then for good
+        self._by_length = ~ties.by_tension
         places, starts = paths.matrix(num_vertices), paths.starts
         self.parted = (places[starts + 1] - places[starts]).tocsr()  # C
         self.together = self.parted.T.tocsr()  # its transpose, built once
@@ -30,6 +35,21 @@ class Ties:
         self.D, self.a, self.s, self.k = segments[self.paths.starts], tension, slack, stiffness
         self._seen = None
         return self
+
+    def take(self, values, instant):
+        super().take(values, instant)
+        return self.at(values.tie_segments, *self._numbers(values.ties))
+
+    def _numbers(self, rows: np.ndarray) -> tuple:
+        """(a, s, k) of the instant, of rows or of their change; the pull of springs is there from the start of statics."""
+        a, s, k = self.instant.schedule.ties(rows, self.instant.j, self.instant.share)
+        return a * np.where(self.cables, self.instant.load, 1.0), s, k
+
+    def stiffest(self, values, schedule):
+        """The largest tension and stiffness of each in all rows, and its least length."""
+        ends = values.ties.reshape(len(values.ties), -1, 2, 3)
+        a, s = ends[:, :, 0, :2].max((0, 2)), ends[:, :, 1, :2].max((0, 2))
+        return self.at(values.tie_segments, a, s, ends[:, :, 0, 2].max(0))
 
     def _sums(self, of_segments):
         """Of each path."""
@@ -70,14 +90,24 @@ class Ties:
         _, _, stretch, e, k, _ = self._state(u)
         return self.a * stretch + 0.5 * k * e * e
 
-    def forces(self, u: np.ndarray, cables: bool = False) -> np.ndarray:
-        """On vertices [N], shape (num_vertices, 3); cables: theirs alone."""
+    def stored(self, u: np.ndarray) -> dict[str, float]:
+        """Of springs: cables are loads."""
+        return {} if self.cables.all() else dict(springs=float(self.energies(u)[~self.cables].sum()))
+
+    def forces(self, u):
         t, *_, T = self._state(u)
-        T = T * self.cables if cables else T
+        return self._along(t, T)
+
+    def loads(self, u):
+        """Of cables."""
+        t, *_, T = self._state(u)
+        return self._along(t, T * self.cables)
+
+    def _along(self, t, T):
+        """Forces of tensions along segments."""
         return -(self.together @ (T[self.paths.path_of, None] * t))
 
     def sizes(self, u: np.ndarray) -> np.ndarray:
-        """Sum of the sizes of the forces that meet at each vertex [N]."""
         T = np.abs(self._state(u)[5])[self.paths.path_of]
         return abs(self.together) @ T
 
@@ -159,17 +189,38 @@ class Ties:
         out[self.paths.starts] = of_segments
         return out
 
-    def jvp(self, u, du, segments_dot, tension_dot, slack_dot, stiffness_dot) -> np.ndarray:
-        """Change of the forces for changes of everything."""
-        t, length, *_, T = self._state(u)
-        dd = segments_dot[self.paths.starts] + self.parted @ du
-        dT = self.tensions_jvp(u, du, segments_dot, tension_dot, slack_dot, stiffness_dot)[self.paths.path_of]
-        return -(self.together @ (dT[:, None] * t + self._across(t, length, T, dd)))
+    def jvp(self, u, du, dv, moved=None):
+        t, length, _, _, k, T = self._state(u)
+        dd = self.parted @ du
+        if moved is None:
+            dT = k * self._sums((t * dd).sum(1))
+        else:
+            dd = moved.tie_segments[self.paths.starts] + dd
+            dT = self.tensions_jvp(u, du, moved.tie_segments, *self._numbers(moved.ties))
+        return -(self.together @ (dT[self.paths.path_of, None] * t + self._across(t, length, T, dd)))
 
-    def vjp(self, u: np.ndarray, w: np.ndarray) -> tuple:
-        """Adjoints of (u, segments, (a, s, k)) for the adjoint w of the forces."""
+    def vjp(self, u, w, adj=None):
         t, length, *_, T = self._state(u)
         w = -(self.parted @ w)
-        by_u, segments, numbers = self.tensions_vjp(u, self._sums((t * w).sum(1)))
+        by_u, segments, (a, s, k) = self.tensions_vjp(u, self._sums((t * w).sum(1)))
         across = self._across(t, length, T, w)
-        return by_u + self.together @ across, segments + self._of_points(across), numbers
+        if adj is not None:
+            adj.tie_segments += segments + self._of_points(across)
+            a = a * np.where(self.cables, self.instant.load, 1.0)
+            self.instant.schedule.add_ties(adj.ties, self.instant.j, self.instant.share, (a, s, k))
+        return by_u + self.together @ across, 0.0
+
+    def resisted(self):
+        """Along paths that are elastic and not slack as the run begins, or whose length is given over time."""
+        size = np.abs(self.values.rest - self.values.rest.mean(0)).max()
+        slack = self.values.ties[0].reshape(-1, 2, 3)[:, 1, :2].max(1) < -1e-9 * size
+        holds = (self.k > 0) & self._by_length & ~(self._may_be_slack & slack)
+        C, t, path = self.parted.tocoo(), directions(self.D), self.paths.path_of
+        rows, vertices, vectors = [], [], []
+        for number, axis in enumerate((None, *np.eye(3))):  # a spring without length holds in all directions
+            own = holds[path[C.row]] & (t.any(1)[C.row] == (axis is None))
+            row = C.row[own]
+            rows.append(path[row] + number * len(self.paths))
+            vertices.append(C.col[own])
+            vectors.append(C.data[own, None] * (t[row] if axis is None else axis))
+        return np.concatenate(rows), np.concatenate(vertices), np.concatenate(vectors)

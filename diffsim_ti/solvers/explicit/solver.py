@@ -12,9 +12,8 @@ from diffsim_ti.common.checked import between
 from diffsim_ti.inputs import Derived
 from diffsim_ti.mechanics.chambers.gases import Chambers
 from diffsim_ti.mechanics.chambers.held_volumes import HeldVolumes
-from diffsim_ti.mechanics.chambers.pressures import following
-from diffsim_ti.mechanics.fluid.interaction import FluidDrag
-from diffsim_ti.mechanics.fluid.on_host import Fluid
+from diffsim_ti.mechanics.host_force import Instant
+from diffsim_ti.mechanics.interactions import host_forces
 from diffsim_ti.mechanics.loads.interaction import DeadLoads
 from diffsim_ti.mechanics.obstacles.contact_stage import ROWS
 from diffsim_ti.mechanics.obstacles.felt_faces import FeltFaces, feels_faces
@@ -22,7 +21,6 @@ from diffsim_ti.mechanics.obstacles.impulse_record import ImpulseRecord
 from diffsim_ti.mechanics.obstacles.way import Way
 from diffsim_ti.mechanics.reduced.body_checks import check_bodies
 from diffsim_ti.mechanics.surfaces.surface_pairs import Tunnelling
-from diffsim_ti.mechanics.ties.attached import Attached
 from diffsim_ti.mechanics.workspace import Workspace
 from diffsim_ti.monitor.energy_balance import EnergyBalance
 from diffsim_ti.monitor.own_work import OwnWork
@@ -151,7 +149,6 @@ class ExplicitWorkspace(Workspace):
         features, a = self.arrays.features(), self.arrays
         self.faces = FeltFaces(self) if a.feels_faces else None
         self.check_apart()
-        self.following = following(self.scene)
         self.chambers = Chambers(self) if self.scene.term(GasChamber) else None
         self.volumes = HeldVolumes(self) if self.scene.holds_volumes else None
         noted = ROWS * len(a.obstacles), a.num_vertices
@@ -161,7 +158,7 @@ class ExplicitWorkspace(Workspace):
             work=runtime.array(a.fp, a.num_vertices * (1 + features.pulled) if features.driven else 1),
             own_work=runtime.array(a.fp, a.num_vertices),
         )
-        self.attached = Attached.of(self.scene)  # springs, cables and foundations, for what looks between passes
+        self.hosts = host_forces(self.scene)  # for what looks between passes
         self.probe = None  # room for a pass that is not taken
         self.energy_watch = EnergyBalance(self) if EnergyBalance.knows(a.law) and not self.scene.term(Growth) else None
 
@@ -245,32 +242,23 @@ class ExplicitWorkspace(Workspace):
     def loads_at(self, j: int, num_passes: int, pulls: bool = True) -> np.ndarray:
         """External forces [N] on each vertex, as pass j of a run takes them; pulls: those of cables too."""
         a, schedule, u = self.arrays, self.solver.schedule, runtime.fetch_row(self.state.u, 0)
-        out, kicks = np.zeros_like(u, np.float64), self._kicks(j, num_passes)
+        out, kicks = np.zeros_like(u, np.float64), self.kicks(j, num_passes)
         if a.rows["forces"] is not None:
             dead = self.scene.interaction(DeadLoads)
             out[dead.acts_at] = sum(w * schedule.load(a.rows["forces"], *k, dead.keyed) for w, k in kicks)
-        if self.following is not None:
-            out += self.following.at(self.numbers_at(j, num_passes)).forces(a.values.rest + u)
-        if self.scene.interaction(FluidDrag):
-            v = runtime.fetch_row(self.state.v, 0)
-            out += Fluid.of(self.scene).at(a.values.parameters, a.values.rest + u - v, 1.0).forces(a.values.rest + u)
-        if a.features().pulled and pulls:
-            both = [[w * part for part in schedule.ties(a.rows["ties"], *k)] for w, k in kicks]
-            numbers = (begin + end for begin, end in zip(*both))
-            out += self.attached.ties.at(a.values.tie_segments, *numbers).forces(u, cables=True)
+        v = runtime.fetch_row(self.state.v, 0)
+        for x, force in zip((x for x in self.scene.interactions if x.on_host), self.hosts):
+            if x.first_load < len(x.vertices) and (pulls or not x.pulls):
+                for w, k in kicks:
+                    out += w * force.take(a.now, Instant(schedule, *k, origin=u - v, gamma=1.0)).loads(u)
         return out
 
-    def _kicks(self, j: int, num_passes: int) -> list[tuple[float, tuple[int, float]]]:
+    def kicks(self, j: int, num_passes: int) -> list[tuple[float, tuple[int, float]]]:
         """(its share, (pass, share of its step)) of the loads that the two kicks of pass j take."""
         schedule, w = self.solver.schedule, self.solver.weights(np.array([j]), num_passes, self.rate)
         of_kicks = (w.share0, w.lag0), (w.share1, w.lag1)
         kicks = [(float(np.ravel(share)[0]), int(np.ravel(lag)[0])) for share, lag in of_kicks]
         return [(share, (j - lag, schedule.end(j - lag) if lag else schedule.begin(j))) for share, lag in kicks]
-
-    def numbers_at(self, j: int, num_passes: int) -> np.ndarray:
-        """Pressures and numbers of chambers, as pass j of a run takes them."""
-        rows = self.arrays.rows["follower"]
-        return sum(w * self.solver.schedule.pressure(rows, *k) for w, k in self._kicks(j, num_passes))
 
     def numbers_of(self, j: int, num_passes: int) -> SimpleNamespace:
         """h [s] of pass j, and its weights as numbers."""
@@ -298,8 +286,7 @@ class ExplicitWorkspace(Workspace):
 
     def _rows(self) -> int:
         """How many rows what is given by steps has."""
-        a = self.arrays
-        return a.num_step_rows([a.values])
+        return self.arrays.num_step_rows([self.arrays.values])
 
     def launches(self, first: int, last: int, num_passes: int, save_every: int, most: int, backwards=False) -> Iterator:
         """Numbers of the launches that passes first .. last - 1 take, for each of which their table is shown.

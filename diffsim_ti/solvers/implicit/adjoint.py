@@ -80,10 +80,8 @@ class ImplicitAdjoint(RecordedPasses):
         masses = a.values.element_masses
         self.element_masses = None if masses is None else np.zeros_like(masses)
         self.growth = None if a.values.growths is None else np.zeros_like(a.values.growths)
-        self.attached = a.values.zeros()  # of springs, cables and foundations
-        self.pressure = None if a.values.follower is None else np.zeros_like(a.values.follower)
+        self.by_hosts = a.values.zeros()  # of the numbers of host forces
         self.rest_adj = np.zeros_like(self.p)
-        self.fluid = np.zeros(len(a.values.parameters))
         self.forces = None if a.values.forces is None else np.zeros_like(a.values.forces)
         self.motion = None if a.values.motion is None else np.zeros_like(a.values.motion)
         self.path = None if a.values.path is None else np.zeros_like(a.values.path)
@@ -112,13 +110,6 @@ class ImplicitAdjoint(RecordedPasses):
             if 0 <= frame < len(self.frames[0]) - 1:
                 self.p += self.frames[0][frame]
                 self.q += self.frames[1][frame]
-
-    def _pull_back_fluid(self, by_star: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Adjoints of u*, and of x, from which velocities are measured; adds those of a fluid's numbers."""
-        fluid = self.ws.fluid
-        by_place, by_speed, numbers = fluid.vjp_of_all(self.places, by_star, len(self.fluid))
-        self.rest_adj, self.fluid = self.rest_adj + by_place, self.fluid + numbers
-        return by_place + by_speed / fluid.gamma, -by_speed / fluid.gamma
 
     def _pull_back_growth(self, j: int) -> None:
         """What tetrahedra felt of growth in pass j goes to its step."""
@@ -159,11 +150,9 @@ class ImplicitAdjoint(RecordedPasses):
         ):  # rounding of what is held, no direction of ours
             seed = np.zeros_like(seed)
         by_star = self.solve(seed)
-        nu = None
         if ws.volumes:
-            by_star, nu = ws.volumes.adjoint(
-                self.places, by_star, self.chamber_record.adjoint(j, save_every), self.solve
-            )
+            by_pressure = self.chamber_record.adjoint(j, save_every)
+            by_star, nu = ws.volumes.adjoint(ws.potential.held_at, by_star, by_pressure, self.solve)
         runtime.fill(ws.potential.w, by_star[None])
         for target in (self.lag, self.walls, *[self.pressed] * ws.potential.presses):
             runtime.fill(target, 0)
@@ -174,22 +163,15 @@ class ImplicitAdjoint(RecordedPasses):
         if ws.potential.faces:
             reaction = reaction + self._vjp_of_faces()
         reaction = reaction + by_contacts
-        if ws.fluid:
-            by_place, by_speed = self._pull_back_fluid(by_star)
-            reaction, by_x = reaction + by_place, by_x + by_speed
+        if ws.hosts:
+            by_place, by_speed = ws.hosts.vjp(ws.potential.held_at, by_star, self.by_hosts)
+            reaction, by_x = reaction + by_place + by_speed / s.gamma, by_x - by_speed / s.gamma
+        if ws.volumes:
+            reaction = reaction + ws.volumes.add_targets(nu, ws.potential.held_at, self.by_hosts)
         if ws.potential.rubbing:
             by_place, by_rub, by_begin = ws.potential.rubbing.vjp(ws.potential.held_at, by_star)
             reaction, by_x, by_lag = reaction + by_place, by_x + by_rub, by_lag + by_begin
-        if ws.attached:
-            reaction = reaction + ws.attached.vjp(ws.potential.held_at, by_star, self.attached, *ws.time_of(j, s))
         share = ws.load_share(j, s)
-        if self.pressure is not None:
-            by_place = ws.follower.vjp(self.places, by_star)
-            felt = ws.follower.pressures_vjp(self.places, by_star)
-            if nu is not None:
-                by_place = by_place + ws.volumes.add_targets(nu, self.places, felt)
-            reaction, self.rest_adj = reaction + by_place, self.rest_adj + by_place
-            ws.solver.schedule.add_pressure(self.pressure, j, ws.share_at_stage(j, s), felt)
         self.gravity += share * (ws.mass * by_star).sum(0)
         self._add_mass(by_star, self.weight(share))
         if self.forces is not None:
@@ -282,7 +264,6 @@ class ImplicitAdjoint(RecordedPasses):
             out.parameters[features.gravity :][:3] = self.gravity
         if features.drag >= 0:
             out.parameters[features.drag] = self.rate
-        out.parameters += self.fluid
         rest = self.frames[0].sum(0)
         if self.ws.pairs:
             out.parameters[a.parameters_of_self_contact], by_pairs = self.ws.pairs.collect()
@@ -292,9 +273,8 @@ class ImplicitAdjoint(RecordedPasses):
             rest = rest + rest_of_areas(a, a.values.rest, by_areas)
         out.rest = rest + self.rest_adj + out.rest
         out.growths = self.growth
-        out.forces, out.motion, out.path, out.follower = self.forces, self.motion, self.path, self.pressure
-        for name in ("ties", "tie_segments", "foundation"):
-            setattr(out, name, getattr(self.attached, name))
+        out.forces, out.motion, out.path = self.forces, self.motion, self.path
+        out.add(self.by_hosts)
         if self.motion is not None:
             out.displacement[a.held] += self.anchor
         return out

@@ -65,9 +65,9 @@ KNOWN: WeakKeyDictionary = WeakKeyDictionary()  # of meshes
 
 
 class Factorised:
-    """r -> M^-1 r for the Hessian that an Operator multiplies by, with stress, patches, mass, springs, cables, foundations,
-    pressures that follow and what a Projection adds. Of contact it has the diagonal blocks, of chambers nothing that couples
-    all of their surface, and nothing of fluids: products and conjugate gradients make up for these.
+    """r -> M^-1 r for the Hessian that an Operator multiplies by, with stress, patches, mass, matrices of host forces and
+    what a Projection adds. Of contact, and of host forces without a matrix, it has the diagonal blocks, of chambers nothing
+    that couples all of their surface: products and conjugate gradients make up for these.
 
     A symmetric matrix is L D L^T, without pivoting, and M = L |D| L^T: positive definite, and the matrix itself where that
     is. Then M^-1 = A^-1 + 2 sum of w w^T / |d| over the negative pivots d, with L^T w = e, so that w . A w = d. `negative`
@@ -118,19 +118,15 @@ def hessian(operator):
     """The matrix of an operator, as `Factorised` has it, in blocks."""
     from scipy.sparse import bsr_matrix
 
-    potential, follower = operator.potential, operator.follower
-    n, u, attached = potential.arrays.num_vertices, potential.held_at, potential.attached
-    contact, more = potential.contact_blocks(), []
+    potential = operator.potential
+    n, u, contact, more = potential.arrays.num_vertices, potential.held_at, potential.contact_blocks(), []
+    for matrix, blocks in potential.hosts.matrices(u):
+        contact = contact - blocks
+        more.append(matrix)
     if contact is not None:
-        if attached:
-            contact = contact - attached.blocks(u)
         more.append(bsr_matrix((contact, np.arange(n), np.arange(n + 1)), shape=(3 * n, 3 * n)))
-    if attached:
-        more.append(attached.matrix(u))
-    for part in getattr(follower, "parts", [follower] if follower is not None else []):
-        K = getattr(part.tangent(potential.arrays.values.rest + u), "K", None)
-        if K is not None:
-            more.append(-0.5 * (K + K.T) if operator.symmetric else -K)
+    for matrix, _ in operator.others.matrices(u):
+        more.append(0.5 * (matrix + matrix.T) if operator.symmetric else matrix)
     if operator.correction is not None:
         more.append(operator.correction.matrix())
     potential.blocks()

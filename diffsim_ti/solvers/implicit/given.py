@@ -1,17 +1,15 @@
-"""What is given in the passes of an implicit run: prescribed places, dead loads, follower pressures, chambers."""
+"""What is given in the passes of an implicit run: prescribed places, dead loads, when host forces act, held volumes."""
 
 from functools import cached_property
 
 import numpy as np
 
 from diffsim_ti.inputs import ConsistentMass, Derived, Mass
-from diffsim_ti.mechanics.chambers.multipliers import HeldVolumes
-from diffsim_ti.mechanics.chambers.pressures import following
+from diffsim_ti.mechanics.chambers.multipliers import HeldPressure, HeldVolumes
+from diffsim_ti.mechanics.host_force import Instant
 from diffsim_ti.mechanics.loads.interaction import DeadLoads
-from diffsim_ti.mechanics.pressure.follower_pressure import FollowerPressure, is_symmetric
-from diffsim_ti.mechanics.pressure.interaction import Pressures
-from diffsim_ti.mechanics.supports.free import projectors_of
 from diffsim_ti.state.stage import Stage
+from diffsim_ti.terms import Chamber
 
 
 class GivenInPasses:
@@ -49,10 +47,10 @@ class GivenInPasses:
     # ---- loads -------------------------------------------------------------------------------------------------------
 
     def lay_on(self, j: int, stage: Stage, share: float = 1.0) -> None:
-        """Set what pass j presses, attaches and grows; of statics a share of what it lays on."""
+        """Set host forces and growth of pass j; of statics a share of what it lays on."""
         self.laid = share if stage.static else 1.0
-        self.press(j, stage)
-        self.attach(j, stage)
+        if self.hosts:
+            self.hosts.take(self.arrays.now, self.instant(j, stage))
         self.grow(j, stage)
 
     def reached(self, j: int, stage: Stage, share: float) -> float:
@@ -60,25 +58,11 @@ class GivenInPasses:
         schedule = self.solver.schedule
         return float(schedule.begin(j) + share * (schedule.end(j) - schedule.begin(j)))
 
-    def press(self, j: int, stage: Stage) -> None:
-        """Set the pressures of pass j."""
-        if self.follower is not None:
-            share = self.share_at_stage(j, stage)
-            schedule, rows = self.solver.schedule, self.arrays.rows["follower"]
-            p = schedule.pressure(rows, j, share)
-            if self.laid < 1 and j > 0:  # of steps of which each has its own the last one's goes over into this one's
-                p, last = (
-                    schedule.pressure(rows, j, schedule.end(j)),
-                    schedule.pressure(rows, j - 1, schedule.end(j - 1)),
-                )
-                p = last + self.laid * (p - last)
-            self.follower.at(p, self.load_share(j, stage))
-
-    def attach(self, j: int, stage: Stage) -> None:
-        """Springs, cables and foundations as they are in pass j."""
-        if self.attached:
-            values, rows = self.arrays.values, self.arrays.rows["ties"]
-            self.attached.at(values, rows, *self.time_of(j, stage))
+    def instant(self, j: int, stage: Stage) -> Instant:
+        """When host forces act in pass j."""
+        gamma = np.inf if stage.static else stage.gamma
+        shares = self.share_at_stage(j, stage), self.load_share(j, stage), self.laid
+        return Instant(self.solver.schedule, j, *shares, self.origin, gamma)
 
     def growth_of(self, rows: np.ndarray, j: int, stage: Stage) -> np.ndarray:
         """What tetrahedra have grown by in pass j, of rows (steps, 2, m); linear in these."""
@@ -98,26 +82,15 @@ class GivenInPasses:
         if self.arrays.values.growths is not None:
             self.arrays.hold_growth(self.growth_of(self.arrays.rows["growths"], j, stage))
 
-    def time_of(self, j: int, stage: Stage) -> tuple:
-        """(schedule, pass, share of its step, share of the loads), which attached things are told."""
-        return self.solver.schedule, j, self.share_at_stage(j, stage), self.load_share(j, stage)
-
-    def follower_pressure(self) -> FollowerPressure | None:
-        """What presses on the surface as it is."""
-        free, rest, pressures = projectors_of(self.free), self.arrays.values.rest, self.scene.interaction(Pressures)
-        alike = pressures is None or is_symmetric(pressures.faces, pressures.load_of, free, rest)
-        return following(self.scene, alike)
-
     @property
     def held_chambers(self) -> list[int]:
         """Places of those that hold a volume among the scene's."""
-        return self.follower.held if self.volumes else []
+        return self.volumes.places if self.volumes else []
 
     def held_volumes(self, eps: float) -> HeldVolumes | None:
         """The scene's chambers that hold a volume."""
-        if not self.scene.holds_volumes:
-            return None
-        return HeldVolumes(self.follower, self.linear, self.arrays.values.rest, self.solver.tolerance, eps)
+        force = self.hosts.only(HeldPressure)
+        return force and HeldVolumes(force, self.linear, self.arrays.values.rest, self.solver.tolerance, eps)
 
     def start_multipliers(self, j: int, u: np.ndarray) -> None:
         """Begin pass j with the pressures of held volumes that the pass before it ended with."""
@@ -139,19 +112,19 @@ class GivenInPasses:
             self.volumes.place(u, self.multipliers[self.pass_of_all(j)])
 
     def chamber_pressures(self, num_frames: int, save_every: int) -> np.ndarray:
-        out = np.zeros((num_frames, len(self.follower.laws)))
+        out = np.zeros((num_frames, len(self.scene.terms_of(Chamber))))
         for frame in range(1, num_frames):
             last = self.solver.num_passes(frame * save_every) - 1
-            out[frame, self.follower.held] = self.multipliers.get(
+            out[frame, self.held_chambers] = self.multipliers.get(
                 self.pass_of_all(last), 0.0
             )  # of none that it came to
         return out
 
     def last_chamber_pressures(self) -> np.ndarray:
         """Those of chambers whose volume is held after the last pass, shape (chambers,); zero before the first."""
-        out = np.zeros(len(self.follower.laws))
+        out = np.zeros(len(self.scene.terms_of(Chamber)))
         if self.multipliers:
-            out[self.follower.held] = self.multipliers[max(self.multipliers)]
+            out[self.held_chambers] = self.multipliers[max(self.multipliers)]
         return out
 
     @property

@@ -82,9 +82,7 @@ class LaidOn:
         for k, laid in ((j, done), (int(ws.solver.schedule.first(ws.solver.schedule.row(j) + 1)) - 1, 1.0)):
             ws.lay_on(k, stage, laid)
             forces = ws.loads(k, stage)
-            if ws.follower is not None:
-                forces = forces + ws.follower.forces(ws.arrays.values.rest)
-            sizes.append(np.linalg.norm(forces))
+            sizes.append(np.linalg.norm(forces + ws.newton.others.forces(np.zeros_like(forces))))
         return sizes[0] / sizes[1] if sizes[1] > 0 else share
 
     def _why(self, error: NotConverged, reached: float) -> str:

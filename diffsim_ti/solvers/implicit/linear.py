@@ -7,34 +7,36 @@ import numpy as np
 
 from diffsim_ti.common.errors import NotConverged
 from diffsim_ti.inputs import diagonal_of
+from diffsim_ti.mechanics.host_force import NONE, HostForces
 from diffsim_ti.mechanics.supports.free import Free, linear_of
 from diffsim_ti.solvers.implicit.factorised import Factorised
 from diffsim_ti.solvers.implicit.preconditioners import BlockJacobi, Preconditioner
 
 
 class Operator:
-    """w -> c m w + d2E/du2 w at the potential's displacement, less what follower pressures change; rows of fixed vertices
-    are zero. Sets that do not deform move as w says, and turn what they feel (mechanics/reduced/rigid_sets.py).
+    """w -> c m w + d2E/du2 w at the potential's displacement, less what forces without an energy change; rows of fixed
+    vertices are zero. Sets that do not deform move as w says, and turn what they feel (mechanics/reduced/rigid_sets.py).
 
-    mass: c m, shape (num_vertices, 1) [N/m]; free: what vertices may do (free.py); transposed: of pressures and such sets.
+    mass: c m, shape (num_vertices, 1) [N/m]; free: what vertices may do (free.py); others: host forces without an energy;
+    transposed: of these and such sets.
     """
 
-    def __init__(self, potential, mass: np.ndarray, free: Free, follower=None, transposed: bool = False):
+    def __init__(self, potential, mass: np.ndarray, free: Free, others: HostForces = NONE, transposed: bool = False):
         self.potential, self.mass, self.free = potential, mass, free
         self.products, self.correction = 0, None
-        self.follower, self.transposed, self._pressing = follower, transposed, None
+        self.others, self.transposed, self._tangent = others, transposed, None
         self.rigid, self._linear = potential.rigid, linear_of(free)
         self._factors = None  # (correction, what `factorised` found with it)
 
     @property
     def symmetric(self) -> bool:
-        return (self.follower is None or self.follower.symmetric) and (not self.rigid or self.rigid.symmetric)
+        return self.others.symmetric and (not self.rigid or self.rigid.symmetric)
 
     @property
     def stays_on_device(self) -> bool:
         """Whether products need nothing of the host."""
         plain = isinstance(self.mass, np.ndarray) and isinstance(self.free, np.ndarray)
-        return plain and self.correction is None and self.follower is None and self.potential.stays_on_device
+        return plain and self.correction is None and not self.others and self.potential.stays_on_device
 
     def factorised(self) -> Factorised | None:
         """What factorised.py makes of it, found once."""
@@ -62,11 +64,10 @@ class Operator:
         y = self.mass * w + self.potential.product(w, convex=self.correction is not None)
         if self.correction is not None:
             y += self.correction(w)
-        if self.follower is not None:
-            if self._pressing is None:
-                at = self.follower.tangent(self.potential.arrays.values.rest + self.potential.held_at)
-                self._pressing = at.T if self.transposed else at
-            y -= self._pressing(w * self._linear)
+        if self.others:
+            if self._tangent is None:
+                self._tangent = self.others.tangent(self.potential.held_at, self.transposed)
+            y -= self._tangent(w * self._linear)
         return y
 
 

@@ -12,12 +12,12 @@ from diffsim_ti.solvers.implicit.rotations import Frames
 
 
 class Multigrid(Preconditioner):
-    """Smoothed aggregation on the assembled matrix of the rest state, springs, cables and foundations included, with rigid
-    motions as near kernel.
+    """Smoothed aggregation on the assembled matrix of the rest state, host forces included, with rigid motions as near
+    kernel.
 
     Isotropic laws: turning a body turns its stiffness, K(R u) = R K(u) R^T. So residuals are turned back by each vertex's
-    mean rotation, and corrections forth. Contact stiffness, and what is attached as it changes, join the finest level. The
-    V-cycle over it is cycle.py's.
+    mean rotation, and corrections forth. Contact stiffness, and that of host forces as it changes, join the finest level.
+    The V-cycle over it is cycle.py's.
     Below ten-node tetrahedra lie the linear ones of their corners, and aggregates of these (p-multigrid): aggregates of all
     ten nodes take half as many iterations again.
     Vanek, Mandel, Brezina 1996, doi:10.1007/BF02238511; Bell, Olson, Schroder, PyAMG, doi:10.21105/joss.04142; Heys,
@@ -30,13 +30,12 @@ class Multigrid(Preconditioner):
         self.potential, self.free = potential, free
         mesh, rest = potential.arrays.mesh, potential.arrays.values.rest
         with potential.at_rest():
-            at, attached = potential.held_at, potential.attached
+            at, hosts = potential.held_at, potential.hosts.matrices(potential.held_at)
             potential.blocks()
-            matrix, diagonal = assemble(potential, mass, free, [attached.matrix(at)] if attached else [])
+            matrix, diagonal = assemble(potential, mass, free, [own for own, _ in hosts])
             self._known = np.zeros((len(at), 3, 3))  # of what `update` adds
-            if attached:
-                own = attached.blocks(at)
-                self._known = free.around(own) if isinstance(free, FreeDirections) else own
+            for _, own in hosts:
+                self._known = self._known + (free.around(own) if isinstance(free, FreeDirections) else own)
         aggregated, allowed = matrix, free
         if mesh.order == 2:
             aggregated, allowed, rest, up = of_corners(matrix, free, mesh, rest)

@@ -2,8 +2,9 @@
 
     Phi(u) = c/2 sum_i m_i |u_i - a_i|^2 + E(u) - sum_i b_i . u_i - W(u),    R = -dPhi/du
 
-W: work of follower pressures. Where an open surface leaves them without a potential there is no Phi, but R: directions come
-from GMRES, and a step is taken that lowers |R| or, in the first rounds, along which -R does negative work.
+W: work of forces without an energy of their own, such as follower pressures. Where these are not symmetric (pressure on
+an open surface, drag) there is no Phi, but R: directions come from GMRES, and a step is taken that lowers |R| or, in the
+first rounds, along which -R does negative work.
 a: where inertia alone would lead [m]; b: dead loads [N]; c = 1 / gamma^2 [1/s^2], zero for statics. Directions come from
 conjugate gradients on the exact Hessian. Where that is met to be indefinite they stop with what they have (buckling needs
 that), or, if that is early, each tetrahedron's d2psi/dF2 is made positive definite and the direction computed anew (crushed
@@ -17,6 +18,7 @@ import numpy as np
 
 from diffsim_ti.common.errors import NotConverged
 from diffsim_ti.inputs import diagonal_of
+from diffsim_ti.mechanics.host_force import NONE, HostForces
 from diffsim_ti.mechanics.obstacles.way import Met
 from diffsim_ti.mechanics.stress.projection import Projection
 from diffsim_ti.mechanics.supports.free import Free, cleaned, linear_of, mask_of
@@ -74,11 +76,11 @@ class Newton:
         tolerance: float,
         max_iterations: int,
         eps: float,
-        follower=None,
+        others: HostForces = NONE,
         volumes=None,
     ):
         self.volumes = volumes  # of chambers, that are held (multipliers.py), or None
-        self.follower = follower  # pressures (mechanics/pressure/follower_pressure.py), or None
+        self.others = others  # host forces without an energy
         self.moves = mask_of(free)  # in some direction
         self.potential, self.free, self.way, self.preconditioners = potential, free, way, preconditioners
         self.tolerance, self.max_iterations, self.eps = tolerance, max_iterations, eps
@@ -88,7 +90,7 @@ class Newton:
 
     @property
     def by_residual(self) -> bool:
-        """Whether there is no potential: of pressures, or of rigid sets whose forces are not taken where a pass ends."""
+        """Whether there is no potential: of forces, or of rigid sets whose forces are not taken where a pass ends."""
         return not self.operator().symmetric
 
     def solve(
@@ -218,14 +220,13 @@ class Newton:
 
     def operator(self) -> Operator:
         """The Hessian of Phi where the potential stands."""
-        return Operator(self.potential, self.mass, self.free, self.follower)
+        return Operator(self.potential, self.mass, self.free, self.others)
 
     def _residual(self, u):
         f, sizes = self.potential.forces()
         inertia = self.mass * (u - self.inertial)
-        if self.follower is not None:
-            x = self.potential.arrays.values.rest + u
-            f, sizes = f + self.follower.forces(x), sizes + self.follower.sizes(x)
+        if self.others:
+            f, sizes = f + self.others.forces(u), sizes + self.others.sizes(u)
         size = np.sqrt((sizes**2).sum() + (self.loads**2).sum() + (inertia**2 * self.moves).sum())
         R = f + self.loads - inertia
         self.rigid.feel(R)
@@ -353,17 +354,16 @@ class Newton:
         return float((step * (self.mass * (u + 0.5 * step - self.inertial) - self.loads)).sum())
 
     def rise(self, u: np.ndarray, before: tuple, there: np.ndarray, problem: tuple) -> float:
-        """How much higher Phi is at another place than at u, where the energy was `before`. What follows the surface does no
-        more work on the way than by its forces at u. Infinite where a tetrahedron changes its volume more than tenfold."""
+        """How much higher Phi is at another place than at u, where the energy was `before`. Forces without an energy do no
+        more work on the way than at u. Infinite where a tetrahedron changes its volume more than tenfold."""
         self.mass, self.inertial, self.loads = problem
         step = self.potential.place(there) - u
         (after, _, J), (E, _, J0) = self.potential.energy(), before
         if np.any((J0 > 0) & ~((J > 0.1 * J0) & (J < 10 * J0))):
             return np.inf
         change = after - E + self._against_loads(u, step)
-        if self.follower is not None:
-            x = self.potential.arrays.values.rest + u
-            change -= min(float((self.follower.forces(x) * step).sum()), self.follower.work(x, step))
+        if self.others:
+            change -= min(float((self.others.forces(u) * step).sum()), self.others.work(u, step))
         return change
 
     def _falls(self, u, d, slope) -> bool:
@@ -383,9 +383,7 @@ class Newton:
         trial = self.potential.place(there)
         E, parts, J = before
         after, step = self._evaluate(trial), trial - u
-        change = after[0] - E + self._against_loads(u, step)
-        if self.follower is not None:
-            change -= self.follower.work(self.potential.arrays.values.rest + u, step)
+        change = after[0] - E + self._against_loads(u, step) - self.others.work(u, step)
         if met or (upright and np.any(~(after[2] > 0.1 * J))):
             change = np.inf
         rounding = parts + after[1] + float((self.stiffness * trial**2).sum())  # of strains that come from large u

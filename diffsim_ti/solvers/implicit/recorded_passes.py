@@ -32,8 +32,7 @@ class RecordedPasses:
             ws.strains.hold(stage, self.u, self.before)
         ws.potential.hold(ws.record, j - base)
         ws.potential.place(self.u_star)
-        self.operator = Operator(ws.potential, self.mass, ws.free, ws.on_surface, self.transposed)
-        self.places = ws.arrays.values.rest + ws.potential.held_at
+        self.operator = Operator(ws.potential, self.mass, ws.free, ws.newton.others, self.transposed)
         ws.take_multipliers(j, ws.potential.held_at)
         if ws.rigid:  # what they feel turns with them
             ws.newton.residual_of(ws.problem(j, stage, self.x, self.y))

@@ -102,20 +102,13 @@ class ImplicitTangent(RecordedPasses):
         if a.features().gravity >= 0:
             dR += share * ws.mass * tangent.parameters[a.features().gravity :][:3]
         dR += ws.given_forces(tangent.forces, j, s)
-        if tangent.follower is not None:
-            dp = ws.solver.schedule.pressure(tangent.follower, j, ws.share_at_stage(j, s))
-            dR += ws.follower.jvp(self.places, held + tangent.rest, dp)
-        if ws.fluid:
-            dv = (held - dx) / s.gamma
-            dR += ws.fluid.jvp_of_all(self.places, held + tangent.rest, dv, tangent.parameters)
-        if ws.attached:
-            dR += ws.attached.jvp(ws.potential.held_at, held, tangent, *ws.time_of(j, s))
+        dR += ws.hosts.jvp(ws.potential.held_at, held, (held - dx) / s.gamma, tangent)
         if ws.rigid:
             dR += ws.rigid.turned(held + tangent.rest)
         d_star = self.solve(dR + self.mass * (dx + s.gamma * dy - held))
         if ws.volumes:
-            targets = ws.volumes.targets_jvp(self.places, held + tangent.rest, dp)
-            d_star, change = ws.volumes.tangent(self.places, d_star, targets, self.solve)
+            targets = ws.volumes.targets_jvp(ws.potential.held_at, held, tangent)
+            d_star, change = ws.volumes.tangent(ws.potential.held_at, d_star, targets, self.solve)
             self.chamber_record.note(j, save_every, change)
         d_star = held + d_star
         if self.contacts:

@@ -9,7 +9,7 @@ from diffsim_ti import runtime
 from diffsim_ti.common.errors import NotConverged
 from diffsim_ti.inputs import ConsistentMass, Mass, kinetic_energy
 from diffsim_ti.mechanics.energy.potential import Potential
-from diffsim_ti.mechanics.fluid.on_host import Fluid, Together
+from diffsim_ti.mechanics.interactions import host_forces
 from diffsim_ti.mechanics.obstacles.approach import Approach
 from diffsim_ti.mechanics.obstacles.obstacle_ways import ObstacleWays
 from diffsim_ti.mechanics.obstacles.pressed import Pressed
@@ -17,9 +17,8 @@ from diffsim_ti.mechanics.obstacles.way import Way
 from diffsim_ti.mechanics.reduced.rigid_sets import RigidSets
 from diffsim_ti.mechanics.stress.held_strains import HeldStrains
 from diffsim_ti.mechanics.stress.law_state import law_state_kernels
-from diffsim_ti.mechanics.supports.free import FreeBodies, FreeDirections, held_as, linear_of, mask_of
+from diffsim_ti.mechanics.supports.free import FreeBodies, FreeDirections, held_as, linear_of, mask_of, projectors_of
 from diffsim_ti.mechanics.surfaces.implicit_pairs import ImplicitPairs
-from diffsim_ti.mechanics.ties.attached import Attached
 from diffsim_ti.mechanics.workspace import Workspace
 from diffsim_ti.monitor.energy_watch import EnergyWatch
 from diffsim_ti.runtime.slots import copy_slot
@@ -52,8 +51,8 @@ class ImplicitWorkspace(Preconditioned, ObstacleWays, Noted, GivenInPasses, Work
     enough = 20  # rounds with which a solution that was not found is looked for in parts
 
     def __init__(self, solver, derived, bend=0.0):
-        self.potential, self._length = None, solver.substep
-        self.energy_watch = EnergyWatch(self) if solver.may_gain_energy and solver.scene.term(Growth) is None else None
+        self.potential, self._length, self.hosts = None, solver.substep, host_forces(solver.scene)
+        self.energy_watch = EnergyWatch(self) if solver.may_gain_energy and not solver.scene.term(Growth) else None
         super().__init__(solver, derived, bend)
 
     def history(self, num_slots, record=False):
@@ -81,14 +80,11 @@ class ImplicitWorkspace(Preconditioned, ObstacleWays, Noted, GivenInPasses, Work
         tolerance, rounds = self.solver.tolerance, self.solver.max_iterations
         me = weakref.proxy(self)  # no circle: a dropped run gives its memory back at once
         way, preconditioner = (lambda *step: me.way_past_obstacles(*step)), (lambda mass: me.preconditioner(mass))
-        self.follower = self.follower_pressure()
+        self.hosts.restrict(projectors_of(self.free), derived.rest)
+        self.potential.hosts, others = self.hosts.with_energy, self.hosts.without_energy
         self.volumes, self.multipliers = self.held_volumes(eps), {}  # the pressures [Pa] that each pass ended with
-        self.fluid = Fluid.of(self.scene)
-        given = [part for part in (self.follower, self.fluid) if part is not None]
-        self.on_surface = Together(*given) if self.fluid else self.follower
-        followers = self.on_surface, self.volumes
-        self.attached = self.potential.attached = Attached.of(self.scene)
-        self.newton = Newton(self.potential, self.free, way, preconditioner, tolerance, rounds, eps, *followers)
+        more = others, self.volumes
+        self.newton = Newton(self.potential, self.free, way, preconditioner, tolerance, rounds, eps, *more)
         self._preconditioners = {}
         self.way, self.approach, self.closing = Way(self.arrays, self.parallel), Approach(self), Closing(self)
         self.check_apart()
@@ -333,9 +329,7 @@ class ImplicitWorkspace(Preconditioned, ObstacleWays, Noted, GivenInPasses, Work
         self.potential.begin(u, x, 1 / stage.gamma, self._walls)
         if self.pressed:
             self.pressed.begin(u, self._walls)
-        if self.fluid:
-            a = self.arrays.values
-            self.fluid.at(a.parameters, a.rest + x, stage.gamma)
+        self.origin = x
         self.lay_on(j, stage)
         if self.volumes:  # after all that the stiffness at rest is made of
             self.volumes.stiffen(self.preconditioner(stage.inertia * self.mass)[1])
