@@ -190,7 +190,7 @@ class ImplicitAdjoint(RecordedPasses):
             by_lag = by_lag + by_place
         if self.path is not None:
             by_walls = runtime.fetch(self.walls).astype(np.float64).sum(1)
-            ws.walls_vjp(by_walls + by_begin + (0.0 if seen is None else seen[3]), j, s, self.path)
+            ws.ways.vjp(by_walls + by_begin + (0.0 if seen is None else seen[3]), j, s, self.path)
         y_adj = s.gamma * inertial + s.e1 * q_free
         db0, db1, de0, de1 = s.by_rate
         self.rate += db0 * (y_adj * self.v).sum() + de0 * (q_free * self.v_star).sum() + de1 * (q_free * self.y).sum()

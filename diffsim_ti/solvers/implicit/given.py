@@ -8,12 +8,13 @@ from diffsim_ti.inputs import ConsistentMass, Derived, Mass
 from diffsim_ti.mechanics.chambers.multipliers import HeldPressure, HeldVolumes
 from diffsim_ti.mechanics.host_force import Instant
 from diffsim_ti.mechanics.loads.interaction import DeadLoads
+from diffsim_ti.mechanics.workspace import Workspace
 from diffsim_ti.state.stage import Stage
 from diffsim_ti.terms import Chamber
 
 
-class GivenInPasses:
-    """A part of ImplicitWorkspace."""
+class GivenInPasses(Workspace):
+    """The part of ImplicitWorkspace that knows what passes are told, but for obstacles."""
 
     laid = 1.0  # share of what a pass of statics lays on that is there (laid_on.py)
 
