@@ -87,6 +87,11 @@ class SpringsAndCables(Interaction):
     def collect(self, found, out, shape):
         out.ties, out.tie_segments = found["tie_felt"], found["tie_rest"]
 
+    def pulls_steadily(self, values):
+        """By tension and slack as each step begins and ends (inputs/ties.py)."""
+        ends = values.ties.reshape(len(values.ties), -1, 2, 3)[..., :2]
+        return bool((ends == ends[0, :, :, :1]).all())
+
     @property
     def stiff_over_time(self):
         return tuple(term for term in self.terms if isinstance(term, Cable))

@@ -94,6 +94,10 @@ class Ties(HostForce):
         """Of springs: cables are loads."""
         return {} if self.cables.all() else dict(springs=float(self.energies(u)[~self.cables].sum()))
 
+    def load_energy(self, u):
+        """Of cables."""
+        return float(self.energies(u)[self.cables].sum())
+
     def forces(self, u):
         t, *_, T = self._state(u)
         return self._along(t, T)
