@@ -11,6 +11,7 @@ from functools import cached_property
 import taichi as ti
 
 from diffsim_ti.mechanics.stress.step_numbers import StepNumbers
+from diffsim_ti.mechanics.ties.pull import across
 from diffsim_ti.runtime import LANES, assign, at, let, traced
 
 
@@ -87,7 +88,7 @@ class FibreBlock(StepNumbers):
     def across(self, T, size, there, unit: list, x: list) -> list:
         """T/|d| of what of x lies across d."""
         q, along = let(there * (T / size)), self.dot(unit, x)
-        return [let(q * (part - along * e)) for part, e in zip(x, unit)]
+        return [let(across(q, e, along, part)) for part, e in zip(x, unit)]
 
     @traced
     def store(self, c, first, f: list, scene, corner) -> None:

@@ -11,8 +11,10 @@ from dataclasses import dataclass
 import taichi as ti
 
 from diffsim_ti.mechanics.stress.step_numbers import StepNumbers
+from diffsim_ti.mechanics.ties import pull
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
+tension, tension_jvp, across = (ti.func(f) for f in (pull.tension, pull.tension_jvp, pull.across))
 
 
 @dataclass(frozen=True)
@@ -74,7 +76,7 @@ class TieElement(StepNumbers):
             e = self.stretch(t, u, s, scene) + n[1]
             if scene.tie_sides[t] > 0 and e <= 0:
                 e, k = zero, zero
-        return self.vector(n[0] + n[2] * e, e, k, zero)
+        return self.vector(tension(n[0], n[2], e), e, k, zero)
 
     @ti.func
     def is_single(self, t, scene: A):
@@ -100,7 +102,7 @@ class TieElement(StepNumbers):
         q = k
         if size > 0:
             q = T / size
-        return q * (x - t.dot(x) * t)
+        return across(q, t, t.dot(x), x)
 
     @ti.func
     def forces(self, t, now: A, scene: A, state: A, s, first):
@@ -126,7 +128,7 @@ class TieElement(StepNumbers):
             D, dD = scene.tie_segments[p], tangent.tie_segments[p]
             d, dd = D + self.parted(p, state.u, s, scene), dD + self.parted(p, tangent.u, 0, scene)
             de += self.unit(d).dot(dd) - self.unit(D).dot(dD)
-        dT = dn[0] + dn[2] * pulled[1] + pulled[2] * de
+        dT = tension_jvp(pulled[2], pulled[1], dn[0], dn[2], de)
         before = self.vector(0)
         for p in range(scene.tie_start[t], last + 1):
             after = self.vector(0)

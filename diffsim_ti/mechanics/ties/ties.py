@@ -8,6 +8,7 @@ import numpy as np
 
 from diffsim_ti.inputs.ties import directions
 from diffsim_ti.mechanics.host_force import HostForce
+from diffsim_ti.mechanics.ties.pull import across, tension, tension_jvp
 
 
 class Ties(HostForce):
@@ -67,7 +68,7 @@ class Ties(HostForce):
         e = stretch + self.s
         pulls = ~(self.one_sided & (e <= 0))
         e, k = e * pulls, self.k * pulls
-        out = directions(d), length, stretch, e, k, self.a + self.k * e
+        out = directions(d), length, stretch, e, k, tension(self.a, self.k, e)
         self._seen = np.array(u), out
         return out
 
@@ -75,7 +76,7 @@ class Ties(HostForce):
         """T/|d| of what of x lies across segments; of a spring without length k x."""
         T, k = T[self.paths.path_of], self.k[self.paths.path_of]
         q = np.divide(T, length, out=np.array(k), where=length > 0)
-        return q[:, None] * (x - (t * x).sum(1)[:, None] * t)
+        return across(q[:, None], t, (t * x).sum(1)[:, None], x)
 
     def lengths(self, u: np.ndarray) -> np.ndarray:
         """Length of each path [m]."""
@@ -177,7 +178,7 @@ class Ties(HostForce):
         _, _, _, e, k, _ = self._state(u)
         dD = segments_dot[self.paths.starts]
         de = self.lengths_jvp(u, du, segments_dot) - self._sums((directions(self.D) * dD).sum(1)) + slack_dot
-        return tension_dot + stiffness_dot * e + k * de
+        return tension_jvp(k, e, tension_dot, stiffness_dot, de)
 
     def tensions_vjp(self, u, T_adj) -> tuple:
         """Adjoints of (u, segments, (a, s, k)) for that of T."""
