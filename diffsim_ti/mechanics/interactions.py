@@ -5,10 +5,19 @@ from diffsim_ti.mechanics.fluid.interaction import FluidDrag
 from diffsim_ti.mechanics.host_force import HostForces
 from diffsim_ti.mechanics.interaction import Interaction
 from diffsim_ti.mechanics.pressure.interaction import Pressures
+from diffsim_ti.mechanics.rotating_frame import InertialForces
 from diffsim_ti.mechanics.ties.interaction import Foundations, SpringsAndCables
 
 # in the order in which vertices gather their corners: what is no load comes first
-KINDS: tuple[type[Interaction], ...] = SpringsAndCables, Pressures, Gases, FilledChambers, FluidDrag, Foundations
+KINDS: tuple[type[Interaction], ...] = (
+    SpringsAndCables,
+    Pressures,
+    Gases,
+    FilledChambers,
+    FluidDrag,
+    Foundations,
+    InertialForces,
+)
 
 
 def interactions_of(scene) -> tuple[Interaction, ...]:

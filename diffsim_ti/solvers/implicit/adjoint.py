@@ -165,7 +165,8 @@ class ImplicitAdjoint(RecordedPasses):
         reaction = reaction + by_contacts
         if ws.hosts:
             by_place, by_speed = ws.hosts.vjp(ws.potential.held_at, by_star, self.by_hosts)
-            reaction, by_x = reaction + by_place + by_speed / s.gamma, by_x - by_speed / s.gamma
+            by_place_of_speed = by_speed / (np.inf if s.static else s.gamma)
+            reaction, by_x = reaction + by_place + by_place_of_speed, by_x - by_place_of_speed
         if ws.volumes:
             reaction = reaction + ws.volumes.add_targets(nu, ws.potential.held_at, self.by_hosts)
         if ws.potential.rubbing:
