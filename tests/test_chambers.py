@@ -10,6 +10,7 @@ import diffsim_ti as ds
 from diffsim_ti.mechanics.chambers.multipliers import HeldVolumes
 from diffsim_ti.mechanics.chambers.pressures import ChamberPressure
 from diffsim_ti.monitor.stability import Stiffness
+from diffsim_ti.terms import Chamber
 
 STEPS = 2
 PLANES = dict(x0="x", y0="y", z0="z")
@@ -45,7 +46,7 @@ def solver_of(kind, of: ds.Scene):
 
 
 def rollout_of(kind, of: ds.Scene, steps=STEPS, **options) -> ds.Rollout:
-    outputs = [ds.ChamberPressure(term, name=f"p_{k}") for k, term in enumerate(of.chambers)]
+    outputs = [ds.ChamberPressure(term, name=f"p_{k}") for k, term in enumerate(of.terms_of(Chamber))]
     return ds.Rollout(solver_of(kind, of), steps, **dict(save_every=1, outputs=outputs, gradients="all") | options)
 
 
@@ -192,7 +193,7 @@ def test_a_held_volume_and_its_pressure_are_one():
 def test_forces_of_a_chamber_add_up_to_nothing():
     of = hollow([gas()])
     x = of.mesh.vertices + 0.01 * np.random.default_rng(3).normal(size=of.mesh.vertices.shape)
-    pressures = ChamberPressure(of, of.chambers).at(of.inputs.derive(of.inputs.values).follower[0, :, 0])
+    pressures = ChamberPressure(of, of.terms_of(Chamber)).at(of.inputs.derive(of.inputs.values).follower[0, :, 0])
     f, v = pressures.forces(x), np.random.default_rng(4).normal(size=x.shape)
     assert np.abs(f.sum(0)).max() < 1e-10 > np.abs(np.cross(x, f).sum(0)).max()
     step = 1e-3 * v
@@ -208,7 +209,7 @@ def test_the_tangent_that_products_use_is_the_derivative_both_ways(holds):
     of = filled(pitted, grown=(1.2,)) if holds else hollow([gas()])
     rng = np.random.default_rng(3)
     x, v = of.mesh.vertices + 0.01 * rng.normal(size=(2, *of.mesh.vertices.shape))
-    pressures = ChamberPressure(of, of.chambers).at(of.inputs.derive(of.inputs.values).follower[0, :, 0])
+    pressures = ChamberPressure(of, of.terms_of(Chamber)).at(of.inputs.derive(of.inputs.values).follower[0, :, 0])
     for law in pressures.laws:
         law.gamma = 3e4
     tangent = pressures.tangent(x)

@@ -60,7 +60,7 @@ def test_volumes_and_their_rates(kind):
         inside = np.array([scene.chamber_volume("oil", x) for x in frames.positions])
         assert np.allclose(inside / V, 1 + 0.002 * np.arange(5), rtol=0, atol=gate)
         if kind is ds.VelocityVerletSolver and precision == "f64":
-            enclosure = scene.chambers[0].enclosure
+            enclosure = scene.terms_of(ds.FilledChamber)[0].enclosure
             rates = [(enclosure.gradient(x) * v).sum() for x, v in zip(frames.positions, frames.velocities)]
             assert rates[1:] == pytest.approx(np.full(4, 10 * V), rel=1e-11)
 

@@ -8,6 +8,7 @@ import taichi as ti
 
 import diffsim_ti as ds
 from diffsim_ti.inputs import Input
+from diffsim_ti.inputs.links import PerStep
 from diffsim_ti.mechanics.host_force import HostForce
 from diffsim_ti.mechanics.interaction import Interaction, VertexwiseForce
 from diffsim_ti.obstacles import obstacle_surfaces, revolved
@@ -213,10 +214,87 @@ class Tether(ds.terms.Term):
         super().__init__(Input("tether_k", k, ((),), "N/m"), Input("tether_c", c, ((),)), Input("tether_d", d, ((3,),)))
 
 
+@dataclass(frozen=True)
+class SwingForce(VertexwiseForce):
+    """f = b of the step that each kick lies in, alike on all vertices: rows of steps that scenes have for it alone."""
+
+    name, asks_for_steps = "swing", True
+    derived, adjoints = dict(swing="vectors2"), dict(swing_felt="vectors2")
+
+    @traced
+    def sizes(self, plan):
+        return super().sizes(plan) | dict(swing_felt=plan.num_vertices)
+
+    @ti.func
+    def mean(self, now: ti.template(), rows: ti.template()):
+        return now.share0 * rows[now.force0, 0] + now.share1 * rows[now.force1, 0]
+
+    @ti.func
+    def force(self, i, u, v, now: ti.template(), scene: ti.template()):
+        return self.mean(now, scene.swing)
+
+    @ti.func
+    def force_jvp(self, i, u, v, du, dv, now: ti.template(), scene: ti.template(), tangent: ti.template()):
+        return self.mean(now, tangent.swing)
+
+    @ti.func
+    def force_vjp(self, i, u, v, w, now: ti.template(), scene: ti.template(), adjoint: ti.template()):
+        for row, share in ti.static(((now.force0, now.share0), (now.force1, now.share1))):
+            adjoint.swing_felt[row, i] = adjoint.swing_felt[row, i] + share * w
+        return self.vector(0), self.vector(0)
+
+
+class SwingOnHost(HostForce):
+    symmetric = True
+
+    def place(self, rows):
+        return min(self.instant.schedule.row(self.instant.j), len(rows) - 1)
+
+    def forces(self, u):
+        return self.instant.load * self.values.swing[self.place(self.values.swing)] + np.zeros_like(u)
+
+    def jvp(self, u, du, dv, moved=None):
+        none = np.zeros_like(u)
+        return none if moved is None else self.instant.load * moved.swing[self.place(moved.swing)] + none
+
+    def vjp(self, u, w, adj=None):
+        if adj is not None:
+            adj.swing[self.place(adj.swing)] += self.instant.load * w.sum(0)
+        return np.zeros_like(w), 0.0
+
+
+class Swings(Interaction):
+    name, derived = "swing", SwingForce.derived
+
+    def kernel(self, values, precision, shape):
+        return SwingForce(precision)
+
+    def host(self):
+        return SwingOnHost()
+
+    def adjoints(self, values, shape):
+        return dict(swing_felt=(len(values.swing), self.mesh.num_vertices))
+
+    def collect(self, found, out, shape):
+        out.swing[..., 0, :] += found["swing_felt"].sum(-2)
+
+
+class Swing(ds.terms.Term):
+    interaction, num_numbers = Swings, 0
+
+    def __init__(self, b):
+        super().__init__(Input("swing_force", b, (("steps", 1, 3),), "N"))
+
+    def links(self, names, own):
+        return [PerStep(names["swing_force"], "swing", 3)]
+
+
 @pytest.fixture(scope="module")
 def tethered():
     cube, law = ds.TetrahedralMesh.create_cube(2, 0.2), ds.StableNeoHookean(1e4, 0.3)
-    terms = [ds.Gravity(), Tether(20.0, 30.0, [0.01, 0.02, 0.0]), ds.ElasticFoundation(1e3, 1e3, "xmin")]
+    swing = np.tile([0.5, 0.0, -0.2], (100, 1, 1))
+    swing[:3] += 0.01 * np.random.default_rng(4).normal(size=(3, 1, 3))  # a little, for steps of other lengths
+    terms = [ds.Gravity(), Tether(20.0, 30.0, [0.01, 0.02, 0.0]), ds.ElasticFoundation(1e3, 1e3, "xmin"), Swing(swing)]
     velocities = dict(initial_velocities=(0.1, -0.5, 0.05))
     return ds.Scene(cube, law, 1000.0, terms, "ymin", precision="f64", **velocities)
 
@@ -226,7 +304,7 @@ def test_a_force_of_ones_own_acts_in_every_solver(tethered, kind):
     options = dict(dt=2e-4) if kind.explicit else dict(dt=5e-3, tolerance=1e-12)
     rollout = ds.Rollout(kind(tethered, **options), 3, gradients="all")
     assert ds.dot_product_test(rollout) < 1e-9
-    names = ["tether_k", "tether_d"] + ["tether_c"] * (kind is not ds.StaticSolver)
+    names = ["tether_k", "tether_d", "swing_force"] + ["tether_c"] * (kind is not ds.StaticSolver)
     assert ds.check_gradients(rollout, inputs=names).passed
 
 
@@ -237,6 +315,22 @@ def test_implicit_and_explicit_steps_feel_the_same(tethered):
     assert np.abs(explicit - implicit).max() < 1e-3 * way
 
 
+def test_a_force_of_ones_own_acts_in_batches_and_step_by_step(tethered):
+    """With numbers of its own, some of which are rows of steps."""
+    solver = ds.VelocityVerletSolver(tethered, dt=2e-4)
+    swing = tethered.inputs.values["swing_force"] * np.array([1.0, 40.0, -40.0])[:, None, None, None]
+    swing[1:, 1] = 0.0  # steps differ
+    found = ds.Batch(solver, 3, 3, lanes=True).forward(swing_force=swing).positions
+    for b in range(3):
+        alone = ds.Rollout(solver, 3).forward(swing_force=swing[b]).positions
+        np.testing.assert_allclose(found[b], alone, rtol=0, atol=1e-15)
+    one = dict(swing_force=swing[1], tether_c=0.0)  # for steps end with a kick of their own, and c sees velocities there
+    simulator = ds.Simulator(ds.VelocityVerletSolver(tethered.with_values(one), dt=2e-4))
+    simulator.run(3)
+    alone = ds.Rollout(solver, 3).forward(**one).positions
+    np.testing.assert_allclose(simulator.positions, alone[-1], rtol=0, atol=1e-15)
+
+
 class OnHostAlone(Tethers):
     kernel = Interaction.kernel
 
@@ -245,11 +339,11 @@ class TetherOnHostAlone(Tether):
     interaction = OnHostAlone
 
 
-def test_what_lacks_a_kernel_is_refused_by_explicit_solvers(tethered):
+def test_what_lacks_a_kernel_is_refused_by_explicit_solvers(tethered, monkeypatch):
     scene = tethered.replace(terms=TetherOnHostAlone(20.0, 30.0, [0.01, 0.02, 0.0]))
     ds.ImplicitEulerSolver(scene)
     with pytest.raises(ValueError, match="OnHostAlone has no `kernel`"):
         ds.VelocityVerletSolver(scene, dt=1e-4)
-    OnHostAlone.host = Interaction.host
+    monkeypatch.setattr(OnHostAlone, "host", Interaction.host)
     with pytest.raises(ValueError, match="OnHostAlone has no `host`"):
         ds.Rollout(ds.ImplicitEulerSolver(scene), 1).forward()

@@ -7,9 +7,12 @@ from quadratic_meshes import box, crumpled, face_rule, renumbered, ring, six, si
 from test_every_adjoint import assert_transposed
 
 import diffsim_ti as ds
+from diffsim_ti.mechanics.loads.interaction import DeadLoads
 from diffsim_ti.mechanics.pressure.follower_pressure import FollowerPressure, is_symmetric
+from diffsim_ti.mechanics.pressure.interaction import Pressures
 from diffsim_ti.mesh import reference_face
 from diffsim_ti.mesh.face_points import face_points
+from diffsim_ti.terms import Chamber
 
 LAW = ds.StableNeoHookean(1e5, 0.3)
 CURVED = pytest.mark.parametrize("make", [wavy, crumpled, lambda: ring(2)], ids=["wavy", "crumpled", "ring"])
@@ -24,7 +27,7 @@ def dead_forces(mesh, *terms) -> np.ndarray:
     """Of a scene's dead loads, for each vertex."""
     scene = ds.Scene(mesh, LAW, terms=terms, precision="f64")
     out = np.zeros_like(mesh.vertices)
-    out[scene.loaded_vertices] = derived(scene).forces[0]
+    out[scene.interaction(DeadLoads).acts_at] = derived(scene).forces[0]
     return out
 
 
@@ -187,8 +190,10 @@ def test_explicit_steps_feel_the_same_pressure(solver):
     moved = ds.Scene(mesh, LAW, terms=terms, precision="f64", initial_positions=mesh.vertices + u)
     bare = ds.Scene(mesh, LAW, precision="f64", initial_positions=mesh.vertices + u)
     both = [ds.Rollout(solver(s, h), 1).forward().velocities[-1] for s in (moved, bare)]
-    faces, load_of = scene.pressed_faces
-    force = FollowerPressure(faces, load_of, mesh.num_vertices).at([2e4, -1e4]).forces(mesh.vertices + u)
+    pressed = scene.interaction(Pressures)
+    force = (
+        FollowerPressure(pressed.faces, pressed.load_of, mesh.num_vertices).at([2e4, -1e4]).forces(mesh.vertices + u)
+    )
     found = (both[0] - both[1]) / h * derived(scene).mass[:, None]
     np.testing.assert_allclose(found, force, atol=1e-6 * np.abs(force).max())
 
@@ -271,7 +276,7 @@ def test_chambers_have_the_volume_of_their_curved_faces(make):
     x = mesh.vertices + scene.supports.free(0.01 * rng.normal(size=mesh.vertices.shape))
     _, normals, places = on_faces(mesh, mesh.faces_of("cavity"), x)  # what is open lies in z = 0, as the origin does
     assert scene.chamber_volume("gas", x) == pytest.approx(-(normals * places).sum() / 3, rel=1e-12)
-    enclosure, w = scene.chambers[0].enclosure, scene.supports.free(rng.normal(size=x.shape))
+    enclosure, w = scene.terms_of(Chamber)[0].enclosure, scene.supports.free(rng.normal(size=x.shape))
     slope = (enclosure.volume(x + 1e-5 * w) - enclosure.volume(x - 1e-5 * w)) / 2e-5
     gradient = (enclosure.gradient(x) * w).sum()
     assert gradient == pytest.approx(slope, rel=1e-6)
@@ -306,7 +311,7 @@ def test_explicit_steps_feel_the_gas(make):
         for s in (scene, bare)
     ]
     both = [ds.Rollout(ds.SemiImplicitSolver(s, h), 1).forward().velocities[-1] for s in moved]
-    chamber, x = scene.chambers[0].enclosure, scene.mesh.vertices + u
+    chamber, x = scene.terms_of(Chamber)[0].enclosure, scene.mesh.vertices + u
     p = 1.1 * 101325 * (chamber.volume(scene.mesh.vertices) / chamber.volume(x)) ** 1.3 - 101325
     force = scene.supports.free(p * chamber.gradient(x))
     found = (both[0] - both[1]) / h * derived(scene).mass[:, None]

@@ -12,6 +12,7 @@ import diffsim_ti as ds
 from diffsim_ti.diff_simulator import rollout_frames
 from diffsim_ti.mechanics.host_force import HostForces
 from diffsim_ti.mechanics.interactions import host_forces
+from diffsim_ti.mechanics.ties.interaction import SpringsAndCables
 
 STEPS = 4
 TIMES = np.array([0.0, 0.003, 0.1])
@@ -100,7 +101,7 @@ def test_a_run_again_has_the_same_bits(kind):
     turned = mesh.tetrahedra[:, [2, 0, 1, 3]]
     mesh = ds.TetrahedralMesh(mesh.vertices, turned, vertex_sets=mesh.vertex_sets).with_surface_set("lid", upper)
     rollout = rollout_of(kind, attached(mesh), mesh=mesh)
-    assert rollout.scene.tie_paths.matrix(mesh.num_vertices).has_canonical_format
+    assert rollout.scene.interaction(SpringsAndCables).paths.matrix(mesh.num_vertices).has_canonical_format
     first, seed = rollout.forward(), np.random.default_rng(5)
     seed = seed.normal(size=first.positions.shape)
     gradients = rollout.vjp(first, seed)

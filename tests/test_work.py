@@ -7,6 +7,7 @@ import pytest
 
 import diffsim_ti as ds
 from diffsim_ti import verify
+from diffsim_ti.mechanics.loads.interaction import DeadLoads
 
 
 def mesh():
@@ -75,7 +76,7 @@ def test_constant_dead_loads_are_exact_whatever_the_way():
     few, many = (ds.Rollout(solver, 40, save_every=n, outputs=ds.WorkOfLoads(weight=True)).forward() for n in (40, 1))
     derived = scene.inputs.derive(scene.inputs.values)
     force = derived.mass[:, None] * [0, -9.81, 0]
-    force[scene.loaded_vertices] += derived.forces[0]
+    force[scene.interaction(DeadLoads).acts_at] += derived.forces[0]
     exact = (force * (many.positions[-1] - many.positions[0])).sum()
     assert few["work"][-1] == pytest.approx(exact, rel=1e-12) and many["work"][-1] == pytest.approx(exact, rel=1e-12)
     assert exact > 1e-3

@@ -63,7 +63,7 @@ class BatchAdjoint:
 
     def _shapes(self) -> dict:
         """Of the scenes' arrays that adjoints have the shapes of."""
-        names = *OF_STEPS, "anchor", "follower", "ties", "tie_segments", "foundation", "growths"
+        names = *OF_STEPS, "anchor", "growths", *self.ws.arrays.own
         return {name: tuple(getattr(self.ws.numbers, name).shape) for name in names}
 
     def start(self, positions_adj: np.ndarray, velocities_adj: np.ndarray, last_frame_is_input: bool) -> None:
@@ -105,7 +105,7 @@ class BatchAdjoint:
         ws, B = self.ws, self.ws.num_scenes
         a, features, rows = ws.arrays, self.features, self.features.sums()
         one, sums, vectors = ws.derived[0], self._of(self.sums), self._vectors
-        out = Derived(*(None if x is None else np.zeros((B, *x.shape)) for x in one.parts().values()))
+        out = one.mapped(lambda x: np.zeros((B, *x.shape)))
         out.coefficients = self._of_tetrahedra(self.coefficients, -1)
         out.parameters[:, : features.num_parameters] = sums[:, rows.of("parameters")].sum(2)
         if features.density:
@@ -178,12 +178,10 @@ class BatchTangent:
             rest=[d.rest for d in tangents],
             anchor=[np.zeros((1, 3)) if d.motion is None else d.displacement[a.held] for d in tangents],
         )
-        for name in ("tie_segments", "foundation"):
-            if getattr(tangents[0], name) is not None:
-                vectors[name] = [getattr(d, name) for d in tangents]
+        vectors |= {name: [getattr(d, name) for d in tangents] for name, kind in a.own.items() if kind == "vectors"}
         for name, arrays in vectors.items():
             setattr(self, name, runtime.upload(layout.pack_vectors(np.stack(arrays)), layout.vector))
-        for name in (*OF_STEPS, "follower", "ties"):
+        for name in (*OF_STEPS, *a.rows_of_steps):
             rows = [np.zeros((1, 1, 3)) if getattr(d, name) is None else getattr(d, name) for d in tangents]
             setattr(self, name, runtime.upload(layout.pack_vectors(in_slots(rows)), layout.vector))
         frames = ws.room_for_frames(ws.frames.frames_u.shape[0])

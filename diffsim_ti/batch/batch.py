@@ -244,13 +244,12 @@ class Batch:
                 if part is not None:
                     target[b] = part
         derived = self.sweep.pull_back(frames.run, by_u, by_v)
-        parts, dead = derived.parts().values(), ~frames.alive
-        for part in parts:
+        for part in derived.parts().values():
             if part is not None:
-                part[dead] = 0  # they have left no trace in others
-        return self._by_inputs(frames, [None if x is None else np.asarray(x) for x in parts], direct)
+                part[~frames.alive] = 0  # they have left no trace in others
+        return self._by_inputs(frames, derived.mapped(np.asarray), direct)
 
-    def _by_inputs(self, frames: BatchFrames, parts: list, direct: list) -> dict[str, np.ndarray]:
+    def _by_inputs(self, frames: BatchFrames, adjoint: Derived, direct: list) -> dict[str, np.ndarray]:
         """Gradients by the wanted inputs; what meets no number that scenes have of their own is summed over them first."""
         inputs, values, wanted = self.scene.inputs, frames.values, self.wanted
         own = tuple(name for name, x in values.items() if isinstance(x, Own))
@@ -258,15 +257,11 @@ class Batch:
         each = tuple(name for name in wanted if name not in alike)
         out = dict.fromkeys(wanted)
         if alike:
-            total = Derived(*(None if x is None else x.sum(0) for x in parts))
+            total = adjoint.mapped(lambda x: x.sum(0))
             out |= inputs.derive_vjp(self.sweep.values_of(values, 0), total, tuple(n for n in wanted if n in alike))
         if each:
-            rows = [
-                inputs.derive_vjp(
-                    self.sweep.values_of(values, b), Derived(*(None if x is None else x[b] for x in parts)), each
-                )
-                for b in range(self.num_scenes)
-            ]
+            of_each = (adjoint.mapped(lambda x, b=b: x[b]) for b in range(self.num_scenes))
+            rows = [inputs.derive_vjp(self.sweep.values_of(values, b), own, each) for b, own in enumerate(of_each)]
             out |= self._joined(values, rows, each)
         for b, by_inputs in direct:
             for name in set(by_inputs).intersection(wanted):

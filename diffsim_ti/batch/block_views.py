@@ -13,7 +13,6 @@ from diffsim_ti.runtime import Bundle, at, let, traced
 from diffsim_ti.solvers.explicit.item_forces import ItemForces
 from diffsim_ti.solvers.explicit.kick_drift import KickDrift
 from diffsim_ti.state.features import Features
-from diffsim_ti.state.numbers import ALONE
 from diffsim_ti.state.pass_table import pass_at
 
 TABLE = dict(ints="ints", floats="scalars")
@@ -112,7 +111,7 @@ class BlockViews:
     def scene_of(self, b, lane, scene, plan):
         """Scene `lane` of block b, for functions of vertices."""
         n = let(b * plan.num_vertices)
-        topology = "force_slot", "motion_slot", *(name for name in self.items.arrays if name not in ALONE)
+        topology = "force_slot", "motion_slot", *(name for name in self.items.arrays if name not in self.items.derived)
         out = {name: getattr(scene, name) for name in topology} | self.numbers_of(b, lane, scene, plan)
         for name in ("inverse_mass", "surface"):
             out[name] = View(getattr(scene, name), n, lane) if name in self.own else getattr(scene, name)
@@ -190,7 +189,12 @@ class BlockViews:
     @property
     def alone(self) -> dict:
         """Their numbers, of which each scene has its own."""
-        return in_blocks({name: kind for name, kind in self.items.arrays.items() if name in ALONE})
+        return in_blocks(self.items.derived)
+
+    @property
+    def lengths(self) -> dict:
+        """What kernels take to find them: the length of a row of each."""
+        return {f"len_{name}": "int" for name in self.items.derived}
 
     @traced
     def numbers_of(self, b, lane, record, plan) -> dict:

@@ -17,7 +17,6 @@ from diffsim_ti.runtime import Bundle, Kernel, at, let, traced
 from diffsim_ti.solvers.explicit.kernels import PLAN, TURNS, ExplicitKernels
 from diffsim_ti.solvers.explicit.kick_drift import KickDrift
 from diffsim_ti.state.features import Features
-from diffsim_ti.state.numbers import ALONE
 from diffsim_ti.state.pass_table import pass_at, reversed_pass
 
 A = ti.template()
@@ -66,7 +65,7 @@ class InnermostKernels(ExplicitKernels):
     def scene_of(self, b, scene, plan):
         """Scene b for functions of vertices."""
         own = [name for name in ("inverse_mass", "surface", "rest") if name in self.own]
-        own += ["parameters", "corner", *OF_STEPS, *self.alone]
+        own += ["parameters", "corner", *OF_STEPS, *self.items.derived]
         return Bundle(**{**vars(scene), **self.columns(scene, own, b, plan)})
 
     @traced
@@ -99,11 +98,6 @@ class InnermostKernels(ExplicitKernels):
     @traced
     def item(self, t, plan):
         return ItemOfScene(let(t // plan.num_scenes), let(t % plan.num_scenes), plan.num_scenes)
-
-    @property
-    def alone(self) -> dict:
-        """Numbers of springs, cables, muscles and pressures, of which each scene has its own."""
-        return {name: kind for name, kind in self.items.arrays.items() if name in ALONE}
 
     @traced
     def after(self, plan):
@@ -227,7 +221,9 @@ class InnermostKernels(ExplicitKernels):
     @cached_property
     def step_jvp(self) -> Kernel:
         """The tangent of these passes along recorded slots; the change of the state is advanced in place."""
-        tangent = self.with_state(CHANGE) | CHANGED | OF_STEPS | dict(rest="vectors") | self.alone | self.growing
+        tangent = (
+            self.with_state(CHANGE) | CHANGED | OF_STEPS | dict(rest="vectors") | self.items.derived | self.growing
+        )
         own = dict(state=self.with_state(STATE), tangent=tangent)
         return self._kernel("step_jvp", self.passes_jvp, own, self.repeated)
 
@@ -309,7 +305,7 @@ class InnermostKernels(ExplicitKernels):
 
     def _kernel(self, name: str, body, arrays: dict, repeated: bool, **numbers) -> Kernel:
         arrays = dict(scene=SCENE | OF_STEPS | self.items.arrays | self.growing) | arrays | dict(table=PLAN)
-        numbers = NUMBERS | numbers | self.items.counts
+        numbers = NUMBERS | numbers | self.items.counts | self.lengths
         if repeated:
             arrays["table"], numbers = PLAN | TURNS, numbers | dict(times="int")
         return Kernel(f"batch_{name}", body, self.vertex.law.precision, arrays, numbers, loops=2 * repeated)

@@ -25,7 +25,6 @@ ADJOINT |= dict.fromkeys(("w", "sums", "felt"), "blocks2")
 SIZES = (
     *("num_tetrahedra", "num_vertices", "num_blocks", "spread"),
     *("num_loaded", "num_held", "num_parameters", "num_passes_shown"),
-    *("num_follower", "num_points", "num_foundation"),
 )
 NUMBERS = dict.fromkeys((*SIZES, "window", "first", "count", "base"), "int") | dict(contact_damping="float")
 
@@ -196,7 +195,7 @@ class BatchKernels(BlockViews):
     def _kernel(self, name: str, body, arrays: dict, **numbers) -> Kernel:
         arrays = dict(scene=self.scene()) | arrays | dict(table=self.table())
         few = self.law.short and self.features.order == 1 and not (self.features.groups or self.items.any)
-        numbers = NUMBERS | numbers | self.items.counts
+        numbers = NUMBERS | numbers | self.items.counts | self.lengths
         return Kernel(f"batch_{name}", body, self.law.precision, arrays, numbers, polished=few)
 
 

@@ -14,7 +14,7 @@ def why_not(solver) -> str | None:
         return "the solver is not explicit"
     if runtime.runs_on_cpu() and not scene.law.lanes:
         return f"the law of {type(scene.material).__name__} does not come in lanes"
-    terms = dict(self_contact=scene.term(SelfContact), chambers=scene.chambers)
+    terms = dict(self_contact=scene.term(SelfContact)) | {x.name: True for x in scene.interactions if x.apart}
     terms |= dict(contact_within_faces=feels_faces(scene), mesh_obstacles=_tables(scene))
     terms |= dict(reduced_sets=scene.reduced)
     there = [name.replace("_", " ") for name, some in terms.items() if some]

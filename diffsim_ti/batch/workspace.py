@@ -1,7 +1,6 @@
 """A run of many scenes side by side: their numbers and states on the device, and the launches that take them on."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from functools import partial
 from operator import is_
 from types import SimpleNamespace
@@ -55,11 +54,10 @@ class BatchWorkspace:
         first = derived[0]
         if any(d.coefficients.ndim != first.coefficients.ndim for d in derived):
             m = a.num_tetrahedra
-            derived = [
-                replace(d, coefficients=np.broadcast_to(d.coefficients, (m, d.coefficients.shape[-1]))) for d in derived
-            ]
-        given = [name for name in ("forces", "follower", "ties") if getattr(first, name) is not None]
-        first = replace(derived[0], **{name: max((getattr(d, name) for d in derived), key=len) for name in given})
+            whole = [np.broadcast_to(d.coefficients, (m, d.coefficients.shape[-1])) for d in derived]
+            derived = [d.replaced(coefficients=own) for d, own in zip(derived, whole)]
+        given = [name for name in ("forces", *a.rows_of_steps) if getattr(first, name) is not None]
+        first = derived[0].replaced(**{name: max((getattr(d, name) for d in derived), key=len) for name in given})
         a.load(first)
         own = {name for name in ("gradients", "volumes", "rest", "surface") if _differ(derived, name)}
         own |= {"gradients", "volumes"} if own & {"gradients", "volumes"} else set()
@@ -125,20 +123,15 @@ class BatchWorkspace:
         anchors = lambda: [none if x is None else x[a.held] for x in starts]  # noqa: E731
         out["anchor"] = starts, lambda: self._packed(anchors() if moves else [none] * self.num_scenes, "vectors")
         self.counts = {}
-        for name in ("forces", "motion", "path", "follower", "ties"):
+        for name in ("forces", "motion", "path", *a.rows_of_steps):
             rows = [_NONE if x is None else x for x in each(name)]
             out[name], self.counts[name] = (tuple(rows), partial(self._in_slots, rows)), rows[0].shape[1]
-        for name in ("tie_segments", "foundation"):
-            own = [_NONE[0] if x is None else x for x in each(name)]
-            out[name], self.counts[name] = (tuple(own), partial(self._packed, own, "vectors")), len(own[0])
+        for name in (name for name in a.own if name not in a.rows_of_steps):
+            own = each(name)
+            out[name], self.counts[name] = (own, partial(self._packed, own, "vectors")), len(own[0])
         growths = each("growths")
         out["growths"] = growths, lambda: (self.layout.pack(growths_placed(a, growths)), self.layout.number)
-        self.num_step_rows = max((len(x) for x in (first.path, first.motion) if x is not None), default=1)
-        has = a.features()
-        asked = has.asks_for_steps
-        if self.num_step_rows == 1 and asked:
-            given = (x for d in derived for x in (d.forces, d.follower, d.ties, d.growths) if x is not None)
-            self.num_step_rows = max(1 + len(x) for x in given)
+        self.num_step_rows = a.num_step_rows(derived)
         return out
 
     def _vertex_of_corner(self) -> np.ndarray:
@@ -299,8 +292,7 @@ class BatchWorkspace:
         sizes |= self.layout.counts(a.num_places, a.num_vertices)
         sizes |= dict(num_loaded=self.counts["forces"], num_held=self.counts["motion"])
         sizes |= dict(num_parameters=self.num_parameters, num_passes_shown=self.table.size)
-        sizes |= dict(num_follower=self.counts["follower"], num_points=self.counts["tie_segments"])
-        sizes |= dict(num_foundation=self.counts["foundation"])
+        sizes |= {f"len_{name}": self.counts[name] for name in a.own}
         sizes |= a.counts
         sizes |= dict(contact_damping=solver.contact_damping)
         run, turn = (num_passes, self.num_step_rows, save_every, schedule), -1 if backwards else 1

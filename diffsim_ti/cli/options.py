@@ -232,16 +232,13 @@ def works_on(scene: "Scene", explicit: bool) -> list[str]:
     known = {
         "friction": rough,
         "contact damping": touched,
-        "drag": scene.term(Drag) is not None or bool(scene.fluids),
+        "drag": scene.term(Drag) is not None,
         "viscosity": scene.law.viscous or bool(scene.law.state_names),
-        "loads": bool(scene.dead_loads or scene.pressures),
-        "gases and filled chambers": bool(scene.chambers),
-        "muscles and cables": bool(scene.cables),
-        "growth": bool(scene.growing),
         "motion of supports": scene.motion is not None,
         "motion of obstacles": bool(scene.moving),
     }
-    return [what for what, acts in known.items() if acts]
+    found = [what for what, acts in known.items() if acts] + [x.works for x in scene.interactions if x.works]
+    return list(dict.fromkeys(found))
 
 
 # ---- what is said at the end ------------------------------------------------------------------------------------------

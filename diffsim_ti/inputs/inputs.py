@@ -1,7 +1,6 @@
 """The inputs of a scene: names, values, and what kernels read of them, with derivatives both ways."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,21 +15,19 @@ from diffsim_ti.inputs.clamps import ClampedMotion
 from diffsim_ti.inputs.consistent_mass import ElementMasses
 from diffsim_ti.inputs.curved_shape import CurvedShape, StressPoints
 from diffsim_ti.inputs.description import POSITIVE, Input, frozen, length, length_per_step, speed
-from diffsim_ti.inputs.foundation import FoundationRows
-from diffsim_ti.inputs.growing import GrowthRows
-from diffsim_ti.inputs.loads import PressureRows, SumOfForces
 from diffsim_ti.inputs.poses import PoseColumns
 from diffsim_ti.inputs.rigid_start import RigidDisplacement, RigidVelocity
 from diffsim_ti.inputs.surface_areas import SurfaceAreas
-from diffsim_ti.inputs.ties import JoinedRows, JoinedSegments
 
 if TYPE_CHECKING:
     from diffsim_ti.scene import Scene
 
 
-@dataclass
 class Derived:
-    """What kernels read; also used for tangents and adjoints of the same numbers. None: the scene has no such thing."""
+    """What kernels read; also used for tangents and adjoints of the same numbers. None: the scene has no such thing.
+
+    Beside these it has the arrays that interactions have of their own (mechanics/interaction.py), by their names.
+    """
 
     displacement: np.ndarray  # (num_vertices, 3) [m]
     velocity: np.ndarray  # (num_vertices, 3) [m/s]
@@ -40,22 +37,15 @@ class Derived:
     rest: np.ndarray  # (num_vertices, 3) [m]
     gradients: np.ndarray  # (num_tetrahedra, 3, 3), rows grad N_1..3 [1/m]; of ten nodes (num_tetrahedra, 4, 3, 3)
     volumes: np.ndarray  # (num_tetrahedra,) [m^3]; of ten nodes (num_tetrahedra, 4)
-    surface: np.ndarray | None = None  # (num_vertices,) of the surface, 0 within [m^2]
-    forces: np.ndarray | None = None  # (1 or steps, k, 3), or (1 or steps, 2 k, 3) as each step begins and ends [N]
-    motion: np.ndarray | None = None  # (steps + 1, num_held, 3) [m]
-    path: np.ndarray | None = None  # paths of obstacles (inputs/poses.py), (steps + 1, columns, 3)
-    # pressures, then numbers of chambers, as each step begins and ends, and 0, (1 or steps, loads and numbers, 3)
-    follower: np.ndarray | None = None
-    ties: np.ndarray | None = None  # numbers of springs and cables (inputs/ties.py), (1 or steps, 2 ties, 3)
-    tie_segments: np.ndarray | None = None  # between their points at rest, (points, 3) [m]
-    element_masses: np.ndarray | None = None  # consistent, of ten nodes, (num_tetrahedra, 10, 10) [kg]
-    growths: np.ndarray | None = None  # as each step begins and ends, (1 or steps, 2, 1 or num_tetrahedra) [-]
-    foundation: np.ndarray | None = None  # rows of the stiffness of vertices on foundations, (3 k, 3) [N/m]
+    surface: np.ndarray | None  # (num_vertices,) of the surface, 0 within [m^2]
+    forces: np.ndarray | None  # (1 or steps, k, 3), or (1 or steps, 2 k, 3) as each step begins and ends [N]
+    motion: np.ndarray | None  # (steps + 1, num_held, 3) [m]
+    path: np.ndarray | None  # paths of obstacles (inputs/poses.py), (steps + 1, columns, 3)
+    element_masses: np.ndarray | None  # consistent, of ten nodes, (num_tetrahedra, 10, 10) [kg]
+    growths: np.ndarray | None  # as each step begins and ends, (1 or steps, 2, 1 or num_tetrahedra) [-]
 
-    def zeros(self, but=()) -> "Derived":
-        """The same shapes, all zero; None for those in `but`."""
-        parts = self.parts().items()
-        return Derived(*(None if part is None or name in but else np.zeros(part.shape) for name, part in parts))
+    def __init__(self, **parts: np.ndarray | None):
+        vars(self).update(parts)
 
     def add(self, other: "Derived", factor: float = 1.0) -> None:
         """Add what another has that is not zero, times a factor."""
@@ -66,11 +56,23 @@ class Derived:
 
     def parts(self) -> dict[str, np.ndarray | None]:
         """{name: array}"""
-        return {name: getattr(self, name) for name in READ}
+        return dict(vars(self))
+
+    def mapped(self, function) -> "Derived":
+        """With function(array) in the place of each; None stays."""
+        return Derived(**{name: None if part is None else function(part) for name, part in vars(self).items()})
+
+    def replaced(self, **parts: np.ndarray | None) -> "Derived":
+        """With others in the place of some."""
+        return Derived(**vars(self) | parts)
+
+    def zeros(self, but=()) -> "Derived":
+        """The same shapes, all zero; None for those in `but`."""
+        return self.replaced(**dict.fromkeys(but)).mapped(lambda part: np.zeros(part.shape))
 
 
-# the names of the arrays that kernels read
-READ = tuple(field.name for field in fields(Derived))
+# the names of the arrays of every scene
+READ = tuple(Derived.__annotations__)
 
 
 class Inputs:
@@ -100,6 +102,8 @@ class Inputs:
             for i in term.described:
                 name = self._names[-1][i.plain] = _free_name(term, i, self.described.keys() | last.keys())
                 self.described[name] = i.known(sizes)
+        own = (name for x in scene.interactions for name in x.derived)
+        self.read = tuple(dict.fromkeys((*READ, *scene.own_numbers, *own)))  # the names of the arrays that kernels read
         self.described |= last
         self.values = self.check({name: i.value for name, i in self.described.items() if i.value is not None})
         named = dict(zip(scene.terms, self._names))
@@ -110,8 +114,6 @@ class Inputs:
         self.paths = [named[term][term.path_name] for term in scene.moving]  # names, in the order of kernels' columns
         self.away = self._away()
         self.keyed = [(named[term][term.plain], term) for term in scene.ordered_terms if term.keyed]
-        alone = len(scene.dead_loads) == 1 and scene.dead_loads[0].sums_itself
-        self.sums_loads = bool(scene.dead_loads) and not alone
         self.chain = Chain(self._links(named), self.described)
 
     def _of_body(self, density, positions, velocities) -> list[Input]:
@@ -182,11 +184,11 @@ class Inputs:
         ]
         if any(term.acts_on_surface for term in scene.terms):
             out.append(SurfaceAreas(mesh))
-        for k, term in enumerate(scene.ordered_terms):
-            own, rows = f"numbers of term {k}", self.parameters.of(term)
-            summed = term.dead and self.sums_loads
-            names = named[term]
-            links_of = term.force_links(names, own, scene.consistent) if summed else term.links(names, own)
+        all_own = {term: f"numbers of term {k}" for k, term in enumerate(scene.ordered_terms)}
+        kind_of = {term: x for x in scene.interactions for term in x.terms}
+        for term, own in all_own.items():
+            names, rows, kind = named[term], self.parameters.of(term), kind_of.get(term)
+            links_of = kind.links_of(term, names, own, scene.consistent) if kind else term.links(names, own)
             out += links_of
             as_they_are = not any(own in link.writes for link in links_of)
             places |= _placed(term, named[term], rows) if as_they_are else {own: rows}
@@ -196,7 +198,7 @@ class Inputs:
                 for link in term.nearer(origin, self.length, names, own) if scene.precision == "f32" else ():
                     out.append(link)
                     places[link.writes[0]] = places.pop(link.reads[0])
-        out += self._sums_of_loads()
+        out += [link for x in scene.interactions for link in x.links(all_own)]
         out.append(links.Placed(places, "parameters", shift))
         if self.paths:
             out.append(PoseColumns(self.paths, "path", self.away.values()))
@@ -206,39 +208,10 @@ class Inputs:
             out.append(links.Same("prescribed_motion", "motion"))
         return out
 
-    def _sums_of_loads(self) -> list[Link]:
-        """What adds the forces of dead loads and foundations, and what lists pressures, chambers, springs and cables."""
-        own = {term: f"numbers of term {k}" for k, term in enumerate(self.scene.ordered_terms)}
-        dead, pressures = self.scene.dead_loads, self.scene.pressures
-        out = []
-        if self.sums_loads:
-            indices = [term.indices(self.mesh) for term in dead]
-            out.append(SumOfForces([f"{own[t]} forces" for t in dead], indices, self.keyed_forces, "forces"))
-        rows = [f"{own[t]} in time" for t in pressures] + [
-            row for t in self.scene.chambers for row in t.in_time(own[t])
-        ]
-        if rows:
-            out.append(PressureRows(rows, "follower"))
-        if self.scene.ties:
-            out.append(JoinedRows([f"{own[t]} rows" for t in self.scene.ties], "ties"))
-            out.append(JoinedSegments([f"{own[t]} segments" for t in self.scene.ties], "tie_segments"))
-        if growing := self.scene.growing:
-            groups = [(None, None) if t.everywhere else t.groups(self.mesh) for t in growing]
-            out.append(GrowthRows([f"{own[t]} in time" for t in growing], *zip(*groups), self.mesh.num_tetrahedra))
-        if founded := self.scene.foundations:
-            indices = [term.indices(self.mesh) for term in founded]
-            out.append(FoundationRows([f"{own[t]} matrices" for t in founded], indices, "foundation"))
-        return out
-
     @property
     def makes_rows(self) -> bool:
         """Whether what changes from step to step is made of inputs together."""
-        return self.sums_loads or bool(self.scene.following or self.scene.cables or self.scene.growing)
-
-    @property
-    def keyed_forces(self) -> bool:
-        """Whether some dead load changes within steps."""
-        return any(term.keyed for term in self.scene.dead_loads)
+        return any(x.makes_rows for x in self.scene.interactions)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -289,16 +262,14 @@ class Inputs:
     def derive(self, values: dict) -> Derived:
         """What kernels read; arrays that may be kept and handed out again: do not write into them."""
         known = self.chain.value(values)
-        return Derived(*map(known.get, READ))
+        return Derived(**{name: known.get(name) for name in self.read})
 
     def derive_each(self, values: dict, changed: list[dict]) -> list[Derived]:
         """The same for values that differ in some inputs, `changed`, which are the same ones in each."""
         known = self.chain.value(values)
-        first, out = Derived(*map(known.get, READ)), []
-        for own in changed:
-            new = self.chain.again(known, own)
-            out.append(Derived(*(new[name] if name in new else getattr(first, name) for name in READ)))
-        return out
+        first = Derived(**{name: known.get(name) for name in self.read})
+        changes = (self.chain.again(known, own) for own in changed)
+        return [first.replaced(**{name: new[name] for name in self.read if name in new}) for new in changes]
 
     @property
     def stress_points(self) -> StressPoints:

@@ -88,6 +88,10 @@ class HostForce:
         """Those of its forces that are loads [N], whose work comes from outside."""
         return np.zeros(u.shape) if self.has_energy else self.forces(u)
 
+    def load_energy(self, u: np.ndarray) -> float:
+        """Energy [J] of loads that pull steadily, which may be counted as the body's own."""
+        return 0.0
+
     def sizes(self, u: np.ndarray) -> np.ndarray:
         """Sum of the sizes of the forces that meet at each vertex [N], of which solvers take their tolerance."""
         return np.linalg.norm(self.forces(u), axis=1)
@@ -213,6 +217,9 @@ class HostForces(tuple):
 
     def stored(self, u: np.ndarray) -> dict[str, float]:
         return {name: energy for part in self for name, energy in part.stored(u).items()}
+
+    def load_energy(self, u: np.ndarray) -> float:
+        return sum(part.load_energy(u) for part in self)
 
     def product(self, u: np.ndarray, w: np.ndarray, convex: bool = False) -> np.ndarray:
         return sum((part.product(u, w, convex) for part in self), np.zeros(w.shape))

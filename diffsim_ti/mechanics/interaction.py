@@ -1,10 +1,11 @@
 """What acts on a body beside its own stress and contact: each kind of force is said once, and all solvers read it here.
 
-An `Interaction` holds all terms of its kind in a scene: which vertices they act on, what kernels read of them, where
-adjoints go and how these come back to the scene's numbers. Its `kernel` is what kernels are compiled for, and equal ones
-share compiled kernels. Explicit steps, their tangents and adjoints, and batches loop over the interactions of a scene
-(mechanics/interactions.py lists the kinds). Implicit steps, statics and outputs loop over their host forms (host_force.py),
-which `host` gives. So a new force is a folder of its own and nothing elsewhere.
+An `Interaction` holds all terms of its kind in a scene: how their inputs become numbers that kernels read, which vertices
+they act on, where adjoints go and how these come back to the scene's numbers. Its `kernel` is what kernels are compiled
+for, and equal ones share compiled kernels. Inputs, explicit steps, their tangents and adjoints, and batches loop over the
+interactions of a scene (mechanics/interactions.py lists the kinds). Implicit steps, statics, bounds of the stable step and
+outputs loop over their host forms (host_force.py), which `host` gives. So a new force is a folder of its own and nothing
+elsewhere.
 """
 
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 import taichi as ti
 
-from diffsim_ti.inputs import Derived
+from diffsim_ti.inputs import Derived, Link
 from diffsim_ti.mechanics.host_force import HostForce
 from diffsim_ti.runtime import PRECISIONS, traced
 
@@ -29,13 +30,15 @@ class ForceKernel:
     """Taichi functions of one kind of force in a pass. Vectors have four components, the last zero. Of vectors write x = x - y
     and -1.0 * x, not x -= y and -x, for which Taichi's compiler fails.
 
-    arrays: {array of the scene that they read: kind}, as in `runtime.array_types`; adjoints: {array that they add to: kind}.
+    arrays: {array of the scene that they read: kind}, as in `runtime.array_types`, without numbers that inputs change;
+    derived: the same of these, arrays of `Derived`; adjoints: {array that they add to: kind}.
     """
 
     precision: str
 
     name: ClassVar[str]  # of its counts
     arrays: ClassVar[dict[str, str]] = {}
+    derived: ClassVar[dict[str, str]] = {}
     adjoints: ClassVar[dict[str, str]] = {}
     is_load: ClassVar[bool] = True  # whether it does work on the body from outside
     pulls: ClassVar[bool] = False  # whether this may be counted as energy of the body's own as well
@@ -52,6 +55,12 @@ class ForceKernel:
     @property
     def vector(self):
         return ti.types.vector(4, self.fp)
+
+    @traced
+    def sizes(self, plan) -> dict:
+        """{array of vectors of which each scene of a batch has its own: how many one of its rows has}; kernels of batches
+        know the length of a row of each of `derived` as len_<name>."""
+        return {name: getattr(plan, f"len_{name}") for name in self.derived}
 
     @ti.func
     def cross(self, a, b):
@@ -79,11 +88,6 @@ class ItemForce(ForceKernel):
     def first(self, plan):
         return getattr(plan, f"first_{self.name}")
 
-    @traced
-    def sizes(self, plan) -> dict:
-        """{array of vectors of which each scene of a batch has its own: how many one of its rows has}"""
-        return {}
-
     def alone(self) -> "ItemForce":
         """For batches, in which items go one by one."""
         return self
@@ -108,10 +112,6 @@ class VertexwiseForce(ForceKernel):
 
     is_load, at_corners = False, False
 
-    @traced
-    def sizes(self, plan) -> dict:
-        return {}
-
     @ti.func
     def force(self, i, u, v, now: A, scene: A):
         """[N]"""
@@ -135,10 +135,15 @@ class Interaction:
 
     name: ClassVar[str]  # of its counts in kernels: num_<name> items, whose corners begin at first_<name>
     kinds: ClassVar[tuple[type, ...]] = ()  # classes of its terms
+    derived: ClassVar[dict[str, str]] = {}  # {array of `Derived`: kind}: "vectors2", rows of steps, or "vectors"
+    works: str = ""  # in words, by what it may do work on the body, or take energy from it
+    is_load = True  # whether it is a load that is given, maybe over time
+    apart: ClassVar[bool] = False  # whether launches of their own, before or after each pass, compute it
     vertices: np.ndarray = np.zeros(0, np.int64)
     first_load = count = 0
     pulls = False  # whether its loads may be counted as energy of the body's own as well
     in_kernels = True  # whether explicit steps take it by its kernel; else a stage of theirs knows its terms
+    on_host = True  # whether it has a host form; else implicit steps know its numbers
     no_equilibrium: ClassVar[str] = ""  # why statics refuse it
 
     def __init__(self, scene: "Scene", terms: "tuple[Term, ...]"):
@@ -155,15 +160,30 @@ class Interaction:
         """More whole numbers that kernels take."""
         return {}
 
+    def links_of(self, term: "Term", names: dict[str, str], own: str, consistent: bool) -> list[Link]:
+        """Those of one of its terms, as `Term.links`; consistent: whether masses are."""
+        return term.links(names, own)
+
+    def links(self, own: "dict[Term, str]") -> list[Link]:
+        """What joins the numbers of its terms to the arrays of `derived`; own: {term: beginning of the names of its own}."""
+        return []
+
+    @property
+    def makes_rows(self) -> bool:
+        """Whether a run of one step asks its links for the rows of that step."""
+        return self.is_load and "vectors2" in self.derived.values()
+
+    def features(self, values: Derived, in_steps: bool) -> dict[str, bool]:
+        """Fields of `Features`, where kernels have something else of it than `kernel`; in_steps: of implicit ones."""
+        return {}
+
     def kernel(self, values: Derived, precision: str, shape: bool) -> ForceKernel:
         """What kernels are compiled for, at the values of a run; shape: whether adjoints of the rest shape are wanted."""
         raise NotImplementedError
 
     def host(self) -> HostForce:
         """Its host form, for implicit steps and statics, stable steps, energies and outputs."""
-        raise ValueError(
-            f"{type(self).__name__} has no `host`, which all solvers ask for: write it (mechanics/host_force.py)"
-        )
+        raise ValueError(f"{type(self).__name__} has no `host`, which all solvers ask for: write it (host_force.py)")
 
     def adjoints(self, values: Derived, shape: bool) -> dict[str, tuple[int, ...]]:
         """{array of vectors that adjoints are added to: its shape}"""
@@ -172,6 +192,20 @@ class Interaction:
     def collect(self, found: dict[str, np.ndarray], out: Derived, shape: bool) -> None:
         """Add to `out` what these arrays hold, vectors of three numbers in float64; in batches all have one axis of scenes
         in front."""
+
+    # ---- what monitors ask -------------------------------------------------------------------------------------------
+
+    def pulls_steadily(self, values: Derived) -> bool:
+        """Of loads that pull: whether they do so in all steps alike."""
+        return True
+
+    stiff_over_time: "tuple[Term, ...]" = ()  # terms whose stiffness may change over time
+    least: ClassVar[tuple[str, ...]] = ()  # plain names of their inputs that are stiffest where they are least
+
+    def added_omega2(self, values: dict[str, np.ndarray], derived: Derived) -> float:
+        """What it adds to the body's largest omega^2 [1/s^2] at most, beside the sums of rows of its host form; at the
+        stiffest `values` and what is derived of them."""
+        return 0.0
 
 
 def add_at(target: np.ndarray, places: np.ndarray, rows: np.ndarray) -> None:

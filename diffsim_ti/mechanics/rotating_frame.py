@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 import taichi as ti
 
+from diffsim_ti.inputs.consistent_mass import ConsistentMass
 from diffsim_ti.mechanics.host_force import HostForce
 from diffsim_ti.mechanics.interaction import Interaction, VertexwiseForce
-from diffsim_ti.inputs.consistent_mass import ConsistentMass
 from diffsim_ti.runtime import traced
 from diffsim_ti.terms import RotatingFrame
 
@@ -143,7 +143,9 @@ class InertialForces(Interaction):
     def __init__(self, scene, terms):
         super().__init__(scene, terms)
         if len(terms) > 1:
-            raise ValueError("a scene takes one RotatingFrame, got several: give the frame that everything is seen from")
+            raise ValueError(
+                "a scene takes one RotatingFrame, got several: give the frame that everything is seen from"
+            )
 
     @property
     def rows(self) -> slice:

@@ -2,12 +2,12 @@
 
 import weakref
 from dataclasses import dataclass
+from operator import is_
 
 import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.mechanics.host_force import Instant
-from diffsim_ti.mechanics.ties.ties import Ties
 from diffsim_ti.mechanics.workspace import Workspace
 from diffsim_ti.monitor import quantities
 from diffsim_ti.state.history import History
@@ -65,7 +65,7 @@ class EnergyBalance:
         """Forget what was seen."""
         self.window: Window | None = None
         self.steady, self._rows = True, None  # whether cables pull as they did at first, and with what (their rows)
-        self._soon = self.first if self.ws.scene.cables else np.inf
+        self._soon = self.first if self.ws.arrays.features().pulled else np.inf
         self.gained, self.moving = 0.0, 0.0  # [J]
         self._risen, self._lowest = 0.0, 0.0  # the level against that of the first look
 
@@ -88,15 +88,13 @@ class EnergyBalance:
 
     def _pulls_stay(self) -> bool:
         """Whether cables pull with what they pulled with at first: once that changes they are loads, until `clear`."""
-        rows = self.ws.arrays.rows["ties"] if self.ws.scene.cables else None
-        if not self.steady or rows is None or rows is self._rows:
+        a, known = self.ws.arrays, self._rows
+        pulling = [x for x in a.interactions if x.is_load and x.pulls]
+        rows = [a.rows[name] for x in pulling for name in x.derived if name in a.rows_of_steps]
+        if not self.steady or (known is not None and all(map(is_, rows, known))):
             return True
-        ends = rows.reshape(len(rows), -1, 2, 3)[
-            ..., :2
-        ]  # tension and slack as a step begins and ends (inputs/ties.py)
-        self.steady = bool(
-            (ends == ends[0, :, :, :1]).all() and (self._rows is None or np.array_equal(rows, self._rows))
-        )
+        self.steady = all(x.pulls_steadily(a.now) for x in pulling)
+        self.steady = self.steady and (known is None or all(map(np.array_equal, rows, known)))
         self._rows = rows
         return self.steady
 
@@ -178,8 +176,8 @@ class EnergyBalance:
         self.moving = max(self.moving, kinetic + stored)
         j = min(now, num_passes - 1)
         if features.pulled and self.steady:
-            ties = ws.hosts.only(Ties).take(a.now, Instant(ws.solver.schedule))
-            stored += float(ties.energies(runtime.fetch_row(ws.state.u, 0))[ties.cables].sum())
+            hosts = ws.hosts.take(a.now, Instant(ws.solver.schedule))
+            stored += hosts.load_energy(runtime.fetch_row(ws.state.u, 0))
         forces = ws.forces_at(j, num_passes) - ws.loads_at(j, num_passes, pulls=not self.steady) + weight
         if a.bodies:  # without what holds them together
             forces = a.bodies.pulled(forces, u)

@@ -68,9 +68,8 @@ class Guard:
         solver = self.ws.solver
         if solver.explicit and self.ws.energy_watch:
             self.ws.energy_watch.clear()
-        soon = solver.explicit and (
-            solver.starts_deformed() or self.ws.scene.cables
-        )  # what pulls squeezes a calm start
+        pulled = self.ws.arrays.features().pulled  # which squeezes a calm start
+        soon = solver.explicit and (solver.starts_deformed() or pulled)
         self._passes, self.every = 0, self.first if soon else self.usual
 
     def mark(self, now: int) -> None:

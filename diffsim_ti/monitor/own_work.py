@@ -12,6 +12,7 @@ import numpy as np
 from diffsim_ti import runtime
 from diffsim_ti.mechanics.workspace import Workspace
 from diffsim_ti.monitor import quantities
+from diffsim_ti.terms import Growth
 
 
 class OwnWork:
@@ -25,7 +26,7 @@ class OwnWork:
     def serves(workspace: Workspace) -> bool:
         """Whether the forces of a scene are those of an energy that does not change with time, at each vertex by itself."""
         scene, law = workspace.scene, workspace.arrays.law
-        energetic = law.reads == ("H",) and not law.state_names and not scene.growing
+        energetic = law.reads == ("H",) and not law.state_names and not scene.term(Growth)
         return energetic and not scene.reduced and not workspace.arrays.features().pressing
 
     def begin(self) -> None:

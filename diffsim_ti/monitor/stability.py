@@ -88,7 +88,7 @@ def element_limit(scene: "Scene", values: dict | None = None, kicks: ViscousStag
                 c[own[0]] = affine_bound(scene.mesh, derived.volumes, own, *viscous, values["density"])
     omega2, c, worst = largest_of(omega2, c)
     hosts = host_forces(scene).with_energy
-    more = _gas_bound(scene, values, derived) if scene.chambers else 0.0
+    more = sum(x.added_omega2(values, derived) for x in scene.interactions)
     if hosts:  # what all of them add at the most
         at = hosts.stiffest(derived, EqualSteps(1.0, 1))
         more += at.largest_omega2(derived.mass, derived.displacement, scene.fixed)
@@ -115,17 +115,6 @@ def _squares_of_strains(mesh, derived) -> tuple[np.ndarray, np.ndarray]:
     rows = np.swapaxes(N, 2, 3).reshape(m, 3 * Q, -1)  # of grad v, whose squares are those of the smaller Gram matrices
     of_dilatation = np.einsum("eqai,epai->eqp", N, N, optimize=True)
     return np.linalg.eigvalsh(of_dilatation)[:, -1], np.linalg.eigvalsh(rows @ np.swapaxes(rows, 1, 2))[:, -1]
-
-
-def _gas_bound(scene: "Scene", values: dict, derived) -> float:
-    """What gases in chambers add to omega^2 at most, at rest: n p_0 / V_0 sum |dV/dx|^2 / m of the free vertices each."""
-    free, out = np.delete(np.arange(scene.mesh.num_vertices), scene.fixed), 0.0
-    for chamber in scene.gases:
-        names = scene.input_names(chamber)
-        p = np.max(values[names[chamber.plain]])
-        V, g = chamber.enclosure.volume(derived.rest), chamber.enclosure.gradient(derived.rest)
-        out += float(values[names["gas_exponent"]] * p / V * ((g[free] ** 2).sum(1) / derived.mass[free]).sum())
-    return out
 
 
 class Stiffness:

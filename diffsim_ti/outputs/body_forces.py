@@ -14,6 +14,7 @@ from diffsim_ti.runtime import Kernel
 from diffsim_ti.state.arrays import SceneArrays
 from diffsim_ti.state.features import Features
 from diffsim_ti.state.numbers import ADJOINT, SCENE, TANGENT, Adjoint, Tangent, with_state
+from diffsim_ti.terms import Growth
 
 A = ti.template()
 STATE = dict(u="vectors2", v="vectors2")
@@ -93,7 +94,7 @@ class BodyForces:
                 f"{type(scene.law).__name__} has a state ({', '.join(scene.law.state_names)}) that frames do not keep: this "
                 "output knows laws of the displacement and velocity gradients only"
             )
-        if scene.growing:
+        if scene.term(Growth):
             raise ValueError("forces of the body at frames do not know Growth over time; take Grown(material, growth)")
         self.scene, self.arrays = scene, SceneArrays(scene)
         a = self.arrays

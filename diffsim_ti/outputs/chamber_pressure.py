@@ -39,8 +39,9 @@ class ChamberPressure(Output):
 
     def settled(self, scene: "Scene") -> "ChamberPressure":
         out = copy(self)
-        out.place, out.inputs = scene.place_of_chamber(self.chamber), scene.inputs
-        chamber = scene.chambers[out.place]
+        chambers = scene.terms_of(Chamber)
+        out.place, out.inputs = scene.place_among(chambers, self.chamber, "chamber"), scene.inputs
+        chamber = chambers[out.place]
         out.law, out.enclosure, (out.rows,) = law_of(chamber), chamber.enclosure, rows_of(scene, [chamber])
         return out
 

@@ -6,8 +6,9 @@ from diffsim_ti.inputs import Derived
 from diffsim_ti.mechanics.chambers.multipliers import HeldPressure
 from diffsim_ti.mechanics.host_force import HostForces, Instant
 from diffsim_ti.mechanics.interactions import host_forces
+from diffsim_ti.mechanics.loads.interaction import DeadLoads
 from diffsim_ti.state.schedule import EqualSteps
-from diffsim_ti.terms import Gravity
+from diffsim_ti.terms import Chamber, Gravity
 
 STEPS = EqualSteps(1.0, 1)  # a pass for each step
 
@@ -25,12 +26,17 @@ class GivenLoads:
     """
 
     def __init__(self, scene, weight: bool = True):
-        self.scene, self.elements = scene, scene.mesh.elements
+        self.elements, self.num_chambers = scene.mesh.elements, len(scene.terms_of(Chamber))
         self.hosts = HostForces(force for force in host_forces(scene) if not force.reads_velocities)
         self.filled = self.hosts.only(HeldPressure)
         gravity = scene.term(Gravity) if weight else None
         self.gravity = None if gravity is None else scene.inputs.parameters.of(gravity)
-        self.loaded, self.keyed = scene.loaded_vertices if scene.dead_loads else None, scene.inputs.keyed_forces
+        self.dead = scene.interaction(DeadLoads)
+
+    @property
+    def any(self) -> bool:
+        """Whether there is one."""
+        return bool(self.hosts) or self.gravity is not None or self.dead is not None
 
     @staticmethod
     def _row(step: int, rows: np.ndarray) -> np.ndarray:
@@ -39,7 +45,7 @@ class GivenLoads:
     def _dead(self, step: int, rows: np.ndarray, begins: bool) -> np.ndarray:
         """Of rows of loads, or of their adjoints, those that a frame shows (inputs/loads.py), as a view."""
         row = self._row(step, rows)
-        return row[1 if step and not begins else 0 :: 2] if self.keyed else row
+        return row[1 if step and not begins else 0 :: 2] if self.dead.keyed else row
 
     def _masses(self, derived: Derived) -> np.ndarray:
         """What gravity acts on, shape (num_vertices,), or its change."""
@@ -61,7 +67,7 @@ class GivenLoads:
 
     def held_vjp(self, x: np.ndarray, w: np.ndarray) -> np.ndarray:
         """Adjoint of the pressures of all chambers, zero of gases, for that of the forces."""
-        out = np.zeros(len(self.scene.chambers))
+        out = np.zeros(self.num_chambers)
         for k, push in self._unit_forces(x):
             out[k] = float((push * w).sum())
         return out
@@ -76,8 +82,8 @@ class GivenLoads:
         out = np.zeros(x.shape)
         if self.gravity is not None:
             out += self._masses(derived)[:, None] * derived.parameters[self.gravity][:3]
-        if self.loaded is not None:
-            out[self.loaded] += self._dead(step, derived.forces, begins)
+        if self.dead:
+            out[self.dead.acts_at] += self._dead(step, derived.forces, begins)
         return out + self._hosts(derived, step, begins, held).forces(x - derived.rest)
 
     def jvp(
@@ -95,8 +101,8 @@ class GivenLoads:
         if self.gravity is not None:
             g, dg = (of.parameters[self.gravity][:3] for of in (derived, moved))
             out += self._masses(moved)[:, None] * g + self._masses(derived)[:, None] * dg
-        if self.loaded is not None:
-            out[self.loaded] += self._dead(step, moved.forces, begins)
+        if self.dead:
+            out[self.dead.acts_at] += self._dead(step, moved.forces, begins)
         hosts = self._hosts(derived, step, begins, held)
         return out + hosts.jvp(x - derived.rest, dx - moved.rest, np.zeros_like(dx), moved)
 
@@ -111,8 +117,8 @@ class GivenLoads:
             else:
                 adj.element_masses += by_mass[self.elements][:, :, None]
             adj.parameters[self.gravity.start : self.gravity.start + 3] += self._masses(derived) @ w
-        if self.loaded is not None:
-            self._dead(step, adj.forces, begins)[:] += w[self.loaded]
+        if self.dead:
+            self._dead(step, adj.forces, begins)[:] += w[self.dead.acts_at]
         by_u, _ = self._hosts(derived, step, begins, held).vjp(x - derived.rest, w, adj)
         adj.rest -= by_u
         return by_u

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from diffsim_ti.terms import Growth
+
 if TYPE_CHECKING:
     from diffsim_ti.rollout.frames import Frames
     from diffsim_ti.scene import Scene
@@ -61,7 +63,7 @@ class Output(ABC):
     @staticmethod
     def refuse_growth(output: str, scene: "Scene") -> None:
         """Raise ValueError where tetrahedra grow over time: an output knows frames, not what they had grown by."""
-        if scene.growing:
+        if scene.term(Growth):
             raise ValueError(
                 f"{output} evaluates the law and does not know Growth over time; take Grown(material, growth), or strains"
             )

@@ -69,7 +69,7 @@ class Reaction(Output):
 
     def settled(self, scene: "Scene") -> "Reaction":
         for x in scene.interactions:
-            if x.host().reads_velocities:
+            if x.on_host and x.host().reads_velocities:
                 terms = ", ".join(sorted({type(term).__name__ for term in x.terms}))
                 raise ValueError(f"Reaction does not know {terms}; leave the one or the other out")
         out = copy(self)

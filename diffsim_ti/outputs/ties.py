@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diffsim_ti.mechanics.ties.ties import Ties
+from diffsim_ti.mechanics.ties.interaction import SpringsAndCables
 from diffsim_ti.outputs.given_loads import at_end
 from diffsim_ti.outputs.output import Change, Output
 from diffsim_ti.terms.ties import Tie
@@ -28,7 +28,10 @@ class _OfTies(Output):
 
     def settled(self, scene: "Scene") -> "_OfTies":
         out = copy(self)
-        out.scene, out.own, out.ties = scene, scene.places_of_tie(self.tie), Ties(scene)
+        ties = scene.interaction(SpringsAndCables)
+        if ties is None:
+            scene.place_among((), self.tie, "spring or cable")
+        out.scene, out.own, out.ties = scene, ties.places(self.tie), ties.host()
         out.count = out.own.stop - out.own.start
         return out
 
@@ -69,7 +72,7 @@ class _OfTies(Output):
 
     def vjp(self, frames: "Frames", seed: np.ndarray) -> Change:
         derived, positions = self.scene.inputs.derive(frames.inputs), np.zeros(frames.positions.shape)
-        adj, all_ties = derived.zeros(), np.zeros((len(positions), len(self.scene.tie_paths)))
+        adj, all_ties = derived.zeros(), np.zeros((len(positions), len(self.ties.paths)))
         all_ties[:, self.own] = seed.reshape(len(positions), -1)
         for k, (ties, u, at) in enumerate(self._frames(frames, derived)):
             positions[k], segments, numbers = self._vjp(ties, u, all_ties[k])

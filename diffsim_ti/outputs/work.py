@@ -44,8 +44,7 @@ class WorkOfLoads(Output):
     def settled(self, scene: "Scene") -> "WorkOfLoads":
         out = copy(self)
         out.scene, out.loads = scene, GivenLoads(scene, weight=self.weight)
-        given = out.loads.gravity, out.loads.loaded, out.loads.hosts or None
-        if all(x is None for x in given):
+        if not out.loads.any:
             raise ValueError(
                 "WorkOfLoads: the scene has no load: add a Traction, BodyForce, ExternalForce or Pressure, or count gravity "
                 "by weight=True"

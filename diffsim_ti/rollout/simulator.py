@@ -151,10 +151,9 @@ class Simulator:
         inputs = self.scene.inputs
         if inputs.makes_rows:
             now = inputs.derive(inputs.at_step(self.step_count, self.solver.dt, self._set))
-            made = dict(forces=now.forces if inputs.sums_loads else None)
-            made |= dict(follower=now.follower, ties=now.ties, growths=now.growths)
+            made = {name: getattr(now, name) for name in ("forces", "growths", *arrays.rows_of_steps)}
             arrays.load_rows(**{name: rows for name, rows in made.items() if rows is not None})
-        if not inputs.sums_loads and values.forces is not None and len(values.forces) > 1:
+        elif values.forces is not None and len(values.forces) > 1:
             rows = values.forces
             if self.step_count >= len(rows):
                 raise ValueError(f"external_forces are given for {len(rows)} steps, this is step {self.step_count}")
@@ -331,7 +330,7 @@ class Simulator:
         if forces.shape != given.shape or not np.all(np.isfinite(forces)):
             raise ValueError(f"forces: expected finite numbers of shape {given.shape}, got shape {forces.shape}")
         self._set[self.scene.input_names(term)["external_forces"]] = forces
-        if not self.scene.inputs.sums_loads:  # else with others, when a step is loaded
+        if not self.scene.inputs.makes_rows:  # else with others, when a step is loaded
             self.workspace.arrays.load_rows(forces=forces[None])
 
     @property

@@ -4,6 +4,7 @@ import warnings
 from typing import TYPE_CHECKING
 
 from diffsim_ti.materials.patch_law import PatchLaw
+from diffsim_ti.terms import Growth
 
 if TYPE_CHECKING:
     from diffsim_ti.scene import Scene
@@ -18,7 +19,7 @@ def _averages(scene: "Scene") -> bool:
         PatchLaw(scene.precision, scene.law)
     except ValueError:
         return False
-    return not scene.growing
+    return scene.term(Growth) is None
 
 
 def warn_if_locking(scene: "Scene") -> None:

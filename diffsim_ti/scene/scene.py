@@ -16,23 +16,11 @@ from diffsim_ti.materials.material import Material
 from diffsim_ti.materials.moduli import youngs_poisson
 from diffsim_ti.materials.patch_law import PatchLaw
 from diffsim_ti.mechanics.energy.assembled import body_stiffness
-from diffsim_ti.mechanics.interactions import interactions_of
+from diffsim_ti.mechanics.interaction import Interaction
+from diffsim_ti.mechanics.interactions import NUMBERS, interactions_of
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.scene.locking import LOCKING_RATIO, warn_if_locking
-from diffsim_ti.terms import (
-    Cable,
-    Chamber,
-    Drag,
-    ElasticFoundation,
-    Gravity,
-    Growth,
-    Obstacle,
-    Pressure,
-    SelfContact,
-    Spring,
-    SurfaceDrag,
-    Term,
-)
+from diffsim_ti.terms import Drag, Gravity, Growth, Obstacle, SelfContact, Term
 from diffsim_ti.terms.mass_scaling import MassScaling
 from diffsim_ti.terms.motion import Motion
 from diffsim_ti.terms.obstacles.obstacle import PER_AREA
@@ -127,25 +115,13 @@ class Scene(TermsOfScene, MadeAgain):
         self.terms = tuple(copy(t) for t in settled)  # one that is listed twice is two
         self.ordered_terms = tuple(sorted(self.terms, key=_kind))
         self.moving = tuple(t for t in self.ordered_terms if t.path is not None)
-        self.dead_loads = tuple(t for t in self.ordered_terms if t.dead)
-        self.pressures = tuple(t for t in self.ordered_terms if isinstance(t, Pressure))
-        self.fluids = tuple(t for t in self.ordered_terms if isinstance(t, SurfaceDrag))
-        self.growing = tuple(t for t in self.ordered_terms if isinstance(t, Growth))
-        if self.growing:
+        if self.term(Growth):
             self.material = grown(self.material, volume)
         self.law  # noqa: B018 - refuses what its volume does not support
-        self.chambers = tuple(t for t in self.ordered_terms if isinstance(t, Chamber))
-        self.gases = tuple(t for t in self.chambers if not t.holds)
-        self.following = (*self.pressures, *self.chambers)  # what presses on the surface as it is
-        self.springs = tuple(t for t in self.ordered_terms if isinstance(t, Spring))
-        cables = (t for t in self.ordered_terms if isinstance(t, Cable))
-        self.cables = tuple(sorted(cables, key=lambda t: t.of_fibres))  # which come last, for kernels
-        self.ties = self.springs + self.cables
-        self.foundations = tuple(t for t in self.ordered_terms if isinstance(t, ElasticFoundation))
+        self.interactions = interactions_of(self)
         self.origin = middle_far_part(mesh.vertices) if self.precision == "f32" else np.zeros(3)  # origin.py
         self.mass_scaling = None if mass_scaling is None else MassScaling.of(self, density, mass_scaling)
         self.inputs = Inputs(self, density, initial_positions, initial_velocities)
-        self.interactions = interactions_of(self)
         self._check_start()
         warn_of_coarse_places(self)
         if volume == "tetrahedra":
@@ -157,12 +133,17 @@ class Scene(TermsOfScene, MadeAgain):
         law = self.material.law(self.precision)
         return PatchLaw(self.precision, law) if self.volume == "patches" else law
 
+    def interaction(self, kind: type[Interaction]) -> Interaction | None:
+        """What acts on the body of one kind, all terms of it together, or None."""
+        return next((x for x in self.interactions if isinstance(x, kind)), None)
+
     def _twin(self) -> "Scene":
         out = Scene.__new__(Scene)
         vars(out).update(vars(self))
         return out
 
     consistent = False  # whether masses and weight are consistent
+    own_numbers = tuple(NUMBERS)  # arrays of `Derived` that known kinds of interactions have of their own
 
     def with_consistent_mass(self) -> "Scene":
         """The scene as statics, implicit steps and modes have it: ten-node tetrahedra with consistent masses and weight, and

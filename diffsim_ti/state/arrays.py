@@ -46,8 +46,10 @@ class SceneArrays:
         self.contacts = tuple(t for t in scene.ordered_terms if t.acts_on_surface)
         self.fixed, self.held, self.supports, self.feels_faces = scene.fixed, scene.held, scene.supports, feels_faces
         self.interactions = tuple(x for x in scene.interactions if x.in_kernels) if presses else ()
+        self._all = scene.interactions
+        self.own = {name: kind for x in self._all for name, kind in x.derived.items()}  # their numbers
         self.mesh, self.precision, self.self_contact = mesh, precision, scene.term(SelfContact)
-        self._upload_topology(scene)
+        self._upload_topology(scene, presses)
         rows = scene.inputs.parameters
         self.obstacles = self._twins(scene)
         self.curved, self.bend = are_felt(mesh, self.contacts, bend), bend
@@ -59,8 +61,6 @@ class SceneArrays:
             moving=sum(poses.columns_of(term.path_width) for term in scene.moving),
             gravity=rows.first(scene.term(Gravity)),
             drag=rows.first(scene.term(Drag)),
-            forces=bool(scene.dead_loads),
-            forces_keyed=scene.inputs.keyed_forces,
             motion=scene.motion is not None,
             guided=bool(len(scene.supports.guided)),
             num_parameters=rows.total,
@@ -75,7 +75,7 @@ class SceneArrays:
         self.offsets = runtime.array(self.vector, self.walls.size)
         self.values: Derived | None = None
         self._known_features: dict[tuple[bool, bool], Features] = {}  # for these values
-        self.rows: dict[str, np.ndarray | None] = {}  # of steps, as the device has them: motion, path, forces
+        self.rows: dict[str, np.ndarray | None] = {}  # numbers as the device has them, of steps too
 
     def _order_tetrahedra(self, scene) -> None:
         """`order`: the tetrahedron in each lane; `place`: the lane of each; `num_places`: lanes to go through."""
@@ -91,7 +91,7 @@ class SceneArrays:
         self.order[:m] = np.arange(m)
         self.place, self.num_places = slice(m), m
 
-    def _upload_topology(self, scene) -> None:
+    def _upload_topology(self, scene, presses) -> None:
         mesh, n = self.mesh, self.num_vertices
         self.tets = runtime.upload(self.to_blocks(mesh.elements).ravel(), ti.i32)
         self.first_contact_corner = num_corners = self.nodes * LANES * self.num_blocks
@@ -105,7 +105,8 @@ class SceneArrays:
             num_corners += len(mesh.surface_vertices)
         self.first_corner = num_corners  # of interactions
         self.counts, first_load, first_push = {}, None, None
-        for x in self.interactions:
+        self.force_slot = self.motion_slot = runtime.array(ti.i32, 1)
+        for x in self._all if presses else ():
             corners = len(x.vertices)
             self.counts |= {f"num_{x.name}": x.count, f"first_{x.name}": num_corners, **x.counts}
             for name, data in x.topology.items():
@@ -120,9 +121,6 @@ class SceneArrays:
         self.counts |= dict(zip(("first_load", "first_push"), ends))
         self.start, self.corner_of = runtime.upload(start, ti.i32), runtime.upload(corner_of, ti.i32)
         self.corner = runtime.array(self.vector, num_corners)
-        self.force_slot = self.motion_slot = runtime.array(ti.i32, 1)
-        if scene.dead_loads:
-            self.force_slot = runtime.upload(slots(scene.loaded_vertices, n), ti.i32)
         if scene.motion is not None:
             self.motion_slot = runtime.upload(slots(scene.held, n), ti.i32)
         if len(scene.supports.guided):
@@ -164,14 +162,13 @@ class SceneArrays:
         return self._known_features[density, shape]
 
     def _make_features(self, density: bool, shape: bool) -> Features:
-        forces, growth = self.values.forces, self.values.growths
+        said = {}
+        for x in self._all:
+            said |= x.features(self.values, self.in_steps)
         return Features(
             **self._features,
-            forces_per_step=forces is not None and len(forces) > 1,
+            **said,
             interactions=tuple(x.kernel(self.values, self.precision, shape) for x in self.interactions),
-            growing=growth is not None,
-            growth_per_step=growth is not None and len(growth) > 1 and not self.in_steps,
-            growth_uniform=growth is None or growth.shape[2] == 1,
             uniform=self.values.coefficients.ndim == 1,
             density=density,
             shape=shape,
@@ -181,11 +178,9 @@ class SceneArrays:
         """Bring values to the device; True if array shapes or kernels changed, so that launches must be bound anew."""
         old, before = self.values, None if self.values is None else self.features()
         self.values, self._known_features = values, {}
-        self.rows = {
-            name: getattr(values, name) for name in ("motion", "path", "forces", "follower", "ties", "growths")
-        }
+        self.rows = values.parts()
         moved = before != self.features()
-        sources = {name: on_device(self, name, values) for name in PARTS if name != "mass"}
+        sources = {name: on_device(self, name, values) for name in (*PARTS, *self.own) if name != "mass"}
         sources["parameters"] = np.concatenate([values.parameters, self.tables]), self.fp
         if not (self.contacts or self.self_contact or any(x.reads_rest for x in self.features().interactions)):
             sources["rest"] = np.zeros((1, 3)), self.vector
@@ -205,16 +200,30 @@ class SceneArrays:
 
     def clear_corners_of_loads(self) -> None:
         """No forces at corners of interactions, where tetrahedra alone are to be gathered."""
-        if self.interactions:
+        if self.corner.shape[0] > self.first_corner:
             clear_from(self.corner, self.first_corner)
+
+    @property
+    def rows_of_steps(self) -> tuple[str, ...]:
+        """Those of the interactions' own numbers that are rows of steps."""
+        return tuple(name for name, kind in self.own.items() if kind == "vectors2")
+
+    def num_step_rows(self, derived: list[Derived]) -> int:
+        """How many rows what is given by steps has: places at their ends, or loads where kernels ask for steps."""
+        first = derived[0]
+        out = max((len(x) for x in (first.path, first.motion) if x is not None), default=1)
+        if out == 1 and self.features().asks_for_steps:
+            given = (getattr(d, name) for d in derived for name in ("forces", "growths", *self.rows_of_steps))
+            return max(1 + len(x) for x in given if x is not None)
+        return out
 
     @property
     def now(self) -> Derived:
         """What is loaded, with the rows of the steps to come."""
-        return replace(self.values, **self.rows)
+        return Derived(**self.rows)
 
     def load_rows(self, **rows: np.ndarray) -> None:
-        """Other rows of motion, path, forces, pressure or ties, by name: those of the steps to come."""
+        """Other rows of what is given by steps, by name: those of the steps to come."""
         for name, data in rows.items():
             runtime.fill(getattr(self, name), self.growth_blocks(data) if name == "growths" else data)
             self.rows[name] = data

@@ -1,8 +1,8 @@
 """Every number of a scene that kernels read, described once: its kind of array, how it comes to the device and back.
 
 The same description serves three records: the values (state/arrays.py), their changes (`Tangent`), their adjoints
-(`Adjoint`). Numbers of tetrahedra lie in blocks of eight. Adjoints of numbers that many vertices feel are summed per vertex
-first, in rows (`Features.sums`).
+(`Adjoint`). Interactions describe what they have of their own (mechanics/interaction.py). Numbers of tetrahedra lie in
+blocks of eight. Adjoints of numbers that many vertices feel are summed per vertex first, in rows (`Features.sums`).
 """
 
 from collections.abc import Callable
@@ -60,14 +60,9 @@ PARTS = {
     "motion": Part("vectors2", _given("motion"), _whole),
     "anchor": Part("vectors", _anchor, _whole),
     "path": Part("vectors2", _given("path"), _whole),
-    "follower": Part("vectors2", _given("follower")),
-    "ties": Part("vectors2", _given("ties")),
-    "tie_segments": Part("vectors", _given("tie_segments")),
-    "foundation": Part("vectors", _given("foundation")),
 }
-ALONE = "follower", "ties", "tie_segments", "foundation"  # which only kernels of scenes that have them take
 TOPOLOGY = dict.fromkeys(("tets", "start", "corner_of", "force_slot", "motion_slot"), "ints")
-TANGENT = {name: part.kind for name, part in PARTS.items() if name not in ALONE}
+TANGENT = {name: part.kind for name, part in PARTS.items()}
 SCENE = TOPOLOGY | TANGENT | dict(inverse_mass="scalars", corner="vectors")  # all that a kernel may read of a scene
 del SCENE["mass"]
 OF_TETRAHEDRA = {name: PARTS[name].kind for name in ("gradients", "volumes", "coefficients", "growths")}
@@ -124,9 +119,10 @@ def with_held(arrays: dict, law) -> dict:
 
 def on_device(arrays, name: str, derived: Derived):
     """(data, element type) of a part; a single zero where the scene has no such thing."""
-    kind = PARTS[name].kind
+    part = PARTS[name] if name in PARTS else Part(arrays.own[name], _given(name))
+    kind = part.kind
     element = {"blocks": arrays.lanes, "blocks2": arrays.lanes, "scalars": arrays.fp}.get(kind, arrays.vector)
-    data = PARTS[name].pack(arrays, derived)
+    data = part.pack(arrays, derived)
     if data is None:
         data = np.zeros({"vectors2": (1, 1, 3), "blocks2": (1, 1, LANES), "scalars": (1,)}.get(kind, (1, 3)))
     return data, element
@@ -136,7 +132,7 @@ class Tangent:
     """Changes of all numbers, on the device."""
 
     def __init__(self, arrays, tangent: Derived):
-        for name in PARTS:
+        for name in (*PARTS, *arrays.own):
             setattr(self, name, runtime.upload(*on_device(arrays, name, tangent)))
 
 

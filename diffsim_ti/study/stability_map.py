@@ -7,9 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from diffsim_ti.mechanics.host_force import Instant
 from diffsim_ti.mechanics.interactions import host_forces
-from diffsim_ti.mechanics.ties.ties import Ties
 from diffsim_ti.rollout.simulator import Simulator
 from diffsim_ti.scene import Scene
 from diffsim_ti.solvers import SOLVERS
@@ -99,11 +97,8 @@ def measure(simulator: Simulator) -> tuple[float, float, float, float]:
 
 def given_by_muscles(simulator: Simulator) -> float:
     """What muscles and cables with steady pulls have given the body since it was at rest [J]."""
-    ties = host_forces(simulator.scene).only(Ties)
-    if ties is None:
-        return 0.0
-    ties.take(simulator.scene.inputs.derive(simulator.values), Instant())
-    return -float(ties.energies(simulator.displacements.astype(float))[ties.cables].sum())
+    hosts = host_forces(simulator.scene).take(simulator.scene.inputs.derive(simulator.values))
+    return -hosts.load_energy(simulator.displacements.astype(float))
 
 
 def kept_energy(

@@ -318,8 +318,7 @@ class Trials:
             out.append("damping: none in the scene")
         if not any(getattr(t, "acts_on_surface", False) for t in self.scene.terms):
             out.append("contact: none in the scene")
-        given = self.scene.dead_loads or self.scene.following or self.scene.cables
-        if not given and self.scene.motion is None:
+        if not any(x.is_load for x in self.scene.interactions) and self.scene.motion is None:
             out.append("forces and motion per step")
         nu = self.scene.largest_poissons_ratio()
         if nu > LOCKING_RATIO + 1e-12:

@@ -66,7 +66,7 @@ class Chamber(Term):
         out.enclosure = Enclosure.of(self.faces(mesh), free, mesh.vertices, called, moves)
         return out
 
-    def in_time(self, own: str) -> list[str]:
+    def rows_in_time(self, own: str) -> list[str]:
         """Names of the rows of its numbers, of which `own` is the beginning."""
         return [f"{own} {row} in time" for row in self.row_names]
 
@@ -74,7 +74,7 @@ class Chamber(Term):
         volume = f"{own} volume"
         sources = [volume if row == "rest" else names[i.plain] for row, i in zip(self.row_names, self._described_rows)]
         out = [RestVolume(self.enclosure, volume)]
-        for k, (source, row) in enumerate(zip(sources, self.in_time(own))):
+        for k, (source, row) in enumerate(zip(sources, self.rows_in_time(own))):
             out.append(InTime(source, row, 1, self.keyed and k == 0))
         return out
 

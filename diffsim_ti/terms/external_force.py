@@ -22,8 +22,6 @@ class ExternalForce(Term):
     Belytschko, Liu, Moran, Nonlinear Finite Elements for Continua and Structures, 2000, sec. 4.4.
     """
 
-    dead = sums_itself = True
-
     def __init__(self, forces: ArrayLike, vertices: str | ArrayLike | None = None, name: str | None = None):
         present("forces", forces)
         shapes = (3,), ("k", 3), ("steps", "k", 3)
@@ -36,7 +34,7 @@ class ExternalForce(Term):
         return [PerStep(names["external_forces"], "forces", 3)]
 
     def force_links(self, names, own, consistent=False):
-        """Beside other loads, by the name `own` forces."""
+        """Beside other loads, which add up, by the name `own` forces."""
         return [InTime(names["external_forces"], f"{own} forces", 3, keyed=False)]
 
     def indices(self, mesh: TetrahedralMesh) -> np.ndarray:

@@ -76,7 +76,6 @@ class Traction(Load):
     """
 
     shape = (3,)
-    dead = True
 
     def __init__(self, traction: OverTime, surface: str | ArrayLike | None = None, name: str | None = None):
         super().__init__("traction", traction, "N/m^2", "traction", name)
@@ -120,7 +119,6 @@ class BodyForce(Load):
     """
 
     shape = (3,)
-    dead = True
 
     def __init__(
         self, force: OverTime, tetrahedra: str | ArrayLike | None = None, per: str = "volume", name: str | None = None
@@ -182,6 +180,10 @@ class Pressure(Load):
     def faces(self, mesh: TetrahedralMesh) -> np.ndarray:
         """Where it acts, as vertex indices, normals outwards, shape (k, 3) or (k, 6)."""
         return _some(self, mesh.faces_of(self.surface))
+
+    def rows_in_time(self, own: str) -> list[str]:
+        """Names of the rows of its numbers, of which `own` is the beginning."""
+        return [f"{own} in time"]
 
     def links(self, names: dict[str, str], own: str) -> list[Link]:
         return [self.in_time(names, own)]

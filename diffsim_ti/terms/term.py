@@ -35,10 +35,6 @@ class Term(ABC):
     path = None  # displacement over time, of an obstacle that moves
     table = np.zeros(0)  # numbers without gradient, laid behind the parameters on the device
     variant: tuple = ()  # what else than its class decides about the kernels of a term
-    dead = (
-        False  # whether it acts by given forces on vertices (`indices`, `force_links`), which add up (inputs/loads.py)
-    )
-    sums_itself = False  # whether its links write "forces" where no other such load is there
     keyed = False  # whether its input is sampled at the ends of each run's steps (`rows`)
 
     def __init__(self, *inputs: Input, name: str | None = None):

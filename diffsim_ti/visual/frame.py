@@ -152,7 +152,7 @@ def _of_items(values: Iterable[tuple], scene: Scene) -> tuple[dict[str, np.ndarr
 def _loads(scene: Scene, positions: np.ndarray, step: int, values: dict) -> dict[str, np.ndarray]:
     """{"loads": forces of loads on each vertex}, of the step that ends there; nothing in a scene without, or where they are
     not known (a chamber's volume is held)."""
-    if scene.holds_volumes or not (scene.dead_loads or scene.following or scene.ties or scene.foundations):
+    loads = GivenLoads(scene, weight=False)
+    if scene.holds_volumes or not loads.any:
         return {}
-    forces = GivenLoads(scene, weight=False).forces
-    return {"loads": forces(scene.inputs.derive(values), positions.astype(np.float64), step)}
+    return {"loads": loads.forces(scene.inputs.derive(values), positions.astype(np.float64), step)}

@@ -11,6 +11,7 @@ import numpy as np
 from diffsim_ti import runtime
 from diffsim_ti.common import interrupts
 from diffsim_ti.common.progress import progress
+from diffsim_ti.mechanics.loads.interaction import DeadLoads
 from diffsim_ti.mechanics.surfaces.surface_pairs import Overlap
 from diffsim_ti.monitor.quantities import Energy
 from diffsim_ti.monitor.stability import lanczos_limit
@@ -99,7 +100,8 @@ class ForwardRun:
     ):
         check_strength(scene)
         self.scene, self.seen, self.adapts = scene, Seen(), dt is None
-        self.driven = scene.motion is not None or bool(scene.moving) or bool(scene.following or scene.cables)
+        given = any(x.is_load and not isinstance(x, DeadLoads) for x in scene.interactions)
+        self.driven = scene.motion is not None or bool(scene.moving) or given
         self.before_part: Callable[[], object] | None = None
         self.obstacles = tuple(t for t in scene.terms if isinstance(t, Obstacle))
         gravity = scene.term(Gravity)

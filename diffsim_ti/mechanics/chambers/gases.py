@@ -21,7 +21,7 @@ class Chambers:
 
     def __init__(self, workspace):
         self.ws, scene, a = weakref.proxy(workspace), workspace.scene, workspace.arrays
-        gases = next(x for x in a.interactions if isinstance(x, Gases))
+        gases = scene.interaction(Gases)
         self.host = gases.host()
         closed, self.rows = [chamber.enclosure for chamber in gases.terms], gases.rows
         counts = [len(enclosure.triangles) for enclosure in closed]

@@ -20,6 +20,7 @@ import numpy as np
 from diffsim_ti.mechanics.chambers.pressures import rows_of
 from diffsim_ti.mesh.enclosure import Enclosure
 from diffsim_ti.runtime.slots import VertexRows
+from diffsim_ti.terms import Chamber, FilledChamber
 
 
 class VolumeLost(FloatingPointError):
@@ -101,8 +102,8 @@ class HeldVolumes:
 
     def __init__(self, workspace):
         self.ws, scene = weakref.proxy(workspace), workspace.scene
-        filled = [chamber for chamber in scene.chambers if chamber.holds]
-        self.places = [scene.chambers.index(chamber) for chamber in filled]
+        filled, chambers = scene.terms_of(FilledChamber), scene.terms_of(Chamber)
+        self.places, self.num_chambers = [chambers.index(chamber) for chamber in filled], len(chambers)
         self.columns = [rows.start for rows in rows_of(scene, filled)]  # of their targets among the numbers of loads
         closed = [chamber.enclosure for chamber in filled]
         self.nodes = np.unique(np.concatenate([enclosure.triangles.ravel() for enclosure in closed]))
@@ -119,7 +120,7 @@ class HeldVolumes:
 
     def spread(self, pressures: np.ndarray) -> np.ndarray:
         """Among those of all chambers, of which others have none here."""
-        out = np.zeros(len(self.ws.scene.chambers))
+        out = np.zeros(self.num_chambers)
         out[self.places] = pressures
         return out
 

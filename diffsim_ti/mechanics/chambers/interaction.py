@@ -7,14 +7,17 @@ import numpy as np
 from diffsim_ti.mechanics.chambers.gas_force import GasForce
 from diffsim_ti.mechanics.chambers.multipliers import HeldPressure
 from diffsim_ti.mechanics.chambers.pressures import ChamberPressure, rows_of
-from diffsim_ti.mechanics.interaction import Interaction, add_at
+from diffsim_ti.mechanics.interaction import add_at
+from diffsim_ti.mechanics.pressure.interaction import Pressing
 from diffsim_ti.terms import FilledChamber, GasChamber
 
+WORKS = "gases and filled chambers"
 
-class Gases(Interaction):
+
+class Gases(Pressing):
     """Three corners for each triangle of a chamber's wall and lids."""
 
-    name, kinds = "gases", (GasChamber,)
+    name, kinds, works, apart = "gases", (GasChamber,), WORKS, True
 
     @cached_property
     def triangles(self) -> np.ndarray:
@@ -46,11 +49,25 @@ class Gases(Interaction):
         if shape:
             add_at(out.rest, self.vertices, found["chamber_rest"])
 
+    @property
+    def stiff_over_time(self):
+        return self.terms
 
-class FilledChambers(Interaction):
+    def added_omega2(self, values, derived):
+        """At rest: n p_0 / V_0 sum |dV/dx|^2 / m of the free vertices, of each chamber."""
+        free, out = np.delete(np.arange(self.mesh.num_vertices), self.scene.fixed), 0.0
+        for chamber in self.terms:
+            names = self.scene.input_names(chamber)
+            p = np.max(values[names[chamber.plain]])
+            V, g = chamber.enclosure.volume(derived.rest), chamber.enclosure.gradient(derived.rest)
+            out += float(values[names["gas_exponent"]] * p / V * ((g[free] ** 2).sum(1) / derived.mass[free]).sum())
+        return out
+
+
+class FilledChambers(Pressing):
     """Implicit steps find their pressures as multipliers (multipliers.py); explicit steps have a stage (held_volumes.py)."""
 
-    name, kinds, in_kernels = "filled", (FilledChamber,), False
+    name, kinds, works, apart, in_kernels = "filled", (FilledChamber,), WORKS, True, False
 
     def host(self):
         return HeldPressure(self.scene, self.terms)

@@ -4,12 +4,14 @@ import numpy as np
 
 from diffsim_ti.mechanics.chambers.laws import law_of
 from diffsim_ti.mechanics.pressure.follower_pressure import FollowerPressure, Tangent, pressures_at
+from diffsim_ti.terms import Chamber, Pressure
 
 
 def rows_of(scene, chambers) -> list[slice]:
     """Rows of the numbers of some of a scene's chambers in `Derived.follower`, in which those of pressures come first."""
-    ends = len(scene.pressures) + np.cumsum([0, *(law_of(chamber).count for chamber in scene.chambers)])
-    return [slice(*map(int, ends[k : k + 2])) for k in map(scene.chambers.index, chambers)]
+    every = scene.terms_of(Pressure, Chamber)
+    ends = np.cumsum([0, *(len(term.rows_in_time("")) for term in every)]).tolist()
+    return [slice(*ends[k : k + 2]) for k in map(every.index, chambers)]
 
 
 class ChamberPressure(FollowerPressure):
@@ -24,7 +26,7 @@ class ChamberPressure(FollowerPressure):
         super().__init__(np.concatenate(faces), load_of, scene.mesh.num_vertices)
         self.enclosures = [chamber.enclosure for chamber in chambers]
         self.laws = [law_of(chamber) for chamber in chambers]
-        self.places = [scene.chambers.index(chamber) for chamber in chambers]
+        self.places = [scene.terms_of(Chamber).index(chamber) for chamber in chambers]
         self.rows = rows_of(scene, chambers)
 
     def restrict(self, free, rest):

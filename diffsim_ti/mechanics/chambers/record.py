@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from diffsim_ti.terms import Chamber
+
 
 class ChamberRecord:
     """The pressure of a frame is that of the pass that leads to it."""
@@ -28,7 +30,7 @@ class ChamberRecord:
 
     def changes(self, num_frames: int) -> np.ndarray:
         """Of the frames, shape (frames, chambers)."""
-        out = np.zeros((num_frames, len(self.solver.scene.chambers)))
+        out = np.zeros((num_frames, len(self.solver.scene.terms_of(Chamber))))
         for frame, change in self._changes.items():
             out[frame, self.held] = change
         return out

@@ -1,20 +1,19 @@
 """The triangle in a fluid (terms/surface_drag.py): corner forces, their differential and adjoint.
 
-With v the mean velocity of the corners against the stream, N = (x_1 - x_0) x (x_2 - x_0), L = |N|, s = v . N, a corner has
-
-    G = -rho / 12 |v| B,    B = c_t L v + (c_n - c_t) (s / L) N.
-
-Corner a of triangle t writes corner `first + 3 t + a`, and vertices gather it with those of tetrahedra.
+drag.py has the formula. Corner a of triangle t writes corner `first + 3 t + a`, and vertices gather it with those of
+tetrahedra.
 """
 
 from dataclasses import dataclass
 
 import taichi as ti
 
+from diffsim_ti.mechanics.fluid import drag
 from diffsim_ti.mechanics.interaction import ItemForce
 from diffsim_ti.runtime import traced
 
 A = ti.template()  # an array or Bundle handed to a Taichi function
+pull, pull_jvp, pull_vjp = (ti.func(f) for f in (drag.pull, drag.pull_jvp, drag.pull_vjp))
 
 
 @dataclass(frozen=True)
@@ -69,7 +68,7 @@ class DraggedTriangle(ItemForce):
         rho, c, k = self.numbers(t, scene.parameters, scene)
         N = self.cross(e, f)
         L, along = ti.sqrt(N.dot(N)), v.dot(N)
-        return e, f, v, ti.sqrt(v.dot(v)), N, L, along, c * L * v + k * along * self.inverse(L) * N
+        return e, f, v, ti.sqrt(v.dot(v)), N, L, along, pull(c, k, v, N, L, along, self.inverse(L))
 
     @ti.func
     def store(self, t, first, force, corner: A):
@@ -91,8 +90,7 @@ class DraggedTriangle(ItemForce):
         dv = self.speed(t, tangent.v, 0, tangent.parameters, scene)
         dN, over = self.cross(de, f) + self.cross(e, df), self.inverse(L)
         dL, dalong, dsize = N.dot(dN) * over, dv.dot(N) + v.dot(dN), v.dot(dv) * self.inverse(size)
-        dB = c * (dL * v + L * dv) + dc * L * v + dk * along * over * N
-        dB += k * over * ((dalong - along * dL * over) * N + along * dN)
+        dB = pull_jvp(c, k, v, N, L, along, over, dc, dk, dv, dN, dL, dalong)
         change = rho * (dsize * B + size * dB) + drho * size * B
         self.store(t, self.first(plan), self.number(-1) * change, scene.corner)
 
@@ -107,10 +105,8 @@ class DraggedTriangle(ItemForce):
             w += adjoint.w[0, scene.dragged[3 * t + a]]
         over, a_B, b = self.inverse(L), -rho * w, -rho * size * w
         across, straight = b.dot(N), b.dot(v)
-        by_along = k * over * across
-        by_L = c * straight - by_along * along * over
-        by_v = c * L * b + by_along * N + a_B.dot(B) * self.inverse(size) * v
-        by_N = k * along * over * b + by_along * v + by_L * over * N
+        by_v, by_N = pull_vjp(c, k, v, N, L, along, over, b, across, straight)
+        by_v += a_B.dot(B) * self.inverse(size) * v
         by_e, by_f = self.cross(f, by_N), self.cross(by_N, e)
         balance = self.number(-1) * (by_e + by_f)
         for a, by in ti.static(enumerate((balance, by_e, by_f))):

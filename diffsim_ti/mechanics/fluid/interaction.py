@@ -13,7 +13,7 @@ from diffsim_ti.terms import SurfaceDrag
 class FluidDrag(Interaction):
     """Each triangle in a fluid is an item. Its six numbers stand in the scene's parameters, from `first_number` on."""
 
-    name, kinds = "dragged", (SurfaceDrag,)
+    name, kinds, works, is_load = "dragged", (SurfaceDrag,), "drag", False
     no_equilibrium = "SurfaceDrag is of velocities, and an equilibrium has none"
 
     @cached_property

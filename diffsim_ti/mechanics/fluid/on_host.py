@@ -1,8 +1,9 @@
 """Drag and lift of a fluid on triangles of the surface in implicit passes, in float64 on the host: forces and their
-derivatives. dragged_triangle.py has the formulas."""
+derivatives. drag.py has the formula."""
 
 import numpy as np
 
+from diffsim_ti.mechanics.fluid.drag import pull, pull_jvp, pull_vjp
 from diffsim_ti.mechanics.host_force import HostForce
 from diffsim_ti.mesh.geometry import triangle_normals, triangle_normals_jvp, triangle_normals_vjp
 
@@ -40,7 +41,7 @@ class Fluid(HostForce):
         N = 2 * triangle_normals(self.values.rest + u, self.triangles)
         v = self._mean(self.velocities(u)) - stream
         L, along, size = np.sqrt(_dot(N, N)), _dot(v, N), np.sqrt(_dot(v, v))
-        return v, size, N, L, along, c * L * v + k * along * _inverse(L) * N
+        return v, size, N, L, along, pull(c, k, v, N, L, along, _inverse(L))
 
     def _to_vertices(self, of_corners):
         """Sums at vertices of what each corner of a triangle has alike."""
@@ -67,8 +68,7 @@ class Fluid(HostForce):
             du, dv = du + moved.rest, dv - stream
         dN = 2 * triangle_normals_jvp(self.values.rest + u, self.triangles, du)
         dL, dalong, dsize = _dot(N, dN) * over, _dot(dv, N) + _dot(v, dN), _dot(v, dv) * _inverse(size)
-        dB = c * (dL * v + L * dv) + dc * L * v + dk * along * over * N
-        dB = dB + k * over * ((dalong - along * dL * over) * N + along * dN)
+        dB = pull_jvp(c, k, v, N, L, along, over, dc, dk, dv, dN, dL, dalong)
         return self._to_vertices(-(rho * (dsize * B + size * dB) + drho * size * B))
 
     def vjp(self, u, w, adj=None):
@@ -77,10 +77,8 @@ class Fluid(HostForce):
         w, over = w[self.triangles].sum(1), _inverse(L)
         b, by_size = -rho * size * w, _dot(-rho * w, B)
         across, straight = _dot(b, N), _dot(b, v)
-        by_along = k * over * across
-        by_L = c * straight - by_along * along * over
-        by_v = c * L * b + by_along * N + by_size * _inverse(size) * v
-        by_N = k * along * over * b + by_along * v + by_L * over * N
+        by_v, by_N = pull_vjp(c, k, v, N, L, along, over, b, across, straight)
+        by_v = by_v + by_size * _inverse(size) * v
         by_place = triangle_normals_vjp(self.values.rest + u, self.triangles, 2 * by_N)
         if adj is not None:
             by_k, by_c, by_rho = along * over * across, L * straight, -size * _dot(w, B) / 12

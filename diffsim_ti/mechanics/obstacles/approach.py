@@ -31,7 +31,7 @@ class Approach:
         Raises Blocked where no room is left.
         """
         ws = self.ws
-        way, before, after = ws.way, ws.walls_before, ws.walls_at_stage
+        way, before, after = ws.ways.way, ws.ways.before, ws.ways.at_stage
         step, drift = held - u, ws.arrays.walls.drift(before, after)
         if not (step.any() or drift.any()):
             return held
@@ -41,21 +41,21 @@ class Approach:
         try:
             for start in starts:
                 if way.share(u, start - u, before, drift) == 1 and self._is_sound(u, start):
-                    ws.put_obstacles(before)
+                    ws.ways.put(before)
                     ws.potential.place(held)
                     if ws.newton.rise(held, ws.potential.energy(), start, problem) <= 0:
                         return start
             return self._in_parts(u, step, before, drift, problem)
         finally:
-            ws.put_obstacles(after)
+            ws.ways.put(after)
 
     def _in_parts(self, place, step, before, drift, problem):
         ws, done, stuck = self.ws, 0.0, 0
         moved = ws.arrays.walls.moved
         for _ in range(self.most_parts):
             left, walls = 1 - done, moved(before, drift, done)
-            share = ws.way.share(place, left * step, walls, left * drift, kept=self.kept)
-            met = ws.way.met
+            share = ws.ways.way.share(place, left * step, walls, left * drift, kept=self.kept)
+            met = ws.ways.way.met
             place, done = place + share * left * step, done + share * left
             if share == 1:
                 return place
@@ -66,19 +66,19 @@ class Approach:
             carried = self._carried(place, (1 - done) * step, walls, (1 - done) * drift, met.obstacle)
             if carried is not None:
                 return carried
-            ws.put_obstacles(walls)
+            ws.ways.put(walls)
             place = ws.newton.solve(place, *problem, rounds=self.rounds)
-        ws.put_obstacles(walls)
+        ws.ways.put(walls)
         own = list(met.vertices)
-        carried = ws.carried(met.obstacle, place[own], walls, drift, own)
+        carried = ws.ways.carried(met.obstacle, place[own], walls, drift, own)
         speed = np.linalg.norm(carried - step[own], axis=1).max() / ws.substep
         raise Blocked.pinched(ws, place, met, 1 - done, float(speed))
 
     def _carried(self, place, step, walls, drift, obstacle: int):
         """All that moves freely goes along with an obstacle; None where that way is not free."""
-        along = step + self.ws.carried(obstacle, place, walls, drift) * self.ws.linear
+        along = step + self.ws.ways.carried(obstacle, place, walls, drift) * self.ws.linear
         along = self.ws.rigid.nearest(place + along) - place if self.ws.rigid else along
-        if not (along - step).any() or self.ws.way.share(place, along, walls, drift) < 1:
+        if not (along - step).any() or self.ws.ways.way.share(place, along, walls, drift) < 1:
             return None
         return place + along if self._is_sound(place, place + along) else None
 

@@ -1,50 +1,86 @@
-"""What a run of an implicit solver asks of obstacles on the way of a step, and how it says what they stopped."""
+"""Where obstacles are in a pass of an implicit run, what is asked of them on the way of a step, and what they stopped."""
+
+import weakref
 
 import numpy as np
 
 from diffsim_ti import runtime
 from diffsim_ti.common.errors import NotConverged
 from diffsim_ti.mechanics.obstacles.blocked import Blocked
+from diffsim_ti.mechanics.obstacles.way import Way
 from diffsim_ti.mechanics.surfaces.surface_pairs import Tunnelling
 from diffsim_ti.state.stage import Stage
+from diffsim_ti.state.walls import Moment
 
 
 class ObstacleWays:
-    """A part of ImplicitWorkspace: ways past obstacles, at rest and in motion."""
+    """Of a workspace. rows: of its obstacles in the pass (state/walls.py); before, at_stage: displacements of theirs where
+    the pass begins and where it takes forces."""
 
-    def way_past_obstacles(self, u, step, most: float = 1.0) -> tuple:
+    def __init__(self, workspace):
+        self.ws = weakref.proxy(workspace)  # which holds this: no circle
+        self.way = Way(workspace.arrays, workspace.parallel)
+
+    # ---- in a pass ---------------------------------------------------------------------------------------------------
+
+    def begin(self, j: int, stage: Stage) -> None:
+        """Pass j."""
+        walls, path, moment = self.ws.arrays.walls, self.ws.arrays.rows["path"], self.moment(j, stage)
+        walls.check(path, moment)
+        self.rows = walls.value(path, moment)
+        self.at_stage, self.before = self.rows[::3].copy(), self.rows[1::3].copy()
+
+    def moment(self, j: int, stage: Stage) -> Moment:
+        """Where pass j lies for obstacles; a chord of two passes about its end for a solver of two steps."""
+        schedule, at_stage = self.ws.solver.schedule, self.ws.share_at_stage(j, stage)
+        begin = schedule.begin(j)
+        tau = (at_stage - begin) * float(schedule.step_length(j)) * (2 if stage.a1 else 1)
+        return Moment(schedule, j, at_stage, begin, tau)
+
+    def jvp(self, dpath: np.ndarray | None, j: int, stage: Stage) -> np.ndarray:
+        """Change of the rows."""
+        return self.ws.arrays.walls.jvp(self.ws.arrays.rows["path"], dpath, self.moment(j, stage))
+
+    def vjp(self, rows_adj: np.ndarray, j: int, stage: Stage, path_adj: np.ndarray) -> None:
+        """Add the adjoints of the rows of paths."""
+        self.ws.arrays.walls.vjp(self.ws.arrays.rows["path"], rows_adj, self.moment(j, stage), path_adj)
+
+    def at_end(self, j: int) -> np.ndarray:
+        """Displacements of the obstacles at the end of pass j."""
+        arrays = self.ws.arrays
+        return arrays.walls.value(arrays.rows["path"], self.moment(j, Stage(1.0)))[::3]
+
+    # ---- on the way of a step ----------------------------------------------------------------------------------------
+
+    def past(self, u, step, most: float = 1.0) -> tuple:
         """(how far along a step no obstacle is met where obstacles are in the pass, what would be met then)."""
-        share = self.way.share(u, step, self._walls[::3], most=most)
+        share = self.way.share(u, step, self.rows[::3], most=most)
         return share, self.way.met
 
-    def put_obstacles(self, places: np.ndarray) -> None:
+    def put(self, places: np.ndarray) -> None:
         """Take forces with obstacles elsewhere."""
-        self._walls[::3] = places
+        self.rows[::3] = places
         if len(places):
-            runtime.fill(self.potential.walls, self._walls)
+            runtime.fill(self.ws.potential.walls, self.rows)
 
     def check_apart(self) -> None:
         """Raise Overlap if a face is in an obstacle, which vertices alone do not show."""
-        u, walls = runtime.fetch_row(self.state.u, 0), runtime.fetch(self.arrays.offsets)[::3].astype(np.float64)
-        faces = self.potential.faces
+        u, walls = runtime.fetch_row(self.ws.state.u, 0), runtime.fetch(self.ws.arrays.offsets)[::3].astype(np.float64)
+        faces = self.ws.potential.faces
         if faces is None:
             self.way.check_apart(u, walls)
         else:
             faces.begin(self.way.check_apart(u, walls, 2 * faces.reach.max(initial=0)))
 
-    def _walls_at_end(self, j: int) -> np.ndarray:
-        """Displacements of the obstacles at the end of pass j."""
-        return self.walls(self.arrays.rows["path"], j, Stage(1.0))[::3]
-
-    def _check_end(self, j: int, u_star, u_next) -> None:
+    def check_end(self, j: int, u_star, u_next) -> None:
         """Raise Tunnelling where surfaces, or a surface and an obstacle, meet beyond the middle of a step."""
-        if self.pairs:
-            self.pairs.check_end(u_star, u_next)
-        drift = self.arrays.walls.drift(self._walls[::3], self._walls_at_end(j))
-        if self.way.share(u_star, u_next - u_star, self._walls[::3], drift) == 1:
+        if self.ws.pairs:
+            self.ws.pairs.check_end(u_star, u_next)
+        drift = self.ws.arrays.walls.drift(self.rows[::3], self.at_end(j))
+        if self.way.share(u_star, u_next - u_star, self.rows[::3], drift) == 1:
             return
         met = self.way.met
-        speed = self._speed(met, u_star, u_next - u_star, self._walls[::3], drift) / 0.5
+        speed = self._speed(met, u_star, u_next - u_star, self.rows[::3], drift) / 0.5
         raise Tunnelling(
             f"beyond the middle of a step, where its forces were taken, {met} meets {self.way.terms[met.obstacle]!r} at "
             f"{speed:.4g} m/s: take a solver whose steps end where forces are taken, ImplicitEulerSolver or BDF2Solver"
@@ -54,28 +90,28 @@ class ObstacleWays:
         """How fast a vertex or face and an obstacle meet that do so in a pass [m/s]."""
         own = list(met.vertices)
         carried = self.carried(met.obstacle, u[own], places, drift, own)
-        return float(np.linalg.norm(step[own] - carried, axis=1).max() / self.substep)
+        return float(np.linalg.norm(step[own] - carried, axis=1).max() / self.ws.substep)
 
     def carried(self, obstacle: int, u, places, drift, vertices=slice(None)) -> np.ndarray:
         """How far an obstacle takes vertices that it holds at displacements u."""
-        points, about = self.arrays.values.rest[vertices] + u, self.way.terms[obstacle].about
-        return self.arrays.walls.way_at(obstacle, places, drift, points, about)
+        points, about = self.ws.arrays.values.rest[vertices] + u, self.way.terms[obstacle].about
+        return self.ws.arrays.walls.way_at(obstacle, places, drift, points, about)
 
-    def _explained(self, error: NotConverged, u) -> NotConverged:
+    def explained(self, error: NotConverged, u) -> NotConverged:
         """The error, or what stood in the way."""
-        report = self.newton.report
+        report = self.ws.newton.report
         if isinstance(error, Blocked) or report.place is None or not report.cuts:
             return error
-        met = self.way.nearest(report.place, self._walls[::3], self.way.widest)
+        met = self.way.nearest(report.place, self.rows[::3], self.way.widest)
         if met is None:
             return error
-        drift = self.arrays.walls.drift(self.walls_before, self.walls_at_stage)
-        speed = self._speed(met, u, report.place - u, self.walls_before, drift)
-        return Blocked.at_an_obstacle(self, error, report.place, met, speed)
+        drift = self.ws.arrays.walls.drift(self.before, self.at_stage)
+        speed = self._speed(met, u, report.place - u, self.before, drift)
+        return Blocked.at_an_obstacle(self.ws, error, report.place, met, speed)
 
     def gap_of(self, met, u) -> float:
         """Distance [m] of what stands before an obstacle."""
-        near = self.way.nearest(u, self._walls[::3], self.way.widest)
+        near = self.way.nearest(u, self.rows[::3], self.way.widest)
         return near.value if near is not None else self.way.widest
 
     def width_of(self, obstacle: int) -> float:

@@ -5,16 +5,29 @@ from functools import cached_property
 import numpy as np
 
 from diffsim_ti.inputs import Derived
+from diffsim_ti.inputs.loads import PressureRows
 from diffsim_ti.mechanics.interaction import Interaction, add_at
 from diffsim_ti.mechanics.pressure.follower_pressure import FollowerPressure
 from diffsim_ti.mechanics.pressure.pressed_face import pressed_element
-from diffsim_ti.terms import Pressure
+from diffsim_ti.terms import Chamber, Pressure
 
 
-class Pressures(Interaction):
+class Pressing(Interaction):
+    """What presses on the surface as it is: pressures and what fills chambers, whose numbers share rows."""
+
+    derived = dict(follower="vectors2")
+
+    def links(self, own):
+        every = self.scene.terms_of(Pressure, Chamber)
+        if self.terms[0] is not every[0]:  # another kind joins them all
+            return []
+        return [PressureRows([row for t in every for row in t.rows_in_time(own[t])], "follower")]
+
+
+class Pressures(Pressing):
     """Each face that a pressure acts on is an item."""
 
-    name, kinds = "pressed", (Pressure,)
+    name, kinds, works = "pressed", (Pressure,), "loads"
 
     @cached_property
     def faces(self) -> np.ndarray:

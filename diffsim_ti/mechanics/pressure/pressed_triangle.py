@@ -22,13 +22,12 @@ class PressedTriangle(StepNumbers, ItemForce):
     shape: bool
     nodes = 3
     name, reads_rest, asks_for_steps = "pressed", True, True
-    arrays = dict(pressed="ints", pressed_load="ints", follower="vectors2")  # nodes of each, number of the load, rows
+    arrays, derived = dict.fromkeys(("pressed", "pressed_load"), "ints"), dict(follower="vectors2")
     adjoints = dict(pressed_felt="vectors2", pressed_rest="vectors")
 
     @traced
     def sizes(self, plan) -> dict:
-        out = dict(follower=plan.num_follower, pressed_felt=plan.num_pressed)
-        return out | dict(pressed_rest=self.nodes * plan.num_pressed)
+        return super().sizes(plan) | dict(pressed_felt=plan.num_pressed, pressed_rest=self.nodes * plan.num_pressed)
 
     @ti.func
     def edges(self, t, x: A, rest: A, s, scene: A):

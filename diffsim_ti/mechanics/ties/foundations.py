@@ -17,12 +17,13 @@ class FoundationForce(VertexwiseForce):
     """Functions of one vertex i."""
 
     name = "foundation"
-    arrays = dict(foundation_slot="ints", foundation="vectors")  # place among those on one, or -1; three rows of K each
+    arrays = dict(foundation_slot="ints")  # place among those on one, or -1
+    derived = dict(foundation="vectors")  # three rows of K each
     adjoints = dict(foundation_felt="vectors")
 
     @traced
     def sizes(self, plan) -> dict:
-        return dict(foundation=plan.num_foundation, foundation_felt=plan.num_foundation)
+        return super().sizes(plan) | dict(foundation_felt=plan.len_foundation)
 
     @ti.func
     def product(self, i, u, scene: A, stiffness: A):

@@ -5,39 +5,69 @@ from functools import cached_property
 import numpy as np
 
 from diffsim_ti import runtime
+from diffsim_ti.inputs.foundation import FoundationRows
+from diffsim_ti.inputs.ties import JoinedRows, JoinedSegments
 from diffsim_ti.mechanics.interaction import Interaction
 from diffsim_ti.mechanics.ties.foundations import FoundationForce, FoundationOnHost
 from diffsim_ti.mechanics.ties.tie_force import TieForce
 from diffsim_ti.mechanics.ties.ties import Ties
+from diffsim_ti.mesh.paths import Paths
 from diffsim_ti.runtime import LANES
 from diffsim_ti.state.corners import slots
 from diffsim_ti.terms import Cable, ElasticFoundation, Spring
 
 
 class SpringsAndCables(Interaction):
-    """Each spring, cable or fibre of a muscle is an item; cables, which are loads, come last."""
+    """Each spring, cable or fibre of a muscle is an item; cables, which are loads, come last, and of these fibres.
 
-    name, kinds, pulls = "ties", (Spring, Cable), True
+    paths: where they run; of each whether it is a cable (cables), whether it pulls only (one_sided), whether with a tension
+    that is given, however long it is (by_tension), and whether what is given changes within steps (keyed).
+    """
+
+    name, kinds, pulls, least = "ties", (Spring, Cable), True, ("cable_length",)
+    derived = TieForce.derived
 
     def __init__(self, scene, terms):
-        super().__init__(scene, scene.ties)
-        self.paths = scene.tie_paths
-        springs = sum(len(term.paths(self.mesh)) for term in scene.springs)
+        super().__init__(scene, tuple(sorted(terms, key=lambda t: (isinstance(t, Cable), t.of_fibres))))
+        self.paths = Paths.joined([term.paths(self.mesh) for term in self.terms])
+        self.cables = self._of_each([isinstance(term, Cable) for term in self.terms])
+        self.one_sided = self._of_each([term.one_sided for term in self.terms])
+        self.by_tension = self._of_each([term.by_tension for term in self.terms])
+        self.is_load = bool(self.cables.any())
+        self.works = "muscles and cables" if self.is_load else ""
+        self.keyed = self._of_each([getattr(term, "keyed", False) for term in self.terms])
+        springs = int((~self.cables).sum())
         self.first_load = int(self.paths.first_corner[self.paths.first_point[springs]])
         self.vertices, self.count = self.paths.vertices, len(self.paths)
 
+    def _of_each(self, of_terms: list) -> np.ndarray:
+        """What each spring, cable or fibre has of its term."""
+        return np.repeat(of_terms, [len(term.paths(self.mesh)) for term in self.terms])
+
+    def places(self, tie) -> slice:
+        """Places of a term's own, given by its name or as the scene lists it."""
+        own = np.flatnonzero(
+            self._of_each(np.arange(len(self.terms))) == self.scene.place_among(self.terms, tie, "spring or cable")
+        )
+        return slice(int(own[0]), int(own[-1]) + 1)
+
+    def links(self, own):
+        rows, segments = ([f"{own[t]} {part}" for t in self.terms] for part in ("rows", "segments"))
+        return [JoinedRows(rows, "ties"), JoinedSegments(segments, "tie_segments")]
+
     @cached_property
     def topology(self):
-        paths, scene = self.paths, self.scene
+        paths = self.paths
         # 1: pulls only, 0: pushes too, -1: pulls as it is told, whose length nobody asks for
-        sides = np.where(scene.given_tensions, -1, scene.one_sided_ties)
+        sides = np.where(self.by_tension, -1, self.one_sided)
         out = dict(tie_start=paths.first_point, point_start=paths.first_corner, point_vertex=paths.vertices)
         return out | dict(point_weight=np.asarray(paths.weights, np.float64), tie_sides=sides)
 
     @property
     def num_fibre_blocks(self) -> int:
         """Eights of fibres, the last ties, where kernels may take them so."""
-        return (self.scene.law.lanes and runtime.runs_on_cpu()) * (self.scene.num_fibres // LANES)
+        fibres = int(self._of_each([term.of_fibres for term in self.terms]).sum())
+        return (self.scene.law.lanes and runtime.runs_on_cpu()) * (fibres // LANES)
 
     @property
     def counts(self):
@@ -46,10 +76,10 @@ class SpringsAndCables(Interaction):
     def kernel(self, values, precision, shape):
         fibres = self.num_fibre_blocks > 0
         nodes = self.mesh.reference.num_nodes if fibres else 0
-        return TieForce(precision, len(values.ties) > 1, bool(self.scene.cables), fibres, nodes, shape and fibres)
+        return TieForce(precision, len(values.ties) > 1, self.is_load, fibres, nodes, shape and fibres)
 
     def host(self):
-        return Ties(self.scene)
+        return Ties(self)
 
     def adjoints(self, values, shape):
         return dict(tie_felt=values.ties.shape[:2], tie_rest=values.tie_segments.shape[:1])
@@ -57,11 +87,25 @@ class SpringsAndCables(Interaction):
     def collect(self, found, out, shape):
         out.ties, out.tie_segments = found["tie_felt"], found["tie_rest"]
 
+    def pulls_steadily(self, values):
+        """By tension and slack as each step begins and ends (inputs/ties.py)."""
+        ends = values.ties.reshape(len(values.ties), -1, 2, 3)[..., :2]
+        return bool((ends == ends[0, :, :, :1]).all())
+
+    @property
+    def stiff_over_time(self):
+        return tuple(term for term in self.terms if isinstance(term, Cable))
+
 
 class Foundations(Interaction):
     """They act vertex by vertex."""
 
-    name, kinds = "foundation", (ElasticFoundation,)
+    name, kinds, is_load = "foundation", (ElasticFoundation,), False
+    derived = FoundationForce.derived
+
+    def links(self, own):
+        indices = [term.indices(self.mesh) for term in self.terms]
+        return [FoundationRows([f"{own[t]} matrices" for t in self.terms], indices, "foundation")]
 
     @property
     def topology(self):
@@ -70,7 +114,7 @@ class Foundations(Interaction):
     @cached_property
     def acts_at(self) -> np.ndarray:
         """Sorted vertices on a foundation."""
-        return self.scene.founded_vertices
+        return np.unique(np.concatenate([term.indices(self.mesh) for term in self.terms]))
 
     def kernel(self, values, precision, shape):
         return FoundationForce(precision)

@@ -25,9 +25,9 @@ class TieForce(ItemForce):
     shape: bool
 
     name, pulls, asks_for_steps = "ties", True, True
-    arrays = dict.fromkeys(("tie_start", "point_start", "point_vertex", "tie_sides"), "ints") | dict(
-        point_weight="scalars", tie_segments="vectors", ties="vectors2"
-    )
+    arrays = dict.fromkeys(("tie_start", "point_start", "point_vertex", "tie_sides"), "ints")
+    arrays |= dict(point_weight="scalars")
+    derived = dict(tie_segments="vectors", ties="vectors2")
     adjoints = dict(tie_felt="vectors2", tie_rest="vectors")
 
     @property
@@ -51,8 +51,7 @@ class TieForce(ItemForce):
 
     @traced
     def sizes(self, plan) -> dict:
-        out = dict(ties=2 * plan.num_ties, tie_segments=plan.num_points)
-        return out | dict(tie_felt=2 * plan.num_ties, tie_rest=plan.num_points)
+        return super().sizes(plan) | dict(tie_felt=plan.len_ties, tie_rest=plan.len_tie_segments)
 
     @traced
     def num_single(self, plan):

@@ -11,18 +11,15 @@ from diffsim_ti.mechanics.host_force import HostForce
 
 
 class Ties(HostForce):
-    """Springs and, after them, cables, of a scene; `at` says what they are at a time."""
+    """Springs and, after them, cables, of `SpringsAndCables`; `at` says what they are at a time."""
 
     has_energy = symmetric = True
 
-    def __init__(self, scene):
-        self.paths = paths = scene.tie_paths
-        self.one_sided, num_vertices = scene.one_sided_ties, scene.mesh.num_vertices
-        count = [len(term.paths(scene.mesh)) for term in scene.ties]
-        self.cables = np.repeat([term in scene.cables for term in scene.ties], count)
-        keyed = np.repeat([getattr(term, "keyed", False) for term in scene.ties], count)
-        self._may_be_slack = self.one_sided & ~keyed  # as the run begins, and then for good
-        self._by_length = ~scene.given_tensions
+    def __init__(self, ties):
+        self.paths = paths = ties.paths
+        self.one_sided, self.cables, num_vertices = ties.one_sided, ties.cables, ties.mesh.num_vertices
+        self._may_be_slack = self.one_sided & ~ties.keyed  # as the run begins, and then for good
+        self._by_length = ~ties.by_tension
         places, starts = paths.matrix(num_vertices), paths.starts
         self.parted = (places[starts + 1] - places[starts]).tocsr()  # C
         self.together = self.parted.T.tocsr()  # its transpose, built once
@@ -96,6 +93,10 @@ class Ties(HostForce):
     def stored(self, u: np.ndarray) -> dict[str, float]:
         """Of springs: cables are loads."""
         return {} if self.cables.all() else dict(springs=float(self.energies(u)[~self.cables].sum()))
+
+    def load_energy(self, u):
+        """Of cables."""
+        return float(self.energies(u)[self.cables].sum())
 
     def forces(self, u):
         t, *_, T = self._state(u)

@@ -9,7 +9,6 @@ from diffsim_ti.mechanics.supports.guides import GUIDED
 from diffsim_ti.runtime import let, traced
 from diffsim_ti.state.bodies import BODIES
 from diffsim_ti.state.features import Features
-from diffsim_ti.state.numbers import ALONE
 
 OF_BODIES = "body_place", "body_mass", "body_numbers", "body_force"  # of which there are changes
 A = ti.template()  # an array or Bundle handed to a Taichi function
@@ -64,14 +63,18 @@ class ItemForces:
         """What kernels read of the scene for all of that."""
         has, out = self.features, {}
         for part in has.in_kernels:
-            out |= part.arrays
+            out |= part.arrays | part.derived
         return out | (GUIDED if has.guided else {}) | (BODIES if has.reduced else {})
+
+    @property
+    def derived(self) -> dict:
+        """Those of these that inputs change."""
+        return {name: kind for part in self.features.in_kernels for name, kind in part.derived.items()}
 
     @property
     def tangent(self) -> dict:
         """Those of which there are changes."""
-        own = {name: kind for name, kind in self.arrays.items() if name in ALONE}
-        return own | ({name: BODIES[name] for name in OF_BODIES} if self.features.reduced else {})
+        return self.derived | ({name: BODIES[name] for name in OF_BODIES} if self.features.reduced else {})
 
     @property
     def adjoint(self) -> dict:

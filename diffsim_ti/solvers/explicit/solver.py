@@ -14,6 +14,7 @@ from diffsim_ti.mechanics.chambers.gases import Chambers
 from diffsim_ti.mechanics.chambers.held_volumes import HeldVolumes
 from diffsim_ti.mechanics.host_force import Instant
 from diffsim_ti.mechanics.interactions import host_forces
+from diffsim_ti.mechanics.loads.interaction import DeadLoads
 from diffsim_ti.mechanics.obstacles.contact_stage import ROWS
 from diffsim_ti.mechanics.obstacles.felt_faces import FeltFaces, feels_faces
 from diffsim_ti.mechanics.obstacles.impulse_record import ImpulseRecord
@@ -28,7 +29,7 @@ from diffsim_ti.solvers.explicit.kernels import ExplicitKernels, explicit_kernel
 from diffsim_ti.solvers.explicit.tangent import ExplicitTangent
 from diffsim_ti.solvers.solver import Solver
 from diffsim_ti.state.pass_table import PassTable
-from diffsim_ti.terms import SelfContact
+from diffsim_ti.terms import GasChamber, Growth, SelfContact
 
 
 @dataclass(frozen=True)
@@ -96,7 +97,10 @@ class ExplicitSolver(Solver):
     def passes_per_launch(self) -> int:
         """How many passes one launch does at most where they run in parallel (runtime/repeated_loops.py)."""
         alone = (
-            self.scene.term(SelfContact) or feels_faces(self.scene) or self.scene.chambers or self.scene.reduced
+            self.scene.term(SelfContact)
+            or feels_faces(self.scene)
+            or any(x.apart for x in self.scene.interactions)
+            or self.scene.reduced
         )  # which act between passes
         return 1 if alone or runtime.runs_on_cpu() or not runtime.can_repeat() else MOST_PASSES
 
@@ -145,7 +149,7 @@ class ExplicitWorkspace(Workspace):
         features, a = self.arrays.features(), self.arrays
         self.faces = FeltFaces(self) if a.feels_faces else None
         self.check_apart()
-        self.chambers = Chambers(self) if self.scene.gases else None
+        self.chambers = Chambers(self) if self.scene.term(GasChamber) else None
         self.volumes = HeldVolumes(self) if self.scene.holds_volumes else None
         noted = ROWS * len(a.obstacles), a.num_vertices
         self.contact = SimpleNamespace(
@@ -156,7 +160,7 @@ class ExplicitWorkspace(Workspace):
         )
         self.hosts = host_forces(self.scene)  # for what looks between passes
         self.probe = None  # room for a pass that is not taken
-        self.energy_watch = EnergyBalance(self) if EnergyBalance.knows(a.law) and not self.scene.growing else None
+        self.energy_watch = EnergyBalance(self) if EnergyBalance.knows(a.law) and not self.scene.term(Growth) else None
 
     def load(self, derived: Derived) -> None:
         super().load(derived)
@@ -240,10 +244,10 @@ class ExplicitWorkspace(Workspace):
         a, schedule, u = self.arrays, self.solver.schedule, runtime.fetch_row(self.state.u, 0)
         out, kicks = np.zeros_like(u, np.float64), self.kicks(j, num_passes)
         if a.rows["forces"] is not None:
-            keyed = a.features().forces_keyed
-            out[self.scene.loaded_vertices] = sum(w * schedule.load(a.rows["forces"], *k, keyed) for w, k in kicks)
+            dead = self.scene.interaction(DeadLoads)
+            out[dead.acts_at] = sum(w * schedule.load(a.rows["forces"], *k, dead.keyed) for w, k in kicks)
         v = runtime.fetch_row(self.state.v, 0)
-        for x, force in zip(self.scene.interactions, self.hosts):
+        for x, force in zip((x for x in self.scene.interactions if x.on_host), self.hosts):
             if x.first_load < len(x.vertices) and (pulls or not x.pulls):
                 for w, k in kicks:
                     out += w * force.take(a.now, Instant(schedule, *k, origin=u - v, gamma=1.0)).loads(u)
@@ -282,13 +286,7 @@ class ExplicitWorkspace(Workspace):
 
     def _rows(self) -> int:
         """How many rows what is given by steps has."""
-        a = self.arrays
-        num_rows = max((len(x) for x in (a.values.path, a.values.motion) if x is not None), default=1)
-        # they ask in which step a pass lies
-        if num_rows == 1 and a.features().asks_for_steps:
-            given = a.values.forces, a.values.follower, a.values.ties, a.values.growths
-            num_rows = max(1 + len(x) for x in given if x is not None)
-        return num_rows
+        return self.arrays.num_step_rows([self.arrays.values])
 
     def launches(self, first: int, last: int, num_passes: int, save_every: int, most: int, backwards=False) -> Iterator:
         """Numbers of the launches that passes first .. last - 1 take, for each of which their table is shown.

@@ -176,7 +176,7 @@ class ImplicitAdjoint(RecordedPasses):
         self.gravity += share * (ws.mass * by_star).sum(0)
         self._add_mass(by_star, self.weight(share))
         if self.forces is not None:
-            felt, keyed = share * by_star[ws.force_vertices], ws.scene.inputs.keyed_forces
+            felt, keyed = share * by_star[ws.dead_loads.acts_at], ws.dead_loads.keyed
             ws.solver.schedule.add_load(self.forces, j, ws.share_at_stage(j, s), keyed, felt)
         # where inertia starts from
         inertial = self.mass * by_star
@@ -191,7 +191,7 @@ class ImplicitAdjoint(RecordedPasses):
             by_lag = by_lag + by_place
         if self.path is not None:
             by_walls = runtime.fetch(self.walls).astype(np.float64).sum(1)
-            ws.walls_vjp(by_walls + by_begin + (0.0 if seen is None else seen[3]), j, s, self.path)
+            ws.ways.vjp(by_walls + by_begin + (0.0 if seen is None else seen[3]), j, s, self.path)
         y_adj = s.gamma * inertial + s.e1 * q_free
         db0, db1, de0, de1 = s.by_rate
         self.rate += db0 * (y_adj * self.v).sum() + de0 * (q_free * self.v_star).sum() + de1 * (q_free * self.y).sum()

@@ -7,11 +7,14 @@ import numpy as np
 from diffsim_ti.inputs import ConsistentMass, Derived, Mass
 from diffsim_ti.mechanics.chambers.multipliers import HeldPressure, HeldVolumes
 from diffsim_ti.mechanics.host_force import Instant
+from diffsim_ti.mechanics.loads.interaction import DeadLoads
+from diffsim_ti.mechanics.workspace import Workspace
 from diffsim_ti.state.stage import Stage
+from diffsim_ti.terms import Chamber
 
 
-class GivenInPasses:
-    """A part of ImplicitWorkspace."""
+class GivenInPasses(Workspace):
+    """The part of ImplicitWorkspace that knows what passes are told, but for obstacles."""
 
     laid = 1.0  # share of what a pass of statics lays on that is there (laid_on.py)
 
@@ -110,7 +113,7 @@ class GivenInPasses:
             self.volumes.place(u, self.multipliers[self.pass_of_all(j)])
 
     def chamber_pressures(self, num_frames: int, save_every: int) -> np.ndarray:
-        out = np.zeros((num_frames, len(self.scene.chambers)))
+        out = np.zeros((num_frames, len(self.scene.terms_of(Chamber))))
         for frame in range(1, num_frames):
             last = self.solver.num_passes(frame * save_every) - 1
             out[frame, self.held_chambers] = self.multipliers.get(
@@ -120,7 +123,7 @@ class GivenInPasses:
 
     def last_chamber_pressures(self) -> np.ndarray:
         """Those of chambers whose volume is held after the last pass, shape (chambers,); zero before the first."""
-        out = np.zeros(len(self.scene.chambers))
+        out = np.zeros(len(self.scene.terms_of(Chamber)))
         if self.multipliers:
             out[self.held_chambers] = self.multipliers[max(self.multipliers)]
         return out
@@ -162,8 +165,8 @@ class GivenInPasses:
 
     def _add_forces(self, rows: np.ndarray | None, out: np.ndarray, j: int, stage: Stage) -> np.ndarray:
         if rows is not None:
-            share, keyed = self.share_at_stage(j, stage), self.scene.inputs.keyed_forces
-            out[self.force_vertices] += self.solver.schedule.load(rows, j, share, keyed)
+            share, keyed = self.share_at_stage(j, stage), self.dead_loads.keyed
+            out[self.dead_loads.acts_at] += self.solver.schedule.load(rows, j, share, keyed)
         return out
 
     def given_forces(self, rows: np.ndarray | None, j: int, stage: Stage) -> np.ndarray:
@@ -178,6 +181,5 @@ class GivenInPasses:
         return min(1.0, (self.pass_of_all(j) + self.laid) / self.solver.substeps)
 
     @cached_property
-    def force_vertices(self) -> np.ndarray:
-        """Vertices that given forces act on."""
-        return self.scene.loaded_vertices
+    def dead_loads(self) -> DeadLoads | None:
+        return self.scene.interaction(DeadLoads)

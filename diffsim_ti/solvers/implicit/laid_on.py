@@ -31,12 +31,12 @@ class LaidOn:
         Raises it or, in statics, NotConverged, which says how far the path of equilibria goes and how it ends.
         """
         ws, newton, (mass, inertial, loads) = self.ws, self.ws.newton, problem
-        most, walls = newton.max_iterations, (ws.walls_before, ws.walls_at_stage)
+        most, walls = newton.max_iterations, (ws.ways.before, ws.ways.at_stage)
         drift, way = ws.arrays.walls.drift(*walls), held - u
         done, share, place = 0.0, self.first, u
 
         def lay_on(s: float) -> tuple:
-            ws.put_obstacles(ws.arrays.walls.moved(walls[0], drift, s))
+            ws.ways.put(ws.arrays.walls.moved(walls[0], drift, s))
             ws.lay_on(j, stage, s)
             return mass, inertial, ws.loads(j, stage) if stage.static else loads
 
@@ -51,7 +51,7 @@ class LaidOn:
                 s = min(done + share, 1.0)
                 part = lay_on(s)
                 part = *part[:2], part[2] - (1 - s) * out_of_balance
-                ws.walls_before, ws.walls_at_stage = (ws.arrays.walls.moved(walls[0], drift, x) for x in (done, s))
+                ws.ways.before, ws.ways.at_stage = (ws.arrays.walls.moved(walls[0], drift, x) for x in (done, s))
                 try:
                     near = ws.approach(place, place + (s - done) * way, [], part)
                     there = newton.solve(near, *part, leave_saddles=stage.static and s == 1)
@@ -69,7 +69,7 @@ class LaidOn:
         finally:
             newton.max_iterations = most
             del newton.steady
-            ws.walls_before, ws.walls_at_stage = walls
+            ws.ways.before, ws.ways.at_stage = walls
             lay_on(1.0)
         return place
 

@@ -1,48 +1,34 @@
-"""What is noted of the passes of an implicit run: what solves took and, where it is asked for, what obstacles did."""
+"""What is noted of the solves of an implicit run: what they took, and whether statics left a branch of equilibria."""
 
 import warnings
+import weakref
 
 import numpy as np
 
-from diffsim_ti.mechanics.obstacles.contact_record import ContactRecord, Shares
 from diffsim_ti.state.solve_report import Buckled
 
 
 class Noted:
-    """A part of ImplicitWorkspace."""
+    """Of a workspace."""
 
     explained, softened = 2.0, 10.0  # times what tangents at both ends, or before, say: farther is another branch
     usual = 8  # rounds of a solve that leaves no branch
 
-    def record_contacts(self) -> None:
-        self.impulses = ContactRecord(self)
+    def __init__(self, workspace):
+        self.ws = weakref.proxy(workspace)  # which holds this: no circle
 
-    def forget_contacts(self) -> None:
-        self.record_contacts()
-
-    def contact_forces(self, frame_time: np.ndarray) -> np.ndarray:
-        return self.impulses.forces
-
-    def note_contacts(self, j: int, save_every: int) -> None:
-        """What obstacles, and friction between surfaces, did in pass j, where it is asked for."""
-        if self.impulses and save_every:
-            at = self.potential.place(self.u_star)
-            shares = self.kept("shares", lambda: Shares(self)) if len(self.arrays.obstacles) else None
-            friction = lambda: self.potential.rubbing.forces(at)  # noqa: E731
-            self.impulses.add(j, save_every, self.is_static, lambda: shares.forces(), friction)
-
-    def note_solves(self, j: int, num_passes: int, seconds: float, begin: tuple) -> None:
+    def note(self, j: int, num_passes: int, seconds: float, begin: tuple) -> None:
         """What pass j took; statics say where they left a branch of stable equilibria. begin: where the pass began, the same
         with held vertices where they got, and its problem."""
-        step, solves = self.step_of(j, num_passes), self.newton.reports
-        self.report.note(step, seconds, solves)
+        step, solves = self.ws.step_of(j, num_passes), self.ws.newton.reports
+        self.ws.report.note(step, seconds, solves)
         saddles, unstable = (sum(getattr(solve, name) for solve in solves) for name in ("saddles", "indefinite"))
         rounds = [max(len(solve.residuals) - 1, 0) for solve in solves]
         far = unstable or max(rounds, default=0) > self.usual  # full steps may leap over the states that are not stable
         # whose curved barriers, and states beside the volumes that are held, are indefinite where nothing buckles
-        if self.arrays.contacts or self.pairs or self.volumes:
+        if self.ws.arrays.contacts or self.ws.pairs or self.ws.volumes:
             far = False
-        if self.is_static and (saddles or far) and self._left_a_branch(j, *begin, saddles):
+        if self.ws.is_static and (saddles or far) and self._left_a_branch(j, *begin, saddles):
             left = f"{saddles} saddle{'s' * (saddles > 1)} left: the body was in balance and not stable, as when it buckles"
             if not saddles:
                 left = (
@@ -59,12 +45,12 @@ class Noted:
         branch it is as far as the tangents between are long in the mean, so that somewhere between it was much softer than
         at both ends: near a limit point or a bifurcation. Where a saddle was left, or the tangent before says next to
         nothing, that alone decides: just beyond a bifurcation the tangent is long."""
-        newton, here = self.newton, self.u_star
-        self.potential.place(u)
+        newton, here = self.ws.newton, self.ws.u_star
+        self.ws.potential.place(u)
         change, far = newton.residual_of(problem), np.linalg.norm(here - u)
         for place in (u, here):
             way = newton.follows(place, change, held - u)
-            if way is None and place is u and self.pass_of_all(j) == 0 and not self._was_stable(j):
+            if way is None and place is u and self.ws.pass_of_all(j) == 0 and not self._was_stable(j):
                 return False
             size = np.inf if way is None else np.linalg.norm(way)
             if way is not None and far <= self.explained * size:
@@ -75,13 +61,8 @@ class Noted:
 
     def _was_stable(self, j: int) -> bool:
         """Whether the potential stands at a stable state before pass j lays on anything."""
-        stage = self.solver.stage(self.rate, True, j)
-        self.lay_on(j, stage, 0.0)
-        stable = not self.newton.is_unstable()
-        self.lay_on(j, stage)
+        stage = self.ws.solver.stage(self.ws.rate, True, j)
+        self.ws.lay_on(j, stage, 0.0)
+        stable = not self.ws.newton.is_unstable()
+        self.ws.lay_on(j, stage)
         return stable
-
-    @property
-    def is_static(self) -> bool:
-        """Whether passes look for equilibria."""
-        return self.solver.stage(self.rate, True, 0).static

@@ -77,7 +77,7 @@ class ImplicitTangent(RecordedPasses):
         if tangent.growths is not None:
             moved = ws.growth_of(tangent.growths, j, s)
             runtime.fill(self.numbers.growths, a.growth_blocks(np.stack([moved, moved])[None]))
-        walls = None if tangent.path is None else ws.walls_jvp(tangent.path, j, s)
+        walls = None if tangent.path is None else ws.ways.jvp(tangent.path, j, s)
         if walls is not None:
             runtime.fill(self.walls, walls)
         if self._presses:

@@ -1,7 +1,6 @@
 """A run of an implicit solver: its passes, what they are told of obstacles, motion and loads."""
 
 import time
-import weakref
 
 import numpy as np
 
@@ -11,15 +10,14 @@ from diffsim_ti.inputs import ConsistentMass, Mass, kinetic_energy
 from diffsim_ti.mechanics.energy.potential import Potential
 from diffsim_ti.mechanics.interactions import host_forces
 from diffsim_ti.mechanics.obstacles.approach import Approach
+from diffsim_ti.mechanics.obstacles.contact_record import ContactRecord, Shares
 from diffsim_ti.mechanics.obstacles.obstacle_ways import ObstacleWays
 from diffsim_ti.mechanics.obstacles.pressed import Pressed
-from diffsim_ti.mechanics.obstacles.way import Way
 from diffsim_ti.mechanics.reduced.rigid_sets import RigidSets
 from diffsim_ti.mechanics.stress.held_strains import HeldStrains
 from diffsim_ti.mechanics.stress.law_state import law_state_kernels
 from diffsim_ti.mechanics.supports.free import FreeBodies, FreeDirections, held_as, linear_of, mask_of, projectors_of
 from diffsim_ti.mechanics.surfaces.implicit_pairs import ImplicitPairs
-from diffsim_ti.mechanics.workspace import Workspace
 from diffsim_ti.monitor.energy_watch import EnergyWatch
 from diffsim_ti.runtime.slots import copy_slot
 from diffsim_ti.solvers.implicit.closing import Closing
@@ -27,11 +25,11 @@ from diffsim_ti.solvers.implicit.given import GivenInPasses
 from diffsim_ti.solvers.implicit.laid_on import LaidOn
 from diffsim_ti.solvers.implicit.newton import Newton
 from diffsim_ti.solvers.implicit.noted import Noted
-from diffsim_ti.solvers.implicit.preconditioned import Preconditioned
+from diffsim_ti.solvers.implicit.preconditioned import Preconditioners
 from diffsim_ti.solvers.implicit.threads import one_blas_thread
 from diffsim_ti.state.history import History
 from diffsim_ti.state.stage import Stage
-from diffsim_ti.state.walls import Moment
+from diffsim_ti.terms import Growth
 
 
 class TwoStepHistory(History):
@@ -43,7 +41,7 @@ class TwoStepHistory(History):
         self.fresh = [True] * num_slots
 
 
-class ImplicitWorkspace(Preconditioned, ObstacleWays, Noted, GivenInPasses, Workspace):
+class ImplicitWorkspace(GivenInPasses):
     """A run of an implicit solver. Vectors of vertices are worked on in float64 on the host, tetrahedra on the device."""
 
     pairs_kind = ImplicitPairs
@@ -51,7 +49,7 @@ class ImplicitWorkspace(Preconditioned, ObstacleWays, Noted, GivenInPasses, Work
 
     def __init__(self, solver, derived, bend=0.0):
         self.potential, self._length, self.hosts = None, solver.substep, host_forces(solver.scene)
-        self.energy_watch = EnergyWatch(self) if solver.may_gain_energy and not solver.scene.growing else None
+        self.energy_watch = EnergyWatch(self) if solver.may_gain_energy and not solver.scene.term(Growth) else None
         super().__init__(solver, derived, bend)
 
     def history(self, num_slots, record=False):
@@ -77,15 +75,13 @@ class ImplicitWorkspace(Preconditioned, ObstacleWays, Noted, GivenInPasses, Work
         self.linear = linear_of(self.free)
         eps = np.finfo(runtime.NUMPY[self.scene.precision]).eps
         tolerance, rounds = self.solver.tolerance, self.solver.max_iterations
-        me = weakref.proxy(self)  # no circle: a dropped run gives its memory back at once
-        way, preconditioner = (lambda *step: me.way_past_obstacles(*step)), (lambda mass: me.preconditioner(mass))
         self.hosts.restrict(projectors_of(self.free), derived.rest)
         self.potential.hosts, others = self.hosts.with_energy, self.hosts.without_energy
         self.volumes, self.multipliers = self.held_volumes(eps), {}  # the pressures [Pa] that each pass ended with
-        more = others, self.volumes
-        self.newton = Newton(self.potential, self.free, way, preconditioner, tolerance, rounds, eps, *more)
-        self._preconditioners = {}
-        self.way, self.approach, self.closing = Way(self.arrays, self.parallel), Approach(self), Closing(self)
+        self.preconditioner, self.noted, self.ways = Preconditioners(self), Noted(self), ObstacleWays(self)
+        finders, more = (self.ways.past, self.preconditioner), (others, self.volumes)
+        self.newton = Newton(self.potential, self.free, *finders, tolerance, rounds, eps, *more)
+        self.approach, self.closing = Approach(self), Closing(self)
         self.check_apart()
 
     @property
@@ -98,8 +94,13 @@ class ImplicitWorkspace(Preconditioned, ObstacleWays, Noted, GivenInPasses, Work
             return super().mass_of(values)
         return ConsistentMass.of(self.scene.mesh, values.element_masses)
 
+    @property
+    def is_static(self) -> bool:
+        """Whether passes look for equilibria."""
+        return self.solver.stage(self.rate, True, 0).static
+
     def balance(self) -> EnergyWatch | None:
-        if self.scene.growing or self.scene.law.state_names or self.solver.stage(self.rate, True, 0).static:
+        if self.scene.term(Growth) or self.scene.law.state_names or self.is_static:
             return None
         self.energy_watch = self.energy_watch or EnergyWatch(self)
         return self.energy_watch
@@ -164,7 +165,7 @@ class ImplicitWorkspace(Preconditioned, ObstacleWays, Noted, GivenInPasses, Work
                 if self.bending:
                     self.bending.look(j + 1, u_next)
                 self.note_contacts(j, save_every)
-                self.note_solves(j, num_passes, time.perf_counter() - begin, self.begun)
+                self.noted.note(j, num_passes, time.perf_counter() - begin, self.begun)
             except FloatingPointError as error:
                 raise self.dated(error, j, num_passes) from None
             if self.solver.multistep:
@@ -221,7 +222,7 @@ class ImplicitWorkspace(Preconditioned, ObstacleWays, Noted, GivenInPasses, Work
         try:
             u_star = self._solve(j, u, held, starts, problem, stage)
         except NotConverged as error:
-            raise self._explained(error, u) from None
+            raise self.ways.explained(error, u) from None
         self.u_star = u_star
         self.keep_multipliers(j)
         v_star = (u_star - x) / stage.gamma
@@ -233,9 +234,9 @@ class ImplicitWorkspace(Preconditioned, ObstacleWays, Noted, GivenInPasses, Work
         # without what rounding adds
         u_next, v_next = self.rigid.end(self.scene.reduced.of(u_next)), self.scene.reduced.of(v_next)
         if stage.c0 != 1:
-            self._check_end(j, u_star, u_next)
+            self.ways.check_end(j, u_star, u_next)
         if self.energy_watch:
-            places = self.walls_before, self.walls_at_stage, self._walls_at_end(j)
+            places = self.ways.before, self.ways.at_stage, self.ways.at_end(j)
             keeps = self.solver.may_gain_energy and not self.solver.multistep  # the midpoint rule, kinetic energy
             undamped = self.inertial(self.solver.stage(0.0, before is None, j), u, v, before)[1]
             added = 0.0 if keeps else self._kinetic_added(u, v, u_next, v_star, undamped, stage)
@@ -295,7 +296,7 @@ class ImplicitWorkspace(Preconditioned, ObstacleWays, Noted, GivenInPasses, Work
             # surfaces are looked at together where they have not passed through each other
             if not self.pairs and not self.newton.rise(u, before, start, problem) < least:
                 continue
-            longest = min(self.way_past_obstacles(u, start - u)[0], self.pairs_share(u, start - u))
+            longest = min(self.ways.past(u, start - u)[0], self.pairs_share(u, start - u))
             at = self.rigid.nearest(u + longest * (start - u))
             rise = self.newton.rise(u, before, at, problem)
             if rise < least and not (self.rigid and not self.newton.is_free(u, at - u)):  # it turns on another way
@@ -306,6 +307,29 @@ class ImplicitWorkspace(Preconditioned, ObstacleWays, Noted, GivenInPasses, Work
         """J of each tetrahedron at a displacement."""
         self.potential.place(u)
         return self.potential.energy()[2]
+
+    # ---- what obstacles do -------------------------------------------------------------------------------------------
+
+    def check_apart(self) -> None:
+        """Raise Overlap if a face is in an obstacle, which vertices alone do not show."""
+        self.ways.check_apart()
+
+    def record_contacts(self) -> None:
+        self.impulses = ContactRecord(self)
+
+    def forget_contacts(self) -> None:
+        self.record_contacts()
+
+    def contact_forces(self, frame_time: np.ndarray) -> np.ndarray:
+        return self.impulses.forces
+
+    def note_contacts(self, j: int, save_every: int) -> None:
+        """What obstacles, and friction between surfaces, did in pass j, where it is asked for."""
+        if self.impulses and save_every:
+            at = self.potential.place(self.u_star)
+            shares = self.kept("shares", lambda: Shares(self)) if len(self.arrays.obstacles) else None
+            friction = lambda: self.potential.rubbing.forces(at)  # noqa: E731
+            self.impulses.add(j, save_every, self.is_static, lambda: shares.forces(), friction)
 
     # ---- what stands in the way --------------------------------------------------------------------------------------
 
@@ -322,37 +346,16 @@ class ImplicitWorkspace(Preconditioned, ObstacleWays, Noted, GivenInPasses, Work
 
     def begin(self, j: int, stage: Stage, u: np.ndarray, x: np.ndarray) -> None:
         """Tell the potential where obstacles are in pass j and where friction is measured from."""
-        self.arrays.walls.check(self.arrays.rows["path"], self.moment(j, stage))
-        self._walls = self.walls(self.arrays.rows["path"], j, stage)
-        self.walls_at_stage, self.walls_before = self._walls[::3].copy(), self._walls[1::3].copy()
-        self.potential.begin(u, x, 1 / stage.gamma, self._walls)
+        self.ways.begin(j, stage)
+        self.potential.begin(u, x, 1 / stage.gamma, self.ways.rows)
         if self.pressed:
-            self.pressed.begin(u, self._walls)
+            self.pressed.begin(u, self.ways.rows)
         self.origin = x
         self.lay_on(j, stage)
         if self.volumes:  # after all that the stiffness at rest is made of
             self.volumes.stiffen(self.preconditioner(stage.inertia * self.mass)[1])
 
-    def moment(self, j: int, stage: Stage) -> Moment:
-        """Where pass j lies for obstacles; a chord of two passes about its end for a solver of two steps."""
-        schedule, at_stage = self.solver.schedule, self.share_at_stage(j, stage)
-        begin = schedule.begin(j)
-        tau = (at_stage - begin) * float(schedule.step_length(j)) * (2 if stage.a1 else 1)
-        return Moment(schedule, j, at_stage, begin, tau)
-
-    def walls(self, path: np.ndarray | None, j: int, stage: Stage) -> np.ndarray:
-        """Where obstacles are in pass j (state/walls.py)."""
-        return self.arrays.walls.value(path, self.moment(j, stage))
-
-    def walls_jvp(self, dpath: np.ndarray | None, j: int, stage: Stage) -> np.ndarray:
-        """Their change."""
-        return self.arrays.walls.jvp(self.arrays.rows["path"], dpath, self.moment(j, stage))
-
     def share_at_stage(self, j: int, stage: Stage) -> float:
         """Share of the step at which pass j takes its forces."""
         schedule = self.solver.schedule
         return schedule.begin(j) + (schedule.end(j) - schedule.begin(j)) * self.laid / stage.c0
-
-    def walls_vjp(self, walls_adj: np.ndarray, j: int, stage: Stage, path_adj: np.ndarray) -> None:
-        """Add the adjoints of the rows of paths for those of `walls`."""
-        self.arrays.walls.vjp(self.arrays.rows["path"], walls_adj, self.moment(j, stage), path_adj)
