@@ -6,12 +6,13 @@ from diffsim_ti.mechanics.host_force import HostForces
 from diffsim_ti.mechanics.interaction import Interaction
 from diffsim_ti.mechanics.loads.interaction import DeadLoads
 from diffsim_ti.mechanics.pressure.interaction import Pressures
+from diffsim_ti.mechanics.rotating_frame import InertialForces
 from diffsim_ti.mechanics.stress.interaction import Growths
 from diffsim_ti.mechanics.ties.interaction import Foundations, SpringsAndCables
 
 # in the order in which vertices gather their corners: what is no load comes first
 KINDS: tuple[type[Interaction], ...] = (
-    *(SpringsAndCables, Pressures, Gases, FilledChambers, FluidDrag, Foundations),
+    *(SpringsAndCables, Pressures, Gases, FilledChambers, FluidDrag, Foundations, InertialForces),
     *(DeadLoads, Growths),  # which have parts of a step of their own
 )
 NUMBERS = {name: kind for each in KINDS for name, kind in each.derived.items()}  # arrays that some kind has of its own

@@ -80,7 +80,7 @@ def _absent(has) -> set[str]:
         ("growths",): has.growing,
         ("surface", "seen", "path"): obstacles,
         ("felt",): has.moving,
-        ("rest",): obstacles or has.shape or any(x.reads_rest for x in has.in_kernels),
+        ("rest",): obstacles or has.shape or any(x.reads_rest for x in has.interactions),
         ("parameters",): obstacles or has.num_parameters,
         ("stage",): has.num_staged,
         ("work",): has.driven,

@@ -15,6 +15,7 @@ from diffsim_ti.terms.obstacles.half_space import HalfSpace
 from diffsim_ti.terms.obstacles.mesh_obstacle import MeshObstacle
 from diffsim_ti.terms.obstacles.obstacle import Obstacle
 from diffsim_ti.terms.pose import Pose
+from diffsim_ti.terms.rotating_frame import RotatingFrame
 from diffsim_ti.terms.self_contact import SelfContact
 from diffsim_ti.terms.surface_drag import SurfaceDrag
 from diffsim_ti.terms.term import Term, VertexForce
@@ -34,7 +35,7 @@ LOADS = (
     Growth,
     ElasticFoundation,
 )
-TERMS = (Gravity, Drag, SurfaceDrag, *LOADS, *OBSTACLES, SelfContact)
+TERMS = (Gravity, Drag, RotatingFrame, SurfaceDrag, *LOADS, *OBSTACLES, SelfContact)
 __all__ = [
     "Anchor",
     "BodyForce",
@@ -59,6 +60,7 @@ __all__ = [
     "Obstacle",
     "Pose",
     "Pressure",
+    "RotatingFrame",
     "SelfContact",
     "Sphere",
     "Spring",
