@@ -201,11 +201,6 @@ class Interaction:
     stiff_over_time: "tuple[Term, ...]" = ()  # terms whose stiffness may change over time
     least: ClassVar[tuple[str, ...]] = ()  # plain names of their inputs that are stiffest where they are least
 
-    def added_omega2(self, values: dict[str, np.ndarray], derived: Derived) -> float:
-        """What it adds to the body's largest omega^2 [1/s^2] at most, beside the sums of rows of its host form; at the
-        stiffest `values` and what is derived of them."""
-        return 0.0
-
 
 def add_at(target: np.ndarray, places: np.ndarray, rows: np.ndarray) -> None:
     """target[..., places, :] += rows, of places that may repeat."""
