@@ -255,7 +255,7 @@ ELSEWHERE = {  # (file, part of the message): the test that provokes it and foll
     ("study/trials.py", "nothing tried meets"): "test_study.py; a budget is no promise",
     ("terms/growth.py", "takes growth of shape"): "test_growth_over_time.py",
     ("terms/muscle.py", "takes activations of shape"): "test_muscles.py",
-    ("terms/terms_of_scene.py", "give them a name="): "test_scene.py",
+    ("scene/scene.py", "give them a name="): "test_scene.py",
     ("torch_bridge/step_sizes.py", "parameter_groups(relative=...)"): "test_step_sizes.py",
     ("torch_bridge/step_sizes.py", "parameter_groups(relative=0.05)"): "test_step_sizes.py",
     ("torch_bridge/tensors.py", "sees no card"): ANOTHER_MACHINE,

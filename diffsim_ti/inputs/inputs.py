@@ -278,10 +278,8 @@ class Inputs:
 
     def derive_jvp(self, values: dict, tangents: dict) -> Derived:
         """Change of what kernels read for changes `tangents` of some inputs."""
-        out, changed = self.derive(values).zeros(), self.chain.jvp(values, tangents)
-        for name in out.parts():
-            setattr(out, name, changed.get(name, getattr(out, name)))
-        return out
+        changed = self.chain.jvp(values, tangents)
+        return self.derive(values).zeros().replaced(**{name: changed[name] for name in self.read if name in changed})
 
     def derive_vjp(self, values: dict, adj: Derived, wanted: Iterable[str]) -> dict[str, np.ndarray]:
         """Adjoints of the wanted inputs for adjoints of what kernels read; those of coefficients come per tetrahedron."""

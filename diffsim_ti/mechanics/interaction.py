@@ -192,14 +192,9 @@ class Interaction:
         """Add to `out` what these arrays hold, vectors of three numbers in float64; in batches all have one axis of scenes
         in front."""
 
-    # ---- what monitors ask -------------------------------------------------------------------------------------------
-
     def pulls_steadily(self, values: Derived) -> bool:
         """Of loads that pull: whether they do so in all steps alike."""
         return True
-
-    stiff_over_time: "tuple[Term, ...]" = ()  # terms whose stiffness may change over time
-    least: ClassVar[tuple[str, ...]] = ()  # plain names of their inputs that are stiffest where they are least
 
 
 def add_at(target: np.ndarray, places: np.ndarray, rows: np.ndarray) -> None:

@@ -100,7 +100,7 @@ class GasChamber(Chamber):
     Volume-dependent pressure loading and its influence on the stability of structures, doi:10.1002/nme.561.
     """
 
-    row_names = ("pressure", "outside", "rest", "exponent")
+    row_names, stiffest = ("pressure", "outside", "rest", "exponent"), staticmethod(np.max)
 
     def __init__(
         self,

@@ -227,7 +227,7 @@ class Cable(Tie):
     doi:10.15607/RSS.2019.XV.052.
     """
 
-    one_sided = True
+    one_sided, stiffest = True, staticmethod(np.max)
     shape = ()
     ndim = 1
 
@@ -246,6 +246,7 @@ class Cable(Tie):
         self.by_tension = by_tension = length is None
         argument, self.given = ("tension", tension) if by_tension else ("length", length)
         self.plain = f"cable_{argument}"
+        self.stiffest = np.max if by_tension else np.min
         inputs = [amount(argument, self.given, (), "N" if by_tension else "m", self.plain)]
         if not by_tension:
             inputs.append(

@@ -49,10 +49,6 @@ class Gases(Pressing):
         if shape:
             add_at(out.rest, self.vertices, found["chamber_rest"])
 
-    @property
-    def stiff_over_time(self):
-        return self.terms
-
 
 class FilledChambers(Pressing):
     """Implicit steps find their pressures as multipliers (multipliers.py); explicit steps have a stage (held_volumes.py)."""
