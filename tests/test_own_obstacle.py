@@ -96,13 +96,13 @@ def test_it_is_drawn(scene):
 # ---- a force of one's own: a term, its Taichi functions, its host form ---------------------------------------------------
 
 
-def tether(u, v, speed, k, c, d):
-    """f = -k (u - d) - c |v| v, for kernels and for the host."""
-    return -k * (u - d) - c * speed * v
+def tether(u, v, k, c, d):
+    """f = -k (u - d) - c v, for kernels and for the host."""
+    return -k * (u - d) - c * v
 
 
-def tether_jvp(u, v, speed, du, dv, dspeed, k, c, d, dk, dc, dd):
-    return -dk * (u - d) - k * (du - dd) - dc * speed * v - c * (dspeed * v + speed * dv)
+def tether_jvp(u, v, du, dv, k, c, d, dk, dc, dd):
+    return -dk * (u - d) - k * (du - dd) - dc * v - c * dv
 
 
 VALUE, JVP = ti.func(tether), ti.func(tether_jvp)
@@ -112,7 +112,7 @@ VALUE, JVP = ti.func(tether), ti.func(tether_jvp)
 class TetherForce(VertexwiseForce):
     """Of each vertex; its numbers k, c, d stand in the parameters from `first` on."""
 
-    first_number: int
+    first: int
     name, reads_rates, adjoints = "tethered", True, dict(tether_felt="vectors")
 
     @traced
@@ -121,33 +121,27 @@ class TetherForce(VertexwiseForce):
 
     @ti.func
     def numbers(self, p: ti.template()):
-        n = ti.static(self.first_number)
+        n = ti.static(self.first)
         return p[n], p[n + 1], self.vector(p[n + 2], p[n + 3], p[n + 4], ti.cast(0, self.fp))
-
-    @ti.func
-    def per(self, speed):
-        return ti.select(speed > 0, 1 / ti.max(speed, ti.cast(1e-30, self.fp)), ti.cast(0, self.fp))
 
     @ti.func
     def force(self, i, u, v, now: ti.template(), scene: ti.template()):
         k, c, d = self.numbers(scene.parameters)
-        return VALUE(u, v, ti.sqrt(v.dot(v)), k, c, d)
+        return VALUE(u, v, k, c, d)
 
     @ti.func
     def force_jvp(self, i, u, v, du, dv, now: ti.template(), scene: ti.template(), tangent: ti.template()):
         k, c, d = self.numbers(scene.parameters)
         dk, dc, dd = self.numbers(tangent.parameters)
-        speed = ti.sqrt(v.dot(v))
-        return JVP(u, v, speed, du, dv, v.dot(dv) * self.per(speed), k, c, d, dk, dc, dd)
+        return JVP(u, v, du, dv, k, c, d, dk, dc, dd)
 
     @ti.func
     def force_vjp(self, i, u, v, w, now: ti.template(), scene: ti.template(), adjoint: ti.template()):
         k, c, d = self.numbers(scene.parameters)
-        speed = ti.sqrt(v.dot(v))
-        by_k, by_c = w.dot(d - u), -speed * v.dot(w)
-        adjoint.tether_felt[2 * i] += self.vector(by_k, by_c, ti.cast(0, self.fp), ti.cast(0, self.fp))
+        zero = ti.cast(0, self.fp)
+        adjoint.tether_felt[2 * i] += self.vector(w.dot(d - u), -v.dot(w), zero, zero)
         adjoint.tether_felt[2 * i + 1] += k * w
-        return -k * w, -c * (speed * w + v.dot(w) * self.per(speed) * v)
+        return -k * w, -c * w
 
 
 class TetherOnHost(HostForce):
@@ -156,31 +150,24 @@ class TetherOnHost(HostForce):
     def __init__(self, rows: slice):
         self.rows = rows
 
-    def take(self, values, instant):
-        self.k, self.c, *self.d = values.parameters[self.rows]
-        return super().take(values, instant)
-
-    def state(self, u):
-        v = self.velocities(u)
-        speed = np.linalg.norm(v, axis=1, keepdims=True)
-        return v, speed, np.divide(v, speed, out=np.zeros_like(v), where=speed > 0)
+    def numbers(self, values):
+        k, c, *d = values.parameters[self.rows]
+        return k, c, np.array(d)
 
     def forces(self, u):
-        v, speed, _ = self.state(u)
-        return tether(u, v, speed, self.k, self.c, np.array(self.d))
+        return tether(u, self.velocities(u), *self.numbers(self.values))
 
     def jvp(self, u, du, dv, moved=None):
-        v, speed, along = self.state(u)
-        dk, dc, *dd = np.zeros(5) if moved is None else moved.parameters[self.rows]
-        dspeed = (along * dv).sum(1, keepdims=True)
-        return tether_jvp(u, v, speed, du, dv, dspeed, self.k, self.c, np.array(self.d), dk, dc, np.array(dd))
+        k, c, d = self.numbers(self.values)
+        if moved is None:
+            return -k * du - c * dv
+        return tether_jvp(u, self.velocities(u), du, dv, k, c, d, *self.numbers(moved))
 
     def vjp(self, u, w, adj=None):
-        v, speed, along = self.state(u)
+        k, c, d = self.numbers(self.values)
         if adj is not None:
-            by_c = -(speed * v * w).sum()
-            adj.parameters[self.rows] += [((np.array(self.d) - u) * w).sum(), by_c, *(self.k * w.sum(0))]
-        return -self.k * w, -self.c * (speed * w + along * (v * w).sum(1, keepdims=True))
+            adj.parameters[self.rows] += [((d - u) * w).sum(), -(self.velocities(u) * w).sum(), *(k * w.sum(0))]
+        return -k * w, -c * w
 
 
 class Tethers(Interaction):

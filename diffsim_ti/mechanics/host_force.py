@@ -38,7 +38,7 @@ class HostForce:
 
     has_energy: whether it has an energy, which line searches and preconditioners then know. Without one, line searches ask
         for `work`. symmetric: whether df/du is in what may move; else linear systems are solved by GMRES.
-    reads_velocities: whether forces depend on velocities. title: how messages call it.
+    reads_velocities: whether forces depend on velocities.
     """
 
     has_energy = symmetric = reads_velocities = False

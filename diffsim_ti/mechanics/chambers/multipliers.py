@@ -90,12 +90,16 @@ class HeldVolumes:
         self._ahead = np.linalg.lstsq(S, -np.array([float((g * soft * R).sum()) for g in G]), rcond=None)[0]
         return R + sum(m * g for m, g in zip(self._ahead, G))
 
+    def _border(self, u: np.ndarray, solve) -> tuple[list, list, np.ndarray]:
+        """(g of each, z = K'^-1 g, g . z of all pairs)"""
+        G = [g * self.free for g in self.gradients(u)]
+        Z = [solve(g) for g in G]
+        return G, Z, np.array([[float((g * z).sum()) for z in Z] for g in G])
+
     def bordered(self, u: np.ndarray, y: np.ndarray, solve) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(d, what comes to R, dp) from y = K'^-1 R, R as `predicted`; solve(g): K'^-1 g. The multipliers go to p + mu, for
         the line search."""
-        G = [g * self.free for g in self.gradients(u)]
-        Z = [solve(g) for g in G]
-        S = np.array([[float((g * z).sum()) for z in Z] for g in G])
+        G, Z, S = self._border(u, solve)
         r, self._before = self.missing, self.multipliers
         mu = np.linalg.lstsq(S, r - np.array([float((g * y).sum()) for g in G]), rcond=None)[0]
         d, mu = y + sum(m * z for m, z in zip(mu, Z)), mu + self._ahead
@@ -109,9 +113,7 @@ class HeldVolumes:
     def tangent(self, u: np.ndarray, y: np.ndarray, targets: np.ndarray, solve) -> tuple[np.ndarray, np.ndarray]:
         """(du, dp) from y = K'^-1 dR, the target in dR having the slope gamma; targets: their change less what V changes by
         all that does not follow from dR."""
-        G = [g * self.free for g in self.gradients(u)]
-        Z = [solve(g) for g in G]
-        S = np.array([[float((g * z).sum()) for z in Z] for g in G])
+        G, Z, S = self._border(u, solve)
         dp = np.linalg.solve(S, targets - np.array([float((g * y).sum()) for g in G]))
         return y + sum(m * z for m, z in zip(dp, Z)), dp
 
@@ -132,8 +134,6 @@ class HeldVolumes:
 
     def adjoint(self, u: np.ndarray, y: np.ndarray, by_pressure: np.ndarray, solve) -> tuple[np.ndarray, np.ndarray]:
         """(w, nu) from y = K'^-T p: the adjoint of R, and what comes to that of targets, and less to that of volumes."""
-        G = [g * self.free for g in self.gradients(u)]
-        Z = [solve(g) for g in G]
-        S = np.array([[float((g * z).sum()) for z in Z] for g in G])
+        G, Z, S = self._border(u, solve)
         nu = np.linalg.solve(S, by_pressure + np.array([float((g * y).sum()) for g in G]))
         return y - sum(m * z for m, z in zip(nu, Z)), nu

@@ -165,7 +165,7 @@ class ImplicitAdjoint(RecordedPasses):
         reaction = reaction + by_contacts
         if ws.hosts:
             by_place, by_speed = ws.hosts.vjp(ws.potential.held_at, by_star, self.by_hosts)
-            reaction, by_x = reaction + by_place + by_speed / s.gamma, by_x - by_speed / s.gamma
+            reaction, by_x = reaction + by_place + by_speed / self.gamma, by_x - by_speed / self.gamma
         if ws.volumes:
             reaction = reaction + ws.volumes.add_targets(nu, ws.potential.held_at, self.by_hosts)
         if ws.potential.rubbing:

@@ -32,6 +32,7 @@ class RecordedPasses:
             ws.strains.hold(stage, self.u, self.before)
         ws.potential.hold(ws.record, j - base)
         ws.potential.place(self.u_star)
+        self.gamma = ws.instant(j, stage).gamma  # of velocities that host forces read
         self.operator = Operator(ws.potential, self.mass, ws.free, ws.newton.others, self.transposed)
         ws.take_multipliers(j, ws.potential.held_at)
         if ws.rigid:  # what they feel turns with them

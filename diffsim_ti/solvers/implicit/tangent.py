@@ -102,7 +102,7 @@ class ImplicitTangent(RecordedPasses):
         if a.features().gravity >= 0:
             dR += share * ws.mass * tangent.parameters[a.features().gravity :][:3]
         dR += ws.given_forces(tangent.forces, j, s)
-        dR += ws.hosts.jvp(ws.potential.held_at, held, (held - dx) / s.gamma, tangent)
+        dR += ws.hosts.jvp(ws.potential.held_at, held, (held - dx) / self.gamma, tangent)
         if ws.rigid:
             dR += ws.rigid.turned(held + tangent.rest)
         d_star = self.solve(dR + self.mass * (dx + s.gamma * dy - held))
