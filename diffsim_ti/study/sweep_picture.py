@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diffsim_ti.study.charts import save, write_csv, write_json
+from diffsim_ti.study.charts import save, without_nan, write_results
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -42,13 +42,10 @@ def _lines(axes: "Axes", sweep: "Sweep", name: str) -> None:
     x, values = np.array(sweep.over[along]), sweep.column(name)
     values = values.reshape(-1, len(x))
     for k, row in enumerate(values):
-        axes.plot(
-            x, row, "o-", ms=3.5, lw=1.2, color="#0072B2", alpha=1 if len(values) == 1 else 0.3 + 0.7 * k / len(values)
-        )
-    refused = x[np.isnan(values).any(0)]
-    axes.plot(
-        refused, np.zeros(len(refused)), "x", color="#D55E00", transform=axes.get_xaxis_transform(), clip_on=False
-    )
+        alpha = 1 if len(values) == 1 else 0.3 + 0.7 * k / len(values)
+        axes.plot(x, row, "o-", ms=3.5, lw=1.2, color="#0072B2", alpha=alpha)
+    refused, foot = x[np.isnan(values).any(0)], dict(transform=axes.get_xaxis_transform(), clip_on=False)
+    axes.plot(refused, np.zeros(len(refused)), "x", color="#D55E00", **foot)
     axes.set_xlabel(along)
     axes.set_xscale("log" if is_log(x) else "linear")
     axes.set_yscale("log" if is_log(values[np.isfinite(values)]) else "linear")
@@ -69,17 +66,7 @@ def _map(axes: "Axes", sweep: "Sweep", name: str) -> None:
 def write_sweep(sweep: "Sweep", folder: str | Path) -> list[str]:
     """sweep.csv, .json, and .png where a run gave a number, in a folder; returns their names."""
     stem = Path(folder) / "sweep"
-    rows = [
-        {k: (None if isinstance(x, float) and not np.isfinite(x) else x) for k, x in row.items()} for row in sweep.rows
-    ]
-    write_csv(rows, _made(stem.with_suffix(".csv")))
-    write_json(dict(over=sweep.over, results=sweep.results, rows=rows), stem.with_suffix(".json"))
-    if not sweep.results:
-        return [str(stem.with_suffix(s)) for s in (".csv", ".json")]
-    draw_sweep(sweep, stem.with_suffix(".png"))
-    return [str(stem.with_suffix(s)) for s in (".png", ".csv", ".json")]
-
-
-def _made(path: Path) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    return path
+    rows = [without_nan(row) for row in sweep.rows]
+    record = dict(over=sweep.over, results=sweep.results, rows=rows)
+    files = write_results(stem, lambda path: draw_sweep(sweep, path) if sweep.results else None, rows, record)
+    return files if sweep.results else files[1:]
