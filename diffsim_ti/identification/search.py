@@ -25,12 +25,7 @@ class Search:
     """The best point so far, its cost sum r^2 + prior, and a report of each iteration, written to `path` if there is one."""
 
     def __init__(
-        self,
-        problem: Problem,
-        priors: Priors,
-        resume: dict | str | Path | None = None,
-        start: np.ndarray | None = None,
-        number: int = 0,
+        self, problem: Problem, priors: Priors, resume: dict | str | Path | None = None, start=None, number: int = 0
     ):
         self.problem, self.priors, self.damping, self.report, self.number = problem, priors, 1e-3, [], number
         self.path = Path(resume) if isinstance(resume, str | Path) else None
@@ -50,6 +45,11 @@ class Search:
 
     def cost_of(self, point: Point) -> float:
         return float(point.residual @ point.residual) + self.priors.cost(point.t)
+
+    @property
+    def chi_square(self) -> float:
+        """Sum of the squared residuals."""
+        return float(self.point.residual @ self.point.residual)
 
     def half_gradient(self, point: Point) -> np.ndarray:
         """Half the cost's gradient by t, from a reverse sweep of each experiment."""
@@ -82,7 +82,7 @@ class Search:
             start=self.number,
             iteration=iteration,
             cost=self.cost,
-            chi_square=float(self.point.residual @ self.point.residual),
+            chi_square=self.chi_square,
             promised=promised,
             damping=self.damping,
             rejected=why,
@@ -92,12 +92,7 @@ class Search:
         )
 
     def record(
-        self,
-        most: int,
-        show: Callable,
-        callback: Callable | None,
-        promised: float | None = None,
-        why: str | None = None,
+        self, most: int, show: Callable, callback: Callable | None, promised=None, why: str | None = None
     ) -> None:
         """Note an iteration, write the state, show and tell it. Raises Ended after the last one, or if the callback asks."""
         done = self.row(len(self.report) + 1, promised, why)
