@@ -59,11 +59,9 @@ class Chamber(Term):
         return mesh.faces_of(self.surface)
 
     def settled(self, scene, density, initial_positions, initial_velocities) -> "Chamber":
-        out, mesh, supports = copy(self), scene.mesh, scene.supports
-        free = supports.freedom(mesh.num_vertices)
-        called = f"{type(self).__name__}" + (f" {self.name!r}" if self.name else "")
-        moves = scene.motion is not None
-        out.enclosure = Enclosure.of(self.faces(mesh), free, mesh.vertices, called, moves)
+        out, mesh, called = copy(self), scene.mesh, type(self).__name__ + (f" {self.name!r}" if self.name else "")
+        free = scene.supports.freedom(mesh.num_vertices)
+        out.enclosure = Enclosure.of(self.faces(mesh), free, mesh.vertices, called, moves=scene.motion is not None)
         return out
 
     def in_time(self, own: str) -> list[str]:
@@ -71,17 +69,12 @@ class Chamber(Term):
         return [f"{own} {row} in time" for row in self.row_names]
 
     def links(self, names: dict[str, str], own: str) -> list[Link]:
-        volume = f"{own} volume"
-        sources = [volume if row == "rest" else names[i.plain] for row, i in zip(self.row_names, self._described_rows)]
+        volume, described = f"{own} volume", iter(self.described)
+        sources = [volume if row == "rest" else names[next(described).plain] for row in self.row_names]
         out = [RestVolume(self.enclosure, volume)]
         for k, (source, row) in enumerate(zip(sources, self.in_time(own))):
             out.append(InTime(source, row, 1, self.keyed and k == 0))
         return out
-
-    @property
-    def _described_rows(self) -> list:
-        described = iter(self.described)
-        return [None if row == "rest" else next(described) for row in self.row_names]
 
 
 class GasChamber(Chamber):

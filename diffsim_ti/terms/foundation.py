@@ -1,7 +1,5 @@
 """An elastic foundation on a surface."""
 
-from copy import copy
-
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -10,11 +8,11 @@ from diffsim_ti.inputs import Input, Link
 from diffsim_ti.inputs.foundation import FoundationStiffness
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.terms.marks import MOST, Points, spread
-from diffsim_ti.terms.term import Term
+from diffsim_ti.terms.term import OnMesh, Term
 from diffsim_ti.terms.ties import AT_LEAST_0
 
 
-class ElasticFoundation(Term):
+class ElasticFoundation(OnMesh, Term):
     """Springs under a surface that pull it back to where it is at rest (Winkler): on each vertex f = -K u, u its
     displacement from the rest shape,
 
@@ -65,14 +63,8 @@ class ElasticFoundation(Term):
             raise ValueError("ElasticFoundation holds nothing: the set is empty; name a set that has members")
         for i in self.described:
             if i.value.ndim and len(i.value) != count:
-                raise ValueError(
-                    f"ElasticFoundation: {i.name} has {len(i.value)} numbers for {count} {kind}; give one or {count}"
-                )
-
-    def settled(self, scene, density, initial_positions, initial_velocities) -> "ElasticFoundation":
-        out = copy(self)
-        out.mesh = scene.mesh
-        return out
+                given = f"{i.name} has {len(i.value)} numbers"
+                raise ValueError(f"ElasticFoundation: {given} for {count} {kind}; give one or {count}")
 
     def drawn(self, moment):
         vertices = self.indices(moment.mesh)

@@ -1,7 +1,5 @@
 """Loads on surfaces and volumes: traction, pressure, body force."""
 
-from copy import copy
-
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -11,10 +9,10 @@ from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.ten_nodes import triangles_of
 from diffsim_ti.terms.marks import arrows, pressing
 from diffsim_ti.terms.over_time import OverTime, amount, is_keyed, rows_at
-from diffsim_ti.terms.term import Term
+from diffsim_ti.terms.term import OnMesh, Term
 
 
-class Load(Term):
+class Load(OnMesh, Term):
     """An amount per area or volume, over time. A scene may list several of a kind: they add up.
 
     Subclasses say what it is: its `argument`, what was `given`, its `unit` and its plain name.
@@ -39,12 +37,6 @@ class Load(Term):
     def rows(self, times: ArrayLike) -> np.ndarray:
         """Its amount at each time [s], where it is keyed."""
         return rows_at(f"{type(self).__name__}: {self.plain}", self._given, times, self.shape)
-
-    def settled(self, scene, density, initial_positions, initial_velocities) -> "Load":
-        """For a mesh, whose sets it names."""
-        out = copy(self)
-        out.mesh = scene.mesh
-        return out
 
     def in_time(self, names: dict[str, str], own: str) -> Link:
         """Its amount in time, as inputs/loads.py has it, by the name `own` in time."""

@@ -34,18 +34,15 @@ class Term(ABC):
     path = None  # displacement over time, of an obstacle that moves
     table = np.zeros(0)  # numbers without gradient, laid behind the parameters on the device
     variant: tuple = ()  # what else than its class decides about the kernels of a term
-    dead = (
-        False  # whether it acts by given forces on vertices (`indices`, `force_links`), which add up (inputs/loads.py)
-    )
+    dead = False  # whether it acts by given forces on vertices (`indices`, `force_links`), which add up
     sums_itself = False  # whether its links write "forces" where no other such load is there
     keyed = False  # whether its input is sampled at the ends of each run's steps (`rows`)
 
     def __init__(self, *inputs: Input, name: str | None = None):
         kind = type(self).__name__
         if name is not None and not (isinstance(name, str) and name.isidentifier()):
-            raise ValueError(
-                f"{kind}: name must be a word such as 'floor', got {name!r}: its inputs' names begin with it"
-            )
+            rule = f"name must be a word such as 'floor', got {name!r}"
+            raise ValueError(f"{kind}: {rule}: its inputs' names begin with it")
         for described in inputs:
             if described.value is not None:
                 described.check_given(kind)
@@ -128,12 +125,18 @@ class Term(ABC):
 
     def __repr__(self) -> str:
         named = [] if self.name is None else [f"name={self.name!r}"]
-        numbers = [f"{name}={_short(value)}" for name, value in self.values.items()]
+        short = lambda x: f"array{x.shape}" if x.size > 3 else np.array2string(x, separator=", ", precision=6)  # noqa: E731
+        numbers = [f"{name}={short(value)}" for name, value in self.values.items()]
         return f"{type(self).__name__}({', '.join(named + numbers)})"
 
 
-def _short(value: np.ndarray) -> str:
-    return f"array{value.shape}" if value.size > 3 else np.array2string(value, separator=", ", precision=6)
+class OnMesh:
+    """The part of a term whose links need the `mesh` of its scene."""
+
+    def settled(self, scene, density, initial_positions, initial_velocities) -> Term:
+        out = copy(self)
+        out.mesh = scene.mesh
+        return out
 
 
 @dataclass(frozen=True)
