@@ -92,10 +92,8 @@ class EnergyBalance:
         ends = rows.reshape(len(rows), -1, 2, 3)[
             ..., :2
         ]  # tension and slack as a step begins and ends (inputs/ties.py)
-        self.steady = bool(
-            (ends == ends[0, :, :, :1]).all() and (self._rows is None or np.array_equal(rows, self._rows))
-        )
-        self._rows = rows
+        same = self._rows is None or np.array_equal(rows, self._rows)
+        self.steady, self._rows = bool((ends == ends[0, :, :, :1]).all() and same), rows
         return self.steady
 
     def _begin(self, first: int, num_passes: int, level: float | None) -> None:
