@@ -93,9 +93,9 @@ class Identification:
     does not explain the data: see `headline`.
     chi_square, degrees, p_value: of the residuals, whose sum of squares is chi^2 distributed if model and noise are right;
     iterations: a dict each; simulations: forward, tangent and reverse runs; stopped: why, converged: whether because of the
-    tolerance; state: for `resume`; starts: where each search began and ended, a dict each, of which this is the best;
-    inputs: of each experiment, for rollout.forward(**inputs[k]). Covariance and what follows from it are None where it was
-    not asked for.
+    tolerance; information: what the data tell; state: for `resume`; starts: where each search began and ended, a dict each,
+    of which this is the best; inputs: of each experiment, for rollout.forward(**inputs[k]). Covariance and what follows from
+    it are None where it was not asked for.
     Roache 1994, doi:10.1115/1.2910291, on errors from two meshes.
     """
 

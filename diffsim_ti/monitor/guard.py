@@ -32,7 +32,16 @@ class Crossing(Divergence):
     stiffness is what stops the vertex, or None where the barrier's own would do.
     """
 
-    def __init__(self, message: str, step: int, vertex: int, stable_dt: float, depth: float, speed: float, stiffness):
+    def __init__(
+        self,
+        message: str,
+        step: int,
+        vertex: int,
+        stable_dt: float,
+        depth: float,
+        speed: float,
+        stiffness: float | None,
+    ):
         super().__init__(message, step, vertex, None, stable_dt)
         self.depth, self.speed, self.stiffness = depth, speed, stiffness
 

@@ -43,7 +43,8 @@ class OfTetrahedra:
         chosen = every if self.tetrahedra is None else mesh.tetrahedron_indices(self.tetrahedra)
         return chosen, np.arange(len(chosen)) if self.per == "tetrahedron" else np.zeros(len(chosen), np.int64)
 
-    def sizes(self, mesh):
+    def sizes(self, mesh: TetrahedralMesh) -> dict[str, int]:
+        """How many tetrahedra "k" stands for."""
         return {"k": len(self.groups(mesh)[0])}
 
     def _shapes(self, chosen: np.ndarray) -> tuple[tuple, tuple]:

@@ -134,6 +134,7 @@ class OnMesh:
     """The part of a term whose links need the `mesh` of its scene."""
 
     def settled(self, scene, density, initial_positions, initial_velocities) -> Term:
+        """The term with that mesh."""
         out = copy(self)
         out.mesh = scene.mesh
         return out
