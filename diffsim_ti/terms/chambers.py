@@ -13,13 +13,13 @@ from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.enclosure import Enclosure
 from diffsim_ti.mesh.ten_nodes import triangles_of
 from diffsim_ti.terms.marks import pressing
-from diffsim_ti.terms.over_time import OverTime, amount, is_keyed, rows_at
+from diffsim_ti.terms.over_time import GivenOverTime, OverTime, amount
 from diffsim_ti.terms.term import Term
 
 ATMOSPHERE = 101325.0  # [Pa]
 
 
-class Chamber(Term):
+class Chamber(GivenOverTime, Term):
     """A cavity, by a surface of the body around it, whose filling pushes on it with one pressure.
 
     The surface is closed, or has rims that are held wholly or move in planes (supports by component), which close it there.
@@ -30,25 +30,14 @@ class Chamber(Term):
     """
 
     holds = False  # whether it holds a volume
-    shape = ()  # of what is given over time
     num_numbers = 0  # what is read of it lies in rows of its own
     row_names: tuple[str, ...] = ()  # of its numbers, each of which has a row in time
 
     def __init__(self, argument: str, given: OverTime, unit: str, plain: str, surface, name: str | None, *more: Input):
         described = replace(amount(argument, given, (), unit, plain), range=POSITIVE)
         super().__init__(described, *more, name=name)
-        self.given, self.keyed, self.surface = given, is_keyed(given), surface
-        if self.keyed:
-            self.rows([0.0])  # refuses what does not fit
-
-    @property
-    def plain(self) -> str:
-        """Plain name of what is given over time."""
-        return self.described[0].plain
-
-    def rows(self, times: ArrayLike) -> np.ndarray:
-        """That at each time [s], where it is keyed."""
-        return rows_at(f"{type(self).__name__}: {self.plain}", self.given, times, ())
+        self.surface = surface
+        self._give(given)
 
     def check(self, mesh: TetrahedralMesh) -> None:
         if len(self.faces(mesh)) == 0:

@@ -8,11 +8,11 @@ from diffsim_ti.inputs.loads import ConsistentShares, InTime, Spread, VertexArea
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.ten_nodes import triangles_of
 from diffsim_ti.terms.marks import arrows, pressing
-from diffsim_ti.terms.over_time import OverTime, amount, is_keyed, rows_at
+from diffsim_ti.terms.over_time import GivenOverTime, OverTime, amount
 from diffsim_ti.terms.term import OnMesh, Term
 
 
-class Load(OnMesh, Term):
+class Load(GivenOverTime, OnMesh, Term):
     """An amount per area or volume, over time. A scene may list several of a kind: they add up.
 
     Subclasses say what it is: its `argument`, what was `given`, its `unit` and its plain name.
@@ -21,22 +21,10 @@ class Load(OnMesh, Term):
     """
 
     num_numbers = 0  # what kernels read of it lies in arrays of its own
-    shape: tuple = ()  # of the amount
 
     def __init__(self, argument: str, given: OverTime, unit: str, plain: str, name: str | None):
         super().__init__(amount(argument, given, self.shape, unit, plain), name=name)
-        self._given, self.keyed = given, is_keyed(given)
-        if self.keyed:
-            self.rows([0.0])  # refuses what does not fit
-
-    @property
-    def plain(self) -> str:
-        """Plain name of its input."""
-        return self.described[0].plain
-
-    def rows(self, times: ArrayLike) -> np.ndarray:
-        """Its amount at each time [s], where it is keyed."""
-        return rows_at(f"{type(self).__name__}: {self.plain}", self._given, times, self.shape)
+        self._give(given)
 
     def in_time(self, names: dict[str, str], own: str) -> Link:
         """Its amount in time, as inputs/loads.py has it, by the name `own` in time."""

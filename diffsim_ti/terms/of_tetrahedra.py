@@ -7,12 +7,12 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti.inputs import Input
 from diffsim_ti.mesh import TetrahedralMesh
-from diffsim_ti.terms.over_time import OverTime, amount, is_keyed, rows_at
+from diffsim_ti.terms.over_time import GivenOverTime, OverTime, amount, is_keyed, rows_at
 
 PER = ("all", "set", "tetrahedron")
 
 
-class OfTetrahedra:
+class OfTetrahedra(GivenOverTime):
     """The part of a term that gives tetrahedra an amount over time; `tetrahedra` and `per` as the terms say."""
 
     def _take(
@@ -26,11 +26,10 @@ class OfTetrahedra:
             raise ValueError(f'{kind}: per="set" takes tetrahedra=["left", "right"], names of sets, got {tetrahedra!r}')
         shape = () if per == "all" else (len(tetrahedra),) if per == "set" else ("k",)
         self.given, self.keyed, self.per, self.tetrahedra = given, is_keyed(given), per, tetrahedra
-        self.plain, self.ndim, self._called = plain, len(shape) + 1, f"{kind}: {argument}"
+        self.ndim, self._called = len(shape) + 1, f"{kind}: {argument}"
         return amount(argument, given, shape, "-", plain), shape
 
     def rows(self, times: ArrayLike) -> np.ndarray:
-        """The amount at each time [s], where it is keyed."""
         at = self.given(0.0) if callable(self.given) else np.asarray(self.given[1])[0]
         return rows_at(self._called, self.given, times, np.shape(at))
 

@@ -13,7 +13,7 @@ from diffsim_ti.inputs.ties import Segments, TieRows
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.paths import Paths
 from diffsim_ti.terms.marks import Lines, Points
-from diffsim_ti.terms.over_time import OverTime, amount, is_keyed, rows_at
+from diffsim_ti.terms.over_time import GivenOverTime, OverTime, amount
 from diffsim_ti.terms.term import OnMesh, Term
 
 
@@ -199,7 +199,7 @@ class Spring(Tie):
         return Paths.of([[a, b] for a, b in zip(start, end)])
 
 
-class Cable(Tie):
+class Cable(GivenOverTime, Tie):
     """A cable (tendon) that slides without friction through points, with one tension T along all of it.
 
     tension [N]: given, T = tension, whatever its length; or length [m]: that without force, of an elastic cable with
@@ -218,7 +218,6 @@ class Cable(Tie):
     """
 
     one_sided = True
-    shape = ()
     ndim = 1
 
     def __init__(
@@ -234,21 +233,17 @@ class Cable(Tie):
         if len(points) < 2:
             raise ValueError(f"Cable: runs through two points at least, got {len(points)}")
         self.by_tension = by_tension = length is None
-        argument, self.given = ("tension", tension) if by_tension else ("length", length)
-        self.plain = f"cable_{argument}"
-        inputs = [amount(argument, self.given, (), "N" if by_tension else "m", self.plain)]
+        argument, given, unit = ("tension", tension, "N") if by_tension else ("length", length, "m")
+        inputs = [amount(argument, given, (), unit, f"cable_{argument}")]
         if not by_tension:
             words = dict(plain="cable_stiffness", label="stiffness")
             inputs.append(Input("stiffness", stiffness, ((),), "N/m", AT_LEAST_0, **words))
         super().__init__(*inputs, *_anchors(points, "cable_anchors"), name=name)
-        self.points, self.keyed = list(points), is_keyed(self.given)
+        self.points = list(points)
+        self._give(given)
         least = self.rows([0.0]) if self.keyed else inputs[0].value
         if np.any(least < 0):
             raise ValueError(f"Cable: {argument} must be >= 0, for it pulls only, got {float(np.min(least)):g}")
-
-    def rows(self, times: ArrayLike) -> np.ndarray:
-        """Its tension or length at each time [s], where it is keyed."""
-        return rows_at(f"Cable: {self.plain}", self.given, times, ())
 
     def found_paths(self, mesh: TetrahedralMesh) -> Paths:
         points, places = [], []
