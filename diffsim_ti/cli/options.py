@@ -5,7 +5,7 @@ import runpy
 from collections.abc import Sequence
 from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
 import typer
@@ -20,10 +20,7 @@ from diffsim_ti.solvers import BDF2Solver, ImplicitEulerSolver, SemiImplicitSolv
 from diffsim_ti.terms import Drag, Gravity, Ground, Term
 from diffsim_ti.terms.obstacles.stiffness import stiffness_of_impact
 from diffsim_ti.writers import WRITERS
-
-if TYPE_CHECKING:
-    from diffsim_ti.writers.adaptive_run import ForwardRun
-
+from diffsim_ti.writers.adaptive_run import ForwardRun
 
 Up = Enum("Up", {name: name for name in ("x", "y", "z", "-x", "-y", "-z")}, type=str)
 SIDES = {f"{axis}{end}": (d, end) for d, axis in enumerate("xyz") for end in ("min", "max")}
@@ -77,7 +74,7 @@ def check_length(duration: float, fps: float, dt: float | None) -> None:
         )
 
 
-def check_time_it_takes(run: "ForwardRun", duration: float) -> None:
+def check_time_it_takes(run: ForwardRun, duration: float) -> None:
     """Raise ValueError for a run whose explicit steps would take more than a month."""
     steps = duration / run.first_substep
     seconds = steps * (2e-6 + 2e-8 * run.scene.mesh.num_tetrahedra)  # of quick steps
@@ -247,7 +244,7 @@ def works_on(scene: Scene, explicit: bool) -> list[str]:
 # ---- what is said at the end ------------------------------------------------------------------------------------------
 
 
-def print_summary(run: "ForwardRun", setup: float, writing: float, files: list[str]) -> None:
+def print_summary(run: ForwardRun, setup: float, writing: float, files: list[str]) -> None:
     """A table of what was simulated, how fast, how well, and where it was written."""
     from rich.console import Console
     from rich.table import Table

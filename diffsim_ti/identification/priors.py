@@ -1,14 +1,11 @@
 """What is known beside the data, in units of the free variables: a number about right, neighbours alike."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from diffsim_ti.identification.unknowns import Free
 from diffsim_ti.mesh.geometry import inner_faces, triangle_normals
-
-if TYPE_CHECKING:
-    from diffsim_ti.identification.unknowns import Free
 
 
 @dataclass(frozen=True)
@@ -21,7 +18,7 @@ class Normal:
     mean: float
     deviation: float
 
-    def rows(self, free: "Free", mesh) -> tuple[np.ndarray, np.ndarray]:
+    def rows(self, free: Free, mesh) -> tuple[np.ndarray, np.ndarray]:
         """(R, r): R t - r has unit deviation."""
         return np.eye(free.size) / self.deviation, free.free(self.mean) / self.deviation
 
@@ -37,7 +34,7 @@ class Smooth:
     deviation: float
     edges: bool = False
 
-    def rows(self, free: "Free", mesh) -> tuple[np.ndarray, np.ndarray]:
+    def rows(self, free: Free, mesh) -> tuple[np.ndarray, np.ndarray]:
         """(R, r), a row for each inner face whose two sides lie in different groups."""
         groups = next(iter(free.rows.values()))
         if groups.shape != (mesh.num_tetrahedra,):
@@ -57,7 +54,7 @@ class Smooth:
 class Priors:
     """All priors on the free variables as rows R t - r, and the weight of each row at the present t."""
 
-    def __init__(self, priors: dict | None, unknowns: list["Free"], mesh):
+    def __init__(self, priors: dict | None, unknowns: list[Free], mesh):
         size, parts, right, edges = sum(free.size for free in unknowns), [], [], []
         labels = [free.label for free in unknowns]
         for label, given in (priors or {}).items():

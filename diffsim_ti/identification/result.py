@@ -1,12 +1,10 @@
 """What an identification found and how well: estimates, intervals, what the data do not see, a test of the residuals."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from diffsim_ti.identification.problem import Problem
+from diffsim_ti.identification.problem import Problem
 
 
 @dataclass
@@ -238,7 +236,7 @@ def ends(intervals: dict) -> tuple[np.ndarray, np.ndarray]:
     return tuple(np.concatenate([np.atleast_1d(pair[k]) for pair in intervals.values()]) for k in (0, 1))
 
 
-def described(problem: "Problem", t: np.ndarray, found: Information, shifts: np.ndarray | float = 0.0) -> dict:
+def described(problem: Problem, t: np.ndarray, found: Information, shifts: np.ndarray | float = 0.0) -> dict:
     """Covariance, standard errors and intervals of the numbers, from the information on the free variables and what these
     change by on a finer mesh, from which as much as a third of that may be left."""
     slopes = np.concatenate([free.slopes(t[part]) for free, part in zip(problem.unknowns, problem.parts)])

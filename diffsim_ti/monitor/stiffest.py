@@ -1,22 +1,17 @@
 """What of gases and cables over time a stable step has to follow."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-from diffsim_ti.terms import Cable, GasChamber
-
-if TYPE_CHECKING:
-    from diffsim_ti.scene import Scene
-    from diffsim_ti.terms import Term
+from diffsim_ti.scene import Scene
+from diffsim_ti.terms import Cable, GasChamber, Term
 
 
-def over_time(scene: "Scene") -> "list[Term]":
+def over_time(scene: Scene) -> list[Term]:
     """Terms whose stiffness may change over time."""
     return [term for term in (*scene.chambers, *scene.cables) if isinstance(term, GasChamber | Cable)]
 
 
-def stiffest(scene: "Scene", values: dict) -> dict[str, np.ndarray]:
+def stiffest(scene: Scene, values: dict) -> dict[str, np.ndarray]:
     """Values in which gases have their largest pressure, cables their largest tension and least length, of all steps that
     are given, of all keyframes, or of the times at which `values` sample a function; of one that they do not, at time 0."""
     out = dict(values)
@@ -31,6 +26,6 @@ def stiffest(scene: "Scene", values: dict) -> dict[str, np.ndarray]:
     return out
 
 
-def sampled_by_runs(scene: "Scene") -> bool:
+def sampled_by_runs(scene: Scene) -> bool:
     """Whether some of them is a function of time, which a run alone samples."""
     return any(term.keyed and callable(term.given) for term in over_time(scene))

@@ -7,12 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diffsim_ti.study.charts import save, write_results
-from diffsim_ti.study.stability_map import OUTCOMES
+from diffsim_ti.study.stability_map import OUTCOMES, StabilityMap
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-    from diffsim_ti.study.stability_map import StabilityMap
 
 
 OUTCOME_COLORS = ("#009E73", "#8FD0EC", "#F0E442", "#BBBBBB", "#D55E00")  # in the order of OUTCOMES
@@ -44,7 +42,7 @@ def draw_maps(results: list, path: str | Path) -> None:
     save(figure, path)
 
 
-def draw_panel(result: "StabilityMap", axes: "Axes") -> None:
+def draw_panel(result: StabilityMap, axes: "Axes") -> None:
     """One solver's map. Rows are as high as each other, whatever lies between their steps."""
     from matplotlib.colors import ListedColormap
 
@@ -63,7 +61,7 @@ def draw_panel(result: "StabilityMap", axes: "Axes") -> None:
     axes.set_title(result.solver.removesuffix("Solver"), loc="left", fontsize=10)
 
 
-def draw_legend(results: "Sequence[StabilityMap]", axes: "Axes") -> None:
+def draw_legend(results: Sequence[StabilityMap], axes: "Axes") -> None:
     """What colours, letters, line and crosses mean."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch

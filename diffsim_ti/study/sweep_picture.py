@@ -6,11 +6,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diffsim_ti.study.charts import save, without_nan, write_results
+from diffsim_ti.study.sweep import Sweep
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-    from diffsim_ti.study.sweep import Sweep
 
 
 def is_log(values) -> bool:
@@ -19,7 +18,7 @@ def is_log(values) -> bool:
     return len(x) > 2 and bool((x > 0).all()) and x.max() > 20 * x.min()
 
 
-def draw_sweep(sweep: "Sweep", path: str | Path) -> None:
+def draw_sweep(sweep: Sweep, path: str | Path) -> None:
     """A panel for each result: over one number a line, over two a map, over more lines over the last one; refused points are
     crosses at the foot of the panel, or white."""
     from matplotlib.figure import Figure
@@ -37,7 +36,7 @@ def draw_sweep(sweep: "Sweep", path: str | Path) -> None:
     save(figure, path)
 
 
-def _lines(axes: "Axes", sweep: "Sweep", name: str) -> None:
+def _lines(axes: "Axes", sweep: Sweep, name: str) -> None:
     along = list(sweep.over)[-1]
     x, values = np.array(sweep.over[along]), sweep.column(name)
     values = values.reshape(-1, len(x))
@@ -54,7 +53,7 @@ def _lines(axes: "Axes", sweep: "Sweep", name: str) -> None:
         axes.spines[side].set_visible(False)
 
 
-def _map(axes: "Axes", sweep: "Sweep", name: str) -> None:
+def _map(axes: "Axes", sweep: Sweep, name: str) -> None:
     (first, y), (second, x) = sweep.over.items()
     drawn = axes.pcolormesh(x, y, sweep.column(name), shading="nearest", cmap="viridis")
     axes.figure.colorbar(drawn, ax=axes)
@@ -63,7 +62,7 @@ def _map(axes: "Axes", sweep: "Sweep", name: str) -> None:
     axes.set_yscale("log" if is_log(y) else "linear")
 
 
-def write_sweep(sweep: "Sweep", folder: str | Path) -> list[str]:
+def write_sweep(sweep: Sweep, folder: str | Path) -> list[str]:
     """sweep.csv, .json, and .png where a run gave a number, in a folder; returns their names."""
     stem = Path(folder) / "sweep"
     rows = [without_nan(row) for row in sweep.rows]
