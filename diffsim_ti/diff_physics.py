@@ -118,7 +118,9 @@ class TorchMaterial(torch.nn.Module):
 
 def _one_of(name: str, *given, default=None):
     """The single value that is not None among spellings of a name, or the default."""
-    values = [value for value in given if value is not None] or [value for value in [default] if value is not None]
+    values = [value for value in given if value is not None]
+    if not values and default is not None:
+        return default
     if len(values) != 1:
         raise ValueError(f"{name}: give exactly one of its spellings, got {len(values)}")
     return values[0]

@@ -3,7 +3,6 @@
 import csv
 import json
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -121,10 +120,10 @@ def without_nan(row: dict) -> dict:
 
 def write_results(stem: Path, draw: Callable[[Path], object], rows: list[dict], record: dict) -> list[str]:
     """A picture, rows and a record as `stem`.png, .csv, .json; returns their names."""
-    files = [stem.with_suffix(suffix) for suffix in (".png", ".csv", ".json")]
-    for write, file in zip((draw, partial(write_csv, rows), partial(write_json, record)), files):
-        write(file)
-    return [str(file) for file in files]
+    draw(stem.with_suffix(".png"))
+    write_csv(rows, stem.with_suffix(".csv"))
+    write_json(record, stem.with_suffix(".json"))
+    return [str(stem.with_suffix(suffix)) for suffix in (".png", ".csv", ".json")]
 
 
 def write_chart(chart: "Chart", folder: str | Path, peers: dict | None = None) -> list[str]:
