@@ -3,7 +3,6 @@
 from copy import copy
 from dataclasses import replace
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.inputs import POSITIVE, Input, Link
@@ -14,12 +13,12 @@ from diffsim_ti.mesh.enclosure import Enclosure
 from diffsim_ti.mesh.ten_nodes import triangles_of
 from diffsim_ti.terms.marks import pressing
 from diffsim_ti.terms.over_time import GivenOverTime, OverTime, amount
-from diffsim_ti.terms.term import Term
+from diffsim_ti.terms.term import OnSurface, Term
 
 ATMOSPHERE = 101325.0  # [Pa]
 
 
-class Chamber(GivenOverTime, Term):
+class Chamber(GivenOverTime, OnSurface, Term):
     """A cavity, by a surface of the body around it, whose filling pushes on it with one pressure.
 
     The surface is closed, or has rims that are held wholly or move in planes (supports by component), which close it there.
@@ -42,10 +41,6 @@ class Chamber(GivenOverTime, Term):
     def check(self, mesh: TetrahedralMesh) -> None:
         if len(self.faces(mesh)) == 0:
             raise ValueError(f"{type(self).__name__}: its surface is empty; name a set that has members")
-
-    def faces(self, mesh: TetrahedralMesh) -> np.ndarray:
-        """Its surface, as vertex indices, normals into it, shape (k, 3) or (k, 6)."""
-        return mesh.faces_of(self.surface)
 
     def settled(self, scene, density, initial_positions, initial_velocities) -> "Chamber":
         out, mesh, called = copy(self), scene.mesh, type(self).__name__ + (f" {self.name!r}" if self.name else "")

@@ -1,6 +1,5 @@
 """An elastic foundation on a surface."""
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from diffsim_ti.common.checked import present
@@ -8,11 +7,11 @@ from diffsim_ti.inputs import Input, Link
 from diffsim_ti.inputs.foundation import FoundationStiffness
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.terms.marks import MOST, Points, spread
-from diffsim_ti.terms.term import OnMesh, Term
+from diffsim_ti.terms.term import OnMesh, OnSurface, Term
 from diffsim_ti.terms.ties import AT_LEAST_0
 
 
-class ElasticFoundation(OnMesh, Term):
+class ElasticFoundation(OnSurface, OnMesh, Term):
     """Springs under a surface that pull it back to where it is at rest (Winkler): on each vertex f = -K u, u its
     displacement from the rest shape,
 
@@ -45,14 +44,6 @@ class ElasticFoundation(OnMesh, Term):
         ]
         super().__init__(*both, name=name)
         self.surface = surface
-
-    def faces(self, mesh: TetrahedralMesh) -> np.ndarray:
-        """Where it acts, as vertex indices, shape (k, 3) or (k, 6)."""
-        return mesh.faces_of(self.surface)
-
-    def indices(self, mesh: TetrahedralMesh) -> np.ndarray:
-        """Vertices that it holds."""
-        return np.unique(self.faces(mesh))
 
     def sizes(self, mesh):
         return {"k": len(self.faces(mesh))}

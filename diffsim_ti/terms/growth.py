@@ -11,7 +11,7 @@ from diffsim_ti.inputs.loads import InTime
 from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.terms.of_tetrahedra import OfTetrahedra
 from diffsim_ti.terms.over_time import OverTime
-from diffsim_ti.terms.term import Term
+from diffsim_ti.terms.term import Term, nonempty
 
 
 def _beyond(x: np.ndarray) -> np.ndarray:
@@ -63,9 +63,7 @@ class Growth(OfTetrahedra, Term):
         return self.per == "all" and self.tetrahedra is None
 
     def check(self, mesh: TetrahedralMesh) -> None:
-        chosen, _ = self.groups(mesh)
-        if len(chosen) == 0:
-            raise ValueError("Growth acts on nothing: the set is empty; name a set that has members")
+        chosen = nonempty(self, self.groups(mesh)[0])
         if len(np.unique(chosen)) < len(chosen):
             raise ValueError("Growth: a tetrahedron is in two of its sets; list two Growth terms, which add up")
         count, last = self._shapes(chosen)

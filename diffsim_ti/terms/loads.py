@@ -9,7 +9,7 @@ from diffsim_ti.mesh import TetrahedralMesh
 from diffsim_ti.mesh.ten_nodes import triangles_of
 from diffsim_ti.terms.marks import arrows, pressing
 from diffsim_ti.terms.over_time import GivenOverTime, OverTime, amount
-from diffsim_ti.terms.term import OnMesh, Term
+from diffsim_ti.terms.term import OnMesh, OnSurface, Term, nonempty
 
 
 class Load(GivenOverTime, OnMesh, Term):
@@ -31,7 +31,7 @@ class Load(GivenOverTime, OnMesh, Term):
         return InTime(names[self.plain], f"{own} in time", len(self.shape) + 1, self.keyed)
 
 
-class Traction(Load):
+class Traction(OnSurface, Load):
     """Force per area of the surface at rest, t [N/m^2], whatever becomes of the surface: a dead load, f_i = t A_i.
 
     A_i is the integral of the shape function of vertex i over the surface: a third of the area of each triangle around it;
@@ -63,15 +63,7 @@ class Traction(Load):
         self.surface = surface
 
     def check(self, mesh: TetrahedralMesh) -> None:
-        self.faces(mesh)
-
-    def faces(self, mesh: TetrahedralMesh) -> np.ndarray:
-        """Where it acts, as vertex indices, shape (k, 3) or (k, 6)."""
-        return _some(self, mesh.faces_of(self.surface))
-
-    def indices(self, mesh: TetrahedralMesh) -> np.ndarray:
-        """Vertices that are acted upon."""
-        return np.unique(self.faces(mesh))
+        nonempty(self, self.faces(mesh))
 
     def drawn(self, moment):
         vertices = self.indices(moment.mesh)
@@ -116,7 +108,7 @@ class BodyForce(Load):
     def chosen(self, mesh: TetrahedralMesh) -> np.ndarray:
         """Tetrahedra that are acted upon."""
         every = np.arange(mesh.num_tetrahedra)
-        return _some(self, every if self.tetrahedra is None else mesh.tetrahedron_indices(self.tetrahedra))
+        return nonempty(self, every if self.tetrahedra is None else mesh.tetrahedron_indices(self.tetrahedra))
 
     def indices(self, mesh: TetrahedralMesh) -> np.ndarray:
         """Vertices that are acted upon."""
@@ -135,7 +127,7 @@ class BodyForce(Load):
         return [self.in_time(names, own), shares, Spread((f"{own} in time", weights), f"{own} forces")]
 
 
-class Pressure(Load):
+class Pressure(OnSurface, Load):
     """Pressure p [Pa] on the surface as it is now: it follows area and normal, f_a = -p n / 3 at each corner of a triangle.
 
     n = (x_1 - x_0) x (x_2 - x_0) / 2 points outwards, so that positive pressures push inwards; on faces of six nodes f_a is
@@ -157,11 +149,7 @@ class Pressure(Load):
         self.surface = surface
 
     def check(self, mesh: TetrahedralMesh) -> None:
-        self.faces(mesh)
-
-    def faces(self, mesh: TetrahedralMesh) -> np.ndarray:
-        """Where it acts, as vertex indices, normals outwards, shape (k, 3) or (k, 6)."""
-        return _some(self, mesh.faces_of(self.surface))
+        nonempty(self, self.faces(mesh))
 
     def links(self, names: dict[str, str], own: str) -> list[Link]:
         return [self.in_time(names, own)]
@@ -169,9 +157,3 @@ class Pressure(Load):
     def drawn(self, moment):
         label, pressure = f"{self.name or 'pressure'} [Pa]", float(moment.values[self.plain])
         return pressing(label, moment, triangles_of(self.faces(moment.mesh)), pressure)
-
-
-def _some(load: Load, rows: np.ndarray) -> np.ndarray:
-    if len(rows) == 0:
-        raise ValueError(f"{type(load).__name__} acts on nothing: the set is empty; name a set that has members")
-    return rows

@@ -15,7 +15,7 @@ from diffsim_ti.mesh.paths import Paths
 from diffsim_ti.terms.marks import MOST, Lines, spread
 from diffsim_ti.terms.of_tetrahedra import OfTetrahedra
 from diffsim_ti.terms.over_time import OverTime
-from diffsim_ti.terms.term import Term
+from diffsim_ti.terms.term import Term, nonempty
 from diffsim_ti.terms.ties import AT_LEAST_0, Cable
 
 
@@ -60,9 +60,7 @@ class Muscle(OfTetrahedra, Cable):
             raise ValueError("Muscle: activation must be >= 0, for it pulls only")
 
     def check(self, mesh: TetrahedralMesh) -> None:
-        chosen, _ = self.groups(mesh)
-        if len(chosen) == 0:
-            raise ValueError("Muscle acts on nothing: the set is empty; name a set that has members")
+        chosen = nonempty(self, self.groups(mesh)[0])
         if self.fibre.ndim == 2 and len(self.fibre) != len(chosen):
             count = len(self.fibre)
             raise ValueError(f"Muscle: fibre has {count} directions for {len(chosen)} tetrahedra; give one or all")

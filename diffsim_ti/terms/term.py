@@ -130,6 +130,13 @@ class Term(ABC):
         return f"{type(self).__name__}({', '.join(named + numbers)})"
 
 
+def nonempty(term: Term, rows: np.ndarray) -> np.ndarray:
+    """What a term acts on. Raises ValueError if that is nothing."""
+    if len(rows) == 0:
+        raise ValueError(f"{type(term).__name__} acts on nothing: the set is empty; name a set that has members")
+    return rows
+
+
 class OnMesh:
     """The part of a term whose links need the `mesh` of its scene."""
 
@@ -138,6 +145,18 @@ class OnMesh:
         out = copy(self)
         out.mesh = scene.mesh
         return out
+
+
+class OnSurface:
+    """The part of a term that acts on a `surface` of the body; None: all of it."""
+
+    def faces(self, mesh: TetrahedralMesh) -> np.ndarray:
+        """Where it acts, as vertex indices, normals out of the body, shape (k, 3) or (k, 6)."""
+        return mesh.faces_of(self.surface)
+
+    def indices(self, mesh: TetrahedralMesh) -> np.ndarray:
+        """Vertices of these faces, sorted."""
+        return np.unique(self.faces(mesh))
 
 
 @dataclass(frozen=True)
