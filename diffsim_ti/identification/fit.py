@@ -136,16 +136,10 @@ def _is_far(search: Search, times: float) -> bool:
 def _result(searches: list[tuple[Search, str, bool]], best: int, with_covariance: bool, check_mesh) -> Identification:
     search, stopped, converged = searches[best]
     problem, t, residual = search.problem, search.point.t, search.point.residual
-    starts = [
-        dict(
-            start=problem.all_numbers(one.start),
-            numbers=problem.all_numbers(one.point.t),
-            cost=one.cost,
-            chi_square=one.chi_square,
-            stopped=why,
-        )
-        for one, why, _ in searches
-    ]
+    starts = []
+    for one, why, _ in searches:
+        ends = dict(start=problem.all_numbers(one.start), numbers=problem.all_numbers(one.point.t))
+        starts.append(ends | dict(cost=one.cost, chi_square=one.chi_square, stopped=why))
     settled, more, simulations = float(problem.size), {}, problem.simulations
     mesh = MeshCheck(reason="more unknowns than a covariance is made for")
     if with_covariance:

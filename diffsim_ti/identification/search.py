@@ -61,13 +61,8 @@ class Search:
 
     @property
     def state(self) -> dict:
-        return dict(
-            labels=self.problem.labels,
-            t=self.point.t.tolist(),
-            damping=self.damping,
-            report=self.report,
-            simulations=self.problem.simulations,
-        )
+        where = dict(labels=self.problem.labels, t=self.point.t.tolist(), damping=self.damping)
+        return where | dict(report=self.report, simulations=self.problem.simulations)
 
     def write(self) -> None:
         """Write the state, if there is a path for it."""
@@ -78,18 +73,10 @@ class Search:
 
     def row(self, iteration: int, promised: float | None = None, why: str | None = None) -> dict:
         """The report of an iteration: what its step promised, why it was not taken."""
-        return dict(
-            start=self.number,
-            iteration=iteration,
-            cost=self.cost,
-            chi_square=self.chi_square,
-            promised=promised,
-            damping=self.damping,
-            rejected=why,
-            simulations=self.problem.simulations,
-            seconds=time.perf_counter() - self.began,
-            numbers=self.problem.all_numbers(self.point.t).tolist(),
-        )
+        spent = dict(simulations=self.problem.simulations, seconds=time.perf_counter() - self.began)
+        where = dict(start=self.number, iteration=iteration, cost=self.cost, chi_square=self.chi_square)
+        step = dict(promised=promised, damping=self.damping, rejected=why)
+        return where | step | spent | dict(numbers=self.problem.all_numbers(self.point.t).tolist())
 
     def record(
         self, most: int, show: Callable, callback: Callable | None, promised=None, why: str | None = None

@@ -103,12 +103,8 @@ class TapeFace:
 
     def by_sets(self, gradients: dict) -> dict:
         """Gradients by the numbers of named sets that have fields."""
-        return {
-            f"{name}[{key}]": gradient
-            for name, rows in self._sets().items()
-            if name in gradients
-            for key, gradient in gathered(gradients[name], rows).items()
-        }
+        known = {name: gathered(gradients[name], rows) for name, rows in self._sets().items() if name in gradients}
+        return {f"{name}[{key}]": gradient for name, of in known.items() for key, gradient in of.items()}
 
     def _loaded(self, name: str) -> np.ndarray:
         """The scene's value of an input."""

@@ -1,5 +1,6 @@
 """Contact of the surface with itself, and of several bodies with each other."""
 
+import warnings
 from collections.abc import Mapping
 
 import numpy as np
@@ -7,7 +8,8 @@ import numpy as np
 from diffsim_ti.common.checked import numbers
 from diffsim_ti.inputs import NOT_NEGATIVE, Input
 from diffsim_ti.mesh import TetrahedralMesh
-from diffsim_ti.terms.bow import warn_of_bow
+from diffsim_ti.mesh.collision_surface import cuts_of
+from diffsim_ti.mesh.face_points import bow
 from diffsim_ti.terms.described import positive
 from diffsim_ti.terms.term import Term
 
@@ -91,7 +93,15 @@ class SelfContact(Term):
                 raise ValueError(f"SelfContact: friction has {both}, which are one pair: name it once")
 
     def check(self, mesh: TetrahedralMesh) -> None:
-        warn_of_bow(mesh, self)
+        width = float(self.values["self_contact_width"])
+        off = bow(mesh) / 4 ** cuts_of(mesh, self)  # so far faces may reach through
+        if off > width:
+            warnings.warn(
+                f"{type(self).__name__}: faces of this mesh are curved, and lie up to {off:.3g} m from the triangles that "
+                f"stand for each, more than the width {width:.3g} m: refine the mesh where it is curved, or take a wider "
+                "one",
+                stacklevel=3,
+            )
         if self.has_friction:
             self.labels(mesh)
 

@@ -80,11 +80,9 @@ class Content:
     def add_surface(self, name: str, triangles: np.ndarray, places: list, times: int | None, colour: tuple) -> None:
         """Triangles that go through `places`, at the times of an accessor."""
         changes, away = [x - places[0] for x in places[1:]], middle_far_part(places[0])
-        shape = dict(
-            attributes=dict(POSITION=self.add(places[0] - away, ARRAY, limits=True)),
-            indices=self.add(triangles.ravel().astype(np.uint32), ELEMENTS),
-            material=len(self.parts["materials"]),
-        )
+        shape = dict(attributes=dict(POSITION=self.add(places[0] - away, ARRAY, limits=True)))
+        shape["indices"] = self.add(triangles.ravel().astype(np.uint32), ELEMENTS)
+        shape["material"] = len(self.parts["materials"])
         if changes:
             shape["targets"] = [dict(POSITION=self.add(x, ARRAY, limits=True)) for x in changes]
         node = len(self.parts["nodes"])
