@@ -180,11 +180,7 @@ FOLLOWED = {
         stiff,
         lambda: (stiff(allow_unstable=True), stiff(substeps=int(advised(stiff)))),
     ),
-    ("terms/growth.py", "names of sets"): (
-        lambda: ds.Growth([0.1], "soft", per="set"),
-        lambda: ds.Growth([0.1, 0.2], tetrahedra=["left", "right"], per="set"),
-    ),
-    ("terms/muscle.py", "names of sets"): (
+    ("terms/of_tetrahedra.py", "names of sets"): (
         lambda: ds.Muscle((1, 0, 0), 1.0, [1.0], tetrahedra="left", per="set"),
         lambda: ds.Muscle((1, 0, 0), 1.0, [1.0, 1.0], tetrahedra=["left", "right"], per="set"),
     ),

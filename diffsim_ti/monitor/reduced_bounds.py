@@ -1,14 +1,11 @@
 """A bound of the frequencies of sets that move by few numbers."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-if TYPE_CHECKING:
-    from diffsim_ti.mesh import TetrahedralMesh
+from diffsim_ti.mesh import TetrahedralMesh
 
 
-def affine_bound(mesh: "TetrahedralMesh", volumes: np.ndarray, own: np.ndarray, mu, lam, density) -> float:
+def affine_bound(mesh: TetrahedralMesh, volumes: np.ndarray, own: np.ndarray, mu, lam, density) -> float:
     """The largest omega^2 [1/s^2] of elements `own` that move by nine strains together, free of all else: that of
 
         sum V (lam (tr G)^2 + 2 mu |sym G|^2)    by    sum m |G y|^2

@@ -1,7 +1,6 @@
 """How large a step may be: a bound by elements, the tight limit by Lanczos, and a bound during the run."""
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,12 +12,10 @@ from diffsim_ti.mechanics.workspace import Workspace
 from diffsim_ti.mesh.patches import volume_patches
 from diffsim_ti.monitor.reduced_bounds import affine_bound
 from diffsim_ti.monitor.stiffest import stiffest
+from diffsim_ti.scene import Scene
 from diffsim_ti.state.schedule import EqualSteps
 from diffsim_ti.state.viscous_stages import ViscousStages
 from diffsim_ti.terms.mass_scaling import row_sums
-
-if TYPE_CHECKING:
-    from diffsim_ti.scene import Scene
 
 ONE = ViscousStages()
 
@@ -46,7 +43,7 @@ class StepLimit(float):
         return f"{self.dt:.4g} s ({self.method}, set by tetrahedron {self.tetrahedron})"
 
 
-def element_limit(scene: "Scene", values: dict | None = None, kicks: ViscousStages = ONE) -> StepLimit:
+def element_limit(scene: Scene, values: dict | None = None, kicks: ViscousStages = ONE) -> StepLimit:
     """A step that is safe at rest, from each tetrahedron by itself, without contact.
 
         omega^2 <= (4 / rho) [max(lam, 0) sum_a |grad N_a|^2 + 2 mu lambda_max(sum_a grad N_a (x) grad N_a)]
