@@ -36,9 +36,7 @@ class Term(ABC):
     table = np.zeros(0)  # numbers without gradient, laid behind the parameters on the device
     variant: tuple = ()  # what else than its class decides about the kernels of a term
     keyed = False  # whether its input is sampled at the ends of each run's steps (`rows`)
-    stiffest = (
-        None  # which of what it is given over time asks for the shortest steps: np.max or np.min; None: no matter
-    )
+    stiffest = None  # np.max or np.min: which of what it is given over time asks for the shortest steps
 
     def __init__(self, *inputs: Input, name: str | None = None):
         kind = type(self).__name__
