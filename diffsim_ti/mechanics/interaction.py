@@ -13,7 +13,7 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti.inputs import Derived
-from diffsim_ti.runtime import PRECISIONS, traced
+from diffsim_ti.runtime import cross, number_type, traced, vector_type
 
 if TYPE_CHECKING:
     from diffsim_ti.scene import Scene
@@ -42,18 +42,7 @@ class ForceKernel:
     asks_for_steps: ClassVar[bool] = False  # whether it reads numbers over time
     apart: ClassVar[bool] = False  # whether launches of their own compute them before each pass
 
-    @property
-    def fp(self):
-        return PRECISIONS[self.precision]
-
-    @property
-    def vector(self):
-        return ti.types.vector(4, self.fp)
-
-    @ti.func
-    def cross(self, a, b):
-        zero = ti.cast(0, self.fp)
-        return self.vector(a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0], zero)
+    fp, vector, cross = number_type, vector_type, staticmethod(cross)
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from diffsim_ti.monitor.reduced_bounds import affine_bound
 from diffsim_ti.monitor.stiffest import stiffest
 from diffsim_ti.state.schedule import EqualSteps
 from diffsim_ti.state.viscous_stages import ViscousStages
+from diffsim_ti.terms.chambers import gas_law
 from diffsim_ti.terms.mass_scaling import row_sums
 
 if TYPE_CHECKING:
@@ -118,13 +119,14 @@ def _squares_of_strains(mesh, derived) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _gas_bound(scene: "Scene", values: dict, derived) -> float:
-    """What gases in chambers add to omega^2 at most, at rest: n p_0 / V_0 sum |dV/dx|^2 / m of the free vertices each."""
+    """What gases in chambers add to omega^2 at most, at rest: -dp/dV sum |dV/dx|^2 / m of the free vertices each."""
     free, out = np.delete(np.arange(scene.mesh.num_vertices), scene.fixed), 0.0
     for chamber in scene.gases:
         names = scene.input_names(chamber)
         p = np.max(values[names[chamber.plain]])
         V, g = chamber.enclosure.volume(derived.rest), chamber.enclosure.gradient(derived.rest)
-        out += float(values[names["gas_exponent"]] * p / V * ((g[free] ** 2).sum(1) / derived.mass[free]).sum())
+        slope = gas_law(p, 0.0, V, values[names["gas_exponent"]], V)[-1]
+        out -= float(slope * ((g[free] ** 2).sum(1) / derived.mass[free]).sum())
     return out
 
 
