@@ -10,7 +10,7 @@ from functools import cached_property
 import taichi as ti
 
 from diffsim_ti.mechanics.loads.explicit import GivenForces
-from diffsim_ti.runtime import LANES, PRECISIONS, Bundle, assign, at, let, traced, variable
+from diffsim_ti.runtime import LANES, Bundle, assign, at, let, traced, variable
 from diffsim_ti.state.features import Features
 
 A = ti.template()
@@ -41,7 +41,7 @@ class FreeVertices:
 
     @property
     def fp(self):
-        return PRECISIONS[self.law.precision]
+        return self.law.fp
 
     @cached_property
     def lanes(self):

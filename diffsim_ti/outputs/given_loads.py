@@ -30,14 +30,17 @@ class GivenLoads:
         self.loaded, self.keyed = scene.loaded_vertices if scene.dead_loads else None, scene.inputs.keyed_forces
         self.attached = Attached.of(scene)
 
+    @staticmethod
+    def _row(step: int, rows: np.ndarray) -> np.ndarray:
+        return rows[min(max(step - 1, 0), len(rows) - 1)]
+
     def _dead(self, step: int, rows: np.ndarray, begins: bool) -> np.ndarray:
-        """Of rows of loads those that a frame shows (inputs/loads.py)."""
-        schedule, j, share = at_end(step, begins)
-        return schedule.load(rows, j, share, self.keyed)
+        """Of rows of loads, or of their adjoints, those that a frame shows (inputs/loads.py), as a view."""
+        row = self._row(step, rows)
+        return row[1 if step and not begins else 0 :: 2] if self.keyed else row
 
     def _pressures(self, step: int, rows: np.ndarray, begins: bool) -> np.ndarray:
-        schedule, *at = at_end(step, begins)
-        return schedule.pressure(rows, *at)
+        return self._row(step, rows)[:, 1 if step and not begins else 0]
 
     def _attached(self, derived: Derived, step: int, begins: bool) -> Attached:
         return self.attached.at(derived, derived.ties, *at_end(step, begins))
@@ -108,7 +111,6 @@ class GivenLoads:
         self, derived: Derived, x: np.ndarray, w: np.ndarray, step: int, adj: Derived, begins: bool = False, held=None
     ) -> np.ndarray:
         """Adjoint of x for that of the forces; adds those of all else, but for held pressures, to `adj`."""
-        schedule, j, share = at_end(step, begins)
         if self.gravity is not None:
             by_mass = w @ derived.parameters[self.gravity][:3]
             if derived.element_masses is None:
@@ -117,13 +119,13 @@ class GivenLoads:
                 adj.element_masses += by_mass[self.elements][:, :, None]
             adj.parameters[self.gravity.start : self.gravity.start + 3] += self._masses(derived) @ w
         if self.loaded is not None:
-            schedule.add_load(adj.forces, j, share, self.keyed, w[self.loaded])
+            self._dead(step, adj.forces, begins)[:] += w[self.loaded]
         out = np.zeros(x.shape)
         if self.attached:
-            out += self._attached(derived, step, begins).vjp(x - derived.rest, w, adj, schedule, j, share)
+            out += self._attached(derived, step, begins).vjp(x - derived.rest, w, adj, *at_end(step, begins))
             adj.rest -= out
         if self.follower is None:
             return out
         follower = self._following(derived, step, begins, held)
-        schedule.add_pressure(adj.follower, j, share, follower.pressures_vjp(x, w))
+        self._pressures(step, adj.follower, begins)[:] += follower.pressures_vjp(x, w)
         return out + follower.vjp(x, w)

@@ -111,33 +111,33 @@ class Schedule(ABC):
 
     # ---- loads: rows of steps, with their values at the beginning and at the end -------------------------------------
 
-    def load_row(self, rows: np.ndarray, j: int) -> np.ndarray:
-        """The row of pass j among those of loads, of which one may serve all steps, as a view."""
-        return rows[min(int(self.row(j)), len(rows) - 1) if len(rows) > 1 else 0]
+    def load_row(self, rows: np.ndarray, j: int) -> int:
+        """The row of pass j among those of loads, of which one may serve all steps."""
+        return min(int(self.row(j)), len(rows) - 1) if len(rows) > 1 else 0
 
     def load(self, rows: np.ndarray, j: int, share: float, keyed: bool) -> np.ndarray:
         """Forces at a share of the step of pass j; keyed: rows have those at the beginning and at the end in turn."""
-        row = self.load_row(rows, j)
+        row = rows[self.load_row(rows, j)]
         return between(row[0::2], row[1::2], share) if keyed else row
 
     def pressure(self, rows: np.ndarray, j: int, share: float) -> np.ndarray:
         """Pressures of loads at a share of the step of pass j."""
-        row = self.load_row(rows, j)
+        row = rows[self.load_row(rows, j)]
         return between(row[:, 0], row[:, 1], share)
 
     def growth(self, rows: np.ndarray, j: int, share: float) -> np.ndarray:
         """What tetrahedra have grown by, of rows (steps, 2, m), at a share of the step of pass j."""
-        return between(*self.load_row(rows, j), share)
+        return between(*rows[self.load_row(rows, j)], share)
 
     def ties(self, rows: np.ndarray, j: int, share: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(tension, slack, stiffness) of springs and cables (inputs/ties.py) at a share of the step of pass j."""
-        row = self.load_row(rows, j)
+        row = rows[self.load_row(rows, j)]
         tension, slack = (between(part[:, 0], part[:, 1], share) for part in (row[0::2], row[1::2]))
         return tension, slack, row[0::2, 2]
 
     def add_load(self, rows_adj: np.ndarray, j: int, share: float, keyed: bool, adjoint: np.ndarray) -> None:
         """Adjoint of `load`."""
-        row = self.load_row(rows_adj, j)
+        row = rows_adj[self.load_row(rows_adj, j)]
         if keyed:
             add_between(row[0::2], row[1::2], share, adjoint)
         else:
@@ -145,16 +145,16 @@ class Schedule(ABC):
 
     def add_pressure(self, rows_adj: np.ndarray, j: int, share: float, adjoint: np.ndarray) -> None:
         """Adjoint of `pressure`."""
-        row = self.load_row(rows_adj, j)
+        row = rows_adj[self.load_row(rows_adj, j)]
         add_between(row[:, 0], row[:, 1], share, adjoint)
 
     def add_growth(self, rows_adj: np.ndarray, j: int, share: float, adjoint: np.ndarray) -> None:
         """Adjoint of `growth`."""
-        add_between(*self.load_row(rows_adj, j), share, adjoint)
+        add_between(*rows_adj[self.load_row(rows_adj, j)], share, adjoint)
 
     def add_ties(self, rows_adj: np.ndarray, j: int, share: float, adjoint: tuple) -> None:
         """Adjoint of `ties`."""
-        row, (tension, slack, stiffness) = self.load_row(rows_adj, j), adjoint
+        row, (tension, slack, stiffness) = rows_adj[self.load_row(rows_adj, j)], adjoint
         for part, by in ((row[0::2], tension), (row[1::2], slack)):
             add_between(part[:, 0], part[:, 1], share, by)
         row[0::2, 2] += stiffness

@@ -149,7 +149,7 @@ class HeldAdjoint:
         self._push(walls, one.q, frame_adj + z)
         self.by_x -= sum(m * e.gradient_jvp(walls.x, one.shown) for m, e in zip(mu, walls.enclosures))
         rate = self._of_all(mu) / schedule.step_length(one.j - 1)
-        row = schedule.load_row(rows, one.j - 1)
+        row = rows[schedule.load_row(rows, one.j - 1)]
         row[:, 0] -= rate
         row[:, 1] += rate
         return z

@@ -144,7 +144,7 @@ class HeldVolumes:
     def rates(self, rows: np.ndarray, j: int) -> np.ndarray:
         """Their rate in the step in which pass j begins to show a frame, the step before [m^3/s], or its change."""
         schedule = self.ws.solver.schedule
-        begin, end, _ = schedule.load_row(rows, j - 1).T
+        begin, end, _ = rows[schedule.load_row(rows, j - 1)].T
         return ((end - begin) / schedule.step_length(j - 1))[self.columns]
 
     def frame(self, j: int, save_every: int, now) -> int:
