@@ -106,9 +106,6 @@ class Grown(Around):
     def own_coefficients(self, *numbers):
         return list(numbers)
 
-    def own_jvp(self, numbers, changes):
-        return changes
-
     def own_vjp(self, numbers, by_columns):
         return by_columns
 
