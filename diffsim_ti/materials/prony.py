@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from diffsim_ti.common.checked import shape_of
 from diffsim_ti.differentiation import exp
 from diffsim_ti.materials.around import Around
-from diffsim_ti.materials.calculus.green import PAIRS, SIX
+from diffsim_ti.materials.calculus.green import SIX, green_strain, hooke, six
 from diffsim_ti.materials.energy_law import EnergyLaw
 from diffsim_ti.materials.material import Material, check_range
 from diffsim_ti.materials.sum_law import SumLaw
@@ -29,20 +29,14 @@ class BranchesLaw(EnergyLaw):
     def state_names(self):
         return tuple(f"z_{k}_{pair}" for k in range(1, self.terms + 1) for pair in SIX)
 
-    def _strain(self, H):
-        G = H + H.transpose() + H.transpose() @ H
-        return [G[i, j] * 0.5 for i, j in PAIRS]
-
     def psi(self, H, p, z):
-        mu, lam, E, total = p[-2], p[-1], self._strain(H), 0
+        E, total = six(green_strain(H, 0.5)), 0
         for k in range(self.terms):
-            e = [a - b for a, b in zip(E, z[6 * k : 6 * k + 6])]
-            trace, size = sum(e[:3]), sum(x * x for x in e[:3]) + 2 * sum(x * x for x in e[3:])
-            total = p[k] * (mu * size + lam / 2 * trace * trace) + total
+            total = p[k] * hooke([a - b for a, b in zip(E, z[6 * k : 6 * k + 6])], p[-2], p[-1]) + total
         return total
 
     def next_state(self, H, p, z, h):
-        E, out = self._strain(H), []
+        E, out = six(green_strain(H, 0.5)), []
         for k in range(self.terms):
             share = 1 - exp(-h / p[self.terms + k])
             out += [b + share * (a - b) for a, b in zip(E, z[6 * k : 6 * k + 6])]

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from diffsim_ti.materials.calculus.tensor import sum_of
 from diffsim_ti.materials.law import Law
 from diffsim_ti.runtime import let, traced
 
@@ -36,41 +37,43 @@ class SumLaw(Law):
         return [*q[:first], *q[last:]], q[first:last]
 
     @traced
-    def _joined(self, of_added, of_base):
-        first = len(self.added.coefficient_names)
+    def _terms(self, q) -> list:
+        """(law, what it takes) of all that acts; of one alone the base."""
+        own, p = self._parts(q)
+        return [(self.added, own), (self.base, p)]
+
+    @traced
+    def _joined(self, H, *of_terms):
+        """Derivatives by q, from those of the terms."""
+        first, (*of_added, of_base) = len(self.added.coefficient_names), of_terms
+        (of_added,) = of_added or [[let(H[0, 0] * 0)] * first]
         return [*of_added[:first], *of_base, *of_added[first:]]
 
     @traced
     def energy_density(self, H, q):
-        own, p = self._parts(q)
-        return self.added.energy_density(H, own) + self.base.energy_density(H, p)
+        return sum_of(law.energy_density(H, p) for law, p in self._terms(q))
 
     @traced
     def energy_by_coefficients(self, H, q):
-        own, p = self._parts(q)
-        return self._joined(self.added.energy_by_coefficients(H, own), self.base.energy_by_coefficients(H, p))
+        return self._joined(H, *(law.energy_by_coefficients(H, p) for law, p in self._terms(q)))
 
     @traced
     def stress(self, H, q):
-        own, p = self._parts(q)
-        return self.added.stress(H, own) + self.base.stress(H, p)
+        return sum_of(law.stress(H, p) for law, p in self._terms(q))
 
     @traced
     def stress_differential(self, H, dH, q):
-        own, p = self._parts(q)
-        return self.added.stress_differential(H, dH, own) + self.base.stress_differential(H, dH, p)
+        return sum_of(law.stress_differential(H, dH, p) for law, p in self._terms(q))
 
     @traced
     def stress_change(self, H, q, dq):
-        (own, p), (d_own, dp) = self._parts(q), self._parts(dq)
-        return self.added.stress_change(H, own, d_own) + self.base.stress_change(H, p, dp)
+        both = zip(self._terms(q), self._terms(dq))
+        return sum_of(law.stress_change(H, p, dp) for (law, p), (_, dp) in both)
 
     @traced
     def stress_differential_and_products(self, H, dH, q):
-        own, p = self._parts(q)
-        of_added, by_added = self.added.stress_differential_and_products(H, dH, own)
-        of_base, by_base = self.base.stress_differential_and_products(H, dH, p)
-        return of_added + of_base, self._joined(by_added, by_base)
+        of_terms = [law.stress_differential_and_products(H, dH, p) for law, p in self._terms(q)]
+        return sum_of(dP for dP, _ in of_terms), self._joined(H, *(products for _, products in of_terms))
 
     @traced
     def next_state_at(self, H, q, h):
@@ -84,4 +87,4 @@ class SumLaw(Law):
     def next_state_vjp(self, H, q, h, z_adj):
         by_H, by_added = self.added.next_state_vjp(H, self._parts(q)[0], h, z_adj)
         zero = let(H[0, 0] * 0)
-        return by_H, self._joined(by_added, [zero] * len(self.base.coefficient_names))
+        return by_H, self._joined(H, by_added, [zero] * len(self.base.coefficient_names))
