@@ -97,12 +97,5 @@ class FibreReinforced(Around):
         mu, lam = self.material.lame(self.inner(values))
         return mu + 2 * np.asarray(values[self.own[0]]), lam
 
-    def own_coefficients(self, *numbers):
-        k1, k2, a = numbers
-        return [k1, k2, *(a[..., d] for d in range(3))]
-
-    def own_vjp(self, numbers, by_columns):
-        return [*by_columns[:2], np.stack(by_columns[2:], -1)]
-
     def law(self, precision):
         return FibreReinforcedLaw(precision, self.material.law(precision))

@@ -178,9 +178,9 @@ class KelvinVoigt(Around):
         return self.material.lame(self.inner(values))
 
     def viscosities(self, values):
-        return tuple(self.own_coefficients(*self._numbers_of(values)))
+        return tuple(self.own_coefficients(self._numbers_of(values)))
 
-    def own_coefficients(self, *numbers):
+    def own_coefficients(self, numbers):
         *own, mu, lam = numbers
         if len(own) == 1:
             return [own[0] * mu, own[0] * lam]
@@ -190,7 +190,7 @@ class KelvinVoigt(Around):
         (*own, mu, lam), (*d_own, dmu, dlam) = numbers, changes
         if len(own) == 1:
             return [d_own[0] * mu + own[0] * dmu, d_own[0] * lam + own[0] * dlam]
-        return self.own_coefficients(*changes)
+        return self.own_coefficients(changes)
 
     def own_vjp(self, numbers, by_columns):
         *own, mu, lam = numbers

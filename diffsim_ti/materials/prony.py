@@ -98,13 +98,5 @@ class Prony(Around):
         shares = np.asarray(values["prony_shares"]).sum(-1)
         return mu + shares * own_mu, lam + shares * own_lam
 
-    def own_coefficients(self, *numbers):
-        g, tau, mu, lam = numbers
-        return [*(g[..., k] for k in range(self.terms)), *(tau[..., k] for k in range(self.terms)), mu, lam]
-
-    def own_vjp(self, numbers, by_columns):
-        n = self.terms
-        return [np.stack(by_columns[:n], -1), np.stack(by_columns[n : 2 * n], -1), *by_columns[2 * n :]]
-
     def law(self, precision):
         return PronyLaw(precision, self.material.law(precision), self.terms)
