@@ -4,6 +4,7 @@ from copy import copy
 from dataclasses import replace
 
 import numpy as np
+import taichi as ti
 from numpy.typing import ArrayLike
 
 from diffsim_ti.inputs import POSITIVE, Input, Link
@@ -17,6 +18,14 @@ from diffsim_ti.terms.over_time import GivenOverTime, OverTime, amount
 from diffsim_ti.terms.term import OnSurface, Term
 
 ATMOSPHERE = 101325.0  # [Pa]
+
+
+def gas_law(p0, outside, V0, n, V):
+    """p = p_0 (V_0 / V)^n - p_out and its derivatives by p_0, p_out, V_0, n and V, of plain numbers or in a kernel."""
+    log = ti.log(V0 / V)
+    grown = ti.exp(n * log)
+    absolute = p0 * grown
+    return absolute - outside, grown, -1, n * absolute / V0, absolute * log, -n * absolute / V
 
 
 class Chamber(GivenOverTime, OnSurface, Term):
@@ -96,9 +105,9 @@ class GasChamber(Chamber):
 
     def drawn(self, moment):
         p, outside, exponent = (float(moment.values[i.plain]) for i in self.described)
-        ratio = self.enclosure.volume(moment.mesh.vertices) / self.enclosure.volume(moment.positions)
+        V0, V = (self.enclosure.volume(x) for x in (moment.mesh.vertices, moment.positions))
         label = f"{self.name or 'gas'} [Pa]"
-        return pressing(label, moment, triangles_of(self.faces(moment.mesh)), p * ratio**exponent - outside)
+        return pressing(label, moment, triangles_of(self.faces(moment.mesh)), gas_law(p, outside, V0, exponent, V)[0])
 
 
 class FilledChamber(Chamber):

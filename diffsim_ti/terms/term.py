@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from diffsim_ti.inputs import Input, Link
 from diffsim_ti.mesh import TetrahedralMesh
-from diffsim_ti.runtime import PRECISIONS
+from diffsim_ti.runtime import number_type
 from diffsim_ti.terms.marks import Mark, Moment
 
 if TYPE_CHECKING:
@@ -172,10 +172,7 @@ class VertexForce(ABC):
     # of obstacles only (obstacle.py): is there friction, is stiffness per area, does it turn, is nearness noted?
     friction, per_area, turns, watched = False, False, False, False
 
-    @property
-    def fp(self):
-        """Taichi's type of its numbers."""
-        return PRECISIONS[self.precision]
+    fp = number_type
 
     @ti.func
     def energy(self, parameters: ti.template(), first, X, u):

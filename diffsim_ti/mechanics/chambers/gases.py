@@ -7,7 +7,6 @@ import numpy as np
 import taichi as ti
 
 from diffsim_ti import runtime
-from diffsim_ti.mechanics.chambers.curved_gas_kernels import CurvedChamberKernels
 from diffsim_ti.mechanics.chambers.gas_kernels import ChamberKernels
 from diffsim_ti.mechanics.chambers.interaction import Gases
 from diffsim_ti.mechanics.host_force import Instant
@@ -25,7 +24,8 @@ class Chambers:
         self.host = gases.host()
         closed, self.rows = [chamber.enclosure for chamber in gases.terms], gases.rows
         counts = [len(enclosure.triangles) for enclosure in closed]
-        own = [np.arange(len(e.triangles)) < e.num_own for e in closed]
+        self.curved, weights = scene.mesh.order == 2, [e.weights for e in closed]
+        push = weights if self.curved else [np.arange(len(e.triangles)) < e.num_own for e in closed]
         self.parts = 1 if runtime.runs_on_cpu() else PARTS
         self.count, self.triangles = len(closed), np.concatenate([e.triangles for e in closed])
 
@@ -35,7 +35,6 @@ class Chambers:
         zero = np.zeros(3)
         self.arrays = SimpleNamespace(
             triangles=ints(self.triangles),
-            own=ints(np.concatenate(own)),
             chamber=ints(np.repeat(np.arange(self.count), counts)),
             first_row=ints([rows.start for rows in self.rows]),
             begins=ints(np.cumsum([0, *counts])),
@@ -43,16 +42,15 @@ class Chambers:
             point=runtime.upload(np.array([zero if e.point is None else e.point - a.origin for e in closed]), a.vector),
             volume=runtime.array(a.fp, self.count * self.parts),
             felt=runtime.array(a.fp, self.count * self.parts),
+            weight=runtime.upload(np.concatenate(weights), a.fp),
+            push=runtime.upload(np.concatenate(push).astype(float), a.fp),
         )
-        self.kernels = ChamberKernels if scene.mesh.order == 1 else CurvedChamberKernels
-        if scene.mesh.order == 2:
-            self.arrays.weight = runtime.upload(np.concatenate([e.weights for e in closed]), a.fp)
         self.now = 0  # the pass that forces were last taken in
 
     def _launch(self, name: str, numbers: dict, slot: int, shape: bool = False, **records) -> None:
         ws, a = self.ws, self.ws.arrays
         per_step = len(a.values.follower) > 1
-        kernels = kernels_of(self.kernels, a.precision, per_step, self.parts, ws.parallel, shape)
+        kernels = kernels_of(ChamberKernels, a.precision, per_step, self.parts, ws.parallel, shape, self.curved)
         sizes = dict(num_triangles=len(self.triangles), num_sums=self.count * self.parts, slot=slot)
         sizes |= dict(first=a.counts["first_gases"])
         launch = ws.bound(getattr(kernels, name), chambers=self.arrays, table=ws.table, **records)
