@@ -155,21 +155,6 @@ class InnermostKernels(ExplicitKernels):
         )
         self.vertex.step(i, j, now, own, at_, plan)
 
-    @ti.func
-    def passes(self, scene: A, state: A, table: A, plan: A):
-        num_items, num_rows = self.after(plan), plan.num_rows  # both bounds are read by one task
-        for t in range(num_items):
-            turn = self.turn_of_first(t, table)
-            if turn < plan.count:
-                if t < plan.num_items:
-                    self.tetrahedron(t, plan.first + turn, scene, state, table, plan)
-                elif ti.static(self.items.any):
-                    self.act(t, plan.first + turn, scene, state, table, plan)
-        for t in range(num_rows):
-            turn = self.turn_of_second(t, table, plan)
-            if turn < plan.count:
-                self.vertex_step(t, plan.first + turn, scene, state, table, plan)
-
     @cached_property
     def step(self) -> Kernel:
         """`count` passes from pass `first` on."""
@@ -209,21 +194,6 @@ class InnermostKernels(ExplicitKernels):
         rate = at(tangent.parameters, drag * plan.num_scenes + b) if drag >= 0 else ti.cast(0, self.vertex.fp)
         return Bundle(**{**vars(plan), "rate_dot": let(rate)})
 
-    @ti.func
-    def passes_jvp(self, scene: A, state: A, tangent: A, table: A, plan: A):
-        num_items, num_rows = self.after(plan), plan.num_rows
-        for t in range(num_items):
-            turn = self.turn_of_first(t, table)
-            if turn < plan.count:
-                if t < plan.num_items:
-                    self.tetrahedron_jvp(t, plan.first + turn, scene, state, tangent, table, plan)
-                elif ti.static(self.items.any):
-                    self.act_jvp(t, plan.first + turn, scene, state, tangent, table, plan)
-        for t in range(num_rows):
-            turn = self.turn_of_second(t, table, plan)
-            if turn < plan.count:
-                self.vertex_step_jvp(t, plan.first + turn, scene, state, tangent, table, plan)
-
     @cached_property
     def step_jvp(self) -> Kernel:
         """The tangent of these passes along recorded slots; the change of the state is advanced in place."""
@@ -255,28 +225,6 @@ class InnermostKernels(ExplicitKernels):
         now = self.pass_of_scene_back(b, j, table, plan)
         own, at_ = self.scene_of(b, scene, plan), self.record_of(b, state, plan)
         self.vertex.step_vjp(i, j, now, own, at_, self.record_of(b, adjoint, plan), plan)
-
-    @ti.func
-    def passes_vjp(self, scene: A, state: A, adjoint: A, table: A, plan: A):
-        """The gather of K w is left to the next call (or to `finish_vjp`), as in a single scene."""
-        moving = ti.static(self.vertex.features.moving)
-        num_items, num_rows, paths = self.after(plan), plan.num_rows, moving * plan.num_scenes
-        for t in range(num_rows):
-            turn = self.turn_of_first(t, table)
-            if turn < plan.count:
-                self.vertex_step_vjp(t, plan.first + plan.count - 1 - turn, scene, state, adjoint, table, plan)
-        for t in range(num_items):
-            turn = self.turn_of_second(t, table, plan)
-            if turn < plan.count:
-                if t < plan.num_items:
-                    self.tetrahedron_vjp(t, plan.first + plan.count - 1 - turn, scene, state, adjoint, table, plan)
-                elif ti.static(self.items.any):
-                    self.act_vjp(t, plan.first + plan.count - 1 - turn, scene, state, adjoint, table, plan)
-        if ti.static(moving > 0):
-            for t in range(paths):
-                by = self.record_of(t % plan.num_scenes, adjoint, plan)
-                first, last, c = plan.first, plan.first + plan.count - 1, t // plan.num_scenes
-                self.vertex.obstacles.fold_part(c, plan.num_vertices, first, last, by, table, plan)
 
     @cached_property
     def step_vjp(self) -> Kernel:

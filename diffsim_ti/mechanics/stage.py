@@ -1,10 +1,9 @@
-"""Stages of an explicit step: what it does one after the other, with tangents and adjoints.
+"""Stages of an explicit step: each says what it does, its tangent and its adjoint.
 
-A step is a list of stages, the outermost first. Each acts before the stages within it, after them, or both: forces of
-surfaces on each other are written before the kick and drift, which is the innermost stage; what constrains or corrects
-where a body went comes after it. Forward, tangent and reverse run such lists (`run`), and each stage stands at the same
-place of all three (solvers/explicit/stages.py), so that the order is said once. In the adjoint a stage goes back first
-through what it did last.
+A step is a list of stages, the outermost first (solvers/explicit/stages.py). Each acts before the stages within it, after
+them, or both: forces of surfaces on each other are written before the kick and drift, which is the innermost stage; what
+corrects where a body went acts after it. Forward, tangent and reverse go through the same list (`Passes.go`), so that the
+order is said once: in the adjoint a stage first goes back through what it did last.
 """
 
 from collections.abc import Callable, Iterable
@@ -17,9 +16,36 @@ from diffsim_ti.inputs import Derived
 from diffsim_ti.state.history import History
 
 
+class Stage:
+    """A stage of a step; `do`, `tangent` and `adjoint` act in pass j of `at`, those within at their `yield`.
+
+    Where tangent and adjoint need buffers of their own, they are methods of objects that a run makes of the stage.
+    """
+
+    in_kicks: ClassVar[bool] = False  # whether it acts in a kick alone, too
+
+    @contextmanager
+    def do(self, at: "Passes"):
+        yield
+
+    @contextmanager
+    def tangent(self, at: "Passes"):
+        yield
+
+    @contextmanager
+    def adjoint(self, at: "Passes"):
+        yield
+
+    def clear(self) -> None:
+        """A reverse sweep begins."""
+
+    def collect(self, out: Derived) -> None:
+        """Add the adjoints that were summed."""
+
+
 @dataclass
 class Passes:
-    """Passes that are done one launch after the other; numbers: of the launch that comes next or is done, by name.
+    """Passes that are done one launch after the other.
 
     run: the workspace, or the tangent or adjoint that holds changes or adjoints of the state. A pass begins with the state
     in slot `slot` of `history` and leads to that in `end`: the same slot, or with stride 1 the next one, slot 0 holding the
@@ -35,10 +61,18 @@ class Passes:
     stride: int
     num_passes: int
     save_every: int
-    numbers: dict
     halt: int = -1
     kick: bool = False
-    launch: Callable | None = None  # of the kick and drift
+    numbers: dict | None = None  # of the launch, by name
+    launch: Callable | None = None  # of the kick and drift, bound by the first pass
+
+    def go(self, way: str, stages: Iterable[Stage], launches: Iterable[dict]) -> None:
+        """way: "do", "tangent" or "adjoint"; launches: their numbers."""
+        ways = [getattr(stage, way) for stage in stages if stage.in_kicks or not self.kick]
+        for self.numbers in launches:
+            with ExitStack() as within:
+                for act in ways:
+                    within.enter_context(act(self))
 
     @property
     def j(self) -> int:
@@ -57,34 +91,3 @@ class Passes:
     def now(self) -> SimpleNamespace:
         """Length [s] and weights of pass j."""
         return self.ws.numbers_of(self.j, self.num_passes)
-
-
-class Stage:
-    """A stage of a step, of its tangent, or of its adjoint, whose sums are its own."""
-
-    in_kicks: ClassVar[bool] = False  # whether it acts in a kick alone, too
-
-    def prepare(self, at: Passes) -> None:
-        """Launches of these passes come next."""
-
-    @contextmanager
-    def do(self, at: Passes):
-        """Act; the stages within this one act at its `yield`."""
-        yield
-
-    def clear(self) -> None:
-        """Of an adjoint: a reverse sweep begins."""
-
-    def collect(self, out: Derived) -> None:
-        """Of an adjoint: add what was summed."""
-
-
-def run(stages: Iterable[Stage], at: Passes, launches: Iterable[dict]) -> None:
-    """Do the passes of launches with these numbers."""
-    acting = [stage for stage in stages if stage.in_kicks or not at.kick]
-    for stage in acting:
-        stage.prepare(at)
-    for at.numbers in launches:
-        with ExitStack() as within:
-            for stage in acting:
-                within.enter_context(stage.do(at))

@@ -51,7 +51,7 @@ class Chambers(Stage):
             self.arrays.weight = runtime.upload(np.concatenate([e.weights for e in closed]), a.fp)
         self.now = 0  # the pass that forces were last taken in
 
-    def launch(self, name: str, at: Passes, shape: bool = False, **records) -> None:
+    def _launch(self, name: str, at: Passes, shape: bool = False, **records) -> None:
         """A kernel at the beginning of a pass."""
         ws, a = self.ws, self.ws.arrays
         per_step = len(a.values.follower) > 1
@@ -64,8 +64,21 @@ class Chambers(Stage):
     @contextmanager
     def do(self, at: Passes):
         self.now = at.j
-        self.launch("forces", at, out=self.ws.arrays)
+        self._launch("forces", at, out=self.ws.arrays)
         yield
+
+    @contextmanager
+    def tangent(self, at: Passes):
+        u, numbers = at.run.u, at.run.numbers
+        change = SimpleNamespace(u=u, rest=numbers.rest, follower=numbers.follower)
+        kept = self.ws.kept(("chamber tangent", id(u), id(numbers)), lambda: (change, u, numbers))[0]
+        self._launch("jvp", at, tangent=kept, out=self.ws.arrays)
+        yield
+
+    @contextmanager
+    def adjoint(self, at: Passes):
+        yield
+        self._launch("vjp", at, at.run.features.shape, adjoint=at.run)
 
     def product(self, w: np.ndarray) -> np.ndarray:
         """df/dx w of the gases in the current state, shape (num_vertices, 3)."""
@@ -73,30 +86,3 @@ class Chambers(Stage):
         following = ws.following.at(ws.numbers_at(self.now, self.now + 2))
         following.given = np.zeros_like(following.given)  # pressures do not count in the stable step
         return following.jvp(ws.arrays.values.rest + runtime.fetch_row(ws.state.u, 0), w)
-
-
-class ChambersTangent(Stage):
-    """Writes changes of the forces for those of the displacement and of the numbers."""
-
-    def __init__(self, stage: Chambers, run):
-        self.chambers = stage
-        self.change = SimpleNamespace(u=run.u, rest=run.numbers.rest, follower=run.numbers.follower)
-
-    @contextmanager
-    def do(self, at: Passes):
-        self.chambers.launch("jvp", at, tangent=self.change, out=at.ws.arrays)
-        yield
-
-
-class ChambersAdjoint(Stage):
-    """Writes products of the transposed derivatives to adjoint corners, adds the adjoints of numbers and places."""
-
-    in_kicks = True
-
-    def __init__(self, stage: Chambers, run):
-        self.chambers, self.shape = stage, run.features.shape
-
-    @contextmanager
-    def do(self, at: Passes):
-        yield
-        self.chambers.launch("vjp", at, self.shape, adjoint=at.run)

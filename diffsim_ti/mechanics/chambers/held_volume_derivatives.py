@@ -65,7 +65,7 @@ class HeldTangent(Stage):
         self.inverse = -self.change.mass[held.nodes, None] / mass**2
 
     @contextmanager
-    def do(self, at: Passes):
+    def tangent(self, at: Passes):
         dx = self.rest + self.held.rows(at.run.u, 0)
         with self.held.alone(at.history, at.end):
             yield
@@ -107,7 +107,7 @@ class HeldAdjoint(Stage):
         self.follower, self.halted = np.zeros_like(values.follower), None
 
     @contextmanager
-    def do(self, at: Passes):
+    def adjoint(self, at: Passes):
         if at.kick:
             self._go_before_state(at.run)
             yield

@@ -38,7 +38,7 @@ class FeltTangent(FaceChanges):
         super().__init__(faces, run.features)
 
     @contextmanager
-    def do(self, at: Passes):
+    def tangent(self, at: Passes):
         alone, run = self.faces.alone(at), at.run
         if alone is None:
             yield
@@ -98,7 +98,7 @@ class FeltAdjoint(FaceChanges):
         self.inverse, self.rest = np.zeros((self.faces.num_surface, 1)), np.zeros((self.faces.num_surface, 3))
 
     @contextmanager
-    def do(self, at: Passes):
+    def adjoint(self, at: Passes):
         alone, run = self.faces.alone(at), at.run
         if alone is None:
             yield

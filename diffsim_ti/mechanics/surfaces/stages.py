@@ -4,7 +4,7 @@ from contextlib import contextmanager
 
 from diffsim_ti.inputs import Derived
 from diffsim_ti.mechanics.stage import Passes, Stage
-from diffsim_ti.mechanics.surfaces.surface_pairs import Tunnelling
+from diffsim_ti.mechanics.surfaces.surface_pairs import SurfacePairs, Tunnelling
 
 
 class SurfaceForces(Stage):
@@ -12,14 +12,13 @@ class SurfaceForces(Stage):
 
     in_kicks = True
 
-    def __init__(self, ws):
-        self.a, self.pairs = ws.arrays, ws.pairs
-
-    def prepare(self, at: Passes) -> None:
-        self.pairs.ensure(at.history.u, at.slot)
+    def __init__(self, pairs: SurfacePairs):
+        self.pairs, self.a = pairs, pairs.a
 
     @contextmanager
     def do(self, at: Passes):
+        if at.launch is None:  # the first pass: after each of them `check_pass` keeps the list
+            self.pairs.ensure(at.history.u, at.slot)
         self.pairs.forces(at.history.u, at.slot, self.a.corner)
         yield
         if at.kick:
@@ -29,13 +28,8 @@ class SurfaceForces(Stage):
         except Tunnelling as error:
             raise at.ws.dated(error, at.j, at.num_passes) from None
 
-
-class SurfaceForcesTangent(Stage):
-    def __init__(self, stage: SurfaceForces, run):
-        self.a, self.pairs = stage.a, stage.pairs
-
     @contextmanager
-    def do(self, at: Passes):
+    def tangent(self, at: Passes):
         pairs, run, place = self.pairs, at.run, (at.history.u, at.slot)
         pairs.ensure(*place)
         if pairs.friction:  # which needs the forces, and their corners are those of the product
@@ -44,15 +38,8 @@ class SurfaceForcesTangent(Stage):
         pairs.product(*place, run.u, self.a.corner, run.numbers.rest, change)
         yield
 
-
-class SurfaceForcesAdjoint(Stage):
-    in_kicks = True
-
-    def __init__(self, stage: SurfaceForces, run):
-        self.a, self.pairs = stage.a, stage.pairs
-
     @contextmanager
-    def do(self, at: Passes):
+    def adjoint(self, at: Passes):
         yield
         self.pairs.ensure(at.history.u, at.slot)
         self.pairs.vjp(at.history.u, at.slot, at.run.w, at.run.corner)
@@ -68,26 +55,19 @@ class SurfaceForcesAdjoint(Stage):
 class SurfaceFriction(Stage):
     """Friction of the pairs, on the velocities after the drift."""
 
-    def __init__(self, friction):
-        self.friction = friction
-
-    def prepare(self, at: Passes) -> None:
-        if at.stride:
-            self.friction.keep(at.history.num_slots)
+    def __init__(self, pairs: SurfacePairs):
+        self.friction, self.a = pairs.friction, pairs.a
 
     @contextmanager
     def do(self, at: Passes):
+        if at.stride:
+            self.friction.keep(at.history.num_slots)
         self.friction.measure(at.history.u, at.slot)
         yield
         self.friction.slide(at.history, at.end, at.now, recording=at.stride > 0)
 
-
-class SurfaceFrictionTangent(Stage):
-    def __init__(self, stage: SurfaceFriction, run):
-        self.friction = stage.friction
-
     @contextmanager
-    def do(self, at: Passes):
+    def tangent(self, at: Passes):
         now, run = at.now, at.run
         if not now.alpha > 0:
             yield
@@ -96,13 +76,8 @@ class SurfaceFrictionTangent(Stage):
             yield
             self.friction.slide_jvp(at.history, at.end, now, run.rate_dot, run.u, run.v, run.numbers)
 
-
-class SurfaceFrictionAdjoint(Stage):
-    def __init__(self, stage: SurfaceFriction, run):
-        self.friction, self.drag = stage.friction, run.features.drag
-
     @contextmanager
-    def do(self, at: Passes):
+    def adjoint(self, at: Passes):
         now = at.now
         if not now.alpha > 0:
             yield
@@ -117,5 +92,6 @@ class SurfaceFrictionAdjoint(Stage):
     def collect(self, out: Derived) -> None:
         by_mass, by_rate = self.friction.collect_pass()
         out.mass = out.mass + by_mass
-        if self.drag >= 0:
-            out.parameters[self.drag] += by_rate
+        drag = self.a.features().drag
+        if drag >= 0:
+            out.parameters[drag] += by_rate

@@ -7,8 +7,9 @@ import numpy as np
 from diffsim_ti import runtime
 from diffsim_ti.inputs import Derived
 from diffsim_ti.mechanics.obstacles.impulse_record import ImpulseRecord
-from diffsim_ti.mechanics.stage import Passes, run
+from diffsim_ti.mechanics.stage import Passes
 from diffsim_ti.mechanics.workspace import FrameArrays
+from diffsim_ti.solvers.explicit.stages import with_buffers
 from diffsim_ti.state.numbers import OF_STEPS, Adjoint
 
 STEPS = [name for name in OF_STEPS if name != "path"]
@@ -38,7 +39,7 @@ class ExplicitAdjoint:
         self.impulses = ImpulseRecord(workspace) if workspace.impulses else None
         if self.impulses:
             self.impulse = self.impulses.impulse
-        self.stages = [x.adjoint(x.value, self) for x in workspace.stages]
+        self.stages = with_buffers(workspace.stages, 1, self)
 
     def fits(self, workspace) -> bool:
         """Whether kernels and shapes are still those of the run; they are as long as launches stay bound."""
@@ -112,8 +113,8 @@ class ExplicitAdjoint:
             self._run(self.ws.launches(j, j + 1, num_passes, 0, 1), base, num_passes, 0, kick=True)
 
     def _run(self, launches, base: int, num_passes: int, save_every: int, **options) -> None:
-        at = Passes(self.ws, self, self.ws.record, base, 1, num_passes, save_every, {}, **options)
-        run(self.stages, at, launches)
+        at = Passes(self.ws, self, self.ws.record, base, 1, num_passes, save_every, **options)
+        at.go("adjoint", self.stages, launches)
 
     def complete(self) -> None:
         """Add to the adjoint of the state what the last pass handed to the corners of tetrahedra."""

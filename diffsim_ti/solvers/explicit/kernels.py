@@ -101,6 +101,20 @@ class ExplicitKernels:
         """The scene, or changes of it, that knows pass j, where tetrahedra grow."""
         return Bundle(**vars(of), now=pass_at(table, j - plan.window)) if self.vertex.features.growing else of
 
+    @traced
+    def after(self, plan):
+        """Number of tetrahedra and of what else writes to corners."""
+        return self.items.after(plan)
+
+    @traced
+    def num_vertices(self, plan):
+        return plan.num_vertices
+
+    @traced
+    def num_parts(self, plan):
+        """Of sums of adjoints of a path."""
+        return plan.num_parts
+
     @ti.func
     def turn_of_first(self, item, table: A):
         """Which time this is that the first loop is gone through."""
@@ -129,10 +143,18 @@ class ExplicitKernels:
             if e < plan.num_items:
                 self.tetrahedra(e, j, scene, state, table, plan)
             else:
-                now, s = pass_at(table, j - plan.window), (j - plan.base) * plan.stride
-                self.items.forces(e - plan.num_items, now, scene, state, s, plan)
+                self.act(e - plan.num_items, j, scene, state, table, plan)
         else:
             self.tetrahedra(e, j, scene, state, table, plan)
+
+    @ti.func
+    def act(self, k, j, scene: A, state: A, table: A, plan: A):
+        now, s = pass_at(table, j - plan.window), (j - plan.base) * plan.stride
+        self.items.forces(k, now, scene, state, s, plan)
+
+    @ti.func
+    def at_vertex(self, i, j, scene: A, state: A, table: A, plan: A):
+        self.vertex.step(i, j, self.pass_on(j, scene, table, plan), scene, state, plan)
 
     @ti.func
     def tetrahedra(self, e, j, scene: A, state: A, table: A, plan: A):
@@ -147,7 +169,7 @@ class ExplicitKernels:
     def passes(self, scene: A, state: A, table: A, plan: A):
         """Slot 0 holds the state before pass `base`; with stride 1 each pass writes the next slot, and its forces."""
         if ti.static(self.parallel):
-            num_items, num_vertices = self.items.after(plan), plan.num_vertices  # both bounds are read by one task
+            num_items, num_vertices = self.after(plan), self.num_vertices(plan)  # both bounds are read by one task
             for e in range(num_items):
                 turn = self.turn_of_first(e, table)
                 if turn < plan.count:
@@ -155,8 +177,7 @@ class ExplicitKernels:
             for i in range(num_vertices):
                 turn = self.turn_of_second(i, table, plan)
                 if turn < plan.count:
-                    j = plan.first + turn
-                    self.vertex.step(i, j, self.pass_on(j, scene, table, plan), scene, state, plan)
+                    self.at_vertex(i, plan.first + turn, scene, state, table, plan)
             if ti.static(self.reduced):
                 for b in range(plan.num_bodies):
                     now = self.pass_on(plan.first, scene, table, plan)
@@ -186,10 +207,17 @@ class ExplicitKernels:
             if e < plan.num_items:
                 self.tetrahedra_jvp(e, j, scene, state, tangent, table, plan)
             else:
-                now, s = pass_at(table, j - plan.window), j - plan.base
-                self.items.forces_jvp(e - plan.num_items, now, scene, state, s, tangent, plan)
+                self.act_jvp(e - plan.num_items, j, scene, state, tangent, table, plan)
         else:
             self.tetrahedra_jvp(e, j, scene, state, tangent, table, plan)
+
+    @ti.func
+    def act_jvp(self, k, j, scene: A, state: A, tangent: A, table: A, plan: A):
+        self.items.forces_jvp(k, pass_at(table, j - plan.window), scene, state, j - plan.base, tangent, plan)
+
+    @ti.func
+    def at_vertex_jvp(self, i, j, scene: A, state: A, tangent: A, table: A, plan: A):
+        self.vertex.step_jvp(i, j, self.pass_of(j, table, plan), scene, state, tangent, plan)
 
     @ti.func
     def tetrahedra_jvp(self, e, j, scene: A, state: A, tangent: A, table: A, plan: A):
@@ -203,7 +231,7 @@ class ExplicitKernels:
     @ti.func
     def passes_jvp(self, scene: A, state: A, tangent: A, table: A, plan: A):
         if ti.static(self.parallel):
-            num_items, num_vertices = self.items.after(plan), plan.num_vertices
+            num_items, num_vertices = self.after(plan), self.num_vertices(plan)
             for e in range(num_items):
                 turn = self.turn_of_first(e, table)
                 if turn < plan.count:
@@ -211,8 +239,7 @@ class ExplicitKernels:
             for i in range(num_vertices):
                 turn = self.turn_of_second(i, table, plan)
                 if turn < plan.count:
-                    j = plan.first + turn
-                    self.vertex.step_jvp(i, j, self.pass_of(j, table, plan), scene, state, tangent, plan)
+                    self.at_vertex_jvp(i, plan.first + turn, scene, state, tangent, table, plan)
             if ti.static(self.reduced):
                 for b in range(plan.num_bodies):
                     now = self.pass_of(plan.first, table, plan)
@@ -244,10 +271,22 @@ class ExplicitKernels:
             if e < plan.num_items:
                 self.tetrahedra_vjp(e, j, scene, state, adjoint, table, plan)
             else:
-                now, s = pass_at(table, j - plan.window), j - plan.base
-                self.items.forces_vjp(e - plan.num_items, now, scene, state, s, adjoint, plan)
+                self.act_vjp(e - plan.num_items, j, scene, state, adjoint, table, plan)
         else:
             self.tetrahedra_vjp(e, j, scene, state, adjoint, table, plan)
+
+    @ti.func
+    def act_vjp(self, k, j, scene: A, state: A, adjoint: A, table: A, plan: A):
+        self.items.forces_vjp(k, pass_at(table, j - plan.window), scene, state, j - plan.base, adjoint, plan)
+
+    @ti.func
+    def at_vertex_vjp(self, i, j, scene: A, state: A, adjoint: A, table: A, plan: A):
+        self.vertex.step_vjp(i, j, self.pass_back(j, table, plan), scene, state, adjoint, plan)
+
+    @ti.func
+    def fold(self, p, first, last, adjoint: A, table: A, plan: A):
+        """Sum adjoints of paths over vertices."""
+        self.vertex.obstacles.fold_part(p, plan.num_vertices, first, last, adjoint, table, plan)
 
     @ti.func
     def tetrahedra_vjp(self, e, j, scene: A, state: A, adjoint: A, table: A, plan: A):
@@ -271,7 +310,7 @@ class ExplicitKernels:
         """The gather of K w is left to the next call (or to `finish_vjp`), so that each pass has two loops, as forward."""
         moving = ti.static(self.vertex.features.moving)
         if ti.static(self.parallel):
-            num_items, num_vertices, parts = self.items.after(plan), plan.num_vertices, moving * plan.num_parts
+            num_items, num_vertices, parts = self.after(plan), self.num_vertices(plan), moving * self.num_parts(plan)
             if ti.static(self.reduced):
                 for b in range(plan.num_bodies):
                     now = self.pass_back(plan.first, table, plan)
@@ -279,17 +318,14 @@ class ExplicitKernels:
             for i in range(num_vertices):
                 turn = self.turn_of_first(i, table)
                 if turn < plan.count:
-                    j = plan.first + plan.count - 1 - turn
-                    now = self.pass_back(j, table, plan)
-                    self.vertex.step_vjp(i, j, now, scene, state, adjoint, plan)
+                    self.at_vertex_vjp(i, plan.first + plan.count - 1 - turn, scene, state, adjoint, table, plan)
             for e in range(num_items):
                 turn = self.turn_of_second(e, table, plan)
                 if turn < plan.count:
                     self.elements_vjp(e, plan.first + plan.count - 1 - turn, scene, state, adjoint, table, plan)
             if ti.static(moving > 0):
                 for p in range(parts):
-                    last = plan.first + plan.count - 1
-                    self.vertex.obstacles.fold_part(p, plan.num_vertices, plan.first, last, adjoint, table, plan)
+                    self.fold(p, plan.first, plan.first + plan.count - 1, adjoint, table, plan)
         else:
             ti.loop_config(serialize=True)
             for back in range(plan.count):
@@ -304,7 +340,7 @@ class ExplicitKernels:
                     self.elements_vjp(e, j, scene, state, adjoint, table, plan)
                 if ti.static(moving > 0):
                     for p in range(moving * plan.num_parts):
-                        self.vertex.obstacles.fold_part(p, plan.num_vertices, j, j, adjoint, table, plan)
+                        self.fold(p, j, j, adjoint, table, plan)
 
     @cached_property
     def step_vjp(self) -> Kernel:

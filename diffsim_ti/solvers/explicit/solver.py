@@ -19,7 +19,7 @@ from diffsim_ti.mechanics.obstacles.felt_faces import FeltFaces, feels_faces
 from diffsim_ti.mechanics.obstacles.impulse_record import ImpulseRecord
 from diffsim_ti.mechanics.obstacles.way import Way
 from diffsim_ti.mechanics.reduced.body_checks import check_bodies
-from diffsim_ti.mechanics.stage import Passes, run
+from diffsim_ti.mechanics.stage import Passes
 from diffsim_ti.mechanics.ties.attached import Attached
 from diffsim_ti.mechanics.workspace import Workspace
 from diffsim_ti.monitor.energy_balance import EnergyBalance
@@ -226,8 +226,8 @@ class ExplicitWorkspace(Workspace):
             self.probe = self.history(2, record=True)
         self.state.copy(0, self.probe, 0)
         seen, counted = self.watch.rows(), runtime.fetch(self.contact.own_work)  # of passes that are taken alone
-        at = Passes(self, self, self.probe, j, 1, num_passes, 0, dict(first=j), kick=True)
-        run([x.value for x in self.stages], at, self.launches(j, j + 1, num_passes, 0, 1))
+        at = Passes(self, self, self.probe, j, 1, num_passes, 0, kick=True)
+        at.go("do", self.stages, self.launches(j, j + 1, num_passes, 0, 1))
         self.watch.put(seen)
         runtime.fill(self.contact.own_work, counted)
         return runtime.fetch(self.probe.f)[0].astype(np.float64)
@@ -320,5 +320,5 @@ class ExplicitWorkspace(Workspace):
         """Passes first .. last - 1 from the current state; or recorded: slot j - base holds the state before pass j."""
         recording = base is not None
         history, most = self.record if recording else self.state, self.most_passes(self.arrays.num_tetrahedra)
-        at = Passes(self, self, history, base or 0, int(recording), num_passes, save_every, dict(first=first))
-        run([x.value for x in self.stages], at, self.launches(first, last, num_passes, save_every, most))
+        at = Passes(self, self, history, base or 0, int(recording), num_passes, save_every)
+        at.go("do", self.stages, self.launches(first, last, num_passes, save_every, most))

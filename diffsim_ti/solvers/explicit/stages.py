@@ -1,68 +1,55 @@
-"""The stages of an explicit step, each with its tangent and adjoint: one list that forward, tangent and reverse run."""
+"""The stages of an explicit step: one list that forward, tangent and reverse go through."""
 
-from collections.abc import Callable
 from contextlib import nullcontext
-from typing import NamedTuple
 
-from diffsim_ti.mechanics.chambers.gases import ChambersAdjoint, ChambersTangent
 from diffsim_ti.mechanics.chambers.held_volume_derivatives import HeldAdjoint, HeldTangent
+from diffsim_ti.mechanics.chambers.held_volumes import HeldVolumes
 from diffsim_ti.mechanics.obstacles.felt_derivatives import FeltAdjoint, FeltTangent
+from diffsim_ti.mechanics.obstacles.felt_faces import FeltFaces
 from diffsim_ti.mechanics.stage import Passes, Stage
-from diffsim_ti.mechanics.surfaces.stages import (
-    SurfaceForces,
-    SurfaceForcesAdjoint,
-    SurfaceForcesTangent,
-    SurfaceFriction,
-    SurfaceFrictionAdjoint,
-    SurfaceFrictionTangent,
-)
+from diffsim_ti.mechanics.surfaces.stages import SurfaceForces, SurfaceFriction
+
+# stages whose tangents and adjoints have buffers of their own: what makes them for a run
+BUFFERED = {HeldVolumes: (HeldTangent, HeldAdjoint), FeltFaces: (FeltTangent, FeltAdjoint)}
 
 
 class KickDrift(Stage):
-    """What one launch does, for as many passes as it takes: tetrahedra and interactions, vertices, reduced sets.
-
-    name: of the kernel (kernels.py); record: what it calls the changes or adjoints of a run, "" forward; more: numbers.
-    """
+    """What one launch does (kernels.py), for as many passes as it takes: tetrahedra and interactions, vertices, reduced
+    sets."""
 
     in_kicks = True
 
-    def __init__(self, name: str, record: str = "", **more):
-        self.name, self.record, self.more = name, record, more
-
-    def prepare(self, at: Passes) -> None:
-        ws, run = at.ws, at.run
-        own = {self.record: (run, run.numbers, run.frames)} if self.record else {}
-        kernels = ws.kernels(run.features if self.record else ws.arrays.features())
-        own |= dict(state=(at.history, ws.frames, ws.watch, ws.contact), table=ws.table)
-        at.launch = ws.bound(getattr(kernels, self.name), **own)
-
     def do(self, at: Passes):
-        own = dict(base=at.base, stride=at.stride, num_passes=at.num_passes, halt=at.halt, kick=int(at.kick))
-        at.launch(**at.numbers, **own, **self.more)
+        return self._launch(at, "step", at.ws.arrays.features())
+
+    def tangent(self, at: Passes):
+        return self._launch(at, "step_jvp", at.run.features, "tangent", rate_dot=at.run.rate_dot)
+
+    def adjoint(self, at: Passes):
+        more = dict(num_passes=at.num_passes, halt=at.halt, kick=int(at.kick))
+        more |= dict(steps=at.run.steps, num_parts=at.run.num_parts)
+        return self._launch(at, "step_vjp", at.run.features, "adjoint", **more)
+
+    @staticmethod
+    def _launch(at: Passes, name: str, features, record: str = "", **more):
+        """record: what the kernel calls the changes or adjoints of a run."""
+        if at.launch is None:
+            ws, run = at.ws, at.run
+            own = {record: (run, run.numbers, run.frames)} if record else {}
+            states = at.history, ws.frames, ws.watch, ws.contact
+            at.launch = ws.bound(getattr(ws.kernels(features), name), state=states, **own, table=ws.table)
+        at.launch(**at.numbers, base=at.base, stride=at.stride, **more)
         return nullcontext()
 
 
-class Stages(NamedTuple):
-    """A stage of a run, and what makes those of its tangent and of its adjoint for a run of these."""
-
-    value: Stage
-    tangent: Callable[..., Stage]
-    adjoint: Callable[..., Stage]
-
-
-def stages_of(ws) -> list[Stages]:
+def stages_of(ws) -> list[Stage]:
     """Those that the scene of a workspace has, the outermost first (mechanics/stage.py)."""
-    friction = ws.pairs and ws.pairs.friction
-    every = (
-        Stages(ws.pairs and SurfaceForces(ws), SurfaceForcesTangent, SurfaceForcesAdjoint),
-        Stages(ws.volumes, HeldTangent, HeldAdjoint),
-        Stages(friction and SurfaceFriction(friction), SurfaceFrictionTangent, SurfaceFrictionAdjoint),
-        Stages(ws.chambers, ChambersTangent, ChambersAdjoint),
-        Stages(ws.faces, FeltTangent, FeltAdjoint),
-        Stages(
-            KickDrift("step"),
-            lambda _, run: KickDrift("step_jvp", "tangent", rate_dot=run.rate_dot),
-            lambda _, run: KickDrift("step_vjp", "adjoint", steps=run.steps, num_parts=run.num_parts),
-        ),
-    )
-    return [stages for stages in every if stages.value]
+    pairs = ws.pairs
+    of_pairs = pairs and SurfaceForces(pairs), pairs and pairs.friction and SurfaceFriction(pairs)
+    every = of_pairs[0], ws.volumes, of_pairs[1], ws.chambers, ws.faces, KickDrift()
+    return [stage for stage in every if stage]
+
+
+def with_buffers(stages: list[Stage], kind: int, run) -> list:
+    """The same for a tangent (kind 0) or an adjoint (kind 1)."""
+    return [BUFFERED[type(x)][kind](x, run) if type(x) in BUFFERED else x for x in stages]

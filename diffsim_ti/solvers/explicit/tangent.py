@@ -7,9 +7,10 @@ import numpy as np
 from diffsim_ti import runtime
 from diffsim_ti.inputs import Derived
 from diffsim_ti.mechanics.obstacles.impulse_record import ImpulseRecord
-from diffsim_ti.mechanics.stage import Passes, run
+from diffsim_ti.mechanics.stage import Passes
 from diffsim_ti.mechanics.workspace import FrameArrays
 from diffsim_ti.runtime.slots import copy_slot
+from diffsim_ti.solvers.explicit.stages import with_buffers
 from diffsim_ti.state.numbers import Tangent
 
 
@@ -32,14 +33,13 @@ class ExplicitTangent:
         if self.z is not None:
             runtime.fill(self.z, 0)
         self.rate_dot = float(tangent.parameters[self.features.drag]) if self.features.drag >= 0 else 0.0
-        self.stages = [x.tangent(x.value, self) for x in workspace.stages]
+        self.stages = with_buffers(workspace.stages, 0, self)
 
     def advance(self, first: int, last: int, num_passes: int, save_every: int) -> None:
         """Tangent of passes first .. last - 1, recorded from slot 0."""
         ws = self.ws
-        at = Passes(ws, self, ws.record, first, 1, num_passes, save_every, dict(first=first))
-        most = ws.most_passes(2 * ws.arrays.num_tetrahedra)
-        run(self.stages, at, ws.launches(first, last, num_passes, save_every, most))
+        launches = ws.launches(first, last, num_passes, save_every, ws.most_passes(2 * ws.arrays.num_tetrahedra))
+        Passes(ws, self, ws.record, first, 1, num_passes, save_every).go("tangent", self.stages, launches)
 
     def contact_forces(self, frame_time: np.ndarray) -> np.ndarray:
         """Changes of the frames' contact forces."""
