@@ -86,7 +86,7 @@ class BatchAdjoint:
         for numbers in self.ws.launches(stop, last, num_passes, save_every, backwards=True):
             ws = self.ws
             launch = ws.bound(ws.kernels(self.features).step_vjp, state=(ws.record, ws.frames, ws.met), adjoint=self)
-            launch(**numbers, base=base, num_passes=num_passes, halt=halt, kick=0, steps=self._steps, num_parts=1)
+            launch(**numbers, base=base, halt=halt, kick=0, steps=self._steps, num_parts=1)
 
     def finish(self) -> None:
         """Complete the adjoint of the start."""

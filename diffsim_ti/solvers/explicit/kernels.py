@@ -390,12 +390,12 @@ class ExplicitKernels:
 
     @cached_property
     def step_vjp(self) -> Kernel:
-        """The adjoint of passes first + count - 1 .. first; `num_passes` is that of the run.
+        """The adjoint of passes first + count - 1 .. first.
 
         halt: the pass at whose state the sweep stops, between its two kicks; kick: only the kick before the state.
         steps: those for which there is room in `felt`; num_parts: sums over vertices that are made for each path.
         """
-        numbers = dict.fromkeys(("num_passes", "halt", "kick", "steps", "num_parts"), "int")
+        numbers = dict.fromkeys(("halt", "kick", "steps", "num_parts"), "int")
         own = adjoints(self.with_record(CHANGE) | ADJOINT | OF_STEPS, self.vertex.features) | self.corners
         own |= dict(w="vectors2", felt="vectors2") | self.items.adjoint
         arrays = dict(state=self.with_record(RECORDED), adjoint=own)

@@ -26,8 +26,7 @@ class KickDrift(Stage):
         return self._launch(at, "step_jvp", at.run.features, "tangent", rate_dot=at.run.rate_dot)
 
     def adjoint(self, at: Passes):
-        more = dict(num_passes=at.num_passes, halt=at.halt, kick=int(at.kick))
-        more |= dict(steps=at.run.steps, num_parts=at.run.num_parts)
+        more = dict(halt=at.halt, kick=int(at.kick), steps=at.run.steps, num_parts=at.run.num_parts)
         return self._launch(at, "step_vjp", at.run.features, "adjoint", **more)
 
     @staticmethod
