@@ -14,25 +14,13 @@ import taichi as ti
 from diffsim_ti.batch.tetrahedra import element_of_scenes
 from diffsim_ti.batch.views import Column, ItemOfScene, Shared, Uniform
 from diffsim_ti.runtime import Bundle, Kernel, at, let, traced
-from diffsim_ti.solvers.explicit.kernels import PLAN, TURNS, ExplicitKernels
+from diffsim_ti.solvers.explicit.kernels import ExplicitKernels
 from diffsim_ti.solvers.explicit.kick_drift import KickDrift
 from diffsim_ti.state.features import Features
-from diffsim_ti.state.numbers import ALONE
+from diffsim_ti.state.numbers import ALONE, OF_STEPS
 from diffsim_ti.state.pass_table import pass_at
 
-STATE = dict.fromkeys(("u", "v", "f", "frames_u", "frames_v", "stage"), "vectors2") | dict(
-    seen="scalars2", work="scalars"
-)
-CHANGE = dict.fromkeys(("u", "v", "frames_u", "frames_v"), "vectors2")
-SCENE = dict.fromkeys(("tets", "start", "corner_of", "force_slot", "motion_slot"), "ints")
-SCENE |= dict.fromkeys(("gradients", "volumes", "coefficients", "parameters", "inverse_mass", "surface"), "scalars")
-SCENE |= dict(rest="vectors", corner="vectors")
-OF_STEPS = dict(forces="vectors2", motion="vectors2", path="vectors2", anchor="vectors")
-CHANGED = dict.fromkeys(("coefficients", "gradients", "volumes", "mass", "parameters", "surface"), "scalars")
-ADJOINT = dict.fromkeys(("coefficients", "gradients", "volumes"), "scalars")
-ADJOINT |= dict(corner="vectors", rate_corner="vectors", w="vectors2", sums="scalars2", felt="vectors2")
-SIZES = ("num_items", "num_rows", "num_scenes", "num_vertices")
-NUMBERS = dict.fromkeys((*SIZES, "window", "first", "count", "base"), "int") | dict(contact_damping="float")
+SIZES = dict(num_rows="int", num_scenes="int")
 
 
 @dataclass(frozen=True)
@@ -67,8 +55,8 @@ class InnermostKernels(ExplicitKernels):
 
     @traced
     def scene_of(self, b, scene, plan):
-        own = [name for name in ("inverse_mass", "surface", "rest") if name in self.own]
-        own += ["parameters", "corner", *OF_STEPS, *self.alone]
+        own = {"inverse_mass", "surface", "rest"} & self.own | {"parameters", "corner", *OF_STEPS, *self.alone}
+        own = [name for name in vars(scene) if name in own]
         return Bundle(**{**vars(scene), **self.columns(scene, own, b, plan)})
 
     @traced
@@ -121,51 +109,16 @@ class InnermostKernels(ExplicitKernels):
     # ---- kernels -------------------------------------------------------------------------------------------------------
 
     @property
-    def growing(self) -> dict:
-        return dict(growths="scalars2") if self.vertex.features.growing else {}
-
-    @property
-    def alone(self) -> dict:
+    def alone(self) -> list[str]:
         """Numbers of springs, cables, muscles and pressures, of which each scene has its own."""
-        return {name: kind for name, kind in self.items.arrays.items() if name in ALONE}
+        return [name for name in self.items.arrays if name in ALONE]
 
-    @cached_property
-    def step(self) -> Kernel:
-        """`count` passes from pass `first` on."""
-        return self._kernel("step", self.passes, dict(state=self.with_state(STATE)), self.repeated, stride="int")
-
-    @cached_property
-    def step_jvp(self) -> Kernel:
-        """The tangent of these passes along recorded slots; the change of the state is advanced in place."""
-        tangent = self.with_state(CHANGE) | CHANGED | OF_STEPS | dict(rest="vectors") | self.alone | self.growing
-        own = dict(state=self.with_state(STATE), tangent=tangent)
-        return self._kernel("step_jvp", self.passes_jvp, own, self.repeated)
-
-    @cached_property
-    def step_vjp(self) -> Kernel:
-        """The adjoint of passes first + count - 1 .. first; numbers as of a single scene (explicit/kernels.py)."""
-        numbers = dict.fromkeys(("halt", "kick", "steps", "num_parts"), "int")
-        adjoint = self.with_state(CHANGE) | ADJOINT | OF_STEPS | self.items.adjoint | self.growing
-        arrays = dict(state=self.with_state(STATE), adjoint=adjoint)
-        return self._kernel("step_vjp", self.passes_vjp, arrays, self.repeated, **numbers)
-
-    @cached_property
-    def finish_vjp(self) -> Kernel:
-        """Add the gather that the first pass of the run has left."""
-        own = dict(scene=dict(start="ints", corner_of="ints"))
-        own |= dict(adjoint=dict(u="vectors2", v="vectors2", corner="vectors", rate_corner="vectors"))
-        numbers = dict(num_rows="int", num_scenes="int")
-        return Kernel("batch_finish_vjp", self.gather_rest, self.vertex.law.precision, own, numbers)
-
-    def with_state(self, arrays: dict) -> dict:
-        return arrays | dict(z="scalars2") if self.vertex.law.state_names else arrays
-
-    def _kernel(self, name: str, body, arrays: dict, repeated: bool, **numbers) -> Kernel:
-        arrays = dict(scene=SCENE | OF_STEPS | self.items.arrays | self.growing) | arrays | dict(table=PLAN)
-        numbers = NUMBERS | numbers | self.items.counts
-        if repeated:
-            arrays["table"], numbers = PLAN | TURNS, numbers | dict(times="int")
-        return Kernel(f"batch_{name}", body, self.vertex.law.precision, arrays, numbers, loops=2 * repeated)
+    def kernel(self, name: str, body, arrays: dict, numbers: dict, *options) -> Kernel:
+        """As of a single scene; numbers of tetrahedra do not lie in blocks."""
+        arrays = {
+            bundle: {x: kind.replace("blocks", "scalars") for x, kind in own.items()} for bundle, own in arrays.items()
+        }
+        return super().kernel(f"batch_{name}", body, arrays, numbers | SIZES, *options)
 
 
 @lru_cache(maxsize=None)

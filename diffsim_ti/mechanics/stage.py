@@ -7,7 +7,7 @@ order is said once: in the adjoint a stage first goes back through what it did l
 """
 
 from collections.abc import Callable, Iterable
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any, ClassVar
@@ -17,24 +17,12 @@ from diffsim_ti.state.history import History
 
 
 class Stage:
-    """A stage of a step; `do`, `tangent` and `adjoint` act in pass j of `at`, those within at their `yield`.
+    """A stage of a step: context managers `do`, `tangent` and `adjoint`, which take `Passes`; stages within act meanwhile.
 
-    Where tangent and adjoint need buffers of their own, they are methods of objects that a run makes of the stage.
+    Where its tangent and adjoint need buffers, other objects have these two, which a run makes of the stage.
     """
 
     in_kicks: ClassVar[bool] = False  # whether it acts in a kick alone, too
-
-    @contextmanager
-    def do(self, at: "Passes"):
-        yield
-
-    @contextmanager
-    def tangent(self, at: "Passes"):
-        yield
-
-    @contextmanager
-    def adjoint(self, at: "Passes"):
-        yield
 
     def clear(self) -> None:
         """A reverse sweep begins."""

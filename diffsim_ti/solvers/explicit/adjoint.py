@@ -37,8 +37,6 @@ class ExplicitAdjoint:
         self._arrays |= self._of_bodies
         vars(self).update(self._arrays)
         self.impulses = ImpulseRecord(workspace) if workspace.impulses else None
-        if self.impulses:
-            self.impulse = self.impulses.impulse
         self.stages = with_buffers(workspace.stages, 1, self)
 
     def fits(self, workspace) -> bool:

@@ -417,7 +417,7 @@ class ExplicitKernels:
         """Add the gather that the first pass of the run has left."""
         gathered = dict(u="vectors2") | (dict(v="vectors2") if self.vertex.reads_rates else {})
         own = dict(scene={name: SCENE[name] for name in ("start", "corner_of")}, adjoint=gathered | self.corners)
-        return Kernel("finish_vjp", self.gather_rest, self.vertex.law.precision, own, dict(num_vertices="int"))
+        return self.kernel("finish_vjp", self.gather_rest, own, dict(num_vertices="int"))
 
     def _kernel(self, name: str, body, arrays: dict, repeated: bool, **numbers) -> Kernel:
         arrays = dict(scene=SCENE | self.items.arrays) | arrays | dict(table=PLAN)
@@ -425,7 +425,10 @@ class ExplicitKernels:
         numbers = NUMBERS | self.items.counts | numbers
         if repeated:
             arrays["table"], numbers = PLAN | TURNS, numbers | dict(times="int")
-        return Kernel(name, body, self.vertex.law.precision, arrays, numbers, 2 * repeated, self.is_short)
+        return self.kernel(name, body, arrays, numbers, 2 * repeated, self.is_short)
+
+    def kernel(self, name: str, body, arrays: dict, numbers: dict, *options) -> Kernel:
+        return Kernel(name, body, self.vertex.law.precision, arrays, numbers, *options)
 
 
 @lru_cache(maxsize=None)

@@ -34,7 +34,7 @@ class KickDrift(Stage):
         """record: what the kernel calls the changes or adjoints of a run."""
         if at.launch is None:
             ws, run = at.ws, at.run
-            own = {record: (run, run.numbers, run.frames)} if record else {}
+            own = {record: (run, run.numbers, run.frames, run.impulses)} if record else {}
             states = at.history, ws.frames, ws.watch, ws.contact
             at.launch = ws.bound(getattr(ws.kernels(features), name), state=states, **own, table=ws.table)
         at.launch(**at.numbers, base=at.base, stride=at.stride, **more)

@@ -26,8 +26,6 @@ class ExplicitTangent:
         self.frames = FrameArrays.of(a, *workspace.frames.frames_u.shape)
         self.numbers, self.z = Tangent(a, tangent), a.law_states(1)
         self.impulses = ImpulseRecord(workspace) if workspace.impulses else None
-        if self.impulses:
-            self.impulse = self.impulses.impulse
         if a.bodies:
             vars(self).update(a.bodies.tangent(tangent))
         if self.z is not None:
