@@ -16,8 +16,8 @@ from diffsim_ti.runtime.slots import VertexRows
 class FaceChanges(Stage):
     """Changes, or adjoints, of what faces do in recorded passes."""
 
-    def __init__(self, faces: FeltFaces, features):
-        a, self.faces, self.features = faces.a, faces, features
+    def __init__(self, faces: FeltFaces, run):
+        a, self.faces, self.features = faces.a, faces, run.features
         self.shift_dot, self.speed_dot, self.seed, self.begin_dot = (
             runtime.array(a.vector, faces.num_surface) for _ in range(4)
         )
@@ -33,9 +33,6 @@ class FaceChanges(Stage):
 
 class FeltTangent(FaceChanges):
     """The tangent of passes; run: what holds the changes of the state and of all else."""
-
-    def __init__(self, faces: FeltFaces, run):
-        super().__init__(faces, run.features)
 
     @contextmanager
     def tangent(self, at: Passes):
@@ -82,7 +79,7 @@ class FeltAdjoint(FaceChanges):
     """The adjoint of passes: sums over them, by faces and surface vertices."""
 
     def __init__(self, faces: FeltFaces, run):
-        super().__init__(faces, run.features)
+        super().__init__(faces, run)
         a, features = faces.a, run.features
         self.path, self.num_parts = run.path, run.num_parts
         self.sums = runtime.array(a.fp, features.num_parameters, faces.num_faces)

@@ -93,7 +93,8 @@ class FeltFaces(Stage):
         kernel = getattr(kernels(features, a.precision, ws.parallel), name)
         # bound anew with the scene's, or with more room for parts
         launches = ws.kept(("faces", id(self.place)), lambda: (self.place, {}))[1]
-        key = (kernel, id(state.u), *(id(x) for x in records.values()))
+        parts = [part for record in records.values() for part in (record if type(record) is tuple else (record,))]
+        key = (kernel, id(state.u), *map(id, parts))
         if key not in launches:
             own = dict(scene=a, faces=self, state=state, table=ws.table)
             launches[key] = kernel.bind(**own, **records), state, records

@@ -37,7 +37,7 @@ class ExplicitAdjoint:
         self._arrays |= self._of_bodies
         vars(self).update(self._arrays)
         self.impulses = ImpulseRecord(workspace) if workspace.impulses else None
-        self.stages = with_buffers(workspace.stages, 1, self)
+        self.stages = with_buffers("adjoint", workspace.stages, self)
 
     def fits(self, workspace) -> bool:
         """Whether kernels and shapes are still those of the run; they are as long as launches stay bound."""

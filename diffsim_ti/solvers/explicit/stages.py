@@ -9,8 +9,11 @@ from diffsim_ti.mechanics.obstacles.felt_faces import FeltFaces
 from diffsim_ti.mechanics.stage import Passes, Stage
 from diffsim_ti.mechanics.surfaces.stages import SurfaceForces, SurfaceFriction
 
-# stages whose tangents and adjoints have buffers of their own: what makes them for a run
-BUFFERED = {HeldVolumes: (HeldTangent, HeldAdjoint), FeltFaces: (FeltTangent, FeltAdjoint)}
+# stages whose tangents and adjoints have buffers: what makes these of them for a run
+BUFFERED = dict(
+    tangent={HeldVolumes: HeldTangent, FeltFaces: FeltTangent},
+    adjoint={HeldVolumes: HeldAdjoint, FeltFaces: FeltAdjoint},
+)
 
 
 class KickDrift(Stage):
@@ -43,12 +46,13 @@ class KickDrift(Stage):
 
 def stages_of(ws) -> list[Stage]:
     """Those that the scene of a workspace has, the outermost first (mechanics/stage.py)."""
-    pairs = ws.pairs
-    of_pairs = pairs and SurfaceForces(pairs), pairs and pairs.friction and SurfaceFriction(pairs)
-    every = of_pairs[0], ws.volumes, of_pairs[1], ws.chambers, ws.faces, KickDrift()
+    forces = SurfaceForces(ws.pairs) if ws.pairs else None
+    friction = SurfaceFriction(ws.pairs) if ws.pairs and ws.pairs.friction else None
+    every = forces, ws.volumes, friction, ws.chambers, ws.faces, KickDrift()
     return [stage for stage in every if stage]
 
 
-def with_buffers(stages: list[Stage], kind: int, run) -> list:
-    """The same for a tangent (kind 0) or an adjoint (kind 1)."""
-    return [BUFFERED[type(x)][kind](x, run) if type(x) in BUFFERED else x for x in stages]
+def with_buffers(way: str, stages: list[Stage], run) -> list:
+    """The same with the buffers that a tangent or an adjoint has for them."""
+    makers = BUFFERED[way]
+    return [makers[type(stage)](stage, run) if type(stage) in makers else stage for stage in stages]

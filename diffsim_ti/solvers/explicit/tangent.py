@@ -31,7 +31,7 @@ class ExplicitTangent:
         if self.z is not None:
             runtime.fill(self.z, 0)
         self.rate_dot = float(tangent.parameters[self.features.drag]) if self.features.drag >= 0 else 0.0
-        self.stages = with_buffers(workspace.stages, 0, self)
+        self.stages = with_buffers("tangent", workspace.stages, self)
 
     def advance(self, first: int, last: int, num_passes: int, save_every: int) -> None:
         """Tangent of passes first .. last - 1, recorded from slot 0."""
