@@ -190,9 +190,7 @@ class FreeVertices:
                     if self.hits(i, b, moved, now, scene, plan) > 0:
                         calm = 0
         if calm == 1:
-            if now.frame >= 0:
-                self.write(state.frames_u, moved.u, now.frame, moved.first)
-                self.write(state.frames_v, moved.v_mid, now.frame, moved.first)
+            self.note_frame(now, state, moved.u, moved.v_mid, moved.first)
             if plan.stride > 0:
                 self.write(state.f, moved.f, s, moved.first)
             self.write(state.u, moved.u_next, s + plan.stride, moved.first)
