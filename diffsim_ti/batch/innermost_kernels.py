@@ -305,7 +305,7 @@ class InnermostKernels(ExplicitKernels):
 
     def _kernel(self, name: str, body, arrays: dict, repeated: bool, **numbers) -> Kernel:
         arrays = dict(scene=SCENE | OF_STEPS | self.items.arrays | self.growing) | arrays | dict(table=PLAN)
-        numbers = NUMBERS | numbers | self.items.counts | self.lengths
+        numbers = NUMBERS | numbers | self.items.counts
         if repeated:
             arrays["table"], numbers = PLAN | TURNS, numbers | dict(times="int")
         return Kernel(f"batch_{name}", body, self.vertex.law.precision, arrays, numbers, loops=2 * repeated)
