@@ -185,6 +185,11 @@ class Interaction:
         """Of loads that pull: whether they do so in all steps alike."""
         return True
 
+    def added_omega2(self, values: dict[str, np.ndarray], derived: Derived) -> float:
+        """What it adds to the body's largest omega^2 [1/s^2] at most, beside the sums of rows of its host form; at values of
+        inputs that are the stiffest of all steps, which need not have others over time."""
+        return 0.0
+
 
 def add_at(target: np.ndarray, places: np.ndarray, rows: np.ndarray) -> None:
     """target[..., places, :] += rows, of places that may repeat."""

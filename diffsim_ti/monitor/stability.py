@@ -84,8 +84,10 @@ def element_limit(scene: Scene, values: dict | None = None, kicks: ViscousStages
             if viscous is not None:
                 c[own[0]] = affine_bound(scene.mesh, derived.volumes, own, *viscous, values["density"])
     omega2, c, worst = largest_of(omega2, c)
-    hosts = host_forces(scene).stiffest(derived, EqualSteps(1.0, 1))
-    more = hosts.largest_omega2(derived.mass, derived.displacement, scene.fixed)  # what all of them add at the most
+    more = sum(x.added_omega2(values, derived) for x in scene.interactions)  # what all of them add at the most
+    if hosts := host_forces(scene).with_energy:
+        at = hosts.stiffest(derived, EqualSteps(1.0, 1))
+        more += at.largest_omega2(derived.mass, derived.displacement, scene.fixed)
     if scene.mass_scaling:
         mass = np.where(derived.mass > 0, derived.mass, 1.0)
         rows = row_sums(scene, mu, lam, scene.volume == "patches") / mass

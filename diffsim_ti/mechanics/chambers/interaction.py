@@ -49,6 +49,16 @@ class Gases(Pressing):
         if shape:
             add_at(out.rest, self.vertices, found["chamber_rest"])
 
+    def added_omega2(self, values, derived):
+        """At rest: n p_0 / V_0 sum |dV/dx|^2 / m of the free vertices, of each chamber."""
+        free, out = np.delete(np.arange(self.mesh.num_vertices), self.scene.fixed), 0.0
+        for chamber in self.terms:
+            names = self.scene.input_names(chamber)
+            p = np.max(values[names[chamber.plain]])
+            V, g = chamber.enclosure.volume(derived.rest), chamber.enclosure.gradient(derived.rest)
+            out += float(values[names["gas_exponent"]] * p / V * ((g[free] ** 2).sum(1) / derived.mass[free]).sum())
+        return out
+
 
 class FilledChambers(Pressing):
     """Implicit steps find their pressures as multipliers (multipliers.py); explicit steps have a stage (held_volumes.py)."""

@@ -103,14 +103,6 @@ class ChamberPressure(FollowerPressure):
                 self.add_numbers(adj, rows, law.by_numbers(V) * felt)
         return by_x
 
-    def added_omega2(self, mass, free):
-        """At rest: -dp/dV sum |dV/dx|^2 / m of each."""
-        out = 0.0
-        for law, enclosure in zip(self.laws, self.enclosures):
-            squares = (enclosure.gradient(self.rest)[free] ** 2).sum(1)
-            out -= float(law.slope(enclosure.volume(self.rest)) * (squares / mass[free]).sum())
-        return out
-
     def work(self, u, step):
         """Minus infinity where a chamber would vanish."""
         x = self.rest + u

@@ -44,12 +44,10 @@ class SpringsAndCables(Interaction):
         """What each spring, cable or fibre has of its term."""
         return np.repeat(of_terms, [len(term.paths(self.mesh)) for term in self.terms])
 
-    def places(self, tie) -> slice:
-        """Places of a term's own, given by its name or as the scene lists it."""
-        own = np.flatnonzero(
-            self._of_each(np.arange(len(self.terms))) == self.scene.place_among(self.terms, tie, "spring or cable")
-        )
-        return slice(int(own[0]), int(own[-1]) + 1)
+    def places(self, number: int) -> slice:
+        """Places of a term's own among them."""
+        ends = np.cumsum([0, *(len(term.paths(self.mesh)) for term in self.terms)]).tolist()
+        return slice(*ends[number : number + 2])
 
     def links(self, own):
         rows, segments = ([f"{own[t]} {part}" for t in self.terms] for part in ("rows", "segments"))
