@@ -15,7 +15,7 @@ from diffsim_ti.monitor.reduced_bounds import affine_bound
 from diffsim_ti.monitor.stiffest import stiffest
 from diffsim_ti.state.schedule import EqualSteps
 from diffsim_ti.state.viscous_stages import ViscousStages
-from diffsim_ti.terms.chambers import gas_law
+from diffsim_ti.terms.gas_law import gas_law
 from diffsim_ti.terms.mass_scaling import row_sums
 
 if TYPE_CHECKING:
@@ -119,7 +119,7 @@ def _squares_of_strains(mesh, derived) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _gas_bound(scene: "Scene", values: dict, derived) -> float:
-    """What gases in chambers add to omega^2 at most, at rest: -dp/dV sum |dV/dx|^2 / m of the free vertices each."""
+    """What gases in chambers add to omega^2 at most, at rest: n p_0 / V_0 sum |dV/dx|^2 / m of the free vertices each."""
     free, out = np.delete(np.arange(scene.mesh.num_vertices), scene.fixed), 0.0
     for chamber in scene.gases:
         names = scene.input_names(chamber)
