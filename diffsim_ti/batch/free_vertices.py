@@ -109,6 +109,10 @@ class FreeVertices:
 
     # ---- forces given on vertices --------------------------------------------------------------------------------------
 
+    @cached_property
+    def given_forces(self) -> GivenForces:
+        return GivenForces(self.features, self.law.precision)
+
     @traced
     def slot(self, i, b, scene, plan) -> tuple:
         """(where the force of vertex i begins in a row, 1 or 0 if it has none)"""
@@ -120,7 +124,7 @@ class FreeVertices:
     def load(self, i, b, now, scene, forces, plan) -> list:
         """The force of a pass."""
         place, loaded = self.slot(i, b, scene, plan)
-        return self.given.mean(lambda row, end: self.read(forces, row, let(place + 3 * end)), now, loaded)
+        return self.given_forces.mean(lambda row, end: self.read(forces, row, let(place + 3 * end)), now, loaded)
 
     @traced
     def add_load(self, i, b, now, scene, forces_adj, f_adj, plan) -> None:
@@ -130,7 +134,7 @@ class FreeVertices:
         def add(row, end, numbers):
             self.add(forces_adj, numbers, row, let(place + 3 * end))
 
-        self.given.mean_vjp(add, f_adj, now, loaded)
+        self.given_forces.mean_vjp(add, f_adj, now, loaded)
 
     # ---- forward -------------------------------------------------------------------------------------------------------
 

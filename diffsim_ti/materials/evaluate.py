@@ -1,4 +1,4 @@
-"""A law for many displacement gradients at once, outside any scene: NumPy arrays in and out, through a kernel of the law."""
+"""A law evaluated for many deformation gradients together, outside any scene."""
 
 from functools import lru_cache
 

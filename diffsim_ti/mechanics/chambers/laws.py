@@ -3,7 +3,7 @@
 import numpy as np
 
 from diffsim_ti.terms import FilledChamber
-from diffsim_ti.terms.chambers import gas_law
+from diffsim_ti.terms.gas_law import gas_law
 
 
 class Gas:

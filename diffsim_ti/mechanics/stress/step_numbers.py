@@ -19,19 +19,6 @@ class StepNumbers:
 
     fp, vector = number_type, vector_type
 
-    @ti.func
-    def row(self, force):
-        """The row that a kick of a step takes."""
-        r = 0
-        if ti.static(self.per_step):
-            r = force
-        return r
-
-    @ti.func
-    def share(self, force, now: A):
-        """How far in that step the pass lies: it ends a step before its own."""
-        return ti.select(force == now.row, now.begin, ti.cast(1, self.fp))
-
     @traced
     def kicks(self, now) -> list:
         """(row, how far in its step the pass lies, weight) of the two kicks that a pass is made of."""
