@@ -9,6 +9,7 @@ from functools import cached_property
 
 import taichi as ti
 
+from diffsim_ti.mechanics.loads.explicit import GivenForces
 from diffsim_ti.runtime import LANES, Bundle, assign, at, let, traced, variable
 from diffsim_ti.solvers.explicit import kick_drift
 from diffsim_ti.state.features import Features
